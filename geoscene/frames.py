@@ -1,0 +1,168 @@
+"""Coordinate frames: geographic (WGS 84), projected (a CRS), scene (projected minus a whole-metre origin)."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pyproj import CRS, Proj, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.database import query_utm_crs_info
+from pyproj.exceptions import CRSError
+
+from geoscene.errors import FrameError
+
+Float = NDArray[np.float64]
+
+_GEOGRAPHIC = "EPSG:4326"
+
+
+def _local_wkt(lon_deg: float, lat_deg: float) -> str:
+    """WKT 2 of a transverse Mercator with scale 1 on a meridian and parallel, so that a metre is a metre there."""
+    text = (
+        f"+proj=tmerc +lat_0={lat_deg:.6f} +lon_0={lon_deg:.6f} +k=1 +x_0=0 +y_0=0"
+        " +datum=WGS84 +units=m +no_defs +type=crs"
+    )
+    document = CRS(text).to_json_dict()
+    document["name"] = f"Local transverse Mercator at {lat_deg:.6f}, {lon_deg:.6f}"
+    return str(CRS.from_json_dict(document).to_wkt())
+
+
+def utm_crs(lon_deg: float, lat_deg: float) -> str:
+    """EPSG code (``EPSG:326xx`` or ``EPSG:327xx``) of the WGS 84 UTM zone that holds a point.
+
+    Raises FrameError outside 80° S to 84° N, where UTM is not defined.
+    """
+    found = query_utm_crs_info(
+        datum_name="WGS 84", area_of_interest=AreaOfInterest(lon_deg, lat_deg, lon_deg, lat_deg)
+    )
+    if not found:
+        raise FrameError(f"no UTM zone at {lat_deg:.4f}, {lon_deg:.4f}; use the local frame (--crs local)")
+    return f"{found[0].auth_name}:{found[0].code}"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The scene frame: x east, y north of the grid, z up, metres, float64.
+
+    wkt      : the projected CRS as WKT 2
+    origin   : (easting, northing) of the scene's zero in that CRS, whole metres
+    vertical : what z means: ``flat`` (height above an assumed level ground), ``orthometric`` (above the
+               geoid of the terrain model) or ``ellipsoidal`` (above WGS 84)
+    """
+
+    wkt: str
+    origin: tuple[float, float]
+    vertical: str = "flat"
+
+    @classmethod
+    def at(cls, lon_deg: float, lat_deg: float, crs: str = "local", vertical: str = "flat") -> Frame:
+        """The frame of a scene centred on a point.
+
+        crs : ``local`` (transverse Mercator with scale 1 on the centre), ``utm`` (the zone of the centre),
+              or anything pyproj reads that is projected and in metres (``EPSG:32618``)
+
+        Raises FrameError for a CRS that is unknown, not projected, not in metres, or not usable at the point.
+        """
+        if not (np.isfinite(lon_deg) and np.isfinite(lat_deg) and abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
+            raise FrameError(f"the centre {lat_deg}, {lon_deg} is not a latitude and longitude in degrees")
+        if crs == "local":
+            return cls(_local_wkt(round(lon_deg, 6), round(lat_deg, 6)), (0.0, 0.0), vertical)
+        try:
+            parsed = CRS.from_user_input(utm_crs(lon_deg, lat_deg) if crs == "utm" else crs)
+        except CRSError as error:
+            raise FrameError(f"--crs {crs}: pyproj does not know it; give local, utm or EPSG:<number>") from error
+        if not parsed.is_projected:
+            raise FrameError(f"--crs {crs} ({parsed.name}) is not a projected system; give local, utm or EPSG:<number>")
+        if any(axis.unit_conversion_factor != 1.0 for axis in parsed.axis_info[:2]):
+            raise FrameError(f"--crs {crs} ({parsed.name}) is not in metres")
+        frame = cls(str(parsed.to_wkt()), (0.0, 0.0), vertical)
+        easting, northing = frame.to_projected(*frame.from_geographic(lon_deg, lat_deg))
+        if not (np.isfinite(easting) and np.isfinite(northing)):
+            raise FrameError(f"--crs {crs} ({parsed.name}) cannot project {lat_deg:.4f}, {lon_deg:.4f}")
+        frame = cls(str(parsed.to_wkt()), (float(np.round(easting)), float(np.round(northing))), vertical)
+        if not 0.9 < float(frame.scale(lon_deg, lat_deg)) < 1.1:
+            raise FrameError(
+                f"--crs {crs} ({parsed.name}) distorts lengths by more than 10 % at {lat_deg:.4f}, {lon_deg:.4f}"
+            )
+        return frame
+
+    @functools.cached_property
+    def crs(self) -> CRS:
+        """The projected CRS."""
+        return CRS.from_wkt(self.wkt)
+
+    @functools.cached_property
+    def name(self) -> str:
+        """``EPSG:n`` where the CRS has such a code, else its name."""
+        code = self.crs.to_authority(min_confidence=100)
+        return ":".join(code) if code else str(self.crs.name)
+
+    @functools.cached_property
+    def _forward(self) -> Transformer:
+        return Transformer.from_crs(_GEOGRAPHIC, self.crs, always_xy=True)
+
+    @functools.cached_property
+    def _proj(self) -> Proj:
+        return Proj(self.crs)
+
+    def from_geographic(self, lon_deg: ArrayLike, lat_deg: ArrayLike) -> tuple[Any, Any]:
+        """Scene x, y (metres, any shape) of longitudes and latitudes in degrees; infinite where undefined."""
+        x, y = self._forward.transform(np.asarray(lon_deg, float), np.asarray(lat_deg, float))
+        return x - self.origin[0], y - self.origin[1]
+
+    def to_geographic(self, x: ArrayLike, y: ArrayLike) -> tuple[Any, Any]:
+        """Longitude and latitude in degrees (any shape) of scene coordinates in metres."""
+        east, north = self.to_projected(x, y)
+        lon, lat = self._forward.transform(east, north, direction="INVERSE")
+        return lon, lat
+
+    def to_projected(self, x: ArrayLike, y: ArrayLike) -> tuple[Any, Any]:
+        """Easting and northing in the CRS (metres, any shape) of scene coordinates."""
+        return np.asarray(x, float) + self.origin[0], np.asarray(y, float) + self.origin[1]
+
+    def to_crs(self, crs: str | CRS, x: ArrayLike, y: ArrayLike) -> tuple[Any, Any]:
+        """Easting and northing (or longitude and latitude) in another CRS of scene coordinates."""
+        other = Transformer.from_crs(self.crs, CRS.from_user_input(crs), always_xy=True)
+        east, north = other.transform(*self.to_projected(x, y))
+        return east, north
+
+    def from_crs(self, crs: str | CRS, east: ArrayLike, north: ArrayLike) -> tuple[Any, Any]:
+        """Scene x, y of coordinates in another CRS (x or longitude first)."""
+        other = Transformer.from_crs(CRS.from_user_input(crs), self.crs, always_xy=True)
+        x, y = other.transform(np.asarray(east, float), np.asarray(north, float))
+        return x - self.origin[0], y - self.origin[1]
+
+    def scale(self, lon_deg: ArrayLike, lat_deg: ArrayLike) -> Float:
+        """Grid metres per true metre, horizontally, at points given in degrees.
+
+        1 at the centre of a local frame, 0.9996 on a UTM zone's meridian. A true horizontal length times this
+        is the length in the scene; heights are not scaled.
+        """
+        factors = self._proj.get_factors(np.asarray(lon_deg, float), np.asarray(lat_deg, float))
+        return np.sqrt(np.asarray(factors.areal_scale, float))
+
+    def scale_at(self, x: ArrayLike, y: ArrayLike) -> Float:
+        """`scale` at scene coordinates."""
+        return self.scale(*self.to_geographic(x, y))
+
+    def convergence(self, lon_deg: ArrayLike, lat_deg: ArrayLike) -> Float:
+        """Angle from true north to grid north in radians, clockwise positive, at points in degrees.
+
+        A true azimuth minus this is a grid azimuth.
+        """
+        factors = self._proj.get_factors(np.asarray(lon_deg, float), np.asarray(lat_deg, float))
+        return np.radians(np.asarray(factors.meridian_convergence, float))
+
+    def to_json(self) -> dict[str, object]:
+        """The frame as `scene.json` stores it."""
+        return {"name": self.name, "wkt": self.wkt, "origin": list(self.origin), "vertical": self.vertical}
+
+    @classmethod
+    def from_json(cls, document: dict[str, Any]) -> Frame:
+        """The frame that `to_json` wrote."""
+        east, north = document["origin"]
+        return cls(document["wkt"], (float(east), float(north)), document["vertical"])

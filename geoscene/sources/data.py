@@ -1,0 +1,92 @@
+"""What a map source yields: features with untouched tags, in longitude and latitude."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.report import Problem
+
+Tags = dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A line with tags: a road, a railway, a barrier, a tree row; also a building outline that is an area.
+
+    osm_id  : ``way/123``
+    nodes   : (n,) int64 OSM node ids
+    lonlat  : (n, 2) float64 degrees
+    """
+
+    osm_id: str
+    tags: Tags
+    nodes: NDArray[np.int64]
+    lonlat: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """A polygon with tags, from a closed way or a multipolygon relation.
+
+    osm_id   : ``way/123`` or ``relation/45``
+    geometry : valid shapely Polygon or MultiPolygon, degrees, exteriors counter-clockwise
+    nodes    : ids of the outer ring's nodes where the area is one closed way, else empty
+    """
+
+    osm_id: str
+    tags: Tags
+    geometry: Any
+    nodes: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A node with tags. ``osm_id`` is ``node/6``."""
+
+    osm_id: str
+    tags: Tags
+    lon: float
+    lat: float
+
+
+@dataclass(frozen=True, slots=True)
+class Relation:
+    """A relation that is no area: ``type=restriction``, ``type=building`` ...
+
+    members : (kind, id, role), kind being ``node``, ``way`` or ``relation``
+    """
+
+    osm_id: str
+    tags: Tags
+    members: tuple[tuple[str, int, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class OsmData:
+    """One map extract.
+
+    bounds      : (west, south, east, north) degrees: the area asked for, else the extract's own, else its nodes'
+    ways        : ways with tags that are lines (anything with ``highway``, ``railway``, ``barrier``, ``waterway`` ...)
+    areas       : closed ways and multipolygons that are areas
+    points      : nodes with tags
+    relations   : other relations
+    problems    : what was repaired or dropped while reading
+    source      : what it was read from, for people
+    timestamp   : newest edit or replication time, ISO 8601, or "" if unknown
+    """
+
+    bounds: tuple[float, float, float, float]
+    ways: list[Way]
+    areas: list[Area]
+    points: list[Point]
+    relations: list[Relation]
+    problems: list[Problem] = field(default_factory=list)
+    source: str = ""
+    timestamp: str = ""
+
+
+ATTRIBUTION = "(c) OpenStreetMap contributors, ODbL 1.0, https://www.openstreetmap.org/copyright"
