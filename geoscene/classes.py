@@ -1,4 +1,4 @@
-"""What a surface is (class) and what it is made of (material), as codes that scenes, points and pixels share."""
+"""What a surface is (class) and is made of (material), as codes that scenes, points and pixels share."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class ClassCodes:
 
 
 # class: (SemanticKITTI, nuScenes lidarseg, Waymo segmentation, ASPRS LAS 1.4 R15, picture colour)
-# Ids from semantic-kitti.yaml, the nuScenes lidarseg list, Waymo's segmentation proto and the LAS 1.4 R15 table;
+# Ids from semantic-kitti.yaml, the nuScenes lidarseg list, Waymo's segmentation proto and LAS 1.4 R15;
 # LAS codes from 64 on are user-definable.
 _CODES: dict[Class, tuple[int, int, int, int, tuple[int, int, int]]] = {
     Class.UNLABELED: (0, 0, 0, 1, (60, 60, 60)),
@@ -128,7 +128,8 @@ def class_codes() -> ClassCodes:
         for table, code in zip(tables, codes, strict=True):
             table[klass] = code
         color[klass] = rgb
-    return ClassCodes(*tables, color)
+    kitti, nuscenes, waymo, asprs = tables
+    return ClassCodes(kitti, nuscenes, waymo, asprs, color)
 
 
 @dataclass(frozen=True, slots=True)

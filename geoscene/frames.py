@@ -21,7 +21,7 @@ _GEOGRAPHIC = "EPSG:4326"
 
 
 def _local_wkt(lon_deg: float, lat_deg: float) -> str:
-    """WKT 2 of a transverse Mercator with scale 1 on a meridian and parallel, so that a metre is a metre there."""
+    """WKT 2 of a transverse Mercator with scale 1 on the given point, so that a metre is a metre there."""
     text = (
         f"+proj=tmerc +lat_0={lat_deg:.6f} +lon_0={lon_deg:.6f} +k=1 +x_0=0 +y_0=0"
         " +datum=WGS84 +units=m +no_defs +type=crs"
@@ -74,9 +74,13 @@ class Frame:
         try:
             parsed = CRS.from_user_input(utm_crs(lon_deg, lat_deg) if crs == "utm" else crs)
         except CRSError as error:
-            raise FrameError(f"--crs {crs}: pyproj does not know it; give local, utm or EPSG:<number>") from error
+            raise FrameError(
+                f"--crs {crs}: pyproj does not know it; give local, utm or EPSG:<number>"
+            ) from error
         if not parsed.is_projected:
-            raise FrameError(f"--crs {crs} ({parsed.name}) is not a projected system; give local, utm or EPSG:<number>")
+            raise FrameError(
+                f"--crs {crs} ({parsed.name}) is not projected; give local, utm or EPSG:<number>"
+            )
         if any(axis.unit_conversion_factor != 1.0 for axis in parsed.axis_info[:2]):
             raise FrameError(f"--crs {crs} ({parsed.name}) is not in metres")
         frame = cls(str(parsed.to_wkt()), (0.0, 0.0), vertical)
@@ -143,7 +147,8 @@ class Frame:
         is the length in the scene; heights are not scaled.
         """
         factors = self._proj.get_factors(np.asarray(lon_deg, float), np.asarray(lat_deg, float))
-        return np.sqrt(np.asarray(factors.areal_scale, float))
+        scale: Float = np.sqrt(np.asarray(factors.areal_scale, float))
+        return scale
 
     def scale_at(self, x: ArrayLike, y: ArrayLike) -> Float:
         """`scale` at scene coordinates."""
@@ -155,7 +160,8 @@ class Frame:
         A true azimuth minus this is a grid azimuth.
         """
         factors = self._proj.get_factors(np.asarray(lon_deg, float), np.asarray(lat_deg, float))
-        return np.radians(np.asarray(factors.meridian_convergence, float))
+        angle: Float = np.radians(np.asarray(factors.meridian_convergence, float))
+        return angle
 
     def to_json(self) -> dict[str, object]:
         """The frame as `scene.json` stores it."""

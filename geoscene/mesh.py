@@ -27,7 +27,7 @@ class Mesh:
     material : (m,) uint8, code of `geoscene.materials`
     surface  : (m,) uint8, OTHER, WALL, ROOF or FLOOR
     color    : (m, 3) uint8, sRGB
-    closed   : (m,) bool, the face belongs to a closed solid (all closed faces of one feature together bound it)
+    closed   : (m,) bool, the face belongs to a closed solid (a feature's closed faces together bound it)
     """
 
     vertices: Float
@@ -43,7 +43,9 @@ class Mesh:
         """Refuse columns that disagree in length."""
         for name in ("feature", "klass", "material", "surface", "color", "closed"):
             if len(getattr(self, name)) != len(self.faces):
-                raise GeosceneError(f"mesh column {name} has {len(getattr(self, name))} rows for {len(self.faces)} faces")
+                raise GeosceneError(
+                    f"mesh column {name} has {len(getattr(self, name))} rows for {len(self.faces)} faces"
+                )
 
     def __len__(self) -> int:
         """Number of faces."""
@@ -98,7 +100,8 @@ class Mesh:
         a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
         n = np.cross(b - a, c - a)
         length = np.linalg.norm(n, axis=1, keepdims=True)
-        return np.divide(n, length, out=np.zeros_like(n), where=length > 0)
+        unit: Float = np.divide(n, length, out=np.zeros_like(n), where=length > 0)
+        return unit
 
 
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:

@@ -183,7 +183,9 @@ def open_scene(path: str | Path) -> Scene:
     folder = Path(path)
     manifest_path = folder / "scene.json"
     if not folder.is_dir():
-        raise SceneFormatError(f"{folder}: no such scene directory; make one with: geoscene build --demo -o {folder}")
+        raise SceneFormatError(
+            f"{folder}: no such scene directory; make one with: geoscene build --demo -o {folder}"
+        )
     if not manifest_path.exists():
         raise SceneFormatError(f"{folder}: no scene.json in it: not a scene, or its build did not finish")
     try:
@@ -192,5 +194,7 @@ def open_scene(path: str | Path) -> Scene:
     except (ValueError, KeyError, TypeError) as error:
         raise SceneFormatError(f"{manifest_path}: damaged ({error}); build the scene again") from error
     if schema != SCHEMA:
-        raise SceneFormatError(f"{folder}: schema version {schema}, this program reads {SCHEMA}; build the scene again")
+        raise SceneFormatError(
+            f"{folder}: schema version {schema}, this program reads {SCHEMA}; build the scene again"
+        )
     return Scene(folder, manifest, Frame.from_json(manifest["frame"]))

@@ -69,8 +69,8 @@ class Relation:
 class OsmData:
     """One map extract.
 
-    bounds      : (west, south, east, north) degrees: the area asked for, else the extract's own, else its nodes'
-    ways        : ways with tags that are lines (anything with ``highway``, ``railway``, ``barrier``, ``waterway`` ...)
+    bounds      : (west, south, east, north) degrees: the area asked for, else the extract's, else its nodes'
+    ways        : ways with tags that are lines (``highway``, ``railway``, ``barrier``, ``waterway`` ...)
     areas       : closed ways and multipolygons that are areas
     points      : nodes with tags
     relations   : other relations
