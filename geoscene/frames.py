@@ -90,7 +90,7 @@ class Frame:
         frame = cls(str(parsed.to_wkt()), (float(np.round(easting)), float(np.round(northing))), vertical)
         if not 0.9 < float(frame.scale(lon_deg, lat_deg)) < 1.1:
             raise FrameError(
-                f"--crs {crs} ({parsed.name}) distorts lengths by more than 10 % at {lat_deg:.4f}, {lon_deg:.4f}"
+                f"--crs {crs} ({parsed.name}) distorts lengths by over 10 % at {lat_deg:.4f}, {lon_deg:.4f}"
             )
         return frame
 

@@ -1,0 +1,56 @@
+"""One frame of a laser scanner as columns, one row a return."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.errors import LidarError
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """The returns of one frame, in the order they were fired.
+
+    start_ns : time of the frame's first firing, nanoseconds since the drive's start
+    xyz       : (n, 3) float32, metres, sensor frame (x forward, y left, z up) at each point's own firing time
+    time_ns   : (n,) int32, nanoseconds after ``start_ns``
+    ring      : (n,) uint16, rank of the beam's elevation, 0 lowest
+    column    : (n,) int32, firing block (azimuth step) within the frame
+    range     : (n,) float64, metres as the sensor reports it
+    intensity : (n,) float32, calibrated reflectivity as the sensor codes it, 0 to 255
+    klass     : (n,) uint8, `geoscene.classes.Class`
+    feature   : (n,) int32, feature number in the scene (the instance), -1 for none
+    incidence : (n,) float32, radians between beam and surface normal
+    true_range : (n,) float64, metres, before noise and quantisation
+    echo      : (n,) uint8, 1 for the first echo of its pulse
+    echoes    : (n,) uint8, echoes of its pulse
+    """
+
+    start_ns: int
+    xyz: NDArray[np.float32]
+    time_ns: NDArray[np.int32]
+    ring: NDArray[np.uint16]
+    column: NDArray[np.int32]
+    range: NDArray[np.float64]
+    intensity: NDArray[np.float32]
+    klass: NDArray[np.uint8]
+    feature: NDArray[np.int32]
+    incidence: NDArray[np.float32]
+    true_range: NDArray[np.float64]
+    echo: NDArray[np.uint8]
+    echoes: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        """Refuse columns that disagree in length."""
+        for f in fields(self)[1:]:
+            if len(getattr(self, f.name)) != len(self.xyz):
+                raise LidarError(
+                    f"cloud column {f.name} has {len(getattr(self, f.name))} rows for {len(self.xyz)}"
+                )
+
+    def __len__(self) -> int:
+        """Number of returns."""
+        return len(self.xyz)

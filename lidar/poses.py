@@ -1,0 +1,103 @@
+"""Where a rigid body is, over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from lidar.errors import InputError
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Poses of a body in the scene; a point b of the body is at position + scale * (rotation @ b).
+
+    position : (n, 3) float64, scene metres
+    rotation : (n, 3, 3) float64, scene axes from body axes (x forward, y left, z up)
+    scale    : (n, 3) float64, scene metres per true metre along the scene's axes; (k, k, 1), where k is the
+               projection's point scale (1 in a local frame, 0.9996 to 1.0004 and more in UTM)
+    """
+
+    position: Float
+    rotation: Float
+    scale: Float
+
+    def __len__(self) -> int:
+        """Number of poses."""
+        return len(self.position)
+
+    def take(self, index: ArrayLike) -> Poses:
+        """Chosen rows."""
+        k = np.asarray(index)
+        return Poses(self.position[k], self.rotation[k], self.scale[k])
+
+    def mounted(self, translation: ArrayLike, rotation: ArrayLike) -> Poses:
+        """Poses of a sensor that sits on the body.
+
+        translation : (3,) true metres in the body frame
+        rotation    : (3, 3) body axes from sensor axes
+        """
+        shift = self.rotation @ np.asarray(translation, float)
+        return Poses(
+            self.position + self.scale * shift, self.rotation @ np.asarray(rotation, float), self.scale
+        )
+
+    def place(self, points: Float) -> Float:
+        """Scene coordinates (n, 3) of body points (n, 3), row by row; one pose serves all points."""
+        turned = np.einsum("nij,nj->ni", np.broadcast_to(self.rotation, (len(points), 3, 3)), points)
+        return self.position + self.scale * turned
+
+    def directions(self, vectors: Float) -> Float:
+        """Ray directions (n, 3) in the scene of body vectors (n, 3), row by row.
+
+        Not unit vectors where the scale is not 1: with them, the ray parameter of a hit is a true distance.
+        """
+        turned = np.einsum("nij,nj->ni", np.broadcast_to(self.rotation, (len(vectors), 3, 3)), vectors)
+        return self.scale * turned
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A vehicle's poses on a rising time axis; linear in position and spherical-linear in rotation between.
+
+    time_ns  : (n,) int64, nanoseconds since the drive's start
+    position : (n, 3) float64, scene metres: the rear axle's centre, on the ground
+    quat_xyzw : (n, 4) float64, scene axes from vehicle axes
+    velocity : (n, 3) float64, true m/s along the scene's axes
+    scale    : (n,) float64, scene metres per true metre, horizontally
+    """
+
+    time_ns: NDArray[np.int64]
+    position: Float
+    quat_xyzw: Float
+    velocity: Float
+    scale: Float
+
+    def __post_init__(self) -> None:
+        """Refuse a trajectory that cannot be interpolated."""
+        if len(self.time_ns) < 2 or (np.diff(self.time_ns) <= 0).any():
+            raise InputError("a trajectory needs two poses or more with rising times")
+        if not (np.isfinite(self.position).all() and np.isfinite(self.quat_xyzw).all()):
+            raise InputError("a trajectory has poses that are not finite")
+
+    @property
+    def duration_ns(self) -> int:
+        """Time of the last pose."""
+        return int(self.time_ns[-1])
+
+    def at(self, time_ns: ArrayLike) -> Poses:
+        """Poses at times (k,) in nanoseconds, held at the first and the last pose outside the drive."""
+        t = np.clip(np.asarray(time_ns, np.int64), self.time_ns[0], self.time_ns[-1])
+        lo = np.clip(np.searchsorted(self.time_ns, t, side="right") - 1, 0, len(self.time_ns) - 2)
+        span = (self.time_ns[lo + 1] - self.time_ns[lo]).astype(float)
+        w = ((t - self.time_ns[lo]) / span)[:, None]
+        position = self.position[lo] + w * (self.position[lo + 1] - self.position[lo])
+        k = self.scale[lo] + w[:, 0] * (self.scale[lo + 1] - self.scale[lo])
+        first, last = int(lo.min()), int(lo.max()) + 2
+        turn = Slerp(self.time_ns[first:last].astype(float), Rotation.from_quat(self.quat_xyzw[first:last]))
+        return Poses(position, turn(t.astype(float)).as_matrix(), np.stack([k, k, np.ones_like(k)], axis=1))
