@@ -50,7 +50,8 @@ class Poses:
     def place(self, points: Float) -> Float:
         """Scene coordinates (n, 3) of body points (n, 3), row by row; one pose serves all points."""
         turned = np.einsum("nij,nj->ni", np.broadcast_to(self.rotation, (len(points), 3, 3)), points)
-        return self.position + self.scale * turned
+        placed: Float = self.position + self.scale * turned
+        return placed
 
     def directions(self, vectors: Float) -> Float:
         """Ray directions (n, 3) in the scene of body vectors (n, 3), row by row.
@@ -58,7 +59,8 @@ class Poses:
         Not unit vectors where the scale is not 1: with them, the ray parameter of a hit is a true distance.
         """
         turned = np.einsum("nij,nj->ni", np.broadcast_to(self.rotation, (len(vectors), 3, 3)), vectors)
-        return self.scale * turned
+        scaled: Float = self.scale * turned
+        return scaled
 
 
 @dataclass(frozen=True)
