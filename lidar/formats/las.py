@@ -142,11 +142,12 @@ def write_las(path: Path, table: Table, info: LasInfo) -> None:
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     import laspy  # noqa: PLC0415
+    import lazrs  # noqa: PLC0415
 
     try:
         with laspy.open(path) as reader:
             yield reader
-    except (laspy.errors.LaspyException, OSError, ValueError) as error:
+    except (laspy.errors.LaspyException, lazrs.LazrsError, OSError, ValueError) as error:
         raise FormatError(f"{path}: not a readable LAS or LAZ file ({error})") from error
 
 

@@ -1,0 +1,169 @@
+"""A dataset on disk: what a drive writes and everything later reads.
+
+DATASET/
+  dataset.json            schema, scene, rig, options, seed, frames, licence; updated last
+  poses.csv               the vehicle at each frame's start
+  trajectory.csv          the vehicle at 100 Hz: what points are placed with
+  calibration.json        mounts and intrinsics of every sensor
+  gnss.csv                fixes
+  <sensor>/<format>/<frame>.<ext>
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from geoscene.frames import Frame
+from geoscene.scene import write_atomically
+from lidar.errors import DatasetError
+from lidar.poses import Trajectory
+
+SCHEMA = 1
+"""Version of the dataset directory; a reader refuses others."""
+
+_TRAJECTORY = ("time_ns", "x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "scale")
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a document as indented UTF-8 JSON."""
+    write_atomically(path, (json.dumps(document, indent=2, ensure_ascii=False) + "\n").encode("utf-8"))
+
+
+def write_columns(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> None:
+    """Write columns as CSV with a header; floats in the shortest text that reads back the same."""
+    lists = [np.asarray(c).tolist() for c in columns.values()]
+    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*lists, strict=True))]
+    write_atomically(path, ("\n".join(lines) + "\n").encode("utf-8"))
+
+
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory as CSV, exactly: reading it gives the same numbers."""
+    t = trajectory
+    columns = [t.time_ns, *t.position.T, *t.quat_xyzw.T, *t.velocity.T, t.scale]
+    write_columns(path, dict(zip(_TRAJECTORY, columns, strict=True)))
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """The trajectory that `write_trajectory` wrote.
+
+    Raises DatasetError if the file is missing or damaged.
+    """
+    try:
+        with path.open(encoding="utf-8") as file:
+            names = tuple(file.readline().strip().split(","))
+            values = np.loadtxt(file, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path}: not a readable trajectory ({error})") from error
+    if names != _TRAJECTORY:
+        raise DatasetError(f"{path}: columns {', '.join(names)}; expected {', '.join(_TRAJECTORY)}")
+    return Trajectory(
+        values[:, 0].astype(np.int64), values[:, 1:4], values[:, 4:8], values[:, 8:11], values[:, 11]
+    )
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset directory, opened.
+
+    path     : the directory
+    manifest : what ``dataset.json`` holds
+    """
+
+    path: Path
+    manifest: dict[str, Any]
+
+    @property
+    def frame(self) -> Frame:
+        """The scene frame that poses are in."""
+        return Frame.from_json(self.manifest["frame"])
+
+    @property
+    def start(self) -> datetime:
+        """UTC time of the drive's start."""
+        return datetime.fromisoformat(self.manifest["start_time"])
+
+    @property
+    def crs(self) -> CRS:
+        """The CRS of LAZ files."""
+        return CRS.from_user_input(self.manifest["export_crs"])
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of the whole drive."""
+        return int(self.manifest["frames"])
+
+    @property
+    def lidars(self) -> dict[str, dict[str, Any]]:
+        """Laser scanners by name, as ``calibration.json`` describes them."""
+        calibration = json.loads((self.path / "calibration.json").read_text("utf-8"))
+        return {name: sensor for name, sensor in calibration["sensors"].items() if sensor["kind"] == "lidar"}
+
+    def trajectory(self) -> Trajectory:
+        """The vehicle's poses."""
+        return read_trajectory(self.path / "trajectory.csv")
+
+    def files(self, sensor: str, kind: str) -> Iterator[tuple[int, Path]]:
+        """(frame number, path) of a sensor's files of one format, in order."""
+        for path in sorted((self.path / sensor / kind).glob(f"*.{kind}")):
+            if path.stem.isdigit():
+                yield int(path.stem), path
+
+
+def open_dataset(path: str | Path) -> Dataset:
+    """Open a dataset directory, finished or not.
+
+    Raises DatasetError if it is none or has another schema version.
+    """
+    folder = Path(path)
+    manifest_path = folder / "dataset.json"
+    if not manifest_path.exists():
+        raise DatasetError(
+            f"{folder}: no dataset.json in it; make one with: lidar drive SCENE --route random -o {folder}"
+        )
+    try:
+        manifest = json.loads(manifest_path.read_text("utf-8"))
+        schema = manifest["schema"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{manifest_path}: damaged ({error})") from error
+    if schema != SCHEMA:
+        raise DatasetError(f"{folder}: schema version {schema}, this program reads {SCHEMA}; drive again")
+    return Dataset(folder, manifest)
+
+
+def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
+    """Make a directory ready for a drive made by ``recipe``; return how many frames it already holds.
+
+    A directory that holds a drive of the same recipe is kept, so that a killed drive goes on; with another
+    recipe, or with other files, it is refused unless ``overwrite``, which deletes a former dataset.
+
+    Raises DatasetError if the directory may not be used.
+    """
+    manifest_path = path / "dataset.json"
+    if path.exists() and not path.is_dir():
+        raise DatasetError(f"{path}: is a file; give a directory")
+    if not path.exists() or not any(path.iterdir()):
+        path.mkdir(parents=True, exist_ok=True)
+        return 0
+    if not manifest_path.exists():
+        raise DatasetError(f"{path}: is not empty and not a dataset; give another directory")
+    if overwrite:
+        shutil.rmtree(path)
+        path.mkdir(parents=True)
+        return 0
+    manifest = open_dataset(path).manifest
+    changed = sorted(k for k in recipe if manifest["recipe"].get(k) != json.loads(json.dumps(recipe[k])))
+    if changed:
+        raise DatasetError(
+            f"{path}: holds a drive made with another {', '.join(changed)}; add --overwrite to replace it"
+        )
+    return int(manifest["frames_done"])
