@@ -1,0 +1,1 @@
+"""What a laser pulse gives back: power, detection, noise, echoes and codes."""

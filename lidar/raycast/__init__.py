@@ -1,0 +1,7 @@
+"""Rays against triangles: exact ranges, instances, motion within a sweep, echoes."""
+
+from lidar.raycast.caster import Caster as Caster
+from lidar.raycast.geometry import ALL as ALL
+from lidar.raycast.geometry import Instances as Instances
+from lidar.raycast.hits import Echoes as Echoes
+from lidar.raycast.hits import Hits as Hits

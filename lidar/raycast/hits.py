@@ -1,0 +1,52 @@
+"""What rays met: the first surface (`Hits`) or the first few (`Echoes`), as columns, one row a ray."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Hits:
+    """The first surface along each ray.
+
+    range    : (n,) float64, ray parameter of the hit (metres for unit directions; true metres for directions
+               from `Poses.directions`); inf for a miss
+    face     : (n,) int32, face in the caster's mesh, or in the mesh of the instance's shape; -1 for a miss
+    instance : (n,) int32, instance that was hit; -1 for the caster's own mesh and for a miss
+    cosine   : (n,) float32, cosine between the face's normal and the way back along the ray: positive on the
+               side from which the face's corners run counter-clockwise, negative on its back; 0 for a miss
+    """
+
+    range: NDArray[np.float64]
+    face: NDArray[np.int32]
+    instance: NDArray[np.int32]
+    cosine: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        """Number of rays."""
+        return len(self.range)
+
+
+@dataclass(frozen=True, slots=True)
+class Echoes:
+    """The first k surfaces along each ray, nearest first.
+
+    count    : (n,) int32, surfaces found, at most k
+    range    : (n, k) float64, as in `Hits`; inf from ``count`` on
+    face     : (n, k) int32; -1 from ``count`` on
+    instance : (n, k) int32; -1 from ``count`` on
+    cosine   : (n, k) float32; 0 from ``count`` on
+    """
+
+    count: NDArray[np.int32]
+    range: NDArray[np.float64]
+    face: NDArray[np.int32]
+    instance: NDArray[np.int32]
+    cosine: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        """Number of rays."""
+        return len(self.count)
