@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Proj, Transformer
-from pyproj.aoi import AreaOfInterest
-from pyproj.database import query_utm_crs_info
+from pyproj.crs import ProjectedCRS
+from pyproj.crs.coordinate_operation import TransverseMercatorConversion
 from pyproj.exceptions import CRSError
 
 from geoscene.errors import FrameError
@@ -22,26 +22,30 @@ _GEOGRAPHIC = "EPSG:4326"
 
 def _local_wkt(lon_deg: float, lat_deg: float) -> str:
     """WKT 2 of a transverse Mercator with scale 1 on the given point, so that a metre is a metre there."""
-    text = (
-        f"+proj=tmerc +lat_0={lat_deg:.6f} +lon_0={lon_deg:.6f} +k=1 +x_0=0 +y_0=0"
-        " +datum=WGS84 +units=m +no_defs +type=crs"
+    return str(
+        ProjectedCRS(
+            TransverseMercatorConversion(lat_deg, lon_deg, scale_factor_natural_origin=1.0),
+            name=f"Local transverse Mercator at {lat_deg:.6f}, {lon_deg:.6f}",
+            geodetic_crs=CRS.from_user_input(_GEOGRAPHIC),
+        ).to_wkt()
     )
-    document = CRS(text).to_json_dict()
-    document["name"] = f"Local transverse Mercator at {lat_deg:.6f}, {lon_deg:.6f}"
-    return str(CRS.from_json_dict(document).to_wkt())
 
 
 def utm_crs(lon_deg: float, lat_deg: float) -> str:
     """EPSG code (``EPSG:326xx`` or ``EPSG:327xx``) of the WGS 84 UTM zone that holds a point.
 
+    With the wide zones of south-west Norway (32V) and Svalbard (31X, 33X, 35X, 37X).
     Raises FrameError outside 80° S to 84° N, where UTM is not defined.
     """
-    found = query_utm_crs_info(
-        datum_name="WGS 84", area_of_interest=AreaOfInterest(lon_deg, lat_deg, lon_deg, lat_deg)
-    )
-    if not found:
+    if not -80.0 <= lat_deg <= 84.0:
         raise FrameError(f"no UTM zone at {lat_deg:.4f}, {lon_deg:.4f}; use the local frame (--crs local)")
-    return f"{found[0].auth_name}:{found[0].code}"
+    lon = (lon_deg + 180.0) % 360.0 - 180.0
+    zone = int((lon + 180.0) // 6.0) + 1
+    if 56.0 <= lat_deg < 64.0 and 3.0 <= lon < 12.0:
+        zone = 32
+    elif lat_deg >= 72.0 and 0.0 <= lon < 42.0:
+        zone = 31 + 2 * int((lon + 3.0) // 12.0)
+    return f"EPSG:{32600 + zone if lat_deg >= 0 else 32700 + zone}"
 
 
 @dataclass(frozen=True)
