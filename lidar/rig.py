@@ -121,7 +121,7 @@ GNSS_MODES = ("single", "sbas", "rtk")
 
 @dataclass(frozen=True, slots=True)
 class ImuSpec:
-    """An inertial unit on the rig; noise as Allan parameters. The defaults are those EuRoC gives its ADIS16448.
+    """An inertial unit on the rig, noise as Allan parameters; the defaults are EuRoC's for its ADIS16448.
 
     gyro_noise : rad/s/sqrt(Hz)
     gyro_walk  : rad/s^2/sqrt(Hz)
@@ -175,10 +175,11 @@ def _mount(table: Table, *, camera: bool = False) -> Mount:
     return Mount((a, b, c), (qx, qy, qz, qw))
 
 
-def _lidar(table: Table) -> LidarSpec:
+def _lidar(table: Table, folder: Path) -> LidarSpec:
+    preset = table.text("preset")
     return LidarSpec(
         name=table.text("name"),
-        preset=table.text("preset"),
+        preset=str(folder / preset) if preset.endswith(".toml") else preset,
         mount=_mount(table),
         rate_hz=table.number("rate_hz", 0.0, low=0.0, high=1e4),
         time_offset_ns=table.integer("time_offset_ns", 0, low=0),
@@ -261,6 +262,7 @@ def load_rig(name: str | Path) -> Rig:
     A preset given as a path ending in ``.toml`` is looked for beside the rig's file. Raises RigError, naming
     file, line and key, for anything missing, unknown or out of bounds.
     """
+    folder = Path(name).parent
     if str(name).endswith(".toml"):
         path = Path(name)
         if not path.is_file():
@@ -275,7 +277,7 @@ def load_rig(name: str | Path) -> Rig:
     tables = {key: root.tables(key) for key in ("lidar", "camera", "gnss", "imu")}
     rig = Rig(
         name=root.text("name", Path(name).stem),
-        lidars=tuple(_lidar(t) for t in tables["lidar"]),
+        lidars=tuple(_lidar(t, folder) for t in tables["lidar"]),
         cameras=tuple(_camera(t) for t in tables["camera"]),
         gnss=tuple(_gnss(t) for t in tables["gnss"]),
         imus=tuple(_imu(t) for t in tables["imu"]),

@@ -120,7 +120,7 @@ class Table:
     def numbers(
         self, key: str, default: Any = ..., *, count: int | Sequence[int] = 0, spread: bool = False
     ) -> tuple[float, ...]:
-        """A list of finite numbers, of one of the given lengths; with ``spread`` one number serves for all."""
+        """Finite numbers, as many as one of the given counts; with ``spread``, one number serves for all."""
         value = self._take(key, default)
         lengths = (count,) if isinstance(count, int) else tuple(count)
         if spread and isinstance(value, int | float) and not isinstance(value, bool):
