@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
+
+
+def _no_rows() -> NDArray[np.int32]:
+    return np.empty(0, np.int32)
+
+
+def _no_text() -> NDArray[np.str_]:
+    return np.empty(0, np.str_)
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,19 +26,37 @@ class RoadGraph:
     node_xyz : (n, 3) float64, scene frame, metres
     tail, head : (m,) int32 node indices: traffic runs from tail to head
     geometry : (m,) object, each (k, 3) float64 centre line of the carriageway from tail to head, scene frame
-    length   : (m,) float64, true metres
+    length   : (m,) float64, true metres in plan
     speed    : (m,) float64, speed limit in m/s
-    speed_source : (m,) str: ``maxspeed`` or ``default``
-    lanes    : (m,) float64, lanes in this direction
-    lanes_source : (m,) str
+    speed_source : (m,) str: ``maxspeed``, ``zone`` (a legal default named by the map: ``DE:urban``) or
+                   ``default`` (by road class)
+    lanes    : (m,) float64, lanes in this direction; a half is a lane shared with the other direction
+    lanes_source : (m,) str: ``lanes`` or ``default``
     width    : (m,) float64, metres of the whole carriageway (both directions)
-    width_source : (m,) str
+    width_source : (m,) str: ``width``, ``est_width``, ``lanes`` (mapped lanes x the class's lane width) or
+                   ``default``
     oneway   : (m,) bool
     layer    : (m,) int8
+    layer_source : (m,) str: ``layer``, ``level``, ``bridge``, ``tunnel`` or ``default`` (ground)
     bridge, tunnel : (m,) bool
     highway  : (m,) str
     name     : (m,) str, "" if none
-    osm_id   : (m,) str, ``way/123``
+    ref      : (m,) str, "" if none
+    osm_id   : (m,) str, ``way/123``; ``way/123;way/124`` where ways of equal tags were joined
+    twin     : (m,) int32, the edge of the same carriageway in the other direction, -1 if there is none
+    signals, stop, give_way : (n,) bool, traffic at the node is controlled so
+
+    Turn restrictions, one row each:
+
+    turn_from, turn_to : (r,) int32 edges
+    turn_via  : (r,) int32 node, head of ``turn_from`` and tail of ``turn_to``
+    turn_kind : (r,) str, OSM's value: ``no_left_turn``, ``only_straight_on`` ...
+
+    What drivers must heed along an edge, one row each:
+
+    control_edge   : (c,) int32
+    control_offset : (c,) float64, true metres in plan from the edge's tail
+    control_kind   : (c,) str: ``traffic_signals``, ``stop``, ``give_way`` or ``crossing``
     """
 
     node_id: NDArray[np.int64]
@@ -47,8 +73,64 @@ class RoadGraph:
     width_source: NDArray[np.str_]
     oneway: NDArray[np.bool_]
     layer: NDArray[np.int8]
+    layer_source: NDArray[np.str_]
     bridge: NDArray[np.bool_]
     tunnel: NDArray[np.bool_]
     highway: NDArray[np.str_]
     name: NDArray[np.str_]
+    ref: NDArray[np.str_]
     osm_id: NDArray[np.str_]
+    twin: NDArray[np.int32]
+    signals: NDArray[np.bool_]
+    stop: NDArray[np.bool_]
+    give_way: NDArray[np.bool_]
+    turn_from: NDArray[np.int32] = field(default_factory=_no_rows)
+    turn_via: NDArray[np.int32] = field(default_factory=_no_rows)
+    turn_to: NDArray[np.int32] = field(default_factory=_no_rows)
+    turn_kind: NDArray[np.str_] = field(default_factory=_no_text)
+    control_edge: NDArray[np.int32] = field(default_factory=_no_rows)
+    control_offset: Float = field(default_factory=lambda: np.empty(0))
+    control_kind: NDArray[np.str_] = field(default_factory=_no_text)
+
+    def __len__(self) -> int:
+        """Number of edges."""
+        return len(self.tail)
+
+    @property
+    def travel_time(self) -> Float:
+        """Seconds (m,) that each edge takes at its speed limit."""
+        seconds: Float = self.length / self.speed
+        return seconds
+
+    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> RoadGraph:
+        """The chosen edges, in the given order, with the nodes they use; rows that lose an edge go too."""
+        chosen = np.arange(len(self))[keep].astype(np.int32)
+        used, ends = np.unique(np.concatenate([self.tail[chosen], self.head[chosen]]), return_inverse=True)
+        edge = np.full(len(self) + 1, -1, np.int32)
+        edge[chosen] = np.arange(len(chosen))
+        node = np.full(len(self.node_id), -1, np.int32)
+        node[used] = np.arange(len(used))
+        per_node = ("node_id", "node_xyz", "signals", "stop", "give_way")
+        apart = {*per_node, "tail", "head", "twin"}
+        columns = {name: getattr(self, name)[used] for name in per_node} | {
+            f.name: getattr(self, f.name)[chosen]
+            for f in fields(self)
+            if f.name not in apart and not f.name.startswith(("turn_", "control_"))
+        }
+        tail, head = ends.astype(np.int32).reshape(2, -1)
+        whole = (edge[self.turn_from] >= 0) & (edge[self.turn_to] >= 0)
+        there = edge[self.control_edge] >= 0
+        return replace(
+            self,
+            **columns,
+            tail=tail,
+            head=head,
+            twin=edge[self.twin[chosen]],
+            turn_from=edge[self.turn_from[whole]],
+            turn_via=node[self.turn_via[whole]],
+            turn_to=edge[self.turn_to[whole]],
+            turn_kind=self.turn_kind[whole],
+            control_edge=edge[self.control_edge[there]],
+            control_offset=self.control_offset[there],
+            control_kind=self.control_kind[there],
+        )
