@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lidar.errors import InputError, LidarError
 from lidar.poses import Poses
+from lidar.raycast import kernels
+from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.geometry import ALL, Geometry, Instances, triangles
 from lidar.raycast.hits import Echoes, Hits
 
 Float = NDArray[np.float64]
+
+_CHUNK = 8192
+"""Rays that a thread takes at a time; a multiple of every packet width, so that packets do not depend on it."""
+_NO_INDEX = np.empty(0, np.int64)
+_NO_TIME = np.empty(0, np.float32)
+_NO_POSES = (_NO_INDEX, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)))
 
 
 class Caster:
@@ -42,6 +54,9 @@ class Caster:
     ) -> None:
         self.geometry = triangles(vertices, faces, mask)
         self.instances = tuple(instances)
+        self._scene = EmbreeScene(
+            self.geometry, self.instances, [[shape._scene for shape in g.shapes] for g in self.instances]
+        )
 
     def cast(
         self,
@@ -68,7 +83,11 @@ class Caster:
 
         Raises InputError for rays that are not finite or have a direction of length zero.
         """
-        raise NotImplementedError
+        d = _rows(directions, "directions")
+        o = np.ascontiguousarray(origins, np.float64).reshape(-1, 3)
+        if len(o) not in (1, len(d)):
+            raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one a ray")
+        return self._cast(_rays(d, o, _NO_POSES, near, far, mask, time, order), threads)
 
     def cast_posed(
         self,
@@ -93,7 +112,15 @@ class Caster:
 
         ``near`` and ``far`` count from the beam's start in true metres; the rest as for `cast`.
         """
-        raise NotImplementedError
+        d = _rows(directions, "directions")
+        o = np.zeros((1, 3)) if offsets is None else _rows(offsets, "offsets")
+        index = np.ascontiguousarray(pose_index, np.int64)
+        if len(o) not in (1, len(d)) or len(index) != len(d):
+            raise InputError(f"{len(d)} directions, {len(o)} offsets and {len(index)} pose numbers disagree")
+        if len(index) and not (index.min() >= 0 and index.max() < len(poses)):
+            raise InputError(f"a ray names a pose beyond the {len(poses)} there are")
+        columns = (np.ascontiguousarray(a, np.float64) for a in (poses.position, poses.rotation, poses.scale))
+        return self._cast(_rays(d, o, (index, *columns), near, far, mask, time, order), threads)
 
     def occluded(
         self,
@@ -110,7 +137,15 @@ class Caster:
 
         Start shadow rays `shadow_near` metres along, so that they do not hit the surface they leave.
         """
-        raise NotImplementedError
+        d = _rows(directions, "directions")
+        o = np.ascontiguousarray(origins, np.float64).reshape(-1, 3)
+        if len(o) not in (1, len(d)):
+            raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one a ray")
+        rays = _rays(d, o, _NO_POSES, near, far, mask, time, None)
+        out = np.empty(len(d), np.bool_)
+        target = self._scene.target
+        _share(lambda lo, hi: kernels.occluded(target, rays, lo, hi, out), rays, threads)
+        return out
 
     def cast_all(
         self,
@@ -135,4 +170,67 @@ class Caster:
 
         time : (n,) the ray times the hits were cast with
         """
-        raise NotImplementedError
+        out = np.empty((len(hits), 3))
+        moments = _NO_TIME if time is None else np.ascontiguousarray(time, np.float32)
+        kernels.normals(self._scene.target, hits.face, hits.instance, moments, out)
+        return out
+
+    def _cast(self, rays: kernels.Rays, threads: int) -> Hits:
+        n = len(rays.directions)
+        ranges, faces, instances = np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
+        cosines = np.empty(n, np.float32)
+        target = self._scene.target
+        _share(
+            lambda lo, hi: kernels.cast(target, rays, lo, hi, ranges, faces, instances, cosines),
+            rays,
+            threads,
+        )
+        return Hits(ranges, faces, instances, cosines)
+
+
+def _rows(values: ArrayLike, name: str) -> Float:
+    rows = np.ascontiguousarray(values, np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 3:
+        raise InputError(f"{name} have the shape {rows.shape}, rays need (n, 3)")
+    return rows
+
+
+def _rays(
+    directions: Float,
+    offsets: Float,
+    poses: tuple[NDArray[np.int64], Float, Float, Float],
+    near: float,
+    far: float | Float,
+    mask: int,
+    time: ArrayLike | None,
+    order: NDArray[np.integer] | None,
+) -> kernels.Rays:
+    """The rays as the kernels want them; refuses columns that disagree."""
+    n = len(directions)
+    work = _NO_INDEX if order is None else np.ascontiguousarray(order, np.int64)
+    if order is not None and not np.array_equal(np.bincount(work, minlength=n), np.ones(n, int)):
+        raise InputError(f"order is not a permutation of {n} rays")
+    moments = _NO_TIME if time is None else np.ascontiguousarray(time, np.float32)
+    if time is not None and not (moments.shape == (n,) and ((moments >= 0) & (moments <= 1)).all()):
+        raise InputError(f"ray times are numbers from 0 to 1, one for each of {n} rays")
+    reach = np.ascontiguousarray(far, np.float64).reshape(-1)
+    if len(reach) not in (1, n) or not (near >= 0 and (reach >= near).all()):
+        raise InputError("rays need 0 <= near <= far, far one number or one a ray")
+    return kernels.Rays(directions, offsets, *poses, work, moments, float(near), reach, int(mask) & ALL)
+
+
+def _share(work: Callable[[int, int], int], rays: kernels.Rays, threads: int) -> None:
+    """Have the threads do the rays in chunks; raises InputError for a ray that cannot be cast."""
+    n = len(rays.directions)
+    if threads <= 1 or n <= _CHUNK:
+        bad = work(0, n)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            bad = max(pool.map(lambda lo: work(lo, min(lo + _CHUNK, n)), range(0, n, _CHUNK)), default=-1)
+    if bad >= 0:
+        direction, origin = rays.directions[bad], rays.offsets[bad if len(rays.offsets) > 1 else 0]
+        raise InputError(
+            f"ray {bad} of {n} has the origin {origin.tolist()} and direction {direction.tolist()}"
+            + (f" at the pose {rays.position[rays.pose[bad]].tolist()}" if rays.pose.size else "")
+            + ": rays need finite numbers and a direction that is not zero"
+        )
