@@ -1,0 +1,98 @@
+"""What the two command-line programs share: errors as one line, exit codes, progress bars, JSON."""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import re
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from cyclopts import App
+
+from geoscene.progress import Progress, silent
+
+DONE, FAILURE, USAGE = 0, 1, 2
+"""Exit codes: it worked, it failed, the input or the options cannot be used."""
+
+_INTERRUPTED = 130
+_NUMBERS = re.compile(r"-\d+(\.\d*)?(,-?\d+(\.\d*)?)+")
+
+
+def _guard_numbers(words: Sequence[str]) -> list[str]:
+    """Put a blank before ``-30.1,-51.2``, which would be taken for an option; number parsers ignore it."""
+    return [f" {word}" if _NUMBERS.fullmatch(word) else word for word in words]
+
+
+def main(app: App, roots: tuple[type[Exception], ...], usage: tuple[type[Exception], ...]) -> None:
+    """Run a program and exit with its code.
+
+    roots : errors that are shown as one line, exit code 1
+    usage : those of them that are the user's to mend, exit code 2
+    """
+    logging.basicConfig(
+        level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
+    )
+    try:
+        code = app(_guard_numbers(sys.argv[1:]), result_action="return_value")
+    except roots as error:
+        _complain(app, error)
+        sys.exit(USAGE if isinstance(error, usage) else FAILURE)
+    except KeyboardInterrupt:
+        _complain(app, "interrupted")
+        sys.exit(_INTERRUPTED)
+    except MemoryError:
+        _complain(app, "out of memory; take a smaller area or fewer workers")
+        sys.exit(FAILURE)
+    except OSError as error:
+        hint = "; free some space and run the same command again" if error.errno == errno.ENOSPC else ""
+        _complain(app, f"{error.filename or 'the system'}: {error.strerror or error}{hint}")
+        sys.exit(FAILURE)
+    sys.exit(code if isinstance(code, int) else DONE)
+
+
+def _complain(app: App, what: object) -> None:
+    text = " ".join(str(what).split())
+    print(f"{app.name[0]}: {text}", file=sys.stderr)
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """Print a document as JSON on standard output."""
+    print(json.dumps(document, indent=2, ensure_ascii=False))
+
+
+@contextmanager
+def progress_bar(*, quiet: bool = False) -> Iterator[Progress]:
+    """A `Progress` that draws bars on standard error; silent when that is not a terminal.
+
+    A bar appears once its stage has taken a second or so.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield silent
+        return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn  # noqa: PLC0415
+    from rich.progress import Progress as Bars  # noqa: PLC0415
+
+    columns = (TextColumn("{task.description:<24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+        yield _bar_callback(bars)
+
+
+def _bar_callback(bars: Any) -> Progress:
+    tasks: dict[str, Any] = {}
+    began: dict[str, float] = {}
+
+    def note(stage: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        if stage not in tasks:
+            if now - began.setdefault(stage, now) < 1.0:
+                return
+            tasks[stage] = bars.add_task(stage, total=total or None)
+        bars.update(tasks[stage], completed=done, total=total or None)
+
+    return note
