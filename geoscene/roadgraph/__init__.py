@@ -1,0 +1,7 @@
+"""The drivable road graph: built from a map, written and read, lifted to the terrain."""
+
+from geoscene.roadgraph.build import RoadOptions as RoadOptions
+from geoscene.roadgraph.build import build_road_graph as build_road_graph
+from geoscene.roadgraph.components import Components as Components
+from geoscene.roadgraph.components import find_components as find_components
+from geoscene.roadgraph.components import main_network as main_network

@@ -1,0 +1,115 @@
+"""Runs of nodes, cut where roads meet or change, and linked where they go on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """The ways' nodes, one row each, in driving order; a run is an unbroken row of nodes of one way.
+
+    node : (k,) int64 node index
+    way  : (k,) int64 way index
+    run  : (k,) int64 run number, ascending
+    """
+
+    node: NDArray[np.int64]
+    way: NDArray[np.int64]
+    run: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """What becomes an edge, or two: a line through nodes, along its ways unless these are symmetric.
+
+    node : (k,) int64 node index
+    way  : (k - 1,) int64 way index of each segment
+    """
+
+    node: NDArray[np.int64]
+    way: NDArray[np.int64]
+
+
+def find_cuts(
+    runs: Runs, kind: NDArray[np.int64], symmetric: NDArray[np.bool_], nodes: int
+) -> NDArray[np.bool_]:
+    """Whether a line must end at each node (nodes,): junctions, dead ends, changes.
+
+    kind      : (ways,) equal for ways that may be joined
+    symmetric : (ways,) the way is the same seen from its other end
+    """
+    first = np.flatnonzero(runs.run[1:] == runs.run[:-1])
+    a, b, way = runs.node[first], runs.node[first + 1], runs.way[first]
+    at, other = np.concatenate([a, b]), np.concatenate([b, a])
+    ways, leaving = np.concatenate([way, way]), np.arange(len(at)) < len(a)
+    degree = np.bincount(at, minlength=nodes)
+    cut: NDArray[np.bool_] = degree != 2
+    pair = np.argsort(at, kind="stable")
+    pair = pair[degree[at[pair]] == 2].reshape(-1, 2)
+    one, two = pair.T
+    turns_back = other[one] == other[two]
+    changes = kind[ways[one]] != kind[ways[two]]
+    against = (leaving[one] == leaving[two]) & ~symmetric[ways[one]]
+    cut[at[one]] |= turns_back | changes | against
+    return cut
+
+
+def link_chains(runs: Runs, cut: NDArray[np.bool_]) -> list[Chain]:
+    """The runs as lines from one cut node to the next; a loop without any is one line from its own start."""
+    pieces = _pieces(runs, cut)
+    loose: dict[int, list[int]] = {}
+    for number, piece in enumerate(pieces):
+        for node in (int(piece.node[0]), int(piece.node[-1])):
+            if not cut[node]:
+                loose.setdefault(node, []).append(number)
+
+    used = [False] * len(pieces)
+
+    def follow(node: int) -> list[Chain]:
+        """Pieces that go on from a node, each turned to begin where the one before ends."""
+        found = []
+        while not cut[node]:
+            following = [number for number in loose[node] if not used[number]]
+            if not following:
+                break
+            used[following[0]] = True
+            piece = pieces[following[0]]
+            found.append(piece if piece.node[0] == node else _turned(piece))
+            node = int(found[-1].node[-1])
+        return found
+
+    chains = []
+    for number, piece in enumerate(pieces):
+        if used[number]:
+            continue
+        used[number] = True
+        ahead = follow(int(piece.node[-1]))
+        behind = [_turned(p) for p in reversed(follow(int(piece.node[0])))]
+        chains.append(_joined([*behind, piece, *ahead]) if ahead or behind else piece)
+    return chains
+
+
+def _pieces(runs: Runs, cut: NDArray[np.bool_]) -> list[Chain]:
+    """The runs cut at cut nodes."""
+    edge = np.flatnonzero(np.diff(runs.run, prepend=-1, append=-1))
+    pieces = []
+    for start, end in zip(edge[:-1].tolist(), edge[1:].tolist(), strict=True):
+        inner = start + 1 + np.flatnonzero(cut[runs.node[start + 1 : end - 1]])
+        stops = [start, *inner.tolist(), end - 1]
+        pieces += [Chain(runs.node[i : j + 1], runs.way[i:j]) for i, j in pairwise(stops)]
+    return pieces
+
+
+def _turned(piece: Chain) -> Chain:
+    return Chain(piece.node[::-1], piece.way[::-1])
+
+
+def _joined(pieces: Sequence[Chain]) -> Chain:
+    nodes = [pieces[0].node, *(piece.node[1:] for piece in pieces[1:])]
+    return Chain(np.concatenate(nodes), np.concatenate([piece.way for piece in pieces]))

@@ -1,0 +1,53 @@
+"""Which parts of the road graph hang together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.roads import RoadGraph
+
+
+@dataclass(frozen=True, slots=True)
+class Components:
+    """Connected parts, numbered from the largest (most nodes) on.
+
+    weak   : (n,) int32 part of each node, one-way streets usable both ways
+    strong : (n,) int32 part of each node, within which every node is reached from every other
+    """
+
+    weak: NDArray[np.int32]
+    strong: NDArray[np.int32]
+
+    @property
+    def largest_strong_share(self) -> float:
+        """Share of the nodes that lie in the largest strongly connected part."""
+        return float((self.strong == 0).mean()) if len(self.strong) else 0.0
+
+
+def find_components(graph: RoadGraph) -> Components:
+    """The connected parts of the graph; turn restrictions are not considered."""
+    from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    n = len(graph.node_id)
+    links = csr_array((np.ones(len(graph), np.int8), (graph.tail, graph.head)), shape=(n, n))
+    parts = [connected_components(links, connection=kind)[1] for kind in ("weak", "strong")]
+    return Components(*(_by_size(part) for part in parts))
+
+
+def _by_size(part: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The same parts, the largest 0, equals in the order of their first node."""
+    _, first, number, size = np.unique(part, return_index=True, return_inverse=True, return_counts=True)
+    order = np.lexsort([first, -size])
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order))
+    return rank[number]
+
+
+def main_network(graph: RoadGraph) -> RoadGraph:
+    """The largest strongly connected part of the graph: from everywhere in it a car gets everywhere."""
+    strong = find_components(graph).strong
+    return graph.take((strong[graph.tail] == 0) & (strong[graph.head] == 0))

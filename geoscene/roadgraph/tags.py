@@ -1,0 +1,274 @@
+"""What the tags of one way say about driving on it; what they do not say is filled in, with its source."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from geoscene.roadgraph.speeds import read_speeds
+from geoscene.sources.data import Tags
+
+CLASSES = (
+    "motorway",
+    "motorway_link",
+    "trunk",
+    "trunk_link",
+    "primary",
+    "primary_link",
+    "secondary",
+    "secondary_link",
+    "tertiary",
+    "tertiary_link",
+    "unclassified",
+    "residential",
+    "living_street",
+    "road",
+    "service",
+)
+"""Values of ``highway`` that a car may use, most important first."""
+
+# Lanes in each direction (OSM wiki, Key:lanes, "Assumptions"). A half is one lane that both directions share.
+_LANES = dict.fromkeys(CLASSES, 1.0) | {"motorway": 2.0, "service": 0.5}
+
+# Metres. Assumed between RASt 06 / RAA (Germany: 2.75 in residential streets, 3.25 on main urban roads,
+# 3.75 on motorways) and the AASHTO Green Book (2.7 to 3.6).
+_LANE_WIDTH = {
+    "motorway": 3.75,
+    "motorway_link": 3.75,
+    "trunk": 3.5,
+    "trunk_link": 3.5,
+    "primary": 3.5,
+    "primary_link": 3.5,
+    "secondary": 3.25,
+    "secondary_link": 3.25,
+    "tertiary": 3.25,
+    "tertiary_link": 3.25,
+    "unclassified": 3.0,
+    "residential": 3.0,
+    "living_street": 2.75,
+    "road": 3.0,
+    "service": 3.0,
+}
+
+# Metres of the whole carriageway of service roads without width or lanes: assumed (an aisle lets two cars
+# pass between rows of parked ones, a driveway is one car wide).
+_SERVICE_WIDTH = {"parking_aisle": 5.5, "alley": 3.5, "driveway": 3.0, "drive-through": 3.0}
+_SERVICE_WIDTH_ELSE = 4.5
+
+# One-way streets are kerb to kerb wider than their one lane: room to pass a stopped car. Assumed.
+_ONEWAY_AT_LEAST = 4.0
+
+# Metres: a cycle lane on the carriageway and a row of parked cars by how they stand (RASt 06).
+_CYCLE_LANE = 1.6
+_PARKED = {"parallel": 2.0, "diagonal": 4.5, "perpendicular": 5.0}
+
+_SHUT = frozenset(
+    {"no", "private", "agricultural", "forestry", "emergency", "military", "delivery", "use_sidepath"}
+)
+_NO = frozenset({"", "no", "false", "0"})
+# Tunnels in name only: the road runs through a house or under a roof, at ground level.
+_ABOVE_GROUND = _NO | {"building_passage", "avalanche_protector", "covered", "culvert", "flooded"}
+
+
+@dataclass(frozen=True, slots=True)
+class Street:
+    """One way for cars. Pairs are (along the way, against it); a one-way street has 0 lanes the other way.
+
+    direction : 1 traffic runs along the way only, -1 against it only, 0 both
+    speed     : m/s
+    width     : metres, the whole carriageway
+    """
+
+    highway: str
+    direction: int
+    speed: tuple[float, float]
+    speed_source: tuple[str, str]
+    lanes: tuple[float, float]
+    lanes_source: str
+    width: float
+    width_source: str
+    layer: int
+    layer_source: str
+    bridge: bool
+    tunnel: bool
+    name: str
+    ref: str
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether it is the same street seen from its other end."""
+        return self.direction == 0 and self.speed[0] == self.speed[1] and self.lanes[0] == self.lanes[1]
+
+
+def drivable(tags: Tags, *, private: bool = False) -> bool:
+    """Whether the public may drive a car on the way (with ``private``: anybody at all).
+
+    The most specific of ``motorcar``, ``motor_vehicle``, ``vehicle`` and ``access`` decides.
+    """
+    if tags.get("highway") not in CLASSES or tags.get("area") == "yes":
+        return False
+    if tags.get("service") == "emergency_access":
+        return False
+    for key in ("motorcar", "motor_vehicle", "vehicle", "access"):
+        if key in tags:
+            value = tags[key]
+            return value not in _SHUT or (private and value in ("private", "delivery"))
+    return True
+
+
+def read_street(tags: Tags) -> tuple[Street, list[str]]:
+    """The street that the tags describe, and the tags (``key=value``) that could not be read."""
+    unread: list[str] = []
+    highway = tags["highway"]
+    direction = _direction(tags)
+    lanes, lanes_source = _lanes(tags, highway, direction, unread)
+    width, width_source = _width(tags, direction, (sum(lanes), lanes_source), unread)
+    speed, speed_source = read_speeds(tags, highway, unread)
+    layer, layer_source = read_layer(tags, unread)
+    street = Street(
+        highway=highway,
+        direction=direction,
+        speed=speed,
+        speed_source=speed_source,
+        lanes=lanes,
+        lanes_source=lanes_source,
+        width=width,
+        width_source=width_source,
+        layer=layer,
+        layer_source=layer_source,
+        bridge=is_bridge(tags),
+        tunnel=is_tunnel(tags),
+        name=tags.get("name", ""),
+        ref=tags.get("ref", ""),
+    )
+    return street, unread
+
+
+def is_bridge(tags: Tags) -> bool:
+    """Whether the way runs on a bridge."""
+    return tags.get("bridge", "") not in _NO
+
+
+def is_tunnel(tags: Tags) -> bool:
+    """Whether the way runs underground (a passage through a house does not)."""
+    return tags.get("tunnel", "") not in _ABOVE_GROUND
+
+
+def read_layer(tags: Tags, unread: list[str]) -> tuple[int, str]:
+    """Layer and its source: the tag, a storey (``level``), else 1 on bridges, -1 in tunnels, 0."""
+    for key in ("layer", "level"):
+        text = tags.get(key)
+        if text is None:
+            continue
+        try:
+            number = round(float(text.split(";", maxsplit=1)[0]))
+        except (ValueError, OverflowError):
+            unread.append(f"{key}={text}")
+            continue
+        if abs(number) <= 20:
+            return number, key
+        unread.append(f"{key}={text}")
+    if is_bridge(tags):
+        return 1, "bridge"
+    return (-1, "tunnel") if is_tunnel(tags) else (0, "default")
+
+
+def metres(text: str) -> float | None:
+    """Metres of a length as mappers write it (``3.5``, ``3,5 m``, ``12'``, ``12'6"``, ``12 ft``), or None."""
+    text = text.strip().lower().split(";", maxsplit=1)[0].replace(",", ".")
+    if match := re.fullmatch(r"(\d+(?:\.\d+)?)\s*(m|meters?|metres?|ft|feet|cm|km|mi)?", text):
+        units = {"ft": 0.3048, "feet": 0.3048, "cm": 0.01, "km": 1000.0, "mi": 1609.344}
+        return float(match[1]) * units.get(match[2] or "", 1.0)
+    if match := re.fullmatch(r"(\d+)\s*['′](?:\s*(\d+(?:\.\d+)?)\s*(?:\"|″|''))?", text):
+        return int(match[1]) * 0.3048 + float(match[2] or 0) * 0.0254
+    return None
+
+
+def _direction(tags: Tags) -> int:
+    """1, -1 or 0. Lanes that change their direction (``reversible``, ``alternating``) serve both."""
+    value = tags.get("oneway:motor_vehicle", tags.get("oneway", ""))
+    if value in ("yes", "true", "1"):
+        return 1
+    if value in ("-1", "reverse"):
+        return -1
+    for key in ("motor_vehicle", "vehicle", "access"):
+        if tags.get(f"{key}:backward") == "no":
+            return 1
+        if tags.get(f"{key}:forward") == "no":
+            return -1
+    implied = tags["highway"] == "motorway" or tags.get("junction") in ("roundabout", "circular")
+    return 1 if implied and value == "" else 0
+
+
+def _count(tags: Tags, key: str, unread: list[str]) -> float | None:
+    text = tags.get(key)
+    if text is None:
+        return None
+    try:
+        number = float(text.split(";", maxsplit=1)[0])
+    except ValueError:
+        number = -1.0
+    if 0 < number <= 20:
+        return number
+    unread.append(f"{key}={text}")
+    return None
+
+
+def _lanes(tags: Tags, highway: str, direction: int, unread: list[str]) -> tuple[tuple[float, float], str]:
+    total = _count(tags, "lanes", unread)
+    ahead = _count(tags, "lanes:forward", unread)
+    back = _count(tags, "lanes:backward", unread)
+    if direction:
+        side = ahead if direction == 1 else back
+        given = total if total is not None else side
+        count = _LANES[highway] if given is None else given
+        count = max(count, 1.0)
+        return ((count, 0.0) if direction == 1 else (0.0, count)), ("default" if given is None else "lanes")
+    middle = _count(tags, "lanes:both_ways", unread) or 0.0
+    if ahead is not None and back is not None:
+        return (ahead + middle / 2, back + middle / 2), "lanes"
+    if total is None:
+        default = _LANES[highway]
+        source = "default" if ahead is None and back is None else "lanes"
+        return (default if ahead is None else ahead, default if back is None else back), source
+    if ahead is not None and total > ahead:
+        return (ahead + middle / 2, total - ahead - middle / 2), "lanes"
+    if back is not None and total > back:
+        return (total - back - middle / 2, back + middle / 2), "lanes"
+    return (total / 2, total / 2), "lanes"
+
+
+def _width(tags: Tags, direction: int, counted: tuple[float, str], unread: list[str]) -> tuple[float, str]:
+    highway, (lanes, lanes_source) = tags["highway"], counted
+    for key in ("width:carriageway", "width", "est_width"):
+        if (text := tags.get(key)) is None:
+            continue
+        width = metres(text)
+        if width is not None and 1.5 <= width <= 60:
+            return width, "est_width" if key == "est_width" else "width"
+        unread.append(f"{key}={text}")
+    if highway == "service" and lanes_source == "default":
+        return _SERVICE_WIDTH.get(tags.get("service", ""), _SERVICE_WIDTH_ELSE), "default"
+    width = lanes * _LANE_WIDTH[highway]
+    if direction and lanes_source == "default":
+        width = max(width, _ONEWAY_AT_LEAST)
+    return width + _beside_lanes(tags), lanes_source
+
+
+def _beside_lanes(tags: Tags) -> float:
+    """Metres of the carriageway that mapped cycle lanes and rows of parked cars take up."""
+    extra = 0.0
+    for side in ("left", "right"):
+        cycleway = tags.get(f"cycleway:{side}", tags.get("cycleway:both", tags.get("cycleway", "")))
+        extra += _CYCLE_LANE if cycleway == "lane" and side in _sides(tags, "cycleway") else 0.0
+        where = tags.get(f"parking:{side}", tags.get("parking:both", "lane"))
+        stand = tags.get(f"parking:{side}:orientation", tags.get("parking:both:orientation", ""))
+        older = tags.get(f"parking:lane:{side}", tags.get("parking:lane:both", ""))
+        extra += _PARKED.get(stand or older, 0.0) if where == "lane" else 0.0
+    return extra
+
+
+def _sides(tags: Tags, key: str) -> tuple[str, ...]:
+    """Sides that a tag speaks of: one-way streets carry a plain ``cycleway=lane`` on one side."""
+    plain = key in tags and not any(f"{key}:{side}" in tags for side in ("left", "right", "both"))
+    return ("right",) if plain and _direction(tags) else ("left", "right")
