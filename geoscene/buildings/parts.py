@@ -1,0 +1,144 @@
+"""Which building a part belongs to, what parts leave of an outline, and buildings that lie on one another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.buildings.footprints import Polygons, clean, subtract
+from geoscene.buildings.table import GRID
+from geoscene.report import Problem
+from geoscene.sources.data import Relation
+
+Rows = NDArray[np.int64]
+
+
+def overlapping(a: Polygons, b: Polygons, *, least: float = 1e-4) -> tuple[Rows, Rows, NDArray[np.float64]]:
+    """Rows of a and of b whose interiors share over ``least`` square metres, and the shared areas."""
+    j, i = shapely.STRtree(a).query(b, predicate="intersects")  # first row: index into b
+    j, i = i.astype(np.int64), j.astype(np.int64)
+    # polygons that merely touch are the many; the exact test is cheaper than their intersection
+    meets = ~shapely.touches(a[j], b[i])
+    j, i = j[meets], i[meets]
+    area = shapely.area(shapely.intersection(a[j], b[i]))
+    keep = area > least
+    return j[keep], i[keep], area[keep]
+
+
+def duplicates(
+    osm_id: Sequence[str], footprint: Polygons, known: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], list[Problem]]:
+    """Which buildings (n,) repeat another, and the report.
+
+    Two are the same if they share over 90 % of both areas. The one about whose height and tags more is known
+    (``known``, any scale) stays; among equals the first.
+    """
+    area = shapely.area(footprint)
+    a, b, shared = overlapping(footprint, footprint)
+    same = (a < b) & (shared > 0.9 * np.maximum(area[a], area[b]))
+    gone = np.zeros(len(footprint), np.bool_)
+    problems = []
+    for i, j, s in zip(a[same], b[same], shared[same], strict=True):
+        if gone[i] or gone[j]:
+            continue
+        loser, winner = (j, i) if known[i] >= known[j] else (i, j)
+        gone[loser] = True
+        detail = f"shares {s:.1f} of {area[loser]:.1f} m2 with {osm_id[winner]}"
+        problems.append(Problem(osm_id[loser], "building", "dropped", "duplicate", detail))
+    return gone, problems
+
+
+def assign(
+    part_id: Sequence[str],
+    part: Polygons,
+    outline_id: Sequence[str],
+    outline: Polygons,
+    relations: Sequence[Relation],
+) -> Rows:
+    """The outline's row for every part (n,), -1 for parts that no outline holds.
+
+    Relations of type building decide; else the outline that covers most of the part, if it covers half, and of
+    several that cover over 90 % the smallest.
+    """
+    found = np.full(len(part), -1, np.int64)
+    p, o, shared = overlapping(part, outline)
+    share = shared / shapely.area(part)[p]
+    order = np.lexsort((shapely.area(outline)[o], -np.minimum(share, 0.9), p))
+    order = order[share[order] > 0.5]
+    _, first = np.unique(p[order], return_index=True)
+    found[p[order][first]] = o[order][first]
+
+    outline_row, part_row = ({name: row for row, name in enumerate(ids)} for ids in (outline_id, part_id))
+    for relation in relations:
+        if relation.tags.get("type") != "building":
+            continue
+        members = [(f"{kind}/{ref}", role) for kind, ref, role in relation.members]
+        target = next((outline_row[m] for m, role in members if role == "outline" and m in outline_row), None)
+        if target is None:
+            continue
+        for member, role in members:
+            if role != "outline" and member in part_row:
+                found[part_row[member]] = target
+    return found
+
+
+def clusters(polygons: Polygons) -> Rows:
+    """Cluster number (n,) of polygons that touch or overlap, directly or through others."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    i, j = shapely.STRtree(polygons).query(polygons, predicate="intersects")
+    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(len(polygons), len(polygons)))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def remainder(outline: Any, parts: Polygons, *, covered: float) -> tuple[Any, float]:
+    """What parts leave of an outline, and the covered share; empty where they cover it but for a tenth."""
+    union = shapely.union_all(parts, grid_size=GRID)
+    share = shapely.area(shapely.intersection(outline, union)) / shapely.area(outline)
+    if share >= covered:
+        return shapely.Polygon(), float(share)
+    return subtract(outline, union), float(share)
+
+
+def cut_overlaps(
+    osm_id: Sequence[str],
+    footprint: Polygons,
+    owner: Rows,
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+) -> tuple[Polygons, list[Problem]]:
+    """Footprints (n,) less what smaller pieces of other buildings take at the same height, and the report.
+
+    Of two pieces of different buildings that share ground and heights the smaller keeps its shape. A piece that
+    keeps under a tenth of its area is dropped (its footprint is empty), as lying inside another.
+
+    low, high : metres above the base; pieces above one another do not meet
+    """
+    area = shapely.area(footprint)
+    a, b, shared = overlapping(footprint, footprint)
+    meets = (a < b) & (owner[a] != owner[b]) & (np.minimum(high[a], high[b]) > np.maximum(low[a], low[b]))
+    a, b, shared = a[meets], b[meets], shared[meets]
+    b_larger = (area[b] > area[a]) | ((area[b] == area[a]) & (b > a))
+    loser, winner = np.where(b_larger, b, a), np.where(b_larger, a, b)
+    out = footprint.copy()
+    problems = []
+    # from the smallest on, so that a piece is final before it cuts others
+    for row in np.unique(loser)[np.argsort(area[np.unique(loser)], kind="stable")]:
+        mine = loser == row
+        cutters = out[winner[mine]]
+        out[row] = subtract(out[row], shapely.union_all(cutters, grid_size=GRID))
+        with_whom = ", ".join(sorted({osm_id[w] for w in winner[mine]}))
+        lost = area[row] - shapely.area(out[row])
+        detail = f"lost {lost:.2f} of {area[row]:.1f} m2 to {with_whom}"
+        if shapely.area(out[row]) < 0.1 * area[row]:
+            out[row] = shapely.Polygon()
+            problems.append(Problem(osm_id[row], "building", "dropped", "inside-another", detail))
+        else:
+            problems.append(Problem(osm_id[row], "building", "repaired", "overlap", detail))
+    out[loser] = clean(out[loser])[0]
+    return out, problems

@@ -1,0 +1,149 @@
+"""Closed shells over footprints: a floor, walls, and a roof surface on top, many at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.errors import GEOSException
+
+from geoscene.buildings.footprints import Polygons, to_grid
+from geoscene.mesh import FLOOR, ROOF, WALL
+from geoscene.validate import degenerate_faces, edge_uses, weld
+
+Float = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Triangles:
+    """Triangles by their corners, each of one piece.
+
+    corners : (m, 3, 3) metres, counter-clockwise seen from outside
+    piece   : (m,) int64
+    surface : (m,) uint8, codes of `geoscene.mesh`
+    """
+
+    corners: Float
+    piece: Ids
+    surface: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        """Number of triangles."""
+        return len(self.corners)
+
+    def take(self, keep: NDArray[Any]) -> Triangles:
+        """The chosen triangles."""
+        return Triangles(self.corners[keep], self.piece[keep], self.surface[keep])
+
+
+def join(groups: list[Triangles]) -> Triangles:
+    """All triangles of the groups, in order."""
+    if not groups:
+        return Triangles(np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty(0, np.uint8))
+    return Triangles(
+        np.concatenate([g.corners for g in groups]),
+        np.concatenate([g.piece for g in groups]),
+        np.concatenate([g.surface for g in groups]),
+    )
+
+
+def triangulate(polygons: Polygons) -> tuple[Float, Ids]:
+    """Constrained Delaunay triangles (m, 3, 2) of polygons (n,), counter-clockwise, and the polygon of each.
+
+    No vertex is added. A polygon that GEOS refuses, or whose triangles do not add up to its area, has none.
+    """
+    try:
+        collections = shapely.constrained_delaunay_triangles(polygons)
+    except GEOSException:
+        collections = np.array([_triangles_or_none(p) for p in polygons], dtype=object)
+    triangles, owner = shapely.get_parts(collections, return_index=True)
+    xy = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
+    double = _double_area(xy)
+    xy[double < 0] = xy[double < 0, ::-1]
+    covered = np.bincount(owner, weights=np.abs(double) / 2, minlength=len(polygons))
+    fine = np.abs(covered - shapely.area(polygons)) < 1e-6 * np.maximum(covered, 1.0)
+    keep = fine[owner] & (double != 0)
+    return xy[keep], owner[keep].astype(np.int64)
+
+
+def _triangles_or_none(polygon: Any) -> Any:
+    try:
+        return shapely.constrained_delaunay_triangles(polygon)
+    except GEOSException:
+        return shapely.GeometryCollection()
+
+
+def _double_area(xy: Float) -> Float:
+    """Twice the signed areas of triangles (m, 3, 2)."""
+    a, b = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
+    area: Float = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return area
+
+
+def lift(xy: Float, z: Float) -> Float:
+    """Corners (m, 3, 3) of plane triangles (m, 3, 2) at heights (m,) or (m, 3)."""
+    height = np.broadcast_to(z.reshape(len(xy), -1), (len(xy), 3))
+    return np.concatenate([xy, height[..., None]], axis=2)
+
+
+def boundary(corners: Float, piece: Ids) -> tuple[Float, Ids]:
+    """Edges (k, 2, 3) that one triangle of its piece uses, in that triangle's direction, and their pieces."""
+    ids, _ = weld(corners.reshape(-1, 3), np.repeat(piece, 3))
+    edge, uses, _ = edge_uses(ids.reshape(-1, 3))
+    open_ = np.flatnonzero(uses[edge] == 1)
+    face, k = open_ // 3, open_ % 3
+    return np.stack([corners[face, k], corners[face, (k + 1) % 3]], axis=1), piece[face]
+
+
+def close(top: Triangles, floor: Triangles, underside: Float) -> Triangles:
+    """Shells of the top surfaces, walls from their edges down to the undersides, and the floors.
+
+    top       : seen from above, every vertex on the grid
+    floor     : seen from above too; its edge is the top's edge in plan
+    underside : (n,) z of each piece's floor
+
+    Walls without height fall away, so that a roof may come down to the floor.
+    """
+    edge, piece = boundary(top.corners, top.piece)
+    a, b = edge[:, 0], edge[:, 1]
+    a0, b0 = a.copy(), b.copy()
+    a0[:, 2] = b0[:, 2] = underside[piece]
+    walls = np.concatenate([np.stack([a0, b0, b], axis=1), np.stack([a0, b, a], axis=1)])
+    wall = Triangles(walls, np.tile(piece, 2), np.full(len(walls), WALL, np.uint8))
+    bottom = Triangles(floor.corners[:, ::-1], floor.piece, np.full(len(floor), FLOOR, np.uint8))
+    shells = join([top, wall, bottom])
+    # a wall of no height is two triangles with two equal corners; real slivers must stay, or the shell opens
+    c = np.rint(shells.corners * 1e4)
+    equal = (c == np.roll(c, -1, axis=1)).all(axis=2).any(axis=1)
+    return shells.take(~equal)
+
+
+def prisms(polygons: Polygons, piece: Ids, low: Float, high: Float) -> Triangles:
+    """Shells with flat roofs over polygons (n,) from low to high (n,) metres; ``piece`` (n,) are their numbers."""
+    xy, owner = triangulate(polygons)
+    top = Triangles(lift(xy, to_grid(high)[owner]), owner, np.full(len(xy), ROOF, np.uint8))
+    floor = Triangles(lift(xy, to_grid(low)[owner]), owner, np.full(len(xy), FLOOR, np.uint8))
+    shells = close(top, floor, to_grid(low))
+    return Triangles(shells.corners, piece[shells.piece], shells.surface)
+
+
+def sound(shells: Triangles, n: int) -> NDArray[np.bool_]:
+    """(n,) bool: the piece's triangles are a closed, oriented, non-degenerate surface of positive volume."""
+    ids, first = weld(shells.corners.reshape(-1, 3), np.repeat(shells.piece, 3))
+    faces = ids.reshape(-1, 3)
+    edge, uses, balance = edge_uses(faces)
+    owner = np.zeros(len(uses), np.int64)
+    owner[edge] = np.repeat(shells.piece, 3)
+    bad = np.bincount(owner, weights=(uses != 2) | (balance != 0), minlength=n)
+    flat = degenerate_faces(shells.corners.reshape(-1, 3)[first], faces)
+    bad += np.bincount(shells.piece, weights=flat, minlength=n)
+    anchor = np.zeros((n, 3))
+    anchor[shells.piece] = shells.corners[:, 0]
+    a, b, c = (shells.corners[:, k] - anchor[shells.piece] for k in range(3))
+    volume = np.bincount(shells.piece, weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0, minlength=n)
+    fine: NDArray[np.bool_] = (bad == 0) & (volume > 0)
+    return fine

@@ -1,0 +1,193 @@
+"""From the table of buildings to watertight solids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.buildings.footprints import clean
+from geoscene.buildings.roofs import roof_shell
+from geoscene.buildings.shells import Triangles, join, prisms, sound
+from geoscene.buildings.table import Buildings
+from geoscene.buildings.unions import unite
+from geoscene.classes import Class
+from geoscene.errors import InputError
+from geoscene.mesh import ROOF, Mesh
+from geoscene.report import Problem
+from geoscene.validate import weld
+
+Float = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Pieces:
+    """Simple polygons to build on: a row of the table each, or one of several polygons of a row."""
+
+    polygon: NDArray[Any]
+    row: Ids
+    building: Ids
+    low: Float
+    high: Float
+    flat: NDArray[np.bool_]
+
+    def take(self, keep: NDArray[Any]) -> _Pieces:
+        return _Pieces(
+            self.polygon[keep],
+            self.row[keep],
+            self.building[keep],
+            self.low[keep],
+            self.high[keep],
+            self.flat[keep],
+        )
+
+
+def build_solids(
+    buildings: Buildings, *, base: NDArray[np.float64], lod: int = 2
+) -> tuple[Mesh, list[Problem]]:
+    """One closed, oriented body of positive volume per building, and what had to be simplified or dropped.
+
+    The bodies stand on the 0.1 mm grid. Faces carry the building's row as feature, class BUILDING, the surface,
+    material and colour. LoD 0 is the whole outline as one block of the building's full height, parts ignored;
+    LoD 1 has parts with their undersides and flat tops at full height; LoD 2 has roofs. What fails is tried
+    again with flat roofs, then with cleaned footprints, then dropped.
+
+    base : (count,) or (n,) z in metres of each building's base, in the order of the table; a part stands on
+           its building's base
+
+    Raises InputError for another level of detail or a base of the wrong length.
+    """
+    if lod not in (0, 1, 2):
+        raise InputError(f"level of detail {lod}: there are 0 (blocks), 1 (parts, flat roofs) and 2 (roofs)")
+    base = np.asarray(base, float)
+    if len(base) not in (buildings.count, len(buildings)):
+        raise InputError(f"{len(base)} bases for {buildings.count} buildings")
+    pieces = _pieces(buildings, base, lod)
+    problems: list[Problem] = []
+
+    done: list[Triangles] = []
+    rows: list[Ids] = []
+    for attempt in ("", "flat-roof", "cleaned-footprint"):
+        if not len(pieces.row):
+            break
+        if attempt:
+            pieces = replace(pieces, flat=np.ones(len(pieces.row), np.bool_))
+        if attempt == "cleaned-footprint":
+            pieces = _simplified(pieces)
+        shells, failed, notes = _bodies(buildings, pieces)
+        problems += notes
+        fine = ~np.isin(shells.piece, np.flatnonzero(np.isin(pieces.building, failed)))
+        good = shells.take(fine)
+        done.append(good)
+        rows.append(pieces.row[good.piece])
+        if attempt:
+            made = np.setdiff1d(pieces.building, failed)
+            problems += [_problem(buildings, b, "repaired", attempt) for b in made]
+        pieces = pieces.take(np.isin(pieces.building, failed))
+    problems += [_problem(buildings, b, "dropped", "no-solid") for b in np.unique(pieces.building)]
+    return _mesh(buildings, join(done), np.concatenate(rows) if rows else np.empty(0, np.int64)), problems
+
+
+def _problem(buildings: Buildings, row: int, action: Any, reason: str, detail: str = "") -> Problem:
+    return Problem(str(buildings.osm_id[row]), "building", action, reason, detail)
+
+
+def _pieces(buildings: Buildings, base: Float, lod: int) -> _Pieces:
+    """What to build, polygon by polygon, sorted by building."""
+    chosen = np.flatnonzero(~buildings.is_part if lod == 0 else buildings.drawn)
+    polygon, index = shapely.get_parts(buildings.footprint[chosen], return_index=True)
+    row = chosen[index]
+    building = buildings.outline[row].astype(np.int64)
+    order = np.argsort(building, kind="stable")
+    polygon, row, building = polygon[order], row[order], building[order]
+    low, high = buildings.min_height[row], buildings.height[row]
+    if lod == 0:
+        low = np.minimum(low, 0.0)
+    flat = (
+        np.full(len(row), lod < 2) | (buildings.roof_shape[row] == "flat") | (buildings.roof_height[row] <= 0)
+    )
+    return _Pieces(polygon, row, building, base[building] + low, base[building] + high, flat)
+
+
+def _simplified(pieces: _Pieces) -> _Pieces:
+    """The pieces with footprints opened by 5 mm and on a grid of 1 cm: thin necks and spikes go."""
+    opened = shapely.buffer(pieces.polygon, -0.005, join_style="mitre")
+    rounded = shapely.set_precision(shapely.buffer(opened, 0.005, join_style="mitre"), 0.01)
+    polygon, index = shapely.get_parts(clean(rounded)[0], return_index=True)
+    return replace(pieces.take(index), polygon=polygon)
+
+
+def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ids, list[Problem]]:
+    """Triangles of all bodies, the buildings that failed, and notes on roofs that fell back to another."""
+    n = len(pieces.row)
+    notes: list[Problem] = []
+    flat = np.flatnonzero(pieces.flat)
+    groups = [prisms(pieces.polygon[flat], flat.astype(np.int64), pieces.low[flat], pieces.high[flat])]
+    for k in np.flatnonzero(~pieces.flat):
+        row = pieces.row[k]
+        shell, fallback = roof_shell(
+            pieces.polygon[k],
+            shape=str(buildings.roof_shape[row]),
+            low=float(pieces.low[k]),
+            high=float(pieces.high[k]),
+            roof_height=float(buildings.roof_height[row]),
+            direction=float(buildings.roof_direction[row]),
+            across=bool(buildings.roof_across[row]),
+        )
+        if fallback:
+            notes.append(_problem(buildings, row, "repaired", "roof-fallback", fallback))
+        groups.append(replace(shell, piece=np.full(len(shell), k, np.int64)))
+    shells = join(groups)
+    fine = sound(shells, n)
+    failed = set(np.unique(pieces.building[~fine]).tolist())
+
+    several = np.bincount(pieces.building, minlength=len(buildings) + 1)[pieces.building] > 1
+    single = shells.take(~several[shells.piece])
+    out = [single]
+    multiple = shells.take(several[shells.piece])
+    order = np.argsort(pieces.building[multiple.piece], kind="stable")
+    multiple = multiple.take(order)
+    owner = pieces.building[multiple.piece]
+    owners, starts = np.unique(owner, return_index=True)
+    for building, start, stop in zip(owners.tolist(), starts, np.append(starts, len(owner))[1:], strict=True):
+        if building in failed:
+            continue
+        united = unite(multiple.take(np.arange(start, stop)))
+        if united is None:
+            failed.add(building)
+            continue
+        body, grooves = united
+        out.append(body)
+        if grooves:
+            detail = f"{grooves} edges where bodies only touched, parted by grooves of a few millimetres"
+            notes.append(_problem(buildings, building, "repaired", "touching-bodies", detail))
+    result = join(out)
+    united_fine = sound(replace(result, piece=pieces.building[result.piece]), len(buildings))
+    failed |= {int(b) for b in np.unique(pieces.building) if not united_fine[b]}
+    bad = np.array(sorted(failed), np.int64)
+    return result, bad, [p for p in notes if p.osm_id not in {buildings.osm_id[b] for b in bad}]
+
+
+def _mesh(buildings: Buildings, triangles: Triangles, row: Ids) -> Mesh:
+    """The mesh of all triangles (with their table rows), welded within each building, sorted by building."""
+    feature = buildings.outline[row].astype(np.int64)
+    order = np.argsort(feature, kind="stable")
+    triangles, row, feature = triangles.take(order), row[order], feature[order]
+    corners = triangles.corners.reshape(-1, 3)
+    ids, first = weld(corners, np.repeat(feature, 3))
+    roof = (triangles.surface == ROOF)[:, None]
+    mesh = Mesh.of(
+        corners[first],
+        ids.reshape(-1, 3),
+        feature=feature,
+        klass=int(Class.BUILDING),
+        material=np.where(roof[:, 0], buildings.roof_material[row], buildings.wall_material[row]),
+        surface=triangles.surface,
+        color=np.where(roof, buildings.roof_color[row], buildings.wall_color[row]),
+        closed=True,
+    )
+    return mesh

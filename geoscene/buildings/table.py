@@ -1,0 +1,110 @@
+"""Buildings and their parts as columns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Texts = NDArray[np.object_]
+
+GRID = 1e-4
+"""Step of the grid of all vertices, metres: file formats that round to 0.1 mm keep solids closed."""
+
+SHAPES = (
+    "flat", "gabled", "hipped", "half-hipped", "pyramidal", "skillion", "gambrel", "mansard", "round", "dome",
+    "onion", "saltbox", "cone",
+)  # fmt: skip
+"""Roof shapes that solids are made of; what a map says otherwise becomes flat, and is counted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BuildingOptions:
+    """How tags become buildings.
+
+    level_height  : metres per storey where the map gives storeys alone
+    min_area      : square metres; smaller buildings are dropped (parts: a hundredth of it)
+    covered       : share of an outline that its parts must cover to replace it whole
+    reach         : metres within which neighbours' known heights inform a missing one
+    canopy        : metres, thickness of roofs that stand on nothing (``building=roof``)
+    """
+
+    level_height: float = 3.0
+    min_area: float = 0.5
+    covered: float = 0.9
+    reach: float = 400.0
+    canopy: float = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class Buildings:
+    """Buildings first, then their parts, one row each; a building's row is its feature number in the layer.
+
+    osm_id           : (n,) str
+    footprint        : (n,) valid shapely Polygon or MultiPolygon on the 0.1 mm grid, scene metres, exteriors
+                       counter-clockwise; where buildings overlapped, what is left of this one
+    is_part          : (n,) bool
+    outline          : (n,) int32, the building's row that a part belongs to; a building's own row
+    min_height       : (n,) metres from the building's base to the underside
+    height           : (n,) metres from the building's base to the top of the roof
+    roof_height      : (n,) metres, the part of height that is roof; 0 if flat
+    roof_shape       : (n,) str, one of SHAPES
+    roof_direction   : (n,) radians counter-clockwise from x, where the roof's face slopes down to, NaN if not given
+    roof_across      : (n,) bool, the ridge runs across the longer side
+    height_source    : (n,) str: tag, est_height, levels, parts, outline, or inferred-<rule>
+    height_sigma     : (n,) metres, one standard deviation of height
+    min_height_source: (n,) str: tag, levels, canopy, or default (0)
+    roof_source      : (n,) str, where roof_height came from: tag, levels, angle, default, or none (flat)
+    levels           : (n,) storeys above ground as tagged, NaN if not
+    use              : (n,) str, the value of building or building:part
+    name             : (n,) str
+    wall_color       : (n, 3) uint8 sRGB
+    roof_color       : (n, 3) uint8 sRGB
+    wall_material    : (n,) uint8, codes of `geoscene.classes.materials`
+    roof_material    : (n,) uint8
+    wall_source      : (n,) str: tag, outline or default
+    roof_look_source : (n,) str: tag, outline or default
+    """
+
+    osm_id: Texts
+    footprint: NDArray[Any]
+    is_part: NDArray[np.bool_]
+    outline: NDArray[np.int32]
+    min_height: Float
+    height: Float
+    roof_height: Float
+    roof_shape: Texts
+    roof_direction: Float
+    roof_across: NDArray[np.bool_]
+    height_source: Texts
+    height_sigma: Float
+    min_height_source: Texts
+    roof_source: Texts
+    levels: Float
+    use: Texts
+    name: Texts
+    wall_color: NDArray[np.uint8]
+    roof_color: NDArray[np.uint8]
+    wall_material: NDArray[np.uint8]
+    roof_material: NDArray[np.uint8]
+    wall_source: Texts
+    roof_look_source: Texts
+
+    def __len__(self) -> int:
+        """Number of rows, parts included."""
+        return len(self.osm_id)
+
+    @property
+    def count(self) -> int:
+        """Number of buildings; parts are the rows from there on."""
+        return int(np.count_nonzero(~self.is_part))
+
+    @property
+    def drawn(self) -> NDArray[np.bool_]:
+        """(n,) bool: the row is a solid of its own; false for an outline that its parts replace."""
+        replaced = np.zeros(len(self), np.bool_)
+        replaced[self.outline[self.is_part]] = True
+        return ~replaced

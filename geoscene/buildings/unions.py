@@ -1,0 +1,150 @@
+"""One body per building: the union of its pieces, on the grid, without edges that carry four faces."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import manifold3d as m3
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.buildings.footprints import to_grid
+from geoscene.buildings.shells import Float, Ids, Triangles
+from geoscene.mesh import WALL
+from geoscene.validate import degenerate_faces, edge_uses, weld
+
+GROOVE = 2e-3
+"""Reach of the groove that parts two bodies of one building which meet in an edge only, metres."""
+
+
+def unite(shells: Triangles) -> tuple[Triangles, int] | None:
+    """The union of the closed shells of one building, and the number of grooves cut; None if there is none.
+
+    Faces keep the piece and surface they come from.
+    """
+    pieces = np.unique(shells.piece)
+    first = m3.Manifold.reserve_ids(4 * len(pieces))
+    # far from zero the booleans lose digits, so the body is united about its own corner
+    origin = to_grid(shells.corners.reshape(-1, 3).min(axis=0))
+    bodies = [_manifold(shells, piece, first + 4 * k, origin) for k, piece in enumerate(pieces)]
+    if any(body is None for body in bodies):
+        return None
+    body = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
+    grooves = 0
+    for attempt in range(4):
+        if body.status() != m3.Error.NoError or body.is_empty():
+            return None
+        corners, run = _triangles(body, first)
+        seams = _crowded_edges(corners)
+        if not len(seams):
+            known = (run >= 0) & (run < 4 * len(pieces))
+            piece = pieces[np.where(known, run // 4, 0)]
+            surface = np.where(known, run % 4, WALL).astype(np.uint8)
+            return Triangles(to_grid(corners + origin), piece, surface), grooves
+        grooves += len(seams)
+        cutters = [_cutter(a, b, GROOVE * (1 + attempt)) for a, b in seams]
+        body = m3.Manifold.batch_boolean([body, *cutters], m3.OpType.Subtract)
+    return None
+
+
+def _manifold(shells: Triangles, piece: int, first: int, origin: Float) -> Any:
+    """The shell of one piece as a manifold whose faces carry ``first`` plus their surface; None if it is none."""
+    mine = shells.take(shells.piece == piece)
+    order = np.argsort(mine.surface, kind="stable")
+    corners, surface = mine.corners[order].reshape(-1, 3) - origin, mine.surface[order]
+    ids, where = weld(corners, np.zeros(len(corners), np.int64))
+    kinds, starts = np.unique(surface, return_index=True)
+    mesh = m3.Mesh64(
+        vert_properties=np.ascontiguousarray(corners[where]),
+        tri_verts=np.ascontiguousarray(ids.reshape(-1, 3).astype(np.uint64)),
+        run_index=(3 * np.r_[starts, len(surface)]).astype(np.uint64),
+        run_original_id=first + kinds.astype(np.uint32),
+    )
+    body = m3.Manifold(mesh)
+    return body if body.status() == m3.Error.NoError and not body.is_empty() else None
+
+
+def _triangles(body: Any, first: int) -> tuple[Float, Ids]:
+    """Corners (m, 3, 3) of a body's triangles on the grid, mended there, and their runs less ``first``."""
+    mesh = body.to_mesh64()
+    faces = mesh.tri_verts.astype(np.int64)
+    run = np.repeat(np.asarray(mesh.run_original_id, np.int64), np.diff(mesh.run_index) // 3) - first
+    points = to_grid(mesh.vert_properties[:, :3])
+    ids, where = weld(points, np.zeros(len(points), np.int64))
+    return mend(points[where], ids[faces], run)
+
+
+def mend(points: Float, faces: Ids, run: Ids) -> tuple[Float, Ids]:
+    """Corners (m, 3, 3) and runs of triangles without the degenerate ones that the grid makes.
+
+    Faces with two equal corners go; faces with three corners on a line are flipped into the neighbour across
+    their longest edge. Both keep a closed surface closed.
+    """
+    distinct = (faces != np.roll(faces, -1, axis=1)).all(axis=1)
+    faces, run = _cancel(faces[distinct], run[distinct])
+    for _ in range(64):
+        flat = np.flatnonzero(degenerate_faces(points, faces))
+        if not len(flat):
+            break
+        faces, run = _cancel(*_flip(points, faces, run, int(flat[0])))
+    return points[faces], run
+
+
+def _cancel(faces: Ids, run: Ids) -> tuple[Ids, Ids]:
+    """Faces without pairs of the same three vertices in opposite order: they bound nothing."""
+    turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    key = {tuple(f): i for i, f in enumerate(turned.tolist())}
+    gone = [i for (a, b, c), i in key.items() if (a, c, b) in key]
+    keep = np.ones(len(faces), np.bool_)
+    keep[gone] = False
+    return faces[keep], run[keep]
+
+
+def _flip(points: Float, faces: Ids, run: Ids, flat: int) -> tuple[Ids, Ids]:
+    """Faces with a face of three corners on a line replaced: its middle corner splits the face beyond."""
+    corners = faces[flat]
+    length = np.linalg.norm(points[np.roll(corners, -1)] - points[corners], axis=1)
+    k = int(np.argmax(length))
+    a, b, middle = corners[k], corners[(k + 1) % 3], corners[(k + 2) % 3]
+    other = np.flatnonzero(((faces == b) & (np.roll(faces, -1, axis=1) == a)).any(axis=1))
+    if not len(other):
+        return np.delete(faces, flat, axis=0), np.delete(run, flat)
+    beyond = int(other[0])
+    apex = int(faces[beyond][(faces[beyond] != a) & (faces[beyond] != b)][0])
+    out, runs = faces.copy(), run.copy()
+    out[beyond] = (b, middle, apex)
+    out[flat] = (middle, a, apex)
+    runs[flat] = run[beyond]
+    return out, runs
+
+
+def _crowded_edges(corners: Float) -> Float:
+    """Edges (k, 2, 3) that more than two triangles share."""
+    flat = corners.reshape(-1, 3)
+    ids, where = weld(flat, np.zeros(len(flat), np.int64))
+    faces = ids.reshape(-1, 3)
+    edge, uses, _ = edge_uses(faces)
+    crowded = np.flatnonzero(uses > 2)
+    half = np.full(len(uses), -1)
+    half[edge[::-1]] = np.arange(len(edge))[::-1]
+    chosen = half[crowded]
+    face, k = chosen // 3, chosen % 3
+    points = flat[where]
+    return np.stack([points[faces[face, k]], points[faces[face, (k + 1) % 3]]], axis=1)
+
+
+def _cutter(a: Float, b: Float, reach: float) -> Any:
+    """A convex body about an edge, reaching a little beyond it on all sides."""
+    # turned off the axes, so that its faces lie in no plane of the building
+    turn = np.array([[0.936, -0.275, 0.218], [0.290, 0.956, -0.036], [-0.199, 0.097, 0.975]])
+    star = np.vstack([turn, -turn]) * reach
+    return m3.Manifold.hull_points(np.vstack([a + star, b + star]))
+
+
+def by_building(building: Ids) -> dict[int, list[int]]:
+    """Pieces of each building, in order."""
+    out: dict[int, list[int]] = defaultdict(list)
+    for piece, owner in enumerate(building.tolist()):
+        out[owner].append(piece)
+    return out
