@@ -1,0 +1,297 @@
+"""Areas among map objects: closed ways and multipolygon relations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.report import Problem
+from geoscene.sources.data import Area, Tags
+from geoscene.sources.elements import Elements, Int, Members
+from geoscene.sources.rings import Chain, assemble, close_cut_ring, polygons_of
+from geoscene.sources.tags import NOISE, area_tags, is_area, is_building, is_open_area, kind_of
+
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
+_NO_NODES: Int = np.empty(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where nodes are, nodes at one position counted as one.
+
+    xy   : (n, 2) float64 degrees
+    same : (n,) int64, index of the first node at the same position
+    """
+
+    xy: NDArray[np.float64]
+    same: Int
+
+    @classmethod
+    def of(cls, elements: Elements) -> Places:
+        """Positions of all nodes."""
+        packed = elements.node_xy[:, 0].astype(np.int64) << 32 | (
+            elements.node_xy[:, 1].astype(np.int64) + 2**31
+        )
+        _, first, inverse = np.unique(packed, return_index=True, return_inverse=True)
+        return cls(elements.lonlat(np.arange(len(packed))), first[inverse].astype(np.int64))
+
+    def merged(self, nodes: Int) -> Int:
+        """Node indices with the first node of each position in place of the others; -1 stays."""
+        return np.where(nodes >= 0, self.same[nodes], -1) if len(self.same) else nodes
+
+
+def _meaning(tags: Tags) -> Tags:
+    return {key: value for key, value in tags.items() if key not in NOISE and key != "type"}
+
+
+def _common(tables: list[Tags]) -> Tags:
+    """The tags that all have alike."""
+    return {k: v for k, v in tables[0].items() if all(t.get(k) == v for t in tables[1:])} if tables else {}
+
+
+@dataclass(frozen=True, slots=True)
+class Claims:
+    """What relations say of ways.
+
+    members : rows of ways that bound a multipolygon; such a way drawn open is no defect
+    taken   : rows of ways whose area is the relation's, so that they are none of their own
+    """
+
+    members: set[int]
+    taken: set[int]
+
+
+@dataclass(frozen=True, slots=True)
+class _Boundary:
+    """A multipolygon relation, its members looked up.
+
+    ways : (row of the way, inner), -1 for ways that are not here
+    """
+
+    osm_id: int
+    tags: Tags
+    ways: list[tuple[int, bool]]
+
+
+def is_multipolygon(tags: Tags) -> bool:
+    """Whether a relation's members bound an area that is looked for; administrative boundaries are not."""
+    return tags.get("type") == "multipolygon"
+
+
+def _boundary(
+    elements: Elements, row_of: dict[int, int], osm_id: int, tags: Tags, members: Members
+) -> tuple[_Boundary, set[int]]:
+    """A relation with the tags that are its own, and the rows of ways whose area is the relation's.
+
+    A relation without tags has those that its outer ways agree on, as was the custom before 2010. A way is not an
+    area of its own if it is outer and shares the relation's building tag or any area tag with the same value, or
+    inner and tagged alike. What a single outer way adds to the tags of a building is taken over.
+    """
+    ways = [(row_of.get(i, -1), role == "inner") for kind, i, role in members if kind == "way"]
+    own = _meaning(tags)
+    outer = sorted({row for row, inner in ways if row >= 0 and not inner})
+    tagged = [meaning for row in outer if (meaning := _meaning(elements.way_tags[row]))]
+    old_style = not own
+    if old_style:
+        own = _common(tagged)
+    taken = set()
+    mine = area_tags(own)
+    for row, inner in ways:
+        if row < 0 or not own:
+            continue
+        theirs = _meaning(elements.way_tags[row])
+        shared = {
+            k
+            for k, v in area_tags(theirs).items()
+            if k in mine and (k.startswith("building") or mine[k] == v)
+        }
+        if (inner and theirs == own) or (not inner and (shared or old_style)):
+            taken.add(row)
+    if len(outer) == 1 and outer[0] in taken and is_building(own):
+        own = {**_meaning(elements.way_tags[outer[0]]), **own}
+    kept = {k: v for k, v in tags.items() if k in NOISE or k == "type"}
+    return _Boundary(osm_id, {**kept, **own} if own else {}, ways), taken
+
+
+def _relation_area(
+    elements: Elements, places: Places, boundary: _Boundary, extent: tuple[float, float, float, float]
+) -> tuple[Any, Problem | None]:
+    """The geometry of a multipolygon, or None, and what was wrong with it."""
+    chains: list[Chain] = []
+    lost_ways = cut = lost_nodes = 0
+    for row, inner in boundary.ways:
+        if row < 0:
+            lost_ways += 1
+            continue
+        nodes = places.merged(elements.chain(row))
+        missing = int((nodes < 0).sum())
+        if missing and elements.way_closed[row]:
+            ring = close_cut_ring(nodes, places.xy, extent)
+            if ring is not None:
+                cut += 1
+                chains.append(Chain(ring, inner))
+                continue
+        lost_nodes += missing
+        breaks = np.flatnonzero(np.diff((nodes >= 0).astype(np.int8))) + 1
+        chains += [Chain(run, inner) for run in np.split(nodes, breaks) if len(run) > 1 and run[0] >= 0]
+    incomplete = lost_ways + lost_nodes > 0
+    made = assemble(chains, places.xy, complete=not incomplete)
+    reason = "incomplete-relation" if incomplete else made.reason or ("missing-nodes" if cut else "")
+    osm_id = f"relation/{boundary.osm_id}"
+    kind = kind_of(boundary.tags)
+    if not reason:
+        if made.geometry is not None:
+            return made.geometry, None
+        reason = "no-area"
+    told = [
+        f"{n} {what}"
+        for n, what in (
+            (lost_ways, "member ways absent"),
+            (lost_nodes, "nodes absent"),
+            (cut, "cut rings closed"),
+        )
+        if n
+    ]
+    detail = ", ".join(told) or f"{len(boundary.ways)} member ways"
+    if made.geometry is None:
+        return None, Problem(osm_id, kind, "dropped", reason, f"{detail}; no ring closes")
+    return made.geometry, Problem(osm_id, kind, "repaired", reason, detail)
+
+
+def multipolygon_areas(
+    elements: Elements,
+    places: Places,
+    extent: tuple[float, float, float, float],
+    wanted: Callable[[Int], bool],
+) -> tuple[list[Area], list[Problem], Claims]:
+    """Areas of multipolygon relations, in order of id, with what was wrong and which ways they take.
+
+    wanted : whether any of the ways in these rows is of interest
+    """
+    row_of = {int(i): row for row, i in enumerate(elements.way_id)}
+    areas: list[Area] = []
+    problems: list[Problem] = []
+    claims = Claims(set(), set())
+    for osm_id, tags, members in elements.relations:
+        if not is_multipolygon(tags):
+            continue
+        boundary, taken = _boundary(elements, row_of, osm_id, tags, members)
+        rows = np.array([row for row, _ in boundary.ways if row >= 0], np.int64)
+        claims.members.update(rows.tolist())
+        if not wanted(rows):
+            continue
+        name = f"relation/{osm_id}"
+        if not boundary.tags:
+            problems.append(Problem(name, "area", "dropped", "no-tags", f"{len(boundary.ways)} member ways"))
+            continue
+        geometry, problem = _relation_area(elements, places, boundary, extent)
+        if problem is not None:
+            problems.append(problem)
+        if geometry is None:
+            continue
+        claims.taken.update(taken)
+        if not _meaning(tags) or not taken:
+            pass
+        else:
+            problems += [
+                Problem(f"way/{elements.way_id[row]}", kind_of(elements.way_tags[row]), "dropped", "tagged-twice",
+                        f"bounds {name}, which is tagged alike")
+                for row in sorted(taken)
+            ]  # fmt: skip
+        areas.append(Area(name, boundary.tags, geometry, _NO_NODES))
+    if areas:
+        oriented = shapely.orient_polygons([area.geometry for area in areas])
+        areas = [Area(a.osm_id, a.tags, g, a.nodes) for a, g in zip(areas, oriented, strict=True)]
+    return areas, problems, claims
+
+
+def way_areas(
+    elements: Elements,
+    places: Places,
+    extent: tuple[float, float, float, float],
+    rows: Iterable[int],
+    claims: Claims,
+) -> tuple[list[Area], list[Problem], set[int]]:
+    """Areas of ways, in order of id, with what was wrong, and the rows that were areas or meant to be."""
+    areas: list[Area] = []
+    problems: list[Problem] = []
+    meant: set[int] = set()
+    rings: list[Int] = []
+    of: list[int] = []
+    for row in rows:
+        tags = elements.way_tags[row]
+        nodes = elements.chain(row)
+        closed = elements.way_closed[row] or (
+            len(nodes) > 3 and nodes[0] >= 0 <= nodes[-1] and places.same[nodes[0]] == places.same[nodes[-1]]
+        )
+        if not (is_area(tags) if closed else is_open_area(tags)):
+            continue
+        meant.add(row)
+        if row in claims.taken or (not closed and row in claims.members):
+            continue
+        name, kind = f"way/{elements.way_id[row]}", kind_of(tags)
+        missing = int((nodes < 0).sum())
+        if missing or not closed:
+            reason = "missing-nodes" if missing else "open-ring"
+            cut = close_cut_ring(nodes, places.xy, extent)
+            if cut is None:
+                told = (
+                    f"{missing} of {len(nodes)} nodes absent"
+                    if missing
+                    else f"{len(nodes)} nodes, not closed"
+                )
+                problems.append(Problem(name, kind, "dropped", reason, told))
+                continue
+            told = f"{missing} of {len(nodes)} nodes absent, " if missing else ""
+            problems.append(
+                Problem(name, kind, "repaired", reason, f"{told}closed straight at the edge of the extract")
+            )
+            nodes = cut
+        merged = places.same[nodes]
+        keep = np.ones(len(nodes), bool)
+        keep[1:] = merged[1:] != merged[:-1]
+        if not keep.all():
+            problems.append(
+                Problem(
+                    name, kind, "repaired", "repeated-node", f"{np.count_nonzero(~keep)} repeats left out"
+                )
+            )
+            nodes = nodes[keep]
+        if len(nodes) < 4:
+            problems.append(Problem(name, kind, "dropped", "no-area", f"{len(nodes)} nodes"))
+            continue
+        rings.append(nodes)
+        of.append(row)
+    if not rings:
+        return areas, problems, meant
+    sizes = np.array([len(ring) for ring in rings])
+    lines = shapely.linearrings(
+        places.xy[np.concatenate(rings)], indices=np.repeat(np.arange(len(rings)), sizes)
+    )
+    sunwise = ~shapely.is_ccw(lines)
+    polygons = shapely.polygons(lines)
+    valid = shapely.is_valid(polygons)
+    polygons = shapely.orient_polygons(polygons)
+    for i, row in enumerate(of):
+        tags = elements.way_tags[row]
+        name = f"way/{elements.way_id[row]}"
+        if valid[i]:
+            nodes = elements.node_id[rings[i][::-1] if sunwise[i] else rings[i]]
+            areas.append(Area(name, tags, polygons[i], nodes))
+            continue
+        geometry = polygons_of(polygons[i])
+        why = str(shapely.is_valid_reason(polygons[i])).partition("[")[0]
+        if geometry is None:
+            problems.append(Problem(name, kind_of(tags), "dropped", "no-area", why))
+            continue
+        reason = "self-touching" if why.startswith("Ring ") else "self-crossing"
+        pieces = int(shapely.get_num_geometries(geometry))
+        told = f"{why.lower()}, {pieces} part{'s' * (pieces > 1)}"
+        problems.append(Problem(name, kind_of(tags), "repaired", reason, told))
+        areas.append(Area(name, tags, geometry, _NO_NODES))
+    return areas, problems, meant

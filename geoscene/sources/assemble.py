@@ -1,0 +1,195 @@
+"""Features from map objects; one way for all sources."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.report import Problem
+from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
+from geoscene.sources.data import OsmData, Point, Relation, Way
+from geoscene.sources.elements import UNITS, Elements, Int
+from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
+
+Bounds = tuple[float, float, float, float]
+
+
+def checked_bounds(bounds: Bounds) -> Bounds:
+    """``bounds`` as floats, or one InputError that lists what is wrong with them."""
+    try:
+        west, south, east, north = (float(v) for v in bounds)
+    except (TypeError, ValueError):
+        raise InputError(f"bounds {bounds!r}: give west, south, east, north in degrees") from None
+    faults = []
+    if not np.isfinite([west, south, east, north]).all():
+        faults.append("not finite")
+    elif abs(west) > 180 or abs(east) > 180 or abs(south) > 90 or abs(north) > 90:
+        faults.append(
+            "outside ±180 (longitude) or ±90 (latitude) degrees; the order is west, south, east, north"
+        )
+    else:
+        if west >= east:
+            faults.append("west is not less than east (areas across 180° are not supported)")
+        if south >= north:
+            faults.append("south is not less than north")
+    if faults:
+        raise InputError(f"bounds {west:g},{south:g},{east:g},{north:g}: {'; '.join(faults)}")
+    return west, south, east, north
+
+
+def _extent(elements: Elements) -> Bounds:
+    """What the source says it covers, else the extent of its nodes."""
+    if elements.bounds is not None:
+        return elements.bounds
+    (west, south), (east, north) = elements.node_xy.min(axis=0) / UNITS, elements.node_xy.max(axis=0) / UNITS
+    return float(west), float(south), float(east), float(north)
+
+
+def _near(elements: Elements, bounds: Bounds | None) -> NDArray[np.bool_]:
+    """(w,) whether each way's box meets the bounds; ways without nodes do not."""
+    ways = np.repeat(np.arange(len(elements.way_id)), np.diff(elements.way_start))
+    here = elements.ref >= 0
+    near = np.zeros(len(elements.way_id), bool)
+    if bounds is None:
+        near[:] = True
+        return near
+    low = np.full((len(near), 2), np.inf)
+    high = np.full((len(near), 2), -np.inf)
+    xy = elements.lonlat(elements.ref[here])
+    np.minimum.at(low, ways[here], xy)
+    np.maximum.at(high, ways[here], xy)
+    west, south, east, north = bounds
+    near[:] = (low <= (east, north)).all(axis=1) & (high >= (west, south)).all(axis=1)
+    return near
+
+
+def _lines(elements: Elements, rows: list[int]) -> tuple[list[Way], list[Problem]]:
+    """Lines of ways; where nodes are missing a line is cut, so that several may share an id."""
+    ways: list[Way] = []
+    problems: list[Problem] = []
+    for row in rows:
+        nodes = elements.chain(row)
+        tags = elements.way_tags[row]
+        name = f"way/{elements.way_id[row]}"
+        missing = int((nodes < 0).sum())
+        runs = [nodes]
+        if missing:
+            breaks = np.flatnonzero(np.diff((nodes >= 0).astype(np.int8))) + 1
+            runs = [run for run in np.split(nodes, breaks) if run[0] >= 0]
+        made = 0
+        for run in runs:
+            if len(run) > 1 and (run[1:] == run[:-1]).any():
+                keep = np.append(True, run[1:] != run[:-1])
+                told = f"{np.count_nonzero(~keep)} repeats left out"
+                problems.append(Problem(name, kind_of(tags), "repaired", "repeated-node", told))
+                run = run[keep]  # noqa: PLW2901 - the cleaned run takes its place
+            if len(run) > 1:
+                ways.append(Way(name, tags, elements.node_id[run], elements.lonlat(run)))
+                made += 1
+        if missing or not made:
+            told = f"{missing} of {len(nodes)} nodes absent" if missing else f"{len(nodes)} nodes"
+            action = "repaired" if made else "dropped"
+            problems.append(
+                Problem(name, kind_of(tags), action, "missing-nodes" if missing else "too-short", told)
+            )
+    return ways, problems
+
+
+def _selected(data: OsmData, bounds: Bounds) -> OsmData:
+    """The features that meet the bounds, whole, and the problems of those and of what was dropped near by."""
+    box = shapely.box(*bounds)
+    shapely.prepare(box)
+    hit = shapely.intersects(box, np.array([a.geometry for a in data.areas], object))
+    areas = [a for a, inside in zip(data.areas, hit, strict=True) if inside]
+    lines = shapely.linestrings(
+        np.concatenate([w.lonlat for w in data.ways]) if data.ways else np.empty((0, 2)),
+        indices=np.repeat(np.arange(len(data.ways)), [len(w.nodes) for w in data.ways]),
+    )
+    hit = shapely.intersects(box, lines)
+    ways = [w for w, inside in zip(data.ways, hit, strict=True) if inside]
+    west, south, east, north = bounds
+    points = [p for p in data.points if west <= p.lon <= east and south <= p.lat <= north]
+    kept = {f.osm_id for group in (areas, ways, points) for f in group}
+    away = {f.osm_id for group in (data.areas, data.ways, data.points) for f in group} - kept
+    return OsmData(
+        bounds=bounds,
+        ways=ways,
+        areas=areas,
+        points=points,
+        relations=[r for r in data.relations if any(f"{kind}/{i}" in kept for kind, i, _ in r.members)],
+        problems=[p for p in data.problems if p.osm_id not in away],
+        source=data.source,
+        timestamp=data.timestamp,
+    )
+
+
+def features(elements: Elements, *, bounds: Bounds | None = None, source: str = "") -> OsmData:
+    """The features of a map extract, each kind in order of id.
+
+    bounds : keep the features that meet this box (west, south, east, north, degrees), whole; all if None
+    source : what the elements came from, for people and for messages
+
+    Raises InputError for bounds that are none, SourceNotFoundError if there is nothing (within them).
+    """
+    if bounds is not None:
+        bounds = checked_bounds(bounds)
+    if len(elements.node_id) == 0:
+        raise SourceNotFoundError(
+            f"{source}: holds no nodes with coordinates; is it a whole OpenStreetMap extract?"
+        )
+    extent = _extent(elements)
+    places = Places.of(elements)
+    near = _near(elements, bounds)
+
+    def wanted(rows: Int) -> bool:
+        return bool(near[rows].any())
+
+    problems = [
+        Problem(f"node/{i}", "node", "dropped", "bad-coordinates", "missing or out of range")
+        for i in elements.misplaced.tolist()
+    ]
+    areas, found, claims = multipolygon_areas(elements, places, extent, wanted)
+    problems += found
+    rows = [row for row in np.flatnonzero(near).tolist() if has_meaning(elements.way_tags[row])]
+    more, found, meant = way_areas(elements, places, extent, rows, claims)
+    problems += found
+    lines = [
+        row
+        for row in rows
+        if row not in meant or (is_line(elements.way_tags[row]) and is_area(elements.way_tags[row]))
+    ]
+    ways, found = _lines(elements, lines)
+    problems += found
+    data = OsmData(
+        bounds=bounds or extent,
+        ways=ways,
+        areas=more + areas,
+        points=_points(elements),
+        relations=[
+            Relation(f"relation/{i}", tags, members)
+            for i, tags, members in elements.relations
+            if not is_multipolygon(tags)
+        ],
+        problems=problems,
+        source=source,
+        timestamp=elements.timestamp,
+    )
+    if bounds is not None:
+        data = _selected(data, bounds)
+        if not (data.ways or data.areas or data.points):
+            raise SourceNotFoundError(
+                f"{source}: nothing within {','.join(f'{v:g}' for v in bounds)};"
+                f" it covers {','.join(f'{v:.5g}' for v in extent)} (west, south, east, north)"
+            )
+    return data
+
+
+def _points(elements: Elements) -> list[Point]:
+    ids = np.array(list(elements.node_tags), np.int64)
+    lonlat = elements.lonlat(np.searchsorted(elements.node_id, ids)).tolist()
+    return [
+        Point(f"node/{i}", elements.node_tags[i], lon, lat)
+        for i, (lon, lat) in zip(ids.tolist(), lonlat, strict=True)
+    ]

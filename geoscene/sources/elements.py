@@ -1,0 +1,155 @@
+"""Map objects as they come, before they are features: columns of nodes, ways and relations."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.sources.data import Tags
+
+Int = NDArray[np.int64]
+Members = tuple[tuple[str, int, str], ...]
+
+UNITS = 10_000_000
+"""OpenStreetMap's coordinates are whole numbers of 1e-7 degrees."""
+
+UNKNOWN = 2**31 - 1
+"""A coordinate that was not given."""
+
+
+@dataclass(frozen=True, slots=True)
+class Elements:
+    """Nodes, ways and relations, each sorted by id, each id once; independent of the order they came in.
+
+    node_id   : (n,) int64
+    node_xy   : (n, 2) int32, longitude and latitude in 1e-7 degrees, within range
+    node_tags : tags of the nodes that have any, by id
+    way_id    : (w,) int64
+    way_start : (w + 1,) int64, way i refers to ``ref[way_start[i] : way_start[i + 1]]``
+    way_closed : (w,) bool, whether the first and last reference are the same node, here or not
+    way_tags  : tags of each way
+    ref       : (r,) int64, node index, or -1 for a node that is not here
+    relations : (id, tags, members)
+    bounds    : (west, south, east, north) degrees as stated by the source, or None
+    timestamp : ISO 8601 or ""
+    misplaced : ids of nodes whose coordinates were missing or out of range
+    """
+
+    node_id: Int
+    node_xy: NDArray[np.int32]
+    node_tags: dict[int, Tags]
+    way_id: Int
+    way_start: Int
+    way_closed: NDArray[np.bool_]
+    way_tags: list[Tags]
+    ref: Int
+    relations: list[tuple[int, Tags, Members]]
+    bounds: tuple[float, float, float, float] | None
+    timestamp: str
+    misplaced: Int
+
+    def chain(self, way: int) -> Int:
+        """(k,) node indices of the way in row ``way``, -1 for nodes that are not here."""
+        return self.ref[self.way_start[way] : self.way_start[way + 1]]
+
+    def lonlat(self, nodes: Int) -> NDArray[np.float64]:
+        """(k, 2) degrees of nodes given by index."""
+        return self.node_xy[nodes] / UNITS
+
+
+def _last_of_each(ids: Int) -> Int:
+    """Positions that sort ``ids``, the last one of equal ids only."""
+    order = np.argsort(ids, kind="stable")
+    ordered = ids[order]
+    last = np.ones(len(ids), bool)
+    last[:-1] = ordered[1:] != ordered[:-1]
+    return order[last]
+
+
+@dataclass(slots=True)
+class Collector:
+    """Takes map objects one by one, in any order; `finish` hands them over as `Elements`.
+
+    An object that comes twice counts as it came last.
+    """
+
+    bounds: tuple[float, float, float, float] | None = None
+    timestamp: str = ""
+    _node_id: array[int] = field(default_factory=lambda: array("q"))
+    _node_x: array[int] = field(default_factory=lambda: array("i"))
+    _node_y: array[int] = field(default_factory=lambda: array("i"))
+    _node_tags: dict[int, Tags] = field(default_factory=dict)
+    _way_id: array[int] = field(default_factory=lambda: array("q"))
+    _way_size: array[int] = field(default_factory=lambda: array("q"))
+    _way_tags: list[Tags] = field(default_factory=list)
+    _refs: array[int] = field(default_factory=lambda: array("q"))
+    _relations: dict[int, tuple[Tags, Members]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Number of objects taken."""
+        return len(self._node_id) + len(self._way_id) + len(self._relations)
+
+    def node(self, osm_id: int, x: int, y: int, tags: Tags | None) -> None:
+        """Take a node at ``x``, ``y`` (longitude, latitude in 1e-7 degrees, `UNKNOWN` if not given)."""
+        self._node_id.append(osm_id)
+        self._node_x.append(x)
+        self._node_y.append(y)
+        if tags:
+            self._node_tags[osm_id] = tags
+
+    def way(self, osm_id: int, refs: Iterable[int], tags: Tags) -> None:
+        """Take a way by its node ids."""
+        before = len(self._refs)
+        self._refs.extend(refs)
+        self._way_id.append(osm_id)
+        self._way_size.append(len(self._refs) - before)
+        self._way_tags.append(tags)
+
+    def relation(self, osm_id: int, tags: Tags, members: Members) -> None:
+        """Take a relation."""
+        self._relations[osm_id] = (tags, members)
+
+    def finish(self) -> Elements:
+        """All objects taken, sorted, references resolved."""
+        ids = np.frombuffer(self._node_id, np.int64) if self._node_id else np.empty(0, np.int64)
+        keep = _last_of_each(ids)
+        ids = ids[keep]
+        xy = np.empty((len(ids), 2), np.int32)
+        for column, values in enumerate((self._node_x, self._node_y)):
+            xy[:, column] = np.frombuffer(values, np.int32)[keep] if values else 0
+        placed = (np.abs(xy.astype(np.int64)) <= (180 * UNITS, 90 * UNITS)).all(axis=1)
+        misplaced, ids, xy = ids[~placed], ids[placed], xy[placed]
+
+        way_id = np.array(self._way_id, np.int64)
+        rows = _last_of_each(way_id)
+        sizes = np.array(self._way_size, np.int64)
+        starts = np.concatenate([[0], np.cumsum(sizes)])
+        new_starts = np.concatenate([[0], np.cumsum(sizes[rows])])
+        picked = np.arange(new_starts[-1]) + np.repeat(starts[rows] - new_starts[:-1], sizes[rows])
+        refs = np.array(self._refs, np.int64)[picked]
+        closed = sizes[rows] > 1
+        closed[closed] = refs[new_starts[:-1][closed]] == refs[new_starts[1:][closed] - 1]
+        if len(ids):
+            place = np.minimum(np.searchsorted(ids, refs), len(ids) - 1)
+            index = np.where(ids[place] == refs, place, -1)
+        else:
+            index = np.full(len(refs), -1)
+        gone = set(misplaced.tolist())
+        return Elements(
+            node_id=ids,
+            node_xy=xy,
+            node_tags={i: self._node_tags[i] for i in sorted(self._node_tags) if i not in gone},
+            way_id=way_id[rows],
+            way_start=new_starts,
+            way_closed=closed,
+            way_tags=[self._way_tags[i] for i in rows.tolist()],
+            ref=index.astype(np.int64),
+            relations=[(i, *self._relations[i]) for i in sorted(self._relations)],
+            bounds=self.bounds,
+            timestamp=self.timestamp,
+            misplaced=misplaced,
+        )

@@ -1,0 +1,122 @@
+"""OpenStreetMap extracts in files."""
+
+from __future__ import annotations
+
+import datetime as dt
+import gzip
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.sources.assemble import Bounds, checked_bounds, features
+from geoscene.sources.data import OsmData
+from geoscene.sources.elements import Collector
+
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
+
+_HELP = "give an OpenStreetMap extract (.osm, .osm.gz, .osm.bz2, .osm.pbf)"
+
+
+def _format_of(path: Path) -> str:
+    """libosmium's name of a file's format, by its first bytes, whatever the file is called.
+
+    Raises InputError for anything that is no OpenStreetMap file.
+    """
+    with path.open("rb") as file:
+        head = file.read(64)
+    if not head:
+        raise InputError(f"{path}: the file is empty; {_HELP}")
+    if head[:2] == b"\x1f\x8b":
+        return "osm.gz"
+    if head[:3] == b"BZh":
+        return "osm.bz2"
+    if head[4:6] == b"\x0a\x09" and head[6:15] == b"OSMHeader":
+        return "pbf"
+    if head[:7] == b"\xff\xe0\x04o5m2":
+        return "o5m"
+    if head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"<":
+        return "osm"
+    raise InputError(f"{path}: not an OpenStreetMap file; {_HELP}")
+
+
+def _collect(path: Path, progress: Progress) -> Collector:
+    """The objects of a file. Raises whatever libosmium raises."""
+    import osmium  # noqa: PLC0415 - heavy
+
+    file = osmium.io.File(str(path), _format_of(path))
+    stream = osmium.FileProcessor(file)
+    header = stream.header
+    taken = Collector()
+    box = header.box()
+    if box.valid() and box.size() > 0:
+        low, high = box.bottom_left, box.top_right
+        taken.bounds = (low.lon, low.lat, high.lon, high.lat)
+    taken.timestamp = header.get("osmosis_replication_timestamp") or header.get("timestamp")
+    newest = dt.datetime.fromtimestamp(0, dt.UTC)
+    kinds = {"n": "node", "w": "way", "r": "relation"}
+    for item in progress(stream):
+        if item.is_node():
+            place = item.location
+            tags = {tag.k: tag.v for tag in item.tags} if item.tags else None
+            taken.node(item.id, place.x, place.y, tags)
+            if tags is None:
+                continue
+        elif item.is_way():
+            if item.deleted:
+                continue
+            taken.way(item.id, [node.ref for node in item.nodes], {tag.k: tag.v for tag in item.tags})
+        elif item.is_relation():
+            if item.deleted:
+                continue
+            members = tuple((kinds[m.type], m.ref, m.role) for m in item.members)
+            taken.relation(item.id, {tag.k: tag.v for tag in item.tags}, members)
+        else:
+            continue
+        if not taken.timestamp:
+            newest = max(newest, item.timestamp)
+    if not taken.timestamp and newest.timestamp() > 0:
+        taken.timestamp = newest.strftime("%Y-%m-%dT%H:%M:%SZ")
+    return taken
+
+
+def read_osm(path: str | Path, *, bounds: Bounds | None = None, progress: Progress = iter) -> OsmData:
+    """The features of an OpenStreetMap extract: XML, plain or compressed (gzip, bzip2), PBF or o5m.
+
+    The format is told by the first bytes, not by the name. Ids may be negative and in any order, relations may
+    stand before ways. What is broken is repaired or dropped by the rules of docs/sources.md and listed in
+    ``problems``; the result does not depend on the order of the file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    bounds
+        Keep what meets this box (west, south, east, north in degrees), whole; everything if None.
+    progress
+        Wraps the stream of map objects; they pass through it one by one.
+
+    Raises
+    ------
+    SourceNotFoundError
+        The file is absent, or holds nothing (within the bounds).
+    InputError
+        The file is no OpenStreetMap file, is cut short or damaged, or the bounds are none.
+    """
+    path = Path(path)
+    if bounds is not None:
+        bounds = checked_bounds(bounds)
+    if not path.exists():
+        raise SourceNotFoundError(f"{path}: no such file; {_HELP}")
+    if path.is_dir():
+        raise InputError(f"{path}: a directory; {_HELP}")
+    try:
+        taken = _collect(path, progress)
+    except InputError:
+        raise
+    except (RuntimeError, OSError, ValueError, EOFError, gzip.BadGzipFile) as error:
+        cause = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path}: damaged, cut short or no OpenStreetMap file ({cause}); {_HELP}") from error
+    if len(taken) == 0:
+        raise SourceNotFoundError(f"{path}: holds no map objects; {_HELP}")
+    return features(taken.finish(), bounds=bounds, source=path.name)

@@ -1,0 +1,213 @@
+"""Areas from the lines that bound them: segments joined by node, whatever their order, direction or role."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.sources.elements import Int
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """One member of an area's boundary.
+
+    nodes : (k,) node indices, none missing
+    inner : whether it is said to bound a hole
+    """
+
+    nodes: Int
+    inner: bool
+
+
+def polygons_of(geometry: Any) -> Any:
+    """The polygonal part of a geometry, valid, exteriors counter-clockwise; None if it has no area."""
+    if not shapely.is_valid(geometry):
+        geometry = shapely.make_valid(geometry, method="structure", keep_collapsed=False)
+    parts = shapely.get_parts(shapely.get_parts(geometry))
+    parts = parts[(shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0)]
+    if len(parts) == 0:
+        return None
+    return shapely.orient_polygons(parts[0] if len(parts) == 1 else shapely.multipolygons(parts))
+
+
+def segments_of(nodes: Int) -> Int:
+    """(s, 2) int64 node indices of a chain's segments, the lesser first; segments of no length left out."""
+    pairs = np.sort(np.stack([nodes[:-1], nodes[1:]], axis=1), axis=1)
+    return pairs[pairs[:, 0] != pairs[:, 1]]
+
+
+def _odd_ends(segments: Int) -> Int:
+    """The nodes at which an odd number of segments end: where the boundary is open."""
+    nodes, count = np.unique(segments, return_counts=True)
+    return nodes[count % 2 == 1]
+
+
+def _prune(segments: Int) -> Int:
+    """Segments less those that lead to a dead end."""
+    while len(segments):
+        nodes, inverse, count = np.unique(segments, return_inverse=True, return_counts=True)
+        alive = (count[inverse.reshape(segments.shape)] > 1).all(axis=1)
+        if alive.all():
+            break
+        segments = segments[alive]
+    return segments
+
+
+def _inside(points: Float, a: Float, b: Float) -> NDArray[np.bool_]:
+    """(p,) whether a ray eastwards from each point crosses an odd number of the segments a to b."""
+    out = np.empty(len(points), bool)
+    for i, (x, y) in enumerate(points):
+        spans = (a[:, 1] > y) != (b[:, 1] > y)
+        p, q = a[spans], b[spans]
+        out[i] = np.count_nonzero(p[:, 0] + (y - p[:, 1]) / (q[:, 1] - p[:, 1]) * (q[:, 0] - p[:, 0]) > x) % 2
+    return out
+
+
+def enclosed(segments: Int, xy: Float) -> tuple[Any, bool]:
+    """The area that segments bound, by the even-odd rule, and whether any cross or overlap between nodes.
+
+    Where the boundary is open, dead ends are left out and what is still enclosed counts as inside. The area is None
+    if nothing is enclosed.
+    """
+    segments = _prune(segments)
+    if len(segments) == 0:
+        return None, False
+    ends = xy[segments]
+    lines = shapely.get_parts(shapely.union_all(shapely.linestrings(ends)))
+    crossing = len(lines) != len(segments)
+    faces = shapely.get_parts(shapely.polygonize(lines))
+    if len(faces) > 1 and len(_odd_ends(segments)) == 0:
+        points = shapely.get_coordinates(shapely.point_on_surface(faces))
+        faces = faces[_inside(points, ends[:, 0], ends[:, 1])]
+    if len(faces) == 0:
+        return None, crossing
+    return polygons_of(shapely.union_all(faces)), crossing
+
+
+def _joined(chains: Sequence[Int]) -> list[list[Int]]:
+    """Chains grouped into rings: closed ones alone, open ones with those they meet end to end."""
+    groups: list[list[Int]] = []
+    owner: dict[int, int] = {}
+    for chain in chains:
+        ends = {int(chain[0]), int(chain[-1])}
+        if len(ends) == 1:
+            groups.append([chain])
+            continue
+        met = sorted({owner[end] for end in ends if end in owner})
+        target = met[0] if met else len(groups)
+        if not met:
+            groups.append([])
+        groups[target].append(chain)
+        for other in met[1:]:
+            groups[target] += groups[other]
+            groups[other] = []
+        for member in groups[target]:
+            owner[int(member[0])] = owner[int(member[-1])] = target
+    return [group for group in groups if group]
+
+
+def _union_of_rings(chains: Sequence[Int], xy: Float) -> Any:
+    """The union of what each ring encloses; empty if none does."""
+    areas = []
+    for group in _joined(chains):
+        segments = np.unique(np.concatenate([segments_of(chain) for chain in group]), axis=0)
+        area, _ = enclosed(segments, xy)
+        if area is not None:
+            areas.append(area)
+    return shapely.union_all(areas)
+
+
+@dataclass(frozen=True, slots=True)
+class Assembly:
+    """What `assemble` made of a boundary.
+
+    geometry : Polygon or MultiPolygon, valid, exteriors counter-clockwise; None if nothing is enclosed
+    reason   : "" if the boundary was sound, else ``open-ring``, ``self-crossing`` or ``duplicate-way``
+    """
+
+    geometry: Any
+    reason: str
+
+
+def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> Assembly:
+    """The area that chains bound together.
+
+    A sound boundary (every node met an even number of times, no crossing between nodes) is taken by the even-odd
+    rule and needs no roles: segments that two rings share cancel, so that touching holes become one. Otherwise, and
+    where members are missing (not ``complete``), the rings that close are taken one by one: the union of the outer
+    less the union of the inner.
+
+    xy : (n, 2) coordinates of all nodes
+    """
+    seen: set[bytes] = set()
+    once: list[Chain] = []
+    parts: list[Int] = []
+    for chain in chains:
+        segments = segments_of(chain.nodes)
+        key = np.unique(segments, axis=0).tobytes()
+        if len(segments) and key not in seen:
+            seen.add(key)
+            once.append(chain)
+            parts.append(segments)
+    if not parts:
+        return Assembly(None, "open-ring")
+    every, count = np.unique(np.concatenate(parts), axis=0, return_counts=True)
+    odd = every[count % 2 == 1]
+    is_open = len(_odd_ends(odd)) > 0
+    reason = "open-ring" if is_open else "duplicate-way" if len(once) < len(chains) else ""
+    crossing = False
+    if complete and not is_open and len(odd):
+        geometry, crossing = enclosed(odd, xy)
+        if not crossing:
+            return Assembly(geometry, reason)
+        reason = "self-crossing"
+    outer = _union_of_rings([c.nodes for c in once if not c.inner], xy)
+    inner = _union_of_rings([c.nodes for c in once if c.inner], xy)
+    if complete and outer.is_empty:
+        return Assembly(polygons_of(inner), reason)
+    return Assembly(polygons_of(shapely.difference(outer, inner)), reason)
+
+
+def close_cut_ring(nodes: Int, xy: Float, extent: tuple[float, float, float, float]) -> Int | None:
+    """A ring that the edge of an extract cut, closed by straight edges over what is missing; None if not sensible.
+
+    It is sensible where both ends of every gap lie within 100 m of the extent's edge, the edges put in are at most a
+    third of the outline, and the outline does not cross itself.
+
+    nodes  : (k,) node indices, -1 where a node is missing; the last need not equal the first
+    xy     : (n, 2) degrees of all nodes
+    extent : (west, south, east, north) degrees of the extract
+    """
+    closed = len(nodes) > 1 and nodes[0] == nodes[-1] and nodes[0] >= 0
+    ring = nodes[:-1] if closed else nodes
+    here = np.flatnonzero(ring >= 0)
+    if len(here) < 3:
+        return None
+    kept = ring[here]
+    following = np.roll(here, -1)
+    gap = following != here + 1
+    gap[-1] = not (closed and here[-1] == len(ring) - 1)
+    west, south, east, north = extent
+    metres = 111_195.0 * np.array(
+        [np.cos(np.radians((south + north) / 2)), 1.0]
+    )  # mean Earth radius, 6371 km
+    start = xy[kept] * metres
+    end = np.roll(start, -1, axis=0)
+    length = np.hypot(*(end - start).T)
+    low, high = np.array([west, south]) * metres, np.array([east, north]) * metres
+    margin = np.minimum(start - low, high - start).min(axis=1)
+    far = np.maximum(margin, np.roll(margin, -1))[gap] > 100.0
+    if far.any() or length[gap].sum() > length.sum() / 3:
+        return None
+    polygon = shapely.polygons(np.vstack([start, start[:1]]))
+    if not shapely.is_valid(polygon) or shapely.area(polygon) < 1.0:
+        return None
+    return np.append(kept, kept[0])
