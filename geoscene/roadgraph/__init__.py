@@ -5,3 +5,5 @@ from geoscene.roadgraph.build import build_road_graph as build_road_graph
 from geoscene.roadgraph.components import Components as Components
 from geoscene.roadgraph.components import find_components as find_components
 from geoscene.roadgraph.components import main_network as main_network
+from geoscene.roadgraph.graphml import read_graphml as read_graphml
+from geoscene.roadgraph.graphml import write_graphml as write_graphml

@@ -36,7 +36,7 @@ def add_turns(graph: RoadGraph, relations: Iterable[Relation], problems: list[Pr
             way = str(graph.osm_id[edge]).split(";")[last]
             edges.setdefault((int(ends[edge]), way), []).append(edge)
 
-    rows: dict[tuple[int, int, int, str], None] = {}
+    found: set[tuple[int, int, int, str]] = set()
     for relation in relations:
         value = _kind(relation.tags)
         if not value:
@@ -53,7 +53,8 @@ def add_turns(graph: RoadGraph, relations: Iterable[Relation], problems: list[Pr
                 for _, way_out in by_role.get("to", []):
                     for edge in arriving.get((at, f"way/{way_in}"), []):
                         for after in leaving.get((at, f"way/{way_out}"), []):
-                            rows[edge, at, after, value] = None
+                            found.add((edge, at, after, value))
+    rows = sorted(found)
     return replace(
         graph,
         turn_from=np.array([row[0] for row in rows], np.int32),

@@ -1,0 +1,293 @@
+"""The road graph as GraphML that osmnx and networkx open."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+from xml.sax.saxutils import escape
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.errors import SceneFormatError
+from geoscene.frames import Frame
+from geoscene.roads import RoadGraph
+from geoscene.scene import write_atomically
+
+Float = NDArray[np.float64]
+
+_XMLNS = "http://graphml.graphdrawing.org/xmlns"
+_GRAPH_KEYS = ("crs", "simplified", "created_with")
+_NODE_KEYS = ("x", "y", "elevation", "street_count", "highway", "controls")
+_EDGE_KEYS = (
+    "osmid",
+    "highway",
+    "name",
+    "ref",
+    "oneway",
+    "reversed",
+    "length",
+    "maxspeed",
+    "speed_kph",
+    "speed_source",
+    "travel_time",
+    "lanes",
+    "lanes_ahead",
+    "lanes_source",
+    "width",
+    "width_source",
+    "layer",
+    "layer_source",
+    "bridge",
+    "tunnel",
+    "edge",
+    "twin",
+    "turns",
+    "controls",
+    "geometry",
+)
+_FLAGS = {"signals": "traffic_signals", "stop": "stop", "give_way": "give_way"}
+_UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
+
+
+def write_graphml(graph: RoadGraph, frame: Frame, path: Path) -> None:
+    """Write the graph as GraphML, with longitude and latitude to 1e-10 degrees (0.01 mm).
+
+    Keys and values are those of ``osmnx.save_graphml``: all text; ``x`` and ``y`` are degrees, ``length``
+    metres, ``lanes`` those of both directions, ``geometry`` WKT in degrees. Where the graph has heights,
+    nodes have ``elevation`` and lines are ``LINESTRING Z``, scene metres. Added keys: ``*_source``;
+    ``lanes_ahead`` (this direction), ``edge`` (its number), ``twin`` (the number of the other direction),
+    ``turns`` (``no_left_turn 17`` names a restriction and the edge turned into) and ``controls``
+    (``12.5 stop``: metres from the tail).
+    """
+    write_atomically(path, "\n".join(_document(graph, frame)).encode())
+
+
+def _document(graph: RoadGraph, frame: Frame) -> Iterator[str]:
+    keys: dict[tuple[str, str], str] = {}
+    yield "<?xml version='1.0' encoding='utf-8'?>"
+    yield f'<graphml xmlns="{_XMLNS}">'
+    for domain, names in (("graph", _GRAPH_KEYS), ("node", _NODE_KEYS), ("edge", _EDGE_KEYS)):
+        for name in names:
+            keys[domain, name] = f"d{len(keys)}"
+            yield f'<key id="{keys[domain, name]}" for="{domain}" attr.name="{name}" attr.type="string"/>'
+    yield '<graph edgedefault="directed">'
+    header = {"crs": "EPSG:4326", "simplified": "True", "created_with": "geoscene"}
+    yield _data("graph", header, keys)
+    tall = bool(np.any(graph.node_xyz[:, 2])) or any(bool(line[:, 2].any()) for line in graph.geometry)
+    for node, row in zip(graph.node_id.tolist(), _node_rows(graph, frame, tall=tall), strict=True):
+        yield f'<node id="{node}">{_data("node", row, keys)}</node>'
+    copies: Counter[tuple[int, int]] = Counter()
+    ends = np.stack([graph.node_id[graph.tail], graph.node_id[graph.head]], axis=1)
+    for (tail, head), row in zip(ends.tolist(), _edge_rows(graph, frame, tall=tall), strict=True):
+        start = f'<edge source="{tail}" target="{head}" id="{copies[tail, head]}">'
+        yield f"{start}{_data('edge', row, keys)}</edge>"
+        copies[tail, head] += 1
+    yield "</graph></graphml>\n"
+
+
+def _data(domain: str, row: Mapping[str, str], keys: Mapping[tuple[str, str], str]) -> str:
+    return "".join(
+        f'<data key="{keys[domain, name]}">{escape(_UNPRINTABLE.sub("", value))}</data>'
+        for name, value in row.items()
+        if value
+    )
+
+
+def _node_rows(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[dict[str, str]]:
+    lon, lat = frame.to_geographic(graph.node_xyz[:, 0], graph.node_xyz[:, 1])
+    once = (graph.twin < 0) | (graph.twin > np.arange(len(graph)))
+    ends = np.concatenate([graph.tail[once], graph.head[once]])
+    streets = np.bincount(ends, minlength=len(graph.node_id))
+    for k in range(len(graph.node_id)):
+        told = [tag for name, tag in _FLAGS.items() if getattr(graph, name)[k]]
+        yield {
+            "x": f"{lon[k]:.10f}",
+            "y": f"{lat[k]:.10f}",
+            "elevation": f"{graph.node_xyz[k, 2]:.4f}" if tall else "",
+            "street_count": str(streets[k]),
+            "highway": told[0] if told else "",
+            "controls": ";".join(told),
+        }
+
+
+def _edge_rows(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[dict[str, str]]:
+    turns, controls = _lists(graph)
+    both = graph.lanes + np.where(graph.twin >= 0, graph.lanes[graph.twin], 0.0)
+    seconds = graph.travel_time
+    for k, wkt in enumerate(_wkt(graph, frame, tall=tall)):
+        ways = [part.removeprefix("way/") for part in str(graph.osm_id[k]).split(";")]
+        yield {
+            "osmid": ways[0] if len(ways) == 1 else f"[{', '.join(ways)}]",
+            "highway": str(graph.highway[k]),
+            "name": str(graph.name[k]),
+            "ref": str(graph.ref[k]),
+            "oneway": str(bool(graph.oneway[k])),
+            "reversed": str(bool(0 <= graph.twin[k] < k)),
+            "length": f"{graph.length[k]:.6f}",
+            "maxspeed": f"{graph.speed[k] * 3.6:.6g}",
+            "speed_kph": repr(float(graph.speed[k] * 3.6)),
+            "speed_source": str(graph.speed_source[k]),
+            "travel_time": f"{seconds[k]:.6f}",
+            "lanes": f"{both[k]:g}",
+            "lanes_ahead": f"{graph.lanes[k]:g}",
+            "lanes_source": str(graph.lanes_source[k]),
+            "width": f"{graph.width[k]:.6g}",
+            "width_source": str(graph.width_source[k]),
+            "layer": str(graph.layer[k]),
+            "layer_source": str(graph.layer_source[k]),
+            "bridge": "yes" if graph.bridge[k] else "",
+            "tunnel": "yes" if graph.tunnel[k] else "",
+            "edge": str(k),
+            "twin": str(graph.twin[k]) if graph.twin[k] >= 0 else "",
+            "turns": ";".join(turns.get(k, [])),
+            "controls": ";".join(controls.get(k, [])),
+            "geometry": wkt,
+        }
+
+
+def _lists(graph: RoadGraph) -> tuple[dict[int, list[str]], dict[int, list[str]]]:
+    turns: dict[int, list[str]] = {}
+    for edge, after, kind in zip(
+        graph.turn_from.tolist(), graph.turn_to.tolist(), graph.turn_kind.tolist(), strict=True
+    ):
+        turns.setdefault(edge, []).append(f"{kind} {after}")
+    controls: dict[int, list[str]] = {}
+    for edge, offset, kind in zip(
+        graph.control_edge.tolist(), graph.control_offset.tolist(), graph.control_kind.tolist(), strict=True
+    ):
+        controls.setdefault(edge, []).append(f"{offset:.4f} {kind}")
+    return turns, controls
+
+
+def _wkt(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[str]:
+    if not len(graph):
+        return
+    points = np.concatenate(list(graph.geometry))
+    lon, lat = frame.to_geographic(points[:, 0], points[:, 1])
+    if tall:
+        texts = [f"{x:.10f} {y:.10f} {z:.4f}" for x, y, z in zip(lon, lat, points[:, 2], strict=True)]
+    else:
+        texts = [f"{x:.10f} {y:.10f}" for x, y in zip(lon, lat, strict=True)]
+    stops = np.cumsum([0, *(len(line) for line in graph.geometry)]).tolist()
+    for start, stop in pairwise(stops):
+        yield f"LINESTRING {'Z ' if tall else ''}({', '.join(texts[start:stop])})"
+
+
+def read_graphml(path: Path, frame: Frame) -> RoadGraph:
+    """The graph that `write_graphml` wrote; places within 0.1 mm.
+
+    Raises SceneFormatError if the file is missing, damaged, or not one of these.
+    """
+    try:
+        nodes, edges = _parse(path)
+        return _graph(nodes, edges, frame)
+    except (OSError, ET.ParseError, KeyError, ValueError, shapely.errors.GEOSException) as error:
+        raise SceneFormatError(
+            f"{path}: not a readable road graph ({type(error).__name__}: {error}); build the scene again"
+        ) from error
+
+
+_Row = dict[str, str]
+
+
+def _parse(path: Path) -> tuple[dict[int, _Row], list[tuple[int, int, _Row]]]:
+    """The nodes' values by id, and the edges with theirs, in the order of their numbers."""
+    keys: dict[str, str] = {}
+    nodes: dict[int, _Row] = {}
+    edges: list[tuple[int, int, _Row]] = []
+    for _, element in ET.iterparse(path):  # noqa: S314  (expat bounds what entities expand to)
+        tag = element.tag.rpartition("}")[2]
+        if tag == "key":
+            keys[element.attrib["id"]] = element.attrib["attr.name"]
+        elif tag in ("node", "edge"):
+            row = {keys[data.attrib["key"]]: data.text or "" for data in element}
+            if tag == "node":
+                nodes[int(element.attrib["id"])] = row
+            else:
+                edges.append((int(element.attrib["source"]), int(element.attrib["target"]), row))
+            element.clear()
+    edges.sort(key=lambda edge: int(edge[2]["edge"]))
+    return nodes, edges
+
+
+def _graph(nodes: dict[int, _Row], edges: list[tuple[int, int, _Row]], frame: Frame) -> RoadGraph:
+    node_id = np.array(list(nodes), np.int64)
+    number = {osm: k for k, osm in enumerate(nodes)}
+    row_of = {int(row["edge"]): k for k, (_, _, row) in enumerate(edges)}
+    rows = [row for _, _, row in edges]
+
+    def column(name: str, kind: Callable[[str], Any], dtype: Any) -> NDArray[Any]:
+        return np.array([kind(row.get(name, "")) for row in rows], dtype)
+
+    places = np.array([[float(n["x"]), float(n["y"])] for n in nodes.values()]).reshape(-1, 2)
+    x, y = frame.from_geographic(places[:, 0], places[:, 1])
+    z = np.array([float(n.get("elevation", 0.0)) for n in nodes.values()])
+    told = [node.get("controls", "").split(";") for node in nodes.values()]
+    flags = {name: np.array([tag in tags for tags in told], np.bool_) for name, tag in _FLAGS.items()}
+    turns = [
+        (k, number[head], row_of[int(turn.split()[1])], turn.split()[0])
+        for k, (_, head, row) in enumerate(edges)
+        for turn in filter(None, row.get("turns", "").split(";"))
+        if int(turn.split()[1]) in row_of
+    ]
+    controls = [
+        (k, *control.split())
+        for k, row in enumerate(rows)
+        for control in filter(None, row.get("controls", "").split(";"))
+    ]
+    return RoadGraph(
+        node_id=node_id,
+        node_xyz=np.stack([x, y, z], axis=1),
+        tail=np.array([number[tail] for tail, _, _ in edges], np.int32),
+        head=np.array([number[head] for _, head, _ in edges], np.int32),
+        geometry=_lines(rows, frame),
+        length=column("length", float, float),
+        speed=column("speed_kph", float, float) / 3.6,
+        speed_source=column("speed_source", str, np.str_),
+        lanes=column("lanes_ahead", float, float),
+        lanes_source=column("lanes_source", str, np.str_),
+        width=column("width", float, float),
+        width_source=column("width_source", str, np.str_),
+        oneway=column("oneway", "True".__eq__, np.bool_),
+        layer=column("layer", int, np.int8),
+        layer_source=column("layer_source", str, np.str_),
+        bridge=column("bridge", "yes".__eq__, np.bool_),
+        tunnel=column("tunnel", "yes".__eq__, np.bool_),
+        highway=column("highway", str, np.str_),
+        name=column("name", str, np.str_),
+        ref=column("ref", str, np.str_),
+        osm_id=column("osmid", _way_ids, np.str_),
+        twin=column("twin", lambda text: row_of.get(int(text), -1) if text else -1, np.int32),
+        **flags,
+        turn_from=np.array([turn[0] for turn in turns], np.int32),
+        turn_via=np.array([turn[1] for turn in turns], np.int32),
+        turn_to=np.array([turn[2] for turn in turns], np.int32),
+        turn_kind=np.array([turn[3] for turn in turns], np.str_),
+        control_edge=np.array([control[0] for control in controls], np.int32),
+        control_offset=np.array([control[1] for control in controls], float),
+        control_kind=np.array([control[2] for control in controls], np.str_),
+    )
+
+
+def _way_ids(osmid: str) -> str:
+    return ";".join(f"way/{int(part)}" for part in osmid.strip("[]").split(","))
+
+
+def _lines(rows: list[_Row], frame: Frame) -> NDArray[np.object_]:
+    lines = np.empty(len(rows), object)
+    if not rows:
+        return lines
+    shapes = shapely.from_wkt([row["geometry"] for row in rows])
+    points, index = shapely.get_coordinates(shapes, include_z=True, return_index=True)
+    x, y = frame.from_geographic(points[:, 0], points[:, 1])
+    xyz = np.stack([x, y, np.nan_to_num(points[:, 2])], axis=1)
+    for k, line in enumerate(np.split(xyz, np.flatnonzero(np.diff(index)) + 1)):
+        lines[k] = line
+    return lines
