@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import logging
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lidar.errors import InputError, LidarError
+from lidar.errors import InputError
 from lidar.poses import Poses
 from lidar.raycast import kernels
 from lidar.raycast.embree import EmbreeScene
-from lidar.raycast.geometry import ALL, Geometry, Instances, triangles
+from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split
 from lidar.raycast.hits import Echoes, Hits
 
 Float = NDArray[np.float64]
@@ -23,6 +22,10 @@ _CHUNK = 8192
 """Rays that a thread takes at a time; a multiple of every packet width, so that packets do not depend on it."""
 _NO_INDEX = np.empty(0, np.int64)
 _NO_TIME = np.empty(0, np.float32)
+_NOTHING: Mapping[int, Geometry] = {}
+_NUMBERS: Mapping[int, int] = {}
+_COPIES = 1 << 20
+"""Number of the first geometry of copies; parts of a mesh have lesser numbers."""
 _NO_POSES = (_NO_INDEX, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)))
 
 
@@ -35,28 +38,56 @@ class Caster:
     vertices, faces : (n, 3) and (m, 3), the caster's own mesh
     mask            : (m,) bits per face, of which a ray's ``mask`` must share one; all bits by default
     instances       : copies of other casters; their numbers run through all groups in the given order
-    backend         : ``embree``, ``embreex`` (slower, same results), or ``auto``: the first that works
+    origin          : (3,) metres, within a few kilometres of all vertices and rays: what float32 coordinates
+                      are relative to; the middle of the vertices by default
+    dynamic         : whether `update` will exchange parts of the mesh
 
-    Raises InputError for meshes that cannot be cast at and BackendError if the backend does not work here.
+    Raises InputError for meshes that cannot be cast at and BackendError if Embree does not work here.
     """
-
-    geometry: Geometry
-    instances: tuple[Instances, ...]
 
     def __init__(
         self,
-        vertices: ArrayLike,
-        faces: ArrayLike,
+        vertices: ArrayLike = (),
+        faces: ArrayLike = (),
         *,
         mask: ArrayLike | None = None,
         instances: Sequence[Instances] = (),
-        backend: str = "auto",
+        origin: ArrayLike | None = None,
+        dynamic: bool = False,
     ) -> None:
-        self.geometry = triangles(vertices, faces, mask)
-        self.instances = tuple(instances)
-        self._scene = EmbreeScene(
-            self.geometry, self.instances, [[shape._scene for shape in g.shapes] for g in self.instances]
-        )
+        v, f = checked(vertices, faces)
+        self.origin: Float = middle(v) if origin is None else np.array(origin, np.float64)
+        self.scene = EmbreeScene(self.origin, dynamic=dynamic)
+        self.instances: tuple[Instances, ...] = ()
+        self.update(attach=dict(enumerate(split(v - self.origin, f, mask))), instances=instances)
+
+    def update(
+        self,
+        *,
+        detach: Iterable[int] = (),
+        attach: Mapping[int, Geometry] = _NOTHING,
+        first: Mapping[int, int] = _NUMBERS,
+        instances: Sequence[Instances] | None = None,
+    ) -> None:
+        """Exchange parts of the mesh, in place; trees of the parts that stay are kept.
+
+        detach    : numbers of parts to take away
+        attach    : parts to add, relative to ``origin``, by number; the same set of numbered parts gives the
+                    same hits, whatever came and went before
+        first     : numbers of the first faces of parts, by the part's number; as they were by default
+        instances : all copies from now on; as they were by default
+        """
+        for number in detach:
+            self.scene.detach(number)
+        for number, part in attach.items():
+            self.scene.attach(number, part)
+        for number, start in first.items():
+            self.scene.parts[number] = replace(self.scene.parts[number], first=start)
+        if instances is not None:
+            self.instances = tuple(instances)
+            shapes = [[shape.scene for shape in group.shapes] for group in self.instances]
+            self.scene.place(self.instances, shapes, _COPIES)
+        self.scene.commit()
 
     def cast(
         self,
@@ -68,6 +99,7 @@ class Caster:
         mask: int = ALL,
         time: ArrayLike | None = None,
         order: NDArray[np.integer] | None = None,
+        normals: bool = False,
         threads: int = 1,
     ) -> Hits:
         """The first hit of each ray.
@@ -79,6 +111,7 @@ class Caster:
         time       : (n,) ray times 0 to 1 within the motion of moving instances; 0 by default
         order      : (n,) permutation: the order in which neighbouring rays are worked on together. Rays are
                      fastest where 16 in a row go almost the same way (16 azimuths of one channel, 16 pixels)
+        normals    : whether to fill in `Hits.normal`
         threads    : threads to use; the result does not depend on it
 
         Raises InputError for rays that are not finite or have a direction of length zero.
@@ -87,7 +120,7 @@ class Caster:
         o = np.ascontiguousarray(origins, np.float64).reshape(-1, 3)
         if len(o) not in (1, len(d)):
             raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one a ray")
-        return self._cast(_rays(d, o, _NO_POSES, near, far, mask, time, order), threads)
+        return self._cast(_rays(d, o, _NO_POSES, near, far, mask, time, order), threads, normals=normals)
 
     def cast_posed(
         self,
@@ -101,6 +134,7 @@ class Caster:
         mask: int = ALL,
         time: ArrayLike | None = None,
         order: NDArray[np.integer] | None = None,
+        normals: bool = False,
         threads: int = 1,
     ) -> Hits:
         """The first hit of each ray of a sensor that moves; ranges are true metres for unit directions.
@@ -120,7 +154,9 @@ class Caster:
         if len(index) and not (index.min() >= 0 and index.max() < len(poses)):
             raise InputError(f"a ray names a pose beyond the {len(poses)} there are")
         columns = (np.ascontiguousarray(a, np.float64) for a in (poses.position, poses.rotation, poses.scale))
-        return self._cast(_rays(d, o, (index, *columns), near, far, mask, time, order), threads)
+        return self._cast(
+            _rays(d, o, (index, *columns), near, far, mask, time, order), threads, normals=normals
+        )
 
     def occluded(
         self,
@@ -143,7 +179,7 @@ class Caster:
             raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one a ray")
         rays = _rays(d, o, _NO_POSES, near, far, mask, time, None)
         out = np.empty(len(d), np.bool_)
-        target = self._scene.target
+        target = self.scene.target
         _share(lambda lo, hi: kernels.occluded(target, rays, lo, hi, out), rays, threads)
         return out
 
@@ -165,27 +201,17 @@ class Caster:
         """
         raise NotImplementedError
 
-    def normals(self, hits: Hits, *, time: ArrayLike | None = None) -> Float:
-        """Unit normals (n, 3) of the faces that were hit, in the caster's axes; zero for a miss.
-
-        time : (n,) the ray times the hits were cast with
-        """
-        out = np.empty((len(hits), 3))
-        moments = _NO_TIME if time is None else np.ascontiguousarray(time, np.float32)
-        kernels.normals(self._scene.target, hits.face, hits.instance, moments, out)
-        return out
-
-    def _cast(self, rays: kernels.Rays, threads: int) -> Hits:
+    def _cast(self, rays: kernels.Rays, threads: int, *, normals: bool) -> Hits:
         n = len(rays.directions)
         ranges, faces, instances = np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
-        cosines = np.empty(n, np.float32)
-        target = self._scene.target
+        cosines, normal = np.empty(n, np.float32), np.empty((n if normals else 0, 3))
+        target = self.scene.target
         _share(
-            lambda lo, hi: kernels.cast(target, rays, lo, hi, ranges, faces, instances, cosines),
+            lambda lo, hi: kernels.cast(target, rays, lo, hi, ranges, faces, instances, cosines, normal),
             rays,
             threads,
         )
-        return Hits(ranges, faces, instances, cosines)
+        return Hits(ranges, faces, instances, cosines, normal)
 
 
 def _rows(values: ArrayLike, name: str) -> Float:

@@ -1,4 +1,4 @@
-"""Embree scenes: triangles and copies of them, and the rays cast at them."""
+"""Embree scenes: triangles and copies of them, and what kernels need to know about both."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar.raycast import kernels
 from lidar.raycast.geometry import Geometry, Instances
+from lidar.raycast.kernels import Target
 from lidar.raycast.library import (
     COHERENT,
+    DYNAMIC,
     FLOAT3,
     FLOAT3X4_ROW_MAJOR,
     INDEX,
@@ -24,7 +25,6 @@ from lidar.raycast.library import (
     UINT,
     UINT3,
     VERTEX,
-    Library,
     fill,
     library,
 )
@@ -41,133 +41,129 @@ def arguments(flags: int = 0, *, context: int = 0, collect: int = 0) -> NDArray[
 
 
 class EmbreeScene:
-    """A committed Embree scene of a geometry and of copies of other scenes' own triangles.
+    """An Embree scene of geometries, by number, and of copies of other scenes' geometries.
+
+    Changes take effect with `commit`, which builds anew only what was attached or placed since: geometries
+    that stay keep their trees (Embree's dynamic scenes have a tree for each, and merge the tops).
+
+    origin  : (3,) float64, what the geometries' vertices are relative to
+    dynamic : whether geometries come and go
 
     Raises BackendError if Embree is not to be had or refuses.
     """
 
-    def __init__(
-        self,
-        geometry: Geometry,
-        instances: Sequence[Instances],
-        shapes: Sequence[Sequence[EmbreeScene]],
-    ) -> None:
-        """Build it; ``shapes`` holds, for each group of instances, the scenes that its shapes are."""
-        lib = library()
-        self.geometry = geometry
-        self.address: int = lib.call("rtcNewScene", lib.device)
-        weakref.finalize(self, lib.embree.rtcReleaseScene, self.address)
-        lib.call("rtcSetSceneFlags", self.address, ROBUST)
-        self._add_triangles(lib)
-        table = _Table(geometry.origin)
-        for group, scenes in zip(instances, shapes, strict=True):
-            self._add_instances(lib, group, scenes, table)
-        lib.call("rtcCommitScene", self.address)
+    def __init__(self, origin: Float, *, dynamic: bool = False) -> None:
+        self.origin = origin
+        self._lib = library()
+        self.address: int = self._lib.call("rtcNewScene", self._lib.device)
+        weakref.finalize(self, self._lib.embree.rtcReleaseScene, self.address)
+        self._lib.call("rtcSetSceneFlags", self.address, ROBUST | (DYNAMIC if dynamic else 0))
+        self.parts: dict[int, Geometry] = {}
+        self._copies: list[tuple[int, NDArray[np.intp]]] = []
+        self._groups: list[tuple[Instances, Sequence[EmbreeScene], Float]] = []
         self._packet, self._single = arguments(COHERENT), arguments()
-        self._parts = table.parts  # the shapes' columns must live as long as their addresses
-        self.target = kernels.Target(
+        self.target: Target
+
+    def _attach(self, geometry: int, number: int) -> None:
+        self._lib.call("rtcCommitGeometry", geometry)
+        self._lib.call("rtcAttachGeometryByID", self.address, geometry, number)
+        self._lib.call("rtcReleaseGeometry", geometry)
+
+    def attach(self, number: int, part: Geometry) -> None:
+        """Add a geometry under a free number. Trees depend on the numbers, not on the order of attaching."""
+        self.parts[number] = part
+        if len(part) == 0:
+            return
+        geometry = self._lib.call("rtcNewGeometry", self._lib.device, TRIANGLE)
+        fill(self._lib, geometry, VERTEX, 0, FLOAT3, part.vertices.astype(np.float32))
+        fill(self._lib, geometry, INDEX, 0, UINT3, part.faces.astype(np.uint32))
+        self._lib.call("rtcSetGeometryMask", geometry, part.mask)
+        self._attach(geometry, number)
+
+    def detach(self, number: int) -> None:
+        """Remove the geometry of a number."""
+        if len(self.parts.pop(number)):
+            self._lib.call("rtcDetachGeometry", self.address, number)
+
+    def place(self, groups: Sequence[Instances], scenes: Sequence[Sequence[EmbreeScene]], first: int) -> None:
+        """Replace all copies; ``scenes`` holds each group's shapes, numbers from ``first`` on are free."""
+        for number, _ in self._copies:
+            self._lib.call("rtcDetachGeometry", self.address, number)
+        self._copies, self._groups = [], []
+        start = 0
+        for group, shapes in zip(groups, scenes, strict=True):
+            moments = group.transform if group.transform.ndim == 4 else group.transform[:, None]
+            origins = np.array([shape.origin for shape in shapes]).reshape(-1, 3)[group.shape]
+            placed = moments.copy()
+            placed[..., 3] += np.einsum("ksij,kj->ksi", moments[..., :3], origins) - self.origin
+            self._groups.append((group, shapes, placed))
+            mask = np.full(len(group), INVALID, np.uint32) if group.mask is None else group.mask
+            for bits in np.unique(mask):
+                rows = np.flatnonzero(mask == bits)
+                copies = self._copy(shapes, group.shape[rows], placed[rows], int(bits))
+                number = first + len(self._copies)
+                self._attach(copies, number)
+                self._copies.append((number, rows + start))
+            start += len(group)
+
+    def _copy(self, shapes: Sequence[EmbreeScene], shape: NDArray[np.int32], placed: Float, mask: int) -> int:
+        """An Embree geometry of copies with one mask."""
+        lib = self._lib
+        copies: int = lib.call("rtcNewGeometry", lib.device, INSTANCE_ARRAY)
+        addresses = (c.c_void_p * len(shapes))(*(one.address for one in shapes))
+        lib.call("rtcSetGeometryInstancedScenes", copies, addresses, len(shapes))
+        steps = placed.shape[1]
+        lib.call("rtcSetGeometryTimeStepCount", copies, steps)
+        for step in range(steps):
+            matrices = np.ascontiguousarray(placed[:, step], np.float32)
+            fill(lib, copies, TRANSFORM, step, FLOAT3X4_ROW_MAJOR, matrices)
+        fill(lib, copies, INDEX, 0, UINT, shape.astype(np.uint32))
+        lib.call("rtcSetGeometryMask", copies, mask)
+        return copies
+
+    def commit(self) -> None:
+        """Build what changed and tell the kernels."""
+        self._lib.call("rtcCommitScene", self.address)
+        parts = [self.parts[number] for number in sorted(self.parts)]
+        rows = np.zeros(max(self.parts, default=-1) + 1, np.int32)
+        rows[sorted(self.parts)] = np.arange(len(parts))
+        starts = np.zeros(max((number for number, _ in self._copies), default=-1) + 1, np.int64)
+        place = 0
+        for number, copied in self._copies:
+            starts[number], place = place, place + len(copied)
+        shape, steps, transforms = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty((0, 12))]
+        for group, shapes, placed in self._groups:
+            first = []
+            for one in shapes:
+                first.append(len(parts))
+                parts += [one.parts[number] for number in sorted(one.parts)]
+            shape.append(np.array(first, np.int64)[group.shape])
+            steps.append(np.full(len(group), placed.shape[1], np.int64))
+            transforms.append(placed.reshape(-1, 12))
+        counts = np.concatenate(steps)
+        self._kept = parts  # their columns must live as long as their addresses
+        self.target = Target(
             self.address,
             self._packet.ctypes.data,
             self._single.ctypes.data,
-            lib.width,
-            geometry.origin,
-            np.array([self.row, *(part.row for part in table.parts)], np.int64),
-            *table.columns(),
-        )
-
-    def _attach(self, lib: Library, geometry: int) -> int:
-        lib.call("rtcCommitGeometry", geometry)
-        number: int = lib.call("rtcAttachGeometry", self.address, geometry)
-        lib.call("rtcReleaseGeometry", geometry)
-        return number
-
-    def _add_triangles(self, lib: Library) -> None:
-        """Attach the own faces, one Embree geometry for each mask."""
-        g = self.geometry
-        points = g.vertices.astype(np.float32)
-        masks = np.unique(g.mask)
-        chosen = [np.flatnonzero(g.mask == mask).astype(np.int32) for mask in masks]
-        for mask, rows in zip(masks, chosen, strict=True):
-            part = lib.call("rtcNewGeometry", lib.device, TRIANGLE)
-            fill(lib, part, VERTEX, 0, FLOAT3, points)
-            corners = g.faces if len(masks) == 1 else g.faces[rows]
-            fill(lib, part, INDEX, 0, UINT3, corners.astype(np.uint32))
-            lib.call("rtcSetGeometryMask", part, int(mask))
-            self._attach(lib, part)
-        self.parts = len(masks)
-        self._faces = np.concatenate(chosen) if len(masks) > 1 else np.empty(0, np.int32)
-        self._starts = np.cumsum([0, *(len(rows) for rows in chosen)]).astype(np.int64)
-        self.row = (
-            g.planes.ctypes.data,
-            g.vertices.ctypes.data,
-            g.faces.ctypes.data,
-            self._faces.ctypes.data if len(masks) > 1 else 0,
-            self._starts.ctypes.data,
-        )
-
-    def _add_instances(
-        self, lib: Library, group: Instances, scenes: Sequence[EmbreeScene], table: _Table
-    ) -> None:
-        """Attach the copies of a group, one Embree geometry for each mask."""
-        moments = group.transform if group.transform.ndim == 4 else group.transform[:, None]
-        placed = table.add(group, scenes, moments)
-        mask = np.full(len(group), INVALID, np.uint32) if group.mask is None else group.mask
-        for bits in np.unique(mask):
-            rows = np.flatnonzero(mask == bits)
-            copies = lib.call("rtcNewGeometry", lib.device, INSTANCE_ARRAY)
-            addresses = (c.c_void_p * len(scenes))(*(scene.address for scene in scenes))
-            lib.call("rtcSetGeometryInstancedScenes", copies, addresses, len(scenes))
-            lib.call("rtcSetGeometryTimeStepCount", copies, moments.shape[1])
-            for step in range(moments.shape[1]):
-                matrices = np.ascontiguousarray(placed[rows, step], np.float32)
-                fill(lib, copies, TRANSFORM, step, FLOAT3X4_ROW_MAJOR, matrices)
-            fill(lib, copies, INDEX, 0, UINT, group.shape[rows].astype(np.uint32))
-            lib.call("rtcSetGeometryMask", copies, int(bits))
-            table.attached(self._attach(lib, copies), rows)
-
-
-class _Table:
-    """The columns of `kernels.Target` that say which instance is where, collected group by group."""
-
-    def __init__(self, origin: Float) -> None:
-        self.origin = origin
-        self.parts: list[EmbreeScene] = []
-        self.count = 0
-        self._starts: dict[int, int] = {}
-        self._numbers: list[NDArray[np.int64]] = []
-        self._shape: list[NDArray[np.int64]] = []
-        self._steps: list[NDArray[np.int64]] = []
-        self._transforms: list[Float] = []
-
-    def add(self, group: Instances, scenes: Sequence[EmbreeScene], moments: Float) -> Float:
-        """Take in a group; its transforms (k, s, 3, 4), caster from shape, each relative to its own origin."""
-        origins = np.array([scene.geometry.origin for scene in scenes]).reshape(-1, 3)[group.shape]
-        placed = moments.copy()
-        placed[..., 3] += np.einsum("ksij,kj->ksi", moments[..., :3], origins) - self.origin
-        self._shape.append(group.shape.astype(np.int64) + 1 + len(self.parts))
-        self._steps.append(np.full(len(group), moments.shape[1], np.int64))
-        self._transforms.append(placed.reshape(-1, 12))
-        self.parts += scenes
-        self._group, self.count = self.count, self.count + len(group)
-        return placed
-
-    def attached(self, geometry: int, rows: NDArray[np.intp]) -> None:
-        """Note that Embree's geometry holds these rows of the group taken in last."""
-        self._starts[geometry] = sum(map(len, self._numbers))
-        self._numbers.append(rows.astype(np.int64) + self._group)
-
-    def columns(self) -> tuple[NDArray[np.int64] | NDArray[np.int32] | Float, ...]:
-        """starts, numbers, shape, first, steps and transforms."""
-        none = np.empty(0, np.int64)
-        starts = np.zeros(max(self._starts, default=-1) + 1, np.int64)
-        for geometry, start in self._starts.items():
-            starts[geometry] = start
-        steps = np.concatenate([none, *self._steps])
-        return (
+            self._lib.width,
+            self.origin,
+            np.array([_addresses(part) for part in parts], np.int64).reshape(-1, 5),
+            rows,
             starts,
-            np.concatenate([none, *self._numbers]).astype(np.int32),
-            np.concatenate([none, *self._shape]).astype(np.int32),
-            np.cumsum(steps) - steps,
-            steps,
-            np.concatenate([np.empty((0, 12)), *self._transforms]),
+            np.concatenate([np.empty(0, np.int32), *(copied for _, copied in self._copies)]).astype(np.int32),
+            np.concatenate(shape).astype(np.int32),
+            np.cumsum(counts) - counts,
+            counts,
+            np.concatenate(transforms),
         )
+
+
+def _addresses(part: Geometry) -> tuple[int, int, int, int, int]:
+    return (
+        part.planes.ctypes.data,
+        part.vertices.ctypes.data,
+        part.faces.ctypes.data,
+        part.numbers.ctypes.data if len(part.numbers) else 0,
+        part.first,
+    )

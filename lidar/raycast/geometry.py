@@ -21,24 +21,35 @@ ALL = 0xFFFFFFFF
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Triangles ready to cast at.
+    """Triangles that rays see alike, ready to be cast at.
 
-    origin   : (3,) float64, whole metres near the middle of the vertices; subtracted from all below
-    vertices : (n, 3) float64, metres, relative to the origin
+    vertices : (n, 3) float64, metres, relative to the caster's origin
     faces    : (m, 3) int32
     planes   : (m, 4) float64: unit normal n and offset d of each face; n @ x = d on it. Zero without area
-    mask     : (m,) uint32, bits of which a ray's mask must share one to see the face
+    numbers  : (m,) int32, what `Hits.face` calls each face, less ``first``; empty: they count up
+    first    : number of the first face
+    mask     : bits of which a ray's mask must share one
     """
 
-    origin: Float
     vertices: Float
     faces: NDArray[np.int32]
     planes: Float
-    mask: NDArray[np.uint32]
+    numbers: NDArray[np.int32]
+    first: int = 0
+    mask: int = ALL
+
+    def __len__(self) -> int:
+        """Number of faces."""
+        return len(self.faces)
 
 
-def triangles(vertices: ArrayLike, faces: ArrayLike, mask: ArrayLike | None = None) -> Geometry:
-    """The geometry of vertices (n, 3) in metres, faces (m, 3) and a mask (m,) or scalar, all bits by default.
+def middle(vertices: Float) -> Float:
+    """The whole metres (3,) nearest the middle of vertices (n, 3): an origin for them."""
+    return np.round((vertices.min(axis=0) + vertices.max(axis=0)) / 2) if len(vertices) else np.zeros(3)
+
+
+def checked(vertices: ArrayLike, faces: ArrayLike) -> tuple[Float, NDArray[np.int32]]:
+    """Vertices (n, 3) float64 and faces (m, 3) int32, contiguous.
 
     Raises InputError for vertices that are not finite and faces that name vertices there are not.
     """
@@ -50,17 +61,38 @@ def triangles(vertices: ArrayLike, faces: ArrayLike, mask: ArrayLike | None = No
     if len(f) and not (f.min() >= 0 and f.max() < len(v)):
         bad = int(np.argmax(((f < 0) | (f >= len(v))).any(axis=1)))
         raise InputError(f"face {bad} names the vertices {f[bad].tolist()} of {len(v)}")
-    origin = np.round((v.min(axis=0) + v.max(axis=0)) / 2) if len(v) else np.zeros(3)
-    local = v - origin
-    a, b, c = (local[f[:, k]] for k in range(3))
+    return v, f
+
+
+def planes(vertices: Float, faces: NDArray[np.int32]) -> Float:
+    """The planes (m, 4) of faces: unit normal and offset; zero for a face without area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     length = np.sqrt(np.einsum("ij,ij->i", normal, normal))[:, None]
-    normal = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
-    planes = np.empty((len(f), 4))
-    planes[:, :3] = normal
-    planes[:, 3] = np.einsum("ij,ij->i", normal, a)
-    bits = np.broadcast_to(np.asarray(ALL if mask is None else mask, np.uint32), (len(f),))
-    return Geometry(origin, local, f, planes, np.ascontiguousarray(bits))
+    out = np.zeros((len(faces), 4))
+    np.divide(normal, length, out=out[:, :3], where=length > 0)
+    out[:, 3] = np.einsum("ij,ij->i", out[:, :3], a)
+    return out
+
+
+def split(vertices: Float, faces: NDArray[np.int32], mask: ArrayLike | None = None) -> list[Geometry]:
+    """Geometries of checked vertices, relative to the origin, and faces: one for each mask that occurs.
+
+    mask : (m,) bits, or one for all; all bits by default
+    """
+    bits = np.broadcast_to(np.asarray(ALL if mask is None else mask, np.uint32), (len(faces),))
+    found = np.unique(bits)
+    if len(found) == 1:
+        whole = planes(vertices, faces)
+        return [Geometry(vertices, faces, whole, np.empty(0, np.int32), mask=int(found[0]))]
+    out = []
+    for one in found:
+        rows = np.flatnonzero(bits == one)
+        used, corners = np.unique(faces[rows], return_inverse=True)
+        points, corners = vertices[used], corners.reshape(-1, 3).astype(np.int32)
+        own = planes(points, corners)
+        out.append(Geometry(points, corners, own, rows.astype(np.int32), mask=int(one)))
+    return out
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,12 +18,15 @@ class Hits:
     instance : (n,) int32, instance that was hit; -1 for the caster's own mesh and for a miss
     cosine   : (n,) float32, cosine between the face's normal and the way back along the ray: positive on the
                side from which the face's corners run counter-clockwise, negative on its back; 0 for a miss
+    normal   : (n, 3) float64, the face's unit normal in the caster's axes, zero for a miss; (0, 3) unless
+               asked for
     """
 
     range: NDArray[np.float64]
     face: NDArray[np.int32]
     instance: NDArray[np.int32]
     cosine: NDArray[np.float32]
+    normal: NDArray[np.float64]
 
     def __len__(self) -> int:
         """Number of rays."""

@@ -32,11 +32,12 @@ class Target(NamedTuple):
     scene, packet, single : addresses of the Embree scene and of the arguments for packets and for single rays
     width      : rays in a packet
     origin     : (3,) float64, subtracted from scene coordinates
-    shapes     : (s + 1, 5) int64, addresses of a mesh's planes, vertices, faces, face numbers (0: as Embree
-                 counts) and their starts; row 0 is the caster's own mesh, the others the instances' shapes
-    starts     : (g,) int64, start in ``numbers`` of Embree's geometry g
+    parts      : (p, 5) int64, addresses of a geometry's planes, vertices, faces and face numbers (0: they
+                 count up) and the first number
+    rows       : (g,) int32, row of ``parts`` of Embree's geometry g, if it is one of triangles
+    starts     : (g,) int64, start in ``numbers`` of Embree's geometry g, if it is one of instances
     numbers    : (k,) int32, instance numbers in Embree's order
-    shape      : (k,) int32, row of ``shapes``
+    shape      : (k,) int32, first row of ``parts`` of the instance's shape
     first      : (k,) int64, first row of ``transforms``
     steps      : (k,) int64, rows of ``transforms``; 1 for an instance at rest
     transforms : (r, 12) float64, caster from instance, each relative to its own origin
@@ -47,7 +48,8 @@ class Target(NamedTuple):
     single: int
     width: int
     origin: Float
-    shapes: NDArray[np.int64]
+    parts: NDArray[np.int64]
+    rows: NDArray[np.int32]
     starts: NDArray[np.int64]
     numbers: NDArray[np.int32]
     shape: NDArray[np.int32]
@@ -122,6 +124,11 @@ def pointer(context: Any, address: Any) -> Any:  # noqa: ARG001
     return types.voidptr(types.int64), build
 
 
+# Compiled into their callers, and without counting references to the columns, which their callers hold:
+# counting them would take ten times as long as the rest.
+inlined = njit(nogil=True, error_model="numpy", forceinline=True, _nrt=False)
+
+
 @njit(nogil=True)
 def aligned(size: int) -> Any:
     """Zeroed bytes that start at a multiple of 64."""
@@ -130,7 +137,7 @@ def aligned(size: int) -> Any:
     return raw[start : start + size]
 
 
-@njit(nogil=True, error_model="numpy")
+@inlined
 def ray_of(rays: Rays, i: int, origin: Float) -> Any:
     """Origin, relative to the caster's, and direction of ray i: six numbers."""
     x, y, z = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
@@ -152,13 +159,13 @@ def ray_of(rays: Rays, i: int, origin: Float) -> Any:
     return a - origin[0], b - origin[1], c - origin[2], x, y, z
 
 
-@njit(nogil=True)
+@inlined
 def usable(a: float, b: float, c: float, squared: float) -> bool:
     """Whether an origin is finite and a direction's squared length finite and not zero."""
     return abs(a) + abs(b) + abs(c) < np.inf and 0.0 < squared < np.inf
 
 
-@njit(nogil=True, error_model="numpy")
+@inlined
 def transform_of(target: Target, instance: int, time: float) -> Any:
     """The transform of an instance at a ray time: twelve numbers, row by row."""
     M = target.transforms
@@ -186,17 +193,16 @@ def transform_of(target: Target, instance: int, time: float) -> Any:
     )
 
 
-@njit(nogil=True, error_model="numpy")
-def plane_of(target: Target, face: int, instance: int, time: float) -> Any:
-    """The plane of a face in the caster's axes: normal (a unit vector for the own mesh) and offset."""
-    row = 0 if instance < 0 else target.shape[instance]
-    planes = target.shapes[row, 0]
-    nx, ny, nz = (
-        _float64_at(planes, 4 * face),
-        _float64_at(planes, 4 * face + 1),
-        _float64_at(planes, 4 * face + 2),
+@inlined
+def plane_of(target: Target, row: int, prim: int, instance: int, time: float) -> Any:
+    """A face's plane in the caster's axes: normal (a unit vector for the own mesh) and offset."""
+    planes = target.parts[row, 0] + 32 * prim
+    nx, ny, nz, d = (
+        _float64_at(planes, 0),
+        _float64_at(planes, 1),
+        _float64_at(planes, 2),
+        _float64_at(planes, 3),
     )
-    d = _float64_at(planes, 4 * face + 3)
     if instance < 0:
         return nx, ny, nz, d
     a, b, c, x, e, f, g, y, h, i, j, z = transform_of(target, instance, time)
@@ -213,15 +219,14 @@ def plane_of(target: Target, face: int, instance: int, time: float) -> Any:
     return mx, my, mz, offset
 
 
-@njit(nogil=True, error_model="numpy")
-def _extent(target: Target, face: int, instance: int, ray: Any, time: float) -> Any:
+@inlined
+def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> Any:
     """Least and greatest ray parameter of a face's corners, measured along the ray."""
     ox, oy, oz, dx, dy, dz = ray
-    row = 0 if instance < 0 else target.shape[instance]
-    vertices, faces = target.shapes[row, 1], target.shapes[row, 2]
+    vertices, faces = target.parts[row, 1], target.parts[row, 2]
     low, high = np.inf, -np.inf
     for k in range(3):
-        v = 3 * np.int64(_int32_at(faces, 3 * face + k))
+        v = 3 * np.int64(_int32_at(faces, 3 * prim + k))
         x, y, z = _float64_at(vertices, v), _float64_at(vertices, v + 1), _float64_at(vertices, v + 2)
         if instance >= 0:
             M = transform_of(target, instance, time)
@@ -235,11 +240,11 @@ def _extent(target: Target, face: int, instance: int, ray: Any, time: float) -> 
     return low, high
 
 
-@njit(nogil=True, error_model="numpy")
-def exact(target: Target, face: int, instance: int, ray: Any, time: float) -> Any:
-    """Range and cosine, in float64, of a ray that meets a face."""
+@inlined
+def exact(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> Any:
+    """Range, normal (not unit) and cosine, in float64, of a ray that meets a face."""
     ox, oy, oz, dx, dy, dz = ray
-    nx, ny, nz, d = plane_of(target, face, instance, time)
+    nx, ny, nz, d = plane_of(target, row, prim, instance, time)
     along = nx * dx + ny * dy + nz * dz
     t = (d - nx * ox - ny * oy - nz * oz) / along
     squared = dx * dx + dy * dy + dz * dz
@@ -247,29 +252,29 @@ def exact(target: Target, face: int, instance: int, ray: Any, time: float) -> An
         squared *= nx * nx + ny * ny + nz * nz
     cosine = -along / np.sqrt(squared)
     if not abs(cosine) >= _GRAZING:
-        low, high = _extent(target, face, instance, ray, time)
+        low, high = _extent(target, row, prim, instance, ray, time)
         t = high if t > high else low if not t >= low else t
         cosine = cosine if cosine == cosine else 0.0  # noqa: PLR0124
-    return t, cosine
+    return t, cosine, nx, ny, nz
 
 
-@njit(nogil=True)
-def numbered(target: Target, prim: Any, geom: Any, inst: Any, place: Any) -> Any:
-    """Face and instance of what Embree names by primitive, geometry, instance geometry and place in it."""
-    instance = np.int64(-1)
-    row = np.int64(0)
-    if inst != _INVALID:
-        instance = np.int64(target.numbers[target.starts[np.int64(inst)] + np.int64(place)])
-        row = np.int64(target.shape[instance])
-    face = np.int64(prim)
-    if target.shapes[row, 3]:
-        face = np.int64(
-            _int32_at(target.shapes[row, 3], _int64_at(target.shapes[row, 4], np.int64(geom)) + face)
-        )
-    return face, instance
+@inlined
+def placed(target: Target, geom: Any, inst: Any, place: Any) -> Any:
+    """Row of ``parts`` and instance of what Embree names by geometry, instance geometry and place in it."""
+    if inst == _INVALID:
+        return np.int64(target.rows[np.int64(geom)]), np.int64(-1)
+    instance = np.int64(target.numbers[target.starts[np.int64(inst)] + np.int64(place)])
+    return np.int64(target.shape[instance]) + np.int64(geom), instance
 
 
-@njit(nogil=True)
+@inlined
+def numbered(target: Target, row: int, prim: int) -> Any:
+    """The number of a face."""
+    numbers = target.parts[row, 3]
+    return target.parts[row, 4] + (prim if numbers == 0 else np.int64(_int32_at(numbers, prim)))
+
+
+@inlined
 def _trace(target: Target, p: int, f: Any, rows: int, valid: Any, coherent: bool, one: Any) -> None:  # noqa: FBT001
     """Trace the valid lanes of a packet, all at once or one by one."""
     W = target.width
@@ -303,7 +308,7 @@ def _trace(target: Target, p: int, f: Any, rows: int, valid: Any, coherent: bool
             f[r * W + k] = one[r]
 
 
-@njit(nogil=True)
+@inlined
 def _nudged(x: float, y: float, z: float) -> Any:
     """A unit vector turned by `_NUDGE`, towards the axis it lies farthest from."""
     if abs(x) <= abs(y) and abs(x) <= abs(z):
@@ -313,14 +318,14 @@ def _nudged(x: float, y: float, z: float) -> Any:
     return x, y, z + _NUDGE
 
 
-@njit(nogil=True)
+@inlined
 def above(x: float) -> Any:
     """The float32 next above a float64, or equal to it."""
     y = np.float32(x)
     return y if y >= x else np.nextafter(y, np.float32(np.inf))
 
 
-@njit(nogil=True, error_model="numpy")
+@inlined
 def gather(target: Target, rays: Rays, at: int, m: int, ids: Any, work: Any) -> Any:
     """Load rays ``at`` to ``at + m`` of the order into ``work``; the bad one's number or -1, and coherence.
 
@@ -350,7 +355,7 @@ def gather(target: Target, rays: Rays, at: int, m: int, ids: Any, work: Any) -> 
     return -1, coherent
 
 
-@njit(nogil=True, error_model="numpy")
+@inlined
 def load(rays: Rays, W: int, k: int, work: Any, f: Any, u: Any) -> None:
     """Write lane k of ``work`` into Embree's packet, with a direction of length 1."""
     f[k], f[W + k], f[2 * W + k] = work[0, k], work[1, k], work[2, k]
@@ -363,7 +368,7 @@ def load(rays: Rays, W: int, k: int, work: Any, f: Any, u: Any) -> None:
     u[11 * W + k] = 0
 
 
-@njit(nogil=True, error_model="numpy")
+@inlined
 def clear(W: int, k: int, u: Any) -> None:
     """Make lane k's hit empty."""
     u[18 * W + k] = _INVALID
@@ -371,18 +376,28 @@ def clear(W: int, k: int, u: Any) -> None:
     u[20 * W + k] = _INVALID
 
 
-@njit(nogil=True, error_model="numpy")
+@inlined
 def _hit(target: Target, u: Any, k: int, work: Any) -> Any:
-    """Range, cosine, face and instance of lane k's hit."""
+    """Range, cosine, face, instance and normal of lane k's hit."""
     W = target.width
     if u[18 * W + k] == _INVALID:
-        return np.inf, 0.0, -1, -1
-    face, instance = numbered(target, u[17 * W + k], u[18 * W + k], u[19 * W + k], u[20 * W + k])
+        return np.inf, 0.0, np.int64(-1), np.int64(-1), 0.0, 0.0, 0.0
+    row, instance = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
+    prim = np.int64(u[17 * W + k])
     ray = (work[0, k], work[1, k], work[2, k], work[3, k], work[4, k], work[5, k])
-    t, cosine = exact(target, face, instance, ray, work[11, k])
+    t, cosine, x, y, z = exact(target, row, prim, instance, ray, work[11, k])
     if t > work[10, k]:
-        return np.inf, 0.0, -1, -1
-    return t, cosine, face, instance
+        return np.inf, 0.0, np.int64(-1), np.int64(-1), 0.0, 0.0, 0.0
+    return t, cosine, numbered(target, row, prim), instance, x, y, z
+
+
+@inlined
+def _unit(out: Float, i: int, x: float, y: float, z: float) -> None:
+    """Write a normal as a unit vector; zero stays zero."""
+    length = np.sqrt(x * x + y * y + z * z)
+    if length > 0.0:
+        x, y, z = x / length, y / length, z / length
+    out[i, 0], out[i, 1], out[i, 2] = x, y, z
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -395,8 +410,11 @@ def cast(
     faces: NDArray[np.int32],
     instances: NDArray[np.int32],
     cosines: NDArray[np.float32],
+    normals: Float,
 ) -> int:
     """Cast the rays lo to hi of the order into the columns of `Hits`; the first bad ray's number, or -1.
+
+    No normals are written if ``normals`` is empty.
 
     Packets start at lo and every width from it.
     """
@@ -422,8 +440,10 @@ def cast(
         doubtful = 0
         for k in range(m):
             i = ids[k]
-            t, cosine, face, instance = _hit(target, u, k, work)
+            t, cosine, face, instance, x, y, z = _hit(target, u, k, work)
             ranges[i], cosines[i], faces[i], instances[i] = t, cosine, face, instance
+            if normals.size:
+                _unit(normals, i, x, y, z)
             valid[k] = 0
             if face < 0 or cosine < 0.0:
                 valid[k] = -1
@@ -440,9 +460,11 @@ def cast(
         for k in range(m):
             if valid[k]:
                 i = ids[k]
-                t, cosine, face, instance = _hit(target, u, k, work)
+                t, cosine, face, instance, x, y, z = _hit(target, u, k, work)
                 if face >= 0 and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
                     ranges[i], cosines[i], faces[i], instances[i] = t, cosine, face, instance
+                    if normals.size:
+                        _unit(normals, i, x, y, z)
     return -1
 
 
@@ -482,21 +504,3 @@ def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_
             if valid[k]:
                 out[ids[k]] = f[8 * W + k] < 0
     return -1
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def normals(
-    target: Target,
-    faces: NDArray[np.int32],
-    instances: NDArray[np.int32],
-    time: NDArray[np.float32],
-    out: Float,
-) -> None:
-    """Fill in the unit normals (n, 3) of faces that were hit; zero for a miss."""
-    for i in range(faces.shape[0]):
-        out[i, 0] = out[i, 1] = out[i, 2] = 0.0
-        if faces[i] >= 0:
-            t = time[i] if time.size else np.float32(0.0)
-            x, y, z, _ = plane_of(target, faces[i], instances[i], t)
-            length = np.sqrt(x * x + y * y + z * z)
-            out[i, 0], out[i, 1], out[i, 2] = x / length, y / length, z / length

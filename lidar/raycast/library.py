@@ -16,7 +16,7 @@ from lidar.errors import BackendError
 TRIANGLE, INSTANCE_ARRAY = 0, 122
 INDEX, VERTEX, TRANSFORM = 0, 1, 23
 UINT, UINT3, FLOAT3, FLOAT3X4_ROW_MAJOR = 0x5001, 0x5003, 0x9003, 0x9134
-ROBUST = 1 << 2
+DYNAMIC, ROBUST = 1 << 0, 1 << 2
 COHERENT, ARGUMENT_FILTER = 1 << 16, 1 << 1
 INVALID = 0xFFFFFFFF
 """Numbers of Embree's C interface (embree4/rtcore_*.h, version 4.4)."""
@@ -40,7 +40,8 @@ _PROTOTYPES: dict[str, tuple[Any, ...]] = {
     "rtcNewGeometry": (_P, _P, _I),
     "rtcReleaseGeometry": (None, _P),
     "rtcCommitGeometry": (None, _P),
-    "rtcAttachGeometry": (_U, _P, _P),
+    "rtcAttachGeometryByID": (None, _P, _P, _U),
+    "rtcDetachGeometry": (None, _P, _U),
     "rtcSetGeometryMask": (None, _P, _U),
     "rtcSetGeometryTimeStepCount": (None, _P, _U),
     "rtcSetGeometryInstancedScenes": (None, _P, _P, _Z),
@@ -141,7 +142,7 @@ def _check(lib: Library) -> None:
     fill(lib, copies, INDEX, 0, UINT, np.zeros(2, np.uint32))
     for scene, geometry in ((shape, triangle), (top, copies)):
         lib.call("rtcCommitGeometry", geometry)
-        lib.call("rtcAttachGeometry", scene, geometry)
+        lib.call("rtcAttachGeometryByID", scene, geometry, 0)
         lib.call("rtcReleaseGeometry", geometry)
         lib.call("rtcCommitScene", scene)
     memory = np.zeros(64, np.uint32)
