@@ -1,10 +1,265 @@
-"""roofs"""
+"""Roofs on any footprint: each shape as a closed shell from the floor to the ridge."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from geoscene.buildings.shells import prisms
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.buildings.cells import (
+    Cells,
+    cut,
+    joined,
+    plain_cells,
+    raise_gables,
+    skeleton_cells,
+    with_field,
+)
+from geoscene.buildings.footprints import to_grid
+from geoscene.buildings.shells import Triangles, close, lift, prisms, triangulate
+from geoscene.buildings.skeleton import straight_skeleton
+from geoscene.mesh import FLOOR, ROOF
+
+Float = NDArray[np.float64]
+Profile = tuple[tuple[float, float], ...]
+
+BOX_LIKE = 0.85
+"""A footprint that fills this share of the smallest rectangle about it takes its ridge from the rectangle."""
+
+_ARC = tuple(
+    (float(1 - np.cos(a)), float(np.sin(a))) for a in np.linspace(0, np.pi / 2, 7)
+)  # a quarter circle, by (distance, height)
+
+ACROSS: dict[str, Profile] = {
+    # (share of the way from the low eave to the other, share of the roof's height), along the cross-section
+    "gabled": ((0, 0), (0.5, 1), (1, 0)),
+    "half-hipped": ((0, 0), (0.5, 1), (1, 0)),
+    "gambrel": ((0, 0), (0.2, 0.6), (0.5, 1), (0.8, 0.6), (1, 0)),
+    "round": tuple((d / 2, h) for d, h in _ARC) + tuple((1 - d / 2, h) for d, h in _ARC[-2::-1]),
+    "saltbox": ((0, 0), (2 / 3, 1), (1, 0.5)),
+}
+
+INWARD: dict[str, Profile] = {
+    # (share of the way from the eaves to the innermost point, share of the roof's height)
+    "hipped": ((0, 0), (1, 1)),
+    "gabled": ((0, 0), (1, 1)),
+    "half-hipped": ((0, 0), (1, 1)),
+    "saltbox": ((0, 0), (1, 1)),
+    "gambrel": ((0, 0), (0.4, 0.6), (1, 1)),
+    "mansard": ((0, 0), (0.3, 0.7), (1, 1)),
+    "round": _ARC,
+    "dome": _ARC,
+    "onion": _ARC,
+    "pyramidal": ((0, 0), (1, 1)),
+    "cone": ((0, 0), (1, 1)),
+}
+
+GABLED = {"gabled": 1.0, "gambrel": 1.0, "round": 1.0, "saltbox": 1.0, "half-hipped": 0.5}
+"""How far the ends of a skeleton's ridges are raised into gables."""
+
+TURNED: dict[str, Profile] = {
+    # (share of the height, share of the footprint's size) of the rings about the middle; never wider than the
+    # footprint, so that an onion does not reach into its neighbour
+    "dome": tuple((h, 1 - d) for d, h in _ARC),
+    "onion": (
+        (0, 1), (0, 0.82), (0.08, 0.95), (0.18, 1), (0.3, 0.95), (0.42, 0.79), (0.55, 0.54), (0.68, 0.32),
+        (0.82, 0.13), (1, 0),
+    ),
+    "pyramidal": ((0, 1), (1, 0)),
+    "cone": ((0, 1), (1, 0)),
+}  # fmt: skip
 
 
-def roof_shell(polygon, *, shape, low, high, roof_height, direction, across):
-    return prisms(
-        np.array([polygon], dtype=object), np.zeros(1, np.int64), np.array([low]), np.array([high])
-    ), "not yet"
+@dataclass(frozen=True, slots=True)
+class RoofSpec:
+    """A roof to be made.
+
+    shape     : one of `geoscene.buildings.table.SHAPES`
+    low, high : z of the underside of the body and of the top of the roof, metres
+    height    : of the roof alone, metres, at most high - low
+    direction : radians counter-clockwise from x, where the roof's (low) face looks to, NaN if not known
+    across    : the ridge runs across the longer side
+    """
+
+    shape: str
+    low: float
+    high: float
+    height: float
+    direction: float = np.nan
+    across: bool = False
+
+
+def roof_shell(polygon: Any, spec: RoofSpec) -> tuple[Triangles, str]:
+    """The closed shell of a body with its roof (pieces numbered 0), and what stands in for the shape, or "".
+
+    polygon : valid, on the grid, exterior counter-clockwise
+
+    Pyramids, cones, domes and onions turn about the centroid where it sees every corner. Ridged shapes take
+    their ridge from the rectangle about the footprint where it nearly fills it, or where the map gives a
+    direction. Everything else stands on the straight skeleton.
+    """
+    if spec.shape in TURNED and _sees_all(polygon):
+        return _turned(polygon, spec), ""
+    if spec.shape == "skillion":
+        return _from_cells(_skillion(polygon, spec), spec), ""
+    if spec.shape in ACROSS and (_box_like(polygon) or np.isfinite(spec.direction) or spec.across):
+        return _from_cells(_ridged(polygon, spec), spec), ""
+    cells = _inward(polygon, spec) if spec.shape in INWARD else None
+    if cells is None:
+        flat = prisms(
+            np.array([polygon], dtype=object),
+            np.zeros(1, np.int64),
+            np.array([spec.low]),
+            np.array([spec.high]),
+        )
+        return flat, f"{spec.shape} roof made flat"
+    stand_in = {"onion": "dome on the skeleton", "dome": "", "saltbox": "gabled"}.get(spec.shape, "")
+    if spec.shape in ("pyramidal", "cone"):
+        stand_in = "hipped"
+    return _from_cells(cells, spec), f"{spec.shape} roof made {stand_in}" if stand_in else ""
+
+
+def _sees_all(polygon: Any) -> bool:
+    """The centroid sees every corner: the footprint has no holes and is star-shaped about it."""
+    if shapely.get_num_interior_rings(polygon):
+        return False
+    ring = shapely.get_coordinates(polygon)
+    a, b = ring[:-1] - _middle(polygon), ring[1:] - _middle(polygon)
+    return bool((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 1e-3).all())
+
+
+def _middle(polygon: Any) -> Float:
+    return to_grid(shapely.get_coordinates(shapely.centroid(polygon))[0])
+
+
+def _axes(polygon: Any) -> tuple[Float, Float, float]:
+    """Unit vectors along the longer and the shorter side of the smallest rectangle, and the rectangle's area."""
+    ring = shapely.get_coordinates(shapely.minimum_rotated_rectangle(polygon))
+    first, second = ring[1] - ring[0], ring[2] - ring[1]
+    lengths = float(np.hypot(*first)), float(np.hypot(*second))
+    along = first / lengths[0] if lengths[0] >= lengths[1] else second / lengths[1]
+    return along, np.array([-along[1], along[0]]), lengths[0] * lengths[1]
+
+
+def _box_like(polygon: Any) -> bool:
+    return bool(shapely.area(polygon) > BOX_LIKE * _axes(polygon)[2])
+
+
+def _slope(polygon: Any, spec: RoofSpec) -> Float:
+    """Unit vector up the slope, from the face that looks to the tagged direction.
+
+    A direction within 22.5 degrees (half a step of the eight-point compass that mappers use) of a side of the
+    rectangle means that side. Without a direction the slope is across the longer side, or along it where the
+    ridge runs across.
+    """
+    along, aside, _ = _axes(polygon)
+    if not np.isfinite(spec.direction):
+        return along if spec.across else aside
+    wanted = -np.array([np.cos(spec.direction), np.sin(spec.direction)])
+    sides = np.array([along, aside, -along, -aside])
+    nearest = sides[np.argmax(sides @ wanted)]
+    return nearest if nearest @ wanted > np.cos(np.radians(22.5)) else wanted
+
+
+def _profile(field: Float, span: float, profile: Profile) -> Float:
+    share, height = np.array(profile, float).T
+    return np.interp(field / span, share, height)
+
+
+def _skillion(polygon: Any, spec: RoofSpec) -> Cells:
+    """One plane, with the height's share as field."""
+    cells = with_field(plain_cells(polygon), _slope(polygon, spec), 0.0)
+    low, high = cells.field.min(), cells.field.max()
+    return replace(cells, field=(cells.field - low) / (high - low))
+
+
+def _ridged(polygon: Any, spec: RoofSpec) -> Cells:
+    """A cross-section drawn along the ridge, with the height's share as field."""
+    up = _slope(polygon, spec)
+    profile = ACROSS[spec.shape]
+    cells = with_field(plain_cells(polygon), up, 0.0)
+    low = float(cells.field.min())
+    span = float(cells.field.max()) - low
+    cells = replace(cells, field=cells.field - low)
+    for share, _ in profile[1:-1]:
+        cells = cut(cells, share * span)
+    height = _profile(cells.field, span, profile)
+    if spec.shape == "half-hipped":
+        # hips begin half way up, with the pitch of the sides
+        ridge = np.array([-up[1], up[0]])
+        for end in (ridge, -ridge):
+            reach = cells.xy @ end
+            hip = 0.5 + (reach - reach.min()) / (span / 2)
+            cells = cut(Cells(cells.xy, (hip - height) * span), 0.0)
+            reach = cells.xy @ end
+            hip = 0.5 + (reach - reach.min()) / (span / 2)
+            across = with_field(cells, up, low).field
+            height = np.minimum(_profile(across, span, profile), hip)
+            cells = replace(cells, field=height)
+        ends = cells.xy @ ridge
+        first, last = 0.5 + (ends - ends.min()) / (span / 2), 0.5 + (ends.max() - ends) / (span / 2)
+        across = with_field(cells, up, low).field
+        height = np.minimum(np.minimum(_profile(across, span, profile), first), last)
+    return replace(cells, field=height)
+
+
+def _inward(polygon: Any, spec: RoofSpec) -> Cells | None:
+    """A profile drawn from the eaves inwards over the straight skeleton, with the height's share as field."""
+    skeleton = straight_skeleton(polygon)
+    if skeleton is None:
+        return None
+    if spec.shape in GABLED:
+        skeleton = raise_gables(skeleton, GABLED[spec.shape])
+    cells = skeleton_cells(skeleton)
+    if cells is None:
+        return None
+    span = float(cells.field.max())
+    for share, _ in INWARD[spec.shape][1:-1]:
+        cells = cut(cells, share * span)
+    return replace(cells, field=_profile(cells.field, span, INWARD[spec.shape]))
+
+
+def _from_cells(cells: Cells, spec: RoofSpec) -> Triangles:
+    """The shell under cells whose field is the share of the roof's height."""
+    eaves = spec.high - spec.height
+    corners = np.concatenate([cells.xy, to_grid(eaves + cells.field * spec.height)[..., None]], axis=2)
+    zeros = np.zeros(len(corners), np.int64)
+    top = Triangles(corners, zeros, np.full(len(corners), ROOF, np.uint8))
+    low = to_grid(np.array([spec.low]))
+    floor = Triangles(
+        lift(cells.xy, np.full(len(corners), low)), zeros, np.full(len(corners), FLOOR, np.uint8)
+    )
+    return close(top, floor, low)
+
+
+def _turned(polygon: Any, spec: RoofSpec) -> Triangles:
+    """The shell under rings that shrink about the footprint's middle."""
+    ring = shapely.get_coordinates(polygon)[:-1]
+    middle = _middle(polygon)
+    eaves = spec.high - spec.height
+    rings = [
+        np.column_stack((middle + (ring - middle) * size, np.full(len(ring), eaves + share * spec.height)))
+        for share, size in TURNED[spec.shape]
+    ]
+    rings = [to_grid(r) for r in rings]
+    triangles = []
+    for lower, upper in zip(rings[:-1], rings[1:], strict=True):
+        a, b, c, d = lower, np.roll(lower, -1, axis=0), np.roll(upper, -1, axis=0), upper
+        triangles += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
+    corners = np.concatenate(triangles)
+    corners = corners[_three_corners(corners)]
+    zeros = np.zeros(len(corners), np.int64)
+    top = Triangles(corners, zeros, np.full(len(corners), ROOF, np.uint8))
+    low = to_grid(np.array([spec.low]))
+    xy, owner = triangulate(np.array([polygon], dtype=object))
+    floor = Triangles(lift(xy, np.full(len(xy), low)), owner, np.full(len(xy), FLOOR, np.uint8))
+    return close(top, floor, low)
+
+
+def _three_corners(corners: Float) -> NDArray[np.bool_]:
+    cell = np.rint(corners * 1e4)
+    distinct: NDArray[np.bool_] = ~(cell == np.roll(cell, -1, axis=1)).all(axis=2).any(axis=1)
+    return distinct

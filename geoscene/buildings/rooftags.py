@@ -61,12 +61,13 @@ def read_roof_tags(tags: Tags) -> RoofTags:
 def default_roof_height(roof: RoofTags, footprint: Any) -> tuple[float, str]:
     """Height of a roof in metres by its angle, else by the usual pitch, and which of the two (angle, default).
 
-    The run is half the shorter side of the smallest rectangle about the footprint (the whole side for a
-    skillion roof). A dome or onion without height is as high as the run (onion: 1.5 runs), the curved and
+    The run is the radius of the largest circle in the footprint (its diameter for a skillion roof). A dome or onion without height is as high as the run (onion: 1.5 runs), the curved and
     broken shapes take 45 degrees.
     """
-    sides = _sides(footprint)
-    run = min(sides) * (1.0 if roof.shape == "skillion" else 0.5)
+    # GEOS gives the circle as the line from its centre to its rim
+    run = float(shapely.length(shapely.maximum_inscribed_circle(footprint, tolerance=0.05)))
+    if roof.shape == "skillion":
+        run *= 2.0
     if np.isfinite(roof.angle_deg):
         return float(run * np.tan(np.radians(roof.angle_deg))), "angle"
     if roof.shape in ("dome", "onion"):
@@ -75,12 +76,3 @@ def default_roof_height(roof: RoofTags, footprint: Any) -> tuple[float, str]:
     if roof.shape == "skillion":
         pitch = 10.0
     return float(min(run * np.tan(np.radians(pitch)), 8.0)), "default"
-
-
-def _sides(footprint: Any) -> tuple[float, float]:
-    """Lengths of the sides of the smallest rectangle about a footprint."""
-    ring = shapely.get_coordinates(shapely.minimum_rotated_rectangle(footprint))
-    if len(ring) < 4:
-        return 1.0, 1.0
-    first, second = np.hypot(*np.diff(ring[:3], axis=0).T)
-    return float(first), float(second)

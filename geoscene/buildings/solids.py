@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import clean
-from geoscene.buildings.roofs import roof_shell
+from geoscene.buildings.roofs import RoofSpec, roof_shell
 from geoscene.buildings.shells import Triangles, join, prisms, sound
 from geoscene.buildings.table import Buildings
 from geoscene.buildings.unions import unite
@@ -129,15 +129,15 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ids, list
     groups = [prisms(pieces.polygon[flat], flat.astype(np.int64), pieces.low[flat], pieces.high[flat])]
     for k in np.flatnonzero(~pieces.flat):
         row = pieces.row[k]
-        shell, fallback = roof_shell(
-            pieces.polygon[k],
+        spec = RoofSpec(
             shape=str(buildings.roof_shape[row]),
             low=float(pieces.low[k]),
             high=float(pieces.high[k]),
-            roof_height=float(buildings.roof_height[row]),
+            height=float(buildings.roof_height[row]),
             direction=float(buildings.roof_direction[row]),
             across=bool(buildings.roof_across[row]),
         )
+        shell, fallback = roof_shell(pieces.polygon[k], spec)
         if fallback:
             notes.append(_problem(buildings, row, "repaired", "roof-fallback", fallback))
         groups.append(replace(shell, piece=np.full(len(shell), k, np.int64)))

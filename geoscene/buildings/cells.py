@@ -1,0 +1,189 @@
+"""Roof surfaces as plane triangles with a height field: made from skeletons, cut along lines of equal height."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.buildings.footprints import to_grid
+from geoscene.buildings.shells import triangulate
+from geoscene.buildings.skeleton import Skeleton
+
+Float = NDArray[np.float64]
+
+ON_LINE = 1e-3
+"""Corners this near to a cutting line, metres of the field, count as on it, so that no slivers arise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """Triangles of a footprint and a field that is linear on each and agrees where they meet.
+
+    xy    : (m, 3, 2) metres on the grid, counter-clockwise
+    field : (m, 3) metres
+    """
+
+    xy: Float
+    field: Float
+
+
+def plain_cells(polygon: Any) -> Cells:
+    """The Delaunay triangles of a polygon, with a field of 0."""
+    xy, _ = triangulate(np.array([polygon], dtype=object))
+    return Cells(xy, np.zeros(xy.shape[:2]))
+
+
+def with_field(cells: Cells, direction: Float, offset: float) -> Cells:
+    """The cells with the field xy . direction - offset."""
+    return replace(cells, field=cells.xy @ direction - offset)
+
+
+def cut(cells: Cells, level: float) -> Cells:
+    """The cells, split where the field crosses a level, so that it is crossed only along their edges."""
+    side = cells.field - level
+    side = np.where(np.abs(side) < ON_LINE, 0.0, side)
+    sign = np.sign(side)
+    crossed = (sign.min(axis=1) < 0) & (sign.max(axis=1) > 0)
+    if not crossed.any():
+        return cells
+    whole = Cells(cells.xy[~crossed], cells.field[~crossed])
+    xy, field, sign = cells.xy[crossed], cells.field[crossed], sign[crossed]
+    # turn each triangle until its lone corner comes first: alone on its side, or on the line
+    on_line = (sign == 0).any(axis=1)
+    alone = np.where(
+        on_line, np.argmax(sign == 0, axis=1), np.argmax(sign * -np.sign(sign.sum(axis=1))[:, None], axis=1)
+    )
+    turn = (alone[:, None] + np.arange(3)) % 3
+    rows = np.arange(len(xy))[:, None]
+    xy, field = xy[rows, turn], field[rows, turn]
+    a, b, c = (xy[:, k] for k in range(3))
+    fa, fb, fc = (field[:, k] for k in range(3))
+    at = np.full(len(xy), level)
+
+    p = _crossing(b, c, fb, fc, level)
+    q = _crossing(a, b, fa, fb, level)
+    r = _crossing(a, c, fa, fc, level)
+    t, u = on_line, ~on_line
+    parts = [
+        (a[t], b[t], p[t], fa[t], fb[t], at[t]),
+        (a[t], p[t], c[t], fa[t], at[t], fc[t]),
+        (a[u], q[u], r[u], fa[u], at[u], at[u]),
+        (q[u], b[u], c[u], at[u], fb[u], fc[u]),
+        (q[u], c[u], r[u], at[u], fc[u], at[u]),
+    ]
+    pieces = [Cells(np.stack(x[:3], axis=1), np.stack(x[3:], axis=1)) for x in parts]
+    return _sound(joined([whole, *pieces]))
+
+
+def joined(cells: list[Cells]) -> Cells:
+    """All cells, in order."""
+    return Cells(np.concatenate([c.xy for c in cells]), np.concatenate([c.field for c in cells]))
+
+
+def _crossing(a: Float, b: Float, fa: Float, fb: Float, level: float) -> Float:
+    """Points on the grid where the field passes a level between a and b, the same whichever way round."""
+    swap = (a[:, 0] > b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] > b[:, 1]))
+    first, last = np.where(swap[:, None], b, a), np.where(swap[:, None], a, b)
+    f0, f1 = np.where(swap, fb, fa), np.where(swap, fa, fb)
+    span = np.where(f1 == f0, 1.0, f1 - f0)
+    part = np.clip((level - f0) / span, 0.0, 1.0)
+    return to_grid(first + part[:, None] * (last - first))
+
+
+def _sound(cells: Cells) -> Cells:
+    """The cells without those that two equal corners make."""
+    c = np.rint(cells.xy * 1e4)
+    equal = (c == np.roll(c, -1, axis=1)).all(axis=2).any(axis=1)
+    return Cells(cells.xy[~equal], cells.field[~equal])
+
+
+def skeleton_cells(skeleton: Skeleton) -> Cells | None:
+    """The faces of a skeleton as cells whose field is the distance from their edges; None if the grid breaks one."""
+    xy = to_grid(skeleton.xy)
+    key = np.rint(xy * 1e4).astype(np.int64)
+    # nodes that the grid makes one take one height
+    _, first, same = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    time = skeleton.time[first][same.ravel()]
+    rings = [_distinct(face, same.ravel()) for face in skeleton.faces]
+    rings = [r for r in rings if len(r) > 2]
+    polygons = np.array([shapely.Polygon(xy[r]) for r in rings], dtype=object)
+    solid = shapely.area(polygons) > 0
+    triangles, owner = triangulate(polygons[solid])
+    missing = np.setdiff1d(np.arange(int(solid.sum())), owner)
+    if len(missing):
+        return None
+    order = np.lexsort(key.T)
+    table = key[order, 0] * (2**31) + key[order, 1]  # unique per cell within 100 km
+    lookup = np.argsort(table)
+    corner = np.rint(triangles.reshape(-1, 2) * 1e4).astype(np.int64)
+    at = np.searchsorted(table[lookup], corner[:, 0] * (2**31) + corner[:, 1])
+    field = time[order][lookup][np.minimum(at, len(lookup) - 1)]
+    return Cells(triangles, field.reshape(-1, 3))
+
+
+def _distinct(face: list[int], same: NDArray[np.integer]) -> list[int]:
+    """The nodes of a ring without those that repeat the one before."""
+    ids = same[face]
+    return [node for node, a, b in zip(face, ids, np.roll(ids, 1), strict=True) if a != b]
+
+
+def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
+    """The skeleton with its triangular faces pushed outwards: into gables (share 1), or half way (half-hipped).
+
+    A triangular face stands on an edge between two faces that lean towards each other over a ridge. Its peak
+    moves along that ridge towards the edge, and the edge rises as far between its ends: all faces stay plane.
+    Faces whose ridge would miss the edge, or which meet over no ridge, stay as they are.
+    """
+    xy, time = [tuple(p) for p in skeleton.xy.tolist()], skeleton.time.tolist()
+    faces = [list(f) for f in skeleton.faces]
+    corners = len(faces)
+    edge_from = {f[0]: k for k, f in enumerate(skeleton.faces)}
+    edge_to = {f[1]: k for k, f in enumerate(skeleton.faces)}
+    for k in range(corners):
+        if len(faces[k]) != 3 or faces[k][2] < corners:
+            continue
+        a, b, peak = faces[k]
+        left, right = faces[edge_to[a]], faces[edge_from[b]]
+        if left[2] != peak or right[-1] != peak:
+            continue
+        beyond = left[3 % len(left)]
+        foot = _foot(xy, time, (a, b), peak, beyond) if right[-2] == beyond else None
+        if foot is None:
+            continue
+        x, y, height = foot
+        new = len(xy)
+        for start in (a, b, peak):
+            (x0, y0), t0 = xy[start], time[start]
+            xy.append((x0 + (x - x0) * share, y0 + (y - y0) * share))
+            time.append(height * share if start != peak else t0 + (height - t0) * share)
+        if share == 1.0:
+            left[2:3], right[-1:], faces[k] = [new], [new], []
+        else:
+            left[2:3], right[-1:], faces[k] = [new, new + 2], [new + 2, new + 1], [new, new + 1, new + 2]
+    return Skeleton(np.array(xy), np.array(time), [f for f in faces if f])
+
+
+def _foot(
+    xy: list[tuple[float, ...]], time: list[float], edge: tuple[int, int], peak: int, beyond: int
+) -> tuple[float, float, float] | None:
+    """Where the ridge from beyond over the peak meets an edge, x, y and the ridge's height there, or None."""
+    (px, py), (qx, qy) = xy[peak], xy[beyond]
+    (ax, ay), (bx, by) = xy[edge[0]], xy[edge[1]]
+    dx, dy, ex, ey = px - qx, py - qy, bx - ax, by - ay
+    length, turn = math.hypot(dx, dy), ex * dy - ey * dx
+    if length < 1e-3 or abs(turn) < 1e-9:
+        return None
+    steps = (ex * (ay - py) - ey * (ax - px)) / turn  # from the peak, in units of the ridge
+    x, y = px + steps * dx, py + steps * dy
+    part = ((x - ax) * ex + (y - ay) * ey) / (ex * ex + ey * ey)
+    rise = time[peak] - time[beyond]
+    height = time[peak] + rise * steps
+    # a ridge that climbs or falls by more than 0.3 is none
+    if steps <= 0 or not 0.05 < part < 0.95 or abs(rise) > 0.3 * length or height <= 0:
+        return None
+    return x, y, height
