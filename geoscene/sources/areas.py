@@ -79,43 +79,45 @@ class _Boundary:
 
 
 def is_multipolygon(tags: Tags) -> bool:
-    """Whether a relation's members bound an area that is looked for; administrative boundaries are not."""
+    """Whether a relation's members bound an area; those of type ``boundary`` are left as relations."""
     return tags.get("type") == "multipolygon"
+
+
+def _says_area(tags: Tags) -> bool:
+    return tags.get("area") == "yes" or bool(area_tags(tags))
 
 
 def _boundary(
     elements: Elements, row_of: dict[int, int], osm_id: int, tags: Tags, members: Members
-) -> tuple[_Boundary, set[int]]:
-    """A relation with the tags that are its own, and the rows of ways whose area is the relation's.
+) -> tuple[_Boundary, set[int], bool]:
+    """A relation with the tags that count, the ways whose area is the relation's, whether both are tagged.
 
-    A relation without tags has those that its outer ways agree on, as was the custom before 2010. A way is not an
-    area of its own if it is outer and shares the relation's building tag or any area tag with the same value, or
-    inner and tagged alike. What a single outer way adds to the tags of a building is taken over.
+    A relation that no tag of its own makes an area has also the tags that its outer ways agree on, if those
+    do, as was the custom before 2016. A way is not an area of its own if it is outer and shares the
+    relation's building tag or any area tag with the same value, or inner and tagged alike. What a single
+    outer way adds to the tags of a building is taken over.
     """
     ways = [(row_of.get(i, -1), role == "inner") for kind, i, role in members if kind == "way"]
     own = _meaning(tags)
     outer = sorted({row for row, inner in ways if row >= 0 and not inner})
-    tagged = [meaning for row in outer if (meaning := _meaning(elements.way_tags[row]))]
-    old_style = not own
+    common = _common([m for row in outer if _says_area(m := _meaning(elements.way_tags[row]))])
+    old_style = not _says_area(own) and _says_area(common)
     if old_style:
-        own = _common(tagged)
-    taken = set()
+        own = {**common, **own}
     mine = area_tags(own)
+    taken = set()
     for row, inner in ways:
-        if row < 0 or not own:
+        if row < 0:
             continue
-        theirs = _meaning(elements.way_tags[row])
-        shared = {
-            k
-            for k, v in area_tags(theirs).items()
-            if k in mine and (k.startswith("building") or mine[k] == v)
-        }
-        if (inner and theirs == own) or (not inner and (shared or old_style)):
+        theirs = area_tags(_meaning(elements.way_tags[row]))
+        shared = {k for k, v in theirs.items() if k in mine and (k.startswith("building") or mine[k] == v)}
+        alike = bool(shared) and all(own.get(k) == v for k, v in _meaning(elements.way_tags[row]).items())
+        if alike if inner else shared or (old_style and elements.way_tags[row].get("area") == "yes"):
             taken.add(row)
     if len(outer) == 1 and outer[0] in taken and is_building(own):
         own = {**_meaning(elements.way_tags[outer[0]]), **own}
     kept = {k: v for k, v in tags.items() if k in NOISE or k == "type"}
-    return _Boundary(osm_id, {**kept, **own} if own else {}, ways), taken
+    return _Boundary(osm_id, {**kept, **own} if own else {}, ways), taken, not old_style
 
 
 def _relation_area(
@@ -143,7 +145,7 @@ def _relation_area(
     made = assemble(chains, places.xy, complete=not incomplete)
     reason = "incomplete-relation" if incomplete else made.reason or ("missing-nodes" if cut else "")
     osm_id = f"relation/{boundary.osm_id}"
-    kind = kind_of(boundary.tags)
+    kind = kind_of(boundary.tags, area=True)
     if not reason:
         if made.geometry is not None:
             return made.geometry, None
@@ -180,7 +182,7 @@ def multipolygon_areas(
     for osm_id, tags, members in elements.relations:
         if not is_multipolygon(tags):
             continue
-        boundary, taken = _boundary(elements, row_of, osm_id, tags, members)
+        boundary, taken, twice = _boundary(elements, row_of, osm_id, tags, members)
         rows = np.array([row for row, _ in boundary.ways if row >= 0], np.int64)
         claims.members.update(rows.tolist())
         if not wanted(rows):
@@ -195,14 +197,18 @@ def multipolygon_areas(
         if geometry is None:
             continue
         claims.taken.update(taken)
-        if not _meaning(tags) or not taken:
-            pass
-        else:
+        if twice:
+            told = f"bounds {name}, which is tagged alike"
             problems += [
-                Problem(f"way/{elements.way_id[row]}", kind_of(elements.way_tags[row]), "dropped", "tagged-twice",
-                        f"bounds {name}, which is tagged alike")
+                Problem(
+                    f"way/{elements.way_id[row]}",
+                    kind_of(elements.way_tags[row]),
+                    "dropped",
+                    "tagged-twice",
+                    told,
+                )
                 for row in sorted(taken)
-            ]  # fmt: skip
+            ]
         areas.append(Area(name, boundary.tags, geometry, _NO_NODES))
     if areas:
         oriented = shapely.orient_polygons([area.geometry for area in areas])
@@ -236,6 +242,7 @@ def way_areas(
             continue
         name, kind = f"way/{elements.way_id[row]}", kind_of(tags)
         missing = int((nodes < 0).sum())
+        repair: tuple[str, str] | None = None
         if missing or not closed:
             reason = "missing-nodes" if missing else "open-ring"
             cut = close_cut_ring(nodes, places.xy, extent)
@@ -248,23 +255,18 @@ def way_areas(
                 problems.append(Problem(name, kind, "dropped", reason, told))
                 continue
             told = f"{missing} of {len(nodes)} nodes absent, " if missing else ""
-            problems.append(
-                Problem(name, kind, "repaired", reason, f"{told}closed straight at the edge of the extract")
-            )
+            repair = (reason, f"{told}closed straight at the edge of the extract")
             nodes = cut
         merged = places.same[nodes]
-        keep = np.ones(len(nodes), bool)
-        keep[1:] = merged[1:] != merged[:-1]
+        keep = np.append(True, merged[1:] != merged[:-1])
         if not keep.all():
-            problems.append(
-                Problem(
-                    name, kind, "repaired", "repeated-node", f"{np.count_nonzero(~keep)} repeats left out"
-                )
-            )
+            repair = repair or ("repeated-node", f"{np.count_nonzero(~keep)} left out")
             nodes = nodes[keep]
         if len(nodes) < 4:
             problems.append(Problem(name, kind, "dropped", "no-area", f"{len(nodes)} nodes"))
             continue
+        if repair:
+            problems.append(Problem(name, kind, "repaired", *repair))
         rings.append(nodes)
         of.append(row)
     if not rings:

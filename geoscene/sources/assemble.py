@@ -7,7 +7,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.errors import InputError, SourceNotFoundError
-from geoscene.report import Problem
+from geoscene.report import Action, Problem
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
 from geoscene.sources.data import OsmData, Point, Relation, Way
 from geoscene.sources.elements import UNITS, Elements, Int
@@ -90,7 +90,7 @@ def _lines(elements: Elements, rows: list[int]) -> tuple[list[Way], list[Problem
                 made += 1
         if missing or not made:
             told = f"{missing} of {len(nodes)} nodes absent" if missing else f"{len(nodes)} nodes"
-            action = "repaired" if made else "dropped"
+            action: Action = "repaired" if made else "dropped"
             problems.append(
                 Problem(name, kind_of(tags), action, "missing-nodes" if missing else "too-short", told)
             )

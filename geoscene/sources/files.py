@@ -19,7 +19,7 @@ _HELP = "give an OpenStreetMap extract (.osm, .osm.gz, .osm.bz2, .osm.pbf)"
 
 
 def _format_of(path: Path) -> str:
-    """libosmium's name of a file's format, by its first bytes, whatever the file is called.
+    """The name that libosmium gives a file's format, by its first bytes, whatever the file is called.
 
     Raises InputError for anything that is no OpenStreetMap file.
     """
@@ -83,8 +83,8 @@ def _collect(path: Path, progress: Progress) -> Collector:
 def read_osm(path: str | Path, *, bounds: Bounds | None = None, progress: Progress = iter) -> OsmData:
     """The features of an OpenStreetMap extract: XML, plain or compressed (gzip, bzip2), PBF or o5m.
 
-    The format is told by the first bytes, not by the name. Ids may be negative and in any order, relations may
-    stand before ways. What is broken is repaired or dropped by the rules of docs/sources.md and listed in
+    The format is told by the first bytes, not by the name. Ids may be negative and in any order, relations
+    may stand before ways. What is broken is repaired or dropped by the rules of docs/sources.md and listed in
     ``problems``; the result does not depend on the order of the file.
 
     Parameters

@@ -40,20 +40,22 @@ def polygons_of(geometry: Any) -> Any:
 
 def segments_of(nodes: Int) -> Int:
     """(s, 2) int64 node indices of a chain's segments, the lesser first; segments of no length left out."""
-    pairs = np.sort(np.stack([nodes[:-1], nodes[1:]], axis=1), axis=1)
-    return pairs[pairs[:, 0] != pairs[:, 1]]
+    pairs: Int = np.sort(np.stack([nodes[:-1], nodes[1:]], axis=1), axis=1)
+    distinct: Int = pairs[pairs[:, 0] != pairs[:, 1]]
+    return distinct
 
 
 def _odd_ends(segments: Int) -> Int:
     """The nodes at which an odd number of segments end: where the boundary is open."""
     nodes, count = np.unique(segments, return_counts=True)
-    return nodes[count % 2 == 1]
+    odd: Int = nodes[count % 2 == 1]
+    return odd
 
 
 def _prune(segments: Int) -> Int:
     """Segments less those that lead to a dead end."""
     while len(segments):
-        nodes, inverse, count = np.unique(segments, return_inverse=True, return_counts=True)
+        _, inverse, count = np.unique(segments, return_inverse=True, return_counts=True)
         alive = (count[inverse.reshape(segments.shape)] > 1).all(axis=1)
         if alive.all():
             break
@@ -74,8 +76,8 @@ def _inside(points: Float, a: Float, b: Float) -> NDArray[np.bool_]:
 def enclosed(segments: Int, xy: Float) -> tuple[Any, bool]:
     """The area that segments bound, by the even-odd rule, and whether any cross or overlap between nodes.
 
-    Where the boundary is open, dead ends are left out and what is still enclosed counts as inside. The area is None
-    if nothing is enclosed.
+    Where the boundary is open, dead ends are left out and what is still enclosed counts as inside. The area
+    is None if nothing is enclosed.
     """
     segments = _prune(segments)
     if len(segments) == 0:
@@ -130,7 +132,8 @@ class Assembly:
     """What `assemble` made of a boundary.
 
     geometry : Polygon or MultiPolygon, valid, exteriors counter-clockwise; None if nothing is enclosed
-    reason   : "" if the boundary was sound, else ``open-ring``, ``self-crossing`` or ``duplicate-way``
+    reason   : "" if the boundary was sound, else ``open-ring``, ``self-crossing``, ``duplicate-way``
+               or ``spike``
     """
 
     geometry: Any
@@ -140,29 +143,34 @@ class Assembly:
 def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> Assembly:
     """The area that chains bound together.
 
-    A sound boundary (every node met an even number of times, no crossing between nodes) is taken by the even-odd
-    rule and needs no roles: segments that two rings share cancel, so that touching holes become one. Otherwise, and
-    where members are missing (not ``complete``), the rings that close are taken one by one: the union of the outer
-    less the union of the inner.
+    A sound boundary (every node met an even number of times, no crossing between nodes) is taken by the
+    even-odd rule and needs no roles: segments that two rings share cancel, so that touching holes become one.
+    Otherwise, and where members are missing (not ``complete``), the rings that close are taken one by one:
+    the union of the outer less the union of the inner.
 
     xy : (n, 2) coordinates of all nodes
     """
     seen: set[bytes] = set()
     once: list[Chain] = []
     parts: list[Int] = []
+    spikes = False
     for chain in chains:
         segments = segments_of(chain.nodes)
-        key = np.unique(segments, axis=0).tobytes()
+        distinct = np.unique(segments, axis=0)
+        key = distinct.tobytes()
         if len(segments) and key not in seen:
             seen.add(key)
             once.append(chain)
+            spikes |= len(distinct) < len(segments)
             parts.append(segments)
     if not parts:
         return Assembly(None, "open-ring")
     every, count = np.unique(np.concatenate(parts), axis=0, return_counts=True)
     odd = every[count % 2 == 1]
     is_open = len(_odd_ends(odd)) > 0
-    reason = "open-ring" if is_open else "duplicate-way" if len(once) < len(chains) else ""
+    reason = (
+        "open-ring" if is_open else "duplicate-way" if len(once) < len(chains) else "spike" if spikes else ""
+    )
     crossing = False
     if complete and not is_open and len(odd):
         geometry, crossing = enclosed(odd, xy)
@@ -177,10 +185,10 @@ def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> As
 
 
 def close_cut_ring(nodes: Int, xy: Float, extent: tuple[float, float, float, float]) -> Int | None:
-    """A ring that the edge of an extract cut, closed by straight edges over what is missing; None if not sensible.
+    """A ring that the edge of an extract cut, closed by straight edges; None if that is not sensible.
 
-    It is sensible where both ends of every gap lie within 100 m of the extent's edge, the edges put in are at most a
-    third of the outline, and the outline does not cross itself.
+    It is sensible where both ends of every gap lie within 100 m of the extent's edge, the edges put in are
+    at most a third of the outline, and the outline does not cross itself and covers a square metre.
 
     nodes  : (k,) node indices, -1 where a node is missing; the last need not equal the first
     xy     : (n, 2) degrees of all nodes

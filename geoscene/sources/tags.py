@@ -67,14 +67,14 @@ AREA_KEYS: dict[str, tuple[bool, frozenset[str]]] = {
 }
 """Which tags make a closed way an area where no ``area`` tag decides.
 
-After the lists that the OpenStreetMap wiki ("Overpass turbo/Polygon Features") and the id-area-keys project keep;
-departures: piers, breakwaters, platforms and attractions are areas only with ``area=yes`` or another area key, for
-their closed ways are as often walked round as filled, and barriers never are without it.
+After the lists that the OpenStreetMap wiki ("Overpass turbo/Polygon Features") and the id-area-keys project
+keep. Departures: piers, breakwaters, platforms and attractions are areas only with ``area=yes`` or another
+area key, for their closed ways are as often walked round as filled, and barriers never are without it.
 """
 
 LINE_KEYS = (
-    "aerialway", "aeroway", "barrier", "golf", "highway", "leisure", "man_made", "natural", "power", "railway",
-    "waterway",
+    "aerialway", "aeroway", "barrier", "golf", "highway", "leisure", "man_made", "natural", "power",
+    "railway", "waterway",
 )  # fmt: skip
 """Keys whose values, where `AREA_KEYS` does not take them for areas, are lines."""
 
@@ -102,7 +102,7 @@ def is_building(tags: Tags) -> bool:
 
 
 def is_area(tags: Tags) -> bool:
-    """Whether a closed way with these tags is an area: ``area`` decides, else buildings are, else `AREA_KEYS`."""
+    """Whether a closed way with these tags is an area: ``area`` decides, then `AREA_KEYS`."""
     stated = tags.get("area")
     if stated == "yes" or is_building(tags):
         return True
@@ -119,22 +119,28 @@ def is_line(tags: Tags) -> bool:
 
 def is_open_area(tags: Tags) -> bool:
     """Whether a way with these tags is an area even if it is drawn open, so that the open end is a defect."""
-    if is_line(tags):
+    if is_building(tags):
+        return True
+    if any(tags.get(key, "no") not in _NO for key in LINE_KEYS if key not in area_tags(tags)):
         return False
-    return is_building(tags) or tags.get("area") == "yes" or "landuse" in tags or "natural" in area_tags(tags)
+    return tags.get("area") == "yes" or "landuse" in tags or "natural" in area_tags(tags)
 
 
-def kind_of(tags: Tags) -> str:
-    """The kind under which problems with an object are counted."""
+def kind_of(tags: Tags, *, area: bool = False) -> str:
+    """The kind under which problems with an object are counted; ``area`` if it is known to be one."""
     if tags.get("building", "no") not in _NO:
         return "building"
     if tags.get("building:part", "no") not in _NO:
         return "building-part"
     if tags.get("natural") == "water" or tags.get("waterway") in {"riverbank", "dock"} or "water" in tags:
         return "water"
-    if tags.get("highway", "no") not in _NO and "highway" not in area_tags(tags):
-        return "road"
-    for key in ("railway", "barrier", "waterway"):
-        if tags.get(key, "no") not in _NO:
-            return key
-    return "area" if is_area(tags) else "line"
+    found = area_tags(tags)
+    for key, kind in (
+        ("highway", "road"),
+        ("railway", "railway"),
+        ("barrier", "barrier"),
+        ("waterway", "waterway"),
+    ):
+        if tags.get(key, "no") not in _NO and key not in found and not (area and found):
+            return kind
+    return "area" if area or is_area(tags) else "line"
