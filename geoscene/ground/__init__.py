@@ -1,0 +1,27 @@
+"""One ground surface: a partition of the plane by what lies on it, triangulated and draped on terrain.
+
+>>> cover, problems = landcover(osm, frame, extent=extent)                           # doctest: +SKIP
+>>> layers = concatenate_layers([cover, road_surfaces, building_pads(footprints)])   # doctest: +SKIP
+>>> plan = plan_ground(extent, layers, tile_size=250.0)                              # doctest: +SKIP
+>>> meshes = [ground_tile(plan, i, j) for i, j in plan.tiles]                        # doctest: +SKIP
+"""
+
+from geoscene.ground.drape import WaterLevels as WaterLevels
+from geoscene.ground.drape import base_heights as base_heights
+from geoscene.ground.drape import drape as drape
+from geoscene.ground.drape import ground_tile as ground_tile
+from geoscene.ground.drape import water_levels as water_levels
+from geoscene.ground.landcover import landcover as landcover
+from geoscene.ground.layers import LANDCOVER as LANDCOVER
+from geoscene.ground.layers import PADS as PADS
+from geoscene.ground.layers import ROADS as ROADS
+from geoscene.ground.layers import Layers as Layers
+from geoscene.ground.layers import building_pads as building_pads
+from geoscene.ground.layers import concatenate_layers as concatenate_layers
+from geoscene.ground.partition import GroundPlan as GroundPlan
+from geoscene.ground.partition import Partition as Partition
+from geoscene.ground.partition import partition as partition
+from geoscene.ground.partition import partition_tile as partition_tile
+from geoscene.ground.partition import plan_ground as plan_ground
+from geoscene.ground.triangulate import Triangles as Triangles
+from geoscene.ground.triangulate import triangulate as triangulate

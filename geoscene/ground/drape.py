@@ -1,0 +1,199 @@
+"""The ground's triangles at their heights: on the terrain, and water level."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import materials
+from geoscene.frames import Frame
+from geoscene.ground.layers import Layers
+from geoscene.ground.partition import GroundPlan, Partition, partition_tile, tile_box, winners
+from geoscene.ground.triangulate import Triangles, triangulate
+from geoscene.mesh import Mesh
+from geoscene.sources.data import Way
+
+Float = NDArray[np.float64]
+Height = Callable[[Float, Float], Float]
+"""z (n,) in metres of the terrain at scene x (n,), y (n,)."""
+
+_STATION = 20.0
+"""Spacing of places along shores and rivers at which the terrain is asked, metres."""
+
+_CUT = 3.0
+"""How deep a river may cut into the terrain model, metres: deeper is a fault of the model or the map."""
+
+_AROUND = 2.0**-9
+_DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False) + 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class WaterLevels:
+    """How high the water stands.
+
+    level   : (n,) float64 metres, of each row of the layers; NaN where the row is no water, or a river
+    river   : (n,) bool, the row is a river: its level at a point is that of the nearest station
+    station : (k, 2) float64, places on rivers' centre lines, scene metres
+    height  : (k,) float64 metres, of the water there
+    reversed : ids of rivers that were drawn against the fall of the terrain
+    """
+
+    level: Float
+    river: NDArray[np.bool_]
+    station: Float
+    height: Float
+    reversed: tuple[str, ...]
+
+
+def water_levels(layers: Layers, ways: Sequence[Way], frame: Frame, *, height: Height) -> WaterLevels:
+    """The level of every water row of the layers.
+
+    The sea has one level: the median of the terrain over it. Standing water has one level a polygon: the
+    lowest terrain on its shore. A river falls along its centre line, level across: at stations every 20 m
+    it is the lowest terrain from its source to there, but not more than 3 m below the terrain; one that
+    the map draws against the fall of the terrain is turned round and named in the result. A river's area
+    without a centre line in it is standing water.
+
+    ways : whose ``waterway`` gives centre lines
+    """
+    level = np.full(len(layers), np.nan)
+    sea = np.flatnonzero(layers.body == "sea")
+    if len(sea):
+        level[sea] = np.median(height(*_inside(layers.polygon[sea])))
+    lines = [way for way in ways if "waterway" in way.tags and len(way.lonlat) > 1]
+    stations, heights, turned = _profiles(lines, frame, height)
+    river = layers.body == "river"
+    if river.any():
+        tree = shapely.STRtree(layers.polygon[river])
+        has_line = np.unique(tree.query(shapely.points(stations), predicate="within")[1])
+        river[np.flatnonzero(river)[~np.isin(np.arange(river.sum()), has_line)]] = False
+    still = np.flatnonzero((layers.body != "") & (layers.body != "sea") & ~river)
+    if len(still):
+        shores = shapely.segmentize(shapely.boundary(layers.polygon[still]), _STATION)
+        xy, owner = shapely.get_coordinates(shores, return_index=True)
+        lowest = np.full(len(still), np.inf)
+        np.minimum.at(lowest, owner, height(xy[:, 0], xy[:, 1]))
+        level[still] = lowest
+    return WaterLevels(level, river, stations, heights, turned)
+
+
+def drape(
+    plan: GroundPlan,
+    cells: Partition,
+    triangles: Triangles,
+    *,
+    height: Height | None = None,
+    levels: WaterLevels | None = None,
+) -> Mesh:
+    """The ground mesh in scene coordinates: faces upward, each with its cell's class, material and feature.
+
+    A vertex on water, its shore included, has the water's level (where several waters meet, the lowest),
+    any other that of the terrain; 0 everywhere without ``height``. Vertices on tiles' borders are settled
+    by what lies around them, not by the tile's own cells, so that neighbouring tiles agree.
+    """
+    x, y = triangles.points.T
+    z = np.zeros(len(x)) if height is None else np.asarray(height(x, y), float)
+    if levels is not None:
+        z = _flooded(plan, cells, triangles, z, levels)
+    color = np.zeros((256, 3), np.uint8)
+    for material in materials().values():
+        color[material.code] = material.color
+    return Mesh.of(
+        np.column_stack([triangles.points, z]),
+        triangles.faces,
+        feature=cells.feature[triangles.cell],
+        klass=cells.klass[triangles.cell],
+        material=cells.material[triangles.cell],
+        color=color[cells.material[triangles.cell]],
+    )
+
+
+def ground_tile(
+    plan: GroundPlan, i: int, j: int, *, height: Height | None = None, levels: WaterLevels | None = None
+) -> Mesh:
+    """The ground of tile (i, j) in scene coordinates: partition, triangles and heights in one call."""
+    cells = partition_tile(plan, i, j)
+    return drape(plan, cells, triangulate(cells), height=height, levels=levels)
+
+
+def base_heights(footprints: Sequence[object] | NDArray[np.object_], height: Height) -> Float:
+    """The lowest ground (n,) along each footprint's outline, metres: where a building on a slope stands.
+
+    The terrain is asked at the outline's vertices and at most 2 m apart between them. NaN for a footprint
+    that is None or empty.
+    """
+    outlines = shapely.segmentize(shapely.boundary(np.asarray(footprints, object)), 2.0)
+    xy, owner = shapely.get_coordinates(outlines, return_index=True)
+    lowest = np.full(len(outlines), np.inf)
+    np.minimum.at(lowest, owner, np.asarray(height(xy[:, 0], xy[:, 1]), float))
+    base: Float = np.where(np.isinf(lowest), np.nan, lowest)
+    return base
+
+
+def _inside(polygons: NDArray[np.object_]) -> tuple[Float, Float]:
+    """Up to about a thousand points well spread inside polygons, on a regular grid; at least one each."""
+    sure = shapely.get_coordinates(shapely.point_on_surface(polygons))
+    xmin, ymin, xmax, ymax = shapely.total_bounds(polygons)
+    step = max(np.sqrt((xmax - xmin) * (ymax - ymin) / 1000.0), 1.0)
+    x, y = np.meshgrid(np.arange(xmin, xmax, step) + step / 2, np.arange(ymin, ymax, step) + step / 2)
+    spread = np.column_stack([x.ravel(), y.ravel()])
+    point, _ = shapely.STRtree(polygons).query(shapely.points(spread), predicate="within")
+    every = np.concatenate([sure, spread[np.unique(point)]])
+    return every[:, 0], every[:, 1]
+
+
+def _profiles(ways: Sequence[Way], frame: Frame, height: Height) -> tuple[Float, Float, tuple[str, ...]]:
+    """Stations (k, 2) on rivers, the water's height (k,) there, and which rivers were turned round."""
+    stations, heights, turned = [np.empty((0, 2))], [np.empty(0)], []
+    for way in ways:
+        line = shapely.LineString(np.column_stack(frame.from_geographic(*way.lonlat.T)))
+        xy = shapely.get_coordinates(shapely.segmentize(line, _STATION))
+        ground = np.asarray(height(xy[:, 0], xy[:, 1]), float)
+        third = max(len(ground) // 3, 1)
+        if ground[-third:].mean() > ground[:third].mean() + 0.5:
+            xy, ground = xy[::-1], ground[::-1]
+            turned.append(way.osm_id)
+        stations.append(xy)
+        heights.append(np.maximum(np.minimum.accumulate(ground), ground - _CUT))
+    return np.concatenate(stations), np.concatenate(heights), tuple(turned)
+
+
+def _flooded(
+    plan: GroundPlan, cells: Partition, triangles: Triangles, z: Float, levels: WaterLevels
+) -> Float:
+    """Heights (n,) of the points, those on water at its level."""
+    wet = plan.layers.body != ""
+    vertex = triangles.faces.ravel()
+    row = np.repeat(cells.row[triangles.cell], 3)
+    edge = np.zeros(len(z), bool)
+    for i, j in np.unique(cells.tile, axis=0):
+        xmin, ymin, xmax, ymax = tile_box(plan, i, j)
+        x, y = triangles.points.T
+        within = (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)
+        edge |= within & ((x == xmin) | (x == xmax) | (y == ymin) | (y == ymax))
+    inner = ~edge[vertex] & (row >= 0)
+    vertex, row = vertex[inner], row[inner]
+    around = triangles.points[edge][:, None] + _AROUND * np.stack(
+        [np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)], axis=1
+    )
+    beside = winners(plan, around[..., 0].ravel(), around[..., 1].ravel())
+    vertex = np.concatenate([vertex, np.repeat(np.flatnonzero(edge), len(_DIRECTIONS))])
+    row = np.concatenate([row, beside])
+    on_water = row >= 0
+    on_water[on_water] = wet[row[on_water]]
+    vertex, row = vertex[on_water], row[on_water]
+    stand = levels.level[row]
+    flows = levels.river[row]
+    if flows.any():
+        from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
+
+        nearest = cKDTree(levels.station).query(triangles.points[vertex[flows]])[1]
+        stand[flows] = levels.height[nearest]
+    level = np.full(len(z), np.inf)
+    np.minimum.at(level, vertex, stand)
+    flooded: Float = np.where(np.isinf(level), z, level)
+    return flooded

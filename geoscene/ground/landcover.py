@@ -1,0 +1,152 @@
+"""What the map says lies on the ground: areas, waterways, railways, the sea."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import materials
+from geoscene.frames import Frame
+from geoscene.ground.coast import sea
+from geoscene.ground.kinds import SEA, SURFACES, Kind, area_kind, line_kind
+from geoscene.ground.layers import Layers, concatenate_layers
+from geoscene.report import Problem
+from geoscene.sources.data import OsmData, Tags, Way
+from geoscene.tags import parse_length
+
+Float = NDArray[np.float64]
+
+_WIDEST = 3000.0
+"""A width beyond this, metres, is a slip of the pen."""
+
+
+def landcover(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
+    """Land cover within the extent as `Layers`, and what was repaired or dropped on the way.
+
+    Areas by `kinds.AREAS`, lines of water, rail and stone widened by their ``width`` or their kind's, and
+    the sea behind coastlines. Roads and buildings are no land cover. A ``surface`` tag decides the
+    material. Priorities lie in [0, 100): the kind's tier, plus less than 1 that is greater for smaller
+    polygons, so that a lawn in a park shows.
+
+    extent : (xmin, ymin, xmax, ymax) scene metres; polygons are cut there
+    """
+    areas, problems = _areas(osm, frame, extent)
+    lines, more = _lines(osm.ways, frame)
+    coast = [way for way in osm.ways if way.tags.get("natural") == "coastline"]
+    # An island drawn as one closed way may come as an area; its ring is a coastline all the same.
+    rings = [
+        (area.osm_id, np.asarray(ring.coords))
+        for area in osm.areas
+        if area.tags.get("natural") == "coastline"
+        for ring in shapely.get_exterior_ring(shapely.get_parts(area.geometry))
+    ]
+    shores = [(way.osm_id, way.lonlat) for way in coast] + rings
+    seas, still_more = sea(
+        [_to_scene(frame, lonlat) for _, lonlat in shores], extent, osm_id=[osm_id for osm_id, _ in shores]
+    )
+    water = Layers.of(
+        seas,
+        klass=SEA.klass,
+        material=materials()[SEA.material].code,
+        priority=float(SEA.tier),
+        source="coastline",
+        body=SEA.body,
+    )
+    cut = _cut(concatenate_layers([areas, lines, water]), extent)
+    return cut, problems + more + still_more
+
+
+def _to_scene(frame: Frame, lonlat: Float) -> Float:
+    return np.column_stack(frame.from_geographic(lonlat[:, 0], lonlat[:, 1]))
+
+
+def _material(tags: Tags, kind: Kind) -> tuple[str, str]:
+    """(material, source): the surface tag's, else the kind's."""
+    named = SURFACES.get(tags.get("surface", "").split(";")[0].strip())
+    if named is None or kind.body:
+        return kind.material, "tags"
+    return named, "surface"
+
+
+def _priority(tier: NDArray[np.integer], polygons: NDArray[np.object_]) -> Float:
+    """Tiers, and within one the smaller polygon above the larger."""
+    priority: Float = tier + 0.99 / (1.0 + shapely.area(polygons) / 100.0)
+    return priority
+
+
+def _areas(osm: OsmData, frame: Frame, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
+    """Land cover drawn as areas that reach into the extent."""
+    found = [(area, kind) for area in osm.areas if (kind := area_kind(area.tags)) is not None]
+    polygons = np.empty(len(found), object)
+    polygons[:] = [area.geometry for area, _ in found]
+    polygons = shapely.transform(polygons, lambda lonlat: _to_scene(frame, lonlat))
+    near = shapely.intersects(shapely.box(*extent), shapely.envelope(polygons))
+    found = [pair for pair, keep in zip(found, near, strict=True) if keep]
+    polygons = polygons[near]
+    problems = []
+    for k in np.flatnonzero(~shapely.is_valid(polygons)):
+        reason = shapely.is_valid_reason(polygons[k])
+        polygons[k] = shapely.make_valid(polygons[k], method="structure", keep_collapsed=False)
+        problems.append(Problem(found[k][0].osm_id, "area", "repaired", "invalid-after-projection", reason))
+    looks = [_material(area.tags, kind) for area, kind in found]
+    return Layers.of(
+        polygons,
+        klass=[kind.klass for _, kind in found],
+        material=[materials()[name].code for name, _ in looks],
+        priority=_priority(np.array([kind.tier for _, kind in found], int), polygons),
+        osm_id=[area.osm_id for area, _ in found],
+        source=[source for _, source in looks],
+        body=[kind.body for _, kind in found],
+    ), problems
+
+
+def _lines(ways: Sequence[Way], frame: Frame) -> tuple[Layers, list[Problem]]:
+    """Land cover drawn as lines, widened."""
+    found = [(way, kind) for way in ways if (kind := line_kind(way.tags)) is not None and len(way.lonlat) > 1]
+    width, source, problems = [], [], []
+    for way, kind in found:
+        metres, problem = _width(way, kind)
+        width.append(metres)
+        source.append("default-width" if metres == kind.width else "width")
+        problems += problem
+    if not found:
+        return concatenate_layers([]), problems
+    xy = _to_scene(frame, np.concatenate([way.lonlat for way, _ in found]))
+    line = np.repeat(np.arange(len(found)), [len(way.lonlat) for way, _ in found])
+    strips = shapely.buffer(shapely.linestrings(xy, indices=line), np.array(width) / 2, quad_segs=2)
+    looks = [_material(way.tags, kind) for way, kind in found]
+    return Layers.of(
+        strips,
+        klass=[kind.klass for _, kind in found],
+        material=[materials()[name].code for name, _ in looks],
+        priority=_priority(np.array([kind.tier for _, kind in found], int), strips),
+        osm_id=[way.osm_id for way, _ in found],
+        source=source,
+        body=[kind.body for _, kind in found],
+    ), problems
+
+
+def _width(way: Way, kind: Kind) -> tuple[float, list[Problem]]:
+    """A line's width in metres, and a problem where its tag cannot be used."""
+    text = way.tags.get("width") or way.tags.get("est_width")
+    if text is None:
+        return kind.width, []
+    metres = parse_length(text)
+    if metres is not None and 0.0 < metres <= _WIDEST:
+        return metres, []
+    detail = f"width={text!r} is no width; took {kind.width} m"
+    return kind.width, [Problem(way.osm_id, "area", "repaired", "unreadable-width", detail)]
+
+
+def _cut(layers: Layers, extent: Sequence[float]) -> Layers:
+    """Rows that have area within the extent, polygons cut a metre outside it."""
+    box = shapely.box(extent[0] - 1.0, extent[1] - 1.0, extent[2] + 1.0, extent[3] + 1.0)
+    polygon = layers.polygon.copy()
+    across = ~shapely.covers(box, polygon)
+    polygon[across] = shapely.intersection(polygon[across], box)
+    keep = shapely.area(polygon) > 0
+    return replace(layers, polygon=polygon).take(keep)

@@ -1,0 +1,110 @@
+"""What may lie on the ground: polygons with a class, a material and a priority, as columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.classes import Class, materials
+from geoscene.errors import InputError
+
+LANDCOVER, ROADS, PADS = 0.0, 100.0, 200.0
+"""Where the priorities of land cover, of road surfaces and of building pads begin."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """Polygons that compete for the ground; where two overlap the higher priority wins, then the earlier row.
+
+    polygon  : (n,) object, shapely Polygon or MultiPolygon, scene metres
+    klass    : (n,) uint8, `geoscene.classes.Class`
+    material : (n,) uint8, code of `geoscene.classes.materials`
+    priority : (n,) float64
+    osm_id   : (n,) str, "" for none
+    source   : (n,) str: what klass, material and shape rest on: ``tags``, ``surface`` (material from the
+               tag), ``width`` (a line with its mapped width), ``default-width`` (a line with an assumed one),
+               ``coastline``
+    body     : (n,) str: kind of water, which decides its level: ``sea``, ``standing``, ``river``; else ""
+    feature  : (n,) int32 feature number, -1 for none
+    """
+
+    polygon: NDArray[np.object_]
+    klass: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    priority: NDArray[np.float64]
+    osm_id: NDArray[np.str_]
+    source: NDArray[np.str_]
+    body: NDArray[np.str_]
+    feature: NDArray[np.int32]
+
+    def __post_init__(self) -> None:
+        """Refuse columns that disagree in length."""
+        lengths = {f.name: len(getattr(self, f.name)) for f in fields(self)}
+        if len(set(lengths.values())) > 1:
+            raise InputError(f"layer columns disagree in length: {lengths}")
+
+    def __len__(self) -> int:
+        """Number of polygons."""
+        return len(self.polygon)
+
+    @classmethod
+    def of(
+        cls,
+        polygon: Sequence[object] | NDArray[np.object_],
+        *,
+        klass: ArrayLike,
+        material: ArrayLike,
+        priority: ArrayLike,
+        osm_id: ArrayLike = "",
+        source: ArrayLike = "tags",
+        body: ArrayLike = "",
+        feature: ArrayLike = -1,
+    ) -> Layers:
+        """Layers of polygons; every other column is broadcast over them."""
+        column = np.empty(len(polygon), object)
+        column[:] = list(polygon)
+        n = (len(column),)
+        return cls(
+            column,
+            np.broadcast_to(np.asarray(klass, np.uint8), n).copy(),
+            np.broadcast_to(np.asarray(material, np.uint8), n).copy(),
+            np.broadcast_to(np.asarray(priority, np.float64), n).copy(),
+            np.broadcast_to(np.asarray(osm_id, np.str_), n).copy(),
+            np.broadcast_to(np.asarray(source, np.str_), n).copy(),
+            np.broadcast_to(np.asarray(body, np.str_), n).copy(),
+            np.broadcast_to(np.asarray(feature, np.int32), n).copy(),
+        )
+
+    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Layers:
+        """The chosen rows, in the given order."""
+        return Layers(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+
+def concatenate_layers(layers: Sequence[Layers]) -> Layers:
+    """One table of all rows, in order."""
+    if not layers:
+        return Layers.of([], klass=0, material=0, priority=0.0)
+    return Layers(*(np.concatenate([getattr(part, f.name) for part in layers]) for f in fields(Layers)))
+
+
+def building_pads(
+    footprints: Sequence[object] | NDArray[np.object_], *, osm_id: ArrayLike = "", feature: ArrayLike = -1
+) -> Layers:
+    """The ground under buildings: one pad a footprint (scene metres), which nothing lies over.
+
+    Footprints that are None, empty or without area make an empty row, so rows stay aligned with buildings.
+    """
+    polygon = np.empty(len(footprints), object)
+    polygon[:] = [shapely.Polygon() if f is None else f for f in footprints]
+    return Layers.of(
+        polygon,
+        klass=Class.BUILDING_PAD,
+        material=materials()["concrete"].code,
+        priority=PADS,
+        osm_id=osm_id,
+        feature=feature,
+    )

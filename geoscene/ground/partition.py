@@ -1,0 +1,392 @@
+"""One partition of the plane: cells without gaps and overlaps, made tile by tile.
+
+Every polygon's outline is put on a grid of `PRECISION`; in a tile, the outlines that come within a
+millimetre of it, the tile's own sides and the terrain's lines are noded together by snap rounding (Hobby
+1999; Guibas and Marimont 1998, as implemented in GEOS). Snap rounding is local: whether a segment bends
+at a point depends only on the segments that pass that very point. As both tiles beside a border node the
+same whole segments there, they find the same vertices on it, whichever other tiles are built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import Class, materials
+from geoscene.errors import GeosceneError, InputError
+from geoscene.ground.layers import Layers
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+PRECISION = 2.0**-13
+"""Side of the grid that ground vertices lie on, 0.12 mm.
+
+A power of two, so that moving a vertex by whole metres is exact in floating point."""
+
+SLIVER = 0.02
+"""A cell nowhere wider than this, metres, joins the neighbour with which it shares most border.
+
+Below the narrowest thing drawn on the ground (a kerb or a line of 0.1 m), above what mappers' hands leave
+between areas meant to touch."""
+
+_REACH = 1e-3
+"""How far beyond a tile's side outlines take part in its noding, metres: several times `PRECISION`."""
+
+
+@dataclass(frozen=True, slots=True)
+class GroundPlan:
+    """What `partition_tile` needs of the whole scene; pickles, so that tiles can go to workers.
+
+    extent    : (xmin, ymin, xmax, ymax) of the ground, scene metres, on the grid
+    tile_size : side of a tile, metres
+    lines     : spacing of the terrain's lines, metres, 0 for none
+    layers    : what competes for the ground
+    bounds    : (n, 4) float64, theirs; infinite the wrong way round for empty polygons
+    base      : (class, material code) where there is nothing
+    start, end : (m, 2) float64 segments of all outlines, on the grid
+    string    : (m,) int64: segments of one outline that follow each other have the same number
+    order, offset : segments by tile: those of tile (i, j) are
+                ``order[offset[k]:offset[k + 1]]``, k the tile's place in `tiles`
+    tiles     : (t, 2) int64, all tiles of the extent, by row
+    """
+
+    extent: tuple[float, float, float, float]
+    tile_size: float
+    lines: float
+    layers: Layers
+    bounds: Float
+    base: tuple[int, int]
+    start: Float
+    end: Float
+    string: Int
+    order: Int
+    offset: Int
+    tiles: Int
+
+
+@dataclass(frozen=True, slots=True)
+class Partition:
+    """Cells that cover an area once.
+
+    polygon  : (n,) object, shapely Polygon, scene metres, vertices on the `PRECISION` grid; neighbours share
+               all vertices along their common border
+    row      : (n,) int32, the row of the layers that won, -1 for the base
+    klass, material : (n,) uint8
+    feature  : (n,) int32
+    tile     : (n, 2) int32
+    slivers  : how many slivers were joined to a neighbour
+    """
+
+    polygon: NDArray[np.object_]
+    row: NDArray[np.int32]
+    klass: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    feature: NDArray[np.int32]
+    tile: NDArray[np.int32]
+    slivers: int
+
+    def __len__(self) -> int:
+        """Number of cells."""
+        return len(self.polygon)
+
+
+def plan_ground(
+    extent: Sequence[float],
+    layers: Layers,
+    *,
+    tile_size: float = 250.0,
+    lines: float = 0.0,
+    base: tuple[int, str] = (Class.TERRAIN, "soil"),
+) -> GroundPlan:
+    """The scene's outlines sorted by tile, ready for `partition_tile`.
+
+    extent : (xmin, ymin, xmax, ymax), scene metres
+    lines  : spacing in metres of lines (parallel to the axes, at its multiples) along which cells are cut, so
+             that the ground can follow a terrain; 0 for none
+    base   : class and material where no polygon lies
+
+    Raises InputError for an extent without area or non-finite, or sizes off the grid.
+    """
+    box = _snap(np.asarray(extent, float))
+    if box.shape != (4,) or not np.isfinite(box).all() or box[0] >= box[2] or box[1] >= box[3]:
+        raise InputError(
+            f"the ground's extent {tuple(extent)} must be xmin < xmax, ymin < ymax in scene metres"
+        )
+    for name, size in (("tile_size", tile_size), ("lines", lines)):
+        if size < 0 or size != _snap(np.asarray(size)):
+            raise InputError(f"{name}={size}: give a multiple of {PRECISION} m, such as whole metres")
+    if tile_size < 1.0:
+        raise InputError(f"tile_size={tile_size}: a tile's side must be 1 m or more")
+    start, end, string = _outlines(layers.polygon, box)
+    low = np.floor(box[:2] / tile_size).astype(np.int64)
+    high = np.maximum(np.ceil(box[2:] / tile_size).astype(np.int64), low + 1)
+    count = high - low
+    order, offset = _by_tile(start, end, low=low, count=count, tile_size=tile_size)
+    j, i = np.divmod(np.arange(count[0] * count[1]), count[0])
+    klass, material = base
+    bounds = shapely.bounds(layers.polygon).reshape(-1, 4)
+    return GroundPlan(
+        (float(box[0]), float(box[1]), float(box[2]), float(box[3])),
+        tile_size,
+        lines,
+        layers,
+        np.where(np.isnan(bounds), (np.inf, np.inf, -np.inf, -np.inf), bounds),
+        (int(klass), materials()[material].code),
+        start,
+        end,
+        string,
+        order,
+        offset,
+        np.stack([i, j], axis=1) + low,
+    )
+
+
+def partition_tile(plan: GroundPlan, i: int, j: int) -> Partition:
+    """The cells of tile (i, j), which covers [i, i + 1) x [j, j + 1) times the tile size, within the extent.
+
+    The same whatever other tiles are made. Raises InputError for a tile outside the extent.
+    """
+    place = np.flatnonzero((plan.tiles[:, 0] == i) & (plan.tiles[:, 1] == j))
+    if len(place) == 0:
+        raise InputError(f"tile ({i}, {j}) is not one of the {len(plan.tiles)} tiles of the ground")
+    box = tile_box(plan, i, j)
+    mine = np.sort(plan.order[plan.offset[place[0]] : plan.offset[place[0] + 1]])
+    lines = [*_strings(plan.start[mine], plan.end[mine], plan.string[mine]), *_ruling(plan, box)]
+    cells = _faces(shapely.union_all(lines, grid_size=PRECISION), box)
+    inside = shapely.get_coordinates(shapely.point_on_surface(cells))
+    row = winners(plan, inside[:, 0], inside[:, 1])
+    edges = _Edges.of(cells)
+    row, slivers = _without_slivers(edges, cells, row)
+    cells, row = _dissolve(edges, row, box, plan.lines)
+    # The base stands after the last row of the layers, where -1 finds it.
+    klass = np.append(plan.layers.klass, np.uint8(plan.base[0]))[row]
+    material = np.append(plan.layers.material, np.uint8(plan.base[1]))[row]
+    feature = np.append(plan.layers.feature, np.int32(-1))[row]
+    tile = np.broadcast_to(np.array([i, j], np.int32), (len(cells), 2)).copy()
+    return Partition(cells, row.astype(np.int32), klass, material, feature, tile, slivers)
+
+
+def partition(
+    extent: Sequence[float],
+    layers: Layers,
+    *,
+    tile_size: float = 250.0,
+    lines: float = 0.0,
+    base: tuple[int, str] = (Class.TERRAIN, "soil"),
+    tiles: Iterable[tuple[int, int]] | None = None,
+) -> Partition:
+    """The cells of the whole extent, or of the chosen tiles, in one table; options as in `plan_ground`."""
+    plan = plan_ground(extent, layers, tile_size=tile_size, lines=lines, base=base)
+    chosen = [(int(i), int(j)) for i, j in plan.tiles] if tiles is None else list(tiles)
+    parts = [partition_tile(plan, i, j) for i, j in chosen]
+    names = [f.name for f in fields(Partition) if f.name != "slivers"]
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Partition(**columns, slivers=sum(part.slivers for part in parts))
+
+
+def tile_box(plan: GroundPlan, i: int, j: int) -> tuple[float, float, float, float]:
+    """(xmin, ymin, xmax, ymax) of a tile's part of the extent, scene metres."""
+    size, (xmin, ymin, xmax, ymax) = plan.tile_size, plan.extent
+    return max(i * size, xmin), max(j * size, ymin), min((i + 1) * size, xmax), min((j + 1) * size, ymax)
+
+
+def winners(plan: GroundPlan, x: Float, y: Float) -> NDArray[np.int64]:
+    """The row of the layers (n,) that holds each point (n,), -1 where none does.
+
+    Fastest for points close together.
+    """
+    best = np.full(len(x), -1, np.int64)
+    if len(x) == 0:
+        return best
+    low, high = plan.bounds[:, :2], plan.bounds[:, 2:]
+    near = np.flatnonzero((low <= (x.max(), y.max())).all(axis=1) & (high >= (x.min(), y.min())).all(axis=1))
+    # Lowest priority first and, among equals, the latest row first: the greatest rank wins.
+    near = near[np.lexsort((-near, plan.layers.priority[near]))]
+    polygons = plan.layers.polygon[near]
+    shapely.prepare(polygons)
+    point, rank = shapely.STRtree(polygons).query(shapely.points(x, y))
+    hit = shapely.contains_xy(polygons[rank], x[point], y[point])
+    top = np.full(len(x), -1, np.int64)
+    np.maximum.at(top, point[hit], rank[hit])
+    best[top >= 0] = near[top[top >= 0]]
+    return best
+
+
+def _snap(values: Float) -> Float:
+    snapped: Float = np.round(values / PRECISION) * PRECISION
+    return snapped
+
+
+def _outlines(polygons: NDArray[np.object_], box: Float) -> tuple[Float, Float, Int]:
+    """Start and end (m, 2) of the outlines' segments near the box, on the grid, and their strings (m,)."""
+    rings = shapely.get_rings(shapely.get_parts(polygons))
+    coords, ring = shapely.get_coordinates(rings, return_index=True)
+    coords = _snap(coords)
+    start, end = coords[:-1], coords[1:]
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    keep = (
+        (ring[:-1] == ring[1:])
+        & (start != end).any(axis=1)
+        & (low <= box[2:] + _REACH).all(axis=1)
+        & (high >= box[:2] - _REACH).all(axis=1)
+    )
+    return start[keep], end[keep], ring[:-1][keep].astype(np.int64)
+
+
+def _by_tile(start: Float, end: Float, *, low: Int, count: Int, tile_size: float) -> tuple[Int, Int]:
+    """Segments by tile, in compressed rows: (order, offset)."""
+    first = np.floor((np.minimum(start, end) - _REACH) / tile_size).astype(np.int64) - low
+    last = np.floor((np.maximum(start, end) + _REACH) / tile_size).astype(np.int64) - low
+    first, last = np.clip(first, 0, count - 1), np.clip(last, 0, count - 1)
+    span = last - first + 1
+    copies = span[:, 0] * span[:, 1]
+    segment = np.repeat(np.arange(len(start)), copies)
+    nth = np.arange(len(segment)) - np.repeat(np.cumsum(copies) - copies, copies)
+    down, across = np.divmod(nth, span[segment, 0])
+    tile = (first[segment, 1] + down) * count[0] + first[segment, 0] + across
+    order = np.argsort(tile, kind="stable")
+    offset = np.searchsorted(tile[order], np.arange(count[0] * count[1] + 1))
+    return segment[order], offset
+
+
+def _strings(start: Float, end: Float, string: Int) -> NDArray[np.object_]:
+    """Line strings of segments, joined where one outline runs on."""
+    if len(start) == 0:
+        return np.empty(0, object)
+    fresh = np.ones(len(start), bool)
+    fresh[1:] = (string[1:] != string[:-1]) | (start[1:] != end[:-1]).any(axis=1)
+    run = np.cumsum(fresh) - 1
+    coords = np.concatenate([start[fresh], end])
+    line = np.concatenate([np.arange(run[-1] + 1), run])
+    order = np.argsort(line, kind="stable")  # a run's first start comes before its ends
+    lines: NDArray[np.object_] = shapely.linestrings(coords[order], indices=line[order])
+    return lines
+
+
+def _ruling(plan: GroundPlan, box: tuple[float, float, float, float]) -> list[object]:
+    """The tile's sides, and the terrain's lines across it."""
+    xmin, ymin, xmax, ymax = box
+    ruling: list[object] = [shapely.box(*box).exterior]
+    if plan.lines > 0:
+        xs = np.arange(np.floor(xmin / plan.lines) + 1, np.ceil(xmax / plan.lines)) * plan.lines
+        ys = np.arange(np.floor(ymin / plan.lines) + 1, np.ceil(ymax / plan.lines)) * plan.lines
+        ruling += [shapely.LineString([(x, ymin), (x, ymax)]) for x in xs]
+        ruling += [shapely.LineString([(xmin, y), (xmax, y)]) for y in ys]
+    return ruling
+
+
+def _faces(linework: object, box: tuple[float, float, float, float]) -> NDArray[np.object_]:
+    """The polygons that noded lines bound within the box."""
+    cells = shapely.get_parts(shapely.polygonize([linework]))
+    x0, y0, x1, y1 = shapely.bounds(cells).T
+    inside: NDArray[np.object_] = cells[(x0 >= box[0]) & (y0 >= box[1]) & (x1 <= box[2]) & (y1 <= box[3])]
+    area, whole = float(shapely.area(inside).sum()), (box[2] - box[0]) * (box[3] - box[1])
+    if abs(area - whole) > 1e-7 * whole:
+        raise GeosceneError(f"ground cells of the tile at {box} cover {area:.6f} m2 of {whole:.6f}")
+    return inside
+
+
+@dataclass(frozen=True, slots=True)
+class _Edges:
+    """Directed edges of cells, the cell's inside always on the same hand.
+
+    a, b   : (m,) int64, numbers of the ends
+    cell   : (m,) int64
+    other  : (m,) int64, the cell on the other side, -1 on the border
+    points : (k, 2) float64, metres
+    """
+
+    a: Int
+    b: Int
+    cell: Int
+    other: Int
+    points: Float
+
+    @classmethod
+    def of(cls, cells: NDArray[np.object_]) -> _Edges:
+        rings, owner = shapely.get_rings(cells, return_index=True)
+        coords, ring = shapely.get_coordinates(rings, return_index=True)
+        points, number = np.unique(np.round(coords / PRECISION).astype(np.int64), axis=0, return_inverse=True)
+        number = number.reshape(-1)
+        follows = ring[:-1] == ring[1:]
+        a, b, cell = number[:-1][follows], number[1:][follows], owner[ring[:-1][follows]]
+        there, back = a * len(points) + b, b * len(points) + a
+        order = np.argsort(there)
+        place = np.minimum(np.searchsorted(there[order], back), len(order) - 1)
+        twin = order[place]
+        other = np.where(there[twin] == back, cell[twin], -1)
+        return cls(a, b, cell.astype(np.int64), other.astype(np.int64), points * PRECISION)
+
+
+def _without_slivers(
+    edges: _Edges, cells: NDArray[np.object_], row: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], int]:
+    """Rows in which a sliver has the row of the wider cell it shares most border with; how many changed."""
+    # The area is at most the radius of the greatest circle within times the outline (Bonnesen), so all
+    # slivers are among the few cells that pass this; those with a wider spot are then let go.
+    thin = 2.0 * shapely.area(cells) < SLIVER * shapely.length(cells)
+    thin[thin] = shapely.is_empty(shapely.buffer(cells[thin], -SLIVER / 2, quad_segs=4))
+    if not thin.any():
+        return row, 0
+    row = row.copy()
+    length = np.hypot(*(edges.points[edges.a] - edges.points[edges.b]).T)
+    changed = np.zeros(len(cells), bool)
+    todo = thin.copy()
+    while todo.any():
+        # Slivers beside a settled cell take its row; then those beside them.
+        use = todo[edges.cell] & (edges.other >= 0) & ~todo[edges.other]
+        if not use.any():
+            break
+        pair, nth = np.unique(
+            np.stack([edges.cell[use], edges.other[use]], axis=1), axis=0, return_inverse=True
+        )
+        shared = np.bincount(nth.reshape(-1), weights=length[use])
+        order = np.lexsort((-pair[:, 1], shared, pair[:, 0]))
+        last = np.append(pair[order[1:], 0] != pair[order[:-1], 0], True)  # the longest border of each
+        chosen = pair[order[last]]
+        changed[chosen[:, 0]] = row[chosen[:, 0]] != row[chosen[:, 1]]
+        row[chosen[:, 0]] = row[chosen[:, 1]]
+        todo[chosen[:, 0]] = False
+    return row, int(changed.sum())
+
+
+def _dissolve(
+    edges: _Edges, row: NDArray[np.int64], box: tuple[float, float, float, float], lines: float
+) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+    """Cells of one row joined (but not across the terrain's lines), and their rows.
+
+    Vertices on what remains of the borders all stay.
+    """
+    kept = (edges.other < 0) | (row[edges.cell] != row[edges.other])
+    if lines > 0:
+        p, q = edges.points[edges.a], edges.points[edges.b]
+        on_line = (p == q) & (p == np.round(p / lines) * lines)
+        kept |= on_line.any(axis=1)
+    drawn = kept & ((edges.a < edges.b) | (edges.other < 0))
+    segments = np.stack([edges.points[edges.a[drawn]], edges.points[edges.b[drawn]]], axis=1)
+    cells = _faces(shapely.multilinestrings(shapely.linestrings(segments)), box)
+    # A joined cell's first edge, in its direction, is an edge of one of the cells it was made of.
+    first = shapely.get_coordinates(shapely.get_exterior_ring(cells))
+    count = shapely.get_num_points(shapely.get_exterior_ring(cells))
+    begin = np.cumsum(count) - count
+    number = _numbers(edges.points, np.stack([first[begin], first[begin + 1]], axis=1))
+    key = edges.a * len(edges.points) + edges.b
+    order = np.argsort(key)
+    place = np.searchsorted(key[order], number[:, 0] * len(edges.points) + number[:, 1])
+    return cells, row[edges.cell[order[place]]]
+
+
+def _numbers(points: Float, wanted: Float) -> Int:
+    """The number (...,) of each wanted point (..., 2) in points (k, 2), which are sorted by x, then y."""
+    grid = np.round(points / PRECISION).astype(np.int64)
+    low, high = grid.min(axis=0), grid.max(axis=0)
+    width = high[1] - low[1] + 1
+    key = (grid[:, 0] - low[0]) * width + grid[:, 1] - low[1]
+    target = np.round(wanted / PRECISION).astype(np.int64) - low
+    number: Int = np.searchsorted(key, target[..., 0] * width + target[..., 1])
+    return number

@@ -1,0 +1,206 @@
+"""The ground is one surface: no gaps, no overlaps, no T-junctions, and tiles that meet."""
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geoscene.classes import Class, materials
+from geoscene.errors import InputError
+from geoscene.ground import (
+    Layers,
+    building_pads,
+    concatenate_layers,
+    drape,
+    ground_tile,
+    partition,
+    partition_tile,
+    plan_ground,
+    triangulate,
+)
+from geoscene.ground.partition import PRECISION, SLIVER, tile_box
+from geoscene.mesh import concatenate
+
+EXTENT = (-30.0, -20.0, 30.0, 45.0)
+GRASS = materials()["grass"].code
+
+
+def blobs(seed, count=12):
+    """Stars, some with holes, some hanging out of the extent, on no grid."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for _ in range(count):
+        middle, reach = rng.uniform(-35, 50, 2), rng.uniform(0.5, 25)
+        turn = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 12)))
+        radius = reach * rng.uniform(0.3, 1, len(turn))
+        star = shapely.Polygon(middle + radius[:, None] * np.column_stack([np.cos(turn), np.sin(turn)]))
+        star = shapely.make_valid(star, method="structure", keep_collapsed=False)
+        if rng.random() < 0.4:
+            star = star.difference(shapely.Point(middle).buffer(reach / 4, quad_segs=3))
+        out.append(star)
+    return out
+
+
+def layers_of(polygons, rng):
+    n = len(polygons)
+    klass = rng.choice([Class.GRASS, Class.WATER, Class.ROAD], n)
+    return Layers.of(
+        polygons, klass=klass, material=GRASS, priority=rng.integers(0, 5, n), feature=np.arange(n)
+    )
+
+
+def edge_counts(faces):
+    """Undirected edges (k, 2) and in how many faces each is."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return np.unique(edges, axis=0, return_counts=True)
+
+
+def welded(mesh):
+    """Vertices of equal coordinates made one."""
+    points, number = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    return points, number.reshape(-1)[mesh.faces]
+
+
+def on_border(points, edges, extent):
+    ends = points[edges][:, :, :2]
+    low, high = np.array(extent[:2]), np.array(extent[2:])
+    return ((ends == low).all(axis=1) | (ends == high).all(axis=1)).any(axis=1)
+
+
+def assert_one_surface(points, faces, extent):
+    """Every edge has two faces, but one on the border of the extent; nothing is doubled or missing."""
+    edges, count = edge_counts(faces)
+    border = on_border(points, edges, extent)
+    assert (count[~border] == 2).all()
+    assert (count[border] == 1).all()
+    a, b, c = (points[faces[:, k], :2] for k in range(3))
+    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    area = (ux * vy - uy * vx) / 2
+    assert (area > 0).all()
+    assert area.sum() == pytest.approx((extent[2] - extent[0]) * (extent[3] - extent[1]), rel=1e-9)
+
+
+@given(st.integers(0, 2**32), st.sampled_from([0.0, 4.0, 7.0]), st.sampled_from([16.0, 25.0, 200.0]))
+@settings(max_examples=40, deadline=None)
+def test_the_ground_is_one_surface_across_tiles(seed, lines, size):
+    rng = np.random.default_rng(seed)
+    plan = plan_ground(EXTENT, layers_of(blobs(seed), rng), tile_size=size, lines=lines)
+    mesh = concatenate([ground_tile(plan, i, j) for i, j in plan.tiles])
+    assert_one_surface(*welded(mesh), EXTENT)
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=25, deadline=None)
+def test_a_point_belongs_to_the_highest_polygon_over_it(seed):
+    rng = np.random.default_rng(seed)
+    layers = layers_of(blobs(seed), rng)
+    cells = partition(EXTENT, layers, tile_size=25.0)
+    xy = rng.uniform(EXTENT[:2], EXTENT[2:], (300, 2))
+    points = shapely.points(xy)
+    # Within a sliver's width of an outline either side may have it.
+    clear = shapely.distance(points, shapely.union_all(shapely.boundary(layers.polygon))) > SLIVER
+    for x, y in xy[clear]:
+        over = shapely.contains_xy(layers.polygon, x, y)
+        ranked = np.where(over, layers.priority, -1)
+        expected = int(np.argmax(ranked)) if over.any() else -1
+        [cell] = np.flatnonzero(shapely.contains_xy(cells.polygon, x, y))
+        assert cells.row[cell] == expected
+
+
+@given(st.integers(0, 2**32))
+@settings(max_examples=15, deadline=None)
+def test_a_tile_does_not_depend_on_which_others_are_made(seed):
+    rng = np.random.default_rng(seed)
+    layers = layers_of(blobs(seed), rng)
+    plan = plan_ground(EXTENT, layers, tile_size=16.0, lines=8.0)
+    i, j = plan.tiles[rng.integers(len(plan.tiles))]
+    alone = ground_tile(plan, i, j)
+    xmin, ymin, xmax, ymax = tile_box(plan, i, j)
+    near = shapely.intersects(layers.polygon, shapely.box(xmin - 1, ymin - 1, xmax + 1, ymax + 1))
+    without_the_far = ground_tile(plan_ground(EXTENT, layers.take(near), tile_size=16.0, lines=8.0), i, j)
+    np.testing.assert_array_equal(alone.vertices, without_the_far.vertices)
+    np.testing.assert_array_equal(alone.faces, without_the_far.faces)
+    np.testing.assert_array_equal(alone.feature, without_the_far.feature)
+
+
+def test_outlines_on_tile_borders_and_grid_ties_still_meet():
+    """Edges along a tile's side, corners on it, and crossings half a grid step off it."""
+    half = PRECISION / 2
+    polygons = [
+        shapely.box(-10, 0, 16, 10),  # ends on a side
+        shapely.box(16, 5, 25, 20),  # begins on it
+        shapely.Polygon([(16, -5), (24, -12), (8, -12)]),  # a corner on it
+        shapely.Polygon([(0, 30), (16 - half, 38), (32, 30)]),
+        shapely.Polygon([(0, 31 + half), (16 + half, 39 + half), (30, 31)]),
+        shapely.Polygon([(-3, 16), (29, 16 + half), (29, 16 - half)]),  # thinner than the grid
+    ]
+    layers = Layers.of(polygons, klass=Class.GRASS, material=GRASS, priority=np.arange(6))
+    plan = plan_ground(EXTENT, layers, tile_size=16.0)
+    mesh = concatenate([ground_tile(plan, i, j) for i, j in plan.tiles])
+    assert_one_surface(*welded(mesh), EXTENT)
+
+
+def test_vertices_stay_where_they_are_when_moved_to_a_tile():
+    """A power of two as the grid: whole metres off and on again give the same numbers."""
+    plan = plan_ground(EXTENT, layers_of(blobs(3), np.random.default_rng(3)), tile_size=25.0)
+    mesh = ground_tile(plan, 0, 0)
+    assert (mesh.shifted((-5000, 4000, 0)).shifted((5000, -4000, 0)).vertices == mesh.vertices).all()
+
+
+def test_a_gap_thinner_than_a_sliver_is_closed_and_a_kerb_is_not():
+    gap = SLIVER / 2
+    left, right = shapely.box(0, 0, 10, 10), shapely.box(10 + gap, 0, 20, 10)
+    kerb = shapely.box(0, 10, 20, 10.1)
+    layers = Layers.of(
+        [left, right, kerb], klass=[Class.GRASS, Class.ROAD, Class.KERB], material=GRASS, priority=[1, 2, 3]
+    )
+    cells = partition((0, 0, 20, 20), layers)
+    assert cells.slivers == 1
+    assert not shapely.contains_xy(cells.polygon[cells.row < 0], 10 + gap / 2, 5).any()
+    assert shapely.area(cells.polygon[cells.klass == Class.KERB]).sum() == pytest.approx(2.0, abs=0.01)
+
+
+def test_pads_win_over_roads_and_carry_the_buildings_number():
+    house = shapely.box(0, 0, 10, 10)
+    road = Layers.of([shapely.box(-20, 4, 20, 6)], klass=Class.ROAD, material=1, priority=100.0)
+    layers = concatenate_layers([building_pads([None, house], feature=[7, 8]), road])
+    cells = partition((-20, -20, 20, 20), layers)
+    area = {int(k): shapely.area(cells.polygon[cells.klass == k]).sum() for k in np.unique(cells.klass)}
+    assert area == pytest.approx({Class.BUILDING_PAD: 100.0, Class.ROAD: 60.0, Class.TERRAIN: 1440.0})
+    assert set(cells.feature[cells.klass == Class.BUILDING_PAD]) == {8}
+
+
+def test_rings_that_touch_in_a_point_and_courtyards_are_triangulated_wholly():
+    holes = [[(2, 2), (4, 5), (2, 8)], [(4, 5), (8, 2), (8, 8)]]  # they touch at (4, 5)
+    block = shapely.Polygon([(0, 0), (10, 0), (10, 10), (0, 10)], holes)
+    cells = partition((-5, -5, 15, 15), Layers.of([block], klass=Class.GRASS, material=GRASS, priority=1))
+    triangles = triangulate(cells)
+    covered = triangles.cell[np.argsort(triangles.cell)]
+    assert len(np.unique(covered)) == len(cells)
+    assert shapely.area(cells.polygon[cells.row == 0]).sum() == pytest.approx(block.area)
+
+
+def test_faces_keep_class_material_and_feature_of_their_cell():
+    layers = Layers.of([shapely.box(0, 0, 5, 5)], klass=Class.SAND, material=10, priority=1, feature=42)
+    plan = plan_ground((-5, -5, 10, 10), layers)
+    cells = partition_tile(plan, 0, 0)
+    mesh = drape(plan, cells, triangulate(cells))
+    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    sandy = (middle[:, :2] > 0).all(axis=1) & (middle[:, :2] < 5).all(axis=1)
+    assert sandy.any()
+    assert (mesh.klass == np.where(sandy, Class.SAND, Class.TERRAIN)).all()
+    assert (mesh.feature == np.where(sandy, 42, -1)).all()
+    assert (mesh.material[sandy] == 10).all()
+    assert (mesh.color[sandy] == materials()["sand"].color).all()
+
+
+@pytest.mark.parametrize("extent", [(0, 0, 0, 5), (0, 0, np.nan, 5), (3, 0, 1, 5)])
+def test_an_extent_without_area_is_refused(extent):
+    with pytest.raises(InputError, match="extent"):
+        plan_ground(extent, concatenate_layers([]))
+
+
+def test_a_tile_outside_the_extent_is_refused():
+    with pytest.raises(InputError, match=r"\(9, 9\)"):
+        partition_tile(plan_ground(EXTENT, concatenate_layers([])), 9, 9)
