@@ -1,0 +1,149 @@
+"""From what a pulse's rays meet to the echoes it has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Echoes:
+    """Surfaces or echoes, one row each, sorted by pulse.
+
+    pulse    : (m,) int32, row of the pulse
+    range    : (m,) float64, metres from the beam's start, along the beam's axis
+    apparent : (m,) float64, reflectance of the white Lambertian target, square on and as large as the beam,
+               that would send back as much
+    feature, klass, cosine : (m,) of the surface, as in `lidar.cloud.Cloud`; cosine of the incidence
+    true_range : (m,) float64, metres to the surface whose number and class the row bears
+    axis       : (m,) bool, the beam's axis itself meets that surface
+    """
+
+    pulse: NDArray[np.int32]
+    range: Float
+    apparent: Float
+    feature: NDArray[np.int32]
+    klass: NDArray[np.uint8]
+    cosine: Float
+    true_range: Float
+    axis: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.pulse)
+
+    def take(self, rows: NDArray[Any]) -> Echoes:
+        """Chosen rows."""
+        return Echoes(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+def joined(first: Echoes, *others: Echoes) -> Echoes:
+    """All rows, sorted by pulse and range."""
+    together = (first, *(other for other in others if len(other)))
+    if len(together) == 1:
+        return first
+    both = Echoes(*(np.concatenate([getattr(e, f.name) for e in together]) for f in fields(Echoes)))
+    return both.take(np.lexsort((both.range, both.pulse)))
+
+
+def merged(surfaces: Echoes, separation: float) -> Echoes:
+    """The echoes of pulses that meet these surfaces.
+
+    Surfaces of a pulse that follow each other within ``separation`` metres are one echo: it lies at their
+    mean range, weighted by received power, and has their power together. It bears the feature, class,
+    incidence and true range of the surface that the beam's axis meets, if that is among them, else of the
+    one that sends back most.
+    """
+    if not len(surfaces):
+        return surfaces
+    starts = np.flatnonzero(np.diff(surfaces.pulse, prepend=-1, append=-1)).astype(np.int64)
+    m = len(surfaces)
+    bearer, place, power = np.empty(m, np.int64), np.empty(m), np.empty(m)
+    count = _merge(starts, surfaces.range, surfaces.apparent, surfaces.axis, separation, bearer, place, power)
+    return replace(surfaces.take(bearer[:count]), range=place[:count], apparent=power[:count])
+
+
+@njit(cache=True, nogil=True)
+def _merge(
+    starts: Any,
+    distance: Any,
+    apparent: Any,
+    axis: Any,
+    separation: Any,
+    bearer: Any,
+    place: Any,
+    power: Any,
+) -> Any:
+    """Fill the columns of the echoes; the number of them."""
+    count = 0
+    row = np.empty(256, np.int64)
+    for p in range(len(starts) - 1):
+        first, size = starts[p], starts[p + 1] - starts[p]
+        if size > len(row):
+            row = np.empty(2 * size, np.int64)
+        for i in range(size):  # insertion sort by range
+            j = i
+            while j > 0 and distance[row[j - 1]] > distance[first + i]:
+                row[j] = row[j - 1]
+                j -= 1
+            row[j] = first + i
+        total = moment = most = 0.0
+        best = row[0]
+        for i in range(size):
+            s = row[i]
+            r = max(distance[s], 1e-3)
+            received = apparent[s] / (r * r)
+            if axis[s] or (received > most and not axis[best]):
+                best = s
+            most = max(most, received)
+            total += received
+            moment += received * distance[s]
+            if i == size - 1 or distance[row[i + 1]] - distance[s] > separation:
+                mean = moment / total if total > 0 else distance[best]
+                bearer[count], place[count], power[count] = best, mean, total * mean * mean
+                count += 1
+                total = moment = most = 0.0
+                best = row[min(i + 1, size - 1)]
+    return count
+
+
+def numbered(echoes: Echoes) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Number of each echo in its pulse, from 1, and echoes of that pulse; rows sorted by pulse and range."""
+    if not len(echoes):
+        return np.empty(0, np.uint8), np.empty(0, np.uint8)
+    starts = np.flatnonzero(np.diff(echoes.pulse, prepend=-1))
+    size = np.diff(starts, append=len(echoes))
+    number = np.arange(len(echoes)) - np.repeat(starts, size) + 1
+    return number.astype(np.uint8), np.repeat(size, size).astype(np.uint8)
+
+
+def reported(
+    echoes: Echoes, amplitude: Float, mode: str, *, most: int, second: bool = False
+) -> NDArray[np.int64]:
+    """Rows that a sensor reports in a return mode; rows sorted by pulse and range.
+
+    mode   : ``strongest`` (the nearer of equals), ``first``, ``last``, ``dual`` (strongest and last), ``all``
+    most   : in ``all``, the first echoes of a pulse that are reported
+    second : in ``dual``, where one echo is strongest and last, the second strongest is reported with it
+    """
+    number, size = numbered(echoes)
+    last = number == size
+    if mode in ("all", "first", "last"):
+        rows = {"all": number <= most, "first": number == 1, "last": last}[mode]
+        return np.flatnonzero(rows).astype(np.int64)
+    pulse = echoes.pulse
+    by_power = np.lexsort((-amplitude, pulse))  # stable: of equal amplitudes the nearer comes first
+    rank = np.empty(len(echoes), np.int64)
+    rank[by_power] = number - 1  # both run through each pulse from its first row
+    chosen = rank == 0
+    if mode == "dual":
+        if second:
+            chosen |= (rank == 1) & np.isin(pulse, pulse[chosen & last])
+        chosen |= last
+    return np.flatnonzero(chosen).astype(np.int64)

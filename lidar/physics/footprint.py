@@ -1,0 +1,48 @@
+"""A beam as a bundle of rays."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.errors import InputError
+
+Float = NDArray[np.float64]
+
+
+def ring_energy(rings: int, *, waist: float = 1.0) -> Float:
+    """Share of a Gaussian beam's power in each of the equally wide rings that fill its 1/e^2 radius.
+
+    The outer edges are at (i + 1/2) / (rings - 1/2) of that radius, so that ring 0 is a disc of half a ring's
+    width, as in HELIOS++ (Winiwarter et al. 2022). ``waist`` is the 1/e^2 radius over the outer edge: 1 is
+    the physical choice and leaves 13.5 % outside; HELIOS++ takes 2.
+    """
+    edge = (np.arange(rings) + 0.5) / (rings - 0.5)
+    inside = 1 - np.exp(-2 * (edge / waist) ** 2)
+    energy: Float = np.diff(inside, prepend=0.0)
+    return energy
+
+
+@functools.cache
+def bundle(rays: int) -> tuple[Float, Float]:
+    """Places (rays, 2) on the unit disc, the axis first, and shares of power (rays,), which add up to 1.
+
+    Ring i has 6 i rays at i / (rings - 1/2) of the 1/e^2 radius: 1, 7, 19, 37 or 61 in all.
+
+    Raises InputError for another number of rays.
+    """
+    rings = next((k for k in range(1, 6) if 1 + 3 * k * (k - 1) == rays), 0)
+    if not rings:
+        raise InputError(f"{rays} rays a pulse: 1, 7, 19, 37 or 61 are wanted")
+    if rings == 1:
+        return np.zeros((1, 2)), np.ones(1)
+    energy = ring_energy(rings)
+    places, shares = [np.zeros((1, 2))], [energy[:1]]
+    for i in range(1, rings):
+        angle = 2 * np.pi * (np.arange(6 * i) + 0.5 * (i % 2)) / (6 * i)
+        places.append(i / (rings - 0.5) * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        shares.append(np.full(6 * i, energy[i] / (6 * i)))
+    share = np.concatenate(shares)
+    return np.concatenate(places), share / share.sum()

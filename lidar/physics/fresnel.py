@@ -1,0 +1,54 @@
+"""Glass and water: what they mirror and what they let through."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.float64]
+
+AIR, WATER, GLASS = 1.0003, 1.33, 1.5
+"""Refractive indices."""
+
+_SLOPE_CALM, _SLOPE_WIND = 0.003, 0.00512  # Cox and Munk 1954: mean square slope 0.003 + 0.00512 U
+
+
+def fresnel(cosine: ArrayLike, index: float, *, outside: float = AIR) -> tuple[Float, Float]:
+    """Reflected shares of power (s, p) at a smooth boundary, by the cosine of incidence."""
+    ci = np.asarray(cosine, float)
+    ct = np.sqrt(1 - (outside / index) ** 2 * (1 - ci * ci))
+    s: Float = ((outside * ci - index * ct) / (outside * ci + index * ct)) ** 2
+    p: Float = ((index * ci - outside * ct) / (index * ci + outside * ct)) ** 2
+    return s, p
+
+
+def surface_reflection(cosine: ArrayLike, index: float = WATER) -> Float:
+    """Reflected share of unpolarised light at one boundary."""
+    s, p = fresnel(cosine, index)
+    return (s + p) / 2
+
+
+def pane_reflection(cosine: ArrayLike, index: float = GLASS) -> Float:
+    """Reflected share of unpolarised light at a pane: both faces, all passes between them, no loss."""
+    s, p = fresnel(cosine, index)
+    return s / (1 + s) + p / (1 + p)
+
+
+def glint(cosine: ArrayLike, *, wind: float = 3.0) -> Float:
+    """Apparent reflectance of open water seen from straight above or nearly: facets that mirror back.
+
+    R / (4 m cos^5) exp(-tan^2 / m) with the slope variance m of Cox and Munk (1954) for a wind in m/s: their
+    radar and laser cross-section, as the Lambertian reflectance that returns as much.
+    """
+    c = np.maximum(np.asarray(cosine, float), 1e-3)
+    slope = _SLOPE_CALM + _SLOPE_WIND * wind
+    tan2 = (1 - c * c) / (c * c)
+    back: Float = float(surface_reflection(1.0)) / (4 * slope * c**5) * np.exp(-tan2 / slope)
+    return back
+
+
+def mirrored(direction: Float, normal: Float) -> Float:
+    """Directions (n, 3) after a mirror with unit normals (n, 3); lengths are kept."""
+    along = np.einsum("ij,ij->i", direction, normal)[:, None]
+    turned: Float = direction - 2 * along * normal
+    return turned

@@ -1,0 +1,26 @@
+"""Calibrated reflectivity as scanners code it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+BRIGHTEST = 1000.0
+"""Apparent reflectance that has the code 255: high-intensity sheeting, typical value."""
+
+
+def reflectivity_code(
+    apparent: Float, *, diffuse_code: float = 100.0, whole: bool = False
+) -> NDArray[np.float32]:
+    """Codes 0 to 255 of apparent reflectances.
+
+    Linear up to ``diffuse_code`` for a perfect white Lambertian target square on, logarithmic above, 255 from
+    `BRIGHTEST` on: the rule of Velodyne, RoboSense and Ouster, whose manuals give the ranges of codes; the
+    base of the logarithm is not published. ``whole`` rounds them, as the instruments do.
+    """
+    bright = np.log10(np.maximum(apparent, 1.0)) / np.log10(BRIGHTEST)
+    code = diffuse_code * np.clip(apparent, 0, 1) + (255.0 - diffuse_code) * np.minimum(bright, 1.0)
+    coded: NDArray[np.float32] = (np.round(code) if whole else code).astype(np.float32)
+    return coded

@@ -1,0 +1,67 @@
+"""Power on the receiver, and whether it is noticed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import erfc
+
+Float = NDArray[np.float64]
+
+GATE = 0.3
+"""Metres of range in which noise has one chance to pass the threshold."""
+
+_DAYLIGHT = 20_000.0  # lux at which daylight doubles the noise power, typical value
+
+
+def amplitude(
+    apparent: ArrayLike,
+    distance: ArrayLike,
+    *,
+    reference_reflectance: float,
+    reference_range: float,
+    extinction: float = 0.0,
+) -> Float:
+    """Received power over the detection threshold of extended targets.
+
+    (rho / rho_ref) (R_ref / R)^2 exp(-2 alpha R): the link equation, scaled so that the target of the data
+    sheet, rho_ref at R_ref, stands at the threshold. The longest range goes with the square root of rho.
+
+    apparent   : reflectance times the law of incidence
+    distance   : metres
+    extinction : 1/m, one way
+    """
+    r = np.maximum(np.asarray(distance, float), 1e-3)
+    scale = np.asarray(apparent, float) / reference_reflectance
+    received: Float = scale * (reference_range / r) ** 2 * np.exp(-2 * extinction * r)
+    return received
+
+
+def apparent_of(
+    received: ArrayLike, distance: ArrayLike, *, reference_reflectance: float, reference_range: float
+) -> Float:
+    """Reflectance that a scanner takes a target to have, whose power it received from a distance in metres.
+
+    The inverse of `amplitude` in clear air, which is what instruments assume.
+    """
+    reflectance: Float = (
+        np.asarray(received) * reference_reflectance * (np.asarray(distance) / reference_range) ** 2
+    )
+    return reflectance
+
+
+def daylight_noise(noise_ratio: float, lux: float) -> float:
+    """Noise over threshold under a light on the scene: shot noise power grows with it, typical values."""
+    return float(noise_ratio * np.sqrt(1 + lux / _DAYLIGHT))
+
+
+def detection_probability(received: ArrayLike, noise_ratio: float) -> Float:
+    """Probability that an echo passes the threshold, with Gaussian noise of ``noise_ratio`` thresholds."""
+    probability: Float = 0.5 * erfc((1 - np.asarray(received, float)) / (np.sqrt(2) * noise_ratio))
+    return probability
+
+
+def false_alarm_probability(noise_ratio: float, reach: float) -> float:
+    """Probability that noise passes the threshold somewhere within ``reach`` metres of one pulse."""
+    gate = 0.5 * erfc(1 / (np.sqrt(2) * noise_ratio))
+    return float(-np.expm1(reach / GATE * np.log1p(-gate)))

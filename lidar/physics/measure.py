@@ -1,0 +1,51 @@
+"""How far a measured range is off."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.float64]
+
+RESOLUTION = 0.09
+"""Metres, range resolution in `signal_sigma`: the default of LISA (Kilic et al. 2021)."""
+
+_WALK = 0.005  # metres nearer per decade of amplitude, typical value
+
+
+def signal_sigma(received: ArrayLike, resolution: float = RESOLUTION) -> Float:
+    """Standard deviation in metres of ranges by received power over threshold.
+
+    dR / sqrt(2 SNR), as in LISA (Kilic et al. 2021).
+    """
+    sigma: Float = resolution / np.sqrt(2 * np.asarray(received, float))
+    return sigma
+
+
+def stretch_sigma(distance: ArrayLike, cosine: ArrayLike, divergence: float) -> Float:
+    """Standard deviation in metres that a footprint's depth on a slanted surface adds.
+
+    The 1/e^2 footprint is R B tan(theta) deep; a Gaussian has a quarter of its 1/e^2 width as deviation. Held
+    to the distance itself, for beams that graze.
+    """
+    c = np.maximum(np.asarray(cosine, float), 1e-3)
+    depth = np.asarray(distance, float) * divergence * np.sqrt(np.maximum(1 - c * c, 0)) / c
+    sigma: Float = np.minimum(depth, np.asarray(distance, float)) / 4
+    return sigma
+
+
+def walk(received: ArrayLike) -> Float:
+    """Metres by which a bright echo appears nearer (negative): its flank crosses the threshold earlier."""
+    error: Float = -_WALK * np.log10(np.maximum(np.asarray(received, float), 1.0))
+    return error
+
+
+def quantised(distance: Float, quantum: float) -> Float:
+    """Distances as whole multiples of ``quantum`` metres; unchanged if that is 0."""
+    if quantum <= 0:
+        return distance
+    # By the steps to the metre, where they are whole: 3 steps of 2 mm are 0.006, not 0.006000000000000001.
+    steps = round(1 / quantum)
+    if abs(steps * quantum - 1) < 1e-9:
+        return np.round(distance * steps) / steps
+    return quantum * np.round(distance / quantum)

@@ -1,0 +1,34 @@
+"""Random numbers that depend on what they are for, not on what was drawn before."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+Float = NDArray[np.float64]
+
+
+def generator(seed: int, *words: object) -> np.random.Generator:
+    """A Philox generator keyed by a seed and words such as sensor, frame and purpose."""
+    text = "/".join(str(word) for word in (seed, *words))
+    digest = hashlib.blake2b(text.encode(), digest_size=16).digest()
+    return np.random.Generator(np.random.Philox(key=int.from_bytes(digest, "little")))
+
+
+def normal_of(number: NDArray[np.integer], seed: int) -> Float:
+    """A standard normal deviate for each whole number, the same whenever it is asked for.
+
+    SplitMix64 (Steele, Lea and Flood 2014) of number and seed, through the inverse normal distribution.
+    """
+    with np.errstate(over="ignore"):
+        x = number.astype(np.uint64) + np.uint64(seed % 2**64) * np.uint64(0xD1342543DE82EF95)
+        x = (x + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        x ^= x >> np.uint64(31)
+    uniform = ((x >> np.uint64(11)).astype(np.float64) + 0.5) / 2.0**53
+    normal: Float = ndtri(uniform)
+    return normal

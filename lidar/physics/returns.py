@@ -1,0 +1,146 @@
+"""From echoes to what is reported: lost, false and measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from lidar.physics.echoes import Echoes
+from lidar.physics.effects import Effects
+from lidar.physics.link import amplitude, apparent_of, daylight_noise, false_alarm_probability
+from lidar.physics.measure import quantised, signal_sigma, stretch_sigma, walk
+from lidar.physics.random import generator
+from lidar.physics.reflect import RETRO
+from lidar.sensors.beams import Firings
+from lidar.sensors.preset import Sensor
+
+Float = NDArray[np.float64]
+
+_BLOOM_ANGLE, _BLOOM_CHANCE = np.radians(0.3), 0.3  # typical values
+_BLOOM_POWER = 0.01  # of the retro-reflector's power, assumed
+_OVERLAP = 5e-5  # probability that another scanner's pulse enters a shot, typical value (1e-5 to 1e-4)
+
+
+def received(sensor: Sensor, echoes: Echoes, effects: Effects) -> Float:
+    """Power over threshold of each echo."""
+    return amplitude(
+        echoes.apparent,
+        echoes.range + sensor.pattern.range_offset,
+        reference_reflectance=sensor.reference_reflectance,
+        reference_range=sensor.reference_range,
+        extinction=effects.extinction,
+    )
+
+
+def detected(sensor: Sensor, echoes: Echoes, effects: Effects, rng: np.random.Generator) -> Echoes:
+    """The echoes that pass the threshold, with the apparent reflectance that the sensor measures.
+
+    With ``detection``, noise is added to each echo's power before it meets the threshold, which gives the
+    probability of `lidar.physics.link.detection_probability`, and is part of the measured reflectance.
+    """
+    power = received(sensor, echoes, effects)
+    measured = power
+    if effects.detection:
+        measured = power + daylight_noise(sensor.noise_ratio, effects.daylight_lux) * rng.standard_normal(
+            len(echoes)
+        )
+    seen = measured > 1
+    apparent = echoes.apparent * measured / np.maximum(power, 1e-300)
+    return replace(echoes, apparent=apparent).take(seen)
+
+
+def false_echoes(
+    sensor: Sensor, pulses: Firings, echoes: Echoes, effects: Effects, seed: int, frame: int
+) -> list[Echoes]:
+    """Echoes of nothing that is there: blooming, other scanners, noise over the threshold."""
+    found = []
+    if effects.blooming:
+        rng = generator(seed, sensor.name, frame, "blooming")
+        found.append(_blooming(pulses, echoes, rng))
+    if effects.interference:
+        rng = generator(seed, sensor.name, frame, "interference")
+        pulse = np.flatnonzero(rng.random(len(pulses)) < 1 - (1 - _OVERLAP) ** effects.interference)
+        power = 100 ** rng.random(len(pulse))  # log-uniform over two decades, assumed
+        found.append(_anywhere(sensor, pulse, power, rng))
+    if effects.false_alarms:
+        rng = generator(seed, sensor.name, frame, "false alarms")
+        noise = daylight_noise(sensor.noise_ratio, effects.daylight_lux)
+        chance = false_alarm_probability(noise, sensor.max_range - sensor.min_range)
+        pulse = np.flatnonzero(rng.random(len(pulses)) < chance)
+        # Beyond a high threshold the tail of a Gaussian falls like an exponential.
+        power = 1 + noise**2 * rng.standard_exponential(len(pulse))
+        found.append(_anywhere(sensor, pulse, power, rng))
+    return found
+
+
+def _nothing(pulse: NDArray[np.integer], distance: Float, apparent: Float) -> Echoes:
+    """Echoes that belong to no surface; their true range is 0."""
+    n = len(pulse)
+    return Echoes(
+        pulse.astype(np.int32),
+        distance,
+        apparent,
+        np.full(n, -1, np.int32),
+        np.full(n, Class.NOISE, np.uint8),
+        np.ones(n),
+        np.zeros(n),
+        np.zeros(n, bool),
+    )
+
+
+def _anywhere(sensor: Sensor, pulse: NDArray[np.integer], power: Float, rng: np.random.Generator) -> Echoes:
+    """Echoes of given power over threshold at ranges the sensor accepts, each as likely as the other."""
+    distance = rng.uniform(sensor.min_range, sensor.max_range, len(pulse))
+    apparent = apparent_of(
+        power,
+        distance,
+        reference_reflectance=sensor.reference_reflectance,
+        reference_range=sensor.reference_range,
+    )
+    return _nothing(pulse, distance - sensor.pattern.range_offset, apparent)
+
+
+def _blooming(pulses: Firings, echoes: Echoes, rng: np.random.Generator) -> Echoes:
+    """Echoes at the range of retro-reflectors in pulses that pass close by one."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415
+
+    bright = echoes.take(echoes.apparent > RETRO)
+    if not len(bright):
+        return _nothing(np.empty(0, np.int32), np.empty(0), np.empty(0))
+    distance, nearest = cKDTree(pulses.direction[bright.pulse]).query(
+        pulses.direction, distance_upper_bound=2 * np.sin(_BLOOM_ANGLE / 2)
+    )
+    beside = np.isfinite(distance)
+    beside[bright.pulse] = False
+    pulse = np.flatnonzero(beside & (rng.random(len(pulses)) < _BLOOM_CHANCE))
+    source = nearest[pulse]
+    return _nothing(pulse, bright.range[source], _BLOOM_POWER * bright.apparent[source])
+
+
+def measured_range(
+    sensor: Sensor, pulses: Firings, echoes: Echoes, effects: Effects, seed: int, frame: int
+) -> Float:
+    """Ranges (m,) as the sensor reports them, metres."""
+    distance = echoes.range + sensor.pattern.range_offset
+    if effects.bias:
+        lasers = int(pulses.channel.max()) + 1
+        error = generator(seed, sensor.name, "bias").normal(0, sensor.bias_sigma, lasers)
+        distance = distance + error[pulses.channel[echoes.pulse]]
+    if effects.walk or effects.range_noise == "signal":
+        power = np.maximum(received(sensor, echoes, effects), 1.0)
+        if effects.walk:
+            distance = distance + walk(power)
+    if effects.range_noise != "none":
+        sigma: Float = np.full(len(echoes), sensor.range_sigma)
+        if effects.range_noise == "signal":
+            sigma = np.hypot(sigma, signal_sigma(power))
+        rng = generator(seed, sensor.name, frame, "range noise")
+        distance = distance + sigma * rng.standard_normal(len(echoes))
+    if effects.stretch and effects.rays == 1:
+        rng = generator(seed, sensor.name, frame, "stretch")
+        width = stretch_sigma(echoes.range, echoes.cosine, sensor.divergence[1])
+        distance = distance + width * rng.standard_normal(len(echoes))
+    return quantised(distance, sensor.range_quantum) if effects.quantise else distance

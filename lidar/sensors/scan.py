@@ -1,0 +1,133 @@
+"""One frame of a scanner in the world."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.cloud import Cloud
+from lidar.physics.echoes import Echoes, joined, merged, numbered, reported
+from lidar.physics.effects import PLAIN, Effects
+from lidar.physics.intensity import reflectivity_code
+from lidar.physics.random import generator
+from lidar.physics.returns import detected, false_echoes, measured_range, received
+from lidar.poses import Trajectory
+from lidar.rig import Mount
+from lidar.sensors.beams import Firings
+from lidar.sensors.motion import cast_from
+from lidar.sensors.preset import Sensor, firings
+from lidar.sensors.surfaces import met
+from lidar.world import World
+
+Float = NDArray[np.float64]
+
+
+def scan(
+    sensor: Sensor,
+    mount: Mount,
+    trajectory: Trajectory,
+    world: World,
+    frame: int,
+    *,
+    seed: int = 0,
+    effects: Effects = PLAIN,
+    threads: int = 1,
+) -> Cloud:
+    """What the sensor reports in frame ``frame`` of the drive, in the order it was fired.
+
+    Actors of the world are where their ray times say, which run from 0 to 1 over `Sensor.window_ns`. The same
+    seed, sensor name and frame give the same cloud, whatever was scanned before.
+
+    Raises BackendError if the ray engine does not work here.
+    """
+    pulses = firings(sensor, frame)
+    if not effects.motion:
+        pulses = replace(pulses, time_ns=np.full_like(pulses.time_ns, pulses.time_ns[0]))
+    rays = cast_from(
+        _unsteady(pulses, sensor, generator(seed, sensor.name, frame, "angle"))
+        if effects.angle_noise
+        else pulses,
+        mount,
+        trajectory,
+        rays=effects.rays,
+        divergence=sensor.divergence,
+        aperture=sensor.aperture,
+    )
+    offset = sensor.pattern.range_offset
+    surfaces = met(
+        rays,
+        world,
+        far=sensor.max_range - offset,
+        wavelength_nm=sensor.wavelength_nm,
+        time=_ray_time(sensor, frame, pulses, effects.rays) if _moving(world) else None,
+        effects=effects,
+        seed=seed,
+        threads=threads,
+    )
+    alone = effects.rays == 1 and not effects.mirrors
+    echoes = surfaces if alone else merged(surfaces, sensor.echo_separation)
+    echoes = echoes.take(echoes.range + offset >= sensor.min_range)
+    if effects.link or effects.detection:
+        echoes = detected(sensor, echoes, effects, generator(seed, sensor.name, frame, "detection"))
+    false = false_echoes(sensor, pulses, echoes, effects, seed, frame)
+    echoes = joined(echoes, *false)
+    number, count = numbered(echoes)
+    if not (alone and not false):
+        power = received(sensor, echoes, effects)
+        rows = reported(
+            echoes, power, sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
+        )
+        echoes, number, count = echoes.take(rows), number[rows], np.minimum(count[rows], sensor.max_echoes)
+    distance = measured_range(sensor, pulses, echoes, effects, seed, frame)
+    keep = np.flatnonzero((distance >= sensor.min_range) & (distance <= sensor.max_range))
+    return _cloud(sensor, pulses, echoes.take(keep), distance[keep], number[keep], count[keep], effects)
+
+
+def _cloud(
+    sensor: Sensor,
+    pulses: Firings,
+    echoes: Echoes,
+    distance: Float,
+    number: NDArray[np.uint8],
+    count: NDArray[np.uint8],
+    effects: Effects,
+) -> Cloud:
+    pulse, offset, start = echoes.pulse, sensor.pattern.range_offset, int(pulses.time_ns[0])
+    xyz = pulses.origin[pulse] + (distance - offset)[:, None] * pulses.direction[pulse]
+    code = reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code, whole=effects.quantise)
+    real = echoes.true_range > 0
+    return Cloud(
+        start_ns=start,
+        xyz=xyz.astype(np.float32),
+        time_ns=(pulses.time_ns[pulse] - start).astype(np.int32),
+        ring=pulses.ring[pulse],
+        column=pulses.column[pulse],
+        range=distance,
+        intensity=code,
+        klass=echoes.klass,
+        feature=echoes.feature,
+        incidence=np.arccos(echoes.cosine).astype(np.float32),
+        true_range=np.where(real, echoes.true_range + offset, 0.0),
+        echo=number,
+        echoes=count,
+    )
+
+
+def _unsteady(pulses: Firings, sensor: Sensor, rng: np.random.Generator) -> Firings:
+    """The pulses where they really go, which is not quite where the sensor says."""
+    bent = pulses.direction + sensor.angle_sigma * rng.standard_normal((len(pulses), 3))
+    return replace(pulses, direction=bent / np.linalg.norm(bent, axis=1, keepdims=True))
+
+
+def _moving(world: World) -> bool:
+    """Whether anything in the world moves during a frame."""
+    return any(group.transform.ndim == 4 for group in world.caster.instances)
+
+
+def _ray_time(sensor: Sensor, frame: int, pulses: Firings, rays: int) -> NDArray[np.float32]:
+    """Times of the rays, 0 to 1 over the frame's window."""
+    start, stop = sensor.window_ns(frame)
+    share = ((pulses.time_ns - start) / (stop - start)).astype(np.float32)
+    return np.repeat(share, rays)
