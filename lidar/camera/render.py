@@ -1,0 +1,382 @@
+"""Images of a world by ray casting: colour, depth, classes, instances and optical flow."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.classes import Class
+from lidar.camera import shade
+from lidar.camera.facades import Facades, facades_of
+from lidar.camera.light import Light, daylight
+from lidar.camera.model import pixel_rays, project
+from lidar.errors import InputError
+from lidar.poses import Poses
+from lidar.raycast import Hits
+from lidar.rig import CameraSpec
+from lidar.world import Surfaces, World
+
+Float = NDArray[np.float64]
+
+_BAND = 1 << 16
+"""Rays worked on at a time: their columns stay in the processor's cache."""
+
+_LIFT = 1e-3
+"""Metres that a shadow ray starts off its surface; more at a distance."""
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How images are made.
+
+    shadows     : cast shadows
+    detail      : draw windows, joints and grain where the scene has flat colour
+    supersample : rays along each side of a pixel, for colour only; labels and depth are those of its centre
+    visibility  : metres at which haze has taken 98 % of a contrast (Koschmieder); inf for clear air
+    exposure    : stops added to the exposure that the light asks for
+    full_well   : electrons at full scale, which set the noise of light; inf for none
+    read_noise  : electrons of noise in the dark, with a finite ``full_well``
+    threads     : threads to use; the images do not depend on it
+    """
+
+    shadows: bool = True
+    detail: bool = True
+    supersample: int = 1
+    visibility: float = 20_000.0
+    exposure: float = 0.0
+    full_well: float = float("inf")
+    read_noise: float = 4.0
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuse options that cannot be meant."""
+        if not (1 <= self.supersample <= 16 and self.visibility > 0 and self.full_well > 0 and self.threads):
+            raise InputError(f"camera options out of bounds: {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One frame of a camera, row by row from the top.
+
+    rgb     : (h, w, 3) uint8, sRGB, or None if not asked for
+    depth   : (h, w) float32, metres: along the optical axis (z) for a pinhole, along the ray for a fisheye;
+              inf for sky and beyond the camera's ``far``
+    klass   : (h, w) uint8, `geoscene.classes.Class`; SKY where nothing is hit, UNLABELED where no ray goes
+    feature : (h, w) int32, feature number in the scene, -1 for none
+    """
+
+    rgb: NDArray[np.uint8] | None
+    depth: NDArray[np.float32]
+    klass: NDArray[np.uint8]
+    feature: NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Rays in the scene and what they hit.
+
+    origin    : (k, 3) scene metres
+    row       : (n,) int32, each ray's row of ``origin``
+    direction : (n, 3) in the scene's axes
+    seen      : (n,) False for a pixel that sees nothing
+    time      : (n,) ray times, or None
+    """
+
+    origin: Float
+    row: NDArray[np.int32]
+    direction: Float
+    seen: NDArray[np.bool_]
+    time: Float | None
+    hits: Hits
+    surfaces: Surfaces
+
+
+def exposure_times(camera: CameraSpec, start_ns: int, *, samples: int = 1) -> NDArray[np.int64]:
+    """Times at which poses are needed for one frame, for `render`: ``samples`` over the exposure.
+
+    Each sample is one time, or, for a rolling shutter, one for each row from the top.
+    """
+    within = (2 * np.arange(samples) + 1) * camera.exposure_ns // (2 * samples)
+    rows = np.arange(camera.height) * camera.row_ns if camera.row_ns else np.zeros(1, np.int64)
+    times: NDArray[np.int64] = (start_ns + within[:, None] + rows[None]).ravel().astype(np.int64)
+    return times
+
+
+def render(
+    camera: CameraSpec,
+    poses: Poses,
+    world: World,
+    *,
+    sun: ArrayLike,
+    times: Float | None = None,
+    random: np.random.Generator | None = None,
+    options: RenderOptions | None = None,
+) -> Frame:
+    """One frame of a camera.
+
+    poses   : of the camera (z forward, x right, y down), one for each of `exposure_times`: a single one, one
+              a row for a rolling shutter, and that many again for every sample of the exposure; colour is
+              their mean, depth and labels are the middle sample's
+    sun     : (3,) direction towards the sun, scene axes, from `lidar.camera.sun.sun_direction`
+    times   : ray times 0 to 1 of the poses, for actors that move
+    random  : source of the noise of a finite ``options.full_well``
+
+    Raises InputError for a number of poses that does not fit the camera.
+    """
+    options = options or RenderOptions()
+    rows = camera.height if camera.row_ns else 1
+    samples, rest = divmod(len(poses), rows)
+    if rest or not samples:
+        raise InputError(f"camera {camera.name}: {len(poses)} poses for {rows} moments; see exposure_times")
+    if np.isfinite(options.full_well) and random is None:
+        raise InputError(f"camera {camera.name}: noise is asked for (full_well) without a random generator")
+    h, w = camera.height, camera.width
+    coloured = "rgb" in camera.images
+    rgb = np.empty((h, w, 3), np.uint8)
+    depth, klass = np.empty((h, w), np.float32), np.empty((h, w), np.uint8)
+    feature = np.empty((h, w), np.int32)
+    light = _light(tuple(float(c) for c in np.asarray(sun, float)))
+    walls = facades_of(world)
+    k = options.supersample
+    fine = _finer(camera, k)
+    electrons = None
+    if random is not None and np.isfinite(options.full_well):
+        electrons = random.standard_normal((h, w, 3), np.float32)
+    middle = samples // 2
+
+    def band(first: int, last: int) -> None:
+        view = _view(camera, poses, world, middle, first, last, times)
+        surfaces, distance = view.surfaces, view.hits.range
+        if coloured:
+            total = np.zeros(((last - first) * w, 3), np.float32)
+            for sample in range(samples):
+                if k > 1 or sample != middle:
+                    seen = _view(fine, poses, world, sample, first * k, last * k, times, rows=h)
+                else:
+                    seen = view
+                part = radiance(world, seen, light, walls, blur=0.0, angle=1 / fine.fx, options=options)
+                total += part if k == 1 else _binned(part, k, w)
+            exposure = light.exposure * 2.0**options.exposure / samples
+            if electrons is not None:
+                total = _noisy(total, exposure, electrons[first:last].reshape(-1, 3), options)
+            shade.develop(total, exposure, shade.transfer_table(), rgb[first:last].reshape(-1, 3))
+        near = np.where(distance <= camera.far, distance, np.inf)
+        depth[first:last] = near.reshape(-1, w)
+        sky = np.where(view.seen, np.uint8(Class.SKY), np.uint8(Class.UNLABELED))
+        klass[first:last] = np.where(np.isfinite(distance), surfaces.klass, sky).reshape(-1, w)
+        feature[first:last] = surfaces.feature.reshape(-1, w)
+
+    step = max(1, _BAND // (w * k * k))
+    edges = [(a, min(a + step, h)) for a in range(0, h, step)]
+    _each(band, edges, options.threads)
+    return Frame(rgb if coloured else None, depth, klass, feature)
+
+
+def _each(work: object, items: Iterable[tuple[int, int]], threads: int) -> None:
+    """Call ``work`` on every item, on several threads where asked."""
+    call = functools.partial(lambda f, ab: f(*ab), work)
+    if threads == 1:
+        for item in items:
+            call(item)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(call, items):
+            pass
+
+
+@functools.lru_cache(maxsize=8)
+def _light(sun: tuple[float, float, float]) -> Light:
+    return daylight(sun)
+
+
+def _finer(camera: CameraSpec, k: int) -> CameraSpec:
+    """The same camera with k by k pixels for each."""
+    return replace(
+        camera,
+        width=camera.width * k,
+        height=camera.height * k,
+        fx=camera.fx * k,
+        fy=camera.fy * k,
+        cx=(camera.cx + 0.5) * k - 0.5,
+        cy=(camera.cy + 0.5) * k - 0.5,
+    )
+
+
+def _binned(fine: NDArray[np.float32], k: int, width: int) -> NDArray[np.float32]:
+    """Means (n, 3) over blocks of k by k pixels; ``width`` is that of the coarse image."""
+    mean: NDArray[np.float32] = fine.reshape(-1, k, width, k, 3).mean(axis=(1, 3), dtype=np.float32)
+    return mean.reshape(-1, 3)
+
+
+def _view(
+    camera: CameraSpec,
+    poses: Poses,
+    world: World,
+    sample: int,
+    first: int,
+    last: int,
+    times: Float | None,
+    *,
+    rows: int | None = None,
+) -> View:
+    """What the rows first to last of a camera see in one sample of the exposure.
+
+    rows : rows of the shutter, where the camera is a finer one
+    """
+    w = camera.width
+    rays = _scaled_rays(camera)[first * w : last * w]
+    moments = (rows or camera.height) if camera.row_ns else 1
+    if moments == 1:
+        row = np.full(len(rays), sample, np.int32)
+    else:
+        line = np.arange(first, last) * moments // camera.height
+        row = np.repeat((sample * moments + line).astype(np.int32), w)
+    direction, seen = np.empty_like(rays), np.empty(len(rays), np.bool_)
+    shade.aim(rays, row, poses.rotation, poses.scale, direction, seen)
+    time = None if times is None else np.asarray(times, float)[row]
+    origin = poses.position[sample] if moments == 1 else poses.position[row]
+    hits = world.caster.cast(origin, direction, near=camera.near, time=time, normals=True)
+    if not seen.all():
+        hits = _without(hits, ~seen)
+    return View(poses.position, row, direction, seen, time, hits, world.lookup(hits))
+
+
+@functools.lru_cache(maxsize=4)
+def _pinhole_rays(camera: CameraSpec) -> Float:
+    rays = pixel_rays(camera)
+    scaled: Float = rays / rays[:, 2:]
+    return scaled
+
+
+def _scaled_rays(camera: CameraSpec) -> Float:
+    """Directions whose ray parameter is the depth that `Frame` speaks of."""
+    return pixel_rays(camera) if camera.model == "fisheye" else _pinhole_rays(camera)
+
+
+def _without(hits: Hits, gone: NDArray[np.bool_]) -> Hits:
+    """The hits with some rays turned into misses."""
+    return Hits(
+        np.where(gone, np.inf, hits.range),
+        np.where(gone, np.int32(-1), hits.face),
+        np.where(gone, np.int32(-1), hits.instance),
+        np.where(gone, np.float32(0), hits.cosine),
+        hits.normal,
+    )
+
+
+def radiance(
+    world: World,
+    view: View,
+    light: Light,
+    walls: Facades,
+    *,
+    blur: float,
+    angle: float,
+    options: RenderOptions,
+) -> NDArray[np.float32]:
+    """Linear light (n, 3) along the rays of a view, in units of `Light`.
+
+    blur, angle : a pixel is blur + angle * distance metres wide
+    """
+    hits, surfaces = view.hits, view.surfaces
+    n = len(hits)
+    normal = hits.normal
+    start, which = np.empty((n, 3)), np.empty(n, np.int64)
+    k = shade.shadow_rays(
+        view.origin, view.row, view.direction, hits.range, normal, light.direction, _LIFT, start, which
+    )
+    lit = np.zeros(n, np.bool_)
+    if k and light.beam.any():
+        which = which[:k]
+        if options.shadows:
+            towards = np.broadcast_to(light.direction, (k, 3))
+            time = None if view.time is None else view.time[which]
+            lit[which] = ~world.caster.occluded(start[:k], towards, time=time)
+        else:
+            lit[which] = True
+    out = np.empty((n, 3), np.float32)
+    if len(walls.style):
+        wall = np.where(hits.instance < 0, walls.wall[hits.face], np.int32(-1))
+    else:
+        wall = np.full(n, -1, np.int32)
+    kind, mirror = shade.material_tables()
+    shade.shade(
+        view.origin,
+        view.row,
+        view.direction,
+        hits.range,
+        normal,
+        surfaces.material,
+        surfaces.color,
+        surfaces.feature,
+        wall,
+        (walls.tangent, walls.along, walls.height, walls.style),
+        lit,
+        (light.direction, light.beam, light.ambient, light.sky, light.horizon),
+        (kind, mirror, shade.linear_table()),
+        (blur, angle, 3.912 / options.visibility, options.detail),
+        out,
+    )
+    out[~view.seen] = 0.0
+    return out
+
+
+def _noisy(
+    light: NDArray[np.float32], exposure: float, normal: NDArray[np.float32], options: RenderOptions
+) -> NDArray[np.float32]:
+    """Light with the noise of a sensor: that of counting electrons, and that of reading them."""
+    electrons = np.minimum(light * exposure, 1.0) * options.full_well
+    spread = np.sqrt(electrons + options.read_noise**2) / options.full_well
+    noisy: NDArray[np.float32] = (light + spread * normal / exposure).astype(np.float32)
+    return noisy
+
+
+def optical_flow(
+    camera: CameraSpec, poses: Poses, later: Poses, world: World, *, later_world: World | None = None
+) -> NDArray[np.float32]:
+    """How far (h, w, 2) each pixel's surface point moves in the image to a later time, pixels right and down.
+
+    NaN where it leaves the camera's field (not merely the image). Sky moves with the camera's turning alone.
+
+    poses, later : the camera's single pose at the two times; a rolling shutter is not taken into account
+    later_world  : the world with the same actors, moved; actors stand still without it
+
+    Raises InputError for more than one pose.
+    """
+    if len(poses) != 1 or len(later) != 1:
+        raise InputError(f"camera {camera.name}: optical flow needs one pose at each time")
+    still = replace(camera, row_ns=0)
+    view = _view(still, poses, world, 0, 0, camera.height, None)
+    hit = np.isfinite(view.hits.range)
+    point = poses.position + np.where(hit, view.hits.range, 1.0)[:, None] * view.direction
+    if later_world is not None:
+        point = _carried(point, view.hits, world, later_world)
+    away = np.where(hit[:, None], point - later.position, view.direction)
+    seen = (away / later.scale) @ later.rotation[0]
+    pixel, _ = project(camera, np.where(view.seen[:, None], seen, np.nan))
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    flow: NDArray[np.float32] = (pixel - np.stack([u.ravel(), v.ravel()], axis=1)).astype(np.float32)
+    return flow.reshape(camera.height, camera.width, 2)
+
+
+def _carried(point: Float, hits: Hits, world: World, later: World) -> Float:
+    """Points on instances, moved as those have moved from one world to a later one."""
+    before, after = (
+        np.concatenate([g.transform.reshape(len(g), -1, 3, 4)[:, 0] for g in w.caster.instances])
+        if w.caster.instances
+        else np.empty((0, 3, 4))
+        for w in (world, later)
+    )
+    if len(before) != len(after):
+        raise InputError(f"{len(before)} things at one time and {len(after)} later: flow needs the same ones")
+    on = np.flatnonzero(hits.instance >= 0)
+    k = hits.instance[on]
+    body = np.linalg.solve(before[k, :, :3], (point[on] - before[k, :, 3])[..., None])
+    moved = point.copy()
+    moved[on] = (after[k, :, :3] @ body)[..., 0] + after[k, :, 3]
+    return moved

@@ -1,0 +1,294 @@
+"""The light that reaches each pixel: materials under sun and sky, windows, haze. Compiled, per pixel."""
+
+# mypy: disallow-untyped-decorators=False
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from geoscene.classes import materials
+from lidar.camera import texture
+from lidar.camera.facades import PAINT, windows
+from lidar.camera.texture import detail, noise
+
+Float = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
+
+_KINDS = {
+    "asphalt": texture.SPECKLED,
+    "asphalt_fresh": texture.SPECKLED,
+    "gravel": texture.SPECKLED,
+    "soil": texture.SPECKLED,
+    "sand": texture.SPECKLED,
+    "ballast": texture.SPECKLED,
+    "tar_roof": texture.SPECKLED,
+    "paving": texture.SLABS,
+    "concrete": texture.SLABS,
+    "brick": texture.BRICK,
+    "plaster": texture.WEATHERED,
+    "stone": texture.WEATHERED,
+    "copper": texture.WEATHERED,
+    "bark": texture.WEATHERED,
+    "wood": texture.WEATHERED,
+    "grass": texture.LEAFY,
+    "dry_grass": texture.LEAFY,
+    "foliage": texture.LEAFY,
+    "conifer": texture.LEAFY,
+    "water": texture.LIQUID,
+    "roof_tile": texture.SHINGLED,
+    "slate": texture.SHINGLED,
+}
+# Reflectance straight on of what mirrors: Fresnel for n = 1.33 and 1.5 (two panes for a window), aluminium.
+_MIRROR = {"water": 0.02, "glass": 0.08, "car_paint": 0.04, "metal": 0.15, "rail_steel": 0.3}
+
+
+@functools.cache
+def material_tables() -> tuple[NDArray[np.uint8], Float]:
+    """Kind of detail (256,) and mirror reflectance straight on (256,) by material code."""
+    kind, mirror = np.zeros(256, np.uint8), np.zeros(256)
+    for name, material in materials().items():
+        kind[material.code] = _KINDS.get(name, texture.PLAIN)
+        mirror[material.code] = _MIRROR.get(name, 0.0)
+    return kind, mirror
+
+
+@functools.cache
+def linear_table() -> Float:
+    """Linear light 0..1 of sRGB bytes (256,); IEC 61966-2-1."""
+    s = np.arange(256) / 255
+    linear: Float = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+    return linear
+
+
+_STEPS = 8192
+_FULL = 4.0
+
+
+@functools.cache
+def transfer_table() -> NDArray[np.uint8]:
+    """Bytes of sRGB for exposed linear light: entry i is for ``_FULL`` * (i / (steps - 1))^2.
+
+    IEC 61966-2-1 up to 0.8 of full scale; above, highlights roll off towards white instead of clipping.
+    """
+    x = _FULL * (np.arange(_STEPS) / (_STEPS - 1)) ** 2
+    x = np.where(x > 0.8, 1.0 - 0.2 * np.exp(-(x - 0.8) / 0.2), x)
+    s = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    table: NDArray[np.uint8] = np.rint(255 * s).astype(np.uint8)
+    return table
+
+
+@compiled
+def develop(radiance: Single, exposure: float, table: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
+    """Fill ``out`` (n, 3) with the sRGB bytes of radiances (n, 3) times the exposure."""
+    scale = exposure / _FULL
+    for i in range(len(radiance)):
+        for c in range(3):
+            x = min(max(radiance[i, c] * scale, 0.0), 1.0)
+            out[i, c] = table[int(math.sqrt(x) * (_STEPS - 1) + 0.5)]
+
+
+@compiled
+def aim(
+    rays: Float, row: NDArray[np.int32], rotation: Float, scale: Float, out: Float, seen: NDArray[np.bool_]
+) -> None:
+    """Fill ``out`` (n, 3) with the scene's directions of camera rays (n, 3), ``seen`` (n,) with which exist.
+
+    The direction of a pixel that sees nothing (NaN) is the optical axis.
+    """
+    for i in range(len(rays)):
+        a, b, c = rays[i, 0], rays[i, 1], rays[i, 2]
+        seen[i] = not math.isnan(a)
+        if not seen[i]:
+            a, b, c = 0.0, 0.0, 1.0
+        o = row[i]
+        for k in range(3):
+            out[i, k] = scale[o, k] * (rotation[o, k, 0] * a + rotation[o, k, 1] * b + rotation[o, k, 2] * c)
+
+
+@compiled
+def shadow_rays(
+    origin: Float,
+    row: NDArray[np.int32],
+    direction: Float,
+    range_: Float,
+    normal: Float,
+    sun: Float,
+    lift: float,
+    start: Float,
+    which: NDArray[np.int64],
+) -> int:
+    """Number k of hits that face the sun; fills ``start`` (k, 3) just off them and ``which`` (k,) their rows.
+
+    Normals (n, 3) are turned in place to face the viewer.
+    """
+    k = 0
+    for i in range(len(range_)):
+        t = range_[i]
+        if not t < np.inf:
+            continue
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        if nx * direction[i, 0] + ny * direction[i, 1] + nz * direction[i, 2] > 0.0:
+            nx, ny, nz = -nx, -ny, -nz
+            normal[i, 0], normal[i, 1], normal[i, 2] = nx, ny, nz
+        if nx * sun[0] + ny * sun[1] + nz * sun[2] > 0.0:
+            o = row[i]
+            off = lift + 1e-6 * t
+            start[k, 0] = origin[o, 0] + t * direction[i, 0] + off * nx
+            start[k, 1] = origin[o, 1] + t * direction[i, 1] + off * ny
+            start[k, 2] = origin[o, 2] + t * direction[i, 2] + off * nz
+            which[k] = i
+            k += 1
+    return k
+
+
+@compiled
+def _sky(sky: Float, x: float, y: float, z: float, sun: Float, out: Float) -> None:
+    """Radiance of the sky towards a unit vector with z >= 0, between the entries of the table."""
+    rows, columns = sky.shape[0] - 1, sky.shape[1] - 1
+    flat = math.sqrt((x * x + y * y) * (sun[0] * sun[0] + sun[1] * sun[1]))
+    turn = (x * sun[0] + y * sun[1]) / flat if flat > 1e-12 else 0.0
+    a = math.sqrt(math.asin(min(max(z, 0.0), 1.0)) * (2.0 / math.pi)) * rows
+    b = (1.0 - min(max(turn, -1.0), 1.0)) * 0.5 * columns
+    i, j = min(int(a), rows - 1), min(int(b), columns - 1)
+    a, b = a - i, b - j
+    for c in range(3):
+        low = sky[i, j, c] + b * (sky[i, j + 1, c] - sky[i, j, c])
+        high = sky[i + 1, j, c] + b * (sky[i + 1, j + 1, c] - sky[i + 1, j, c])
+        out[c] = low + a * (high - low)
+
+
+@compiled
+def _mirrored(
+    sky: Float, sun: Float, d: Float, nx: float, ny: float, nz: float, town: Float, out: Float
+) -> None:
+    """What a mirror shows: the sky where the mirrored ray climbs, else ``town``, its lit surroundings."""
+    along = 2.0 * (nx * d[0] + ny * d[1] + nz * d[2])
+    x, y, z = d[0] - along * nx, d[1] - along * ny, d[2] - along * nz
+    _sky(sky, x, y, max(z, 0.0), sun, out)
+    s = min(max((z - 0.03) / 0.4, 0.0), 1.0)
+    for c in range(3):
+        out[c] = town[c] + s * (out[c] - town[c])
+
+
+@compiled
+def _fresnel(straight: float, cosine: float) -> float:
+    """Schlick's approximation (Computer Graphics Forum 13, 1994)."""
+    k = 1.0 - min(max(cosine, 0.0), 1.0)
+    return straight + (1.0 - straight) * k * k * k * k * k
+
+
+@compiled
+def shade(
+    origin: Float,
+    row: NDArray[np.int32],
+    direction: Float,
+    range_: Float,
+    normal: Float,
+    material: NDArray[np.uint8],
+    color: NDArray[np.uint8],
+    feature: NDArray[np.int32],
+    wall: NDArray[np.int32],
+    walls: tuple[Float, Float, Float, Float],
+    lit: NDArray[np.bool_],
+    light: tuple[Float, Float, Float, Float, Float],
+    tables: tuple[NDArray[np.uint8], Float, Float],
+    settings: tuple[float, float, float, bool],
+    out: Single,
+) -> None:
+    """Fill ``out`` (n, 3) with the radiance along each ray.
+
+    walls    : tangent, along, height, style of `lidar.camera.facades.Facades`; ``wall`` (n,) are rows of them
+    light    : direction, beam, ambient, sky, horizon of `lidar.camera.light.Light`
+    tables   : `material_tables` and `linear_table`
+    settings : size of a pixel at distance 0 (metres) and its growth with distance (radians), extinction of
+               haze (1/m), whether detail is drawn
+    """
+    tangent, along, height, style = walls
+    sun, beam, ambient, sky, horizon = light
+    kinds, mirrors, linear = tables
+    blur, angle, extinction, detailed = settings
+    glow = np.empty(3)
+    pane = np.empty(4)
+    d = np.empty(3)
+    albedo = np.empty(3)
+    irradiance = np.empty(3)
+    town = 0.6 * horizon
+    for i in range(len(range_)):
+        dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        d[0], d[1], d[2] = dx / length, dy / length, dz / length
+        t = range_[i]
+        if not t < np.inf:
+            _sky(sky, d[0], d[1], max(d[2], 0.0), sun, glow)
+            facing = d[0] * sun[0] + d[1] * sun[1] + d[2] * sun[2]
+            disc = min(max((facing - 0.999985) / 4e-6, 0.0), 1.0)  # 0.27 degrees, softened
+            for c in range(3):
+                out[i, c] = glow[c] + disc * beam[c] * 100.0
+            continue
+        o = row[i]
+        x, y, z = origin[o, 0] + t * dx, origin[o, 1] + t * dy, origin[o, 2] + t * dz
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        cosine = max(-(nx * d[0] + ny * d[1] + nz * d[2]), 0.0)
+        distance = t * length
+        size = blur + distance * angle
+        footprint = size / math.sqrt(max(cosine, 0.02))
+        m = material[i]
+        kind = kinds[m]
+        mirror = mirrors[m]
+        w = wall[i]
+        upright = abs(nz) < 0.3
+        u = 0.0
+        if w >= 0:
+            u = x * tangent[w, 0] + y * tangent[w, 1]
+        elif upright:
+            flat = math.sqrt(nx * nx + ny * ny)
+            u = (y * nx - x * ny) / flat
+
+        factor = detail(kind, upright, x, y, z, u, footprint) if detailed else 1.0
+        for c in range(3):
+            albedo[c] = linear[color[i, c]] * factor
+        glass = 0.0
+        open_sky = 1.0
+        if w >= 0:
+            foot = z - height[w, 0]
+            open_sky = 0.6 + 0.4 * min(max(foot / 9.0, 0.0), 1.0)
+            if detailed:
+                windows(u - along[w, 0], foot, style[w], size / max(cosine, 0.05), size, feature[i], pane)
+                glass, paint = pane[0], style[w, PAINT]
+                for c in range(3):
+                    albedo[c] *= 1.0 - 0.3 * pane[2]
+                    albedo[c] += pane[1] * (paint - albedo[c]) + glass * (pane[3] - albedo[c])
+
+        rx, ry, rz = nx, ny, nz
+        if kind == texture.LIQUID and detailed:
+            ripple = 0.02 / (1.0 + footprint)
+            rx += ripple * noise(x / 0.7, y / 0.7, 30)
+            ry += ripple * noise(x / 0.7 + 40.0, y / 0.7, 31)
+        shine = glass * _fresnel(0.08, cosine)
+        if mirror > 0.0:
+            shine = max(shine, _fresnel(mirror, cosine))
+
+        b4, b5, b6 = 1.092548 * nx * ny, 1.092548 * ny * nz, 0.315392 * (3.0 * nz * nz - 1.0)
+        b7, b8 = 1.092548 * nx * nz, 0.546274 * (nx * nx - ny * ny)
+        facing = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 0.0) if lit[i] else 0.0
+        for c in range(3):
+            e = 0.282095 * ambient[0, c] + 0.488603 * (
+                ny * ambient[1, c] + nz * ambient[2, c] + nx * ambient[3, c]
+            )
+            e += b4 * ambient[4, c] + b5 * ambient[5, c] + b6 * ambient[6, c]
+            e += b7 * ambient[7, c] + b8 * ambient[8, c]
+            irradiance[c] = max(e, 0.0) * open_sky + beam[c] * facing
+        if shine > 0.0:
+            _mirrored(sky, sun, d, rx, ry, rz, town, glow)
+        clear = math.exp(-extinction * distance)
+        for c in range(3):
+            r = (1.0 - shine) * albedo[c] * irradiance[c] / math.pi
+            if shine > 0.0:
+                r += shine * glow[c]
+            out[i, c] = r * clear + horizon[c] * (1.0 - clear)

@@ -1,0 +1,87 @@
+"""Images come back from their files bit for bit."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from PIL import Image
+
+from lidar.camera.png import (
+    counts_to_depth,
+    depth_to_counts,
+    encode_png,
+    feature_to_image,
+    image_to_feature,
+    read_png,
+    write_png,
+)
+from lidar.errors import FormatError
+
+SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40))
+IMAGES = st.one_of(
+    SIZES.flatmap(lambda s: hnp.arrays(np.uint8, (*s, 3))),
+    SIZES.flatmap(lambda s: hnp.arrays(np.uint8, s)),
+    SIZES.flatmap(lambda s: hnp.arrays(np.uint16, s)),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(image=IMAGES)
+def test_another_reader_finds_the_same_pixels(image, tmp_path_factory):
+    path = tmp_path_factory.mktemp("png") / "a.png"
+    write_png(path, image)
+    with Image.open(path) as opened:
+        opened.verify()  # checks every chunk's sum
+    with Image.open(path) as opened:
+        assert opened.mode == {"uint16": "I;16"}.get(image.dtype.name, "RGB" if image.ndim == 3 else "L")
+        np.testing.assert_array_equal(np.array(opened), image)
+    back = read_png(path)
+    assert back.dtype == image.dtype
+    np.testing.assert_array_equal(back, image)
+
+
+def test_same_pixels_same_bytes():
+    image = np.random.default_rng(0).integers(0, 255, (30, 40, 3), np.uint8)
+    assert encode_png(image) == encode_png(np.asfortranarray(image))
+
+
+def test_flat_images_are_small():
+    assert len(encode_png(np.full((720, 1280), 17, np.uint8))) < 10_000
+
+
+@pytest.mark.parametrize("bad", [np.zeros((3, 3, 4), np.uint8), np.zeros((3, 3)), np.zeros((0, 3), np.uint8)])
+def test_other_arrays_are_refused(bad):
+    with pytest.raises(FormatError):
+        encode_png(bad)
+
+
+def test_depth_counts_are_those_of_kitti():
+    depth = np.array([0.0, 0.0001, 1.0, 100.0, 255.99, 256.1, np.inf, np.nan], np.float32)
+    assert depth_to_counts(depth).tolist() == [1, 1, 256, 25600, 65533, 0, 0, 0]
+
+
+@settings(max_examples=50, deadline=None)
+@given(depth=hnp.arrays(np.float32, 50, elements=st.floats(0.0625, 255.875, width=32)))
+def test_depth_there_and_back_within_half_a_count(depth):
+    back = counts_to_depth(depth_to_counts(depth))
+    np.testing.assert_allclose(back, depth, atol=0.5 / 256 + 1e-4)
+
+
+def test_no_data_comes_back_as_infinity():
+    assert np.isinf(counts_to_depth(depth_to_counts(np.array([np.inf])))).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(feature=hnp.arrays(np.int32, (4, 5), elements=st.integers(-1, 2**24 - 2)))
+def test_instances_there_and_back(feature):
+    image = feature_to_image(feature)
+    assert image.dtype == np.uint8
+    np.testing.assert_array_equal(image_to_feature(image), feature)
+
+
+def test_a_file_that_is_no_image_is_named(tmp_path):
+    path = tmp_path / "a.png"
+    path.write_bytes(b"not a png")
+    with pytest.raises(FormatError, match=r"a\.png"):
+        read_png(path)
