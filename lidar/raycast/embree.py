@@ -146,7 +146,7 @@ class EmbreeScene:
             self.address,
             self._packet.ctypes.data,
             self._single.ctypes.data,
-            self._lib.width,
+            (0,) * self._lib.width,
             self.origin,
             np.array([_addresses(part) for part in parts], np.int64).reshape(-1, 5),
             rows,

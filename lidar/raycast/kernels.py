@@ -22,6 +22,7 @@ _INVALID = np.uint32(0xFFFFFFFF)
 _NUDGE = 3e-7  # radians; the smallest that closed every leak among a million rays aimed at vertices
 _COHERENT = 0.985  # cosine; packets that fan out over more than 10° are faster as single rays
 _SPREAD = 4.0  # metres; so are packets whose origins lie farther apart
+_UNIT = 1e-12  # how far the squared length of a unit vector may be from 1
 _GRAZING = 1e-3  # cosine below which a range is held within the face's extent along the ray
 _RAY, _ROWS = 12, 21  # 32-bit rows of RTCRayN and RTCRayHitN
 
@@ -30,7 +31,7 @@ class Target(NamedTuple):
     """What rays are cast at.
 
     scene, packet, single : addresses of the Embree scene and of the arguments for packets and for single rays
-    width      : rays in a packet
+    lanes      : as many zeros as rays in a packet: its length is a constant to the compiler
     origin     : (3,) float64, subtracted from scene coordinates
     parts      : (p, 5) int64, addresses of a geometry's planes, vertices, faces and face numbers (0: they
                  count up) and the first number
@@ -46,7 +47,7 @@ class Target(NamedTuple):
     scene: int
     packet: int
     single: int
-    width: int
+    lanes: tuple[int, ...]
     origin: Float
     parts: NDArray[np.int64]
     rows: NDArray[np.int32]
@@ -126,7 +127,8 @@ def pointer(context: Any, address: Any) -> Any:  # noqa: ARG001
 
 # Compiled into their callers, and without counting references to the columns, which their callers hold:
 # counting them would take ten times as long as the rest.
-inlined = njit(nogil=True, error_model="numpy", forceinline=True, _nrt=False)
+_UNCOUNTED: dict[str, Any] = {"_nrt": False}
+inlined = njit(nogil=True, error_model="numpy", forceinline=True, **_UNCOUNTED)
 
 
 @njit(nogil=True)
@@ -241,16 +243,18 @@ def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: 
 
 
 @inlined
-def exact(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> Any:
-    """Range, normal (not unit) and cosine, in float64, of a ray that meets a face."""
+def exact(target: Target, row: int, prim: int, instance: int, ray: Any, inverse: float, time: float) -> Any:
+    """Range, cosine and normal (not unit), in float64, of a ray that meets a face.
+
+    inverse : one over the length of the ray's direction
+    """
     ox, oy, oz, dx, dy, dz = ray
     nx, ny, nz, d = plane_of(target, row, prim, instance, time)
     along = nx * dx + ny * dy + nz * dz
     t = (d - nx * ox - ny * oy - nz * oz) / along
-    squared = dx * dx + dy * dy + dz * dz
+    cosine = -along * inverse
     if instance >= 0:
-        squared *= nx * nx + ny * ny + nz * nz
-    cosine = -along / np.sqrt(squared)
+        cosine /= np.sqrt(nx * nx + ny * ny + nz * nz)
     if not abs(cosine) >= _GRAZING:
         low, high = _extent(target, row, prim, instance, ray, time)
         t = high if t > high else low if not t >= low else t
@@ -277,7 +281,7 @@ def numbered(target: Target, row: int, prim: int) -> Any:
 @inlined
 def _trace(target: Target, p: int, f: Any, rows: int, valid: Any, coherent: bool, one: Any) -> None:  # noqa: FBT001
     """Trace the valid lanes of a packet, all at once or one by one."""
-    W = target.width
+    W = len(target.lanes)
     if coherent and W > 1:
         v = valid.ctypes.data
         if rows == _ROWS:
@@ -326,12 +330,14 @@ def above(x: float) -> Any:
 
 
 @inlined
-def gather(target: Target, rays: Rays, at: int, m: int, ids: Any, work: Any) -> Any:
-    """Load rays ``at`` to ``at + m`` of the order into ``work``; the bad one's number or -1, and coherence.
+def gather(target: Target, rays: Rays, at: int, m: int, ids: Any, work: Any, f: Any) -> Any:
+    """Load rays ``at`` to ``at + m`` of the order; the number of a bad one or -1, and whether they are alike.
 
-    work : (12, width) float64: origin, direction, unit direction, length, far, time
+    work : (8, width) float64: origin, direction, one over its length, far
+    f    : Embree's packet; its rays get directions of length 1
     """
-    coherent = True
+    W = len(target.lanes)
+    near = rays.near
     for k in range(m):
         i = rays.order[at + k] if rays.order.size else at + k
         ids[k] = i
@@ -339,55 +345,46 @@ def gather(target: Target, rays: Rays, at: int, m: int, ids: Any, work: Any) -> 
         squared = dx * dx + dy * dy + dz * dz
         if not usable(ox, oy, oz, squared):
             return i, False
-        length = np.sqrt(squared)
-        ux, uy, uz = dx / length, dy / length, dz / length
+        inverse = 1.0
+        if abs(squared - 1.0) > _UNIT:
+            inverse = 1.0 / np.sqrt(squared)
+        far = rays.far[i] if rays.far.size > 1 else rays.far[0]
         work[0, k], work[1, k], work[2, k] = ox, oy, oz
         work[3, k], work[4, k], work[5, k] = dx, dy, dz
-        work[6, k], work[7, k], work[8, k] = ux, uy, uz
-        work[9, k] = length
-        work[10, k] = rays.far[i] if rays.far.size > 1 else rays.far[0]
-        work[11, k] = rays.time[i] if rays.time.size else 0.0
-        coherent = (
-            coherent
-            and ux * work[6, 0] + uy * work[7, 0] + uz * work[8, 0] > _COHERENT
-            and abs(ox - work[0, 0]) + abs(oy - work[1, 0]) + abs(oz - work[2, 0]) < _SPREAD
+        work[6, k], work[7, k] = inverse, far
+        f[k], f[W + k], f[2 * W + k] = ox, oy, oz
+        f[3 * W + k] = near / inverse
+        f[4 * W + k], f[5 * W + k], f[6 * W + k] = dx * inverse, dy * inverse, dz * inverse
+        if rays.time.size:
+            f[7 * W + k] = rays.time[i]
+        f[8 * W + k] = above(far / inverse)
+    alike = True
+    for k in (m // 3, 2 * m // 3, m - 1):  # a sample tells a scan from a shuffle
+        along = work[3, 0] * work[3, k] + work[4, 0] * work[4, k] + work[5, 0] * work[5, k]
+        apart = (
+            abs(work[0, 0] - work[0, k]) + abs(work[1, 0] - work[1, k]) + abs(work[2, 0] - work[2, k])
         )
-    return -1, coherent
+        alike = alike and along * work[6, 0] * work[6, k] > _COHERENT and apart < _SPREAD
+    return -1, alike
 
 
 @inlined
-def load(rays: Rays, W: int, k: int, work: Any, f: Any, u: Any) -> None:
-    """Write lane k of ``work`` into Embree's packet, with a direction of length 1."""
-    f[k], f[W + k], f[2 * W + k] = work[0, k], work[1, k], work[2, k]
-    f[3 * W + k] = rays.near * work[9, k]
-    f[4 * W + k], f[5 * W + k], f[6 * W + k] = work[6, k], work[7, k], work[8, k]
-    f[7 * W + k] = work[11, k]
-    f[8 * W + k] = above(work[10, k] * work[9, k])
-    u[9 * W + k] = rays.mask
-    u[10 * W + k] = k
-    u[11 * W + k] = 0
+def _reload(W: int, k: int, work: Any, f: Any, far: float) -> None:
+    """Turn the direction of lane k of Embree's packet a little and let it look as far as ``far``."""
+    inverse = work[6, k]
+    x, y, z = _nudged(work[3, k] * inverse, work[4, k] * inverse, work[5, k] * inverse)
+    f[4 * W + k], f[5 * W + k], f[6 * W + k] = x, y, z
+    f[8 * W + k] = above(far / inverse)
 
 
 @inlined
-def clear(W: int, k: int, u: Any) -> None:
-    """Make lane k's hit empty."""
-    u[18 * W + k] = _INVALID
-    u[19 * W + k] = _INVALID
-    u[20 * W + k] = _INVALID
-
-
-@inlined
-def _hit(target: Target, u: Any, k: int, work: Any) -> Any:
+def _hit(target: Target, f: Any, u: Any, k: int, work: Any) -> Any:
     """Range, cosine, face, instance and normal of lane k's hit."""
-    W = target.width
-    if u[18 * W + k] == _INVALID:
-        return np.inf, 0.0, np.int64(-1), np.int64(-1), 0.0, 0.0, 0.0
+    W = len(target.lanes)
     row, instance = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
     prim = np.int64(u[17 * W + k])
     ray = (work[0, k], work[1, k], work[2, k], work[3, k], work[4, k], work[5, k])
-    t, cosine, x, y, z = exact(target, row, prim, instance, ray, work[11, k])
-    if t > work[10, k]:
-        return np.inf, 0.0, np.int64(-1), np.int64(-1), 0.0, 0.0, 0.0
+    t, cosine, x, y, z = exact(target, row, prim, instance, ray, work[6, k], f[7 * W + k])
     return t, cosine, numbered(target, row, prim), instance, x, y, z
 
 
@@ -418,50 +415,54 @@ def cast(
 
     Packets start at lo and every width from it.
     """
-    W = target.width
+    W = len(target.lanes)
     packet = aligned(4 * _ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
     one = aligned(128).view(np.float32)
     valid = aligned(4 * W).view(np.int32)
-    work = np.zeros((12, W))
-    ids = np.zeros(W, np.int64)
+    work, ids = np.zeros((8, W)), np.zeros(W, np.int64)
     p = packet.ctypes.data
+    for k in range(W):
+        u[9 * W + k] = rays.mask
+        u[10 * W + k] = k
     for at in range(lo, hi, W):
         m = min(W, hi - at)
-        bad, coherent = gather(target, rays, at, m, ids, work)
+        bad, alike = gather(target, rays, at, m, ids, work, f)
         if bad >= 0:
             return bad
         for k in range(W):
             valid[k] = -1 if k < m else 0
-        for k in range(m):
-            load(rays, W, k, work, f, u)
-            clear(W, k, u)
-        _trace(target, p, f, _ROWS, valid, coherent, one)
-        doubtful = 0
+            u[18 * W + k] = _INVALID
+            u[19 * W + k] = _INVALID
+        _trace(target, p, f, _ROWS, valid, alike, one)
+        doubtful = False
         for k in range(m):
             i = ids[k]
-            t, cosine, face, instance, x, y, z = _hit(target, u, k, work)
-            ranges[i], cosines[i], faces[i], instances[i] = t, cosine, face, instance
+            ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
+            valid[k] = -1
             if normals.size:
-                _unit(normals, i, x, y, z)
-            valid[k] = 0
-            if face < 0 or cosine < 0.0:
-                valid[k] = -1
-                doubtful += 1
-        if doubtful == 0:
+                _unit(normals, i, 0.0, 0.0, 0.0)
+            if u[18 * W + k] != _INVALID:
+                t, cosine, face, instance, x, y, z = _hit(target, f, u, k, work)
+                if t <= work[7, k]:
+                    ranges[i], cosines[i], faces[i], instances[i] = t, cosine, face, instance
+                    valid[k] = -1 if cosine < 0.0 else 0
+                    if normals.size:
+                        _unit(normals, i, x, y, z)
+            doubtful = doubtful or valid[k] != 0
+        if not doubtful:
             continue
         for k in range(m):
             if valid[k]:
-                load(rays, W, k, work, f, u)
-                clear(W, k, u)
-                f[4 * W + k], f[5 * W + k], f[6 * W + k] = _nudged(work[6, k], work[7, k], work[8, k])
-                f[8 * W + k] = min(f[8 * W + k], above(ranges[ids[k]] * work[9, k]))
-        _trace(target, p, f, _ROWS, valid, coherent, one)
+                u[18 * W + k] = _INVALID
+                u[19 * W + k] = _INVALID
+                _reload(W, k, work, f, min(work[7, k], ranges[ids[k]]))
+        _trace(target, p, f, _ROWS, valid, alike, one)
         for k in range(m):
-            if valid[k]:
+            if valid[k] and u[18 * W + k] != _INVALID:
                 i = ids[k]
-                t, cosine, face, instance, x, y, z = _hit(target, u, k, work)
-                if face >= 0 and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
+                t, cosine, face, instance, x, y, z = _hit(target, f, u, k, work)
+                if t <= work[7, k] and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
                     ranges[i], cosines[i], faces[i], instances[i] = t, cosine, face, instance
                     if normals.size:
                         _unit(normals, i, x, y, z)
@@ -471,35 +472,35 @@ def cast(
 @njit(nogil=True, cache=True, error_model="numpy")
 def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_]) -> int:
     """Fill in whether anything lies on the rays lo to hi; the first bad ray's number, or -1."""
-    W = target.width
+    W = len(target.lanes)
     packet = aligned(4 * _RAY * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
     one = aligned(64).view(np.float32)
     valid = aligned(4 * W).view(np.int32)
-    work = np.zeros((12, W))
-    ids = np.zeros(W, np.int64)
+    work, ids = np.zeros((8, W)), np.zeros(W, np.int64)
     p = packet.ctypes.data
+    for k in range(W):
+        u[9 * W + k] = rays.mask
+        u[10 * W + k] = k
     for at in range(lo, hi, W):
         m = min(W, hi - at)
-        bad, coherent = gather(target, rays, at, m, ids, work)
+        bad, alike = gather(target, rays, at, m, ids, work, f)
         if bad >= 0:
             return bad
         for k in range(W):
             valid[k] = -1 if k < m else 0
-        for k in range(m):
-            load(rays, W, k, work, f, u)
-        _trace(target, p, f, _RAY, valid, coherent, one)
-        free = 0
+        _trace(target, p, f, _RAY, valid, alike, one)
+        doubtful = False
         for k in range(m):
             out[ids[k]] = f[8 * W + k] < 0
             valid[k] = 0 if out[ids[k]] else -1
-            free += 0 if out[ids[k]] else 1
-        if free == 0:
+            doubtful = doubtful or valid[k] != 0
+        if not doubtful:
             continue
         for k in range(m):
             if valid[k]:
-                f[4 * W + k], f[5 * W + k], f[6 * W + k] = _nudged(work[6, k], work[7, k], work[8, k])
-        _trace(target, p, f, _RAY, valid, coherent, one)
+                _reload(W, k, work, f, work[7, k])
+        _trace(target, p, f, _RAY, valid, alike, one)
         for k in range(m):
             if valid[k]:
                 out[ids[k]] = f[8 * W + k] < 0
