@@ -30,9 +30,11 @@ def ramp(values: ArrayLike, low: float, high: float) -> NDArray[np.uint8]:
     at = share * (len(_VIRIDIS) - 1)
     steps = np.arange(len(_VIRIDIS))
     channels = [np.interp(at, steps, _VIRIDIS[:, k]) for k in range(3)]
-    return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
+    rgb: NDArray[np.uint8] = np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
+    return rgb
 
 
 def distinct(index: ArrayLike) -> NDArray[np.uint8]:
     """Colours (..., 3) that are easy to tell apart, repeating after eight."""
-    return _DISTINCT[np.asarray(index) % len(_DISTINCT)]
+    rgb: NDArray[np.uint8] = _DISTINCT[np.asarray(index) % len(_DISTINCT)]
+    return rgb

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,11 @@ from lidar.formats.table import Table, records, rows
 from lidar.formats.text import read_csv
 from lidar.georeference import Georeference
 from lidar.poses import Trajectory
+from lidar.sensors.beams import frame_ns
 
 Float = NDArray[np.float64]
-ColorBy = Literal["class", "height", "intensity", "sensor"]
+COLORS = ("class", "height", "intensity", "sensor")
+"""What the colours of a map may show."""
 
 _READERS = {"pcd": read_pcd, "ply": read_ply, "csv": read_csv}
 _COLUMNS = ("x", "y", "z", "intensity", "gps_time", "ring", "label", "instance", "source")
@@ -57,7 +59,7 @@ def aggregate(
     out: Path,
     *,
     voxel: float | None = None,
-    color: ColorBy = "class",
+    color: str = "class",
     sensors: Sequence[str] = (),
     progress: Progress = silent,
 ) -> MapSummary:
@@ -66,7 +68,7 @@ def aggregate(
     LAS, LAZ and PLY hold easting, northing and height in the dataset's export CRS; PCD, whose readers take
     float32 alone, the same less the whole-metre offset that its comment line states.
 
-    voxel   : side in metres of cubes of which each keeps the return nearest to its centre; all returns by default
+    voxel   : side in metres of cubes that keep the return nearest to their centre; all returns by default
     color   : what red, green and blue show
     sensors : names of the scanners to take; all by default
 
@@ -74,8 +76,8 @@ def aggregate(
     """
     if out.suffix.lower() not in _SUFFIXES:
         raise InputError(f"{out}: maps are written as {', '.join(_SUFFIXES)}")
-    if color not in get_args(ColorBy):
-        raise InputError(f"--color {color}: one of {', '.join(get_args(ColorBy))}")
+    if color not in COLORS:
+        raise InputError(f"--color {color}: one of {', '.join(COLORS)}")
     if voxel is not None and not (np.isfinite(voxel) and voxel > 0):
         raise InputError(f"--voxel {voxel}: give a positive number of metres")
     lidars = dataset.lidars
@@ -139,7 +141,7 @@ class _Source:
         if self._trajectory is None:
             self._trajectory = self.dataset.trajectory()
         sensor = self._lidars[name]
-        start = int(sensor["time_offset_ns"]) + int(sensor["period_ns"]) * frame
+        start = int(sensor["time_offset_ns"]) + int(frame * frame_ns(sensor["rate_hz"]))
         times, inverse = np.unique(table["time_ns"].astype(np.int64), return_inverse=True)
         mount = np.array(sensor["vehicle_from_sensor"])
         poses = self._trajectory.at(start + times).mounted(mount[:3, 3], mount[:3, :3]).take(inverse)
@@ -164,7 +166,7 @@ class _Source:
         return float(low), float(high)
 
 
-def _colored(table: Table, color: ColorBy, limits: tuple[float, float]) -> Table:
+def _colored(table: Table, color: str, limits: tuple[float, float]) -> Table:
     if color == "class":
         rgb = class_codes().color[table["label"]]
     elif color == "height":

@@ -97,8 +97,9 @@ class LasWriter:
         record = self._laspy.ScaleAwarePointRecord.zeros(rows(table), header=self._header)
         record.x, record.y, record.z = table["x"], table["y"], table["z"]
         record.classification = class_codes().asprs[table["label"]].astype(np.uint8)
-        record.return_number = table.get("echo", 1)
-        record.number_of_returns = table.get("echoes", 1)
+        one = np.ones(rows(table), np.uint8)
+        record.return_number = table.get("echo", one)
+        record.number_of_returns = table.get("echoes", one)
         if "intensity" in table:
             record.intensity = np.clip(np.rint(table["intensity"] * INTENSITY_UNIT), 0, 65535).astype(
                 np.uint16

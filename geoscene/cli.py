@@ -1,0 +1,252 @@
+"""The `geoscene` program: build, look into and check scenes."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import App, Group, Parameter, validators
+
+from geoscene import __version__
+from geoscene.console import FAILURE, print_json, progress_bar
+from geoscene.console import main as run
+from geoscene.errors import GeosceneError, InputError
+
+app = App(
+    name="geoscene",
+    version=__version__,
+    help="""Turn a real place from OpenStreetMap into a watertight 3D scene.
+
+    A first scene, without a network:  geoscene build --demo -o scene
+
+    Then look at it (geoscene info scene), check it (geoscene validate scene), open scene/features.gpkg in
+    QGIS, or drive through it:  lidar drive scene --route random -o drive
+    """,
+)
+app.register_install_completion_command()
+
+_SOURCE = Group("Where the map comes from (one of)", sort_key=1)
+_OUTPUT = Group("Output", sort_key=3)
+
+Numbers = Annotated[str | None, Parameter(group=_SOURCE)]
+
+
+def _numbers(text: str, option: str, names: str) -> list[float]:
+    count = names.count(",") + 1
+    try:
+        values = [float(v) for v in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise InputError(f"{option} {text.strip()}: give {count} numbers in degrees as {names}")
+    return values
+
+
+@app.command
+def build(
+    *,
+    osm: Annotated[Path | None, Parameter(group=_SOURCE)] = None,
+    place: Annotated[str | None, Parameter(group=_SOURCE)] = None,
+    bbox: Numbers = None,
+    point: Numbers = None,
+    radius: Annotated[float, Parameter(group=_SOURCE)] = 500.0,
+    demo: Annotated[bool, Parameter(group=_SOURCE, negative=())] = False,
+    crs: str = "local",
+    lod: int = 2,
+    tile_size: float = 250.0,
+    name: str = "",
+    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
+    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+) -> int:
+    """Build a scene: solids of all buildings, one ground surface, the drivable road graph.
+
+    Examples
+    --------
+    geoscene build --demo -o scene
+
+    geoscene build --osm city.osm.pbf -o scene --crs utm
+
+    geoscene build --place "Norfolk, VA" -o norfolk
+
+    geoscene build --point 36.8853,-76.3059 --radius 800 -o odu
+
+    Parameters
+    ----------
+    osm
+        OpenStreetMap file: .osm, .osm.gz, .osm.bz2 or .osm.pbf. With --bbox, the part of it inside.
+    place
+        Name of a place, asked of Nominatim and fetched from Overpass (needs a network; answers are cached).
+    bbox
+        W,S,E,N in degrees, fetched from Overpass, or cut out of --osm.
+    point
+        LAT,LON in degrees, with --radius, fetched from Overpass.
+    radius
+        Metres around --point.
+    demo
+        The extract of central Helsinki that comes along; needs no network.
+    crs
+        Frame of the scene: local (a transverse Mercator on its centre in which a metre is a metre), utm, or
+        an EPSG code such as EPSG:32618.
+    lod
+        Level of detail of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs.
+    tile_size
+        Side of a tile in metres.
+    name
+        Name of the scene, for people.
+    out
+        Directory to write the scene to.
+    overwrite
+        Replace a scene that is there.
+    json
+        Print the build report as JSON.
+    quiet
+        No progress bars.
+    """
+    from geoscene.build import BuildOptions  # noqa: PLC0415  (half a second, not needed for --help)
+    from geoscene.build import build as build_scene  # noqa: PLC0415
+
+    began = time.perf_counter()
+    options = BuildOptions(crs=crs, lod=lod, tile_size=tile_size, name=name)
+    with progress_bar(quiet=quiet) as progress:
+        progress("reading the map", 0, 0)
+        data = _read(osm, place, bbox, point, radius, demo=demo)
+        scene = build_scene(data, out, options, overwrite=overwrite, progress=progress)
+    report = scene.manifest | {"path": str(out), "seconds": round(time.perf_counter() - began, 2)}
+    if json:
+        print_json(report)
+    else:
+        _print_scene(report)
+        print(f"\n{report['seconds']:.1f} s; next: lidar drive {out} --route random -o drive")
+    return 0
+
+
+def _read(
+    osm: Path | None, place: str | None, bbox: str | None, point: str | None, radius: float, *, demo: bool
+) -> Any:
+    from geoscene import sources  # noqa: PLC0415
+
+    given = [n for n, v in (("--osm", osm), ("--place", place), ("--point", point), ("--demo", demo)) if v]
+    if bbox and not osm:
+        given.append("--bbox")
+    if len(given) != 1:
+        what = f"not {' and '.join(given)} together" if given else "none was given"
+        raise InputError(f"give one of --osm FILE, --place NAME, --bbox, --point or --demo; {what}")
+    box = None
+    if bbox:
+        west, south, east, north = _numbers(bbox, "--bbox", "W,S,E,N")
+        if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
+            raise InputError(f"--bbox {bbox.strip()}: W,S,E,N must rise from west to east and south to north")
+        box = (west, south, east, north)
+    if osm:
+        return sources.read_osm(osm, bounds=box)
+    if demo:
+        return sources.read_osm(sources.demo_path())
+    if place:
+        return sources.fetch_place(place)
+    if point:
+        lat, lon = _numbers(point, "--point", "LAT,LON")
+        if not (abs(lat) <= 90 and abs(lon) <= 180):
+            raise InputError(f"--point {point.strip()}: not a latitude and longitude in degrees")
+        return sources.fetch_point(lat, lon, radius)
+    assert box is not None  # noqa: S101  (the only source left)
+    return sources.fetch_bbox(*box)
+
+
+@app.command
+def info(
+    scene: Annotated[Path, Parameter(validator=validators.Path(exists=False))],
+    /,
+    *,
+    json: Annotated[bool, Parameter(negative=())] = False,
+) -> int:
+    """Say what a scene holds: frame, extent, counts, where heights come from, repairs and drops.
+
+    Parameters
+    ----------
+    scene
+        Directory of the scene.
+    json
+        Print as JSON.
+    """
+    from geoscene.scene import open_scene  # noqa: PLC0415
+
+    opened = open_scene(scene)
+    report = opened.manifest | {"path": str(scene), "extent": _extent(opened.manifest)}
+    if json:
+        print_json(report)
+    else:
+        _print_scene(report)
+    return 0
+
+
+@app.command
+def validate(scene: Path, /, *, json: Annotated[bool, Parameter(negative=())] = False) -> int:
+    """Check every solid of a scene: closed, oriented, of positive volume. Exit code 1 if one is not.
+
+    Parameters
+    ----------
+    scene
+        Directory of the scene.
+    json
+        Print the verdicts as JSON.
+    """
+    from geoscene.check import check_scene  # noqa: PLC0415
+    from geoscene.scene import open_scene  # noqa: PLC0415
+
+    report = check_scene(open_scene(scene))
+    if json:
+        print_json(report)
+    else:
+        for row in report["broken"]:
+            print(f"{row['osm_id']} (feature {row['feature']}): {row['fault']}")
+        sound = report["solids"] - len(report["broken"])
+        print(f"{report['solids']} solids, {sound} closed, oriented and of positive volume")
+    return FAILURE if report["broken"] else 0
+
+
+def _extent(manifest: dict[str, Any]) -> dict[str, Any]:
+    xmin, ymin, xmax, ymax = manifest["bounds"]
+    return {
+        "width_m": xmax - xmin,
+        "height_m": ymax - ymin,
+        "geographic": manifest["geographic_bounds"],
+    }
+
+
+def _print_scene(report: dict[str, Any]) -> None:
+    counts, frame = report["counts"], report["frame"]
+    xmin, ymin, xmax, ymax = report["bounds"]
+    west, south, east, north = report["geographic_bounds"]
+    rows = {
+        "frame": f"{frame['name']}, heights {frame['vertical']}",
+        "extent": f"{xmax - xmin:.0f} x {ymax - ymin:.0f} m;"
+        f" lon {west:.5f} to {east:.5f}, lat {south:.5f} to {north:.5f}",
+        "buildings": f"{counts['buildings']} in the map, {counts['dropped']} dropped,"
+        f" {counts['solids']} solids, {counts['watertight']} of them watertight",
+        "roads": f"{counts['road_km']:.1f} km in {counts['road_edges']} edges",
+        "heights": _listed(report["heights"]),
+        "roofs": _listed(report["roofs"]),
+    }
+    print(report["name"] or report["path"])
+    for title, text in rows.items():
+        print(f"  {title:<10} {text}")
+    for action, kinds in report["problems"].items():
+        for kind, reasons in kinds.items():
+            print(f"  {action:<10} {kind}: {_listed(reasons)}")
+    print(f"  {report['attribution']}")
+
+
+def _listed(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {n}" for name, n in counts.items())
+
+
+def main() -> None:
+    """Run the program."""
+    run(app, (GeosceneError,), (InputError,))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""What a dataset holds beside clouds and images: poses, calibration, fixes, time stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from lidar.attitude import euler_from_quat
+from lidar.camera.model import intrinsic_matrix
+from lidar.dataset import write_columns, write_json
+from lidar.poses import Trajectory
+from lidar.record import Camera, Scanner
+from lidar.rig import Mount
+
+
+def iso_times(start: datetime, time_ns: NDArray[np.integer]) -> list[str]:
+    """ISO 8601 UTC time stamps with nanoseconds of times since a start."""
+    whole = start.replace(tzinfo=None)
+    base = np.datetime64(whole - timedelta(microseconds=whole.microsecond), "ns")
+    stamps = base + np.asarray(time_ns, "timedelta64[ns]") + np.timedelta64(whole.microsecond, "us")
+    return [f"{s}Z" for s in np.datetime_as_string(stamps, unit="ns")]
+
+
+def pose_columns(
+    trajectory: Trajectory, frame: Frame, start: datetime, time_ns: NDArray[np.integer]
+) -> dict[str, Any]:
+    """Columns of ``poses.csv``: the vehicle at given times.
+
+    x, y, z in scene metres; alpha, beta, gamma in radians with R = Rz(gamma) Ry(beta) Rx(alpha), scene axes
+    from vehicle axes; lon, lat in degrees (WGS 84) and h in metres as the scene's heights.
+    """
+    poses = trajectory.at(time_ns)
+    x, y, z = poses.position.T
+    quat = _quaternions(poses.rotation)
+    alpha, beta, gamma = np.moveaxis(euler_from_quat(quat), -1, 0)
+    lon, lat = frame.to_geographic(x, y)
+    return {
+        "timestamp": iso_times(start, time_ns),
+        "frame": np.arange(len(time_ns)),
+        "x": x,
+        "y": y,
+        "z": z,
+        "alpha": alpha,
+        "beta": beta,
+        "gamma": gamma,
+        "qx": quat[:, 0],
+        "qy": quat[:, 1],
+        "qz": quat[:, 2],
+        "qw": quat[:, 3],
+        "lon": lon,
+        "lat": lat,
+        "h": z,
+    }
+
+
+def _quaternions(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    quat: NDArray[np.float64] = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return quat
+
+
+def _mounted(mount: Mount) -> dict[str, Any]:
+    matrix = np.eye(4)
+    matrix[:3, :3] = mount.rotation
+    matrix[:3, 3] = mount.translation
+    return {
+        "vehicle_from_sensor": matrix.tolist(),
+        "translation": list(mount.translation),
+        "quat_xyzw": list(mount.quat_xyzw),
+    }
+
+
+def calibration(sensors: Sequence[Scanner | Camera]) -> dict[str, Any]:
+    """What ``calibration.json`` says: mounts, rates and intrinsics."""
+    out: dict[str, Any] = {}
+    for sensor in sensors:
+        if isinstance(sensor, Scanner):
+            s = sensor.sensor
+            out[sensor.name] = {
+                "kind": "lidar",
+                "model": f"{s.maker} {s.model}",
+                "rate_hz": s.rate_hz,
+                "time_offset_ns": s.start_ns,
+                "wavelength_nm": s.wavelength_nm,
+                "min_range": s.min_range,
+                "max_range": s.max_range,
+                "range_quantum": s.range_quantum,
+                **_mounted(sensor.spec.mount),
+            }
+        else:
+            c = sensor.spec
+            out[sensor.name] = {
+                "kind": "camera",
+                "model": c.model,
+                "rate_hz": c.rate_hz,
+                "time_offset_ns": c.time_offset_ns,
+                "width": c.width,
+                "height": c.height,
+                "K": intrinsic_matrix(c).tolist(),
+                "distortion": list(c.distortion),
+                "depth_counts_per_metre": 256,
+                **_mounted(c.mount),
+            }
+    return {
+        "frames": {
+            "vehicle": "x forward, y left, z up; origin: the rear axle's centre on the ground",
+            "lidar": "x forward, y left, z up",
+            "camera": "x right, y down, z forward; the centre of the top-left pixel is (0, 0)",
+        },
+        "sensors": out,
+    }
+
+
+def write_sidecars(
+    out: Path,
+    frame: Frame,
+    sensors: Sequence[Scanner | Camera],
+    trajectory: Trajectory,
+    start: datetime,
+    frames: Mapping[str, int],
+) -> None:
+    """Write ``poses.csv`` (a row a frame of the first sensor), ``calibration.json`` and time stamps."""
+    write_json(out / "calibration.json", calibration(sensors))
+    for k, sensor in enumerate(sensors):
+        times = np.array([sensor.frame_start_ns(f) for f in range(frames[sensor.name])], np.int64)
+        folder = out / sensor.name
+        folder.mkdir(parents=True, exist_ok=True)
+        stamps: dict[str, Any] = {
+            "frame": np.arange(len(times)),
+            "time_ns": times,
+            "timestamp": iso_times(start, times),
+        }
+        write_columns(folder / "timestamps.csv", stamps)
+        if k == 0:
+            write_columns(out / "poses.csv", pose_columns(trajectory, frame, start, times))

@@ -1,0 +1,116 @@
+"""From a scene and a route's description to the vehicle's trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.geopackage import read_layer
+from geoscene.progress import Progress, silent
+from geoscene.roadgraph import read_graphml
+from geoscene.roads import RoadGraph
+from geoscene.scene import Scene
+from lidar.errors import BlockedError, RouteError
+from lidar.motion import drive_path
+from lidar.path import Path, plan_path
+from lidar.poses import Trajectory
+from lidar.route import Route, Spec, plan_route
+from lidar.vehicle import load_vehicle
+
+_ATTEMPTS = 40
+_RANDOM_SECONDS = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Travel:
+    """A planned drive.
+
+    route, path, trajectory : see `lidar.route`, `lidar.path` and `lidar.poses`
+    length     : true metres that the trajectory covers
+    """
+
+    route: Route
+    path: Path
+    trajectory: Trajectory
+    length: float
+
+
+def road_graph(scene: Scene) -> RoadGraph:
+    """The scene's road graph.
+
+    Raises RouteError if the scene has none.
+    """
+    path = scene.path / "roads.graphml"
+    if not path.exists():
+        raise RouteError(f"{scene.path}: this scene has no roads to drive on")
+    return read_graphml(path, scene.frame)
+
+
+def standing_footprints(scene: Scene) -> NDArray[np.object_]:
+    """Footprints, scene metres, of buildings that reach down to the ground."""
+    if "buildings" not in scene.layers or len(set(scene.layers["buildings"])) == 1:
+        return np.empty(0, object)
+    layer = read_layer(scene.path / "features.gpkg", "buildings", scene.frame)
+    low = np.asarray(layer.columns["min_height"], float)
+    standing: NDArray[np.object_] = layer.geometry[low < 2.5]
+    return standing
+
+
+def plan_travel(
+    scene: Scene,
+    spec: Spec,
+    vehicle: str,
+    *,
+    seed: int = 0,
+    duration: float | None = None,
+    side: str = "right",
+    progress: Progress = silent,
+) -> Travel:
+    """The trajectory of a vehicle along a route through a scene.
+
+    Where a street is too narrow for the vehicle between its buildings, it is left out and the route planned
+    again. Raises RouteError if no way is left.
+    """
+    graph = road_graph(scene)
+    body = load_vehicle(vehicle)
+    obstacles = standing_footprints(scene)
+    seconds = duration if duration is not None or spec != "random" else _RANDOM_SECONDS
+    avoid: set[tuple[int, int]] = set()
+    blocked: BlockedError | None = None
+    for attempt in range(_ATTEMPTS):
+        progress("planning", attempt, 0)
+        try:
+            route = plan_route(
+                graph,
+                scene.frame,
+                spec,
+                seed=seed,
+                duration=seconds,
+                side=cast("Literal['left', 'right']", side),
+                body_width=body.width,
+                avoid=avoid,
+            )
+            path = plan_path(route, body, scene.frame, obstacles=obstacles)
+        except BlockedError as error:
+            blocked = error
+            before = len(avoid)
+            avoid |= set(error.turns)
+            if len(avoid) == before:
+                raise
+            continue
+        except RouteError:
+            if blocked is not None:
+                raise blocked from None
+            raise
+        trajectory = drive_path(path, body, duration=seconds)
+        return Travel(route, path, trajectory, _driven(trajectory))
+    raise blocked or RouteError("no route found")
+
+
+def _driven(trajectory: Trajectory) -> float:
+    steps = np.diff(trajectory.position, axis=0)
+    steps[:, :2] /= trajectory.scale[1:, None]
+    return float(np.linalg.norm(steps, axis=1).sum())
