@@ -15,6 +15,18 @@ class RouteError(InputError):
     """A route that cannot be driven on the scene's road graph."""
 
 
+class BlockedError(RouteError):
+    """A route that bends too tightly for the vehicle, or on which its body would touch an obstacle.
+
+    turns : pairs of edges of the road graph that a detour must not take one after the other; an edge twice,
+            if it must not be taken at all
+    """
+
+    def __init__(self, message: str, turns: list[tuple[int, int]]) -> None:
+        super().__init__(message)
+        self.turns = turns
+
+
 class RigError(InputError):
     """A rig or sensor description with a mistake in it."""
 

@@ -1,5 +1,9 @@
 """Where maps come from: files, map servers, and the demo extract."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from geoscene.sources.data import ATTRIBUTION as ATTRIBUTION
 from geoscene.sources.data import Area as Area
 from geoscene.sources.data import OsmData as OsmData
@@ -7,4 +11,31 @@ from geoscene.sources.data import Point as Point
 from geoscene.sources.data import Relation as Relation
 from geoscene.sources.data import Tags as Tags
 from geoscene.sources.data import Way as Way
-from geoscene.sources.files import read_osm as read_osm
+
+if TYPE_CHECKING:
+    from geoscene.sources.demo import demo_path as demo_path
+    from geoscene.sources.files import read_osm as read_osm
+    from geoscene.sources.network import Servers as Servers
+    from geoscene.sources.network import fetch_bbox as fetch_bbox
+    from geoscene.sources.network import fetch_place as fetch_place
+    from geoscene.sources.network import fetch_point as fetch_point
+    from geoscene.sources.network import locate as locate
+
+_LATE = {
+    "demo_path": "demo",
+    "read_osm": "files",
+    "Servers": "network",
+    "fetch_bbox": "network",
+    "fetch_place": "network",
+    "fetch_point": "network",
+    "locate": "network",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Functions are imported when first asked for, and with them shapely and osmium."""
+    if name not in _LATE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib  # noqa: PLC0415
+
+    return getattr(importlib.import_module(f"{__name__}.{_LATE[name]}"), name)

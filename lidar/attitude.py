@@ -1,0 +1,94 @@
+"""Attitudes: quaternions (x, y, z, w), Euler angles in two conventions, and axes.
+
+The angles of `poses.csv` are alpha about X (roll), beta about Y (pitch), gamma about Z (yaw), radians, with
+
+    R = Rz(gamma) Ry(beta) Rx(alpha)
+
+the matrix that turns vehicle vectors (x forward, y left, z up) into scene vectors: rotations about the fixed
+scene axes in the order X, Y, Z, or, read the other way, about the vehicle's own axes in the order Z, Y', X''.
+Yaw is counter-clockwise from the scene's x axis (east), positive pitch is nose down, positive roll is left
+side up. The alternative R = Rx(alpha) Ry(beta) Rz(gamma), intrinsic X-Y'-Z'', differs at large angles; its
+functions end in ``_intrinsic``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Float = NDArray[np.float64]
+
+LOCK = 1e-7
+"""Radians from 90 degrees of the middle angle within which the outer angles cannot be told apart."""
+
+
+def _angles(R: Float, sign: float) -> tuple[Float, Float, Float]:
+    """The three angles of Rz Ry Rx (sign 1), or of its mirror Rx Ry Rz given transposed (sign -1)."""
+    middle = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 0, 0], R[..., 1, 0]))
+    locked = np.abs(np.abs(middle) - np.pi / 2) < LOCK
+    first = np.where(locked, 0.0, np.arctan2(R[..., 2, 1], R[..., 2, 2]))
+    last = np.where(locked, np.arctan2(-R[..., 0, 1], R[..., 1, 1]), np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+    return sign * first, sign * middle, sign * last
+
+
+def euler_from_quat(quat_xyzw: ArrayLike) -> Float:
+    """Angles (..., 3) alpha, beta, gamma of R = Rz(gamma) Ry(beta) Rx(alpha), beta in [-pi/2, pi/2].
+
+    With the nose straight up or down roll and yaw cannot be told apart: alpha is then 0 and gamma takes both.
+    """
+    quat = np.asarray(quat_xyzw, float)
+    R = Rotation.from_quat(quat.reshape(-1, 4)).as_matrix()
+    out: Float = np.stack(_angles(R, 1.0), axis=-1).reshape(*quat.shape[:-1], 3)
+    return out
+
+
+def quat_from_euler(alpha: ArrayLike, beta: ArrayLike, gamma: ArrayLike) -> Float:
+    """Quaternions (..., 4) x, y, z, w of R = Rz(gamma) Ry(beta) Rx(alpha), with w >= 0."""
+    a, b, g = np.broadcast_arrays(*(np.asarray(v, float) / 2.0 for v in (alpha, beta, gamma)))
+    ca, sa, cb, sb, cg, sg = np.cos(a), np.sin(a), np.cos(b), np.sin(b), np.cos(g), np.sin(g)
+    quat = np.stack(
+        [
+            sa * cb * cg - ca * sb * sg,
+            ca * sb * cg + sa * cb * sg,
+            ca * cb * sg - sa * sb * cg,
+            ca * cb * cg + sa * sb * sg,
+        ],
+        axis=-1,
+    )
+    positive: Float = np.where(quat[..., 3:] < 0, -quat, quat)
+    return positive
+
+
+def euler_from_quat_intrinsic(quat_xyzw: ArrayLike) -> Float:
+    """Angles (..., 3) alpha, beta, gamma of R = Rx(alpha) Ry(beta) Rz(gamma), the order X-Y'-Z''."""
+    quat = np.asarray(quat_xyzw, float)
+    # the inverse of Rx Ry Rz is Rz(-gamma) Ry(-beta) Rx(-alpha)
+    R = np.swapaxes(Rotation.from_quat(quat.reshape(-1, 4)).as_matrix(), -1, -2)
+    out: Float = np.stack(_angles(R, -1.0), axis=-1).reshape(*quat.shape[:-1], 3)
+    return out
+
+
+def quat_from_euler_intrinsic(alpha: ArrayLike, beta: ArrayLike, gamma: ArrayLike) -> Float:
+    """Quaternions (..., 4) x, y, z, w of R = Rx(alpha) Ry(beta) Rz(gamma), with w >= 0."""
+    inverse = quat_from_euler(-np.asarray(alpha, float), -np.asarray(beta, float), -np.asarray(gamma, float))
+    conjugate: Float = inverse * np.array([-1.0, -1.0, -1.0, 1.0])
+    return conjugate
+
+
+def matrix_from_quat(quat_xyzw: ArrayLike) -> Float:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4)."""
+    quat = np.asarray(quat_xyzw, float)
+    R: Float = Rotation.from_quat(quat.reshape(-1, 4)).as_matrix().reshape(*quat.shape[:-1], 3, 3)
+    return R
+
+
+def body_rates(time_s: ArrayLike, quat_xyzw: ArrayLike) -> Float:
+    """Angular velocities (n, 3) in the body frame, rad/s, at times (n,) with attitudes (n, 4).
+
+    Central differences of the rotation vector, exact for a constant rate; one-sided at the ends.
+    """
+    t, turn = np.asarray(time_s, float), Rotation.from_quat(np.asarray(quat_xyzw, float))
+    half = (turn[:-1].inv() * turn[1:]).as_rotvec() / np.diff(t)[:, None]
+    rates: Float = np.concatenate([half[:1], half]) * 0.5 + np.concatenate([half, half[-1:]]) * 0.5
+    return rates

@@ -1,0 +1,272 @@
+"""The path a vehicle drives along a route: drivable by construction, clear of obstacles, on the ground.
+
+The route's line has kinks and a vehicle has a steering wheel. The line is relaxed (a smoothing spline that
+gives way where it bends too tightly), then a kinematic vehicle follows it: a point on the rear axle whose
+curvature never exceeds what the vehicle can steer and changes no faster than the wheel turns. What comes out
+has continuous position, heading and curvature and no side slip, whatever went in. Where the body would touch
+an obstacle the line is pushed aside and followed again; where that does not help, a RouteError says so.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from lidar.clearance import Line, Setting, pushes, turn_round, turns_at
+from lidar.errors import BlockedError, RouteError
+from lidar.route import Route
+from lidar.steering import Pose, Track, follow, line_heading, relaxed
+from lidar.vehicle import Vehicle
+
+Float = NDArray[np.float64]
+Ground = Callable[[Float, Float], Float]
+
+MARGIN = 0.25
+"""Metres that the body keeps from obstacles."""
+_REPAIRS = 16
+_PUSH = 4.0  # metres before and behind an obstacle over which the line is pushed aside
+_ASIDE = 4.0  # metres that the line may be pushed aside at most
+_WHEEL = 0.95  # share of the full lock that the line asks for, so that the wheel has some left to correct
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Where the rear axle goes; a row every few decimetres.
+
+    s         : (n,) true metres driven from the start, along the slope
+    position  : (n, 3) scene metres, the rear axle's centre on the ground
+    heading   : (n,) radians, where the vehicle points, counter-clockwise from the scene's x axis, unwrapped
+    curvature : (n,) 1/m, change of heading per true metre driven over ground; positive is a turn to the left
+    slope     : (n,) radians, of the path where the vehicle points, positive uphill
+    bank      : (n,) radians, of the ground across the vehicle, positive where the left wheels stand higher
+    scale     : (n,) scene metres per true metre
+    gear      : (n,) int8, 1 forwards, -1 backwards
+    leg       : (n,) int32, stretch between stops; at a stop the position stands twice
+    limit     : (n,) m/s, speed limit
+    edge      : (n,) int32, edge of the road graph, -1 for none
+    offset    : (n,) true metres from the route's line, positive to its left
+    """
+
+    s: Float
+    position: Float
+    heading: Float
+    curvature: Float
+    slope: Float
+    bank: Float
+    scale: Float
+    gear: NDArray[np.int8]
+    leg: NDArray[np.int32]
+    limit: Float
+    edge: NDArray[np.int32]
+    offset: Float
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.s)
+
+    @property
+    def length(self) -> float:
+        """True metres driven."""
+        return float(self.s[-1])
+
+    def take(self, keep: NDArray[Any] | slice) -> Path:
+        """Chosen rows."""
+        return Path(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+
+def plan_path(
+    route: Route,
+    vehicle: Vehicle,
+    frame: Frame,
+    *,
+    obstacles: Sequence[Any] | NDArray[np.object_] | shapely.STRtree | None = None,
+    ground: Ground | None = None,
+    margin: float = MARGIN,
+) -> Path:
+    """The path of a vehicle along a route.
+
+    obstacles : polygons in scene metres that the body must not touch (footprints of buildings that stand on
+                the ground); they do not hold on bridges and in tunnels
+    ground    : height in metres of scene x (n,) and y (n,); without it, and on bridges and in tunnels, the
+                heights of the route's line are the ground
+    margin    : metres that the body keeps from obstacles
+
+    Raises BlockedError where the vehicle cannot follow the route, or cannot without touching an obstacle: its
+    ``turns`` say what a detour must avoid. Raises RouteError for a route too short to drive.
+    """
+    if not isinstance(obstacles, shapely.STRtree):
+        obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))
+    setting = Setting(vehicle, frame, obstacles, margin, min(0.25, vehicle.turning_radius / 8), route.side)
+    line = _resampled(route, min(0.5, 2 * setting.step))
+    cuts = [0, *(np.flatnonzero(line.turn) + 1).tolist(), len(line.edge)]
+    legs: list[Track] = []
+    lines: list[Line] = []
+    pose: Pose | None = None
+    for first, last in itertools.pairwise(cuts):
+        part = line.take(slice(first, last))
+        turns_back = last < len(line.edge)
+        if turns_back:
+            part = _shortened(part, vehicle)
+        tracks = [_clear_track(part, setting, pose)]
+        if turns_back:
+            tracks += turn_round(tracks[-1].end, part, setting)
+        pose = tracks[-1].end
+        legs += tracks
+        lines += [part] * len(tracks)
+    return _joined(legs, lines, setting, ground)
+
+
+def _resampled(route: Route, spacing: float) -> Line:
+    """The route's line with points about ``spacing`` apart; its turning points stay points."""
+    parts = []
+    ends = [0, *(np.asarray(route.turns, int) + 1).tolist(), len(route.line)]
+    for first, last in itertools.pairwise(ends):
+        xyz = route.line[first:last]
+        s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))])
+        keep = np.concatenate([[True], np.diff(s) > 1e-9])
+        xyz, s = xyz[keep], s[keep]
+        if len(s) < 2 or s[-1] < 2 * spacing:
+            raise RouteError(f"the route has a stretch of {s[-1]:.2f} m; too short to drive")
+        at = np.linspace(0.0, s[-1], max(math.ceil(s[-1] / spacing), 4) + 1)
+        index = np.arange(first, last)[keep][np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(s) - 1)]
+        turn = np.zeros(len(at), bool)
+        turn[-1] = last < len(route.line)
+        new = np.stack([np.interp(at, s, xyz[:, k]) for k in range(3)], axis=1)
+        parts.append(Line(new, route.edge[index], route.limit[index], route.free[index], turn))
+    return Line(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Line)))
+
+
+def _shortened(line: Line, vehicle: Vehicle) -> Line:
+    """The line without its last metres, so that the front of the body ends where the line did."""
+    spare = min(round(vehicle.front / line.gap), len(line.edge) - 5)
+    return line.take(slice(0, len(line.edge) - max(spare, 0)))
+
+
+def _clear_track(line: Line, setting: Setting, pose: Pose | None) -> Track:
+    """A leg along the line on which the body touches no obstacle, from a pose if one is given.
+
+    Raises BlockedError if the line cannot be pushed clear, or bends too tightly.
+    """
+    from scipy.ndimage import gaussian_filter1d, maximum_filter1d  # noqa: PLC0415
+
+    vehicle = setting.vehicle
+    cap = _WHEEL / vehicle.turning_radius
+    reach = min(2.0, 0.5 * vehicle.turning_radius)
+    middle = line.xyz[len(line.xyz) // 2]
+    scale = float(setting.frame.scale_at(middle[0], middle[1]))
+    base, gap = line.xyz[:, :2], line.gap
+    heading = gaussian_filter1d(line_heading(base), 2.0 / gap, mode="nearest")
+    left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+    shift = np.zeros(len(base))
+    for _ in range(_REPAIRS):
+        xy = relaxed(base + shift[:, None] * left, cap / scale, reach)
+        track = follow(xy, vehicle, scale, pose=pose, step=setting.step)
+        if track.row[-1] < len(base) - 1:
+            x, y, _ = track.end
+            raise BlockedError(
+                f"the {vehicle.name} cannot follow the route near scene x {x:.1f}, y {y:.1f} (edge"
+                f" {line.edge[track.row[-1]]}): it bends too tightly for a turning radius of"
+                f" {vehicle.turning_radius} m",
+                turns_at(line, track.row[-1:]),
+            )
+        push, at = pushes(track, line, setting)
+        if not len(at):
+            return track
+        for sign in (1.0, -1.0):
+            bump = np.zeros(len(base))
+            np.maximum.at(bump, at, np.maximum(sign * push, 0.0))
+            wide = maximum_filter1d(bump, 2 * math.ceil(_PUSH / gap) + 1)
+            shift += sign * gaussian_filter1d(wide, 0.5 * _PUSH / gap, mode="nearest")
+        shift = np.clip(shift, -_ASIDE, _ASIDE)
+    worst = at[np.argmax(np.abs(push))]
+    x, y, _ = line.xyz[worst]
+    raise BlockedError(
+        f"the {vehicle.name} ({vehicle.length} x {vehicle.width} m) does not pass between the buildings near"
+        f" scene x {x:.1f}, y {y:.1f} (edge {line.edge[worst]}); choose another route or a smaller vehicle",
+        turns_at(line, at),
+    )
+
+
+def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Ground | None) -> Path:
+    """One path of all legs, with the ground under it."""
+    heights = _heights(legs, lines, setting, ground)
+    parts = []
+    start = 0.0
+    for number, (leg, line, (z, slope, bank)) in enumerate(zip(legs, lines, heights, strict=True)):
+        over = np.full(len(z) - 1, leg.step)
+        s = start + np.concatenate([[0.0], np.cumsum(np.hypot(over, np.diff(z)))])
+        start = float(s[-1])
+        scale = np.asarray(setting.frame.scale_at(leg.xy[:, 0], leg.xy[:, 1]), float)
+        heading = line_heading(line.xyz[:, :2])[leg.row]
+        d = leg.xy - line.xyz[leg.row, :2]
+        parts.append(
+            Path(
+                s=s,
+                position=np.column_stack([leg.xy, z]),
+                heading=leg.heading,
+                curvature=leg.curvature,
+                slope=slope,
+                bank=bank,
+                scale=scale,
+                gear=np.full(len(s), leg.gear, np.int8),
+                leg=np.full(len(s), number, np.int32),
+                limit=line.limit[leg.row],
+                edge=line.edge[leg.row],
+                offset=(d[:, 1] * np.cos(heading) - d[:, 0] * np.sin(heading)) / scale,
+            )
+        )
+    whole = Path(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Path)))
+    # a leg may have begun from its line's own heading, whole turns away from where the leg before it ended
+    turns = np.concatenate([[0.0], np.cumsum(np.round(np.diff(whole.heading) / (2 * np.pi)) * 2 * np.pi)])
+    return replace(whole, heading=whole.heading - turns)
+
+
+def _heights(
+    legs: list[Track], lines: list[Line], setting: Setting, ground: Ground | None
+) -> list[tuple[Float, Float, Float]]:
+    """Height of the rear axle, slope ahead and bank of each leg, smoothed over the wheelbase."""
+    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
+
+    raw = [_raw_heights(leg, line, setting, ground) for leg, line in zip(legs, lines, strict=True)]
+    sizes = np.array([len(leg.row) for leg in legs])
+    starts = np.cumsum(sizes)[:-1]
+    # where a leg begins the position stands twice: smooth the rows that differ, then say them twice again
+    once = np.ones(int(sizes.sum()), bool)
+    once[starts] = False
+    twice = np.cumsum(once) - 1
+    width = max(setting.vehicle.wheelbase, 1.0) / legs[0].step
+    columns = [
+        gaussian_filter1d(np.concatenate(column)[once], width, mode="nearest")[twice]
+        for column in zip(*raw, strict=True)
+    ]
+    return list(zip(*(np.split(column, starts) for column in columns), strict=True))
+
+
+def _raw_heights(
+    leg: Track, line: Line, setting: Setting, ground: Ground | None
+) -> tuple[Float, Float, Float]:
+    """Height, slope ahead and bank at the rows of a leg, as the line or the ground has them."""
+    z, bank = line.xyz[leg.row, 2].copy(), np.zeros(len(leg.row))
+    # rows of the line are farther apart than those of the leg: between them heights run straight
+    first = np.searchsorted(leg.row, leg.row, side="left")
+    count = np.searchsorted(leg.row, leg.row, side="right") - first
+    above = line.xyz[np.minimum(leg.row + 1, len(line.edge) - 1), 2]
+    z += (above - z) * (np.arange(len(z)) - first) / count
+    if ground is not None:
+        ask = ~line.free[leg.row]
+        c, s = np.cos(leg.heading[ask]), np.sin(leg.heading[ask])
+        x, y = leg.xy[ask].T
+        track = max(setting.vehicle.track, 0.1)
+        half = track / 2 * setting.frame.scale_at(x, y)
+        left, right = ground(x - half * s, y + half * c), ground(x + half * s, y - half * c)
+        z[ask] = 0.5 * (left + right)
+        bank[ask] = np.arctan2(left - right, track)
+    return z, leg.gear * np.arctan(np.gradient(z, leg.step)), bank
