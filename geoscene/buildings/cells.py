@@ -10,9 +10,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.buildings.footprints import to_grid
-from geoscene.buildings.shells import triangulate
+from geoscene.buildings.footprints import Polygons, to_grid
+from geoscene.buildings.shells import boundary, lift, triangulate
 from geoscene.buildings.skeleton import Skeleton
+from geoscene.validate import weld
 
 Float = NDArray[np.float64]
 
@@ -26,16 +27,18 @@ class Cells:
 
     xy    : (m, 3, 2) metres on the grid, counter-clockwise
     field : (m, 3) metres
+    face  : (m,) int64, triangles of one number lie in one plane
     """
 
     xy: Float
     field: Float
+    face: NDArray[np.int64]
 
 
 def plain_cells(polygon: Any) -> Cells:
     """The Delaunay triangles of a polygon, with a field of 0."""
     xy, _ = triangulate(np.array([polygon], dtype=object))
-    return Cells(xy, np.zeros(xy.shape[:2]))
+    return Cells(xy, np.zeros(xy.shape[:2]), np.zeros(len(xy), np.int64))
 
 
 def with_field(cells: Cells, direction: Float, offset: float) -> Cells:
@@ -44,15 +47,19 @@ def with_field(cells: Cells, direction: Float, offset: float) -> Cells:
 
 
 def cut(cells: Cells, level: float) -> Cells:
-    """The cells, split where the field crosses a level, so that it is crossed only along their edges."""
+    """The cells, split where the field crosses a level, so that it is crossed only along their edges.
+
+    Faces on the two sides of the level get numbers of their own.
+    """
     side = cells.field - level
     side = np.where(np.abs(side) < ON_LINE, 0.0, side)
     sign = np.sign(side)
     crossed = (sign.min(axis=1) < 0) & (sign.max(axis=1) > 0)
+    above = (sign.max(axis=1) > 0).astype(np.int64)
     if not crossed.any():
-        return cells
-    whole = Cells(cells.xy[~crossed], cells.field[~crossed])
-    xy, field, sign = cells.xy[crossed], cells.field[crossed], sign[crossed]
+        return replace(cells, face=2 * cells.face + above)
+    whole = Cells(cells.xy[~crossed], cells.field[~crossed], (2 * cells.face + above)[~crossed])
+    xy, field, sign, face = cells.xy[crossed], cells.field[crossed], sign[crossed], 2 * cells.face[crossed]
     # turn each triangle until its lone corner comes first: alone on its side, or on the line
     on_line = (sign == 0).any(axis=1)
     alone = np.where(
@@ -69,20 +76,86 @@ def cut(cells: Cells, level: float) -> Cells:
     q = _crossing(a, b, fa, fb, level)
     r = _crossing(a, c, fa, fc, level)
     t, u = on_line, ~on_line
+    tip = (np.take_along_axis(sign, turn[:, :1], axis=1)[:, 0] > 0).astype(np.int64)
+    first = (np.take_along_axis(sign, turn[:, 1:2], axis=1)[:, 0] > 0).astype(np.int64)
     parts = [
-        (a[t], b[t], p[t], fa[t], fb[t], at[t]),
-        (a[t], p[t], c[t], fa[t], at[t], fc[t]),
-        (a[u], q[u], r[u], fa[u], at[u], at[u]),
-        (q[u], b[u], c[u], at[u], fb[u], fc[u]),
-        (q[u], c[u], r[u], at[u], fc[u], at[u]),
+        (a[t], b[t], p[t], fa[t], fb[t], at[t], face[t] + first[t]),
+        (a[t], p[t], c[t], fa[t], at[t], fc[t], face[t] + 1 - first[t]),
+        (a[u], q[u], r[u], fa[u], at[u], at[u], face[u] + tip[u]),
+        (q[u], b[u], c[u], at[u], fb[u], fc[u], face[u] + 1 - tip[u]),
+        (q[u], c[u], r[u], at[u], fc[u], at[u], face[u] + 1 - tip[u]),
     ]
-    pieces = [Cells(np.stack(x[:3], axis=1), np.stack(x[3:], axis=1)) for x in parts]
+    pieces = [Cells(np.stack(x[:3], axis=1), np.stack(x[3:6], axis=1), x[6]) for x in parts]
     return _sound(joined([whole, *pieces]))
 
 
 def joined(cells: list[Cells]) -> Cells:
     """All cells, in order."""
-    return Cells(np.concatenate([c.xy for c in cells]), np.concatenate([c.field for c in cells]))
+    return Cells(
+        np.concatenate([c.xy for c in cells]),
+        np.concatenate([c.field for c in cells]),
+        np.concatenate([c.face for c in cells]),
+    )
+
+
+def outlines(xy: Float, face: NDArray[np.int64]) -> Polygons | None:
+    """The polygons that triangles (m, 3, 2) of one number make together, with all vertices on their edges.
+
+    None where the edges do not join to valid polygons, as among triangles that the grid has turned over.
+    """
+    corners = lift(xy, np.zeros(len(xy)))
+    edge, owner = boundary(corners, face)
+    ids, _ = weld(edge.reshape(-1, 3), np.repeat(owner, 2))
+    start, stop = ids.reshape(-1, 2).T.tolist()
+    onward = dict(zip(start, zip(stop, edge[:, 0, :2].tolist(), owner.tolist(), strict=True), strict=True))
+    if len(onward) < len(start):
+        return None
+    shells: list[Any] = []
+    holes: list[tuple[int, Any]] = []
+    owners: list[int] = []
+    while onward:
+        first = at = next(iter(onward))
+        ring = []
+        while at in onward:
+            following, point, number = onward.pop(at)
+            ring.append(point)
+            at = following
+        if at != first or len(ring) < 3:
+            return None
+        whole = shapely.Polygon(ring)
+        if shapely.is_ccw(whole.exterior):
+            shells.append(whole)
+            owners.append(number)
+        else:
+            holes.append((number, whole))
+    for number, hole in holes:
+        inside = [k for k, o in enumerate(owners) if o == number and shells[k].covers(hole)]
+        if len(inside) != 1:
+            return None
+        k = inside[0]
+        shells[k] = shapely.Polygon(shells[k].exterior, [*shells[k].interiors, hole.exterior.coords[::-1]])
+    polygons = np.array(shells, dtype=object)
+    return shapely.orient_polygons(polygons) if shapely.is_valid(polygons).all() else None
+
+
+def merged(cells: Cells) -> Cells:
+    """The cells with each face triangulated afresh, because many cuts leave many slivers."""
+    polygons = outlines(cells.xy, cells.face)
+    if polygons is None:
+        return cells
+    xy, owner = triangulate(polygons)
+    if len(np.unique(owner)) < len(polygons):
+        return cells
+    return Cells(xy, _values_at(xy, cells.xy.reshape(-1, 2), cells.field.ravel()), owner)
+
+
+def _values_at(xy: Float, known: Float, values: Float) -> Float:
+    """Values (m, 3) at corners (m, 3, 2) that all occur among known points (n, 2), by their place on the grid."""
+    # the product keeps cells apart within 100 km of zero
+    key, wanted = (np.rint(p * 1e4).astype(np.int64) @ np.array([2**31, 1]) for p in (known, xy))
+    order = np.argsort(key, kind="stable")
+    found: Float = values[order][np.searchsorted(key[order], wanted)]
+    return found
 
 
 def _crossing(a: Float, b: Float, fa: Float, fb: Float, level: float) -> Float:
@@ -99,11 +172,11 @@ def _sound(cells: Cells) -> Cells:
     """The cells without those that two equal corners make."""
     c = np.rint(cells.xy * 1e4)
     equal = (c == np.roll(c, -1, axis=1)).all(axis=2).any(axis=1)
-    return Cells(cells.xy[~equal], cells.field[~equal])
+    return Cells(cells.xy[~equal], cells.field[~equal], cells.face[~equal])
 
 
-def skeleton_cells(skeleton: Skeleton) -> Cells | None:
-    """The faces of a skeleton as cells whose field is the distance from their edges; None if the grid breaks one."""
+def skeleton_cells(skeleton: Skeleton) -> Cells:
+    """The faces of a skeleton as cells whose field is the distance from their edges."""
     xy = to_grid(skeleton.xy)
     key = np.rint(xy * 1e4).astype(np.int64)
     # nodes that the grid makes one take one height
@@ -112,18 +185,22 @@ def skeleton_cells(skeleton: Skeleton) -> Cells | None:
     rings = [_distinct(face, same.ravel()) for face in skeleton.faces]
     rings = [r for r in rings if len(r) > 2]
     polygons = np.array([shapely.Polygon(xy[r]) for r in rings], dtype=object)
-    solid = shapely.area(polygons) > 0
-    triangles, owner = triangulate(polygons[solid])
-    missing = np.setdiff1d(np.arange(int(solid.sum())), owner)
+    polygons = polygons[shapely.area(polygons) > 0]
+    triangles, owner = triangulate(polygons)
+    missing = np.setdiff1d(np.arange(len(polygons)), owner)
     if len(missing):
-        return None
-    order = np.lexsort(key.T)
-    table = key[order, 0] * (2**31) + key[order, 1]  # unique per cell within 100 km
-    lookup = np.argsort(table)
-    corner = np.rint(triangles.reshape(-1, 2) * 1e4).astype(np.int64)
-    at = np.searchsorted(table[lookup], corner[:, 0] * (2**31) + corner[:, 1])
-    field = time[order][lookup][np.minimum(at, len(lookup) - 1)]
-    return Cells(triangles, field.reshape(-1, 3))
+        # a sliver that crosses itself on the grid: ear clipping takes any ring, the shell is checked afterwards
+        clipped = [_clip_ears(shapely.get_coordinates(p)[:-1]) for p in polygons[missing]]
+        triangles = np.concatenate([triangles, *clipped])
+        owner = np.concatenate([owner, np.repeat(missing, [len(c) for c in clipped])])
+    return Cells(triangles, _values_at(triangles, xy, time), owner)
+
+
+def _clip_ears(ring: Float) -> Float:
+    """Triangles (k, 3, 2) of a ring (n, 2) by ear clipping."""
+    from mapbox_earcut import triangulate_float64  # noqa: PLC0415 - rarely needed
+
+    return np.asarray(ring[triangulate_float64(ring, np.array([len(ring)], np.uint32)).reshape(-1, 3)])
 
 
 def _distinct(face: list[int], same: NDArray[np.integer]) -> list[int]:
@@ -149,7 +226,7 @@ def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
             continue
         a, b, peak = faces[k]
         left, right = faces[edge_to[a]], faces[edge_from[b]]
-        if left[2] != peak or right[-1] != peak:
+        if min(len(left), len(right)) < 4 or left[2] != peak or right[-1] != peak:
             continue
         beyond = left[3 % len(left)]
         foot = _foot(xy, time, (a, b), peak, beyond) if right[-2] == beyond else None

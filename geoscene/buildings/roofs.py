@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from geoscene.buildings.cells import (
     Cells,
     cut,
-    joined,
+    merged,
+    outlines,
     plain_cells,
     raise_gables,
     skeleton_cells,
@@ -193,7 +194,7 @@ def _ridged(polygon: Any, spec: RoofSpec) -> Cells:
         for end in (ridge, -ridge):
             reach = cells.xy @ end
             hip = 0.5 + (reach - reach.min()) / (span / 2)
-            cells = cut(Cells(cells.xy, (hip - height) * span), 0.0)
+            cells = cut(replace(cells, field=(hip - height) * span), 0.0)
             reach = cells.xy @ end
             hip = 0.5 + (reach - reach.min()) / (span / 2)
             across = with_field(cells, up, low).field
@@ -214,8 +215,6 @@ def _inward(polygon: Any, spec: RoofSpec) -> Cells | None:
     if spec.shape in GABLED:
         skeleton = raise_gables(skeleton, GABLED[spec.shape])
     cells = skeleton_cells(skeleton)
-    if cells is None:
-        return None
     span = float(cells.field.max())
     for share, _ in INWARD[spec.shape][1:-1]:
         cells = cut(cells, share * span)
@@ -225,14 +224,20 @@ def _inward(polygon: Any, spec: RoofSpec) -> Cells | None:
 def _from_cells(cells: Cells, spec: RoofSpec) -> Triangles:
     """The shell under cells whose field is the share of the roof's height."""
     eaves = spec.high - spec.height
+    cells = merged(cells)
     corners = np.concatenate([cells.xy, to_grid(eaves + cells.field * spec.height)[..., None]], axis=2)
     zeros = np.zeros(len(corners), np.int64)
     top = Triangles(corners, zeros, np.full(len(corners), ROOF, np.uint8))
     low = to_grid(np.array([spec.low]))
-    floor = Triangles(
-        lift(cells.xy, np.full(len(corners), low)), zeros, np.full(len(corners), FLOOR, np.uint8)
-    )
-    return close(top, floor, low)
+    polygons = outlines(cells.xy, zeros)
+    xy = cells.xy if polygons is None else triangulate(polygons)[0]
+    return close(top, _floor(xy, low), low)
+
+
+def _floor(xy: Float, low: Float) -> Triangles:
+    """The floor of plane triangles (m, 3, 2)."""
+    zeros = np.zeros(len(xy), np.int64)
+    return Triangles(lift(xy, low[zeros]), zeros, np.full(len(xy), FLOOR, np.uint8))
 
 
 def _turned(polygon: Any, spec: RoofSpec) -> Triangles:
@@ -254,9 +259,7 @@ def _turned(polygon: Any, spec: RoofSpec) -> Triangles:
     zeros = np.zeros(len(corners), np.int64)
     top = Triangles(corners, zeros, np.full(len(corners), ROOF, np.uint8))
     low = to_grid(np.array([spec.low]))
-    xy, owner = triangulate(np.array([polygon], dtype=object))
-    floor = Triangles(lift(xy, np.full(len(xy), low)), owner, np.full(len(xy), FLOOR, np.uint8))
-    return close(top, floor, low)
+    return close(top, _floor(triangulate(np.array([polygon], dtype=object))[0], low), low)
 
 
 def _three_corners(corners: Float) -> NDArray[np.bool_]:

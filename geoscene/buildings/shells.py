@@ -86,7 +86,7 @@ def _double_area(xy: Float) -> Float:
 
 def lift(xy: Float, z: Float) -> Float:
     """Corners (m, 3, 3) of plane triangles (m, 3, 2) at heights (m,) or (m, 3)."""
-    height = np.broadcast_to(z.reshape(len(xy), -1), (len(xy), 3))
+    height = np.broadcast_to(z[:, None] if z.ndim == 1 else z, (len(xy), 3))
     return np.concatenate([xy, height[..., None]], axis=2)
 
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import manifold3d as m3
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import to_grid
 from geoscene.buildings.shells import Float, Ids, Triangles
