@@ -26,7 +26,7 @@ class RoadOptions:
     """What goes into the road graph.
 
     simplify : nodes only where roads meet, end or change; else every OSM node is a node
-    private  : with roads that are closed to the public
+    private  : with roads that are closed to the public, tracks and busways
     """
 
     simplify: bool = True
@@ -48,7 +48,7 @@ def build_road_graph(
     problems: list[Problem] = []
     ways = [way for way in osm.ways if drivable(way.tags, private=options.private)]
     streets = _read_streets(ways, problems)
-    runs, node_id, lonlat = _read_runs(ways, problems)
+    runs, node_id, lonlat = read_runs(ways, problems)
     if options.simplify:
         kinds = {street: number for number, street in enumerate(dict.fromkeys(streets))}
         kind = np.array([kinds[street] for street in streets], np.int64)
@@ -71,7 +71,7 @@ def _read_streets(ways: Sequence[Way], problems: list[Problem]) -> list[Street]:
     return streets
 
 
-def _read_runs(ways: Sequence[Way], problems: list[Problem]) -> tuple[Runs, NDArray[np.int64], Float]:
+def read_runs(ways: Sequence[Way], problems: list[Problem]) -> tuple[Runs, NDArray[np.int64], Float]:
     """Unbroken runs of placed nodes; the nodes' ids, ascending; their longitudes and latitudes."""
     if not ways:
         none = np.empty(0, np.int64)

@@ -38,7 +38,8 @@ def add_controls(
     ends = np.concatenate([graph.tail[one_each], graph.head[one_each]])
     arms = np.bincount(ends, minlength=len(graph.node_id))
     arm_metres = np.bincount(ends, np.tile(graph.length[one_each], 2), minlength=len(graph.node_id))
-    rank = np.array([CLASSES.index(name.removesuffix("_link")) for name in graph.highway.tolist()], np.int64)
+    ranks = {name: CLASSES.index(name.removesuffix("_link")) for name in CLASSES}
+    rank = np.array([ranks.get(name, len(CLASSES)) for name in graph.highway.tolist()], np.int64)
     best = np.full(len(graph.node_id), len(CLASSES), np.int64)
     worst = np.zeros(len(graph.node_id), np.int64)
     np.minimum.at(best, ends, np.tile(rank[one_each], 2))

@@ -101,7 +101,7 @@ def _one_limit(text: str) -> tuple[float, str] | None:
 
 def read_speeds(tags: Tags, highway: str, unread: list[str]) -> tuple[tuple[float, float], tuple[str, str]]:
     """Limits in m/s along the way and against it, and their sources; unreadable tags join ``unread``."""
-    default = _SPEED[highway] * _KMH, "default"
+    default = _SPEED.get(highway, _SPEED["service"]) * _KMH, "default"
     both = default
     for key in ("maxspeed", "zone:maxspeed", "maxspeed:type", "source:maxspeed", "zone:traffic"):
         text = tags.get(key, "")

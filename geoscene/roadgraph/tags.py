@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 from geoscene.roadgraph.speeds import read_speeds
 from geoscene.sources.data import Tags
+from geoscene.tags import parse_length
 
 CLASSES = (
     "motorway",
@@ -25,10 +25,13 @@ CLASSES = (
     "road",
     "service",
 )
-"""Values of ``highway`` that a car may use, most important first."""
+"""Values of ``highway`` that the public may drive on, most important first."""
+
+OTHER_CLASSES = ("busway", "bus_guideway", "raceway", "escape", "track")
+"""Values of ``highway`` with a carriageway that is not for the public."""
 
 # Lanes in each direction (OSM wiki, Key:lanes, "Assumptions"). A half is one lane that both directions share.
-_LANES = dict.fromkeys(CLASSES, 1.0) | {"motorway": 2.0, "service": 0.5}
+_LANES = dict.fromkeys(CLASSES, 1.0) | {"motorway": 2.0, "service": 0.5, "track": 0.5}
 
 # Metres. Assumed between RASt 06 / RAA (Germany: 2.75 in residential streets, 3.25 on main urban roads,
 # 3.75 on motorways) and the AASHTO Green Book (2.7 to 3.6).
@@ -48,6 +51,7 @@ _LANE_WIDTH = {
     "living_street": 2.75,
     "road": 3.0,
     "service": 3.0,
+    "track": 2.5,
 }
 
 # Metres of the whole carriageway of service roads without width or lanes: assumed (an aisle lets two cars
@@ -101,19 +105,19 @@ class Street:
 
 
 def drivable(tags: Tags, *, private: bool = False) -> bool:
-    """Whether the public may drive a car on the way (with ``private``: anybody at all).
+    """Whether the public may drive a car on the way; with ``private`` whether somebody may drive something.
 
     The most specific of ``motorcar``, ``motor_vehicle``, ``vehicle`` and ``access`` decides.
     """
-    if tags.get("highway") not in CLASSES or tags.get("area") == "yes":
+    highway = tags.get("highway")
+    if tags.get("area") == "yes" or highway not in (CLASSES + OTHER_CLASSES if private else CLASSES):
         return False
-    if tags.get("service") == "emergency_access":
-        return False
+    if private:
+        return True
     for key in ("motorcar", "motor_vehicle", "vehicle", "access"):
         if key in tags:
-            value = tags[key]
-            return value not in _SHUT or (private and value in ("private", "delivery"))
-    return True
+            return tags[key] not in _SHUT
+    return tags.get("service") != "emergency_access"
 
 
 def read_street(tags: Tags) -> tuple[Street, list[str]]:
@@ -173,17 +177,6 @@ def read_layer(tags: Tags, unread: list[str]) -> tuple[int, str]:
     return (-1, "tunnel") if is_tunnel(tags) else (0, "default")
 
 
-def metres(text: str) -> float | None:
-    """Metres of a length as mappers write it (``3.5``, ``3,5 m``, ``12'``, ``12'6"``, ``12 ft``), or None."""
-    text = text.strip().lower().split(";", maxsplit=1)[0].replace(",", ".")
-    if match := re.fullmatch(r"(\d+(?:\.\d+)?)\s*(m|meters?|metres?|ft|feet|cm|km|mi)?", text):
-        units = {"ft": 0.3048, "feet": 0.3048, "cm": 0.01, "km": 1000.0, "mi": 1609.344}
-        return float(match[1]) * units.get(match[2] or "", 1.0)
-    if match := re.fullmatch(r"(\d+)\s*['′](?:\s*(\d+(?:\.\d+)?)\s*(?:\"|″|''))?", text):
-        return int(match[1]) * 0.3048 + float(match[2] or 0) * 0.0254
-    return None
-
-
 def _direction(tags: Tags) -> int:
     """1, -1 or 0. Lanes that change their direction (``reversible``, ``alternating``) serve both."""
     value = tags.get("oneway:motor_vehicle", tags.get("oneway", ""))
@@ -221,14 +214,14 @@ def _lanes(tags: Tags, highway: str, direction: int, unread: list[str]) -> tuple
     if direction:
         side = ahead if direction == 1 else back
         given = total if total is not None else side
-        count = _LANES[highway] if given is None else given
+        count = _LANES.get(highway, 1.0) if given is None else given
         count = max(count, 1.0)
         return ((count, 0.0) if direction == 1 else (0.0, count)), ("default" if given is None else "lanes")
     middle = _count(tags, "lanes:both_ways", unread) or 0.0
     if ahead is not None and back is not None:
         return (ahead + middle / 2, back + middle / 2), "lanes"
     if total is None:
-        default = _LANES[highway]
+        default = _LANES.get(highway, 1.0)
         source = "default" if ahead is None and back is None else "lanes"
         return (default if ahead is None else ahead, default if back is None else back), source
     if ahead is not None and total > ahead:
@@ -243,13 +236,13 @@ def _width(tags: Tags, direction: int, counted: tuple[float, str], unread: list[
     for key in ("width:carriageway", "width", "est_width"):
         if (text := tags.get(key)) is None:
             continue
-        width = metres(text)
+        width = parse_length(text)
         if width is not None and 1.5 <= width <= 60:
             return width, "est_width" if key == "est_width" else "width"
         unread.append(f"{key}={text}")
     if highway == "service" and lanes_source == "default":
         return _SERVICE_WIDTH.get(tags.get("service", ""), _SERVICE_WIDTH_ELSE), "default"
-    width = lanes * _LANE_WIDTH[highway]
+    width = lanes * _LANE_WIDTH.get(highway, 3.5)
     if direction and lanes_source == "default":
         width = max(width, _ONEWAY_AT_LEAST)
     return width + _beside_lanes(tags), lanes_source

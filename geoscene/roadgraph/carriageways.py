@@ -1,0 +1,247 @@
+"""Every carriageway of a map, whoever may use it: where it runs, how wide it is, what lies beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from geoscene.ground.kinds import SURFACES
+from geoscene.report import Problem
+from geoscene.roadgraph.build import read_runs
+from geoscene.roadgraph.chains import find_cuts, link_chains
+from geoscene.roadgraph.tags import Street, drivable, read_street
+from geoscene.sources.data import OsmData, Tags, Way
+from geoscene.tags import parse_length
+
+Float = NDArray[np.float64]
+
+KERB = 0.15
+"""Metres, plan width of a kerb stone (usual sizes are 0.12 to 0.15)."""
+
+SIDEWALK = 2.0
+"""Metres, a sidewalk of unknown width. Assumed; street design guides ask for 1.5 to 2.5."""
+
+# Streets that have sidewalks in built-up places, and the limit above which a place is not built up.
+_WALKED = ("primary", "secondary", "tertiary", "residential", "living_street")
+_BUILT_UP = 61 / 3.6
+
+PAVED = frozenset({"asphalt", "concrete", "paving", "brick", "stone"})
+"""Materials that carry paint and kerbs."""
+
+
+def surface_material(tags: Tags, default: str) -> tuple[str, str]:
+    """Name of the material that ``surface`` means, and its source (``surface`` or ``default``)."""
+    name = SURFACES.get(tags.get("surface", "").split(";", maxsplit=1)[0])
+    return (default, "default") if name is None else (name, "surface")
+
+
+@dataclass(frozen=True, slots=True)
+class Carriageways:
+    """One row a stretch of road between two nodes; a two-way street is one row. Sides as seen along the line.
+
+    line   : (k,) shapely LineString, scene metres
+    ends   : (k, 2) int32 node of the line's start and end
+    node_xy : (n, 2) float64 scene metres
+    node_id : (n,) int64 OSM ids
+    street : (k,) what the tags say (its ``speed`` and ``name`` are those of the first way)
+    width  : (k,) float64 scene metres
+    walk   : (k, 2) float64 scene metres, width of the sidewalk on the left and on the right, 0 for none
+    walk_source : (k, 2) str: ``sidewalk`` (tag), ``default`` or "" (none)
+    material, material_source : (k,) str
+    marked : (k,) bool, ``lane_markings`` or the class says that lanes are painted
+    osm_id : (k,) str
+    """
+
+    line: NDArray[np.object_]
+    ends: NDArray[np.int32]
+    node_xy: Float
+    node_id: NDArray[np.int64]
+    street: list[Street]
+    width: Float
+    walk: Float
+    walk_source: NDArray[np.str_]
+    material: NDArray[np.str_]
+    material_source: NDArray[np.str_]
+    marked: NDArray[np.bool_]
+    osm_id: NDArray[np.str_]
+
+    def __len__(self) -> int:
+        """Number of stretches."""
+        return len(self.line)
+
+    def take(self, keep: NDArray[np.bool_]) -> Carriageways:
+        """The chosen stretches; nodes stay as they are."""
+        columns = {
+            f.name: getattr(self, f.name)[keep]
+            for f in fields(self)
+            if f.name not in ("node_xy", "node_id", "street")
+        }
+        return replace(self, **columns, street=[s for s, k in zip(self.street, keep, strict=True) if k])
+
+    @property
+    def place(self) -> NDArray[np.int8]:
+        """0 on the ground, 1 on a bridge (or an upper storey), 2 in a tunnel."""
+        return np.array([place_of(s.layer, s.layer_source, s.bridge, s.tunnel) for s in self.street], np.int8)
+
+    @property
+    def layer(self) -> NDArray[np.int8]:
+        """OSM layer of each stretch."""
+        return np.array([s.layer for s in self.street], np.int8)
+
+
+def place_of(layer: int, layer_source: str, bridge: bool, tunnel: bool) -> int:  # noqa: FBT001
+    """0 on the ground, 1 on a bridge or an upper storey, 2 in a tunnel or a basement.
+
+    ``layer`` alone lifts nothing: a road of layer -1 that is no tunnel runs in a cutting, which is ground.
+    """
+    storey = layer if layer_source == "level" else 0
+    if bridge or storey > 0:
+        return 1
+    return 2 if tunnel or storey < 0 else 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """Everything that must agree where two ways become one stretch."""
+
+    street: Street
+    walk: tuple[float, float]
+    walk_source: tuple[str, str]
+    material: tuple[str, str]
+    marked: bool
+
+    @property
+    def symmetric(self) -> bool:
+        return self.street.symmetric and self.walk[0] == self.walk[1]
+
+
+def read_carriageways(
+    osm: OsmData, frame: Frame, *, sidewalks: Literal["mapped", "urban"], left_hand: bool
+) -> Carriageways:
+    """The carriageways of a map.
+
+    sidewalks : ``urban`` gives streets of built-up places sidewalks where the map does not speak of them and
+                shows no footway beside them
+    left_hand : traffic keeps left
+    """
+    ways = [way for way in osm.ways if drivable(way.tags, private=True)]
+    kinds = [_read_kind(way) for way in ways]
+    ignored: list[Problem] = []  # reported with the road graph
+    runs, node_id, lonlat = read_runs(ways, ignored)
+    number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
+    cut = find_cuts(
+        runs,
+        np.array([number[kind] for kind in kinds], np.int64),
+        np.array([kind.symmetric for kind in kinds], np.bool_),
+        len(node_id),
+    )
+    chains = link_chains(runs, cut)
+    x, y = frame.from_geographic(lonlat[:, 0], lonlat[:, 1])
+    xy = np.stack([x, y], axis=1)
+    sizes = [len(chain.node) for chain in chains]
+    places = xy[np.concatenate([c.node for c in chains])] if chains else np.empty((0, 2))
+    line = shapely.linestrings(places, indices=np.repeat(np.arange(len(chains)), sizes))
+    of = [kinds[chain.way[0]] for chain in chains]
+    middle = shapely.get_coordinates(shapely.line_interpolate_point(line, 0.5, normalized=True))
+    scale = frame.scale_at(middle[:, 0], middle[:, 1]) if chains else np.empty(0)
+    table = Carriageways(
+        line=np.asarray(line, object),
+        ends=np.array([(c.node[0], c.node[-1]) for c in chains], np.int32).reshape(-1, 2),
+        node_xy=xy,
+        node_id=node_id,
+        street=[kind.street for kind in of],
+        width=np.array([kind.street.width for kind in of], float) * scale,
+        walk=np.array([kind.walk for kind in of], float).reshape(-1, 2) * scale[:, None],
+        walk_source=np.array([kind.walk_source for kind in of], "<U8").reshape(-1, 2),
+        material=np.array([kind.material[0] for kind in of], "<U8"),
+        material_source=np.array([kind.material[1] for kind in of], "<U8"),
+        marked=np.array([kind.marked for kind in of], np.bool_),
+        osm_id=np.array([ways[chain.way[0]].osm_id for chain in chains], np.str_),
+    )
+    return _guess_sidewalks(table, osm, frame, urban=sidewalks == "urban", left_hand=left_hand)
+
+
+def _read_kind(way: Way) -> _Kind:
+    street, _ = read_street(way.tags)
+    walks = [_sidewalk(way.tags, side) for side in ("left", "right")]
+    rough = street.highway == "track" and way.tags.get("tracktype") != "grade1"
+    material = surface_material(way.tags, "gravel" if rough else "asphalt")
+    markings = way.tags.get("lane_markings")
+    main = street.highway.removesuffix("_link") in ("motorway", "trunk", "primary", "secondary", "tertiary")
+    mapped = street.lanes_source == "lanes" and sum(street.lanes) >= 2 and street.highway != "service"
+    marked = markings != "no" and (main or mapped or markings == "yes") and material[0] in PAVED
+    return _Kind(street, (walks[0][0], walks[1][0]), (walks[0][1], walks[1][1]), material, marked)
+
+
+def _sidewalk(tags: Tags, side: str) -> tuple[float, str]:
+    """Width of the sidewalk on a side and its source; ``?`` where the map does not speak of it."""
+    value = tags.get(f"sidewalk:{side}", tags.get("sidewalk:both", tags.get("sidewalk")))
+    if value is None:
+        return 0.0, "?"
+    if value in ("both", "yes", side):
+        width = None
+        for key in (f"sidewalk:{side}:width", "sidewalk:both:width", "sidewalk:width"):
+            width = width or parse_length(tags.get(key))
+        return (width if width and 0.5 <= width <= 15 else SIDEWALK), "sidewalk"
+    return 0.0, ""
+
+
+def _guess_sidewalks(
+    table: Carriageways, osm: OsmData, frame: Frame, *, urban: bool, left_hand: bool
+) -> Carriageways:
+    """The table with its unknown sidewalks decided."""
+    unknown = table.walk_source == "?"
+    walk, source = table.walk.copy(), np.where(unknown, "", table.walk_source)
+    walked = np.array(
+        [s.highway in _WALKED and max(s.speed) <= _BUILT_UP and not s.tunnel for s in table.street], np.bool_
+    )
+    rows = np.flatnonzero(walked & unknown.any(axis=1) & np.isin(table.material, list(PAVED)))
+    if urban and len(rows):
+        beside = _footway_beside(table, rows, osm, frame)
+        # Of a divided road each half has its sidewalk on the outer side.
+        divided = np.array([s.direction != 0 and s.highway in _WALKED[:2] for s in table.street], np.bool_)
+        against = np.array([s.direction == -1 for s in table.street], np.bool_)
+        for side in (0, 1):
+            inner = divided & (((side == 0) != left_hand) ^ against)
+            chosen = rows[unknown[rows, side] & ~beside[:, side] & ~inner[rows]]
+            walk[chosen, side] = SIDEWALK
+            source[chosen, side] = "default"
+    return replace(table, walk=walk, walk_source=source)
+
+
+def _footway_beside(
+    table: Carriageways, rows: NDArray[np.int64], osm: OsmData, frame: Frame
+) -> NDArray[np.bool_]:
+    """Whether a mapped footway runs along the left and the right of each stretch (len(rows), 2)."""
+    found = np.zeros((len(rows), 2), np.bool_)
+    lines = [
+        np.stack(frame.from_geographic(*way.lonlat[np.isfinite(way.lonlat).all(axis=1)].T), axis=1)
+        for way in osm.ways
+        if way.tags.get("highway") in ("footway", "path", "pedestrian", "cycleway", "steps")
+        and way.tags.get("footway") != "crossing"
+    ]
+    tree = shapely.STRtree([shapely.LineString(line) for line in lines if len(line) > 1])
+    at = np.linspace(0.1, 0.9, 5)
+    length = shapely.length(table.line[rows])
+    here = shapely.get_coordinates(
+        shapely.line_interpolate_point(table.line[rows][:, None], at, normalized=True)
+    ).reshape(len(rows), len(at), 2)
+    step = np.minimum(0.5 / np.maximum(length, 1.0), 0.05)[:, None]
+    there = shapely.get_coordinates(
+        shapely.line_interpolate_point(table.line[rows][:, None], at + step, normalized=True)
+    ).reshape(len(rows), len(at), 2)
+    way = there - here
+    way /= np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-9)
+    left = np.stack([-way[..., 1], way[..., 0]], axis=2)
+    aside = (table.width[rows] / 2 + 3.0)[:, None, None]
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        points = shapely.points((here + sign * aside * left).reshape(-1, 2))
+        near = np.zeros(len(points), np.bool_)
+        near[tree.query(points, predicate="dwithin", distance=5.0)[0]] = True
+        found[:, side] = near.reshape(len(rows), len(at)).sum(axis=1) >= 2
+    return found

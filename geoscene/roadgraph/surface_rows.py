@@ -1,0 +1,99 @@
+"""Road surfaces as columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.classes import materials
+
+GRID = 1e-4
+"""Metres: coordinates of surfaces are whole multiples of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceRows:
+    """Polygons in plan that compete for the ground; where two overlap the higher priority wins.
+
+    polygon  : (n,) object, valid shapely Polygon, scene metres, coordinates on a grid of 0.1 mm
+    klass    : (n,) uint8, `geoscene.classes.Class`
+    material : (n,) uint8, code of `geoscene.classes.materials`
+    priority : (n,) float64
+    osm_id   : (n,) str, the way, node or relation
+    source   : (n,) str, what shape and material rest on, as ``shape/material``: shape is ``width``,
+               ``est_width``, ``lanes`` or ``default`` (where the width comes from), ``sidewalk`` (tag),
+               ``area``, ``crossing`` (tag), ``control`` (a signal or sign); material is ``surface`` or
+               ``default``
+    place    : (n,) int8, 0 on the ground, 1 on a bridge or an upper storey, 2 in a tunnel or a basement
+    level    : (n,) int8, OSM layer
+    edge     : (n,) int32, the edge of the road graph that runs on it, -1 for none
+    """
+
+    polygon: NDArray[np.object_]
+    klass: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    priority: NDArray[np.float64]
+    osm_id: NDArray[np.str_]
+    source: NDArray[np.str_]
+    place: NDArray[np.int8]
+    level: NDArray[np.int8]
+    edge: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Number of polygons."""
+        return len(self.polygon)
+
+    @classmethod
+    def of(
+        cls,
+        polygon: NDArray[np.object_],
+        *,
+        klass: ArrayLike,
+        material: Sequence[str] | NDArray[np.str_] | str,
+        priority: ArrayLike,
+        osm_id: ArrayLike = "",
+        source: ArrayLike = "default/default",
+        place: ArrayLike = 0,
+        level: ArrayLike = 0,
+        edge: ArrayLike = -1,
+    ) -> SurfaceRows:
+        """Rows of shapes; materials by name, every other column broadcast.
+
+        Shapes are put on the grid, made valid, and split into polygons; what has no area is left out.
+        """
+        n = (len(polygon),)
+        table = materials()
+        names = np.broadcast_to(np.asarray(material, np.str_), n).tolist()
+        shapes = shapely.set_precision(polygon, GRID)
+        parts, row = shapely.get_parts(shapes, return_index=True)
+        keep = (shapely.get_type_id(parts) == 3) & (shapely.area(parts) > GRID)
+        row = row[keep]
+        return cls(
+            parts[keep],
+            np.broadcast_to(np.asarray(klass, np.uint8), n)[row],
+            np.array([table[name].code for name in names], np.uint8)[row],
+            np.broadcast_to(np.asarray(priority, np.float64), n)[row],
+            np.broadcast_to(np.asarray(osm_id, np.str_), n)[row],
+            np.broadcast_to(np.asarray(source, np.str_), n)[row],
+            np.broadcast_to(np.asarray(place, np.int8), n)[row],
+            np.broadcast_to(np.asarray(level, np.int8), n)[row],
+            np.broadcast_to(np.asarray(edge, np.int32), n)[row],
+        )
+
+    def columns(self) -> dict[str, Any]:
+        """The columns by name, in order."""
+        return {f.name: getattr(self, f.name) for f in fields(SurfaceRows)}
+
+    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> SurfaceRows:
+        """The chosen rows, in the given order."""
+        return SurfaceRows(**{name: column[keep] for name, column in self.columns().items()})
+
+
+def concatenate_rows(parts: Sequence[SurfaceRows]) -> SurfaceRows:
+    """One table of all rows, in order."""
+    return SurfaceRows(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SurfaceRows)))
