@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
-import gzip
+import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,8 @@ from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.sources.assemble import Bounds, checked_bounds, features
 from geoscene.sources.data import OsmData
 from geoscene.sources.elements import Collector
+from geoscene.sources.lenient import collect_xml
+from geoscene.sources.overpass import collect_answer
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
@@ -19,7 +21,7 @@ _HELP = "give an OpenStreetMap extract (.osm, .osm.gz, .osm.bz2, .osm.pbf)"
 
 
 def _format_of(path: Path) -> str:
-    """The name that libosmium gives a file's format, by its first bytes, whatever the file is called.
+    """What a file's format is called, by its first bytes, whatever the file is called.
 
     Raises InputError for anything that is no OpenStreetMap file.
     """
@@ -35,24 +37,20 @@ def _format_of(path: Path) -> str:
         return "pbf"
     if head[:7] == b"\xff\xe0\x04o5m2":
         return "o5m"
-    if head.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"<":
+    text = head.lstrip(b"\xef\xbb\xbf \t\r\n")
+    if text[:1] == b"<":
         return "osm"
+    if text[:1] == b"{":
+        return "json"
     raise InputError(f"{path}: not an OpenStreetMap file; {_HELP}")
 
 
-def _collect(path: Path, progress: Progress) -> Collector:
-    """The objects of a file. Raises whatever libosmium raises."""
+def _stream(file: Any, taken: Collector, progress: Progress) -> None:
+    """Put the objects that libosmium reads into ``taken``."""
     import osmium  # noqa: PLC0415 - heavy
 
-    file = osmium.io.File(str(path), _format_of(path))
     stream = osmium.FileProcessor(file)
-    header = stream.header
-    taken = Collector()
-    box = header.box()
-    if box.valid() and box.size() > 0:
-        low, high = box.bottom_left, box.top_right
-        taken.bounds = (low.lon, low.lat, high.lon, high.lat)
-    taken.timestamp = header.get("osmosis_replication_timestamp") or header.get("timestamp")
+    stated = stream.header.get("osmosis_replication_timestamp") or stream.header.get("timestamp")
     newest = dt.datetime.fromtimestamp(0, dt.UTC)
     kinds = {"n": "node", "w": "way", "r": "relation"}
     for item in progress(stream):
@@ -62,26 +60,42 @@ def _collect(path: Path, progress: Progress) -> Collector:
             taken.node(item.id, place.x, place.y, tags)
             if tags is None:
                 continue
-        elif item.is_way():
-            if item.deleted:
-                continue
+        elif item.is_way() and not item.deleted:
             taken.way(item.id, [node.ref for node in item.nodes], {tag.k: tag.v for tag in item.tags})
-        elif item.is_relation():
-            if item.deleted:
-                continue
+        elif item.is_relation() and not item.deleted:
             members = tuple((kinds[m.type], m.ref, m.role) for m in item.members)
             taken.relation(item.id, {tag.k: tag.v for tag in item.tags}, members)
         else:
             continue
-        if not taken.timestamp:
+        if not stated:
             newest = max(newest, item.timestamp)
-    if not taken.timestamp and newest.timestamp() > 0:
-        taken.timestamp = newest.strftime("%Y-%m-%dT%H:%M:%SZ")
+    taken.timestamp = stated or (newest.strftime("%Y-%m-%dT%H:%M:%SZ") if newest.timestamp() > 0 else "")
+
+
+def _collect(path: Path, progress: Progress) -> Collector:
+    """The objects of a file. Raises whatever its reader raises."""
+    import osmium  # noqa: PLC0415 - heavy
+
+    form = _format_of(path)
+    taken = Collector()
+    if form == "json":
+        collect_answer(json.loads(path.read_bytes()), taken)
+        return taken
+    file = osmium.io.File(str(path), form)
+    box = osmium.FileProcessor(file).header.box()
+    if box.valid() and box.size() > 0:
+        low, high = box.bottom_left, box.top_right
+        taken.bounds = (low.lon, low.lat, high.lon, high.lat)
+    try:
+        _stream(file, taken, progress)
+    except osmium.InvalidLocationError:  # a node's position is no number: read on without libosmium
+        taken = Collector(bounds=taken.bounds)
+        collect_xml(path, form, taken, progress=progress)
     return taken
 
 
 def read_osm(path: str | Path, *, bounds: Bounds | None = None, progress: Progress = iter) -> OsmData:
-    """The features of an OpenStreetMap extract: XML, plain or compressed (gzip, bzip2), PBF or o5m.
+    """The features of an OpenStreetMap extract: XML (plain, gzip, bzip2), PBF, o5m or Overpass JSON.
 
     The format is told by the first bytes, not by the name. Ids may be negative and in any order, relations
     may stand before ways. What is broken is repaired or dropped by the rules of docs/sources.md and listed in
@@ -112,9 +126,9 @@ def read_osm(path: str | Path, *, bounds: Bounds | None = None, progress: Progre
         raise InputError(f"{path}: a directory; {_HELP}")
     try:
         taken = _collect(path, progress)
-    except InputError:
-        raise
-    except (RuntimeError, OSError, ValueError, EOFError, gzip.BadGzipFile) as error:
+    except InputError as error:
+        raise error if str(path) in str(error) else InputError(f"{path}: {error}; {_HELP}") from None
+    except (RuntimeError, OSError, ValueError, EOFError) as error:
         cause = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: damaged, cut short or no OpenStreetMap file ({cause}); {_HELP}") from error
     if len(taken) == 0:

@@ -214,8 +214,8 @@ def _fetch(
     area = _area_km2(bounds)
     if area > servers.max_area_km2:
         raise InputError(
-            f"{source}: {area:,.0f} km², more than the {servers.max_area_km2:,.0f} km² that map servers may be"
-            " asked for; take a part of it, or an extract of the region (--osm FILE)"
+            f"{source}: {area:,.0f} km², more than the {servers.max_area_km2:,.0f} km² that map servers"
+            " may be asked for; take a part of it, or an extract of the region (--osm FILE)"
         )
     taken = Collector(bounds=bounds)
     for part in progress(_parts(bounds, servers.max_query_km2)):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from geoscene.errors import InputError
 from geoscene.sources.data import Tags
-from geoscene.sources.elements import UNITS, UNKNOWN, Collector
+from geoscene.sources.elements import Collector
+from geoscene.sources.lenient import whole_units
 
 Box = tuple[float, float, float, float]
 
@@ -33,13 +33,6 @@ def query_for(box: Box, *, timeout: int = 180) -> str:
     )
 
 
-def _whole(degrees: Any) -> int:
-    """A coordinate in 1e-7 degrees, `UNKNOWN` if it is none."""
-    if not isinstance(degrees, int | float) or not math.isfinite(degrees) or abs(degrees) > 200:
-        return UNKNOWN
-    return round(degrees * UNITS)
-
-
 def collect_answer(answer: Any, taken: Collector) -> None:
     """Put the objects of one answer into ``taken``.
 
@@ -54,7 +47,7 @@ def collect_answer(answer: Any, taken: Collector) -> None:
             tags: Tags = item.get("tags") or {}
             kind, osm_id = item["type"], item["id"]
             if kind == "node":
-                taken.node(osm_id, _whole(item.get("lon")), _whole(item.get("lat")), tags or None)
+                taken.node(osm_id, whole_units(item.get("lon")), whole_units(item.get("lat")), tags or None)
             elif kind == "way":
                 taken.way(osm_id, item.get("nodes", ()), tags)
             elif kind == "relation":

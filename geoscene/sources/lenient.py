@@ -1,0 +1,58 @@
+"""OpenStreetMap XML with coordinates that are no coordinates, which libosmium refuses as a whole."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+from geoscene.sources.elements import UNITS, UNKNOWN, Collector
+
+_OPEN: dict[str, Callable[..., Any]] = {"osm": open, "osm.gz": gzip.open, "osm.bz2": bz2.open}
+
+
+def whole_units(degrees: Any) -> int:
+    """A coordinate in 1e-7 degrees; `UNKNOWN` if it is none, or far out of range."""
+    try:
+        value = float(degrees)
+    except (TypeError, ValueError):
+        return UNKNOWN
+    return round(value * UNITS) if math.isfinite(value) and abs(value) <= 200 else UNKNOWN
+
+
+def collect_xml(
+    path: Path, form: str, taken: Collector, *, progress: Callable[[Iterable[Any]], Iterable[Any]]
+) -> None:
+    """Put the objects of an XML file into ``taken``, nodes without a position too; slower than libosmium.
+
+    form : ``osm``, ``osm.gz`` or ``osm.bz2``
+
+    Raises ValueError or OSError for a file that is damaged.
+    """
+    try:
+        with _OPEN[form](path, "rb") as file:
+            for _, item in progress(ET.iterparse(file)):  # noqa: S314 - expat limits the expansion of entities
+                if item.tag not in {"node", "way", "relation"}:
+                    continue
+                tags = {tag.get("k", ""): tag.get("v", "") for tag in item.iter("tag")}
+                osm_id = int(item.get("id", ""))
+                if item.tag == "node":
+                    x, y = whole_units(item.get("lon")), whole_units(item.get("lat"))
+                    taken.node(osm_id, x, y, tags or None)
+                elif item.tag == "way":
+                    taken.way(osm_id, [int(nd.get("ref", "")) for nd in item.iter("nd")], tags)
+                else:
+                    members = tuple(
+                        (m.get("type", ""), int(m.get("ref", "")), m.get("role", ""))
+                        for m in item.iter("member")
+                    )
+                    taken.relation(osm_id, tags, members)
+                if not taken.timestamp or item.get("timestamp", "") > taken.timestamp:
+                    taken.timestamp = item.get("timestamp", "")
+                item.clear()
+    except ET.ParseError as error:
+        raise ValueError(str(error)) from error
