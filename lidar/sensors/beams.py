@@ -104,3 +104,9 @@ def frozen(array: NDArray[T]) -> NDArray[T]:
     """The same array, made read-only: it is shared between frames."""
     array.flags.writeable = False
     return array
+
+
+def numbers(count: int, lasers: int) -> tuple[NDArray[np.int32], NDArray[np.uint16]]:
+    """Block and laser of each pulse, where ``lasers`` pulses are fired in each of ``count`` blocks."""
+    block = np.repeat(np.arange(count, dtype=np.int32), lasers)
+    return block, np.tile(np.arange(lasers, dtype=np.uint16), count)

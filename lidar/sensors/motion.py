@@ -10,18 +10,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lidar.physics.footprint import bundle
-from lidar.poses import Poses, Trajectory
+from lidar.poses import KNOT_NS, Poses, Trajectory
 from lidar.rig import Mount
 from lidar.sensors.beams import Firings
 
 Float = NDArray[np.float64]
-
-KNOT_NS = 200_000
-"""Poses are taken this often, nanoseconds; between two of them a beam moves along the chord.
-
-A car that yaws at 1 rad/s leaves the true arc by (2e-4)^2 / 8 = 5e-9 rad.
-"""
-
 
 @dataclass(frozen=True, slots=True)
 class Rays:

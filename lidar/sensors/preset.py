@@ -11,8 +11,12 @@ import numpy as np
 
 from lidar.errors import RigError
 from lidar.sensors.beams import Firings, Pattern, frame_ns
+from lidar.sensors.flash import read_flash
+from lidar.sensors.line import read_line
+from lidar.sensors.prisms import read_prisms
 from lidar.sensors.scanner2d import read_scan2d
 from lidar.sensors.spinning import read_spinning
+from lidar.sensors.sweep import read_listed, read_sweep
 from lidar.sensors.table import Table, read_table
 
 RETURN_MODES = ("strongest", "last", "first", "dual", "all")
@@ -193,5 +197,10 @@ def _read(table: Table, name: str, rate_hz: float, return_mode: str, start_ns: i
 
 _READERS: dict[str, Callable[[Table, float, tuple[float, ...]], Pattern]] = {
     "spinning": lambda table, _rate, _rates: read_spinning(table),
+    "prism": lambda table, _rate, _rates: read_prisms(table),
+    "sweep": lambda table, _rate, _rates: read_sweep(table),
+    "table": lambda table, _rate, _rates: read_listed(table),
+    "flash": lambda table, rate, _rates: read_flash(table, rate),
+    "line": lambda table, _rate, _rates: read_line(table),
     "scan2d": read_scan2d,
 }
