@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,13 @@ def to_grid(xy: NDArray[np.float64]) -> NDArray[np.float64]:
     # dividing by 1e4, as GEOS does, gives the float nearest to the decimal; multiplying by 1e-4 does not
     rounded: NDArray[np.float64] = np.rint(xy * 1e4) / 1e4
     return rounded
+
+
+def gathered(shapes: Sequence[Any]) -> Polygons:
+    """A column of shapes."""
+    out = np.empty(len(shapes), dtype=object)
+    out[:] = shapes
+    return out
 
 
 def project(geometry: Polygons, frame: Frame) -> Polygons:

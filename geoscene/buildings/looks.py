@@ -30,15 +30,15 @@ _MATERIALS: dict[str, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Colour and material of a wall or a roof, and whether the map says so (source ``tag``) or not (``""``)."""
+    """Colour and material of a wall or a roof as tagged, None where the map does not say."""
 
     color: tuple[int, int, int] | None
     material: Material | None
 
     @property
-    def source(self) -> str:
-        """``tag`` if the map gives either."""
-        return "tag" if self.color is not None or self.material is not None else ""
+    def tagged(self) -> bool:
+        """The map gives either."""
+        return self.color is not None or self.material is not None
 
 
 def _first(tags: Tags, *keys: str) -> str | None:
@@ -66,10 +66,19 @@ def read_roof(tags: Tags) -> Look:
     )
 
 
-def settle(own: Look, outline: Look | None, default: str) -> tuple[tuple[int, int, int], int, str]:
-    """Colour, material code and source (tag, outline or default); a part without its own takes its outline's."""
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """Colour, material code and where they come from: tag, outline or default."""
+
+    color: tuple[int, int, int]
+    material: int
+    source: str
+
+
+def settle_look(own: Look, outline: Look | None, default: str) -> Settled:
+    """The look of a wall or roof; a part without its own takes its outline's, else the default material."""
     for look, source in ((own, "tag"), (outline, "outline")):
-        if look is not None and look.source:
+        if look is not None and look.tagged:
             material = look.material or materials()[default]
-            return look.color or material.color, material.code, source
-    return materials()[default].color, materials()[default].code, "default"
+            return Settled(look.color or material.color, material.code, source)
+    return Settled(materials()[default].color, materials()[default].code, "default")

@@ -61,6 +61,9 @@ INWARD: dict[str, Profile] = {
 GABLED = {"gabled": 1.0, "gambrel": 1.0, "round": 1.0, "saltbox": 1.0, "half-hipped": 0.5}
 """How far the ends of a skeleton's ridges are raised into gables."""
 
+_STAND_IN = {"onion": "a dome", "saltbox": "gabled", "pyramidal": "hipped", "cone": "hipped"}
+"""What a shape becomes on the skeleton, if not itself."""
+
 TURNED: dict[str, Profile] = {
     # (share of the height, share of the footprint's size) of the rings about the middle; never wider than the
     # footprint, so that an onion does not reach into its neighbour
@@ -108,17 +111,17 @@ def roof_shell(polygon: Any, spec: RoofSpec) -> tuple[Triangles, str]:
         return _from_cells(_skillion(polygon, spec), spec), ""
     if spec.shape in ACROSS and (_box_like(polygon) or np.isfinite(spec.direction) or spec.across):
         return _from_cells(_ridged(polygon, spec), spec), ""
-    cells = _inward(polygon, spec) if spec.shape in INWARD else None
+    cells, raised = _inward(polygon, spec)
     if cells is None:
-        flat = prisms(
+        flat = (
             np.array([polygon], dtype=object),
             np.zeros(1, np.int64),
             np.array([spec.low]),
             np.array([spec.high]),
         )
-        return flat, f"{spec.shape} roof made flat"
-    stand_in = {"onion": "dome on the skeleton", "dome": "", "saltbox": "gabled"}.get(spec.shape, "")
-    if spec.shape in ("pyramidal", "cone"):
+        return prisms(*flat), f"{spec.shape} roof made flat"
+    stand_in = _STAND_IN.get(spec.shape, "")
+    if spec.shape in GABLED and not raised:
         stand_in = "hipped"
     return _from_cells(cells, spec), f"{spec.shape} roof made {stand_in}" if stand_in else ""
 
@@ -146,6 +149,8 @@ def _axes(polygon: Any) -> tuple[Float, Float, float]:
 
 
 def _box_like(polygon: Any) -> bool:
+    if shapely.get_num_interior_rings(polygon):
+        return False  # a ridge would run across the courtyard
     return bool(shapely.area(polygon) > BOX_LIKE * _axes(polygon)[2])
 
 
@@ -207,18 +212,23 @@ def _ridged(polygon: Any, spec: RoofSpec) -> Cells:
     return replace(cells, field=height)
 
 
-def _inward(polygon: Any, spec: RoofSpec) -> Cells | None:
-    """A profile drawn from the eaves inwards over the straight skeleton, with the height's share as field."""
+def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
+    """A profile drawn from the eaves inwards over the straight skeleton, with the height's share as field.
+
+    None if there is no skeleton. The flag says whether some end was raised into a gable.
+    """
     skeleton = straight_skeleton(polygon)
     if skeleton is None:
-        return None
+        return None, False
+    corners = len(skeleton.xy)
     if spec.shape in GABLED:
         skeleton = raise_gables(skeleton, GABLED[spec.shape])
     cells = skeleton_cells(skeleton)
     span = float(cells.field.max())
-    for share, _ in INWARD[spec.shape][1:-1]:
+    profile = INWARD[spec.shape]
+    for share, _ in profile[1:-1]:
         cells = cut(cells, share * span)
-    return replace(cells, field=_profile(cells.field, span, INWARD[spec.shape]))
+    return replace(cells, field=_profile(cells.field, span, profile)), len(skeleton.xy) > corners
 
 
 def _from_cells(cells: Cells, spec: RoofSpec) -> Triangles:

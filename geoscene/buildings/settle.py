@@ -1,0 +1,161 @@
+"""Every building's and part's heights: from its tags, its building, its parts, or by inference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.buildings.footprints import gathered
+from geoscene.buildings.heights import HIGHEST, SIGMA_PRIOR, Tagged, infer_heights
+from geoscene.buildings.rooftags import RoofTags, default_roof_height
+from geoscene.buildings.table import BuildingOptions, Float, Texts
+from geoscene.report import Problem
+from geoscene.sources.data import Tags
+
+_OPEN_BELOW = ("roof", "carport", "canopy")
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A building or a part on its way into the table.
+
+    outline : row of its building; its own row if it is none's part
+    is_rest : it is what parts leave of an outline
+    """
+
+    osm_id: str
+    tags: Tags
+    footprint: Any
+    use: str
+    outline: int = -1
+    is_part: bool = False
+    is_rest: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Heights:
+    """Columns (n,) of `geoscene.buildings.table.Buildings`, by shorter names."""
+
+    low: Float
+    high: Float
+    roof: Float
+    sigma: Float
+    source: Texts
+    low_source: Texts
+    roof_source: Texts
+
+
+def texts(values: Sequence[str]) -> Texts:
+    """A column of text."""
+    return np.array(values, dtype=object)
+
+
+def settle_heights(
+    rows: Sequence[Row], tagged: Sequence[Tagged], roofs: Sequence[RoofTags], *, options: BuildingOptions
+) -> tuple[Heights, list[Problem]]:
+    """Underside, top and roof of every row (buildings first, then parts), and what had to be put right."""
+    problems: list[Problem] = []
+    h = Heights(
+        np.nan_to_num([t.minimum for t in tagged]),
+        np.array([t.height for t in tagged], float),
+        np.array([t.roof for t in tagged], float),
+        np.array([t.sigma for t in tagged], float),
+        texts([t.source for t in tagged]),
+        texts([t.minimum_source or "default" for t in tagged]),
+        texts([t.roof_source for t in tagged]),
+    )
+    _settle_roofs(rows, roofs, h)
+    is_part = np.array([r.is_part for r in rows], np.bool_)
+    outline = np.array([r.outline for r in rows], np.int64)
+    _settle_wholes(rows, is_part, outline, h, options=options)
+    _settle_rests(rows, is_part, outline, h)
+
+    lacking = is_part & ~np.isfinite(h.high)
+    h.high[lacking], h.source[lacking] = h.high[outline[lacking]], "outline"
+    # the building's top says little about one part's
+    h.sigma[lacking] = np.maximum(h.sigma[outline[lacking]], SIGMA_PRIOR * h.high[lacking] / 2)
+    np.minimum(h.high, HIGHEST, out=h.high)
+
+    for k in np.flatnonzero(h.high - h.low < 0.01):
+        detail = f"underside at {h.low[k]:g} m, top at {h.high[k]:g} m; underside put at 0"
+        problems.append(Problem(rows[k].osm_id, "building", "repaired", "underside-over-top", detail))
+        h.low[k], h.low_source[k] = 0.0, "default"
+
+    lifted = h.high - np.minimum(h.roof, h.high) - options.canopy
+    use = texts([r.use for r in rows])
+    open_below = np.isin(use, _OPEN_BELOW) & (h.low_source == "default") & (lifted > 0.5)
+    h.low[open_below], h.low_source[open_below] = lifted[open_below], "canopy"
+
+    for k in np.flatnonzero(h.roof > h.high - h.low + 1e-9):
+        room = h.high[k] - h.low[k]
+        if h.roof_source[k] == "tag":
+            detail = f"roof of {h.roof[k]:g} m on {room:g} m"
+            problems.append(Problem(rows[k].osm_id, "building", "repaired", "roof-over-height", detail))
+        h.roof[k] = room if h.roof_source[k] in ("tag", "levels") else 0.5 * room
+    return h, problems
+
+
+def _settle_roofs(rows: Sequence[Row], roofs: Sequence[RoofTags], h: Heights) -> None:
+    """Fill in the heights of roofs, in place."""
+    for k, roof in enumerate(roofs):
+        if roof.shape == "flat":
+            h.roof[k], h.roof_source[k] = 0.0, "none"
+        elif not np.isfinite(h.roof[k]):
+            h.roof[k], h.roof_source[k] = default_roof_height(roof, rows[k].footprint)
+            if h.source[k] == "levels":  # storeys do not count the roof
+                h.high[k] += h.roof[k]
+
+
+def _settle_wholes(
+    rows: Sequence[Row],
+    is_part: NDArray[np.bool_],
+    outline: NDArray[np.int64],
+    h: Heights,
+    *,
+    options: BuildingOptions,
+) -> None:
+    """Fill in the heights of buildings, in place: at least as high as their highest part, else inferred."""
+    own = is_part & np.isfinite(h.high) & ~np.array([r.is_rest for r in rows], np.bool_)
+    tops = np.full(len(rows), -np.inf)
+    np.maximum.at(tops, outline[own], h.high[own])
+    higher = ~is_part & np.isfinite(tops) & ~(h.high >= tops)
+    h.high[higher], h.source[higher], h.sigma[higher] = tops[higher], "parts", options.level_height
+
+    whole = np.flatnonzero(~is_part)
+    footprint = gathered([rows[k].footprint for k in whole])
+    inferred, sigma, rule = infer_heights(
+        shapely.get_coordinates(shapely.point_on_surface(footprint)),
+        texts([rows[k].use for k in whole]),
+        np.asarray(shapely.area(footprint), float),
+        h.high[whole],
+        reach=options.reach,
+    )
+    lacking = ~np.isfinite(h.high[whole])
+    gaps = whole[lacking]
+    h.high[gaps], h.sigma[gaps], h.source[gaps] = inferred[lacking], sigma[lacking], rule[lacking]
+
+
+def _settle_rests(
+    rows: Sequence[Row], is_part: NDArray[np.bool_], outline: NDArray[np.int64], h: Heights
+) -> None:
+    """Settle, in place, what parts leave of an outline.
+
+    Its own tags hold unless a part that stands on the ground reaches as high, for then the tags speak of that
+    part: the rest is as high as the lowest part on the ground.
+    """
+    for k in np.flatnonzero([r.is_rest for r in rows]):
+        parts = np.flatnonzero(is_part & (outline == outline[k]) & np.isfinite(h.high))
+        grounded = [p for p in parts if p != k and h.low[p] < 0.01]
+        if not grounded:
+            continue
+        tops = h.high[grounded]
+        if not np.isfinite(h.high[k]) or tops.max() >= h.high[k] - 0.5:
+            lowest = grounded[int(np.argmin(tops))]
+            if not h.high[k] <= h.high[lowest]:
+                h.high[k], h.source[k], h.sigma[k] = h.high[lowest], "parts", SIGMA_PRIOR * h.high[lowest]
+                h.roof[k] = min(h.roof[k], h.high[k])
