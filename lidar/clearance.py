@@ -16,6 +16,8 @@ from lidar.vehicle import Vehicle
 
 Float = NDArray[np.float64]
 
+ASIDE = 4.0
+"""Metres that a line may be pushed aside to get past an obstacle."""
 _NEAR = 12.0  # metres from a junction within which its turn is to blame
 _SWEEP = 0.5  # metres between the poses at which the body is held against obstacles
 
@@ -63,13 +65,16 @@ class Line:
         return Line(self.xyz[keep], self.edge[keep], self.limit[keep], self.free[keep], self.turn[keep])
 
 
-def body_outlines(xy: Float, heading: Float, vehicle: Vehicle, margin: float = 0.0) -> NDArray[np.object_]:
-    """Outlines (n,) of the body in plan, wider and longer by the margin on each side.
+def body_outlines(
+    xy: Float, heading: Float, vehicle: Vehicle, margin: float = 0.0, aside: float = 0.0
+) -> NDArray[np.object_]:
+    """Outlines (n,) of the body in plan, longer by the margin at each end and wider by both on each side.
 
     xy      : (n, 2) scene metres of the rear axle
     heading : (n,) radians
     """
     back, front, half = -vehicle.rear_overhang - margin, vehicle.front + margin, vehicle.width / 2 + margin
+    half += aside
     box = np.array([[back, -half], [front, -half], [front, half], [back, half]])
     c, s = np.cos(heading), np.sin(heading)
     turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=1)
@@ -91,26 +96,43 @@ def touching(
 
 
 def pushes(track: Track, line: Line, setting: Setting) -> tuple[Float, NDArray[np.int64]]:
-    """How far the line must move, positive to the left, and at which of its rows, to free the body."""
-    rows, bodies, obstacles = touching(track, line, setting)
+    """How far the line must move, positive to the left, and at which of its rows, to free the body.
+
+    Not a number where no place beside the line within `ASIDE` is free.
+    """
+    rows = np.unique(touching(track, line, setting)[0])
     if not len(rows):
         return np.empty(0), np.empty(0, np.int64)
-    parts = shapely.intersection(bodies, obstacles)
-    points, which = shapely.get_coordinates(parts, return_index=True)
-    c, s = np.cos(track.heading[rows])[which], np.sin(track.heading[rows])[which]
-    d = points - track.xy[rows][which]
-    ahead, aside = d[:, 0] * c + d[:, 1] * s, d[:, 1] * c - d[:, 0] * s
-    n = len(rows)
-    low, high, far = np.full(n, np.inf), np.full(n, -np.inf), np.full(n, -np.inf)
-    np.minimum.at(low, which, aside)
-    np.maximum.at(high, which, aside)
-    np.maximum.at(far, which, ahead)
     half = setting.vehicle.width / 2 + setting.margin
-    on_left = low + high > 0
-    push = np.where(on_left, low - half, high + half)
-    push += np.where(on_left, -0.05, 0.05)
-    at = track.row[rows] + np.round(np.clip(far, 0.0, setting.vehicle.front) / line.gap).astype(np.int64)
+    strips = body_outlines(track.xy[rows], track.heading[rows], setting.vehicle, setting.margin, aside=ASIDE)
+    strip, obstacle = setting.tree.query(strips, predicate="intersects")
+    parts, of = shapely.get_parts(
+        shapely.intersection(strips[strip], setting.tree.geometries[obstacle]), return_index=True
+    )
+    points, part = shapely.get_coordinates(parts, return_index=True)
+    k = strip[of][part]
+    c, s = np.cos(track.heading[rows])[k], np.sin(track.heading[rows])[k]
+    d = points - track.xy[rows][k]
+    ahead, across = d[:, 0] * c + d[:, 1] * s, d[:, 1] * c - d[:, 0] * s
+    low, high = np.full(len(parts), np.inf), np.full(len(parts), -np.inf)
+    np.minimum.at(low, part, across)
+    np.maximum.at(high, part, across)
+    near = np.full(len(rows), -np.inf)
+    body = np.abs(across) <= half
+    np.maximum.at(near, k[body], ahead[body])
+    push = np.array([_way_out(low[strip[of] == r], high[strip[of] == r], half) for r in range(len(rows))])
+    at = track.row[rows] + np.round(np.clip(near, 0.0, setting.vehicle.front) / line.gap).astype(np.int64)
     return push, np.minimum(at, len(line.edge) - 1)
+
+
+def _way_out(low: Float, high: Float, half: float) -> float:
+    """The least shift sideways that takes a body of a half width clear of intervals; NaN if none does."""
+    ways = np.concatenate([high + half, low - half])
+    ways += np.copysign(0.05, ways)
+    free = ((ways[:, None] - half >= high) | (ways[:, None] + half <= low)).all(axis=1) & (
+        np.abs(ways) < ASIDE
+    )
+    return float(ways[free][np.argmin(np.abs(ways[free]))]) if free.any() else np.nan
 
 
 def turns_at(line: Line, rows: NDArray[np.int64]) -> list[tuple[int, int]]:

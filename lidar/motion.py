@@ -160,10 +160,10 @@ def _within(
 def _time_law(s: Float, limit: Float, vehicle: Vehicle, dt: float) -> tuple[Float, Float]:
     """Distance and speed at every ``dt`` of a leg driven from rest to rest (or at the limit throughout).
 
-    The fastest profile under the limits and the accelerations (a forward and a backward pass) is averaged over
-    a window in time. An average of speeds keeps the bounds of their accelerations, and its acceleration changes
-    by no more than acceleration plus deceleration per window: the jerk. Where the average is faster than the
-    limit of the place reached by then, the limit is lowered and the profile made again.
+    The fastest profile under the limits and the accelerations (a forward and a backward pass) is averaged
+    over a window in time. An average of speeds keeps the bounds of their accelerations, and its acceleration
+    changes by no more than acceleration plus deceleration per window: the jerk. Where the average is faster
+    than the limit of the place reached by then, the limit is lowered and the profile made again.
     """
     up, down, jerk = (_SPARE * v for v in (vehicle.acceleration, vehicle.deceleration, vehicle.jerk))
     length = float(s[-1])

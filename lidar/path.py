@@ -20,7 +20,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.frames import Frame
-from lidar.clearance import Line, Setting, pushes, turn_round, turns_at
+from lidar.clearance import ASIDE, Line, Setting, pushes, turn_round, turns_at
 from lidar.errors import BlockedError, RouteError
 from lidar.route import Route
 from lidar.steering import Pose, Track, follow, line_heading, relaxed
@@ -33,7 +33,6 @@ MARGIN = 0.25
 """Metres that the body keeps from obstacles."""
 _REPAIRS = 16
 _PUSH = 4.0  # metres before and behind an obstacle over which the line is pushed aside
-_ASIDE = 4.0  # metres that the line may be pushed aside at most
 _WHEEL = 0.95  # share of the full lock that the line asks for, so that the wheel has some left to correct
 
 
@@ -180,13 +179,17 @@ def _clear_track(line: Line, setting: Setting, pose: Pose | None) -> Track:
         push, at = pushes(track, line, setting)
         if not len(at):
             return track
+        if np.isnan(push).any():
+            break
         for sign in (1.0, -1.0):
             bump = np.zeros(len(base))
             np.maximum.at(bump, at, np.maximum(sign * push, 0.0))
             wide = maximum_filter1d(bump, 2 * math.ceil(_PUSH / gap) + 1)
             shift += sign * gaussian_filter1d(wide, 0.5 * _PUSH / gap, mode="nearest")
-        shift = np.clip(shift, -_ASIDE, _ASIDE)
-    worst = at[np.argmax(np.abs(push))]
+        shift = np.clip(shift, -ASIDE, ASIDE)
+    stuck = np.isnan(push)
+    at = at[stuck] if stuck.any() else at
+    worst = at[0]
     x, y, _ = line.xyz[worst]
     raise BlockedError(
         f"the {vehicle.name} ({vehicle.length} x {vehicle.width} m) does not pass between the buildings near"
@@ -243,10 +246,11 @@ def _heights(
     once[starts] = False
     twice = np.cumsum(once) - 1
     width = max(setting.vehicle.wheelbase, 1.0) / legs[0].step
-    columns = [
-        gaussian_filter1d(np.concatenate(column)[once], width, mode="nearest")[twice]
-        for column in zip(*raw, strict=True)
-    ]
+    z, slope, bank = (np.concatenate(column)[once] for column in zip(*raw, strict=True))
+    # beyond its ends the road goes on as steep as it was
+    spare = math.ceil(4 * width) + 1
+    z = gaussian_filter1d(np.pad(z, spare, mode="reflect", reflect_type="odd"), width)[spare : spare + len(z)]
+    columns = [z[twice], *(gaussian_filter1d(c, width, mode="mirror")[twice] for c in (slope, bank))]
     return list(zip(*(np.split(column, starts) for column in columns), strict=True))
 
 
@@ -254,12 +258,12 @@ def _raw_heights(
     leg: Track, line: Line, setting: Setting, ground: Ground | None
 ) -> tuple[Float, Float, Float]:
     """Height, slope ahead and bank at the rows of a leg, as the line or the ground has them."""
-    z, bank = line.xyz[leg.row, 2].copy(), np.zeros(len(leg.row))
-    # rows of the line are farther apart than those of the leg: between them heights run straight
-    first = np.searchsorted(leg.row, leg.row, side="left")
-    count = np.searchsorted(leg.row, leg.row, side="right") - first
-    above = line.xyz[np.minimum(leg.row + 1, len(line.edge) - 1), 2]
-    z += (above - z) * (np.arange(len(z)) - first) / count
+    heading = line_heading(line.xyz[:, :2])[leg.row]
+    d = leg.xy - line.xyz[leg.row, :2]
+    place = leg.row + (d[:, 0] * np.cos(heading) + d[:, 1] * np.sin(heading)) / line.gap
+    # the last row may lie a little beyond the end of the line
+    profile = np.append(line.xyz[:, 2], 2 * line.xyz[-1, 2] - line.xyz[-2, 2])
+    z, bank = np.interp(place, np.arange(len(profile)), profile), np.zeros(len(leg.row))
     if ground is not None:
         ask = ~line.free[leg.row]
         c, s = np.cos(leg.heading[ask]), np.sin(leg.heading[ask])

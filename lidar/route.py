@@ -120,7 +120,7 @@ def _need_streets(graph: RoadGraph) -> None:
 
 
 def turns_back(graph: RoadGraph, before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether (k,) going from one edge to the next turns the vehicle round: by more than `U_TURN` on the spot."""
+    """Whether (k,) going from one edge to the next turns the vehicle round: by `U_TURN` or more."""
     leave, enter = _end_headings(graph)
     turn = np.abs((enter[after] - leave[before] + np.pi) % (2 * np.pi) - np.pi)
     back: NDArray[np.bool_] = (graph.twin[before] == after) | (turn > U_TURN)

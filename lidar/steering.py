@@ -116,11 +116,11 @@ def follow(xy: Float, vehicle: Vehicle, scale: float, *, step: float, pose: Pose
     stride = step * scale
     budget = int(3 * m * gap / stride) + 400
     for _ in range(budget):
-        out.append((x, y, th, k, j))
         while (
             j + 1 < m and (x - lx[j + 1]) ** 2 + (y - ly[j + 1]) ** 2 <= (x - lx[j]) ** 2 + (y - ly[j]) ** 2
         ):
             j += 1
+        out.append((x, y, th, k, j))
         c, s = math.cos(lh[j]), math.sin(lh[j])
         along, aside = (x - lx[j]) * c + (y - ly[j]) * s, ((y - ly[j]) * c - (x - lx[j]) * s) / scale
         if j == m - 1 and along >= -0.5 * stride:
