@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from lidar.errors import InputError
 from lidar.poses import Poses
 from lidar.raycast import kernels
+from lidar.raycast.columns import Rays
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split
 from lidar.raycast.hits import Echoes, Hits
@@ -201,7 +202,7 @@ class Caster:
         """
         raise NotImplementedError
 
-    def _cast(self, rays: kernels.Rays, threads: int, *, normals: bool) -> Hits:
+    def _cast(self, rays: Rays, threads: int, *, normals: bool) -> Hits:
         n = len(rays.directions)
         ranges, faces, instances = np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
         cosines, normal = np.empty(n, np.float32), np.empty((n if normals else 0, 3))
@@ -230,7 +231,7 @@ def _rays(
     mask: int,
     time: ArrayLike | None,
     order: NDArray[np.integer] | None,
-) -> kernels.Rays:
+) -> Rays:
     """The rays as the kernels want them; refuses columns that disagree."""
     n = len(directions)
     work = _NO_INDEX if order is None else np.ascontiguousarray(order, np.int64)
@@ -242,10 +243,10 @@ def _rays(
     reach = np.ascontiguousarray(far, np.float64).reshape(-1)
     if len(reach) not in (1, n) or not (near >= 0 and (reach >= near).all()):
         raise InputError("rays need 0 <= near <= far, far one number or one a ray")
-    return kernels.Rays(directions, offsets, *poses, work, moments, float(near), reach, int(mask) & ALL)
+    return Rays(directions, offsets, *poses, work, moments, float(near), reach, int(mask) & ALL)
 
 
-def _share(work: Callable[[int, int], int], rays: kernels.Rays, threads: int) -> None:
+def _share(work: Callable[[int, int], int], rays: Rays, threads: int) -> None:
     """Have the threads do the rays in chunks; raises InputError for a ray that cannot be cast."""
     n = len(rays.directions)
     if threads <= 1 or n <= _CHUNK:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar.raycast.geometry import Geometry, Instances
-from lidar.raycast.kernels import Target
+from lidar.raycast.columns import Target
 from lidar.raycast.library import (
     COHERENT,
     DYNAMIC,

@@ -1,0 +1,69 @@
+"""What compiled kernels are given: rays, and what they are cast at, as tuples of columns."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+class Target(NamedTuple):
+    """What rays are cast at.
+
+    scene, packet, single : addresses of the Embree scene and of the arguments for packets and for single rays
+    lanes      : as many zeros as rays in a packet: its length is a constant to the compiler
+    origin     : (3,) float64, subtracted from scene coordinates
+    parts      : (p, 5) int64, addresses of a geometry's planes, vertices, faces and face numbers (0: they
+                 count up) and the first number
+    rows       : (g,) int32, row of ``parts`` of Embree's geometry g, if it is one of triangles
+    starts     : (g,) int64, start in ``numbers`` of Embree's geometry g, if it is one of instances
+    numbers    : (k,) int32, instance numbers in Embree's order
+    shape      : (k,) int32, first row of ``parts`` of the instance's shape
+    first      : (k,) int64, first row of ``transforms``
+    steps      : (k,) int64, rows of ``transforms``; 1 for an instance at rest
+    transforms : (r, 12) float64, caster from instance, each relative to its own origin
+    """
+
+    scene: int
+    packet: int
+    single: int
+    lanes: tuple[int, ...]
+    origin: Float
+    parts: NDArray[np.int64]
+    rows: NDArray[np.int32]
+    starts: NDArray[np.int64]
+    numbers: NDArray[np.int32]
+    shape: NDArray[np.int32]
+    first: NDArray[np.int64]
+    steps: NDArray[np.int64]
+    transforms: Float
+
+
+class Rays(NamedTuple):
+    """Rays as contiguous columns.
+
+    directions : (n, 3) float64, in the pose's axes where there are poses
+    offsets    : (n, 3) float64, origins in the pose's frame; (1, 3) serves all, with poses it is zero
+    pose       : (n,) int64, row of the poses; empty: directions and offsets are in the caster's frame
+    position, rotation, scale : the poses (see `lidar.poses.Poses`)
+    order      : (n,) int64, order of work; empty: as they come
+    time       : (n,) float32, ray times; empty: all 0
+    near       : ray parameter
+    far        : (n,) float64, ray parameter; (1,) serves all
+    mask       : bits
+    """
+
+    directions: Float
+    offsets: Float
+    pose: NDArray[np.int64]
+    position: Float
+    rotation: Float
+    scale: Float
+    order: NDArray[np.int64]
+    time: NDArray[np.float32]
+    near: float
+    far: Float
+    mask: int

@@ -1,0 +1,64 @@
+"""Raw memory and Embree's functions as compiled code reaches them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+
+intersect1 = types.ExternalFunction("rtcIntersect1", types.void(*[types.int64] * 3))
+occluded1 = types.ExternalFunction("rtcOccluded1", types.void(*[types.int64] * 3))
+intersect4, intersect8, intersect16, occluded4, occluded8, occluded16 = (
+    types.ExternalFunction(f"rtc{what}{width}", types.void(*[types.int64] * 4))
+    for what in ("Intersect", "Occluded")
+    for width in (4, 8, 16)
+)
+"""Embree's tracing functions, by the names that `lidar.raycast.library` publishes; arguments are addresses."""
+
+
+def _loader(kind: Any, size: int) -> Any:
+    @intrinsic
+    def load(context: Any, address: Any, index: Any) -> Any:  # noqa: ARG001
+        def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+            step = builder.mul(values[1], values[1].type(size))
+            place = builder.inttoptr(builder.add(values[0], step), target.get_value_type(kind).as_pointer())
+            return builder.load(place)
+
+        return kind(types.int64, types.int64), build
+
+    return load
+
+
+float64_at = _loader(types.float64, 8)
+float32_at = _loader(types.float32, 4)
+int64_at = _loader(types.int64, 8)
+int32_at = _loader(types.int32, 4)
+"""The number at an index of a column whose address is given."""
+
+
+@intrinsic
+def pointer(context: Any, address: Any) -> Any:  # noqa: ARG001
+    """The void pointer to an address."""
+
+    def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        return builder.inttoptr(values[0], cgutils.voidptr_t)
+
+    return types.voidptr(types.int64), build
+
+
+@njit(nogil=True)
+def aligned(size: int) -> Any:
+    """Zeroed bytes that start at a multiple of 64."""
+    raw = np.zeros(size + 64, np.uint8)
+    start = (64 - raw.ctypes.data % 64) % 64
+    return raw[start : start + size]
+
+
+_UNCOUNTED: dict[str, Any] = {"_nrt": False}
+inlined = njit(nogil=True, error_model="numpy", forceinline=True, **_UNCOUNTED)
+"""Compiled into the caller, and without counting references to the arrays, which the caller holds: counting
+them for every ray takes ten times as long as the rest."""
