@@ -13,7 +13,9 @@ from geoscene.classes import Class
 from geoscene.frames import Frame
 from geoscene.report import Problem
 from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, read_carriageways
+from geoscene.roadgraph.crossings import crossing_rows
 from geoscene.roadgraph.junctions import build_junctions, carriageway
+from geoscene.roadgraph.markings import marking_rows, stop_rows
 from geoscene.roadgraph.paths import path_surfaces, rail_surfaces, square_surfaces
 from geoscene.roadgraph.surface_rows import SurfaceRows, concatenate_rows
 from geoscene.roadgraph.tags import CLASSES
@@ -66,6 +68,9 @@ def road_surfaces(
             square_surfaces(osm, frame),
             path_surfaces(osm, frame),
             *_carriageway_rows(roads, edge),
+            crossing_rows(osm, roads, frame),
+            marking_rows(roads, edge, left_hand=options.left_hand),
+            stop_rows(graph, roads, left_hand=options.left_hand),
             rail_surfaces(osm, frame),
         ]
     )

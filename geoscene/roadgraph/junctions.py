@@ -30,6 +30,8 @@ _RADIUS_ELSE = 2.0
 _REACH = 20.0
 # A road that goes on straight (radians) and as wide (metres) needs no joint.
 _BEND, _STEP = np.radians(1.0), 0.05
+# Neighbours closer to a straight line than this (radians) have no inner corner to round.
+_ROUNDED = np.radians(8.0)
 
 _QUAD = 6
 """Segments of a quarter circle: 1.7 cm off a circle of 2 m, 5 cm off one of 6 m."""
@@ -78,7 +80,8 @@ def build_junctions(roads: Carriageways, importance: NDArray[np.int64]) -> Junct
     reach = np.maximum(tangent, tangent[np.argsort(after)])
     stub = _stubs(roads, arms, np.maximum(reach + 0.5, half + 1.0))
     disc = shapely.buffer(shapely.points(arms.node_xy), np.minimum(width, width[after]) / 2, quad_segs=_QUAD)
-    corner = _closed(stub[keep], stub[after][keep], disc[keep], radius[keep])
+    rounded = np.where(np.abs(between - np.pi) > _ROUNDED, radius, 0.0)
+    corner = _corner(np.stack([stub, stub[after], disc], axis=1)[keep], rounded[keep])
 
     walk_width = np.minimum(arms.walk[:, 0], arms.walk[after][:, 1])[keep]
     walked = walk_width > 0
@@ -202,15 +205,13 @@ def cut_line(xy: Float, start: float, end: float) -> Float:
     return np.stack([np.interp(at, along, column) for column in xy.T], axis=1)
 
 
-def _closed(
-    one: NDArray[np.object_], two: NDArray[np.object_], disc: NDArray[np.object_], radius: Float
-) -> NDArray[np.object_]:
-    """Three shapes as one, its inner corners rounded."""
-    together = shapely.union(shapely.union(one, two), disc)
+def _corner(shapes: NDArray[np.object_], radius: Float) -> NDArray[np.object_]:
+    """Shapes (c, s) as one each, with inner corners rounded where the radius is not 0."""
+    count, each = shapes.shape
+    together = shapely.multipolygons(shapes.ravel(), indices=np.repeat(np.arange(count), each))
     grown = shapely.buffer(together, radius, quad_segs=_QUAD, join_style="mitre", mitre_limit=2.0)
     closed: NDArray[np.object_] = shapely.buffer(grown, -radius, quad_segs=_QUAD)
-    whole: NDArray[np.object_] = shapely.union(closed, together)
-    return whole
+    return closed
 
 
 def _wedges(arms: _Arms, between: Float, reach: Float) -> NDArray[np.object_]:
@@ -229,5 +230,7 @@ def _parts(
 ) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
     """Polygons and the position of their group, for `shapely.multipolygons`."""
     parts, of = shapely.get_parts(shapes, return_index=True)
+    areal = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
+    parts, of = parts[areal], of[areal]
     _, index = np.unique(group, return_inverse=True)
     return parts, index[of]

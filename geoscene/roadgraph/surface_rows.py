@@ -71,7 +71,7 @@ class SurfaceRows:
         names = np.broadcast_to(np.asarray(material, np.str_), n).tolist()
         shapes = shapely.set_precision(polygon, GRID)
         parts, row = shapely.get_parts(shapes, return_index=True)
-        keep = (shapely.get_type_id(parts) == 3) & (shapely.area(parts) > GRID)
+        keep = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > GRID)
         row = row[keep]
         return cls(
             parts[keep],

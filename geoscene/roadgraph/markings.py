@@ -1,0 +1,184 @@
+"""Paint along the road: centre lines, lane separators, edge lines and stop lines."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.roadgraph.carriageways import PAVED, Carriageways
+from geoscene.roadgraph.junctions import cut_line, junction_reach
+from geoscene.roadgraph.surface_rows import SurfaceRows
+from geoscene.roads import RoadGraph
+
+Float = NDArray[np.float64]
+
+PRIORITY = 170.0
+
+# Metres. Widths of lines 0.10 to 0.15 (Vienna Convention, annex 2; MUTCD 3A.04: 4 to 6 inches); broken lane
+# lines 3 m on, 6 m off (RMS: 1:2; MUTCD 3A.04: 1:3); stop lines 0.3 to 0.6 wide (MUTCD 3B.19).
+_LINE = 0.12
+_DASH, _GAP = 3.0, 6.0
+_STOP = 0.4
+_EDGE_IN = 0.25
+# Paint ends this far before the rounding of a junction begins, and a stop line lies there.
+_CLEAR = 1.0
+# Metres: a lane is not wider than this; what is left over on both sides is for parking and bicycles.
+_LANE_MOST = 4.5
+_MINOR = frozenset({"service", "track", "busway", "bus_guideway", "raceway", "escape"})
+_EDGED = frozenset({"motorway", "trunk", "primary", "secondary"})
+
+
+def marking_rows(roads: Carriageways, edge: NDArray[np.int32], *, left_hand: bool) -> SurfaceRows:
+    """Lines along marked carriageways; they stop where streets meet, not where a driveway joins.
+
+    Between the two directions the line is solid, between lanes of one direction broken; roads of the upper
+    classes have edge lines where they have no kerb.
+    """
+    keep = np.array([s.highway not in _MINOR for s in roads.street], np.bool_)
+    streets, of = roads.take(keep), np.flatnonzero(keep)
+    reach, _ = junction_reach(streets)
+    reach = np.where(reach > 0, reach + _CLEAR, 0.0)
+    shown = streets.marked & (shapely.length(streets.line) - reach.sum(axis=1) > _DASH)
+    rows = np.flatnonzero(shown)
+    lines = np.empty(len(rows), object)
+    for k, row in enumerate(rows.tolist()):
+        xy = shapely.get_coordinates(streets.line[row])
+        length = float(shapely.length(streets.line[row]))
+        lines[k] = shapely.linestrings(cut_line(xy, reach[row, 0], length - reach[row, 1]))
+
+    which, aside, dashed = _offsets(streets, rows, left_hand=left_hand)
+    parallel = lines[which]
+    moved = aside != 0
+    parallel[moved] = shapely.offset_curve(parallel[moved], aside[moved], join_style="mitre")
+    parts, index = shapely.get_parts(parallel, return_index=True)
+    which, dashed = which[index], dashed[index]
+    dashes, dash_of = _dashes(parts[dashed])
+    painted = np.concatenate([parts[~dashed], dashes])
+    row = of[rows[np.concatenate([which[~dashed], which[dashed][dash_of]])]]
+    return SurfaceRows.of(
+        shapely.buffer(painted, _LINE / 2, cap_style="flat", join_style="mitre"),
+        klass=Class.LANE_MARKING,
+        material="lane_paint",
+        priority=PRIORITY,
+        osm_id=roads.osm_id[row],
+        source=np.array([f"{s.lanes_source}/default" for s in roads.street], "<U16")[row],
+        place=roads.place[row],
+        level=roads.layer[row],
+        edge=edge[row],
+    )
+
+
+def _offsets(
+    roads: Carriageways, rows: NDArray[np.int64], *, left_hand: bool
+) -> tuple[NDArray[np.int64], Float, NDArray[np.bool_]]:
+    """Painted lines as (position in ``rows``, metres to the left of the carriageway's middle, broken)."""
+    found: list[tuple[int, float, bool]] = []
+    for k, row in enumerate(rows.tolist()):
+        street, width = roads.street[row], float(roads.width[row])
+        count = round(sum(street.lanes))
+        lane = min(width / max(count, 1), _LANE_MOST)
+        # Lanes along the line lie on its right, or on its left where traffic keeps left.
+        along = street.lanes[1] if left_hand else street.lanes[0]
+        for i in range(1, count):
+            between = 0 < along < count and abs(i - along) < 0.75
+            found.append((k, (i - count / 2) * lane, not between))
+        if street.highway.removesuffix("_link") in _EDGED:
+            for side, sign in ((0, 1.0), (1, -1.0)):
+                if roads.walk[row, side] == 0 and width > 4 * _EDGE_IN:
+                    found.append((k, sign * (width / 2 - _EDGE_IN), False))
+    return (
+        np.array([f[0] for f in found], np.int64),
+        np.array([f[1] for f in found], float),
+        np.array([f[2] for f in found], np.bool_),
+    )
+
+
+def _dashes(lines: NDArray[np.object_]) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+    """The dashes of broken lines, as lines, and the line of each."""
+    length = shapely.length(lines)
+    count = np.maximum(np.floor((length + _GAP) / (_DASH + _GAP)), 0).astype(np.int64)
+    of = np.repeat(np.arange(len(lines)), count)
+    number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    spare = (length - count * (_DASH + _GAP) + _GAP)[of] / 2
+    start = spare + number * (_DASH + _GAP)
+    at = start[:, None] + _DASH * np.array([0.0, 0.5, 1.0])
+    points = shapely.line_interpolate_point(lines[of][:, None], at)
+    if not len(of):
+        return np.empty(0, object), of
+    return shapely.linestrings(shapely.get_coordinates(points).reshape(-1, 3, 2)), of
+
+
+def stop_rows(graph: RoadGraph, roads: Carriageways, *, left_hand: bool) -> SurfaceRows:
+    """Stop lines before signals and stop signs, and broken ones before give-way signs.
+
+    They lie across the lanes of their direction: where the map has the signal or sign, but not inside the
+    junction ahead and not upon a crossing.
+    """
+    paved = dict(zip(roads.osm_id.tolist(), np.isin(roads.material, list(PAVED)).tolist(), strict=True))
+    keep = np.array([s.highway not in _MINOR for s in roads.street], np.bool_)
+    streets = roads.take(keep)
+    reach, _ = junction_reach(streets)
+    inside: dict[int, float] = {}
+    for node, metres in zip(
+        streets.node_id[streets.ends].ravel().tolist(), reach.ravel().tolist(), strict=True
+    ):
+        inside[node] = max(inside.get(node, 0.0), metres)
+
+    crossings = (
+        graph.control_edge[graph.control_kind == "crossing"],
+        graph.control_offset[graph.control_kind == "crossing"],
+    )
+    lines: dict[tuple[int, int], tuple[int, float, str]] = {}
+    for edge, offset, kind in zip(
+        graph.control_edge.tolist(), graph.control_offset.tolist(), graph.control_kind.tolist(), strict=True
+    ):
+        first = str(graph.osm_id[edge]).split(";")[0]
+        if kind == "crossing" or graph.width[edge] < 4 or not paved.get(first, False):
+            continue
+        free = float(graph.length[edge]) - inside.get(int(graph.node_id[graph.head[edge]]), 0.0) - _CLEAR
+        place = min(offset, free)
+        here = crossings[1][crossings[0] == edge]
+        blocking = here[np.abs(here - place) < 3.5]
+        place = float(blocking.min()) - 3.0 if len(blocking) else place
+        if place > 1.0:
+            lines.setdefault((edge, round(place / 5)), (edge, place, kind))
+    return _across(graph, list(lines.values()), left_hand=left_hand)
+
+
+def _across(graph: RoadGraph, lines: list[tuple[int, float, str]], *, left_hand: bool) -> SurfaceRows:
+    """Painted bands across the lanes of edges: (edge, metres from its tail, kind of control)."""
+    shapes, edges = [], []
+    for edge, place, kind in lines:
+        xy = graph.geometry[edge][:, :2]
+        plan = float(np.hypot(*np.diff(xy, axis=0).T).sum())
+        at = place * plan / float(graph.length[edge])
+        bit = cut_line(xy, at - _STOP / 2, at + _STOP / 2)
+        ahead = (bit[-1] - bit[0]) / np.hypot(*(bit[-1] - bit[0]))
+        left = np.array([-ahead[1], ahead[0]])
+        twin = int(graph.twin[edge])
+        share = graph.lanes[edge] / (graph.lanes[edge] + (graph.lanes[twin] if twin >= 0 else 0.0))
+        far = float(graph.width[edge]) / 2 - _EDGE_IN
+        near = far - share * 2 * far + (_LINE if twin >= 0 else 0.0)
+        sign = 1.0 if left_hand else -1.0
+        count = 1 if kind != "give_way" else max(int((far - near) / 0.8), 1)
+        stops = np.linspace(near, far, count + 1)
+        fill = 1.0 if count == 1 else 0.6
+        for a, b in zip(stops[:-1], stops[:-1] + np.diff(stops) * fill, strict=True):
+            ends = bit[0] + left * sign * a, bit[0] + left * sign * b
+            shapes.append([ends[0], ends[1], ends[1] + ahead * _STOP, ends[0] + ahead * _STOP])
+            edges.append(edge)
+    rows = np.array(edges, np.int64)
+    place_of_edge = np.where(graph.tunnel[rows], 2, np.where(graph.bridge[rows], 1, 0))
+    return SurfaceRows.of(
+        shapely.polygons(shapes) if shapes else np.empty(0, object),
+        klass=Class.LANE_MARKING,
+        material="lane_paint",
+        priority=PRIORITY,
+        osm_id=np.array([str(graph.osm_id[edge]).split(";")[0] for edge in edges], np.str_),
+        source="control/default",
+        place=place_of_edge,
+        level=graph.layer[rows],
+        edge=rows,
+    )
