@@ -7,7 +7,6 @@
 """
 
 from geoscene.ground.drape import WaterLevels as WaterLevels
-from geoscene.ground.drape import base_heights as base_heights
 from geoscene.ground.drape import drape as drape
 from geoscene.ground.drape import ground_tile as ground_tile
 from geoscene.ground.drape import water_levels as water_levels

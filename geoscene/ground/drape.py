@@ -120,20 +120,6 @@ def ground_tile(
     return drape(plan, cells, triangulate(cells), height=height, levels=levels)
 
 
-def base_heights(footprints: Sequence[object] | NDArray[np.object_], height: Height) -> Float:
-    """The lowest ground (n,) along each footprint's outline, metres: where a building on a slope stands.
-
-    The terrain is asked at the outline's vertices and at most 2 m apart between them. NaN for a footprint
-    that is None or empty.
-    """
-    outlines = shapely.segmentize(shapely.boundary(np.asarray(footprints, object)), 2.0)
-    xy, owner = shapely.get_coordinates(outlines, return_index=True)
-    lowest = np.full(len(outlines), np.inf)
-    np.minimum.at(lowest, owner, np.asarray(height(xy[:, 0], xy[:, 1]), float))
-    base: Float = np.where(np.isinf(lowest), np.nan, lowest)
-    return base
-
-
 def _inside(polygons: NDArray[np.object_]) -> tuple[Float, Float]:
     """Up to about a thousand points well spread inside polygons, on a regular grid; at least one each."""
     sure = shapely.get_coordinates(shapely.point_on_surface(polygons))

@@ -1,0 +1,396 @@
+"""Heights of the ground from elevation rasters, interpolated in their own grids."""
+
+from __future__ import annotations
+
+import functools
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+from pyproj import CRS, Transformer
+
+from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.frames import Frame
+
+Float = NDArray[np.float64]
+Vertical = Literal["flat", "orthometric", "ellipsoidal"]
+
+_UNITS = {
+    "": 1.0, "m": 1.0, "metre": 1.0, "metres": 1.0, "meter": 1.0, "meters": 1.0,
+    "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "international foot": 0.3048,
+    "us-ft": 1200 / 3937, "us survey foot": 1200 / 3937, "us_survey_foot": 1200 / 3937, "ftus": 1200 / 3937,
+    "cm": 0.01, "dm": 0.1,
+}  # fmt: skip
+"""Metres per vertical unit; the US survey foot is 1200/3937 m by its definition."""
+
+_LOWEST, _HIGHEST = -500.0, 9000.0
+"""No land lies below the Dead Sea's shore or above Everest: what does is a void without its mark."""
+
+_MARGIN = 3
+"""Posts read beyond the scene on each side."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Posts of one elevation model, or of several that share a lattice.
+
+    crs    : horizontal CRS, WKT
+    origin : (2,) float64, post (0, 0) in that CRS, easting or longitude first
+    step   : (2, 2) float64, from (column, row) to CRS units: ``place = origin + step @ (column, row)``
+    values : (rows, columns) float64 metres, without voids
+    known  : (rows, columns) bool, posts that a raster covers, filled voids included
+    """
+
+    crs: str
+    origin: Float
+    step: Float
+    values: Float
+    known: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """The height of the ground as a function of place.
+
+    frame    : the scene frame that x and y are in
+    grids    : finest first; a place takes its height from the first that covers it; none for flat ground
+    vertical : what heights are above: ``flat``, ``orthometric`` (a geoid) or ``ellipsoidal``
+    datum    : the vertical datum in words, such as ``EGM96``, and how it is known
+    spacing  : metres between the posts of the finest grid, 0 for flat ground
+    posts    : posts read
+    voids    : posts among them that held no height and were filled from their neighbours
+    uncovered : share of the scene that no raster covers, which took the nearest height
+    sources  : names of the files
+    """
+
+    frame: Frame
+    grids: tuple[Grid, ...] = ()
+    vertical: Vertical = "flat"
+    datum: str = "level ground"
+    spacing: float = 0.0
+    posts: int = 0
+    voids: int = 0
+    uncovered: float = 0.0
+    sources: tuple[str, ...] = ()
+
+    @property
+    def lines(self) -> float:
+        """Metres between the ground's terrain lines: half the posts' spacing, 10 to 50; 0 if flat."""
+        return float(np.clip(np.floor(self.spacing / 2), 10.0, 50.0)) if self.grids else 0.0
+
+    def height(self, x: ArrayLike, y: ArrayLike) -> Float:
+        """Metres of the ground's z at scene coordinates (any shape), bilinear between the four posts around.
+
+        Beyond the posts read, the height of the nearest edge.
+        """
+        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        z = np.zeros(x.shape)
+        open_ = np.full(x.shape, bool(self.grids))
+        for k, transformer in enumerate(self._transformers):
+            grid, last = self.grids[k], k == len(self.grids) - 1
+            value, covered = _bilinear(grid, *_posts(grid, transformer, self.frame, x[open_], y[open_]))
+            take = np.zeros(x.shape, bool)
+            take[open_] = True if last else covered
+            z[take] = value[take[open_]]
+            open_ &= ~take
+        return z
+
+    @functools.cached_property
+    def _transformers(self) -> list[Transformer]:
+        return [Transformer.from_crs(self.frame.crs, CRS.from_wkt(g.crs), always_xy=True) for g in self.grids]
+
+
+def flat_terrain(frame: Frame) -> Terrain:
+    """Level ground at z = 0."""
+    return Terrain(frame)
+
+
+def open_terrain(
+    paths: Sequence[str | Path],
+    frame: Frame,
+    *,
+    bounds: Sequence[float],
+    unit: str | None = None,
+    vertical: Literal["orthometric", "ellipsoidal"] | None = None,
+    outside: Literal["error", "nearest"] = "error",
+) -> Terrain:
+    """The terrain within a scene's bounds, from elevation rasters.
+
+    GeoTIFF, .hgt, or one of them in a .zip, in any CRS.
+
+    Rasters whose posts share one lattice (the tiles of one model) are joined before anything is
+    interpolated, so no seam shows between them. Voids (the raster's nodata, not a number, or lower than
+    -500 m or higher than 9,000 m) are filled from around by inverse distances and counted.
+
+    bounds   : (xmin, ymin, xmax, ymax), scene metres; only what lies within is read unit     : of heights
+    (``m``, ``ft``, ``us-ft``) where the files do not say or are wrong; metres if they do not vertical :
+    what heights are above, where the files do not say; a geoid (``orthometric``) if they do not outside
+    : what to do where no raster covers the bounds: raise, or take the ``nearest`` height and tell the
+               share
+
+    Raises SourceNotFoundError for a missing file, InputError for one that is no raster, has no CRS or an
+    unknown unit, for rasters that do not cover the bounds, and for ones that disagree on what heights are
+    above.
+    """
+    if not paths:
+        raise InputError("no elevation file was given")
+    box = shapely.box(*bounds)
+    rasters = [_open(Path(path), unit=unit, vertical=vertical) for path in paths]
+    kinds = {(r.vertical, r.datum) for r in rasters}
+    if len({kind for kind, _ in kinds}) > 1:
+        raise InputError(
+            "the elevation files disagree on what heights are above: "
+            + "; ".join(f"{r.path.name}: {r.vertical}" for r in rasters)
+        )
+    covered = shapely.intersection(shapely.union_all([_outline(r, frame) for r in rasters]), box).area
+    uncovered = max(1.0 - covered / box.area, 0.0)
+    if uncovered > 1e-9 and (outside == "error" or covered == 0.0):
+        raise InputError(_not_covered(rasters, frame, bounds, uncovered))
+    groups: list[list[_Raster]] = []
+    for raster in rasters:
+        for group in groups:
+            if _shares_lattice(group[0], raster):
+                group.append(raster)
+                break
+        else:
+            groups.append([raster])
+    read = [found for group in groups if (found := _read(group, frame, bounds)) is not None]
+    read.sort(key=lambda found: found[1])
+    if not read:
+        names = ", ".join(r.path.name for r in rasters)
+        raise InputError(f"{names}: no heights within the scene, only voids")
+    return Terrain(
+        frame,
+        tuple(grid for grid, _, _, _ in read),
+        rasters[0].vertical,
+        ", ".join(sorted({datum for _, datum in kinds})),
+        min(spacing for _, spacing, _, _ in read),
+        sum(posts for _, _, posts, _ in read),
+        sum(voids for _, _, _, voids in read),
+        uncovered if uncovered > 1e-9 else 0.0,
+        tuple(r.path.name for r in rasters),
+    )
+
+
+def base_heights(footprints: Sequence[object] | NDArray[np.object_], terrain: Terrain) -> Float:
+    """The lowest ground (n,) along each footprint's outline, metres: where a building on a slope stands.
+
+    The terrain is asked at the outline's vertices and at most 2 m apart between them. NaN for a footprint
+    that is None or empty.
+    """
+    outlines = np.empty(len(footprints), object)
+    outlines[:] = list(footprints)
+    outlines = shapely.segmentize(shapely.boundary(outlines), 2.0)
+    xy, owner = shapely.get_coordinates(outlines, return_index=True)
+    lowest = np.full(len(outlines), np.inf)
+    np.minimum.at(lowest, owner, terrain.height(xy[:, 0], xy[:, 1]))
+    base: Float = np.where(np.isinf(lowest), np.nan, lowest)
+    return base
+
+
+@dataclass(frozen=True, slots=True)
+class _Raster:
+    """One file: where its posts lie and what its numbers mean; post (0, 0) is its first pixel's middle."""
+
+    path: Path
+    name: str
+    crs: CRS
+    origin: Float
+    step: Float
+    shape: tuple[int, int]
+    nodata: float | None
+    to_metres: tuple[float, float]
+    vertical: Literal["orthometric", "ellipsoidal"]
+    datum: str
+
+
+def _gdal_name(path: Path) -> str:
+    """What GDAL calls the raster: a path, or one within a zip archive."""
+    if not path.exists():
+        raise SourceNotFoundError(f"{path}: no such elevation file")
+    if path.suffix.lower() != ".zip":
+        return str(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [n for n in archive.namelist() if n.lower().endswith((".hgt", ".tif", ".tiff"))]
+    except zipfile.BadZipFile as error:
+        raise InputError(f"{path}: not a zip archive, or a damaged one") from error
+    if len(names) != 1:
+        raise InputError(f"{path}: {len(names)} rasters (.hgt, .tif) in it; give an archive that holds one")
+    return f"/vsizip/{path.resolve()}/{names[0]}"
+
+
+def _open(path: Path, *, unit: str | None, vertical: Literal["orthometric", "ellipsoidal"] | None) -> _Raster:
+    """What a file says of itself, and what the caller says where it is silent."""
+    import rasterio  # noqa: PLC0415 - slow to import
+    from rasterio.errors import RasterioIOError  # noqa: PLC0415
+
+    name = _gdal_name(path)
+    try:
+        with rasterio.Env(GTIFF_REPORT_COMPD_CS="YES"), rasterio.open(name) as source:
+            if source.crs is None:
+                raise InputError(
+                    f"{path}: no CRS in it; assign one, as with: gdal_edit.py -a_srs EPSG:4326 FILE"
+                )
+            crs = CRS.from_wkt(source.crs.to_wkt())
+            stated, kind, datum = _vertical(crs, source.driver)
+            stated = (source.units[0] or stated).strip().lower()
+            factor = _UNITS.get((unit or stated).lower())
+            if factor is None:
+                raise InputError(f"{path}: heights in {unit or stated!r}; say which unit: m, ft or us-ft")
+            a = source.transform
+            step = np.array([[a.a, a.b], [a.d, a.e]])
+            return _Raster(
+                path,
+                name,
+                crs.sub_crs_list[0] if crs.is_compound else crs.to_2d(),
+                np.array([a.c, a.f]) + step @ (0.5, 0.5),
+                step,
+                source.shape,
+                source.nodata,
+                (source.scales[0] * factor, source.offsets[0] * factor),
+                vertical or kind or "orthometric",
+                datum if vertical is None else f"{vertical}, as told",
+            )
+    except RasterioIOError as error:
+        raise InputError(f"{path}: not a raster that GDAL reads ({error})") from error
+
+
+def _vertical(crs: CRS, driver: str) -> tuple[str, Literal["orthometric", "ellipsoidal"] | None, str]:
+    """(unit, kind, datum) of heights as a CRS states them."""
+    if crs.is_compound:
+        upright = crs.sub_crs_list[1]
+        factor = upright.axis_info[0].unit_conversion_factor
+        unit = {1.0: "m", 0.3048: "ft"}.get(factor, "us-ft" if abs(factor - 1200 / 3937) < 1e-9 else "?")
+        return unit, "orthometric", str(upright.name)
+    if len(crs.axis_info) == 3:
+        return "", "ellipsoidal", f"ellipsoid of {crs.name}"
+    if driver == "SRTMHGT":
+        return "m", "orthometric", "EGM96"  # the SRTM mission's own datum; the format states none
+    return "", None, "not stated, taken for heights above a geoid"
+
+
+def _outline(raster: _Raster, frame: Frame) -> Any:
+    """The raster's edge, outside its pixels, as a polygon in the scene."""
+    rows, columns = raster.shape
+    edge = shapely.segmentize(shapely.box(-0.5, -0.5, columns - 0.5, rows - 0.5), max(rows, columns) / 32)
+    xy = raster.origin + shapely.get_coordinates(edge) @ raster.step.T
+    outline = shapely.Polygon(np.column_stack(frame.from_crs(raster.crs, *xy.T)))
+    # Neighbouring tiles' edges agree to the rounding of their headers and of the projection between vertices.
+    return shapely.make_valid(outline).buffer(0.01, join_style="mitre")
+
+
+def _not_covered(rasters: Sequence[_Raster], frame: Frame, bounds: Sequence[float], share: float) -> str:
+    xmin, ymin, xmax, ymax = bounds
+    lon, lat = frame.to_geographic([xmin, xmax, xmax, xmin], [ymin, ymin, ymax, ymax])
+    return (
+        f"{', '.join(r.path.name for r in rasters)}: {100 * share:.2g} % of the scene lies outside; it spans "
+        f"W {lon.min():.5f} S {lat.min():.5f} E {lon.max():.5f} N {lat.max():.5f}; "
+        "add the files that cover it, or let what lies outside take the nearest height"
+    )
+
+
+def _shares_lattice(one: _Raster, other: _Raster) -> bool:
+    """Whether the posts of both lie on one lattice: the same CRS and steps, a whole number of steps apart."""
+    if one.crs != other.crs or not np.allclose(one.step, other.step, rtol=1e-7, atol=0):
+        return False
+    apart = np.linalg.solve(one.step, other.origin - one.origin)
+    return bool(np.abs(apart - np.round(apart)).max() < 1e-2)
+
+
+def _read(
+    group: Sequence[_Raster], frame: Frame, bounds: Sequence[float]
+) -> tuple[Grid, float, int, int] | None:
+    """(grid, spacing in metres, posts, voids) of rasters on one lattice; None without a height in bounds."""
+    import rasterio  # noqa: PLC0415 - slow to import
+    from rasterio.windows import Window  # noqa: PLC0415
+
+    first = group[0]
+    side = max(float(np.diff(bounds[::2])[0]), 1.0)
+    edge = shapely.get_coordinates(shapely.segmentize(shapely.box(*bounds), side / 32))
+    place = np.column_stack(frame.to_crs(first.crs, *edge.T))
+    post = np.linalg.solve(first.step, (place - first.origin).T)
+    low = np.floor(post.min(axis=1)).astype(int) - _MARGIN
+    high = np.ceil(post.max(axis=1)).astype(int) + _MARGIN + 1
+    values = np.full((high[1] - low[1], high[0] - low[0]), np.nan)
+    known = np.zeros(values.shape, bool)
+    for raster in group:
+        shift = np.round(np.linalg.solve(first.step, raster.origin - first.origin)).astype(int)
+        begin = np.maximum(low - shift, 0)
+        end = np.minimum(high - shift, raster.shape[::-1])
+        if (begin >= end).any():
+            continue
+        with rasterio.open(raster.name) as source:
+            found = source.read(1, window=Window(*begin, *(end - begin)))
+        void = ~np.isfinite(found)
+        if raster.nodata is not None:
+            void |= found == np.asarray(raster.nodata, found.dtype)
+        metres = found.astype(np.float64) * raster.to_metres[0] + raster.to_metres[1]
+        with np.errstate(invalid="ignore"):
+            void |= (metres < _LOWEST) | (metres > _HIGHEST)
+        metres[void] = np.nan
+        (c0, r0), (c1, r1) = begin + shift - low, end + shift - low
+        known[r0:r1, c0:c1] = True
+        here = values[r0:r1, c0:c1]
+        values[r0:r1, c0:c1] = np.where(np.isnan(here), metres, here)
+    if np.isnan(values).all():
+        return None
+    voids = int((known & np.isnan(values)).sum())
+    posts = int(known.sum())
+    origin = first.origin + first.step @ low
+    grid = Grid(first.crs.to_wkt(), origin, first.step, _filled(values, known), known)
+    middle = np.array([(bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2])
+    east, north = frame.to_crs(first.crs, *middle)
+    steps = np.column_stack([[0.0, 0.0], first.step]) + np.array([[east], [north]])
+    sx, sy = frame.from_crs(first.crs, *steps)
+    return grid, float(np.hypot(np.diff(sx[[0, 1]]), np.diff(sy[[0, 1]]))[0]), posts, voids
+
+
+def _filled(values: Float, known: NDArray[np.bool_]) -> Float:
+    """Values without gaps: voids by inverse distances, posts outside all rasters by the nearest."""
+    from rasterio.fill import fillnodata  # noqa: PLC0415 - slow to import
+    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
+
+    good = ~np.isnan(values)
+    if good.all():
+        return values
+    filled = values.copy()
+    void = known & ~good
+    if void.any():
+        around = fillnodata(np.where(good, values, 0.0), mask=good, max_search_distance=100.0)
+        near = distance_transform_edt(~good) < 100.0
+        filled[void & near] = around[void & near]
+    rest = np.isnan(filled)
+    if rest.any():
+        row, column = distance_transform_edt(rest, return_distances=False, return_indices=True)
+        filled = filled[row, column]
+    return filled
+
+
+def _posts(grid: Grid, transformer: Transformer, frame: Frame, x: Float, y: Float) -> tuple[Float, Float]:
+    """Column and row (n,), fractional, of scene coordinates (n,)."""
+    place = np.stack(transformer.transform(*frame.to_projected(x, y)))
+    column, row = np.linalg.solve(grid.step, place - grid.origin[:, None])
+    return column, row
+
+
+def _bilinear(grid: Grid, column: Float, row: Float) -> tuple[Float, NDArray[np.bool_]]:
+    """Heights (n,) at fractional posts (n,), and whether a raster covers the place (its pixels do)."""
+    rows, columns = grid.values.shape
+    column, row = np.clip(column, 0.0, columns - 1.0), np.clip(row, 0.0, rows - 1.0)
+    c = np.minimum(column.astype(int), columns - 2)
+    r = np.minimum(row.astype(int), rows - 2)
+    u, v = column - c, row - r
+    z = grid.values
+    value: Float = (
+        z[r, c] * (1 - u) * (1 - v)
+        + z[r, c + 1] * u * (1 - v)
+        + z[r + 1, c] * (1 - u) * v
+        + z[r + 1, c + 1] * u * v
+    )
+    return value, grid.known[np.round(row).astype(int), np.round(column).astype(int)]
