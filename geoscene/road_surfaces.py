@@ -63,14 +63,16 @@ def road_surfaces(
     options = options or SurfaceOptions()
     roads = read_carriageways(osm, frame, sidewalks=options.sidewalks, left_hand=options.left_hand)
     edge = _edges_below(roads, graph)
+    crossings = crossing_rows(osm, roads, frame)
+    strips = crossings.polygon[crossings.priority == crossings.priority.min(initial=np.inf)]
     rows = concatenate_rows(
         [
             square_surfaces(osm, frame),
             path_surfaces(osm, frame),
             *_carriageway_rows(roads, edge),
-            crossing_rows(osm, roads, frame),
+            crossings,
             marking_rows(roads, edge, left_hand=options.left_hand),
-            stop_rows(graph, roads, left_hand=options.left_hand),
+            stop_rows(graph, roads, strips, left_hand=options.left_hand),
             rail_surfaces(osm, frame),
         ]
     )

@@ -30,6 +30,8 @@ _RADIUS_ELSE = 2.0
 _REACH = 20.0
 # A road that goes on straight (radians) and as wide (metres) needs no joint.
 _BEND, _STEP = np.radians(1.0), 0.05
+# Where a road that bends less than this (radians) changes its width, it does so by 1 in twice this number.
+_BENT, _SLANT = np.radians(30.0), 3.0
 # Neighbours closer to a straight line than this (radians) have no inner corner to round.
 _ROUNDED = np.radians(8.0)
 
@@ -81,7 +83,9 @@ def build_junctions(roads: Carriageways, importance: NDArray[np.int64]) -> Junct
     stub = _stubs(roads, arms, np.maximum(reach + 0.5, half + 1.0))
     disc = shapely.buffer(shapely.points(arms.node_xy), np.minimum(width, width[after]) / 2, quad_segs=_QUAD)
     rounded = np.where(np.abs(between - np.pi) > _ROUNDED, radius, 0.0)
-    corner = _corner(np.stack([stub, stub[after], disc], axis=1)[keep], rounded[keep])
+    slanted = (count == 2) & (np.abs(between - np.pi) < _BENT) & (width[after] > width + _STEP)
+    taper = np.where(slanted, _tapers(roads, arms, after), disc)
+    corner = _corner(np.stack([stub, stub[after], disc, taper], axis=1)[keep], rounded[keep])
 
     walk_width = np.minimum(arms.walk[:, 0], arms.walk[after][:, 1])[keep]
     walked = walk_width > 0
@@ -203,6 +207,25 @@ def cut_line(xy: Float, start: float, end: float) -> Float:
     inside = (along > start) & (along < end)
     at = np.concatenate([[start], along[inside], [end]])
     return np.stack([np.interp(at, along, column) for column in xy.T], axis=1)
+
+
+def _tapers(roads: Carriageways, arms: _Arms, after: NDArray[np.int64]) -> NDArray[np.object_]:
+    """Between each arm's end and the wider next arm's, the slant from one width to the other."""
+    width = roads.width[arms.road]
+    wide = np.maximum(width, width[after])
+    line = roads.line[arms.road]
+    far = np.minimum(_SLANT * (wide - width), shapely.length(line) / 2)
+    ahead = np.where(arms.end == 0, far, -np.maximum(far, 1e-9))
+    there = shapely.get_coordinates(shapely.line_interpolate_point(line, ahead))
+    across = np.stack([-np.sin(arms.angle), np.cos(arms.angle)], axis=1) / 2
+    corners = [
+        arms.node_xy + across * wide[:, None],
+        arms.node_xy - across * wide[:, None],
+        there - across * width[:, None],
+        there + across * width[:, None],
+    ]
+    tapers: NDArray[np.object_] = shapely.convex_hull(shapely.multipoints(np.stack(corners, axis=1)))
+    return tapers
 
 
 def _corner(shapes: NDArray[np.object_], radius: Float) -> NDArray[np.object_]:

@@ -11,6 +11,7 @@ from geoscene.roadgraph.carriageways import PAVED, Carriageways
 from geoscene.roadgraph.junctions import cut_line, junction_reach
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.roads import RoadGraph
+from geoscene.routing import edge_lines
 
 Float = NDArray[np.float64]
 
@@ -24,6 +25,8 @@ _STOP = 0.4
 _EDGE_IN = 0.25
 # Paint ends this far before the rounding of a junction begins, and a stop line lies there.
 _CLEAR = 1.0
+# A crossing that begins up to this far before a signal or sign belongs to it, metres.
+_STRIP_BEFORE = 12.0
 # Metres: a lane is not wider than this; what is left over on both sides is for parking and bicycles.
 _LANE_MOST = 4.5
 _MINOR = frozenset({"service", "track", "busway", "bus_guideway", "raceway", "escape"})
@@ -110,11 +113,15 @@ def _dashes(lines: NDArray[np.object_]) -> tuple[NDArray[np.object_], NDArray[np
     return shapely.linestrings(shapely.get_coordinates(points).reshape(-1, 3, 2)), of
 
 
-def stop_rows(graph: RoadGraph, roads: Carriageways, *, left_hand: bool) -> SurfaceRows:
+def stop_rows(
+    graph: RoadGraph, roads: Carriageways, crossings: NDArray[np.object_], *, left_hand: bool
+) -> SurfaceRows:
     """Stop lines before signals and stop signs, and broken ones before give-way signs.
 
     They lie across the lanes of their direction: where the map has the signal or sign, but not inside the
-    junction ahead and not upon a crossing.
+    junction ahead and before its crossings.
+
+    crossings : (c,) shapely, the strips where people cross
     """
     paved = dict(zip(roads.osm_id.tolist(), np.isin(roads.material, list(PAVED)).tolist(), strict=True))
     keep = np.array([s.highway not in _MINOR for s in roads.street], np.bool_)
@@ -126,10 +133,7 @@ def stop_rows(graph: RoadGraph, roads: Carriageways, *, left_hand: bool) -> Surf
     ):
         inside[node] = max(inside.get(node, 0.0), metres)
 
-    crossings = (
-        graph.control_edge[graph.control_kind == "crossing"],
-        graph.control_offset[graph.control_kind == "crossing"],
-    )
+    strips = _strips(graph, crossings)
     lines: dict[tuple[int, int], tuple[int, float, str]] = {}
     for edge, offset, kind in zip(
         graph.control_edge.tolist(), graph.control_offset.tolist(), graph.control_kind.tolist(), strict=True
@@ -139,12 +143,30 @@ def stop_rows(graph: RoadGraph, roads: Carriageways, *, left_hand: bool) -> Surf
             continue
         free = float(graph.length[edge]) - inside.get(int(graph.node_id[graph.head[edge]]), 0.0) - _CLEAR
         place = min(offset, free)
-        here = crossings[1][crossings[0] == edge]
-        blocking = here[np.abs(here - place) < 3.5]
-        place = float(blocking.min()) - 3.0 if len(blocking) else place
+        ahead = [start for start in strips.get(edge, []) if start > place - _STRIP_BEFORE]
+        place = min(place, *(start - _CLEAR for start in ahead)) if ahead else place
         if place > 1.0:
             lines.setdefault((edge, round(place / 5)), (edge, place, kind))
     return _across(graph, list(lines.values()), left_hand=left_hand)
+
+
+def _strips(graph: RoadGraph, crossings: NDArray[np.object_]) -> dict[int, list[float]]:
+    """Where crossings begin on each controlled edge that has some: true metres from its tail."""
+    edges = np.unique(graph.control_edge)
+    if not len(edges) or not len(crossings):
+        return {}
+    lines = edge_lines(graph)[edges]
+    which, strip = shapely.STRtree(crossings).query(lines, predicate="intersects")
+    inside, of = shapely.get_coordinates(
+        shapely.intersection(lines[which], crossings[strip]), return_index=True
+    )
+    at = shapely.line_locate_point(lines[which][of], shapely.points(inside), normalized=True)
+    begin = np.full(len(which), np.inf)
+    np.minimum.at(begin, of, at * graph.length[edges[which]][of])
+    found: dict[int, list[float]] = {}
+    for edge, metres in zip(edges[which].tolist(), begin.tolist(), strict=True):
+        found.setdefault(edge, []).append(metres)
+    return found
 
 
 def _across(graph: RoadGraph, lines: list[tuple[int, float, str]], *, left_hand: bool) -> SurfaceRows:
