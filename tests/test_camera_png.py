@@ -1,5 +1,8 @@
 """Images come back from their files bit for bit."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +15,9 @@ from lidar.camera.png import (
     depth_to_counts,
     encode_png,
     feature_to_image,
+    flow_to_image,
     image_to_feature,
+    image_to_flow,
     read_png,
     write_png,
 )
@@ -78,6 +83,36 @@ def test_instances_there_and_back(feature):
     image = feature_to_image(feature)
     assert image.dtype == np.uint8
     np.testing.assert_array_equal(image_to_feature(image), feature)
+
+
+def test_flow_counts_are_those_of_kitti():
+    flow = np.array([[[1.0, -0.5], [np.nan, 0], [600, 0]]], np.float32)
+    image = flow_to_image(flow)
+    assert image.tolist() == [[[32832, 32736, 1], [0, 0, 0], [0, 0, 0]]]
+    back = image_to_flow(image)
+    np.testing.assert_array_equal(back[0, 0], [1.0, -0.5])
+    assert np.isnan(back[0, 1:]).all()
+
+
+def test_sixteen_bit_colour_is_laid_out_as_the_standard_says(tmp_path):
+    # Pillow reads only half of each number, so the file is taken apart by hand.
+    image = np.random.default_rng(0).integers(0, 65535, (7, 5, 3), np.uint16)
+    data = encode_png(image)
+    at, chunks = 8, {}
+    while at < len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        body = data[at + 4 : at + 8 + length]
+        assert struct.unpack_from(">I", data, at + 8 + length)[0] == zlib.crc32(body)
+        chunks[body[:4]] = body[4:]
+        at += 12 + length
+    assert struct.unpack(">IIBBBBB", chunks[b"IHDR"]) == (5, 7, 16, 2, 0, 0, 0)
+    rows = np.frombuffer(zlib.decompress(chunks[b"IDAT"]), np.uint8).reshape(7, 31)
+    assert (rows[:, 0] == 2).all()
+    whole = np.cumsum(rows[:, 1:], axis=0, dtype=np.uint8)
+    np.testing.assert_array_equal(whole.reshape(7, 5, 3, 2).view(">u2")[..., 0], image)
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(FormatError, match="16-bit"):
+        read_png(tmp_path / "a.png")
 
 
 def test_a_file_that_is_no_image_is_named(tmp_path):

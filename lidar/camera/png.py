@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +19,12 @@ DEPTH_SCALE = 256.0
 
 
 def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    """The PNG file of an image: (h, w, 3) uint8 colour, (h, w) uint8 or (h, w) uint16 grey.
+    """The PNG file of an image (h, w, 3) in colour or (h, w) in grey, uint8 or uint16.
 
     Written for speed, twice that of an encoder that tries every filter on every row: each row is stored as
     its difference from the one above, packed lightly (PNG, W3C 2003). Raises FormatError for another array.
     """
-    kinds = {("uint8", 3): (8, 2), ("uint8", 2): (8, 0), ("uint16", 2): (16, 0)}
+    kinds = {("uint8", 3): (8, 2), ("uint8", 2): (8, 0), ("uint16", 2): (16, 0), ("uint16", 3): (16, 2)}
     kind = kinds.get((image.dtype.name, image.ndim))
     if kind is None or image.size == 0 or image.shape[2:] not in ((), (3,)):
         raise FormatError(f"an array {image.shape} of {image.dtype} is no PNG image that is written here")
@@ -51,14 +52,16 @@ def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None
 
 
 def read_png(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """The array that `write_png` wrote, bit for bit.
+    """The array that `write_png` wrote, bit for bit; not 16-bit colour, which Pillow does not read.
 
     Raises FormatError if the file cannot be read as such an image.
     """
     try:
-        with Image.open(path) as image:
-            if image.mode not in ("RGB", "L", "I;16"):
-                raise FormatError(f"{path}: an image of mode {image.mode}; expected RGB, L or I;16")
+        data = path.read_bytes()
+        with Image.open(BytesIO(data)) as image:
+            deep_colour = data[24:26] == b"\x10\x02"  # bit depth and colour type in the header
+            if image.mode not in ("RGB", "L", "I;16") or deep_colour:
+                raise FormatError(f"{path}: neither 8-bit colour nor 8- or 16-bit grey")
             return np.array(image)
     except (OSError, UnidentifiedImageError) as error:
         raise FormatError(f"{path}: not a readable image ({error})") from error
@@ -95,3 +98,27 @@ def feature_to_image(feature: NDArray[np.int32]) -> NDArray[np.uint8]:
 def image_to_feature(image: NDArray[np.uint8]) -> NDArray[np.int32]:
     """The feature numbers that `feature_to_image` packed, -1 for none."""
     return (image.astype(np.int32) @ np.array([1, 256, 65536], np.int32) - 1).astype(np.int32)
+
+
+FLOW_SCALE = 64.0
+"""Counts per pixel of a flow image, as in KITTI's flow benchmark, about 32768."""
+
+
+def flow_to_image(flow: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Optical flow (h, w, 2) in pixels as a 16-bit colour image (h, w, 3), as in KITTI's flow benchmark.
+
+    R is 64 times the way right + 32768, G the same for down, B is 1; all are 0 where there is no flow, or
+    more than 511 pixels of it.
+    """
+    held = np.isfinite(flow).all(axis=2) & (np.abs(flow) < 511.5).all(axis=2)
+    image = np.zeros((*held.shape, 3), np.uint16)
+    image[held, :2] = np.rint(flow[held] * FLOW_SCALE + 32768)
+    image[held, 2] = 1
+    return image
+
+
+def image_to_flow(image: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """The flow that `flow_to_image` took, to 1/128 of a pixel; NaN where there is none."""
+    flow = ((image[..., :2].astype(np.float64) - 32768) / FLOW_SCALE).astype(np.float32)
+    flow[image[..., 2] == 0] = np.nan
+    return flow

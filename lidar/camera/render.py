@@ -304,13 +304,13 @@ def radiance(
         wall = np.where(hits.instance < 0, walls.wall[hits.face], np.int32(-1))
     else:
         wall = np.full(n, -1, np.int32)
-    kind, mirror = shade.material_tables()
     shade.shade(
         view.origin,
         view.row,
         view.direction,
         hits.range,
         normal,
+        surfaces.klass,
         surfaces.material,
         surfaces.color,
         surfaces.feature,
@@ -318,7 +318,7 @@ def radiance(
         (walls.tangent, walls.along, walls.height, walls.style),
         lit,
         (light.direction, light.beam, light.ambient, light.sky, light.horizon),
-        (kind, mirror, shade.linear_table()),
+        (*shade.material_tables(), shade.linear_table()),
         (blur, angle, 3.912 / options.visibility, options.detail),
         out,
     )
