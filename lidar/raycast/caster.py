@@ -27,7 +27,7 @@ _NOTHING: Mapping[int, Geometry] = {}
 _NUMBERS: Mapping[int, int] = {}
 _COPIES = 1 << 20
 """Number of the first geometry of copies; parts of a mesh have lesser numbers."""
-_NO_POSES = (_NO_INDEX, np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)))
+_NO_POSES = (_NO_INDEX, np.empty((0, 3)), np.empty((0, 3, 3)))
 
 
 class Caster:
@@ -154,9 +154,10 @@ class Caster:
             raise InputError(f"{len(d)} directions, {len(o)} offsets and {len(index)} pose numbers disagree")
         if len(index) and not (index.min() >= 0 and index.max() < len(poses)):
             raise InputError(f"a ray names a pose beyond the {len(poses)} there are")
-        columns = (np.ascontiguousarray(a, np.float64) for a in (poses.position, poses.rotation, poses.scale))
+        position = np.ascontiguousarray(poses.position, np.float64)
+        matrix = poses.scale[:, :, None] * poses.rotation
         return self._cast(
-            _rays(d, o, (index, *columns), near, far, mask, time, order), threads, normals=normals
+            _rays(d, o, (index, position, matrix), near, far, mask, time, order), threads, normals=normals
         )
 
     def occluded(
@@ -225,7 +226,7 @@ def _rows(values: ArrayLike, name: str) -> Float:
 def _rays(
     directions: Float,
     offsets: Float,
-    poses: tuple[NDArray[np.int64], Float, Float, Float],
+    poses: tuple[NDArray[np.int64], Float, Float],
     near: float,
     far: float | Float,
     mask: int,

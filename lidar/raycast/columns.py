@@ -48,7 +48,8 @@ class Rays(NamedTuple):
     directions : (n, 3) float64, in the pose's axes where there are poses
     offsets    : (n, 3) float64, origins in the pose's frame; (1, 3) serves all, with poses it is zero
     pose       : (n,) int64, row of the poses; empty: directions and offsets are in the caster's frame
-    position, rotation, scale : the poses (see `lidar.poses.Poses`)
+    position   : (p, 3) float64, of the poses
+    matrix     : (p, 3, 3) float64, scale * rotation of the poses (see `lidar.poses.Poses`)
     order      : (n,) int64, order of work; empty: as they come
     time       : (n,) float32, ray times; empty: all 0
     near       : ray parameter
@@ -60,8 +61,7 @@ class Rays(NamedTuple):
     offsets: Float
     pose: NDArray[np.int64]
     position: Float
-    rotation: Float
-    scale: Float
+    matrix: Float
     order: NDArray[np.int64]
     time: NDArray[np.float32]
     near: float

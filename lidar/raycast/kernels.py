@@ -57,13 +57,12 @@ def _vector(address: int, row: int) -> Any:
 
 @inlined
 def _posed(pose: Any, p: int, x: float, y: float, z: float) -> Any:
-    """A vector of the pose's frame in the caster's axes: scale * (rotation @ vector)."""
+    """A vector of the pose's frame in the caster's axes."""
     R = pose[1] + 72 * p
-    sx, sy, sz = _vector(pose[2], p)
     return (
-        sx * (float64_at(R, 0) * x + float64_at(R, 1) * y + float64_at(R, 2) * z),
-        sy * (float64_at(R, 3) * x + float64_at(R, 4) * y + float64_at(R, 5) * z),
-        sz * (float64_at(R, 6) * x + float64_at(R, 7) * y + float64_at(R, 8) * z),
+        float64_at(R, 0) * x + float64_at(R, 1) * y + float64_at(R, 2) * z,
+        float64_at(R, 3) * x + float64_at(R, 4) * y + float64_at(R, 5) * z,
+        float64_at(R, 6) * x + float64_at(R, 7) * y + float64_at(R, 8) * z,
     )
 
 
@@ -77,7 +76,7 @@ def gather(target: Target, rays: Rays, at: int, m: int, W: int, ids: Any, work: 
     step = 1 if rays.offsets.shape[0] > 1 else 0
     directions, offsets, far = rays.directions.ctypes.data, rays.offsets.ctypes.data, rays.far.ctypes.data
     order, pose_of, time = rays.order.ctypes.data, rays.pose.ctypes.data, rays.time.ctypes.data
-    pose = (rays.position.ctypes.data, rays.rotation.ctypes.data, rays.scale.ctypes.data)
+    pose = (rays.position.ctypes.data, rays.matrix.ctypes.data)
     cx, cy, cz = target.origin[0], target.origin[1], target.origin[2]
     for k in range(W):
         i = at + min(k, m - 1)
@@ -130,17 +129,28 @@ def first_bad(W: int, ids: Any, work: Any) -> int:
 
 
 @inlined
+def _copy(W: int, f: Any, to: int, work: Any, row: int) -> None:
+    for k in range(W):
+        f[to * W + k] = work[row * W + k]
+
+
+@inlined
+def _product(W: int, f: Any, to: int, work: Any, row: int) -> None:
+    for k in range(W):
+        f[to * W + k] = work[row * W + k] * work[6 * W + k]
+
+
+@inlined
 def load(W: int, near: float, work: Any, f: Any) -> None:
     """Write the lanes of ``work`` into Embree's packet, with directions of length 1 and far rounded up."""
+    for row in range(3):
+        _copy(W, f, row, work, row)
+        _product(W, f, 4 + row, work, 3 + row)
     for k in range(W):
-        inverse = work[6 * W + k]
-        f[k], f[W + k], f[2 * W + k] = work[k], work[W + k], work[2 * W + k]
-        f[3 * W + k] = near / inverse
-        f[4 * W + k] = work[3 * W + k] * inverse
-        f[5 * W + k] = work[4 * W + k] * inverse
-        f[6 * W + k] = work[5 * W + k] * inverse
-        f[7 * W + k] = work[8 * W + k]
-        f[8 * W + k] = work[7 * W + k] / inverse * _UP
+        f[3 * W + k] = near / work[6 * W + k]
+    _copy(W, f, 7, work, 8)
+    for k in range(W):
+        f[8 * W + k] = work[7 * W + k] / work[6 * W + k] * _UP
 
 
 @inlined
@@ -316,13 +326,13 @@ def meet(W: int, work: Any, hit: Any) -> None:
 
 
 @inlined
-def _look_up(target: Target, W: int, m: int, u: Any, work: Any, hit: Any, what: Any) -> None:
+def _look_up(target: Target, W: int, u: Any, work: Any, hit: Any, what: Any) -> None:
     """Find the planes of the lanes' hits and where the rays meet them.
 
     hit  : normal (3) and offset of the plane, range, cosine
     what : row of ``parts``, number in it, instance
     """
-    for k in range(m):
+    for k in range(W):
         if u[18 * W + k] != _INVALID:
             row, instance = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
             prim = np.int64(u[17 * W + k])
@@ -377,9 +387,11 @@ def cast(
             u[19 * W + k] = _INVALID
         together = _alike(W, work)
         _trace(target, W, _ROWS, f, valid, together, one)
-        _look_up(target, W, m, u, work, hit, what)
+        _look_up(target, W, u, work, hit, what)
         doubtful = False
-        for k in range(m):
+        for k in range(W):
+            if k >= m:
+                break
             i = ids[k]
             t, cosine, face, instance = np.inf, 0.0, np.int64(-1), np.int64(-1)
             doubt = True
@@ -397,14 +409,14 @@ def cast(
                 _normal(normals, i, face >= 0, W, k, hit)
         if not doubtful:
             continue
-        for k in range(m):
+        for k in range(W):
             if valid[k]:
                 u[18 * W + k] = _INVALID
                 u[19 * W + k] = _INVALID
                 nudge(W, k, work, f, min(work[7 * W + k], ranges[ids[k]]))
         _trace(target, W, _ROWS, f, valid, together, one)
-        _look_up(target, W, m, u, work, hit, what)
-        for k in range(m):
+        _look_up(target, W, u, work, hit, what)
+        for k in range(W):
             if valid[k] and u[18 * W + k] != _INVALID:
                 i = ids[k]
                 t, cosine = settle(target, W, k, work, hit, what)
@@ -444,11 +456,11 @@ def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_
             doubtful |= not met
         if not doubtful:
             continue
-        for k in range(m):
+        for k in range(W):
             if valid[k]:
                 nudge(W, k, work, f, work[7 * W + k])
         _trace(target, W, _RAY, f, valid, together, one)
-        for k in range(m):
+        for k in range(W):
             if valid[k]:
                 out[ids[k]] = f[8 * W + k] < 0
     return -1
