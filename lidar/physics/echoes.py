@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
+_FAINT = 1e-3  # share of the brightest surface's power that is as good as nothing
+
 
 @dataclass(frozen=True, slots=True)
 class Echoes:
@@ -57,8 +59,8 @@ def merged(surfaces: Echoes, separation: float) -> Echoes:
 
     Surfaces of a pulse that follow each other within ``separation`` metres are one echo: it lies at their
     mean range, weighted by received power, and has their power together. It bears the feature, class,
-    incidence and true range of the surface that the beam's axis meets, if that is among them, else of the
-    one that sends back most.
+    incidence and true range of the surface that the beam's axis meets, if that is among them and sends
+    anything back (water and panes may not), else of the one that sends back most.
     """
     if not len(surfaces):
         return surfaces
@@ -93,23 +95,25 @@ def _merge(
                 row[j] = row[j - 1]
                 j -= 1
             row[j] = first + i
-        total = moment = most = 0.0
-        best = row[0]
+        total = moment = most = central = 0.0
+        best = middle = row[0]
         for i in range(size):
             s = row[i]
             r = max(distance[s], 1e-3)
             received = apparent[s] / (r * r)
-            if axis[s] or (received > most and not axis[best]):
-                best = s
-            most = max(most, received)
+            if received > most:
+                best, most = s, received
+            if axis[s]:
+                middle, central = s, received
             total += received
             moment += received * distance[s]
             if i == size - 1 or distance[row[i + 1]] - distance[s] > separation:
                 mean = moment / total if total > 0 else distance[best]
-                bearer[count], place[count], power[count] = best, mean, total * mean * mean
+                bearer[count] = middle if central > _FAINT * most else best
+                place[count], power[count] = mean, total * mean * mean
                 count += 1
-                total = moment = most = 0.0
-                best = row[min(i + 1, size - 1)]
+                total = moment = most = central = 0.0
+                best = middle = row[min(i + 1, size - 1)]
     return count
 
 

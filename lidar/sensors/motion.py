@@ -16,6 +16,7 @@ from lidar.sensors.beams import Firings
 
 Float = NDArray[np.float64]
 
+
 @dataclass(frozen=True, slots=True)
 class Rays:
     """The rays of a frame: those of the first pulse, of the second, ...; the beam's axis leads each bundle.

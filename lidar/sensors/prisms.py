@@ -86,9 +86,7 @@ def _refracted(x: Any, y: Any, z: Any, nx: Any, ny: Any, nz: Any, ratio: Any) ->
     c = -(x * nx + y * ny + z * nz)
     s2 = ratio * ratio * (1 - c * c)
     along = ratio * c - np.sqrt(1 - s2)
-    x, y, z = ratio * x + along * nx, ratio * y + along * ny, ratio * z + along * nz
-    length = 1 / np.sqrt(x * x + y * y + z * z)
-    return x * length, y * length, z * length
+    return ratio * x + along * nx, ratio * y + along * ny, ratio * z + along * nz
 
 
 def read_prisms(table: Table) -> Prisms:
