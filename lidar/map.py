@@ -142,16 +142,21 @@ class _Source:
             self._trajectory = self.dataset.trajectory()
         sensor = self._lidars[name]
         start = int(sensor["time_offset_ns"]) + int(frame * frame_ns(sensor["rate_hz"]))
-        times, inverse = np.unique(table["time_ns"].astype(np.int64), return_inverse=True)
+        time_ns = start + table["time_ns"].astype(np.int64)
         mount = np.array(sensor["vehicle_from_sensor"])
-        poses = self._trajectory.at(start + times).mounted(mount[:3, 3], mount[:3, :3]).take(inverse)
-        world = self.geo.points(poses.place(np.column_stack([table[k] for k in "xyz"]).astype(np.float64)))
+        placed = self._trajectory.place(
+            np.column_stack([table[k] for k in "xyz"]),
+            time_ns,
+            translation=mount[:3, 3],
+            rotation=mount[:3, :3],
+        )
+        world = self.geo.points(placed)
         return {
             "x": world[:, 0],
             "y": world[:, 1],
             "z": world[:, 2],
             "intensity": table["intensity"],
-            "gps_time": gps_seconds(self.dataset.start, start + times)[inverse],
+            "gps_time": gps_seconds(self.dataset.start, time_ns),
             "ring": table["ring"],
             "label": table["label"].astype(np.uint8),
             "instance": table["instance"],

@@ -190,16 +190,16 @@ class Recorder:
         return len(cloud)
 
     def _world_table(self, scanner: Scanner, cloud: Cloud, table: Table) -> Table:
-        times, which = np.unique(cloud.time_ns, return_inverse=True)
-        mount = scanner.spec.mount
-        poses = self.trajectory.at(cloud.start_ns + times.astype(np.int64))
-        poses = poses.mounted(mount.translation, mount.rotation).take(which)
-        world = self.geo.points(poses.place(cloud.xyz.astype(np.float64)))
+        mount, time_ns = scanner.spec.mount, cloud.start_ns + cloud.time_ns.astype(np.int64)
+        placed = self.trajectory.place(
+            cloud.xyz, time_ns, translation=mount.translation, rotation=mount.rotation
+        )
+        world = self.geo.points(placed)
         return table | {
             "x": world[:, 0],
             "y": world[:, 1],
             "z": world[:, 2],
-            "gps_time": gps_seconds(self.start, cloud.start_ns + times.astype(np.int64))[which],
+            "gps_time": gps_seconds(self.start, time_ns),
         }
 
     def _record_images(self, camera: Camera, frame: int, world: World) -> None:
