@@ -39,7 +39,7 @@ class WaterLevels:
     river   : (n,) bool, the row is a river: its level at a point is that of the nearest station
     station : (k, 2) float64, places on rivers' centre lines, scene metres
     height  : (k,) float64 metres, of the water there
-    reversed : ids of rivers that were drawn against the fall of the terrain
+    reversed : ids of waterways that were drawn against the fall of the terrain
     """
 
     level: Float
@@ -52,18 +52,16 @@ class WaterLevels:
 def water_levels(layers: Layers, ways: Sequence[Way], frame: Frame, *, height: Height) -> WaterLevels:
     """The level of every water row of the layers.
 
-    The sea has one level: the median of the terrain over it. Standing water has one level a polygon: the
-    lowest terrain on its shore. A river falls along its centre line, level across: at stations every 20 m
-    it is the lowest terrain from its source to there, but not more than 3 m below the terrain; one that
-    the map draws against the fall of the terrain is turned round and named in the result. A river's area
-    without a centre line in it is standing water.
+    The sea has one level: the median of the terrain over it. Standing water, with all that touches it,
+    has one level: the sea's if the sea is among it, else the lowest terrain on its shore. A river falls
+    along its centre line, level across: at stations every 20 m it is the lowest terrain from its source
+    to there, but not more than 3 m below the terrain; one that the map draws against a fall of more than
+    3 m is turned round and named in the result. A river's area without a centre line in it is standing
+    water.
 
     ways : whose ``waterway`` gives centre lines
     """
     level = np.full(len(layers), np.nan)
-    sea = np.flatnonzero(layers.body == "sea")
-    if len(sea):
-        level[sea] = np.median(height(*_inside(layers.polygon[sea])))
     lines = [way for way in ways if "waterway" in way.tags and len(way.lonlat) > 1]
     stations, heights, turned = _profiles(lines, frame, height)
     river = layers.body == "river"
@@ -71,13 +69,9 @@ def water_levels(layers: Layers, ways: Sequence[Way], frame: Frame, *, height: H
         tree = shapely.STRtree(layers.polygon[river])
         has_line = np.unique(tree.query(shapely.points(stations), predicate="within")[1])
         river[np.flatnonzero(river)[~np.isin(np.arange(river.sum()), has_line)]] = False
-    still = np.flatnonzero((layers.body != "") & (layers.body != "sea") & ~river)
+    still = np.flatnonzero((layers.body != "") & ~river)
     if len(still):
-        shores = shapely.segmentize(shapely.boundary(layers.polygon[still]), _STATION)
-        xy, owner = shapely.get_coordinates(shores, return_index=True)
-        lowest = np.full(len(still), np.inf)
-        np.minimum.at(lowest, owner, height(xy[:, 0], xy[:, 1]))
-        level[still] = lowest
+        level[still] = _still_levels(layers.polygon[still], layers.body[still] == "sea", height)
     return WaterLevels(level, river, stations, heights, turned)
 
 
@@ -132,6 +126,30 @@ def _inside(polygons: NDArray[np.object_]) -> tuple[Float, Float]:
     return every[:, 0], every[:, 1]
 
 
+def _still_levels(polygons: NDArray[np.object_], sea: NDArray[np.bool_], height: Height) -> Float:
+    """The level (n,) of waters that do not flow; those that touch stand equally high."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    n = len(polygons)
+    one, other = shapely.STRtree(polygons).query(polygons, predicate="intersects")
+    # All sea is one water, whatever land divides it.
+    first = np.flatnonzero(sea)[:1]
+    one = np.concatenate([one, np.repeat(first, sea.sum())])
+    other = np.concatenate([other, np.flatnonzero(sea)[: len(one) - len(other)]])
+    water = connected_components(coo_array((np.ones(len(one)), (one, other)), shape=(n, n)), directed=False)[
+        1
+    ]
+    shores = shapely.segmentize(shapely.boundary(polygons), _STATION)
+    xy, owner = shapely.get_coordinates(shores, return_index=True)
+    level = np.full(n, np.inf)
+    np.minimum.at(level, water[owner], height(xy[:, 0], xy[:, 1]))
+    if sea.any():
+        level[water[first]] = np.median(height(*_inside(polygons[sea])))
+    levels: Float = level[water]
+    return levels
+
+
 def _profiles(ways: Sequence[Way], frame: Frame, height: Height) -> tuple[Float, Float, tuple[str, ...]]:
     """Stations (k, 2) on rivers, the water's height (k,) there, and which rivers were turned round."""
     stations, heights, turned = [np.empty((0, 2))], [np.empty(0)], []
@@ -140,7 +158,7 @@ def _profiles(ways: Sequence[Way], frame: Frame, height: Height) -> tuple[Float,
         xy = shapely.get_coordinates(shapely.segmentize(line, _STATION))
         ground = np.asarray(height(xy[:, 0], xy[:, 1]), float)
         third = max(len(ground) // 3, 1)
-        if ground[-third:].mean() > ground[:third].mean() + 0.5:
+        if ground[-third:].mean() > ground[:third].mean() + _CUT:
             xy, ground = xy[::-1], ground[::-1]
             turned.append(way.osm_id)
         stations.append(xy)
