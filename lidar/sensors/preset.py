@@ -97,6 +97,11 @@ class Sensor:
         """Times within which all pulses of a frame are fired, nanoseconds since the drive's start."""
         return self.frame_start_ns(frame), self.frame_start_ns(frame + 1) + self.pattern.tail_ns
 
+    def footprint(self, distance: float) -> tuple[float, float]:
+        """Width and height in metres of the beam at a distance in metres."""
+        wide, high = (a + distance * b for a, b in zip(self.aperture, self.divergence, strict=True))
+        return wide, high
+
     def frame_count(self, duration_ns: int) -> int:
         """Number of frames that end within a drive of that length."""
         return max(0, int((duration_ns - self.start_ns) // frame_ns(self.rate_hz)))
