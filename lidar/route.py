@@ -15,6 +15,7 @@ from geoscene.frames import Frame
 from geoscene.roads import RoadGraph
 from geoscene.routing import edge_lines, turn_table
 from lidar.errors import RouteError
+from lidar.physics.random import generator
 
 Float = NDArray[np.float64]
 Side = Literal["right", "left"]
@@ -191,7 +192,7 @@ def random_edges(
     streets it has not driven, and turns round only at dead ends, and only where the graph has no round trip
     without that worth the name (a fifth of what turning round would open).
     """
-    rng = np.random.Generator(np.random.Philox(key=[seed, 0x726F757465]))
+    rng = generator(seed, "route")
     before, after = permitted_turns(graph, avoid)
     back = turns_back(graph, before, after)
     label, size = _components(graph, before[~back], after[~back])

@@ -54,7 +54,7 @@ def test_a_random_drive_prefers_streets_it_has_not_seen():
         edges = random_edges(graph, seed=seed, metres=2500.0)
         streets = np.minimum(edges, graph.twin[edges])
         seen.append(len(set(streets.tolist())) / len(streets))
-    assert np.mean(seen) > 0.8
+    assert np.mean(seen) > 0.83  # a walk that prefers nothing sees 0.78
 
 
 def test_a_village_of_one_dead_end_street_is_driven_up_and_down():
