@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import shapely
@@ -16,31 +16,40 @@ from numpy.typing import NDArray
 
 from geoscene import __version__
 from geoscene.buildings import Buildings, build_solids, read_buildings
-from geoscene.classes import Class, materials
 from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.features import building_layers, ground_layer, road_layer, tree_layer
 from geoscene.frames import Frame
 from geoscene.geopackage import Layer
 from geoscene.ground import (
+    GroundPlan,
+    Layers,
+    WaterLevels,
     building_pads,
     concatenate_layers,
+    ground_tile,
     landcover,
-    partition_tile,
     plan_ground,
-    triangulate,
+    water_levels,
 )
-from geoscene.ground.layers import Layers
 from geoscene.mesh import Mesh, concatenate
 from geoscene.progress import Progress, silent
 from geoscene.report import Problem, summarise
 from geoscene.road_surfaces import road_surfaces
 from geoscene.roadgraph import build_road_graph, find_components, write_graphml
 from geoscene.roads import RoadGraph
-from geoscene.scene import Scene, open_scene
+from geoscene.scene import Instances, Scene, open_scene
+from geoscene.shapes import concatenate_instances, shapes
 from geoscene.sources import ATTRIBUTION, OsmData
 from geoscene.store import SceneWriter, split
+from geoscene.terrain import Terrain, base_heights, flat_terrain, open_terrain
+from geoscene.urban import paved_fabric
 from geoscene.validate import validate_mesh
+from geoscene.vegetation import Trees, clear_of, forest_trees, needle_shares, read_trees, tree_instances
 
 Float = NDArray[np.float64]
+Bounds = tuple[float, float, float, float]
+
+_STANDING = 1.0  # metres: a building whose underside is higher leaves the ground under it as it is
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +58,16 @@ class BuildOptions:
 
     crs       : ``local``, ``utm`` or a CRS that pyproj knows
     lod       : of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs
+    dem       : elevation files; level ground without
+    dem_gaps  : what to do where they do not cover the scene: ``error``, or ``nearest`` height and say so
     tile_size : metres, side of a tile
     name      : of the scene, for people
     """
 
     crs: str = "local"
     lod: int = 2
+    dem: tuple[str, ...] = ()
+    dem_gaps: str = "error"
     tile_size: float = 250.0
     name: str = ""
 
@@ -62,17 +75,31 @@ class BuildOptions:
         """Refuse options that cannot be meant."""
         if self.lod not in (0, 1, 2):
             raise InputError(f"--lod {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
+        if self.dem_gaps not in ("error", "nearest"):
+            raise InputError(f"--dem-gaps {self.dem_gaps}: error or nearest")
         if not 50 <= self.tile_size <= 2000 or self.tile_size != int(self.tile_size):
             raise InputError(f"--tile-size {self.tile_size}: give whole metres from 50 to 2000")
 
 
 @dataclass(frozen=True, slots=True)
-class _Ground:
-    """What is drawn on the ground, before it is cut to tiles."""
+class Plan:
+    """All that tiles are made from: features of the whole scene, numbered, not yet cut.
 
-    cover: Layers
-    roads: Layers
-    pads: Layers
+    layers : the feature tables, in the order of their numbers
+    ground : what lies on the ground
+    levels : how high its water stands
+    solids : the buildings
+    trees  : mapped ones
+    needles : share of needle-leaved trees by row of the ground's layers
+    """
+
+    terrain: Terrain
+    layers: list[Layer]
+    ground: GroundPlan
+    levels: WaterLevels
+    solids: Mesh
+    trees: Trees
+    needles: Float
 
 
 def build(
@@ -89,39 +116,44 @@ def build(
     serve and SceneFormatError for a directory that may not be used.
     """
     options = options or BuildOptions()
-    west, south, east, north = osm.bounds
-    frame = Frame.at((west + east) / 2, (south + north) / 2, options.crs)
     if not (osm.areas or osm.ways):
         raise SourceNotFoundError(f"{osm.source or 'the extract'}: nothing in it to build from")
+    west, south, east, north = osm.bounds
+    frame = Frame.at((west + east) / 2, (south + north) / 2, options.crs)
     problems: list[Problem] = list(osm.problems)
     with SceneWriter(out, tile_size=options.tile_size, overwrite=overwrite) as writer:
         progress("buildings", 0, 0)
         buildings, found = read_buildings(osm, frame)
         problems += found
         extent = _extent(frame, osm.bounds, buildings)
-        solids, found = build_solids(buildings, base=np.zeros(buildings.count), lod=options.lod)
+        terrain = _terrain(frame, extent, options)
+        frame = replace(frame, vertical=terrain.vertical)
+        base = base_heights(buildings.footprint[: buildings.count], terrain)
+        solids, found = build_solids(buildings, base=base, lod=options.lod)
         problems += found
 
-        progress("roads", 0, 0)
+        progress("roads and ground", 0, 0)
         graph, found = build_road_graph(osm, frame)
         problems += found
         if len(graph):
             write_graphml(graph, frame, writer.folder / "roads.graphml")
-        ground, found = _read_ground(osm, graph, frame, buildings, extent)
+        plan, found = _plan(osm, frame, extent, terrain, buildings, base, solids, graph, options)
         problems += found
 
-        layers, ground = _numbered(buildings, ground, graph)
-        area = _write_tiles(writer, extent, ground, solids, progress)
-        manifest = _manifest(osm, options, buildings, graph, solids, problems) | {"ground": area}
+        area = _write_tiles(writer, plan, progress)
+        manifest = _manifest(osm, options, plan, buildings, graph, problems) | {"ground": area}
         writer.finish(
-            frame=frame, bounds=extent, layers=layers, shapes={}, problems=problems, manifest=manifest
+            frame=frame,
+            bounds=extent,
+            layers=plan.layers,
+            shapes=shapes(),
+            problems=problems,
+            manifest=manifest,
         )
     return open_scene(out)
 
 
-def _extent(
-    frame: Frame, bounds: tuple[float, float, float, float], buildings: Buildings
-) -> tuple[float, float, float, float]:
+def _extent(frame: Frame, bounds: Bounds, buildings: Buildings) -> Bounds:
     """The ground's rectangle: around the extract's bounds and all buildings, out to whole metres."""
     west, south, east, north = bounds
     step = max((east - west) / 8, (north - south) / 8, 1e-6)
@@ -135,15 +167,31 @@ def _extent(
     return xmin, ymin, max(xmax, xmin + 10), max(ymax, ymin + 10)
 
 
-def _read_ground(
+def _terrain(frame: Frame, extent: Bounds, options: BuildOptions) -> Terrain:
+    if not options.dem:
+        return flat_terrain(frame)
+    outside: Literal["error", "nearest"] = "nearest" if options.dem_gaps == "nearest" else "error"
+    return open_terrain(options.dem, frame, bounds=extent, outside=outside)
+
+
+def _plan(
     osm: OsmData,
-    graph: RoadGraph,
     frame: Frame,
+    extent: Bounds,
+    terrain: Terrain,
     buildings: Buildings,
-    extent: tuple[float, float, float, float],
-) -> tuple[_Ground, list[Problem]]:
+    base: Float,
+    solids: Mesh,
+    graph: RoadGraph,
+    options: BuildOptions,
+) -> tuple[Plan, list[Problem]]:
+    """Read what lies and stands on the ground, and number all features."""
+    n, count = len(buildings), buildings.count
+    footprints = buildings.footprint[:count]
     cover, problems = landcover(osm, frame, extent=extent)
+    cover = concatenate_layers([paved_fabric(footprints), cover])
     surfaces, found = road_surfaces(osm, graph, frame)
+    problems += found
     roads = Layers.of(
         surfaces.polygon,
         klass=surfaces.klass,
@@ -152,124 +200,72 @@ def _read_ground(
         osm_id=surfaces.osm_id,
         source=surfaces.source,
     )
-    standing = buildings.footprint[: buildings.count].copy()
-    standing[buildings.min_height[: buildings.count] >= 1.0] = None
-    pads = building_pads(standing, osm_id=buildings.osm_id[: buildings.count].astype(str))
-    return _Ground(cover, roads, pads), problems + found
-
-
-def _numbered(buildings: Buildings, ground: _Ground, graph: RoadGraph) -> tuple[list[Layer], _Ground]:
-    """The scene's layers, and the ground with feature numbers that match them."""
-    n, count = len(buildings), buildings.count
-    cover = replace(ground.cover, feature=np.arange(n, n + len(ground.cover), dtype=np.int32))
-    first = n + len(cover)
-    roads = replace(ground.roads, feature=np.arange(first, first + len(ground.roads), dtype=np.int32))
-    pads = replace(ground.pads, feature=np.arange(count, dtype=np.int32))
-    lines = np.empty(len(graph), object)
-    lines[:] = [shapely.linestrings(line) for line in graph.geometry]
+    standing = footprints.copy()
+    standing[buildings.min_height[:count] >= _STANDING] = None
+    pads = building_pads(
+        standing, osm_id=buildings.osm_id[:count].astype(str), feature=np.arange(count, dtype=np.int32)
+    )
+    cover, roads = _numbered(cover, n), _numbered(roads, n + len(cover))
+    ground = plan_ground(
+        extent,
+        concatenate_layers([cover, roads, pads]),
+        tile_size=options.tile_size,
+        lines=terrain.lines,
+    )
+    height = terrain.height if terrain.grids else None
+    levels = water_levels(ground.layers, osm.ways, frame, height=terrain.height)
+    trees, found = read_trees(osm, frame)
+    problems += found
+    trees, found = clear_of(ground, trees)
+    problems += found
+    first = n + len(cover) + len(roads) + len(graph)
+    trees = replace(trees, feature=np.arange(first, first + len(trees), dtype=np.int32))
+    foot = height(*trees.xy.T) if height else np.zeros(len(trees))
     layers = [
-        _building_layer("buildings", buildings, np.arange(count)),
-        _building_layer("building_parts", buildings, np.arange(count, n)),
-        _ground_layer("landcover", cover),
-        _ground_layer("road_surfaces", roads),
-        Layer("roads", lines, _road_columns(graph)),
+        *building_layers(buildings, base),
+        ground_layer("landcover", cover),
+        ground_layer("road_surfaces", roads),
+        road_layer(graph),
+        tree_layer(trees, foot),
     ]
-    return layers, _Ground(cover, roads, pads)
+    return Plan(terrain, layers, ground, levels, solids, trees, needle_shares(ground, osm)), problems
 
 
-def _building_layer(name: str, b: Buildings, rows: NDArray[np.integer]) -> Layer:
-    columns: dict[str, NDArray[Any]] = {
-        "osm_id": b.osm_id[rows],
-        "use": b.use[rows],
-        "name": b.name[rows],
-        "height": b.height[rows],
-        "height_source": b.height_source[rows],
-        "height_sigma": b.height_sigma[rows],
-        "min_height": b.min_height[rows],
-        "min_height_source": b.min_height_source[rows],
-        "levels": b.levels[rows],
-        "roof_shape": b.roof_shape[rows],
-        "roof_height": b.roof_height[rows],
-        "roof_source": b.roof_source[rows],
-        "wall_material": _names(b.wall_material[rows]),
-        "wall_source": b.wall_source[rows],
-        "roof_material": _names(b.roof_material[rows]),
-        "roof_look_source": b.roof_look_source[rows],
-    }
-    if name == "building_parts":
-        columns = {"building": b.outline[rows], **columns}
-    return Layer(name, b.footprint[rows], columns)
+def _numbered(layers: Layers, first: int) -> Layers:
+    return replace(layers, feature=np.arange(first, first + len(layers), dtype=np.int32))
 
 
-def _names(codes: NDArray[np.integer]) -> NDArray[np.str_]:
-    table = np.zeros(256, "U32")
-    for name, material in materials().items():
-        table[material.code] = name
-    names: NDArray[np.str_] = table[codes]
-    return names
+def make_tile(plan: Plan, i: int, j: int) -> tuple[Mesh, Instances]:
+    """Ground and trees of tile (i, j), scene coordinates; the same whatever other tiles are made."""
+    height = plan.terrain.height if plan.terrain.grids else None
+    ground = ground_tile(plan.ground, i, j, height=height, levels=plan.levels)
+    size = plan.ground.tile_size
+    here = (np.floor(plan.trees.xy / size) == (i, j)).all(axis=1)
+    woods = forest_trees(plan.ground, i, j, needles=plan.needles)
+    copies = [tree_instances(trees, height=height) for trees in (plan.trees.take(here), woods)]
+    return ground, concatenate_instances(copies)
 
 
-def _ground_layer(name: str, ground: Layers) -> Layer:
-    return Layer(
-        name,
-        ground.polygon,
-        {
-            "osm_id": ground.osm_id,
-            "class": np.array([Class(k).name.lower() for k in ground.klass], np.str_),
-            "material": _names(ground.material),
-            "priority": ground.priority,
-            "source": ground.source,
-        },
-    )
-
-
-def _road_columns(graph: RoadGraph) -> dict[str, NDArray[Any]]:
-    names = (
-        "osm_id", "highway", "name", "ref", "oneway", "speed", "speed_source", "lanes", "lanes_source",
-        "width", "width_source", "layer", "layer_source", "bridge", "tunnel", "length",
-    )  # fmt: skip
-    return {name: getattr(graph, name) for name in names}
-
-
-def _write_tiles(
-    writer: SceneWriter,
-    extent: tuple[float, float, float, float],
-    ground: _Ground,
-    solids: Mesh,
-    progress: Progress,
-) -> dict[str, float]:
-    """Write all tiles; return the ground's area against the extent's, square metres."""
-    plan = plan_ground(
-        extent, concatenate_layers([ground.cover, ground.roads, ground.pads]), tile_size=writer.tile_size
-    )
-    color = np.zeros((256, 3), np.uint8)
-    for material in materials().values():
-        color[material.code] = material.color
-    stands = split(solids, _tile_of_features(solids, writer.tile_size))
-    tiles = sorted({(int(i), int(j)) for i, j in plan.tiles} | set(stands))
-    covered = {(int(i), int(j)) for i, j in plan.tiles}
-    total = 0.0
+def _write_tiles(writer: SceneWriter, plan: Plan, progress: Progress) -> dict[str, float]:
+    """Write all tiles; return the ground's area in plan against the extent's, square metres."""
+    stands = split(plan.solids, _tile_of_features(plan.solids, writer.tile_size))
+    covered = {(int(i), int(j)) for i, j in plan.ground.tiles}
+    tiles = sorted(covered | set(stands))
+    area = 0.0
     for done, (i, j) in enumerate(tiles):
-        progress("ground", done, len(tiles))
-        parts = [stands[i, j]] if (i, j) in stands else []
-        if (i, j) in covered:
-            cells = partition_tile(plan, i, j)
-            flat = triangulate(cells)
-            code = cells.material[flat.cell]
-            total += float(shapely.area(cells.polygon).sum())
-            parts.append(
-                Mesh.of(
-                    np.column_stack([flat.points, np.zeros(len(flat.points))]),
-                    flat.faces,
-                    feature=cells.feature[flat.cell],
-                    klass=cells.klass[flat.cell],
-                    material=code,
-                    color=color[code],
-                )
-            )
-        writer.tile(i, j, concatenate(parts))
-    xmin, ymin, xmax, ymax = extent
-    return {"area": total, "extent_area": (xmax - xmin) * (ymax - ymin)}
+        progress("tiles", done, len(tiles))
+        mesh, copies = make_tile(plan, i, j) if (i, j) in covered else (Mesh.empty(), Instances.empty())
+        area += _plan_area(mesh)
+        standing = [stands[i, j]] if (i, j) in stands else []
+        writer.tile(i, j, concatenate([*standing, mesh]), copies)
+    xmin, ymin, xmax, ymax = plan.ground.extent
+    return {"area": area, "extent_area": (xmax - xmin) * (ymax - ymin)}
+
+
+def _plan_area(mesh: Mesh) -> float:
+    a, b, c = (mesh.vertices[mesh.faces[:, k], :2] for k in range(3))
+    u, v = b - a, c - a
+    return float((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / 2)
 
 
 def _tile_of_features(mesh: Mesh, size: float) -> NDArray[np.int64]:
@@ -289,17 +285,23 @@ def _tile_of_features(mesh: Mesh, size: float) -> NDArray[np.int64]:
 def _manifest(
     osm: OsmData,
     options: BuildOptions,
+    plan: Plan,
     buildings: Buildings,
     graph: RoadGraph,
-    solids: Mesh,
     problems: Sequence[Problem],
 ) -> dict[str, Any]:
     count = buildings.count
-    verdict = validate_mesh(solids)
+    verdict = validate_mesh(plan.solids)
     summary = summarise(problems)
     dropped = summary["dropped"].get("building", {})
     components = find_components(graph)
-    recipe = {"source": osm.source, "bounds": osm.bounds, "options": asdict(options), "version": __version__}
+    terrain = plan.terrain
+    recipe = {
+        "source": osm.source,
+        "bounds": osm.bounds,
+        "options": asdict(options),
+        "version": __version__,
+    }
     return {
         "generator": f"geoscene {__version__}",
         "name": options.name,
@@ -312,10 +314,20 @@ def _manifest(
                 "timestamp": osm.timestamp,
                 "licence": "ODbL-1.0",
                 "attribution": ATTRIBUTION,
-            }
+            },
+            *({"kind": "terrain", "from": name} for name in terrain.sources),
         ],
         "geographic_bounds": list(osm.bounds),
         "options": asdict(options),
+        "terrain": {
+            "vertical": terrain.vertical,
+            "datum": terrain.datum,
+            "spacing_m": terrain.spacing,
+            "posts": terrain.posts,
+            "voids_filled": terrain.voids,
+            "uncovered_share": terrain.uncovered,
+            "rivers_turned": list(plan.levels.reversed),
+        },
         "counts": {
             "buildings": count + sum(dropped.values()) - dropped.get("no-solid", 0),
             "solids": len(verdict),
@@ -323,11 +335,12 @@ def _manifest(
             "repaired": sum(summary["repaired"].get("building", {}).values()),
             "building_parts": len(buildings) - count,
             "watertight": int(verdict.ok.sum()),
-            "faces": len(solids),
+            "faces": len(plan.solids),
             "road_edges": len(graph),
             "road_km": round(float(graph.length.sum()) / 1000, 3),
             "road_components": int(components.strong.max(initial=-1)) + 1,
             "road_largest_component_share": round(components.largest_strong_share, 4),
+            "trees": len(plan.trees),
         },
         "heights": dict(sorted(Counter(buildings.height_source[:count].tolist()).items())),
         "roofs": dict(sorted(Counter(buildings.roof_shape[buildings.drawn].tolist()).items())),

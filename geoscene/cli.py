@@ -54,6 +54,8 @@ def build(
     demo: Annotated[bool, Parameter(group=_SOURCE, negative=())] = False,
     crs: str = "local",
     lod: int = 2,
+    dem: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
+    dem_gaps: str = "error",
     tile_size: float = 250.0,
     name: str = "",
     out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
@@ -92,6 +94,10 @@ def build(
         an EPSG code such as EPSG:32618.
     lod
         Level of detail of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs.
+    dem
+        Elevation files: GeoTIFF, .hgt or .hgt.zip, one or more, in any CRS. Level ground without.
+    dem_gaps
+        Where they do not cover the scene: error, or nearest (take the nearest height and say so).
     tile_size
         Side of a tile in metres.
     name
@@ -109,7 +115,14 @@ def build(
     from geoscene.build import build as build_scene  # noqa: PLC0415
 
     began = time.perf_counter()
-    options = BuildOptions(crs=crs, lod=lod, tile_size=tile_size, name=name)
+    options = BuildOptions(
+        crs=crs,
+        lod=lod,
+        dem=tuple(map(str, dem or ())),
+        dem_gaps=dem_gaps,
+        tile_size=tile_size,
+        name=name,
+    )
     with progress_bar(quiet=quiet) as progress:
         progress("reading the map", 0, 0)
         data = _read(osm, place, bbox, point, radius, demo=demo)
