@@ -245,7 +245,7 @@ def _shifted(frame: Frame, position: Float, error: Float) -> Float:
     lon, lat = frame.to_geographic(position[:, 0], position[:, 1])
     turn, scale = frame.convergence(lon, lat), frame.scale(lon, lat)
     c, s = np.cos(turn), np.sin(turn)
-    known: NDArray[np.bool_] = np.isfinite(error).all(axis=1)
+    known = np.asarray(np.isfinite(error).all(axis=1))
     e, n = np.where(known[:, None], error[:, :2], 0.0).T
     x, y = position[:, 0] + scale * (e * c - n * s), position[:, 1] + scale * (e * s + n * c)
     lon, lat = frame.to_geographic(x, y)

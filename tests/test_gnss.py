@@ -258,7 +258,7 @@ def test_in_the_open_the_sky_is_whole():
 def test_a_street_canyon_spoils_fixes():
     s = spec("single", rate=0.02, arm=(0.0, 0.0, 1.6))
     trajectory = standing(200_000.0)
-    low, high = (view(trajectory, s, h)[0] for h in (1.0, 25.0))
+    low, high = (view(trajectory, s, h)[0] for h in (1.0, 15.0))
     free, walled = (observe_gnss(trajectory, FRAME, s, seed=4, start=START, sky=k) for k in (low, high))
     fixed = walled.quality > 0
     assert 0.1 < fixed.mean() < 1.0
