@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.mesh import WALL
-from lidar.camera.texture import hashed, pulses
+from lidar.camera.texture import covered, hashed, pulses, span
 from lidar.raycast import Caster, Geometry, Hits
 from lidar.world import World
 
@@ -128,32 +128,39 @@ def _styles(feature: NDArray[np.int32], along: Float, height: Float) -> Float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def windows(u: float, v: float, style: Float, across: float, up: float, feature: int, out: Float) -> None:
+def windows(
+    u: float, v: float, style: Float, w: int, across: float, up: float, feature: int, out: Float
+) -> None:
     """Fill ``out`` with the shares of glass, frame and band in a pixel, and the albedo behind the glass.
 
+    style, w   : `Facades.style` and the wall's row of it
     u, v       : metres from the wall's left end and the building's foot
     across, up : the pixel's footprint along them, metres
     """
     out[:] = 0.0
-    bay, storey = style[BAY], style[STOREY]
+    bay, storey = style[w, BAY], style[w, STOREY]
     k = math.floor(v / storey)
-    if style[BAND] > 0.0:
-        out[2] = pulses(v + 0.5 * storey, storey, style[BAND], up)
-    if k < 0 or k >= style[FLOORS]:
+    if style[w, BAND] > 0.0:
+        out[2] = pulses(v + 0.5 * storey, storey, style[w, BAND], up)
+    if k < 0 or k >= style[w, FLOORS]:
         return
-    wide, tall, rise = style[WIDE], style[TALL], style[RISE]
-    if k == 0 and style[SHOP_WIDE] > 0.0:
-        wide, tall, rise = style[SHOP_WIDE], style[SHOP_TALL], -0.06 * storey
+    wide, tall, rise = style[w, WIDE], style[w, TALL], style[w, RISE]
+    if k == 0 and style[w, SHOP_WIDE] > 0.0:
+        wide, tall, rise = style[w, SHOP_WIDE], style[w, SHOP_TALL], -0.06 * storey
+    column = math.floor(u / bay)
+    aside = abs(u - (column + 0.5) * bay) - 0.5 * wide - 0.08
+    above = abs(v - rise - (k + 0.5) * storey) - 0.5 * tall - 0.08
+    if across < bay and up < storey and (aside > 0.5 * across or above > 0.5 * up):
+        return
     # Each storey's row of windows is one pulse; a footprint beyond a storey sees the mean of them.
-    y = v - rise
-    inside_y = pulses(y, storey, tall, up)
-    inner = pulses(u, bay, wide, across) * inside_y
-    bar = pulses(u, bay, 0.06, across) * inside_y
-    outer = pulses(u, bay, wide + 0.16, across) * pulses(y, storey, tall + 0.16, up)
+    x, y = span(u, bay, across), span(v - rise, storey, up)
+    inside_y = covered(y, storey, tall)
+    inner, bar = covered(x, bay, wide) * inside_y, covered(x, bay, 0.06) * inside_y
+    outer = covered(x, bay, wide + 0.16) * covered(y, storey, tall + 0.16)
     out[0] = inner - bar
     out[1] = max(outer - inner, 0.0) + bar
     fade = max(0.0, 1.0 - max(across / bay, up / storey))
-    shown = hashed(feature * 131 + math.floor(u / bay), k, 21)
+    shown = hashed(feature * 131 + column, k, 21)
     out[3] = 0.06 + fade * (0.45 * shown * shown * shown - 0.04)
 
 

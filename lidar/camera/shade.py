@@ -279,7 +279,7 @@ def shade(
             foot = z - height[w, 0]
             open_sky = 0.6 + 0.4 * min(max(foot / 9.0, 0.0), 1.0)
             if detailed:
-                windows(u - along[w, 0], foot, style[w], size / max(cosine, 0.05), size, feature[i], pane)
+                windows(u - along[w, 0], foot, style, w, size / max(cosine, 0.05), size, feature[i], pane)
                 glass, paint = pane[0], style[w, PAINT]
                 for c in range(3):
                     albedo[c] *= 1.0 - 0.3 * pane[2]

@@ -63,17 +63,27 @@ def grain(x: float, y: float, size: float, footprint: float, k: int) -> float:
 
 
 @compiled
-def _risen(x: float, period: float, width: float) -> float:
-    """Integral from 0 to x of a train of pulses, each ``width`` wide and in the middle of its period."""
-    n = math.floor(x / period)
-    return n * width + min(max(x - n * period - 0.5 * (period - width), 0.0), width)
+def span(x: float, period: float, footprint: float) -> tuple[float, float, float, float]:
+    """A footprint about x on a pattern, for `covered`: its ends within their periods, periods between."""
+    f = max(footprint, 1e-3)
+    low, high = x - 0.5 * f, x + 0.5 * f
+    first, last = math.floor(low / period), math.floor(high / period)
+    return low - first * period, high - last * period, float(last - first), 1.0 / f
+
+
+@compiled
+def covered(ends: tuple[float, float, float, float], period: float, width: float) -> float:
+    """Share of a `span` that lies on pulses, each ``width`` wide and in the middle of its period."""
+    low, high, whole, inverse = ends
+    gap = 0.5 * (period - width)
+    ahead = min(max(high - gap, 0.0), width) - min(max(low - gap, 0.0), width)
+    return (whole * width + ahead) * inverse
 
 
 @compiled
 def pulses(x: float, period: float, width: float, footprint: float) -> float:
     """Share of a footprint about x that lies on a train of pulses."""
-    f = max(footprint, 1e-3)
-    return (_risen(x + 0.5 * f, period, width) - _risen(x - 0.5 * f, period, width)) / f
+    return covered(span(x, period, footprint), period, width)
 
 
 @compiled
@@ -100,6 +110,20 @@ def courses(u: float, v: float, footprint: float) -> float:
 PLAIN, SPECKLED, SLABS, BRICK, WEATHERED, LEAFY, LIQUID, SHINGLED = range(8)
 """Kinds of detail that a material may have."""
 
+# For each kind up to three grains: amplitude, size in metres, how much longer they are across than up.
+_GRAINS = np.array(
+    [
+        [[0.05, 1.1, 1.0], [0.04, 0.13, 1.0], [0.0, 1.0, 1.0]],
+        [[0.14, 1.9, 1.0], [0.16, 0.21, 1.0], [0.34, 0.045, 1.0]],
+        [[0.04, 2.7, 1.0], [0.09, 0.09, 1.0], [0.0, 1.0, 1.0]],
+        [[0.12, 0.9, 1.0], [0.25, 0.24, 3.0], [0.0, 1.0, 1.0]],
+        [[0.07, 2.3, 1.0], [0.05, 0.35, 0.15], [0.05, 0.11, 1.0]],
+        [[0.28, 1.7, 1.0], [0.30, 0.37, 1.0], [0.34, 0.11, 1.0]],
+        [[0.05, 1.1, 1.0], [0.0, 1.0, 1.0], [0.0, 1.0, 1.0]],
+        [[0.12, 1.3, 1.0], [0.16, 0.2, 1.0], [0.0, 1.0, 1.0]],
+    ]
+)
+
 
 @compiled
 def detail(kind: int, upright: int, x: float, y: float, z: float, u: float, footprint: float) -> float:
@@ -108,36 +132,18 @@ def detail(kind: int, upright: int, x: float, y: float, z: float, u: float, foot
         a, b = u, z
     else:
         a, b = x + 0.31 * z, y + 0.47 * z
-    if kind == SPECKLED:
-        return (
-            1.0
-            + 0.10 * grain(a, b, 3.1, footprint, 1)
-            + 0.12 * grain(a, b, 0.43, footprint, 2)
-            + 0.26 * grain(a, b, 0.07, footprint, 3)
-        )
+    tone = 1.0
+    for k in range(3):
+        amplitude, size, stretch = _GRAINS[kind, k]
+        if amplitude > 0.0:
+            tone += amplitude * grain(a, b * stretch, size, footprint, 8 * k + kind)
     if kind == SLABS:
-        tone = hashed(math.floor(a / 0.6), math.floor(b / 0.6), 5) - 0.5 if footprint < 0.6 else 0.0
-        fade = max(0.0, 1.0 - footprint / 0.6)
-        tone = 1.0 + 0.16 * fade * tone + 0.09 * grain(a, b, 0.09, footprint, 4)
-        return tone * (1.0 - 0.45 * joints(a, b, 0.6, 0.014, footprint))
-    if kind == BRICK:
-        tone = 1.0 + 0.12 * grain(a, b, 0.9, footprint, 6) + 0.25 * grain(a, b * 3.0, 0.24, footprint, 7)
-        return tone * (1.0 + 0.5 * courses(a, b, footprint))
-    if kind == WEATHERED:
-        return (
-            1.0
-            + 0.07 * grain(a, b, 2.3, footprint, 8)
-            + 0.05 * grain(a, b * 0.15, 0.35, footprint, 9)
-            + 0.05 * grain(a, b, 0.11, footprint, 10)
-        )
-    if kind == LEAFY:
-        return (
-            1.0
-            + 0.28 * grain(a, b, 1.7, footprint, 11)
-            + 0.30 * grain(a, b, 0.37, footprint, 12)
-            + 0.34 * grain(a, b, 0.11, footprint, 13)
-        )
-    if kind == SHINGLED:
-        tone = 1.0 + 0.12 * grain(a, b, 1.3, footprint, 14) + 0.16 * grain(a, b, 0.2, footprint, 15)
-        return tone * (1.0 - 0.35 * pulses(z, 0.22, 0.03, footprint))
-    return 1.0 + 0.05 * grain(a, b, 1.1, footprint, 16) + 0.04 * grain(a, b, 0.13, footprint, 17)
+        if footprint < 0.6:
+            slab = hashed(math.floor(a / 0.6), math.floor(b / 0.6), 5) - 0.5
+            tone += 0.16 * (1.0 - footprint / 0.6) * slab
+        tone *= 1.0 - 0.45 * joints(a, b, 0.6, 0.014, footprint)
+    elif kind == BRICK:
+        tone *= 1.0 + 0.5 * courses(a, b, footprint)
+    elif kind == SHINGLED:
+        tone *= 1.0 - 0.35 * pulses(z, 0.22, 0.03, footprint)
+    return tone
