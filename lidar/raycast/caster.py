@@ -2,32 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import functools
+import logging
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lidar.errors import InputError
+from lidar.errors import BackendError, InputError
 from lidar.poses import Poses
-from lidar.raycast import kernels
-from lidar.raycast.columns import Rays
 from lidar.raycast.embree import EmbreeScene
+from lidar.raycast.fallback import EmbreexScene
 from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split
 from lidar.raycast.hits import Echoes, Hits
+from lidar.raycast.library import library
+from lidar.raycast.rays import free_rays, limited, posed_rays
 
 Float = NDArray[np.float64]
 
-_CHUNK = 8192
-"""Rays that a thread takes at a time; a multiple of every packet width, so that packets do not depend on it."""
-_NO_INDEX = np.empty(0, np.int64)
-_NO_TIME = np.empty(0, np.float32)
+log = logging.getLogger(__name__)
+
 _NOTHING: Mapping[int, Geometry] = {}
 _NUMBERS: Mapping[int, int] = {}
 _COPIES = 1 << 20
 """Number of the first geometry of copies; parts of a mesh have lesser numbers."""
-_NO_POSES = (_NO_INDEX, np.empty((0, 3)), np.empty((0, 3, 3)))
+
+
+@functools.cache
+def _works(backend: str) -> bool:
+    """Whether to use Embree directly; says once if that was wished for and cannot be."""
+    if backend not in ("auto", "embree", "embreex"):
+        raise InputError(f"backend {backend!r} is none of auto, embree and embreex")
+    if backend == "embreex":
+        return False
+    try:
+        library()
+    except BackendError as error:
+        if backend == "embree":
+            raise
+        log.warning("casting rays with plain embreex, several times slower: %s", error)
+        return False
+    return True
 
 
 class Caster:
@@ -42,6 +58,8 @@ class Caster:
     origin          : (3,) metres, within a few kilometres of all vertices and rays: what float32 coordinates
                       are relative to; the middle of the vertices by default
     dynamic         : whether `update` will exchange parts of the mesh
+    backend         : ``embree``; ``embreex``, which needs no more than that package's own interface and gives
+                      the same results at a fifth of the speed; or ``auto``: Embree if it works here
 
     Raises InputError for meshes that cannot be cast at and BackendError if Embree does not work here.
     """
@@ -55,10 +73,12 @@ class Caster:
         instances: Sequence[Instances] = (),
         origin: ArrayLike | None = None,
         dynamic: bool = False,
+        backend: str = "auto",
     ) -> None:
         v, f = checked(vertices, faces)
         self.origin: Float = middle(v) if origin is None else np.array(origin, np.float64)
-        self.scene = EmbreeScene(self.origin, dynamic=dynamic)
+        scene = EmbreeScene if _works(backend) else EmbreexScene
+        self.scene = scene(self.origin, dynamic=dynamic)
         self.instances: tuple[Instances, ...] = ()
         self.update(attach=dict(enumerate(split(v - self.origin, f, mask))), instances=instances)
 
@@ -117,11 +137,8 @@ class Caster:
 
         Raises InputError for rays that are not finite or have a direction of length zero.
         """
-        d = _rows(directions, "directions")
-        o = np.ascontiguousarray(origins, np.float64).reshape(-1, 3)
-        if len(o) not in (1, len(d)):
-            raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one a ray")
-        return self._cast(_rays(d, o, _NO_POSES, near, far, mask, time, order), threads, normals=normals)
+        rays = limited(free_rays(origins, directions), near=near, far=far, mask=mask, time=time, order=order)
+        return self.scene.cast(rays, normals=normals, threads=threads)
 
     def cast_posed(
         self,
@@ -147,18 +164,9 @@ class Caster:
 
         ``near`` and ``far`` count from the beam's start in true metres; the rest as for `cast`.
         """
-        d = _rows(directions, "directions")
-        o = np.zeros((1, 3)) if offsets is None else _rows(offsets, "offsets")
-        index = np.ascontiguousarray(pose_index, np.int64)
-        if len(o) not in (1, len(d)) or len(index) != len(d):
-            raise InputError(f"{len(d)} directions, {len(o)} offsets and {len(index)} pose numbers disagree")
-        if len(index) and not (index.min() >= 0 and index.max() < len(poses)):
-            raise InputError(f"a ray names a pose beyond the {len(poses)} there are")
-        position = np.ascontiguousarray(poses.position, np.float64)
-        matrix = poses.scale[:, :, None] * poses.rotation
-        return self._cast(
-            _rays(d, o, (index, position, matrix), near, far, mask, time, order), threads, normals=normals
-        )
+        rays = posed_rays(poses, pose_index, directions, offsets)
+        rays = limited(rays, near=near, far=far, mask=mask, time=time, order=order)
+        return self.scene.cast(rays, normals=normals, threads=threads)
 
     def occluded(
         self,
@@ -173,17 +181,11 @@ class Caster:
     ) -> NDArray[np.bool_]:
         """Whether anything lies on each ray (n,) between ``near`` and ``far`` (a number or (n,)).
 
-        Start shadow rays `shadow_near` metres along, so that they do not hit the surface they leave.
+        Shadow rays start on a surface: lift their origins off it by a millimetre along its normal, or they hit
+        it.
         """
-        d = _rows(directions, "directions")
-        o = np.ascontiguousarray(origins, np.float64).reshape(-1, 3)
-        if len(o) not in (1, len(d)):
-            raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one a ray")
-        rays = _rays(d, o, _NO_POSES, near, far, mask, time, None)
-        out = np.empty(len(d), np.bool_)
-        target = self.scene.target
-        _share(lambda lo, hi: kernels.occluded(target, rays, lo, hi, out), rays, threads)
-        return out
+        rays = limited(free_rays(origins, directions), near=near, far=far, mask=mask, time=time)
+        return self.scene.occluded(rays, threads=threads)
 
     def cast_all(
         self,
@@ -201,64 +203,7 @@ class Caster:
 
         A ray that meets an edge or vertex meets each of the faces there.
         """
-        raise NotImplementedError
-
-    def _cast(self, rays: Rays, threads: int, *, normals: bool) -> Hits:
-        n = len(rays.directions)
-        ranges, faces, instances = np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32)
-        cosines, normal = np.empty(n, np.float32), np.empty((n if normals else 0, 3))
-        target = self.scene.target
-        _share(
-            lambda lo, hi: kernels.cast(target, rays, lo, hi, ranges, faces, instances, cosines, normal),
-            rays,
-            threads,
-        )
-        return Hits(ranges, faces, instances, cosines, normal)
-
-
-def _rows(values: ArrayLike, name: str) -> Float:
-    rows = np.ascontiguousarray(values, np.float64)
-    if rows.ndim != 2 or rows.shape[1] != 3:
-        raise InputError(f"{name} have the shape {rows.shape}, rays need (n, 3)")
-    return rows
-
-
-def _rays(
-    directions: Float,
-    offsets: Float,
-    poses: tuple[NDArray[np.int64], Float, Float],
-    near: float,
-    far: float | Float,
-    mask: int,
-    time: ArrayLike | None,
-    order: NDArray[np.integer] | None,
-) -> Rays:
-    """The rays as the kernels want them; refuses columns that disagree."""
-    n = len(directions)
-    work = _NO_INDEX if order is None else np.ascontiguousarray(order, np.int64)
-    if order is not None and not np.array_equal(np.bincount(work, minlength=n), np.ones(n, int)):
-        raise InputError(f"order is not a permutation of {n} rays")
-    moments = _NO_TIME if time is None else np.ascontiguousarray(time, np.float32)
-    if time is not None and not (moments.shape == (n,) and ((moments >= 0) & (moments <= 1)).all()):
-        raise InputError(f"ray times are numbers from 0 to 1, one for each of {n} rays")
-    reach = np.ascontiguousarray(far, np.float64).reshape(-1)
-    if len(reach) not in (1, n) or not (near >= 0 and (reach >= near).all()):
-        raise InputError("rays need 0 <= near <= far, far one number or one a ray")
-    return Rays(directions, offsets, *poses, work, moments, float(near), reach, int(mask) & ALL)
-
-
-def _share(work: Callable[[int, int], int], rays: Rays, threads: int) -> None:
-    """Have the threads do the rays in chunks; raises InputError for a ray that cannot be cast."""
-    n = len(rays.directions)
-    if threads <= 1 or n <= _CHUNK:
-        bad = work(0, n)
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            bad = max(pool.map(lambda lo: work(lo, min(lo + _CHUNK, n)), range(0, n, _CHUNK)), default=-1)
-    if bad >= 0:
-        direction, origin = rays.directions[bad], rays.offsets[bad if len(rays.offsets) > 1 else 0]
-        raise InputError(
-            f"ray {bad} of {n} has the origin {origin.tolist()} and direction {direction.tolist()}"
-            + (f" at the pose {rays.position[rays.pose[bad]].tolist()}" if rays.pose.size else "")
-            + ": rays need finite numbers and a direction that is not zero"
-        )
+        if k < 1:
+            raise InputError(f"cast_all looks for k = {k} surfaces; give 1 or more")
+        rays = limited(free_rays(origins, directions), near=near, far=far, mask=mask, time=time)
+        return self.scene.echoes(rays, k, threads=threads)

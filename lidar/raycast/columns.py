@@ -46,7 +46,7 @@ class Rays(NamedTuple):
     """Rays as contiguous columns.
 
     directions : (n, 3) float64, in the pose's axes where there are poses
-    offsets    : (n, 3) float64, origins in the pose's frame; (1, 3) serves all, with poses it is zero
+    offsets    : (n, 3) float64, origins in the pose's frame; (1, 3) serves all, (0, 3) is the frame's zero
     pose       : (n,) int64, row of the poses; empty: directions and offsets are in the caster's frame
     position   : (p, 3) float64, of the poses
     matrix     : (p, 3, 3) float64, scale * rotation of the poses (see `lidar.poses.Poses`)

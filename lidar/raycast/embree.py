@@ -9,8 +9,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar.raycast import kernels
+from lidar.raycast.columns import Rays, Target
+from lidar.raycast.echoes import COLLECT, echoes
 from lidar.raycast.geometry import Geometry, Instances
-from lidar.raycast.columns import Target
+from lidar.raycast.hits import Echoes, Hits
 from lidar.raycast.library import (
     COHERENT,
     DYNAMIC,
@@ -28,6 +31,7 @@ from lidar.raycast.library import (
     fill,
     library,
 )
+from lidar.raycast.rays import share
 
 Float = NDArray[np.float64]
 
@@ -157,6 +161,39 @@ class EmbreeScene:
             counts,
             np.concatenate(transforms),
         )
+
+    def cast(self, rays: Rays, *, normals: bool, threads: int) -> Hits:
+        """The first hit of each ray."""
+        n = len(rays.directions)
+        columns = np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.float32)
+        hits = Hits(*columns, np.empty((n if normals else 0, 3)))
+        target = self.target
+
+        def work(lo: int, hi: int) -> int:
+            return int(kernels.cast(target, rays, lo, hi, *columns, hits.normal))
+
+        share(work, rays, threads)
+        return hits
+
+    def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:
+        """Whether anything lies on each ray."""
+        out, target = np.empty(len(rays.directions), np.bool_), self.target
+        share(lambda lo, hi: int(kernels.occluded(target, rays, lo, hi, out)), rays, threads)
+        return out
+
+    def echoes(self, rays: Rays, k: int, *, threads: int) -> Echoes:
+        """The first k surfaces along each ray."""
+        n = len(rays.directions)
+        columns = (
+            np.empty(n, np.int32),
+            np.empty((n, k)),
+            np.empty((n, k), np.int32),
+            np.empty((n, k), np.int32),
+            np.empty((n, k), np.float32),
+        )
+        target = self.target
+        share(lambda lo, hi: int(echoes(target, rays, COLLECT, lo, hi, *columns)), rays, threads)
+        return Echoes(*columns)
 
 
 def _addresses(part: Geometry) -> tuple[int, int, int, int, int]:

@@ -73,7 +73,7 @@ def gather(target: Target, rays: Rays, at: int, m: int, W: int, ids: Any, work: 
     work : origin (3), direction (3), one over its length, far, time
     """
     ordered, posed, timed, reach = rays.order.size, rays.pose.size, rays.time.size, rays.far.size > 1
-    step = 1 if rays.offsets.shape[0] > 1 else 0
+    shifted, step = rays.offsets.shape[0] > 0, 1 if rays.offsets.shape[0] > 1 else 0
     directions, offsets, far = rays.directions.ctypes.data, rays.offsets.ctypes.data, rays.far.ctypes.data
     order, pose_of, time = rays.order.ctypes.data, rays.pose.ctypes.data, rays.time.ctypes.data
     pose = (rays.position.ctypes.data, rays.matrix.ctypes.data)
@@ -88,8 +88,8 @@ def gather(target: Target, rays: Rays, at: int, m: int, W: int, ids: Any, work: 
             p = int64_at(pose_of, i)
             x, y, z = _posed(pose, p, x, y, z)
             a, b, c = _vector(pose[0], p)
-            if step:
-                ox, oy, oz = _vector(offsets, i)
+            if shifted:
+                ox, oy, oz = _vector(offsets, step * i)
                 ox, oy, oz = _posed(pose, p, ox, oy, oz)
                 a, b, c = a + ox, b + oy, c + oz
         else:

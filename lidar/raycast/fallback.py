@@ -1,0 +1,273 @@
+"""Rays through embreex's own interface: the same results, several times slower, for when Embree is out of reach.
+
+embreex casts single float32 rays at triangles and knows neither masks nor copies: copies at rest are written out
+as triangles, faces that a mask hides are left out of a scene of their own, and things that move are cast at one
+by one in their own frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.errors import BackendError
+from lidar.raycast.columns import Rays
+from lidar.raycast.geometry import ALL, Geometry, Instances
+from lidar.raycast.hits import Echoes, Hits
+from lidar.raycast.rays import in_scene
+from lidar.raycast.reference import Reference
+
+Float = NDArray[np.float64]
+
+_NUDGE = 3e-7
+_GRAZING = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class _Soup:
+    """Triangles relative to an origin: corners (m, 3, 3), and their face, instance and mask (m,)."""
+
+    corners: Float
+    face: NDArray[np.int32]
+    instance: NDArray[np.int32]
+    mask: NDArray[np.uint32]
+
+    def take(self, rows: NDArray[np.bool_]) -> _Soup:
+        return _Soup(self.corners[rows], self.face[rows], self.instance[rows], self.mask[rows])
+
+
+def _joined(soups: Sequence[_Soup]) -> _Soup:
+    none = _Soup(np.empty((0, 3, 3)), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.uint32))
+    every = [none, *soups]
+    return _Soup(
+        np.concatenate([s.corners for s in every]),
+        np.concatenate([s.face for s in every]),
+        np.concatenate([s.instance for s in every]),
+        np.concatenate([s.mask for s in every]),
+    )
+
+
+def _mesh(parts: dict[int, Geometry]) -> _Soup:
+    soups = []
+    for number in sorted(parts):
+        part = parts[number]
+        m = len(part)
+        numbers = part.numbers if len(part.numbers) else np.arange(m, dtype=np.int32)
+        face, none = (numbers + part.first).astype(np.int32), np.full(m, -1, np.int32)
+        soups.append(_Soup(part.vertices[part.faces], face, none, np.full(m, part.mask, np.uint32)))
+    return _joined(soups)
+
+
+class _Body:
+    """Triangles that stand still in some frame, castable with embreex and, for echoes, in float64."""
+
+    def __init__(self, soup: _Soup) -> None:
+        from embreex.mesh_construction import TriangleMesh  # noqa: PLC0415
+        from embreex.rtcore_scene import EmbreeScene  # noqa: PLC0415
+
+        self.soup = soup
+        a, b, c = (soup.corners[:, k] for k in range(3))
+        self.normal = np.cross(b - a, c - a)
+        self._scene: Any = None
+        self._reference: Reference | None = None
+        if len(soup.face):
+            self._scene = EmbreeScene()
+            TriangleMesh(self._scene, soup.corners.astype(np.float32))
+
+    def met(self, o: Float, d: Float, near: float, far: Float, turned: bool) -> NDArray[np.int64]:  # noqa: FBT001
+        """Rows of the triangles that rays meet first, -1 for none."""
+        if self._scene is None:
+            return np.full(len(d), -1)
+        length = np.linalg.norm(d, axis=1)
+        unit = d / length[:, None]
+        if turned:
+            unit[np.arange(len(d)), np.argmin(np.abs(unit), axis=1)] += _NUDGE
+        # The bounds are written over with the ranges found, so they must be a copy; unbounded is 1e37.
+        reach = np.minimum((far - near) * length * (1 + 2.0**-23), 1e37).astype(np.float32)
+        start = (o + near * d).astype(np.float32)
+        found = self._scene.run(start, unit.astype(np.float32), dists=reach, query="INTERSECT", output=1)
+        return np.asarray(found["primID"], np.int64)
+
+    def at(self, rows: NDArray[np.int64], o: Float, d: Float) -> tuple[Float, Float, Float]:
+        """Range, cosine and normal (not unit) of rays that meet triangles; inf, 0 and 0 for row -1."""
+        t, cosine = np.full(len(d), np.inf), np.zeros(len(d))
+        normal = np.zeros((len(d), 3))
+        hit = np.flatnonzero(rows >= 0)
+        n, corners = self.normal[rows[hit]], self.soup.corners[rows[hit]]
+        along = np.einsum("ij,ij->i", n, d[hit])
+        size = np.linalg.norm(n, axis=1) * np.linalg.norm(d[hit], axis=1)
+        cosine[hit] = -np.divide(along, size, out=np.zeros_like(along), where=size > 0)
+        steep = np.abs(cosine[hit]) > 0
+        gap = np.einsum("ij,ij->i", n, corners[:, 0] - o[hit])
+        t[hit] = np.divide(gap, along, out=np.zeros_like(along), where=steep)
+        # At a grazing angle the range is held within the face's extent along the ray.
+        extent = (
+            np.einsum("ikj,ij->ik", corners - o[hit, None], d[hit])
+            / np.einsum("ij,ij->i", d[hit], d[hit])[:, None]
+        )
+        held = np.clip(t[hit], extent.min(axis=1), extent.max(axis=1))
+        t[hit] = np.where(np.abs(cosine[hit]) < _GRAZING, held, t[hit])
+        normal[hit] = n
+        return t, cosine, normal
+
+    def all_met(self, o: Float, d: Float, k: int, near: float, far: Float) -> NDArray[np.int64]:
+        """Rows (n, k) of the first k triangles along each ray, -1 from the last on."""
+        if self._reference is None:
+            self._reference = Reference(self.soup.corners)
+        return self._reference.cast(o, d, k=k, near=near, far=far)[1]
+
+
+@dataclass(frozen=True, slots=True)
+class _Mover:
+    """A thing that moves: its instance number, body and transforms (s, 3, 4) over ray times 0 to 1."""
+
+    instance: int
+    mask: int
+    body: _Body
+    steps: Float
+
+    def frames(self, time: NDArray[np.float32], n: int) -> Float:
+        """Transforms (n, 3, 4) at ray times."""
+        moment = np.zeros(n) if len(time) == 0 else time.astype(float)
+        place = moment * (len(self.steps) - 1)
+        step = np.minimum(place.astype(int), len(self.steps) - 2)
+        w = (place - step)[:, None, None]
+        between: Float = self.steps[step] + w * (self.steps[step + 1] - self.steps[step])
+        return between
+
+
+class EmbreexScene:
+    """The interface of `lidar.raycast.embree.EmbreeScene`, by way of embreex."""
+
+    def __init__(self, origin: Float, *, dynamic: bool = False) -> None:  # noqa: ARG002
+        self.origin = origin
+        self.parts: dict[int, Geometry] = {}
+        self._groups: list[tuple[Instances, Sequence[EmbreexScene]]] = []
+        self._rest = _joined([])
+        self._movers: list[_Mover] = []
+        self._bodies: dict[int, _Body] = {}
+
+    def attach(self, number: int, part: Geometry) -> None:
+        """Add a geometry under a free number."""
+        self.parts[number] = part
+
+    def detach(self, number: int) -> None:
+        """Remove the geometry of a number."""
+        del self.parts[number]
+
+    def place(
+        self,
+        groups: Sequence[Instances],
+        scenes: Sequence[Sequence[Any]],
+        first: int,  # noqa: ARG002
+    ) -> None:
+        """Replace all copies; ``scenes`` holds each group's shapes."""
+        self._groups = list(zip(groups, scenes, strict=True))
+
+    def commit(self) -> None:
+        """Write the copies at rest out and note those that move."""
+        soups, self._movers, self._bodies, start = [_mesh(self.parts)], [], {}, 0
+        for group, shapes in self._groups:
+            if any(not isinstance(shape, EmbreexScene) for shape in shapes):
+                raise BackendError("shapes that are copied need the backend of the caster that copies them")
+            masks = np.full(len(group), ALL, np.uint32) if group.mask is None else group.mask
+            meshes = [_mesh(shape.parts) for shape in shapes]
+            for k, (which, matrix, bits) in enumerate(zip(group.shape, group.transform, masks, strict=True)):
+                placed = np.array(matrix)
+                placed[..., 3] += placed[..., :3] @ shapes[which].origin - self.origin
+                mesh = meshes[which]
+                number = np.full(len(mesh.face), start + k, np.int32)
+                if placed.ndim == 2:
+                    corners = mesh.corners @ placed[:, :3].T + placed[:, 3]
+                    soups.append(_Soup(corners, mesh.face, number, mesh.mask & bits))
+                else:
+                    soup = _Soup(mesh.corners, mesh.face, number, mesh.mask)
+                    self._movers.append(_Mover(start + k, int(bits), _Body(soup), placed))
+            start += len(group)
+        self._rest = _joined(soups)
+
+    def _body(self, mask: int) -> _Body:
+        if mask not in self._bodies:
+            self._bodies[mask] = _Body(self._rest.take((self._rest.mask & np.uint32(mask)) != 0))
+        return self._bodies[mask]
+
+    def _views(self, rays: Rays, o: Float, d: Float) -> list[tuple[_Body, Float, Float, Float]]:
+        """Bodies that the rays can see, with the rays' origins and directions and the body's normals' axes."""
+        views = [(self._body(rays.mask), o, d, np.broadcast_to(np.eye(3), (len(d), 3, 3)))]
+        for mover in self._movers:
+            body = mover.body
+            if mover.mask & rays.mask and (body.soup.mask & np.uint32(rays.mask)).all():
+                M = mover.frames(rays.time, len(d))
+                back = np.linalg.inv(M[:, :, :3])
+                local = np.einsum("nij,nj->ni", back, o - M[:, :, 3])
+                cofactor = np.linalg.det(M[:, :, :3])[:, None, None] * np.swapaxes(back, 1, 2)
+                views.append((body, local, np.einsum("nij,nj->ni", back, d), cofactor))
+        return views
+
+    def cast(self, rays: Rays, *, normals: bool, threads: int) -> Hits:  # noqa: ARG002
+        """The first hit of each ray."""
+        start, d = in_scene(rays)
+        n, o = len(d), start - self.origin
+        far = np.broadcast_to(rays.far, (n,))
+        best, cosine, normal = np.full(n, np.inf), np.zeros(n), np.zeros((n, 3))
+        face, instance = np.full(n, -1, np.int32), np.full(n, -1, np.int32)
+        views = self._views(rays, o, d)
+        for turned in (False, True):
+            todo = np.flatnonzero((face < 0) | (cosine < 0)) if turned else np.arange(n)
+            for body, local, way, axes in views:
+                rows = body.met(local[todo], way[todo], rays.near, far[todo], turned)
+                t, c, m = body.at(rows, local[todo], way[todo])
+                m = np.einsum("nij,nj->ni", axes[todo], m)
+                length = np.linalg.norm(m, axis=1) * np.linalg.norm(d[todo], axis=1)
+                c = -np.divide(
+                    np.einsum("ij,ij->i", m, d[todo]), length, out=np.zeros_like(c), where=length > 0
+                )
+                better = (t < best[todo]) & (t <= far[todo])
+                if turned:
+                    better &= (face[todo] < 0) | (c > 0)
+                won, of = todo[better], rows[better]
+                best[won], cosine[won], normal[won] = t[better], c[better], m[better]
+                face[won], instance[won] = body.soup.face[of], body.soup.instance[of]
+        if not normals:
+            return Hits(best, face, instance, cosine.astype(np.float32), np.empty((0, 3)))
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+        return Hits(best, face, instance, cosine.astype(np.float32), unit)
+
+    def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:
+        """Whether anything lies on each ray."""
+        return self.cast(rays, normals=False, threads=threads).face >= 0
+
+    def echoes(self, rays: Rays, k: int, *, threads: int) -> Echoes:  # noqa: ARG002
+        """The first k surfaces along each ray."""
+        start, d = in_scene(rays)
+        n, o = len(d), start - self.origin
+        far = np.broadcast_to(rays.far, (n,))
+        columns: list[list[Float | NDArray[np.int32]]] = [[], [], [], []]
+        for body, local, way, axes in self._views(rays, o, d):
+            for rows in body.all_met(local, way, k, rays.near, far).T:
+                t, _, m = body.at(rows, local, way)
+                m = np.einsum("nij,nj->ni", axes, m)
+                length = np.linalg.norm(m, axis=1) * np.linalg.norm(d, axis=1)
+                c = -np.divide(np.einsum("ij,ij->i", m, d), length, out=np.zeros(n), where=length > 0)
+                met = rows >= 0
+                face = np.where(met, body.soup.face[rows], -1) if len(body.soup.face) else rows
+                number = np.where(met, body.soup.instance[rows], -1) if len(body.soup.face) else rows
+                for column, value in zip(columns, (t, c, face, number), strict=True):
+                    column.append(value)
+        ranges, cosines, faces, numbers = (np.stack(column, axis=1) for column in columns)
+        order = np.argsort(ranges, axis=1, kind="stable")[:, :k]
+        ranges, cosines, faces, numbers = (
+            np.take_along_axis(column, order, axis=1) for column in (ranges, cosines, faces, numbers)
+        )
+        return Echoes(
+            (faces >= 0).sum(axis=1).astype(np.int32),
+            ranges,
+            faces.astype(np.int32),
+            numbers.astype(np.int32),
+            cosines.astype(np.float32),
+        )

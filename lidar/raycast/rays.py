@@ -1,0 +1,135 @@
+"""Rays checked and laid out for the kernels, and shared out among threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lidar.errors import InputError
+from lidar.poses import Poses
+from lidar.raycast.columns import Rays
+from lidar.raycast.geometry import ALL
+
+Float = NDArray[np.float64]
+
+_CHUNK = 8192
+"""Rays that a thread takes at a time; a multiple of every packet width, so that packets do not depend on it."""
+
+
+def _rows(values: ArrayLike, name: str) -> Float:
+    rows = np.ascontiguousarray(values, np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 3:
+        raise InputError(f"{name} have the shape {rows.shape}, rays need (n, 3)")
+    return rows
+
+
+def free_rays(origins: ArrayLike, directions: ArrayLike) -> Rays:
+    """Rays in the caster's frame from origins (n, 3) or (3,) and directions (n, 3)."""
+    d = _rows(directions, "directions")
+    o = np.ascontiguousarray(origins, np.float64)
+    o = _rows(o[None] if o.ndim == 1 else o, "origins")
+    if len(o) not in (1, len(d)):
+        raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one a ray")
+    return _plain(d, o, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+
+
+def posed_rays(
+    poses: Poses, pose_index: NDArray[np.integer], directions: ArrayLike, offsets: ArrayLike | None
+) -> Rays:
+    """Rays in the frames of poses; see `lidar.raycast.Caster.cast_posed`."""
+    d = _rows(directions, "directions")
+    o = np.empty((0, 3)) if offsets is None else _rows(offsets, "offsets")
+    index = np.ascontiguousarray(pose_index, np.int64)
+    if len(o) not in (0, 1, len(d)) or index.shape != (len(d),):
+        raise InputError(f"{len(d)} directions, {len(o)} offsets and {len(index)} pose numbers disagree")
+    if len(index) and not (index.min() >= 0 and index.max() < len(poses)):
+        raise InputError(f"a ray names a pose beyond the {len(poses)} there are")
+    matrix = np.ascontiguousarray(poses.scale[:, :, None] * poses.rotation, np.float64)
+    return _plain(d, o, index, np.ascontiguousarray(poses.position, np.float64), matrix)
+
+
+def _plain(d: Float, o: Float, pose: NDArray[np.int64], position: Float, matrix: Float) -> Rays:
+    none, start = np.empty(0, np.int64), np.empty(0, np.float32)
+    return Rays(d, o, pose, position, matrix, none, start, 0.0, np.array([np.inf]), ALL)
+
+
+def limited(
+    rays: Rays,
+    *,
+    near: float,
+    far: float | Float,
+    mask: int,
+    time: ArrayLike | None,
+    order: NDArray[np.integer] | None = None,
+) -> Rays:
+    """The rays with bounds, mask, times and order of work.
+
+    Raises InputError unless 0 <= near <= far, times lie within 0 to 1 and the order is a permutation.
+    """
+    n = len(rays.directions)
+    reach = np.ascontiguousarray(far, np.float64).reshape(-1)
+    if len(reach) not in (1, n) or not (near >= 0 and (reach >= near).all()):
+        raise InputError("rays need 0 <= near <= far, far one number or one a ray")
+    limits = rays._replace(near=float(near), far=reach, mask=int(mask) & ALL)
+    if time is not None:
+        moments = np.ascontiguousarray(time, np.float32)
+        if not (moments.shape == (n,) and ((moments >= 0) & (moments <= 1)).all()):
+            raise InputError(f"ray times are numbers from 0 to 1, one for each of {n} rays")
+        limits = limits._replace(time=moments)
+    if order is not None:
+        work = np.ascontiguousarray(order, np.int64)
+        named = np.zeros(n, np.bool_)
+        if work.shape == (n,) and (n == 0 or (work.min() >= 0 and work.max() < n)):
+            named[work] = True
+        if not named.all():
+            raise InputError(f"order is not a permutation of {n} rays")
+        limits = limits._replace(order=work)
+    return limits
+
+
+def in_scene(rays: Rays) -> tuple[Float, Float]:
+    """Origins and directions (n, 3) in the caster's frame.
+
+    Raises InputError for a ray that cannot be cast, as the kernels do.
+    """
+    d, o = rays.directions, rays.offsets
+    if rays.pose.size:
+        matrix = rays.matrix[rays.pose]
+        d = np.einsum("nij,nj->ni", matrix, d)
+        shift = np.einsum("nij,nj->ni", matrix, np.broadcast_to(o, d.shape)) if len(o) else 0.0
+        o = rays.position[rays.pose] + shift
+    o = np.broadcast_to(o, d.shape)
+    with np.errstate(over="ignore", invalid="ignore"):
+        squared = np.einsum("ij,ij->i", d, d)
+        usable = (squared > 0) & (squared < 1e100) & (np.abs(o).sum(axis=1) < 1e100)
+    if not usable.all():
+        raise _refusal(rays, int(np.argmin(usable)))
+    return o, d
+
+
+def _refusal(rays: Rays, bad: int) -> InputError:
+    where = f" at the pose {rays.position[rays.pose[bad]].tolist()}" if rays.pose.size else ""
+    if len(rays.offsets):
+        where = f" from {rays.offsets[bad if len(rays.offsets) > 1 else 0].tolist()}" + where
+    return InputError(
+        f"ray {bad} of {len(rays.directions)}, direction {rays.directions[bad].tolist()}{where}, cannot be cast:"
+        " rays need finite numbers and a direction that is not zero"
+    )
+
+
+def share(work: Callable[[int, int], int], rays: Rays, threads: int) -> None:
+    """Have threads do the rays in chunks of the order; ``work`` returns a ray that cannot be cast, or -1.
+
+    Raises InputError for such a ray.
+    """
+    n = len(rays.directions)
+    if threads <= 1 or n <= _CHUNK:
+        bad = work(0, n)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            bad = max(pool.map(lambda lo: work(lo, min(lo + _CHUNK, n)), range(0, n, _CHUNK)))
+    if bad >= 0:
+        raise _refusal(rays, bad)
