@@ -46,7 +46,8 @@ class Verdict:
     @property
     def ok(self) -> NDArray[np.bool_]:
         """(n,) bool, nothing is wrong with the feature."""
-        return self.finite & self.closed & self.oriented & self.positive & (self.degenerate == 0)
+        fine: NDArray[np.bool_] = self.finite & self.closed & self.oriented & self.positive
+        return np.asarray(fine & (self.degenerate == 0), np.bool_)
 
     def fault(self, row: int) -> str:
         """The first thing wrong with a feature as a slug, "" if nothing."""
@@ -99,8 +100,7 @@ def degenerate_faces(points: Float, faces: NDArray[np.integer], *, grid: float =
     cell = np.rint(points * (1.0 / grid)).astype(np.int64)
     a, b, c = (cell[faces[:, k]] for k in range(3))
     # integer differences below 2**31 (200 km) keep the cross product exact
-    flat: NDArray[np.bool_] = ~np.cross(b - a, c - a).any(axis=1)
-    return flat
+    return np.asarray(~np.cross(b - a, c - a).any(axis=1), np.bool_)
 
 
 def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
@@ -149,5 +149,5 @@ def _volumes(points: Float, triangles: Ids, owner: Ids, n: int) -> Float:
     anchor = np.zeros((n, 3))
     anchor[owner[::-1]] = points[triangles[::-1, 0]]
     a, b, c = (points[triangles[:, k]] - anchor[owner] for k in range(3))
-    volume: Float = np.bincount(owner, weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0, minlength=n)
-    return volume
+    sixfold = np.bincount(owner, weights=np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=n)
+    return np.asarray(sixfold / 6.0, float)

@@ -1,4 +1,4 @@
-"""Roof surfaces as plane triangles with a height field: made from skeletons, cut along lines of equal height."""
+"""Roof surfaces as plane triangles with a field: made from skeletons, cut along lines of equal height."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.shells import boundary, lift, triangulate
-from geoscene.buildings.skeleton import Skeleton
+from geoscene.buildings.skeleton import Skeleton, loops
 from geoscene.validate import weld
 
 Float = NDArray[np.float64]
@@ -150,7 +150,7 @@ def merged(cells: Cells) -> Cells:
 
 
 def _values_at(xy: Float, known: Float, values: Float) -> Float:
-    """Values (m, 3) at corners (m, 3, 2) that all occur among known points (n, 2), by their place on the grid."""
+    """Values (m, 3) at corners (m, 3, 2) that all occur among known points (n, 2) of the grid."""
     # the product keeps cells apart within 100 km of zero
     key, wanted = (np.rint(p * 1e4).astype(np.int64) @ np.array([2**31, 1]) for p in (known, xy))
     order = np.argsort(key, kind="stable")
@@ -182,18 +182,52 @@ def skeleton_cells(skeleton: Skeleton) -> Cells:
     # nodes that the grid makes one take one height
     _, first, same = np.unique(key, axis=0, return_index=True, return_inverse=True)
     time = skeleton.time[first][same.ravel()]
-    rings = [_distinct(face, same.ravel()) for face in skeleton.faces]
-    rings = [r for r in rings if len(r) > 2]
-    polygons = np.array([shapely.Polygon(xy[r]) for r in rings], dtype=object)
+    rings = _unpinched(xy, [_distinct(face, same.ravel()) for face in skeleton.faces])
+    polygons = np.array([shapely.Polygon(xy[r]) for r in rings if len(r) > 2], dtype=object)
     polygons = polygons[shapely.area(polygons) > 0]
     triangles, owner = triangulate(polygons)
     missing = np.setdiff1d(np.arange(len(polygons)), owner)
     if len(missing):
-        # a sliver that crosses itself on the grid: ear clipping takes any ring, the shell is checked afterwards
+        # ear clipping takes any ring; whether the shell is sound is checked later
         clipped = [_clip_ears(shapely.get_coordinates(p)[:-1]) for p in polygons[missing]]
         triangles = np.concatenate([triangles, *clipped])
         owner = np.concatenate([owner, np.repeat(missing, [len(c) for c in clipped])])
     return Cells(triangles, _values_at(triangles, xy, time), owner)
+
+
+def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:
+    """Rings (node numbers) without needles that cross themselves on the grid.
+
+    Where a node of a ring lies within two millimetres of another arc of the ring, the arc is led through it, in
+    the ring beyond too, and the ring falls into two.
+    """
+    rings = list(rings)
+    for _ in range(8 * len(rings)):
+        k = next((k for k, r in enumerate(rings) if len(r) > 2 and not shapely.Polygon(xy[r]).is_valid), -1)
+        found = _pinch(xy, rings[k]) if k >= 0 else None
+        if found is None:
+            break
+        node, start, stop = found
+        for i, ring in enumerate(rings):
+            arcs = list(zip(ring, [*ring[1:], *ring[:1]], strict=True))
+            for a, b in ((start, stop), (stop, start)):
+                if (a, b) in arcs:
+                    at = arcs.index((a, b)) + 1
+                    rings[i], *more = loops([*ring[:at], node, *ring[at:]])
+                    rings += more
+    return rings
+
+
+def _pinch(xy: Float, ring: list[int]) -> tuple[int, int, int] | None:
+    """The node of a ring nearest to an arc of it that is not its own, and the arc's ends, if within 2 mm."""
+    start, stop = np.array(ring), np.array([*ring[1:], *ring[:1]])
+    line = shapely.linestrings(np.stack([xy[start], xy[stop]], axis=1))
+    distance = shapely.distance(shapely.points(xy[start])[:, None], line)
+    own = (start[:, None] == start) | (start[:, None] == stop)
+    near, arc = np.unravel_index(np.argmin(np.where(own, np.inf, distance)), distance.shape)
+    if own.all() or distance[near, arc] > 2 * ON_LINE:
+        return None
+    return ring[near], int(start[arc]), int(stop[arc])
 
 
 def _clip_ears(ring: Float) -> Float:
@@ -210,7 +244,7 @@ def _distinct(face: list[int], same: NDArray[np.integer]) -> list[int]:
 
 
 def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
-    """The skeleton with its triangular faces pushed outwards: into gables (share 1), or half way (half-hipped).
+    """The skeleton with its triangular faces pushed out, into gables (share 1) or less (half-hipped).
 
     A triangular face stands on an edge between two faces that lean towards each other over a ridge. Its peak
     moves along that ridge towards the edge, and the edge rises as far between its ends: all faces stay plane.
@@ -218,11 +252,10 @@ def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
     """
     xy, time = [tuple(p) for p in skeleton.xy.tolist()], skeleton.time.tolist()
     faces = [list(f) for f in skeleton.faces]
-    corners = len(faces)
-    edge_from = {f[0]: k for k, f in enumerate(skeleton.faces)}
-    edge_to = {f[1]: k for k, f in enumerate(skeleton.faces)}
-    for k in range(corners):
-        if len(faces[k]) != 3 or faces[k][2] < corners:
+    edge_from = {f[0]: k for k, f in enumerate(skeleton.faces[: skeleton.corners])}
+    edge_to = {f[1]: k for k, f in enumerate(skeleton.faces[: skeleton.corners])}
+    for k in range(skeleton.corners):
+        if len(faces[k]) != 3 or faces[k][2] < skeleton.corners:
             continue
         a, b, peak = faces[k]
         left, right = faces[edge_to[a]], faces[edge_from[b]]
@@ -242,7 +275,7 @@ def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
             left[2:3], right[-1:], faces[k] = [new], [new], []
         else:
             left[2:3], right[-1:], faces[k] = [new, new + 2], [new + 2, new + 1], [new, new + 1, new + 2]
-    return Skeleton(np.array(xy), np.array(time), [f for f in faces if f])
+    return Skeleton(np.array(xy), np.array(time), [f for f in faces if f], skeleton.corners)
 
 
 def _foot(

@@ -89,7 +89,7 @@ def _take(
 def _settle_parts(
     outlines: list[Row], parts: list[Row], osm: OsmData, options: BuildingOptions, problems: list[Problem]
 ) -> list[Row]:
-    """Buildings, then parts, with their outlines' rows; what parts leave of an outline becomes a part itself."""
+    """Buildings, then parts, with their outlines' rows; what parts leave of an outline becomes a part."""
     shapes = gathered([p.footprint for p in parts])
     target = assign(
         [p.osm_id for p in parts],

@@ -34,16 +34,17 @@ def gathered(shapes: Sequence[Any]) -> Polygons:
 
 def project(geometry: Polygons, frame: Frame) -> Polygons:
     """Polygons (n,) in degrees as polygons in scene metres, not yet on the grid."""
-    return shapely.transform(
+    out: Polygons = shapely.transform(
         geometry, lambda lonlat: np.column_stack(frame.from_geographic(lonlat[:, 0], lonlat[:, 1]))
     )
+    return out
 
 
 def clean(polygons: Polygons) -> tuple[Polygons, NDArray[np.bool_]]:
     """Valid polygons on the grid (n,), and which of them had to be repaired.
 
-    What remains of a polygon may be a MultiPolygon, or empty. Rings of the result do not touch: where they met
-    in a point, a notch of 2 mm parts them, because a wall edge there would carry four faces.
+    What remains of a polygon may be a MultiPolygon, or empty. Rings of the result do not touch: where they
+    met in a point, a notch of 2 mm parts them, because a wall edge there would carry four faces.
     """
     out = np.array(polygons, dtype=object)
     finite = np.isfinite(shapely.bounds(out)).all(axis=1) & ~shapely.is_empty(out)
@@ -81,7 +82,7 @@ def _flatten(parts: Polygons, row: NDArray[np.integer]) -> tuple[Polygons, NDArr
 
 def _pinched(polygons: Polygons) -> NDArray[np.bool_]:
     """(n,) bool: some vertex occurs twice in the rings of the polygon."""
-    rings, ring_row = shapely.get_rings(_exploded(polygons), return_index=True)
+    rings, ring_row = shapely.get_rings(shapely.get_parts(polygons), return_index=True)
     piece_row = shapely.get_parts(polygons, return_index=True)[1]
     xy, ring = shapely.get_coordinates(rings, return_index=True)
     row = piece_row[ring_row[ring]]
@@ -92,11 +93,6 @@ def _pinched(polygons: Polygons) -> NDArray[np.bool_]:
     pinched = np.zeros(len(polygons), np.bool_)
     pinched[table[order[1:][twice], 0].astype(int)] = True
     return pinched
-
-
-def _exploded(polygons: Polygons) -> Polygons:
-    """All simple polygons of polygons (n,), in order."""
-    return shapely.get_parts(polygons)
 
 
 def _part_rings(polygon: Any) -> Any:

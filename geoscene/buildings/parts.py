@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import Polygons, clean, subtract
-from geoscene.buildings.table import GRID
+from geoscene.buildings.table import GRID, Texts
 from geoscene.report import Problem
 from geoscene.sources.data import Relation
 
@@ -30,7 +30,7 @@ def overlapping(a: Polygons, b: Polygons, *, least: float = 1e-4) -> tuple[Rows,
 
 
 def duplicates(
-    osm_id: Sequence[str], footprint: Polygons, known: NDArray[np.float64]
+    osm_id: Sequence[str] | Texts, footprint: Polygons, known: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], list[Problem]]:
     """Which buildings (n,) repeat another, and the report.
 
@@ -61,8 +61,8 @@ def assign(
 ) -> Rows:
     """The outline's row for every part (n,), -1 for parts that no outline holds.
 
-    Relations of type building decide; else the outline that covers most of the part, if it covers half, and of
-    several that cover over 90 % the smallest.
+    Relations of type building decide; else the outline that covers most of the part, if it covers half, and
+    of several that cover over 90 % the smallest.
     """
     found = np.full(len(part), -1, np.int64)
     p, o, shared = overlapping(part, outline)
@@ -93,7 +93,7 @@ def clusters(polygons: Polygons) -> Rows:
 
     i, j = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(len(polygons), len(polygons)))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
 def remainder(outline: Any, parts: Polygons, *, covered: float) -> tuple[Any, float]:
@@ -106,7 +106,7 @@ def remainder(outline: Any, parts: Polygons, *, covered: float) -> tuple[Any, fl
 
 
 def cut_overlaps(
-    osm_id: Sequence[str],
+    osm_id: Sequence[str] | Texts,
     footprint: Polygons,
     owner: Rows,
     low: NDArray[np.float64],
@@ -114,8 +114,8 @@ def cut_overlaps(
 ) -> tuple[Polygons, list[Problem]]:
     """Footprints (n,) less what smaller pieces of other buildings take at the same height, and the report.
 
-    Of two pieces of different buildings that share ground and heights the smaller keeps its shape. A piece that
-    keeps under a tenth of its area is dropped (its footprint is empty), as lying inside another.
+    Of two pieces of different buildings that share ground and heights the smaller keeps its shape. A piece
+    that keeps under a tenth of its area is dropped (its footprint is empty), as lying inside another.
 
     low, high : metres above the base; pieces above one another do not meet
     """

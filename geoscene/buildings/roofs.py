@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -140,7 +141,7 @@ def _middle(polygon: Any) -> Float:
 
 
 def _axes(polygon: Any) -> tuple[Float, Float, float]:
-    """Unit vectors along the longer and the shorter side of the smallest rectangle, and the rectangle's area."""
+    """Unit vectors along the longer and shorter side of the smallest rectangle, and the rectangle's area."""
     ring = shapely.get_coordinates(shapely.minimum_rotated_rectangle(polygon))
     first, second = ring[1] - ring[0], ring[2] - ring[1]
     lengths = float(np.hypot(*first)), float(np.hypot(*second))
@@ -172,7 +173,7 @@ def _slope(polygon: Any, spec: RoofSpec) -> Float:
 
 def _profile(field: Float, span: float, profile: Profile) -> Float:
     share, height = np.array(profile, float).T
-    return np.interp(field / span, share, height)
+    return np.asarray(np.interp(field / span, share, height), float)
 
 
 def _skillion(polygon: Any, spec: RoofSpec) -> Cells:
@@ -261,7 +262,7 @@ def _turned(polygon: Any, spec: RoofSpec) -> Triangles:
     ]
     rings = [to_grid(r) for r in rings]
     triangles = []
-    for lower, upper in zip(rings[:-1], rings[1:], strict=True):
+    for lower, upper in pairwise(rings):
         a, b, c, d = lower, np.roll(lower, -1, axis=0), np.roll(upper, -1, axis=0), upper
         triangles += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
     corners = np.concatenate(triangles)

@@ -13,8 +13,10 @@ from geoscene.sources.data import Tags
 from geoscene.tags import parse_direction, parse_number
 
 _OTHER_NAMES = {
-    "pitched": "gabled", "gable": "gabled", "hip": "hipped", "half_hipped": "half-hipped", "lean_to": "skillion",
-    "shed": "skillion", "pyramid": "pyramidal", "conical": "cone", "monopitch": "skillion", "spherical": "dome",
+    "pitched": "gabled", "gable": "gabled", "hip": "hipped", "half_hipped": "half-hipped",
+    "lean_to": "skillion",
+    "shed": "skillion", "pyramid": "pyramidal", "conical": "cone", "monopitch": "skillion",
+    "spherical": "dome",
     "barrel": "round", "vaulted": "round", "rounded": "round", "no": "flat", "yes": "flat",
 }  # fmt: skip
 
@@ -59,10 +61,11 @@ def read_roof_tags(tags: Tags) -> RoofTags:
 
 
 def default_roof_height(roof: RoofTags, footprint: Any) -> tuple[float, str]:
-    """Height of a roof in metres by its angle, else by the usual pitch, and which of the two (angle, default).
+    """Height of a roof in metres by its angle, else the usual pitch, and which of the two: angle, default.
 
-    The run is the radius of the largest circle in the footprint (its diameter for a skillion roof). A dome or onion without height is as high as the run (onion: 1.5 runs), the curved and
-    broken shapes take 45 degrees.
+    The run is the radius of the largest circle in the footprint (its diameter for a skillion roof). A dome or
+    onion without height is as high as the run (onion: 1.5 runs), the curved and broken shapes take 45
+    degrees.
     """
     # GEOS gives the circle as the line from its centre to its rim
     run = float(shapely.length(shapely.maximum_inscribed_circle(footprint, tolerance=0.05)))

@@ -81,7 +81,7 @@ def settle_heights(
     h.sigma[lacking] = np.maximum(h.sigma[outline[lacking]], SIGMA_PRIOR * h.high[lacking] / 2)
     np.minimum(h.high, HIGHEST, out=h.high)
 
-    for k in np.flatnonzero(h.high - h.low < 0.01):
+    for k in np.flatnonzero(h.high - h.low < 0.01).tolist():
         detail = f"underside at {h.low[k]:g} m, top at {h.high[k]:g} m; underside put at 0"
         problems.append(Problem(rows[k].osm_id, "building", "repaired", "underside-over-top", detail))
         h.low[k], h.low_source[k] = 0.0, "default"
@@ -91,7 +91,7 @@ def settle_heights(
     open_below = np.isin(use, _OPEN_BELOW) & (h.low_source == "default") & (lifted > 0.5)
     h.low[open_below], h.low_source[open_below] = lifted[open_below], "canopy"
 
-    for k in np.flatnonzero(h.roof > h.high - h.low + 1e-9):
+    for k in np.flatnonzero(h.roof > h.high - h.low + 1e-9).tolist():
         room = h.high[k] - h.low[k]
         if h.roof_source[k] == "tag":
             detail = f"roof of {h.roof[k]:g} m on {room:g} m"
@@ -127,10 +127,10 @@ def _settle_wholes(
     h.high[higher], h.source[higher], h.sigma[higher] = tops[higher], "parts", options.level_height
 
     whole = np.flatnonzero(~is_part)
-    footprint = gathered([rows[k].footprint for k in whole])
+    footprint = gathered([rows[k].footprint for k in whole.tolist()])
     inferred, sigma, rule = infer_heights(
         shapely.get_coordinates(shapely.point_on_surface(footprint)),
-        texts([rows[k].use for k in whole]),
+        texts([rows[k].use for k in whole.tolist()]),
         np.asarray(shapely.area(footprint), float),
         h.high[whole],
         reach=options.reach,

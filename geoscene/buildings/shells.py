@@ -123,7 +123,7 @@ def close(top: Triangles, floor: Triangles, underside: Float) -> Triangles:
 
 
 def prisms(polygons: Polygons, piece: Ids, low: Float, high: Float) -> Triangles:
-    """Shells with flat roofs over polygons (n,) from low to high (n,) metres; ``piece`` (n,) are their numbers."""
+    """Shells over polygons (n,) from low to high (n,) metres, flat; ``piece`` (n,) are their numbers."""
     xy, owner = triangulate(polygons)
     top = Triangles(lift(xy, to_grid(high)[owner]), owner, np.full(len(xy), ROOF, np.uint8))
     floor = Triangles(lift(xy, to_grid(low)[owner]), owner, np.full(len(xy), FLOOR, np.uint8))

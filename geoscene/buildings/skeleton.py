@@ -1,16 +1,17 @@
 """Straight skeletons of polygons with holes, by moving the edges inwards from event to event.
 
-The wavefront of Aichholzer, Aurenhammer, Alberts and Gärtner, "A novel type of skeleton for polygons" (1995): all
-edges move inwards at unit speed; an edge that shrinks to nothing joins its neighbours, a reflex corner that
-meets an edge splits the front (or joins a hole's front to it). Every step looks for the next event among all
-edges and corners anew, so no event can be missed or come twice; events at the same moment come one after the
-other with no time between. Where that fails on a symmetric polygon, its corners are moved by micrometres until
-no two events coincide, and the result is checked: each edge has one face, and the faces fill the polygon.
+The wavefront of Aichholzer, Aurenhammer, Alberts and Gärtner, "A novel type of skeleton for polygons" (1995):
+all edges move inwards at unit speed; an edge that shrinks to nothing joins its neighbours, a reflex corner
+that meets an edge splits the front (or joins a hole's front to it). Every step looks for the next event among
+all edges and corners anew, so no event can be missed or come twice; events at the same moment come one after
+the other with no time between. Where that fails on a symmetric polygon, its corners are moved by micrometres
+until no two events coincide, and the result is checked: each edge has one face, and the faces fill the
+polygon.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ Float = NDArray[np.float64]
 _PARALLEL = 1e-7
 _STILL = 1e-12
 _NEAR = 1e-9
+_SAME = 1e-3
 _SHAKES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
 
 
@@ -29,14 +31,17 @@ _SHAKES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
 class Skeleton:
     """A straight skeleton; face k stands on edge k of the polygon.
 
-    xy    : (n, 2) nodes, metres; the polygon's own corners first, ring by ring, exterior first
-    time  : (n,) distance of each node from the edges it belongs to, metres; 0 at the polygon's corners
-    faces : per edge the nodes around its face, counter-clockwise, beginning with the edge's two corners
+    xy      : (n, 2) nodes, metres; the polygon's own corners first, ring by ring, exterior first
+    time    : (n,) distance of each node from the edges it belongs to, metres; 0 at the polygon's corners
+    faces   : per edge the nodes around its face, counter-clockwise, beginning with the edge's two corners;
+              after those of all edges, what joining near nodes has split off from them
+    corners : number of the polygon's corners, and of its edges
     """
 
     xy: Float
     time: Float
     faces: list[list[int]]
+    corners: int
 
 
 class _Front:
@@ -72,8 +77,9 @@ class _Front:
         a, b = self.inward[before], self.inward[after]
         turn = a[0] * b[1] - a[1] * b[0]
         if abs(turn) < _PARALLEL:
-            return a.copy() if a @ b > 0 else None
-        return np.array([b[1] - a[1], a[0] - b[0]]) / turn
+            return np.asarray(a, float) if float(a @ b) > 0 else None
+        velocity: Float = np.array([b[1] - a[1], a[0] - b[0]]) / turn
+        return velocity
 
     def _before(self, corner: int) -> int:
         """The edge before a corner."""
@@ -220,7 +226,7 @@ class _Front:
             if ring is None:
                 return None
             faces.append(ring)
-        return Skeleton(np.array(self.nodes), np.array(self.times), faces)
+        return Skeleton(np.array(self.nodes), np.array(self.times), faces, len(faces))
 
     def _ring(self, edge: int) -> list[int] | None:
         """The nodes around the face of an edge, or None if its arcs make no ring."""
@@ -258,10 +264,52 @@ def straight_skeleton(polygon: Any) -> Skeleton | None:
             continue
         xy = found.xy.copy()
         xy[: len(corners)] = corners
-        found = Skeleton(xy + centre, found.time, found.faces)
+        found = replace(found, xy=xy + centre)
         if _fills(found, polygon):
-            return found
+            return _joined(found)
     return None
+
+
+def _joined(skeleton: Skeleton) -> Skeleton:
+    """The skeleton with nodes joined that an arc shorter than a millimetre connects.
+
+    On a grid the many nodes near one point, as in the middle of a regular polygon, would fall over one another.
+    """
+    parent = list(range(len(skeleton.xy)))
+
+    def root(node: int) -> int:
+        while parent[node] != node:
+            node = parent[node]
+        return node
+
+    for face in skeleton.faces:
+        ring = np.array(face)
+        step = skeleton.xy[np.roll(ring, -1)] - skeleton.xy[ring]
+        for k in np.flatnonzero((step**2).sum(axis=1) < _SAME**2).tolist():
+            low, high = sorted((root(face[k]), root(face[(k + 1) % len(face)])))
+            if high >= skeleton.corners:  # two corners stay two
+                parent[high] = low
+    faces, extra = [], []
+    for face in skeleton.faces:
+        main, *rest = loops([root(node) for node in face])
+        faces.append(main)
+        extra += rest
+    return replace(skeleton, faces=faces + extra)
+
+
+def loops(ring: list[int]) -> list[list[int]]:
+    """A ring that may pass a node twice as rings that do not, the one that holds its first edge first."""
+    loops: list[list[int]] = []
+    path: list[int] = []
+    for node in ring:
+        if node in path:
+            at = path.index(node)
+            if len(path) - at > 2:
+                loops.append(path[at:])
+            del path[at + 1 :]
+        else:
+            path.append(node)
+    return [path, *loops]
 
 
 def _fills(skeleton: Skeleton, polygon: Any) -> bool:

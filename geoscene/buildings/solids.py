@@ -51,10 +51,10 @@ def build_solids(
 ) -> tuple[Mesh, list[Problem]]:
     """One closed, oriented body of positive volume per building, and what had to be simplified or dropped.
 
-    The bodies stand on the 0.1 mm grid. Faces carry the building's row as feature, class BUILDING, the surface,
-    material and colour. LoD 0 is the whole outline as one block of the building's full height, parts ignored;
-    LoD 1 has parts with their undersides and flat tops at full height; LoD 2 has roofs. What fails is tried
-    again with flat roofs, then with cleaned footprints, then dropped.
+    The bodies stand on the 0.1 mm grid. Faces carry the building's row as feature, class BUILDING, the
+    surface, material and colour. LoD 0 is the outline as one block from the ground up, as high as its parts
+    on the average; LoD 1 has parts with their undersides and flat tops at full height; LoD 2 has roofs. What
+    fails is tried again with flat roofs, then with cleaned footprints, then dropped.
 
     base : (count,) or (n,) z in metres of each building's base, in the order of the table; a part stands on
            its building's base
@@ -106,11 +106,20 @@ def _pieces(buildings: Buildings, base: Float, lod: int) -> _Pieces:
     polygon, row, building = polygon[order], row[order], building[order]
     low, high = buildings.min_height[row], buildings.height[row]
     if lod == 0:
-        low = np.minimum(low, 0.0)
+        low, high = np.minimum(low, 0.0), _mean_heights(buildings)[row]
     flat = (
         np.full(len(row), lod < 2) | (buildings.roof_shape[row] == "flat") | (buildings.roof_height[row] <= 0)
     )
     return _Pieces(polygon, row, building, base[building] + low, base[building] + high, flat)
+
+
+def _mean_heights(buildings: Buildings) -> Float:
+    """Heights (n,) of the table's rows, for buildings with parts the mean of the parts' by area."""
+    area = np.where(buildings.drawn, shapely.area(buildings.footprint), 0.0)
+    total = np.bincount(buildings.outline, weights=area, minlength=len(buildings))
+    sums = np.bincount(buildings.outline, weights=area * buildings.height, minlength=len(buildings))
+    mean: Float = np.divide(sums, total, out=buildings.height.copy(), where=total > 0)
+    return mean
 
 
 def _simplified(pieces: _Pieces) -> _Pieces:
@@ -180,7 +189,7 @@ def _mesh(buildings: Buildings, triangles: Triangles, row: Ids) -> Mesh:
     corners = triangles.corners.reshape(-1, 3)
     ids, first = weld(corners, np.repeat(feature, 3))
     roof = (triangles.surface == ROOF)[:, None]
-    mesh = Mesh.of(
+    return Mesh.of(
         corners[first],
         ids.reshape(-1, 3),
         feature=feature,
@@ -190,4 +199,3 @@ def _mesh(buildings: Buildings, triangles: Triangles, row: Ids) -> Mesh:
         color=np.where(roof, buildings.roof_color[row], buildings.wall_color[row]),
         closed=True,
     )
-    return mesh

@@ -52,7 +52,8 @@ class Buildings:
     height           : (n,) metres from the building's base to the top of the roof
     roof_height      : (n,) metres, the part of height that is roof; 0 if flat
     roof_shape       : (n,) str, one of SHAPES
-    roof_direction   : (n,) radians counter-clockwise from x, where the roof's face slopes down to, NaN if not given
+    roof_direction   : (n,) radians counter-clockwise from x, where the roof's face slopes down to, NaN if not
+                       given
     roof_across      : (n,) bool, the ridge runs across the longer side
     height_source    : (n,) str: tag, est_height, levels, parts, outline, or inferred-<rule>
     height_sigma     : (n,) metres, one standard deviation of height

@@ -48,7 +48,7 @@ def unite(shells: Triangles) -> tuple[Triangles, int] | None:
 
 
 def _manifold(shells: Triangles, piece: int, first: int, origin: Float) -> Any:
-    """The shell of one piece as a manifold whose faces carry ``first`` plus their surface; None if it is none."""
+    """One piece as a manifold whose faces carry ``first`` plus their surface; None if it is none."""
     mine = shells.take(shells.piece == piece)
     order = np.argsort(mine.surface, kind="stable")
     corners, surface = mine.corners[order].reshape(-1, 3) - origin, mine.surface[order]
