@@ -106,17 +106,17 @@ def _eye(corners: Float, view: View, size: tuple[int, int]) -> tuple[CameraSpec,
     right = np.array([math.cos(a), -math.sin(a), 0.0])
     axes = np.stack([right, np.cross(forward, right), forward], axis=1)
     f = width / 2 / math.tan(math.radians(view.fov_deg) / 2)
-    half = np.array([width, height]) / 2 / f
-    target = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    for _ in range(4):
-        away = (corners - target) @ axes
-        distance = float((np.abs(away[:, :2]) / half - away[:, 2:]).max()) * 1.02
-        seen = away[:, :2] / (away[:, 2:] + distance)
-        target = target + axes[:, :2] @ ((seen.min(axis=0) + seen.max(axis=0)) / 2 * distance)
+    half = 0.98 * np.array([width, height]) / 2 / f
+    # A corner at (x, z) is in view from (s, -d) if |x - s| <= half * (z + d): the least d that leaves room
+    # for an s, in width and in height, and the middle of that room.
+    x, z = (corners @ axes)[:, :2] / half, (corners @ axes)[:, 2:]
+    distance = float(((x - z).max(axis=0) - (x + z).min(axis=0)).max()) / 2
+    aside = half * ((x - z).max(axis=0) + (x + z).min(axis=0)) / 2
+    position = axes @ [*aside, -distance]
     camera = CameraSpec(
         "picture", Mount(), width, height, f, f, (width - 1) / 2, (height - 1) / 2, near=0.5, far=np.inf
     )
-    return camera, Poses((target - distance * forward)[None], axes[None], np.ones((1, 3)))
+    return camera, Poses(position[None], axes[None], np.ones((1, 3)))
 
 
 def cloud_picture(

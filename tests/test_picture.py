@@ -53,7 +53,8 @@ def test_everything_is_in_view_and_the_view_is_filled(azimuth, elevation, fov, s
     share = (pixels + 0.5) / size
     assert share.min() >= 0
     assert share.max() <= 1
-    assert np.ptp(share, axis=0).max() > 0.75
+    edges = np.stack([share.min(axis=0), 1 - share.max(axis=0)])
+    assert (edges < 0.03).all(axis=0).any()  # one way it touches both sides of the picture
 
 
 def test_from_above_north_is_up_and_east_is_right():
@@ -68,7 +69,7 @@ def test_from_above_north_is_up_and_east_is_right():
     )
     (u, v), (east, level), (upright, north) = (_where(image, c) for c in (RED, GREEN, BLUE))
     assert east - u == pytest.approx(v - north, abs=1.5)
-    assert east - u == pytest.approx(200 * 10 / 20 / 1.02, abs=2)
+    assert east - u == pytest.approx(200 * 10 / 20 * 0.98, abs=2)
     assert abs(level - v) <= 1
     assert abs(upright - u) <= 1
 
@@ -130,7 +131,7 @@ def test_a_scene_from_above_is_a_map():
     image = scene_picture(_village(), view="top", size=(400, 300), sun=(0, 0, 1), options=PLAIN)
     redness = (image[..., 0] > 150) & (image[..., 1] < 60)
     v, u = np.nonzero(redness)
-    scale = 300 / 100 / 1.02  # pixels a metre: the height of the picture is the tighter fit
+    scale = 300 / 100 * 0.98  # pixels a metre: the height of the picture is the tighter fit
     assert np.ptp(u) + 1 == pytest.approx(20 * scale, abs=3)
     assert np.ptp(v) + 1 == pytest.approx(10 * scale, abs=3)
     assert u.mean() == pytest.approx(200 + 30 * scale, abs=3)
