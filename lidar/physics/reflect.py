@@ -21,7 +21,6 @@ INCIDENCE_LAWS = ("lambert", "phong", "oren-nayar")
 RETRO = 1.0
 """Reflectance over which a material is a retro-reflector."""
 
-_PHONG_EXPONENT = 10.0  # width of the specular lobe; HELIOS++ leaves it free, 10 is a typical value
 _ROUGHNESS = np.radians(20.0)  # slope deviation of rough facades, typical value
 _RETRO_FLAT, _RETRO_FALL = np.radians(30.0), np.radians(45.0)  # sheeting: flat to 30°, 40 % at 45°, typical
 _RETRO_LEFT = 0.4
@@ -54,8 +53,8 @@ def apparent(
     cosine      : of the angle between beam and normal, 0 to 1
     specular    : mirror-like share, for ``phong``
     law         : ``lambert``: rho cos. ``phong``: rho ((1 - ks) cos + ks |cos 2 theta|^n), as in HELIOS++
-                  (Winiwarter et al. 2022), with n = 10. ``oren-nayar``: Oren and Nayar 1994, source and
-                  receiver in one place, roughness 20 degrees
+                  (Winiwarter et al. 2022), with n = 10 (typical). ``oren-nayar``: Oren and Nayar 1994,
+                  source and receiver in one place, roughness 20 degrees (typical)
 
     Retro-reflective sheeting is flat to 30 degrees, falls to 40 % at 45 and to nothing at 90 under each law.
 
@@ -64,7 +63,8 @@ def apparent(
     if law == "lambert":
         back = reflectance * cosine
     elif law == "phong":
-        lobe = np.abs(2 * cosine * cosine - 1) ** _PHONG_EXPONENT
+        square = (2 * cosine * cosine - 1) ** 2
+        lobe = square * (square * square) ** 2  # to the tenth power
         back = reflectance * ((1 - specular) * cosine + specular * lobe)
     elif law == "oren-nayar":
         s2 = _ROUGHNESS * _ROUGHNESS

@@ -82,17 +82,27 @@ class _Look:
         self.world, self.effects, self.seed = world, effects, seed
         self.reflectance, self.specular = reflectance_table(wavelength_nm)
 
+    def _spread(self, feature: NDArray[np.int32]) -> Float:
+        """Factor of each feature's reflectance."""
+        if not len(feature):
+            return np.ones(0)
+        first = int(feature.min())
+        every = np.arange(first, int(feature.max()) + 1)
+        factor: Float = np.exp(self.effects.spread * normal_of(every, self.seed))[feature - first]
+        return factor
+
     def at(self, hits: Hits) -> tuple[Echoes, NDArray[np.uint8]]:
         """Rows for hits, numbered from 0 and all on the axis, and their materials."""
         found = self.world.lookup(hits)
         cosine = np.minimum(np.abs(hits.cosine).astype(np.float64), 1.0)
         rho = self.reflectance[found.material]
         if self.effects.spread:
-            one_off = rho * np.exp(self.effects.spread * normal_of(found.feature, self.seed))
+            one_off = rho * self._spread(found.feature)
             rho = np.where(rho > RETRO, one_off, np.minimum(one_off, RETRO))
         back = apparent(rho, cosine, specular=self.specular[found.material], law=self.effects.law)
         if self.effects.mirrors:
-            back = np.where(found.material == _codes()[1], glint(cosine), back)
+            water = np.flatnonzero(found.material == _codes()[1])
+            back[water] = glint(cosine[water])
         n = len(hits.range)
         rows = Echoes(
             np.arange(n, dtype=np.int32),
