@@ -70,6 +70,7 @@ class _Body:
         from embreex.rtcore_scene import EmbreeScene  # noqa: PLC0415
 
         self.soup = soup
+        self._seen: dict[int, _Body] = {}
         a, b, c = (soup.corners[:, k] for k in range(3))
         self.normal = np.cross(b - a, c - a)
         self._scene: Any = None
@@ -77,6 +78,15 @@ class _Body:
         if len(soup.face):
             self._scene = EmbreeScene()
             TriangleMesh(self._scene, soup.corners.astype(np.float32))
+
+    def seen(self, mask: int) -> _Body:
+        """The part of the body that a mask shows."""
+        shown = (self.soup.mask & np.uint32(mask)) != 0
+        if shown.all():
+            return self
+        if mask not in self._seen:
+            self._seen[mask] = _Body(self.soup.take(shown))
+        return self._seen[mask]
 
     def met(self, o: Float, d: Float, near: float, far: Float, turned: bool) -> NDArray[np.int64]:  # noqa: FBT001
         """Rows of the triangles that rays meet first, -1 for none."""
@@ -147,9 +157,8 @@ class EmbreexScene:
         self.origin = origin
         self.parts: dict[int, Geometry] = {}
         self._groups: list[tuple[Instances, Sequence[EmbreexScene]]] = []
-        self._rest = _joined([])
+        self._rest = _Body(_joined([]))
         self._movers: list[_Mover] = []
-        self._bodies: dict[int, _Body] = {}
 
     def attach(self, number: int, part: Geometry) -> None:
         """Add a geometry under a free number."""
@@ -170,7 +179,7 @@ class EmbreexScene:
 
     def commit(self) -> None:
         """Write the copies at rest out and note those that move."""
-        soups, self._movers, self._bodies, start = [_mesh(self.parts)], [], {}, 0
+        soups, self._movers, start = [_mesh(self.parts)], [], 0
         for group, shapes in self._groups:
             if any(not isinstance(shape, EmbreexScene) for shape in shapes):
                 raise BackendError("shapes that are copied need the backend of the caster that copies them")
@@ -188,19 +197,14 @@ class EmbreexScene:
                     soup = _Soup(mesh.corners, mesh.face, number, mesh.mask)
                     self._movers.append(_Mover(start + k, int(bits), _Body(soup), placed))
             start += len(group)
-        self._rest = _joined(soups)
-
-    def _body(self, mask: int) -> _Body:
-        if mask not in self._bodies:
-            self._bodies[mask] = _Body(self._rest.take((self._rest.mask & np.uint32(mask)) != 0))
-        return self._bodies[mask]
+        self._rest = _Body(_joined(soups))
 
     def _views(self, rays: Rays, o: Float, d: Float) -> list[tuple[_Body, Float, Float, Float]]:
         """Bodies that the rays can see, with the rays' origins and directions and the body's normals' axes."""
-        views = [(self._body(rays.mask), o, d, np.broadcast_to(np.eye(3), (len(d), 3, 3)))]
+        views = [(self._rest.seen(rays.mask), o, d, np.broadcast_to(np.eye(3), (len(d), 3, 3)))]
         for mover in self._movers:
-            body = mover.body
-            if mover.mask & rays.mask and (body.soup.mask & np.uint32(rays.mask)).all():
+            if mover.mask & rays.mask:
+                body = mover.body.seen(rays.mask)
                 M = mover.frames(rays.time, len(d))
                 back = np.linalg.inv(M[:, :, :3])
                 local = np.einsum("nij,nj->ni", back, o - M[:, :, 3])
