@@ -27,6 +27,8 @@ U_TURN_S = 30.0
 """Seconds that turning round at a dead end costs in the search for the fastest way."""
 U_TURN = np.radians(150.0)
 """Change of direction at a node from which on the vehicle must turn round, in radians."""
+_STEP = 0.3  # metres between the lanes of two streets from which on a change of lane is drawn out
+_STRAIGHT = 0.5  # cosine of the turn up to which a junction is gone straight over
 _KEEP = 0.2  # metres between the body and the kerb where the carriageway is narrow
 
 
@@ -281,8 +283,18 @@ def _cut(line: Float, begin: float, end: float) -> Float:
     return np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
 
 
-def _meet(a: Float, b: Float, reach: float) -> tuple[Float, Float]:
-    """Two lanes that follow each other, cut where they cross or extended to where they meet."""
+def _meet(a: Float, b: Float, reach: float, change: float) -> tuple[Float, Float]:
+    """Two lanes that follow each other, joined within ``reach``.
+
+    Straight on, a lane that lies ``change`` metres further out than the other is left over five times that
+    length. In a turn the lanes are cut where they cross, or extended to where they meet.
+    """
+    u, v = a[-1, :2] - a[-2, :2], b[1, :2] - b[0, :2]
+    u, v = u / max(float(np.hypot(*u)), 1e-9), v / max(float(np.hypot(*v)), 1e-9)
+    if abs(change) > _STEP and u @ v > _STRAIGHT:
+        long_a, long_b = (float(np.hypot(*np.diff(x[:, :2], axis=0).T).sum()) for x in (a, b))
+        taper = 2.5 * abs(change)
+        return _cut(a, 0.0, max(1 - taper / long_a, 0.6)), _cut(b, min(taper / long_b, 0.4), 1.0)
     one, two = shapely.linestrings(a[:, :2]), shapely.linestrings(b[:, :2])
     cross = shapely.get_coordinates(shapely.intersection(one, two))
     if len(cross):
@@ -294,8 +306,6 @@ def _meet(a: Float, b: Float, reach: float) -> tuple[Float, Float]:
             at_one = float(shapely.line_locate_point(one, points[k]) / one.length)
             at_two = float(shapely.line_locate_point(two, points[k]) / two.length)
             return _cut(a, 0.0, max(at_one, 1e-6)), _cut(b, min(at_two, 1 - 1e-6), 1.0)
-    u, v = a[-1, :2] - a[-2, :2], b[1, :2] - b[0, :2]
-    u, v = u / max(float(np.hypot(*u)), 1e-9), v / max(float(np.hypot(*v)), 1e-9)
     sine = u[0] * v[1] - u[1] * v[0]
     if abs(sine) > 0.2:
         gap = b[0, :2] - a[-1, :2]
@@ -333,7 +343,8 @@ def lane_route(
     for k in range(len(order) - 1):
         if not rounds[k]:
             reach = 2.0 * max(abs(float(offset[order[k]])), abs(float(offset[order[k + 1]])), 1.0)
-            lanes[k], lanes[k + 1] = _meet(lanes[k], lanes[k + 1], reach)
+            change = float(offset[order[k + 1]] - offset[order[k]])
+            lanes[k], lanes[k + 1] = _meet(lanes[k], lanes[k + 1], reach, change)
     sizes = np.array([len(lane) for lane in lanes])
     last = np.cumsum(sizes) - 1
     turns = last[rounds].tolist()
