@@ -1,0 +1,87 @@
+"""The ground as roads need it: banked up to ramps, cut down to underpasses, level across carriageways."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from geoscene.roadgraph.carriageways import place_of
+from geoscene.roadgraph.paths import way_lines
+from geoscene.roadgraph.profile import Height, Obstacles
+from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
+from geoscene.roads import RoadGraph
+from geoscene.sources.data import OsmData, Tags
+
+Float = NDArray[np.float64]
+
+# Metres of free height (railways: EN 15273 with overhead line; waterways: a rowing boat on small ones) that
+# bridges leave.
+_CLEAR = {
+    "railway": {"rail": 5.7, "light_rail": 5.0, "tram": 4.7, "subway": 4.5, "narrow_gauge": 4.5},
+    "waterway": {"river": 3.0, "canal": 3.0, "stream": 1.0, "ditch": 0.5, "drain": 0.5},
+}
+
+
+def find_obstacles(osm: OsmData, frame: Frame) -> Obstacles:
+    """Railways and waterways on the ground, which bridges must clear."""
+    ways = [way for way in osm.ways if _clear(way.tags) is not None]
+    lines = way_lines(ways, frame)
+    kept = np.flatnonzero([line is not None for line in lines])
+    return Obstacles(lines[kept], np.array([_clear(ways[k].tags) for k in kept.tolist()], float))
+
+
+def _clear(tags: Tags) -> float | None:
+    layer, source = read_layer(tags, [])
+    if place_of(layer, source, is_bridge(tags), is_tunnel(tags)) != 0:
+        return None
+    for key, heights in _CLEAR.items():
+        if tags.get(key) in heights:
+            return heights[tags[key]]
+    return None
+
+
+def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 1.0, batter: float = 8.0) -> Height:
+    """The ground with its roads built into it: a function of x, y (n,) that gives z (n,).
+
+    Within a carriageway and its shoulder the ground is level across, at the road's profile; over the next
+    ``batter`` metres it passes into the terrain. Where roads meet, the nearer one counts for more. Bridges
+    and tunnels leave the ground as it is.
+
+    graph  : with heights, from `profile`
+    ground : height of the terrain
+    """
+    once = np.flatnonzero(
+        ((graph.twin < 0) | (graph.twin > np.arange(len(graph)))) & ~graph.bridge & ~graph.tunnel
+    )
+    if not len(once):
+        return ground
+    lines = [graph.geometry[e] for e in once.tolist()]
+    start = np.concatenate([line[:-1] for line in lines])
+    end = np.concatenate([line[1:] for line in lines])
+    half = np.repeat(graph.width[once] / 2 + shoulder, [len(line) - 1 for line in lines])
+    boxes = shapely.linestrings(np.stack([start[:, :2], end[:, :2]], axis=1))
+    tree = shapely.STRtree(boxes)
+    reach = float(half.max()) + batter
+
+    def height(x: Float, y: Float) -> Float:
+        z = np.asarray(ground(x, y), float).copy()
+        xy = np.stack([x, y], axis=1)
+        point, road = tree.query(shapely.points(xy), predicate="dwithin", distance=reach)
+        along = end[road, :2] - start[road, :2]
+        square = np.maximum((along**2).sum(axis=1), 1e-12)
+        t = np.clip(((xy[point] - start[road, :2]) * along).sum(axis=1) / square, 0.0, 1.0)
+        foot = start[road] + t[:, None] * (end[road] - start[road])
+        beyond = np.maximum(np.hypot(*(xy[point] - foot[:, :2]).T) - half[road], 0.0)
+        share = np.clip(1.0 - beyond / batter, 0.0, 1.0)
+        weight = share**2 / (0.1 + beyond) ** 2
+        total = np.bincount(point, weight, len(z))
+        near = total > 0
+        road_z = np.divide(np.bincount(point, weight * foot[:, 2], len(z)), total, out=z.copy(), where=near)
+        most = np.zeros(len(z))
+        np.maximum.at(most, point, share)
+        blend = most * most * (3.0 - 2.0 * most)
+        return z + blend * (road_z - z)
+
+    return height

@@ -1,0 +1,284 @@
+"""Heights along roads: smooth on the ground, over what bridges cross, under it in tunnels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.roadgraph.quadratic import Bounds, interior_point
+from geoscene.roadgraph.stations import Stations, find_crossings, place_stations
+from geoscene.roads import RoadGraph
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Height = Callable[[Float, Float], Float]
+"""z (n,) in metres of the ground at scene x (n,), y (n,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProfileOptions:
+    """How roads leave the ground. Lengths in metres, slopes as a ratio.
+
+    clearance : free height over a road that a bridge crosses or a tunnel holds (AASHTO: 4.3 to 4.9 and more)
+    deck      : thickness of what carries a road over another
+    cover     : ground over a tunnel
+    slope     : greatest slope of ramps, bridges and tunnels (steeper only where the ground is)
+    step      : greatest change of slope from one station to the next, beyond the ground's own
+    smooth    : length over which unevenness of the ground is smoothed
+    spacing   : distance of stations
+    """
+
+    clearance: float = 4.7
+    deck: float = 0.8
+    cover: float = 1.0
+    slope: float = 0.08
+    step: float = 0.02
+    smooth: float = 12.0
+    spacing: float = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacles:
+    """Lines on the ground that bridges cross: tracks and water.
+
+    line  : (k,) shapely LineString, scene metres
+    clear : (k,) float64 metres of free height that they need
+    """
+
+    line: NDArray[np.object_]
+    clear: Float
+
+
+# Weights of the least-squares terms, per metre of road. Ground far from any bridge or tunnel holds a road
+# more firmly than a ramp does; what is forbidden is a hundred thousand times dearer than either.
+_FIRM, _RAMP, _LOOSE = 100.0, 1.0, 1e-6
+_RAMP_REACH = 150.0
+# A bridge or a tunnel is a string pulled taut rather than a sprung beam over more than this length, metres.
+_TAUT = 30.0
+_HARD, _HARDEST = 1e8, 1e9
+"""Of slopes; of heights, which come first where a short ramp cannot serve both."""
+
+
+def profile(
+    graph: RoadGraph,
+    ground: Height,
+    *,
+    obstacles: Obstacles | None = None,
+    options: ProfileOptions | None = None,
+) -> RoadGraph:
+    """The graph with heights (and vertices at most ``spacing`` apart where heights vary).
+
+    Constrained least squares over all stations at once. Minimised: the squared distance from the ground, plus
+    the squared curvature in height times ``smooth`` to the fourth; bridges and tunnels have the second term
+    only, so they run on from their ramps. Bounds: a road is above one that it crosses by clearance and deck;
+    a bridge is above obstacles and the ground; a tunnel is under the ground, deeper with the distance from
+    its mouth; slopes; changes of slope. Bounds that contradict each other (a ramp too short for its
+    slope) give way, slopes before heights. Solved by an interior-point method.
+
+    ground    : height of the terrain; what it returns is kept to where nothing stands against it
+    obstacles : what else bridges cross
+    """
+    options = options or ProfileOptions()
+    if not len(graph):
+        return graph
+    stations = place_stations(graph, spacing=options.spacing)
+    terrain = np.asarray(ground(stations.xy[:, 0], stations.xy[:, 1]), float)
+    bounds = _bounds(graph, stations, terrain, ground, obstacles, options)
+    z = _solve(graph, stations, terrain, bounds, options)
+    return _with_heights(graph, stations, z)
+
+
+def _weights(graph: RoadGraph, stations: Stations) -> Float:
+    """How firmly the ground holds each station: per metre, times the metres that the station stands for."""
+    a, b, metres, edge = stations.segments
+    structure = graph.bridge[edge] | graph.tunnel[edge]
+    count = len(stations.xy)
+    ends = np.zeros(count, np.bool_)
+    ends[a[structure]] = ends[b[structure]] = True
+    far = _distance(count, (a[~structure], b[~structure], metres[~structure]), ends, _RAMP_REACH)
+    per_metre = _RAMP + (_FIRM - _RAMP) * np.clip(far / _RAMP_REACH, 0.0, 1.0) ** 2
+    share = np.where(structure, 0.0, metres / 2)
+    held = np.bincount(a, share, count) + np.bincount(b, share, count)
+    return np.maximum(held * per_metre, _LOOSE)
+
+
+def _distance(count: int, links: tuple[Int, Int, Float], start: NDArray[np.bool_], limit: float) -> Float:
+    """Metres along links from the nearest start, at most ``limit``."""
+    from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
+    from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
+
+    if not start.any():
+        return np.full(count, limit)
+    a, b, metres = links
+    # One more station, linked to all starts, makes one source of them.
+    source = np.flatnonzero(start)
+    rows = np.concatenate([a, np.full(len(source), count)])
+    columns = np.concatenate([b, source])
+    values = np.concatenate([metres, np.full(len(source), 1e-6)])
+    least = np.lexsort([values, columns, rows])
+    first = np.unique(np.stack([rows[least], columns[least]]), axis=1, return_index=True)[1]
+    keep = least[first]
+    net = csr_array((values[keep], (rows[keep], columns[keep])), shape=(count + 1, count + 1))
+    reach = dijkstra(net, directed=False, indices=count, limit=limit)[:count]
+    near: Float = np.minimum(reach, limit)
+    return near
+
+
+def _bounds(
+    graph: RoadGraph,
+    stations: Stations,
+    terrain: Float,
+    ground: Height,
+    obstacles: Obstacles | None,
+    options: ProfileOptions,
+) -> Bounds:
+    """All that heights must obey."""
+    rows = _Rows(len(stations.xy))
+    a, b, metres, edge = stations.segments
+    structure = graph.bridge[edge] | graph.tunnel[edge]
+
+    own = np.abs(terrain[b] - terrain[a])
+    most = np.where(structure, options.slope * metres, np.maximum(options.slope * metres, own))
+    rows.add([(b, 1.0), (a, -1.0)], -most, _HARD)
+    rows.add([(a, 1.0), (b, -1.0)], -most, _HARD)
+
+    p, q, r, before, after = stations.triples
+    near = np.minimum(before, after)
+    bend = (terrain[r] - terrain[q]) / after - (terrain[q] - terrain[p]) / before
+    on_ground = np.ones(len(terrain), np.bool_)
+    on_ground[a[structure]] = on_ground[b[structure]] = False
+    allowed = (options.step + np.where(on_ground[p] & on_ground[q] & on_ground[r], np.abs(bend), 0.0)) * near
+    turn = [(p, near / before), (q, -near / before - near / after), (r, near / after)]
+    rows.add(turn, -allowed, _HARD)
+    rows.add([(station, -factor) for station, factor in turn], -allowed, _HARD)
+
+    high = options.clearance + options.deck
+    upper, on_upper, lower, on_lower, margin = find_crossings(graph, stations)
+    i, j, t = stations.at(lower, on_lower)
+    length = stations.along[np.searchsorted(stations.edge, upper, side="right") - 1]
+    for shift in (-margin, 0.0 * margin, margin):
+        k, m, s = stations.at(upper, np.clip(on_upper + shift, 0.0, length))
+        rows.add([(k, 1 - s), (m, s), (i, t - 1), (j, -t)], np.full(len(upper), high), _HARDEST)
+
+    bridge, tunnel = (_mouth_distance(graph, stations, kind, options) for kind in ("bridge", "tunnel"))
+    deck = np.flatnonzero(np.isfinite(bridge))
+    rows.add(
+        [(deck, 1.0)], terrain[deck] + np.minimum(options.deck, options.slope / 2 * bridge[deck]), _HARDEST
+    )
+    bore = np.flatnonzero(np.isfinite(tunnel))
+    deep = np.minimum(options.clearance + options.cover, options.slope / 2 * tunnel[bore])
+    rows.add([(bore, -1.0)], deep - terrain[bore], _HARDEST)
+
+    if obstacles is not None and len(obstacles.line):
+        over, along, x, y, clear = _over_obstacles(graph, stations, obstacles)
+        i, j, t = stations.at(over, along)
+        rows.add([(i, 1 - t), (j, t)], np.asarray(ground(x, y), float) + clear + options.deck, _HARDEST)
+    return rows.bounds()
+
+
+class _Rows:
+    """Collects rows ``a z >= b``."""
+
+    def __init__(self, stations: int) -> None:
+        self._stations = stations
+        self._count = 0
+        self._entries: list[tuple[Int, Int, Float]] = []
+        self._right: list[Float] = []
+        self._weight: list[Float] = []
+
+    def add(self, terms: Sequence[tuple[Int, Float | float]], right: Float, weight: float) -> None:
+        """Add rows: the sum of factor times height over the terms is at least ``right``."""
+        number = self._count + np.arange(len(right))
+        for station, factor in terms:
+            self._entries.append((number, station, np.broadcast_to(factor, len(right)).astype(float)))
+        self._right.append(right)
+        self._weight.append(np.full(len(right), weight))
+        self._count += len(right)
+
+    def bounds(self) -> Bounds:
+        """All rows as a sparse matrix with its right side and weights."""
+        from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
+
+        row, column, value = (np.concatenate([entry[k] for entry in self._entries]) for k in range(3))
+        matrix = csr_array((value, (row, column)), shape=(self._count, self._stations))
+        return Bounds(matrix, np.concatenate(self._right), np.concatenate(self._weight))
+
+
+def _mouth_distance(graph: RoadGraph, stations: Stations, kind: str, options: ProfileOptions) -> Float:
+    """Metres from each station of a bridge or a tunnel to its nearest end, NaN elsewhere."""
+    flag = getattr(graph, kind)
+    a, b, metres, edge = stations.segments
+    of_kind = flag[edge]
+    inside, outside = np.zeros((2, len(stations.xy)), np.bool_)
+    inside[a[of_kind]] = inside[b[of_kind]] = True
+    outside[a[~of_kind]] = outside[b[~of_kind]] = True
+    limit = 4 * (options.clearance + options.deck + options.cover) / options.slope
+    links = a[of_kind], b[of_kind], metres[of_kind]
+    far = _distance(len(stations.xy), links, inside & outside, limit)
+    return np.where(inside, far, np.nan)
+
+
+def _over_obstacles(
+    graph: RoadGraph, stations: Stations, obstacles: Obstacles
+) -> tuple[Int, Float, Float, Float, Float]:
+    """Where bridges cross obstacles: (edge, metres along it, x, y, free height needed)."""
+    once = np.unique(stations.edge)
+    once = once[graph.bridge[once]]
+    lines = np.array([shapely.linestrings(graph.geometry[e][:, :2]) for e in once.tolist()], object)
+    one, two = shapely.STRtree(obstacles.line).query(lines, predicate="intersects")
+    points, pair = shapely.get_parts(shapely.intersection(lines[one], obstacles.line[two]), return_index=True)
+    kept = shapely.get_type_id(points) == shapely.GeometryType.POINT
+    points, one, two = points[kept], one[pair[kept]], two[pair[kept]]
+    x, y = shapely.get_coordinates(points).T
+    return once[one], shapely.line_locate_point(lines[one], points), x, y, obstacles.clear[two]
+
+
+def _solve(
+    graph: RoadGraph, stations: Stations, terrain: Float, bounds: Bounds, options: ProfileOptions
+) -> Float:
+    """Heights (v,) of least cost within the bounds."""
+    from scipy.sparse import csr_array, diags_array  # noqa: PLC0415  (slow to import)
+
+    weight = _weights(graph, stations)
+    p, q, r, before, after = stations.triples
+    before, after = np.maximum(before, 0.5), np.maximum(after, 0.5)
+    reach = (before + after) / 2
+    row = np.arange(len(p))
+    bend = csr_array(
+        (
+            np.concatenate([1 / before, -1 / before - 1 / after, 1 / after]),
+            (np.tile(row, 3), np.concatenate([p, q, r])),
+        ),
+        shape=(len(p), len(terrain)),
+    )
+    stiff = bend.T @ diags_array(options.smooth**4 / reach) @ bend
+    a, b, metres, edge = stations.segments
+    taut = np.where((graph.bridge | graph.tunnel)[edge], options.smooth**4 / _TAUT**2, 0.0)
+    row = np.arange(len(a))
+    rise = csr_array(
+        (np.repeat([-1.0, 1.0], len(a)), (np.tile(row, 2), np.concatenate([a, b]))),
+        shape=(len(a), len(terrain)),
+    )
+    cost = (stiff + rise.T @ diags_array(taut / metres) @ rise + diags_array(weight)).tocsc()
+    return interior_point(cost, weight * terrain, bounds, terrain)
+
+
+def _with_heights(graph: RoadGraph, stations: Stations, z: Float) -> RoadGraph:
+    """The graph at the stations' heights; a line that stays level keeps the vertices that it had."""
+    geometry = np.empty(len(graph), object)
+    begin = np.flatnonzero(np.diff(stations.edge, prepend=-1))
+    for start, stop in zip(begin.tolist(), [*begin[1:].tolist(), len(stations.edge)], strict=True):
+        edge, row = int(stations.edge[start]), stations.row[start:stop]
+        if np.ptp(z[row]) < 1e-3:
+            row = row[stations.drawn[start:stop]]
+        line = np.column_stack([stations.xy[row], z[row]])
+        geometry[edge] = line
+        if graph.twin[edge] >= 0:
+            geometry[graph.twin[edge]] = line[::-1].copy()
+    node_xyz = graph.node_xyz.copy()
+    node_xyz[:, 2] = z[: len(node_xyz)]
+    return replace(graph, geometry=geometry, node_xyz=node_xyz)

@@ -1,0 +1,162 @@
+"""Places along the road graph at which heights are unknown, and how they hang together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.roads import RoadGraph
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+# Arms of a node whose directions differ by less than this (radians) are one road that goes on.
+_GOES_ON = np.radians(40.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Stations:
+    """Stations of a graph, the two edges of a two-way street sharing theirs.
+
+    xy      : (v, 2) float64 scene metres; the first rows are the graph's nodes
+    row     : (r,) int64 stations edge after edge, each edge's from its tail to its head
+    edge    : (r,) int64 edge of each row
+    along   : (r,) float64 scene metres in plan from the edge's tail
+    drawn   : (r,) bool, the row is a vertex of the edge's line (else put in between)
+    """
+
+    xy: Float
+    row: Int
+    edge: Int
+    along: Float
+    drawn: NDArray[np.bool_]
+
+    @property
+    def segments(self) -> tuple[Int, Int, Float, Int]:
+        """Neighbours on an edge: (from (s,), to (s,), metres (s,), edge (s,))."""
+        first = np.flatnonzero(self.edge[1:] == self.edge[:-1])
+        metres = np.maximum(self.along[first + 1] - self.along[first], 1e-3)
+        return self.row[first], self.row[first + 1], metres, self.edge[first]
+
+    @property
+    def triples(self) -> tuple[Int, Int, Int, Float, Float]:
+        """Stations before, at and after each bend: (a, b, c (t,), metres from a to b, and from b to c).
+
+        Within edges, and across nodes where a road goes on.
+        """
+        a, b, metres, edge = self.segments
+        inner = np.flatnonzero(edge[1:] == edge[:-1])
+        inside = (a[inner], b[inner], b[inner + 1], metres[inner], metres[inner + 1])
+        begins = np.flatnonzero(np.diff(edge, prepend=-1))
+        ends = np.flatnonzero(np.diff(edge, append=-1))
+        node = np.concatenate([a[begins], b[ends]])
+        other = np.concatenate([b[begins], a[ends]])
+        far = np.concatenate([metres[begins], metres[ends]])
+        away = self.xy[other] - self.xy[node]
+        away /= np.maximum(np.hypot(*away.T), 1e-9)[:, None]
+        i, j = _pairs(node)
+        on = (away[i] * away[j]).sum(axis=1) < -np.cos(_GOES_ON)
+        i, j = i[on], j[on]
+        across = (other[i], node[i], other[j], far[i], far[j])
+        joined = [np.concatenate(columns) for columns in zip(inside, across, strict=True)]
+        return joined[0], joined[1], joined[2], joined[3], joined[4]
+
+    def at(self, edge: Int, along: Float) -> tuple[Int, Int, Float]:
+        """Stations before and after places on edges, and the share (0..1) of the latter."""
+        # One rising number for all edges, so that one search serves them all.
+        step = float(self.along.max(initial=0.0)) + 1.0
+        key = self.edge * step + self.along
+        after = np.searchsorted(key, edge * step + along, side="right")
+        first = np.searchsorted(self.edge, edge, side="left")
+        last = np.searchsorted(self.edge, edge, side="right") - 1
+        after = np.clip(after, first + 1, last)
+        before = after - 1
+        metres = np.maximum(self.along[after] - self.along[before], 1e-9)
+        share = np.clip((along - self.along[before]) / metres, 0.0, 1.0)
+        return self.row[before], self.row[after], share
+
+
+def _pairs(group: Int) -> tuple[Int, Int]:
+    """All pairs i < j of rows of equal group."""
+    order = np.argsort(group, kind="stable")
+    size = np.bincount(group)[group[order]]
+    start = np.searchsorted(group[order], group[order])
+    ahead = size - 1 - (np.arange(len(order)) - start)
+    i = np.repeat(np.arange(len(order)), ahead)
+    j = i + 1 + np.arange(len(i)) - np.repeat(np.cumsum(ahead) - ahead, ahead)
+    return order[i], order[j]
+
+
+def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
+    """Stations at all vertices and, between them, at most ``spacing`` metres apart."""
+    once = np.flatnonzero((graph.twin < 0) | (graph.twin > np.arange(len(graph))))
+    rows, edges, alongs, drawns, places = [], [], [], [], [graph.node_xyz[:, :2]]
+    count = len(graph.node_id)
+    for edge in once.tolist():
+        xy = graph.geometry[edge][:, :2]
+        corner = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+        pieces = np.maximum(np.ceil(np.diff(corner) / spacing), 1).astype(np.int64)
+        first = np.repeat(np.arange(len(pieces)), pieces)
+        part = np.arange(len(first)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        along = np.append(corner[first] + part * (np.diff(corner) / pieces)[first], corner[-1])
+        inner = len(along) - 2
+        rows.append(np.r_[graph.tail[edge], np.arange(count, count + inner), graph.head[edge]])
+        places.append(np.stack([np.interp(along[1:-1], corner, column) for column in xy.T], axis=1))
+        edges.append(np.full(len(along), edge))
+        alongs.append(along)
+        drawns.append(np.append(part == 0, True))
+        count += inner
+    if not len(once):
+        none = np.empty(0, np.int64)
+        return Stations(graph.node_xyz[:, :2], none, none, np.empty(0), np.empty(0, np.bool_))
+    return Stations(
+        np.concatenate(places),
+        np.concatenate(rows).astype(np.int64),
+        np.concatenate(edges),
+        np.concatenate(alongs),
+        np.concatenate(drawns),
+    )
+
+
+def find_crossings(graph: RoadGraph, stations: Stations) -> tuple[Int, Float, Int, Float, Float]:
+    """Where one road runs over another: (upper edge, metres along it, lower edge, metres along it, margin).
+
+    Those are lines that cross in plan without a common node there and differ in layer, or in being bridge or
+    tunnel. The margin is how far along the upper road half the lower road's width reaches, metres.
+    """
+    once = np.unique(stations.edge)
+    lines = np.array([shapely.linestrings(graph.geometry[e][:, :2]) for e in once.tolist()], object)
+    rank = graph.layer[once] * 2.0 + graph.bridge[once] - graph.tunnel[once]
+    one, two = shapely.STRtree(lines).query(lines, predicate="intersects")
+    over = rank[one] > rank[two]
+    one, two = one[over], two[over]
+    points, pair = shapely.get_parts(shapely.intersection(lines[one], lines[two]), return_index=True)
+    point = shapely.get_type_id(points) == shapely.GeometryType.POINT
+    points, one, two = points[point], one[pair[point]], two[pair[point]]
+    xy = shapely.get_coordinates(points)
+    at_node = np.zeros(len(points), np.bool_)
+    for upper_end in (graph.tail, graph.head):
+        for lower_end in (graph.tail, graph.head):
+            same = upper_end[once[one]] == lower_end[once[two]]
+            near = np.hypot(*(graph.node_xyz[upper_end[once[one]], :2] - xy).T) < 0.5
+            at_node |= same & near
+    points, one, two = points[~at_node], one[~at_node], two[~at_node]
+    upper, lower = (shapely.line_locate_point(lines[k], points) for k in (one, two))
+    sine = np.clip(np.abs(_cross(_heading(lines[one], upper), _heading(lines[two], lower))), 0.2, 1.0)
+    return once[one], upper, once[two], lower, graph.width[once[two]] / 2 / sine
+
+
+def _heading(lines: NDArray[np.object_], along: Float) -> Float:
+    step = np.minimum(1.0, shapely.length(lines) / 4)
+    at = np.clip(along, step, shapely.length(lines) - step)
+    a, b = (shapely.get_coordinates(shapely.line_interpolate_point(lines, at + s)) for s in (-step, step))
+    way: Float = (b - a) / np.maximum(np.hypot(*(b - a).T), 1e-9)[:, None]
+    return way
+
+
+def _cross(a: Float, b: Float) -> Float:
+    turn: Float = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return turn
