@@ -44,6 +44,10 @@ class Echoes:
         """Chosen rows."""
         return Echoes(*(getattr(self, f.name)[rows] for f in fields(self)))
 
+    def where(self, keep: NDArray[np.bool_]) -> Echoes:
+        """The rows of a mask, without a copy if that is all."""
+        return self if keep.all() else self.take(keep)
+
 
 def joined(first: Echoes, *others: Echoes) -> Echoes:
     """All rows, sorted by pulse and range."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from lidar.cloud import Cloud
@@ -68,7 +70,7 @@ def scan(
     )
     alone = effects.rays == 1 and not effects.mirrors
     echoes = surfaces if alone else merged(surfaces, sensor.echo_separation)
-    echoes = echoes.take(echoes.range + offset >= sensor.min_range)
+    echoes = echoes.where(echoes.range + offset >= sensor.min_range)
     if effects.link or effects.detection:
         echoes = detected(sensor, echoes, effects, generator(seed, sensor.name, frame, "detection"))
     false = false_echoes(sensor, pulses, echoes, effects, seed, frame)
@@ -81,8 +83,9 @@ def scan(
         )
         echoes, number, count = echoes.take(rows), number[rows], np.minimum(count[rows], sensor.max_echoes)
     distance = measured_range(sensor, pulses, echoes, effects, seed, frame)
-    keep = np.flatnonzero((distance >= sensor.min_range) & (distance <= sensor.max_range))
-    return _cloud(sensor, pulses, echoes.take(keep), distance[keep], number[keep], count[keep], effects)
+    keep = (distance >= sensor.min_range) & (distance <= sensor.max_range)
+    echoes, distance, number, count = echoes.where(keep), distance[keep], number[keep], count[keep]
+    return _cloud(sensor, pulses, echoes, distance, number, count, effects)
 
 
 def _cloud(
@@ -95,13 +98,15 @@ def _cloud(
     effects: Effects,
 ) -> Cloud:
     pulse, offset, start = echoes.pulse, sensor.pattern.range_offset, int(pulses.time_ns[0])
-    xyz = pulses.origin[pulse] + (distance - offset)[:, None] * pulses.direction[pulse]
+    n = len(pulse)
+    xyz, time = np.empty((n, 3), np.float32), np.empty(n, np.int32)
+    _place(pulse, distance - offset, pulses.origin, pulses.direction, pulses.time_ns, xyz, time)
     code = reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code, whole=effects.quantise)
     real = echoes.true_range > 0
     return Cloud(
         start_ns=start,
-        xyz=xyz.astype(np.float32),
-        time_ns=(pulses.time_ns[pulse] - start).astype(np.int32),
+        xyz=xyz,
+        time_ns=time,
         ring=pulses.ring[pulse],
         column=pulses.column[pulse],
         range=distance,
@@ -113,6 +118,17 @@ def _cloud(
         echo=number,
         echoes=count,
     )
+
+
+@njit(cache=True, nogil=True)
+def _place(pulse: Any, reach: Any, origin: Any, direction: Any, time_ns: Any, xyz: Any, time: Any) -> None:
+    """Fill ``xyz`` and ``time`` of returns."""
+    for i in range(len(pulse)):
+        p = pulse[i]
+        xyz[i, 0] = origin[p, 0] + reach[i] * direction[p, 0]
+        xyz[i, 1] = origin[p, 1] + reach[i] * direction[p, 1]
+        xyz[i, 2] = origin[p, 2] + reach[i] * direction[p, 2]
+        time[i] = time_ns[p] - time_ns[0]
 
 
 def _unsteady(pulses: Firings, sensor: Sensor, rng: np.random.Generator) -> Firings:

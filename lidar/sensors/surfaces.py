@@ -191,6 +191,8 @@ def _along(
 
 
 def _rows(hits: Hits, rows: NDArray[np.int32] | NDArray[np.bool_]) -> Hits:
-    """Chosen rows."""
+    """Chosen rows, without a copy if that is all in order."""
+    if len(rows) == len(hits.range) and rows.dtype != np.bool_:
+        return hits
     normal = hits.normal[rows] if len(hits.normal) else hits.normal
     return Hits(hits.range[rows], hits.face[rows], hits.instance[rows], hits.cosine[rows], normal)
