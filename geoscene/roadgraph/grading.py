@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from geoscene.frames import Frame
 from geoscene.roadgraph.carriageways import place_of
+from geoscene.roadgraph.long_profile import Height, Obstacles
 from geoscene.roadgraph.paths import way_lines
-from geoscene.roadgraph.profile import Height, Obstacles
 from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
 from geoscene.roads import RoadGraph
 from geoscene.sources.data import OsmData, Tags
@@ -82,6 +82,7 @@ def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 1.0, ba
         most = np.zeros(len(z))
         np.maximum.at(most, point, share)
         blend = most * most * (3.0 - 2.0 * most)
-        return z + blend * (road_z - z)
+        graded: Float = z + blend * (road_z - z)
+        return graded
 
     return height
