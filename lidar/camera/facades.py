@@ -103,6 +103,16 @@ BAY, STOREY, FLOORS, WIDE, TALL, RISE, SHOP_WIDE, SHOP_TALL, BAND, PAINT = range
 """Columns of `Facades.style`."""
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _chances(feature: NDArray[np.int32], count: int) -> Float:
+    """Numbers (k, count) from 0 to 1 that belong to feature numbers (k,)."""
+    out = np.empty((len(feature), count))
+    for i in range(len(feature)):
+        for j in range(count):
+            out[i, j] = hashed(feature[i], j, 20)
+    return out
+
+
 def _styles(feature: NDArray[np.int32], along: Float, height: Float) -> Float:
     """How windows look on each wall (k, 10), out of the building's number alone: no map says.
 
@@ -110,7 +120,7 @@ def _styles(feature: NDArray[np.int32], along: Float, height: Float) -> Float:
     SHOP_WIDE is 0 where the ground floor is like the others, BAND where no line marks the storeys.
     """
     style = np.zeros((len(feature), 10))
-    chance = np.array([[hashed(int(f), j, 20) for j in range(8)] for f in feature]).reshape(-1, 8)
+    chance = _chances(feature, 7)
     width = along[:, 1] - along[:, 0]
     storey = 2.9 + 0.7 * chance[:, 0]
     bays = np.floor(width / (2.1 + 1.7 * chance[:, 1]))

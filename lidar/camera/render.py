@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -85,6 +84,8 @@ class View:
     direction : (n, 3) in the scene's axes
     seen      : (n,) False for a pixel that sees nothing
     time      : (n,) ray times, or None
+    hits      : what the rays hit
+    surfaces  : and what that is
     """
 
     origin: Float
@@ -149,7 +150,8 @@ def render(
         electrons = random.standard_normal((h, w, 3), np.float32)
     middle = samples // 2
 
-    def band(first: int, last: int) -> None:
+    def band(edges: tuple[int, int]) -> None:
+        first, last = edges
         view = _view(camera, poses, world, middle, first, last, times)
         surfaces, distance = view.surfaces, view.hits.range
         if coloured:
@@ -172,21 +174,14 @@ def render(
         feature[first:last] = surfaces.feature.reshape(-1, w)
 
     step = max(1, _BAND // (w * k * k))
-    edges = [(a, min(a + step, h)) for a in range(0, h, step)]
-    _each(band, edges, options.threads)
+    bands = [(a, min(a + step, h)) for a in range(0, h, step)]
+    if options.threads == 1:
+        for edges in bands:
+            band(edges)
+    else:
+        with ThreadPoolExecutor(options.threads) as pool:
+            list(pool.map(band, bands))
     return Frame(rgb if coloured else None, depth, klass, feature)
-
-
-def _each(work: object, items: Iterable[tuple[int, int]], threads: int) -> None:
-    """Call ``work`` on every item, on several threads where asked."""
-    call = functools.partial(lambda f, ab: f(*ab), work)
-    if threads == 1:
-        for item in items:
-            call(item)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(call, items):
-            pass
 
 
 @functools.lru_cache(maxsize=8)
