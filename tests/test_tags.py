@@ -16,7 +16,7 @@ metres = st.decimals(min_value=0, max_value=2000, places=3).map(float)
     [
         ("12", 12.0), ("48.5 m", 48.5), ("48.5m", 48.5), ("9,5", 9.5), ("5;6", 5.0), ("~10", 10.0),
         ("ca. 7 m", 7.0), ("12'6\"", 150 * 0.0254), ("12' 6''", 150 * 0.0254), ("12′6″", 150 * 0.0254),
-        ("5 ft 6 in", 66 * 0.0254), ("574'", 574 * 0.3048), ("6 ft", 6 * 0.3048), ("8\"", 8 * 0.0254),
+        ("5 ft 6 in", 66 * 0.0254), ("574'", 574 * 0.3048), ("6 ft", 6 * 0.3048), ('8"', 8 * 0.0254),
         ("1.2 km", 1200.0), ("250 cm", 2.5), ("1,234.5", 1234.5), ("1.234,5 m", 1234.5), ("-3", -3.0),
         ("2 storeys", None), ("high", None), ("", None), (None, None), ("1.2.3", None), ("10-12", None),
         ("1e3", None), ("nan", None), ("inf", None), ("12 m2", None), ("9" * 400, None),
@@ -27,10 +27,18 @@ def test_a_length_is_read_in_metres(text, expected):
     assert found is None if expected is None else found == pytest.approx(expected, rel=1e-12)
 
 
-@given(metres, st.sampled_from([("m", 1.0), ("", 1.0), ("km", 1000.0), ("ft", 0.3048), ("'", 0.3048), ("mi", 1609.344)]))
+@given(
+    metres,
+    st.sampled_from([("m", 1.0), ("", 1.0), ("km", 1000.0), ("ft", 0.3048), ("'", 0.3048), ("mi", 1609.344)]),
+)
 def test_unit_space_and_decimal_comma_do_not_matter(value, unit):
     name, size = unit
-    for text in (f"{value}{name}", f"{value} {name}", f" {value} {name.upper()} ", f"{value}{name}".replace(".", ",")):
+    for text in (
+        f"{value}{name}",
+        f"{value} {name}",
+        f" {value} {name.upper()} ",
+        f"{value}{name}".replace(".", ","),
+    ):
         assert parse_length(text) == pytest.approx(value * size, rel=1e-12)
 
 
@@ -65,7 +73,16 @@ def test_a_direction_is_a_bearing_below_360(degrees):
 
 @pytest.mark.parametrize(
     ("text", "expected"),
-    [("N", 0), ("e", 90), ("SW", 225), ("NNE", 22.5), ("north-west", 315), ("South", 180), ("up", None), (None, None)],
+    [
+        ("N", 0),
+        ("e", 90),
+        ("SW", 225),
+        ("NNE", 22.5),
+        ("north-west", 315),
+        ("South", 180),
+        ("up", None),
+        (None, None),
+    ],
 )
 def test_compass_points_are_bearings(text, expected):
     assert parse_direction(text) == expected
@@ -81,7 +98,8 @@ def test_a_hex_colour_is_its_bytes(rgb):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("red", (255, 0, 0)), ("light grey", (211, 211, 211)), ("Dark_Red", (139, 0, 0)), ("#fa0", (255, 170, 0)),
+        ("red", (255, 0, 0)), ("light grey", (211, 211, 211)), ("Dark_Red", (139, 0, 0)),
+        ("#fa0", (255, 170, 0)),
         ("white;red", (255, 255, 255)), ("multicolour", None), ("#12", None), (None, None), ("", None),
     ],
 )  # fmt: skip

@@ -12,7 +12,8 @@ from geoscene.validate import validate_mesh
 
 CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float)
 BOX = np.array(
-    [[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [1, 3, 7], [1, 7, 5], [3, 2, 6], [3, 6, 7],
+    [[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [1, 3, 7], [1, 7, 5], [3, 2, 6],
+     [3, 6, 7],
      [2, 0, 4], [2, 4, 6]]
 )  # fmt: skip
 
@@ -23,7 +24,11 @@ def box(feature=0, *, at=(0.0, 0.0, 0.0), size=(1.0, 1.0, 1.0)):
 
 def soup(mesh):
     """The same triangles, each with vertices of its own."""
-    return replace(mesh, vertices=mesh.vertices[mesh.faces].reshape(-1, 3), faces=np.arange(3 * len(mesh), dtype=np.int32).reshape(-1, 3))
+    return replace(
+        mesh,
+        vertices=mesh.vertices[mesh.faces].reshape(-1, 3),
+        faces=np.arange(3 * len(mesh), dtype=np.int32).reshape(-1, 3),
+    )
 
 
 def without_a_face(mesh):
@@ -80,7 +85,7 @@ BROKEN = {
 
 
 @given(
-    st.tuples(*[st.integers(-10**7, 10**7)] * 3),
+    st.tuples(*[st.integers(-(10**7), 10**7)] * 3),
     st.tuples(*[st.integers(1, 10**6)] * 3),
     st.booleans(),
 )

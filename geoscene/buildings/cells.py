@@ -198,8 +198,8 @@ def skeleton_cells(skeleton: Skeleton) -> Cells:
 def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:
     """Rings (node numbers) without needles that cross themselves on the grid.
 
-    Where a node of a ring lies within two millimetres of another arc of the ring, the arc is led through it, in
-    the ring beyond too, and the ring falls into two.
+    Where a node of a ring lies within two millimetres of another arc of the ring, the arc is led through it,
+    in the ring beyond too, and the ring falls into two.
     """
     rings = list(rings)
     for _ in range(8 * len(rings)):

@@ -44,7 +44,8 @@ def clean(polygons: Polygons) -> tuple[Polygons, NDArray[np.bool_]]:
     """Valid polygons on the grid (n,), and which of them had to be repaired.
 
     What remains of a polygon may be a MultiPolygon, or empty. Rings of the result do not touch: where they
-    met in a point, a notch of 2 mm parts them, because a wall edge there would carry four faces.
+    met in a point, a notch of 2 mm parts them (up to 100 mm in thin wedges), because a wall edge there would
+    carry four faces.
     """
     out = np.array(polygons, dtype=object)
     finite = np.isfinite(shapely.bounds(out)).all(axis=1) & ~shapely.is_empty(out)
@@ -81,33 +82,31 @@ def _flatten(parts: Polygons, row: NDArray[np.integer]) -> tuple[Polygons, NDArr
 
 
 def _pinched(polygons: Polygons) -> NDArray[np.bool_]:
-    """(n,) bool: some vertex occurs twice in the rings of the polygon."""
-    rings, ring_row = shapely.get_rings(shapely.get_parts(polygons), return_index=True)
-    piece_row = shapely.get_parts(polygons, return_index=True)[1]
-    xy, ring = shapely.get_coordinates(rings, return_index=True)
-    row = piece_row[ring_row[ring]]
-    last = np.r_[ring[1:] != ring[:-1], True] if len(ring) else np.empty(0, np.bool_)
-    table = np.column_stack((row[~last], np.rint(xy[~last] * 1e4)))
-    order = np.lexsort(table.T[::-1])
-    twice = (np.diff(table[order], axis=0) == 0).all(axis=1)
-    pinched = np.zeros(len(polygons), np.bool_)
-    pinched[table[order[1:][twice], 0].astype(int)] = True
-    return pinched
+    """(n,) bool: rings of the polygon touch."""
+    return np.asarray(~shapely.is_simple(shapely.boundary(polygons)), np.bool_)
 
 
 def _part_rings(polygon: Any) -> Any:
-    """The polygon less a small notch at every vertex that occurs twice."""
-    for _ in range(3):
-        xy = np.concatenate(
-            [shapely.get_coordinates(r)[:-1] for r in shapely.get_rings(shapely.get_parts(polygon))]
-        )
-        distinct, count = np.unique(np.rint(xy * 1e4), axis=0, return_counts=True)
-        if not (count > 1).any():
+    """The polygon less a notch wherever a corner of a ring lies on another ring."""
+    points, cut = _touching(polygon), polygon
+    # the notch opens the point only if the rings leave it by more than the grid: thin wedges need larger ones
+    for reach in (NOTCH, 10 * NOTCH, 50 * NOTCH):
+        notches = shapely.union_all(shapely.buffer(points, reach, quad_segs=1))
+        cut = _polygonal(np.array([shapely.difference(polygon, notches, grid_size=GRID)], dtype=object))[0]
+        if not len(_touching(cut)):
             break
-        notches = shapely.buffer(shapely.points(distinct[count > 1] / 1e4), NOTCH, quad_segs=1)
-        cut = shapely.difference(polygon, shapely.union_all(notches), grid_size=GRID)
-        polygon = _polygonal(np.array([cut], dtype=object))[0]
-    return polygon
+    return cut
+
+
+def _touching(polygon: Any) -> Polygons:
+    """The corners of a polygon's rings that lie on other rings, as points."""
+    rings = shapely.get_rings(shapely.get_parts(polygon))
+    corners, ring = shapely.get_coordinates(rings, return_index=True)
+    points = shapely.points(corners)
+    distance = shapely.distance(points[:, None], rings)
+    distance[np.arange(len(ring)), ring] = np.inf
+    found: Polygons = points[distance.min(axis=1, initial=np.inf) < GRID / 2]
+    return found
 
 
 def subtract(polygon: Any, others: Any, *, sliver: float = 0.02) -> Any:

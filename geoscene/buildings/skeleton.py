@@ -273,7 +273,8 @@ def straight_skeleton(polygon: Any) -> Skeleton | None:
 def _joined(skeleton: Skeleton) -> Skeleton:
     """The skeleton with nodes joined that an arc shorter than a millimetre connects.
 
-    On a grid the many nodes near one point, as in the middle of a regular polygon, would fall over one another.
+    On a grid the many nodes near one point, as in the middle of a regular polygon, would fall over each
+    other.
     """
     parent = list(range(len(skeleton.xy)))
 

@@ -172,8 +172,7 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ids, list
         body, grooves = united
         out.append(body)
         if grooves:
-            detail = f"{grooves} edges where bodies only touched, parted by grooves of a few millimetres"
-            notes.append(_problem(buildings, building, "repaired", "touching-bodies", detail))
+            notes.append(_problem(buildings, building, "repaired", "touching-bodies", grooves))
     result = join(out)
     united_fine = sound(replace(result, piece=pieces.building[result.piece]), len(buildings))
     failed |= {int(b) for b in np.unique(pieces.building) if not united_fine[b]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from typing import Any
 
 import manifold3d as m3
@@ -13,12 +12,13 @@ from geoscene.buildings.shells import Float, Ids, Triangles
 from geoscene.mesh import WALL
 from geoscene.validate import degenerate_faces, edge_uses, weld
 
-GROOVE = 2e-3
-"""Reach of the groove that parts two bodies of one building which meet in an edge only, metres."""
+GROOVES = (2e-3, 2e-2, 1e-1)
+"""Reach of the groove that parts two bodies of one building which meet in an edge only, metres; the next
+where the bodies leave the edge in so thin a wedge that the grid closes it again."""
 
 
-def unite(shells: Triangles) -> tuple[Triangles, int] | None:
-    """The union of the closed shells of one building, and the number of grooves cut; None if there is none.
+def unite(shells: Triangles) -> tuple[Triangles, str] | None:
+    """The union of the closed shells of one building, and what grooves were cut or ""; None if there is none.
 
     Faces keep the piece and surface they come from.
     """
@@ -30,8 +30,8 @@ def unite(shells: Triangles) -> tuple[Triangles, int] | None:
     if any(body is None for body in bodies):
         return None
     body = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
-    grooves = 0
-    for attempt in range(4):
+    cut = ""
+    for reach in (*GROOVES, None):
         if body.status() != m3.Error.NoError or body.is_empty():
             return None
         corners, run = _triangles(body, first)
@@ -40,9 +40,11 @@ def unite(shells: Triangles) -> tuple[Triangles, int] | None:
             known = (run >= 0) & (run < 4 * len(pieces))
             piece = pieces[np.where(known, run // 4, 0)]
             surface = np.where(known, run % 4, WALL).astype(np.uint8)
-            return Triangles(to_grid(corners + origin), piece, surface), grooves
-        grooves += len(seams)
-        cutters = [_cutter(a, b, GROOVE * (1 + attempt)) for a, b in seams]
+            return Triangles(to_grid(corners + origin), piece, surface), cut
+        if reach is None:
+            break
+        cut = f"{len(seams)} edges where bodies only touched, parted by grooves of {1e3 * reach:.0f} mm"
+        cutters = [_cutter(a, b, reach) for a, b in seams]
         body = m3.Manifold.batch_boolean([body, *cutters], m3.OpType.Subtract)
     return None
 
@@ -139,11 +141,3 @@ def _cutter(a: Float, b: Float, reach: float) -> Any:
     turn = np.array([[0.936, -0.275, 0.218], [0.290, 0.956, -0.036], [-0.199, 0.097, 0.975]])
     star = np.vstack([turn, -turn]) * reach
     return m3.Manifold.hull_points(np.vstack([a + star, b + star]))
-
-
-def by_building(building: Ids) -> dict[int, list[int]]:
-    """Pieces of each building, in order."""
-    out: dict[int, list[int]] = defaultdict(list)
-    for piece, owner in enumerate(building.tolist()):
-        out[owner].append(piece)
-    return out
