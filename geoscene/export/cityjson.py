@@ -1,0 +1,380 @@
+"""CityJSON 2.0: semantic city objects, the solids as solids, the trees as copies of templates."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from geoscene.classes import Class, materials
+from geoscene.errors import InputError
+from geoscene.export.files import Summary, append, size_of, spool, whole_file
+from geoscene.export.objects import (
+    Features,
+    Part,
+    Piece,
+    attribution,
+    geoscene_lod,
+    klass_name,
+    parts,
+    pieces,
+    read_features,
+)
+from geoscene.export.shells import bodies, shell_numbers
+from geoscene.frames import Frame, utm_crs
+from geoscene.mesh import FLOOR, ROOF, WALL, Mesh
+from geoscene.progress import Progress, silent
+from geoscene.scene import Instances, Scene
+
+Float = NDArray[np.float64]
+
+STEP = 1e-4
+"""Metres between whole numbers of the file: the grid that solids lie on, so that nothing moves."""
+
+STEP_ELSEWHERE = 1e-5
+"""The same in a CRS other than the scene's, where neighbours on the old grid must not fall together."""
+
+LOD = {0: "1.1", 1: "1.3", 2: "2.1"}
+"""The scene's level of detail in the terms of Biljecki, Ledoux and Stoter, "An improved LOD specification
+for 3D building models" (2016): blocks; parts of several heights; roofs over indented outlines."""
+
+_TYPES: dict[int, str] = {
+    Class.ROAD: "Road",
+    Class.LANE_MARKING: "Road",
+    Class.CROSSING: "Road",
+    Class.SIDEWALK: "Road",
+    Class.KERB: "Road",
+    Class.PARKING: "Road",
+    Class.RAIL: "Railway",
+    Class.TERRAIN: "TINRelief",
+    Class.GRASS: "LandUse",
+    Class.FOREST_FLOOR: "LandUse",
+    Class.SAND: "LandUse",
+    Class.BUILDING_PAD: "LandUse",
+    Class.WATER: "WaterBody",
+    Class.BUILDING: "Building",
+    Class.BRIDGE: "Bridge",
+    Class.TUNNEL: "Tunnel",
+    Class.WALL: "CityFurniture",
+    Class.FENCE: "CityFurniture",
+    Class.HEDGE: "PlantCover",
+    Class.TREE_CROWN: "SolitaryVegetationObject",
+    Class.TRUNK: "SolitaryVegetationObject",
+    Class.POLE: "CityFurniture",
+    Class.TRAFFIC_SIGN: "CityFurniture",
+    Class.TRAFFIC_LIGHT: "CityFurniture",
+    Class.BOLLARD: "CityFurniture",
+    Class.BENCH: "CityFurniture",
+    Class.OTHER_STRUCTURE: "OtherConstruction",
+}
+_CONSTRUCTIONS = frozenset({"Building", "Bridge", "Tunnel", "OtherConstruction"})
+_AUXILIARY = frozenset({Class.KERB, Class.LANE_MARKING})
+
+
+_PARTS = {"Railway": "TrafficArea", "WaterBody": "WaterSurface"}
+
+
+class _Palette:
+    """Numbers of the file's materials, in order of first use."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[tuple[int, ...], int] = {}
+
+    def values(self, mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Number of the material (m,) of each face."""
+        looks = np.column_stack([mesh.material[rows], mesh.color[rows]])
+        known, which = np.unique(looks, axis=0, return_inverse=True)
+        numbers = [self._numbers.setdefault(tuple(look), len(self._numbers)) for look in known.tolist()]
+        chosen: NDArray[np.int64] = np.array(numbers, np.int64)[which.ravel()]
+        return chosen
+
+    def to_json(self) -> dict[str, Any]:
+        """CityJSON's ``appearance``."""
+        names = {material.code: name for name, material in materials().items()}
+        return {
+            "materials": [
+                {"name": names.get(code, "unknown"), "diffuseColor": [round(v / 255, 4) for v in rgb]}
+                for code, *rgb in self._numbers
+            ]
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class _Target:
+    """Where the coordinates of a file are counted from: CRS, step and zero."""
+
+    frame: Frame
+    crs: CRS
+    same: bool
+    step: float
+    zero: Float
+
+    def whole(self, points: Float) -> NDArray[np.int64]:
+        """Whole numbers (n, 3) of points in scene metres."""
+        x, y = (
+            self.frame.to_projected(points[:, 0], points[:, 1])
+            if self.same
+            else self.frame.to_crs(self.crs, points[:, 0], points[:, 1])
+        )
+        moved = np.column_stack([x, y, points[:, 2]]) - self.zero
+        return np.rint(moved * (1.0 / self.step)).astype(np.int64)
+
+
+def _target(scene: Scene, crs: str | None) -> tuple[_Target, tuple[str, ...]]:
+    """The CRS asked for; else the scene's where it has an EPSG code, else UTM, which has one."""
+    notes: tuple[str, ...] = ()
+    xmin, ymin, xmax, ymax = scene.bounds
+    middle = ((xmin + xmax) / 2, (ymin + ymax) / 2)
+    if crs is None and not scene.frame.name.startswith("EPSG:"):
+        crs = utm_crs(*(float(v) for v in scene.frame.to_geographic(*middle)))
+        notes = (f"CityJSON names a CRS by its code and the scene's has none: coordinates are in {crs}",)
+    try:
+        parsed = CRS.from_user_input(crs or scene.frame.name)
+    except Exception as error:
+        raise InputError(f"--crs {crs}: pyproj does not know it; give EPSG:<number>") from error
+    if not parsed.is_projected or parsed.to_epsg() is None:
+        raise InputError(f"--crs {crs}: CityJSON needs a projected CRS with an EPSG code")
+    same = parsed == scene.frame.crs
+    x, y = scene.frame.to_crs(parsed, *middle)
+    zero = np.array([np.floor(x), np.floor(y), 0.0])
+    return _Target(scene.frame, parsed, same, STEP if same else STEP_ELSEWHERE, zero), notes
+
+
+def write_cityjson(
+    scene: Scene,
+    path: Path,
+    *,
+    crs: str | None = None,
+    layers: Collection[str] | None = None,
+    progress: Progress = silent,
+) -> Summary:
+    """Write a scene as CityJSON 2.0, tile by tile.
+
+    Buildings are Solids (MultiSolids where they are of several bodies, cavities as inner shells) with
+    RoofSurface, WallSurface, GroundSurface and, under what overhangs, OuterCeilingSurface; roads, water, land
+    cover and the bare terrain are surfaces, cut at the tiles' edges; trees and street furniture are geometry
+    instances. Attributes are those of ``features.gpkg``, sources of guesses included.
+
+    crs : projected, with an EPSG code; the scene's own where it has one, else UTM
+
+    Raises InputError for a CRS that CityJSON cannot name.
+    """
+    target, notes = _target(scene, crs)
+    features = read_features(scene)
+    library = list(scene.shapes().values())
+    palette = _Palette()
+    lod = LOD[geoscene_lod(scene)]
+    objects = solids = faces = count = 0
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    with whole_file(path) as out, spool(path) as vertices:
+        out.write(b'{"type":"CityJSON","version":"2.0","CityObjects":{')
+        for done, part in enumerate(parts(scene, layers)):
+            progress("CityJSON", done, len(scene.tile_indices))
+            whole, entries, closed = _tile_objects(part, features, library, target, palette, lod, count)
+            for name, entry in entries:
+                out.write(b",\n" if objects else b"\n")
+                out.write(_json(name) + b":" + _json(entry))
+                objects += 1
+            if len(whole):
+                vertices.write(b",\n" if count else b"\n")
+                vertices.write(_json(whole.tolist())[1:-1])
+                low, high = np.minimum(low, whole.min(axis=0)), np.maximum(high, whole.max(axis=0))
+            count += len(whole)
+            solids += closed
+            faces += len(part.mesh)
+        out.write(b'},\n"vertices":[')
+        append(out, vertices)
+        out.write(b"],\n")
+        if library:
+            out.write(b'"geometry-templates":' + _json(_templates(library, palette)) + b",\n")
+        out.write(b'"appearance":' + _json(palette.to_json()) + b",\n")
+        extent = np.concatenate([low, high]) * target.step + np.tile(target.zero, 2)
+        out.write(b'"transform":' + _json({"scale": [target.step] * 3, "translate": target.zero.tolist()}))
+        out.write(b',\n"metadata":' + _json(_metadata(scene, target, extent if count else None)) + b"}\n")
+    files, size = size_of(path)
+    return Summary(
+        path, "cityjson", files, size, objects, solids, faces, f"EPSG:{target.crs.to_epsg()}", notes
+    )
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _metadata(scene: Scene, target: _Target, extent: Float | None) -> dict[str, Any]:
+    title = [str(scene.manifest.get("name", "")), attribution(scene)]
+    out: dict[str, Any] = {"title": " - ".join(filter(None, title))}
+    if "fingerprint" in scene.manifest:
+        out["identifier"] = str(scene.manifest["fingerprint"])
+    if extent is not None:
+        out["geographicalExtent"] = np.round(extent, 5).tolist()
+    out["referenceSystem"] = f"https://www.opengis.net/def/crs/EPSG/0/{target.crs.to_epsg()}"
+    return out
+
+
+def _tile_objects(
+    part: Part,
+    features: Features,
+    library: Sequence[Mesh],
+    target: _Target,
+    palette: _Palette,
+    lod: str,
+    first: int,
+) -> tuple[NDArray[np.int64], list[tuple[str, dict[str, Any]]], int]:
+    """The tile's vertices as whole numbers, its city objects by name, and how many of them are solids."""
+    mesh = part.mesh
+    anchors = part.instances.transform[:, :, 3]
+    points = np.concatenate([mesh.vertices, anchors]) + part.origin
+    whole, ids = np.unique(target.whole(points), axis=0, return_inverse=True)
+    ids = ids.ravel()
+    corners = ids[mesh.faces].astype(np.int64)
+    found = pieces(mesh)
+    owner = np.zeros(len(mesh), np.int64)
+    for number, piece in enumerate(found):
+        owner[piece.rows] = number
+    closed = np.flatnonzero(mesh.closed)
+    shell = np.full(len(mesh), -1, np.int64)
+    shell[closed] = shell_numbers(corners[closed], owner[closed])
+    entries = []
+    solids = 0
+    for piece in found:
+        kind = _TYPES.get(piece.klass, "OtherConstruction" if piece.solid else "LandUse")
+        look = palette.values(mesh, piece.rows)
+        if piece.solid:
+            shells = shell[piece.rows]
+            geometry = _solid(mesh, piece, whole, corners[piece.rows], shells, look, first, kind)
+            solids += 1
+        else:
+            geometry = _surface(piece, corners[piece.rows] + first, look, kind)
+        entry = {
+            "type": kind,
+            "attributes": {"class": klass_name(piece.klass), **features.attributes(piece.feature)},
+            "geometry": [{"lod": lod if kind in _CONSTRUCTIONS else "1", **geometry}],
+        }
+        entries.append((_name(features, piece, part.index), entry))
+    entries += _copies(part.instances, features, library, part.index, ids[len(mesh.vertices) :] + first)
+    return whole, entries, solids
+
+
+def _name(features: Features, piece: Piece, index: tuple[int, int]) -> str:
+    name = features.name(piece.feature)
+    if piece.solid and piece.feature >= 0:
+        return name
+    return f"{name}/{klass_name(piece.klass)}@{index[0]}_{index[1]}"
+
+
+def _solid(
+    mesh: Mesh,
+    piece: Piece,
+    whole: NDArray[np.int64],
+    triangles: NDArray[np.int64],
+    shell: NDArray[np.int64],
+    look: NDArray[np.int64],
+    first: int,
+    kind: str,
+) -> dict[str, Any]:
+    groups = bodies(whole.astype(float), triangles, shell)
+
+    def spread(values: NDArray[np.int64]) -> list[Any]:
+        nested = [[values[rows].tolist() for rows in body] for body in groups]
+        return nested if len(groups) > 1 else nested[0]
+
+    out = {
+        "type": "MultiSolid" if len(groups) > 1 else "Solid",
+        "boundaries": spread(triangles[:, None] + first),
+        "material": {"visual": {"values": spread(look)}},
+    }
+    if kind in _CONSTRUCTIONS:
+        names, values = np.unique(_surface_kinds(mesh, piece, whole, triangles), return_inverse=True)
+        out["semantics"] = {"surfaces": [{"type": str(n)} for n in names], "values": spread(values)}
+    return out
+
+
+def _surface_kinds(
+    mesh: Mesh, piece: Piece, whole: NDArray[np.int64], triangles: NDArray[np.int64]
+) -> NDArray[np.str_]:
+    """Semantic type (m,) of each face: a floor is the ground's where it lies lowest, else a ceiling's."""
+    code = mesh.surface[piece.rows]
+    height = whole[triangles, 2].max(axis=1)
+    ground = height - whole[triangles, 2].min() <= 1
+    return np.select(
+        [code == ROOF, code == WALL, (code == FLOOR) & ground, code == FLOOR],
+        ["RoofSurface", "WallSurface", "GroundSurface", "OuterCeilingSurface"],
+        "ClosureSurface",
+    )
+
+
+def _surface(
+    piece: Piece, triangles: NDArray[np.int64], look: NDArray[np.int64], kind: str
+) -> dict[str, Any]:
+    out: dict[str, Any] = {
+        "type": "CompositeSurface" if kind == "TINRelief" else "MultiSurface",
+        "boundaries": triangles[:, None].tolist(),
+        "material": {"visual": {"values": look.tolist()}},
+    }
+    part = _PARTS.get(kind, "")
+    if kind == "Road":
+        part = "AuxiliaryTrafficArea" if piece.klass in _AUXILIARY else "TrafficArea"
+    if part:
+        out["semantics"] = {"surfaces": [{"type": part}], "values": [0] * len(triangles)}
+    return out
+
+
+def _copies(
+    instances: Instances,
+    features: Features,
+    library: Sequence[Mesh],
+    index: tuple[int, int],
+    anchors: NDArray[np.int64],
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """One object a feature, of as many copies as it has; one a copy that has no feature."""
+    key = np.where(instances.feature >= 0, instances.feature, -1 - np.arange(len(instances)))
+    _, first, owner = np.unique(key, return_index=True, return_inverse=True)
+    rows_of: list[list[int]] = [[] for _ in first]
+    for row, number in enumerate(owner.tolist()):
+        rows_of[number].append(row)
+    for number in np.argsort(first, kind="stable").tolist():
+        rows = rows_of[number]
+        feature = int(instances.feature[rows[0]])
+        klass = int(library[instances.shape[rows[-1]]].klass[0])
+        name = features.name(feature) if feature >= 0 else f"copy/{rows[0]}"
+        matrix = np.tile(np.eye(4), (len(rows), 1, 1))
+        matrix[:, :3, :3] = instances.transform[rows][:, :, :3]
+        entry = {
+            "type": _TYPES.get(klass, "CityFurniture"),
+            "attributes": {"class": klass_name(klass), **features.attributes(feature)},
+            "geometry": [
+                {
+                    "type": "GeometryInstance",
+                    "template": int(instances.shape[row]),
+                    "boundaries": [int(anchors[row])],
+                    "transformationMatrix": np.round(matrix[k], 9).ravel().tolist(),
+                }
+                for k, row in enumerate(rows)
+            ],
+        }
+        yield f"{name}@{index[0]}_{index[1]}", entry
+
+
+def _templates(library: Sequence[Mesh], palette: _Palette) -> dict[str, Any]:
+    templates, vertices = [], []
+    first = 0
+    for mesh in library:
+        look = palette.values(mesh, np.arange(len(mesh)))
+        templates.append(
+            {
+                "type": "MultiSurface",
+                "lod": "2",
+                "boundaries": (mesh.faces[:, None] + first).tolist(),
+                "material": {"visual": {"values": look.tolist()}},
+            }
+        )
+        vertices += np.round(mesh.vertices, 9).tolist()
+        first += len(mesh.vertices)
+    return {"templates": templates, "vertices-templates": vertices}

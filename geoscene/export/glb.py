@@ -1,0 +1,143 @@
+"""One .glb of a whole scene: a named node an object, trees as GPU instances, attributes as metadata."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.export.files import Summary, size_of, whole_file
+from geoscene.export.gltf import GlbWriter, y_up
+from geoscene.export.objects import (
+    Features,
+    Part,
+    attribution,
+    klass_name,
+    parts,
+    pieces,
+    read_features,
+)
+from geoscene.mesh import Mesh
+from geoscene.progress import Progress, silent
+from geoscene.scene import Scene
+
+Float = NDArray[np.float64]
+
+
+def write_glb(
+    scene: Scene, path: Path, *, layers: Collection[str] | None = None, progress: Progress = silent
+) -> Summary:
+    """Write a scene as one binary glTF 2.0 file, tile by tile.
+
+    Axes as glTF wants them: x east, y up, z south, metres. The root node holds the origin of the scene's
+    frame in its CRS, the CRS stands in the root's ``extras``; vertices are float32 counted from a whole metre
+    near the middle of their object, so that nothing is lost. Every object is a node with its name, and its
+    attributes in ``extras``; the same attributes are property tables (EXT_structural_metadata), one a layer,
+    whose rows the vertices name (EXT_mesh_features). Trees and street furniture are copies
+    (EXT_mesh_gpu_instancing, EXT_instance_features).
+
+    Raises InputError for more than 4 GiB.
+    """
+    features = read_features(scene)
+    library = scene.shapes()
+    objects = solids = faces = 0
+    with whole_file(path) as out, GlbWriter(path) as writer:
+        tables = _tables(writer, features, layers)
+        shapes: dict[int, int] = {}
+        tiles = []
+        for done, part in enumerate(parts(scene, layers)):
+            progress("GLB", done, len(scene.tile_indices))
+            first = writer.nodes
+            closed = _objects(writer, part, features, tables)
+            objects += writer.nodes - first
+            solids += closed
+            objects += _copies(writer, part, features, tables, shapes, library)
+            faces += len(part.mesh)
+            if writer.nodes > first:
+                name = f"tile {part.index[0]} {part.index[1]}"
+                children = list(range(first, writer.nodes))
+                place = y_up(part.origin).tolist()
+                tiles.append(writer.node(name=name, translation=place, children=children))
+        east, north = scene.frame.origin
+        root = writer.node(
+            name=str(scene.manifest.get("name", "")) or "scene",
+            translation=[east, 0.0, -north],
+            children=tiles or None,
+            extras={"crs": scene.frame.name, "wkt": scene.frame.wkt, "vertical": scene.frame.vertical},
+        )
+        writer.finish(out, scene_nodes=[root], asset={"copyright": attribution(scene)})
+    files, size = size_of(path)
+    return Summary(path, "glb", files, size, objects, solids, faces, scene.frame.name)
+
+
+def _tables(
+    writer: GlbWriter, features: Features, layers: Collection[str] | None
+) -> dict[str, tuple[int, int, int]]:
+    """Number of each layer's property table, its first feature's number and how many it has."""
+    tables = {}
+    for name, columns, first in zip(features.layers, features.columns, features.starts, strict=True):
+        if layers is None or name in layers:
+            count = len(next(iter(columns.values())))
+            tables[name] = (writer.property_table(name, columns, count), int(first), count)
+    return tables
+
+
+def _objects(
+    writer: GlbWriter, part: Part, features: Features, tables: dict[str, tuple[int, int, int]]
+) -> int:
+    """Add a node for every object of a tile; how many of them are solids."""
+    solids = 0
+    for piece in pieces(part.mesh):
+        mesh = part.mesh.take(piece.rows)
+        middle = np.round((mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2)
+        told: dict[str, Any] = {}
+        if piece.feature >= 0:
+            table, first, count = tables[features.layer(piece.feature)]
+            rows = np.full(len(mesh.vertices), piece.feature - first)
+            told = {"table": table, "rows": rows, "count": count}
+        number = writer.mesh(mesh, y_up(mesh.vertices - middle).astype("<f4"), **told)
+        name = features.name(piece.feature)
+        writer.node(
+            name=name if piece.solid else f"{name} {klass_name(piece.klass)}",
+            mesh=number,
+            translation=y_up(middle).tolist(),
+            extras={
+                "class": klass_name(piece.klass),
+                "layer": features.layer(piece.feature),
+                "feature": piece.feature,
+                **features.attributes(piece.feature),
+            },
+        )
+        solids += piece.solid
+    return solids
+
+
+def _copies(
+    writer: GlbWriter,
+    part: Part,
+    features: Features,
+    tables: dict[str, tuple[int, int, int]],
+    shapes: dict[int, int],
+    library: dict[str, Mesh],
+) -> int:
+    """Add a node for every shape and layer of a tile's copies; how many copies there are."""
+    copies = part.instances
+    layer = np.searchsorted(features.starts, copies.feature, side="right")
+    keys = np.column_stack([copies.shape, layer])
+    names: Sequence[str] = list(library)
+    for number, of_layer in np.unique(keys, axis=0).tolist():
+        chosen = (keys == (number, of_layer)).all(axis=1)
+        if number not in shapes:
+            mesh = library[names[number]]
+            shapes[number] = writer.mesh(mesh, y_up(mesh.vertices).astype("<f4"), name=names[number])
+        told: dict[str, Any] = {}
+        if of_layer:
+            table, first, count = tables[features.layers[of_layer - 1]]
+            told = {"table": table, "rows": copies.feature[chosen] - first, "count": count}
+        transform = copies.transform[chosen]
+        origin = np.round(transform[:, :, 3].mean(axis=0))
+        writer.copies(shapes[number], transform, name=names[number], origin=origin, **told)
+    return len(copies)

@@ -1,0 +1,201 @@
+"""The objects of a tile: the faces of one feature, with its name and attributes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.errors import InputError
+from geoscene.export.files import plain
+from geoscene.mesh import Mesh
+from geoscene.scene import Instances, Scene
+
+Float = NDArray[np.float64]
+
+BARE = "terrain"
+"""Name of the layer of faces that belong to no feature."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Attributes of all features of a scene.
+
+    starts  : (k,) int64, first feature number of each layer
+    layers  : names of the layers, in the same order
+    columns : of each layer, column name to values
+    unique  : (n,) bool, the feature is the only one with its ``osm_id``
+    """
+
+    starts: NDArray[np.int64]
+    layers: tuple[str, ...]
+    columns: tuple[dict[str, NDArray[Any]], ...]
+    unique: NDArray[np.bool_]
+
+    def layer(self, feature: int) -> str:
+        """Name of the layer that a feature is of."""
+        return self.layers[self._row(feature)[0]] if feature >= 0 else BARE
+
+    def attributes(self, feature: int) -> dict[str, Any]:
+        """What is known of a feature, with where it is known from; what is not known is left out."""
+        if feature < 0:
+            return {}
+        layer, row = self._row(feature)
+        told = {name: plain(values[row]) for name, values in self.columns[layer].items()}
+        return {name: value for name, value in told.items() if value is not None}
+
+    def name(self, feature: int) -> str:
+        """``way/123`` for the only feature of that OSM id, else ``layer/number``."""
+        if feature < 0:
+            return BARE
+        layer, row = self._row(feature)
+        if self.unique[feature] and self.layers[layer] == "buildings":
+            return str(self.columns[layer]["osm_id"][row])
+        return f"{self.layers[layer]}/{feature}"
+
+    def _row(self, feature: int) -> tuple[int, int]:
+        layer = int(np.searchsorted(self.starts, feature, side="right")) - 1
+        return layer, feature - int(self.starts[layer])
+
+
+def read_features(scene: Scene) -> Features:
+    """The attributes of all features, without their geometry.
+
+    Raises SceneFormatError if ``features.gpkg`` lacks a layer.
+    """
+    from pyogrio.errors import DataLayerError, DataSourceError  # noqa: PLC0415
+    from pyogrio.raw import read  # noqa: PLC0415
+
+    from geoscene.errors import SceneFormatError  # noqa: PLC0415
+
+    names, starts, columns = [], [], []
+    path = scene.path / "features.gpkg"
+    for name, (start, stop) in sorted(scene.layers.items(), key=lambda item: item[1]):
+        if start == stop:
+            continue
+        try:
+            meta, _, _, values = read(path, layer=name, read_geometry=False)
+        except (DataSourceError, DataLayerError) as error:
+            raise SceneFormatError(f"{path}: no readable layer {name} ({error})") from error
+        names.append(name)
+        starts.append(start)
+        columns.append({str(k): v for k, v in zip(meta["fields"], values, strict=True) if k != "feature"})
+    sizes = np.diff([*starts, max((stop for _, stop in scene.layers.values()), default=0)])
+    ids = [c.get("osm_id", np.full(n, "")) for c, n in zip(columns, sizes, strict=True)]
+    osm_id = np.concatenate([np.empty(0, object), *ids]).astype(str)
+    _, owner, count = np.unique(osm_id, return_inverse=True, return_counts=True)
+    return Features(np.array(starts, np.int64), tuple(names), tuple(columns), count[owner] == 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """The faces of one object in one tile.
+
+    rows    : (m,) int64, which faces of the tile's mesh
+    feature : scene-wide number, -1 for none
+    klass   : `Class` code of its first face
+    solid   : the faces bound a solid; else they are a surface
+    """
+
+    rows: NDArray[np.int64]
+    feature: int
+    klass: int
+    solid: bool
+
+
+def pieces(mesh: Mesh) -> list[Piece]:
+    """The objects of a tile: solids by feature, surfaces by feature and class; in order of feature number."""
+    if not len(mesh):
+        return []
+    part = np.where(mesh.closed, 0, mesh.klass.astype(np.int64) + 1)
+    key = (mesh.feature.astype(np.int64) + 1) * 512 + part
+    order = np.argsort(key, kind="stable")
+    cuts = np.flatnonzero(np.diff(key[order])) + 1
+    return [
+        Piece(rows, int(mesh.feature[rows[0]]), int(mesh.klass[rows[0]]), bool(mesh.closed[rows[0]]))
+        for rows in np.split(order, cuts)
+    ]
+
+
+def check_layers(scene: Scene, layers: Collection[str] | None) -> None:
+    """Refuse names of layers that the scene has not."""
+    known = [*scene.layers, BARE]
+    unknown = sorted(set(layers or ()) - set(known))
+    if unknown:
+        raise InputError(f"no layer {', '.join(unknown)}; this scene has {', '.join(known)}")
+
+
+def wanted_rows(
+    scene: Scene, feature: NDArray[np.int32], layers: Collection[str] | None
+) -> NDArray[np.bool_]:
+    """(m,) bool: the face or copy is of one of the layers; all of them for None."""
+    if layers is None:
+        return np.ones(len(feature), np.bool_)
+    keep = np.zeros(len(feature), np.bool_)
+    for name in layers:
+        start, stop = (-1, 0) if name == BARE else scene.layers[name]
+        keep |= (feature >= start) & (feature < stop)
+    return keep
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What a tile holds of the wanted layers, in tile coordinates; see `geoscene.scene.Tile`."""
+
+    index: tuple[int, int]
+    origin: Float
+    mesh: Mesh
+    instances: Instances
+
+
+def parts(scene: Scene, layers: Collection[str] | None = None) -> Iterator[Part]:
+    """The tiles of a scene one at a time, less what is not of the wanted layers."""
+    check_layers(scene, layers)
+    for i, j in scene.tile_indices:
+        tile = scene.tile(i, j)
+        mesh, copies = tile.mesh, tile.instances
+        if layers is not None:
+            mesh = mesh.take(wanted_rows(scene, mesh.feature, layers))
+            keep = wanted_rows(scene, copies.feature, layers)
+            copies = Instances(copies.shape[keep], copies.transform[keep], copies.feature[keep])
+        yield Part((i, j), tile.origin, mesh, copies)
+
+
+def expand(instances: Instances, library: Sequence[Mesh]) -> Iterator[tuple[int, Mesh]]:
+    """Feature number and mesh of each copy, in tile coordinates, for formats that know no copies."""
+    for k in range(len(instances)):
+        shape, transform = library[instances.shape[k]], instances.transform[k]
+        points = shape.vertices @ transform[:, :3].T + transform[:, 3]
+        feature = int(instances.feature[k])
+        yield (
+            feature,
+            Mesh.of(
+                points,
+                shape.faces if np.linalg.det(transform[:, :3]) > 0 else shape.faces[:, ::-1],
+                feature=feature,
+                klass=shape.klass,
+                material=shape.material,
+                surface=shape.surface,
+                color=shape.color,
+                closed=shape.closed,
+            ),
+        )
+
+
+def klass_name(code: int) -> str:
+    """``building`` for 14."""
+    return Class(code).name.lower()
+
+
+def geoscene_lod(scene: Scene) -> int:
+    """Level of detail that the scene's buildings were built at."""
+    return int(scene.manifest.get("options", {}).get("lod", 2))
+
+
+def attribution(scene: Scene) -> str:
+    """Whom to credit for the data."""
+    return str(scene.manifest.get("attribution", ""))

@@ -1,0 +1,67 @@
+"""Solids taken apart: the closed shells of each, outer ones with the cavities inside them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.validate import edge_uses
+
+Ids = NDArray[np.int64]
+Float = NDArray[np.float64]
+
+
+def shell_numbers(corners: Ids, owner: NDArray[np.integer]) -> Ids:
+    """Number (m,) of the shell each face is of: faces of one owner that hang together by edges.
+
+    corners : (m, 3) ids of welded vertices
+    owner   : (m,) the object of each face
+    """
+    from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    m = len(corners)
+    if not m:
+        return np.empty(0, np.int64)
+    own = owner.astype(np.int64)[:, None] * (corners.max() + 1) + corners
+    _, ids = np.unique(own, return_inverse=True)
+    edge, uses, _ = edge_uses(ids.reshape(-1, 3).astype(np.int64))
+    face = np.repeat(np.arange(m), 3)
+    links = csr_array((np.ones(3 * m, np.int8), (face, m + edge)), shape=(m + len(uses), m + len(uses)))
+    labels = connected_components(links, directed=False)[1][:m]
+    _, first, numbers = np.unique(labels, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    shells: Ids = rank[numbers]
+    return shells
+
+
+def bodies(points: Float, faces: NDArray[np.integer], shell: Ids) -> list[list[Ids]]:
+    """The bodies of one object, each as rows of faces per shell: the outer shell first, then its cavities.
+
+    A shell of negative volume is a cavity of the smallest outer shell whose box holds its box.
+    """
+    numbers = np.unique(shell)
+    if len(numbers) == 1:
+        return [[np.arange(len(faces))]]
+    rows = [np.flatnonzero(shell == number) for number in numbers]
+    boxes = [(points[faces[r]].min(axis=(0, 1)), points[faces[r]].max(axis=(0, 1))) for r in rows]
+    volume = np.array([signed_volume(points, faces[r]) for r in rows])
+    outer = np.flatnonzero(volume > 0)
+    out = {int(k): [rows[k]] for k in outer}
+    for k in np.flatnonzero(volume <= 0):
+        low, high = boxes[k]
+        around = [o for o in outer if (boxes[o][0] <= low).all() and (boxes[o][1] >= high).all()]
+        if around:
+            out[int(min(around, key=lambda o: volume[o]))].append(rows[k])
+        else:
+            out[int(k)] = [rows[k]]
+    return list(out.values())
+
+
+def signed_volume(points: Float, faces: NDArray[np.integer]) -> float:
+    """Volume that faces enclose, positive where they are counter-clockwise seen from outside."""
+    if not len(faces):
+        return 0.0
+    a, b, c = (points[faces[:, k]] - points[faces[0, 0]] for k in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
