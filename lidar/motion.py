@@ -274,7 +274,26 @@ def poses_along(path: Path, vehicle: Vehicle, motion: Motion) -> Trajectory:
     )
     across = motion.speed**2 * columns["curvature"] * gear
     roll = columns["bank"] + vehicle.roll_gradient * across
-    pitch = -columns["slope"] - vehicle.pitch_gradient * motion.acceleration * gear
+    pitch = -vehicle.pitch_gradient * motion.acceleration * gear
+    if vehicle.kind != "air" or vehicle.cruise:  # what hovers climbs level
+        pitch = pitch - columns["slope"]
+    if any(vehicle.bob):
+        shift = _gait(motion, vehicle, heading)
+        seconds = motion.time_ns * 1e-9
+        velocity = velocity + np.gradient(shift, seconds, axis=0)
+        position = position + shift * np.column_stack([columns["scale"], columns["scale"], np.ones(n)])
     return Trajectory(
         motion.time_ns, position, quat_from_euler(roll, pitch, heading), velocity, columns["scale"]
     )
+
+
+def _gait(motion: Motion, vehicle: Vehicle, heading: Float) -> Float:
+    """True metres (n, 3) along the scene's axes by which a walker's body is off its path, step by step.
+
+    The body rises once a step and sways to one side and the other in two, in proportion to its speed.
+    """
+    sway, rise, steps = vehicle.bob
+    phase = 2 * np.pi * steps / vehicle.max_speed * motion.s
+    share = motion.speed / vehicle.max_speed
+    left, up = sway * share * np.sin(phase / 2), rise * share * (1 - np.cos(phase)) / 2
+    return np.column_stack([-np.sin(heading) * left, np.cos(heading) * left, up])

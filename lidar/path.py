@@ -103,8 +103,10 @@ def plan_path(
     """
     if not isinstance(obstacles, shapely.STRtree):
         obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))
-    setting = Setting(vehicle, frame, obstacles, margin, min(0.25, vehicle.turning_radius / 8), route.side)
-    line = _resampled(route, min(0.5, 2 * setting.step))
+    # what flies has no lane and bends on another scale
+    step = vehicle.turning_radius / 17 if vehicle.kind == "air" else min(0.25, vehicle.turning_radius / 8)
+    setting = Setting(vehicle, frame, obstacles, margin, step, route.side)
+    line = _resampled(route, 2 * step if vehicle.kind == "air" else min(0.5, 2 * step))
     cuts = [0, *(np.flatnonzero(line.turn) + 1).tolist(), len(line.edge)]
     legs: list[Track] = []
     lines: list[Line] = []
@@ -158,7 +160,7 @@ def _clear_track(line: Line, setting: Setting, pose: Pose | None) -> Track:
 
     vehicle = setting.vehicle
     cap = _WHEEL / vehicle.turning_radius
-    reach = min(2.0, 0.5 * vehicle.turning_radius)
+    reach = 0.47 * vehicle.turning_radius
     middle = line.xyz[len(line.xyz) // 2]
     scale = float(setting.frame.scale_at(middle[0], middle[1]))
     base, gap = line.xyz[:, :2], line.gap
@@ -245,7 +247,8 @@ def _heights(
     once = np.ones(int(sizes.sum()), bool)
     once[starts] = False
     twice = np.cumsum(once) - 1
-    width = max(setting.vehicle.wheelbase, 1.0) / legs[0].step
+    body = setting.vehicle
+    width = (body.turning_radius if body.kind == "air" else max(body.wheelbase, 1.0)) / legs[0].step
     z, slope, bank = (np.concatenate(column)[once] for column in zip(*raw, strict=True))
     # beyond its ends the road goes on as steep as it was
     spare = math.ceil(4 * width) + 1

@@ -125,9 +125,12 @@ def follow(xy: Float, vehicle: Vehicle, scale: float, *, step: float, pose: Pose
         along, aside = (x - lx[j]) * c + (y - ly[j]) * s, ((y - ly[j]) * c - (x - lx[j]) * s) / scale
         if j == m - 1 and along >= -0.5 * stride:
             break
-        off = math.remainder(th - lh[j], 2 * math.pi)
+        # between the line's points its heading turns on and its side moves over
+        bend_here = lk[j] + (lk[min(j + 1, m - 1)] - lk[j]) * max(-0.5, min(1.5, along / gap))
+        aside -= 0.5 * bend_here * (along / scale) ** 2
+        off = math.remainder(th - lh[j] - bend_here * along / scale, 2 * math.pi)
         pull = 1.2 * length * math.tanh(aside / (1.2 * length))
-        want = lk[min(j + 1, m - 1)] - near * pull - turn_in * math.sin(max(-1.5, min(1.5, off)))
+        want = bend_here - near * pull - turn_in * math.sin(max(-1.5, min(1.5, off)))
         want = max(-most, min(most, want))
         new = k + max(-rate * step, min(rate * step, want - k))
         mean = 0.5 * (k + new)

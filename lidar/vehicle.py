@@ -19,6 +19,8 @@ _POSITIVE = (
     *("acceleration", "deceleration", "jerk", "lateral_acceleration", "lateral_jerk"),
 )
 
+_SIGNED = ("roll_gradient", "pitch_gradient")
+
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
@@ -32,9 +34,12 @@ class Vehicle:
     max_speed       : m/s
     acceleration, deceleration, jerk : largest along the path, m/s^2, m/s^2, m/s^3
     lateral_acceleration, lateral_jerk : largest across the path, m/s^2, m/s^3
-    roll_gradient, pitch_gradient : lean of the body in radians for 1 m/s^2 across and along
+    roll_gradient, pitch_gradient : lean of the body in radians for 1 m/s^2 across and along; positive leans
+                                    out
+                      of bends and back under acceleration (springs), negative into them and forward (lift)
     cruise          : whether it is already at speed when the drive starts and still when it ends (aircraft)
-    bob             : (3,) metres of sway to the left, of rise at each step, and steps a second (walkers)
+    bob             : metres of sway to each side, metres of rise at each step, and steps a second at full
+                      speed
     source          : where the numbers come from
     """
 
@@ -118,7 +123,7 @@ def _checked(table: dict[str, object], name: str) -> Vehicle:
         value, kind = table[key], str(known[key].type)
         if kind == "float" and isinstance(value, (int, float)) and not isinstance(value, bool):
             values[key] = float(value)
-            if not (np.isfinite(values[key]) and float(value) >= 0):  # type: ignore[call-overload]
+            if not np.isfinite(float(value)) or (float(value) < 0 and key not in _SIGNED):
                 faults.append(f"{key} = {value} must be a number of at least 0")
         elif kind.startswith("tuple") and isinstance(value, list) and len(value) == 3:
             values[key] = tuple(float(v) for v in value)
