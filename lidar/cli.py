@@ -42,6 +42,8 @@ def drive(
     side: str = "right",
     seed: int = 0,
     start: str | None = None,
+    fidelity: str = "standard",
+    settings: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
     formats: Annotated[str, Parameter(name="--format", group=_OUTPUT)] = "pcd,laz",
     crs: Annotated[str, Parameter(group=_OUTPUT)] = "utm",
     exact: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
@@ -83,6 +85,11 @@ def drive(
     start
         UTC time of the drive's start, ISO 8601 (2026-06-21T08:00:00); it sets the sun and the time stamps.
         By default 10:00 local solar time on 21 June 2026.
+    fidelity
+        draft (one pose a frame, exact ranges), standard (a pose a pulse, exact ranges) or survey (beams with a
+        size, several echoes, noise, lost and false returns).
+    settings
+        One effect set apart from the level, NAME=VALUE; again for more. An unknown name lists them all.
     formats
         Formats of clouds, with commas: pcd, ply, csv (sensor frame), laz, las (georeferenced).
     crs
@@ -115,6 +122,8 @@ def drive(
         crs=crs,
         exact=exact,
         side=side,
+        fidelity=fidelity,
+        settings=tuple(_setting(text) for text in settings or ()),
         workers=workers,
     )
     with progress_bar(quiet=quiet) as progress:
@@ -159,6 +168,13 @@ def _point(word: str) -> tuple[float, float] | None:
     if not (abs(lat) <= 90 and abs(lon) <= 180):
         raise InputError(f"--route {word}: not a latitude and longitude in degrees")
     return lat, lon
+
+
+def _setting(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise InputError(f"--set {text}: give NAME=VALUE, such as rays=7")
+    return name.strip(), value.strip()
 
 
 def _time(text: str) -> datetime:

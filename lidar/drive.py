@@ -21,6 +21,7 @@ from lidar import __version__
 from lidar.dataset import prepare, write_json, write_trajectory
 from lidar.errors import InputError
 from lidar.georeference import Georeference, export_crs
+from lidar.physics.effects import effects_of
 from lidar.poses import Trajectory
 from lidar.record import FORMATS, Camera, Recorder, Scanner, cameras, scanners
 from lidar.rig import Rig, load_rig
@@ -50,6 +51,8 @@ class DriveOptions:
     crs        : of LAZ files: ``utm``, ``scene`` or any pyproj name
     exact      : georeference every point through the projection instead of a bounded affine map
     side       : side of the road
+    fidelity   : level of `lidar.physics.effects.LEVELS`: draft, standard or survey
+    settings   : single effects set apart from the level, as (name, text)
     workers    : threads
     """
 
@@ -63,6 +66,8 @@ class DriveOptions:
     crs: str = "utm"
     exact: bool = False
     side: str = "right"
+    fidelity: str = "standard"
+    settings: tuple[tuple[str, str], ...] = ()
     workers: int = 2
 
     def __post_init__(self) -> None:
@@ -75,6 +80,7 @@ class DriveOptions:
             raise InputError(f"--side {self.side}: left or right")
         if not 1 <= self.workers <= 256:
             raise InputError(f"--workers {self.workers}: give 1 to 256")
+        effects_of(self.fidelity, dict(self.settings))
 
     def recipe(self, scene: Scene) -> dict[str, Any]:
         """What the dataset's bytes depend on, as JSON."""
@@ -92,6 +98,8 @@ class DriveOptions:
             "crs": self.crs,
             "exact": self.exact,
             "side": self.side,
+            "fidelity": self.fidelity,
+            "settings": [list(pair) for pair in self.settings],
         }
 
 
@@ -181,9 +189,20 @@ def drive(
     if not (out / "dataset.json").exists():
         write_json(out / "dataset.json", manifest | {"frames_done": 0})
     write_trajectory(out / "trajectory.csv", trajectory)
-    write_sidecars(out, scene.frame, sensors, trajectory, start, manifest["sensor_frames"])
+    counts = manifest["sensor_frames"]
+    write_sidecars(out, scene, rig, sensors, trajectory, start, counts, seed=options.seed)
     watch = Stopwatch()
-    recorder = Recorder(out, scene.frame, trajectory, start, geo, options.formats, options.seed, watch)
+    recorder = Recorder(
+        out,
+        scene.frame,
+        trajectory,
+        start,
+        geo,
+        options.formats,
+        options.seed,
+        effects_of(options.fidelity, dict(options.settings)),
+        watch,
+    )
     points = _record(scene, trajectory, jobs, sensors, recorder, options.workers, progress)
     write_json(out / "dataset.json", manifest | {"frames_done": manifest["frames"]})
     return DriveSummary(

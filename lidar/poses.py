@@ -100,6 +100,20 @@ class Trajectory:
         """Time of the last pose."""
         return int(self.time_ns[-1])
 
+    def until(self, time_ns: int) -> Trajectory:
+        """The trajectory up to a time; itself if it ends before."""
+        if time_ns >= self.time_ns[-1]:
+            return self
+        n = int(np.searchsorted(self.time_ns, time_ns, side="right"))
+        keep = slice(max(n, 2))
+        return Trajectory(
+            self.time_ns[keep],
+            self.position[keep],
+            self.quat_xyzw[keep],
+            self.velocity[keep],
+            self.scale[keep],
+        )
+
     def at(self, time_ns: ArrayLike) -> Poses:
         """Poses at times (k,) in nanoseconds, held at the first and the last pose outside the drive."""
         t = np.clip(np.asarray(time_ns, np.int64), self.time_ns[0], self.time_ns[-1])
@@ -113,7 +127,12 @@ class Trajectory:
         return Poses(position, turn(t.astype(float)).as_matrix(), np.stack([k, k, np.ones_like(k)], axis=1))
 
     def place(
-        self, points: NDArray[np.floating], time_ns: NDArray[np.integer], *, translation: ArrayLike, rotation: ArrayLike
+        self,
+        points: NDArray[np.floating],
+        time_ns: NDArray[np.integer],
+        *,
+        translation: ArrayLike,
+        rotation: ArrayLike,
     ) -> Float:
         """Scene coordinates (n, 3) of points that a sensor on the vehicle measured, each at its own time.
 

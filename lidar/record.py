@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.frames import Frame
-from lidar.camera.png import depth_to_counts, feature_to_image, write_png
-from lidar.camera.render import exposure_times, render
+from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
+from lidar.camera.render import exposure_times, optical_flow, render
 from lidar.camera.sun import sun_direction
 from lidar.cloud import Cloud
 from lidar.formats.las import LasInfo, gps_seconds, write_las
@@ -23,6 +24,7 @@ from lidar.formats.ply import write_ply
 from lidar.formats.table import Table, cloud_table
 from lidar.formats.text import write_csv
 from lidar.georeference import Georeference
+from lidar.physics.effects import Effects
 from lidar.poses import Trajectory
 from lidar.rig import CameraSpec, LidarSpec, Rig
 from lidar.sensors.beams import frame_ns
@@ -138,6 +140,7 @@ class Recorder:
         geo: Georeference,
         formats: Sequence[str],
         seed: int,
+        effects: Effects,
         watch: _Watch,
     ) -> None:
         self.out = out
@@ -147,6 +150,7 @@ class Recorder:
         self.geo = geo
         self.formats = tuple(formats)
         self.seed = seed
+        self.effects = effects
         self.watch = watch
         self._las = LasInfo(geo.crs, geo.offset, start)
 
@@ -170,7 +174,15 @@ class Recorder:
 
     def _record_cloud(self, scanner: Scanner, frame: int, world: World) -> int:
         with self.watch.stage("scan"):
-            cloud = scan(scanner.sensor, scanner.spec.mount, self.trajectory, world, frame)
+            cloud = scan(
+                scanner.sensor,
+                scanner.spec.mount,
+                self.trajectory,
+                world,
+                frame,
+                seed=self.seed,
+                effects=self.effects,
+            )
         begin = scanner.frame_start_ns(frame)
         paths = self.paths(scanner, frame)
         for path in paths.values():
@@ -219,6 +231,16 @@ class Recorder:
                     write_png(path, image.klass)
                 elif kind == "instance":
                     write_png(path, feature_to_image(image.feature))
+                elif kind == "flow":
+                    write_png(path, flow_to_image(self._flow(camera, frame, world)))
+
+    def _flow(self, camera: Camera, frame: int, world: World) -> NDArray[np.float32]:
+        mount = camera.spec.mount
+        here, later = (
+            self.trajectory.at([camera.frame_start_ns(k)]).mounted(mount.translation, mount.rotation)
+            for k in (frame, frame + 1)
+        )
+        return optical_flow(camera.spec, here, later, world)
 
     def _sun(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
         return _sun(self.frame, self.start, *self.trajectory.position[0, :2].tolist())

@@ -11,12 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.frames import Frame
+from geoscene.scene import Scene, write_atomically
 from lidar.attitude import euler_from_quat
 from lidar.camera.model import intrinsic_matrix
 from lidar.dataset import write_columns, write_json
+from lidar.gnss import antenna_motion, epochs, gnss_columns, observe_gnss
+from lidar.imu import imu_columns, observe_imu
+from lidar.nmea import nmea
 from lidar.poses import Trajectory
 from lidar.record import Camera, Scanner
-from lidar.rig import Mount
+from lidar.rig import GnssSpec, Mount, Rig
+from lidar.sky import sky_view
+from lidar.world import World
 
 
 def iso_times(start: datetime, time_ns: NDArray[np.integer]) -> list[str]:
@@ -77,9 +83,13 @@ def _mounted(mount: Mount) -> dict[str, Any]:
     }
 
 
-def calibration(sensors: Sequence[Scanner | Camera]) -> dict[str, Any]:
+def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]:
     """What ``calibration.json`` says: mounts, rates and intrinsics."""
     out: dict[str, Any] = {}
+    for kind, specs in (("gnss", rig.gnss), ("imu", rig.imus)):
+        for spec in specs:
+            rates = {"rate_hz": spec.rate_hz, "time_offset_ns": spec.time_offset_ns}
+            out[spec.name] = {"kind": kind, **rates, **_mounted(spec.mount)}
     for sensor in sensors:
         if isinstance(sensor, Scanner):
             s = sensor.sensor
@@ -120,23 +130,48 @@ def calibration(sensors: Sequence[Scanner | Camera]) -> dict[str, Any]:
 
 def write_sidecars(
     out: Path,
-    frame: Frame,
+    scene: Scene,
+    rig: Rig,
     sensors: Sequence[Scanner | Camera],
     trajectory: Trajectory,
     start: datetime,
     frames: Mapping[str, int],
+    *,
+    seed: int,
 ) -> None:
-    """Write ``poses.csv`` (a row a frame of the first sensor), ``calibration.json`` and time stamps."""
-    write_json(out / "calibration.json", calibration(sensors))
+    """Write all but clouds and images.
+
+    ``poses.csv`` (a row a frame of the first sensor), ``calibration.json``, time stamps by sensor, and
+    ``<name>.csv`` of every receiver (also as NMEA sentences) and inertial unit of the rig.
+    """
+    write_json(out / "calibration.json", calibration(rig, sensors))
     for k, sensor in enumerate(sensors):
         times = np.array([sensor.frame_start_ns(f) for f in range(frames[sensor.name])], np.int64)
         folder = out / sensor.name
         folder.mkdir(parents=True, exist_ok=True)
-        stamps: dict[str, Any] = {
-            "frame": np.arange(len(times)),
-            "time_ns": times,
-            "timestamp": iso_times(start, times),
-        }
-        write_columns(folder / "timestamps.csv", stamps)
+        stamps: dict[str, Any] = {"frame": np.arange(len(times)), "time_ns": times}
+        write_columns(folder / "timestamps.csv", stamps | {"timestamp": iso_times(start, times)})
         if k == 0:
-            write_columns(out / "poses.csv", pose_columns(trajectory, frame, start, times))
+            write_columns(out / "poses.csv", pose_columns(trajectory, scene.frame, start, times))
+    for receiver in rig.gnss:
+        _write_fixes(out, scene, receiver, trajectory, start, seed)
+    for unit in rig.imus:
+        rows = observe_imu(trajectory, scene.frame, unit, seed=seed)
+        stamped: dict[str, Any] = {"timestamp": iso_times(start, rows.time_ns), **imu_columns(rows)}
+        write_columns(out / f"{unit.name}.csv", stamped)
+
+
+def _write_fixes(
+    out: Path, scene: Scene, spec: GnssSpec, trajectory: Trajectory, start: datetime, seed: int
+) -> None:
+    times = epochs(spec, trajectory.duration_ns)
+    antenna, _ = antenna_motion(trajectory, scene.frame, spec, times)
+
+    def world_at(region: tuple[float, float, float, float]) -> World:
+        return World.load(scene, region=region)
+
+    sky = sky_view(scene.frame, antenna, start, times, world_at, mask_deg=spec.mask_deg)
+    fixes = observe_gnss(trajectory, scene.frame, spec, seed=seed, start=start, sky=sky)
+    stamped: dict[str, Any] = {"timestamp": iso_times(start, fixes.time_ns), **gnss_columns(fixes)}
+    write_columns(out / f"{spec.name}.csv", stamped)
+    write_atomically(out / f"{spec.name}.nmea", "".join(nmea(fixes, start)).encode("ascii"))

@@ -105,7 +105,9 @@ def plan_travel(
             if blocked is not None:
                 raise blocked from None
             raise
-        trajectory = drive_path(path, body, duration=seconds)
+        trajectory = drive_path(path, body)
+        if seconds is not None:
+            trajectory = trajectory.until(round(seconds * 1e9))
         return Travel(route, path, trajectory, _driven(trajectory))
     raise blocked or RouteError("no route found")
 

@@ -1,0 +1,144 @@
+"""The two programs as users meet them: words in, files out, one clear line when something is wrong."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from geoscene.sources import demo_path
+
+BOX = "24.9405,60.1655,24.9475,60.1690"
+
+
+def program(name, *words, **options):
+    return subprocess.run(
+        [sys.executable, "-m", f"{name}.cli", *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+        **options,
+    )
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    out = tmp_path_factory.mktemp("cli") / "scene"
+    done = program("geoscene", "build", "--osm", demo_path(), "--bbox", BOX, "-o", out, "--json")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert json.loads(done.stdout)["counts"]["buildings"] > 20
+    return out
+
+
+def test_info_is_for_programs_and_for_people(scene):
+    report = json.loads(program("geoscene", "info", scene, "--json").stdout)
+    counts = report["counts"]
+    assert counts["buildings"] == counts["solids"] + counts["dropped"]
+    assert report["frame"]["name"].startswith("Local transverse Mercator")
+    assert sum(report["heights"].values()) == counts["solids"]
+    assert report["extent"]["width_m"] > 300
+    text = program("geoscene", "info", scene).stdout
+    for word in ("frame", "extent", "buildings", "heights", "OpenStreetMap"):
+        assert word in text
+
+
+def test_validate_passes_a_sound_scene(scene):
+    done = program("geoscene", "validate", scene, "--json")
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["broken"] == []
+
+
+def test_a_drive_and_its_map(scene, tmp_path):
+    words = [
+        "--route",
+        "random",
+        "--duration",
+        "2",
+        "--rig",
+        "vlp16",
+        "--format",
+        "pcd,laz",
+        "--seed",
+        "5",
+        "--json",
+    ]
+    done = program("lidar", "drive", scene, *words, "-o", tmp_path / "drive")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["frames"] == 20
+    again = json.loads(program("lidar", "drive", scene, *words, "-o", tmp_path / "drive").stdout)
+    assert again["resumed"] == 20
+    assert again["points"] == 0
+    done = program("lidar", "map", tmp_path / "drive", "-o", tmp_path / "m.laz", "--voxel", "0.2")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "m.laz").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "says"),
+    [
+        ("geoscene", ["build", "-o", "x"], "none was given"),
+        ("geoscene", ["build", "--demo", "--place", "Rome", "-o", "x"], "--place and --demo"),
+        ("geoscene", ["build", "--osm", "nowhere.osm", "-o", "x"], "nowhere.osm"),
+        ("geoscene", ["build", "--point", "-91.5,-76.3", "-o", "x"], "-91.5,-76.3"),
+        ("geoscene", ["build", "--bbox", "1,2,3", "-o", "x"], "W,S,E,N"),
+        ("geoscene", ["build", "--demo", "--crs", "EPSG:4326", "-o", "x"], "EPSG:4326"),
+        ("geoscene", ["build", "--demo", "--lod", "9", "-o", "x"], "--lod 9"),
+        ("geoscene", ["build", "--demo", "--dem", "nowhere.tif", "-o", "x"], "nowhere.tif"),
+        ("geoscene", ["info", "nowhere"], "nowhere"),
+        ("geoscene", ["validate", "nowhere"], "nowhere"),
+        ("lidar", ["drive", "nowhere", "--route", "random", "-o", "x"], "nowhere"),
+        ("lidar", ["map", "nowhere", "-o", "x.laz"], "nowhere"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_two(tmp_path, name, words, says):
+    done = program(name, *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--route", "-30.1,-51.2", "-30.2,-51.3"], "-30.1"),
+        (["--route", "60.166,24.944"], "two or more"),
+        (["--route", "tour.gpx"], "tour.gpx"),
+        (["--route", "random", "--rig", "none"], "none"),
+        (["--route", "random", "--format", "doc"], "doc"),
+        (["--route", "random", "--start", "noon"], "noon"),
+        (["--route", "random", "--crs", "EPSG:1"], "EPSG:1"),
+    ],
+)
+def test_bad_drives_are_one_line_and_exit_code_two(scene, tmp_path, words, says):
+    done = program("lidar", "drive", scene, *words, "-o", "x", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert says in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "commands"), [("geoscene", ["build", "info", "validate"]), ("lidar", ["drive", "map"])]
+)
+def test_help_teaches_every_command(name, commands):
+    assert program(name, "--version").stdout.strip() == "0.1.0"
+    top = program(name, "--help").stdout
+    assert "--install-completion" in top
+    for command in commands:
+        assert command in top
+        text = program(name, command, "--help").stdout
+        assert len(text.splitlines()) > 8
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys, geoscene.cli, lidar.cli;"
+        "heavy = {'osmnx', 'geopandas', 'rasterio', 'trimesh', 'numba', 'scipy', 'shapely'};"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
