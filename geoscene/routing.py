@@ -65,7 +65,8 @@ def nearest_edge(
     first = np.full(len(points), len(graph), np.int64)
     np.minimum.at(first, query, found)
     lines = tree.geometries[first]
-    along = shapely.line_locate_point(lines, points, normalized=True)
+    plan = np.maximum(shapely.length(lines), 1e-9)  # nodes may share a place
+    along = shapely.line_locate_point(lines, points) / plan
     return first.astype(np.int32), along * graph.length[first], shapely.distance(lines, points)
 
 

@@ -50,7 +50,7 @@ def add_controls(
     for edge, vertex, with_way, tags in _met(graph, points, sides, lines):
         plan = np.linalg.norm(np.diff(graph.geometry[edge][:, :2], axis=0), axis=1)
         length = float(graph.length[edge])
-        offset = length * float(plan[:vertex].sum() / plan.sum())
+        offset = length * float(plan[:vertex].sum() / max(plan.sum(), 1e-9))
         node = int(graph.head[edge])
         at_end = vertex == len(plan)
         for kind in _kinds(tags):

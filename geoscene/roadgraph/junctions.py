@@ -96,7 +96,8 @@ def build_junctions(roads: Carriageways, importance: NDArray[np.int64]) -> Junct
     )
     group = arms.group[keep]
     first = np.flatnonzero(np.diff(group, prepend=-1))
-    polygon = shapely.buffer(shapely.multipolygons(*_parts(corner, group)), 0.0)
+    parts, of = _parts(corner, group)
+    polygon = shapely.buffer(shapely.multipolygons(parts, indices=of), 0.0)
     rank = importance[arms.road]
     main = np.where(rank >= rank[after], arms.road, arms.road[after])[keep]
     best = np.lexsort([-importance[main], group])
