@@ -1,7 +1,7 @@
 """Rays a second of this path, of plain embreex, of Open3D and of a native loop, in turns in one process.
 
-The native loop is C, compiled here if gcc is found: the same poses and directions, the same library, packets and
-scene flags, float32 ranges and no second look at doubtful rays. It is the limit; ratios to it are the result.
+The native loop is C, compiled here if gcc is found: the same poses and directions, the same library, packets
+and scene flags, float32 ranges and no second look at doubtful rays. It is the limit; ratios to it are given.
 
     python benchmarks/rays.py --triangles 0.1 0.6 1 --rounds 5 --json rays.json
     python benchmarks/rays.py --leaks 10_000_000
@@ -23,6 +23,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from lidar.poses import Poses
@@ -36,10 +39,15 @@ NATIVE = r"""
 #include <stdint.h>
 typedef void (*trace_t)(const int *, void *, void *, void *);
 #define W 16
-struct packet { float ox[W], oy[W], oz[W], near[W], dx[W], dy[W], dz[W], time[W], far[W];
-  uint32_t mask[W], id[W], flags[W]; float ng[3][W], uv[2][W]; uint32_t prim[W], geom[W], inst[W], place[W]; };
+struct packet {
+  float ox[W], oy[W], oz[W], near[W], dx[W], dy[W], dz[W], time[W], far[W];
+  uint32_t mask[W], id[W], flags[W];
+  float ng[3][W], uv[2][W];
+  uint32_t prim[W], geom[W], inst[W], place[W];
+};
 void cast(trace_t trace, void *scene, void *args, const double *position, const double *rotation,
-          const int64_t *pose, const double *dirs, const double *origin, long lo, long hi, float *t, uint32_t *prim) {
+          const int64_t *pose, const double *dirs, const double *origin, long lo, long hi,
+          float *t, uint32_t *prim) {
   struct packet p __attribute__((aligned(64)));
   int valid[W] __attribute__((aligned(64)));
   for (long b = lo; b < hi; b += W) {
@@ -57,7 +65,10 @@ void cast(trace_t trace, void *scene, void *args, const double *position, const 
       p.geom[k] = p.inst[k] = p.place[k] = 0xFFFFFFFFu;
     }
     trace(valid, scene, &p, args);
-    for (int k = 0; k < m; k++) { t[b + k] = p.far[k]; prim[b + k] = p.geom[k] == 0xFFFFFFFFu ? 0xFFFFFFFFu : p.prim[k]; }
+    for (int k = 0; k < m; k++) {
+      t[b + k] = p.far[k];
+      prim[b + k] = p.geom[k] == 0xFFFFFFFFu ? 0xFFFFFFFFu : p.prim[k];
+    }
   }
 }
 """
@@ -103,9 +114,45 @@ def city(triangles: float, seed: int = 7) -> tuple[Float, NDArray[np.int32]]:
 
 
 BOX = np.array(
-    [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4]]
-    + [[2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5], [3, 7, 5]]
-)
+    [
+        0,
+        2,
+        1,
+        1,
+        2,
+        3,
+        4,
+        5,
+        6,
+        5,
+        7,
+        6,
+        0,
+        1,
+        4,
+        1,
+        5,
+        4,
+        2,
+        6,
+        3,
+        3,
+        6,
+        7,
+        0,
+        4,
+        2,
+        2,
+        4,
+        6,
+        1,
+        3,
+        5,
+        3,
+        7,
+        5,
+    ]
+).reshape(-1, 3)
 
 
 def relief(x: Float, y: Float) -> Float:
@@ -191,7 +238,7 @@ def paths(vertices: Float, faces: NDArray[np.int32], threads: int) -> dict[str, 
         out["native"] = run
     out["embreex"] = plain_embreex(vertices - caster.origin, faces, caster.origin, threads)
     try:
-        import open3d as o3d
+        import open3d as o3d  # noqa: PLC0415
     except ImportError:
         return out
     scene = o3d.t.geometry.RaycastingScene(nthreads=threads)
@@ -211,10 +258,7 @@ def paths(vertices: Float, faces: NDArray[np.int32], threads: int) -> dict[str, 
 def plain_embreex(
     vertices: Float, faces: NDArray[np.int32], origin: Float, threads: int
 ) -> Callable[[Poses, NDArray[np.int64], Float], object]:
-    """embreex's own run() on rays made with NumPy outside the clock."""
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-
+    """Embreex's own run() on rays made with NumPy outside the clock."""
     scene = EmbreeScene()
     TriangleMesh(scene, vertices.astype(np.float32), faces)
     ready: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
@@ -284,8 +328,6 @@ def measure(triangles: float, sensor: str, threads: int, rounds: int, frames: in
 
 def leaks(rays: int) -> dict[str, int]:
     """Rays from inside closed solids at their vertices and edges that hit nothing, by solid."""
-    import trimesh
-
     rng = np.random.default_rng(1)
     turn = trimesh.transformations.euler_matrix(0.3, 0.6, 0.2)
     ball = trimesh.creation.icosphere(subdivisions=4, radius=10.0)

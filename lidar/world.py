@@ -12,7 +12,7 @@ from geoscene.classes import materials
 from geoscene.mesh import Mesh
 from geoscene.scene import Scene
 from lidar.errors import InputError
-from lidar.raycast import ALL, Caster, Geometry, Hits, Instances
+from lidar.raycast import Caster, Geometry, Hits, Instances
 from lidar.raycast.geometry import split
 
 Float = NDArray[np.float64]

@@ -6,6 +6,7 @@ import functools
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -106,7 +107,7 @@ class Caster:
             self.scene.parts[number] = replace(self.scene.parts[number], first=start)
         if instances is not None:
             self.instances = tuple(instances)
-            shapes = [[shape.scene for shape in group.shapes] for group in self.instances]
+            shapes: Any = [[shape.scene for shape in group.shapes] for group in self.instances]
             self.scene.place(self.instances, shapes, _COPIES)
         self.scene.commit()
 
@@ -160,7 +161,7 @@ class Caster:
         poses      : p poses of the sensor
         pose_index : (n,) each ray's row of ``poses``
         directions : (n, 3) unit vectors in the sensor frame
-        offsets    : (n, 3) where each beam starts in the sensor frame, true metres; the frame's zero by default
+        offsets    : (n, 3) where each beam starts in the sensor frame, true metres; its zero by default
 
         ``near`` and ``far`` count from the beam's start in true metres; the rest as for `cast`.
         """
@@ -181,8 +182,7 @@ class Caster:
     ) -> NDArray[np.bool_]:
         """Whether anything lies on each ray (n,) between ``near`` and ``far`` (a number or (n,)).
 
-        Shadow rays start on a surface: lift their origins off it by a millimetre along its normal, or they hit
-        it.
+        Lift the origins of shadow rays off their surface by a millimetre along its normal, or they hit it.
         """
         rays = limited(free_rays(origins, directions), near=near, far=far, mask=mask, time=time)
         return self.scene.occluded(rays, threads=threads)

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 from typing import Any
 
+import numba
 import numpy as np
-from numba import carray, cfunc, njit, types
+from numba import cfunc, njit, types
 from numpy.typing import NDArray
 
 from lidar.raycast.columns import Rays, Target
-from lidar.raycast.kernels import first_bad, gather, load, meet, nudge, numbered, placed, plane_of, settle
+from lidar.raycast.kernels import first_bad, gather, load, meet, nudge, numbered, placed
 from lidar.raycast.library import ARGUMENT_FILTER, INVALID
 from lidar.raycast.memory import aligned, inlined, intersect1, pointer
 
 Float = NDArray[np.float64]
 
+carray: Any = vars(numba)["carray"]  # numba does not declare it as its own
+
 _SPARE = 4
-"""Faces kept beyond those asked for: float32 and float64 may order faces a few micrometres apart differently."""
+"""Faces kept beyond those asked for: float32 and float64 may differ in the order of near faces."""
 
 
-@cfunc(types.void(types.CPointer(types.int64)), cache=True)
+_ARGUMENTS: Any = types.CPointer(types.int64)  # type: ignore[no-untyped-call]
+
+
+@cfunc(types.void(_ARGUMENTS), cache=True)
 def _collect(arguments: Any) -> None:
     """Keep a face if it is among the nearest; refuse it as a hit so that Embree goes on.
 
@@ -59,7 +65,7 @@ def _collect(arguments: Any) -> None:
     kept[1] = min(n + 1, room)
 
 
-COLLECT: int = _collect.address
+COLLECT = int(_collect.address or 0)
 """Address of the filter, for `echoes`."""
 
 
@@ -74,9 +80,7 @@ def _pass(target: Target, f: Any, u: Any, kept: Any, arguments: Any) -> Any:
 
 
 @inlined
-def _resolve(
-    target: Target, n: int, names: Any, work: Any, hit: Any, what: Any, found: Any, cosines: Any
-) -> Any:
+def _resolve(target: Target, n: int, names: Any, work: Any, what: Any, found: Any, cosines: Any) -> Any:
     """Exact ranges of the faces kept, nearest first, within reach; their number.
 
     found, cosines : range and cosine of each; ``what`` gets face and instance, two rows a face
@@ -85,20 +89,17 @@ def _resolve(
     for e in range(n):
         row, instance = placed(target, names[4 * e + 1], names[4 * e + 2], names[4 * e + 3])
         prim = np.int64(names[4 * e])
-        hit[0], hit[1], hit[2], hit[3] = plane_of(target, row, prim, instance, work[8])
-        meet(1, work, hit)
-        what[0], what[1], what[2] = row, prim, instance
-        t, cosine = settle(target, 1, 0, work, hit, what)
+        t, cosine, _, _, _ = meet(target, 1, 0, row, prim, instance, work)
         if t > work[7]:
             continue
         face = numbered(target, row, prim)
         i = count
         while i > 0 and found[i - 1] > t:
             found[i], cosines[i] = found[i - 1], cosines[i - 1]
-            what[2 * i + 3], what[2 * i + 4] = what[2 * i + 1], what[2 * i + 2]
+            what[2 * i], what[2 * i + 1] = what[2 * i - 2], what[2 * i - 1]
             i -= 1
         found[i], cosines[i] = t, cosine
-        what[2 * i + 3], what[2 * i + 4] = face, instance
+        what[2 * i], what[2 * i + 1] = face, instance
         count += 1
     return count
 
@@ -127,23 +128,21 @@ def echoes(
     arguments = np.zeros(8, np.int64)
     arguments.view(np.uint32)[0], arguments.view(np.uint32)[1] = ARGUMENT_FILTER, INVALID
     arguments[1], arguments[2] = kept.ctypes.data, collect
-    work, hit, ids = np.zeros(9), np.zeros(6), np.zeros(1, np.int64)
-    what = np.zeros(3 + 2 * room, np.int64)
+    work, ids = np.zeros(9), np.zeros(1, np.int64)
+    what = np.zeros(2 * room, np.int64)
     found, cosine = np.zeros(room), np.zeros(room)
     for at in range(lo, hi):
         if not gather(target, rays, at, 1, 1, ids, work):
             return first_bad(1, ids, work)
         load(1, rays.near, work, f)
         u[9] = rays.mask
-        count = _resolve(target, _pass(target, f, u, kept, arguments), names, work, hit, what, found, cosine)
+        count = _resolve(target, _pass(target, f, u, kept, arguments), names, work, what, found, cosine)
         if count == 0 or cosine[0] < 0.0:
             nudge(1, 0, work, f, work[7])
-            again = _resolve(
-                target, _pass(target, f, u, kept, arguments), names, work, hit, what, found, cosine
-            )
+            again = _resolve(target, _pass(target, f, u, kept, arguments), names, work, what, found, cosine)
             if again < count:  # the second look lost a face: the first one counts
                 load(1, rays.near, work, f)
-                _resolve(target, _pass(target, f, u, kept, arguments), names, work, hit, what, found, cosine)
+                _resolve(target, _pass(target, f, u, kept, arguments), names, work, what, found, cosine)
             count = max(count, again)
         i = ids[0]
         counts[i] = min(count, k)
@@ -151,6 +150,6 @@ def echoes(
             met = e < count
             ranges[i, e] = found[e] if met else np.inf
             cosines[i, e] = cosine[e] if met else 0.0
-            faces[i, e] = what[2 * e + 3] if met else -1
-            instances[i, e] = what[2 * e + 4] if met else -1
+            faces[i, e] = what[2 * e] if met else -1
+            instances[i, e] = what[2 * e + 1] if met else -1
     return -1

@@ -1,8 +1,8 @@
-"""Rays through embreex's own interface: the same results, several times slower, for when Embree is out of reach.
+"""Rays through embreex's own interface: the same results, slower, for when Embree itself is out of reach.
 
-embreex casts single float32 rays at triangles and knows neither masks nor copies: copies at rest are written out
-as triangles, faces that a mask hides are left out of a scene of their own, and things that move are cast at one
-by one in their own frames.
+embreex casts single float32 rays at triangles and knows neither masks nor copies: copies at rest are written
+out as triangles, faces that a mask hides are left out of a scene of their own, and things that move are cast
+at one by one in their own frames.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ class EmbreexScene:
         self._rest = _Body(_joined(soups))
 
     def _views(self, rays: Rays, o: Float, d: Float) -> list[tuple[_Body, Float, Float, Float]]:
-        """Bodies that the rays can see, with the rays' origins and directions and the body's normals' axes."""
+        """Bodies that rays can see, with the rays' origins and directions and the axes of their normals."""
         views = [(self._rest.seen(rays.mask), o, d, np.broadcast_to(np.eye(3), (len(d), 3, 3)))]
         for mover in self._movers:
             if mover.mask & rays.mask:
@@ -251,7 +251,7 @@ class EmbreexScene:
         start, d = in_scene(rays)
         n, o = len(d), start - self.origin
         far = np.broadcast_to(rays.far, (n,))
-        columns: list[list[Float | NDArray[np.int32]]] = [[], [], [], []]
+        columns: list[list[NDArray[Any]]] = [[], [], [], []]
         for body, local, way, axes in self._views(rays, o, d):
             for rows in body.all_met(local, way, k, rays.near, far).T:
                 t, _, m = body.at(rows, local, way)

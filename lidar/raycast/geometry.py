@@ -88,8 +88,9 @@ def split(vertices: Float, faces: NDArray[np.int32], mask: ArrayLike | None = No
     out = []
     for one in found:
         rows = np.flatnonzero(bits == one)
-        used, corners = np.unique(faces[rows], return_inverse=True)
-        points, corners = vertices[used], corners.reshape(-1, 3).astype(np.int32)
+        used, renumbered = np.unique(faces[rows], return_inverse=True)
+        points: Float = vertices[used]
+        corners: NDArray[np.int32] = np.ascontiguousarray(renumbered.reshape(-1, 3), np.int32)
         own = planes(points, corners)
         out.append(Geometry(points, corners, own, rows.astype(np.int32), mask=int(one)))
     return out

@@ -68,7 +68,7 @@ def _posed(pose: Any, p: int, x: float, y: float, z: float) -> Any:
 
 @inlined
 def gather(target: Target, rays: Rays, at: int, m: int, W: int, ids: Any, work: Any) -> bool:
-    """Load rays ``at`` to ``at + m`` of the order, the last again in lanes left over; whether all can be cast.
+    """Load rays ``at`` to ``at + m`` of the order, the last again in lanes left over; whether all will do.
 
     work : origin (3), direction (3), one over its length, far, time
     """
@@ -299,55 +299,34 @@ def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: 
 
 
 @inlined
-def settle(target: Target, W: int, k: int, work: Any, hit: Any, what: Any) -> Any:
-    """Range and cosine of lane k's hit, also where its plane is not unit or seen at a grazing angle."""
-    t, cosine = hit[4 * W + k], hit[5 * W + k]
-    instance = what[2 * W + k]
+def meet(target: Target, W: int, k: int, row: int, prim: int, instance: int, work: Any) -> Any:
+    """Range, cosine and normal (not unit), in float64, where lane k's ray meets the plane of a face."""
+    ox, oy, oz, dx, dy, dz = (
+        work[k],
+        work[W + k],
+        work[2 * W + k],
+        work[3 * W + k],
+        work[4 * W + k],
+        work[5 * W + k],
+    )
+    nx, ny, nz, d = plane_of(target, row, prim, instance, work[8 * W + k])
+    along = nx * dx + ny * dy + nz * dz
+    t = (d - nx * ox - ny * oy - nz * oz) / along
+    cosine = -along * work[6 * W + k]
     if instance >= 0:
-        nx, ny, nz = hit[k], hit[W + k], hit[2 * W + k]
         cosine /= np.sqrt(nx * nx + ny * ny + nz * nz)
     if not abs(cosine) >= _GRAZING:
-        ray = (work[k], work[W + k], work[2 * W + k], work[3 * W + k], work[4 * W + k], work[5 * W + k])
-        low, high = _extent(target, what[k], what[W + k], instance, ray, work[8 * W + k])
+        low, high = _extent(target, row, prim, instance, (ox, oy, oz, dx, dy, dz), work[8 * W + k])
         t = high if t > high else low if not t >= low else t
         cosine = cosine if cosine == cosine else 0.0  # noqa: PLR0124
-    return t, cosine
+    return t, cosine, nx, ny, nz
 
 
 @inlined
-def meet(W: int, work: Any, hit: Any) -> None:
-    """Ranges and cosines, in float64, of lanes that meet the planes in ``hit``."""
-    for k in range(W):
-        nx, ny, nz = hit[k], hit[W + k], hit[2 * W + k]
-        along = nx * work[3 * W + k] + ny * work[4 * W + k] + nz * work[5 * W + k]
-        gap = hit[3 * W + k] - nx * work[k] - ny * work[W + k] - nz * work[2 * W + k]
-        hit[4 * W + k] = gap / along
-        hit[5 * W + k] = -along * work[6 * W + k]
-
-
-@inlined
-def _look_up(target: Target, W: int, u: Any, work: Any, hit: Any, what: Any) -> None:
-    """Find the planes of the lanes' hits and where the rays meet them.
-
-    hit  : normal (3) and offset of the plane, range, cosine
-    what : row of ``parts``, number in it, instance
-    """
-    for k in range(W):
-        if u[18 * W + k] != _INVALID:
-            row, instance = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
-            prim = np.int64(u[17 * W + k])
-            x, y, z, d = plane_of(target, row, prim, instance, work[8 * W + k])
-            hit[k], hit[W + k], hit[2 * W + k], hit[3 * W + k] = x, y, z, d
-            what[k], what[W + k], what[2 * W + k] = row, prim, instance
-    meet(W, work, hit)
-
-
-@inlined
-def _normal(out: Float, i: int, met: bool, W: int, k: int, hit: Any) -> None:  # noqa: FBT001
-    """Write lane k's normal as a unit vector; zero for a miss."""
-    x, y, z = hit[k], hit[W + k], hit[2 * W + k]
+def _normal(out: Float, i: int, x: float, y: float, z: float) -> None:
+    """Write a normal as a unit vector; zero stays zero."""
     length = np.sqrt(x * x + y * y + z * z)
-    scale = 1.0 / length if met and length > 0.0 else 0.0
+    scale = 1.0 / length if length > 0.0 else 0.0
     out[i, 0], out[i, 1], out[i, 2] = scale * x, scale * y, scale * z
 
 
@@ -371,8 +350,7 @@ def cast(
     packet = aligned(4 * _ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
     one, valid = aligned(128).view(np.float32), aligned(4 * W).view(np.int32)
-    work, hit = np.zeros(9 * W), np.zeros(6 * W)
-    ids, what = np.zeros(W, np.int64), np.zeros(3 * W, np.int64)
+    work, ids = np.zeros(9 * W), np.zeros(W, np.int64)
     for k in range(W):
         u[9 * W + k] = rays.mask
         u[10 * W + k] = k
@@ -387,26 +365,28 @@ def cast(
             u[19 * W + k] = _INVALID
         together = _alike(W, work)
         _trace(target, W, _ROWS, f, valid, together, one)
-        _look_up(target, W, u, work, hit, what)
         doubtful = False
-        for k in range(W):
-            if k >= m:
-                break
+        for k in range(m):
             i = ids[k]
-            t, cosine, face, instance = np.inf, 0.0, np.int64(-1), np.int64(-1)
-            doubt = True
+            valid[k] = -1
             if u[18 * W + k] != _INVALID:
-                t, cosine = settle(target, W, k, work, hit, what)
-                doubt = cosine < 0.0
+                row, instance = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
+                prim = np.int64(u[17 * W + k])
+                t, cosine, x, y, z = meet(target, W, k, row, prim, instance, work)
                 if t <= work[7 * W + k]:
-                    face, instance = numbered(target, what[k], what[W + k]), what[2 * W + k]
-                else:
-                    t, cosine = np.inf, 0.0
-            ranges[i], cosines[i], faces[i], instances[i] = t, cosine, face, instance
-            valid[k] = -1 if doubt else 0
-            doubtful |= doubt
+                    ranges[i], cosines[i] = t, cosine
+                    faces[i], instances[i] = numbered(target, row, prim), instance
+                    if normals.size:
+                        _normal(normals, i, x, y, z)
+                    if cosine < 0.0:
+                        doubtful = True
+                    else:
+                        valid[k] = 0
+                    continue
+            doubtful = True
+            ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
             if normals.size:
-                _normal(normals, i, face >= 0, W, k, hit)
+                _normal(normals, i, 0.0, 0.0, 0.0)
         if not doubtful:
             continue
         for k in range(W):
@@ -415,16 +395,17 @@ def cast(
                 u[19 * W + k] = _INVALID
                 nudge(W, k, work, f, min(work[7 * W + k], ranges[ids[k]]))
         _trace(target, W, _ROWS, f, valid, together, one)
-        _look_up(target, W, u, work, hit, what)
-        for k in range(W):
+        for k in range(m):
             if valid[k] and u[18 * W + k] != _INVALID:
                 i = ids[k]
-                t, cosine = settle(target, W, k, work, hit, what)
+                row, instance = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
+                prim = np.int64(u[17 * W + k])
+                t, cosine, x, y, z = meet(target, W, k, row, prim, instance, work)
                 if t <= work[7 * W + k] and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
                     ranges[i], cosines[i] = t, cosine
-                    faces[i], instances[i] = numbered(target, what[k], what[W + k]), what[2 * W + k]
+                    faces[i], instances[i] = numbered(target, row, prim), instance
                     if normals.size:
-                        _normal(normals, i, faces[i] >= 0, W, k, hit)
+                        _normal(normals, i, x, y, z)
     return -1
 
 

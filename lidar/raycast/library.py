@@ -23,9 +23,7 @@ INVALID = 0xFFFFFFFF
 
 _PACKETS = ((16, 34), (8, 33), (4, 32))
 _VERSION = 0
-_TRACERS = ("rtcIntersect1", "rtcOccluded1") + tuple(
-    f"rtc{what}{width}" for what in ("Intersect", "Occluded") for width, _ in _PACKETS
-)
+_TRACERS = [f"rtc{what}{width}" for what in ("Intersect", "Occluded") for width in (1, 4, 8, 16)]
 
 _P, _U, _Z, _I = c.c_void_p, c.c_uint, c.c_size_t, c.c_int
 _PROTOTYPES: dict[str, tuple[Any, ...]] = {

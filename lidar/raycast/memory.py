@@ -9,15 +9,16 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-
-intersect1 = types.ExternalFunction("rtcIntersect1", types.void(*[types.int64] * 3))
-occluded1 = types.ExternalFunction("rtcOccluded1", types.void(*[types.int64] * 3))
-intersect4, intersect8, intersect16, occluded4, occluded8, occluded16 = (
+intersect1: Any = types.ExternalFunction("rtcIntersect1", types.void(*[types.int64] * 3))
+occluded1: Any = types.ExternalFunction("rtcOccluded1", types.void(*[types.int64] * 3))
+_packets: list[Any] = [
     types.ExternalFunction(f"rtc{what}{width}", types.void(*[types.int64] * 4))
     for what in ("Intersect", "Occluded")
     for width in (4, 8, 16)
-)
-"""Embree's tracing functions, by the names that `lidar.raycast.library` publishes; arguments are addresses."""
+]
+intersect4, intersect8, intersect16, occluded4, occluded8, occluded16 = _packets
+"""Embree's tracing functions, by the names that `lidar.raycast.library` publishes; all arguments are
+addresses."""
 
 
 def _loader(kind: Any, size: int) -> Any:
@@ -41,13 +42,15 @@ int32_at = _loader(types.int32, 4)
 
 
 @intrinsic
-def pointer(context: Any, address: Any) -> Any:  # noqa: ARG001
-    """The void pointer to an address."""
-
+def _pointer(context: Any, address: Any) -> Any:  # noqa: ARG001
     def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         return builder.inttoptr(values[0], cgutils.voidptr_t)
 
     return types.voidptr(types.int64), build
+
+
+pointer: Any = _pointer
+"""The void pointer to an address."""
 
 
 @njit(nogil=True)

@@ -16,7 +16,7 @@ from lidar.raycast.geometry import ALL
 Float = NDArray[np.float64]
 
 _CHUNK = 8192
-"""Rays that a thread takes at a time; a multiple of every packet width, so that packets do not depend on it."""
+"""Rays that a thread takes at a time; a multiple of every packet width, so that packets stay as they are."""
 
 
 def _rows(values: ArrayLike, name: str) -> Float:
@@ -115,8 +115,8 @@ def _refusal(rays: Rays, bad: int) -> InputError:
     if len(rays.offsets):
         where = f" from {rays.offsets[bad if len(rays.offsets) > 1 else 0].tolist()}" + where
     return InputError(
-        f"ray {bad} of {len(rays.directions)}, direction {rays.directions[bad].tolist()}{where}, cannot be cast:"
-        " rays need finite numbers and a direction that is not zero"
+        f"ray {bad} of {len(rays.directions)}, direction {rays.directions[bad].tolist()}{where},"
+        " cannot be cast: rays need finite numbers and a direction that is not zero"
     )
 
 

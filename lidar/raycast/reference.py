@@ -21,7 +21,7 @@ def _tree(low: Float, high: Float, order: Any, box: Any, child: Any) -> int:
     """
     stack = [(0, len(order), 0)]
     used = 1
-    while len(stack):
+    while stack:
         start, stop, node = stack.pop()
         for a in range(3):
             box[node, a], box[node, 3 + a] = np.inf, -np.inf
@@ -74,7 +74,7 @@ def _pass(
     """Collect the nearest faces a ray meets, as many as ``ranges`` has room for; their number."""
     count, room = 0, len(ranges)
     stack = [0]
-    while len(stack):
+    while stack:
         node = stack.pop()
         reach = min(far, ranges[room - 1]) if count == room else far
         first, last = near, reach
@@ -136,7 +136,7 @@ class Reference:
     def cast(
         self, origins: Float, directions: Float, *, k: int = 1, near: float = 0.0, far: float | Float = np.inf
     ) -> tuple[Float, NDArray[np.int64]]:
-        """Ray parameters (n, k) of the first k faces, nearest first, inf if there are fewer; and the faces, -1."""
+        """Ray parameters and faces (n, k) of the first k hits, nearest first; inf and -1 past the last."""
         o, d = (np.ascontiguousarray(np.broadcast_to(a, directions.shape)) for a in (origins, directions))
         ranges, faces = np.full((len(d), k), np.inf), np.full((len(d), k), -1, np.int64)
         reach = np.ascontiguousarray(np.broadcast_to(np.asarray(far, float), (len(d),)))
