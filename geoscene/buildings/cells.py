@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.shells import boundary, lift, triangulate
-from geoscene.buildings.skeleton import Skeleton, loops
+from geoscene.buildings.skeleton import Skeleton, loops, polygons_of
 from geoscene.validate import weld
 
 Float = NDArray[np.float64]
@@ -183,7 +183,7 @@ def skeleton_cells(skeleton: Skeleton) -> Cells:
     _, first, same = np.unique(key, axis=0, return_index=True, return_inverse=True)
     time = skeleton.time[first][same.ravel()]
     rings = _unpinched(xy, [_distinct(face, same.ravel()) for face in skeleton.faces])
-    polygons = np.array([shapely.Polygon(xy[r]) for r in rings if len(r) > 2], dtype=object)
+    polygons = polygons_of(xy, [r for r in rings if len(r) > 2])
     polygons = polygons[shapely.area(polygons) > 0]
     triangles, owner = triangulate(polygons)
     missing = np.setdiff1d(np.arange(len(polygons)), owner)
@@ -201,10 +201,10 @@ def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:
     Where a node of a ring lies within two millimetres of another arc of the ring, the arc is led through it,
     in the ring beyond too, and the ring falls into two.
     """
-    rings = list(rings)
     for _ in range(8 * len(rings)):
-        k = next((k for k, r in enumerate(rings) if len(r) > 2 and not shapely.Polygon(xy[r]).is_valid), -1)
-        found = _pinch(xy, rings[k]) if k >= 0 else None
+        rings = [r for r in rings if len(r) > 2]
+        crossed = np.flatnonzero(~shapely.is_valid(polygons_of(xy, rings)))
+        found = _pinch(xy, rings[crossed[0]]) if len(crossed) else None
         if found is None:
             break
         node, start, stop = found

@@ -193,24 +193,26 @@ def _ridged(polygon: Any, spec: RoofSpec) -> Cells:
     cells = replace(cells, field=cells.field - low)
     for share, _ in profile[1:-1]:
         cells = cut(cells, share * span)
-    height = _profile(cells.field, span, profile)
     if spec.shape == "half-hipped":
-        # hips begin half way up, with the pitch of the sides
-        ridge = np.array([-up[1], up[0]])
-        for end in (ridge, -ridge):
-            reach = cells.xy @ end
-            hip = 0.5 + (reach - reach.min()) / (span / 2)
-            cells = cut(replace(cells, field=(hip - height) * span), 0.0)
-            reach = cells.xy @ end
-            hip = 0.5 + (reach - reach.min()) / (span / 2)
-            across = with_field(cells, up, low).field
-            height = np.minimum(_profile(across, span, profile), hip)
-            cells = replace(cells, field=height)
-        ends = cells.xy @ ridge
-        first, last = 0.5 + (ends - ends.min()) / (span / 2), 0.5 + (ends.max() - ends) / (span / 2)
-        across = with_field(cells, up, low).field
-        height = np.minimum(np.minimum(_profile(across, span, profile), first), last)
-    return replace(cells, field=height)
+        return merged(_hipped_ends(cells, up, low, span))
+    return merged(replace(cells, field=_profile(cells.field, span, profile)))
+
+
+def _hipped_ends(cells: Cells, up: Float, low: float, span: float) -> Cells:
+    """A gabled cross-section whose ends are hipped from half way up, with the pitch of the sides."""
+    ridge = np.array([-up[1], up[0]])
+    hips = [(along, float((cells.xy @ along).min())) for along in (ridge, -ridge)]
+
+    def height(xy: Float, count: int) -> Float:
+        planes = [0.5 + 2 * (xy @ along - start) / span for along, start in hips[:count]]
+        return np.asarray(
+            np.minimum.reduce([_profile(xy @ up - low, span, ACROSS["gabled"]), *planes]), float
+        )
+
+    for k, (along, start) in enumerate(hips):
+        above = 0.5 + 2 * (cells.xy @ along - start) / span - height(cells.xy, k)
+        cells = cut(replace(cells, field=above * span), 0.0)
+    return replace(cells, field=height(cells.xy, len(hips)))
 
 
 def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
@@ -229,14 +231,17 @@ def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
     profile = INWARD[spec.shape]
     for share, _ in profile[1:-1]:
         cells = cut(cells, share * span)
+    if len(profile) > 2:
+        cells = merged(cells)
     return replace(cells, field=_profile(cells.field, span, profile)), len(skeleton.xy) > corners
 
 
 def _from_cells(cells: Cells, spec: RoofSpec) -> Triangles:
     """The shell under cells whose field is the share of the roof's height."""
     eaves = spec.high - spec.height
-    cells = merged(cells)
-    corners = np.concatenate([cells.xy, to_grid(eaves + cells.field * spec.height)[..., None]], axis=2)
+    # the tagged height is the top's, also where the footprint leaves out the ridge
+    share = cells.field / cells.field.max()
+    corners = np.concatenate([cells.xy, to_grid(eaves + share * spec.height)[..., None]], axis=2)
     zeros = np.zeros(len(corners), np.int64)
     top = Triangles(corners, zeros, np.full(len(corners), ROOF, np.uint8))
     low = to_grid(np.array([spec.low]))

@@ -313,16 +313,25 @@ def loops(ring: list[int]) -> list[list[int]]:
     return [path, *loops]
 
 
+def polygons_of(xy: Float, rings: list[list[int]]) -> NDArray[Any]:
+    """Polygons of rings of node numbers, three or more each."""
+    if not rings:
+        return np.empty(0, dtype=object)
+    sizes = [len(r) for r in rings]
+    nodes = np.concatenate([np.array(r) for r in rings])
+    lines = shapely.linearrings(xy[nodes], indices=np.repeat(np.arange(len(rings)), sizes))
+    polygons: NDArray[Any] = shapely.polygons(lines)
+    return polygons
+
+
 def _fills(skeleton: Skeleton, polygon: Any) -> bool:
-    """The faces have positive areas that add up to the polygon's, and do not cross themselves."""
-    shapes = [shapely.Polygon(skeleton.xy[f]) for f in skeleton.faces]
-    area = np.array([_signed_area(skeleton.xy[f]) for f in skeleton.faces])
+    """The faces are simple, counter-clockwise, and as large together as the polygon.
+
+    As their arcs pair up, they then cover each point of it once.
+    """
+    shapes = polygons_of(skeleton.xy, skeleton.faces)
+    area = shapely.area(shapes)
+    # rounding may turn slivers or let them cross themselves: a thousandth of a square metre is let pass
+    sound = (shapely.is_valid(shapes) & shapely.is_ccw(shapely.get_exterior_ring(shapes))) | (area < 1e-3)
     size = shapely.area(polygon)
-    # faces of slivers may touch themselves by rounding: a thousandth of a square metre is let pass
-    valid = shapely.is_valid(shapes) | (area < 1e-3)
-    return bool((area > -1e-6).all() and abs(area.sum() - size) < 1e-5 * max(size, 1.0) and valid.all())
-
-
-def _signed_area(ring: Float) -> float:
-    x, y = (ring - ring[0]).T
-    return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)
+    return bool(sound.all() and abs(area.sum() - size) < 1e-5 * max(size, 1.0))
