@@ -72,10 +72,14 @@ def test_the_skeleton_roof_cut_at_a_height_is_the_footprint_moved_in_by_as_much(
     level = share * skeleton.time.max()
     cells = cut(skeleton_cells(skeleton), level)
     above = np.abs(triangle_areas(cells.xy[cells.field.mean(axis=1) > level])).sum()
-    # GEOS moves the edges in by itself, with corners as sharp as they come, but first straightens out what is
-    # below a hundredth of the distance
-    moved = polygon.buffer(-level, join_style="mitre", mitre_limit=1e4).area
-    assert above == pytest.approx(moved, abs=(0.01 * level + 2e-3) * polygon.length)
+    # GEOS moves the edges in by itself, with corners as sharp as they come. It first straightens out what is
+    # below a hundredth of the distance, which goes wrong now and then: at once, or in small steps, but not both
+    once = stepwise = polygon.buffer(-level, join_style="mitre", mitre_limit=1e4)
+    if abs(above - once.area) > 1e-3 * polygon.length:
+        stepwise = polygon
+        for _ in range(40):
+            stepwise = stepwise.buffer(-level / 40, join_style="mitre", mitre_limit=1e4)
+    assert above == pytest.approx(stepwise.area, abs=2e-3 * polygon.length)
 
 
 @given(footprints())
