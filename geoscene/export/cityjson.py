@@ -285,7 +285,7 @@ def _solid(
         nested = [[values[rows].tolist() for rows in body] for body in groups]
         return nested if len(groups) > 1 else nested[0]
 
-    out = {
+    out: dict[str, Any] = {
         "type": "MultiSolid" if len(groups) > 1 else "Solid",
         "boundaries": spread(triangles[:, None] + first),
         "material": {"visual": {"values": spread(look)}},
@@ -342,7 +342,7 @@ def _copies(
     for number in np.argsort(first, kind="stable").tolist():
         rows = rows_of[number]
         feature = int(instances.feature[rows[0]])
-        klass = int(library[instances.shape[rows[-1]]].klass[0])
+        klass = int(library[int(instances.shape[rows[-1]])].klass[0])
         name = features.name(feature) if feature >= 0 else f"copy/{rows[0]}"
         matrix = np.tile(np.eye(4), (len(rows), 1, 1))
         matrix[:, :3, :3] = instances.transform[rows][:, :, :3]

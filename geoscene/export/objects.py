@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.export.files import plain
-from geoscene.mesh import Mesh
+from geoscene.mesh import Mesh, concatenate
 from geoscene.scene import Instances, Scene
 
 Float = NDArray[np.float64]
@@ -165,25 +165,20 @@ def parts(scene: Scene, layers: Collection[str] | None = None) -> Iterator[Part]
         yield Part((i, j), tile.origin, mesh, copies)
 
 
-def expand(instances: Instances, library: Sequence[Mesh]) -> Iterator[tuple[int, Mesh]]:
-    """Feature number and mesh of each copy, in tile coordinates, for formats that know no copies."""
-    for k in range(len(instances)):
-        shape, transform = library[instances.shape[k]], instances.transform[k]
-        points = shape.vertices @ transform[:, :3].T + transform[:, 3]
-        feature = int(instances.feature[k])
-        yield (
-            feature,
-            Mesh.of(
-                points,
-                shape.faces if np.linalg.det(transform[:, :3]) > 0 else shape.faces[:, ::-1],
-                feature=feature,
-                klass=shape.klass,
-                material=shape.material,
-                surface=shape.surface,
-                color=shape.color,
-                closed=shape.closed,
-            ),
-        )
+def expand(instances: Instances, library: Sequence[Mesh]) -> Mesh:
+    """The copies as one mesh, each face with its copy's feature, for formats that know no copies."""
+    out = []
+    for number in np.unique(instances.shape).tolist():
+        chosen = instances.shape == number
+        shape, transform = library[number], instances.transform[chosen]
+        k, n = len(transform), len(shape.vertices)
+        points = np.einsum("kij,nj->kni", transform[:, :, :3], shape.vertices) + transform[:, None, :, 3]
+        faces = shape.faces + (np.arange(k) * n)[:, None, None]
+        told = {name: np.tile(getattr(shape, name), k) for name in ("klass", "material", "surface", "closed")}
+        feature = np.repeat(instances.feature[chosen], len(shape))
+        color = np.tile(shape.color, (k, 1))
+        out.append(Mesh.of(points.reshape(-1, 3), faces.reshape(-1, 3), feature=feature, color=color, **told))
+    return concatenate(out)
 
 
 def klass_name(code: int) -> str:

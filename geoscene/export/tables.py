@@ -1,0 +1,133 @@
+"""Features as rows: the layers of a scene in pieces, in the plan, and its buildings as surfaces in space."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from geoscene.classes import Class
+from geoscene.errors import InputError, SceneFormatError
+from geoscene.export.objects import read_features
+from geoscene.mesh import Mesh
+from geoscene.scene import Scene
+
+SOLIDS = "building_solids"
+"""Name of the layer of buildings as MultiPolygon Z, which a scene does not store as features."""
+
+ROWS = 20_000
+"""Features that are in memory at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Some features of one layer.
+
+    layer    : its name
+    geometry : (n,) shapely, in the coordinates asked for
+    columns  : column name to (n,) values
+    """
+
+    layer: str
+    geometry: NDArray[np.object_]
+    columns: dict[str, NDArray[Any]]
+
+
+def target_crs(scene: Scene, crs: str | None) -> CRS:
+    """The CRS of a name, or the scene's; raises InputError for a name that pyproj does not know."""
+    if crs is None:
+        return scene.frame.crs
+    try:
+        return CRS.from_user_input(crs)
+    except CRSError as error:
+        raise InputError(f"--crs {crs}: pyproj does not know it; give EPSG:<number>") from error
+
+
+def chosen_layers(scene: Scene, layers: Collection[str] | None, *, solids: bool) -> list[str]:
+    """Names of the layers to write, in the scene's order; by default all that hold anything.
+
+    Raises InputError for a name that is none of the scene's.
+    """
+    known = [name for name, (a, b) in sorted(scene.layers.items(), key=lambda item: item[1]) if b > a]
+    if layers is None:
+        return [*known, SOLIDS] if solids and "buildings" in known else known
+    unknown = sorted(set(layers) - {*scene.layers, SOLIDS})
+    if unknown:
+        names = ", ".join([*scene.layers, SOLIDS])
+        raise InputError(f"no layer {', '.join(unknown)}; this scene has {names}")
+    return [name for name in [*known, SOLIDS] if name in layers]
+
+
+def kinds_of_columns(scene: Scene, layer: str) -> dict[str, np.dtype[Any]]:
+    """Type of each column of a layer; object for text."""
+    from pyogrio import read_info  # noqa: PLC0415  (0.3 s)
+    from pyogrio.errors import DataLayerError, DataSourceError  # noqa: PLC0415
+
+    path = scene.path / "features.gpkg"
+    try:
+        told = read_info(path, layer="buildings" if layer == SOLIDS else layer)
+    except (DataSourceError, DataLayerError) as error:
+        raise SceneFormatError(f"{path}: no readable layer {layer} ({error})") from error
+    kinds = [np.dtype(kind) for kind in told["dtypes"]]
+    return dict(zip(told["fields"].tolist(), kinds, strict=True))
+
+
+def rows(scene: Scene, layer: str, crs: CRS) -> Iterator[Rows]:
+    """The features of a layer, some at a time, in their order (solids: tile by tile)."""
+    if layer == SOLIDS:
+        yield from _solids(scene, crs)
+        return
+    from pyogrio.raw import read  # noqa: PLC0415
+
+    start, stop = scene.layers[layer]
+    same = crs == scene.frame.crs
+    for skip in range(0, stop - start, ROWS):
+        meta, _, wkb, values = read(
+            scene.path / "features.gpkg", layer=layer, skip_features=skip, max_features=ROWS
+        )
+        geometry = shapely.from_wkb(wkb)
+        if not same:
+            geometry = _moved(scene, geometry, crs, projected=True)
+        yield Rows(layer, geometry, dict(zip(meta["fields"].tolist(), values, strict=True)))
+
+
+def _moved(scene: Scene, geometry: NDArray[np.object_], crs: CRS, *, projected: bool) -> NDArray[np.object_]:
+    """Geometries in scene metres, or in the frame's projected coordinates, in those of a CRS."""
+    flat = shapely.get_coordinates(geometry, include_z=True)
+    east, north = scene.frame.origin if projected else (0.0, 0.0)
+    x, y = scene.frame.to_crs(crs, flat[:, 0] - east, flat[:, 1] - north)
+    tall = bool(shapely.has_z(geometry).any())
+    out: NDArray[np.object_] = shapely.set_coordinates(
+        shapely.force_3d(geometry) if tall else geometry.copy(),
+        np.column_stack([x, y, np.nan_to_num(flat[:, 2])] if tall else [x, y]),
+    )
+    return out
+
+
+def _solids(scene: Scene, crs: CRS) -> Iterator[Rows]:
+    features = read_features(scene)
+    columns = features.columns[features.layers.index("buildings")]
+    first, stop = scene.layers["buildings"]
+    for tile in scene.tiles():
+        mesh = tile.mesh
+        keep = mesh.closed & (mesh.feature >= first) & (mesh.feature < stop) & (mesh.klass == Class.BUILDING)
+        chosen = mesh.take(np.flatnonzero(keep)[np.argsort(mesh.feature[keep], kind="stable")])
+        if not len(chosen):
+            continue
+        feature, geometry = surfaces(chosen.shifted(tile.origin))
+        own = {name: values[feature - first] for name, values in columns.items()}
+        yield Rows(SOLIDS, _moved(scene, geometry, crs, projected=False), {"feature": feature, **own})
+
+
+def surfaces(mesh: Mesh) -> tuple[NDArray[np.int32], NDArray[np.object_]]:
+    """Feature numbers (n,) and the faces of each as a MultiPolygon Z; the mesh's faces in feature order."""
+    corners = mesh.vertices[mesh.faces]
+    rings = np.concatenate([corners, corners[:, :1]], axis=1)
+    feature, owner = np.unique(mesh.feature, return_inverse=True)
+    return feature, shapely.multipolygons(shapely.polygons(rings), indices=owner)

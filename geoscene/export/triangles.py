@@ -1,0 +1,204 @@
+"""Meshes for modellers and printers: OBJ with its MTL, PLY, STL."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import materials
+from geoscene.export.files import Summary, append, size_of, spool, whole_file
+from geoscene.export.objects import attribution, expand, klass_name, parts, pieces, read_features
+from geoscene.mesh import Mesh, concatenate
+from geoscene.progress import Progress, silent
+from geoscene.scene import Scene
+from geoscene.validate import degenerate_faces, validate_mesh
+
+Float = NDArray[np.float64]
+
+
+def _meshes(
+    scene: Scene, layers: Collection[str] | None, stage: str, progress: Progress
+) -> Iterator[tuple[tuple[int, int], Mesh]]:
+    """Index and mesh of each tile in scene metres, its copies expanded."""
+    library = list(scene.shapes().values())
+    for done, part in enumerate(parts(scene, layers)):
+        progress(stage, done, len(scene.tile_indices))
+        copies = [expand(part.instances, library)] if len(part.instances) else []
+        yield part.index, concatenate([part.mesh, *copies]).shifted(part.origin)
+
+
+def _head(scene: Scene) -> list[str]:
+    """Where the coordinates are, as lines of comment."""
+    east, north = scene.frame.origin
+    wkt = " ".join(scene.frame.wkt.split())
+    return [
+        "made by geoscene; x east, y north, z up, metres",
+        attribution(scene),
+        f"add {east:.0f} to x and {north:.0f} to y for coordinates in {scene.frame.name}",
+        f"heights: {scene.frame.vertical}",
+        f"crs {wkt}",
+    ]
+
+
+def write_obj(
+    scene: Scene, path: Path, *, layers: Collection[str] | None = None, progress: Progress = silent
+) -> Summary:
+    """Write a scene as Wavefront OBJ with an MTL beside it: an object a feature, z up, scene metres.
+
+    Coordinates are whole tenths of a millimetre, the grid of the solids, so that nothing moves.
+    """
+    features = read_features(scene)
+    objects = solids = faces = first = 0
+    looks: dict[tuple[int, ...], str] = {}
+    library = path.with_suffix(".mtl")
+    with whole_file(library) as colors, whole_file(path) as out:
+        out.write("".join(f"# {line}\n" for line in _head(scene)).encode())
+        out.write(f"mtllib {library.name}\n".encode())
+        for index, mesh in _meshes(scene, layers, "OBJ", progress):
+            out.write(_lines("v %.4f %.4f %.4f\n", mesh.vertices))
+            for piece in pieces(mesh):
+                name = features.name(piece.feature)
+                if not piece.solid or piece.feature < 0:
+                    name += f"/{klass_name(piece.klass)}@{index[0]}_{index[1]}"
+                out.write(f"o {name.replace(' ', '_')}\n".encode())
+                look = np.column_stack([mesh.material[piece.rows], mesh.color[piece.rows]])
+                known, which = np.unique(look, axis=0, return_inverse=True)
+                for number, key in enumerate(known.tolist()):
+                    material = looks.setdefault(tuple(key), _material_name(key))
+                    out.write(f"usemtl {material}\n".encode())
+                    rows = piece.rows[which.ravel() == number]
+                    out.write(_lines("f %d %d %d\n", mesh.faces[rows] + (first + 1)))
+                objects += 1
+                solids += piece.solid
+            first += len(mesh.vertices)
+            faces += len(mesh)
+        for (_, *rgb), material in looks.items():
+            color = " ".join(f"{v / 255:.4f}" for v in rgb)
+            colors.write(f"newmtl {material}\nKd {color}\nKa 0 0 0\nKs 0 0 0\nd 1\nillum 1\n\n".encode())
+    size = size_of(path)[1] + size_of(library)[1]
+    return Summary(path, "obj", 2, size, objects, solids, faces, scene.frame.name)
+
+
+def _lines(form: str, values: NDArray[Any]) -> bytes:
+    """Each row of values by one printf form: one call of the interpreter for all."""
+    return ((form * len(values)) % tuple(values.ravel().tolist())).encode()
+
+
+def _material_name(look: list[int]) -> str:
+    names = {material.code: name for name, material in materials().items()}
+    code, r, g, b = look
+    return f"{names.get(code, 'unknown')}_{r:02x}{g:02x}{b:02x}"
+
+
+_FACE = np.dtype(
+    [
+        ("corners", "u1"), ("corner", "<i4", 3), ("feature", "<i4"), ("class", "u1"), ("material", "u1"),
+        ("surface", "u1"), ("closed", "u1"), ("red", "u1"), ("green", "u1"), ("blue", "u1"),
+    ]
+)  # fmt: skip
+
+
+def write_ply(
+    scene: Scene, path: Path, *, layers: Collection[str] | None = None, progress: Progress = silent
+) -> Summary:
+    """Write a scene as one binary little-endian PLY: double vertices in scene metres, z up.
+
+    Each face has ``feature``, ``class``, ``material``, ``surface`` (0 other, 1 wall, 2 roof, 3 floor),
+    ``closed`` (of a solid), ``red``, ``green`` and ``blue``; codes as in ``scene.json``.
+    """
+    solids: set[int] = set()
+    vertices = faces = objects = 0
+    with whole_file(path) as out, spool(path) as rest:
+        out.write(_ply_head(scene, 0, 0))
+        for _, mesh in _meshes(scene, layers, "PLY", progress):
+            out.write(mesh.vertices.astype("<f8").tobytes())
+            rows = np.zeros(len(mesh), _FACE)
+            rows["corners"] = 3
+            rows["corner"] = mesh.faces + vertices
+            rows["feature"], rows["class"], rows["material"] = mesh.feature, mesh.klass, mesh.material
+            rows["surface"], rows["closed"] = mesh.surface, mesh.closed
+            for k, name in enumerate(("red", "green", "blue")):
+                rows[name] = mesh.color[:, k]
+            rest.write(rows.tobytes())
+            vertices += len(mesh.vertices)
+            faces += len(mesh)
+            objects += len(pieces(mesh))
+            solids |= set(np.unique(mesh.feature[mesh.closed]).tolist())
+        append(out, rest)
+        out.seek(0)
+        out.write(_ply_head(scene, vertices, faces))
+    files, size = size_of(path)
+    return Summary(path, "ply", files, size, objects, len(solids), faces, scene.frame.name)
+
+
+def _ply_head(scene: Scene, vertices: int, faces: int) -> bytes:
+    """The header; its length does not depend on the counts, which are known only at the end."""
+    kinds = {"i": "int", "u": "uchar"}
+    columns = [f"property {kinds[_FACE[name].kind]} {name}" for name in _FACE.names[2:]]  # type: ignore[index]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {line}" for line in _head(scene)),
+        f"element vertex {vertices:<12d}",
+        *(f"property double {axis}" for axis in "xyz"),
+        f"element face {faces:<12d}",
+        "property list uchar int vertex_indices",
+        *columns,
+        "end_header",
+    ]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def write_stl(
+    scene: Scene, path: Path, *, layers: Collection[str] | None = None, progress: Progress = silent
+) -> Summary:
+    """Write the solids of a scene as one binary STL, z up, metres from the middle of the scene.
+
+    STL has no objects, no colours and float32 coordinates. Faces that these make degenerate are left out, and
+    so is, and is counted in the notes, a solid that they would not leave closed.
+    """
+    xmin, ymin, xmax, ymax = scene.bounds
+    middle = np.array([np.round((xmin + xmax) / 2), np.round((ymin + ymax) / 2), 0.0])
+    east, north = scene.frame.origin
+    facets = solids = broken = 0
+    row = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
+    head = f"geoscene; add {middle[0] + east:.0f} {middle[1] + north:.0f} 0; {scene.frame.name}"
+    with whole_file(path) as out:
+        out.write(head.encode("ascii", "replace")[:80].ljust(80, b" ") + bytes(4))
+        for _, mesh in _meshes(scene, layers, "STL", progress):
+            mesh, lost = _in_single_precision(mesh.take(mesh.closed).shifted(-middle))  # noqa: PLW2901
+            rows = np.zeros(len(mesh), row)
+            rows["normal"] = mesh.normals()
+            rows["corner"] = mesh.vertices[mesh.faces]
+            out.write(rows.tobytes())
+            facets += len(mesh)
+            solids += len(np.unique(mesh.feature))
+            broken += lost
+        out.seek(80)
+        out.write(np.array(facets, "<u4").tobytes())
+    files, size = size_of(path)
+    notes = (f"{broken} solids left out: float32 coordinates would not leave them closed",) if broken else ()
+    return Summary(path, "stl", files, size, solids, solids, facets, scene.frame.name, notes)
+
+
+def _in_single_precision(mesh: Mesh) -> tuple[Mesh, int]:
+    """The solids with vertices that float32 holds, less those that are then no longer closed; how many."""
+    points = mesh.vertices.astype(np.float32).astype(np.float64)
+    rounded = Mesh.of(
+        points,
+        mesh.faces,
+        feature=mesh.feature,
+        klass=mesh.klass,
+        material=mesh.material,
+        surface=mesh.surface,
+        color=mesh.color,
+        closed=mesh.closed,
+    )
+    rounded = rounded.take(~degenerate_faces(points, mesh.faces))
+    verdict = validate_mesh(rounded)
+    bad = verdict.feature[~verdict.ok]
+    return rounded.take(~np.isin(rounded.feature, bad)), len(bad)
