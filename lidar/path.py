@@ -33,6 +33,7 @@ MARGIN = 0.25
 """Metres that the body keeps from obstacles."""
 _REPAIRS = 16
 _PUSH = 4.0  # metres before and behind an obstacle over which the line is pushed aside
+_ASTRAY = 1.5  # turning radii from the middle of its lane beyond which a vehicle has left the street
 _WHEEL = 0.95  # share of the full lock that the line asks for, so that the wheel has some left to correct
 
 
@@ -168,15 +169,17 @@ def _clear_track(line: Line, setting: Setting, pose: Pose | None) -> Track:
     left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
     shift = np.zeros(len(base))
     for _ in range(_REPAIRS):
-        xy = relaxed(base + shift[:, None] * left, cap / scale, reach)
+        pushed = base + shift[:, None] * left
+        xy = relaxed(pushed, cap / scale, reach)
         track = follow(xy, vehicle, scale, pose=pose, step=setting.step)
-        if track.row[-1] < len(base) - 1:
-            x, y, _ = track.end
+        lost = _lost(track, line, pushed, vehicle)
+        if len(lost):
+            x, y = base[lost[0]]
             raise BlockedError(
                 f"the {vehicle.name} cannot follow the route near scene x {x:.1f}, y {y:.1f} (edge"
-                f" {line.edge[track.row[-1]]}): it bends too tightly for a turning radius of"
+                f" {line.edge[lost[0]]}): it bends too tightly for a turning radius of"
                 f" {vehicle.turning_radius} m",
-                turns_at(line, track.row[-1:]),
+                turns_at(line, lost),
             )
         push, at = pushes(track, line, setting)
         if not len(at):
@@ -198,6 +201,17 @@ def _clear_track(line: Line, setting: Setting, pose: Pose | None) -> Track:
         f" scene x {x:.1f}, y {y:.1f} (edge {line.edge[worst]}); choose another route or a smaller vehicle",
         turns_at(line, at),
     )
+
+
+def _lost(track: Track, line: Line, xy: Float, vehicle: Vehicle) -> NDArray[np.int64]:
+    """The row of the line, pushed to ``xy`` (n, 2), where the track leaves it; none if it does not."""
+    if track.row[-1] < len(line.edge) - 1:
+        return track.row[-1:]
+    d = track.xy - xy[track.row]
+    astray = (line.edge[track.row] >= 0) & (np.hypot(*d.T) > _ASTRAY * vehicle.turning_radius)
+    rows = track.row[astray]
+    worst = int(np.argmax(np.hypot(*d.T)))
+    return track.row[worst : worst + 1] if len(rows) else rows
 
 
 def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Ground | None) -> Path:
