@@ -22,6 +22,8 @@ from lidar.raycast.library import (
     INDEX,
     INSTANCE_ARRAY,
     INVALID,
+    LOW,
+    MEDIUM,
     ROBUST,
     TRANSFORM,
     TRIANGLE,
@@ -62,6 +64,9 @@ class EmbreeScene:
         self.address: int = self._lib.call("rtcNewScene", self._lib.device)
         weakref.finalize(self, self._lib.embree.rtcReleaseScene, self.address)
         self._lib.call("rtcSetSceneFlags", self.address, ROBUST | (DYNAMIC if dynamic else 0))
+        if dynamic:
+            # Only in scenes of low quality does Embree keep a tree for each geometry; those are made well.
+            self._lib.call("rtcSetSceneBuildQuality", self.address, LOW)
         self.parts: dict[int, Geometry] = {}
         self._copies: list[tuple[int, NDArray[np.intp]]] = []
         self._groups: list[tuple[Instances, Sequence[EmbreeScene], Float]] = []
@@ -82,6 +87,7 @@ class EmbreeScene:
         fill(self._lib, geometry, VERTEX, 0, FLOAT3, part.vertices.astype(np.float32))
         fill(self._lib, geometry, INDEX, 0, UINT3, part.faces.astype(np.uint32))
         self._lib.call("rtcSetGeometryMask", geometry, part.mask)
+        self._lib.call("rtcSetGeometryBuildQuality", geometry, MEDIUM)
         self._attach(geometry, number)
 
     def detach(self, number: int) -> None:

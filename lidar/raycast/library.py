@@ -17,6 +17,7 @@ TRIANGLE, INSTANCE_ARRAY = 0, 122
 INDEX, VERTEX, TRANSFORM = 0, 1, 23
 UINT, UINT3, FLOAT3, FLOAT3X4_ROW_MAJOR = 0x5001, 0x5003, 0x9003, 0x9134
 DYNAMIC, ROBUST = 1 << 0, 1 << 2
+LOW, MEDIUM = 0, 1
 COHERENT, ARGUMENT_FILTER = 1 << 16, 1 << 1
 INVALID = 0xFFFFFFFF
 """Numbers of Embree's C interface (embree4/rtcore_*.h, version 4.4)."""
@@ -34,6 +35,8 @@ _PROTOTYPES: dict[str, tuple[Any, ...]] = {
     "rtcNewScene": (_P, _P),
     "rtcReleaseScene": (None, _P),
     "rtcSetSceneFlags": (None, _P, _I),
+    "rtcSetSceneBuildQuality": (None, _P, _I),
+    "rtcSetGeometryBuildQuality": (None, _P, _I),
     "rtcCommitScene": (None, _P),
     "rtcNewGeometry": (_P, _P, _I),
     "rtcReleaseGeometry": (None, _P),
