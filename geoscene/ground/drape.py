@@ -24,6 +24,9 @@ Height = Callable[[Float, Float], Float]
 _STATION = 20.0
 """Spacing of places along shores and rivers at which the terrain is asked, metres."""
 
+_FINE = 2.0
+"""Spacing of the places at which a river's level is kept, metres."""
+
 _CUT = 3.0
 """How deep a river may cut into the terrain model, metres: deeper is a fault of the model or the map."""
 
@@ -54,7 +57,7 @@ def water_levels(layers: Layers, ways: Sequence[Way], frame: Frame, *, height: H
 
     The sea has one level: the median of the terrain over it. Standing water, with all that touches it,
     has one level: the sea's if the sea is among it, else the lowest terrain on its shore. A river falls
-    along its centre line, level across: at stations every 20 m it is the lowest terrain from its source
+    along its centre line, level across: every 20 m it is the lowest terrain from its source
     to there, but not more than 3 m below the terrain; one that the map draws against a fall of more than
     3 m is turned round and named in the result. A river's area without a centre line in it is standing
     water.
@@ -161,8 +164,12 @@ def _profiles(ways: Sequence[Way], frame: Frame, height: Height) -> tuple[Float,
         if ground[-third:].mean() > ground[:third].mean() + _CUT:
             xy, ground = xy[::-1], ground[::-1]
             turned.append(way.osm_id)
-        stations.append(xy)
-        heights.append(np.maximum(np.minimum.accumulate(ground), ground - _CUT))
+        level = np.maximum(np.minimum.accumulate(ground), ground - _CUT)
+        # Between stations the water falls evenly.
+        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(xy, axis=0).T)))
+        fine = np.linspace(0.0, along[-1], max(int(along[-1] / _FINE), 1) + 1)
+        stations.append(np.column_stack([np.interp(fine, along, column) for column in xy.T]))
+        heights.append(np.interp(fine, along, level))
     return np.concatenate(stations), np.concatenate(heights), tuple(turned)
 
 

@@ -112,7 +112,7 @@ def plan_ground(
 
     extent : (xmin, ymin, xmax, ymax), scene metres
     lines  : spacing in metres of lines (parallel to the axes, at its multiples) along which cells are cut, so
-             that the ground can follow a terrain; 0 for none
+             that the ground can follow a terrain (still water is not cut); 0 for none
     base   : class and material where no polygon lies
 
     Raises InputError for an extent without area or non-finite, or sizes off the grid.
@@ -167,7 +167,8 @@ def partition_tile(plan: GroundPlan, i: int, j: int) -> Partition:
     row = winners(plan, inside[:, 0], inside[:, 1])
     edges = _Edges.of(cells)
     row, slivers = _without_slivers(edges, cells, row)
-    cells, row = _dissolve(edges, row, box, plan.lines)
+    level = np.append(np.isin(plan.layers.body, ("sea", "standing")), np.False_)[row]
+    cells, row = _dissolve(edges, row, box, lines=plan.lines, level=level)
     cells = shapely.coverage_simplify(cells, BEND, simplify_boundary=False)
     # The base stands after the last row of the layers, where -1 finds it.
     klass = np.append(plan.layers.klass, np.uint8(plan.base[0]))[row]
@@ -362,9 +363,14 @@ def _without_slivers(
 
 
 def _dissolve(
-    edges: _Edges, row: NDArray[np.int64], box: tuple[float, float, float, float], lines: float
+    edges: _Edges,
+    row: NDArray[np.int64],
+    box: tuple[float, float, float, float],
+    *,
+    lines: float,
+    level: NDArray[np.bool_],
 ) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
-    """Cells of one row joined (but not across the terrain's lines), and their rows.
+    """Cells of one row joined, over the terrain's lines only where they are level, and their rows.
 
     Vertices on what remains of the borders all stay.
     """
@@ -372,7 +378,7 @@ def _dissolve(
     if lines > 0:
         p, q = edges.points[edges.a], edges.points[edges.b]
         on_line = (p == q) & (p == np.round(p / lines) * lines)
-        kept |= on_line.any(axis=1)
+        kept |= on_line.any(axis=1) & ~level[edges.cell]
     drawn = kept & ((edges.a < edges.b) | (edges.other < 0))
     segments = np.stack([edges.points[edges.a[drawn]], edges.points[edges.b[drawn]]], axis=1)
     cells = _faces(shapely.multilinestrings(shapely.linestrings(segments)), box)
