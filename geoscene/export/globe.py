@@ -1,0 +1,59 @@
+"""Scene coordinates as Earth-centred ones, and as east, north, up about the scene's middle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from geoscene.frames import Frame
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Globe:
+    """East, north, up at a point of the ellipsoid, metres; straight axes, so that the Earth bends away.
+
+    frame  : the scene's
+    lift   : metres that heights of the scene are raised by to be ellipsoidal
+    matrix : (4, 4) east, north, up to WGS 84 Earth-centred (EPSG:4978)
+    """
+
+    frame: Frame
+    lift: float
+    matrix: Float
+
+    @classmethod
+    def at(cls, frame: Frame, x: float, y: float, *, lift: float = 0.0) -> Globe:
+        """The globe with its zero at a point of the scene."""
+        lon, lat = (np.radians(float(v)) for v in frame.to_geographic(x, y))
+        matrix = np.eye(4)
+        matrix[:3, 0] = -np.sin(lon), np.cos(lon), 0
+        matrix[:3, 1] = -np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)
+        matrix[:3, 2] = np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)
+        matrix[:3, 3] = earth_centred(frame, np.array([[x, y, 0.0]]), lift=lift)[0]
+        return cls(frame, lift, matrix)
+
+    def local(self, points: Float) -> Float:
+        """East, north, up (n, 3) of points in scene metres."""
+        out: Float = (earth_centred(self.frame, points, lift=self.lift) - self.matrix[:3, 3]) @ self.matrix[
+            :3, :3
+        ]
+        return out
+
+    def jacobian(self, points: Float) -> Float:
+        """(n, 3, 3): how east, north, up change with scene x, y and z at points in scene metres."""
+        steps = np.concatenate([np.eye(3), -np.eye(3)])
+        around = self.local((points[:, None] + steps).reshape(-1, 3)).reshape(-1, 6, 3)
+        out: Float = ((around[:, :3] - around[:, 3:]) / 2).transpose(0, 2, 1)
+        return out
+
+
+def earth_centred(frame: Frame, points: Float, *, lift: float = 0.0) -> Float:
+    """WGS 84 Earth-centred coordinates (n, 3), EPSG:4978, of points in scene metres."""
+    lon, lat = frame.to_geographic(points[:, 0], points[:, 1])
+    change = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    return np.column_stack(change.transform(lon, lat, points[:, 2] + lift))

@@ -1,0 +1,260 @@
+"""3D Tiles 1.1: a quadtree of boxes over the scene's tiles, their content as binary glTF."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.errors import InputError
+from geoscene.export.files import Summary, size_of, whole_file, whole_folder
+from geoscene.export.globe import Globe
+from geoscene.export.gltf import GlbWriter, y_up
+from geoscene.export.objects import Features, Part, attribution, expand, parts, pieces, read_features
+from geoscene.mesh import Mesh
+from geoscene.progress import Progress, silent
+from geoscene.scene import Instances, Scene, write_atomically
+
+Float = NDArray[np.float64]
+
+_MARGIN = 1e-3
+"""Metres that boxes are larger than their content, for what float32 rounds."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Node:
+    """A tile of the tileset: its box as lowest and highest corner, and its JSON."""
+
+    low: Float
+    high: Float
+    document: dict[str, Any]
+
+
+def write_3dtiles(
+    scene: Scene,
+    path: Path,
+    *,
+    layers: Collection[str] | None = None,
+    height_offset: float = 0.0,
+    progress: Progress = silent,
+) -> Summary:
+    """Write a scene as a folder with ``tileset.json`` (3D Tiles 1.1), tile by tile.
+
+    Coordinates are east, north, up about the scene's middle, true to the ellipsoid (no flat Earth); the
+    root's transform takes them to EPSG:4978. Each tile of the scene has its ground and solids, and as its child its
+    copies (trees, street furniture; EXT_mesh_gpu_instancing). The geometric error of a tile is the size of
+    what is missing while its children are not there: their box's diagonal where the tile is but a box, the
+    height of the tallest copy where the copies are missing, 0 where nothing is. Features have attributes
+    as property tables (EXT_structural_metadata, EXT_mesh_features).
+
+    height_offset : metres from the zero of the scene's heights up from the WGS 84 ellipsoid (for orthometric
+                    heights the geoid's undulation)
+
+    Raises InputError where the folder is something else, and for a scene without anything in it.
+    """
+    xmin, ymin, xmax, ymax = scene.bounds
+    globe = Globe.at(scene.frame, (xmin + xmax) / 2, (ymin + ymax) / 2, lift=height_offset)
+    features = read_features(scene)
+    library = list(scene.shapes().values())
+    names = list(scene.shapes())
+    objects = solids = faces = 0
+    with whole_folder(path, mark="tileset.json") as folder:
+        (folder / "content").mkdir()
+        nodes: dict[tuple[int, int], _Node] = {}
+        for done, part in enumerate(parts(scene, layers)):
+            progress("3D Tiles", done, len(scene.tile_indices))
+            node = _tile(folder, scene, part, features, globe, names, library)
+            if node is not None:
+                nodes[part.index] = node
+            found = pieces(part.mesh)
+            objects += len(found) + len(part.instances)
+            solids += sum(piece.solid for piece in found)
+            faces += len(part.mesh)
+        if not nodes:
+            raise InputError(f"{scene.path}: nothing of the chosen layers in it")
+        root = _quadtree(nodes)
+        diagonal = float(np.linalg.norm(root.high - root.low))
+        document = {
+            "asset": {"version": "1.1", "extras": {"attribution": attribution(scene)}},
+            "geometricError": max(diagonal, root.document["geometricError"]),
+            "root": {**root.document, "transform": globe.matrix.T.ravel().tolist()},
+        }
+        text = json.dumps(document, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+        write_atomically(folder / "tileset.json", text.encode())
+    notes: tuple[str, ...] = ()
+    if scene.frame.vertical != "ellipsoidal" and not height_offset:
+        notes = (f"{scene.frame.vertical} heights stand as ellipsoidal ones; --height-offset raises them",)
+    files, size = size_of(path)
+    return Summary(path, "3dtiles", files, size, objects, solids, faces, "EPSG:4978", notes)
+
+
+def _box(low: Float, high: Float) -> dict[str, list[float]]:
+    """A bounding volume around a box; it is no smaller for being written in decimals."""
+    middle, half = (low + high) / 2, (high - low) / 2 + _MARGIN
+    return {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]}
+
+
+def _quadtree(nodes: dict[tuple[int, int], _Node]) -> _Node:
+    """One node over all: fours of neighbours are joined until one is left."""
+    west, south = (min(index[axis] for index in nodes) for axis in (0, 1))
+    level = {(i - west, j - south): node for (i, j), node in sorted(nodes.items())}
+    while len(level) > 1:
+        groups: dict[tuple[int, int], list[_Node]] = {}
+        for (i, j), node in level.items():
+            groups.setdefault((i >> 1, j >> 1), []).append(node)
+        level = {index: _joined(children) for index, children in groups.items()}
+    return next(iter(level.values()))
+
+
+def _joined(children: list[_Node]) -> _Node:
+    if len(children) == 1:
+        return children[0]
+    low = np.min([c.low for c in children], axis=0)
+    high = np.max([c.high for c in children], axis=0)
+    document = {
+        "boundingVolume": _box(low, high),
+        "geometricError": float(np.linalg.norm(high - low)),
+        "refine": "ADD",
+        "children": [c.document for c in children],
+    }
+    return _Node(low, high, document)
+
+
+def _tile(
+    folder: Path,
+    scene: Scene,
+    part: Part,
+    features: Features,
+    globe: Globe,
+    names: list[str],
+    library: list[Mesh],
+) -> _Node | None:
+    """Write the contents of one tile; its node, or None where there is nothing in it."""
+    name = f"{part.index[0]}_{part.index[1]}"
+    copies = None
+    if len(part.instances):
+        file = folder / "content" / f"{name}_copies.glb"
+        _write_copies(file, scene, part, features, globe, names)
+        copies = _copies_node(f"content/{file.name}", part, globe, library)
+    if not len(part.mesh):
+        return copies
+    low, high = _write_mesh(folder / "content" / f"{name}.glb", scene, part, features, globe)
+    document: dict[str, Any] = {
+        "boundingVolume": _box(low, high),
+        "geometricError": 0.0,
+        "refine": "ADD",
+        "content": {"uri": f"content/{name}.glb", "boundingVolume": _box(low, high)},
+    }
+    if copies is not None:
+        low, high = np.minimum(low, copies.low), np.maximum(high, copies.high)
+        document["boundingVolume"] = _box(low, high)
+        document["geometricError"] = float(_tallest(part.instances, library))
+        document["children"] = [copies.document]
+    return _Node(low, high, document)
+
+
+def _tallest(instances: Instances, library: list[Mesh]) -> float:
+    heights = np.array([np.ptp(shape.vertices[:, 2]) for shape in library])
+    return float((heights[instances.shape] * np.linalg.norm(instances.transform[:, :, 2], axis=1)).max())
+
+
+def _write_mesh(
+    path: Path, scene: Scene, part: Part, features: Features, globe: Globe
+) -> tuple[Float, Float]:
+    """Write the faces of a tile, a mesh a layer; the lowest and highest corner of the points as written."""
+    mesh = part.mesh
+    local = globe.local(mesh.vertices + part.origin)
+    middle = np.round((local.min(axis=0) + local.max(axis=0)) / 2)
+    layer = np.searchsorted(features.starts, mesh.feature, side="right")
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    with whole_file(path) as out, GlbWriter(path) as writer:
+        children = []
+        for number in np.unique(layer).tolist():
+            rows = np.flatnonzero(layer == number)
+            feature, which = np.unique(mesh.feature[rows], return_inverse=True)
+            # A vertex names its feature, so that features cannot share one.
+            key = which[:, None] * len(mesh.vertices) + mesh.faces[rows].astype(np.int64)
+            own, corners = np.unique(key, return_inverse=True)
+            points = (local[own % len(mesh.vertices)] - middle).astype(np.float32)
+            low = np.minimum(low, points.min(axis=0) + middle)
+            high = np.maximum(high, points.max(axis=0) + middle)
+            told: dict[str, Any] = {}
+            if number:
+                table = _table(writer, features, number - 1, feature)
+                told = {"table": table, "rows": own // len(mesh.vertices), "count": len(feature)}
+            faces = Mesh.of(
+                np.empty((0, 3)),
+                corners.reshape(-1, 3),
+                feature=mesh.feature[rows],
+                klass=mesh.klass[rows],
+                material=mesh.material[rows],
+                color=mesh.color[rows],
+            )
+            turned = np.stack([points[:, 0], points[:, 2], -points[:, 1]], axis=1)
+            name = features.layers[number - 1] if number else "terrain"
+            children.append(writer.node(name=name, mesh=writer.mesh(faces, turned, **told)))
+        root = writer.node(translation=y_up(middle).tolist(), children=children)
+        writer.finish(out, scene_nodes=[root], asset={"copyright": attribution(scene)})
+    return low, high
+
+
+def _table(writer: GlbWriter, features: Features, layer: int, feature: NDArray[np.integer]) -> int:
+    """Add the attributes of some features of a layer, in their order; returns the table's number."""
+    rows = feature - features.starts[layer]
+    columns = {"feature": feature.astype(np.int32)}
+    columns |= {name: values[rows] for name, values in features.columns[layer].items()}
+    return writer.property_table(features.layers[layer], columns, len(feature))
+
+
+def _write_copies(
+    path: Path, scene: Scene, part: Part, features: Features, globe: Globe, names: list[str]
+) -> None:
+    """Write the copies of a tile, a node a shape and layer."""
+    copies = part.instances
+    anchors = copies.transform[:, :, 3] + part.origin
+    transform = copies.transform.copy()
+    transform[:, :, :3] = globe.jacobian(anchors) @ transform[:, :, :3]
+    transform[:, :, 3] = globe.local(anchors)
+    shapes = scene.shapes()
+    layer = np.searchsorted(features.starts, copies.feature, side="right")
+    keys = np.column_stack([copies.shape, layer])
+    with whole_file(path) as out, GlbWriter(path) as writer:
+        tables: dict[int, tuple[int, NDArray[np.integer]]] = {}
+        meshes: dict[int, int] = {}
+        nodes = []
+        for number, of_layer in np.unique(keys, axis=0).tolist():
+            chosen = (keys == (number, of_layer)).all(axis=1)
+            if number not in meshes:
+                mesh = shapes[names[number]]
+                meshes[number] = writer.mesh(mesh, y_up(mesh.vertices).astype("<f4"), name=names[number])
+            told: dict[str, Any] = {}
+            if of_layer:
+                if of_layer not in tables:
+                    feature = np.unique(copies.feature[layer == of_layer])
+                    tables[of_layer] = (_table(writer, features, of_layer - 1, feature), feature)
+                table, feature = tables[of_layer]
+                rows = np.searchsorted(feature, copies.feature[chosen])
+                told = {"table": table, "rows": rows, "count": len(feature)}
+            origin = np.round(transform[chosen, :, 3].mean(axis=0))
+            nodes.append(
+                writer.copies(meshes[number], transform[chosen], name=names[number], origin=origin, **told)
+            )
+        writer.finish(out, scene_nodes=nodes, asset={"copyright": attribution(scene)})
+
+
+def _copies_node(uri: str, part: Part, globe: Globe, library: list[Mesh]) -> _Node:
+    points = globe.local(expand(part.instances, library).vertices + part.origin)
+    low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
+    box = _box(low, high)
+    document = {
+        "boundingVolume": box,
+        "geometricError": 0.0,
+        "refine": "ADD",
+        "content": {"uri": uri, "boundingVolume": box},
+    }
+    return _Node(low, high, document)
