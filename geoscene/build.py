@@ -4,52 +4,27 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal, cast
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene import __version__
-from geoscene.buildings import Buildings, build_solids, read_buildings
 from geoscene.errors import InputError, SourceNotFoundError
-from geoscene.features import building_layers, ground_layer, road_layer, tree_layer
-from geoscene.frames import Frame
-from geoscene.geopackage import Layer
-from geoscene.ground import (
-    GroundPlan,
-    Layers,
-    WaterLevels,
-    building_pads,
-    concatenate_layers,
-    ground_tile,
-    landcover,
-    plan_ground,
-    water_levels,
-)
-from geoscene.mesh import Mesh, concatenate
+from geoscene.manifest import scene_manifest
+from geoscene.plan import KINDS, Plan, make_plan
 from geoscene.progress import Progress, silent
-from geoscene.report import Problem, summarise
-from geoscene.road_surfaces import road_surfaces
-from geoscene.roadgraph import build_road_graph, find_components, write_graphml
-from geoscene.roads import RoadGraph
-from geoscene.scene import Instances, Scene, open_scene
-from geoscene.shapes import concatenate_instances, shapes
-from geoscene.sources import ATTRIBUTION, OsmData
-from geoscene.store import SceneWriter, split
-from geoscene.terrain import Terrain, base_heights, flat_terrain, open_terrain
-from geoscene.urban import paved_fabric
-from geoscene.validate import validate_mesh
-from geoscene.vegetation import Trees, clear_of, forest_trees, needle_shares, read_trees, tree_instances
-
-Float = NDArray[np.float64]
-Bounds = tuple[float, float, float, float]
-
-_STANDING = 1.0  # metres: a building whose underside is higher leaves the ground under it as it is
+from geoscene.reach import route_line
+from geoscene.report import Problem
+from geoscene.roadgraph import write_graphml
+from geoscene.scene import Scene, open_scene
+from geoscene.shapes import shapes
+from geoscene.sources import OsmData
+from geoscene.store import SceneWriter
+from geoscene.tiles import Keys, TileReport, build_tiles, tiles_document
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +35,10 @@ class BuildOptions:
     lod       : of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs
     dem       : elevation files; level ground without
     dem_gaps  : what to do where they do not cover the scene: ``error``, or ``nearest`` height and say so
+    only      : what is built besides the ground, of `geoscene.plan.KINDS`; all by default
+    along     : waypoints (LAT,LON words) or one file (GPX, GeoJSON, or CSV with lon and lat): only tiles are
+                built that a sensor of that reach can see from there
+    reach     : metres, with ``along``
     tile_size : metres, side of a tile
     name      : of the scene, for people
     """
@@ -68,6 +47,9 @@ class BuildOptions:
     lod: int = 2
     dem: tuple[str, ...] = ()
     dem_gaps: str = "error"
+    only: tuple[str, ...] = KINDS
+    along: tuple[str, ...] = ()
+    reach: float = 120.0
     tile_size: float = 250.0
     name: str = ""
 
@@ -77,29 +59,12 @@ class BuildOptions:
             raise InputError(f"--lod {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
         if self.dem_gaps not in ("error", "nearest"):
             raise InputError(f"--dem-gaps {self.dem_gaps}: error or nearest")
+        if unknown := sorted(set(self.only) - set(KINDS)):
+            raise InputError(f"--only {','.join(unknown)}: of {','.join(KINDS)}")
+        if not 0 < self.reach < 1e6:
+            raise InputError(f"--reach {self.reach}: give metres")
         if not 50 <= self.tile_size <= 2000 or self.tile_size != int(self.tile_size):
             raise InputError(f"--tile-size {self.tile_size}: give whole metres from 50 to 2000")
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """All that tiles are made from: features of the whole scene, numbered, not yet cut.
-
-    layers : the feature tables, in the order of their numbers
-    ground : what lies on the ground
-    levels : how high its water stands
-    solids : the buildings
-    trees  : mapped ones
-    needles : share of needle-leaved trees by row of the ground's layers
-    """
-
-    terrain: Terrain
-    layers: list[Layer]
-    ground: GroundPlan
-    levels: WaterLevels
-    solids: Mesh
-    trees: Trees
-    needles: Float
 
 
 def build(
@@ -108,9 +73,13 @@ def build(
     options: BuildOptions | None = None,
     *,
     overwrite: bool = False,
+    workers: int = 1,
     progress: Progress = silent,
 ) -> Scene:
     """Build a scene of a map extract and write it to a directory.
+
+    A build that was killed goes on where it stopped; one that replaces a scene takes over what its options
+    leave the same. The bytes do not depend on ``workers``, nor on what was there before.
 
     Raises SourceNotFoundError for an extract without anything to build, FrameError for a CRS that cannot
     serve and SceneFormatError for a directory that may not be used.
@@ -118,231 +87,74 @@ def build(
     options = options or BuildOptions()
     if not (osm.areas or osm.ways):
         raise SourceNotFoundError(f"{osm.source or 'the extract'}: nothing in it to build from")
-    west, south, east, north = osm.bounds
-    frame = Frame.at((west + east) / 2, (south + north) / 2, options.crs)
-    problems: list[Problem] = list(osm.problems)
-    with SceneWriter(out, tile_size=options.tile_size, overwrite=overwrite) as writer:
-        progress("buildings", 0, 0)
-        buildings, found = read_buildings(osm, frame)
-        problems += found
-        extent = _extent(frame, osm.bounds, buildings)
-        terrain = _terrain(frame, extent, options)
-        frame = replace(frame, vertical=terrain.vertical)
-        base = base_heights(buildings.footprint[: buildings.count], terrain)
-        solids, found = build_solids(buildings, base=base, lod=options.lod)
-        problems += found
-
-        progress("roads and ground", 0, 0)
-        graph, found = build_road_graph(osm, frame)
-        problems += found
-        if len(graph):
-            write_graphml(graph, frame, writer.folder / "roads.graphml")
-        plan, found = _plan(osm, frame, extent, terrain, buildings, base, solids, graph, options)
-        problems += found
-
-        area = _write_tiles(writer, plan, progress)
-        manifest = _manifest(osm, options, plan, buildings, graph, problems) | {"ground": area}
+    with SceneWriter(out, overwrite=overwrite) as writer:
+        plan, problems = make_plan(
+            osm,
+            options.crs,
+            dem=options.dem,
+            dem_gaps=cast("Literal['error', 'nearest']", options.dem_gaps),
+            tile_size=options.tile_size,
+            only=options.only,
+            progress=progress,
+        )
+        keys = _keys(osm, options)
+        tiles = _tiles_along(plan, options)
+        reports: list[TileReport] = []
+        for report in build_tiles(
+            plan, writer.folder, tiles, lod=options.lod, keys=keys, workers=workers, former=writer.former
+        ):
+            reports.append(report)
+            progress("tiles", len(reports), len(tiles))
+        problems += _tile_problems(reports)
+        if len(plan.graph):
+            write_graphml(plan.graph, plan.frame, writer.folder / "roads.graphml")
         writer.finish(
-            frame=frame,
-            bounds=extent,
+            frame=plan.frame,
             layers=plan.layers,
             shapes=shapes(),
             problems=problems,
-            manifest=manifest,
+            tiles=tiles_document(keys, reports),
+            manifest=scene_manifest(osm, asdict(options), plan, reports, problems, fingerprint=_digest(keys)),
         )
     return open_scene(out)
 
 
-def _extent(frame: Frame, bounds: Bounds, buildings: Buildings) -> Bounds:
-    """The ground's rectangle: around the extract's bounds and all buildings, out to whole metres."""
-    west, south, east, north = bounds
-    step = max((east - west) / 8, (north - south) / 8, 1e-6)
-    rim = shapely.segmentize(shapely.box(west, south, east, north), step)
-    x, y = frame.from_geographic(*shapely.get_coordinates(rim).T)
-    boxes = shapely.bounds(buildings.footprint[: buildings.count])
-    xs = np.concatenate([x, boxes[:, 0] - 2, boxes[:, 2] + 2])
-    ys = np.concatenate([y, boxes[:, 1] - 2, boxes[:, 3] + 2])
-    xmin, ymin = float(np.floor(xs.min())), float(np.floor(ys.min()))
-    xmax, ymax = float(np.ceil(xs.max())), float(np.ceil(ys.max()))
-    return xmin, ymin, max(xmax, xmin + 10), max(ymax, ymin + 10)
+def _tile_problems(reports: Sequence[TileReport]) -> list[Problem]:
+    return [problem for report in sorted(reports, key=lambda r: (r.i, r.j)) for problem in report.problems]
 
 
-def _terrain(frame: Frame, extent: Bounds, options: BuildOptions) -> Terrain:
-    if not options.dem:
-        return flat_terrain(frame)
-    outside: Literal["error", "nearest"] = "nearest" if options.dem_gaps == "nearest" else "error"
-    return open_terrain(options.dem, frame, bounds=extent, outside=outside)
+def _tiles_along(plan: Plan, options: BuildOptions) -> list[tuple[int, int]]:
+    """Tiles to build: all, or those of which anything lies within reach of the route."""
+    tiles = plan.tiles()
+    if not options.along:
+        return tiles
+    line = route_line(options.along, plan.graph, plan.frame)
+    boxes = shapely.bounds(plan.buildings.footprint[: plan.buildings.count]).reshape(-1, 4)
+    size = options.tile_size
+    low, high = plan.home * size, (plan.home + 1) * size
+    beyond = np.concatenate([low - boxes[:, :2], boxes[:, 2:] - high]).max(initial=0.0)
+    near = line.buffer(options.reach + beyond)
+    box = shapely.box(*(np.array(tiles) * size).T, *((np.array(tiles) + 1) * size).T)
+    return [tile for tile, met in zip(tiles, shapely.intersects(box, near), strict=True) if met]
 
 
-def _plan(
-    osm: OsmData,
-    frame: Frame,
-    extent: Bounds,
-    terrain: Terrain,
-    buildings: Buildings,
-    base: Float,
-    solids: Mesh,
-    graph: RoadGraph,
-    options: BuildOptions,
-) -> tuple[Plan, list[Problem]]:
-    """Read what lies and stands on the ground, and number all features."""
-    n, count = len(buildings), buildings.count
-    footprints = buildings.footprint[:count]
-    cover, problems = landcover(osm, frame, extent=extent)
-    cover = concatenate_layers([paved_fabric(footprints), cover])
-    surfaces, found = road_surfaces(osm, graph, frame)
-    problems += found
-    roads = Layers.of(
-        surfaces.polygon,
-        klass=surfaces.klass,
-        material=surfaces.material,
-        priority=surfaces.priority,
-        osm_id=surfaces.osm_id,
-        source=surfaces.source,
-    )
-    standing = footprints.copy()
-    standing[buildings.min_height[:count] >= _STANDING] = None
-    pads = building_pads(
-        standing, osm_id=buildings.osm_id[:count].astype(str), feature=np.arange(count, dtype=np.int32)
-    )
-    cover, roads = _numbered(cover, n), _numbered(roads, n + len(cover))
-    ground = plan_ground(
-        extent,
-        concatenate_layers([cover, roads, pads]),
-        tile_size=options.tile_size,
-        lines=terrain.lines,
-    )
-    height = terrain.height if terrain.grids else None
-    levels = water_levels(ground.layers, osm.ways, frame, height=terrain.height)
-    trees, found = read_trees(osm, frame)
-    problems += found
-    trees, found = clear_of(ground, trees)
-    problems += found
-    first = n + len(cover) + len(roads) + len(graph)
-    trees = replace(trees, feature=np.arange(first, first + len(trees), dtype=np.int32))
-    foot = height(*trees.xy.T) if height else np.zeros(len(trees))
-    layers = [
-        *building_layers(buildings, base),
-        ground_layer("landcover", cover),
-        ground_layer("road_surfaces", roads),
-        road_layer(graph),
-        tree_layer(trees, foot),
+def _keys(osm: OsmData, options: BuildOptions) -> Keys:
+    """Digests of what ground and solids of a tile depend on."""
+    dem = [(str(p), Path(p).stat().st_size, Path(p).stat().st_mtime_ns) for p in options.dem]
+    common = [
+        __version__,
+        osm.source,
+        osm.digest,
+        list(osm.bounds),
+        options.crs,
+        dem,
+        options.dem_gaps,
+        sorted(options.only),
+        options.tile_size,
     ]
-    return Plan(terrain, layers, ground, levels, solids, trees, needle_shares(ground, osm)), problems
+    return Keys(ground=_digest(common), solids=_digest([*common, options.lod]))
 
 
-def _numbered(layers: Layers, first: int) -> Layers:
-    return replace(layers, feature=np.arange(first, first + len(layers), dtype=np.int32))
-
-
-def make_tile(plan: Plan, i: int, j: int) -> tuple[Mesh, Instances]:
-    """Ground and trees of tile (i, j), scene coordinates; the same whatever other tiles are made."""
-    height = plan.terrain.height if plan.terrain.grids else None
-    ground = ground_tile(plan.ground, i, j, height=height, levels=plan.levels)
-    size = plan.ground.tile_size
-    here = (np.floor(plan.trees.xy / size) == (i, j)).all(axis=1)
-    woods = forest_trees(plan.ground, i, j, needles=plan.needles)
-    copies = [tree_instances(trees, height=height) for trees in (plan.trees.take(here), woods)]
-    return ground, concatenate_instances(copies)
-
-
-def _write_tiles(writer: SceneWriter, plan: Plan, progress: Progress) -> dict[str, float]:
-    """Write all tiles; return the ground's area in plan against the extent's, square metres."""
-    stands = split(plan.solids, _tile_of_features(plan.solids, writer.tile_size))
-    covered = {(int(i), int(j)) for i, j in plan.ground.tiles}
-    tiles = sorted(covered | set(stands))
-    area = 0.0
-    for done, (i, j) in enumerate(tiles):
-        progress("tiles", done, len(tiles))
-        mesh, copies = make_tile(plan, i, j) if (i, j) in covered else (Mesh.empty(), Instances.empty())
-        area += _plan_area(mesh)
-        standing = [stands[i, j]] if (i, j) in stands else []
-        writer.tile(i, j, concatenate([*standing, mesh]), copies)
-    xmin, ymin, xmax, ymax = plan.ground.extent
-    return {"area": area, "extent_area": (xmax - xmin) * (ymax - ymin)}
-
-
-def _plan_area(mesh: Mesh) -> float:
-    a, b, c = (mesh.vertices[mesh.faces[:, k], :2] for k in range(3))
-    u, v = b - a, c - a
-    return float((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / 2)
-
-
-def _tile_of_features(mesh: Mesh, size: float) -> NDArray[np.int64]:
-    """Tile (m, 2) of each face: the one that holds the middle of its feature's box."""
-    if not len(mesh):
-        return np.empty((0, 2), np.int64)
-    corner = mesh.vertices[mesh.faces][:, :, :2]
-    feature, owner = np.unique(mesh.feature, return_inverse=True)
-    low = np.full((len(feature), 2), np.inf)
-    high = np.full((len(feature), 2), -np.inf)
-    np.minimum.at(low, owner, corner.min(axis=1))
-    np.maximum.at(high, owner, corner.max(axis=1))
-    tile: NDArray[np.int64] = np.floor((low + high) / 2 / size).astype(np.int64)[owner]
-    return tile
-
-
-def _manifest(
-    osm: OsmData,
-    options: BuildOptions,
-    plan: Plan,
-    buildings: Buildings,
-    graph: RoadGraph,
-    problems: Sequence[Problem],
-) -> dict[str, Any]:
-    count = buildings.count
-    verdict = validate_mesh(plan.solids)
-    summary = summarise(problems)
-    dropped = summary["dropped"].get("building", {})
-    components = find_components(graph)
-    terrain = plan.terrain
-    recipe = {
-        "source": osm.source,
-        "bounds": osm.bounds,
-        "options": asdict(options),
-        "version": __version__,
-    }
-    return {
-        "generator": f"geoscene {__version__}",
-        "name": options.name,
-        "attribution": ATTRIBUTION,
-        "fingerprint": hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:20],
-        "sources": [
-            {
-                "kind": "osm",
-                "from": osm.source,
-                "timestamp": osm.timestamp,
-                "licence": "ODbL-1.0",
-                "attribution": ATTRIBUTION,
-            },
-            *({"kind": "terrain", "from": name} for name in terrain.sources),
-        ],
-        "geographic_bounds": list(osm.bounds),
-        "options": asdict(options),
-        "terrain": {
-            "vertical": terrain.vertical,
-            "datum": terrain.datum,
-            "spacing_m": terrain.spacing,
-            "posts": terrain.posts,
-            "voids_filled": terrain.voids,
-            "uncovered_share": terrain.uncovered,
-            "rivers_turned": list(plan.levels.reversed),
-        },
-        "counts": {
-            "buildings": count + sum(dropped.values()) - dropped.get("no-solid", 0),
-            "solids": len(verdict),
-            "dropped": sum(dropped.values()),
-            "repaired": sum(summary["repaired"].get("building", {}).values()),
-            "building_parts": len(buildings) - count,
-            "watertight": int(verdict.ok.sum()),
-            "faces": len(plan.solids),
-            "road_edges": len(graph),
-            "road_km": round(float(graph.length.sum()) / 1000, 3),
-            "road_components": int(components.strong.max(initial=-1)) + 1,
-            "road_largest_component_share": round(components.largest_strong_share, 4),
-            "trees": len(plan.trees),
-        },
-        "heights": dict(sorted(Counter(buildings.height_source[:count].tolist()).items())),
-        "roofs": dict(sorted(Counter(buildings.roof_shape[buildings.drawn].tolist()).items())),
-        "problems": summary,
-    }
+def _digest(value: object) -> str:
+    plain = asdict(value) if isinstance(value, Keys) else value
+    return hashlib.sha256(json.dumps(plain).encode()).hexdigest()[:20]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -56,10 +57,14 @@ def build(
     lod: int = 2,
     dem: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
     dem_gaps: str = "error",
+    only: str = "",
+    along: Annotated[list[str] | None, Parameter(consume_multiple=True, negative=())] = None,
+    reach: float = 120.0,
     tile_size: float = 250.0,
     name: str = "",
     out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
     overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    workers: Annotated[int | None, Parameter(group=_OUTPUT)] = None,
     json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
 ) -> int:
@@ -98,6 +103,14 @@ def build(
         Elevation files: GeoTIFF, .hgt or .hgt.zip, one or more, in any CRS. Level ground without.
     dem_gaps
         Where they do not cover the scene: error, or nearest (take the nearest height and say so).
+    only
+        What is built besides the ground, with commas: buildings, roads, landcover, trees, furniture,
+        barriers.
+    along
+        Build only the tiles that can be seen from a route: LAT,LON LAT,LON ... or a GPX, GeoJSON or CSV file
+        (such as the poses.csv of a dataset).
+    reach
+        How far can be seen from --along, metres: the reach of the sensors.
     tile_size
         Side of a tile in metres.
     name
@@ -105,7 +118,9 @@ def build(
     out
         Directory to write the scene to.
     overwrite
-        Replace a scene that is there.
+        Replace a scene that is there, taking over what the options leave the same.
+    workers
+        Processes; as many as there are cores by default. The bytes do not depend on it.
     json
         Print the build report as JSON.
     quiet
@@ -113,6 +128,7 @@ def build(
     """
     from geoscene.build import BuildOptions  # noqa: PLC0415  (half a second, not needed for --help)
     from geoscene.build import build as build_scene  # noqa: PLC0415
+    from geoscene.plan import KINDS  # noqa: PLC0415
 
     began = time.perf_counter()
     options = BuildOptions(
@@ -120,13 +136,18 @@ def build(
         lod=lod,
         dem=tuple(map(str, dem or ())),
         dem_gaps=dem_gaps,
+        only=tuple(k for k in only.split(",") if k) or KINDS,
+        along=tuple(along or ()),
+        reach=reach,
         tile_size=tile_size,
         name=name,
     )
     with progress_bar(quiet=quiet) as progress:
         progress("reading the map", 0, 0)
         data = _read(osm, place, bbox, point, radius, demo=demo)
-        scene = build_scene(data, out, options, overwrite=overwrite, progress=progress)
+        scene = build_scene(
+            data, out, options, overwrite=overwrite, workers=_workers(workers), progress=progress
+        )
     report = scene.manifest | {"path": str(out), "seconds": round(time.perf_counter() - began, 2)}
     if json:
         print_json(report)
@@ -134,6 +155,12 @@ def build(
         _print_scene(report)
         print(f"\n{report['seconds']:.1f} s; next: lidar drive {out} --route random -o drive")
     return 0
+
+
+def _workers(given: int | None) -> int:
+    if given is not None and not 1 <= given <= 256:
+        raise InputError(f"--workers {given}: give 1 to 256")
+    return given or os.cpu_count() or 1
 
 
 def _read(
@@ -238,7 +265,10 @@ def _print_scene(report: dict[str, Any]) -> None:
         "extent": f"{xmax - xmin:.0f} x {ymax - ymin:.0f} m;"
         f" lon {west:.5f} to {east:.5f}, lat {south:.5f} to {north:.5f}",
         "buildings": f"{counts['buildings']} in the map, {counts['dropped']} dropped,"
-        f" {counts['solids']} solids, {counts['watertight']} of them watertight",
+        f" {counts['solids']} solids",
+        "watertight": f"{counts['watertight']} of {counts['closed_objects']} closed objects",
+        "standing": f"{counts['trees']} mapped trees, {counts['furniture']} pieces of furniture,"
+        f" {counts['barriers']} barriers",
         "roads": f"{counts['road_km']:.1f} km in {counts['road_edges']} edges",
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),

@@ -8,8 +8,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.barriers import Barriers
 from geoscene.buildings import Buildings
 from geoscene.classes import Class, materials
+from geoscene.furniture import Furniture
 from geoscene.geopackage import Layer
 from geoscene.ground import Layers
 from geoscene.roads import RoadGraph
@@ -91,6 +93,39 @@ def tree_layer(trees: Trees, z: NDArray[np.float64]) -> Layer:
             "trunk": trees.trunk,
             "form": trees.form,
             "form_source": trees.form_source,
+        },
+    )
+
+
+def furniture_layer(furniture: Furniture, z: NDArray[np.float64]) -> Layer:
+    """Layer ``furniture``: lamps, signals, signs, benches and the like, where they stand."""
+    return Layer(
+        "furniture",
+        shapely.points(np.column_stack([furniture.xy, z])),
+        {
+            "osm_id": furniture.osm_id,
+            "shape": furniture.shape,
+            "height": furniture.height,
+            "height_source": furniture.height_source,
+            "heading": furniture.heading,
+            "heading_source": furniture.heading_source,
+            "place_source": furniture.place_source,
+        },
+    )
+
+
+def barrier_layer(barriers: Barriers) -> Layer:
+    """Layer ``barriers``: walls, fences and hedges in plan."""
+    return Layer(
+        "barriers",
+        barriers.polygon,
+        {
+            "osm_id": barriers.osm_id,
+            "class": np.array([Class(k).name.lower() for k in barriers.klass], np.str_),
+            "material": material_names(barriers.material),
+            "height": barriers.height,
+            "height_source": barriers.height_source,
+            "width_source": barriers.width_source,
         },
     )
 

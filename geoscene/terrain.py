@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -177,18 +177,20 @@ def open_terrain(
     )
 
 
-def base_heights(footprints: Sequence[object] | NDArray[np.object_], terrain: Terrain) -> Float:
+def base_heights(
+    footprints: Sequence[object] | NDArray[np.object_], height: Callable[[Float, Float], Float]
+) -> Float:
     """The lowest ground (n,) along each footprint's outline, metres: where a building on a slope stands.
 
-    The terrain is asked at the outline's vertices and at most 2 m apart between them. NaN for a footprint
-    that is None or empty.
+    ``height`` (z of the ground at x, y) is asked at the outline's vertices and at most 2 m apart between
+    them. NaN for a footprint that is None or empty.
     """
     outlines = np.empty(len(footprints), object)
     outlines[:] = list(footprints)
     outlines = shapely.segmentize(shapely.boundary(outlines), 2.0)
     xy, owner = shapely.get_coordinates(outlines, return_index=True)
     lowest = np.full(len(outlines), np.inf)
-    np.minimum.at(lowest, owner, terrain.height(xy[:, 0], xy[:, 1]))
+    np.minimum.at(lowest, owner, height(xy[:, 0], xy[:, 1]))
     base: Float = np.where(np.isinf(lowest), np.nan, lowest)
     return base
 

@@ -204,7 +204,7 @@ def test_a_building_stands_on_the_lowest_ground_along_its_outline(tmp_path):
     terrain = open_terrain([path], FRAME, bounds=BOUNDS)
     x0 = float(FRAME.from_crs(UTM, east[0, 30], FRAME.to_crs(UTM, 0, 0)[1])[0])
     across = shapely.box(x0 - 30, -10, x0 + 50, 10)  # no corner lies in the valley, its sides cross it
-    base = base_heights([across, None, shapely.box(x0 + 20, 0, x0 + 30, 5)], terrain)
+    base = base_heights([across, None, shapely.box(x0 + 20, 0, x0 + 30, 5)], terrain.height)
     assert base[0] == pytest.approx(0.0, abs=1.1)
     assert np.isnan(base[1])
     assert base[2] == pytest.approx(20.0, abs=0.1)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from geoscene.report import Problem
@@ -87,6 +89,22 @@ class OsmData:
     problems: list[Problem] = field(default_factory=list)
     source: str = ""
     timestamp: str = ""
+
+    @property
+    def digest(self) -> str:
+        """Digest of ids, tags and coordinates: equal digests mean equal maps."""
+        found = hashlib.sha256()
+        for way in self.ways:
+            found.update(repr((way.osm_id, sorted(way.tags.items()))).encode() + way.lonlat.tobytes())
+        for area in self.areas:
+            found.update(
+                repr((area.osm_id, sorted(area.tags.items()))).encode() + shapely.to_wkb(area.geometry)
+            )
+        for point in self.points:
+            found.update(repr((point.osm_id, sorted(point.tags.items()), point.lon, point.lat)).encode())
+        for relation in self.relations:
+            found.update(repr((relation.osm_id, sorted(relation.tags.items()), relation.members)).encode())
+        return found.hexdigest()[:20]
 
 
 ATTRIBUTION = "(c) OpenStreetMap contributors, ODbL 1.0, https://www.openstreetmap.org/copyright"

@@ -1,0 +1,95 @@
+"""What ``scene.json`` says of a build."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from geoscene import __version__
+from geoscene.plan import Plan
+from geoscene.report import Problem, summarise
+from geoscene.roadgraph import find_components
+from geoscene.sources import ATTRIBUTION, OsmData
+from geoscene.tiles import TileReport
+
+
+def scene_manifest(
+    osm: OsmData,
+    options: Mapping[str, Any],
+    plan: Plan,
+    reports: Sequence[TileReport],
+    problems: Sequence[Problem],
+    *,
+    fingerprint: str,
+) -> dict[str, Any]:
+    """Sources, options, counts, where heights come from, repairs and drops."""
+    xmin, ymin, xmax, ymax = plan.extent
+    terrain = plan.terrain
+    return {
+        "generator": f"geoscene {__version__}",
+        "name": options["name"],
+        "attribution": ATTRIBUTION,
+        "fingerprint": fingerprint,
+        "sources": [
+            {
+                "kind": "osm",
+                "from": osm.source,
+                "timestamp": osm.timestamp,
+                "licence": "ODbL-1.0",
+                "attribution": ATTRIBUTION,
+            },
+            *({"kind": "terrain", "from": name} for name in terrain.sources),
+        ],
+        "geographic_bounds": list(osm.bounds),
+        "bounds": [xmin, ymin, xmax, ymax],
+        "tile_size": options["tile_size"],
+        "tiles": sorted((r.i, r.j) for r in reports),
+        "options": dict(options),
+        "terrain": {
+            "vertical": terrain.vertical,
+            "datum": terrain.datum,
+            "spacing_m": terrain.spacing,
+            "posts": terrain.posts,
+            "voids_filled": terrain.voids,
+            "uncovered_share": terrain.uncovered,
+            "rivers_turned": list(plan.levels.reversed),
+        },
+        "ground": {
+            "area": sum(r.area for r in sorted(reports, key=lambda r: (r.i, r.j))),
+            "extent_area": (xmax - xmin) * (ymax - ymin),
+        },
+        "counts": _counts(plan, reports, problems),
+        "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
+        "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),
+        "problems": summarise(problems),
+    }
+
+
+def _counts(plan: Plan, reports: Sequence[TileReport], problems: Sequence[Problem]) -> dict[str, Any]:
+    count = plan.buildings.count
+    summary = summarise(problems)
+    dropped = summary["dropped"].get("building", {})
+    components = find_components(plan.graph)
+    return {
+        "buildings": count + sum(dropped.values()) - dropped.get("no-solid", 0),
+        "solids": sum(r.buildings for r in reports),
+        "dropped": sum(dropped.values()),
+        "repaired": sum(summary["repaired"].get("building", {}).values()),
+        "building_parts": len(plan.buildings) - count,
+        "closed_objects": sum(r.solids for r in reports),
+        "watertight": sum(r.watertight for r in reports),
+        "faces": sum(r.faces for r in reports),
+        "road_edges": len(plan.graph),
+        "road_km": round(float(plan.graph.length.sum()) / 1000, 3),
+        "road_components": int(components.strong.max(initial=-1)) + 1,
+        "road_largest_component_share": round(components.largest_strong_share, 4),
+        "trees": len(plan.trees),
+        "furniture": len(plan.furniture),
+        "barriers": len(plan.barriers),
+        "instances": sum(r.instances for r in reports),
+    }
+
+
+def _tally(values: Any) -> dict[str, int]:
+    return dict(sorted(Counter(values.tolist()).items()))

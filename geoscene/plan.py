@@ -1,0 +1,274 @@
+"""All that a scene's tiles are made from: features of the whole place, numbered, not yet cut."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.barriers import Barriers, read_barriers
+from geoscene.buildings import Buildings, read_buildings
+from geoscene.features import (
+    barrier_layer,
+    building_layers,
+    furniture_layer,
+    ground_layer,
+    road_layer,
+    tree_layer,
+)
+from geoscene.frames import Frame
+from geoscene.furniture import Furniture, read_furniture
+from geoscene.geopackage import Layer
+from geoscene.ground import (
+    GroundPlan,
+    Layers,
+    WaterLevels,
+    building_pads,
+    concatenate_layers,
+    landcover,
+    plan_ground,
+    water_levels,
+)
+from geoscene.progress import Progress
+from geoscene.report import Problem
+from geoscene.road_surfaces import road_surfaces
+from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
+from geoscene.roads import RoadGraph
+from geoscene.sources import OsmData
+from geoscene.terrain import Terrain, base_heights, flat_terrain, open_terrain
+from geoscene.urban import paved_fabric
+from geoscene.vegetation import Trees, clear_of, needle_shares, read_trees
+
+Float = NDArray[np.float64]
+Bounds = tuple[float, float, float, float]
+Height = Callable[[Float, Float], Float]
+
+KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
+"""What a scene may hold besides its ground; `make_plan` takes all or some."""
+
+_STANDING = 1.0  # metres: a building whose underside is higher leaves the ground under it as it is
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What tiles are made from.
+
+    frame     : of the scene
+    terrain   : the elevation model, or level ground
+    height    : z of the ground at x, y, roads graded into it; None where all is at 0
+    buildings : their table
+    base      : (count,) z of each building's base
+    home      : (count, 2) int64, the tile that each building belongs to: the one with the middle of its box
+    graph     : roads, with heights
+    ground    : what lies on the ground
+    levels    : how high its water stands
+    trees     : mapped ones
+    needles   : share of needle-leaved trees by row of the ground's layers
+    layers    : the feature tables, in the order of their numbers
+    """
+
+    frame: Frame
+    terrain: Terrain
+    height: Height | None
+    buildings: Buildings
+    base: Float
+    home: NDArray[np.int64]
+    graph: RoadGraph
+    ground: GroundPlan
+    levels: WaterLevels
+    trees: Trees
+    needles: Float
+    furniture: Furniture
+    barriers: Barriers
+    layers: list[Layer]
+
+    @property
+    def extent(self) -> Bounds:
+        """(xmin, ymin, xmax, ymax) of the ground, scene metres."""
+        return self.ground.extent
+
+    def tiles(self) -> list[tuple[int, int]]:
+        """All tiles, in order."""
+        ground = {(int(i), int(j)) for i, j in self.ground.tiles}
+        return sorted(ground | {(int(i), int(j)) for i, j in np.unique(self.home, axis=0)})
+
+
+def make_plan(
+    osm: OsmData,
+    crs: str,
+    *,
+    dem: tuple[str, ...],
+    dem_gaps: Literal["error", "nearest"],
+    tile_size: float,
+    only: Collection[str],
+    progress: Progress,
+) -> tuple[Plan, list[Problem]]:
+    """Read all features of a map, and what was repaired or dropped on the way.
+
+    Arguments as in `geoscene.build.BuildOptions`. Raises FrameError and InputError for a CRS or elevation
+    files that cannot serve.
+    """
+    west, south, east, north = osm.bounds
+    frame = Frame.at((west + east) / 2, (south + north) / 2, crs)
+    problems: list[Problem] = list(osm.problems)
+
+    progress("buildings", 0, 0)
+    buildings, found = read_buildings(osm if "buildings" in only else _without_areas(osm), frame)
+    problems += found
+    extent = _extent(frame, osm.bounds, buildings)
+    terrain = open_terrain(dem, frame, bounds=extent, outside=dem_gaps) if dem else flat_terrain(frame)
+    frame = replace(frame, vertical=terrain.vertical)
+
+    progress("roads", 0, 0)
+    graph, found = build_road_graph(osm if "roads" in only else _without_ways(osm), frame)
+    problems += found
+    graph = profile(graph, terrain.height, obstacles=find_obstacles(osm, frame))
+    uneven = bool(terrain.grids) or any(line[:, 2].any() for line in graph.geometry)
+    height = graded_ground(graph, terrain.height) if uneven else None
+    footprints = buildings.footprint[: buildings.count]
+    base = base_heights(footprints, height or terrain.height)
+
+    progress("ground", 0, 0)
+    cover, roads, pads, found = _surfaces(osm, frame, extent, buildings, graph, only)
+    problems += found
+    n = len(buildings)
+    cover, roads = _numbered(cover, n), _numbered(roads, n + len(cover))
+    layers = concatenate_layers([cover, roads, pads])
+    ground = plan_ground(extent, layers, tile_size=tile_size, lines=terrain.lines)
+    levels = water_levels(ground.layers, osm.ways, frame, height=terrain.height)
+
+    trees, furniture, barriers, found = _standing(osm, frame, ground, only)
+    problems += found
+    first = n + len(cover) + len(roads) + len(graph)
+    trees = _numbered(trees, first)
+    furniture = _numbered(furniture, first + len(trees))
+    barriers = _numbered(barriers, first + len(trees) + len(furniture))
+    tables = [
+        *building_layers(buildings, base),
+        ground_layer("landcover", cover),
+        ground_layer("road_surfaces", roads),
+        road_layer(graph),
+        tree_layer(trees, _foot(trees.xy, height)),
+        furniture_layer(furniture, _foot(furniture.xy, height)),
+        barrier_layer(barriers),
+    ]
+    plan = Plan(
+        frame=frame,
+        terrain=terrain,
+        height=height,
+        buildings=buildings,
+        base=base,
+        home=_homes(footprints, tile_size),
+        graph=graph,
+        ground=ground,
+        levels=levels,
+        trees=trees,
+        needles=needle_shares(ground, osm),
+        furniture=furniture,
+        barriers=barriers,
+        layers=tables,
+    )
+    return plan, problems
+
+
+def _without_areas(osm: OsmData) -> OsmData:
+    return replace(osm, areas=[], relations=[])
+
+
+def _without_ways(osm: OsmData) -> OsmData:
+    return replace(osm, ways=[], relations=[], points=[])
+
+
+def _extent(frame: Frame, bounds: Bounds, buildings: Buildings) -> Bounds:
+    """The ground's rectangle: around the extract's bounds and all buildings, out to whole metres."""
+    west, south, east, north = bounds
+    step = max((east - west) / 8, (north - south) / 8, 1e-6)
+    rim = shapely.segmentize(shapely.box(west, south, east, north), step)
+    x, y = frame.from_geographic(*shapely.get_coordinates(rim).T)
+    boxes = shapely.bounds(buildings.footprint[: buildings.count])
+    xs = np.concatenate([x, boxes[:, 0] - 2, boxes[:, 2] + 2])
+    ys = np.concatenate([y, boxes[:, 1] - 2, boxes[:, 3] + 2])
+    xmin, ymin = float(np.floor(xs.min())), float(np.floor(ys.min()))
+    xmax, ymax = float(np.ceil(xs.max())), float(np.ceil(ys.max()))
+    return xmin, ymin, max(xmax, xmin + 10), max(ymax, ymin + 10)
+
+
+def _surfaces(
+    osm: OsmData,
+    frame: Frame,
+    extent: Bounds,
+    buildings: Buildings,
+    graph: RoadGraph,
+    only: Collection[str],
+) -> tuple[Layers, Layers, Layers, list[Problem]]:
+    """Land cover, road surfaces and building pads."""
+    problems: list[Problem] = []
+    count = buildings.count
+    footprints = buildings.footprint[:count]
+    parts = [paved_fabric(footprints)]
+    if "landcover" in only:
+        cover, found = landcover(osm, frame, extent=extent)
+        parts.append(cover)
+        problems += found
+    roads = Layers.of([], klass=0, material=0, priority=0.0)
+    if "roads" in only:
+        surfaces, found = road_surfaces(osm, graph, frame)
+        problems += found
+        roads = Layers.of(
+            surfaces.polygon,
+            klass=surfaces.klass,
+            material=surfaces.material,
+            priority=surfaces.priority,
+            osm_id=surfaces.osm_id,
+            source=surfaces.source,
+        )
+    standing = footprints.copy()
+    standing[buildings.min_height[:count] >= _STANDING] = None
+    pads = building_pads(
+        standing, osm_id=buildings.osm_id[:count].astype(str), feature=np.arange(count, dtype=np.int32)
+    )
+    return concatenate_layers(parts), roads, pads, problems
+
+
+def _standing(
+    osm: OsmData, frame: Frame, ground: GroundPlan, only: Collection[str]
+) -> tuple[Trees, Furniture, Barriers, list[Problem]]:
+    """Trees, furniture and barriers that can stand where they are."""
+    trees, problems = read_trees(osm, frame)
+    trees, found = clear_of(ground, trees)
+    furniture, more = read_furniture(osm, frame, ground)
+    barriers, still_more = read_barriers(osm, frame, ground)
+    tables: list[Any] = [trees, furniture, barriers]
+    kept = [table if kind in only else table.take(np.zeros(len(table), np.bool_))
+            for kind, table in zip(KINDS[3:], tables, strict=True)]  # fmt: skip
+    said = [problems + found, more, still_more]
+    listed = [p for kind, found in zip(KINDS[3:], said, strict=True) if kind in only for p in found]
+    return kept[0], kept[1], kept[2], listed
+
+
+def _numbered(table: Any, first: int) -> Any:
+    return replace(table, feature=np.arange(first, first + len(table), dtype=np.int32))
+
+
+def _foot(xy: Float, height: Height | None) -> Float:
+    return np.zeros(len(xy)) if height is None else np.asarray(height(xy[:, 0], xy[:, 1]), float)
+
+
+def _homes(footprints: NDArray[Any], tile_size: float) -> NDArray[np.int64]:
+    boxes = shapely.bounds(footprints).reshape(-1, 4)
+    home: NDArray[np.int64] = np.floor((boxes[:, :2] + boxes[:, 2:]) / 2 / tile_size).astype(np.int64)
+    return home
+
+
+def take_buildings(buildings: Buildings, rows: NDArray[np.integer]) -> Buildings:
+    """The chosen buildings (rows below ``count``, rising) with their parts, as a table of their own."""
+    number = np.full(len(buildings), -1, np.int32)
+    number[rows] = np.arange(len(rows))
+    parts = np.flatnonzero(buildings.is_part & (number[buildings.outline] >= 0))
+    keep = np.concatenate([rows, parts])
+    columns = {f.name: getattr(buildings, f.name)[keep] for f in fields(Buildings)}
+    return Buildings(**(columns | {"outline": number[columns["outline"]]}))

@@ -1,0 +1,248 @@
+"""One tile at a time, by any number of workers, and never twice."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geoscene.barriers import barrier_meshes
+from geoscene.buildings import build_solids
+from geoscene.furniture import furniture_instances
+from geoscene.ground import ground_tile
+from geoscene.mesh import Mesh, concatenate
+from geoscene.plan import Plan, take_buildings
+from geoscene.report import Problem
+from geoscene.scene import Instances, Tile, read_tile, write_atomically, write_tile
+from geoscene.shapes import concatenate_instances
+from geoscene.validate import validate_mesh
+from geoscene.vegetation import forest_trees, tree_instances
+
+
+@dataclass(frozen=True, slots=True)
+class TileReport:
+    """What is in a tile.
+
+    solids, watertight : closed objects of the mesh, and how many of them passed the check
+    buildings  : of which buildings
+    faces      : of the mesh
+    instances  : copies of shapes
+    area       : ground in plan, square metres
+    problems   : buildings that were simplified or dropped
+    """
+
+    i: int
+    j: int
+    solids: int
+    watertight: int
+    buildings: int
+    faces: int
+    instances: int
+    area: float
+    problems: tuple[Problem, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """What the parts of a tile depend on, as digests: equal keys mean equal parts."""
+
+    ground: str
+    solids: str
+
+
+def make_solids(plan: Plan, i: int, j: int, lod: int) -> tuple[Mesh, list[Problem]]:
+    """Buildings of tile (i, j), scene coordinates, numbered as in the plan."""
+    rows = np.flatnonzero((plan.home == (i, j)).all(axis=1))
+    if not len(rows):
+        return Mesh.empty(), []
+    mesh, problems = build_solids(take_buildings(plan.buildings, rows), base=plan.base[rows], lod=lod)
+    return replace(mesh, feature=rows[mesh.feature].astype(np.int32)), problems
+
+
+def make_ground(plan: Plan, i: int, j: int) -> tuple[Mesh, Instances]:
+    """Ground, barriers, trees and furniture of tile (i, j), scene coordinates."""
+    size = plan.ground.tile_size
+    covered = (plan.ground.tiles == (i, j)).all(axis=1).any()
+    meshes = [ground_tile(plan.ground, i, j, height=plan.height, levels=plan.levels)] if covered else []
+    trees, furniture, barriers = plan.trees, plan.furniture, plan.barriers
+    here = (np.floor(trees.xy / size) == (i, j)).all(axis=1)
+    there = (np.floor(furniture.xy / size) == (i, j)).all(axis=1)
+    copies = [
+        tree_instances(trees.take(here), height=plan.height),
+        furniture_instances(furniture.take(there), height=plan.height),
+    ]
+    if covered and len(plan.needles):
+        woods = forest_trees(plan.ground, i, j, needles=plan.needles)
+        copies.append(tree_instances(woods, height=plan.height))
+    meshes += barrier_meshes(barriers.take(_barriers_of(plan, i, j)), height=plan.height)
+    return concatenate(meshes), concatenate_instances(copies)
+
+
+def _barriers_of(plan: Plan, i: int, j: int) -> Any:
+    import shapely  # noqa: PLC0415
+
+    boxes = shapely.bounds(plan.barriers.polygon).reshape(-1, 4)
+    home = np.floor((boxes[:, :2] + boxes[:, 2:]) / 2 / plan.ground.tile_size)
+    return (home == (i, j)).all(axis=1)
+
+
+def tile_path(folder: Path, i: int, j: int) -> Path:
+    """Where a tile lies."""
+    return folder / "tiles" / f"{i}_{j}.npz"
+
+
+def build_tile(plan: Plan, folder: Path, i: int, j: int, *, lod: int, former: Path | None) -> TileReport:
+    """Make tile (i, j), write it into ``folder`` and say what is in it.
+
+    former : a tile whose ground is the same and is taken from it
+    """
+    size = plan.ground.tile_size
+    solids, problems = make_solids(plan, i, j, lod)
+    if former is not None:
+        old = read_tile(former)
+        rest = old.mesh.take(~_is_building(old.mesh, plan)).shifted(old.origin)
+        transform = old.instances.transform.copy()
+        transform[:, :, 3] += old.origin
+        copies = replace(old.instances, transform=transform)
+    else:
+        rest, copies = make_ground(plan, i, j)
+    mesh = concatenate([solids, rest])
+    low = float(np.floor(mesh.vertices[:, 2].min(initial=0.0)))
+    origin = np.array([i * size, j * size, low])
+    moved = copies.transform.copy()
+    moved[:, :, 3] -= origin
+    write_tile(tile_path(folder, i, j), Tile(origin, mesh.shifted(-origin), replace(copies, transform=moved)))
+    verdict = validate_mesh(mesh)
+    built = verdict.feature < plan.buildings.count
+    return TileReport(
+        i,
+        j,
+        len(verdict),
+        int(verdict.ok.sum()),
+        int(built.sum()),
+        len(mesh),
+        len(copies),
+        _plan_area(rest.take(~rest.closed)),
+        tuple(problems),
+    )
+
+
+def _is_building(mesh: Mesh, plan: Plan) -> Any:
+    return mesh.closed & (mesh.feature < plan.buildings.count)
+
+
+def _plan_area(mesh: Mesh) -> float:
+    a, b, c = (mesh.vertices[mesh.faces[:, k], :2] for k in range(3))
+    u, v = b - a, c - a
+    return float((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / 2)
+
+
+def build_tiles(
+    plan: Plan,
+    folder: Path,
+    tiles: Sequence[tuple[int, int]],
+    *,
+    lod: int,
+    keys: Keys,
+    workers: int,
+    former: Path | None,
+) -> Iterator[TileReport]:
+    """Make all tiles that ``folder`` does not hold yet, and report on every one, in no particular order.
+
+    Workers are forked processes; where the system has none, all is done in this one. A tile and its report lie
+    in ``folder`` as soon as they are made, so that a build that was killed goes on from there. Tiles of a
+    ``former`` scene whose keys are the same are copied, or give their ground.
+    """
+    (folder / "tiles").mkdir(parents=True, exist_ok=True)
+    known = _known(folder, keys)
+    yield from known.values()
+    todo = [tile for tile in tiles if tile not in known]
+    source = _Former.of(former, keys)
+    if workers > 1 and len(todo) > 1 and "fork" in multiprocessing.get_all_start_methods():
+        _shared.append((plan, folder, lod, source))  # forked workers inherit it
+        try:
+            with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
+                for task in as_completed([pool.submit(_work, tile) for tile in todo]):
+                    yield _noted(folder, keys, task.result())
+        finally:
+            _shared.clear()
+    else:
+        for tile in todo:
+            yield _noted(folder, keys, source.build(plan, folder, tile, lod))
+
+
+@dataclass(frozen=True, slots=True)
+class _Former:
+    """A scene built before, and which parts of its tiles may be taken over."""
+
+    folder: Path | None
+    tiles: frozenset[tuple[int, int]]
+    ground: bool
+    all: bool
+    reports: dict[tuple[int, int], TileReport]
+
+    @classmethod
+    def of(cls, folder: Path | None, keys: Keys) -> _Former:
+        path = None if folder is None else folder / "tiles.json"
+        if folder is None or path is None or not path.exists():
+            return cls(None, frozenset(), ground=False, all=False, reports={})
+        document = json.loads(path.read_text("utf-8"))
+        reports = {(r.i, r.j): r for r in map(_report, document["tiles"])}
+        ground = document["keys"]["ground"] == keys.ground
+        both = ground and document["keys"]["solids"] == keys.solids
+        return cls(folder, frozenset(reports), ground=ground, all=both, reports=reports)
+
+    def build(self, plan: Plan, folder: Path, tile: tuple[int, int], lod: int) -> TileReport:
+        old = None
+        if self.folder is not None and self.ground and tile in self.tiles:
+            old = tile_path(self.folder, *tile)
+            if self.all and old.exists():
+                write_atomically(tile_path(folder, *tile), old.read_bytes())
+                return self.reports[tile]
+        return build_tile(
+            plan, folder, *tile, lod=lod, former=old if old is not None and old.exists() else None
+        )
+
+
+_shared: list[tuple[Plan, Path, int, _Former]] = []
+
+
+def _work(tile: tuple[int, int]) -> TileReport:
+    plan, folder, lod, source = _shared[0]
+    return source.build(plan, folder, tile, lod)
+
+
+def _report(document: dict[str, Any]) -> TileReport:
+    return TileReport(**(document | {"problems": tuple(Problem(**p) for p in document["problems"])}))
+
+
+def _noted(folder: Path, keys: Keys, report: TileReport) -> TileReport:
+    """Append a report to the folder's journal."""
+    with (folder / "tiles.jsonl").open("a", encoding="utf-8") as journal:
+        journal.write(json.dumps({"keys": asdict(keys), **asdict(report)}) + "\n")
+    return report
+
+
+def _known(folder: Path, keys: Keys) -> dict[tuple[int, int], TileReport]:
+    """Reports of the tiles that a build with the same keys has left in the folder."""
+    path = folder / "tiles.jsonl"
+    known: dict[tuple[int, int], TileReport] = {}
+    for line in path.read_text("utf-8").splitlines() if path.exists() else ():
+        try:
+            document = json.loads(line)
+        except ValueError:  # the last line of a build that was killed
+            continue
+        if document.pop("keys") == asdict(keys) and tile_path(folder, document["i"], document["j"]).exists():
+            known[document["i"], document["j"]] = _report(document)
+    return known
+
+
+def tiles_document(keys: Keys, reports: Sequence[TileReport]) -> dict[str, Any]:
+    """What ``tiles.json`` of a finished scene says."""
+    return {"keys": asdict(keys), "tiles": [asdict(r) for r in sorted(reports, key=lambda r: (r.i, r.j))]}
