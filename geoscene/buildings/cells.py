@@ -196,14 +196,16 @@ def skeleton_cells(skeleton: Skeleton) -> Cells:
 
 
 def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:
-    """Rings (node numbers) without needles that cross themselves on the grid.
+    """Rings (node numbers) without needles that cross themselves or turn over on the grid.
 
     Where a node of a ring lies within two millimetres of another arc of the ring, the arc is led through it,
     in the ring beyond too, and the ring falls into two.
     """
     for _ in range(8 * len(rings)):
         rings = [r for r in rings if len(r) > 2]
-        crossed = np.flatnonzero(~shapely.is_valid(polygons_of(xy, rings)))
+        polygons = polygons_of(xy, rings)
+        turned = ~shapely.is_ccw(shapely.get_exterior_ring(polygons))
+        crossed = np.flatnonzero(turned | ~shapely.is_valid(polygons))
         found = _pinch(xy, rings[crossed[0]]) if len(crossed) else None
         if found is None:
             break
@@ -252,12 +254,15 @@ def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
     """
     xy, time = [tuple(p) for p in skeleton.xy.tolist()], skeleton.time.tolist()
     faces = [list(f) for f in skeleton.faces]
-    edge_from = {f[0]: k for k, f in enumerate(skeleton.faces[: skeleton.corners])}
-    edge_to = {f[1]: k for k, f in enumerate(skeleton.faces[: skeleton.corners])}
+    edges = [(k, f[0], f[1]) for k, f in enumerate(faces[: skeleton.corners]) if len(f) > 2]
+    edge_from = {start: k for k, start, _ in edges}
+    edge_to = {stop: k for k, _, stop in edges}
     for k in range(skeleton.corners):
         if len(faces[k]) != 3 or faces[k][2] < skeleton.corners:
             continue
         a, b, peak = faces[k]
+        if a not in edge_to or b not in edge_from:
+            continue
         left, right = faces[edge_to[a]], faces[edge_from[b]]
         if min(len(left), len(right)) < 4 or left[2] != peak or right[-1] != peak:
             continue
