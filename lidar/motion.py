@@ -82,16 +82,20 @@ def motion_along(
 
 
 def speed_limits(path: Path, vehicle: Vehicle) -> Float:
-    """Speed (n,) that the limit, the bend and the turning of the wheel allow at each row of a path, m/s."""
+    """Speed (n,) in m/s that limits, bends, crests and the turning of the wheel allow along a path."""
     bend = np.abs(path.curvature)
     change = np.abs(_along(path, path.curvature))
+    crest = np.abs(_along(path, path.slope))
     with np.errstate(divide="ignore"):
         by_bend = np.sqrt(_SPARE * vehicle.lateral_acceleration / bend)
         by_wheel = np.cbrt(_SPARE * vehicle.lateral_jerk / change)
+        by_crest = np.sqrt(_SPARE * vehicle.lateral_acceleration / crest)
     posted = np.minimum(
         path.limit, np.minimum(np.append(path.limit[1:], np.inf), np.append(np.inf, path.limit[:-1]))
     )
-    allowed = np.minimum(np.minimum(posted, vehicle.max_speed), np.minimum(by_bend, by_wheel))
+    allowed = np.minimum(
+        np.minimum(posted, vehicle.max_speed), np.minimum(by_bend, np.minimum(by_wheel, by_crest))
+    )
     limit: Float = np.maximum(allowed, _SLOWEST)
     return limit
 

@@ -263,31 +263,34 @@ def _heights(
     twice = np.cumsum(once) - 1
     body = setting.vehicle
     width = (body.turning_radius if body.kind == "air" else max(body.wheelbase, 1.0)) / legs[0].step
-    z, slope, bank = (np.concatenate(column)[once] for column in zip(*raw, strict=True))
+    z, rise, bank = (np.concatenate(column)[once] for column in zip(*raw, strict=True))
     # beyond its ends the road goes on as steep as it was
     spare = math.ceil(4 * width) + 1
     z = gaussian_filter1d(np.pad(z, spare, mode="reflect", reflect_type="odd"), width)[spare : spare + len(z)]
-    columns = [z[twice], *(gaussian_filter1d(c, width, mode="mirror")[twice] for c in (slope, bank))]
+    rise, bank = (gaussian_filter1d(c, width, mode="mirror")[twice] for c in (rise, bank))
+    columns = [z[twice], np.arctan(rise), bank]
     return list(zip(*(np.split(column, starts) for column in columns), strict=True))
 
 
 def _raw_heights(
     leg: Track, line: Line, setting: Setting, ground: Ground | None
 ) -> tuple[Float, Float, Float]:
-    """Height, slope ahead and bank at the rows of a leg, as the line or the ground has them."""
+    """Height, rise ahead per metre and bank at the rows of a leg, as the line or the ground has them."""
     heading = line_heading(line.xyz[:, :2])[leg.row]
     d = leg.xy - line.xyz[leg.row, :2]
     place = leg.row + (d[:, 0] * np.cos(heading) + d[:, 1] * np.sin(heading)) / line.gap
     # the last row may lie a little beyond the end of the line
     profile = np.append(line.xyz[:, 2], 2 * line.xyz[-1, 2] - line.xyz[-2, 2])
     z, bank = np.interp(place, np.arange(len(profile)), profile), np.zeros(len(leg.row))
-    if ground is not None:
-        ask = ~line.free[leg.row]
+    ask = np.flatnonzero(~line.free[leg.row])
+    if ground is not None and len(ask):
         c, s = np.cos(leg.heading[ask]), np.sin(leg.heading[ask])
         x, y = leg.xy[ask].T
         track = max(setting.vehicle.track, 0.1)
         half = track / 2 * setting.frame.scale_at(x, y)
         left, right = ground(x - half * s, y + half * c), ground(x + half * s, y - half * c)
-        z[ask] = 0.5 * (left + right)
-        bank[ask] = np.arctan2(left - right, track)
-    return z, leg.gear * np.arctan(np.gradient(z, leg.step)), bank
+        # over bridges and through tunnels, what the line lacks at both ends is shared out between them
+        rows = np.arange(len(z))
+        z = z + np.interp(rows, ask, 0.5 * (left + right) - z[ask])
+        bank = np.interp(rows, ask, np.arctan2(left - right, track))
+    return z, leg.gear * np.gradient(z, leg.step), bank

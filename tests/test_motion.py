@@ -178,3 +178,16 @@ def test_bad_options_are_refused():
     for options in ({"rate_hz": 0.0}, {"duration": -1.0}):
         with pytest.raises(InputError, match="must be positive"):
             drive_path(path, CAR, **options)
+
+
+def test_a_crest_is_taken_without_taking_off():
+    x = np.arange(0.0, 401.0, 4.0)
+    hill = free_route(
+        np.column_stack([x, np.zeros(len(x)), 20.0 * np.exp(-(((x - 200.0) / 25.0) ** 2))]), limit=25.0
+    )
+    trajectory = drive_path(plan_path(hill, CAR, FRAME), CAR)
+    lift = np.gradient(trajectory.velocity[:, 2], 0.01)
+    speed = np.linalg.norm(trajectory.velocity, axis=1)
+    at_top = np.argmin(np.abs(trajectory.position[:, 0] - 200.0))
+    assert speed[at_top] == pytest.approx(np.sqrt(0.98 * 2.5 / (2 * 20.0 / 25.0**2)), rel=0.1)
+    assert np.abs(lift).max() < 1.1 * CAR.lateral_acceleration

@@ -213,3 +213,25 @@ def test_in_a_real_city_the_body_touches_no_building(shared_osm, name):
         assert path.length > 1500.0
         assert np.percentile(np.abs(path.offset), 95) < 1.5
         assert route.edges.size > 10
+
+
+def test_a_ground_that_is_given_is_carried_over_bridges_without_a_step():
+    graph = road_graph(
+        [(0, 0), (100, 0), (150, 0), (250, 0)],
+        [(0, 1), (1, 2), (2, 3)],
+        bridge=[False, False, True, True, False, False],
+    )
+
+    def ground(x, _y):
+        return np.where((x > 101) & (x < 149), -8.0, 2.0)  # a ravine under the bridge
+
+    path = plan_path(lane_route(graph, [0, 2, 4], (0.0, 100.0)), CAR, FRAME, ground=ground)
+    np.testing.assert_allclose(path.position[:, 2], 2.0, atol=1e-6)
+
+
+def test_velocity_along_a_hilly_path_is_its_derivative():
+    x = np.arange(0.0, 401.0, 4.0)
+    line = np.column_stack([x, np.zeros(len(x)), 6.0 * np.sin(x / 30.0)])
+    path = plan_path(free_route(line), CAR, FRAME)
+    rise = np.diff(path.position[:, 2]) / np.diff(path.s)
+    np.testing.assert_allclose(rise, np.sin(0.5 * (path.slope[1:] + path.slope[:-1])), atol=2e-3)
