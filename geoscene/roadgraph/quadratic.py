@@ -50,7 +50,13 @@ def interior_point(cost: Any, pull: Float, bounds: Bounds, start: Float) -> Floa
         primal = a @ z + give * force - b - gap
         stiff = 1.0 / (give + gap / force)
         system = (cost + across @ diags_array(stiff) @ a).tocsc()
-        factor = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        # Positive definite: pivots stay on the diagonal, which keeps the factor sparse.
+        factor = splu(
+            system,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
 
         def step(complement: Float) -> tuple[Float, Float, Float]:
             short = -primal - complement / force  # noqa: B023
