@@ -133,7 +133,7 @@ def _resampled(route: Route, spacing: float) -> Line:
     for first, last in itertools.pairwise(ends):
         xyz = route.line[first:last]
         s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))])
-        keep = np.concatenate([[True], np.diff(s) > 1e-9])
+        keep = np.append(np.diff(s) > 1e-9, True)  # of points that coincide the last says what comes
         xyz, s = xyz[keep], s[keep]
         if len(s) < 2 or s[-1] < 2 * spacing:
             raise RouteError(f"the route has a stretch of {s[-1]:.2f} m; too short to drive")

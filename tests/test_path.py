@@ -235,3 +235,14 @@ def test_velocity_along_a_hilly_path_is_its_derivative():
     path = plan_path(free_route(line), CAR, FRAME)
     rise = np.diff(path.position[:, 2]) / np.diff(path.s)
     np.testing.assert_allclose(rise, np.sin(0.5 * (path.slope[1:] + path.slope[:-1])), atol=2e-3)
+
+
+def test_every_row_of_the_path_knows_its_street():
+    graph = road_graph(
+        [(0, 0), (80, 0), (160, 0), (240, 0)], [(0, 1), (1, 2), (2, 3)], speed=[9.0, 9, 5, 5, 12, 12]
+    )
+    path = plan_path(lane_route(graph, [0, 2, 4], (0.0, 80.0)), CAR, FRAME)
+    expected = np.array([0, 2, 4])[np.clip((path.position[:, 0] // 80).astype(int), 0, 2)]
+    inner = np.abs(path.position[:, 0] % 80.0 - 40.0) < 39.0
+    np.testing.assert_array_equal(path.edge[inner], expected[inner])
+    np.testing.assert_array_equal(path.limit[inner], graph.speed[expected[inner]])
