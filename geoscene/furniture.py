@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import shapely
@@ -21,6 +21,10 @@ from geoscene.tags import parse_direction, parse_length
 
 Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
+_Stand = tuple[Float, float, str, str]
+"""(place, heading, place source, heading source)."""
+_Row = tuple[Float, float, str, str, str, float, str, str]
+"""A stand with (shape, height, height source, id)."""
 
 _TALLEST = 60.0
 """Metres: a taller pole is a mast or a slip of the pen."""
@@ -113,18 +117,17 @@ def read_furniture(
     inside = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
     roads = _Roads.of(osm, frame)
     problems: list[Problem] = []
-    rows: list[tuple[Float, str, float, float, str, str, str, str]] = []
+    rows: list[_Row] = []
     for k in np.flatnonzero(inside):
         point, shape = chosen[k]
         height, height_source = _height(point, shape, problems)
-        stands = _stands(point, shape, xy[k], roads, plan, frame, left_hand=left_hand)
-        if not stands:
-            problems.append(Problem(point.osm_id, "furniture", "dropped", "no-roadside"))
-        for where, heading, place_source, heading_source in stands:
-            rows.append(
-                (where, shape, height, heading, height_source, place_source, heading_source, point.osm_id)
-            )
+        rows += [
+            (*stand, shape, height, height_source, point.osm_id)
+            for stand in _stands(point, shape, xy[k], roads, frame, left_hand=left_hand)
+        ]
     table = _table(rows)
+    table, adrift = _put_beside(table, plan, left_hand=left_hand)
+    problems += [Problem(str(osm_id), "furniture", "dropped", "no-roadside") for osm_id in np.unique(adrift)]
     built = np.append(plan.layers.klass == Class.BUILDING_PAD, np.False_)[winners(plan, *table.xy.T)]
     problems += [
         Problem(str(osm_id), "furniture", "dropped", "in-building")
@@ -242,16 +245,9 @@ class _Roads:
 
 
 def _stands(
-    point: Point,
-    shape: str,
-    xy: Float,
-    roads: _Roads,
-    plan: GroundPlan,
-    frame: Frame,
-    *,
-    left_hand: bool,
-) -> list[tuple[Float, float, str, str]]:
-    """Where a thing stands and faces: (place, heading, place source, heading source), one or two."""
+    point: Point, shape: str, xy: Float, roads: _Roads, frame: Frame, *, left_hand: bool
+) -> list[_Stand]:
+    """Where a thing stands and faces, once or twice; ``roadside`` ones are still on the centre line."""
     stated = parse_direction(point.tags.get("direction") or point.tags.get("light:direction"))
     heading = None
     if stated is not None:
@@ -259,7 +255,7 @@ def _stands(
         heading = np.pi / 2 - (np.radians(stated) - float(frame.convergence(lon, lat)))
     on = roads.by_node.get(int(point.osm_id.removeprefix("node/")), [])
     if on and (shape == "traffic_signals" or shape.startswith("sign_")):
-        return _beside(point, xy, roads, on, plan, left_hand=left_hand)
+        return _heeded(point, xy, roads, on)
     if heading is not None:
         return [(xy, heading, "node", "direction")]
     near = roads.tree.query_nearest(shapely.Point(xy), max_distance=_FARTHEST, all_matches=False)
@@ -283,50 +279,51 @@ def _stands(
     return [(xy, float(np.arctan2(toward[1], toward[0])), "node", "road")]
 
 
-def _beside(
-    point: Point, xy: Float, roads: _Roads, on: list[tuple[int, int]], plan: GroundPlan, *, left_hand: bool
-) -> list[tuple[Float, float, str, str]]:
-    """Places beside the road for a thing on its centre line, one for each direction of its traffic."""
+def _heeded(point: Point, xy: Float, roads: _Roads, on: list[tuple[int, int]]) -> list[_Stand]:
+    """A thing on a road's centre line, once for each direction of traffic that heeds it, facing that."""
     # A node inside a way knows its course; one where ways meet takes that of the first that passes through.
     row, index = max(on, key=lambda at: 0 < at[1] < shapely.get_num_points(roads.lines[at[0]]) - 1)
     course = roads.course(row, index)
     stated = point.tags.get("traffic_signals:direction") or point.tags.get("direction", "")
     signs = {"forward": (1,), "backward": (-1,), "both": (1, -1)}.get(stated)
+    source = "direction" if signs is not None else "road"
     if signs is None:
         signs = (int(roads.oneway[row]),) if roads.oneway[row] else (1, -1)
-    out = []
-    for sign in signs:
-        ahead = course * sign
-        aside = np.array([ahead[1], -ahead[0]]) * (-1.0 if left_hand else 1.0)
-        where = _roadside(plan, xy, aside, ahead)
-        if where is None:
-            continue
-        source = "direction" if stated in {"forward", "backward", "both"} else "road"
-        out.append((where, float(np.arctan2(-ahead[1], -ahead[0])), "roadside", source))
-    return out
+    against = [-course * sign for sign in signs]
+    return [(xy, float(np.arctan2(y, x)), "roadside", source) for x, y in against]
 
 
-def _roadside(plan: GroundPlan, xy: Float, aside: Float, ahead: Float) -> Float | None:
-    """The place (2,) half a metre off the road's surface, None if there is none within reach.
+def _put_beside(table: Furniture, plan: GroundPlan, *, left_hand: bool) -> tuple[Furniture, NDArray[np.str_]]:
+    """The table with its roadside things half a metre off the road, and the ids that found no place.
 
-    Straight to the side; amid a junction, where that leads along another road, back to the near corner.
+    Straight to the side of the traffic that the thing faces; amid a junction, where that leads along another
+    road, back to the near corner.
     """
+    moved = np.flatnonzero(table.place_source == "roadside")
+    ahead = -np.column_stack([np.cos(table.heading[moved]), np.sin(table.heading[moved])])
+    aside = np.column_stack([ahead[:, 1], -ahead[:, 0]]) * (-1.0 if left_hand else 1.0)
+    courses = np.stack([aside, (aside - ahead) / np.sqrt(2.0)], axis=1)
     reach = np.arange(0.0, _FARTHEST, 0.25)
-    for course in (aside, (aside - ahead) / np.sqrt(2.0)):
-        places = xy + reach[:, None] * course
-        klass = np.append(plan.layers.klass, np.uint8(plan.base[0]))[winners(plan, *places.T)]
-        road = np.isin(klass, _ON_ROAD)
-        if not road[0]:
-            return xy + aside * _WITHOUT_SURFACE
-        if not road[reach <= _WIDEST].all():
-            place: Float = xy + course * (reach[np.argmin(road)] + _ASIDE)
-            return place
-    return None
+    places = table.xy[moved][:, None, None] + reach[:, None] * courses[:, :, None]
+    klass = np.append(plan.layers.klass, np.uint8(plan.base[0]))[
+        winners(plan, places[..., 0].ravel(), places[..., 1].ravel())
+    ]
+    road = np.isin(klass, _ON_ROAD).reshape(places.shape[:3])
+    ends = np.any(~road[:, :, reach <= _WIDEST], axis=2)
+    no_surface = ~road[:, 0, 0]
+    which = np.where(ends[:, 0], 0, 1)
+    nth = np.arange(len(moved))
+    off = np.where(no_surface, _WITHOUT_SURFACE, reach[np.argmin(road[nth, which], axis=1)] + _ASIDE)
+    xy = table.xy.copy()
+    xy[moved] += off[:, None] * courses[nth, which]
+    keep = np.ones(len(table), bool)
+    keep[moved] = no_surface | ends.any(axis=1)
+    return replace(table, xy=xy).take(keep), table.osm_id[~keep]
 
 
-def _table(rows: list[tuple[Float, str, float, float, str, str, str, str]]) -> Furniture:
+def _table(rows: list[_Row]) -> Furniture:
     columns: list[list[object]] = [list(column) for column in zip(*rows, strict=True)] if rows else [[]] * 8
-    where, shape, height, heading, height_source, place_source, heading_source, osm_id = columns
+    where, heading, place_source, heading_source, shape, height, height_source, osm_id = columns
     return Furniture(
         np.array(where, float).reshape(-1, 2),
         np.array(shape, np.str_),
