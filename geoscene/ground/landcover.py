@@ -37,16 +37,8 @@ def landcover(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[L
     areas, problems = _areas(osm, frame, extent)
     lines, more = _lines(osm.ways, frame)
     coast = [way for way in osm.ways if way.tags.get("natural") == "coastline"]
-    # An island drawn as one closed way may come as an area; its ring is a coastline all the same.
-    rings = [
-        (area.osm_id, np.asarray(ring.coords))
-        for area in osm.areas
-        if area.tags.get("natural") == "coastline"
-        for ring in shapely.get_exterior_ring(shapely.get_parts(area.geometry))
-    ]
-    shores = [(way.osm_id, way.lonlat) for way in coast] + rings
     seas, still_more = sea(
-        [_to_scene(frame, lonlat) for _, lonlat in shores], extent, osm_id=[osm_id for osm_id, _ in shores]
+        [_to_scene(frame, way.lonlat) for way in coast], extent, osm_id=[way.osm_id for way in coast]
     )
     water = Layers.of(
         seas,
