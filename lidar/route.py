@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -381,11 +381,3 @@ def free_route(xyz: ArrayLike, *, limit: float = np.inf, side: Side = "right") -
 def street_tree(graph: RoadGraph) -> shapely.STRtree:
     """Search tree over the edges' centre lines."""
     return shapely.STRtree(edge_lines(graph))
-
-
-def concatenated(routes: Sequence[Route]) -> Route:
-    """Routes one after the other as one."""
-    columns = {f.name: np.concatenate([getattr(r, f.name) for r in routes]) for f in fields(Route)[:4]}
-    starts = np.cumsum([0, *(len(r.line) for r in routes[:-1])])
-    turns = np.concatenate([r.turns + s for r, s in zip(routes, starts, strict=True)])
-    return Route(**columns, turns=turns, edges=np.concatenate([r.edges for r in routes]), side=routes[0].side)

@@ -44,7 +44,6 @@ _SLOTS_DEG = (  # argument of latitude at the epoch, four slots a plane
     (197.046, 302.596, 66.066, 333.686),
     (238.886, 345.226, 105.206, 135.346),
 )
-SATELLITES = 24
 
 _RINGS = 6  # rings of the dome that is looked at for how much of it is blocked
 _SPOKES = 16
