@@ -46,11 +46,11 @@ def write_3dtiles(
     """Write a scene as a folder with ``tileset.json`` (3D Tiles 1.1), tile by tile.
 
     Coordinates are east, north, up about the scene's middle, true to the ellipsoid (no flat Earth); the
-    root's transform takes them to EPSG:4978. Each tile of the scene has its ground and solids, and as its child its
-    copies (trees, street furniture; EXT_mesh_gpu_instancing). The geometric error of a tile is the size of
-    what is missing while its children are not there: their box's diagonal where the tile is but a box, the
-    height of the tallest copy where the copies are missing, 0 where nothing is. Features have attributes
-    as property tables (EXT_structural_metadata, EXT_mesh_features).
+    root's transform takes them to EPSG:4978. Each tile of the scene has its ground and solids, and as its
+    child its copies (trees, street furniture; EXT_mesh_gpu_instancing). The geometric error of a tile is the
+    size of what is missing while its children are not there: their box's diagonal where the tile is but a
+    box, the height of the tallest copy where the copies are missing, 0 where nothing is. Features have their
+    attributes as property tables (EXT_structural_metadata, EXT_mesh_features).
 
     height_offset : metres from the zero of the scene's heights up from the WGS 84 ellipsoid (for orthometric
                     heights the geoid's undulation)

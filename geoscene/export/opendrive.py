@@ -1,0 +1,327 @@
+"""OpenDRIVE 1.7: the road graph as reference lines, lanes, junctions, signals, bridges and tunnels."""
+
+from __future__ import annotations
+
+import warnings
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.errors import InputError
+from geoscene.export.files import Summary, size_of, whole_file
+from geoscene.export.objects import attribution
+from geoscene.export.roadnet import END, START, Carriageway, Connection, RoadNet, road_net
+from geoscene.progress import Progress, silent
+from geoscene.roadgraph import read_graphml
+from geoscene.roads import RoadGraph
+from geoscene.scene import Scene
+
+Float = NDArray[np.float64]
+
+_TYPES = {
+    "motorway": "motorway",
+    "motorway_link": "motorway",
+    "trunk": "townExpressway",
+    "trunk_link": "townExpressway",
+    "primary": "townArterial",
+    "primary_link": "townArterial",
+    "secondary": "townArterial",
+    "secondary_link": "townArterial",
+    "tertiary": "townCollector",
+    "tertiary_link": "townCollector",
+    "unclassified": "townLocal",
+    "residential": "townLocal",
+    "living_street": "townPlayStreet",
+    "service": "townPrivate",
+}
+_FAST = 70 / 3.6
+"""Metres a second above which a road that is no motorway is a rural one."""
+
+_SIGNALS = {
+    "traffic_signals": ("yes", "OpenDRIVE", "1000001"),
+    "stop": ("no", "DE", "206"),
+    "give_way": ("no", "DE", "205"),
+}
+"""Dynamic, country, type: OpenDRIVE's own code of a three-light signal, the numbers of the StVO's signs."""
+
+
+def write_opendrive(
+    scene: Scene, path: Path, *, left_hand: bool = False, progress: Progress = silent
+) -> Summary:
+    """Write the road graph as OpenDRIVE 1.7.
+
+    Every carriageway is a road: its centre line with the corners rounded (lines and arcs, within 0.1 m of the
+    map's), its heights, its lanes in both directions, its speed limit, its signals and signs, bridges and
+    tunnels. Where roads meet is a junction with a connecting road (paramPoly3) for every permitted turn.
+    ``userData`` names the OpenStreetMap way. A lane that both directions share has the type
+    ``bidirectional``.
+
+    left_hand : traffic keeps left
+
+    Raises InputError for a scene without roads.
+    """
+    if not (scene.path / "roads.graphml").exists():
+        raise InputError(f"{scene.path}: no drivable roads in it, so no OpenDRIVE")
+    graph = read_graphml(scene.path / "roads.graphml", scene.frame)
+    net = road_net(graph, left_hand=left_hand)
+    controls: dict[int, list[tuple[float, str]]] = defaultdict(list)
+    for edge, offset, kind in zip(
+        graph.control_edge.tolist(), graph.control_offset.tolist(), graph.control_kind.tolist(), strict=True
+    ):
+        controls[edge].append((offset / max(float(graph.length[edge]), 1e-9), kind))
+    first = len(net.roads) + 1
+    junctions = {
+        int(node): first + len(net.connections) + k for k, node in enumerate(np.flatnonzero(net.junctions))
+    }
+    with whole_file(path) as out:
+        out.write(_header(scene).encode())
+        for k in range(len(net.roads)):
+            progress("OpenDRIVE", k, len(net.roads))
+            told = "".join(_road(graph, net, k, junctions, controls, left_hand=left_hand))
+            out.write(told.encode())
+        for k, connection in enumerate(net.connections):
+            told = "".join(
+                _connecting_road(graph, net, connection, first + k, junctions, left_hand=left_hand)
+            )
+            out.write(told.encode())
+        out.write("".join(_junctions(net, junctions, first, left_hand=left_hand)).encode())
+        out.write(b"</OpenDRIVE>\n")
+    files, size = size_of(path)
+    return Summary(path, "opendrive", files, size, len(net.roads), crs=scene.frame.name)
+
+
+def _n(value: float) -> str:
+    """A number without noise: 1e-9 is a nanometre, and far below a nanoradian at a kilometre."""
+    text = f"{value:.9f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text
+
+
+def _header(scene: Scene) -> str:
+    xmin, ymin, xmax, ymax = scene.bounds
+    with warnings.catch_warnings():
+        # PROJ strings are all that OpenDRIVE takes; pyproj warns of what they leave out of a CRS.
+        warnings.simplefilter("ignore", UserWarning)
+        proj = scene.frame.crs.to_proj4()
+    east, north = scene.frame.origin
+    offset = f'<offset x="{_n(east)}" y="{_n(north)}" z="0" hdg="0"/>\n' if east or north else ""
+    stamps = [str(source.get("timestamp") or "") for source in scene.manifest.get("sources", [])]
+    date = max([stamp.rstrip("Z") for stamp in stamps if "T" in stamp], default="2000-01-01T00:00:00")
+    name = quoteattr(str(scene.manifest.get("name", "")) or "scene")
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<OpenDRIVE>\n'
+        f'<header revMajor="1" revMinor="7" name={name} version="1" date="{date}" north="{_n(ymax)}" '
+        f'south="{_n(ymin)}" east="{_n(xmax)}" west="{_n(xmin)}" vendor="geoscene">\n'
+        f"<geoReference><![CDATA[{proj}]]></geoReference>\n{offset}"
+        f'<userData code="attribution" value={quoteattr(attribution(scene))}/>\n</header>\n'
+    )
+
+
+def _road(
+    graph: RoadGraph,
+    net: RoadNet,
+    k: int,
+    junctions: dict[int, int],
+    controls: dict[int, list[tuple[float, str]]],
+    *,
+    left_hand: bool,
+) -> Iterator[str]:
+    road = net.roads[k]
+    edge, plan = road.edge, road.plan
+    name = quoteattr(str(graph.name[edge] or graph.ref[edge]))
+    rule = "LHT" if left_hand else "RHT"
+    yield f'<road name={name} length="{_n(plan.total)}" id="{k + 1}" junction="-1" rule="{rule}">\n<link>'
+    nodes = {START: int(graph.tail[edge]), END: int(graph.head[edge])}
+    for end, word in ((START, "predecessor"), (END, "successor")):
+        if (k, end) in net.joints:
+            other, contact = net.joints[k, end]
+            point = "start" if contact == START else "end"
+            yield f'<{word} elementType="road" elementId="{other + 1}" contactPoint="{point}"/>'
+        elif nodes[end] in junctions:
+            yield f'<{word} elementType="junction" elementId="{junctions[nodes[end]]}"/>'
+    speed = float(graph.speed[edge])
+    yield f'</link>\n<type s="0" type="{_type(graph, edge)}">{_speed(speed)}</type>\n<planView>\n'
+    for s, x, y, heading, length, curvature in zip(
+        *(c.tolist() for c in (plan.s, plan.x, plan.y, plan.heading, plan.length, plan.curvature)),
+        strict=True,
+    ):
+        shape = f'<arc curvature="{curvature:.12g}"/>' if curvature else "<line/>"
+        yield _geometry(s, x, y, heading, length, shape)
+    yield "</planView>\n<elevationProfile>\n"
+    yield from _elevations(plan.at, road.line[:, 2])
+    yield "</elevationProfile>\n<lateralProfile/>\n<lanes>\n"
+    shift = road.shift if not left_hand else -road.shift
+    yield f'<laneOffset s="0" a="{_n(shift)}" b="0" c="0" d="0"/>\n<laneSection s="0">\n'
+    yield from _lanes(graph, net, k, left_hand=left_hand)
+    yield "</laneSection>\n</lanes>\n<objects>"
+    for kind, there, detail in (
+        ("tunnel", graph.tunnel[edge], 'type="standard" lighting="1" daylight="0"'),
+        ("bridge", graph.bridge[edge], 'type="concrete"'),
+    ):
+        if there:
+            yield f'<{kind} id="{kind}{k + 1}" s="0" length="{_n(plan.total)}" {detail}/>'
+    yield "</objects>\n<signals>"
+    yield from _signals(road, k, controls, left_hand=left_hand)
+    yield f'</signals>\n<userData code="osm" value={quoteattr(str(graph.osm_id[edge]))}/>\n</road>\n'
+
+
+def _type(graph: RoadGraph, edge: int) -> str:
+    kind = _TYPES.get(str(graph.highway[edge]), "unknown")
+    return "rural" if kind != "motorway" and graph.speed[edge] > _FAST else kind
+
+
+def _speed(speed: float) -> str:
+    return f'<speed max="{_n(round(speed, 4))}" unit="m/s"/>'
+
+
+def _geometry(s: float, x: float, y: float, heading: float, length: float, shape: str) -> str:
+    place = f's="{_n(s)}" x="{_n(x)}" y="{_n(y)}" hdg="{heading:.12g}" length="{_n(length)}"'
+    return f"<geometry {place}>{shape}</geometry>\n"
+
+
+def _elevations(at: Float, height: Float) -> Iterator[str]:
+    """Straight slopes from vertex to vertex; those that go on as before are joined."""
+    slope = np.diff(height) / np.maximum(np.diff(at), 1e-9)
+    fresh = np.append(True, np.abs(np.diff(slope)) > 1e-9)
+    for s, z, b in zip(at[:-1][fresh], height[:-1][fresh], slope[fresh], strict=True):
+        yield f'<elevation s="{_n(s)}" a="{_n(z)}" b="{_n(b)}" c="0" d="0"/>\n'
+
+
+def _lanes(graph: RoadGraph, net: RoadNet, k: int, *, left_hand: bool) -> Iterator[str]:
+    """The lanes of a road, from left to right; across a joint they go on in the lane of the same place."""
+    road = net.roads[k]
+    sign = 1 if left_hand else -1
+    along = [(sign * (i + 1), road.edge) for i in range(road.ahead + road.shared)]
+    against = [(-sign * (i + 1), road.twin) for i in range(road.back)]
+    left, right = (along, against) if left_hand else (against, along)
+    flip = {end: -1 if net.joints[k, end][1] == end else 1 for end in (START, END) if (k, end) in net.joints}
+    if left:
+        yield "<left>\n"
+        for number, edge in reversed(left):
+            yield _lane(graph, road, number, edge, flip, sign, len(left))
+        yield "</left>\n"
+    middle = "solid" if road.twin >= 0 and not road.shared else "none"
+    yield f'<center><lane id="0" type="none" level="false"><link/>{_mark(middle)}</lane></center>\n'
+    if right:
+        yield "<right>\n"
+        for number, edge in right:
+            yield _lane(graph, road, number, edge, flip, sign, len(right))
+        yield "</right>\n"
+
+
+def _lane(
+    graph: RoadGraph, road: Carriageway, number: int, edge: int, flip: dict[int, int], sign: int, count: int
+) -> str:
+    links = "".join(
+        f'<{word} id="{flip[end] * number}"/>'
+        for end, word in ((START, "predecessor"), (END, "successor"))
+        if end in flip
+    )
+    shared = road.shared and number == sign
+    return (
+        f'<lane id="{number}" type="{"bidirectional" if shared else "driving"}" level="false">'
+        f'<link>{links}</link><width sOffset="0" a="{_n(road.width)}" b="0" c="0" d="0"/>'
+        f"{_mark('broken' if abs(number) < count else 'none')}"
+        f'<speed sOffset="0" max="{_n(round(float(graph.speed[edge]), 4))}" unit="m/s"/></lane>\n'
+    )
+
+
+def _mark(kind: str) -> str:
+    width = "" if kind == "none" else ' width="0.12"'
+    return (
+        f'<roadMark sOffset="0" type="{kind}" weight="standard" color="standard"{width} laneChange="none"/>'
+    )
+
+
+def _signals(
+    road: Carriageway, k: int, controls: dict[int, list[tuple[float, str]]], *, left_hand: bool
+) -> Iterator[str]:
+    """What drivers of each direction must heed, at the side of the road that they keep to."""
+    count = 0
+    total = road.plan.total
+    for edge in (road.edge, road.twin):
+        along = edge == road.edge
+        for share, kind in controls.get(edge, []):
+            if kind not in _SIGNALS:
+                continue
+            count += 1
+            dynamic, country, code = _SIGNALS[kind]
+            place = (share if along else 1 - share) * road.whole - road.begins
+            s = min(max(place, 0.0), total)
+            lanes = road.ahead + road.back + road.shared
+            t = (lanes * road.width / 2 + 0.5) * (1 if along == left_hand else -1)
+            high = "3" if dynamic == "yes" else "2.2"
+            yield (
+                f'<signal s="{_n(s)}" t="{_n(t)}" id="{k + 1}{count:03d}" name="{kind}" dynamic="{dynamic}" '
+                f'orientation="{"+" if along else "-"}" zOffset="{high}" country="{country}" type="{code}" '
+                f'subtype="-1" value="-1" height="0.9" width="0.6" hOffset="0" pitch="0" roll="0"/>'
+            )
+
+
+def _connecting_road(
+    graph: RoadGraph, net: RoadNet, c: Connection, number: int, junctions: dict[int, int], *, left_hand: bool
+) -> Iterator[str]:
+    curve = c.curve
+    rule = "LHT" if left_hand else "RHT"
+    side, sign = ("left", 1) if left_hand else ("right", -1)
+    yield (
+        f'<road name="" length="{_n(curve.length)}" id="{number}" junction="{junctions[c.node]}" '
+        f'rule="{rule}">\n<link>'
+    )
+    source, target = net.roads[net.road_of[c.before]], net.roads[net.road_of[c.after]]
+    leaves = "end" if c.before == source.edge else "start"
+    enters = "start" if c.after == target.edge else "end"
+    for word, edge, point in (("predecessor", c.before, leaves), ("successor", c.after, enters)):
+        other = int(net.road_of[edge]) + 1
+        yield f'<{word} elementType="road" elementId="{other}" contactPoint="{point}"/>'
+    speed = min(float(graph.speed[c.before]), float(graph.speed[c.after]))
+    kind = _type(graph, c.before)
+    yield f'</link>\n<type s="0" type="{kind}">{_speed(speed)}</type>\n<planView>\n'
+    u, v = (dict(zip("abcd", w.tolist(), strict=True)) for w in (curve.u, curve.v))
+    told = " ".join(
+        f'{letter}{axis}="{value:.12g}"' for axis, w in (("U", u), ("V", v)) for letter, value in w.items()
+    )
+    shape = f'<paramPoly3 {told} pRange="normalized"/>'
+    yield _geometry(0.0, curve.x, curve.y, curve.heading, curve.length, shape)
+    a, b, cc, d = c.rise.tolist()
+    yield (
+        f'</planView>\n<elevationProfile><elevation s="0" a="{_n(a)}" b="{_n(b)}" c="{cc:.12g}" '
+        f'd="{d:.12g}"/></elevationProfile>\n<lateralProfile/>\n<lanes>\n<laneSection s="0">\n'
+    )
+    middle = f'<center><lane id="0" type="none" level="false"><link/>{_mark("none")}</lane></center>\n'
+    lanes = []
+    growth = (c.widths[1] - c.widths[0]) / max(curve.length, 1e-3)
+    for k, (before, after) in enumerate(c.lanes.tolist()):
+        lanes.append(
+            f'<lane id="{sign * (k + 1)}" type="driving" level="false"><link><predecessor id="{before}"/>'
+            f'<successor id="{after}"/></link><width sOffset="0" a="{_n(c.widths[0])}" b="{_n(growth)}" '
+            f'c="0" d="0"/>{_mark("none")}<speed sOffset="0" max="{_n(round(speed, 4))}" unit="m/s"/></lane>\n'
+        )
+    if left_hand:
+        yield f"<{side}>\n{''.join(reversed(lanes))}</{side}>\n{middle}"
+    else:
+        yield f"{middle}<{side}>\n{''.join(lanes)}</{side}>\n"
+    yield "</laneSection>\n</lanes>\n</road>\n"
+
+
+def _junctions(net: RoadNet, junctions: dict[int, int], first: int, *, left_hand: bool) -> Iterator[str]:
+    """Each junction with its connections, whose order is that of the connecting roads."""
+    sign = 1 if left_hand else -1
+    ways: dict[int, list[tuple[int, Connection]]] = defaultdict(list)
+    for k, connection in enumerate(net.connections):
+        ways[connection.node].append((first + k, connection))
+    for node, number in junctions.items():
+        yield f'<junction name="" id="{number}" type="default">\n'
+        for k, (road, c) in enumerate(ways[node]):
+            incoming = int(net.road_of[c.before]) + 1
+            yield (
+                f'<connection id="{k}" incomingRoad="{incoming}" connectingRoad="{road}" '
+                f'contactPoint="start">'
+            )
+            for lane, (before, _) in enumerate(c.lanes.tolist()):
+                yield f'<laneLink from="{before}" to="{sign * (lane + 1)}"/>'
+            yield "</connection>\n"
+        yield "</junction>\n"

@@ -1,0 +1,294 @@
+"""Carriageways with lanes, and junctions that join them: the road graph as OpenDRIVE sees it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.export.planview import Curve, PlanView, connecting_curve, cut, plan_view
+from geoscene.roads import RoadGraph
+from geoscene.routing import turn_table
+
+Float = NDArray[np.float64]
+Lane = tuple[int, float, float]
+"""Number of a lane, where its inner edge is (metres left of the centre line, looking as it drives), width."""
+
+START, END = 0, 1
+
+_LEAST_GAP, _MOST_GAP, _MOST_SHARE = 2.0, 30.0, 0.4
+_STRAIGHT = np.radians(0.05)
+
+
+@dataclass(frozen=True, slots=True)
+class Carriageway:
+    """One road: an edge of the graph and its twin, cut back where junctions are.
+
+    edge     : number of its edge along the reference line
+    twin     : of the other, -1 for none
+    line     : (n, 3) centre line as cut, scene metres
+    plan     : the reference line
+    begins   : metres of the edge's centre line, before it was cut, at which ``line`` begins
+    whole    : metres of it in all
+    width    : metres of a lane
+    ahead, back : number of lanes along the edge and along its twin
+    shared   : one more lane, used in both directions, between them
+    shift    : metres that the lanes' middle line lies left of the reference line
+    """
+
+    edge: int
+    twin: int
+    line: Float
+    plan: PlanView
+    begins: float
+    whole: float
+    width: float
+    ahead: int
+    back: int
+    shared: bool
+    shift: float
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """A way through a junction.
+
+    node   : the junction's
+    before, after : edges
+    curve  : reference line
+    lanes  : (k, 2) numbers of the lanes that are joined
+    widths : metres of a lane at its start and end
+    rise   : (4,) height along it, coefficients of 1, s, s2, s3
+    """
+
+    node: int
+    before: int
+    after: int
+    curve: Curve
+    lanes: NDArray[np.int64]
+    widths: tuple[float, float]
+    rise: Float
+
+
+@dataclass(frozen=True, slots=True)
+class RoadNet:
+    """Carriageways, the nodes that are junctions, the ways through them, and joints without a junction.
+
+    roads       : in the order of their edges
+    road_of     : (m,) number of the road that each edge of the graph is a direction of, -1 for none
+    junctions   : (n,) bool, by node
+    connections : in order of nodes and edges
+    joints      : (road, end) to the (road, end) that continues it
+    """
+
+    roads: list[Carriageway]
+    road_of: NDArray[np.int64]
+    junctions: NDArray[np.bool_]
+    connections: list[Connection]
+    joints: dict[tuple[int, int], tuple[int, int]]
+
+
+def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
+    """The road graph as carriageways and junctions.
+
+    A node where two roads of the same lanes meet within 0.05 degrees is a joint; any other where roads meet is a
+    junction, and has a way through for every turn that the graph permits (`geoscene.routing.turn_table`).
+    """
+    firsts = [k for k in range(len(graph)) if not 0 <= graph.twin[k] < k and _span(graph.geometry[k]) > 0.05]
+    number = {edge: k for k, edge in enumerate(firsts)}
+    road_of = np.array(
+        [number.get(k, number.get(int(graph.twin[k]), -1)) for k in range(len(graph))], np.int64
+    )
+    before, after = turn_table(graph)
+    known = (road_of[before] >= 0) & (road_of[after] >= 0) & (graph.twin[before] != after)
+    before, after = before[known], after[known]
+    ends: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    for k, edge in enumerate(firsts):
+        ends[int(graph.tail[edge])].append((k, START))
+        ends[int(graph.head[edge])].append((k, END))
+    joints = _joints(graph, firsts, ends, before, after)
+    junctions = np.zeros(len(graph.node_id), np.bool_)
+    junctions[graph.head[before]] = True
+    for k, end in joints:
+        edge = firsts[k]
+        junctions[graph.head[edge] if end == END else graph.tail[edge]] = False
+    gaps = _gaps(graph, firsts, ends, junctions)
+    roads = [_carriageway(graph, edge, gaps[k]) for k, edge in enumerate(firsts)]
+    connections = []
+    for first, then in sorted(zip(before.tolist(), after.tolist(), strict=True)):
+        node = int(graph.head[first])
+        if junctions[node]:
+            made = _connection(graph, roads, road_of, first, then, left_hand=left_hand)
+            connections.append(made)
+    connections.sort(key=lambda c: (c.node, c.before, c.after))
+    return RoadNet(roads, road_of, junctions, connections, joints)
+
+
+def _span(line: Float) -> float:
+    return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
+
+
+def _direction(graph: RoadGraph, edge: int, end: int) -> float:
+    """Heading (radians) in which a road leaves the node at one of its ends."""
+    line = graph.geometry[edge][:, :2]
+    if end == END:
+        line = line[::-1]
+    far = np.flatnonzero(np.hypot(*(line - line[0]).T) > 1e-3)
+    dx, dy = line[far[0]] - line[0]
+    return float(np.arctan2(dy, dx))
+
+
+def _angle(a: float, b: float) -> float:
+    return abs((a - b + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _joints(
+    graph: RoadGraph,
+    firsts: list[int],
+    ends: dict[int, list[tuple[int, int]]],
+    before: NDArray[np.int32],
+    after: NDArray[np.int32],
+) -> dict[tuple[int, int], tuple[int, int]]:
+    turns = set(zip(before.tolist(), after.tolist(), strict=True))
+    joints = {}
+    for met in ends.values():
+        if len(met) != 2 or met[0][0] == met[1][0]:
+            continue
+        (a, end_a), (b, end_b) = met
+        edge_a, edge_b = firsts[a], firsts[b]
+        away = _angle(_direction(graph, edge_a, end_a), _direction(graph, edge_b, end_b))
+        if np.pi - away > _STRAIGHT:
+            continue
+        turned = end_a == end_b  # one runs against the other
+        twin_a, twin_b = int(graph.twin[edge_a]), int(graph.twin[edge_b])
+        if (twin_a < 0) != (twin_b < 0) or (twin_a < 0 and turned):
+            continue
+        along = (twin_b, edge_b) if turned else (edge_b, twin_b)
+        same = graph.width[edge_a] == graph.width[edge_b] and graph.lanes[edge_a] == graph.lanes[along[0]]
+        wanted = {(edge_a, along[0]) if end_a == END else (along[0], edge_a)}
+        if twin_a >= 0:
+            same = same and graph.lanes[twin_a] == graph.lanes[along[1]]
+            wanted.add((along[1], twin_a) if end_a == END else (twin_a, along[1]))
+        if same and wanted <= turns:
+            joints[a, end_a] = (b, end_b)
+            joints[b, end_b] = (a, end_a)
+    return joints
+
+
+def _gaps(
+    graph: RoadGraph,
+    firsts: list[int],
+    ends: dict[int, list[tuple[int, int]]],
+    junctions: NDArray[np.bool_],
+) -> Float:
+    """Metres (roads, 2) that each road is cut back at its ends, so that it clears its neighbours' sides.
+
+    Roads of half widths a and b that leave a node at an angle t meet (b + a cos t) / sin t from it.
+    """
+    gaps = np.zeros((len(firsts), 2))
+    for node, met in ends.items():
+        if not junctions[node]:
+            continue
+        heading = [_direction(graph, firsts[k], end) for k, end in met]
+        half = [graph.width[firsts[k]] / 2 for k, _ in met]
+        for i, (k, end) in enumerate(met):
+            need = _LEAST_GAP
+            for j in range(len(met)):
+                t = _angle(heading[i], heading[j])
+                if j != i and np.radians(5) < t < np.radians(170):
+                    need = max(need, (half[j] + half[i] * np.cos(t)) / np.sin(t) + 1.0)
+            most = min(_MOST_GAP, _MOST_SHARE * _span(graph.geometry[firsts[k]]))
+            gaps[k, end] = min(need, most)
+    return gaps
+
+
+def _carriageway(graph: RoadGraph, edge: int, gap: Float) -> Carriageway:
+    full = graph.geometry[edge]
+    fresh = np.append(True, np.hypot(*np.diff(full[:, :2], axis=0).T) > 1e-3)
+    line = cut(full[fresh], float(gap[START]), float(gap[END]))
+    twin = int(graph.twin[edge])
+    there, back = float(graph.lanes[edge]), float(graph.lanes[twin]) if twin >= 0 else 0.0
+    shared = twin >= 0 and there % 1 > 0 and back % 1 > 0
+    ahead, behind = int(there), int(back)
+    if not shared:
+        ahead, behind = max(ahead, 1), max(behind, 1) if twin >= 0 else 0
+    count = ahead + behind + shared
+    width = float(graph.width[edge]) / count
+    return Carriageway(
+        edge, twin, line, plan_view(line[:, :2]), float(gap[START]), _span(full), width, ahead, behind,
+        shared, width * (ahead + shared - behind) / 2,
+    )  # fmt: skip
+
+
+def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[Lane]:
+    """The lanes of one direction of a road, from the middle outwards.
+
+    Traffic that keeps right drives along the reference line in lanes of negative number; the shared lane lies
+    on that side. ``shift`` is taken for traffic on the right: it is mirrored for the left.
+    """
+    sign = 1 if left_hand else -1  # of the lanes along the reference line
+    along = edge == road.edge
+    middle = -sign * road.shift if along else sign * road.shift  # of the lanes' zero, left as one drives
+    count = road.ahead if along else road.back
+    first = 1 + (road.shared and along)
+    if count == 0:  # the shared lane is all there is
+        inner = middle if along else middle - sign * road.width
+        return [(sign, inner, road.width)]
+    number = sign if along else -sign
+    return [
+        (number * (first + k), middle + sign * (first - 1 + k) * road.width, road.width) for k in range(count)
+    ]
+
+
+def _connection(
+    graph: RoadGraph,
+    roads: list[Carriageway],
+    road_of: NDArray[np.int64],
+    before: int,
+    after: int,
+    *,
+    left_hand: bool,
+) -> Connection:
+    """The way from the end of one edge to the start of another."""
+    sign = 1 if left_hand else -1
+    source, target = roads[road_of[before]], roads[road_of[after]]
+    start, heading, slope = _pose(source, arriving=True, along=before == source.edge)
+    end, end_heading, end_slope = _pose(target, arriving=False, along=after == target.edge)
+    here = driven_lanes(source, before, left_hand=left_hand)
+    there = driven_lanes(target, after, left_hand=left_hand)
+    turn = (end_heading - heading + np.pi) % (2 * np.pi) - np.pi
+    count = min(len(here), len(there))
+    outer = sign * turn > np.radians(30)  # a turn towards the side that one keeps to starts in the last lane
+    here, there = (here[-count:], there[-count:]) if outer else (here[:count], there[:count])
+    first = start[:2] + here[0][1] * np.array([-np.sin(heading), np.cos(heading)])
+    last = end[:2] + there[0][1] * np.array([-np.sin(end_heading), np.cos(end_heading)])
+    curve = connecting_curve(first, heading, last, end_heading)
+    length = max(curve.length, 1e-3)
+    rise = end[2] - start[2]
+    c = (3 * rise / length - 2 * slope - end_slope) / length
+    d = (slope + end_slope - 2 * rise / length) / length**2
+    return Connection(
+        int(graph.head[before]),
+        before,
+        after,
+        curve,
+        np.array([[a[0], b[0]] for a, b in zip(here, there, strict=True)], np.int64),
+        (here[0][2], there[0][2]),
+        np.array([start[2], slope, c, d]),
+    )
+
+
+def _pose(road: Carriageway, *, arriving: bool, along: bool) -> tuple[Float, float, float]:
+    """Point (3,), heading and slope, as driven, of the end of a road where traffic leaves or enters it."""
+    last = arriving == along
+    plan, line = road.plan, road.line
+    rows = (-2, -1) if last else (0, 1)
+    span = plan.at[rows[1]] - plan.at[rows[0]]
+    slope = float((line[rows[1], 2] - line[rows[0], 2]) / span)
+    heading = float(plan.heading[-1 if last else 0])
+    if last:
+        heading += float(plan.curvature[-1] * plan.length[-1])
+    point = line[-1 if last else 0]
+    return (point, heading, slope) if along else (point, heading + np.pi, -slope)
