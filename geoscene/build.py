@@ -129,10 +129,13 @@ def _tiles_along(plan: Plan, options: BuildOptions) -> list[tuple[int, int]]:
     if not options.along:
         return tiles
     line = route_line(options.along, plan.graph, plan.frame)
-    boxes = shapely.bounds(plan.buildings.footprint[: plan.buildings.count]).reshape(-1, 4)
     size = options.tile_size
-    low, high = plan.home * size, (plan.home + 1) * size
-    beyond = np.concatenate([low - boxes[:, :2], boxes[:, 2:] - high]).max(initial=0.0)
+    boxes = shapely.bounds(plan.buildings.footprint).reshape(-1, 4)
+    beyond = 0.0  # how far buildings stick out of the tiles they belong to
+    for (i, j), rows in plan.rows["buildings"].items():
+        low, high = np.array([i, j]) * size, np.array([i + 1, j + 1]) * size
+        sticks = np.concatenate([low - boxes[rows, :2], boxes[rows, 2:] - high])
+        beyond = max(beyond, float(sticks.max()))
     near = line.buffer(options.reach + beyond)
     box = shapely.box(*(np.array(tiles) * size).T, *((np.array(tiles) + 1) * size).T)
     return [tile for tile, met in zip(tiles, shapely.intersects(box, near), strict=True) if met]

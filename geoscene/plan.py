@@ -62,7 +62,8 @@ class Plan:
     height    : z of the ground at x, y, roads graded into it; None where all is at 0
     buildings : their table
     base      : (count,) z of each building's base
-    home      : (count, 2) int64, the tile that each building belongs to: the one with the middle of its box
+    rows      : by kind (``buildings``, ``trees``, ``furniture``, ``barriers``) the rows that belong to each tile:
+                those with the middle of their box in it
     graph     : roads, with heights
     ground    : what lies on the ground
     levels    : how high its water stands
@@ -76,7 +77,7 @@ class Plan:
     height: Height | None
     buildings: Buildings
     base: Float
-    home: NDArray[np.int64]
+    rows: dict[str, dict[tuple[int, int], NDArray[np.int64]]]
     graph: RoadGraph
     ground: GroundPlan
     levels: WaterLevels
@@ -94,7 +95,11 @@ class Plan:
     def tiles(self) -> list[tuple[int, int]]:
         """All tiles, in order."""
         ground = {(int(i), int(j)) for i, j in self.ground.tiles}
-        return sorted(ground | {(int(i), int(j)) for i, j in np.unique(self.home, axis=0)})
+        return sorted(ground.union(*self.rows.values()))
+
+    def of_tile(self, kind: str, i: int, j: int) -> NDArray[np.int64]:
+        """Rows of a kind that belong to tile (i, j), rising."""
+        return self.rows[kind].get((i, j), np.empty(0, np.int64))
 
 
 def make_plan(
@@ -162,7 +167,12 @@ def make_plan(
         height=height,
         buildings=buildings,
         base=base,
-        home=_homes(footprints, tile_size),
+        rows={
+            "buildings": _by_tile(footprints, tile_size),
+            "trees": _by_tile(shapely.points(trees.xy), tile_size),
+            "furniture": _by_tile(shapely.points(furniture.xy), tile_size),
+            "barriers": _by_tile(barriers.polygon, tile_size),
+        },
         graph=graph,
         ground=ground,
         levels=levels,
@@ -258,10 +268,16 @@ def _foot(xy: Float, height: Height | None) -> Float:
     return np.zeros(len(xy)) if height is None else np.asarray(height(xy[:, 0], xy[:, 1]), float)
 
 
-def _homes(footprints: NDArray[Any], tile_size: float) -> NDArray[np.int64]:
-    boxes = shapely.bounds(footprints).reshape(-1, 4)
-    home: NDArray[np.int64] = np.floor((boxes[:, :2] + boxes[:, 2:]) / 2 / tile_size).astype(np.int64)
-    return home
+def _by_tile(shapes: NDArray[Any], tile_size: float) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Rows by the tile that holds the middle of their box."""
+    boxes = shapely.bounds(shapes).reshape(-1, 4)
+    home = np.floor((boxes[:, :2] + boxes[:, 2:]) / 2 / tile_size).astype(np.int64)
+    if not len(home):
+        return {}
+    keys, owner = np.unique(home, axis=0, return_inverse=True)
+    order = np.argsort(owner.ravel(), kind="stable")
+    cuts = np.searchsorted(owner.ravel()[order], np.arange(len(keys) + 1))
+    return {(int(i), int(j)): order[a:b] for (i, j), a, b in zip(keys, cuts[:-1], cuts[1:], strict=True)}
 
 
 def take_buildings(buildings: Buildings, rows: NDArray[np.integer]) -> Buildings:

@@ -58,7 +58,7 @@ class Keys:
 
 def make_solids(plan: Plan, i: int, j: int, lod: int) -> tuple[Mesh, list[Problem]]:
     """Buildings of tile (i, j), scene coordinates, numbered as in the plan."""
-    rows = np.flatnonzero((plan.home == (i, j)).all(axis=1))
+    rows = plan.of_tile("buildings", i, j)
     if not len(rows):
         return Mesh.empty(), []
     mesh, problems = build_solids(take_buildings(plan.buildings, rows), base=plan.base[rows], lod=lod)
@@ -67,29 +67,19 @@ def make_solids(plan: Plan, i: int, j: int, lod: int) -> tuple[Mesh, list[Proble
 
 def make_ground(plan: Plan, i: int, j: int) -> tuple[Mesh, Instances]:
     """Ground, barriers, trees and furniture of tile (i, j), scene coordinates."""
-    size = plan.ground.tile_size
-    covered = (plan.ground.tiles == (i, j)).all(axis=1).any()
+    covered = ((plan.ground.tiles[:, 0] == i) & (plan.ground.tiles[:, 1] == j)).any()
     meshes = [ground_tile(plan.ground, i, j, height=plan.height, levels=plan.levels)] if covered else []
-    trees, furniture, barriers = plan.trees, plan.furniture, plan.barriers
-    here = (np.floor(trees.xy / size) == (i, j)).all(axis=1)
-    there = (np.floor(furniture.xy / size) == (i, j)).all(axis=1)
+    trees = plan.trees.take(plan.of_tile("trees", i, j))
+    furniture = plan.furniture.take(plan.of_tile("furniture", i, j))
     copies = [
-        tree_instances(trees.take(here), height=plan.height),
-        furniture_instances(furniture.take(there), height=plan.height),
+        tree_instances(trees, height=plan.height),
+        furniture_instances(furniture, height=plan.height),
     ]
     if covered and len(plan.needles):
         woods = forest_trees(plan.ground, i, j, needles=plan.needles)
         copies.append(tree_instances(woods, height=plan.height))
-    meshes += barrier_meshes(barriers.take(_barriers_of(plan, i, j)), height=plan.height)
+    meshes += barrier_meshes(plan.barriers.take(plan.of_tile("barriers", i, j)), height=plan.height)
     return concatenate(meshes), concatenate_instances(copies)
-
-
-def _barriers_of(plan: Plan, i: int, j: int) -> Any:
-    import shapely  # noqa: PLC0415
-
-    boxes = shapely.bounds(plan.barriers.polygon).reshape(-1, 4)
-    home = np.floor((boxes[:, :2] + boxes[:, 2:]) / 2 / plan.ground.tile_size)
-    return (home == (i, j)).all(axis=1)
 
 
 def tile_path(folder: Path, i: int, j: int) -> Path:
@@ -155,8 +145,8 @@ def build_tiles(
 ) -> Iterator[TileReport]:
     """Make all tiles that ``folder`` does not hold yet, and report on every one, in no particular order.
 
-    Workers are forked processes; where the system has none, all is done in this one. A tile and its report lie
-    in ``folder`` as soon as they are made, so that a build that was killed goes on from there. Tiles of a
+    Workers are forked processes; where the system has none, all is done in this one. A tile and its report
+    lie in ``folder`` as soon as they are made, so that a build that was killed goes on from there. Tiles of a
     ``former`` scene whose keys are the same are copied, or give their ground.
     """
     (folder / "tiles").mkdir(parents=True, exist_ok=True)
