@@ -298,7 +298,8 @@ def _connecting_road(
         lanes.append(
             f'<lane id="{sign * (k + 1)}" type="driving" level="false"><link><predecessor id="{before}"/>'
             f'<successor id="{after}"/></link><width sOffset="0" a="{_n(c.widths[0])}" b="{_n(growth)}" '
-            f'c="0" d="0"/>{_mark("none")}<speed sOffset="0" max="{_n(round(speed, 4))}" unit="m/s"/></lane>\n'
+            f'c="0" d="0"/>{_mark("none")}<speed sOffset="0" max="{_n(round(speed, 4))}" unit="m/s"/>'
+            "</lane>\n"
         )
     if left_hand:
         yield f"<{side}>\n{''.join(reversed(lanes))}</{side}>\n{middle}"

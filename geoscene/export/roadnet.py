@@ -93,8 +93,8 @@ class RoadNet:
 def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
     """The road graph as carriageways and junctions.
 
-    A node where two roads of the same lanes meet within 0.05 degrees is a joint; any other where roads meet is a
-    junction, and has a way through for every turn that the graph permits (`geoscene.routing.turn_table`).
+    A node where two roads of the same lanes meet within 0.05 degrees is a joint; any other where roads meet
+    is a junction, with a way through for every turn that the graph permits (`geoscene.routing.turn_table`).
     """
     firsts = [k for k in range(len(graph)) if not 0 <= graph.twin[k] < k and _span(graph.geometry[k]) > 0.05]
     number = {edge: k for k, edge in enumerate(firsts)}

@@ -1,0 +1,126 @@
+"""What a scene can be exported as, and the one function that does it."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from geoscene.errors import InputError
+from geoscene.export.files import Summary
+from geoscene.progress import Progress, silent
+from geoscene.scene import Scene
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One format.
+
+    title    : for people
+    writer   : ``module:function`` within this package
+    suffixes : of file names by which it is known, the usual one first; none for a folder
+    options  : of `export_scene` that it takes
+    """
+
+    title: str
+    writer: str
+    suffixes: tuple[str, ...]
+    options: frozenset[str]
+
+
+def _kind(title: str, writer: str, suffixes: str, options: str) -> Kind:
+    return Kind(title, writer, tuple(suffixes.split()), frozenset(options.split()))
+
+
+KINDS: dict[str, Kind] = {
+    "cityjson": _kind("CityJSON 2.0", "cityjson:write_cityjson", ".city.json .cityjson", "crs layers"),
+    "glb": _kind("binary glTF 2.0", "glb:write_glb", ".glb", "layers"),
+    "3dtiles": _kind("3D Tiles 1.1", "tiles3d:write_3dtiles", "", "layers height_offset"),
+    "obj": _kind("Wavefront OBJ and MTL", "triangles:write_obj", ".obj", "layers"),
+    "ply": _kind("PLY", "triangles:write_ply", ".ply", "layers"),
+    "stl": _kind("STL, solids only", "triangles:write_stl", ".stl", "layers"),
+    "gpkg": _kind("GeoPackage", "vector:write_gpkg", ".gpkg", "crs layers"),
+    "geojson": _kind("GeoJSON", "vector:write_geojson", ".geojson", "layers"),
+    "geoparquet": _kind("GeoParquet", "vector:write_geoparquet", ".parquet .geoparquet", "crs layers"),
+    "geotiff": _kind("GeoTIFF", "raster:write_geotiff", ".tif .tiff", "layers model resolution"),
+    "opendrive": _kind("OpenDRIVE 1.7", "opendrive:write_opendrive", ".xodr", "left_hand"),
+    "sumo": _kind("SUMO network", "sumo:write_sumo", ".net.xml", "left_hand"),
+}
+"""All formats by name."""
+
+
+def kind_of(out: Path) -> str:
+    """The format that a file name's suffix means.
+
+    Raises InputError for a suffix that means none.
+    """
+    name = out.name.lower()
+    for kind, told in KINDS.items():
+        if name.endswith(told.suffixes) and told.suffixes:
+            return kind
+    known = " ".join(told.suffixes[0] for told in KINDS.values() if told.suffixes)
+    raise InputError(f"{out}: its name does not say what to write; give --to ({', '.join(KINDS)}) or {known}")
+
+
+def export_scene(
+    scene: Scene,
+    out: Path,
+    kind: str | None = None,
+    *,
+    crs: str | None = None,
+    layers: Collection[str] | None = None,
+    model: str | None = None,
+    resolution: float | None = None,
+    height_offset: float | None = None,
+    left_hand: bool | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Summary:
+    """Write a scene in another format and say what was written.
+
+    out    : file; for 3D Tiles a folder
+    kind   : one of `KINDS`; by default what the suffix of ``out`` means
+    crs    : CityJSON, GeoPackage, GeoParquet: of the coordinates, default the scene's (for CityJSON UTM where
+             the scene's has no EPSG code)
+    layers : names of the scene's layers to write, ``terrain`` for the bare ground, ``building_solids`` for
+             buildings as surfaces in tables; default all
+    model  : GeoTIFF: ``surface`` (the default), ``terrain`` or ``classes``
+    resolution : GeoTIFF: metres, default 0.5
+    height_offset : 3D Tiles: metres that lift the scene's heights to ellipsoidal ones, default 0
+    left_hand : OpenDRIVE, SUMO: traffic keeps left
+    overwrite : replace what is there
+
+    Raises InputError for a kind or an option that cannot be, an option that the kind does not take, and a
+    name that is taken; MissingExtraError where an optional package is needed.
+    """
+    name = kind_of(out) if kind is None else kind
+    if name not in KINDS:
+        raise InputError(f"--to {name}: there are {', '.join(KINDS)}")
+    told = KINDS[name]
+    given: dict[str, Any] = {
+        key: value
+        for key, value in (
+            ("crs", crs),
+            ("layers", layers),
+            ("model", model),
+            ("resolution", resolution),
+            ("height_offset", height_offset),
+            ("left_hand", left_hand),
+        )
+        if value is not None
+    }
+    foreign = sorted(set(given) - told.options)
+    if foreign:
+        names = ", ".join(f"--{key.replace('_', '-')}" for key in foreign)
+        takes = ", ".join(f"--{key.replace('_', '-')}" for key in sorted(told.options))
+        raise InputError(f"{names} does not go with {told.title}, which takes {takes}")
+    if out.exists() and not overwrite:
+        raise InputError(f"{out}: is there already; add --overwrite to replace it")
+    if out.is_dir() and told.suffixes:
+        raise InputError(f"{out}: is a folder; {told.title} is a file, name one")
+    module, function = told.writer.split(":")
+    write = getattr(importlib.import_module(f"geoscene.export.{module}"), function)
+    summary: Summary = write(scene, out, **given, progress=progress)
+    return summary

@@ -1,0 +1,52 @@
+"""SUMO networks, made of our OpenDRIVE by SUMO's own netconvert."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+from pathlib import Path
+
+from geoscene.errors import GeosceneError, need
+from geoscene.export.files import Summary, size_of, whole_file
+from geoscene.export.opendrive import write_opendrive
+from geoscene.progress import Progress, silent
+from geoscene.scene import Scene
+
+_STAMP = re.compile(rb"<!--.*?-->\s*", re.DOTALL)
+
+
+def write_sumo(scene: Scene, path: Path, *, left_hand: bool = False, progress: Progress = silent) -> Summary:
+    """Write the road graph as a SUMO network (``.net.xml``).
+
+    The network is what ``netconvert`` of the package eclipse-sumo makes of `write_opendrive`; its comments
+    hold the time of day and are left out.
+
+    left_hand : traffic keeps left
+
+    Raises MissingExtraError without eclipse-sumo, InputError for a scene without roads, GeosceneError with
+    the last line of netconvert where that fails.
+    """
+    home = Path(need("sumo", "sumo").SUMO_HOME)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".geoscene-") as folder:
+        roads, net = Path(folder) / "roads.xodr", Path(folder) / "roads.net.xml"
+        told = write_opendrive(scene, roads, left_hand=left_hand, progress=progress)
+        command: list[str | Path] = [
+            home / "bin" / "netconvert",
+            "--opendrive-files",
+            roads,
+            "--output-file",
+            net,
+        ]
+        # no shell, and nothing in the command is the user's but the name of a folder
+        run = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+        if run.returncode or not net.exists():
+            lines = [line for line in run.stderr.splitlines() if line.strip()] or ["it said nothing"]
+            raise GeosceneError(f"netconvert failed: {lines[-1]}")
+        with whole_file(path) as out:
+            out.write(_STAMP.sub(b"", net.read_bytes()))
+    warned = run.stderr.count("Warning")
+    files, size = size_of(path)
+    notes = (f"netconvert gave {warned} warnings",) if warned else ()
+    return Summary(path, "sumo", files, size, told.objects, crs=scene.frame.name, notes=notes)
