@@ -17,6 +17,7 @@ from geoscene.mesh import Mesh, concatenate
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
 from geoscene.tags import parse_length
+from geoscene.validate import GRID
 
 Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
@@ -75,9 +76,12 @@ _PASSABLE = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.RAIL)
 class Barriers:
     """Barriers as columns, one row a map object.
 
-    polygon  : (n,) object, shapely Polygon or MultiPolygon, what it covers in plan, scene metres klass,
-    material : (n,) uint8 height   : (n,) float64, metres above the ground height_source, width_source :
-    (n,) str: ``height``, ``width`` or ``default``; ``area`` where its shape is drawn osm_id   : (n,) str
+    polygon  : (n,) object, shapely Polygon or MultiPolygon, what it covers in plan, scene metres
+    klass, material : (n,) uint8
+    height   : (n,) float64, metres above the ground
+    height_source, width_source : (n,) str: ``height``, ``width`` or ``default``; ``area`` where its shape is
+               drawn
+    osm_id   : (n,) str
     feature  : (n,) int32, -1 for none
     """
 
@@ -159,10 +163,14 @@ def _solid(barriers: Barriers, row: int, height: Height | None) -> Mesh:
     """The closed solids of one barrier."""
     material = next(m for m in materials().values() if m.code == barriers.material[row])
     parts = []
-    for part in shapely.get_parts(shapely.segmentize(barriers.polygon[row], _STATION)):
-        triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(part))
+    shape = shapely.set_precision(shapely.segmentize(barriers.polygon[row], _STATION), GRID)
+    for part in shapely.get_parts(shape):
+        # In whole steps of the grid, so that what lies on one line does so exactly.
+        steps = shapely.transform(part, lambda c: np.rint(c / GRID))
+        triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(steps))
         corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
-        xy, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+        grid, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+        xy = grid * GRID
         faces = faces.reshape(-1, 3)
         (ux, uy), (vx, vy) = ((xy[faces[:, k]] - xy[faces[:, 0]]).T for k in (1, 2))
         faces = np.where((ux * vy < uy * vx)[:, None], faces[:, ::-1], faces)

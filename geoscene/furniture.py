@@ -66,12 +66,15 @@ _KINDS: dict[tuple[str, str], str] = {
 class Furniture:
     """Things that stand by the road, one row a thing.
 
-    xy       : (n, 2) float64, scene metres shape    : (n,) str, name in `geoscene.shapes.shapes` height
-    : (n,) float64 metres above the ground heading  : (n,) float64, radians counter-clockwise from east:
-    where it faces height_source : (n,) str: ``height`` or ``default`` (the shape's own) place_source :
-    (n,) str: ``node`` (where the map has it) or ``roadside`` (beside the road whose node it is)
+    xy       : (n, 2) float64, scene metres
+    shape    : (n,) str, name in `geoscene.shapes.shapes`
+    height   : (n,) float64 metres above the ground
+    heading  : (n,) float64, radians counter-clockwise from east: where it faces
+    height_source : (n,) str: ``height`` or ``default`` (the shape's own)
+    place_source : (n,) str: ``node`` (where the map has it) or ``roadside`` (beside the road of its node)
     heading_source : (n,) str: ``direction``, ``road`` (against its traffic, or towards it) or ``default``
-    osm_id   : (n,) str feature  : (n,) int32, -1 for none
+    osm_id   : (n,) str
+    feature  : (n,) int32, -1 for none
     """
 
     xy: Float

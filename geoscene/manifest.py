@@ -10,6 +10,7 @@ from geoscene import __version__
 from geoscene.plan import Plan
 from geoscene.report import Problem, summarise
 from geoscene.roadgraph import find_components
+from geoscene.shapes import LEAF_AREA_DENSITY
 from geoscene.sources import ATTRIBUTION, OsmData
 from geoscene.tiles import TileReport
 
@@ -61,6 +62,7 @@ def scene_manifest(
         },
         "counts": _counts(plan, reports, problems),
         "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
+        "leaf_area_density": LEAF_AREA_DENSITY,
         "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),
         "problems": summarise(problems),
     }

@@ -50,6 +50,8 @@ Height = Callable[[Float, Float], Float]
 KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
 """What a scene may hold besides its ground; `make_plan` takes all or some."""
 
+_RAMP_LINES = 10.0  # metres between the lines along which level ground bends to ramps
+_RAMP_REACH = 25.0  # metres from a ramp's middle within which the ground is graded to it, at most
 _STANDING = 1.0  # metres: a building whose underside is higher leaves the ground under it as it is
 
 
@@ -62,8 +64,8 @@ class Plan:
     height    : z of the ground at x, y, roads graded into it; None where all is at 0
     buildings : their table
     base      : (count,) z of each building's base
-    rows      : by kind (``buildings``, ``trees``, ``furniture``, ``barriers``) the rows that belong to each tile:
-                those with the middle of their box in it
+    rows      : by kind (``buildings``, ``trees``, ``furniture``, ``barriers``) the rows that belong to each
+                tile: those with the middle of their box in it
     graph     : roads, with heights
     ground    : what lies on the ground
     levels    : how high its water stands
@@ -143,7 +145,13 @@ def make_plan(
     n = len(buildings)
     cover, roads = _numbered(cover, n), _numbered(roads, n + len(cover))
     layers = concatenate_layers([cover, roads, pads])
-    ground = plan_ground(extent, layers, tile_size=tile_size, lines=terrain.lines)
+    ground = plan_ground(
+        extent,
+        layers,
+        tile_size=tile_size,
+        lines=terrain.lines or (_RAMP_LINES if uneven else 0.0),
+        ruled=None if terrain.grids else _ramp_tiles(graph, tile_size),
+    )
     levels = water_levels(ground.layers, osm.ways, frame, height=terrain.height)
 
     trees, furniture, barriers, found = _standing(osm, frame, ground, only)
@@ -258,6 +266,17 @@ def _standing(
     said = [problems + found, more, still_more]
     listed = [p for kind, found in zip(KINDS[3:], said, strict=True) if kind in only for p in found]
     return kept[0], kept[1], kept[2], listed
+
+
+def _ramp_tiles(graph: RoadGraph, tile_size: float) -> set[tuple[int, int]]:
+    """Tiles of level ground into which ramps are graded."""
+    if not len(graph):
+        return set()
+    points = np.concatenate(list(graph.geometry))
+    raised = points[np.abs(points[:, 2]) > 1e-3, :2]
+    around = np.array([(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]) * _RAMP_REACH
+    tiles = np.floor((raised[:, None, :] + around).reshape(-1, 2) / tile_size).astype(int)
+    return {(int(i), int(j)) for i, j in np.unique(tiles, axis=0)}
 
 
 def _numbered(table: Any, first: int) -> Any:

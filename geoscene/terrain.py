@@ -127,11 +127,11 @@ def open_terrain(
     interpolated, so no seam shows between them. Voids (the raster's nodata, not a number, or lower than
     -500 m or higher than 9,000 m) are filled from around by inverse distances and counted.
 
-    bounds   : (xmin, ymin, xmax, ymax), scene metres; only what lies within is read unit     : of heights
-    (``m``, ``ft``, ``us-ft``) where the files do not say or are wrong; metres if they do not vertical :
-    what heights are above, where the files do not say; a geoid (``orthometric``) if they do not outside
-    : what to do where no raster covers the bounds: raise, or take the ``nearest`` height and tell the
-               share
+    bounds   : (xmin, ymin, xmax, ymax), scene metres; only what lies within is read
+    unit     : of heights (``m``, ``ft``, ``us-ft``) where the files do not say or are wrong; else metres
+    vertical : what heights are above, where the files do not say; else a geoid (``orthometric``)
+    outside  : what to do where no raster covers the bounds: raise, or take the ``nearest`` height and tell
+               the share
 
     Raises SourceNotFoundError for a missing file, InputError for one that is no raster, has no CRS or an
     unknown unit, for rasters that do not cover the bounds, and for ones that disagree on what heights are

@@ -177,8 +177,8 @@ def forest_trees(
     Place, size and kind are drawn for each square of one lattice over the plane from (seed, column, row)
     alone: a tree depends neither on tiles nor on other woods. Their feature is their wood's.
 
-    density : trees per m2; 0.02 (200 to the hectare) is a closed stand of grown trees needles : (rows of
-    the plan's layers,) share of needle-leaved trees, from `needle_shares`; none if not given
+    density : trees per m2; 0.02 (200 to the hectare) is a closed stand of grown trees
+    needles : (rows of the plan's layers,) share of needle-leaved trees, from `needle_shares`; none by default
     """
     side = 1.0 / np.sqrt(density)
     xmin, ymin, xmax, ymax = tile_box(plan, i, j)

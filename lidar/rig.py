@@ -103,7 +103,7 @@ class GnssSpec:
     mount          : its translation is the lever arm to the antenna
     rate_hz        : fixes a second
     time_offset_ns : first fix after the drive's start
-    mode           : single, sbas or rtk
+    mode           : single, sbas, rtk or ideal
     mask_deg       : elevation below which satellites are not used
     """
 
@@ -115,7 +115,7 @@ class GnssSpec:
     mask_deg: float = 10.0
 
 
-GNSS_MODES = ("single", "sbas", "rtk")
+GNSS_MODES = ("single", "sbas", "rtk", "ideal")
 """What a receiver can be."""
 
 

@@ -13,14 +13,14 @@ from geoscene.progress import Progress, silent
 from geoscene.roadgraph import read_graphml
 from geoscene.roads import RoadGraph
 from geoscene.scene import Scene
-from lidar.errors import BlockedError, RouteError
+from lidar.detour import plan_drive
+from lidar.errors import RouteError
 from lidar.motion import drive_path
-from lidar.path import Path, plan_path
+from lidar.path import Path
 from lidar.poses import Trajectory
-from lidar.route import Route, Spec, plan_route
+from lidar.route import Route, Spec
 from lidar.vehicle import load_vehicle
 
-_ATTEMPTS = 40
 _RANDOM_SECONDS = 60.0
 
 
@@ -77,39 +77,22 @@ def plan_travel(
     graph = road_graph(scene)
     body = load_vehicle(vehicle)
     obstacles = standing_footprints(scene)
+    progress("planning", 0, 0)
     seconds = duration if duration is not None or spec != "random" else _RANDOM_SECONDS
-    avoid: set[tuple[int, int]] = set()
-    blocked: BlockedError | None = None
-    for attempt in range(_ATTEMPTS):
-        progress("planning", attempt, 0)
-        try:
-            route = plan_route(
-                graph,
-                scene.frame,
-                spec,
-                seed=seed,
-                duration=seconds,
-                side=cast("Literal['left', 'right']", side),
-                body_width=body.width,
-                avoid=avoid,
-            )
-            path = plan_path(route, body, scene.frame, obstacles=obstacles)
-        except BlockedError as error:
-            blocked = error
-            before = len(avoid)
-            avoid |= set(error.turns)
-            if len(avoid) == before:
-                raise
-            continue
-        except RouteError:
-            if blocked is not None:
-                raise blocked from None
-            raise
-        trajectory = drive_path(path, body)
-        if seconds is not None:
-            trajectory = trajectory.until(round(seconds * 1e9))
-        return Travel(route, path, trajectory, _driven(trajectory))
-    raise blocked or RouteError("no route found")
+    route, path = plan_drive(
+        graph,
+        scene.frame,
+        spec,
+        body,
+        seed=seed,
+        duration=seconds,
+        side=cast("Literal['left', 'right']", side),
+        obstacles=obstacles,
+    )
+    trajectory = drive_path(path, body)
+    if seconds is not None:
+        trajectory = trajectory.until(round(seconds * 1e9))
+    return Travel(route, path, trajectory, _driven(trajectory))
 
 
 def _driven(trajectory: Trajectory) -> float:

@@ -50,6 +50,7 @@ class GroundPlan:
     extent    : (xmin, ymin, xmax, ymax) of the ground, scene metres, on the grid
     tile_size : side of a tile, metres
     lines     : spacing of the terrain's lines, metres, 0 for none
+    ruled     : tiles that have these lines; None for all
     layers    : what competes for the ground
     bounds    : (n, 4) float64, theirs; infinite the wrong way round for empty polygons
     base      : (class, material code) where there is nothing
@@ -63,6 +64,7 @@ class GroundPlan:
     extent: tuple[float, float, float, float]
     tile_size: float
     lines: float
+    ruled: frozenset[tuple[int, int]] | None
     layers: Layers
     bounds: Float
     base: tuple[int, int]
@@ -106,6 +108,7 @@ def plan_ground(
     *,
     tile_size: float = 250.0,
     lines: float = 0.0,
+    ruled: Iterable[tuple[int, int]] | None = None,
     base: tuple[int, str] = (Class.TERRAIN, "soil"),
 ) -> GroundPlan:
     """The scene's outlines sorted by tile, ready for `partition_tile`.
@@ -113,6 +116,7 @@ def plan_ground(
     extent : (xmin, ymin, xmax, ymax), scene metres
     lines  : spacing in metres of lines (parallel to the axes, at its multiples) along which cells are cut, so
              that the ground can follow a terrain (still water is not cut); 0 for none
+    ruled  : tiles that have such lines, where only they are uneven; all by default
     base   : class and material where no polygon lies
 
     Raises InputError for an extent without area or non-finite, or sizes off the grid.
@@ -139,6 +143,7 @@ def plan_ground(
         (float(box[0]), float(box[1]), float(box[2]), float(box[3])),
         tile_size,
         lines,
+        None if ruled is None else frozenset(ruled),
         layers,
         np.where(np.isnan(bounds), (np.inf, np.inf, -np.inf, -np.inf), bounds),
         (int(klass), materials()[material].code),
@@ -161,14 +166,14 @@ def partition_tile(plan: GroundPlan, i: int, j: int) -> Partition:
         raise InputError(f"tile ({i}, {j}) is not one of the {len(plan.tiles)} tiles of the ground")
     box = tile_box(plan, i, j)
     mine = np.sort(plan.order[plan.offset[place[0]] : plan.offset[place[0] + 1]])
-    lines = [*_strings(plan.start[mine], plan.end[mine], plan.string[mine]), *_ruling(plan, box)]
+    lines = [*_strings(plan.start[mine], plan.end[mine], plan.string[mine]), *_ruling(plan, i, j, box)]
     cells = _faces(shapely.union_all(lines, grid_size=PRECISION), box)
     inside = shapely.get_coordinates(shapely.point_on_surface(cells))
     row = winners(plan, inside[:, 0], inside[:, 1])
     edges = _Edges.of(cells)
     row, slivers = _without_slivers(edges, cells, row)
     level = np.append(np.isin(plan.layers.body, ("sea", "standing")), np.False_)[row]
-    cells, row = _dissolve(edges, row, box, lines=plan.lines, level=level)
+    cells, row = _dissolve(edges, row, box, lines=_spacing(plan, i, j), level=level)
     cells = shapely.coverage_simplify(cells, BEND, simplify_boundary=False)
     # The base stands after the last row of the layers, where -1 finds it.
     klass = np.append(plan.layers.klass, np.uint8(plan.base[0]))[row]
@@ -275,13 +280,32 @@ def _strings(start: Float, end: Float, string: Int) -> NDArray[np.object_]:
     return lines
 
 
-def _ruling(plan: GroundPlan, box: tuple[float, float, float, float]) -> list[object]:
-    """The tile's sides, and the terrain's lines across it."""
+def _spacing(plan: GroundPlan, i: int, j: int) -> float:
+    """Spacing of the terrain's lines in tile (i, j), 0 where it has none."""
+    return plan.lines if plan.ruled is None or (i, j) in plan.ruled else 0.0
+
+
+def _ruling(plan: GroundPlan, i: int, j: int, box: tuple[float, float, float, float]) -> list[object]:
+    """The tile's sides, and the terrain's lines across it.
+
+    A side has a vertex at every line of the tile on either side of it, so that the two agree.
+    """
     xmin, ymin, xmax, ymax = box
-    ruling: list[object] = [shapely.box(*box).exterior]
-    if plan.lines > 0:
-        xs = np.arange(np.floor(xmin / plan.lines) + 1, np.ceil(xmax / plan.lines)) * plan.lines
-        ys = np.arange(np.floor(ymin / plan.lines) + 1, np.ceil(ymax / plan.lines)) * plan.lines
+    lines = plan.lines or np.inf
+    xs = np.arange(np.floor(xmin / lines) + 1, np.ceil(xmax / lines)) * lines
+    ys = np.arange(np.floor(ymin / lines) + 1, np.ceil(ymax / lines)) * lines
+    own = _spacing(plan, i, j) > 0
+    none = np.empty(0)
+    bottom, top = (xs if own or _spacing(plan, i, j + k) else none for k in (-1, 1))
+    left, right = (ys if own or _spacing(plan, i + k, j) else none for k in (-1, 1))
+    ring = [
+        (xmin, ymin), *((x, ymin) for x in bottom),
+        (xmax, ymin), *((xmax, y) for y in right),
+        (xmax, ymax), *((x, ymax) for x in top[::-1]),
+        (xmin, ymax), *((xmin, y) for y in left[::-1]),
+    ]  # fmt: skip
+    ruling: list[object] = [shapely.LinearRing(ring)]
+    if own:
         ruling += [shapely.LineString([(x, ymin), (x, ymax)]) for x in xs]
         ruling += [shapely.LineString([(xmin, y), (xmax, y)]) for y in ys]
     return ruling
