@@ -28,7 +28,7 @@ class Features:
     starts  : (k,) int64, first feature number of each layer
     layers  : names of the layers, in the same order
     columns : of each layer, column name to values
-    unique  : (n,) bool, the feature is the only one with its ``osm_id``
+    unique  : (n,) bool, the feature is the only one of its layer with its ``osm_id``
     """
 
     starts: NDArray[np.int64]
@@ -49,7 +49,7 @@ class Features:
         return {name: value for name, value in told.items() if value is not None}
 
     def name(self, feature: int) -> str:
-        """``way/123`` for the only feature of that OSM id, else ``layer/number``."""
+        """``way/123`` for the only building of that OSM id, else ``layer/number``."""
         if feature < 0:
             return BARE
         layer, row = self._row(feature)
@@ -84,11 +84,11 @@ def read_features(scene: Scene) -> Features:
         names.append(name)
         starts.append(start)
         columns.append({str(k): v for k, v in zip(meta["fields"], values, strict=True) if k != "feature"})
-    sizes = np.diff([*starts, max((stop for _, stop in scene.layers.values()), default=0)])
-    ids = [c.get("osm_id", np.full(n, "")) for c, n in zip(columns, sizes, strict=True)]
-    osm_id = np.concatenate([np.empty(0, object), *ids]).astype(str)
-    _, owner, count = np.unique(osm_id, return_inverse=True, return_counts=True)
-    return Features(np.array(starts, np.int64), tuple(names), tuple(columns), count[owner] == 1)
+    unique = [np.empty(0, np.bool_)]
+    for layer in columns:
+        _, owner, count = np.unique(layer["osm_id"].astype(str), return_inverse=True, return_counts=True)
+        unique.append(count[owner] == 1)
+    return Features(np.array(starts, np.int64), tuple(names), tuple(columns), np.concatenate(unique))
 
 
 @dataclass(frozen=True, slots=True)
