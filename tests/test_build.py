@@ -1,6 +1,5 @@
 """A scene is whole, closed, in its place, and the same every time."""
 
-import hashlib
 import json
 import shutil
 
@@ -8,6 +7,7 @@ import geopandas
 import numpy as np
 import pytest
 
+import geoscene.tiles
 from geoscene.build import BuildOptions, build
 from geoscene.check import check_scene
 from geoscene.classes import Class
@@ -33,7 +33,8 @@ def scene(osm, tmp_path_factory):
 def test_every_solid_is_closed_oriented_and_of_positive_volume(scene):
     report = check_scene(scene)
     assert report["broken"] == []
-    assert report["solids"] == scene.manifest["counts"]["solids"] > 20
+    counts = scene.manifest["counts"]
+    assert report["solids"] == counts["closed_objects"] == counts["watertight"] > counts["solids"] > 20
     assert report["volume"] > 1e5
 
 
@@ -98,7 +99,7 @@ def test_face_features_are_rows_of_the_geopackage(scene):
         mesh = tile.mesh
         built = mesh.klass == Class.BUILDING
         assert ((mesh.feature[built] >= start) & (mesh.feature[built] < stop)).all()
-        assert (mesh.closed == built).all()
+        assert mesh.closed[built].all()
         for feature in np.unique(mesh.feature[built])[:3]:
             corners = mesh.vertices[mesh.faces[mesh.feature == feature]] + tile.origin
             row = layer.iloc[int(feature)]
@@ -115,14 +116,74 @@ def test_heights_say_where_they_come_from(scene):
         assert layer.height_sigma[guessed].min() > layer.height_sigma[layer.height_source == "tag"].max()
 
 
-def test_the_same_map_is_the_same_bytes(osm, scene, tmp_path):
-    again = build(osm, tmp_path / "again", BuildOptions(name="demo"))
-    for path in sorted(scene.path.rglob("*")):
-        if path.is_file():
-            other = again.path / path.relative_to(scene.path)
-            assert (
-                hashlib.sha256(path.read_bytes()).digest() == hashlib.sha256(other.read_bytes()).digest()
-            ), path
+def same_files(a, b):
+    names = sorted(p.relative_to(a) for p in a.rglob("*") if p.is_file())
+    assert names == sorted(p.relative_to(b) for p in b.rglob("*") if p.is_file())
+    for name in names:
+        assert (a / name).read_bytes() == (b / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_same_map_is_the_same_bytes_for_any_number_of_workers(osm, scene, tmp_path, workers):
+    again = build(osm, tmp_path / "again", BuildOptions(name="demo"), workers=workers)
+    same_files(scene.path, again.path)
+
+
+def test_a_killed_build_goes_on_and_ends_with_the_same_bytes(osm, scene, tmp_path, monkeypatch):
+    made = []
+    whole = geoscene.tiles.build_tile
+
+    def dying(*args, **options):
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        made.append(args)
+        return whole(*args, **options)
+
+    monkeypatch.setattr(geoscene.tiles, "build_tile", dying)
+    with pytest.raises(KeyboardInterrupt):
+        build(osm, tmp_path / "scene", BuildOptions(name="demo"))
+    assert not (tmp_path / "scene").exists()
+    monkeypatch.setattr(geoscene.tiles, "build_tile", lambda *a, **o: made.append(a) or whole(*a, **o))
+    again = build(osm, tmp_path / "scene", BuildOptions(name="demo"))
+    assert len(made) == len(scene.tile_indices)  # no tile twice
+    same_files(scene.path, again.path)
+    assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+
+
+@pytest.mark.parametrize(
+    ("change", "grounds"), [({"lod": 1}, 0), ({"name": "other"}, 0), ({"tile_size": 200}, 1)]
+)
+def test_a_rebuild_makes_anew_only_what_the_options_change(
+    osm, scene, tmp_path, monkeypatch, change, grounds
+):
+    shutil.copytree(scene.path, tmp_path / "scene")
+    made = []
+    whole = geoscene.tiles.ground_tile
+    monkeypatch.setattr(geoscene.tiles, "ground_tile", lambda *a, **o: made.append(a) or whole(*a, **o))
+    options = BuildOptions(**({"name": "demo"} | change))
+    again = build(osm, tmp_path / "scene", options, overwrite=True)
+    assert len(made) == grounds * len(again.tile_indices)
+    same_files(build(osm, tmp_path / "fresh", options).path, again.path)
+
+
+def test_tiles_along_a_route_are_the_tiles_of_the_whole_scene(osm, tmp_path):
+    along = ("60.1665,24.9420", "60.1668,24.9440")
+    options = BuildOptions(name="demo", along=along, reach=20.0, tile_size=100.0)
+    part = build(osm, tmp_path / "part", options)
+    whole = build(osm, tmp_path / "whole", BuildOptions(name="demo", tile_size=100.0))
+    assert 0 < len(part.tile_indices) < len(whole.tile_indices)
+    for i, j in part.tile_indices:
+        name = f"tiles/{i}_{j}.npz"
+        assert (part.path / name).read_bytes() == (whole.path / name).read_bytes()
+
+
+def test_only_what_is_asked_for_is_built(osm, tmp_path):
+    scene = build(osm, tmp_path / "s", BuildOptions(only=("buildings",)))
+    counts = scene.manifest["counts"]
+    assert counts["solids"] > 20
+    assert counts["trees"] == counts["furniture"] == counts["barriers"] == counts["road_edges"] == 0
+    ground = scene.manifest["ground"]
+    assert ground["area"] == pytest.approx(ground["extent_area"], rel=1e-6)
 
 
 def test_a_scene_is_not_written_over_unless_asked(osm, scene, tmp_path):
@@ -136,7 +197,7 @@ def test_a_scene_is_not_written_over_unless_asked(osm, scene, tmp_path):
 
 
 def test_a_build_that_fails_leaves_nothing(osm, tmp_path, monkeypatch):
-    monkeypatch.setattr("geoscene.build.triangulate", lambda _: 1 / 0)
+    monkeypatch.setattr("geoscene.tiles.ground_tile", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         build(osm, tmp_path / "half")
     assert list(tmp_path.iterdir()) == []
@@ -179,7 +240,8 @@ SMALL = [
 def test_real_places_build_watertight(name, shared_osm, tmp_path):
     scene = build(read_osm(shared_osm(name)), tmp_path / "s")
     counts = scene.manifest["counts"]
-    assert counts["solids"] == counts["watertight"] == counts["buildings"] - counts["dropped"]
+    assert counts["solids"] == counts["buildings"] - counts["dropped"]
+    assert counts["watertight"] == counts["closed_objects"] >= counts["solids"]
     meshes = [tile.mesh for tile in scene.tiles()]
     assert all(validate_mesh(mesh).ok.all() for mesh in meshes)
     ground = scene.manifest["ground"]
