@@ -133,7 +133,6 @@ def _draw(
 
 def _write_draft(path: Path, scene: Scene, grid: _Grid, cells: NDArray[Any], model: Model) -> None:
     import rasterio  # noqa: PLC0415  (0.4 s)
-    from rasterio.transform import from_origin  # noqa: PLC0415
     from rasterio.windows import Window  # noqa: PLC0415
 
     profile = {
@@ -143,7 +142,7 @@ def _write_draft(path: Path, scene: Scene, grid: _Grid, cells: NDArray[Any], mod
         "count": 1,
         "dtype": cells.dtype,
         "crs": rasterio.crs.CRS.from_wkt(scene.frame.wkt),
-        "transform": from_origin(grid.west, grid.north, grid.cell, grid.cell),
+        "transform": rasterio.Affine(grid.cell, 0.0, grid.west, 0.0, -grid.cell, grid.north),
         "nodata": 0 if model == "classes" else np.nan,
         "tiled": True,
         "BIGTIFF": "IF_SAFER",
