@@ -53,6 +53,9 @@ def build(
     point: Numbers = None,
     radius: Annotated[float, Parameter(group=_SOURCE)] = 500.0,
     demo: Annotated[bool, Parameter(group=_SOURCE, negative=())] = False,
+    cache: Annotated[Path | None, Parameter(group=_SOURCE)] = None,
+    nominatim: Annotated[str | None, Parameter(group=_SOURCE)] = None,
+    overpass: Annotated[str | None, Parameter(group=_SOURCE)] = None,
     crs: str = "local",
     lod: int = 2,
     dem: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
@@ -94,6 +97,12 @@ def build(
         Metres around --point.
     demo
         The extract of central Helsinki that comes along; needs no network.
+    cache
+        Directory for answers of map servers; ~/.cache/geoscene by default.
+    nominatim
+        Address of another Nominatim server.
+    overpass
+        Address of another Overpass server, or several with commas, tried in turn.
     crs
         Frame of the scene: local (a transverse Mercator on its centre in which a metre is a metre), utm, or
         an EPSG code such as EPSG:32618.
@@ -144,7 +153,8 @@ def build(
     )
     with progress_bar(quiet=quiet) as progress:
         progress("reading the map", 0, 0)
-        data = _read(osm, place, bbox, point, radius, demo=demo)
+        asked = {"cache_dir": cache or Path.home() / ".cache" / "geoscene"} | _servers(nominatim, overpass)
+        data = _read(osm, place, bbox, point, radius, asked, demo=demo)
         scene = build_scene(
             data, out, options, overwrite=overwrite, workers=_workers(workers), progress=progress
         )
@@ -157,6 +167,20 @@ def build(
     return 0
 
 
+def _servers(nominatim: str | None, overpass: str | None) -> dict[str, Any]:
+    """The servers option for `geoscene.sources`, where other addresses are given."""
+    given: dict[str, Any] = {}
+    if nominatim:
+        given["nominatim"] = nominatim
+    if overpass:
+        given["overpass"] = tuple(overpass.split(","))
+    if not given:
+        return {}
+    from geoscene.sources import Servers  # noqa: PLC0415
+
+    return {"servers": Servers(**given)}
+
+
 def _workers(given: int | None) -> int:
     if given is not None and not 1 <= given <= 256:
         raise InputError(f"--workers {given}: give 1 to 256")
@@ -164,7 +188,14 @@ def _workers(given: int | None) -> int:
 
 
 def _read(
-    osm: Path | None, place: str | None, bbox: str | None, point: str | None, radius: float, *, demo: bool
+    osm: Path | None,
+    place: str | None,
+    bbox: str | None,
+    point: str | None,
+    radius: float,
+    asked: dict[str, Any],
+    *,
+    demo: bool,
 ) -> Any:
     from geoscene import sources  # noqa: PLC0415
 
@@ -185,14 +216,14 @@ def _read(
     if demo:
         return sources.read_osm(sources.demo_path())
     if place:
-        return sources.fetch_place(place)
+        return sources.fetch_place(place, **asked)
     if point:
         lat, lon = _numbers(point, "--point", "LAT,LON")
         if not (abs(lat) <= 90 and abs(lon) <= 180):
             raise InputError(f"--point {point.strip()}: not a latitude and longitude in degrees")
-        return sources.fetch_point(lat, lon, radius)
+        return sources.fetch_point(lat, lon, radius, **asked)
     assert box is not None  # noqa: S101  (the only source left)
-    return sources.fetch_bbox(*box)
+    return sources.fetch_bbox(*box, **asked)
 
 
 @app.command

@@ -56,7 +56,7 @@ class Servers:
         "https://overpass.private.coffee/api",
         "https://maps.mail.ru/osm/tools/overpass/api",
     )
-    user_agent: str = f"geoscene/{__version__} (https://github.com/geoscene/geoscene)"
+    user_agent: str = f"geoscene/{__version__} (builds 3D scenes from OpenStreetMap)"
     timeout: int = 180
     rounds: int = 3
     wait: float = 30.0
