@@ -1,0 +1,46 @@
+"""Heights of the ground under points of a scene."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.scene import Scene
+from lidar.raycast import Caster
+
+Float = NDArray[np.float64]
+
+_GROUND = (
+    *(Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.SIDEWALK, Class.KERB, Class.PARKING, Class.RAIL),
+    *(Class.TERRAIN, Class.GRASS, Class.FOREST_FLOOR, Class.SAND, Class.BUILDING_PAD, Class.BRIDGE),
+)
+_ABOVE, _BELOW = 1.5, 6.0
+"""Metres above and below the expected height within which the ground is looked for."""
+
+
+def ground_heights(scene: Scene, xyz: Float, *, above: float = _ABOVE, below: float = _BELOW) -> Float:
+    """Height (n,) of the ground at points (n, 3), looked for near their own heights.
+
+    Points without ground near them keep their height. One tile is held at a time.
+    """
+    z: Float = xyz[:, 2].copy()
+    if not len(xyz):
+        return z
+    known = set(scene.tile_indices)
+    cell = np.floor(xyz[:, :2] / scene.tile_size).astype(int)
+    for i, j in np.unique(cell, axis=0).tolist():
+        if (i, j) not in known:
+            continue
+        rows = np.flatnonzero((cell == (i, j)).all(axis=1))
+        tile = scene.tile(i, j)
+        faces = tile.mesh.faces[np.isin(tile.mesh.klass, _GROUND)]
+        if not len(faces):
+            continue
+        caster = Caster(tile.mesh.vertices, faces)
+        start = xyz[rows] - tile.origin + [0.0, 0.0, above]
+        down = np.broadcast_to([0.0, 0.0, -1.0], start.shape)
+        hits = caster.cast(start, down, far=above + below)
+        found = np.isfinite(hits.range)
+        z[rows[found]] = xyz[rows[found], 2] + above - hits.range[found]
+    return z
