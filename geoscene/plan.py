@@ -50,8 +50,8 @@ Height = Callable[[Float, Float], Float]
 KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
 """What a scene may hold besides its ground; `make_plan` takes all or some."""
 
-_RAMP_LINES = 10.0  # metres between the lines along which level ground bends to ramps
-_RAMP_REACH = 25.0  # metres from a ramp's middle within which the ground is graded to it, at most
+_ROAD_LINES = 10.0  # metres between the lines along which the ground bends to roads
+_ROAD_REACH = 25.0  # metres from a road's middle within which the ground is graded to it, at most
 _STANDING = 1.0  # metres: a building whose underside is higher leaves the ground under it as it is
 
 
@@ -149,8 +149,9 @@ def make_plan(
         extent,
         layers,
         tile_size=tile_size,
-        lines=terrain.lines or (_RAMP_LINES if uneven else 0.0),
-        ruled=None if terrain.grids else _ramp_tiles(graph, tile_size),
+        lines=_ROAD_LINES if uneven else 0.0,
+        ruled=_graded_tiles(graph, tile_size, level=not terrain.grids),
+        coarse=terrain.lines,
     )
     levels = water_levels(ground.layers, osm.ways, frame, height=terrain.height)
 
@@ -268,14 +269,15 @@ def _standing(
     return kept[0], kept[1], kept[2], listed
 
 
-def _ramp_tiles(graph: RoadGraph, tile_size: float) -> set[tuple[int, int]]:
-    """Tiles of level ground into which ramps are graded."""
+def _graded_tiles(graph: RoadGraph, tile_size: float, *, level: bool) -> set[tuple[int, int]]:
+    """Tiles whose ground is graded to roads; on ``level`` ground those with ramps alone."""
     if not len(graph):
         return set()
     points = np.concatenate(list(graph.geometry))
-    raised = points[np.abs(points[:, 2]) > 1e-3, :2]
-    around = np.array([(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]) * _RAMP_REACH
-    tiles = np.floor((raised[:, None, :] + around).reshape(-1, 2) / tile_size).astype(int)
+    if level:
+        points = points[np.abs(points[:, 2]) > 1e-3]
+    around = np.array([(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]) * _ROAD_REACH
+    tiles = np.floor((points[:, None, :2] + around).reshape(-1, 2) / tile_size).astype(int)
     return {(int(i), int(j)) for i, j in np.unique(tiles, axis=0)}
 
 

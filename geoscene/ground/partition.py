@@ -51,6 +51,7 @@ class GroundPlan:
     tile_size : side of a tile, metres
     lines     : spacing of the terrain's lines, metres, 0 for none
     ruled     : tiles that have these lines; None for all
+    coarse    : spacing of the lines in the other tiles, 0 for none
     layers    : what competes for the ground
     bounds    : (n, 4) float64, theirs; infinite the wrong way round for empty polygons
     base      : (class, material code) where there is nothing
@@ -65,6 +66,7 @@ class GroundPlan:
     tile_size: float
     lines: float
     ruled: frozenset[tuple[int, int]] | None
+    coarse: float
     layers: Layers
     bounds: Float
     base: tuple[int, int]
@@ -109,6 +111,7 @@ def plan_ground(
     tile_size: float = 250.0,
     lines: float = 0.0,
     ruled: Iterable[tuple[int, int]] | None = None,
+    coarse: float = 0.0,
     base: tuple[int, str] = (Class.TERRAIN, "soil"),
 ) -> GroundPlan:
     """The scene's outlines sorted by tile, ready for `partition_tile`.
@@ -116,7 +119,8 @@ def plan_ground(
     extent : (xmin, ymin, xmax, ymax), scene metres
     lines  : spacing in metres of lines (parallel to the axes, at its multiples) along which cells are cut, so
              that the ground can follow a terrain (still water is not cut); 0 for none
-    ruled  : tiles that have such lines, where only they are uneven; all by default
+    ruled  : tiles that have such lines; all by default
+    coarse : spacing of the lines in other tiles, 0 for none
     base   : class and material where no polygon lies
 
     Raises InputError for an extent without area or non-finite, or sizes off the grid.
@@ -126,7 +130,7 @@ def plan_ground(
         raise InputError(
             f"the ground's extent {tuple(extent)} must be xmin < xmax, ymin < ymax in scene metres"
         )
-    for name, size in (("tile_size", tile_size), ("lines", lines)):
+    for name, size in (("tile_size", tile_size), ("lines", lines), ("coarse", coarse)):
         if size < 0 or size != _snap(np.asarray(size)):
             raise InputError(f"{name}={size}: give a multiple of {PRECISION} m, such as whole metres")
     if tile_size < 1.0:
@@ -144,6 +148,7 @@ def plan_ground(
         tile_size,
         lines,
         None if ruled is None else frozenset(ruled),
+        coarse,
         layers,
         np.where(np.isnan(bounds), (np.inf, np.inf, -np.inf, -np.inf), bounds),
         (int(klass), materials()[material].code),
@@ -282,22 +287,24 @@ def _strings(start: Float, end: Float, string: Int) -> NDArray[np.object_]:
 
 def _spacing(plan: GroundPlan, i: int, j: int) -> float:
     """Spacing of the terrain's lines in tile (i, j), 0 where it has none."""
-    return plan.lines if plan.ruled is None or (i, j) in plan.ruled else 0.0
+    return plan.lines if plan.ruled is None or (i, j) in plan.ruled else plan.coarse
+
+
+def _multiples(low: float, high: float, *spacings: float) -> Float:
+    """Multiples of the spacings (0 for none) between two numbers, rising."""
+    steps = [np.arange(np.floor(low / s) + 1, np.ceil(high / s)) * s for s in spacings if s > 0]
+    return np.unique(np.concatenate([np.empty(0), *steps]))
 
 
 def _ruling(plan: GroundPlan, i: int, j: int, box: tuple[float, float, float, float]) -> list[object]:
     """The tile's sides, and the terrain's lines across it.
 
-    A side has a vertex at every line of the tile on either side of it, so that the two agree.
+    A side has a vertex at every line of the tiles on both its hands, so that the two agree.
     """
     xmin, ymin, xmax, ymax = box
-    lines = plan.lines or np.inf
-    xs = np.arange(np.floor(xmin / lines) + 1, np.ceil(xmax / lines)) * lines
-    ys = np.arange(np.floor(ymin / lines) + 1, np.ceil(ymax / lines)) * lines
-    own = _spacing(plan, i, j) > 0
-    none = np.empty(0)
-    bottom, top = (xs if own or _spacing(plan, i, j + k) else none for k in (-1, 1))
-    left, right = (ys if own or _spacing(plan, i + k, j) else none for k in (-1, 1))
+    own = _spacing(plan, i, j)
+    bottom, top = (_multiples(xmin, xmax, own, _spacing(plan, i, j + k)) for k in (-1, 1))
+    left, right = (_multiples(ymin, ymax, own, _spacing(plan, i + k, j)) for k in (-1, 1))
     ring = [
         (xmin, ymin), *((x, ymin) for x in bottom),
         (xmax, ymin), *((xmax, y) for y in right),
@@ -305,9 +312,8 @@ def _ruling(plan: GroundPlan, i: int, j: int, box: tuple[float, float, float, fl
         (xmin, ymax), *((xmin, y) for y in left[::-1]),
     ]  # fmt: skip
     ruling: list[object] = [shapely.LinearRing(ring)]
-    if own:
-        ruling += [shapely.LineString([(x, ymin), (x, ymax)]) for x in xs]
-        ruling += [shapely.LineString([(xmin, y), (xmax, y)]) for y in ys]
+    ruling += [shapely.LineString([(x, ymin), (x, ymax)]) for x in _multiples(xmin, xmax, own)]
+    ruling += [shapely.LineString([(xmin, y), (xmax, y)]) for y in _multiples(ymin, ymax, own)]
     return ruling
 
 
