@@ -49,6 +49,17 @@ def buildings():
     return concatenate([box, west, east, outer, cavity, tower.shifted([-30.5, -60.25, 0])])
 
 
+def hedge(feature):
+    """A hedge of two bodies."""
+    made = [prism(rectangle(6, 1, x=x, y=-80), -1.0, 2.0) for x in (60, 70)]
+    return concatenate(
+        [
+            Mesh.of(*solid, feature=feature, klass=Class.HEDGE, material=12, color=(66, 112, 48), closed=True)
+            for solid in made
+        ]
+    )
+
+
 def _ground(i, j, size, first):
     """A tile of sloping ground: a road along y = 0, bare ground elsewhere."""
     x0, y0 = i * size, j * size
@@ -120,6 +131,7 @@ def write_world(path, crs="utm"):
             shapely.points(np.array(TREES)[:, :2]),
             {"osm_id": np.array([f"node/{k}" for k in range(3)]), "height": np.array(TREES)[:, 2]},
         ),
+        Layer("barriers", shapely.box([57], [-80.5], [73], [-79.5]), {"osm_id": np.array(["way/77"])}),
         Layer("roads", lines, {"osm_id": graph.osm_id, "lanes": graph.lanes, "bridge": graph.bridge}),
     ]
     x, y, height = np.array(TREES).T
@@ -150,7 +162,9 @@ def write_world(path, crs="utm"):
         (writer.folder / "tiles").mkdir()
         for i, j in manifest["tiles"]:
             own = [k for k in range(4) if tuple(np.floor(middle[k, :2] / size)) == (i, j)]
-            mesh = concatenate([solids.take(np.isin(solids.feature, own)), _ground(i, j, size, first)])
+            standing = [solids.take(np.isin(solids.feature, own))]
+            standing += [hedge(tree + len(TREES))] if (i, j) == (0, -1) else []
+            mesh = concatenate([*standing, _ground(i, j, size, first)])
             here = (np.floor(copies.transform[:, :2, 3] / size) == (i, j)).all(axis=1)
             some = Instances(copies.shape[here], copies.transform[here], copies.feature[here])
             origin = np.array([i * size, j * size, np.floor(mesh.vertices[:, 2].min())])

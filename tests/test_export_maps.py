@@ -47,7 +47,7 @@ def test_the_surface_model_is_the_roof_over_the_ground(scene, tmp_path):
     box = (np.abs(x - 12.5) < 5) & (np.abs(y + 20.25) < 10)
     assert box.sum() == 20 * 39  # two more rows lie on the edge
     assert (height[box] == 30).all()
-    field = (x > 60) & (y < -60)
+    field = (x > 60) & (y < -85)
     np.testing.assert_allclose(height[field], SLOPE * x[field], atol=1e-5)
     tree_x, tree_y, tall = TREES[2]
     crown = np.hypot(x - tree_x, y - tree_y) < 1
@@ -60,7 +60,7 @@ def test_the_class_map_names_what_is_seen_from_above(scene, tmp_path):
     assert set(klass[box]) == {Class.BUILDING}
     road = (np.abs(y) < 4) & (x > 50)
     assert set(klass[road]) == {Class.ROAD}
-    assert set(klass[(x > 60) & (y < -60)]) == {Class.TERRAIN}
+    assert set(klass[(x > 60) & (y < -85)]) == {Class.TERRAIN}
     assert Class.TREE_CROWN in klass
     assert profile["nodata"] == 0
     with rasterio.open(tmp_path / "a.tif") as raster:

@@ -107,9 +107,14 @@ def test_surfaces_of_a_building_say_what_they_are(city):
 
 
 def test_bodies_and_cavities_are_shells_of_their_own(city):
-    pair, hollow = (city["CityObjects"][name]["geometry"][0] for name in ("way/2", "way/3"))
-    assert pair["type"] == "MultiSolid"
-    assert [len(body) for body in pair["boundaries"]] == [1, 1]
+    objects = city["CityObjects"]
+    pair, hollow = objects["way/2"], objects["way/3"]["geometry"][0]
+    assert pair["geometry"] == []
+    assert pair["attributes"]["height_source"] == "default"
+    for name in pair["children"]:
+        assert (objects[name]["type"], objects[name]["parents"]) == ("BuildingPart", ["way/2"])
+        assert [len(shell) for shell in objects[name]["geometry"][0]["boundaries"]] == [12]
+    assert len(pair["children"]) == 2
     assert hollow["type"] == "Solid"
     assert [len(shell) for shell in hollow["boundaries"]] == [12, 12]
     assert [len(v) for v in hollow["semantics"]["values"]] == [12, 12]
@@ -118,6 +123,23 @@ def test_bodies_and_cavities_are_shells_of_their_own(city):
     assert np.ptp(points[outer][..., 2]) == pytest.approx(20)
     verdict = validate_mesh(Mesh.of(points, inner[:, ::-1], feature=0, closed=True))
     np.testing.assert_allclose(verdict.volume, 1000)
+
+
+# Geometry types that the schema of CityJSON 2.0 lets the kinds have that occur here.
+ALLOWED = {
+    "Building": {"Solid"},
+    "BuildingPart": {"Solid"},
+    "PlantCover": {"MultiSolid", "MultiSurface"},
+    "Road": {"MultiSurface", "CompositeSurface"},
+    "TINRelief": {"CompositeSurface"},
+    "SolitaryVegetationObject": {"GeometryInstance"},
+}
+
+
+def test_every_kind_of_object_has_a_geometry_that_the_schema_lets_it_have(city):
+    for told in city["CityObjects"].values():
+        assert {g["type"] for g in told["geometry"]} <= ALLOWED[told["type"]]
+    assert {told["type"] for told in city["CityObjects"].values()} == set(ALLOWED)
 
 
 def test_a_tree_in_cityjson_stands_where_it_grows(city, scene):

@@ -10,6 +10,7 @@ import shapely
 import trimesh
 from export_worlds import NAMES, SOLID_VOLUMES, write_world
 
+from geoscene.classes import Class
 from geoscene.export import export_scene
 from geoscene.mesh import Mesh
 from geoscene.validate import validate_mesh
@@ -61,13 +62,11 @@ def _cityjson(path, scene):
     out = {}
     for name, told in document["CityObjects"].items():
         for geometry in told["geometry"]:
-            if told["type"] == "Building":
-                bodies = (
-                    geometry["boundaries"] if geometry["type"] == "MultiSolid" else [geometry["boundaries"]]
-                )
-                faces = [face[0] for body in bodies for shell in body for face in shell]
-                out[name] = points, np.array(faces)
-    return out
+            if told["type"] in ("Building", "BuildingPart"):
+                assert geometry["type"] == "Solid"
+                faces = [face[0] for shell in geometry["boundaries"] for face in shell]
+                out.setdefault(told.get("parents", [name])[0], []).extend(faces)
+    return {name: (points, np.array(faces)) for name, faces in out.items()}
 
 
 def _parts(pieces):
@@ -192,7 +191,7 @@ def test_a_building_is_the_same_closed_solid(kind, exported, scene):
     assert set(found) == set(NAMES)
     truth = {}
     for tile in scene.tiles():
-        for feature in np.unique(tile.mesh.feature[tile.mesh.closed]):
+        for feature in np.unique(tile.mesh.feature[tile.mesh.klass == Class.BUILDING]):
             mesh = tile.mesh.take(tile.mesh.closed & (tile.mesh.feature == feature)).shifted(tile.origin)
             truth[NAMES[feature]] = mesh
     for name, (points, faces) in found.items():

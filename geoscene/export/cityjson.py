@@ -74,6 +74,7 @@ _TYPES: dict[int, str] = {
     Class.OTHER_STRUCTURE: "OtherConstruction",
 }
 _CONSTRUCTIONS = frozenset({"Building", "Bridge", "Tunnel", "OtherConstruction"})
+_WITH_PARTS = frozenset({"Building", "Bridge", "Tunnel"})
 _AUXILIARY = frozenset({Class.KERB, Class.LANE_MARKING})
 
 
@@ -156,7 +157,7 @@ def write_cityjson(
 ) -> Summary:
     """Write a scene as CityJSON 2.0, tile by tile.
 
-    Buildings are Solids (MultiSolids where they are of several bodies, cavities as inner shells) with
+    Buildings are Solids (of several bodies: a BuildingPart for each; cavities are inner shells) with
     RoofSurface, WallSurface, GroundSurface and, under what overhangs, OuterCeilingSurface; roads, water, land
     cover and the bare terrain are surfaces, cut at the tiles' edges; trees and street furniture are geometry
     instances. Attributes are those of ``features.gpkg``, sources of guesses included.
@@ -246,18 +247,15 @@ def _tile_objects(
     for piece in found:
         kind = _TYPES.get(piece.klass, "OtherConstruction" if piece.solid else "LandUse")
         look = palette.values(mesh, piece.rows)
+        name = _name(features, piece, part.index)
+        told = {"class": klass_name(piece.klass), **features.attributes(piece.feature)}
         if piece.solid:
-            shells = shell[piece.rows]
-            geometry = _solid(mesh, piece, whole, corners[piece.rows], shells, look, first, kind)
+            made = _solids(mesh, piece, whole, corners[piece.rows], shell[piece.rows], look, first, kind)
+            entries += _solid_entries(name, kind, told, [{"lod": lod, **solid} for solid in made])
             solids += 1
         else:
-            geometry = _surface(piece, corners[piece.rows] + first, look, kind)
-        entry = {
-            "type": kind,
-            "attributes": {"class": klass_name(piece.klass), **features.attributes(piece.feature)},
-            "geometry": [{"lod": lod if kind in _CONSTRUCTIONS else "1", **geometry}],
-        }
-        entries.append((_name(features, piece, part.index), entry))
+            made = [{"lod": "1", **_surface(piece, corners[piece.rows] + first, look, kind)}]
+            entries.append((name, {"type": kind, "attributes": told, "geometry": made}))
     entries += _copies(part.instances, features, library, part.index, ids[len(mesh.vertices) :] + first)
     return whole, entries, solids
 
@@ -269,7 +267,34 @@ def _name(features: Features, piece: Piece, index: tuple[int, int]) -> str:
     return f"{name}/{klass_name(piece.klass)}@{index[0]}_{index[1]}"
 
 
-def _solid(
+def _solid_entries(
+    name: str, kind: str, attributes: dict[str, Any], solids: list[dict[str, Any]]
+) -> list[tuple[str, dict[str, Any]]]:
+    """The city objects of one object of one or more bodies, in the geometries that the schema lets each have.
+
+    Buildings, bridges and tunnels of several bodies have a part for each; plant cover is a MultiSolid always.
+    """
+    if kind in _WITH_PARTS and len(solids) > 1:
+        names = [f"{name}-{k + 1}" for k in range(len(solids))]
+        parts_of = [
+            (own, {"type": f"{kind}Part", "parents": [name], "geometry": [solid]})
+            for own, solid in zip(names, solids, strict=True)
+        ]
+        whole = {"type": kind, "attributes": attributes, "children": names, "geometry": []}
+        return [(name, whole), *parts_of]
+    if kind not in _CONSTRUCTIONS and (len(solids) > 1 or kind == "PlantCover"):
+        looks = [solid["material"]["visual"]["values"] for solid in solids]
+        multi = {
+            "lod": solids[0]["lod"],
+            "type": "MultiSolid",
+            "boundaries": [solid["boundaries"] for solid in solids],
+            "material": {"visual": {"values": looks}},
+        }
+        solids = [multi]
+    return [(name, {"type": kind, "attributes": attributes, "geometry": solids})]
+
+
+def _solids(
     mesh: Mesh,
     piece: Piece,
     whole: NDArray[np.int64],
@@ -278,21 +303,21 @@ def _solid(
     look: NDArray[np.int64],
     first: int,
     kind: str,
-) -> dict[str, Any]:
-    groups = bodies(whole.astype(float), triangles, shell)
-
-    def spread(values: NDArray[np.int64]) -> list[Any]:
-        nested = [[values[rows].tolist() for rows in body] for body in groups]
-        return nested if len(groups) > 1 else nested[0]
-
-    out: dict[str, Any] = {
-        "type": "MultiSolid" if len(groups) > 1 else "Solid",
-        "boundaries": spread(triangles[:, None] + first),
-        "material": {"visual": {"values": spread(look)}},
-    }
-    if kind in _CONSTRUCTIONS:
-        names, values = np.unique(_surface_kinds(mesh, piece, whole, triangles), return_inverse=True)
-        out["semantics"] = {"surfaces": [{"type": str(n)} for n in names], "values": spread(values)}
+) -> list[dict[str, Any]]:
+    """A Solid for each body."""
+    names, values = np.unique(_surface_kinds(mesh, piece, whole, triangles), return_inverse=True)
+    surfaces = [{"type": str(n)} for n in names]
+    out = []
+    for body in bodies(whole.astype(float), triangles, shell):
+        solid: dict[str, Any] = {
+            "type": "Solid",
+            "boundaries": [(triangles[rows][:, None] + first).tolist() for rows in body],
+            "material": {"visual": {"values": [look[rows].tolist() for rows in body]}},
+        }
+        if kind in _CONSTRUCTIONS:
+            marks = [values[rows].tolist() for rows in body]
+            solid["semantics"] = {"surfaces": surfaces, "values": marks}
+        out.append(solid)
     return out
 
 
