@@ -16,6 +16,9 @@ from geoscene.sources.data import OsmData, Tags
 
 Float = NDArray[np.float64]
 
+_SHARP = 0.05
+"""Where carriageways overlap, a road counts for most near its middle: the less this is, the more so."""
+
 # Metres of free height (railways: EN 15273 with overhead line; waterways: a rowing boat on small ones) that
 # bridges leave.
 _CLEAR = {
@@ -73,9 +76,9 @@ def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 1.0, ba
         square = np.maximum((along**2).sum(axis=1), 1e-12)
         t = np.clip(((xy[point] - start[road, :2]) * along).sum(axis=1) / square, 0.0, 1.0)
         foot = start[road] + t[:, None] * (end[road] - start[road])
-        beyond = np.maximum(np.hypot(*(xy[point] - foot[:, :2]).T) - half[road], 0.0)
-        share = np.clip(1.0 - beyond / batter, 0.0, 1.0)
-        weight = share**2 / (0.1 + beyond) ** 2
+        away = np.hypot(*(xy[point] - foot[:, :2]).T)
+        share = np.clip(1.0 - np.maximum(away - half[road], 0.0) / batter, 0.0, 1.0)
+        weight = share**2 / (_SHARP + (away / half[road]) ** 2) ** 2
         total = np.bincount(point, weight, len(z))
         near = total > 0
         road_z = np.divide(np.bincount(point, weight * foot[:, 2], len(z)), total, out=z.copy(), where=near)
