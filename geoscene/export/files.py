@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.errors import InputError
 
@@ -104,8 +103,3 @@ def plain(value: Any) -> Any:
     if value is None or value == "" or (isinstance(value, float) and not np.isfinite(value)):
         return None
     return value
-
-
-def as_text(values: NDArray[Any]) -> NDArray[np.object_]:
-    """Text of a column, "" for none."""
-    return np.array(["" if v is None else str(v) for v in values], object)

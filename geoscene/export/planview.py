@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ REACH = 0.1
 """Metres that a reference line may cut a corner of its polyline by."""
 
 _SMALLEST_RADIUS = 0.3
+_STRAIGHT = 1e-7  # radians: vertices that turn by less are no corners
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +54,14 @@ def plan_view(points: Float, *, reach: float = REACH) -> PlanView:
     heading = np.arctan2(step[:, 1], step[:, 0])
     turn = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi
     bend = np.maximum(np.abs(turn), 1e-12)
+    if (bend < _STRAIGHT).any():
+        corner = np.concatenate([[True], bend >= _STRAIGHT, [True]])
+        along = np.append(0.0, np.cumsum(side))
+        plan = plan_view(points[corner], reach=reach)
+        return replace(plan, at=np.interp(along, along[corner], plan.at))
     tangent = np.minimum(np.minimum(side[:-1], side[1:]) / 2, reach / np.tan(bend / 4))
     radius = tangent / np.tan(bend / 2)
-    tangent = np.where((bend < 1e-7) | (radius < _SMALLEST_RADIUS), 0.0, tangent)
+    tangent = np.where(radius < _SMALLEST_RADIUS, 0.0, tangent)
     arc = np.where(tangent > 0, radius * bend, 0.0)
 
     before, after = np.append(0.0, tangent), np.append(tangent, 0.0)
