@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geoscene.frames import Frame
 from geoscene.roads import RoadGraph
 from lidar.errors import BlockedError, RouteError
-from lidar.path import MARGIN, Ground, Path, plan_path
+from lidar.path import MARGIN, Path, Surface, plan_path
 from lidar.route import TOLERANCE, Route, Side, Spec, plan_route
 from lidar.vehicle import Vehicle
 
@@ -33,7 +33,7 @@ def plan_drive(
     tolerance: float = TOLERANCE,
     as_is: bool = False,
     obstacles: Sequence[Any] | NDArray[np.object_] | shapely.STRtree | None = None,
-    ground: Ground | None = None,
+    ground: Surface | None = None,
     margin: float = MARGIN,
 ) -> tuple[Route, Path]:
     """A route and the path along it on which the vehicle touches no obstacle; arguments as for both.

@@ -28,6 +28,10 @@ from lidar.vehicle import Vehicle
 
 Float = NDArray[np.float64]
 Ground = Callable[[Float, Float], Float]
+"""z (n,) of the ground at scene x (n,), y (n,)."""
+
+Surface = Callable[[Float, Float, Float], Float]
+"""z (n,) of the surface that wheels stand on at scene x, y (n,), near heights z (n,)."""
 
 MARGIN = 0.25
 """Metres that the body keeps from obstacles."""
@@ -88,15 +92,14 @@ def plan_path(
     frame: Frame,
     *,
     obstacles: Sequence[Any] | NDArray[np.object_] | shapely.STRtree | None = None,
-    ground: Ground | None = None,
+    ground: Surface | None = None,
     margin: float = MARGIN,
 ) -> Path:
     """The path of a vehicle along a route.
 
     obstacles : polygons in scene metres that the body must not touch (footprints of buildings that stand on
                 the ground); they do not hold on bridges and in tunnels
-    ground    : height in metres of scene x (n,) and y (n,); without it, and on bridges and in tunnels, the
-                heights of the route's line are the ground
+    ground    : the surface near the heights of the route's line; without it, those heights are the ground
     margin    : metres that the body keeps from obstacles
 
     Raises BlockedError where the vehicle cannot follow the route, or cannot without touching an obstacle: its
@@ -214,7 +217,7 @@ def _lost(track: Track, line: Line, xy: Float, vehicle: Vehicle) -> NDArray[np.i
     return track.row[worst : worst + 1] if len(rows) else rows
 
 
-def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Ground | None) -> Path:
+def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Surface | None) -> Path:
     """One path of all legs, with the ground under it."""
     heights = _heights(legs, lines, setting, ground)
     parts = []
@@ -249,7 +252,7 @@ def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Grou
 
 
 def _heights(
-    legs: list[Track], lines: list[Line], setting: Setting, ground: Ground | None
+    legs: list[Track], lines: list[Line], setting: Setting, ground: Surface | None
 ) -> list[tuple[Float, Float, Float]]:
     """Height of the rear axle, slope ahead and bank of each leg, smoothed over the wheelbase."""
     from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
@@ -273,7 +276,7 @@ def _heights(
 
 
 def _raw_heights(
-    leg: Track, line: Line, setting: Setting, ground: Ground | None
+    leg: Track, line: Line, setting: Setting, ground: Surface | None
 ) -> tuple[Float, Float, Float]:
     """Height, rise ahead per metre and bank at the rows of a leg, as the line or the ground has them."""
     heading = line_heading(line.xyz[:, :2])[leg.row]
@@ -282,15 +285,11 @@ def _raw_heights(
     # the last row may lie a little beyond the end of the line
     profile = np.append(line.xyz[:, 2], 2 * line.xyz[-1, 2] - line.xyz[-2, 2])
     z, bank = np.interp(place, np.arange(len(profile)), profile), np.zeros(len(leg.row))
-    ask = np.flatnonzero(~line.free[leg.row])
-    if ground is not None and len(ask):
-        c, s = np.cos(leg.heading[ask]), np.sin(leg.heading[ask])
-        x, y = leg.xy[ask].T
+    if ground is not None and len(z):
+        c, s = np.cos(leg.heading), np.sin(leg.heading)
+        x, y = leg.xy.T
         track = max(setting.vehicle.track, 0.1)
         half = track / 2 * setting.frame.scale_at(x, y)
-        left, right = ground(x - half * s, y + half * c), ground(x + half * s, y - half * c)
-        # over bridges and through tunnels, what the line lacks at both ends is shared out between them
-        rows = np.arange(len(z))
-        z = z + np.interp(rows, ask, 0.5 * (left + right) - z[ask])
-        bank = np.interp(rows, ask, np.arctan2(left - right, track))
+        left, right = ground(x - half * s, y + half * c, z), ground(x + half * s, y - half * c, z)
+        z, bank = 0.5 * (left + right), np.arctan2(left - right, track)
     return z, leg.gear * np.gradient(z, leg.step), bank

@@ -8,6 +8,7 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.classes import Class
 from geoscene.geopackage import read_layer
 from geoscene.progress import Progress, silent
 from geoscene.roadgraph import read_graphml
@@ -16,12 +17,19 @@ from geoscene.scene import Scene
 from lidar.detour import plan_drive
 from lidar.errors import RouteError
 from lidar.motion import drive_path
-from lidar.path import Path
+from lidar.path import Path, Surface
 from lidar.poses import Trajectory
 from lidar.route import Route, Spec
 from lidar.vehicle import load_vehicle
+from lidar.world import World
 
 _RANDOM_SECONDS = 60.0
+_ABOVE = (
+    1.5  # metres over the graph's height from which the surface under the wheels is looked for, and below it
+)
+_DRIVEN = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD or c == Class.BRIDGE]
+
+Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +67,26 @@ def standing_footprints(scene: Scene) -> NDArray[np.object_]:
     return standing
 
 
+def road_surface(scene: Scene) -> Surface:
+    """The surface of ground and bridges, as rays see it, near given heights; those where there is none."""
+    world: World | None = None
+
+    def surface(x: Float, y: Float, z: Float) -> Float:
+        nonlocal world
+        region = (float(x.min()) - 1, float(y.min()) - 1, float(x.max()) + 1, float(y.max()) + 1)
+        if world is None:
+            world = World.load(scene, region=region)
+        else:
+            world.follow(region)
+        origins = np.column_stack([x, y, z + _ABOVE])
+        hits = world.caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape), far=2 * _ABOVE)
+        on_it = np.isfinite(hits.range) & np.isin(world.lookup(hits).klass, _DRIVEN)
+        found: Float = np.where(on_it, z + _ABOVE - np.where(on_it, hits.range, 0.0), z)
+        return found
+
+    return surface
+
+
 def plan_travel(
     scene: Scene,
     spec: Spec,
@@ -88,6 +116,7 @@ def plan_travel(
         duration=seconds,
         side=cast("Literal['left', 'right']", side),
         obstacles=obstacles,
+        ground=road_surface(scene),
     )
     trajectory = drive_path(path, body)
     if seconds is not None:

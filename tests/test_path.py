@@ -164,7 +164,7 @@ def test_on_a_slope_the_vehicle_stands_on_the_ground():
 def test_a_ground_that_is_given_lifts_and_banks_the_vehicle():
     line = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0]])
 
-    def ground(x, y):
+    def ground(x, y, _near=None):
         return 5.0 + 0.05 * x + 0.02 * y
 
     path = plan_path(free_route(line), CAR, FRAME, ground=ground)
@@ -215,18 +215,19 @@ def test_in_a_real_city_the_body_touches_no_building(shared_osm, name):
         assert route.edges.size > 10
 
 
-def test_a_ground_that_is_given_is_carried_over_bridges_without_a_step():
+def test_of_stacked_surfaces_the_one_near_the_road_is_driven_on():
     graph = road_graph(
         [(0, 0), (100, 0), (150, 0), (250, 0)],
         [(0, 1), (1, 2), (2, 3)],
         bridge=[False, False, True, True, False, False],
     )
 
-    def ground(x, _y):
-        return np.where((x > 101) & (x < 149), -8.0, 2.0)  # a ravine under the bridge
+    def ground(x, _y, near):
+        deck, ravine = np.full(len(x), 0.4), np.where((x > 101) & (x < 149), -8.0, 0.4)
+        return np.where(np.abs(deck - near) < np.abs(ravine - near), deck, ravine)
 
     path = plan_path(lane_route(graph, [0, 2, 4], (0.0, 100.0)), CAR, FRAME, ground=ground)
-    np.testing.assert_allclose(path.position[:, 2], 2.0, atol=1e-6)
+    np.testing.assert_allclose(path.position[:, 2], 0.4, atol=1e-6)
 
 
 def test_velocity_along_a_hilly_path_is_its_derivative():
