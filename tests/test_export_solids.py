@@ -10,9 +10,11 @@ import shapely
 import trimesh
 from export_worlds import NAMES, SOLID_VOLUMES, write_world
 
+from geoscene.build import BuildOptions, build
 from geoscene.classes import Class
 from geoscene.export import export_scene
 from geoscene.mesh import Mesh
+from geoscene.sources import demo_path, read_osm
 from geoscene.validate import validate_mesh
 
 STEPS = {
@@ -238,3 +240,36 @@ def test_cityjson_of_a_frame_without_a_code_is_in_utm_and_closed(tmp_path):
     verdict = validate_mesh(mesh)
     assert verdict.ok.all()
     np.testing.assert_allclose(verdict.volume, SOLID_VOLUMES[0], rtol=1e-6)
+
+
+def test_every_solid_of_a_real_place_is_still_closed_after_ply(tmp_path):
+    osm = read_osm(demo_path(), bounds=(24.9405, 60.1655, 24.9475, 60.1690))
+    scene = build(osm, tmp_path / "demo", BuildOptions(crs="utm"))
+    mesh = trimesh.load(export_scene(scene, tmp_path / "a.ply").path, process=False)
+    rows = mesh.metadata["_ply_raw"]["face"]["data"]
+    closed = np.asarray(rows["closed"]).ravel() == 1
+    feature = np.asarray(rows["feature"]).ravel()[closed]
+    verdict = validate_mesh(Mesh.of(mesh.vertices, mesh.faces[closed], feature=feature, closed=True))
+    assert verdict.ok.all()
+    assert len(verdict) >= scene.manifest["counts"]["solids"] > 20
+
+
+def test_every_solid_of_a_real_place_is_still_closed_after_cityjson(tmp_path):
+    osm = read_osm(demo_path(), bounds=(24.9405, 60.1655, 24.9475, 60.1690))
+    scene = build(osm, tmp_path / "demo", BuildOptions())
+    document = json.loads(export_scene(scene, tmp_path / "a.city.json").path.read_text())
+    points = np.array(document["vertices"]) * document["transform"]["scale"]
+    solids = [
+        solid
+        for told in document["CityObjects"].values()
+        for geometry in told["geometry"]
+        for solid in {"Solid": [geometry["boundaries"]], "MultiSolid": geometry["boundaries"]}.get(
+            geometry["type"], []
+        )
+    ]
+    faces = [np.array([face[0] for shell in solid for face in shell]) for solid in solids]
+    feature = np.repeat(np.arange(len(faces)), [len(f) for f in faces])
+    mesh = Mesh.of(points, np.concatenate(faces), feature=feature, closed=True)
+    verdict = validate_mesh(mesh, grid=document["transform"]["scale"][0])
+    assert verdict.ok.all()
+    assert len(verdict) >= scene.manifest["counts"]["solids"] > 20
