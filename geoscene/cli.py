@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -73,8 +74,8 @@ def build(
 ) -> int:
     """Build a scene: solids of all buildings, one ground surface, the drivable road graph.
 
-    Examples
-    --------
+    For example:
+
     geoscene build --demo -o scene
 
     geoscene build --osm city.osm.pbf -o scene --crs utm
@@ -276,6 +277,94 @@ def validate(scene: Path, /, *, json: Annotated[bool, Parameter(negative=())] = 
         sound = report["solids"] - len(report["broken"])
         print(f"{report['solids']} solids, {sound} closed, oriented and of positive volume")
     return FAILURE if report["broken"] else 0
+
+
+@app.command
+def export(
+    scene: Path,
+    /,
+    *,
+    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
+    to: str | None = None,
+    crs: str | None = None,
+    layers: str | None = None,
+    model: str | None = None,
+    resolution: float | None = None,
+    height_offset: float | None = None,
+    left_hand: Annotated[bool | None, Parameter(negative=())] = None,
+    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+) -> int:
+    """Write a scene in another format.
+
+    For example:
+
+    geoscene export scene -o city.city.json
+
+    geoscene export scene -o city.glb
+
+    geoscene export scene --to 3dtiles -o tiles
+
+    geoscene export scene -o surface.tif --model surface --resolution 0.5
+
+    geoscene export scene -o roads.xodr
+
+    Parameters
+    ----------
+    scene
+        Directory of the scene.
+    out
+        File to write; for 3D Tiles a directory.
+    to
+        cityjson, glb, 3dtiles, obj, ply, stl, gpkg, geojson, geoparquet, geotiff, opendrive or sumo; by the
+        name of the file where that says it.
+    crs
+        CRS of the export, where the format carries one: an EPSG code; the scene's own by default, or its UTM
+        zone.
+    layers
+        Layers of GIS formats, with commas; all by default.
+    model
+        Of a GeoTIFF: surface, terrain or classes.
+    resolution
+        Of a GeoTIFF: metres a cell.
+    height_offset
+        Metres added to heights, such as the geoid's height for formats that want ellipsoidal ones.
+    left_hand
+        Of road networks: traffic keeps left.
+    overwrite
+        Replace what is there.
+    json
+        Print the summary as JSON.
+    quiet
+        No progress bars.
+    """
+    from geoscene.export import export_scene  # noqa: PLC0415
+    from geoscene.scene import open_scene  # noqa: PLC0415
+
+    with progress_bar(quiet=quiet) as progress:
+        summary = export_scene(
+            open_scene(scene),
+            out,
+            to,
+            crs=crs,
+            layers=tuple(layers.split(",")) if layers else None,
+            model=model,
+            resolution=resolution,
+            height_offset=height_offset,
+            left_hand=left_hand,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    if json:
+        print_json({**asdict(summary), "path": str(summary.path)})
+    else:
+        print(
+            f"{summary.path}: {summary.kind}, {summary.objects} objects, {summary.bytes / 1e6:.1f} MB, {summary.crs}"
+        )
+        for note in summary.notes:
+            print(f"  {note}")
+    return 0
 
 
 def _extent(manifest: dict[str, Any]) -> dict[str, Any]:

@@ -58,8 +58,8 @@ def drive(
     A run that was stopped goes on where it stopped when the same command is given again, and ends with the
     same bytes.
 
-    Examples
-    --------
+    For example:
+
     lidar drive scene --route random --duration 30 --seed 1 -o drive
 
     lidar drive scene --route 60.1699,24.9384 60.1755,24.9414 --rig vlp16 --format pcd,laz -o drive
@@ -199,8 +199,8 @@ def map_(
 ) -> int:
     """Put all clouds of a dataset into one georeferenced cloud.
 
-    Examples
-    --------
+    For example:
+
     lidar map drive -o map.laz
 
     lidar map drive -o map.ply --voxel 0.1 --color height
