@@ -359,9 +359,8 @@ def export(
     if json:
         print_json({**asdict(summary), "path": str(summary.path)})
     else:
-        print(
-            f"{summary.path}: {summary.kind}, {summary.objects} objects, {summary.bytes / 1e6:.1f} MB, {summary.crs}"
-        )
+        size = f"{summary.bytes / 1e6:.1f} MB"
+        print(f"{summary.path}: {summary.kind}, {summary.objects} objects, {size}, {summary.crs}")
         for note in summary.notes:
             print(f"  {note}")
     return 0

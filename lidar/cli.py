@@ -86,8 +86,8 @@ def drive(
         UTC time of the drive's start, ISO 8601 (2026-06-21T08:00:00); it sets the sun and the time stamps.
         By default 10:00 local solar time on 21 June 2026.
     fidelity
-        draft (one pose a frame, exact ranges), standard (a pose a pulse, exact ranges) or survey (beams with a
-        size, several echoes, noise, lost and false returns).
+        draft (one pose a frame, exact ranges), standard (a pose a pulse, exact ranges) or survey (beams with
+        a size, several echoes, noise, lost and false returns).
     settings
         One effect set apart from the level, NAME=VALUE; again for more. An unknown name lists them all.
     formats
