@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import shapely
@@ -68,6 +69,8 @@ _OPENINGS = {"gate": 3.0, "lift_gate": 4.0, "swing_gate": 4.0, "sliding_gate": 4
              "toll_booth": 4.0, "wicket_gate": 1.2}  # fmt: skip
 """Width in metres, where ``width`` has none, of what opens a barrier that passes through its node."""
 
+_APART = 0.005
+"""Metres by which bands that touch themselves in a point are made narrower on each side."""
 _PASSABLE = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.RAIL)
 """A barrier drawn across these is open there."""
 
@@ -164,6 +167,8 @@ def _solid(barriers: Barriers, row: int, height: Height | None) -> Mesh:
     material = next(m for m in materials().values() if m.code == barriers.material[row])
     parts = []
     shape = shapely.set_precision(shapely.segmentize(barriers.polygon[row], _STATION), GRID)
+    if _touches_itself(shape):
+        shape = shapely.set_precision(shapely.buffer(shape, -_APART, join_style="mitre"), GRID)
     for part in shapely.get_parts(shape):
         # In whole steps of the grid, so that what lies on one line does so exactly.
         steps = shapely.transform(part, lambda c: np.rint(c / GRID))
@@ -203,6 +208,13 @@ def _solid(barriers: Barriers, row: int, height: Height | None) -> Mesh:
             )
         )
     return concatenate(parts)
+
+
+def _touches_itself(shape: Any) -> bool:
+    """Rings of the shape meet in a point, where a solid would have an edge of four faces."""
+    rings = shapely.get_rings(shapely.get_parts(shape))
+    coordinates = np.concatenate([np.empty((0, 2)), *(shapely.get_coordinates(ring)[:-1] for ring in rings)])
+    return len(np.unique(np.rint(coordinates / GRID), axis=0)) < len(coordinates)
 
 
 def _kind(tags: Tags) -> Kind | None:
