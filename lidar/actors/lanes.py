@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import shapely
@@ -24,6 +24,7 @@ _SIDE = 0.55  # metres that two bodies in neighbouring lanes have between them a
 _QUIET = {"service": 0.02, "track": 0.0, "living_street": 0.2}
 """How much less traffic likes a road of this kind."""
 _STRAIGHT = np.radians(30.0)
+_EDGE = 60.0  # metres from the bounds of the map within which a street that ends is one that leaves it
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +38,8 @@ class Lanes:
     after  : for each edge the edges that may follow it
     leave, enter : (m,) headings in which an edge is left and entered, radians
     liking : (m,) how much traffic there is on an edge, relative
+    open   : (m,) bool, the edge leads on, or out of the map: whoever takes it does not end in a dead end
+    exit   : (m,) bool, the edge ends at the map's edge
     """
 
     graph: RoadGraph
@@ -47,10 +50,17 @@ class Lanes:
     leave: Float
     enter: Float
     liking: Float
+    open: NDArray[np.bool_]
+    exit: NDArray[np.bool_]
 
 
-def lanes_of(graph: RoadGraph, *, side: str = "right") -> Lanes:
-    """The lanes of a road graph."""
+def lanes_of(
+    graph: RoadGraph, *, side: str = "right", bounds: tuple[float, float, float, float] | None = None
+) -> Lanes:
+    """The lanes of a road graph.
+
+    bounds : (xmin, ymin, xmax, ymax) of the map in scene metres: streets that end near them go on beyond
+    """
     two_way = graph.twin >= 0
     other = np.where(two_way, graph.lanes[graph.twin], 0.0)
     total = np.maximum(graph.lanes + other, 1.0)
@@ -66,6 +76,9 @@ def lanes_of(graph: RoadGraph, *, side: str = "right") -> Lanes:
     for k, line in enumerate(graph.geometry):
         enter[k], leave[k] = _heading(line[:, :2], first=True), _heading(line[:, :2], first=False)
     liking = np.array([_QUIET.get(str(kind), 1.0) for kind in graph.highway])
+    leads_out = _leaving(graph, bounds)
+    straight_on = graph.twin[before] != after
+    leads_on = _leading_on(before[straight_on], after[straight_on], leads_out)
     return Lanes(
         graph,
         np.maximum(np.floor(graph.lanes), 1.0).astype(np.int64),
@@ -75,7 +88,31 @@ def lanes_of(graph: RoadGraph, *, side: str = "right") -> Lanes:
         leave,
         enter,
         liking,
+        leads_on,
+        leads_out,
     )
+
+
+def _leaving(graph: RoadGraph, bounds: tuple[float, float, float, float] | None) -> NDArray[np.bool_]:
+    """Edges (m,) without a way on whose end lies near the map's edge."""
+    if bounds is None:
+        return np.zeros(len(graph), np.bool_)
+    end = graph.node_xyz[graph.head, :2]
+    within = np.minimum(end - bounds[:2], np.array(bounds[2:]) - end).min(axis=1)
+    ways = np.bincount(graph.tail, minlength=len(graph.node_id))[graph.head]
+    out: NDArray[np.bool_] = (within < _EDGE) & (ways - (graph.twin >= 0) < 1)
+    return out
+
+
+def _leading_on(before: Ints, after: Ints, leads_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Edges (m,) from which a drive can go on for ever, or to the map's edge."""
+    leads_on = np.ones(len(leads_out), np.bool_)
+    while True:
+        further = leads_out.copy()
+        further[before[leads_on[after]]] = True
+        if np.array_equal(further, leads_on):
+            return leads_on
+        leads_on = further
 
 
 def _heading(xy: Float, *, first: bool) -> float:
@@ -92,10 +129,11 @@ def turn(lanes: Lanes, a: int, b: int) -> float:
     return float((lanes.enter[b] - lanes.leave[a] + np.pi) % (2 * np.pi) - np.pi)
 
 
-def lane_shift(lanes: Lanes, edge: int, lane: int, width: float) -> float:
+def lane_shift(lanes: Lanes, edge: int, lane: int, width: float, *, kerb: bool = False) -> float:
     """Metres from an edge's centre line to a lane's middle, positive on the side that traffic keeps to.
 
-    Lane 0 is the one at the kerb. A body of that width stays inside the carriageway where there is room.
+    Lane 0 is the one at the kerb. A body of that width stays inside the carriageway where there is room; with
+    ``kerb`` it keeps to the kerb within its lane.
     """
     g = lanes.graph
     other = float(g.lanes[g.twin[edge]]) if g.twin[edge] >= 0 else 0.0
@@ -103,6 +141,8 @@ def lane_shift(lanes: Lanes, edge: int, lane: int, width: float) -> float:
     whole = float(g.width[edge])
     shared = other > 0 and total < 2
     middle = whole / 4 if shared else whole / 2 - (lane + 0.5) * whole / total
+    if kerb and lane == 0:
+        middle = whole / 2 - width / 2 - 2 * _KERB
     room = max(whole / 2 - width / 2 - _KERB, 0.0)
     return float(np.clip(middle, -room, room))
 
@@ -132,6 +172,11 @@ class Way:
         """Number of stations."""
         return len(self.xyz)
 
+    def part(self, first: int, last: int) -> Way:
+        """The stations from the first up to, not including, the last."""
+        columns = (getattr(self, f.name)[first:last] for f in fields(self)[:-1])
+        return Way(*columns, self.scale)
+
 
 def wander(
     lanes: Lanes,
@@ -159,6 +204,7 @@ def wander(
         turns = np.array([turn(lanes, edge, int(w)) for w in ways])
         weight = lanes.liking[ways] * np.where(np.abs(turns) < _STRAIGHT, 3.0, 1.0)
         weight = weight * np.where(np.abs(turns) > np.radians(140), 0.02, 1.0)
+        weight = weight * np.where(lanes.open[ways], 1.0, 1e-9)
         if lanes.count[edge] > 1:
             inward = turns * lanes.side > _STRAIGHT
             outward = turns * lanes.side < -_STRAIGHT
@@ -184,15 +230,27 @@ def wander(
 
 
 def way_along(
-    lanes: Lanes, edges: Sequence[int], picked: Sequence[int], *, width: float, radius: float, scale: float
+    lanes: Lanes,
+    edges: Sequence[int],
+    picked: Sequence[int],
+    *,
+    width: float,
+    radius: float,
+    scale: float,
+    kerb: bool = False,
 ) -> Way:
     """The way along lanes of edges that follow each other, rounded to bends of ``radius`` and more.
 
     width  : metres of the body
     radius : true metres
+    kerb   : keep to the kerb within the lane
     """
     parts, owner = [], []
-    lines = [_lane_line(lanes, e, k, width) for e, k in zip(edges, picked, strict=True)]
+    graph = lanes.graph
+    lines = [
+        beside(graph.geometry[e], -lanes.side * scale * lane_shift(lanes, e, k, width, kerb=kerb))
+        for e, k in zip(edges, picked, strict=True)
+    ]
     for k, line in enumerate(lines):
         if k + 1 < len(lines):
             line, following, joint = _joint(line, lines[k + 1], radius)  # noqa: PLW2901
@@ -209,29 +267,33 @@ def way_along(
     at = np.arange(0.0, max(along[-1], 6 * gap), gap)
     line = np.stack([np.interp(at, along, xyz[:, c]) for c in range(3)], axis=1)
     row = own[np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(own) - 1)]
+    edge, lane = np.asarray(edges, np.int64)[row], np.asarray(picked, np.int64)[row]
+    return rounded(line, edge, lane, graph.speed[edge], radius=radius, scale=scale)
+
+
+def rounded(line: Float, edge: Ints, lane: Ints, limit: Float, *, radius: float, scale: float) -> Way:
+    """The way along a line (n, 3) of evenly spaced points, rounded to bends of ``radius`` true metres and more.
+
+    edge, lane, limit : columns of `Way` at the points
+    """
+    gap = STEP * scale
     smooth = relaxed(line[:, :2], 0.95 / radius / scale, 0.45 * radius)
     # corners that were rounded are shorter: even spacing again
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(smooth, axis=0).T))])
     even = np.arange(0.0, length[-1], gap)
-    near = np.clip(np.searchsorted(length, even), 0, len(row) - 1)
+    near = np.clip(np.searchsorted(length, even), 0, len(line) - 1)
     out = np.column_stack(
         [*(np.interp(even, length, smooth[:, c]) for c in (0, 1)), np.interp(even, length, line[:, 2])]
     )
-    which = row[near]
-    edge = np.asarray(edges, np.int64)[which]
     return Way(
         out,
         line_heading(out[:, :2]),
         line_curvature(out[:, :2]) * scale,
-        edge,
-        np.asarray(picked, np.int64)[which],
-        lanes.graph.speed[edge],
+        edge[near],
+        lane[near],
+        limit[near],
         scale,
     )
-
-
-def _lane_line(lanes: Lanes, edge: int, lane: int, width: float) -> Float:
-    return beside(lanes.graph.geometry[edge], -lanes.side * lane_shift(lanes, edge, lane, width))
 
 
 def beside(line: Float, offset: float) -> Float:
@@ -295,52 +357,3 @@ def _within(line: Float, begin: float, end: float) -> Float:
     at = np.concatenate([[begin], along[inside], [max(end, begin + 1e-3)]])
     part: Float = np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
     return part
-
-
-@dataclass(frozen=True, slots=True)
-class Zones:
-    """Junctions: where ways cross or join; near ones are one.
-
-    polygon : (z,) shapely polygons, scene metres
-    tree    : their search tree
-    nodes   : the graph's nodes in each
-    """
-
-    polygon: NDArray[np.object_]
-    tree: shapely.STRtree
-    nodes: Sequence[Ints]
-
-
-def zones_of(graph: RoadGraph) -> Zones:
-    """The junctions of a graph: circles about nodes of three or more streets, united where they touch."""
-    one = (graph.twin < 0) | (graph.twin > np.arange(len(graph)))
-    ends = np.concatenate([graph.tail[one], graph.head[one]])
-    arms = np.bincount(ends, minlength=len(graph.node_id))
-    half = np.zeros(len(graph.node_id))
-    np.maximum.at(half, graph.tail, graph.width / 2)
-    np.maximum.at(half, graph.head, graph.width / 2)
-    node = np.flatnonzero(arms >= 3)
-    if not len(node):
-        none = np.empty(0, object)
-        return Zones(none, shapely.STRtree(none), [])
-    circles = shapely.buffer(shapely.points(graph.node_xyz[node, :2]), half[node] + 3.0, quad_segs=4)
-    polygon = shapely.get_parts(shapely.union_all(circles))
-    tree = shapely.STRtree(polygon)
-    point, zone = tree.query(shapely.points(graph.node_xyz[node, :2]), predicate="intersects")
-    return Zones(polygon, tree, [node[point[zone == z]] for z in range(len(polygon))])
-
-
-def zone_at(zones: Zones, xy: Float) -> Ints:
-    """The junction (n,) that each point lies in, -1 for none."""
-    out = np.full(len(xy), -1, np.int64)
-    if len(zones.polygon) and len(xy):
-        point, zone = zones.tree.query(shapely.points(xy), predicate="intersects")
-        out[point] = zone
-    return out
-
-
-def road_rank(highway: str) -> int:
-    """Rank of a road's class, 0 the most important."""
-    order = ("motorway", "trunk", "primary", "secondary", "tertiary", "unclassified", "residential")
-    name = highway.removesuffix("_link")
-    return order.index(name) if name in order else len(order)

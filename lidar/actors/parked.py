@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 import shapely
@@ -12,18 +13,21 @@ from geoscene.scene import Scene
 from lidar.actors.actors import Actors
 from lidar.actors.ground import ground_heights
 from lidar.actors.lanes import Lanes, beside, lane_shift
-from lidar.actors.shapes import PAINTS, catalogue
 from lidar.actors.tracks import attitude, table, wheels
-from lidar.actors.traffic import pick, rectangles
+from lidar.actors.sweep import rectangles
+from lidar.actors.traffic import pick
 from lidar.physics.random import generator
 
 Float = NDArray[np.float64]
 
-_KINDS = {"hatchback": 0.38, "sedan": 0.30, "suv": 0.22, "van": 0.10}
+CARS = {"hatchback": 0.38, "sedan": 0.30, "suv": 0.22, "van": 0.10}
+"""Shares of what parks: assumed."""
 _FREE = 1.3  # metres from the middle of the lane that a parked car leaves free: half a car and a hand
 _OVER = 0.35  # metres by which a car's middle may stand beyond the kerb where the street is that narrow
-_CORNER, _CROSSING = 5.0, 3.0  # metres kept free before junctions and crossings
-_STREETS = ("residential", "living_street", "unclassified", "tertiary", "secondary", "primary", "service")
+_ROOM, _BETWEEN = 0.2, 0.4  # metres to what stands there, and to each other
+_SKY = 1e4  # metres above and below zero between which the ground lies
+_QUIET = ("residential", "living_street", "unclassified", "tertiary", "service")
+_BUSY = ("secondary", "primary")
 _FAST = 14.5  # m/s from which on nobody parks at the kerb
 _SLOT = (2.5, 5.2)  # metres of a place in a parking lot
 _AISLE = 6.0
@@ -43,25 +47,29 @@ class Spots:
     hint: Float
 
 
+def concatenated(parts: Sequence[Spots]) -> Spots:
+    """All spots, in order."""
+    return Spots(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Spots)))
+
+
 def kerb_spots(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: float) -> Spots:
     """Places along kerbs on the edges ``near``, a share of them, at random."""
     g = lanes.graph
     xy, heading, hint = [], [], []
     for e in np.flatnonzero(near).tolist():
-        quiet = str(g.highway[e]) in _STREETS and g.speed[e] < _FAST and not (g.bridge[e] or g.tunnel[e])
-        if not quiet or g.length[e] < 15.0:
+        kind = str(g.highway[e])
+        slow = g.speed[e] < _FAST and not (g.bridge[e] or g.tunnel[e])
+        if not slow or g.length[e] < 15.0 or kind not in (*_QUIET, *_BUSY):
             continue
         rng = generator(seed, "parked", "kerb", e)
         lane = lane_shift(lanes, e, 0, 1.82)
-        both = (lanes.side,) if g.twin[e] >= 0 else (lanes.side, -lanes.side)
+        # the inner side of a one-way street of several lanes is a median as likely as not
+        alone = g.twin[e] < 0 and lanes.count[e] == 1 and kind in _QUIET
+        both = (lanes.side, -lanes.side) if alone else (lanes.side,)
         for side in both:
-            inner = (
-                lane
-                if g.twin[e] >= 0 or side == lanes.side
-                else -lane_shift(lanes, e, int(lanes.count[e]) - 1, 1.82)
-            )
+            inner = lane if side == lanes.side else -lane
             out = max(float(g.width[e]) / 2 - 0.92 - 0.15, inner + _FREE + 0.92)
-            if out > float(g.width[e]) / 2 + _OVER:
+            if out > float(g.width[e]) / 2 + (_OVER if kind in _QUIET else -0.9):
                 continue
             line = beside(g.geometry[e], -side * out)
             along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
@@ -119,63 +127,43 @@ def lot_spots(lots: NDArray[np.object_], *, seed: int, share: float) -> Spots:
 
 
 def parked_actors(
-    spots: Spots, scene: Scene, obstacles: shapely.STRtree, taken: shapely.STRtree, *, seed: int, scale: float
+    spots: Spots,
+    scene: Scene,
+    kinds: dict[str, float],
+    trees: Sequence[shapely.STRtree],
+    *,
+    seed: int,
+    scale: float,
 ) -> Actors:
-    """Cars on the spots where they touch neither an obstacle nor ground that is taken nor another car.
+    """Vehicles on the spots where they touch nothing, nor each other.
 
-    obstacles : polygons and points that stand there: buildings, poles, trees
-    taken     : polygons that must stay free: what others drive over, junctions, crossings
+    kinds : shares of the kinds of vehicles
+    trees : what stands there, and what must stay free, as polygons in plan
     """
-    known = catalogue()
-    paints = np.array([share for _, share in PAINTS.values()])
-    kinds, shares = list(_KINDS), np.array(list(_KINDS.values()))
-    rng = generator(seed, "parked", "cars")
     n = len(spots.xy)
-    shapes = [
-        pick(known, kinds[int(rng.choice(len(kinds), p=shares / shares.sum()))], rng, paints)
-        for _ in range(n)
-    ]
+    rng = generator(seed, "parked", *kinds)
+    names, chance = list(kinds), np.array(list(kinds.values()))
+    shapes = [pick(names[k], rng) for k in rng.choice(len(names), size=n, p=chance / chance.sum())]
     grow = 1 + rng.uniform(-0.03, 0.03, (n, 3))
-    length = np.array([s.length for s in shapes]) * grow[:, 0] if n else np.empty(0)
-    width = np.array([s.width for s in shapes]) * grow[:, 1] if n else np.empty(0)
-    boxes = np.array(
-        [
-            rectangles(spots.xy[k : k + 1], spots.heading[k : k + 1], length[k] * scale, width[k] * scale)[0]
-            for k in range(n)
-        ],
-        object,
-    )
+    size = np.array([[s.length, s.width, s.base] for s in shapes]).reshape(-1, 3)
+    length, width, base = size[:, 0] * grow[:, 0], size[:, 1] * grow[:, 1], size[:, 2] * grow[:, 0]
+    boxes = rectangles(spots.xy, spots.heading, length * scale, width * scale)
     keep = np.ones(n, bool)
-    for tree, room in ((obstacles, 0.25), (taken, 0.1)):
-        if n and len(tree):
-            keep[np.unique(tree.query(boxes, predicate="dwithin", distance=room)[0])] = False
-    if n:
-        a, b = shapely.STRtree(boxes).query(boxes, predicate="dwithin", distance=0.4)
-        for first, second in zip(a[a < b].tolist(), b[a < b].tolist(), strict=True):
-            if keep[first]:
-                keep[second] = False
+    for tree in trees:
+        if len(tree):
+            keep[np.unique(tree.query(boxes, predicate="dwithin", distance=_ROOM)[0])] = False
+    a, b = shapely.STRtree(boxes).query(boxes, predicate="dwithin", distance=_BETWEEN)
+    for first, second in zip(a[a < b].tolist(), b[a < b].tolist(), strict=True):
+        keep[second] &= not keep[first]
     rows = np.flatnonzero(keep)
-    hint = spots.hint[rows]
-    bases = np.array([shapes[k].base for k in rows]) * grow[rows, 0] if len(rows) else np.empty(0)
-    points = [
-        wheels(
-            spots.xy[k : k + 1],
-            spots.heading[k : k + 1],
-            spots.hint[k : k + 1],
-            b * scale,
-            0.8 * shapes[k].width,
-        )
-        for k, b in zip(rows.tolist(), bases.tolist(), strict=True)
-    ]
-    under = np.concatenate(points).reshape(-1, 3) if points else np.empty((0, 3))
-    unknown = np.repeat(np.isnan(hint), 4)
-    under[unknown, 2] = 0.0
-    z: Float = np.empty(len(under))
-    z[~unknown] = ground_heights(scene, under[~unknown])
-    z[unknown] = ground_heights(scene, under[unknown], above=4000.0, below=4000.0)
-    height, pitch, roll = attitude(z.reshape(-1, 4), 1.0, 1.0)
-    tracks = np.array([0.8 * shapes[k].width for k in rows])
-    pitch, roll = np.arctan2(np.tan(pitch), bases), np.arctan2(np.tan(roll), tracks)
+    track = 0.8 * size[rows, 1]
+    under = wheels(spots.xy[rows], spots.heading[rows], spots.hint[rows], base[rows] * scale, track * scale)
+    known = np.repeat(np.isfinite(spots.hint[rows]), 4)
+    points = np.nan_to_num(under.reshape(-1, 3), nan=0.0)
+    z: Float = np.empty(len(points))
+    z[known] = ground_heights(scene, points[known])
+    z[~known] = ground_heights(scene, points[~known], above=_SKY, below=_SKY)
+    height, pitch, roll = attitude(z.reshape(-1, 4), base[rows], track)
     return table(
         [shapes[k] for k in rows],
         grow[rows],

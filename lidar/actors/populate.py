@@ -1,4 +1,4 @@
-"""A scene's road users for a drive: traffic, parked cars, people."""
+"""A scene's road users for a drive: traffic, parked vehicles, people."""
 
 from __future__ import annotations
 
@@ -12,19 +12,32 @@ from numpy.typing import NDArray
 from geoscene.errors import SceneFormatError
 from geoscene.geopackage import Layer, read_layer
 from geoscene.roads import RoadGraph
-from geoscene.routing import edge_lines
 from geoscene.scene import Scene
 from lidar.actors.actors import Actors, joined
-from lidar.actors.lanes import lanes_of
-from lidar.actors.parked import Spots, kerb_spots, lot_spots, parked_actors
-from lidar.actors.sweep import body_poses
+from lidar.actors.flow import simulate_trips
+from lidar.actors.junctions import junction_plan
+from lidar.actors.lanes import Lanes, beside, lane_shift, lanes_of
+from lidar.actors.parked import CARS, concatenated, kerb_spots, lot_spots, parked_actors
+from lidar.actors.sweep import body_poses, rectangles
 from lidar.actors.tracks import moving_actors
-from lidar.actors.traffic import junction_plan, rectangles, simulate_trips, vehicle_trips
+from lidar.actors.traffic import Area, Trip, area_of, ego_line, vehicle_trips
+from lidar.actors.walkers import walker_trips, walks_of
 from lidar.errors import InputError
 from lidar.poses import Trajectory
 from lidar.vehicle import Vehicle
 
 Float = NDArray[np.float64]
+
+_ROAD = ("road", "lane_marking", "crossing", "parking")
+_HEADROOM = 2.5  # metres under what stands out of a wall that one can stand below
+_POST = 0.2  # metres, half the thickness of posts and trunks
+_BOUNDS = {
+    "vehicles": (0, 60),
+    "cyclists": (0, 30),
+    "walkers": (0, 400),
+    "parked": (0, 1),
+    "reach": (50, 1000),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,12 +45,16 @@ class TrafficOptions:
     """How busy a place is.
 
     vehicles : moving vehicles per kilometre of lane
+    cyclists : per kilometre of lane
+    walkers  : people per kilometre of sidewalk
     parked   : share of the places along kerbs and in parking lots that are taken
-    reach    : metres from the ego vehicle within which there are road users
+    reach    : true metres from the ego vehicle within which there are road users
     side     : side of the road that traffic keeps to
     """
 
     vehicles: float = 12.0
+    cyclists: float = 1.0
+    walkers: float = 15.0
     parked: float = 0.6
     reach: float = 200.0
     side: Literal["right", "left"] = "right"
@@ -45,14 +62,14 @@ class TrafficOptions:
     def __post_init__(self) -> None:
         """Refuse densities that cannot be meant."""
         faults = [
-            f"{name} {value}: {low} to {high}"
-            for name, value, low, high in (
-                ("vehicles", self.vehicles, 0, 60), ("parked", self.parked, 0, 1), ("reach", self.reach, 50, 1000),
-            )
-            if not low <= value <= high
-        ]  # fmt: skip
+            f"{name} = {getattr(self, name)} is not within {low} to {high}"
+            for name, (low, high) in _BOUNDS.items()
+            if not low <= getattr(self, name) <= high
+        ]
+        if self.side not in ("left", "right"):
+            faults.append(f"side = {self.side!r} is neither left nor right")
         if faults:
-            raise InputError("traffic out of bounds: " + "; ".join(faults))
+            raise InputError("traffic: " + "; ".join(faults))
 
 
 def populate(
@@ -68,58 +85,73 @@ def populate(
 
     ego     : the ego vehicle's trajectory, which is given: the others keep clear of it
     vehicle : its size
+
+    Raises InputError for a scene whose features cannot be read.
     """
     options = options or TrafficOptions()
-    lanes = lanes_of(graph, side=options.side)
+    lanes = lanes_of(graph, side=options.side, bounds=scene.bounds)
     plan = junction_plan(graph, lanes, seed=seed)
-    x, y = ego.position[0, :2]
-    scale = float(np.mean(np.asarray(scene.frame.scale_at(x, y), float)))
+    scale = float(np.mean(np.asarray(scene.frame.scale_at(*ego.position[0, :2]), float)))
+    area = area_of(lanes, ego, options.reach, scale)
+    around = shapely.buffer(ego_line(ego), (options.reach + 30.0) * scale)
+    shapely.prepare(around)
     surfaces = _layer(scene, "road_surfaces")
-    road = _union(surfaces, ("road", "lane_marking", "crossing", "parking"), 0.3)
-    trips = vehicle_trips(
-        graph, lanes, ego, seed=seed, density=options.vehicles, reach=options.reach, ground=road, scale=scale
+    road = _union(surfaces, _ROAD, around, 0.3)
+    standing = _standing(scene, around)
+
+    trips = vehicle_trips(lanes, area, seed=seed, density=options.vehicles, ground=road)
+    trips += vehicle_trips(
+        lanes, area, seed=seed, density=options.cyclists, shares={"cyclist": 1.0}, ground=road
     )
+    walks = walks_of(lanes, area, _union(surfaces, ("sidewalk",), around, 0.0), standing)
+    trips += walker_trips(lanes, area, walks, seed=seed, density=options.walkers)
     box = (vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang)
-    flow = simulate_trips(trips, graph, plan, ego, box, reach=options.reach)
-    groups = [moving_actors(trips, flow, scene, scale=scale)]
+    flow = simulate_trips(trips, graph, plan, ego, box, reach=options.reach * scale)
 
-    route = _route(ego)
-    near = shapely.dwithin(edge_lines(graph), route, options.reach)
-    lots = _polygons(_layer(scene, "landcover"), ("parking",))
-    lots = lots[shapely.dwithin(lots, route, options.reach)]
-    spots = [
-        kerb_spots(lanes, near, seed=seed, share=options.parked),
-        lot_spots(lots, seed=seed, share=options.parked),
-    ]
-    whole = Spots(*(np.concatenate([getattr(s, name) for s in spots]) for name in ("xy", "heading", "hint")))
-    driven = [_ego_boxes(ego, vehicle, scale)]
-    for trip in trips:
-        xy, heading = body_poses(trip.way, trip.shape.base * trip.stretch[0])
-        part = slice(0, None, 4)
-        driven.append(
-            rectangles(
-                xy[part], heading[part], trip.shape.length + 0.5, trip.shape.width * trip.stretch[1] + 0.3
-            )
-        )
+    lots = _polygons(_layer(scene, "landcover"), ("parking",), around)
+    crossings = shapely.buffer(_polygons(surfaces, ("crossing",), around), 2.0)
     free = [
-        *driven,
+        _ego_boxes(ego, vehicle, scale),
+        _swept(trips),
+        _strips(lanes, area),
         shapely.buffer(plan.zones.polygon, 3.0),
-        shapely.buffer(_polygons(surfaces, ("crossing",)), 2.0),
+        crossings,
     ]
-    groups.append(
-        parked_actors(
-            whole, scene, shapely.STRtree(_standing(scene, route.buffer(options.reach + 20))),
-            shapely.STRtree(np.concatenate(free)), seed=seed, scale=scale,
-        )
-    )  # fmt: skip
-    beyond = max((stop for _, stop in scene.layers.values()), default=0)
-    return joined(groups, first_feature=beyond)
+    trees = [shapely.STRtree(part) for part in (standing, np.concatenate(free))]
+    spots = concatenated(
+        [
+            kerb_spots(lanes, area.near, seed=seed, share=options.parked),
+            lot_spots(lots, seed=seed, share=options.parked),
+        ]
+    )
+    groups = [
+        moving_actors(trips, flow, scene, scale=scale),
+        parked_actors(spots, scene, CARS, trees, seed=seed, scale=scale),
+    ]
+    return joined(groups, first_feature=max((stop for _, stop in scene.layers.values()), default=0))
 
 
-def _route(ego: Trajectory) -> shapely.Geometry:
-    """The ego's way in plan."""
-    xy = ego.position[:: max(len(ego.position) // 2000, 1), :2]
-    return shapely.linestrings(xy).simplify(0.5) if np.ptp(xy, axis=0).max() > 0.5 else shapely.points(xy[0])
+def _swept(trips: list[Trip]) -> NDArray[np.object_]:
+    """Boxes of movers along their ways, with some room."""
+    parts = [np.empty(0, object)]
+    for trip in trips:
+        xy, heading = body_poses(trip.way, trip.axle)
+        every = slice(0, None, 2 if trip.walks else 4)
+        parts.append(rectangles(xy[every], heading[every], max(trip.length, 1.0) + 0.5, trip.width + 0.3))
+    return np.concatenate(parts)
+
+
+def _strips(lanes: Lanes, area: Area) -> NDArray[np.object_]:
+    """Lanes around the ego's way as wide as a car."""
+    lines = [
+        beside(lanes.graph.geometry[e], -lanes.side * lane_shift(lanes, e, lane, 1.82))[:, :2]
+        for e in np.flatnonzero(area.near & (lanes.liking > 0)).tolist()
+        for lane in range(int(lanes.count[e]))
+    ]
+    strips: NDArray[np.object_] = shapely.buffer(
+        [shapely.linestrings(xy) for xy in lines], 1.0, cap_style="flat"
+    )
+    return strips
 
 
 def _ego_boxes(ego: Trajectory, vehicle: Vehicle, scale: float) -> NDArray[np.object_]:
@@ -140,16 +172,20 @@ def _layer(scene: Scene, name: str) -> Layer | None:
         return None  # a scene without such features has no such layer
 
 
-def _polygons(layer: Layer | None, classes: tuple[str, ...]) -> NDArray[np.object_]:
+def _polygons(layer: Layer | None, classes: tuple[str, ...], area: shapely.Geometry) -> NDArray[np.object_]:
+    """Polygons of some classes that touch an area."""
     if layer is None:
         return np.empty(0, object)
     kept = layer.geometry[np.isin(layer.columns["class"].astype(str), classes)]
-    parts: NDArray[np.object_] = shapely.get_parts(kept)
+    parts: NDArray[np.object_] = shapely.get_parts(kept[shapely.intersects(area, kept)])
     return parts
 
 
-def _union(layer: Layer | None, classes: tuple[str, ...], grow: float) -> shapely.Geometry | None:
-    parts = _polygons(layer, classes)
+def _union(
+    layer: Layer | None, classes: tuple[str, ...], area: shapely.Geometry, grow: float
+) -> shapely.Geometry | None:
+    """Surfaces of some classes around an area as one, grown; None where there are none."""
+    parts = _polygons(layer, classes, area)
     if not len(parts):
         return None
     whole = shapely.buffer(shapely.union_all(parts), grow)
@@ -158,20 +194,18 @@ def _union(layer: Layer | None, classes: tuple[str, ...], grow: float) -> shapel
 
 
 def _standing(scene: Scene, area: shapely.Geometry) -> NDArray[np.object_]:
-    """Footprints of buildings and posts, trees and other things that stand in an area."""
-    parts: list[NDArray[np.object_]] = []
+    """Footprints of buildings that reach down to the ground, and of posts, trunks and the like, in an area."""
+    parts: list[NDArray[np.object_]] = [np.empty(0, object)]
     buildings = _layer(scene, "buildings")
     if buildings is not None:
         low = np.asarray(buildings.columns["min_height"], float)
-        parts.append(buildings.geometry[low < 2.5])
-    shapely.prepare(area)
+        parts.append(buildings.geometry[low < _HEADROOM])
     for i, j in scene.tile_indices:
         corner = np.array([i, j]) * scene.tile_size
-        if not shapely.intersects(area, shapely.box(*corner, *(corner + scene.tile_size))):
-            continue
-        tile = scene.tile(i, j)
-        posts = tile.instances.transform[:, :2, 3] + tile.origin[:2]
-        parts.append(shapely.buffer(shapely.points(posts), 0.2))
-    whole = np.concatenate([*parts, np.empty(0, object)])
+        if shapely.intersects(area, shapely.box(*corner, *(corner + scene.tile_size))):
+            tile = scene.tile(i, j)
+            posts = tile.instances.transform[:, :2, 3] + tile.origin[:2]
+            parts.append(shapely.buffer(shapely.points(posts), _POST))
+    whole = np.concatenate(parts)
     kept: NDArray[np.object_] = whole[shapely.intersects(area, whole)]
     return kept

@@ -2,7 +2,7 @@
 
 Every mover holds the squares of ground that it covers from its tail to where it could stop. A mover takes new
 squares only if nobody holds them, and never goes faster than lets it stop within its own: so no two bodies
-touch, whatever the ways look like. How fast it goes within that is the Intelligent Driver Model (Treiber,
+touch, whatever their ways look like. How fast it goes within that is the Intelligent Driver Model (Treiber,
 Hennecke and Helbing, "Congested traffic states in empirical observations and microscopic simulations", 2000).
 A junction is entered only by who may hold his whole way through it (crossing ways exclude each other, movers
 on the same way follow each other), so nobody waits in the middle of it for who waits for him.
@@ -17,44 +17,52 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lidar.actors.junctions import is_green
 from lidar.actors.lanes import STEP
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
-EGO = -2
-"""Holder of the squares under the ego vehicle."""
 HARD = 8.0
 """m/s^2: the braking that a mover could still do, which decides how far ahead it holds the ground."""
-_LOOK = 90.0  # metres ahead that are looked at
+_LOOK = (15.0, 5.0)  # metres, and metres for each m/s, ahead that are looked at
+_BESIDE = 90.0  # metres from the ego within which what is held already is looked at again
 _YIELD_S = 4.0  # seconds to arrival within which somebody with priority is waited for
-_LINE = 1.2  # metres before a stop line at which a mover stands
+_PATIENCE = 100  # steps for which a mover waits for room to appear
+_NOBODY = -1
 
 
 class Movers(NamedTuple):
-    """Movers and their ways, one row a mover; flat tables start at ``*_start`` (n + 1).
+    """Movers and their ways, one row a mover (n); flat tables begin at ``*_start`` (n + 1).
 
-    station_start : into ``speed_limit`` (desired speed at each station, m/s), ``x``, ``y``, ``heading``
-    square_start  : into ``square``, ``first``, ``last``, ``leave`` of `lidar.actors.sweep.Sweep`
-    block_start   : into the blocks, stretches of the way through junctions:
-    block_from, block_to : stations of the body's middle, first and last, at which it is in the junction
+    station_start : into the stations of ways, `STEP` metres apart:
+    wish          : speed that its driver wants, m/s
+    x, y, heading : of the body's middle
+
+    square_start  : into the squares of `lidar.actors.sweep.Sweep`: square (numbered from 0), first, last, leave
+
+    block_start   : into the blocks, stretches of ways through junctions:
+    block_from, block_to : first and last station of the body's middle at which it is in the junction
     block_stop    : station at which to wait
     block_zone, block_group : junction, and group of its signals, -1 for none
     block_way     : number of the way through the junction; movers of one number follow each other
     block_rank    : the lower goes first
+
     headway, pull, brake, gap : time gap s, acceleration, comfortable braking m/s^2, standing gap m
     length, width : metres
-    appear        : step at which the mover appears
-    begin         : station at which it appears
+    appear, begin : step and station at which the mover appears
+    leaves        : whether its way leads out of the map; otherwise it stops at its end
+    whole         : whether it takes all of a block at once: people on crossings
     """
 
     station_start: Ints
-    speed_limit: Float
+    wish: Float
     x: Float
     y: Float
     heading: Float
     square_start: Ints
-    square: NDArray[np.int32]
+    square: NDArray[np.integer]
     first: NDArray[np.int32]
     last: NDArray[np.int32]
     leave: NDArray[np.int32]
@@ -74,14 +82,16 @@ class Movers(NamedTuple):
     width: Float
     appear: Ints
     begin: Ints
+    leaves: Flags
+    whole: Flags
 
 
 class Ego(NamedTuple):
-    """What the others know of the ego vehicle, a row a step, and the squares it will cover.
+    """What the others know of the ego vehicle, a row a step (t), and the squares it covers then.
 
-    x, y, heading, speed : (t,) of its box's middle
-    half    : (2,) metres, half its box, grown by what others keep from it
-    event_start, event_square : squares that it covers at each step (t + 1) and (e,)
+    x, y, heading, speed : of its box's middle
+    half    : (2,) metres, half its box
+    event_start, event_square : (t + 1) and (e,) squares that it covers, and what others keep from it, at steps
     """
 
     x: Float
@@ -90,424 +100,328 @@ class Ego(NamedTuple):
     speed: Float
     half: Float
     event_start: Ints
-    event_square: NDArray[np.int32]
+    event_square: NDArray[np.integer]
 
 
-class Signals(NamedTuple):
-    """Fixed-time signals, a row a junction: seconds of the cycle, its offset, and windows kept for the ego.
+class _Ground(NamedTuple):
+    """Squares: who holds them and how often, which way through a junction they are kept for and by how many,
+    and from when until when the ego needs them next, in seconds."""
 
-    cycle, shift : (z,) seconds
-    window       : (w, 4) junction, group, from and to in seconds: only that group has green
-    """
-
-    cycle: Float
-    shift: Float
-    window: Float
-
-
-@njit(cache=True, nogil=True)
-def is_green(zone: int, group: int, t: float, cycle: Any, shift: Any, window: Any) -> bool:
-    """Whether a group of a junction's signals shows green: half the cycle each, less 5 s to clear."""
-    for w in range(len(window)):
-        if window[w, 0] == zone and window[w, 2] <= t <= window[w, 3]:
-            return bool(window[w, 1] == group)
-    phase = (t + shift[zone]) % cycle[zone]
-    half = 0.5 * cycle[zone]
-    return bool(group * half <= phase < (group + 1) * half - 5.0)
+    owner: NDArray[np.int32]
+    times: NDArray[np.int16]
+    hold: NDArray[np.int32]
+    holds: NDArray[np.int16]
+    arrive: NDArray[np.float32]
+    until: NDArray[np.float32]
 
 
-@njit(cache=True, nogil=True)
-def _meets(
-    ax: float,
-    ay: float,
-    ah: float,
-    al: float,
-    aw: float,
-    bx: float,
-    by: float,
-    bh: float,
-    bl: float,
-    bw: float,
-) -> bool:
-    """Whether two rectangles (middle, heading, half sizes) share a point: separating axes."""
-    dx, dy = bx - ax, by - ay
-    for h in (ah, ah + math.pi / 2, bh, bh + math.pi / 2):
-        c, s = math.cos(h), math.sin(h)
-        far = abs(dx * c + dy * s)
-        ra = al * abs(math.cos(ah - h)) + aw * abs(math.sin(ah - h))
-        rb = bl * abs(math.cos(bh - h)) + bw * abs(math.sin(bh - h))
-        if far > ra + rb:
-            return False
-    return True
+class _State(NamedTuple):
+    """Movers: whether they are there and done, metres along their ways, speed, the rows of their squares that
+    are ahead of them, taken and (in the order of leaving) left, the last station that they hold, their next
+    block, and whether it is theirs."""
+
+    active: Flags
+    gone: Flags
+    s: Float
+    v: Float
+    ahead: Ints
+    taken: Ints
+    left: Ints
+    station: Ints
+    block: Ints
+    granted: Flags
 
 
 @njit(cache=True, nogil=True)
 def run(
-    m: Any,
-    ego: Any,
-    signals: Any,
-    out_of_play: Any,
-    blocked: Any,
-    squares: int,
-    dt: float,
-    steps: int,
-    horizon: int,
-    far: float,
+    m: Any, ego: Any, signals: Any, out: Any, squares: int, dt: float, steps: int, horizon: int, far: float
 ) -> Any:
-    """Rows (mover, step, metres along the way, speed) by step, and who met the ego.
+    """Rows (mover, step, metres along the way, speed) by step, and which movers (n,) met the ego.
 
-    out_of_play : (n,) movers to leave out
-    blocked     : squares that nobody may take
-    horizon     : steps that the ego's squares are known ahead
-    far         : metres from the ego beyond which movers end
+    out     : (n,) bool, movers to leave out
+    squares : number of squares
+    horizon : steps that the ego's way is known ahead
+    far     : metres from the ego beyond which movers end
     """
     n = len(m.appear)
-    nobody = -1
-    owner = np.full(squares, nobody, np.int32)
-    times = np.zeros(squares, np.int16)
-    hold = np.full(squares, nobody, np.int32)
-    holds = np.zeros(squares, np.int16)
-    arrive = np.full(squares, np.inf, np.float32)
-    until = np.full(squares, -np.inf, np.float32)
-    for p in blocked:
-        owner[p] = EGO - 1
-    active = np.zeros(n, np.bool_)
-    gone = out_of_play.copy()
+    g = _Ground(
+        np.full(squares, _NOBODY, np.int32),
+        np.zeros(squares, np.int16),
+        np.full(squares, _NOBODY, np.int32),
+        np.zeros(squares, np.int16),
+        np.full(squares, np.inf, np.float32),
+        np.full(squares, -np.inf, np.float32),
+    )
+    st = _State(
+        np.zeros(n, np.bool_),
+        out.copy(),
+        np.zeros(n),
+        np.zeros(n),
+        m.square_start[:-1].copy(),
+        m.square_start[:-1].copy(),
+        m.square_start[:-1].copy(),
+        np.full(n, -1, np.int64),
+        m.block_start[:-1].copy(),
+        np.zeros(n, np.bool_),
+    )
     met = np.zeros(n, np.bool_)
-    s, v = np.zeros(n), np.zeros(n)
-    taken, left = np.zeros(n, np.int64), np.zeros(n, np.int64)  # rows of squares taken and given back
-    station = np.full(n, -1, np.int64)  # last station that is held
-    block = m.block_start[:-1].copy()
-    granted = np.zeros(n, np.bool_)
-    waiting = np.zeros(n, np.int64)
-    room = 4096
-    log = np.empty((room, 4))
+    log = np.empty((4096, 4))
     rows = 0
-
     for step in range(steps):
-        t = step * dt
-        ahead = step + horizon
-        for e in range(ahead if step else 0, ahead + 1):
-            if e < len(ego.x):
-                for q in range(ego.event_start[e], ego.event_start[e + 1]):
-                    p = ego.event_square[q]
-                    te = e * dt
-                    if until[p] < t:
-                        arrive[p] = te
-                    until[p] = te
-        if step == 0:
-            for e in range(min(horizon, len(ego.x))):
-                for q in range(ego.event_start[e], ego.event_start[e + 1]):
-                    p = ego.event_square[q]
-                    arrive[p] = min(arrive[p], e * dt)
-                    until[p] = max(until[p], e * dt)
+        for ahead in range(step + horizon if step else 0, step + horizon + 1):
+            _expect_ego(g, ego, ahead, step * dt, dt)
         for i in range(n):
-            if gone[i]:
+            if st.gone[i] or not (st.active[i] or _appears(i, step, step * dt, m, g, st)):
                 continue
-            base = m.station_start[i]
-            stations = m.station_start[i + 1] - base
-            q0, q1 = m.square_start[i], m.square_start[i + 1]
-            if not active[i]:
-                if step < m.appear[i]:
-                    continue
-                if step > m.appear[i] + 100:
-                    gone[i] = True
-                    continue
-                k = m.begin[i]
-                # it comes at a speed that lets it stop before whatever is ahead
-                free = k
-                lo = q0
-                while lo < q1 and m.last[lo] < k:
-                    lo += 1
-                fits = True
-                wish = m.speed_limit[base + k]
-                want = min(k + int(wish * wish / (2 * m.brake[i]) / STEP) + 4, stations - 1)
-                if block[i] < m.block_start[i + 1]:
-                    want = min(want, max(m.block_stop[block[i]], k))
-                stop = want
-                for q in range(q0, q1):
-                    if m.first[q] > want:
-                        break
-                    if m.last[q] < k:
-                        continue
-                    p = m.square[q]
-                    if owner[p] != nobody or (until[p] >= t and m.first[q] <= k + 30):
-                        stop = min(stop, m.first[q] - 1)
-                        if m.first[q] <= k + 3:
-                            fits = False
-                            break
-                if not fits or stop < k + 2:
-                    continue
-                free = stop
-                s[i] = k * STEP
-                v[i] = min(wish, math.sqrt(2 * m.brake[i] * max((free - k - 2) * STEP, 0.0)) * 0.9)
-                active[i] = True
-                q = q0
-                while q < q1 and m.first[q] <= free:
-                    if m.last[q] >= k:
-                        p = m.square[q]
-                        owner[p] = i
-                        times[p] += 1
-                    q += 1
-                taken[i] = q
-                station[i] = free
-                left[i] = q0
-                while left[i] < q1 and m.last[m.leave[left[i]] + q0] < k:
-                    left[i] += 1
-            k = int(s[i] / STEP)
-            # who goes where: the next junction
-            limit = stations - 1
-            b = block[i]
-            while b < m.block_start[i + 1] and k > m.block_to[b]:
-                b += 1
-                granted[i] = False
-            block[i] = b
-            line = False
-            if b < m.block_start[i + 1] and not granted[i]:
-                near = m.block_stop[b] - k <= (v[i] * v[i] / (1.3 * m.brake[i]) + 2.0 * v[i]) / STEP + 12
-                if (
-                    near
-                    and k <= m.block_from[b]
-                    and _may_enter(
-                        i,
-                        b,
-                        k,
-                        t,
-                        m,
-                        signals,
-                        ego,
-                        v,
-                        block,
-                        granted,
-                        active,
-                        s,
-                        owner,
-                        hold,
-                        arrive,
-                        until,
-                        station,
-                        taken,
-                    )
-                ):
-                    granted[i] = True
-                    for q in range(q0, q1):
-                        if m.first[q] > m.block_to[b]:
-                            break
-                        if m.first[q] >= m.block_from[b]:
-                            hold[m.square[q]] = m.block_way[b]
-                            holds[m.square[q]] += 1
-                if not granted[i]:
-                    limit = min(limit, max(m.block_stop[b], station[i]))
-                    line = near
-            # what is ahead
-            look = min(limit, k + int(_LOOK / STEP))
-            lead_speed, stop_at, free = 0.0, look + 1, True
-            q = left[i]
-            pointer = taken[i]
-            own_end = pointer
-            # squares held already may since be wanted by the ego
-            close = math.hypot(m.x[base + k] - ego.x[step], m.y[base + k] - ego.y[step])
-            if close > far:
-                gone[i] = True
-            for q in range(q0 if close < _LOOK else own_end, own_end):
-                if m.last[q] < k or m.first[q] <= k:
-                    continue
-                p = m.square[q]
-                if until[p] >= t and arrive[p] - t < (m.last[q] - k) * STEP / max(v[i], 2.0) + 1.0:
-                    if m.first[q] < stop_at:
-                        stop_at = m.first[q]
-                        free = False
-                        lead_speed = max(
-                            ego.speed[step] * math.cos(ego.heading[step] - m.heading[base + k]), 0.0
-                        )
-            q = own_end
-            while q < q1 and m.first[q] <= look and m.first[q] < stop_at:
-                p = m.square[q]
-                o = owner[p]
-                if o != nobody and o != i:
-                    stop_at = m.first[q]
-                    free = False
-                    lead_speed = 0.0
-                    if o >= 0:
-                        ko = m.station_start[o] + int(s[o] / STEP)
-                        lead_speed = max(
-                            v[o] * math.cos(m.heading[ko] - m.heading[base + min(stop_at, stations - 1)]), 0.0
-                        )
-                    break
-                if until[p] >= t and arrive[p] - t < (m.last[q] - k) * STEP / max(v[i], 2.0) + 1.0:
-                    stop_at = m.first[q]
-                    free = False
-                    lead_speed = max(ego.speed[step] * math.cos(ego.heading[step] - m.heading[base + k]), 0.0)
-                    break
-                q += 1
-            wish = max(m.speed_limit[base + k], 0.5)
-            here = v[i]
-            ratio = here / wish
-            pull = m.pull[i] * (1.0 - ratio**4)
-            if not free or (line and stop_at > limit):
-                gap = max(stop_at * STEP - s[i] - STEP, 0.05)
-                quiet = m.gap[i] if not free else 0.3
-                desired = quiet + max(
-                    here * m.headway[i]
-                    + here * (here - lead_speed) / (2 * math.sqrt(m.pull[i] * m.brake[i])),
-                    0.0,
-                )
-                pull -= m.pull[i] * (desired / gap) ** 2
-            pull = min(max(pull, -HARD), m.pull[i])
-            new = max(here + pull * dt, 0.0)
-            # hold the ground as far as it takes to stop; go as fast as the ground that is held allows
-            need = min(int((s[i] + (here + new) / 2 * dt + new * new / (2 * HARD)) / STEP) + 2, limit)
-            q = taken[i]
-            reached = station[i]
-            while q < q1 and m.first[q] <= need:
-                p = m.square[q]
-                o = owner[p]
-                if (o != nobody and o != i) or (
-                    until[p] >= t and arrive[p] - t < (m.last[q] - k) * STEP / max(v[i], 2.0) + 0.5
-                ):
-                    need = m.first[q] - 1
-                    break
-                q += 1
-            need = max(need, reached)
-            q = taken[i]
-            while q < q1 and m.first[q] <= need:
-                p = m.square[q]
-                owner[p] = i
-                times[p] += 1
-                q += 1
-            taken[i] = q
-            station[i] = need
-            end = (need - 1) * STEP if need < stations - 1 else (stations - 1) * STEP
-            room_left = end - s[i] - here * dt / 2
-            root = (dt / 2) ** 2 * HARD * HARD + 2 * HARD * room_left
-            most = -HARD * dt / 2 + math.sqrt(root) if root > 0 else 0.0
-            if new > most:
-                new = max(most, 0.0)
-            s[i] += (here + new) / 2 * dt if room_left > -here * dt / 2 else 0.0
-            v[i] = new
-            if s[i] > (stations - 2) * STEP:
-                gone[i] = True  # at the end of its way
-            k = int(s[i] / STEP)
-            while left[i] < q1 and (m.last[m.leave[left[i]] + q0] < k or gone[i]):
-                row = m.leave[left[i]] + q0
-                p = m.square[row]
-                if row < taken[i] and m.last[row] >= m.begin[i]:
-                    times[p] -= 1
-                    if times[p] == 0:
-                        owner[p] = nobody
-                left[i] += 1
-            _give_back(i, k, m, block, hold, holds, granted, gone[i])
-            if rows == room:
-                room *= 2
-                more = np.empty((room, 4))
-                more[:rows] = log[:rows]
+            _move(i, step, dt, m, g, st, ego, signals)
+            row = m.station_start[i] + int(st.s[i] / STEP)
+            if rows == len(log):
+                more = np.empty((2 * rows, 4))
+                more[:rows] = log
                 log = more
-            log[rows, 0], log[rows, 1], log[rows, 2], log[rows, 3] = i, step, s[i], v[i]
+            log[rows, 0], log[rows, 1], log[rows, 2], log[rows, 3] = i, step, st.s[i], st.v[i]
             rows += 1
-            if gone[i]:
-                active[i] = False
-                continue
-            row = base + k
-            if _meets(
-                ego.x[step],
-                ego.y[step],
-                ego.heading[step],
-                ego.half[0],
-                ego.half[1],
-                m.x[row],
-                m.y[row],
-                m.heading[row],
-                m.length[i] / 2,
-                m.width[i] / 2,
-            ):
+            if math.hypot(m.x[row] - ego.x[step], m.y[row] - ego.y[step]) > far:
+                st.gone[i] = True
+            if _meet(i, row, step, m, ego):
                 met[i] = True
-    return log[:rows], met, waiting
+            _leave(i, m, g, st)
+    return log[:rows], met
 
 
 @njit(cache=True, nogil=True)
-def _give_back(i: int, k: int, m: Any, block: Any, hold: Any, holds: Any, granted: Any, gone: bool) -> None:
-    """End a mover's hold of a junction that it has left."""
-    b = block[i]
-    if b >= m.block_start[i + 1] or not granted[i] or (k <= m.block_to[b] and not gone):
+def _expect_ego(g: Any, ego: Any, ahead: int, t: float, dt: float) -> None:
+    """Note the squares that the ego will cover at a step ahead."""
+    if ahead >= len(ego.x):
         return
-    for q in range(m.square_start[i], m.square_start[i + 1]):
-        if m.first[q] > m.block_to[b]:
-            break
-        if m.first[q] >= m.block_from[b]:
-            p = m.square[q]
-            holds[p] -= 1
-            if holds[p] == 0:
-                hold[p] = -1
-    granted[i] = False
-    block[i] = b + 1
+    for q in range(ego.event_start[ahead], ego.event_start[ahead + 1]):
+        p = ego.event_square[q]
+        if g.until[p] < t:
+            g.arrive[p] = ahead * dt
+        g.until[p] = ahead * dt
 
 
 @njit(cache=True, nogil=True)
-def _may_enter(
-    i: int,
-    b: int,
-    k: int,
-    t: float,
-    m: Any,
-    signals: Any,
-    ego: Any,
-    v: Any,
-    block: Any,
-    granted: Any,
-    active: Any,
-    s: Any,
-    owner: Any,
-    hold: Any,
-    arrive: Any,
-    until: Any,
-    station: Any,
-    taken: Any,
-) -> bool:
-    """Whether a mover may enter its next junction."""
-    zone, group = m.block_zone[b], m.block_group[b]
-    base = m.station_start[i]
-    end = m.block_to[b] + 2
-    pace = max(v[i], 3.0)
-    eta = max(m.block_stop[b] - k, 0) * STEP / pace
-    if group >= 0 and not is_green(zone, group, t + eta, signals.cycle, signals.shift, signals.window):
+def _wanted(g: Any, p: int, t: float, seconds: float) -> bool:
+    """Whether the ego will need a square less than some seconds from now."""
+    return bool(g.until[p] >= t and g.arrive[p] - t < seconds)
+
+
+@njit(cache=True, nogil=True)
+def _appears(i: int, step: int, t: float, m: Any, g: Any, st: Any) -> bool:
+    """Whether a mover appears now: where there is room for it, as fast as the room allows."""
+    if step < m.appear[i]:
         return False
-    for q in range(taken[i], m.square_start[i + 1]):
-        if m.first[q] > end:
+    if step > m.appear[i] + _PATIENCE:
+        st.gone[i] = True
+        return False
+    base, k = m.station_start[i], m.begin[i]
+    stations = m.station_start[i + 1] - base
+    q0, q1 = m.square_start[i], m.square_start[i + 1]
+    wish = m.wish[base + k]
+    free = min(k + int(wish * wish / (2 * m.brake[i]) / STEP) + 4, stations - 1)
+    if st.block[i] < m.block_start[i + 1]:
+        free = min(free, max(m.block_stop[st.block[i]], k))
+    for q in range(q0, q1):
+        if m.first[q] > free:
+            break
+        if m.last[q] >= k and (g.owner[m.square[q]] != _NOBODY or _wanted(g, m.square[q], t, 6.0)):
+            free = m.first[q] - 1
+    if free < k + 2:
+        return False
+    st.active[i] = True
+    st.s[i] = k * STEP
+    st.v[i] = min(wish, 0.9 * math.sqrt(2 * m.brake[i] * (free - k - 2) * STEP))
+    _take(i, free, m, g, st)
+    while st.left[i] < q1 and m.last[m.leave[st.left[i]] + q0] < k:
+        st.left[i] += 1
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _take(i: int, station: int, m: Any, g: Any, st: Any) -> None:
+    """Hold the ground up to a station."""
+    q = st.taken[i]
+    while q < m.square_start[i + 1] and m.first[q] <= station:
+        if m.last[q] >= m.begin[i]:
+            g.owner[m.square[q]] = i
+            g.times[m.square[q]] += 1
+        q += 1
+    st.taken[i] = q
+    st.station[i] = station
+
+
+@njit(cache=True, nogil=True)
+def _leave(i: int, m: Any, g: Any, st: Any) -> None:
+    """Give back the ground behind a mover, and the junction that it has left."""
+    q0, q1 = m.square_start[i], m.square_start[i + 1]
+    k = int(st.s[i] / STEP)
+    while st.left[i] < q1 and (st.gone[i] or m.last[m.leave[st.left[i]] + q0] < k):
+        row = m.leave[st.left[i]] + q0
+        if row < st.taken[i] and m.last[row] >= m.begin[i]:
+            p = m.square[row]
+            g.times[p] -= 1
+            if g.times[p] == 0:
+                g.owner[p] = _NOBODY
+        st.left[i] += 1
+    b = st.block[i]
+    if b == m.block_start[i + 1] or not (st.gone[i] or k > m.block_to[b]):
+        return
+    if st.granted[i]:
+        for q in range(q0, q1):
+            if m.block_from[b] <= m.first[q] <= m.block_to[b]:
+                p = m.square[q]
+                g.holds[p] -= 1
+                if g.holds[p] == 0:
+                    g.hold[p] = _NOBODY
+    st.granted[i] = False
+    st.block[i] = b + 1
+
+
+@njit(cache=True, nogil=True)
+def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signals: Any) -> None:
+    """Move a mover on by one step."""
+    base = m.station_start[i]
+    end = m.station_start[i + 1] - base - 1
+    t, s, v = step * dt, st.s[i], st.v[i]
+    k = int(s / STEP)
+    while st.ahead[i] < m.square_start[i + 1] and m.first[st.ahead[i]] <= k:
+        st.ahead[i] += 1
+    limit = end
+    line = not m.leaves[i]
+    b = st.block[i]
+    if b < m.block_start[i + 1] and not st.granted[i]:
+        near = m.block_stop[b] - k <= (v * v / (1.3 * m.brake[i]) + 2.0 * v) / STEP + 12
+        if near and k <= m.block_from[b] and _may_enter(i, k, t, m, g, st, signals):
+            st.granted[i] = True
+            for q in range(st.ahead[i], m.square_start[i + 1]):
+                if m.block_from[b] <= m.first[q] <= m.block_to[b]:
+                    g.hold[m.square[q]] = m.block_way[b]
+                    g.holds[m.square[q]] += 1
+            if m.whole[i]:
+                _take(i, max(st.station[i], min(m.block_to[b] + 1, end)), m, g, st)
+        else:
+            limit = min(end, max(m.block_stop[b], st.station[i]))
+            line = near
+    stop_at, lead = _obstacle(i, k, t, step, limit, m, g, st, ego)
+    free = stop_at > min(limit, k + _sight(v))
+    wish = max(m.wish[base + k], 0.3)
+    pull = 1.0 - (v / wish) ** 4
+    if not free or (line and stop_at > limit):
+        gap = max((stop_at - 1) * STEP - s, 0.05)
+        quiet = 0.3 if free else m.gap[i]
+        close = v * (v - lead) / (2 * math.sqrt(m.pull[i] * m.brake[i]))
+        pull -= ((quiet + max(v * m.headway[i] + close, 0.0)) / gap) ** 2
+    new = max(v + min(max(m.pull[i] * pull, -HARD), m.pull[i]) * dt, 0.0)
+    # hold the ground as far as it takes to stop; go as fast as the ground that is held allows
+    need = min(int((s + (v + new) / 2 * dt + new * new / (2 * HARD)) / STEP) + 2, limit)
+    q = st.taken[i]
+    while q < m.square_start[i + 1] and m.first[q] <= need:
+        p = m.square[q]
+        other = g.owner[p] != _NOBODY and g.owner[p] != i
+        if other or _wanted(g, p, t, (m.last[q] - k) * STEP / max(v, 2.0) + 0.5):
+            need = m.first[q] - 1
+            break
+        q += 1
+    _take(i, max(need, st.station[i]), m, g, st)
+    room = min(st.station[i] - 1, end - 1) * STEP - s - v * dt / 2
+    root = (dt / 2 * HARD) ** 2 + 2 * HARD * room
+    new = min(new, max(math.sqrt(root) - dt / 2 * HARD, 0.0) if root > 0 else 0.0)
+    st.s[i] = min(s + (v + new) / 2 * dt, max(end - 1, k) * STEP)
+    st.v[i] = new
+    if m.leaves[i] and st.s[i] > (end - 3) * STEP:
+        st.gone[i] = True
+
+
+@njit(cache=True, nogil=True)
+def _sight(v: float) -> int:
+    """Stations ahead that are looked at."""
+    return int((_LOOK[0] + _LOOK[1] * v) / STEP)
+
+
+@njit(cache=True, nogil=True)
+def _obstacle(
+    i: int, k: int, t: float, step: int, limit: int, m: Any, g: Any, st: Any, ego: Any
+) -> tuple[int, float]:
+    """First station ahead that cannot be had now, one beyond what is looked at if all can, and how fast what is
+    there goes the mover's way."""
+    base = m.station_start[i]
+    look = min(limit, k + _sight(st.v[i]))
+    pace = max(st.v[i], 2.0)
+    beside = math.hypot(m.x[base + k] - ego.x[step], m.y[base + k] - ego.y[step]) > _BESIDE
+    # what is held already may since be wanted by the ego
+    for q in range(st.taken[i] if beside else st.ahead[i], m.square_start[i + 1]):
+        if m.first[q] > look:
             break
         p = m.square[q]
-        o = owner[p]
-        if o >= 0 and o != i:
-            ko = m.station_start[o] + int(s[o] / STEP)
-            along = math.cos(
-                m.heading[ko] - m.heading[base + min(m.first[q], m.station_start[i + 1] - base - 1)]
-            )
-            same = block[o] < m.block_start[o + 1] and m.block_way[block[o]] == m.block_way[b]
-            if along < 0.5 or v[o] < 1.5 or not (same or m.first[q] > m.block_from[b]):
-                return False
+        o = g.owner[p]
+        if o != _NOBODY and o != i:
+            there = m.heading[base + m.first[q]]
+            theirs = m.heading[m.station_start[o] + int(st.s[o] / STEP)]
+            return m.first[q], max(st.v[o] * math.cos(theirs - there), 0.0)
+        if _wanted(g, p, t, (m.last[q] - k) * STEP / pace + 1.0):
+            return m.first[q], max(ego.speed[step] * math.cos(ego.heading[step] - m.heading[base + k]), 0.0)
+    return look + 1, 0.0
+
+
+@njit(cache=True, nogil=True)
+def _may_enter(i: int, k: int, t: float, m: Any, g: Any, st: Any, signals: Any) -> bool:
+    """Whether a mover may enter its next junction."""
+    b = st.block[i]
+    zone, group, way = m.block_zone[b], m.block_group[b], m.block_way[b]
+    base = m.station_start[i]
+    pace = max(st.v[i], 1.2 if m.whole[i] else 3.0)
+    eta = max(m.block_stop[b] - k, 0) * STEP / pace
+    if group >= 0 and not is_green(zone, group, t + eta, signals):
+        return False
+    behind = False  # somebody on the same way through is ahead
+    for q in range(st.ahead[i], m.square_start[i + 1]):
+        if m.first[q] > m.block_to[b] + 2:
             break
-        if o != -1 and o != i:
-            return False
-    for q in range(m.square_start[i], m.square_start[i + 1]):
-        if m.first[q] > end:
-            break
-        if m.first[q] < m.block_from[b]:
-            continue
         p = m.square[q]
-        if hold[p] != -1 and hold[p] != m.block_way[b] and m.first[q] <= m.block_to[b]:
-            return False
-        if until[p] >= t and arrive[p] - t < (m.last[q] - k) * STEP / pace + 2.0:
-            return False
-    for j in range(len(v)):
-        if j == i or not active[j] or block[j] >= m.block_start[j + 1]:
-            continue
-        c = block[j]
-        if m.block_zone[c] != zone or granted[j] or m.block_way[c] == m.block_way[b]:
-            continue
-        if m.block_group[c] >= 0 and m.block_group[c] != group:
-            continue
-        if m.block_rank[c] < m.block_rank[b] and v[j] > 1.0:
-            kj = int(s[j] / STEP)
-            theirs = (m.block_from[c] - kj) * STEP / max(v[j], 3.0)
-            if theirs < eta + _YIELD_S:
+        o = g.owner[p]
+        if q >= st.taken[i] and o != _NOBODY and o != i and not behind:
+            theirs = m.heading[m.station_start[o] + int(st.s[o] / STEP)]
+            same = st.block[o] < m.block_start[o + 1] and m.block_way[st.block[o]] == way
+            moves = st.v[o] > 0.5 * pace and math.cos(theirs - m.heading[base + m.first[q]]) > 0.5
+            if not moves or not (same or m.first[q] > m.block_from[b]):
                 return False
+            behind = True
+        if m.first[q] >= m.block_from[b]:
+            if g.hold[p] not in (_NOBODY, way) and m.first[q] <= m.block_to[b]:
+                return False
+            if _wanted(g, p, t, (m.last[q] - k) * STEP / pace + 2.0):
+                return False
+    return not (m.whole[i] and behind) and not _yields(i, eta, m, st)
+
+
+@njit(cache=True, nogil=True)
+def _yields(i: int, eta: float, m: Any, st: Any) -> bool:
+    """Whether somebody with priority is about to arrive at a mover's next junction."""
+    b = st.block[i]
+    for j in range(len(st.v)):
+        c = st.block[j]
+        if j == i or not st.active[j] or st.gone[j] or st.granted[j] or c == m.block_start[j + 1]:
+            continue
+        rival = m.block_zone[c] == m.block_zone[b] and m.block_way[c] != m.block_way[b]
+        if not rival or (m.block_group[c] >= 0 and m.block_group[c] != m.block_group[b]):
+            continue
+        arrives = (m.block_from[c] - int(st.s[j] / STEP)) * STEP / max(st.v[j], 3.0)
+        if m.block_rank[c] < m.block_rank[b] and st.v[j] > 1.0 and arrives < eta + _YIELD_S:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _meet(i: int, row: int, step: int, m: Any, ego: Any) -> bool:
+    """Whether a mover's box and the ego's share a point: separating axes."""
+    dx, dy = ego.x[step] - m.x[row], ego.y[step] - m.y[row]
+    if math.hypot(dx, dy) > m.length[i] + 2 * ego.half[0]:
+        return False
+    a, b = m.heading[row], ego.heading[step]
+    for h in (a, a + math.pi / 2, b, b + math.pi / 2):
+        mine = m.length[i] / 2 * abs(math.cos(a - h)) + m.width[i] / 2 * abs(math.sin(a - h))
+        its = ego.half[0] * abs(math.cos(b - h)) + ego.half[1] * abs(math.sin(b - h))
+        if abs(dx * math.cos(h) + dy * math.sin(h)) > mine + its:
+            return False
     return True

@@ -13,7 +13,8 @@ from lidar.actors.ground import ground_heights
 from lidar.actors.lanes import STEP
 from lidar.actors.shapes import STRIDE, Shape, catalogue
 from lidar.actors.sweep import body_poses
-from lidar.actors.traffic import DT, Flow, Trip
+from lidar.actors.flow import DT, Flow
+from lidar.actors.traffic import Trip
 
 Float = NDArray[np.float64]
 
@@ -79,7 +80,7 @@ def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: flo
     for n, row in enumerate(present.tolist()):
         trip = trips[row]
         at = flow.gone[ends[n] : ends[n + 1]] / STEP
-        axle = trip.shape.base * trip.stretch[0]
+        axle = trip.axle
         xy, heading = body_poses(trip.way, axle)
         stations = np.arange(len(xy))
         middle = np.stack([np.interp(at, stations, xy[:, c]) for c in (0, 1)], axis=1)
@@ -107,7 +108,7 @@ def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: flo
         part = slice(ends[n], ends[n + 1])
         trip = trips[row]
         middle, yaw = parts[n]
-        height, pitch, roll = attitude(z[part], trip.shape.base * trip.stretch[0], 0.8 * trip.shape.width)
+        height, pitch, roll = attitude(z[part], trip.axle, 0.8 * trip.shape.width)
         height, pitch, roll = (_settled(c, flow.gone[part]) for c in (height, pitch, roll))
         speed = flow.speed[part] * scale
         course = _course(middle, yaw)
@@ -130,7 +131,7 @@ def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: flo
     )
 
 
-def wheels(middle: Float, yaw: Float, hint: Float, axle: float, track: float) -> Float:
+def wheels(middle: Float, yaw: Float, hint: Float, axle: float | Float, track: float | Float) -> Float:
     """Points (n, 4, 3) on the ground: front left, front right, rear left, rear right."""
     c, s = np.cos(yaw), np.sin(yaw)
     corners = [(0.5, 0.5), (0.5, -0.5), (-0.5, 0.5), (-0.5, -0.5)]
@@ -143,7 +144,7 @@ def wheels(middle: Float, yaw: Float, hint: Float, axle: float, track: float) ->
     return np.stack(points, axis=1)
 
 
-def attitude(z: Float, axle: float, track: float) -> tuple[Float, Float, Float]:
+def attitude(z: Float, axle: float | Float, track: float | Float) -> tuple[Float, Float, Float]:
     """Height of the middle, pitch (nose down positive) and roll of bodies whose wheels stand at z (n, 4)."""
     fore, aft = z[:, :2].mean(axis=1), z[:, 2:].mean(axis=1)
     left, right = z[:, [0, 2]].mean(axis=1), z[:, [1, 3]].mean(axis=1)
