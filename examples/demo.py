@@ -30,6 +30,7 @@ began = time.perf_counter()
 
 
 def say(text: str) -> None:
+    """Print a line with the time it took to get there."""
     print(f"[{time.perf_counter() - began:5.1f} s] {text}", flush=True)
 
 
