@@ -10,6 +10,7 @@ class BuildWithDemo(build_py):
     """Copies ``data/*.osm.pbf`` to ``geoscene/demo`` in wheels; a checkout reads it from ``data``."""
 
     def run(self) -> None:
+        """Build, then copy, unless the checkout itself is installed."""
         super().run()
         if not self.editable_mode:
             target = Path(self.build_lib) / "geoscene" / "demo"

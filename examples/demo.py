@@ -41,9 +41,8 @@ with progress_bar() as progress:
         read_osm(demo_path()), out / "scene", BuildOptions(name="Helsinki"), overwrite=True, progress=progress
     )
     counts, report = scene.manifest["counts"], check_scene(scene)
-    say(
-        f"{counts['solids']} buildings, {len(report['broken'])} of them not watertight; {counts['road_km']} km of road"
-    )
+    broken = len(report["broken"])
+    say(f"{counts['solids']} buildings, {broken} solids broken; {counts['road_km']} km of road")
 
     # 2. The scene from above and obliquely.
     world = World.load(scene)

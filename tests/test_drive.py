@@ -154,9 +154,8 @@ def test_another_drive_is_not_written_over(scene, dataset):
 def test_pose_rows_agree_with_each_other_and_with_the_earth(scene, dataset):
     with (dataset.path / "poses.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == [
-        "timestamp", "frame", "x", "y", "z", "alpha", "beta", "gamma", "qx", "qy", "qz", "qw", "lon", "lat", "h",
-    ]  # fmt: skip
+    names = "timestamp frame x y z alpha beta gamma qx qy qz qw lon lat h"
+    assert list(rows[0]) == names.split()
     assert len(rows) == dataset.frames
     stamps = [datetime.fromisoformat(r["timestamp"]) for r in rows]
     assert stamps[0] == dataset.start.astimezone(UTC)
