@@ -3,6 +3,10 @@
 from lidar.actors.actors import Actors as Actors
 from lidar.actors.actors import actor_shapes as actor_shapes
 from lidar.actors.actors import actor_transforms as actor_transforms
+from lidar.actors.actors import states as states
 from lidar.actors.actors import velocities as velocities
+from lidar.actors.boxes import box_rows as box_rows
+from lidar.actors.boxes import count_points as count_points
+from lidar.actors.boxes import image_boxes as image_boxes
 from lidar.actors.populate import TrafficOptions as TrafficOptions
 from lidar.actors.populate import populate as populate

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ class Actors:
 
     shapes  : the bodies in use
     shape   : (n,) int32 body of each actor; of a walker or rider the first pose
-    poses   : (n,) int32 poses that its body goes through as it moves: bodies ``shape`` to ``shape + poses - 1``
+    poses   : (n,) int32 poses that its body goes through as it moves: bodies from ``shape`` on
     stride  : (n,) metres that it moves in one round of its poses
     kind    : (n,) str, of `lidar.actors.shapes.KINDS`
     klass   : (n,) uint8, `geoscene.classes.Class`
@@ -145,6 +145,13 @@ def actor_shapes(actors: Actors) -> list[Mesh]:
     return [shape.mesh for shape in actors.shapes]
 
 
+def poses_of(actors: Actors, rows: NDArray[np.int64], at: States) -> NDArray[np.int32]:
+    """Bodies (k,) of actors in their states: walkers and riders take the pose of their stride."""
+    step = at.gone / actors.stride[rows] * actors.poses[rows]
+    shape: NDArray[np.int32] = actors.shape[rows] + step.astype(np.int32) % actors.poses[rows]
+    return shape
+
+
 def actor_transforms(
     actors: Actors, start_ns: int, end_ns: int, *, region: Region | None = None, moments: int = 3
 ) -> tuple[NDArray[np.int32], Float, NDArray[np.int32]]:
@@ -161,8 +168,7 @@ def actor_transforms(
     turn = rotations(at.angles) * actors.stretch[np.repeat(rows, moments), None, :]
     turn[:, :2] *= actors.scale
     transform = np.concatenate([turn, at.position[:, :, None]], axis=2).reshape(k, moments, 3, 4)
-    step = at.gone.reshape(k, moments)[:, 0] / actors.stride[rows] * actors.poses[rows]
-    shape = actors.shape[rows] + step.astype(np.int32) % actors.poses[rows]
+    shape = poses_of(actors, rows, States(*(getattr(at, f.name)[::moments] for f in fields(States))))
     if region is not None:
         x, y = transform[:, 0, :2, 3].T
         reach = actors.size[rows, 0]

@@ -30,7 +30,7 @@ _KEEP = (0.8, 0.3)  # metres that others keep from the ego's box before and besi
 _ROUNDS = 30
 _NEAR = 6.0  # metres in plan from an edge's middle within which the ego may be on it
 _LINE_REACH = 20.0  # metres before a junction within which lines to stop at are heeded
-_LINE_ROOM = 2.5  # metres before the middle of a crossing, or a signal, at which the front of a vehicle stops
+_LINE_ROOM = 4.0  # metres before the middle of a crossing, or a signal, at which the front of a vehicle stops
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,8 +53,10 @@ class Zones:
 
 
 def zones_of(graph: RoadGraph) -> Zones:
-    """The junctions of a graph: circles about nodes of three or more streets, united where they touch, and with
-    signals where they are close to each other."""
+    """The junctions of a graph: circles about nodes of three or more streets, united where they touch.
+
+    Those with signals are united where they are close to each other: they are one junction to traffic.
+    """
     one = (graph.twin < 0) | (graph.twin > np.arange(len(graph)))
     ends = np.concatenate([graph.tail[one], graph.head[one]])
     arms = np.bincount(ends, minlength=len(graph.node_id))

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from geoscene.roads import RoadGraph
@@ -174,8 +173,8 @@ class Way:
 
     def part(self, first: int, last: int) -> Way:
         """The stations from the first up to, not including, the last."""
-        columns = (getattr(self, f.name)[first:last] for f in fields(self)[:-1])
-        return Way(*columns, self.scale)
+        columns = {f.name: getattr(self, f.name)[first:last] for f in fields(self) if f.name != "scale"}
+        return replace(self, **columns)
 
 
 def wander(
@@ -272,8 +271,9 @@ def way_along(
 
 
 def rounded(line: Float, edge: Ints, lane: Ints, limit: Float, *, radius: float, scale: float) -> Way:
-    """The way along a line (n, 3) of evenly spaced points, rounded to bends of ``radius`` true metres and more.
+    """The way along a line (n, 3) of evenly spaced points, rounded to bends of ``radius`` and more.
 
+    radius            : true metres
     edge, lane, limit : columns of `Way` at the points
     """
     gap = STEP * scale
@@ -303,11 +303,12 @@ def beside(line: Float, offset: float) -> Float:
     d = d[size > 1e-9] / size[size > 1e-9, None]
     keep = np.concatenate([[True], size > 1e-9])
     if offset == 0.0 or not len(d):
-        return line[keep]
+        kept: Float = line[keep]
+        return kept
     normal = np.column_stack([-d[:, 1], d[:, 0]])
     before, after = np.vstack([normal[:1], normal]), np.vstack([normal, normal[-1:]])
     mitre = (before + after) / np.maximum(1 + (before * after).sum(axis=1), 0.5)[:, None]
-    moved = line[keep].copy()
+    moved: Float = line[keep].copy()
     moved[:, :2] += offset * mitre
     return moved
 

@@ -13,8 +13,8 @@ from geoscene.scene import Scene
 from lidar.actors.actors import Actors
 from lidar.actors.ground import ground_heights
 from lidar.actors.lanes import Lanes, beside, lane_shift
-from lidar.actors.tracks import attitude, table, wheels
 from lidar.actors.sweep import rectangles
+from lidar.actors.tracks import attitude, table, wheels
 from lidar.actors.traffic import pick
 from lidar.physics.random import generator
 

@@ -194,7 +194,7 @@ def _union(
 
 
 def _standing(scene: Scene, area: shapely.Geometry) -> NDArray[np.object_]:
-    """Footprints of buildings that reach down to the ground, and of posts, trunks and the like, in an area."""
+    """Footprints in an area of buildings that reach down to the ground, of posts, trunks and the like."""
     parts: list[NDArray[np.object_]] = [np.empty(0, object)]
     buildings = _layer(scene, "buildings")
     if buildings is not None:

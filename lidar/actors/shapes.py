@@ -169,8 +169,15 @@ def _van(length: float, width: float, height: float, paint: Rgb) -> list[Mesh]:
     """A delivery van: a box with a sloping front."""
     half, w = length / 2 - 0.012, width / 2
     rings = []
-    for at, low, high, top in ((-1.0, 0.30, height, 0.90), (0.30, 0.25, height, 0.90), (0.42, 0.25, height - 0.08, 0.88),
-                               (0.74, 0.25, 1.22, 0.94), (0.985, 0.27, 1.02, 0.90), (1.0, 0.36, 0.80, 0.86)):  # fmt: skip
+    stations = (
+        (-1.0, 0.30, height, 0.90),
+        (0.30, 0.25, height, 0.90),
+        (0.42, 0.25, height - 0.08, 0.88),
+        (0.74, 0.25, 1.22, 0.94),
+        (0.985, 0.27, 1.02, 0.90),
+        (1.0, 0.36, 0.80, 0.86),
+    )
+    for at, low, high, top in stations:
         mid = min(1.15, 0.6 * (low + high))
         rings.append(
             [(at * half, a * w, z) for a, z in ((0.92, low), (1.0, 0.55), (1.0, mid), (top, high))]
@@ -191,10 +198,13 @@ def _truck(length: float, width: float, height: float, paint: Rgb) -> list[Mesh]
     """A lorry: cab, chassis and a box."""
     half, w = length / 2 - 0.012, width / 2
     cab = half - 1.9
+    windows = [
+        [(x, a * w, z) for a, z in ((0.97, 1.5), (lean, top), (-lean, top), (-0.97, 1.5))]
+        for x, top, lean in ((cab, 2.75, 0.92), (half - 0.25, 2.75, 0.92), (half - 0.02, 1.56, 0.96))
+    ]
     parts = [
         box((cab, -0.97 * w, 0.55), (half, 0.97 * w, 1.55), color=paint),
-        loft([[(x, a * w, z) for a, z in ((0.97, 1.5), (lean, top), (-lean, top), (-0.97, 1.5))]
-              for x, top, lean in ((cab, 2.75, 0.92), (half - 0.25, 2.75, 0.92), (half - 0.02, 1.56, 0.96))], color=paint),
+        loft(windows, color=paint),
         box((-half, -0.42 * w, 0.6), (cab + 0.1, 0.42 * w, 0.98), "metal", DARK),
         box((-half, -w, 0.96), (cab - 0.1, w, height), color=WHITE),
         box((-half, -0.95 * w, 0.45), (-half + 0.08, 0.95 * w, 0.6), "metal", DARK),
@@ -259,8 +269,15 @@ def _bicycle(paint: Rgb) -> list[Mesh]:
 def _motorcycle(paint: Rgb) -> list[Mesh]:
     """A motorcycle 2.1 m long with its rider."""
     r, x = 0.31, 0.70
-    tank = [[(at, a * w, z) for a, z in ((0.8, low), (1.0, (low + high) / 2), (0.6, high), (-0.6, high), (-1.0, (low + high) / 2), (-0.8, low))]
-            for at, w, low, high in ((-0.85, 0.05, 0.72, 0.86), (-0.35, 0.13, 0.60, 0.80), (0.02, 0.15, 0.58, 0.86), (0.34, 0.16, 0.56, 0.98), (0.52, 0.08, 0.66, 0.90))]  # fmt: skip
+    stations = (
+        (-0.85, 0.05, 0.72, 0.86),
+        (-0.35, 0.13, 0.60, 0.80),
+        (0.02, 0.15, 0.58, 0.86),
+        (0.34, 0.16, 0.56, 0.98),
+        (0.52, 0.08, 0.66, 0.90),
+    )
+    across = ((0.8, 0.0), (1.0, 0.5), (0.6, 1.0), (-0.6, 1.0), (-1.0, 0.5), (-0.8, 0.0))
+    tank = [[(at, a * w, low + b * (high - low)) for a, b in across] for at, w, low, high in stations]
     parts = [wheel(-x, 0.0, r, 0.16), wheel(x, 0.0, r, 0.12), loft(tank, color=paint)]
     parts += [
         box((-0.25, -0.14, 0.22), (0.32, 0.14, 0.60), "metal", DARK),
@@ -323,7 +340,7 @@ def catalogue() -> dict[str, Shape]:
     made: list[tuple[str, str, float, list[Mesh]]] = []
     paints = {name: color for name, (color, _) in PAINTS.items()}
     for kind in ("sedan", "hatchback", "suv", *_FLEET):
-        for name, paint in (_FLEET[kind] if kind in _FLEET else paints).items():
+        for name, paint in _FLEET.get(kind, paints).items():
             size = _SIZES.get(kind)
             base = size[0] * size[3] if size else 1.2
             made.append((f"{kind}/{name}", kind, base, _parts(kind, paint)))

@@ -28,6 +28,7 @@ HARD = 8.0
 """m/s^2: the braking that a mover could still do, which decides how far ahead it holds the ground."""
 _LOOK = (15.0, 5.0)  # metres, and metres for each m/s, ahead that are looked at
 _BESIDE = 90.0  # metres from the ego within which what is held already is looked at again
+_COARSE = 3  # one square in so many is looked at: what stands there covers more
 _YIELD_S = 4.0  # seconds to arrival within which somebody with priority is waited for
 _PATIENCE = 100  # steps for which a mover waits for room to appear
 _NOBODY = -1
@@ -40,7 +41,8 @@ class Movers(NamedTuple):
     wish          : speed that its driver wants, m/s
     x, y, heading : of the body's middle
 
-    square_start  : into the squares of `lidar.actors.sweep.Sweep`: square (numbered from 0), first, last, leave
+    square_start  : into the squares of `lidar.actors.sweep.Sweep`, numbered from 0:
+    square, first, last, leave
 
     block_start   : into the blocks, stretches of ways through junctions:
     block_from, block_to : first and last station of the body's middle at which it is in the junction
@@ -91,7 +93,7 @@ class Ego(NamedTuple):
 
     x, y, heading, speed : of its box's middle
     half    : (2,) metres, half its box
-    event_start, event_square : (t + 1) and (e,) squares that it covers, and what others keep from it, at steps
+    event_start, event_square : (t + 1) and (e,), the squares under it and what others keep from it
     """
 
     x: Float
@@ -104,8 +106,12 @@ class Ego(NamedTuple):
 
 
 class _Ground(NamedTuple):
-    """Squares: who holds them and how often, which way through a junction they are kept for and by how many,
-    and from when until when the ego needs them next, in seconds."""
+    """Squares of ground.
+
+    owner, times  : who holds each and how often, `_NOBODY` for nobody
+    hold, holds   : the way through a junction that it is kept for, and by how many
+    arrive, until : when the ego needs it next, and until when, in seconds
+    """
 
     owner: NDArray[np.int32]
     times: NDArray[np.int16]
@@ -116,9 +122,15 @@ class _Ground(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Movers: whether they are there and done, metres along their ways, speed, the rows of their squares that
-    are ahead of them, taken and (in the order of leaving) left, the last station that they hold, their next
-    block, and whether it is theirs."""
+    """Where movers are.
+
+    active, gone  : whether they have appeared, and ended
+    s, v          : metres along their ways, m/s
+    ahead         : the first row of their squares that they do not stand on yet
+    taken, left   : rows taken, and rows (in the order of leaving) given back
+    station       : the last station that they hold
+    block, granted : the next block, and whether they may enter it
+    """
 
     active: Flags
     gone: Flags
@@ -318,7 +330,7 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     q = st.taken[i]
     while q < m.square_start[i + 1] and m.first[q] <= need:
         p = m.square[q]
-        other = g.owner[p] != _NOBODY and g.owner[p] != i
+        other = g.owner[p] not in (_NOBODY, i)
         if other or _wanted(g, p, t, (m.last[q] - k) * STEP / max(v, 2.0) + 0.5):
             need = m.first[q] - 1
             break
@@ -343,19 +355,21 @@ def _sight(v: float) -> int:
 def _obstacle(
     i: int, k: int, t: float, step: int, limit: int, m: Any, g: Any, st: Any, ego: Any
 ) -> tuple[int, float]:
-    """First station ahead that cannot be had now, one beyond what is looked at if all can, and how fast what is
-    there goes the mover's way."""
+    """First station ahead that cannot be had now, and how fast what is there goes the mover's way.
+
+    One station beyond what is looked at if all can be had.
+    """
     base = m.station_start[i]
     look = min(limit, k + _sight(st.v[i]))
     pace = max(st.v[i], 2.0)
     beside = math.hypot(m.x[base + k] - ego.x[step], m.y[base + k] - ego.y[step]) > _BESIDE
     # what is held already may since be wanted by the ego
-    for q in range(st.taken[i] if beside else st.ahead[i], m.square_start[i + 1]):
+    for q in range(st.taken[i] if beside else st.ahead[i], m.square_start[i + 1], _COARSE):
         if m.first[q] > look:
             break
         p = m.square[q]
         o = g.owner[p]
-        if o != _NOBODY and o != i:
+        if o not in (_NOBODY, i):
             there = m.heading[base + m.first[q]]
             theirs = m.heading[m.station_start[o] + int(st.s[o] / STEP)]
             return m.first[q], max(st.v[o] * math.cos(theirs - there), 0.0)
@@ -380,7 +394,7 @@ def _may_enter(i: int, k: int, t: float, m: Any, g: Any, st: Any, signals: Any) 
             break
         p = m.square[q]
         o = g.owner[p]
-        if q >= st.taken[i] and o != _NOBODY and o != i and not behind:
+        if q >= st.taken[i] and o not in (_NOBODY, i) and not behind:
             theirs = m.heading[m.station_start[o] + int(st.s[o] / STEP)]
             same = st.block[o] < m.block_start[o + 1] and m.block_way[st.block[o]] == way
             moves = st.v[o] > 0.5 * pace and math.cos(theirs - m.heading[base + m.first[q]]) > 0.5

@@ -115,7 +115,7 @@ def wheel(x: float, y: float, radius: float, width: float, *, corners: int = 10)
 
 
 def hoop(x: float, radius: float, width: float, *, corners: int = 12) -> Mesh:
-    """A bicycle's wheel in the plane y = 0 that stands on the ground at x: a tyre, open between the spokes."""
+    """A bicycle's wheel in the plane y = 0 that stands on the ground at x: a tyre, without spokes."""
     turn = 2 * np.pi * np.arange(corners) / corners
     ring = np.column_stack([np.cos(turn), np.zeros(corners), np.sin(turn)])
     side = np.array([0.0, width / 2, 0.0])
@@ -136,7 +136,7 @@ def hoop(x: float, radius: float, width: float, *, corners: int = 12) -> Mesh:
             np.column_stack([p + here, q + ahead, q + here]),
             np.column_stack([p + here, p + ahead, q + ahead]),
         ]
-    return painted(tubes.reshape(-1, 3) + [x, 0.0, radius], np.vstack(faces), "tyre")
+    return painted(tubes.reshape(-1, 3) + np.array([x, 0.0, radius]), np.vstack(faces), "tyre")
 
 
 def limb(
@@ -149,7 +149,7 @@ def limb(
     flat: float = 1.0,
     corners: int = 6,
 ) -> Mesh:
-    """A tapering bar between two points; ``thick`` is its diameter at each, ``flat`` its depth against that."""
+    """A tapering bar between two points; ``thick`` is its width at each, ``flat`` its depth against that."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     along = (b - a) / np.linalg.norm(b - a)
     aside = np.array([0.0, 1.0, 0.0]) if abs(along[1]) < 0.9 else np.array([1.0, 0.0, 0.0])

@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.scene import Scene
 from lidar.actors.actors import Actors
+from lidar.actors.flow import DT, Flow
 from lidar.actors.ground import ground_heights
 from lidar.actors.lanes import STEP
 from lidar.actors.shapes import STRIDE, Shape, catalogue
 from lidar.actors.sweep import body_poses
-from lidar.actors.flow import DT, Flow
 from lidar.actors.traffic import Trip
 
 Float = NDArray[np.float64]
@@ -160,7 +160,7 @@ def _course(middle: Float, yaw: Float) -> Float:
 
 
 def _settled(values: Float, gone: Float) -> Float:
-    """Values at metres ``gone``, averaged over a metre before and behind: tyres and springs take steps softly."""
+    """Values at metres ``gone``, averaged over a metre: tyres and springs take steps softly."""
     if len(values) < 2 or gone[-1] - gone[0] < 0.5:
         return np.full(len(values), values.mean()) if len(values) else values
     even = np.arange(gone[0] - 1.0, gone[-1] + 1.0, 0.25)

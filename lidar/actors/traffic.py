@@ -54,14 +54,20 @@ DRIVERS: dict[str, Driver] = {
     "motorcycle": Driver(4.0, 60.0, 1.1, 2.0, 2.5, 2.0),
     "cyclist": Driver(2.5, 6.0, 1.0, 0.8, 1.5, 1.0, kerb=True),
 }
-"""Headway, acceleration and braking: about the values that Treiber and Kesting, "Traffic Flow Dynamics" (2013),
-give for city traffic (1 s, 1 m/s^2, 1.5 m/s^2, 2 m), livelier in acceleration as cars are at lights; lorries
-and buses slower. Radii: of the middle, from kerb-to-kerb turning circles of such vehicles, nominal. Cyclists:
-assumed."""
+"""Headway, acceleration and braking: about the values that Treiber and Kesting, "Traffic Flow Dynamics"
+(2013), give for city traffic (1 s, 1 m/s^2, 1.5 m/s^2, 2 m), livelier in acceleration as cars are at lights;
+lorries and buses slower. Radii: of the middle, from kerb-to-kerb turning circles of such vehicles, nominal.
+Cyclists: assumed."""
 
 MOTOR_SHARES = {
-    "sedan": 0.30, "hatchback": 0.30, "suv": 0.20, "van": 0.10, "truck": 0.04, "bus": 0.02, "motorcycle": 0.04,
-}  # fmt: skip
+    "sedan": 0.30,
+    "hatchback": 0.30,
+    "suv": 0.20,
+    "van": 0.10,
+    "truck": 0.04,
+    "bus": 0.02,
+    "motorcycle": 0.04,
+}
 """Shares of the traffic: assumed."""
 
 
@@ -77,8 +83,7 @@ class Trip:
     appear_s : when, in seconds
     leaves   : whether the way's end is out of sight; otherwise it stops there
     walks    : whether it goes on foot, off the carriageway
-    crossing : stretches of the way of who walks across carriageways: first and last station, and a number that
-               the crossing has
+    crossing : stretches of a walk across carriageways: first and last station, and the crossing's number
     """
 
     shape: Shape

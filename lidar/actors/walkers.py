@@ -155,8 +155,10 @@ def _stroll(
 
 
 def _crossings(lanes: Lanes, walks: Walks) -> dict[int, list[tuple[int, float, float, int]]]:
-    """Crossings by the stretch of sidewalk from which they start: the stretch opposite, metres along the one and
-    the other, and a number for each crossing."""
+    """Crossings by the stretch of sidewalk from which they start.
+
+    Each is the stretch opposite, metres along the one and the other, and the crossing's number.
+    """
     g = lanes.graph
     edge, offset = (
         g.control_edge[g.control_kind == "crossing"],
