@@ -15,6 +15,7 @@ from geoscene.furniture import Furniture
 from geoscene.geopackage import Layer
 from geoscene.ground import Layers
 from geoscene.roads import RoadGraph
+from geoscene.structures import Structures
 from geoscene.vegetation import Trees
 
 
@@ -126,6 +127,26 @@ def barrier_layer(barriers: Barriers) -> Layer:
             "height": barriers.height,
             "height_source": barriers.height_source,
             "width_source": barriers.width_source,
+        },
+    )
+
+
+def structure_layer(structures: Structures) -> Layer:
+    """Layer ``structures``: pieces of bridges and tunnels in plan."""
+    return Layer(
+        "structures",
+        structures.polygon,
+        {
+            "osm_id": structures.osm_id,
+            "edge": structures.edge,
+            "kind": np.where(structures.tunnel, "tunnel", "bridge"),
+            "level": structures.level,
+            "body": structures.body,
+            "body_source": structures.body_source,
+            "rise": structures.rise,
+            "rise_source": structures.rise_source,
+            "piers": np.array([len(shape.geoms) for shape in structures.pier], np.int64),
+            "pier_spacing": structures.pier_spacing,
         },
     )
 

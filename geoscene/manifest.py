@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import shapely
+
 from geoscene import __version__
 from geoscene.plan import Plan
 from geoscene.report import Problem, summarise
@@ -59,6 +61,7 @@ def scene_manifest(
         "ground": {
             "area": sum(r.area for r in sorted(reports, key=lambda r: (r.i, r.j))),
             "extent_area": (xmax - xmin) * (ymax - ymin),
+            "open_area": _open_area(plan),
         },
         "counts": _counts(plan, reports, problems),
         "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
@@ -66,6 +69,12 @@ def scene_manifest(
         "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),
         "problems": summarise(problems),
     }
+
+
+def _open_area(plan: Plan) -> float:
+    """Square metres of the extent without ground, where tunnels come out of it."""
+    openings = [shape for shape in plan.openings if shape is not None]
+    return float(shapely.intersection(shapely.union_all(openings), shapely.box(*plan.extent)).area)
 
 
 def _counts(plan: Plan, reports: Sequence[TileReport], problems: Sequence[Problem]) -> dict[str, Any]:
@@ -89,6 +98,8 @@ def _counts(plan: Plan, reports: Sequence[TileReport], problems: Sequence[Proble
         "trees": len(plan.trees),
         "furniture": len(plan.furniture),
         "barriers": len(plan.barriers),
+        "bridge_pieces": int((~plan.structures.tunnel).sum()),
+        "tunnel_pieces": int(plan.structures.tunnel.sum()),
         "instances": sum(r.instances for r in reports),
     }
 

@@ -18,6 +18,7 @@ from geoscene.features import (
     furniture_layer,
     ground_layer,
     road_layer,
+    structure_layer,
     tree_layer,
 )
 from geoscene.frames import Frame
@@ -35,10 +36,17 @@ from geoscene.ground import (
 )
 from geoscene.progress import Progress
 from geoscene.report import Problem
-from geoscene.road_surfaces import road_surfaces
+from geoscene.road_surfaces import RoadSurfaces, road_surfaces
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roads import RoadGraph
 from geoscene.sources import OsmData
+from geoscene.structures import (
+    Structures,
+    find_openings,
+    ground_below,
+    opening_layers,
+    read_structures,
+)
 from geoscene.terrain import Terrain, base_heights, flat_terrain, open_terrain
 from geoscene.urban import paved_fabric
 from geoscene.vegetation import Trees, clear_of, needle_shares, read_trees
@@ -64,13 +72,15 @@ class Plan:
     height    : z of the ground at x, y, roads graded into it; None where all is at 0
     buildings : their table
     base      : (count,) z of each building's base
-    rows      : by kind (``buildings``, ``trees``, ``furniture``, ``barriers``) the rows that belong to each
-                tile: those with the middle of their box in it
+    rows      : by kind (``buildings``, ``trees``, ``furniture``, ``barriers``, ``structures``) the rows that
+                belong to each tile: those with the middle of their box in it
     graph     : roads, with heights
     ground    : what lies on the ground
     levels    : how high its water stands
     trees     : mapped ones
     needles   : share of needle-leaved trees by row of the ground's layers
+    structures : bridges and tunnels
+    openings  : where the ground is left out over each of them, None for most
     layers    : the feature tables, in the order of their numbers
     """
 
@@ -87,6 +97,8 @@ class Plan:
     needles: Float
     furniture: Furniture
     barriers: Barriers
+    structures: Structures
+    openings: NDArray[np.object_]
     layers: list[Layer]
 
     @property
@@ -136,15 +148,22 @@ def make_plan(
     graph = profile(graph, terrain.height, obstacles=find_obstacles(osm, frame))
     uneven = bool(terrain.grids) or any(line[:, 2].any() for line in graph.geometry)
     height = graded_ground(graph, terrain.height) if uneven else None
+    surfaces, found = road_surfaces(osm if "roads" in only else _nothing(osm), graph, frame)
+    problems += found
+    structures, found = read_structures(surfaces, graph, osm, frame, height=height)
+    problems += found
+    structures = structures.take(shapely.intersects(structures.polygon, shapely.box(*extent)))
+    height = ground_below(structures, height or terrain.height) if len(structures) else height
+    openings = find_openings(structures, height)
     footprints = buildings.footprint[: buildings.count]
     base = base_heights(footprints, height or terrain.height)
 
     progress("ground", 0, 0)
-    cover, roads, pads, found = _surfaces(osm, frame, extent, buildings, graph, only)
+    cover, roads, pads, found = _surfaces(osm, frame, extent, buildings, surfaces, only)
     problems += found
     n = len(buildings)
     cover, roads = _numbered(cover, n), _numbered(roads, n + len(cover))
-    layers = concatenate_layers([cover, roads, pads])
+    layers = concatenate_layers([cover, roads, pads, opening_layers(structures, openings)])
     ground = plan_ground(
         extent,
         layers,
@@ -161,6 +180,7 @@ def make_plan(
     trees = _numbered(trees, first)
     furniture = _numbered(furniture, first + len(trees))
     barriers = _numbered(barriers, first + len(trees) + len(furniture))
+    structures = _numbered(structures, first + len(trees) + len(furniture) + len(barriers))
     tables = [
         *building_layers(buildings, base),
         ground_layer("landcover", cover),
@@ -169,6 +189,7 @@ def make_plan(
         tree_layer(trees, _foot(trees.xy, height)),
         furniture_layer(furniture, _foot(furniture.xy, height)),
         barrier_layer(barriers),
+        structure_layer(structures),
     ]
     plan = Plan(
         frame=frame,
@@ -181,6 +202,7 @@ def make_plan(
             "trees": _by_tile(shapely.points(trees.xy), tile_size),
             "furniture": _by_tile(shapely.points(furniture.xy), tile_size),
             "barriers": _by_tile(barriers.polygon, tile_size),
+            "structures": _by_tile(structures.polygon, tile_size),
         },
         graph=graph,
         ground=ground,
@@ -189,6 +211,8 @@ def make_plan(
         needles=needle_shares(ground, osm),
         furniture=furniture,
         barriers=barriers,
+        structures=structures,
+        openings=openings,
         layers=tables,
     )
     return plan, problems
@@ -200,6 +224,10 @@ def _without_areas(osm: OsmData) -> OsmData:
 
 def _without_ways(osm: OsmData) -> OsmData:
     return replace(osm, ways=[], relations=[], points=[])
+
+
+def _nothing(osm: OsmData) -> OsmData:
+    return replace(osm, areas=[], ways=[], relations=[], points=[])
 
 
 def _extent(frame: Frame, bounds: Bounds, buildings: Buildings) -> Bounds:
@@ -221,7 +249,7 @@ def _surfaces(
     frame: Frame,
     extent: Bounds,
     buildings: Buildings,
-    graph: RoadGraph,
+    surfaces: RoadSurfaces,
     only: Collection[str],
 ) -> tuple[Layers, Layers, Layers, list[Problem]]:
     """Land cover, road surfaces and building pads."""
@@ -233,18 +261,14 @@ def _surfaces(
         cover, found = landcover(osm, frame, extent=extent)
         parts.append(cover)
         problems += found
-    roads = Layers.of([], klass=0, material=0, priority=0.0)
-    if "roads" in only:
-        surfaces, found = road_surfaces(osm, graph, frame)
-        problems += found
-        roads = Layers.of(
-            surfaces.polygon,
-            klass=surfaces.klass,
-            material=surfaces.material,
-            priority=surfaces.priority,
-            osm_id=surfaces.osm_id,
-            source=surfaces.source,
-        )
+    roads = Layers.of(
+        surfaces.polygon,
+        klass=surfaces.klass,
+        material=surfaces.material,
+        priority=surfaces.priority,
+        osm_id=surfaces.osm_id,
+        source=surfaces.source,
+    )
     standing = footprints.copy()
     standing[buildings.min_height[:count] >= _STANDING] = None
     pads = building_pads(

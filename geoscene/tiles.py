@@ -14,6 +14,7 @@ import numpy as np
 
 from geoscene.barriers import barrier_meshes
 from geoscene.buildings import build_solids
+from geoscene.classes import Class
 from geoscene.furniture import furniture_instances
 from geoscene.ground import ground_tile
 from geoscene.mesh import Mesh, concatenate
@@ -21,6 +22,7 @@ from geoscene.plan import Plan, take_buildings
 from geoscene.report import Problem
 from geoscene.scene import Instances, Tile, read_tile, write_atomically, write_tile
 from geoscene.shapes import concatenate_instances
+from geoscene.structures import structure_meshes
 from geoscene.validate import validate_mesh
 from geoscene.vegetation import forest_trees, tree_instances
 
@@ -66,9 +68,12 @@ def make_solids(plan: Plan, i: int, j: int, lod: int) -> tuple[Mesh, list[Proble
 
 
 def make_ground(plan: Plan, i: int, j: int) -> tuple[Mesh, Instances]:
-    """Ground, barriers, trees and furniture of tile (i, j), scene coordinates."""
+    """Ground, barriers, bridges, tunnels, trees and furniture of tile (i, j), scene coordinates."""
     covered = ((plan.ground.tiles[:, 0] == i) & (plan.ground.tiles[:, 1] == j)).any()
-    meshes = [ground_tile(plan.ground, i, j, height=plan.height, levels=plan.levels)] if covered else []
+    meshes = []
+    if covered:
+        ground = ground_tile(plan.ground, i, j, height=plan.height, levels=plan.levels)
+        meshes.append(ground.take(ground.klass != Class.TUNNEL))  # open where tunnels come out
     trees = plan.trees.take(plan.of_tile("trees", i, j))
     furniture = plan.furniture.take(plan.of_tile("furniture", i, j))
     copies = [
@@ -79,6 +84,9 @@ def make_ground(plan: Plan, i: int, j: int) -> tuple[Mesh, Instances]:
         woods = forest_trees(plan.ground, i, j, needles=plan.needles)
         copies.append(tree_instances(woods, height=plan.height))
     meshes += barrier_meshes(plan.barriers.take(plan.of_tile("barriers", i, j)), height=plan.height)
+    meshes += structure_meshes(
+        plan.structures, plan.of_tile("structures", i, j), height=plan.height, openings=plan.openings
+    )
     return concatenate(meshes), concatenate_instances(copies)
 
 

@@ -45,12 +45,12 @@ def _clear(tags: Tags) -> float | None:
     return None
 
 
-def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 1.0, batter: float = 8.0) -> Height:
+def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 2.5, batter: float = 8.0) -> Height:
     """The ground with its roads built into it: a function of x, y (n,) that gives z (n,).
 
     Within a carriageway and its shoulder the ground is level across, at the road's profile; over the next
     ``batter`` metres it passes into the terrain. Where roads meet, the nearer one counts for more. Bridges
-    and tunnels leave the ground as it is.
+    and tunnels leave the ground as it is; where they begin, the road's ground ends square.
 
     graph  : with heights, from `profile`
     ground : height of the terrain
@@ -64,6 +64,14 @@ def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 1.0, ba
     start = np.concatenate([line[:-1] for line in lines])
     end = np.concatenate([line[1:] for line in lines])
     half = np.repeat(graph.width[once] / 2 + shoulder, [len(line) - 1 for line in lines])
+    structure = graph.bridge | graph.tunnel
+    mouth = np.zeros(len(graph.node_id), np.bool_)
+    mouth[graph.tail[structure]] = mouth[graph.head[structure]] = True
+    sizes = np.array([len(line) - 1 for line in lines])
+    last = np.cumsum(sizes) - 1
+    square_start, square_end = np.zeros((2, len(start)), np.bool_)
+    square_start[last - sizes + 1] = mouth[graph.tail[once]]
+    square_end[last] = mouth[graph.head[once]]
     boxes = shapely.linestrings(np.stack([start[:, :2], end[:, :2]], axis=1))
     tree = shapely.STRtree(boxes)
     reach = float(half.max()) + batter
@@ -74,10 +82,16 @@ def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 1.0, ba
         point, road = tree.query(shapely.points(xy), predicate="dwithin", distance=reach)
         along = end[road, :2] - start[road, :2]
         square = np.maximum((along**2).sum(axis=1), 1e-12)
-        t = np.clip(((xy[point] - start[road, :2]) * along).sum(axis=1) / square, 0.0, 1.0)
+        free = ((xy[point] - start[road, :2]) * along).sum(axis=1) / square
+        t = np.clip(free, 0.0, 1.0)
         foot = start[road] + t[:, None] * (end[road] - start[road])
         away = np.hypot(*(xy[point] - foot[:, :2]).T)
-        share = np.clip(1.0 - np.maximum(away - half[road], 0.0) / batter, 0.0, 1.0)
+        beyond = np.maximum(away - half[road], 0.0)
+        ahead = np.abs(free - t) * np.sqrt(square)
+        cut = np.where(free < t, square_start[road], square_end[road]) & (ahead > 0)
+        aside = np.sqrt(np.maximum(away**2 - ahead**2, 0.0)) - half[road]
+        beyond[cut] = np.hypot(np.maximum(aside, 0.0), ahead)[cut]
+        share = np.clip(1.0 - beyond / batter, 0.0, 1.0)
         weight = share**2 / (_SHARP + (away / half[road]) ** 2) ** 2
         total = np.bincount(point, weight, len(z))
         near = total > 0

@@ -1,0 +1,55 @@
+"""Heights of carriageways beside their centre lines."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.structures.table import Structures
+
+Float = NDArray[np.float64]
+
+_FADE = 1.5
+"""Metres beyond its outside over which a carriageway's height ceases to count."""
+
+SHEET = 2.5
+"""Metres: carriageways that meet in plan and differ less in height are one, else one is over the other."""
+
+
+def foot(line: Float, xy: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
+    """Of the nearest place on a line (k, 3) to points (n, 2): its z, how far it is, whether it is no end."""
+    start, along = line[:-1], np.diff(line, axis=0)
+    square = np.maximum((along[:, :2] ** 2).sum(axis=1), 1e-12)
+    t = ((xy[:, None] - start[:, :2]) * along[:, :2]).sum(axis=2) / square
+    there = start + np.clip(t, 0.0, 1.0)[..., None] * along
+    metres = np.hypot(*(xy[:, None] - there[..., :2]).transpose(2, 0, 1))
+    best = metres.argmin(axis=1)
+    row = np.arange(len(xy))
+    ends = ((best == 0) & (t[row, best] < 0)) | ((best == len(along) - 1) & (t[row, best] > 1))
+    return there[row, best, 2], metres[row, best], ~ends
+
+
+def surface_heights(table: Structures, piece: int, xy: Float) -> Float:
+    """Heights (n,) of a piece's carriageway at points (n, 2).
+
+    Level across its centre line. Where carriageways join, they share the surface by the inverse square of
+    their distance, so that each centre line has its own height.
+    """
+    own, metres, _ = foot(table.around[piece], xy)
+    weight = _weight(metres, float(table.half[piece]))
+    total, z = weight, weight * own
+    for other in table.near[piece]:
+        if table.edge[other] == table.edge[piece] and table.osm_id[other] == table.osm_id[piece]:
+            continue  # the same line further on
+        theirs, metres, beside = foot(table.around[other], xy)
+        weight = _weight(metres, float(table.half[other]))
+        weight = np.where(beside & (np.abs(theirs - own) < SHEET), weight, 0.0)
+        total, z = total + weight, z + weight * theirs
+    heights: Float = z / total
+    return heights
+
+
+def _weight(metres: Float, half: float) -> Float:
+    share = np.clip(1.0 - (metres - half) / _FADE, 1e-4, 1.0)
+    weight: Float = share**2 / (metres + 1e-3) ** 2
+    return weight

@@ -1,0 +1,123 @@
+"""Solids over a plane cut into triangles: each triangle is solid in some layers and empty in others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+
+PRECISION = 1e-3
+"""Metres: the grid that plans are cut on, ten times that on which solids are checked."""
+
+SIDE = -1
+"""Level of a face that stands upright."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """An area cut into triangles that meet edge to edge.
+
+    xy    : (n, 2) float64, scene metres
+    faces : (m, 3) int64, counter-clockwise
+    """
+
+    xy: Float
+    faces: Int
+
+    @property
+    def middle(self) -> Float:
+        """A point (m, 2) within each triangle."""
+        middle: Float = self.xy[self.faces].mean(axis=1)
+        return middle
+
+
+@dataclass(frozen=True, slots=True)
+class Shell:
+    """The boundary of what is solid.
+
+    vertices : (v, 3) float64
+    faces    : (f, 3) int64, counter-clockwise seen from the empty side
+    level    : (f,) int64, the level that a face lies on, `SIDE` for upright ones
+    up       : (f,) bool, the face looks upward
+    triangle : (f,) int64, the triangle of the plan whose solid it bounds
+    """
+
+    vertices: Float
+    faces: Int
+    level: Int
+    up: NDArray[np.bool_]
+    triangle: Int
+
+
+def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
+    """The triangles of an area (Polygon or MultiPolygon), none of which crosses one of the lines.
+
+    Lines are shapely line work; what lies outside the area is of no account. All is put on a grid of 1 mm by
+    snap rounding.
+    """
+    near = lines[shapely.intersects(lines, area)] if len(lines) else lines
+    within = shapely.intersection(near, area)
+    linework = shapely.union_all([shapely.boundary(area), *within], grid_size=PRECISION)
+    cells = shapely.get_parts(shapely.polygonize([linework]))
+    shapely.prepare(area)
+    inside = shapely.get_coordinates(shapely.point_on_surface(cells))
+    cells = cells[shapely.contains_xy(area, inside[:, 0], inside[:, 1])]
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(cells))
+    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
+    grid, faces = np.unique(
+        np.rint(corners.reshape(-1, 2) / PRECISION).astype(np.int64), axis=0, return_inverse=True
+    )
+    faces = faces.reshape(-1, 3)
+    u, v = grid[faces[:, 1]] - grid[faces[:, 0]], grid[faces[:, 2]] - grid[faces[:, 0]]
+    twice = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    faces = np.where((twice < 0)[:, None], faces[:, ::-1], faces)
+    return Plan(grid * PRECISION, faces[twice != 0].astype(np.int64))
+
+
+def raise_shell(plan: Plan, levels: Float, solid: NDArray[np.bool_]) -> Shell:
+    """The closed surface around the solid layers of a plan's triangles.
+
+    levels : (n, l) float64, rising heights of the levels at each of the plan's vertices
+    solid  : (m, l - 1) bool, whether a triangle is solid between one level and the next
+    """
+    n, count = levels.shape
+    vertices = np.column_stack([np.tile(plan.xy, (count, 1)), levels.T.reshape(-1)])
+    padded = np.pad(solid, ((0, 0), (1, 1)))
+    faces, level, up, triangle = [], [], [], []
+    for k in range(count):
+        for looks_up, rows in (
+            (True, np.flatnonzero(padded[:, k] & ~padded[:, k + 1])),
+            (False, np.flatnonzero(~padded[:, k] & padded[:, k + 1])),
+        ):
+            corners = plan.faces[rows] + k * n
+            faces.append(corners if looks_up else corners[:, ::-1])
+            level.append(np.full(len(rows), k))
+            up.append(np.full(len(rows), looks_up))
+            triangle.append(rows)
+    start, end, own, other = half_edges(plan)
+    beyond = np.append(solid, np.zeros((1, count - 1), np.bool_), axis=0)[other]
+    edge, layer = np.nonzero(solid[own] & ~beyond)
+    a, b = start[edge] + layer * n, end[edge] + layer * n
+    faces += [np.column_stack([a, b, b + n]), np.column_stack([a, b + n, a + n])]
+    level.append(np.full(2 * len(a), SIDE))
+    up.append(np.zeros(2 * len(a), np.bool_))
+    triangle += [own[edge], own[edge]]
+    return Shell(
+        vertices, np.concatenate(faces), np.concatenate(level), np.concatenate(up), np.concatenate(triangle)
+    )
+
+
+def half_edges(plan: Plan) -> tuple[Int, Int, Int, Int]:
+    """Edges of all triangles: (start, end, triangle, the triangle on the other side or -1), each (3 m,)."""
+    start, end = plan.faces.ravel(), np.roll(plan.faces, -1, axis=1).ravel()
+    own = np.repeat(np.arange(len(plan.faces)), 3)
+    there, back = start * len(plan.xy) + end, end * len(plan.xy) + start
+    order = np.argsort(there)
+    place = np.minimum(np.searchsorted(there[order], back), len(order) - 1)
+    twin = order[place]
+    return start, end, own, np.where(there[twin] == back, own[twin], -1)

@@ -1,0 +1,125 @@
+"""Where structures meet the ground: it lies below decks, and is open where tunnels come out of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import Class, materials
+from geoscene.ground.layers import PADS, Layers
+from geoscene.roadgraph.junctions import cut_line
+from geoscene.structures.heights import surface_heights
+from geoscene.structures.table import StructureOptions, Structures
+
+Float = NDArray[np.float64]
+Height = Callable[[Float, Float], Float]
+
+OPENING = PADS + 100.0
+"""Priority of openings: nothing lies over them."""
+
+LIP, THINNEST = 0.05, 0.15
+"""Metres: how far a tunnel's roof stands out of open ground or lies under other; its least thickness."""
+
+_FALL = 0.25
+"""Slope at which the ground leaves a deck, from its end on, until it is below."""
+
+_BELOW = 0.1
+"""Metres between a deck and the ground below it at least."""
+
+_STEP = 2.0
+"""Metres along a tunnel at which the ground above it is looked at."""
+
+_INTO = 0.1
+"""Metres by which the ground reaches into a tunnel's wall beside an opening."""
+
+
+def ground_below(table: Structures, height: Height) -> Height:
+    """The ground lowered where it would stand above the underside of a bridge.
+
+    At a bridge's end it may be as high as the deck, whence it falls by 1 in 4.
+    """
+    bridges = np.flatnonzero(~table.tunnel)
+    if not len(bridges):
+        return height
+    tree = shapely.STRtree(table.polygon[bridges])
+
+    def lowered(x: Float, y: Float) -> Float:
+        z = np.asarray(height(x, y), float).copy()
+        points = shapely.points(x, y)
+        point, found = tree.query(points, predicate="intersects")
+        for bridge in np.unique(found).tolist():
+            rows, k = point[found == bridge], int(bridges[bridge])
+            deck = surface_heights(table, k, np.column_stack([x[rows], y[rows]]))
+            away = shapely.distance(points[rows], table.approach[k])
+            away = np.where(np.isnan(away), np.inf, away)
+            below = np.minimum(_FALL * away, table.body[k] + _BELOW)
+            z[rows] = np.minimum(z[rows], deck - below)
+        return z
+
+    return lowered
+
+
+def find_openings(table: Structures, height: Height | None) -> NDArray[np.object_]:
+    """Where the ground must be open over each piece (n,): shapely polygons, None where it need not be.
+
+    That is where it is not higher than the least roof over a tunnel's ceiling.
+    """
+    openings = np.empty(len(table), object)
+    for k in np.flatnonzero(table.tunnel).tolist():
+        flat = shapely.LineString(table.line[k][:, :2])
+        half = float(table.half[k])
+        cuts = np.linspace(0.0, flat.length, max(int(np.ceil(flat.length / _STEP)), 1) + 1)
+        strips = np.array(
+            [
+                shapely.LineString(cut_line(table.line[k], a, b)[:, :2]).buffer(half + 5.0, cap_style="flat")
+                for a, b in pairwise(cuts)
+            ]
+        )
+        strips = shapely.intersection(strips, table.polygon[k])
+        xy, strip = shapely.get_coordinates(shapely.segmentize(strips, _STEP), return_index=True)
+        ground = np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
+        covered = ground > surface_heights(table, k, xy) + table.rise[k] + THINNEST + 2 * LIP
+        open_ = np.bincount(strip[~covered], minlength=len(strips)) > 0
+        if open_.any():
+            within = table.inner[k].buffer(table.body[k] - _INTO, join_style="mitre")
+            shape = shapely.union_all(shapely.buffer(strips[open_], 1e-3)).intersection(table.polygon[k])
+            parts = shapely.get_parts(shapely.intersection(shape, within))
+            parts = parts[
+                (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0.01)
+            ]
+            openings[k] = shapely.MultiPolygon(parts.tolist()) if len(parts) else None
+    return openings
+
+
+def opening_layers(table: Structures, openings: NDArray[np.object_]) -> Layers:
+    """Rows of class TUNNEL for `geoscene.ground`: cells to leave out of the ground."""
+    rows = np.flatnonzero([shape is not None for shape in openings])
+    return Layers.of(
+        openings[rows],
+        klass=Class.TUNNEL,
+        material=materials()["concrete"].code,
+        priority=OPENING,
+        osm_id=table.osm_id[rows],
+        feature=table.feature[rows],
+    )
+
+
+def tunnel_roof(
+    xy: Float,
+    ceiling: Float,
+    ground: Float,
+    opening: shapely.Geometry | None,
+    options: StructureOptions,
+) -> Float:
+    """Heights (n,) of a tunnel's roof at points (n, 2): under the ground, or out of it where it is open."""
+    thick = ceiling + options.roof
+    roof: Float = np.clip(ground - LIP, ceiling + THINNEST, thick)
+    if opening is not None:
+        shapely.prepare(opening)
+        out = shapely.dwithin(opening, shapely.points(xy), 2e-3)
+        roof = np.where(out, np.maximum(thick, ground + LIP), roof)
+    return roof

@@ -1,0 +1,126 @@
+"""What runs on bridges and in tunnels: centre lines with heights, and where they come from the ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.roadgraph.junctions import cut_line
+from geoscene.roadgraph.surface_rows import SurfaceRows
+from geoscene.roads import RoadGraph
+
+Float = NDArray[np.float64]
+
+_APPROACH = 6.0
+"""Metres of the road on the ground that tell which way a bridge or tunnel opens."""
+
+_WALK = 5.0
+"""Metres beside a carriageway that its sidewalk and parapet take up at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Members:
+    """Roads and paths on bridges and in tunnels, one row each.
+
+    line     : (n,) object, (k, 3) float64 scene metres
+    tunnel   : (n,) bool
+    foot     : (n,) bool, for people on foot or bicycles
+    width    : (n,) float64 metres of what is driven or walked on
+    rows     : (n,) object, (k,) int64 rows of the raised surfaces that are its own
+    approach : (n,) object, shapely: the first metres of the roads at its ends that are not
+               like it, on the ground or, from a tunnel, on a bridge
+    landed   : (n, 2) bool, start and end meet the ground
+    level    : (n,) int8
+    edge     : (n,) int32, -1 for paths
+    osm_id   : (n,) str
+    """
+
+    line: NDArray[np.object_]
+    tunnel: NDArray[np.bool_]
+    foot: NDArray[np.bool_]
+    width: Float
+    rows: NDArray[np.object_]
+    approach: NDArray[np.object_]
+    landed: NDArray[np.bool_]
+    level: NDArray[np.int8]
+    edge: NDArray[np.int32]
+    osm_id: NDArray[np.str_]
+
+    def __len__(self) -> int:
+        """Number of members."""
+        return len(self.line)
+
+
+def concatenate_members(parts: list[Members]) -> Members:
+    """One table of all rows, in order."""
+    return Members(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Members)))
+
+
+def road_members(graph: RoadGraph, raised: SurfaceRows) -> Members:
+    """The bridges and tunnels of a road graph with heights that have surfaces; two-way streets once."""
+    structure = graph.bridge | graph.tunnel
+    order = np.argsort(raised.edge, kind="stable")
+    begin, stop = (
+        np.searchsorted(raised.edge[order], np.arange(len(graph)), side=s) for s in ("left", "right")
+    )
+    once = np.flatnonzero(
+        structure & (begin < stop) & ((graph.twin < 0) | (graph.twin > np.arange(len(graph))))
+    )
+    arms = _arms(graph, once)
+    count = len(once)
+    line, rows, approach = (np.empty(count, object) for _ in range(3))
+    landed = np.zeros((count, 2), np.bool_)
+    for k, edge in enumerate(once.tolist()):
+        line[k] = graph.geometry[edge]
+        rows[k] = order[begin[edge] : stop[edge]]
+        kind = _kind(graph, edge)
+        ends = [arms[int(node)] for node in (graph.tail[edge], graph.head[edge])]
+        landed[k] = [any(other == 0 for other, _, _ in found) for found in ends]
+        bands = [
+            _band(first, max(width, graph.width[edge]))
+            for found in ends
+            for other, first, width in found
+            if other != kind
+        ]
+        bands += [
+            shapely.Point(line[k][e, :2]).buffer(graph.width[edge] / 2)
+            for e, found in zip((0, -1), ends, strict=True)
+            if any(other != kind for other, _, _ in found)
+        ]
+        approach[k] = shapely.union_all(bands)
+    return Members(
+        line,
+        graph.tunnel[once],
+        np.zeros(count, np.bool_),
+        graph.width[once],
+        rows,
+        approach,
+        landed,
+        graph.layer[once],
+        once.astype(np.int32),
+        graph.osm_id[once],
+    )
+
+
+def _kind(graph: RoadGraph, edge: int) -> int:
+    """0 on the ground, 1 on a bridge, 2 in a tunnel."""
+    return 2 if graph.tunnel[edge] else int(graph.bridge[edge])
+
+
+def _arms(graph: RoadGraph, members: NDArray[np.int64]) -> dict[int, list[tuple[int, Float, float]]]:
+    """Kind, first metres (from the node on) and width of all roads at the ends of members, by node."""
+    ends = np.unique(np.concatenate([graph.tail[members], graph.head[members]]))
+    arms: dict[int, list[tuple[int, Float, float]]] = {int(node): [] for node in ends}
+    for node, step in ((graph.tail, 1), (graph.head, -1)):
+        for edge in np.flatnonzero(np.isin(node, ends)).tolist():
+            line = cut_line(graph.geometry[edge][::step, :2], 0.0, _APPROACH)
+            arms[int(node[edge])].append((_kind(graph, edge), line, float(graph.width[edge])))
+    return arms
+
+
+def _band(first: Float, width: float) -> shapely.Geometry:
+    """What opens in a parapet or a wall for a road: as wide as the wider of both, and some sidewalk."""
+    return shapely.LineString(first).buffer(width / 2 + _WALK, cap_style="flat", join_style="mitre")

@@ -1,0 +1,112 @@
+"""Where bridges stand on piers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.roadgraph.surface_rows import SurfaceRows
+from geoscene.structures.heights import foot
+from geoscene.structures.table import StructureOptions, Structures
+
+Float = NDArray[np.float64]
+Height = Callable[[Float, Float], Float]
+
+_KEPT_FREE = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.SIDEWALK, Class.KERB, Class.RAIL)
+"""No pier stands on these."""
+
+_FREE = 0.5
+"""Metres between a pier and what it must not stand on."""
+
+_RAIL_FREE = 2.0
+"""Metres between a pier and a rail."""
+
+_LOW = 1.0
+"""Metres: where a bridge is less above the ground it needs no pier."""
+
+_SHARE, _ALONG = 0.6, 1.0
+"""A pier's width as a share of its bridge's, and its length along it in metres. Assumed."""
+
+_SHIFTS = (0.0, 2.0, -2.0, 4.0, -4.0, 6.0, -6.0, 8.0, -8.0, 10.0, -10.0)
+"""Metres along the bridge by which a pier gives way."""
+
+
+def place_piers(
+    table: Structures, ground: SurfaceRows, *, height: Height | None, options: StructureOptions
+) -> Structures:
+    """The table with piers in the middle of equal spans, moved or left out where something passes below.
+
+    ground : roads, paths and rails on the ground
+    """
+    rows = np.flatnonzero(np.isin(ground.klass, _KEPT_FREE))
+    below = shapely.STRtree(ground.polygon[rows])
+    rail = ground.klass[rows] == Class.RAIL
+    pieces = shapely.STRtree(table.polygon)
+    pier, spacing = table.pier.copy(), table.pier_spacing.copy()
+    for k in np.flatnonzero(~table.tunnel).tolist():
+        flat = shapely.LineString(table.line[k][:, :2])
+        count = max(int(np.ceil(flat.length / options.pier_spacing)), 1)
+        spacing[k] = flat.length / count
+        at = (np.arange(count) + 0.5) * spacing[k]
+        tries = np.add.outer(at, [s for s in _SHIFTS if abs(s) < spacing[k] / 2])
+        shapes = _piers(table, k, flat, tries.ravel())
+        free = _stands_out(table, k, flat, tries.ravel(), height) & ~shapely.is_empty(shapes)
+        hit, found = below.query(shapes, predicate="dwithin", distance=_FREE)
+        free[hit] = False
+        hit, found = below.query(shapes, predicate="dwithin", distance=_RAIL_FREE)
+        free[hit[rail[found]]] = False
+        free &= ~_on_pieces(table, k, pieces, shapes)
+        free = free.reshape(tries.shape)
+        first = free.argmax(axis=1) + np.arange(count) * tries.shape[1]
+        pier[k] = shapely.MultiPolygon(shapely.get_parts(shapes[first[free.any(axis=1)]]).tolist())
+    spacing[shapely.is_empty(pier)] = 0.0
+    return replace(table, pier=pier, pier_spacing=spacing)
+
+
+def _piers(table: Structures, k: int, flat: shapely.LineString, at: Float) -> NDArray[np.object_]:
+    """Piers' outlines (n,) at metres along a piece."""
+    wide = min(_SHARE * 2 * table.half[k], 2 * table.half[k] - 0.6)
+    here, there = (
+        shapely.get_coordinates(shapely.line_interpolate_point(flat, np.clip(at + s, 0.0, flat.length)))
+        for s in (-0.5, 0.5)
+    )
+    way = there - here
+    way /= np.maximum(np.hypot(*way.T), 1e-9)[:, None]
+    across = np.column_stack([-way[:, 1], way[:, 0]]) * wide / 2
+    middle = (here + there) / 2
+    lines = shapely.linestrings(np.stack([middle - across, middle + across], axis=1))
+    along = min(_ALONG, wide)
+    within = table.polygon[k].buffer(-0.3)
+    shapes: NDArray[np.object_] = shapely.intersection(
+        shapely.buffer(lines, along / 2, cap_style="flat"), within
+    )
+    return shapes
+
+
+def _stands_out(
+    table: Structures, k: int, flat: shapely.LineString, at: Float, height: Height | None
+) -> NDArray[np.bool_]:
+    """Whether the bridge is well above the ground at metres along it."""
+    xy = shapely.get_coordinates(shapely.line_interpolate_point(flat, at))
+    ground = np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
+    high: NDArray[np.bool_] = foot(table.line[k], xy)[0] - table.body[k] > ground + _LOW
+    return high
+
+
+def _on_pieces(
+    table: Structures, k: int, pieces: shapely.STRtree, shapes: NDArray[np.object_]
+) -> NDArray[np.bool_]:
+    """Whether each pier would stand in the way of another bridge, or over an open tunnel."""
+    blocked = np.zeros(len(shapes), np.bool_)
+    hit, found = pieces.query(shapes, predicate="dwithin", distance=_FREE)
+    for row, other in zip(hit.tolist(), found.tolist(), strict=True):
+        if other == k or other in table.near[k]:
+            continue
+        xy = shapely.get_coordinates(shapes[row].centroid)
+        blocked[row] |= foot(table.line[other], xy)[0][0] < foot(table.line[k], xy)[0][0]
+    return blocked

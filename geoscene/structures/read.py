@@ -1,0 +1,40 @@
+"""Bridges and tunnels of a map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from geoscene.report import Problem
+from geoscene.road_surfaces import RoadSurfaces
+from geoscene.roads import RoadGraph
+from geoscene.sources.data import OsmData
+from geoscene.structures.members import road_members
+from geoscene.structures.pieces import cut_pieces
+from geoscene.structures.piers import place_piers
+from geoscene.structures.table import StructureOptions, Structures
+
+Float = NDArray[np.float64]
+Height = Callable[[Float, Float], Float]
+
+
+def read_structures(
+    surfaces: RoadSurfaces,
+    graph: RoadGraph,
+    osm: OsmData,
+    frame: Frame,
+    *,
+    height: Height | None = None,
+    options: StructureOptions | None = None,
+) -> tuple[Structures, list[Problem]]:
+    """The bridges and tunnels of a map, and what was changed or left out.
+
+    graph  : with heights, from `geoscene.roadgraph.profile`
+    height : of the ground with its roads (`geoscene.roadgraph.graded_ground`); level at 0 without
+    """
+    options = options or StructureOptions()
+    table = cut_pieces(road_members(graph, surfaces.raised), surfaces.raised, options)
+    return place_piers(table, surfaces, height=height, options=options), []

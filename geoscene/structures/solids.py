@@ -1,0 +1,163 @@
+"""Bridges and tunnels as closed solids."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import Class, materials
+from geoscene.mesh import FLOOR, OTHER, ROOF, WALL, Mesh
+from geoscene.structures.heights import surface_heights
+from geoscene.structures.layered import SIDE, Plan, Shell, cut_plan, raise_shell
+from geoscene.structures.meeting import tunnel_roof
+from geoscene.structures.table import StructureOptions, Structures
+
+Float = NDArray[np.float64]
+Height = Callable[[Float, Float], Float]
+
+_STANDING = 0.5
+"""Metres that piers and abutments reach under the ground."""
+
+
+def structure_meshes(
+    table: Structures,
+    rows: Sequence[int] | NDArray[np.integer] | None = None,
+    *,
+    height: Height | None = None,
+    openings: NDArray[np.object_] | None = None,
+    options: StructureOptions | None = None,
+) -> list[Mesh]:
+    """One closed solid for each of the chosen rows (all by default), in scene coordinates.
+
+    Upward faces of a carriageway have the class and material of what lies there, all others class BRIDGE or
+    TUNNEL.
+
+    height   : of the ground that piers stand on and that lies on tunnels
+    openings : where the ground is open over tunnels, from `find_openings`
+    """
+    chosen = range(len(table)) if rows is None else [int(k) for k in rows]
+    return [_solid(table, k, height, openings, options or StructureOptions()) for k in chosen]
+
+
+def _solid(
+    table: Structures,
+    k: int,
+    height: Height | None,
+    openings: NDArray[np.object_] | None,
+    options: StructureOptions,
+) -> Mesh:
+    plan = cut_plan(table.polygon[k], _linework(table, k, openings))
+    if not len(plan.faces):
+        return Mesh.empty()
+    z = surface_heights(table, k, plan.xy)
+    ground = np.zeros(len(z)) if height is None else np.asarray(height(*plan.xy.T), float)
+    middle = plan.middle
+    rim = ~shapely.contains_xy(table.inner[k], *middle.T)
+    if table.tunnel[k]:
+        levels, solid = _tunnel(table, k, plan, z, ground, rim, openings, options)
+        floor = 1
+    else:
+        levels, solid = _bridge(table, k, plan, z, ground, rim)
+        floor = 2
+    shell = raise_shell(plan, levels, solid)
+    return _dressed(table, k, plan, shell, floor, rim)
+
+
+def _bridge(
+    table: Structures, k: int, plan: Plan, z: Float, ground: Float, rim: NDArray[np.bool_]
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Levels under ground, soffit, deck, parapet; piers reach down, parapets up."""
+    soffit = z - table.body[k]
+    levels = np.column_stack([np.minimum(ground - _STANDING, soffit - 0.1), soffit, z, z + table.rise[k]])
+    pier = shapely.contains_xy(table.pier[k], *plan.middle.T)
+    return levels, np.column_stack([pier, np.ones(len(rim), np.bool_), rim])
+
+
+def _tunnel(
+    table: Structures,
+    k: int,
+    plan: Plan,
+    z: Float,
+    ground: Float,
+    rim: NDArray[np.bool_],
+    openings: NDArray[np.object_] | None,
+    options: StructureOptions,
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Levels under the floor, floor, ceiling, roof; walls between."""
+    ceiling = z + table.rise[k]
+    opening = None if openings is None else openings[k]
+    roof = tunnel_roof(plan.xy, ceiling, ground, opening, options)
+    full = np.ones(len(rim), np.bool_)
+    return np.column_stack([z - table.body[k], z, ceiling, roof]), np.column_stack([full, rim, full])
+
+
+def _linework(table: Structures, k: int, openings: NDArray[np.object_] | None) -> NDArray[np.object_]:
+    """Lines along which the piece is cut: what lies on it, its rim, and where its height bends."""
+    lines = [
+        *shapely.boundary(table.surfaces.polygon[table.tops[k]]),
+        shapely.boundary(table.inner[k]),
+        shapely.boundary(table.pier[k]),
+    ]
+    if openings is not None and openings[k] is not None:
+        lines.append(shapely.boundary(openings[k]))
+    for piece in (k, *table.near[k].tolist()):
+        line = table.around[piece]
+        lines.append(shapely.LineString(line[:, :2]))
+        lines += list(_ribs(line, float(table.half[piece]) + 1.0))
+    out = np.empty(len(lines), object)
+    out[:] = lines
+    return out
+
+
+def _ribs(line: Float, reach: float) -> NDArray[np.object_]:
+    """Straight lines across a centre line at its vertices, where it bends or changes its slope."""
+    step = np.diff(line[:, :2], axis=0)
+    way = step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
+    at = way[:-1] + way[1:]
+    at /= np.maximum(np.hypot(*at.T), 1e-9)[:, None]
+    across = np.column_stack([-at[:, 1], at[:, 0]]) * reach
+    ribs: NDArray[np.object_] = shapely.linestrings(
+        np.stack([line[1:-1, :2] - across, line[1:-1, :2] + across], axis=1)
+    )
+    return np.atleast_1d(ribs)
+
+
+def _dressed(table: Structures, k: int, plan: Plan, shell: Shell, floor: int, rim: NDArray[np.bool_]) -> Mesh:
+    """The shell as a mesh, its faces of the classes of what lies on them."""
+    concrete = materials()["concrete"]
+    body = Class.TUNNEL if table.tunnel[k] else Class.BRIDGE
+    klass = np.full(len(shell.faces), body, np.uint8)
+    material = np.full(len(shell.faces), concrete.code, np.uint8)
+    on_top = shell.up & (shell.level == floor)
+    row = _top_rows(table, k, plan.middle)[shell.triangle]
+    dressed = on_top & (row >= 0) & ~rim[shell.triangle]
+    klass[dressed] = table.surfaces.klass[row[dressed]]
+    material[dressed] = table.surfaces.material[row[dressed]]
+    color = np.zeros((256, 3), np.uint8)
+    for entry in materials().values():
+        color[entry.code] = entry.color
+    surface = np.where(shell.level == SIDE, WALL, np.where(shell.up, np.where(on_top, OTHER, ROOF), FLOOR))
+    mesh = Mesh.of(
+        shell.vertices,
+        shell.faces,
+        feature=int(table.feature[k]),
+        klass=klass,
+        material=material,
+        surface=surface,
+        color=color[material],
+        closed=True,
+    )
+    return mesh.take(np.ones(len(mesh), np.bool_))
+
+
+def _top_rows(table: Structures, k: int, xy: Float) -> NDArray[np.int64]:
+    """The surface (n,) that lies on top at points (n, 2), -1 where none does."""
+    tops = table.tops[k]
+    tops = tops[np.lexsort([-tops, table.surfaces.priority[tops]])]
+    row = np.full(len(xy), -1, np.int64)
+    for top in tops.tolist():
+        row[shapely.contains_xy(table.surfaces.polygon[top], *xy.T)] = top
+    return row
