@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -153,15 +154,24 @@ def poses_of(actors: Actors, rows: NDArray[np.int64], at: States) -> NDArray[np.
 
 
 def actor_transforms(
-    actors: Actors, start_ns: int, end_ns: int, *, region: Region | None = None, moments: int = 3
+    actors: Actors,
+    start_ns: int,
+    end_ns: int,
+    *,
+    region: Region | None = None,
+    moments: int = 3,
+    which: Literal["all", "moving", "parked"] = "all",
 ) -> tuple[NDArray[np.int32], Float, NDArray[np.int32]]:
     """Bodies (k,), transforms (k, moments, 3, 4) and features (k,) over a span, for `World.place_actors`.
 
     start_ns, end_ns : the times that ray times 0 and 1 stand for
     region  : (xmin, ymin, xmax, ymax) outside which actors are left out
+    which   : those that ever move, those that never do, or all
     moments : poses within the span; a car that turns at 0.5 rad/s is off by 0.1 mm between three in 0.1 s
     """
     rows = alive(actors, start_ns, end_ns)
+    if which != "all":
+        rows = rows[actors.parked[rows] == (which == "parked")]
     times = np.linspace(start_ns, end_ns, moments).astype(np.int64)
     k = len(rows)
     at = states(actors, np.repeat(rows, moments), np.tile(times, k))

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from geoscene.scene import Scene
 from lidar.actors.actors import Actors
-from lidar.actors.ground import ground_heights
 from lidar.actors.lanes import Lanes, beside, lane_shift
 from lidar.actors.sweep import rectangles
-from lidar.actors.tracks import attitude, table, wheels
+from lidar.actors.tracks import standing, table
 from lidar.actors.traffic import pick
 from lidar.physics.random import generator
 
@@ -25,7 +24,6 @@ CARS = {"hatchback": 0.38, "sedan": 0.30, "suv": 0.22, "van": 0.10}
 _FREE = 1.3  # metres from the middle of the lane that a parked car leaves free: half a car and a hand
 _OVER = 0.35  # metres by which a car's middle may stand beyond the kerb where the street is that narrow
 _ROOM, _BETWEEN = 0.2, 0.4  # metres to what stands there, and to each other
-_SKY = 1e4  # metres above and below zero between which the ground lies
 _QUIET = ("residential", "living_street", "unclassified", "tertiary", "service")
 _BUSY = ("secondary", "primary")
 _FAST = 14.5  # m/s from which on nobody parks at the kerb
@@ -39,7 +37,7 @@ class Spots:
 
     xy      : (n, 2) scene metres, the middle of the box
     heading : (n,) radians
-    hint    : (n,) metres, height near which the ground is
+    hint    : (n,) metres, height near which the ground is; NaN for the topmost
     """
 
     xy: Float
@@ -156,14 +154,15 @@ def parked_actors(
     for first, second in zip(a[a < b].tolist(), b[a < b].tolist(), strict=True):
         keep[second] &= not keep[first]
     rows = np.flatnonzero(keep)
-    track = 0.8 * size[rows, 1]
-    under = wheels(spots.xy[rows], spots.heading[rows], spots.hint[rows], base[rows] * scale, track * scale)
-    known = np.repeat(np.isfinite(spots.hint[rows]), 4)
-    points = np.nan_to_num(under.reshape(-1, 3), nan=0.0)
-    z: Float = np.empty(len(points))
-    z[known] = ground_heights(scene, points[known])
-    z[~known] = ground_heights(scene, points[~known], above=_SKY, below=_SKY)
-    height, pitch, roll = attitude(z.reshape(-1, 4), base[rows], track)
+    height, pitch, roll = standing(
+        scene,
+        spots.xy[rows],
+        spots.heading[rows],
+        spots.hint[rows],
+        axle=base[rows],
+        track=0.8 * width[rows],
+        scale=scale,
+    )
     return table(
         [shapes[k] for k in rows],
         grow[rows],

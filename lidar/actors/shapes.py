@@ -359,13 +359,23 @@ def catalogue() -> dict[str, Shape]:
                 person(tall, clothes, phase) for phase in (*(2 * np.pi / STRIDE * np.arange(STRIDE)), None)
             ]
             made += [(f"{kind}/{name}/{k}", kind, 0.4, parts) for k, parts in enumerate(poses)]
-    return {name: _shape(name, kind, base, parts) for name, kind, base, parts in made}
+    figures: dict[str, list[tuple[str, str, float, Mesh]]] = {}
+    for name, kind, base, parts in made:
+        figure = "/".join(name.split("/")[:2])
+        mesh = body(parts, _CLASS.get(kind, Class.CAR))
+        figures.setdefault(figure, []).append((name, kind, base, mesh))
+    return {shape.name: shape for poses in figures.values() for shape in _shapes(poses)}
 
 
-def _shape(name: str, kind: str, base: float, parts: list[Mesh]) -> Shape:
-    klass = _CLASS.get(kind, Class.CAR)
-    mesh = body(parts, klass)
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    mesh = mesh.shifted([*(-(low + high)[:2] / 2), 0.0])
+def _shapes(poses: list[tuple[str, str, float, Mesh]]) -> list[Shape]:
+    """The poses of one figure, in one box that holds all of them."""
+    points = np.concatenate([mesh.vertices for _, _, _, mesh in poses])
+    low, high = points.min(axis=0), points.max(axis=0)
     length, width, _ = (high - low).tolist()
-    return Shape(name, kind, klass, length, width, float(high[2]), base, mesh)
+    middle = [*(-(low + high)[:2] / 2), 0.0]
+    return [
+        Shape(
+            name, kind, Class(int(mesh.klass[0])), length, width, float(high[2]), base, mesh.shifted(middle)
+        )
+        for name, kind, base, mesh in poses
+    ]

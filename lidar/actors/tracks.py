@@ -22,6 +22,13 @@ _POSES = {"cyclist": STRIDE, "adult": STRIDE, "small_adult": STRIDE, "child": ST
 _STRIDE = {"cyclist": 5.6, "adult": 1.45, "small_adult": 1.35, "child": 1.05}
 """Metres in a stride of two steps, and in a turn of a bicycle's pedals: typical."""
 
+_UPRIGHT = ("adult", "small_adult", "child")
+_LEANING = ("cyclist", "motorcycle", "bicycle")
+_TRACK = 0.8  # metres between wheels for each of width
+_SKY = 1e4  # metres above and below zero between which the ground lies
+_STEP_UP = 0.5  # metres by which the ground under a wheel may differ from that under the middle
+_STEEP, _BANKED = 0.3, 0.15  # radians
+
 
 def table(
     shapes: Sequence[Shape],
@@ -75,80 +82,79 @@ def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: flo
     """Actors of the trips that took place."""
     present, counts = np.unique(flow.trip, return_counts=True)
     ends = np.concatenate([[0], np.cumsum(counts)])
-    parts: list[tuple[Float, Float]] = []
-    asked = []
-    for n, row in enumerate(present.tolist()):
-        trip = trips[row]
-        at = flow.gone[ends[n] : ends[n + 1]] / STEP
-        axle = trip.axle
-        xy, heading = body_poses(trip.way, axle)
+    n = len(flow.trip)
+    middle, yaw, hint, axle, track = np.empty((n, 2)), *np.empty((4, n))
+    for k, row in enumerate(present.tolist()):
+        trip, part = trips[row], slice(ends[k], ends[k + 1])
+        at = flow.gone[part] / STEP
+        xy, heading = body_poses(trip.way, trip.axle)
         stations = np.arange(len(xy))
-        middle = np.stack([np.interp(at, stations, xy[:, c]) for c in (0, 1)], axis=1)
-        yaw = np.interp(at, stations, heading)
-        hint = np.interp(at, stations, trip.way.xyz[:, 2])
-        parts.append((middle, yaw))
-        asked.append(wheels(middle, yaw, hint, axle * scale, 0.8 * trip.shape.width * scale))
-    if not parts:
-        none = np.empty((0, 3))
-        return table(
-            [],
-            none,
-            np.empty(0, np.int64),
-            np.empty(0, np.int64),
-            none,
-            none,
-            none,
-            np.empty(0),
-            parked=False,
-            scale=scale,
-        )
-    z = ground_heights(scene, np.concatenate(asked).reshape(-1, 3)).reshape(-1, 4)
-    position, angles, velocity = [], [], []
-    for n, row in enumerate(present.tolist()):
-        part = slice(ends[n], ends[n + 1])
-        trip = trips[row]
-        middle, yaw = parts[n]
-        height, pitch, roll = attitude(z[part], trip.axle, 0.8 * trip.shape.width)
-        height, pitch, roll = (_settled(c, flow.gone[part]) for c in (height, pitch, roll))
-        speed = flow.speed[part] * scale
-        course = _course(middle, yaw)
-        position.append(np.column_stack([middle, height]))
-        angles.append(np.column_stack([yaw, pitch, roll]))
-        velocity.append(
-            np.column_stack([speed * np.cos(course), speed * np.sin(course), -speed * np.tan(pitch)])
-        )
+        middle[part] = np.stack([np.interp(at, stations, xy[:, c]) for c in (0, 1)], axis=1)
+        yaw[part] = np.interp(at, stations, heading)
+        hint[part] = np.interp(at, stations, trip.way.xyz[:, 2])
+        axle[part], track[part] = trip.axle, _TRACK * trip.width
+    z, pitch, roll = standing(scene, middle, yaw, hint, axle=axle, track=track, scale=scale)
+    speed, course = flow.speed * scale, np.empty(n)
+    for k, row in enumerate(present.tolist()):
+        part = slice(ends[k], ends[k + 1])
+        course[part] = _course(middle[part], yaw[part])
+        for column in (z, pitch, roll):
+            column[part] = _settled(column[part], flow.gone[part])
+        kind = trips[row].shape.kind
+        pitch[part] *= kind not in _UPRIGHT
+        roll[part] *= kind not in _UPRIGHT and kind not in _LEANING
+    climb = np.zeros(n)
+    for k in range(len(present)):
+        part = slice(ends[k], ends[k + 1])
+        climb[part] = _rate(z[part])
     return table(
         [trips[row].shape for row in present],
         [trips[row].stretch for row in present],
         counts,
         np.round(flow.step * DT * 1e9).astype(np.int64),
-        np.concatenate(position),
-        np.concatenate(angles),
-        np.concatenate(velocity),
+        np.column_stack([middle, z]),
+        np.column_stack([yaw, pitch, roll]),
+        np.column_stack([speed * np.cos(course), speed * np.sin(course), climb]),
         flow.gone,
         parked=False,
         scale=scale,
     )
 
 
-def wheels(middle: Float, yaw: Float, hint: Float, axle: float | Float, track: float | Float) -> Float:
-    """Points (n, 4, 3) on the ground: front left, front right, rear left, rear right."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    corners = [(0.5, 0.5), (0.5, -0.5), (-0.5, 0.5), (-0.5, -0.5)]
-    points = [
-        np.column_stack(
-            [middle[:, 0] + a * axle * c - b * track * s, middle[:, 1] + a * axle * s + b * track * c, hint]
-        )
-        for a, b in corners
-    ]
-    return np.stack(points, axis=1)
+def standing(
+    scene: Scene, middle: Float, yaw: Float, hint: Float, *, axle: Float, track: Float, scale: float
+) -> tuple[Float, Float, Float]:
+    """Height (n,), pitch (nose down positive) and roll of bodies that stand on the ground on four wheels.
+
+    middle, yaw : (n, 2) scene metres and (n,) radians
+    hint        : (n,) height near which the ground is; NaN to take the topmost
+    axle, track : (n,) true metres between axles and between wheels
+
+    Wheels that would hang over an edge are taken to stand as high as the middle.
+    """
+    known = np.isfinite(hint)
+    points = np.column_stack([middle, np.where(known, hint, 0.0)])
+    points[known, 2] = ground_heights(scene, points[known])
+    points[~known, 2] = ground_heights(scene, points[~known], above=_SKY, below=_SKY)
+    c, s = np.cos(yaw) * scale / 2, np.sin(yaw) * scale / 2
+    z = np.empty((len(points), 2, 2))
+    for a, fore in enumerate((1, -1)):
+        for b, left in enumerate((1, -1)):
+            wheel = points.copy()
+            wheel[:, 0] += fore * axle * c - left * track * s
+            wheel[:, 1] += fore * axle * s + left * track * c
+            z[:, a, b] = ground_heights(scene, wheel, above=_STEP_UP, below=_STEP_UP)
+    pitch = np.arctan2(z[:, 1].mean(axis=1) - z[:, 0].mean(axis=1), axle)
+    roll = np.arctan2(z[:, :, 0].mean(axis=1) - z[:, :, 1].mean(axis=1), track)
+    steep = (np.abs(pitch) > _STEEP) | (np.abs(roll) > _BANKED)
+    height = np.where(steep, points[:, 2], z.mean(axis=(1, 2)))
+    return height, np.clip(pitch, -_STEEP, _STEEP), np.clip(roll, -_BANKED, _BANKED)
 
 
-def attitude(z: Float, axle: float | Float, track: float | Float) -> tuple[Float, Float, Float]:
-    """Height of the middle, pitch (nose down positive) and roll of bodies whose wheels stand at z (n, 4)."""
-    fore, aft = z[:, :2].mean(axis=1), z[:, 2:].mean(axis=1)
-    left, right = z[:, [0, 2]].mean(axis=1), z[:, [1, 3]].mean(axis=1)
-    return z.mean(axis=1), np.arctan2(aft - fore, axle), np.arctan2(left - right, track)
+def _rate(values: Float) -> Float:
+    """Change of values at knots `DT` apart, per second."""
+    rate: Float = np.gradient(values, DT) if len(values) > 1 else np.zeros(len(values))
+    return rate
 
 
 def _course(middle: Float, yaw: Float) -> Float:
