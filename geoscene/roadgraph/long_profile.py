@@ -61,6 +61,8 @@ _RAMP_REACH = 150.0
 _TAUT = 30.0
 _HARD, _HARDEST = 1e8, 1e9
 """Of slopes; of heights, which come first where a short ramp cannot serve both."""
+_PORTAL, _WISHED = 15.0, 1e3
+"""Metres from a tunnel's mouth within which it should be covered; what that counts, well below the others."""
 
 
 def profile(
@@ -76,7 +78,7 @@ def profile(
     the squared curvature in height times ``smooth`` to the fourth; bridges and tunnels have the second term
     only, so they run on from their ramps. Bounds: a road is above one that it crosses by clearance and deck;
     a bridge is above obstacles and the ground; a tunnel is under the ground, deeper with the distance from
-    its mouth; slopes; changes of slope. Bounds that contradict each other (a ramp too short for its
+    its mouth, and if slopes allow wholly so after 15 m; slopes; changes of slope. Bounds that contradict each other (a ramp too short for its
     slope) give way, slopes before heights. Solved by an interior-point method.
 
     ground    : height of the terrain; what it returns is kept to where nothing stands against it
@@ -172,6 +174,10 @@ def _bounds(
     bore = np.flatnonzero(np.isfinite(tunnel))
     deep = np.minimum(options.clearance + options.cover, options.slope / 2 * tunnel[bore])
     rows.add([(bore, -1.0)], deep - terrain[bore], _HARDEST)
+    # Where the ground does not rise over it, the road goes down into a cutting before its tunnel begins.
+    bore = bore[tunnel[bore] >= _PORTAL]
+    whole = np.full(len(bore), options.clearance + options.cover)
+    rows.add([(bore, -1.0)], whole - terrain[bore], _WISHED)
 
     if obstacles is not None and len(obstacles.line):
         over, along, x, y, clear = _over_obstacles(graph, stations, obstacles)
