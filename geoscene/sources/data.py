@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from geoscene.report import Problem
@@ -93,6 +92,8 @@ class OsmData:
     @property
     def digest(self) -> str:
         """Digest of ids, tags and coordinates: equal digests mean equal maps."""
+        import shapely  # noqa: PLC0415  (this module is imported for its names alone)
+
         found = hashlib.sha256()
         for way in self.ways:
             found.update(repr((way.osm_id, sorted(way.tags.items()))).encode() + way.lonlat.tobytes())
