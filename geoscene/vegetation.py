@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.frames import Frame
-from geoscene.ground.partition import GroundPlan, tile_box, winners
+from geoscene.ground.partition import GroundPlan, rows_near, tile_box, values_at, winners
 from geoscene.report import Problem
 from geoscene.scene import Instances
 from geoscene.shapes import concatenate_instances, place
@@ -141,7 +141,7 @@ def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
     x, y = trees.xy.T
     inside = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
     trees = trees.take(inside)
-    klass = np.append(plan.layers.klass, np.uint8(plan.base[0]))[winners(plan, *trees.xy.T)]
+    klass = values_at(plan.layers.klass, winners(plan, *trees.xy.T), plan.base[0])
     single = np.char.startswith(trees.osm_id, "node/")
     built = klass == Class.BUILDING_PAD
     blocked = built | (~single & np.isin(klass, [Class.ROAD, Class.LANE_MARKING, Class.RAIL, Class.WATER]))
@@ -182,6 +182,8 @@ def forest_trees(
     """
     side = 1.0 / np.sqrt(density)
     xmin, ymin, xmax, ymax = tile_box(plan, i, j)
+    if not (plan.layers.klass[rows_near(plan, xmin, ymin, xmax, ymax)] == Class.FOREST_FLOOR).any():
+        return _none()
     column, row = (
         grid.ravel()
         for grid in np.meshgrid(
@@ -191,14 +193,13 @@ def forest_trees(
     )
     draw = _uniform(seed, column, row, 4)
     x, y = (column + 0.1 + 0.8 * draw[0]) * side, (row + 0.1 + 0.8 * draw[1]) * side
-    owner = winners(plan, x, y)
-    floor = np.append(plan.layers.klass == Class.FOREST_FLOOR, np.False_)
-    stands = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax) & floor[owner]
     # A trunk needs room: there must be forest half a metre away on all sides.
-    for dx, dy in ((0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)):
-        still = np.flatnonzero(stands)
-        stands[still] = floor[winners(plan, x[still] + dx, y[still] + dy)]
-    x, y, draw, owner = x[stands], y[stands], draw[:, stands], owner[stands]
+    within = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
+    x, y, draw = x[within], y[within], draw[:, within]
+    dx, dy = np.array([(0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)]).T[:, :, None]
+    found = winners(plan, (x + dx).ravel(), (y + dy).ravel()).reshape(5, -1)
+    stands = (values_at(plan.layers.klass, found.ravel(), 0) == Class.FOREST_FLOOR).reshape(5, -1).all(axis=0)
+    x, y, draw, owner = x[stands], y[stands], draw[:, stands], found[0, stands]
     share = np.zeros(len(plan.layers)) if needles is None else needles
     form = np.where(draw[3] < share[owner], "needleleaved", "broadleaved")
     height = np.where(form == "needleleaved", HEIGHT["needleleaved"], HEIGHT["broadleaved"])
@@ -216,6 +217,14 @@ def forest_trees(
         np.where(share[owner] > 0, "leaf_type", "default"),
         plan.layers.osm_id[owner],
         plan.layers.feature[owner],
+    )
+
+
+def _none() -> Trees:
+    """No trees."""
+    text, number = np.empty(0, np.str_), np.empty(0)
+    return Trees(
+        np.empty((0, 2)), number, number, number, text, text, text, text, text, np.empty(0, np.int32)
     )
 
 

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from geoscene.classes import materials
 from geoscene.frames import Frame
 from geoscene.ground.layers import Layers
-from geoscene.ground.partition import GroundPlan, Partition, partition_tile, tile_box, winners
+from geoscene.ground.partition import (
+    GroundPlan,
+    Partition,
+    partition_tile,
+    rows_near,
+    tile_box,
+    values_at,
+    winners,
+)
 from geoscene.ground.triangulate import Triangles, triangulate
 from geoscene.mesh import Mesh
 from geoscene.sources.data import Way
@@ -177,7 +185,9 @@ def _flooded(
     plan: GroundPlan, cells: Partition, triangles: Triangles, z: Float, levels: WaterLevels
 ) -> Float:
     """Heights (n,) of the points, those on water at its level."""
-    wet = plan.layers.body != ""
+    low, high = triangles.points.min(axis=0) - _AROUND, triangles.points.max(axis=0) + _AROUND
+    if not (plan.layers.body[rows_near(plan, *low, *high)] != "").any():
+        return z
     vertex = triangles.faces.ravel()
     row = np.repeat(cells.row[triangles.cell], 3)
     edge = np.zeros(len(z), bool)
@@ -194,8 +204,7 @@ def _flooded(
     beside = winners(plan, around[..., 0].ravel(), around[..., 1].ravel())
     vertex = np.concatenate([vertex, np.repeat(np.flatnonzero(edge), len(_DIRECTIONS))])
     row = np.concatenate([row, beside])
-    on_water = row >= 0
-    on_water[on_water] = wet[row[on_water]]
+    on_water = values_at(plan.layers.body, row, "") != ""
     vertex, row = vertex[on_water], row[on_water]
     stand = levels.level[row]
     flows = levels.river[row]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import shapely
@@ -53,7 +54,7 @@ class GroundPlan:
     ruled     : tiles that have these lines; None for all
     coarse    : spacing of the lines in the other tiles, 0 for none
     layers    : what competes for the ground
-    bounds    : (n, 4) float64, theirs; infinite the wrong way round for empty polygons
+    tree      : STRtree over their polygons
     base      : (class, material code) where there is nothing
     start, end : (m, 2) float64 segments of all outlines, on the grid
     string    : (m,) int64: segments of one outline that follow each other have the same number
@@ -68,7 +69,7 @@ class GroundPlan:
     ruled: frozenset[tuple[int, int]] | None
     coarse: float
     layers: Layers
-    bounds: Float
+    tree: shapely.STRtree
     base: tuple[int, int]
     start: Float
     end: Float
@@ -142,7 +143,6 @@ def plan_ground(
     order, offset = _by_tile(start, end, low=low, count=count, tile_size=tile_size)
     j, i = np.divmod(np.arange(count[0] * count[1]), count[0])
     klass, material = base
-    bounds = shapely.bounds(layers.polygon).reshape(-1, 4)
     return GroundPlan(
         (float(box[0]), float(box[1]), float(box[2]), float(box[3])),
         tile_size,
@@ -150,7 +150,7 @@ def plan_ground(
         None if ruled is None else frozenset(ruled),
         coarse,
         layers,
-        np.where(np.isnan(bounds), (np.inf, np.inf, -np.inf, -np.inf), bounds),
+        shapely.STRtree(layers.polygon),
         (int(klass), materials()[material].code),
         start,
         end,
@@ -166,24 +166,23 @@ def partition_tile(plan: GroundPlan, i: int, j: int) -> Partition:
 
     The same whatever other tiles are made. Raises InputError for a tile outside the extent.
     """
-    place = np.flatnonzero((plan.tiles[:, 0] == i) & (plan.tiles[:, 1] == j))
-    if len(place) == 0:
+    place = tile_place(plan, i, j)
+    if place is None:
         raise InputError(f"tile ({i}, {j}) is not one of the {len(plan.tiles)} tiles of the ground")
     box = tile_box(plan, i, j)
-    mine = np.sort(plan.order[plan.offset[place[0]] : plan.offset[place[0] + 1]])
+    mine = np.sort(plan.order[plan.offset[place] : plan.offset[place + 1]])
     lines = [*_strings(plan.start[mine], plan.end[mine], plan.string[mine]), *_ruling(plan, i, j, box)]
     cells = _faces(shapely.union_all(lines, grid_size=PRECISION), box)
     inside = shapely.get_coordinates(shapely.point_on_surface(cells))
     row = winners(plan, inside[:, 0], inside[:, 1])
     edges = _Edges.of(cells)
     row, slivers = _without_slivers(edges, cells, row)
-    level = np.append(np.isin(plan.layers.body, ("sea", "standing")), np.False_)[row]
+    level = np.isin(values_at(plan.layers.body, row, ""), ("sea", "standing"))
     cells, row = _dissolve(edges, row, box, lines=_spacing(plan, i, j), level=level)
     cells = shapely.coverage_simplify(cells, BEND, simplify_boundary=False)
-    # The base stands after the last row of the layers, where -1 finds it.
-    klass = np.append(plan.layers.klass, np.uint8(plan.base[0]))[row]
-    material = np.append(plan.layers.material, np.uint8(plan.base[1]))[row]
-    feature = np.append(plan.layers.feature, np.int32(-1))[row]
+    klass = values_at(plan.layers.klass, row, plan.base[0])
+    material = values_at(plan.layers.material, row, plan.base[1])
+    feature = values_at(plan.layers.feature, row, -1)
     tile = np.broadcast_to(np.array([i, j], np.int32), (len(cells), 2)).copy()
     return Partition(cells, row.astype(np.int32), klass, material, feature, tile, slivers)
 
@@ -212,26 +211,43 @@ def tile_box(plan: GroundPlan, i: int, j: int) -> tuple[float, float, float, flo
     return max(i * size, xmin), max(j * size, ymin), min((i + 1) * size, xmax), min((j + 1) * size, ymax)
 
 
-def winners(plan: GroundPlan, x: Float, y: Float) -> NDArray[np.int64]:
-    """The row of the layers (n,) that holds each point (n,), -1 where none does.
+def tile_place(plan: GroundPlan, i: int, j: int) -> int | None:
+    """The row of tile (i, j) in the plan's tiles, None where it is not among them."""
+    (west, south), (east, north) = plan.tiles[0].tolist(), plan.tiles[-1].tolist()
+    return (j - south) * (east - west + 1) + i - west if west <= i <= east and south <= j <= north else None
 
-    Fastest for points close together.
-    """
+
+def rows_near(plan: GroundPlan, xmin: float, ymin: float, xmax: float, ymax: float) -> NDArray[np.int64]:
+    """The rows of the layers whose boxes meet a box, in no particular order."""
+    return np.asarray(plan.tree.query(shapely.box(xmin, ymin, xmax, ymax)), np.int64)
+
+
+def winners(plan: GroundPlan, x: Float, y: Float) -> NDArray[np.int64]:
+    """The row of the layers (n,) that holds each point (n,), -1 where none does."""
     best = np.full(len(x), -1, np.int64)
-    if len(x) == 0:
-        return best
-    low, high = plan.bounds[:, :2], plan.bounds[:, 2:]
-    near = np.flatnonzero((low <= (x.max(), y.max())).all(axis=1) & (high >= (x.min(), y.min())).all(axis=1))
-    # Lowest priority first and, among equals, the latest row first: the greatest rank wins.
-    near = near[np.lexsort((-near, plan.layers.priority[near]))]
-    polygons = plan.layers.polygon[near]
-    shapely.prepare(polygons)
-    point, rank = shapely.STRtree(polygons).query(shapely.points(x, y))
-    hit = shapely.contains_xy(polygons[rank], x[point], y[point])
-    top = np.full(len(x), -1, np.int64)
-    np.maximum.at(top, point[hit], rank[hit])
-    best[top >= 0] = near[top[top >= 0]]
+    point, row = plan.tree.query(shapely.points(x, y))
+    polygons = plan.layers.polygon
+    # Only what this call prepared is let go of, for what a preparation holds is larger than its polygon.
+    fresh = np.unique(row)
+    fresh = fresh[~shapely.is_prepared(polygons[fresh])]
+    shapely.prepare(polygons[fresh])
+    hit = shapely.contains_xy(polygons[row], x[point], y[point])
+    shapely.destroy_prepared(polygons[fresh])
+    point, row = point[hit], row[hit]
+    # The last of each point has the highest priority and, among equals, is the earliest row.
+    order = np.lexsort((-row, plan.layers.priority[row], point))
+    point, row = point[order], row[order]
+    last = np.flatnonzero(np.diff(point, append=-1))
+    best[point[last]] = row[last]
     return best
+
+
+def values_at(column: NDArray[Any], row: NDArray[np.int64], base: object) -> NDArray[Any]:
+    """A column's values (n,) at rows (n,), and ``base`` where the row is -1."""
+    values = np.full(len(row), base, column.dtype)
+    there = row >= 0
+    values[there] = column[row[there]]
+    return values
 
 
 def _snap(values: Float) -> Float:
