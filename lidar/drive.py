@@ -7,10 +7,10 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from lidar import __version__
+from lidar.actors import Actors, TrafficOptions, populate
+from lidar.crowd import Worlds
 from lidar.dataset import prepare, write_json, write_trajectory
 from lidar.errors import InputError
 from lidar.georeference import Georeference, export_crs
@@ -26,9 +28,9 @@ from lidar.poses import Trajectory
 from lidar.record import FORMATS, Camera, Recorder, Scanner, cameras, scanners
 from lidar.rig import Rig, load_rig
 from lidar.route import Spec
-from lidar.sidecars import write_sidecars
-from lidar.travel import Travel, plan_travel
-from lidar.world import World
+from lidar.sidecars import gather_boxes, write_sidecars
+from lidar.travel import Travel, plan_travel, road_graph
+from lidar.vehicle import load_vehicle
 
 Float = NDArray[np.float64]
 
@@ -52,6 +54,7 @@ class DriveOptions:
     exact      : georeference every point through the projection instead of a bounded affine map
     side       : side of the road
     fidelity   : level of `lidar.physics.effects.LEVELS`: draft, standard or survey
+    traffic    : other road users and parked cars; none by default
     settings   : single effects set apart from the level, as (name, text)
     workers    : threads
     """
@@ -67,6 +70,7 @@ class DriveOptions:
     exact: bool = False
     side: str = "right"
     fidelity: str = "standard"
+    traffic: TrafficOptions | None = None
     settings: tuple[tuple[str, str], ...] = ()
     workers: int = 2
 
@@ -99,6 +103,7 @@ class DriveOptions:
             "exact": self.exact,
             "side": self.side,
             "fidelity": self.fidelity,
+            "traffic": asdict(self.traffic) if self.traffic else None,
             "settings": [list(pair) for pair in self.settings],
         }
 
@@ -152,7 +157,7 @@ class Stopwatch:
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
+class Job:
     """One frame of one sensor."""
 
     start_ns: int
@@ -178,8 +183,14 @@ def drive(
     travel = plan_travel(scene, options.route, options.vehicle or rig.vehicle, seed=options.seed,
                          duration=options.duration, side=options.side, progress=progress)  # fmt: skip
     trajectory = travel.trajectory
+    actors = None
+    if options.traffic is not None:
+        progress("traffic", 0, 0)
+        body = load_vehicle(options.vehicle or rig.vehicle)
+        traffic = replace(options.traffic, side=cast("Literal['left', 'right']", options.side))
+        actors = populate(scene, road_graph(scene), trajectory, body, seed=options.seed, options=traffic)
     geo = Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact)
-    jobs = _jobs(sensors, trajectory.duration_ns)
+    jobs = schedule(sensors, trajectory.duration_ns)
     if sensors and not jobs:
         raise InputError(f"the drive lasts {trajectory.duration_ns / 1e9:.2f} s, less than one frame")
 
@@ -202,8 +213,21 @@ def drive(
         options.seed,
         effects_of(options.fidelity, dict(options.settings)),
         watch,
+        actors=actors,
+        reach=max((s.reach for s in sensors), default=0.0),
     )
-    points = _record(scene, trajectory, jobs, sensors, recorder, options.workers, progress)
+    points = record_all(
+        scene,
+        trajectory,
+        jobs,
+        sensors,
+        recorder,
+        actors=actors,
+        workers=options.workers,
+        progress=progress,
+    )
+    if actors is not None:
+        gather_boxes(out)
     write_json(out / "dataset.json", manifest | {"frames_done": manifest["frames"]})
     return DriveSummary(
         out,
@@ -221,9 +245,10 @@ def _centre(bounds: tuple[float, float, float, float]) -> tuple[float, float]:
     return (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
 
 
-def _jobs(sensors: Sequence[Scanner | Camera], duration_ns: int) -> list[_Job]:
+def schedule(sensors: Sequence[Scanner | Camera], duration_ns: int) -> list[Job]:
+    """All frames of all sensors that end within a drive of that length, in order of time."""
     jobs = [
-        _Job(sensor.frame_start_ns(k), i, k, sensor)
+        Job(sensor.frame_start_ns(k), i, k, sensor)
         for i, sensor in enumerate(sensors)
         for k in range(sensor.frame_count(duration_ns))
     ]
@@ -238,7 +263,7 @@ def _manifest(
     geo: Georeference,
     travel: Travel,
     sensors: Sequence[Scanner | Camera],
-    jobs: Sequence[_Job],
+    jobs: Sequence[Job],
 ) -> dict[str, Any]:
     frames = dict.fromkeys((s.name for s in sensors), 0)
     for job in jobs:
@@ -261,32 +286,31 @@ def _manifest(
     }
 
 
-def _record(
+def record_all(
     scene: Scene,
     trajectory: Trajectory,
-    jobs: Sequence[_Job],
+    jobs: Sequence[Job],
     sensors: Sequence[Scanner | Camera],
     recorder: Recorder,
-    workers: int,
-    progress: Progress,
+    *,
+    actors: Actors | None = None,
+    workers: int = 1,
+    progress: Progress = silent,
 ) -> int:
     """Do all jobs that are not done yet, chunk by chunk of the route; return the number of points written."""
     pending = [job for job in jobs if not recorder.is_done(job.sensor, job.frame)]
     progress("driving", len(jobs) - len(pending), len(jobs))
     reach = max((s.reach for s in sensors), default=0.0)
-    world: World | None = None
+    worlds = Worlds(scene, reach, actors)
     points = 0
     done = len(jobs) - len(pending)
     with ThreadPoolExecutor(workers) as pool:
         for chunk, region in _chunks(pending, trajectory):
             with recorder.watch.stage("load"):
-                if world is None:
-                    world = World.load(scene, region=region, margin=reach)
-                else:
-                    world.follow(region)
+                worlds.follow(region)
             running: set[Future[int]] = set()
             for job in chunk:
-                running.add(pool.submit(recorder.record, job.sensor, job.frame, world))
+                running.add(pool.submit(recorder.record, job.sensor, job.frame, worlds))
                 if len(running) >= 2 * workers:
                     finished, running = wait(running, return_when=FIRST_COMPLETED)
                     points += sum(f.result() for f in finished)
@@ -300,10 +324,10 @@ def _record(
 
 
 def _chunks(
-    jobs: Sequence[_Job], trajectory: Trajectory
-) -> Iterator[tuple[list[_Job], tuple[float, float, float, float]]]:
+    jobs: Sequence[Job], trajectory: Trajectory
+) -> Iterator[tuple[list[Job], tuple[float, float, float, float]]]:
     """Runs of jobs during which the vehicle stays within a square of `_CHUNK`, with the box it covers."""
-    chunk: list[_Job] = []
+    chunk: list[Job] = []
     low = high = np.zeros(2)
     for job in jobs:
         span = np.linspace(job.start_ns, job.start_ns + job.sensor.period_ns, 5).astype(np.int64)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from lidar.errors import InputError
 
@@ -116,15 +115,18 @@ class Trajectory:
 
     def at(self, time_ns: ArrayLike) -> Poses:
         """Poses at times (k,) in nanoseconds, held at the first and the last pose outside the drive."""
-        t = np.clip(np.asarray(time_ns, np.int64), self.time_ns[0], self.time_ns[-1])
-        lo = np.clip(np.searchsorted(self.time_ns, t, side="right") - 1, 0, len(self.time_ns) - 2)
-        span = (self.time_ns[lo + 1] - self.time_ns[lo]).astype(float)
-        w = ((t - self.time_ns[lo]) / span)[:, None]
-        position = self.position[lo] + w * (self.position[lo + 1] - self.position[lo])
-        k = self.scale[lo] + w[:, 0] * (self.scale[lo + 1] - self.scale[lo])
-        first, last = int(lo.min()), int(lo.max()) + 2
-        turn = Slerp(self.time_ns[first:last].astype(float), Rotation.from_quat(self.quat_xyzw[first:last]))
-        return Poses(position, turn(t.astype(float)).as_matrix(), np.stack([k, k, np.ones_like(k)], axis=1))
+        t = np.asarray(time_ns, np.int64).reshape(-1)
+        k = len(t)
+        out = Poses(np.empty((k, 3)), np.empty((k, 3, 3)), np.ones((k, 3)))
+        _interpolate(
+            t,
+            self.time_ns,
+            self.position,
+            self.quat_xyzw,
+            self.scale,
+            (out.position, out.rotation, out.scale),
+        )
+        return out
 
     def place(
         self,
@@ -151,6 +153,42 @@ class Trajectory:
         out: Float = np.empty((len(points), 3))
         _place(points, knot - first, since / KNOT_NS, knots.position, turn, out)
         return out
+
+
+@njit(cache=True, nogil=True)
+def _interpolate(time: Any, knot: Any, place: Any, quat: Any, scale: Any, out: Any) -> None:
+    """Fill ``out``: position, rotation and scale at each time; the shorter way round between quaternions."""
+    position, rotation, factor = out
+    last = len(knot) - 2
+    for i in range(len(time)):
+        t = min(max(time[i], knot[0]), knot[-1])
+        k = min(np.searchsorted(knot, t, side="right") - 1, last)
+        w = (t - knot[k]) / (knot[k + 1] - knot[k])
+        for r in range(3):
+            position[i, r] = place[k, r] + w * (place[k + 1, r] - place[k, r])
+        factor[i, 0] = factor[i, 1] = scale[k] + w * (scale[k + 1] - scale[k])
+        a, b = quat[k], quat[k + 1]
+        size = np.sqrt((a * a).sum() * (b * b).sum())
+        along = (a * b).sum() / size
+        # The angle from its sine too: near 1 the cosine says little of it.
+        cross = np.sqrt(
+            (a[3] * b[0] - a[0] * b[3] - a[1] * b[2] + a[2] * b[1]) ** 2
+            + (a[3] * b[1] - a[1] * b[3] - a[2] * b[0] + a[0] * b[2]) ** 2
+            + (a[3] * b[2] - a[2] * b[3] - a[0] * b[1] + a[1] * b[0]) ** 2
+        )
+        angle = np.arctan2(cross / size, abs(along))
+        u, v = 1.0 - w, w
+        if angle > 1e-8:
+            u, v = np.sin(u * angle) / np.sin(angle), np.sin(w * angle) / np.sin(angle)
+        if along < 0.0:
+            v = -v
+        u, v = u / np.sqrt((a * a).sum()), v / np.sqrt((b * b).sum())
+        x, y, z, s = u * a[0] + v * b[0], u * a[1] + v * b[1], u * a[2] + v * b[2], u * a[3] + v * b[3]
+        n = 2.0 / (x * x + y * y + z * z + s * s)
+        m = rotation[i]
+        m[0, 0], m[0, 1], m[0, 2] = 1 - n * (y * y + z * z), n * (x * y - z * s), n * (x * z + y * s)
+        m[1, 0], m[1, 1], m[1, 2] = n * (x * y + z * s), 1 - n * (x * x + z * z), n * (y * z - x * s)
+        m[2, 0], m[2, 1], m[2, 2] = n * (x * z - y * s), n * (y * z + x * s), 1 - n * (x * x + y * y)
 
 
 @njit(cache=True, nogil=True)

@@ -1,5 +1,6 @@
 """Every cloud format gives back what was written, to its own step, and strangers' readers agree."""
 
+import io
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -130,6 +131,27 @@ def test_laspy_reads_world_coordinates_crs_classes_and_time(tmp_path, suffix):
     np.testing.assert_array_equal(np.concatenate([t["label"] for t in back]), cloud["label"])
     assert np.abs(np.concatenate([t["intensity"] for t in back]) - cloud["intensity"]).max() < 0.002
     assert read_crs(path).to_epsg() == 32618
+
+
+def test_an_uncompressed_file_in_parts_is_what_laspy_writes_of_its_points(tmp_path):
+    cloud = table(900)
+    world = cloud | {"gps_time": cloud["time_ns"] * 1e-9}
+    for axis, shift in zip("xyz", INFO.offset, strict=True):
+        world[axis] = cloud[axis] + shift
+    parts = [{name: column[rows] for name, column in world.items()} for rows in (slice(400), slice(400, 900))]
+    with LasWriter(tmp_path / "a.las", INFO, tuple(world)) as writer:
+        for part in parts:
+            writer.write(part)
+    copy = io.BytesIO()
+    laspy.read(tmp_path / "a.las").write(copy)
+    assert (tmp_path / "a.las").read_bytes() == copy.getvalue()
+
+
+def test_a_point_beyond_what_las_can_count_is_refused(tmp_path):
+    far = table(3) | {"x": np.array([0.0, 1.0, 3e6])}
+    with pytest.raises(FormatError, match="too far"):
+        write_las(tmp_path / "a.las", far, replace(INFO, offset=(0.0, 0.0, 0.0)))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_gps_time_of_a_known_moment():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import io
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -58,67 +60,143 @@ class LasInfo:
     created: datetime
 
 
+@dataclass(frozen=True)
+class _Layout:
+    """What all files with the same columns share.
+
+    header : laspy's, with its CRS
+    start  : bytes of an uncompressed file before its points, for a file without points
+    kinds  : of a point
+    """
+
+    header: Any
+    start: bytes
+    kinds: np.dtype[np.void]
+
+
+@functools.lru_cache(maxsize=16)
+def _layout(info: LasInfo, extra: tuple[str, ...], colour: bool) -> _Layout:  # noqa: FBT001
+    import laspy  # noqa: PLC0415  (0.4 s)
+
+    header = laspy.LasHeader(version="1.4", point_format=7 if colour else 6)
+    header.scales = np.full(3, SCALE)
+    header.offsets = np.asarray(info.offset, float)
+    header.add_crs(info.crs)
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    header.creation_date = info.created.date()
+    header.system_identifier = "simulated"
+    header.generating_software = "geoscene lidar"
+    header.add_extra_dims([laspy.ExtraBytesParams(n, _EXTRA[n][0], _EXTRA[n][1]) for n in extra])
+    for one in header.vlrs.get("ExtraBytesVlr"):
+        for column in one.extra_bytes_structs:
+            column.options &= ~0b110  # no bounds of values: laspy takes those of one point for those of all
+    start = io.BytesIO()
+    laspy.LasWriter(start, header, do_compress=False, closefd=False).close()
+    return _Layout(header, start.getvalue(), header.point_format.dtype())
+
+
+class _Uncompressed:
+    """Points of a LAS file, as they are; what the header says of them is filled in at the end.
+
+    Places are those of the public header block of LAS 1.4 R15 (ASPRS 2019), table 3.
+    """
+
+    def __init__(self, path: Path, layout: _Layout) -> None:
+        self.dest = path.open("wb")
+        self.dest.write(layout.start)
+        self._offset = layout.header.offsets
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
+        self._by_return = np.zeros(16, np.uint64)
+
+    def write_points(self, points: NDArray[np.void]) -> None:
+        """Append points."""
+        if not len(points):
+            return
+        counts = [points[axis] for axis in "XYZ"]
+        self._low = np.minimum(self._low, [c.min() * SCALE for c in counts] + self._offset)
+        self._high = np.maximum(self._high, [c.max() * SCALE for c in counts] + self._offset)
+        self._by_return += np.bincount(points["bit_fields"] & 15, minlength=16).astype(np.uint64)
+        self.dest.write(points.data)
+
+    def close(self) -> None:
+        """Say in the header what was written."""
+        if count := int(self._by_return.sum()):
+            self.dest.seek(179)
+            self.dest.write(np.stack([self._high, self._low], axis=1).astype("<f8").tobytes())
+            self.dest.seek(247)
+            self.dest.write(np.array([count, *self._by_return[1:]], "<u8").tobytes())
+        self.dest.close()
+
+
+class _Compressed:
+    """Points of a LAZ file."""
+
+    def __init__(self, path: Path, layout: _Layout) -> None:
+        import laspy  # noqa: PLC0415
+
+        self._header = layout.header
+        self._record: Any = laspy.ScaleAwarePointRecord
+        self._writer: Any = laspy.open(path, mode="w", header=layout.header, do_compress=True)
+        self.dest = self._writer.dest
+
+    def write_points(self, points: NDArray[np.void]) -> None:
+        """Append points."""
+        h = self._header
+        self._writer.write_points(self._record(points, h.point_format, scales=h.scales, offsets=h.offsets))
+
+    def close(self) -> None:
+        """Write what is left."""
+        self._writer.close()
+
+
 class LasWriter:
     """A LAS or LAZ file that takes tables one after the other and appears under its name when closed whole.
 
     Tables need x, y, z (projected, float64) and label; they may have gps_time, intensity, ring, instance,
-    range, incidence, echo, echoes, source (point source id), red, green, blue.
+    range, incidence, echo, echoes (up to 15), source (point source id), red, green, blue.
     """
 
     def __init__(self, path: Path, info: LasInfo, columns: tuple[str, ...]) -> None:
-        import laspy  # noqa: PLC0415  (0.4 s)
-
-        colour = "red" in columns
-        header = laspy.LasHeader(version="1.4", point_format=7 if colour else 6)
-        header.scales = np.full(3, SCALE)
-        header.offsets = np.asarray(info.offset, float)
-        header.add_crs(info.crs)
-        header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
-        header.creation_date = info.created.date()
-        header.system_identifier = "simulated"
-        header.generating_software = "geoscene lidar"
-        extra = [
-            laspy.ExtraBytesParams(name=n, type=kind, description=text)
-            for n, (kind, text) in _EXTRA.items()
-            if n in columns
-        ]
-        header.add_extra_dims(extra)
         self.path = path
-        self._columns = columns
-        self._laspy: Any = laspy
-        self._header = header
+        self._info = info
+        self._extra = tuple(n for n in _EXTRA if n in columns)
+        self._colour = "red" in columns
+        self._layout = _layout(info, self._extra, self._colour)
         self._part = path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
-        self._writer = laspy.open(
-            self._part, mode="w", header=header, do_compress=path.suffix.lower() == ".laz"
-        )
+        sink = _Compressed if path.suffix.lower() == ".laz" else _Uncompressed
+        self._sink = sink(self._part, self._layout)
 
     def write(self, table: Table) -> None:
-        """Append a table."""
-        record = self._laspy.ScaleAwarePointRecord.zeros(rows(table), header=self._header)
-        record.x, record.y, record.z = table["x"], table["y"], table["z"]
-        record.classification = class_codes().asprs[table["label"]].astype(np.uint8)
-        one = np.ones(rows(table), np.uint8)
-        record.return_number = table.get("echo", one)
-        record.number_of_returns = table.get("echoes", one)
+        """Append a table.
+
+        Raises FormatError for coordinates too far from the offset to be counted in millimetres.
+        """
+        points = np.zeros(rows(table), self._layout.kinds)
+        for k, axis in enumerate("xyz"):
+            counts = np.round((table[axis] - self._info.offset[k]) / SCALE)
+            if len(counts) and not np.abs(counts).max() < 2**31:
+                raise FormatError(f"{self.path}: a point lies too far from {self._info.offset} for LAS")
+            points[axis.upper()] = counts
+        points["classification"] = class_codes().asprs[table["label"]]
+        one = np.ones(1, np.uint8)
+        number, count = (np.minimum(table.get(name, one), 15) for name in ("echo", "echoes"))
+        points["bit_fields"] = number | count << 4
         if "intensity" in table:
-            record.intensity = np.clip(np.rint(table["intensity"] * INTENSITY_UNIT), 0, 65535).astype(
-                np.uint16
-            )
+            points["intensity"] = np.clip(np.rint(table["intensity"] * INTENSITY_UNIT), 0, 65535)
         if "gps_time" in table:
-            record.gps_time = table["gps_time"]
+            points["gps_time"] = table["gps_time"]
         if "source" in table:
-            record.point_source_id = table["source"]
-        for name in _EXTRA:
-            if name in self._columns:
-                record[name] = table[name]
-        for name in ("red", "green", "blue"):
-            if name in self._columns:
-                record[name] = table[name].astype(np.uint16) * 257
-        self._writer.write_points(record)
+            points["point_source_id"] = table["source"]
+        for name in self._extra:
+            points[name] = table[name]
+        if self._colour:
+            for name in ("red", "green", "blue"):
+                points[name] = table[name].astype(np.uint16) * 257
+        self._sink.write_points(points)
 
     def close(self) -> None:
         """Finish the file and move it to its name."""
-        self._writer.close()
+        self._sink.close()
         self._part.replace(self.path)
 
     def __enter__(self) -> Self:
@@ -130,7 +208,7 @@ class LasWriter:
         if kind is None:
             self.close()
         else:
-            self._writer.dest.close()
+            self._sink.dest.close()
             self._part.unlink(missing_ok=True)
 
 
