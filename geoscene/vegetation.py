@@ -193,13 +193,17 @@ def forest_trees(
     )
     draw = _uniform(seed, column, row, 4)
     x, y = (column + 0.1 + 0.8 * draw[0]) * side, (row + 0.1 + 0.8 * draw[1]) * side
+    owner = winners(plan, x, y)
+    stands = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
+    stands &= values_at(plan.layers.klass, owner, Class.UNLABELED) == Class.FOREST_FLOOR
+    x, y, draw, owner = x[stands], y[stands], draw[:, stands], owner[stands]
     # A trunk needs room: there must be forest half a metre away on all sides.
-    within = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
-    x, y, draw = x[within], y[within], draw[:, within]
-    dx, dy = np.array([(0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)]).T[:, :, None]
-    found = winners(plan, (x + dx).ravel(), (y + dy).ravel()).reshape(5, -1)
-    stands = (values_at(plan.layers.klass, found.ravel(), 0) == Class.FOREST_FLOOR).reshape(5, -1).all(axis=0)
-    x, y, draw, owner = x[stands], y[stands], draw[:, stands], found[0, stands]
+    dx, dy = np.array([(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)]).T[:, :, None]
+    beside = values_at(
+        plan.layers.klass, winners(plan, (x + dx).ravel(), (y + dy).ravel()), Class.UNLABELED
+    ).reshape(4, -1)
+    roomy = (beside == Class.FOREST_FLOOR).all(axis=0)
+    x, y, draw, owner = x[roomy], y[roomy], draw[:, roomy], owner[roomy]
     share = np.zeros(len(plan.layers)) if needles is None else needles
     form = np.where(draw[3] < share[owner], "needleleaved", "broadleaved")
     height = np.where(form == "needleleaved", HEIGHT["needleleaved"], HEIGHT["broadleaved"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -50,6 +51,7 @@ class WaterLevels:
     river   : (n,) bool, the row is a river: its level at a point is that of the nearest station
     station : (k, 2) float64, places on rivers' centre lines, scene metres
     height  : (k,) float64 metres, of the water there
+    nearest : finds the station nearest to a place, None without stations
     reversed : ids of waterways that were drawn against the fall of the terrain
     """
 
@@ -57,6 +59,7 @@ class WaterLevels:
     river: NDArray[np.bool_]
     station: Float
     height: Float
+    nearest: Any
     reversed: tuple[str, ...]
 
 
@@ -83,7 +86,12 @@ def water_levels(layers: Layers, ways: Sequence[Way], frame: Frame, *, height: H
     still = np.flatnonzero((layers.body != "") & ~river)
     if len(still):
         level[still] = _still_levels(layers.polygon[still], layers.body[still] == "sea", height)
-    return WaterLevels(level, river, stations, heights, turned)
+    nearest = None
+    if len(stations):
+        from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
+
+        nearest = cKDTree(stations)
+    return WaterLevels(level, river, stations, heights, nearest, turned)
 
 
 def drape(
@@ -209,10 +217,7 @@ def _flooded(
     stand = levels.level[row]
     flows = levels.river[row]
     if flows.any():
-        from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
-
-        nearest = cKDTree(levels.station).query(triangles.points[vertex[flows]])[1]
-        stand[flows] = levels.height[nearest]
+        stand[flows] = levels.height[levels.nearest.query(triangles.points[vertex[flows]])[1]]
     level = np.full(len(z), np.inf)
     np.minimum.at(level, vertex, stand)
     flooded: Float = np.where(np.isinf(level), z, level)

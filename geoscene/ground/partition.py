@@ -242,7 +242,7 @@ def winners(plan: GroundPlan, x: Float, y: Float) -> NDArray[np.int64]:
     return best
 
 
-def values_at(column: NDArray[Any], row: NDArray[np.int64], base: object) -> NDArray[Any]:
+def values_at(column: NDArray[Any], row: NDArray[np.integer[Any]], base: object) -> NDArray[Any]:
     """A column's values (n,) at rows (n,), and ``base`` where the row is -1."""
     values = np.full(len(row), base, column.dtype)
     there = row >= 0
