@@ -1,5 +1,5 @@
 # make demo   set up, build the bundled real scene, drive it, write pictures and point clouds
-# make test   set up, lint, types, tests
+# make test   set up, tests
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin

@@ -18,6 +18,7 @@ from geoscene.errors import GeosceneError, InputError
 app = App(
     name="geoscene",
     version=__version__,
+    suppress_keyboard_interrupt=False,
     help="""Turn a real place from OpenStreetMap into a watertight 3D scene.
 
     A first scene, without a network:  geoscene build --demo -o scene
@@ -128,7 +129,7 @@ def build(
     out
         Directory to write the scene to.
     overwrite
-        Replace a scene that is there, taking over what the options leave the same.
+        Replace a scene that is there. What its tiles have in common with it is not computed again.
     workers
         Processes; as many as there are cores by default. The bytes do not depend on it.
     json

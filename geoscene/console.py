@@ -43,7 +43,7 @@ def main(app: App, roots: tuple[type[Exception], ...], usage: tuple[type[Excepti
         _complain(app, error)
         sys.exit(USAGE if isinstance(error, usage) else FAILURE)
     except KeyboardInterrupt:
-        _complain(app, "interrupted")
+        _complain(app, "interrupted; the same command goes on from here")
         sys.exit(_INTERRUPTED)
     except MemoryError:
         _complain(app, "out of memory; take a smaller area or fewer workers")

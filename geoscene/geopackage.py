@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.errors import SceneFormatError
+from geoscene.errors import GeosceneError, SceneFormatError
 from geoscene.frames import Frame
 
 _DATE = "2000-01-01T00:00:00Z"  # a constant, so that the same scene is the same bytes
@@ -62,6 +62,7 @@ def _geometry_type(geometry: NDArray[np.object_]) -> str:
 def write_geopackage(path: Path, layers: Sequence[Layer], frame: Frame) -> None:
     """Write layers in the frame's projected CRS; empty layers are left out."""
     import pyogrio  # noqa: PLC0415  (0.3 s)
+    from pyogrio.errors import DataSourceError  # noqa: PLC0415
     from pyogrio.raw import write  # noqa: PLC0415
 
     part = path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -97,6 +98,9 @@ def write_geopackage(path: Path, layers: Sequence[Layer], frame: Frame) -> None:
                 append=part.exists(),
                 layer_options={"FID": "fid", "SPATIAL_INDEX": "YES"},
             )
+    except DataSourceError as error:
+        raise GeosceneError(f"{path}: cannot be written ({error}); is the disk full?") from error
+    else:
         if part.exists():
             part.replace(path)
         else:

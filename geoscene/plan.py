@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.barriers import Barriers, read_barriers
 from geoscene.buildings import Buildings, read_buildings
+from geoscene.errors import InputError
 from geoscene.features import (
     barrier_layer,
     building_layers,
@@ -42,6 +43,7 @@ from geoscene.roads import RoadGraph
 from geoscene.sources import OsmData
 from geoscene.structures import (
     Structures,
+    buildings_over,
     find_openings,
     ground_below,
     opening_layers,
@@ -57,6 +59,9 @@ Height = Callable[[Float, Float], Float]
 
 KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
 """What a scene may hold besides its ground; `make_plan` takes all or some."""
+
+LARGEST_KM2 = 4000.0
+"""Square kilometres of the largest scene: 64,000 tiles of 250 m."""
 
 _ROAD_LINES = 10.0  # metres between the lines along which the ground bends to roads
 _ROAD_REACH = 25.0  # metres from a road's middle within which the ground is graded to it, at most
@@ -132,6 +137,12 @@ def make_plan(
     files that cannot serve.
     """
     west, south, east, north = osm.bounds
+    area = (east - west) * (north - south) * 111.2**2 * np.cos(np.radians((south + north) / 2))
+    if area > LARGEST_KM2:
+        raise InputError(
+            f"{osm.source}: {area:,.0f} km2, more than the {LARGEST_KM2:,.0f} of one scene;"
+            " cut a part out (--bbox)"
+        )
     frame = Frame.at((west + east) / 2, (south + north) / 2, crs)
     problems: list[Problem] = list(osm.problems)
 
@@ -157,6 +168,8 @@ def make_plan(
     openings = find_openings(structures, height)
     footprints = buildings.footprint[: buildings.count]
     base = base_heights(footprints, height or terrain.height)
+    buildings, found = buildings_over(buildings, base, structures)
+    problems += found
 
     progress("ground", 0, 0)
     cover, roads, pads, found = _surfaces(osm, frame, extent, buildings, surfaces, only)

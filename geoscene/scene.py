@@ -120,6 +120,13 @@ def read_shapes(path: Path) -> dict[str, Mesh]:
     """The shapes that `write_shapes` wrote, in order; none if there is no such file."""
     if not path.exists():
         return {}
+    try:
+        return _shapes(path)
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise SceneFormatError(f"{path}: damaged ({error}); build the scene again") from error
+
+
+def _shapes(path: Path) -> dict[str, Mesh]:
     with np.load(path, allow_pickle=False) as archive:
         return {
             str(name): Mesh(**{f.name: archive[f"{name}/{f.name}"] for f in fields(Mesh)})

@@ -18,6 +18,7 @@ from lidar.errors import InputError, LidarError
 app = App(
     name="lidar",
     version=__version__,
+    suppress_keyboard_interrupt=False,
     help="""Drive vehicles with ray-cast sensors through scenes made by geoscene.
 
     lidar drive scene --route random --duration 20 -o drive
@@ -44,6 +45,7 @@ def drive(
     start: str | None = None,
     fidelity: str = "standard",
     settings: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
+    traffic: str | None = None,
     formats: Annotated[str, Parameter(name="--format", group=_OUTPUT)] = "pcd,laz",
     crs: Annotated[str, Parameter(group=_OUTPUT)] = "utm",
     exact: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
@@ -90,6 +92,9 @@ def drive(
         a size, several echoes, noise, lost and false returns).
     settings
         One effect set apart from the level, NAME=VALUE; again for more. An unknown name lists them all.
+    traffic
+        Other road users: on, or densities such as vehicles=20,parked=0.5,walkers=5,cyclists=2 (vehicles and
+        cyclists per km of lane, walkers per km of sidewalk, parked as a share of the places).
     formats
         Formats of clouds, with commas: pcd, ply, csv (sensor frame), laz, las (georeferenced).
     crs
@@ -124,6 +129,7 @@ def drive(
         side=side,
         fidelity=fidelity,
         settings=tuple(_setting(text) for text in settings or ()),
+        traffic=_traffic(traffic),
         workers=workers,
     )
     with progress_bar(quiet=quiet) as progress:
@@ -168,6 +174,24 @@ def _point(word: str) -> tuple[float, float] | None:
     if not (abs(lat) <= 90 and abs(lon) <= 180):
         raise InputError(f"--route {word}: not a latitude and longitude in degrees")
     return lat, lon
+
+
+def _traffic(text: str | None) -> Any:
+    if text is None or text == "off":
+        return None
+    from lidar.actors import TrafficOptions  # noqa: PLC0415
+
+    if text == "on":
+        return TrafficOptions()
+    known = ("vehicles", "cyclists", "walkers", "parked", "reach")
+    pairs = [_setting(word) for word in text.split(",")] if "=" in text else [(text, "")]
+    if unknown := [name for name, _ in pairs if name not in known]:
+        raise InputError(f"--traffic {text}: {', '.join(unknown)} is none of on, off, {', '.join(known)}")
+    try:
+        given: dict[str, Any] = {name: float(value) for name, value in pairs}
+        return TrafficOptions(**given)
+    except ValueError as error:
+        raise InputError(f"--traffic {text}: {error}") from None
 
 
 def _setting(text: str) -> tuple[str, str]:

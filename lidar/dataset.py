@@ -166,4 +166,6 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
         raise DatasetError(
             f"{path}: holds a drive made with another {', '.join(changed)}; add --overwrite to replace it"
         )
+    for left in path.rglob("*.part"):  # of a drive that was killed
+        left.unlink()
     return int(manifest["frames_done"])

@@ -76,6 +76,8 @@ class DriveOptions:
 
     def __post_init__(self) -> None:
         """Refuse options that cannot be meant."""
+        if not self.formats:
+            raise InputError(f"--format: give one or more of {','.join(FORMATS)}")
         if unknown := sorted(set(self.formats) - set(FORMATS)):
             raise InputError(f"--format {','.join(unknown)}: one or more of {','.join(FORMATS)}")
         if self.duration is not None and not 0.1 <= self.duration <= 86400:

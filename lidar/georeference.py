@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
 
 from geoscene.frames import Frame, utm_crs
-from lidar.errors import InputError
 
 Float = NDArray[np.float64]
 
@@ -23,15 +21,14 @@ def export_crs(frame: Frame, crs: str = "utm") -> CRS:
     """The CRS of exported clouds: ``utm`` (zone of the scene's origin), ``scene``, or any pyproj name.
 
     A scene frame that is itself a registered system (``--crs utm`` or an EPSG code) is kept for ``utm``.
-    Raises InputError for a name that pyproj does not know.
+    Raises FrameError for a system that is unknown, not projected, not in metres, or not of that place.
     """
     if crs == "scene" or (crs == "utm" and frame.name.startswith("EPSG:")):
         return frame.crs
     lon, lat = frame.to_geographic(0.0, 0.0)
-    try:
-        return CRS.from_user_input(utm_crs(float(lon), float(lat)) if crs == "utm" else crs)
-    except CRSError:
-        raise InputError(f"--crs {crs}: pyproj does not know it; give utm, scene or an EPSG code") from None
+    if crs == "utm":
+        return CRS.from_user_input(utm_crs(float(lon), float(lat)))
+    return Frame.at(float(lon), float(lat), crs).crs
 
 
 @dataclass(frozen=True)

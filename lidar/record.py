@@ -14,10 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.frames import Frame
+from lidar.actors import Actors, box_rows, count_points
 from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
 from lidar.camera.render import exposure_times, optical_flow, render
 from lidar.camera.sun import sun_direction
 from lidar.cloud import Cloud
+from lidar.crowd import Worlds
+from lidar.dataset import write_columns
 from lidar.formats.las import LasInfo, gps_seconds, write_las
 from lidar.formats.pcd import write_pcd
 from lidar.formats.ply import write_ply
@@ -93,10 +96,8 @@ class Camera:
         return self.spec.time_offset_ns + int(frame * frame_ns(self.spec.rate_hz))
 
     def frame_count(self, duration_ns: int) -> int:
-        """Number of frames whose exposure ends within a drive of that length."""
-        s = self.spec
-        last = duration_ns - s.time_offset_ns - s.exposure_ns - s.height * s.row_ns
-        return max(0, int(last // frame_ns(s.rate_hz)) + 1) if last >= 0 else 0
+        """Number of frames whose period ends within a drive of that length, as for scanners."""
+        return max(0, int((duration_ns - self.spec.time_offset_ns) // frame_ns(self.spec.rate_hz)))
 
 
 def scanners(rig: Rig) -> list[Scanner]:
@@ -142,6 +143,9 @@ class Recorder:
         seed: int,
         effects: Effects,
         watch: _Watch,
+        *,
+        actors: Actors | None = None,
+        reach: float = 0.0,
     ) -> None:
         self.out = out
         self.frame = frame
@@ -152,6 +156,8 @@ class Recorder:
         self.seed = seed
         self.effects = effects
         self.watch = watch
+        self.actors = actors
+        self.reach = reach
         self._las = LasInfo(geo.crs, geo.offset, start)
 
     def paths(self, sensor: Scanner | Camera, frame: int) -> dict[str, Path]:
@@ -163,16 +169,38 @@ class Recorder:
 
     def is_done(self, sensor: Scanner | Camera, frame: int) -> bool:
         """Whether all files of a frame are there."""
-        return all(path.exists() for path in self.paths(sensor, frame).values())
+        files = list(self.paths(sensor, frame).values())
+        if self.actors is not None and isinstance(sensor, Scanner):
+            files.append(self._boxes_path(sensor, frame))
+        return all(path.exists() and path.stat().st_size for path in files)
 
-    def record(self, sensor: Scanner | Camera, frame: int, world: World) -> int:
+    def _boxes_path(self, scanner: Scanner, frame: int) -> Path:
+        return self.out / scanner.name / "boxes" / f"{frame:06d}.csv"
+
+    def record(self, sensor: Scanner | Camera, frame: int, worlds: Worlds) -> int:
         """Sense one frame and write its files; return the number of points."""
+        start = sensor.frame_start_ns(frame)
         if isinstance(sensor, Scanner):
-            return self._record_cloud(sensor, frame, world)
-        self._record_images(sensor, frame, world)
+            world = worlds.during(*sensor.sensor.window_ns(frame))
+            cloud = self._record_cloud(sensor, frame, world)
+            if self.actors is not None:
+                self._record_boxes(self.actors, sensor, frame, cloud)
+            return len(cloud)
+        times = exposure_times(sensor.spec, start, samples=5 if sensor.spec.exposure_ns else 1)
+        end = max(int(times[-1]), start + 1)
+        self._record_images(sensor, frame, worlds.during(start, end), times, (times - start) / (end - start))
         return 0
 
-    def _record_cloud(self, scanner: Scanner, frame: int, world: World) -> int:
+    def _record_boxes(self, actors: Actors, scanner: Scanner, frame: int, cloud: Cloud) -> None:
+        """Write the boxes of a frame, with the number of its points on each."""
+        begin = scanner.frame_start_ns(frame)
+        columns = box_rows(actors, self.trajectory, begin, frame, reach=self.reach)
+        points = count_points(actors, columns["id"], cloud.feature)
+        path = self._boxes_path(scanner, frame)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_columns(path, {**columns, "points": points})
+
+    def _record_cloud(self, scanner: Scanner, frame: int, world: World) -> Cloud:
         with self.watch.stage("scan"):
             cloud = scan(
                 scanner.sensor,
@@ -199,7 +227,7 @@ class Recorder:
             for kind in world_kinds:
                 with self.watch.stage(f"write {kind}"):
                     write_las(paths[kind], placed, self._las)
-        return len(cloud)
+        return cloud
 
     def _world_table(self, scanner: Scanner, cloud: Cloud, table: Table) -> Table:
         mount, time_ns = scanner.spec.mount, cloud.start_ns + cloud.time_ns.astype(np.int64)
@@ -214,12 +242,13 @@ class Recorder:
             "gps_time": gps_seconds(self.start, time_ns),
         }
 
-    def _record_images(self, camera: Camera, frame: int, world: World) -> None:
+    def _record_images(
+        self, camera: Camera, frame: int, world: World, times: NDArray[np.int64], shares: NDArray[np.float64]
+    ) -> None:
         spec = camera.spec
         with self.watch.stage("render"):
-            times = exposure_times(spec, camera.frame_start_ns(frame), samples=5 if spec.exposure_ns else 1)
             poses = self.trajectory.at(times).mounted(spec.mount.translation, spec.mount.rotation)
-            image = render(spec, poses, world, sun=self._sun())
+            image = render(spec, poses, world, sun=self._sun(), times=None if self.actors is None else shares)
         for kind, path in self.paths(camera, frame).items():
             path.parent.mkdir(parents=True, exist_ok=True)
             with self.watch.stage(f"write {kind}"):

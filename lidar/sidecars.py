@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -175,3 +176,16 @@ def _write_fixes(
     stamped: dict[str, Any] = {"timestamp": iso_times(start, fixes.time_ns), **gnss_columns(fixes)}
     write_columns(out / f"{spec.name}.csv", stamped)
     write_atomically(out / f"{spec.name}.nmea", "".join(nmea(fixes, start)).encode("ascii"))
+
+
+def gather_boxes(out: Path) -> None:
+    """Write ``boxes.csv``: the boxes of all frames of the first scanner, in order."""
+    calibration = json.loads((out / "calibration.json").read_text("utf-8"))
+    scanners = [name for name, sensor in calibration["sensors"].items() if sensor["kind"] == "lidar"]
+    parts = sorted((out / scanners[0] / "boxes").glob("*.csv")) if scanners else []
+    lines: list[str] = []
+    for part in parts:
+        header, *rows = part.read_text("utf-8").splitlines()
+        lines += rows if lines else [header, *rows]
+    if lines:
+        write_atomically(out / "boxes.csv", ("\n".join(lines) + "\n").encode("utf-8"))

@@ -57,6 +57,29 @@ def road_graph(scene: Scene) -> RoadGraph:
     return read_graphml(path, scene.frame)
 
 
+def covered(graph: RoadGraph, scene: Scene) -> RoadGraph:
+    """The part of a road graph that lies on the scene's tiles.
+
+    Raises RouteError if none does.
+    """
+    xmin, ymin, xmax, ymax = scene.bounds
+    size = scene.tile_size
+    tiles = np.array(scene.tile_indices).reshape(-1, 2)
+    points = np.concatenate([np.empty((0, 3)), *graph.geometry])[:, :2]
+    edge = np.repeat(np.arange(len(graph)), [len(line) for line in graph.geometry])
+    low, high = np.array([xmin, ymin]), np.array([xmax, ymax])
+    inside = ((points >= low) & (points <= high)).all(axis=1)
+    width = int(tiles[:, 1].max() - tiles[:, 1].min()) + 3
+    base = tiles.min(axis=0) - 1
+    keys = (tiles - base) @ np.array([width, 1])
+    place = np.clip(np.floor(points / size).astype(int) - base, 0, [10**6, width - 1])
+    inside &= np.isin(place @ np.array([width, 1]), keys)
+    kept = np.bincount(edge, ~inside, minlength=len(graph)) == 0
+    if not kept.any():
+        raise RouteError(f"{scene.path}: no road lies within the tiles of this scene")
+    return graph if kept.all() else graph.take(kept)
+
+
 def standing_footprints(scene: Scene) -> NDArray[np.object_]:
     """Footprints, scene metres, of buildings that reach down to the ground."""
     if "buildings" not in scene.layers or len(set(scene.layers["buildings"])) == 1:
@@ -102,7 +125,7 @@ def plan_travel(
     Where a street is too narrow for the vehicle between its buildings, it is left out and the route planned
     again. Raises RouteError if no way is left.
     """
-    graph = road_graph(scene)
+    graph = covered(road_graph(scene), scene)
     body = load_vehicle(vehicle)
     obstacles = standing_footprints(scene)
     progress("planning", 0, 0)

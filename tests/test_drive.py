@@ -15,11 +15,13 @@ import laspy
 import numpy as np
 import pytest
 from pyproj import CRS, Transformer
+from scipy.spatial.transform import Rotation
 
 from geoscene.build import BuildOptions, build
 from geoscene.classes import Class
 from geoscene.scene import open_scene
 from geoscene.sources import demo_path, read_osm
+from lidar.actors import TrafficOptions
 from lidar.attitude import quat_from_euler
 from lidar.dataset import open_dataset
 from lidar.drive import DriveOptions, drive
@@ -211,3 +213,37 @@ def test_a_scene_opens_again(scene):
     again = open_scene(scene.path)
     assert again.frame == scene.frame
     assert again.tile_indices == scene.tile_indices
+
+
+def test_traffic_is_labelled_boxed_and_the_same_for_any_number_of_workers(scene, tmp_path):
+    options = replace(
+        OPTIONS, duration=2.0, formats=("pcd",), traffic=TrafficOptions(vehicles=20.0, parked=0.8)
+    )
+    drive(scene, tmp_path / "a", options)
+    drive(scene, tmp_path / "b", replace(options, workers=1))
+    assert digest(tmp_path / "a") == digest(tmp_path / "b")
+    with (tmp_path / "a" / "boxes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    hit = [row for row in rows if int(row["points"]) > 30]
+    assert len(hit) > 5
+    first = max(stop for _, stop in scene.layers.values())
+    trajectory = open_dataset(tmp_path / "a").trajectory()
+    calibration = json.loads((tmp_path / "a" / "calibration.json").read_text())
+    mount = np.array(calibration["sensors"]["lidar_top"]["vehicle_from_sensor"])
+    for row in hit[:: max(1, len(hit) // 20)]:
+        frame = int(row["frame"])
+        cloud = read_pcd(tmp_path / "a" / "lidar_top" / "pcd" / f"{frame:06d}.pcd")
+        on_it = cloud["instance"] == int(row["instance"])
+        assert on_it.sum() == int(row["points"])
+        assert int(row["instance"]) >= first
+        xyz = np.column_stack([cloud[k][on_it] for k in "xyz"])
+        times = int(row["time_ns"]) + cloud["time_ns"][on_it].astype(np.int64)
+        placed = trajectory.place(xyz, times, translation=mount[:3, 3], rotation=mount[:3, :3])
+        centre = np.array([float(row[k]) for k in "xyz"])
+        velocity = np.array([float(row[k]) for k in ("vx", "vy", "vz")])
+        away = placed - centre - (times - int(row["time_ns"]))[:, None] * 1e-9 * velocity
+        turn = Rotation.from_quat([float(row[k]) for k in ("qx", "qy", "qz", "qw")])
+        inside = np.abs(turn.inv().apply(away)) <= np.array(
+            [float(row[k]) / 2 + 0.15 for k in ("length", "width", "height")]
+        )
+        assert inside.all(axis=1).mean() > 0.98

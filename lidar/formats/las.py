@@ -162,7 +162,7 @@ class LasWriter:
         self._extra = tuple(n for n in _EXTRA if n in columns)
         self._colour = "red" in columns
         self._layout = _layout(info, self._extra, self._colour)
-        self._part = path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
+        self._part = path.with_name(f"{path.name}.{os.getpid()}.part")
         sink = _Compressed if path.suffix.lower() == ".laz" else _Uncompressed
         self._sink = sink(self._part, self._layout)
 
