@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from roadgrids import grid, road_graph
 
-from lidar.actors.flow import DT, simulate_trips
+from lidar.actors.flow import DT, ego_on, green_windows, simulate_trips
 from lidar.actors.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.actors.lanes import STEP, lane_shift, lanes_of
 from lidar.actors.simulate import HARD
@@ -19,7 +19,7 @@ from lidar.actors.traffic import area_of, vehicle_trips
 from lidar.motion import drive_path
 from lidar.path import plan_path
 from lidar.poses import Trajectory
-from lidar.route import lane_route, plan_route
+from lidar.route import plan_route
 from lidar.vehicle import load_vehicle
 
 CAR = load_vehicle("car")
@@ -83,18 +83,36 @@ def overlaps(boxes):
     return int((a < b).sum())
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seed=st.integers(0, 10_000), lit=st.booleans(), lanes=st.sampled_from([1.0, 2.0]))
 def test_no_two_vehicles_ever_touch_and_none_jumps(seed, lit, lanes):
     graph = city(lit=lit, lanes=lanes, width=7.0 * lanes)
-    trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 90.0), seed=seed, reach=600.0)
+    trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 65.0), seed=seed, reach=600.0)
     assert len(np.unique(flow.trip)) > 15
-    assert flow.step.max() * DT > 85
+    assert flow.step.max() * DT > 60
     poses = tracks(trips, flow)
     for moment in poses[::3]:
         assert overlaps(boxes_at(trips, moment)) == 0
     moved = np.hypot(*np.diff(poses[:, :, :2], axis=0).transpose(2, 0, 1))
     assert np.nanmax(moved) < 13.9 * 1.1 * DT + 0.1
+
+
+def test_not_even_reckless_drivers_touch():
+    """Who keeps no gap and no headway still stops within the ground that is his."""
+    graph = city(lit=False)
+    ego = standing((400.0, 400.0), 45.0)
+    lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
+    trips = vehicle_trips(lanes, area_of(lanes, ego, 600.0, 1.0), seed=9, density=30.0)
+    wild = [
+        replace(
+            t, driver=replace(t.driver, headway=0.0, gap=0.0, brake=50.0, pull=4.0), wish=0 * t.wish + 16.0
+        )
+        for t in trips
+    ]
+    flow = simulate_trips(wild, graph, junction_plan(graph, lanes, seed=9), ego, BOX, reach=600.0)
+    for moment in tracks(wild, flow)[::2]:
+        assert overlaps(boxes_at(wild, moment)) == 0
+    assert flow.speed.max() > 14.0
 
 
 def test_speed_changes_as_a_vehicle_can():
@@ -117,11 +135,11 @@ def test_braking_is_mild_almost_always():
     assert flow.speed.mean() > 2.0  # and yet they get on
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(seed=st.integers(0, 1000), lit=st.booleans())
 def test_the_ego_is_never_touched(seed, lit):
     graph = city(lit=lit)
-    ego = driving(graph, seed, 40.0)
+    ego = driving(graph, seed, 30.0)
     trips, flow, _ = flow_on(graph, ego, seed=seed, reach=300.0)
     poses = tracks(trips, flow)
     times = (np.arange(len(poses)) * DT * 1e9).astype(np.int64)
@@ -241,14 +259,19 @@ def test_more_density_is_more_traffic():
     assert flow_on(graph, ego, seed=1, density=0.0)[0] == []
 
 
-def test_a_route_is_driven_among_traffic_that_gets_out_of_its_way():
-    """An ego that drives through a lit junction meets green: the others wait."""
+def test_signals_are_green_for_the_ego_when_it_comes():
     graph = city(lit=True)
-    chain = [k for k in range(len(graph)) if graph.node_xyz[graph.tail[k], 1] == 90.0]
-    along = [k for k in chain if graph.node_xyz[graph.head[k], 1] == 90.0]
-    east = sorted((k for k in along if graph.tail[k] < graph.head[k]), key=lambda k: graph.tail[k])
-    path = plan_path(lane_route(graph, east, (0.0, 90.0)), CAR, Plane())
-    ego = drive_path(path, CAR)
-    trips, flow, _ = flow_on(graph, ego, seed=11, reach=300.0)
-    assert len(np.unique(flow.trip)) > 5
-    assert len(trips) >= len(np.unique(flow.trip))
+    ego = driving(graph, 3, 40.0)
+    lanes = lanes_of(graph)
+    plan = junction_plan(graph, lanes, seed=11)
+    signals = plan.signals._replace(window=green_windows(plan, ego_on(ego, BOX, graph)))
+    times = np.arange(0.0, 40.0, 0.1)
+    at = ego.at((times * 1e9).astype(np.int64))
+    zone = zone_at(plan.zones, at.position[:, :2])
+    entries = np.flatnonzero((np.diff(zone) != 0) & (zone[1:] >= 0)) + 1
+    assert len(entries) >= 2
+    for k in entries:
+        forward = at.rotation[k, :2, 0]
+        group = signal_group(plan, int(zone[k]), float(np.arctan2(forward[1], forward[0])))
+        assert is_green(int(zone[k]), group, float(times[k]), signals)
+        assert not is_green(int(zone[k]), 1 - group, float(times[k]), signals)

@@ -66,9 +66,9 @@ def simulate_trips(
         none = np.empty(0, np.int64)
         return Flow(none, none, np.empty(0), np.empty(0))
     movers = _movers(trips, graph, plan)
-    known = _ego(ego, ego_box, graph)
+    known = ego_on(ego, ego_box, graph)
     movers, known, squares = _numbered(movers, known)
-    signals = plan.signals._replace(window=_windows(plan, known))
+    signals = plan.signals._replace(window=green_windows(plan, known))
     out = np.zeros(len(trips), bool)
     for _ in range(_ROUNDS):
         log, met = run(movers, known, signals, out, squares, DT, len(known.x), _HORIZON, reach + 100.0)
@@ -80,7 +80,8 @@ def simulate_trips(
     return Flow(log[:, 0].astype(np.int64), log[:, 1].astype(np.int64), log[:, 2], log[:, 3])
 
 
-def _ego(ego: Trajectory, box: tuple[float, float, float], graph: RoadGraph) -> Ego:
+def ego_on(ego: Trajectory, box: tuple[float, float, float], graph: RoadGraph) -> Ego:
+    """What the others know of the ego vehicle; ``box`` as in `simulate_trips`."""
     length, width, ahead = box
     steps = int(ego.duration_ns * 1e-9 / DT) + 2
     time = np.round(np.arange(steps) * DT * 1e9).astype(np.int64)
@@ -125,7 +126,7 @@ def _numbered(movers: Movers, ego: Ego) -> tuple[Movers, Ego, int]:
     return movers._replace(square=mine), ego._replace(event_square=its), len(used)
 
 
-def _windows(plan: Plan, ego: Ego) -> Float:
+def green_windows(plan: Plan, ego: Ego) -> Float:
     """Windows (w, 4) in which signals are green for the ego: from 8 s before it reaches a junction."""
     zone = zone_at(plan.zones, np.column_stack([ego.x, ego.y]))
     rows = []
