@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 import shapely
 
-from geoscene.buildings.footprints import clean, gathered, project
+from geoscene.buildings.footprints import clean, gathered, groups, project
 from geoscene.buildings.heights import read_heights
 from geoscene.buildings.looks import read_roof, read_walls, settle_look
 from geoscene.buildings.parts import assign, clusters, cut_overlaps, duplicates, remainder
@@ -100,9 +100,8 @@ def _settle_parts(
     )
     wholes = list(outlines)
     orphans = np.flatnonzero(target < 0)
-    cluster = clusters(shapes[orphans])
-    for group in np.unique(cluster):
-        members = orphans[cluster == group]
+    for group in groups(clusters(shapes[orphans])):
+        members = orphans[group]
         first = parts[members[np.argmax(shapely.area(shapes[members]))]].osm_id
         shape = clean(gathered([shapely.union_all(shapes[members])]))[0][0]
         target[members] = len(wholes)
@@ -111,11 +110,12 @@ def _settle_parts(
         problems.append(Problem(first, "building", "repaired", "parts-without-outline", detail))
 
     rests = []
-    for row in np.unique(target):
+    for members in groups(target):
+        row = int(target[members[0]])
         whole = wholes[row]
-        rest, share = remainder(whole.footprint, shapes[target == row], covered=options.covered)
+        rest, share = remainder(whole.footprint, shapes[members], covered=options.covered)
         if shapely.area(rest) >= options.min_area:
-            rests.append(replace(whole, footprint=rest, outline=int(row), is_part=True, is_rest=True))
+            rests.append(replace(whole, footprint=rest, outline=row, is_part=True, is_rest=True))
             detail = f"parts cover {share:.0%}; {shapely.area(rest):.1f} m2 of the outline stay as a part"
             problems.append(Problem(whole.osm_id, "building", "repaired", "partly-covered", detail))
     return [

@@ -32,6 +32,12 @@ def gathered(shapes: Sequence[Any]) -> Polygons:
     return out
 
 
+def groups(number: NDArray[np.integer]) -> list[NDArray[np.int64]]:
+    """The places (rising) of each number that occurs, in order of number."""
+    order = np.argsort(number, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(order) else []
+
+
 def project(geometry: Polygons, frame: Frame) -> Polygons:
     """Polygons (n,) in degrees as polygons in scene metres, not yet on the grid."""
     out: Polygons = shapely.transform(
@@ -66,8 +72,8 @@ def _polygonal(geometry: Polygons) -> Polygons:
     parts, row = shapely.get_parts(geometry, return_index=True)
     parts, row = _flatten(parts, row)
     out = np.full(len(geometry), shapely.Polygon(), dtype=object)
-    for k in np.unique(row):
-        mine = parts[row == k]
+    for members in groups(row):
+        k, mine = row[members[0]], parts[members]
         out[k] = mine[0] if len(mine) == 1 else shapely.multipolygons(mine)
     return out
 

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.buildings.footprints import Polygons, clean, subtract
+from geoscene.buildings.footprints import Polygons, clean, groups, subtract
 from geoscene.buildings.table import GRID, Texts
 from geoscene.report import Problem
 from geoscene.sources.data import Relation
@@ -128,8 +128,8 @@ def cut_overlaps(
     out = footprint.copy()
     problems = []
     # from the smallest on, so that a piece is final before it cuts others
-    for row in np.unique(loser)[np.argsort(area[np.unique(loser)], kind="stable")]:
-        mine = loser == row
+    for mine in sorted(groups(loser), key=lambda g: area[loser[g[0]]]):
+        row = loser[mine[0]]
         cutters = out[winner[mine]]
         out[row] = subtract(out[row], shapely.union_all(cutters, grid_size=GRID))
         with_whom = ", ".join(sorted({osm_id[w] for w in winner[mine]}))

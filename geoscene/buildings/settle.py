@@ -148,8 +148,11 @@ def _settle_rests(
     Its own tags hold unless a part that stands on the ground reaches as high, for then the tags speak of that
     part: the rest is as high as the lowest part on the ground.
     """
+    of = np.argsort(outline, kind="stable")
+    begin, end = (np.searchsorted(outline[of], outline, side=side) for side in ("left", "right"))
     for k in np.flatnonzero([r.is_rest for r in rows]):
-        parts = np.flatnonzero(is_part & (outline == outline[k]) & np.isfinite(h.high))
+        family = of[begin[k] : end[k]]
+        parts = family[is_part[family] & np.isfinite(h.high[family])]
         grounded = [p for p in parts if p != k and h.low[p] < 0.01]
         if not grounded:
             continue
