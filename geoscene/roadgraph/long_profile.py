@@ -78,7 +78,8 @@ def profile(
     the squared curvature in height times ``smooth`` to the fourth; bridges and tunnels have the second term
     only, so they run on from their ramps. Bounds: a road is above one that it crosses by clearance and deck;
     a bridge is above obstacles and the ground; a tunnel is under the ground, deeper with the distance from
-    its mouth, and if slopes allow wholly so after 15 m; slopes; changes of slope. Bounds that contradict each other (a ramp too short for its
+    its mouth, and if slopes allow wholly so after 15 m; slopes; changes of slope. Bounds that
+    contradict each other (a ramp too short for its
     slope) give way, slopes before heights. Solved by an interior-point method.
 
     ground    : height of the terrain; what it returns is kept to where nothing stands against it

@@ -82,10 +82,15 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
 def raise_shell(plan: Plan, levels: Float, solid: NDArray[np.bool_]) -> Shell:
     """The closed surface around the solid layers of a plan's triangles.
 
+    Where what is solid would touch itself along an upright edge alone, its smallest triangles there are left
+    out, so that every edge has two faces.
+
     levels : (n, l) float64, rising heights of the levels at each of the plan's vertices
     solid  : (m, l - 1) bool, whether a triangle is solid between one level and the next
     """
     n, count = levels.shape
+    start, end, own, other = half_edges(plan)
+    solid = np.column_stack([_unpinched(plan, layer, start, own, other) for layer in solid.T])
     vertices = np.column_stack([np.tile(plan.xy, (count, 1)), levels.T.reshape(-1)])
     padded = np.pad(solid, ((0, 0), (1, 1)))
     faces, level, up, triangle = [], [], [], []
@@ -99,7 +104,6 @@ def raise_shell(plan: Plan, levels: Float, solid: NDArray[np.bool_]) -> Shell:
             level.append(np.full(len(rows), k))
             up.append(np.full(len(rows), looks_up))
             triangle.append(rows)
-    start, end, own, other = half_edges(plan)
     beyond = np.append(solid, np.zeros((1, count - 1), np.bool_), axis=0)[other]
     edge, layer = np.nonzero(solid[own] & ~beyond)
     a, b = start[edge] + layer * n, end[edge] + layer * n
@@ -110,6 +114,23 @@ def raise_shell(plan: Plan, levels: Float, solid: NDArray[np.bool_]) -> Shell:
     return Shell(
         vertices, np.concatenate(faces), np.concatenate(level), np.concatenate(up), np.concatenate(triangle)
     )
+
+
+def _unpinched(plan: Plan, solid: NDArray[np.bool_], start: Int, own: Int, other: Int) -> NDArray[np.bool_]:
+    """A layer (m,) in which the solid around each vertex hangs together."""
+    (ux, uy), (vx, vy) = (plan.xy[plan.faces[:, k]].T - plan.xy[plan.faces[:, 0]].T for k in (1, 2))
+    area = np.repeat(ux * vy - uy * vx, 3)
+    solid = solid.copy()
+    while True:
+        # Each sector of solid about a vertex has one side that begins there with the empty on its right.
+        side = solid[own] & ~np.append(solid, False)[other]
+        pinched = np.bincount(start[side], minlength=len(plan.xy)) > 1
+        corner = np.flatnonzero(pinched[start] & solid[own])
+        if not len(corner):
+            return solid
+        order = corner[np.lexsort([area[corner], start[corner]])]
+        least = order[np.flatnonzero(np.diff(start[order], prepend=-1))]
+        solid[own[least]] = False
 
 
 def half_edges(plan: Plan) -> tuple[Int, Int, Int, Int]:

@@ -143,7 +143,7 @@ def _half(outline: shapely.Geometry, line: shapely.LineString) -> float:
 def _neighbours(
     polygon: NDArray[np.object_], around: NDArray[np.object_], tunnel: NDArray[np.bool_]
 ) -> tuple[NDArray[np.object_], set[tuple[int, int]]]:
-    """For each piece, the others of its carriageway that touch it; and pairs that partly overlie each other."""
+    """For each piece, its neighbours on one carriageway; and which pairs of them overlie in part."""
     one, two = shapely.STRtree(polygon).query(polygon, predicate="dwithin", distance=_TOUCH)
     keep = (one < two) & (tunnel[one] == tunnel[two])
     one, two = one[keep], two[keep]

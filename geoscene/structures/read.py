@@ -12,7 +12,8 @@ from geoscene.report import Problem
 from geoscene.road_surfaces import RoadSurfaces
 from geoscene.roads import RoadGraph
 from geoscene.sources.data import OsmData
-from geoscene.structures.members import road_members
+from geoscene.structures.members import concatenate_members, road_members
+from geoscene.structures.paths import path_members
 from geoscene.structures.pieces import cut_pieces
 from geoscene.structures.piers import place_piers
 from geoscene.structures.table import StructureOptions, Structures
@@ -36,5 +37,7 @@ def read_structures(
     height : of the ground with its roads (`geoscene.roadgraph.graded_ground`); level at 0 without
     """
     options = options or StructureOptions()
-    table = cut_pieces(road_members(graph, surfaces.raised), surfaces.raised, options)
-    return place_piers(table, surfaces, height=height, options=options), []
+    raised = surfaces.raised
+    paths, problems = path_members(raised, osm, frame, graph, height=height, options=options)
+    table = cut_pieces(concatenate_members([road_members(graph, raised), paths]), raised, options)
+    return place_piers(table, surfaces, height=height, options=options), problems

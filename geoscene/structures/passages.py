@@ -1,0 +1,107 @@
+"""Buildings that tunnels run through: they stand over them."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.buildings import Buildings
+from geoscene.buildings.table import GRID
+from geoscene.report import Problem
+from geoscene.structures.heights import surface_heights
+from geoscene.structures.table import StructureOptions, Structures
+
+Float = NDArray[np.float64]
+
+_SCANT = 1.0
+"""Square metres; a smaller overlap of building and tunnel is left as it is."""
+
+_OVER = 0.1
+"""Metres from a tunnel's roof to the underside of what stands over it."""
+
+
+def buildings_over(
+    buildings: Buildings, base: Float, table: Structures, *, options: StructureOptions | None = None
+) -> tuple[Buildings, list[Problem]]:
+    """The buildings with a passage where a tunnel would run into them, and which they are.
+
+    What stands over the tunnel becomes a part with its underside above the tunnel's roof; the rest becomes a
+    part that reaches down as before. Roofs of what is so divided are flat.
+
+    base : (count,) z in metres of each building's base
+    """
+    options = options or StructureOptions()
+    rows = np.flatnonzero(buildings.drawn)
+    tunnels = np.flatnonzero(table.tunnel)
+    pair = shapely.STRtree(buildings.footprint[rows]).query(table.polygon[tunnels], predicate="intersects")
+    tunnel, row = tunnels[pair[0]], rows[pair[1]]
+    common = shapely.intersection(buildings.footprint[row], table.polygon[tunnel])
+    low, high = np.empty((2, len(row)))
+    for k, piece in enumerate(tunnel.tolist()):
+        z = surface_heights(table, piece, shapely.get_coordinates(common[k]).reshape(-1, 2))
+        low[k] = z.min(initial=np.inf) - table.body[piece]
+        high[k] = z.max(initial=-np.inf) + table.rise[piece] + options.roof + _OVER
+    stands = base[buildings.outline[row]]
+    met = shapely.area(common) > _SCANT
+    met &= (high > stands + buildings.min_height[row]) & (low < stands + buildings.height[row])
+    if not met.any():
+        return buildings, []
+    return _divided(buildings, row[met], table.polygon[tunnel[met]], (high - stands)[met])
+
+
+def _divided(
+    buildings: Buildings, row: NDArray[np.int64], corridor: NDArray[np.object_], clear: Float
+) -> tuple[Buildings, list[Problem]]:
+    """Rows (k,) divided along corridors (k,), what is in them standing ``clear`` (k,) over the base."""
+    footprint, underside = buildings.footprint.copy(), buildings.min_height.copy()
+    source: list[int] = []
+    shape: list[shapely.Geometry] = []
+    new_low: list[float] = []
+    for k in np.unique(row).tolist():
+        rest, first = footprint[k], len(source)
+        for there in np.flatnonzero(row == k).tolist():
+            over = _polygons(shapely.intersection(rest, corridor[there]))
+            rest = _polygons(shapely.difference(rest, corridor[there]))
+            if not over.is_empty and clear[there] < buildings.height[k] - _OVER:
+                source.append(k)
+                shape.append(over)
+                new_low.append(clear[there])
+        if buildings.is_part[k]:
+            if rest.is_empty:  # all of it is over tunnels
+                rest, underside[k] = footprint[k], max(clear[row == k].max(), underside[k])
+                del source[first:], shape[first:], new_low[first:]
+            footprint[k] = rest
+        elif not rest.is_empty:
+            source.append(k)
+            shape.append(rest)
+            new_low.append(buildings.min_height[k])
+    problems = [
+        Problem(str(buildings.osm_id[k]), "building", "repaired", "over-tunnel", "stands over a tunnel")
+        for k in np.unique(buildings.outline[row]).tolist()
+    ]
+    extra = np.array(source, np.int64)
+    added = {f.name: getattr(buildings, f.name)[extra] for f in fields(Buildings)}
+    added["footprint"] = np.array(shape, object) if shape else np.empty(0, object)
+    added |= {
+        "is_part": np.ones(len(extra), np.bool_),
+        "outline": buildings.outline[extra],
+        "min_height": np.array(new_low, float),
+        "min_height_source": np.full(len(extra), "tunnel", object),
+        "roof_shape": np.full(len(extra), "flat", object),
+        "roof_height": np.zeros(len(extra)),
+        "roof_source": np.full(len(extra), "none", object),
+    }
+    kept = replace(buildings, footprint=footprint, min_height=underside)
+    columns = {f.name: np.concatenate([getattr(kept, f.name), added[f.name]]) for f in fields(Buildings)}
+    return Buildings(**columns), problems
+
+
+def _polygons(shape: shapely.Geometry) -> shapely.Geometry:
+    """The polygons of a shape, on the grid of buildings, without crumbs."""
+    parts = shapely.get_parts(shapely.set_precision(shape, GRID))
+    areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0.05)
+    parts = shapely.orient_polygons(shapely.set_precision(parts[areal], 0.0))
+    return parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts.tolist())

@@ -1,0 +1,291 @@
+"""Bridges and tunnels that no car takes: footways, cycleways and private roads, with heights of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.frames import Frame
+from geoscene.report import Problem
+from geoscene.roadgraph import find_obstacles
+from geoscene.roadgraph.paths import way_lines
+from geoscene.roadgraph.surface_rows import SurfaceRows
+from geoscene.roads import RoadGraph
+from geoscene.routing import edge_lines
+from geoscene.sources.data import OsmData
+from geoscene.structures.heights import foot
+from geoscene.structures.members import Members
+from geoscene.structures.table import StructureOptions
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Height = Callable[[Float, Float], Float]
+
+_STATION = 5.0
+"""Metres between places at which heights are settled."""
+
+_BESIDE = 4.0
+"""Metres from a road bridge's carriageway within which a path of the same layer is on that bridge."""
+
+_SLOPE = 0.12
+"""Greatest slope from where a path must be high or low; one in eight, a steep ramp. Assumed."""
+
+_HANGING = 0.5
+"""Metres between a bridge's end and the ground that are reported."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Net:
+    """Stations along all ways, shared where ways share nodes.
+
+    xy     : (v, 2) float64
+    rows   : per way, its stations in order
+    a, b   : (s,) neighbouring stations
+    metres : (s,) between them
+    """
+
+    xy: Float
+    rows: list[Int]
+    a: Int
+    b: Int
+    metres: Float
+
+
+def path_members(
+    raised: SurfaceRows,
+    osm: OsmData,
+    frame: Frame,
+    graph: RoadGraph,
+    *,
+    height: Height | None,
+    options: StructureOptions,
+) -> tuple[Members, list[Problem]]:
+    """Bridges and tunnels of ways that are not in the road graph, and what ends above the ground.
+
+    Their heights: beside a road bridge of the same layer, that bridge's; else they run evenly from ground to
+    ground, but as far over (or under) roads, tracks and water as these need, and from there fall (rise) by
+    the slope of a ramp.
+    """
+    own = np.flatnonzero(
+        (raised.edge < 0) & ~np.isin(raised.klass, (Class.RAIL, Class.LANE_MARKING)) & (raised.place > 0)
+    )
+    place = dict(zip(raised.osm_id[own].tolist(), raised.place[own].tolist(), strict=True))
+    ways = [way for way in osm.ways if way.osm_id in place and len(way.nodes) > 1]
+    lines = way_lines(ways, frame)
+    kept = [
+        k
+        for k, way in enumerate(ways)
+        if lines[k] is not None and way.nodes[0] != way.nodes[-1] and np.isfinite(way.lonlat).all()
+    ]
+    ways, lines = [ways[k] for k in kept], lines[kept]
+    ids = np.array([way.osm_id for way in ways], np.str_)
+    tunnel = np.array([place[name] == 2 for name in ids.tolist()], np.bool_)
+    rows = [own[raised.osm_id[own] == name] for name in ids.tolist()]
+    level = np.array([raised.level[r[0]] for r in rows], np.int8)
+    net = _network(lines, [way.nodes for way in ways])
+    ends = _ends(net)
+    z = _heights(net, tunnel, level, ends, graph, osm, frame, height, options)
+
+    count = len(ways)
+    line, approach, own_rows = (np.empty(count, object) for _ in range(3))
+    landed = np.zeros((count, 2), np.bool_)
+    width = np.empty(count)
+    problems = []
+    for k in range(count):
+        station = net.rows[k]
+        line[k] = np.column_stack([net.xy[station], z[station]])
+        own_rows[k] = rows[k]
+        area = shapely.area(shapely.union_all(raised.polygon[rows[k]]))
+        width[k] = max(area / max(lines[k].length, 1.0), 0.5)
+        landed[k] = ends[station[[0, -1]]]
+        approach[k] = shapely.union_all(
+            [_onward(line[k][:: 1 - 2 * e, :2], width[k]) for e in (0, 1) if landed[k, e]]
+        )
+        gap = z[station[[0, -1]]] - _ground(net.xy[station[[0, -1]]], height)
+        worst = float(np.abs(gap[landed[k]]).max(initial=0.0))
+        if worst > _HANGING:
+            detail = f"an end {worst:.1f} m from the ground"
+            problems.append(Problem(str(ids[k]), "structure", "repaired", "no-ramp", detail))
+    foot_only = np.array([(raised.klass[r] != Class.ROAD).all() for r in rows], np.bool_)
+    edge = np.full(count, -1, np.int32)
+    return Members(line, tunnel, foot_only, width, own_rows, approach, landed, level, edge, ids), problems
+
+
+def _ground(xy: Float, height: Height | None) -> Float:
+    return np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
+
+
+def _onward(xy: Float, width: float) -> shapely.Geometry:
+    """The way's first metres beyond the start of its line, and half a turn about it."""
+    step = xy[1] - xy[0]
+    step /= max(float(np.hypot(*step)), 1e-9)
+    band = shapely.LineString([xy[0], xy[0] - 3.0 * step]).buffer(width, cap_style="flat")
+    return band.union(shapely.Point(xy[0]).buffer(width / 2))
+
+
+def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]]) -> _Net:
+    """Stations at the ends and along lines."""
+    number: dict[int, int] = {}
+    places: list[Float] = []
+    rows, a, b, metres = [], [], [], []
+    count = 0
+    for line, ids in zip(lines, nodes, strict=True):
+        xy = shapely.get_coordinates(shapely.segmentize(line, _STATION))
+        station = np.empty(len(xy), np.int64)
+        # Ways share nodes; one is found again by its place in the line.
+        drawn = shapely.get_coordinates(line)
+        whole = len(drawn) == len(ids)
+        ends = (0, -1)
+        known = (
+            zip(drawn.tolist(), ids.tolist(), strict=True)
+            if whole
+            else ((drawn[e].tolist(), ids[e]) for e in ends)
+        )
+        at = {tuple(place): int(node) for place, node in known}
+        for k, p in enumerate(xy.tolist()):
+            node = at.get(tuple(p))
+            if node is not None and node in number:
+                station[k] = number[node]
+                continue
+            station[k] = count
+            places.append(xy[k])
+            if node is not None:
+                number[node] = count
+            count += 1
+        rows.append(station)
+        a.append(station[:-1])
+        b.append(station[1:])
+        metres.append(np.maximum(np.hypot(*np.diff(xy, axis=0).T), 1e-3))
+    if not rows:
+        none = np.empty(0, np.int64)
+        return _Net(np.empty((0, 2)), [], none, none, np.empty(0))
+    return _Net(np.array(places), rows, np.concatenate(a), np.concatenate(b), np.concatenate(metres))
+
+
+def _ends(net: _Net) -> NDArray[np.bool_]:
+    """Whether a station (v,) is an end at which no other of the ways goes on."""
+    ends: NDArray[np.bool_] = np.bincount(np.concatenate([net.a, net.b]), minlength=len(net.xy)) == 1
+    return ends
+
+
+def _heights(
+    net: _Net,
+    tunnel: NDArray[np.bool_],
+    level: NDArray[np.int8],
+    ends: NDArray[np.bool_],
+    graph: RoadGraph,
+    osm: OsmData,
+    frame: Frame,
+    height: Height | None,
+    options: StructureOptions,
+) -> Float:
+    """Heights (v,) of stations."""
+    if not len(net.xy):
+        return np.empty(0)
+    ground = _ground(net.xy, height)
+    down = np.zeros(len(net.xy), np.bool_)
+    for rows, below in zip(net.rows, tunnel.tolist(), strict=True):
+        down[rows] |= below
+    fixed = np.where(ends, ground, np.nan)
+    on_road = _on_road_bridges(net, tunnel, level, graph)
+    fixed = np.where(np.isnan(on_road), fixed, on_road)
+    z = _even(net, fixed, ground)
+    need = _needs(net, tunnel, graph, osm, frame, height, options)
+    for sign, chosen in ((1.0, ~down), (-1.0, down)):
+        bound = np.where(chosen, sign * need, -np.inf)
+        bound[~np.isnan(on_road) | np.isnan(bound)] = -np.inf
+        z = sign * np.maximum(sign * z, _cones(net, bound))
+    return np.where(np.isnan(on_road), z, on_road)
+
+
+def _on_road_bridges(
+    net: _Net, tunnel: NDArray[np.bool_], level: NDArray[np.int8], graph: RoadGraph
+) -> Float:
+    """Height (v,) of the road bridge or tunnel of the same layer that a station is beside, NaN if none."""
+    z = np.full(len(net.xy), np.nan)
+    edges = np.flatnonzero(graph.bridge | graph.tunnel)
+    if not len(edges):
+        return z
+    tree = shapely.STRtree(edge_lines(graph)[edges])
+    for rows, below, layer in zip(net.rows, tunnel.tolist(), level.tolist(), strict=True):
+        point, found = tree.query(shapely.points(net.xy[rows]), predicate="dwithin", distance=20.0)
+        edge = edges[found]
+        same = (graph.layer[edge] == layer) & (graph.tunnel[edge] == below)
+        for e in np.unique(edge[same]).tolist():
+            at = rows[np.unique(point[same & (edge == e)])]
+            high, away, beside = foot(graph.geometry[e], net.xy[at])
+            near = (beside | (away < 1.0)) & (away < graph.width[e] / 2 + _BESIDE)
+            z[at[near]] = high[near]
+    return z
+
+
+def _even(net: _Net, fixed: Float, ground: Float) -> Float:
+    """Heights (v,) that run evenly between the fixed ones; the ground's where none is fixed."""
+    from scipy.sparse import csr_array, diags_array  # noqa: PLC0415  (slow to import)
+    from scipy.sparse.linalg import spsolve  # noqa: PLC0415
+
+    count = len(fixed)
+    stiff = 1.0 / net.metres
+    row, column = np.concatenate([net.a, net.b]), np.concatenate([net.b, net.a])
+    links = csr_array((np.tile(stiff, 2), (row, column)), shape=(count, count))
+    held = np.where(np.isnan(fixed), 1e-6, 1e6)
+    matrix = diags_array(np.asarray(links.sum(axis=1)).ravel() + held) - links
+    z: Float = spsolve(matrix.tocsc(), held * np.where(np.isnan(fixed), ground, fixed))
+    return z
+
+
+def _needs(
+    net: _Net,
+    tunnel: NDArray[np.bool_],
+    graph: RoadGraph,
+    osm: OsmData,
+    frame: Frame,
+    height: Height | None,
+    options: StructureOptions,
+) -> Float:
+    """How high stations of bridges must be at least and those of tunnels at most; NaN where anything goes."""
+    obstacles = find_obstacles(osm, frame)
+    roads = edge_lines(graph)
+    lines = np.concatenate([roads, obstacles.line])
+    tree = shapely.STRtree(lines)
+    need = np.full(len(net.xy), np.nan)
+    for rows, below in zip(net.rows, tunnel.tolist(), strict=True):
+        way = shapely.LineString(net.xy[rows])
+        for other in tree.query(way, predicate="crosses").tolist():
+            points = shapely.get_coordinates(shapely.intersection(way, lines[other]))
+            for xy in points:
+                if other < len(roads):
+                    z = float(foot(graph.geometry[other], xy[None])[0][0])
+                    over = z + options.headroom + options.slab
+                else:
+                    z = float(_ground(xy[None], height)[0])
+                    over = z + float(obstacles.clear[other - len(roads)]) + options.slab
+                if other < len(roads) and (graph.tunnel[other] or (graph.bridge[other] and below)):
+                    continue  # far below or above the ground that the path is near
+                under = z - options.passage - options.roof - 2 * options.margin
+                nearest = rows[np.hypot(*(net.xy[rows] - xy).T) < _STATION]
+                bound = np.fmin if below else np.fmax
+                need[nearest] = bound(need[nearest], under if below else over)
+    return need
+
+
+def _cones(net: _Net, bound: Float) -> Float:
+    """The greatest of all bounds (v,) less slope times distance along ways; -inf where none reaches."""
+    from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
+    from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
+
+    start = np.flatnonzero(np.isfinite(bound))
+    if not len(start):
+        return np.full(len(bound), -np.inf)
+    count, top = len(bound), float(bound[start].max())
+    row = np.concatenate([net.a, np.full(len(start), count)])
+    column = np.concatenate([net.b, start])
+    cost = np.concatenate([net.metres * _SLOPE, top - bound[start] + 1e-9])
+    links = csr_array((cost, (row, column)), shape=(count + 1, count + 1))
+    reach: Float = top - dijkstra(links, directed=False, indices=count)[:count]
+    return reach
