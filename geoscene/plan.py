@@ -78,7 +78,7 @@ class Plan:
     buildings : their table
     base      : (count,) z of each building's base
     rows      : by kind (``buildings``, ``trees``, ``furniture``, ``barriers``, ``structures``) the rows that
-                belong to each tile: those with the middle of their box in it
+                belong to each tile: those with the middle of their box in it; ``parts`` go with their buildings
     graph     : roads, with heights
     ground    : what lies on the ground
     levels    : how high its water stands
@@ -212,6 +212,7 @@ def make_plan(
         base=base,
         rows={
             "buildings": _by_tile(footprints, tile_size),
+            "parts": _by_tile(footprints[buildings.outline[buildings.count:]], tile_size, first=buildings.count),
             "trees": _by_tile(shapely.points(trees.xy), tile_size),
             "furniture": _by_tile(shapely.points(furniture.xy), tile_size),
             "barriers": _by_tile(barriers.polygon, tile_size),
@@ -326,8 +327,10 @@ def _foot(xy: Float, height: Height | None) -> Float:
     return np.zeros(len(xy)) if height is None else np.asarray(height(xy[:, 0], xy[:, 1]), float)
 
 
-def _by_tile(shapes: NDArray[Any], tile_size: float) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Rows by the tile that holds the middle of their box."""
+def _by_tile(
+    shapes: NDArray[Any], tile_size: float, *, first: int = 0
+) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Rows, the first of them numbered ``first``, by the tile that holds the middle of their box."""
     boxes = shapely.bounds(shapes).reshape(-1, 4)
     home = np.floor((boxes[:, :2] + boxes[:, 2:]) / 2 / tile_size).astype(np.int64)
     if not len(home):
@@ -335,14 +338,13 @@ def _by_tile(shapes: NDArray[Any], tile_size: float) -> dict[tuple[int, int], ND
     keys, owner = np.unique(home, axis=0, return_inverse=True)
     order = np.argsort(owner.ravel(), kind="stable")
     cuts = np.searchsorted(owner.ravel()[order], np.arange(len(keys) + 1))
-    return {(int(i), int(j)): order[a:b] for (i, j), a, b in zip(keys, cuts[:-1], cuts[1:], strict=True)}
+    return {(int(i), int(j)): first + order[a:b] for (i, j), a, b in zip(keys, cuts[:-1], cuts[1:], strict=True)}
 
 
-def take_buildings(buildings: Buildings, rows: NDArray[np.integer]) -> Buildings:
-    """The chosen buildings (rows below ``count``, rising) with their parts, as a table of their own."""
-    number = np.full(len(buildings), -1, np.int32)
-    number[rows] = np.arange(len(rows))
-    parts = np.flatnonzero(buildings.is_part & (number[buildings.outline] >= 0))
+def take_buildings(
+    buildings: Buildings, rows: NDArray[np.int64], parts: NDArray[np.int64]
+) -> Buildings:
+    """The chosen buildings (rows below ``count``, rising) with all their parts (rows), as a table."""
     keep = np.concatenate([rows, parts])
     columns = {f.name: getattr(buildings, f.name)[keep] for f in fields(Buildings)}
-    return Buildings(**(columns | {"outline": number[columns["outline"]]}))
+    return Buildings(**(columns | {"outline": np.searchsorted(rows, columns["outline"]).astype(np.int32)}))
