@@ -78,7 +78,8 @@ class Plan:
     buildings : their table
     base      : (count,) z of each building's base
     rows      : by kind (``buildings``, ``trees``, ``furniture``, ``barriers``, ``structures``) the rows that
-                belong to each tile: those with the middle of their box in it; ``parts`` go with their buildings
+                belong to each tile: those with the middle of their box in it; ``parts`` go with
+                their buildings
     graph     : roads, with heights
     ground    : what lies on the ground
     levels    : how high its water stands
@@ -212,7 +213,9 @@ def make_plan(
         base=base,
         rows={
             "buildings": _by_tile(footprints, tile_size),
-            "parts": _by_tile(footprints[buildings.outline[buildings.count:]], tile_size, first=buildings.count),
+            "parts": _by_tile(
+                footprints[buildings.outline[buildings.count :]], tile_size, first=buildings.count
+            ),
             "trees": _by_tile(shapely.points(trees.xy), tile_size),
             "furniture": _by_tile(shapely.points(furniture.xy), tile_size),
             "barriers": _by_tile(barriers.polygon, tile_size),
@@ -338,12 +341,12 @@ def _by_tile(
     keys, owner = np.unique(home, axis=0, return_inverse=True)
     order = np.argsort(owner.ravel(), kind="stable")
     cuts = np.searchsorted(owner.ravel()[order], np.arange(len(keys) + 1))
-    return {(int(i), int(j)): first + order[a:b] for (i, j), a, b in zip(keys, cuts[:-1], cuts[1:], strict=True)}
+    return {
+        (int(i), int(j)): first + order[a:b] for (i, j), a, b in zip(keys, cuts[:-1], cuts[1:], strict=True)
+    }
 
 
-def take_buildings(
-    buildings: Buildings, rows: NDArray[np.int64], parts: NDArray[np.int64]
-) -> Buildings:
+def take_buildings(buildings: Buildings, rows: NDArray[np.int64], parts: NDArray[np.int64]) -> Buildings:
     """The chosen buildings (rows below ``count``, rising) with all their parts (rows), as a table."""
     keep = np.concatenate([rows, parts])
     columns = {f.name: getattr(buildings, f.name)[keep] for f in fields(Buildings)}

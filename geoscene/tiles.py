@@ -16,7 +16,7 @@ from geoscene.barriers import barrier_meshes
 from geoscene.buildings import build_solids
 from geoscene.classes import Class
 from geoscene.furniture import furniture_instances
-from geoscene.ground import ground_tile
+from geoscene.ground import ground_tile, tile_place
 from geoscene.mesh import Mesh, concatenate
 from geoscene.plan import Plan, take_buildings
 from geoscene.report import Problem
@@ -63,13 +63,14 @@ def make_solids(plan: Plan, i: int, j: int, lod: int) -> tuple[Mesh, list[Proble
     rows = plan.of_tile("buildings", i, j)
     if not len(rows):
         return Mesh.empty(), []
-    mesh, problems = build_solids(take_buildings(plan.buildings, rows), base=plan.base[rows], lod=lod)
+    chosen = take_buildings(plan.buildings, rows, plan.of_tile("parts", i, j))
+    mesh, problems = build_solids(chosen, base=plan.base[rows], lod=lod)
     return replace(mesh, feature=rows[mesh.feature].astype(np.int32)), problems
 
 
 def make_ground(plan: Plan, i: int, j: int) -> tuple[Mesh, Instances]:
     """Ground, barriers, bridges, tunnels, trees and furniture of tile (i, j), scene coordinates."""
-    covered = ((plan.ground.tiles[:, 0] == i) & (plan.ground.tiles[:, 1] == j)).any()
+    covered = tile_place(plan.ground, i, j) is not None
     meshes = []
     if covered:
         ground = ground_tile(plan.ground, i, j, height=plan.height, levels=plan.levels)

@@ -22,5 +22,6 @@ from geoscene.ground.partition import Partition as Partition
 from geoscene.ground.partition import partition as partition
 from geoscene.ground.partition import partition_tile as partition_tile
 from geoscene.ground.partition import plan_ground as plan_ground
+from geoscene.ground.partition import tile_place as tile_place
 from geoscene.ground.triangulate import Triangles as Triangles
 from geoscene.ground.triangulate import triangulate as triangulate
