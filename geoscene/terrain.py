@@ -34,6 +34,9 @@ _LOWEST, _HIGHEST = -500.0, 9000.0
 _MARGIN = 3
 """Posts read beyond the scene on each side."""
 
+_AT_ONCE = 10_000
+"""Footprints whose ground is looked up at once: some 300,000 places, which bounds the memory."""
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -187,10 +190,11 @@ def base_heights(
     """
     outlines = np.empty(len(footprints), object)
     outlines[:] = list(footprints)
-    outlines = shapely.segmentize(shapely.boundary(outlines), 2.0)
-    xy, owner = shapely.get_coordinates(outlines, return_index=True)
     lowest = np.full(len(outlines), np.inf)
-    np.minimum.at(lowest, owner, height(xy[:, 0], xy[:, 1]))
+    for first in range(0, len(outlines), _AT_ONCE):
+        fine = shapely.segmentize(shapely.boundary(outlines[first : first + _AT_ONCE]), 2.0)
+        xy, owner = shapely.get_coordinates(fine, return_index=True)
+        np.minimum.at(lowest, first + owner, height(xy[:, 0], xy[:, 1]))
     base: Float = np.where(np.isinf(lowest), np.nan, lowest)
     return base
 
