@@ -10,12 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from roadgrids import grid, road_graph
 
+from lidar.actors.area import area_of
 from lidar.actors.flow import DT, ego_on, green_windows, simulate_trips
 from lidar.actors.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.actors.lanes import STEP, lane_shift, lanes_of
 from lidar.actors.simulate import HARD
 from lidar.actors.sweep import body_poses, rectangles
-from lidar.actors.traffic import area_of, vehicle_trips
+from lidar.actors.traffic import vehicle_trips
 from lidar.motion import drive_path
 from lidar.path import plan_path
 from lidar.poses import Trajectory

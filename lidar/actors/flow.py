@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.roads import RoadGraph
 from geoscene.routing import edge_lines
+from lidar.actors.area import LEFT
 from lidar.actors.junctions import Plan, road_rank, signal_group, zone_at
 from lidar.actors.lanes import STEP, Way
 from lidar.actors.simulate import Ego, Movers, run
@@ -71,7 +72,7 @@ def simulate_trips(
     signals = plan.signals._replace(window=green_windows(plan, known))
     out = np.zeros(len(trips), bool)
     for _ in range(_ROUNDS):
-        log, met = run(movers, known, signals, out, squares, DT, len(known.x), _HORIZON, reach + 100.0)
+        log, met = run(movers, known, signals, out, squares, DT, len(known.x), _HORIZON, reach + LEFT)
         if not met.any():
             break
         out |= met

@@ -38,7 +38,7 @@ class Lanes:
     leave, enter : (m,) headings in which an edge is left and entered, radians
     liking : (m,) how much traffic there is on an edge, relative
     open   : (m,) bool, the edge leads on, or out of the map: whoever takes it does not end in a dead end
-    exit   : (m,) bool, the edge ends at the map's edge
+    exit, entry : (m,) bool, the edge ends, or begins, at the map's edge
     """
 
     graph: RoadGraph
@@ -51,6 +51,7 @@ class Lanes:
     liking: Float
     open: NDArray[np.bool_]
     exit: NDArray[np.bool_]
+    entry: NDArray[np.bool_]
 
 
 def lanes_of(
@@ -75,7 +76,8 @@ def lanes_of(
     for k, line in enumerate(graph.geometry):
         enter[k], leave[k] = _heading(line[:, :2], first=True), _heading(line[:, :2], first=False)
     liking = np.array([_QUIET.get(str(kind), 1.0) for kind in graph.highway])
-    leads_out = _leaving(graph, bounds)
+    leads_out = _at_edge(graph, bounds, graph.head, graph.tail)
+    leads_in = _at_edge(graph, bounds, graph.tail, graph.head)
     straight_on = graph.twin[before] != after
     leads_on = _leading_on(before[straight_on], after[straight_on], leads_out)
     return Lanes(
@@ -89,17 +91,23 @@ def lanes_of(
         liking,
         leads_on,
         leads_out,
+        leads_in,
     )
 
 
-def _leaving(graph: RoadGraph, bounds: tuple[float, float, float, float] | None) -> NDArray[np.bool_]:
-    """Edges (m,) without a way on whose end lies near the map's edge."""
+def _at_edge(
+    graph: RoadGraph,
+    bounds: tuple[float, float, float, float] | None,
+    end: NDArray[np.int32],
+    other: NDArray[np.int32],
+) -> NDArray[np.bool_]:
+    """Edges (m,) one end of which lies near the map's edge and joins no other street."""
     if bounds is None:
         return np.zeros(len(graph), np.bool_)
-    end = graph.node_xyz[graph.head, :2]
-    within = np.minimum(end - bounds[:2], np.array(bounds[2:]) - end).min(axis=1)
-    ways = np.bincount(graph.tail, minlength=len(graph.node_id))[graph.head]
-    out: NDArray[np.bool_] = (within < _EDGE) & (ways - (graph.twin >= 0) < 1)
+    xy = graph.node_xyz[end, :2]
+    within = np.minimum(xy - bounds[:2], np.array(bounds[2:]) - xy).min(axis=1)
+    joining = np.bincount(other, minlength=len(graph.node_id))[end]
+    out: NDArray[np.bool_] = (within < _EDGE) & (joining - (graph.twin >= 0) < 1)
     return out
 
 

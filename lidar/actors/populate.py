@@ -14,13 +14,14 @@ from geoscene.geopackage import Layer, read_layer
 from geoscene.roads import RoadGraph
 from geoscene.scene import Scene
 from lidar.actors.actors import Actors, joined
+from lidar.actors.area import Area, area_of, ego_line
 from lidar.actors.flow import simulate_trips
 from lidar.actors.junctions import junction_plan
 from lidar.actors.lanes import Lanes, beside, lane_shift, lanes_of
 from lidar.actors.parked import CARS, concatenated, kerb_spots, lot_spots, parked_actors
 from lidar.actors.sweep import body_poses, rectangles
 from lidar.actors.tracks import moving_actors
-from lidar.actors.traffic import Area, Trip, area_of, ego_line, vehicle_trips
+from lidar.actors.traffic import Trip, vehicle_trips
 from lidar.actors.walkers import walker_trips, walks_of
 from lidar.errors import InputError
 from lidar.poses import Trajectory

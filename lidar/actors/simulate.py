@@ -30,7 +30,7 @@ _LOOK = (15.0, 5.0)  # metres, and metres for each m/s, ahead that are looked at
 _BESIDE = 90.0  # metres from the ego within which what is held already is looked at again
 _COARSE = 3  # one square in so many is looked at: what stands there covers more
 _YIELD_S = 4.0  # seconds to arrival within which somebody with priority is waited for
-_PATIENCE = 100  # steps for which a mover waits for room to appear
+_PATIENCE = 20  # steps for which a mover waits for room to appear
 _NOBODY = -1
 
 
@@ -224,7 +224,8 @@ def _appears(i: int, step: int, t: float, m: Any, g: Any, st: Any) -> bool:
     """Whether a mover appears now: where there is room for it, as fast as the room allows."""
     if step < m.appear[i]:
         return False
-    if step > m.appear[i] + _PATIENCE:
+    # what is there from the start is there at once; later comers may wait at the rim
+    if step > m.appear[i] + (_PATIENCE if m.appear[i] else 0):
         st.gone[i] = True
         return False
     base, k = m.station_start[i], m.begin[i]

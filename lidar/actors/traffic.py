@@ -9,12 +9,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.routing import edge_lines
+from lidar.actors.area import Area, entrances
 from lidar.actors.lanes import STEP, Lanes, Way, wander, way_along
 from lidar.actors.shapes import PAINTS, Shape, catalogue
 from lidar.actors.sweep import body_poses, rectangles
 from lidar.physics.random import generator
-from lidar.poses import Trajectory
 
 Float = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -22,6 +21,9 @@ Ints = NDArray[np.int64]
 _LATERAL = 2.0  # m/s^2 across the way that drivers put up with in bends
 _TRIES = 5  # ways that are tried for a vehicle until one keeps to the carriageway
 _SHORT = 40  # stations that a way has at least
+_FAR = 3000.0  # metres that a way has at most
+_WAVE_S = 5.0  # seconds between looks at where traffic comes in
+_MEAN = 0.45  # mean speed of traffic against the limit, with its stops: what it comes to in the simulation
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,41 +115,6 @@ class Trip:
         return self.shape.base * self.stretch[0]
 
 
-@dataclass(frozen=True, slots=True)
-class Area:
-    """Where there are road users.
-
-    lines : (m,) the graph's edges in plan
-    near  : (m,) bool, edges within ``reach`` of the ego's way
-    ego   : its trajectory
-    reach : metres from the ego
-    scale : scene metres per true metre
-    """
-
-    lines: NDArray[np.object_]
-    near: NDArray[np.bool_]
-    ego: Trajectory
-    reach: float
-    scale: float
-
-    def appears(self, xy: Float) -> float | None:
-        """Seconds at which a place (2,) first comes within reach of the ego; None if it never does."""
-        close = np.flatnonzero(np.hypot(*(self.ego.position[:, :2] - xy).T) <= self.reach * self.scale)
-        return float(self.ego.time_ns[close[0]]) * 1e-9 if len(close) else None
-
-
-def area_of(lanes: Lanes, ego: Trajectory, reach: float, scale: float) -> Area:
-    """The surroundings of the ego's way."""
-    lines = edge_lines(lanes.graph)
-    return Area(lines, shapely.dwithin(lines, ego_line(ego), reach * scale), ego, reach, scale)
-
-
-def ego_line(ego: Trajectory) -> shapely.Geometry:
-    """The ego's way in plan."""
-    xy = ego.position[:: max(len(ego.position) // 5000, 1), :2]
-    return shapely.linestrings(xy).simplify(0.2) if np.ptp(xy, axis=0).max() > 0.5 else shapely.points(xy[0])
-
-
 def vehicle_trips(
     lanes: Lanes,
     area: Area,
@@ -157,7 +124,7 @@ def vehicle_trips(
     shares: dict[str, float] | None = None,
     ground: shapely.Geometry | None = None,
 ) -> list[Trip]:
-    """Vehicles at random places on the lanes around the ego's way.
+    """Vehicles at random places on the lanes around the ego, and others that come in from the rim in time.
 
     density : vehicles per kilometre of lane
     shares  : of kinds of `DRIVERS`; `MOTOR_SHARES` by default
@@ -166,44 +133,53 @@ def vehicle_trips(
     shares = shares or MOTOR_SHARES
     graph, liking = lanes.graph, lanes.liking
     metres = graph.length * lanes.count * area.near * (liking > 0) * np.maximum(liking, 0.05) * lanes.open
-    count = round(density * float(metres.sum()) / 1000)
-    kinds, chance = list(shares), np.array(list(shares.values()))
-    trips = []
-    for number in range(count):
-        rng = generator(seed, "traffic", kinds[-1], number)
-        edge = int(rng.choice(len(metres), p=metres / metres.sum()))
-        at, lane = rng.random(), int(rng.integers(lanes.count[edge]))
-        kind = kinds[int(rng.choice(len(kinds), p=chance / chance.sum()))]
+    name = "+".join(shares)
+    trips: list[Trip | None] = []
+    for number in range(round(density * float(metres.sum()) / 1000)):
+        rng = generator(seed, "traffic", name, number)
+        edge, at = int(rng.choice(len(metres), p=metres / metres.sum())), rng.random()
         where = shapely.line_interpolate_point(area.lines[edge], at, normalized=True)
-        appear = area.appears(shapely.get_coordinates(where)[0])
-        if appear is None:
-            continue
-        start = (edge, 0 if DRIVERS[kind].kerb else lane, at)
-        trip = _trip(lanes, area, rng, kind, start, appear, ground)
-        if trip is not None:
-            trips.append(trip)
-    return trips
+        spans = area.visits(shapely.get_coordinates(where)[0])
+        trips += [_trip(lanes, area, rng, shares, (edge, at), span, ground) for span in spans]
+    for wave in range(int(area.time[-1] / _WAVE_S)):
+        begin = wave * _WAVE_S
+        for edge, at in entrances(lanes, area, begin):
+            rng = generator(seed, "traffic", name, "wave", wave, edge)
+            rate = density / 1000 * lanes.count[edge] * max(liking[edge], 0.05) * _MEAN * graph.speed[edge]
+            for _ in range(rng.poisson(rate * _WAVE_S)):
+                t = begin + rng.random() * _WAVE_S
+                where = shapely.line_interpolate_point(area.lines[edge], at, normalized=True)
+                span = (t, area.until(shapely.get_coordinates(where)[0], t))
+                trips.append(_trip(lanes, area, rng, shares, (edge, at), span, ground))
+    return [trip for trip in trips if trip is not None]
 
 
 def _trip(
     lanes: Lanes,
     area: Area,
     rng: np.random.Generator,
-    kind: str,
-    start: tuple[int, int, float],
-    appear: float,
+    shares: dict[str, float],
+    place: tuple[int, float],
+    span: tuple[float, float],
     ground: shapely.Geometry | None,
 ) -> Trip | None:
-    """A vehicle's trip from an edge, a lane and a share of the edge's length; None if it finds no way."""
-    edge, lane, at = start
-    shape, grow = pick(kind, rng), varied(rng)
+    """A vehicle's trip from a share of an edge's length on; None if it finds no way.
+
+    span : seconds in which the place is in the surroundings of the ego
+    """
+    edge, at = place
+    kind = list(shares)[
+        int(rng.choice(len(shares), p=np.array(list(shares.values())) / sum(shares.values())))
+    ]
     driver = DRIVERS[kind]
+    lane = 0 if driver.kerb else int(rng.integers(lanes.count[edge]))
+    shape, grow = pick(kind, rng), varied(rng)
     pace = float(np.clip(rng.normal(1.0, 0.06), 0.85, 1.1))
     width = shape.width * grow[1]
     if width > lanes.wide[edge]:
         return None
     top = min(float(lanes.graph.speed.max()) * 1.1, driver.top)
-    metres = top * (area.ego.duration_ns * 1e-9 - appear) + 60.0
+    metres = min(top * (span[1] - span[0]), _FAR) + 60.0
     for _ in range(_TRIES):
         edges, picked = wander(lanes, rng, edge, lane, metres=metres, inside=area.near, width=width)
         whole = way_along(
@@ -218,7 +194,7 @@ def _trip(
         end = edges[-1]
         leaves = bool(lanes.exit[end] or not area.near[end])
         wish = desired_speed(way, driver, pace)
-        return Trip(shape, grow, way, driver, wish, begin - first, appear, leaves)
+        return Trip(shape, grow, way, driver, wish, begin - first, span[0], leaves)
     return None
 
 

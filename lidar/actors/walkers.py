@@ -10,8 +10,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from lidar.actors.area import Area
 from lidar.actors.lanes import STEP, Lanes, Way, beside, rounded
-from lidar.actors.traffic import Area, Driver, Trip, pick, varied
+from lidar.actors.traffic import Driver, Trip, pick, varied
 from lidar.physics.random import generator
 
 Float = NDArray[np.float64]
@@ -105,16 +106,13 @@ def walker_trips(lanes: Lanes, area: Area, walks: Walks, *, seed: int, density: 
         shape, grow = pick(kind, rng), varied(rng)
         pace = _FREE[kind] * float(np.clip(rng.normal(1.0, 0.12), 0.7, 1.4))
         place = shapely.line_interpolate_point(shapely.linestrings(walks.line[walk][:, :2]), begin)
-        appear = area.appears(shapely.get_coordinates(place)[0])
-        if appear is None:
-            continue
-        far = pace * (area.ego.duration_ns * 1e-9 - appear) + 20.0
-        line, over = _stroll(walks, crossings, walk, begin, far, lanes.side, rng)
-        way, crossed = _way(line, over, area.scale)
-        wish = np.full(len(way), pace)
-        trips.append(
-            Trip(shape, grow, way, _WALK, wish, 0, appear, leaves=False, walks=True, crossing=crossed)
-        )
+        for start, end in area.visits(shapely.get_coordinates(place)[0]):
+            line, over = _stroll(walks, crossings, walk, begin, pace * (end - start) + 20.0, lanes.side, rng)
+            way, crossed = _way(line, over, area.scale)
+            wish = np.full(len(way), pace)
+            trips.append(
+                Trip(shape, grow, way, _WALK, wish, 0, start, leaves=False, walks=True, crossing=crossed)
+            )
     return trips
 
 
