@@ -20,11 +20,11 @@ _ABOVE, _BELOW = 1.5, 6.0
 
 
 def ground_heights(scene: Scene, xyz: Float, *, above: float = _ABOVE, below: float = _BELOW) -> Float:
-    """Height (n,) of the ground at points (n, 3), looked for near their own heights.
+    """Height (n,) of the ground at points (n, 3), looked for near their own heights; NaN where there is none.
 
-    Points without ground near them keep their height. One tile is held at a time.
+    One tile is held at a time.
     """
-    z: Float = xyz[:, 2].copy()
+    z: Float = np.full(len(xyz), np.nan)
     if not len(xyz):
         return z
     known = set(scene.tile_indices)

@@ -133,7 +133,7 @@ def parked_actors(
     seed: int,
     scale: float,
 ) -> Actors:
-    """Vehicles on the spots where they touch nothing, nor each other.
+    """Vehicles on the spots where all wheels have ground and they touch nothing, nor each other.
 
     kinds : shares of the kinds of vehicles
     trees : what stands there, and what must stay free, as polygons in plan
@@ -154,7 +154,7 @@ def parked_actors(
     for first, second in zip(a[a < b].tolist(), b[a < b].tolist(), strict=True):
         keep[second] &= not keep[first]
     rows = np.flatnonzero(keep)
-    height, pitch, roll = standing(
+    *pose, sound = standing(
         scene,
         spots.xy[rows],
         spots.heading[rows],
@@ -163,6 +163,8 @@ def parked_actors(
         track=0.8 * width[rows],
         scale=scale,
     )
+    rows = rows[sound]
+    height, pitch, roll = (column[sound] for column in pose)
     return table(
         [shapes[k] for k in rows],
         grow[rows],

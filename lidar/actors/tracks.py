@@ -93,7 +93,7 @@ def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: flo
         yaw[part] = np.interp(at, stations, heading)
         hint[part] = np.interp(at, stations, trip.way.xyz[:, 2])
         axle[part], track[part] = trip.axle, _TRACK * trip.width
-    z, pitch, roll = standing(scene, middle, yaw, hint, axle=axle, track=track, scale=scale)
+    z, pitch, roll, _ = standing(scene, middle, yaw, hint, axle=axle, track=track, scale=scale)
     speed, course = flow.speed * scale, np.empty(n)
     for k, row in enumerate(present.tolist()):
         part = slice(ends[k], ends[k + 1])
@@ -123,19 +123,25 @@ def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: flo
 
 def standing(
     scene: Scene, middle: Float, yaw: Float, hint: Float, *, axle: Float, track: Float, scale: float
-) -> tuple[Float, Float, Float]:
+) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
     """Height (n,), pitch (nose down positive) and roll of bodies that stand on the ground on four wheels.
+
+    The last column says whether there is ground under the middle and under each wheel.
 
     middle, yaw : (n, 2) scene metres and (n,) radians
     hint        : (n,) height near which the ground is; NaN to take the topmost
     axle, track : (n,) true metres between axles and between wheels
 
-    Wheels that would hang over an edge are taken to stand as high as the middle.
+    Wheels that would hang over an edge are taken to stand as high as the middle, and the middle where there
+    is no ground as high as the hint.
     """
     known = np.isfinite(hint)
     points = np.column_stack([middle, np.where(known, hint, 0.0)])
-    points[known, 2] = ground_heights(scene, points[known])
-    points[~known, 2] = ground_heights(scene, points[~known], above=_SKY, below=_SKY)
+    under = np.empty(len(points))
+    under[known] = ground_heights(scene, points[known])
+    under[~known] = ground_heights(scene, points[~known], above=_SKY, below=_SKY)
+    sound = np.isfinite(under)
+    points[sound, 2] = under[sound]
     c, s = np.cos(yaw) * scale / 2, np.sin(yaw) * scale / 2
     z = np.empty((len(points), 2, 2))
     for a, fore in enumerate((1, -1)):
@@ -143,12 +149,14 @@ def standing(
             wheel = points.copy()
             wheel[:, 0] += fore * axle * c - left * track * s
             wheel[:, 1] += fore * axle * s + left * track * c
-            z[:, a, b] = ground_heights(scene, wheel, above=_STEP_UP, below=_STEP_UP)
+            under = ground_heights(scene, wheel, above=_STEP_UP, below=_STEP_UP)
+            sound &= np.isfinite(under)
+            z[:, a, b] = np.where(np.isfinite(under), under, points[:, 2])
     pitch = np.arctan2(z[:, 1].mean(axis=1) - z[:, 0].mean(axis=1), axle)
     roll = np.arctan2(z[:, :, 0].mean(axis=1) - z[:, :, 1].mean(axis=1), track)
     steep = (np.abs(pitch) > _STEEP) | (np.abs(roll) > _BANKED)
     height = np.where(steep, points[:, 2], z.mean(axis=(1, 2)))
-    return height, np.clip(pitch, -_STEEP, _STEEP), np.clip(roll, -_BANKED, _BANKED)
+    return height, np.clip(pitch, -_STEEP, _STEEP), np.clip(roll, -_BANKED, _BANKED), sound & ~steep
 
 
 def _rate(values: Float) -> Float:
