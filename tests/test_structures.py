@@ -1,0 +1,400 @@
+"""Bridges carry roads at their height, tunnels are open from mouth to mouth, and all of them are solids."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geoscene.buildings import build_solids, read_buildings
+from geoscene.classes import Class
+from geoscene.frames import Frame
+from geoscene.mesh import Mesh, concatenate
+from geoscene.road_surfaces import road_surfaces
+from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
+from geoscene.sources import read_osm
+from geoscene.sources.data import Area, OsmData, Way
+from geoscene.structures import (
+    StructureOptions,
+    buildings_over,
+    find_openings,
+    ground_below,
+    read_structures,
+    structure_meshes,
+)
+from geoscene.structures.layered import Plan, cut_plan, raise_shell
+from geoscene.terrain import open_terrain
+from geoscene.validate import validate_mesh
+
+FRAME = Frame.at(10.0, 50.0)
+SIZES = StructureOptions()
+
+
+def flat(x, y):
+    return 0.0 * (x + y)
+
+
+def lonlat(xy):
+    return np.column_stack(FRAME.to_geographic(*np.asarray(xy, float).T))
+
+
+def town(places, ways, areas=()):
+    where = {n: lonlat([xy])[0] for n, xy in places.items()}
+    return OsmData(
+        bounds=(9.9, 49.9, 10.1, 50.1),
+        ways=[
+            Way(f"way/{100 + k}", tags, np.array(nodes, np.int64), np.array([where[n] for n in nodes]))
+            for k, (tags, nodes) in enumerate(ways)
+        ],
+        areas=list(areas),
+        points=[],
+        relations=[],
+    )
+
+
+class Town:
+    """A map with its structures, as a scene has them."""
+
+    def __init__(self, osm, frame=FRAME, ground=flat):
+        graph, _ = build_road_graph(osm, frame)
+        self.graph = profile(graph, ground, obstacles=find_obstacles(osm, frame))
+        graded = graded_ground(self.graph, ground)
+        surfaces, _ = road_surfaces(osm, self.graph, frame)
+        self.ground_rows = surfaces
+        self.table, self.problems = read_structures(surfaces, self.graph, osm, frame, height=graded)
+        self.height = ground_below(self.table, graded)
+        self.openings = find_openings(self.table, self.height)
+        self.meshes = structure_meshes(self.table, height=self.height, openings=self.openings)
+
+    def mesh(self, *, only=None):
+        chosen = range(len(self.meshes)) if only is None else np.flatnonzero(only)
+        return numbered([self.meshes[k] for k in chosen])
+
+    def centre_lines(self, kind, step=2.0):
+        """Points (n, 3) on the centre lines of edges of a kind, not nearer than 0.5 m to their ends."""
+        once = (self.graph.twin < 0) | (self.graph.twin > np.arange(len(self.graph)))
+        points = []
+        for edge in np.flatnonzero(getattr(self.graph, kind) & once):
+            line = self.graph.geometry[edge]
+            along = np.append(0.0, np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T)))
+            at = np.arange(0.5, along[-1] - 0.5, step)
+            points.append(np.column_stack([np.interp(at, along, column) for column in line.T]))
+        return np.concatenate(points)
+
+
+def numbered(meshes):
+    return concatenate(
+        [
+            Mesh.of(m.vertices, m.faces, feature=k, klass=m.klass, material=m.material, closed=m.closed)
+            for k, m in enumerate(meshes)
+        ]
+    )
+
+
+def moved(points, *offset):
+    return points + np.array(offset, float)
+
+
+def hits(mesh, points):
+    """Heights and faces of the mesh above and below points: (point (h,), z (h,), face (h,))."""
+    corners = mesh.vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lying = np.flatnonzero(np.abs(normal[:, 2]) > 1e-9)
+    tree = shapely.STRtree(shapely.polygons(corners[lying, :, :2]))
+    point, found = tree.query(shapely.points(points[:, :2]), predicate="intersects")
+    face = lying[found]
+    away = points[point, :2] - corners[face, 0, :2]
+    z = corners[face, 0, 2] - (away * normal[face, :2]).sum(axis=1) / normal[face, 2]
+    return point, z, face
+
+
+def first_below(mesh, points):
+    """Height (n,) and class (n,) of what a ray straight down from the points meets first."""
+    point, z, face = hits(mesh, points)
+    under = z <= points[point, 2]
+    point, z, face = point[under], z[under], face[under]
+    order = np.lexsort([z, point])
+    last = np.append(np.diff(point[order]) > 0, True)
+    height, klass = np.full(len(points), -np.inf), np.zeros(len(points), int)
+    height[point[order[last]]] = z[order[last]]
+    klass[point[order[last]]] = mesh.klass[face[order[last]]]
+    return height, klass
+
+
+def first_above(mesh, points):
+    """Height (n,) of what a ray straight up from the points meets first."""
+    return -first_below(
+        Mesh.of(mesh.vertices * [1, 1, -1], mesh.faces, klass=mesh.klass), points * [1, 1, -1]
+    )[0]
+
+
+def crosses(mesh, start, end):
+    """Whether the segment from start to end (3,) meets a face (Moeller and Trumbore 1997)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    way = np.asarray(end, float) - start
+    p = np.cross(way, c - a)
+    det = ((b - a) * p).sum(axis=1)
+    met = np.abs(det) > 1e-12
+    a, b, c, p, det = a[met], b[met], c[met], p[met], det[met]
+    s = start - a
+    u = (s * p).sum(axis=1) / det
+    q = np.cross(s, b - a)
+    v = (way * q).sum(axis=1) / det
+    t = ((c - a) * q).sum(axis=1) / det
+    return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < 1)).any())
+
+
+ROAD = {"highway": "secondary", "sidewalk": "no"}
+BRIDGE = ROAD | {"bridge": "yes", "layer": "1"}
+TUNNEL = ROAD | {"tunnel": "yes", "layer": "-1"}
+PLACES = {1: (-400, 0), 2: (-60, 0), 3: (60, 0), 4: (400, 0), 5: (0, -300), 6: (0, 300)}
+OVER = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), (ROAD, [5, 6])]
+UNDER = [(ROAD, [1, 2]), (TUNNEL, [2, 3]), (ROAD, [3, 4])]
+
+
+@pytest.fixture(scope="module")
+def bridge():
+    return Town(town(PLACES, OVER))
+
+
+@pytest.fixture(scope="module")
+def tunnel():
+    return Town(town(PLACES, UNDER))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(2, 6), st.integers(0, 2**32 - 1))
+def test_whatever_stands_on_a_slab_or_hangs_from_it_is_one_closed_solid(size, seed):
+    rng = np.random.default_rng(seed)
+    lines = np.array(
+        [shapely.LineString(rng.uniform(0, size, (2, 2))) for _ in range(size)] + [shapely.Point(0, 0)],
+        object,
+    )
+    plan = cut_plan(shapely.box(0, 0, size, size), lines[:-1])
+    slab = np.ones(len(plan.faces), bool)
+    solid = np.column_stack([rng.random(len(slab)) < 0.4, slab, rng.random(len(slab)) < 0.4])
+    levels = np.cumsum(rng.uniform(0.2, 1.0, (len(plan.xy), 4)), axis=1)
+    shell = raise_shell(plan, levels, solid)
+    verdict = validate_mesh(Mesh.of(shell.vertices, shell.faces, feature=0, closed=True))
+    assert verdict.ok.all(), verdict.fault(0)
+
+
+def test_a_shell_holds_what_is_solid_and_no_more():
+    plan = Plan(np.array([[0, 0], [2, 0], [2, 2], [0, 2.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    levels = np.tile([0.0, 1.0, 3.0], (4, 1))
+    shell = raise_shell(plan, levels, np.array([[True, True], [True, False]]))
+    verdict = validate_mesh(Mesh.of(shell.vertices, shell.faces, feature=0, closed=True))
+    assert verdict.ok.all()
+    assert verdict.volume[0] == pytest.approx(4 * 1 + 2 * 2)
+    assert set(plan.xy[:, 0]) == {0.0, 2.0}
+
+
+def test_the_deck_is_where_the_road_graph_says(bridge):
+    points = bridge.centre_lines("bridge")
+    z, klass = first_below(bridge.mesh(), moved(points, 0, 0, 2))
+    np.testing.assert_allclose(z, points[:, 2], atol=1e-3)
+    assert set(klass) <= {Class.ROAD, Class.LANE_MARKING}
+
+
+def test_a_deck_is_level_across_and_has_its_thickness(bridge):
+    mesh, points = bridge.mesh(), bridge.centre_lines("bridge")
+    aside = moved(points, 0, 2.5, 0)
+    np.testing.assert_allclose(first_below(mesh, moved(aside, 0, 0, 2))[0], points[:, 2], atol=0.01)
+    soffit = first_above(mesh, moved(points, 0, 0, -3))
+    on_piers = np.isinf(soffit) | (soffit > points[:, 2] - 0.1)
+    np.testing.assert_allclose(soffit[~on_piers], points[~on_piers, 2] - SIZES.deck, atol=0.01)
+    assert on_piers.mean() < 0.2
+
+
+def test_parapets_stand_on_both_sides_and_not_across(bridge):
+    mesh = bridge.mesh()
+    deck = bridge.centre_lines("bridge")[30]
+    for side in (-1, 1):
+        assert crosses(mesh, moved(deck, 0, 0, 0.5), moved(deck, 0, 20.0 * side, 0.5))
+    for a, b in pairwise(bridge.centre_lines("bridge")):
+        assert not crosses(mesh, moved(a, 0, 0, 0.3), moved(b, 0, 0, 0.3))
+    nodes = bridge.graph.node_xyz[np.isin(bridge.graph.node_id, [2, 3])]
+    for node in nodes:
+        onto = moved(node, -3.0 * np.sign(node[0]), 0, 0.5)
+        assert not crosses(mesh, moved(node, 3.0 * np.sign(node[0]), 0, 0.5), onto)
+
+
+def test_piers_keep_off_the_road_below(bridge):
+    piers = shapely.union_all(bridge.table.pier)
+    assert len(bridge.table.pier[0].geoms) + len(bridge.table.pier[1].geoms) >= 2
+    below = shapely.LineString([(0, -300), (0, 300)]).buffer(3.25)
+    assert piers.distance(below) > 0.3
+    foot = shapely.get_coordinates(shapely.centroid(shapely.get_parts(piers)))
+    low = bridge.mesh().vertices[:, 2].min()
+    assert low < bridge.height(*foot.T).min()  # they reach into the ground
+
+
+def test_the_ground_leaves_a_bridge_free(bridge):
+    points = bridge.centre_lines("bridge")
+    ground = bridge.height(points[:, 0], points[:, 1])
+    assert (ground < points[:, 2]).all()
+    middle = np.abs(points[:, 0]) < 5
+    assert np.abs(ground[middle]).max() < 0.2
+    ends = np.array([[-60.0, 0], [60.0, 0]])
+    node = bridge.graph.node_xyz[np.isin(bridge.graph.node_id, [2, 3]), 2]
+    np.testing.assert_allclose(bridge.height(*ends.T), node, atol=0.02)
+
+
+def test_a_tunnel_has_a_floor_and_a_ceiling(tunnel):
+    mesh, points = tunnel.mesh(), tunnel.centre_lines("tunnel")
+    z, klass = first_below(mesh, moved(points, 0, 0, 2))
+    np.testing.assert_allclose(z, points[:, 2], atol=1e-3)
+    assert set(klass) <= {Class.ROAD, Class.LANE_MARKING}
+    np.testing.assert_allclose(
+        first_above(mesh, moved(points, 0, 0, 2)), points[:, 2] + SIZES.headroom, atol=1e-3
+    )
+
+
+def test_a_tunnel_is_open_from_mouth_to_mouth_and_walled(tunnel):
+    mesh, points = tunnel.mesh(), tunnel.centre_lines("tunnel")
+    for a, b in pairwise(points):
+        assert not crosses(mesh, moved(a, 0, 0, 1), moved(b, 0, 0, 1))
+        for side in (-1, 1):
+            assert crosses(mesh, moved(a, 0, 0, 1), moved(a, 0.1, 15.0 * side, 1))
+    first, last = points[0], points[-1]
+    assert not crosses(mesh, moved(first, -10, 0, 1), moved(first, 0, 0, 1))
+    assert not crosses(mesh, moved(last, 0, 0, 1), moved(last, 10, 0, 1))
+
+
+def test_the_ground_is_open_over_the_mouths_and_closed_over_the_middle(tunnel):
+    opening = shapely.union_all([shape for shape in tunnel.openings if shape is not None])
+    assert opening.covers(shapely.LineString([(-59.9, 0), (-55, 0)]))
+    assert opening.covers(shapely.LineString([(55, 0), (59.9, 0)]))
+    assert not opening.intersects(shapely.Point(0, 0))
+    # The way in lies in a cutting, and where the ground is closed the roof is under it.
+    assert tunnel.height(np.array([-61.0]), np.array([0.0]))[0] < -2.0
+    roof = first_below(tunnel.mesh(), np.array([[0.0, 0.0, 1.0]]))[0]
+    assert -2.0 < roof[0] < 0.0
+
+
+def test_around_an_opening_the_shell_stands_as_high_as_the_ground(tunnel):
+    opening = shapely.union_all([shape for shape in tunnel.openings if shape is not None])
+    rim = shapely.get_coordinates(shapely.segmentize(shapely.boundary(opening), 1.0))
+    mouth = np.abs(np.abs(rim[:, 0]) - 60) < 0.2
+    points = np.column_stack([rim, np.full(len(rim), 10.0)])[~mouth]
+    top, _ = first_below(tunnel.mesh(), points)
+    assert (top > tunnel.height(points[:, 0], points[:, 1])).all()
+
+
+def test_a_road_that_forks_on_its_bridge_has_one_deck_there():
+    places = {1: (-200, 0), 2: (-100, 0), 3: (0, 0), 4: (100, 12), 5: (100, -12), 6: (200, 24), 7: (200, -24)}
+    ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (BRIDGE | {"oneway": "yes"}, [3, 4]), (BRIDGE, [3, 5]),
+            (ROAD, [4, 6]), (ROAD, [5, 7])]  # fmt: skip
+    fork = Town(town(places, ways))
+    mesh, points = fork.mesh(), fork.centre_lines("bridge", 1.0)
+    assert validate_mesh(mesh).ok.all()
+    z, klass = first_below(mesh, moved(points, 0, 0, 1.5))
+    np.testing.assert_allclose(z, points[:, 2], atol=0.02)
+    assert Class.BRIDGE not in klass  # no parapet stands in the way
+    apart = shapely.intersection(fork.table.polygon[:, None], fork.table.polygon[None])
+    assert shapely.area(apart[~np.eye(len(apart), dtype=bool)]).max() < 0.1
+
+
+def test_a_building_stands_over_the_tunnel_that_would_run_into_it(tunnel):
+    outline = lonlat([(-58, -15), (-40, -15), (-40, 15), (-58, 15)])
+    house = Area(
+        "way/900",
+        {"building": "yes", "building:levels": "6"},
+        shapely.MultiPolygon([shapely.Polygon(outline)]),
+        np.empty(0, np.int64),
+    )
+    buildings, _ = read_buildings(town(PLACES, UNDER, [house]), FRAME)
+    base = np.full(buildings.count, -4.0)
+    over, problems = buildings_over(buildings, base, tunnel.table)
+    assert [p.reason for p in problems] == ["over-tunnel"]
+    solid, _ = build_solids(over, base=base)
+    assert validate_mesh(solid).ok.all()
+    points = tunnel.centre_lines("tunnel")
+    inside = (points[:, 0] > -57) & (points[:, 0] < -41)
+    for a, b in pairwise(points[inside]):
+        assert not crosses(solid, moved(a, 0, 0, 1), moved(b, 0, 0, 1))
+    assert crosses(build_solids(buildings, base=base)[0], points[0] + [-5, 0, 1], points[0] + [10, 0, 1])
+    assert solid.vertices[:, 2].max() == pytest.approx(base[0] + buildings.height[0], abs=1e-3)
+
+
+def test_a_footbridge_clears_the_road_and_its_parapets_are_railings():
+    places = PLACES | {7: (-80, 20), 8: (80, 20)}
+    ways = [(ROAD, [5, 6]), ({"highway": "footway", "bridge": "yes", "layer": "1"}, [7, 8])]
+    walk = Town(town(places, ways))
+    line = np.concatenate(list(walk.table.line))
+    assert line[:, 2].max() >= SIZES.headroom + SIZES.slab - 1e-6
+    assert line[np.abs(line[:, 0]) > 79, 2] == pytest.approx(0.0, abs=0.01)
+    z, klass = first_below(walk.mesh(), np.array([[0.0, 20.0, 50.0]]))
+    assert z[0] >= SIZES.headroom + SIZES.slab - 1e-6
+    assert klass[0] == Class.SIDEWALK
+    assert set(walk.table.rise) == {SIZES.railing}
+
+
+def test_a_footway_on_a_road_bridge_is_as_high_as_the_road():
+    places = PLACES | {7: (-60, 6), 8: (60, 6)}
+    ways = [*OVER, ({"highway": "footway", "bridge": "yes", "layer": "1"}, [7, 8])]
+    both = Town(town(places, ways))
+    road = both.centre_lines("bridge")
+    z, klass = first_below(both.mesh(), moved(road, 0, 6.0, 2))
+    np.testing.assert_allclose(z, road[:, 2], atol=0.05)
+    assert (klass == Class.SIDEWALK).mean() > 0.9
+
+
+def test_long_bridges_come_in_pieces_that_fit():
+    long = Town(
+        town(
+            {1: (-600, 0), 2: (-300, 0), 3: (300, 40), 4: (600, 40)},
+            [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4])],
+        )
+    )
+    assert len(long.table) >= 8
+    boxes = shapely.bounds(long.table.polygon)
+    assert (np.hypot(boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]) < 110).all()
+    points = long.centre_lines("bridge", 0.37)
+    z, _ = first_below(long.mesh(), moved(points, 0, 0, 2))
+    np.testing.assert_allclose(z, points[:, 2], atol=0.01)  # no crack between pieces
+
+
+def test_every_guess_has_its_source(bridge, tunnel):
+    for table in (bridge.table, tunnel.table):
+        assert set(table.body_source) == set(table.rise_source) == {"default"}
+    assert bridge.table.pier_spacing.max() <= SIZES.pier_spacing
+    assert set(bridge.table.osm_id) == {"way/101"}
+    assert set(tunnel.table.osm_id) == {"way/101"}
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    ("name", "bounds", "dem"),
+    [
+        ("portland_central_roads.osm.pbf", (-122.6883, 45.5217, -122.6803, 45.5273), None),
+        ("baltimore_harbor.osm.pbf", (-76.5922, 39.2620, -76.5840, 39.2670), None),
+        ("monaco.osm.pbf", (7.4205, 43.7320, 7.4305, 43.7395), "N43E007.hgt.zip"),
+    ],
+)
+def test_real_bridges_and_tunnels(shared_osm, shared_dem, name, bounds, dem):
+    osm = read_osm(shared_osm(name), bounds=bounds)
+    west, south, east, north = osm.bounds
+    frame = Frame.at((west + east) / 2, (south + north) / 2)
+    ground = flat
+    if dem:
+        ground = open_terrain(
+            [shared_dem(dem)], frame, bounds=(-1500, -1500, 1500, 1500), outside="nearest"
+        ).height
+    real = Town(osm, frame, ground)
+    mesh = real.mesh()
+    verdict = validate_mesh(mesh)
+    assert len(verdict) == len(real.table) > 10
+    assert verdict.ok.all()
+    for kind in ("bridge", "tunnel"):
+        if not getattr(real.graph, kind).any():
+            continue
+        points = real.centre_lines(kind)
+        z, _ = first_below(mesh, moved(points, 0, 0, 2))
+        # A few of Monaco's tunnels fork and part in height while their carriageways still overlap.
+        assert (np.abs(z - points[:, 2]) < 0.02).mean() > (0.98 if dem else 0.999)
+        if kind == "tunnel":
+            above = first_above(mesh, moved(points, 0, 0, 2))
+            assert (np.abs(above - points[:, 2] - SIZES.headroom) < 0.02).mean() > 0.98
