@@ -110,6 +110,7 @@ def populate(
     flow = simulate_trips(trips, graph, plan, ego, box, reach=options.reach * scale)
 
     lots = _polygons(_layer(scene, "landcover"), ("parking",), around)
+    structures = _layer(scene, "structures")
     crossings = shapely.buffer(_polygons(surfaces, ("crossing",), around), 2.0)
     free = [
         _ego_boxes(ego, vehicle, scale),
@@ -117,6 +118,7 @@ def populate(
         _strips(lanes, area),
         shapely.buffer(plan.zones.polygon, 3.0),
         crossings,
+        np.empty(0, object) if structures is None else shapely.buffer(structures.geometry, 0.5),
     ]
     trees = [shapely.STRtree(part) for part in (standing, np.concatenate(free))]
     spots = concatenated(
