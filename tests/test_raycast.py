@@ -417,3 +417,12 @@ if child == 0:
 raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_a_lone_copy_is_the_shape_it_says():
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
+    shapes = [Caster(corners + np.array([0.0, 0.0, height]), [[0, 1, 2]]) for height in (1.0, 2.0, 3.0)]
+    stay = np.eye(3, 4)[None]
+    caster = Caster(instances=[Instances(shapes, np.array([2], np.int32), stay)])
+    hits = caster.cast([[0.0, 0.0, 10.0]], [[0.0, 0.0, -1.0]])
+    assert hits.range[0] == 7.0

@@ -119,6 +119,8 @@ class EmbreeScene:
     def _copy(self, shapes: Sequence[EmbreeScene], shape: NDArray[np.int32], placed: Float, mask: int) -> int:
         """An Embree geometry of copies with one mask."""
         lib = self._lib
+        if len(shape) == 1:  # of an array of one, Embree takes the first shape whatever its index
+            shapes, shape = [shapes[int(shape[0])]], np.zeros(1, np.int32)
         copies: int = lib.call("rtcNewGeometry", lib.device, INSTANCE_ARRAY)
         addresses = (c.c_void_p * len(shapes))(*(one.address for one in shapes))
         lib.call("rtcSetGeometryInstancedScenes", copies, addresses, len(shapes))
