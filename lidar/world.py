@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,29 @@ class Surfaces:
     material: NDArray[np.uint8]
     surface: NDArray[np.uint8]
     color: NDArray[np.uint8]
+
+
+class Faces(NamedTuple):
+    """What the faces of a world are, for compiled code.
+
+    A hit is on row ``face + start[instance]`` of ``what``, a miss (both -1) on its last.
+
+    start : (k + 1,) int64, first row of each instance's shape; the last is 0, the caster's own mesh
+    named : (k,) int32, feature number of each instance
+    what  : (m,) int64, feature << 32 | class << 8 | material
+    """
+
+    start: NDArray[np.int64]
+    named: NDArray[np.int32]
+    what: NDArray[np.int64]
+
+
+def packed(surfaces: Surfaces) -> NDArray[np.int64]:
+    """The column `Faces.what` of surfaces."""
+    what = surfaces.feature.astype(np.int64) << 32
+    what |= surfaces.klass.astype(np.int64) << 8
+    what |= surfaces.material
+    return what
 
 
 def _surfaces(mesh: Mesh) -> Surfaces:
@@ -104,6 +128,7 @@ class World:
         self._tiles: dict[int, _Tile] = {}
         self._moving: tuple[Instances, NDArray[np.int32]] = _nothing(self._actors)
         self.caster = Caster(origin=np.zeros(3), dynamic=True)
+        self._lay()
 
     @classmethod
     def load(
@@ -143,7 +168,7 @@ class World:
         old, kept = self._tiles, self._tiles.keys() & set(ranks)
         self._tiles = {rank: old[rank] if rank in kept else self._read(rank) for rank in ranks}
         self.region = region
-        self._number()
+        self._lay()
         self.caster.update(
             detach=[number for rank in old.keys() - kept for number in old[rank].parts],
             attach={n: p for rank in ranks if rank not in kept for n, p in self._tiles[rank].parts.items()},
@@ -171,6 +196,11 @@ class World:
         found["feature"][copied] = self._feature[hits.instance[copied]]
         return Surfaces(**found)
 
+    @property
+    def faces(self) -> Faces:
+        """What the faces are that rays hit, for compiled code."""
+        return Faces(self._base, self._feature, self._what)
+
     def _read(self, rank: int) -> _Tile:
         tile = self.scene.tile(*self.scene.tile_indices[rank])
         mesh, copies = tile.mesh, tile.instances
@@ -185,7 +215,7 @@ class World:
             copies.feature,
         )
 
-    def _number(self) -> None:
+    def _lay(self) -> None:
         """Lay the tables of tiles and shapes end to end, a miss last, where index -1 finds it."""
         tables = [*(tile.surfaces for tile in self._tiles.values()), *self._copied]
         starts = np.cumsum([0, *(len(table.klass) for table in tables)])
@@ -196,11 +226,17 @@ class World:
                 for f in fields(Surfaces)
             )
         )
-        of_shape, of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes)])
+        self._what = packed(self._surfaces)
+        self._of_shape, self._of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes)])
+        self._number()
+
+    def _number(self) -> None:
+        """Say where the tables of all copies start and what they are called."""
         static = np.concatenate([np.empty(0, np.int32), *(tile.shape for tile in self._tiles.values())])
         moving, feature = self._moving
-        self._base = np.concatenate([of_shape[static], of_actor[moving.shape], [0]])
-        self._feature = np.concatenate([*(tile.feature for tile in self._tiles.values()), feature])
+        self._base = np.concatenate([self._of_shape[static], self._of_actor[moving.shape], [0]])
+        named = [np.asarray(rows, np.int32) for rows in (*(t.feature for t in self._tiles.values()), feature)]
+        self._feature = np.concatenate(named)
 
     def _instances(self) -> list[Instances]:
         tiles = self._tiles.values()

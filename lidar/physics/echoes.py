@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
+_MODES = ("strongest", "first", "last", "dual", "all")
+_STRONGEST, _FIRST, _LAST, _DUAL, _ALL = range(5)
 _FAINT = 1e-3  # share of the brightest surface's power that is as good as nothing
 
 
@@ -75,6 +77,52 @@ def merged(surfaces: Echoes, separation: float) -> Echoes:
     return replace(surfaces.take(bearer[:count]), range=place[:count], apparent=power[:count])
 
 
+@njit(cache=True, nogil=True, inline="always")
+def insert(row: Any, size: Any, new: Any, distance: Any) -> None:
+    """Put the number ``new`` into the first ``size`` of ``row``, which stay sorted by their distance."""
+    j = size
+    while j > 0 and distance[row[j - 1]] > distance[new]:
+        row[j] = row[j - 1]
+        j -= 1
+    row[j] = new
+
+
+@njit(cache=True, nogil=True, inline="always")
+def gather(
+    row: Any, size: Any, surfaces: Any, separation: Any, count: Any, bearer: Any, place: Any, power: Any
+) -> Any:
+    """Write the echoes of a pulse behind the ``count`` there are: their bearers, ranges and powers.
+
+    row      : numbers of its surfaces, the first ``size`` of them, sorted by range
+    surfaces : distance, apparent reflectance and axis by number
+    """
+    distance, apparent, axis = surfaces
+    total = moment = most = central = 0.0
+    first, best, middle = 0, row[0], row[0]
+    for i in range(size):
+        s = row[i]
+        r = max(distance[s], 1e-3)
+        received = apparent[s] / (r * r)
+        if received > most:
+            best, most = s, received
+        if axis[s]:
+            middle, central = s, received
+        total += received
+        moment += received * distance[s]
+        if i == size - 1 or distance[row[i + 1]] - distance[s] > separation:
+            bearer[count] = middle if central > _FAINT * most else best
+            if i == first or not total > 0.0:
+                place[count], power[count] = distance[best], apparent[best]
+            else:
+                mean = moment / total
+                place[count], power[count] = mean, total * mean * mean
+            count += 1
+            total = moment = most = central = 0.0
+            first = i + 1
+            best = middle = row[min(i + 1, size - 1)]
+    return count
+
+
 @njit(cache=True, nogil=True)
 def _merge(
     starts: Any,
@@ -93,31 +141,9 @@ def _merge(
         first, size = starts[p], starts[p + 1] - starts[p]
         if size > len(row):
             row = np.empty(2 * size, np.int64)
-        for i in range(size):  # insertion sort by range
-            j = i
-            while j > 0 and distance[row[j - 1]] > distance[first + i]:
-                row[j] = row[j - 1]
-                j -= 1
-            row[j] = first + i
-        total = moment = most = central = 0.0
-        best = middle = row[0]
         for i in range(size):
-            s = row[i]
-            r = max(distance[s], 1e-3)
-            received = apparent[s] / (r * r)
-            if received > most:
-                best, most = s, received
-            if axis[s]:
-                middle, central = s, received
-            total += received
-            moment += received * distance[s]
-            if i == size - 1 or distance[row[i + 1]] - distance[s] > separation:
-                mean = moment / total if total > 0 else distance[best]
-                bearer[count] = middle if central > _FAINT * most else best
-                place[count], power[count] = mean, total * mean * mean
-                count += 1
-                total = moment = most = central = 0.0
-                best = middle = row[min(i + 1, size - 1)]
+            insert(row, i, first + i, distance)
+        count = gather(row, size, (distance, apparent, axis), separation, count, bearer, place, power)
     return count
 
 
@@ -140,18 +166,35 @@ def reported(
     most   : in ``all``, the first echoes of a pulse that are reported
     second : in ``dual``, where one echo is strongest and last, the second strongest is reported with it
     """
-    number, size = numbered(echoes)
-    last = number == size
-    if mode in ("all", "first", "last"):
-        rows = {"all": number <= most, "first": number == 1, "last": last}[mode]
-        return np.flatnonzero(rows).astype(np.int64)
-    pulse = echoes.pulse
-    by_power = np.lexsort((-amplitude, pulse))  # stable: of equal amplitudes the nearer comes first
-    rank = np.empty(len(echoes), np.int64)
-    rank[by_power] = number - 1  # both run through each pulse from its first row
-    chosen = rank == 0
-    if mode == "dual":
-        if second:
-            chosen |= (rank == 1) & np.isin(pulse, pulse[chosen & last])
-        chosen |= last
-    return np.flatnonzero(chosen).astype(np.int64)
+    rows = np.empty(len(echoes), np.int64)
+    count = _reported(echoes.pulse, amplitude, _MODES.index(mode), most, second, rows)
+    return rows[:count]
+
+
+@njit(cache=True, nogil=True)
+def _reported(pulse: Any, amplitude: Any, mode: Any, most: Any, second: Any, rows: Any) -> Any:
+    """Fill in the chosen rows; the number of them."""
+    count, stop = 0, 0
+    while stop < len(pulse):
+        start = stop
+        stop += 1
+        while stop < len(pulse) and pulse[stop] == pulse[start]:
+            stop += 1
+        best, next_best = start, -1
+        for i in range(start + 1, stop):
+            if amplitude[i] > amplitude[best]:
+                best, next_best = i, best
+            elif next_best < 0 or amplitude[i] > amplitude[next_best]:
+                next_best = i
+        for i in range(start, stop):
+            last = i == stop - 1
+            if (
+                (mode == _STRONGEST and i == best)
+                or (mode == _FIRST and i == start)
+                or (mode == _LAST and last)
+                or (mode == _DUAL and (i == best or last or (second and best == stop - 1 and i == next_best)))
+                or (mode == _ALL and i - start < most)
+            ):
+                rows[count] = i
+                count += 1
+    return count
