@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -25,6 +26,12 @@ from geoscene.shapes import shapes
 from geoscene.sources import OsmData
 from geoscene.store import SceneWriter
 from geoscene.tiles import Keys, TileReport, build_tiles, tiles_document
+
+_BESIDE = 15.0
+"""Metres from a road's middle to its outermost lane and to a sensor there, at most."""
+
+_CROWN, _ARM = 5.0, 10.0
+"""Metres by which the crown of a forest's tree and the arm of a lamp or a signal reach beyond their feet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,16 +136,24 @@ def _tiles_along(plan: Plan, options: BuildOptions) -> list[tuple[int, int]]:
     if not options.along:
         return tiles
     line = route_line(options.along, plan.graph, plan.frame)
+    shapely.prepare(line)
+    reach = options.reach + _BESIDE
     size = options.tile_size
-    boxes = shapely.bounds(plan.buildings.footprint).reshape(-1, 4)
-    beyond = 0.0  # how far buildings stick out of the tiles they belong to
-    for (i, j), rows in plan.rows["buildings"].items():
-        low, high = np.array([i, j]) * size, np.array([i + 1, j + 1]) * size
-        sticks = np.concatenate([low - boxes[rows, :2], boxes[rows, 2:] - high])
-        beyond = max(beyond, float(sticks.max()))
-    near = line.buffer(options.reach + beyond)
-    box = shapely.box(*(np.array(tiles) * size).T, *((np.array(tiles) + 1) * size).T)
-    return [tile for tile, met in zip(tiles, shapely.intersects(box, near), strict=True) if met]
+    squares = shapely.box(*(np.array(tiles) * size).T, *((np.array(tiles) + 1) * size).T)
+    seen = set(itertools.compress(tiles, shapely.dwithin(line, squares, reach + _CROWN)))
+    # What stands in a tile may stick out of it, a long wall or bridge by far.
+    buildings = shapely.dwithin(line, plan.buildings.footprint, reach)
+    near = {
+        "buildings": buildings,
+        "parts": buildings,
+        "trees": shapely.dwithin(line, shapely.points(plan.trees.xy), reach + plan.trees.crown / 2),
+        "furniture": shapely.dwithin(line, shapely.points(plan.furniture.xy), reach + _ARM),
+        "barriers": shapely.dwithin(line, plan.barriers.polygon, reach),
+        "structures": shapely.dwithin(line, plan.structures.polygon, reach),
+    }
+    for kind, by_tile in plan.rows.items():
+        seen |= {tile for tile, rows in by_tile.items() if near[kind][rows].any()}
+    return sorted(seen)
 
 
 def _keys(osm: OsmData, options: BuildOptions) -> Keys:

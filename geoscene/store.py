@@ -44,6 +44,9 @@ class SceneWriter:
         self.path = path
         self.folder = path.with_name(f"{path.name}.part")
         self.folder.mkdir(parents=True, exist_ok=True)
+        for left in self.folder.iterdir():
+            if left.name not in ("tiles", "tiles.jsonl"):  # a killed build's tiles serve, nothing else
+                left.unlink()
 
     def finish(
         self,

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
+import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -159,14 +162,20 @@ def build_tiles(
     ``former`` scene whose keys are the same are copied, or give their ground.
     """
     (folder / "tiles").mkdir(parents=True, exist_ok=True)
-    known = _known(folder, keys)
+    wanted = set(tiles)
+    known = {tile: report for tile, report in _known(folder, keys).items() if tile in wanted}
+    kept = {tile_path(folder, *tile) for tile in known}
+    for path in (folder / "tiles").iterdir():
+        if path not in kept:  # of another build, or half written
+            path.unlink()
     yield from known.values()
     todo = [tile for tile in tiles if tile not in known]
     source = _Former.of(former, keys)
     if workers > 1 and len(todo) > 1 and "fork" in multiprocessing.get_all_start_methods():
         _shared.append((plan, folder, lod, source))  # forked workers inherit it
         try:
-            with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("fork")) as pool:
+            fork = multiprocessing.get_context("fork")
+            with ProcessPoolExecutor(workers, mp_context=fork, initializer=_end_with_parent) as pool:
                 for task in as_completed([pool.submit(_work, tile) for tile in todo]):
                     yield _noted(folder, keys, task.result())
         finally:
@@ -210,6 +219,19 @@ class _Former:
 
 
 _shared: list[tuple[Plan, Path, int, _Former]] = []
+
+
+def _end_with_parent() -> None:
+    """See to it that this worker does not outlive a build that is killed."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch(sentinel: int) -> None:
+        wait([sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
 
 
 def _work(tile: tuple[int, int]) -> TileReport:

@@ -1,0 +1,233 @@
+"""What builds cost as cities grow, and what a build along a route saves.
+
+    python benchmarks/scale.py sizes [1000 10000 100000] [--workers 2] [--lod 2] [--folder DIR] [--json]
+    python benchmarks/scale.py stages EXTRACT [EXTRACT ...] [--json]
+    python benchmarks/scale.py along EXTRACT --route LAT,LON LAT,LON [--reach 100] [--folder DIR] [--json]
+
+``sizes`` makes cities (benchmarks/make_osm.py) and builds them with the program, one after another.
+``stages`` times the stages of buildings in one process, tile by tile as the build does it, without parsing
+and without the ground. ``along`` builds the whole and the part seen from a route, drives the route through
+both with a 16-beam scanner for ten seconds and compares the clouds byte by byte.
+
+CPU time is that of all processes. Memory is the greatest sum of proportional set sizes of the process and its
+children (what forked workers share counts once), looked at five times a second; Linux only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from make_osm import make_city, write_city
+
+from geoscene.buildings import build_solids, read_buildings
+from geoscene.frames import Frame
+from geoscene.plan import take_buildings
+from geoscene.scene import open_scene
+from geoscene.sources import read_osm
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Of one command: seconds by the clock, of all processors, and the peak of memory in MiB."""
+
+    wall_s: float
+    cpu_s: float
+    peak_mib: int
+
+
+def run(command: list[str]) -> Cost:
+    """The cost of a command; raises CalledProcessError where it fails."""
+    began = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    peak = 0
+    while True:
+        pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+        if pid:
+            break
+        peak = max(peak, sum(map(_proportional_kib, _family(process.pid))))
+        time.sleep(0.2)
+    wall = time.perf_counter() - began
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    return Cost(round(wall, 2), round(usage.ru_utime + usage.ru_stime, 2), peak // 1024)
+
+
+def _family(root: int) -> list[int]:
+    """A process and all its descendants."""
+    children: dict[int, list[int]] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            except OSError:  # it has ended meanwhile
+                continue
+            children.setdefault(parent, []).append(int(entry.name))
+    family = [root]
+    for pid in family:
+        family += children.get(pid, [])
+    return family
+
+
+def _proportional_kib(pid: int) -> int:
+    try:
+        text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    except OSError:  # it has ended meanwhile
+        return 0
+    found = [line.split()[1] for line in text.splitlines() if line.startswith("Pss:")]
+    return int(found[0]) if found else 0
+
+
+def build_command(osm: Path, out: Path, *extra: str) -> list[str]:
+    """The words that build a scene of an extract."""
+    words = [sys.executable, "-m", "geoscene.cli", "build", "--osm", str(osm), "--out", str(out)]
+    return [*words, "--overwrite", "--quiet", *extra]
+
+
+def sizes(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
+    """Cost of the build of cities, one row a size."""
+    rows = []
+    for count in given.buildings:
+        osm, out = folder / f"city_{count}.osm.pbf", folder / f"city_{count}"
+        write_city(make_city(count, seed=0), osm)
+        words = build_command(osm, out, "--lod", str(given.lod), "--workers", str(given.workers))
+        cost = run(words)
+        scene = open_scene(out).manifest
+        counts = scene["counts"]
+        xmin, ymin, xmax, ymax = scene["bounds"]
+        rows.append(
+            {
+                "buildings": counts["buildings"],
+                "km2": round((xmax - xmin) * (ymax - ymin) / 1e6, 1),
+                "tiles": len(scene["tiles"]),
+                "faces": counts["faces"],
+                "watertight": f"{counts['watertight']}/{counts['closed_objects']}",
+                **asdict(cost),
+                "ms_cpu_per_building": round(1000 * cost.cpu_s / counts["buildings"], 2),
+                "scene_mib": sum(f.stat().st_size for f in out.rglob("*") if f.is_file()) >> 20,
+            }
+        )
+    return rows
+
+
+def stages(given: argparse.Namespace) -> list[dict[str, Any]]:
+    """Buildings per second and processor of reading footprints, heights and looks, and of making solids."""
+    rows = []
+    for path in given.extract:
+        began = time.process_time()
+        osm = read_osm(path)
+        parsed = time.process_time()
+        west, south, east, north = osm.bounds
+        table, _ = read_buildings(osm, Frame.at((west + east) / 2, (south + north) / 2))
+        read = time.process_time()
+        count = table.count
+        row: dict[str, Any] = {"extract": path.name, "buildings": count, "parse_s": round(parsed - began, 2)}
+        row["read_s"] = round(read - parsed, 2)
+        for lod in (1, 2):
+            start = time.process_time()
+            for rows_, parts in _tiles(table):
+                build_solids(take_buildings(table, rows_, parts), base=np.zeros(len(rows_)), lod=lod)
+            spent = time.process_time() - start
+            row |= {
+                f"lod{lod}_solids_s": round(spent, 2),
+                f"lod{lod}_per_s": round(count / (spent + read - parsed)),
+            }
+        rows.append(row)
+    return rows
+
+
+def _tiles(table: Any) -> list[tuple[Any, Any]]:
+    """Rows of buildings and of their parts by tiles of 250 m."""
+    import shapely  # noqa: PLC0415 - used here alone
+
+    boxes = shapely.bounds(table.footprint[: table.count])
+    home = np.floor((boxes[:, :2] + boxes[:, 2:]) / 500.0).astype(int)
+    _, tile = np.unique(home, axis=0, return_inverse=True)
+    tile = tile.ravel()
+    parts = np.flatnonzero(table.is_part)
+    order, of_part = np.argsort(tile, kind="stable"), tile[table.outline[parts]]
+    cuts = np.searchsorted(tile[order], np.arange(tile.max(initial=-1) + 2))
+    by_tile = np.argsort(of_part, kind="stable")
+    part_cuts = np.searchsorted(of_part[by_tile], np.arange(tile.max(initial=-1) + 2))
+    return [
+        (order[a:b], parts[by_tile[c:d]])
+        for a, b, c, d in zip(cuts[:-1], cuts[1:], part_cuts[:-1], part_cuts[1:], strict=True)
+    ]
+
+
+def along(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
+    """Cost of the whole build and of the one along a route, and whether what is there is the same."""
+    rows, clouds, tiles = [], [], []
+    extra = {"whole": [], "along": ["--along", *given.route, "--reach", str(given.reach)]}
+    for name, words in extra.items():
+        out, drive = folder / name, folder / f"{name}_drive"
+        cost = run(build_command(given.extract, out, "--workers", str(given.workers), *words))
+        command = [sys.executable, "-m", "lidar.cli", "drive", str(out), "--route", *given.route]
+        command += ["--rig", "vlp16", "--duration", "10", "--format", "pcd", "--out", str(drive)]
+        driven = run([*command, "--overwrite", "--quiet"])
+        found = {p.relative_to(drive): p.read_bytes() for p in sorted(drive.rglob("*.pcd"))}
+        clouds.append(found)
+        tiles.append({p.name: p.read_bytes() for p in (out / "tiles").iterdir()})
+        rows.append(
+            {"build": name, "tiles": len(tiles[-1]), **asdict(cost), "drive_s": driven.wall_s}
+            | {"clouds": len(found), "cloud_mib": sum(map(len, found.values())) >> 20}
+        )
+    whole, part = tiles
+    rows[1] |= {
+        "same_tiles": all(whole[name] == data for name, data in part.items()),
+        "same_clouds": bool(clouds[0]) and clouds[0] == clouds[1],
+    }
+    return rows
+
+
+def print_table(rows: list[dict[str, Any]]) -> None:
+    """Print rows under the names of their columns."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    cells = [names, *([str(row.get(name, "")) for name in names] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for line in cells:
+        print("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)))
+
+
+def main() -> None:
+    """Measure what the words ask for."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    kinds = parser.add_subparsers(dest="kind", required=True)
+    one = kinds.add_parser("sizes")
+    one.add_argument("buildings", type=int, nargs="*", default=[1000, 10_000, 100_000])
+    one.add_argument("--lod", type=int, default=2)
+    two = kinds.add_parser("stages")
+    two.add_argument("extract", type=Path, nargs="+")
+    three = kinds.add_parser("along")
+    three.add_argument("extract", type=Path)
+    three.add_argument("--route", nargs="+", required=True)
+    three.add_argument("--reach", type=float, default=100.0)
+    for kind in (one, two, three):
+        kind.add_argument("--workers", type=int, default=2)
+        kind.add_argument("--folder", type=Path)
+        kind.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = given.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        rows = stages(given) if given.kind == "stages" else globals()[given.kind](given, folder)
+    if given.json:
+        print(json.dumps(rows, indent=1))
+    else:
+        print_table(rows)
+
+
+if __name__ == "__main__":
+    main()
