@@ -67,14 +67,16 @@ def apparent(
     """
     if law not in INCIDENCE_LAWS:
         raise InputError(f"incidence law {law!r} is not known: {', '.join(INCIDENCE_LAWS)}")
-    rows = np.broadcast_arrays(*(np.asarray(v, np.float64) for v in (reflectance, cosine, specular)))
-    back: Float = np.empty(rows[0].shape)
-    _apparent(*(column.ravel() for column in rows), INCIDENCE_LAWS.index(law), back.reshape(-1))
+    r, c, s = (
+        np.ascontiguousarray(v, np.float64) for v in np.broadcast_arrays(reflectance, cosine, specular)
+    )
+    back: Float = np.empty(r.shape)
+    _apparent(r.reshape(-1), c.reshape(-1), s.reshape(-1), INCIDENCE_LAWS.index(law), back.reshape(-1))
     return back
 
 
 @njit(cache=True, nogil=True)
-def sent_back(reflectance: float, cosine: float, specular: float, law: int) -> float:
+def sent_back(reflectance: Any, cosine: Any, specular: Any, law: Any) -> Any:
     """What `apparent` says of one surface, for compiled code; ``law`` is the row of `INCIDENCE_LAWS`."""
     if reflectance > RETRO:
         angle = np.arccos(min(max(cosine, 0.0), 1.0))
@@ -99,6 +101,6 @@ def sent_back(reflectance: float, cosine: float, specular: float, law: int) -> f
 
 
 @njit(cache=True, nogil=True)
-def _apparent(reflectance: Any, cosine: Any, specular: Any, law: int, back: Any) -> None:
+def _apparent(reflectance: Any, cosine: Any, specular: Any, law: Any, back: Any) -> None:
     for i in range(len(back)):
         back[i] = sent_back(reflectance[i], cosine[i], specular[i], law)
