@@ -102,10 +102,11 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
     began = time.perf_counter()
     from geoscene.scene import open_scene  # noqa: PLC0415
     from lidar.dataset import read_trajectory  # noqa: PLC0415
+    from lidar.devices import scanners  # noqa: PLC0415
     from lidar.drive import Stopwatch, record_all, schedule  # noqa: PLC0415
     from lidar.georeference import Georeference, export_crs  # noqa: PLC0415
     from lidar.physics.effects import effects_of  # noqa: PLC0415
-    from lidar.record import Recorder, scanners  # noqa: PLC0415
+    from lidar.record import Contents, Recorder  # noqa: PLC0415
     from lidar.rig import load_rig  # noqa: PLC0415
 
     imported = time.perf_counter()
@@ -115,11 +116,16 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
     geo = Georeference(scene.frame, export_crs(scene.frame))
     effects = effects_of("standard", {"rays": str(rays)})
     watch = Stopwatch()
-    recorder = Recorder(out, scene.frame, trajectory, _START, geo, ("las",), 0, effects, watch)
+    recorder = Recorder(out, scene.frame, trajectory, _START, geo, Contents(("las",), effects=effects), watch)
     points = record_all(scene, trajectory, schedule(sensors, trajectory.duration_ns), sensors, recorder,
                         workers=workers)  # fmt: skip
     ended = time.perf_counter()
-    return {"import_s": imported - began, "loop_s": ended - imported, "points": points, **watch.seconds}
+    return {
+        "import_s": imported - began,
+        "loop_s": ended - imported,
+        "points": sum(points.values()),
+        **watch.seconds,
+    }
 
 
 def load(work: Path) -> dict[str, float]:
@@ -145,7 +151,7 @@ def child(arguments: dict[str, Any]) -> dict[str, float]:
 def pulses(work: Path, seconds: float) -> int:
     """Pulses fired in the drive."""
     from lidar.dataset import read_trajectory  # noqa: PLC0415
-    from lidar.record import scanners  # noqa: PLC0415
+    from lidar.devices import scanners  # noqa: PLC0415
     from lidar.rig import load_rig  # noqa: PLC0415
     from lidar.sensors.preset import firings  # noqa: PLC0415
 

@@ -54,11 +54,14 @@ class Faces(NamedTuple):
     start : (k + 1,) int64, first row of each instance's shape; the last is 0, the caster's own mesh
     named : (k,) int32, feature number of each instance
     what  : (m,) int64, feature << 32 | class << 8 | material
+    low, high : bounds of all feature numbers
     """
 
     start: NDArray[np.int64]
     named: NDArray[np.int32]
     what: NDArray[np.int64]
+    low: int
+    high: int
 
 
 def packed(surfaces: Surfaces) -> NDArray[np.int64]:
@@ -199,7 +202,7 @@ class World:
     @property
     def faces(self) -> Faces:
         """What the faces are that rays hit, for compiled code."""
-        return Faces(self._base, self._feature, self._what)
+        return self._faces
 
     def _read(self, rank: int) -> _Tile:
         tile = self.scene.tile(*self.scene.tile_indices[rank])
@@ -227,6 +230,8 @@ class World:
             )
         )
         self._what = packed(self._surfaces)
+        feature = self._surfaces.feature
+        self._bounds = int(feature.min()), int(feature.max())
         self._of_shape, self._of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes)])
         self._number()
 
@@ -237,6 +242,10 @@ class World:
         self._base = np.concatenate([self._of_shape[static], self._of_actor[moving.shape], [0]])
         named = [np.asarray(rows, np.int32) for rows in (*(t.feature for t in self._tiles.values()), feature)]
         self._feature = np.concatenate(named)
+        low, high = self._bounds
+        if len(self._feature):
+            low, high = min(low, int(self._feature.min())), max(high, int(self._feature.max()))
+        self._faces = Faces(self._base, self._feature, self._what, low, high)
 
     def _instances(self) -> list[Instances]:
         tiles = self._tiles.values()

@@ -8,7 +8,7 @@ from geoscene.classes import Class, materials
 from geoscene.mesh import Mesh, concatenate
 from lidar.poses import Trajectory
 from lidar.raycast import Caster
-from lidar.world import Surfaces
+from lidar.world import Faces, Surfaces, packed
 
 _CORNERS = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 _FACES = np.array(
@@ -27,6 +27,13 @@ class MeshWorld:
 
     def __post_init__(self):
         self.caster = Caster(self.mesh.vertices, self.mesh.faces)
+
+    @property
+    def faces(self):
+        m = self.mesh
+        what = packed(Surfaces(m.feature, m.klass, m.material, m.surface, m.color))
+        low, high = int(m.feature.min()), int(m.feature.max())
+        return Faces(np.zeros(1, np.int64), np.empty(0, np.int32), what, low, high)
 
     def lookup(self, hits):
         seen, m = hits.face >= 0, self.mesh

@@ -9,6 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lidar.raycast.memory import inlined
+
 Float = NDArray[np.float64]
 
 _MODES = ("strongest", "first", "last", "dual", "all")
@@ -77,7 +79,7 @@ def merged(surfaces: Echoes, separation: float) -> Echoes:
     return replace(surfaces.take(bearer[:count]), range=place[:count], apparent=power[:count])
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def insert(row: Any, size: Any, new: Any, distance: Any) -> None:
     """Put the number ``new`` into the first ``size`` of ``row``, which stay sorted by their distance."""
     j = size
@@ -87,16 +89,24 @@ def insert(row: Any, size: Any, new: Any, distance: Any) -> None:
     row[j] = new
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def gather(
-    row: Any, size: Any, surfaces: Any, separation: Any, count: Any, bearer: Any, place: Any, power: Any
+    row: Any,
+    size: Any,
+    distance: Any,
+    apparent: Any,
+    axis: Any,
+    separation: Any,
+    count: Any,
+    bearer: Any,
+    place: Any,
+    power: Any,
 ) -> Any:
     """Write the echoes of a pulse behind the ``count`` there are: their bearers, ranges and powers.
 
-    row      : numbers of its surfaces, the first ``size`` of them, sorted by range
-    surfaces : distance, apparent reflectance and axis by number
+    row : numbers of its surfaces, the first ``size`` of them, sorted by range
+    distance, apparent, axis : of surfaces, by number
     """
-    distance, apparent, axis = surfaces
     total = moment = most = central = 0.0
     first, best, middle = 0, row[0], row[0]
     for i in range(size):
@@ -143,7 +153,7 @@ def _merge(
             row = np.empty(2 * size, np.int64)
         for i in range(size):
             insert(row, i, first + i, distance)
-        count = gather(row, size, (distance, apparent, axis), separation, count, bearer, place, power)
+        count = gather(row, size, distance, apparent, axis, separation, count, bearer, place, power)
     return count
 
 

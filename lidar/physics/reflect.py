@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import materials
 from lidar.errors import InputError
+from lidar.raycast.memory import inlined
 
 Float = NDArray[np.float64]
 
@@ -75,7 +76,7 @@ def apparent(
     return back
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def sent_back(reflectance: Any, cosine: Any, specular: Any, law: Any) -> Any:
     """What `apparent` says of one surface, for compiled code; ``law`` is the row of `INCIDENCE_LAWS`."""
     if reflectance > RETRO:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,9 @@ pointer: Any = _pointer
 """The void pointer to an address."""
 
 
+_UNCOUNTED: dict[str, Any] = {"_nrt": False}
+
+
 @njit(nogil=True)
 def aligned(size: int) -> Any:
     """Zeroed bytes that start at a multiple of 64."""
@@ -61,7 +65,9 @@ def aligned(size: int) -> Any:
     return raw[start : start + size]
 
 
-_UNCOUNTED: dict[str, Any] = {"_nrt": False}
-inlined = njit(nogil=True, error_model="numpy", forceinline=True, **_UNCOUNTED)
-"""Compiled into the caller, and without counting references to the arrays, which the caller holds: counting
-them for every ray takes ten times as long as the rest."""
+def inlined(function: Callable[..., Any]) -> Any:
+    """The function compiled into its callers, and without counting references to its arrays.
+
+    The caller holds the arrays; counting references for every ray takes ten times as long as the rest.
+    """
+    return njit(nogil=True, error_model="numpy", forceinline=True, **_UNCOUNTED)(function)

@@ -18,82 +18,134 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Rays:
-    """The rays of a frame: those of the first pulse, of the second, ...; the beam's axis leads each bundle.
+class Beam:
+    """How a pulse is spread over rays.
 
-    poses     : of the sensor
-    index     : (n,) int32, each ray's row of ``poses``
-    direction : (n, 3) float64, unit vectors in the sensor frame of that pose
-    origin    : (n, 3) float64, metres, in the same frame
-    order     : (n,) int32, permutation in which neighbours go almost the same way
-    per_pulse : rays of a pulse
-    share     : (per_pulse,) float64, their shares of its power
+    spread : (rays, 2) radians, to the left and up, off the beam's axis, which comes first
+    size   : (rays, 2) metres, to the left and up, where the rays start
+    share  : (rays,) share of the pulse's power
     """
 
-    poses: Poses
-    index: NDArray[np.int32]
-    direction: Float
-    origin: Float
-    order: NDArray[np.int32]
-    per_pulse: int
+    spread: Float
+    size: Float
     share: Float
 
+    def __len__(self) -> int:
+        """Rays a pulse."""
+        return len(self.share)
 
-def cast_from(
-    firings: Firings,
-    mount: Mount,
-    trajectory: Trajectory,
-    *,
-    rays: int = 1,
-    divergence: tuple[float, float] = (0.0, 0.0),
-    aperture: tuple[float, float] = (0.0, 0.0),
-) -> Rays:
-    """The rays of pulses that are fired from a moving vehicle.
 
-    Direction and start of a ray carry the motion from its pose to the pulse's own time, so that casting them
-    from the pose is casting each pulse from where the sensor is when it fires. Poses are taken every
-    `KNOT_NS` and beams moved linearly between them, as in `Trajectory.place`.
+def beam_of(
+    rays: int, *, divergence: tuple[float, float] = (0.0, 0.0), aperture: tuple[float, float] = (0.0, 0.0)
+) -> Beam:
+    """The beam of a scanner.
 
     rays       : rays a pulse, see `lidar.physics.footprint.bundle`
     divergence : (2,) radians, full 1/e^2 angles, level and upright
     aperture   : (2,) metres, the beam's size at its start
     """
-    first, last = (int(t) // KNOT_NS for t in (firings.time_ns.min(), firings.time_ns.max()))
-    knots = trajectory.at(KNOT_NS * np.arange(first, last + 2, dtype=np.int64))
-    poses = knots.mounted(mount.translation, mount.rotation)
-    back = poses.rotation[:-1].transpose(0, 2, 1)
-    turn = back @ poses.rotation[1:] - np.eye(3)
-    step = (poses.position[1:] - poses.position[:-1]) / poses.scale[:-1]
-    shift = np.einsum("nij,nj->ni", back, step)
     place, share = bundle(rays)
-    n = len(firings) * rays
-    index, direction, origin = np.empty(n, np.int32), np.empty((n, 3)), np.empty((n, 3))
-    spread, size = place * np.divide(divergence, 2), place * np.divide(aperture, 2)
-    _fill(
-        firings.time_ns - first * KNOT_NS,
-        firings.direction,
-        firings.origin,
-        (turn, shift),
-        (spread, size),
-        (index, direction, origin),
-    )
-    order: Any = firings.order
-    if rays > 1:  # those of a pulse go together
-        order = (order[:, None] * np.int32(rays) + np.arange(rays, dtype=np.int32)).ravel()
-    return Rays(poses, index, direction, origin, order, rays, share)
+    return Beam(place * np.divide(divergence, 2), place * np.divide(aperture, 2), share)
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """Rays of consecutive pulses: those of the first, of the second, ...; the beam's axis leads each bundle.
+
+    poses     : of the sensor
+    index     : (n,) int64, each ray's row of ``poses``
+    direction : (n, 3) float64, unit vectors in the sensor frame of that pose
+    origin    : (n, 3) float64, metres, in the same frame
+    order     : (n,) int64, permutation in which neighbours go almost the same way
+    """
+
+    poses: Poses
+    index: NDArray[np.int64]
+    direction: Float
+    origin: Float
+    order: NDArray[np.int64]
+
+    def take(self, rows: NDArray[np.integer]) -> Rays:
+        """Chosen rays, in no order."""
+        none = np.empty(0, np.int64)
+        return Rays(self.poses, self.index[rows], self.direction[rows], self.origin[rows], none)
+
+
+class Carrier:
+    """A moving sensor that fires pulses, some of them at a time.
+
+    Direction and start of a ray carry the motion from its pose to the pulse's own time, so that casting them
+    from the pose is casting each pulse from where the sensor is when it fires. Poses are taken every
+    `KNOT_NS` and beams moved linearly between them, as in `Trajectory.place`.
+
+    firings : the pulses
+    batch   : pulses at a time, at most
+    """
+
+    def __init__(
+        self, firings: Firings, mount: Mount, trajectory: Trajectory, beam: Beam, *, batch: int
+    ) -> None:
+        first, last = (int(t) // KNOT_NS for t in (firings.time_ns.min(), firings.time_ns.max()))
+        knots = trajectory.at(KNOT_NS * np.arange(first, last + 2, dtype=np.int64))
+        self.poses = knots.mounted(mount.translation, mount.rotation)
+        back = self.poses.rotation[:-1].transpose(0, 2, 1)
+        step = (self.poses.position[1:] - self.poses.position[:-1]) / self.poses.scale[:-1]
+        self._turn = back @ self.poses.rotation[1:] - np.eye(3)
+        self._shift = np.einsum("nij,nj->ni", back, step)
+        self._firings, self._beam, self._batch = firings, beam, batch
+        self._start_ns = first * KNOT_NS
+        self._order = np.empty(len(firings), np.int64)
+        _batches(firings.order, batch, self._order)
+
+    def rays(self, batch: int) -> Rays:
+        """The rays of a batch, by its number."""
+        part = slice(batch * self._batch, (batch + 1) * self._batch)
+        fired, beam = self._firings, self._beam
+        work = self._order[part]
+        n = len(work) * len(beam)
+        out = Rays(
+            self.poses, np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.int64)
+        )
+        _fill(
+            fired.time_ns[part],
+            self._start_ns,
+            fired.direction[part],
+            fired.origin[part],
+            work - part.start,
+            (self._turn, self._shift),
+            (beam.spread, beam.size),
+            (out.index, out.direction, out.origin, out.order),
+        )
+        return out
 
 
 @njit(cache=True, nogil=True)
-def _fill(since: Any, directions: Any, origins: Any, motion: Any, spread: Any, out: Any) -> None:
-    """Fill ``out``: pose, direction and origin of every ray."""
+def _batches(order: Any, size: int, out: Any) -> None:
+    """Fill ``out`` with the order, one batch of rows after the other."""
+    batches = -(-len(order) // size)
+    place = size * np.arange(batches)
+    for i in range(len(order)):
+        batch = order[i] // size
+        out[place[batch]] = order[i]
+        place[batch] += 1
+
+
+@njit(cache=True, nogil=True)
+def _fill(
+    time: Any, start: int, directions: Any, origins: Any, work: Any, motion: Any, spread: Any, out: Any
+) -> None:
+    """Fill ``out``: pose, direction, origin and order of every ray."""
     turn, shift = motion
     angle, size = spread
-    index, direction, origin = out
+    index, direction, origin, order = out
     i = 0
-    for pulse in range(len(since)):
-        k = since[pulse] // KNOT_NS
-        w = (since[pulse] - k * KNOT_NS) / KNOT_NS
-        m = turn[k]
+    for pulse in range(len(time)):
+        k = (time[pulse] - start) // KNOT_NS
+        w = (time[pulse] - start - k * KNOT_NS) / KNOT_NS
+        a00, a01, a02 = turn[k, 0, 0], turn[k, 0, 1], turn[k, 0, 2]
+        a10, a11, a12 = turn[k, 1, 0], turn[k, 1, 1], turn[k, 1, 2]
+        a20, a21, a22 = turn[k, 2, 0], turn[k, 2, 1], turn[k, 2, 2]
+        sx, sy, sz = shift[k, 0], shift[k, 1], shift[k, 2]
         x, y, z = directions[pulse, 0], directions[pulse, 1], directions[pulse, 2]
         ox, oy, oz = origins[pulse, 0], origins[pulse, 1], origins[pulse, 2]
         # Across the beam: level to the left (lx, ly), and upright (ux, uy, uz).
@@ -108,13 +160,14 @@ def _fill(since: Any, directions: Any, origins: Any, motion: Any, spread: Any, o
             dx, dy, dz = x + a * lx + b * ux, y + a * ly + b * uy, z + b * uz
             a, b = size[ray, 0], size[ray, 1]
             px, py, pz = ox + a * lx + b * ux, oy + a * ly + b * uy, oz + b * uz
-            vx = dx + w * (m[0, 0] * dx + m[0, 1] * dy + m[0, 2] * dz)
-            vy = dy + w * (m[1, 0] * dx + m[1, 1] * dy + m[1, 2] * dz)
-            vz = dz + w * (m[2, 0] * dx + m[2, 1] * dy + m[2, 2] * dz)
+            vx = dx + w * (a00 * dx + a01 * dy + a02 * dz)
+            vy = dy + w * (a10 * dx + a11 * dy + a12 * dz)
+            vz = dz + w * (a20 * dx + a21 * dy + a22 * dz)
             scale = 1 / np.sqrt(vx * vx + vy * vy + vz * vz)
             direction[i, 0], direction[i, 1], direction[i, 2] = vx * scale, vy * scale, vz * scale
-            origin[i, 0] = px + w * (m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + shift[k, 0])
-            origin[i, 1] = py + w * (m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + shift[k, 1])
-            origin[i, 2] = pz + w * (m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + shift[k, 2])
+            origin[i, 0] = px + w * (a00 * px + a01 * py + a02 * pz + sx)
+            origin[i, 1] = py + w * (a10 * px + a11 * py + a12 * pz + sy)
+            origin[i, 2] = pz + w * (a20 * px + a21 * py + a22 * pz + sz)
             index[i] = k
+            order[i] = work[pulse] * len(angle) + ray
             i += 1

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lidar.cloud import Cloud
-from lidar.physics.echoes import Echoes, joined, merged, numbered, reported
+from lidar.physics.echoes import Echoes, joined, numbered, reported
 from lidar.physics.effects import PLAIN, Effects
 from lidar.physics.intensity import reflectivity_code
 from lidar.physics.random import generator
@@ -18,7 +18,7 @@ from lidar.physics.returns import detected, false_echoes, measured_range, receiv
 from lidar.poses import Trajectory
 from lidar.rig import Mount
 from lidar.sensors.beams import Firings
-from lidar.sensors.motion import cast_from
+from lidar.sensors.motion import beam_of
 from lidar.sensors.preset import Sensor, firings
 from lidar.sensors.surfaces import met
 from lidar.world import World
@@ -47,36 +47,31 @@ def scan(
     pulses = firings(sensor, frame)
     if not effects.motion:
         pulses = replace(pulses, time_ns=np.full_like(pulses.time_ns, pulses.time_ns[0]))
-    rays = cast_from(
-        _unsteady(pulses, sensor, generator(seed, sensor.name, frame, "angle"))
-        if effects.angle_noise
-        else pulses,
+    offset = sensor.pattern.range_offset
+    bent = pulses
+    if effects.angle_noise:
+        bent = _unsteady(pulses, sensor, generator(seed, sensor.name, frame, "angle"))
+    echoes = met(
+        bent,
         mount,
         trajectory,
-        rays=effects.rays,
-        divergence=sensor.divergence,
-        aperture=sensor.aperture,
-    )
-    offset = sensor.pattern.range_offset
-    surfaces = met(
-        rays,
         world,
+        beam=beam_of(effects.rays, divergence=sensor.divergence, aperture=sensor.aperture),
         far=sensor.max_range - offset,
         wavelength_nm=sensor.wavelength_nm,
-        time=_ray_time(sensor, frame, pulses, effects.rays) if _moving(world) else None,
+        separation=sensor.echo_separation,
+        time=_ray_time(sensor, frame, pulses) if _moving(world) else None,
         effects=effects,
         seed=seed,
         threads=threads,
     )
-    alone = effects.rays == 1 and not effects.mirrors
-    echoes = surfaces if alone else merged(surfaces, sensor.echo_separation)
     echoes = echoes.where(echoes.range + offset >= sensor.min_range)
     if effects.link or effects.detection:
         echoes = detected(sensor, echoes, effects, generator(seed, sensor.name, frame, "detection"))
     false = false_echoes(sensor, pulses, echoes, effects, seed, frame)
     echoes = joined(echoes, *false)
     number, count = numbered(echoes)
-    if not (alone and not false):
+    if effects.rays > 1 or effects.mirrors or false:
         power = received(sensor, echoes, effects)
         rows = reported(
             echoes, power, sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
@@ -142,8 +137,8 @@ def _moving(world: World) -> bool:
     return any(group.transform.ndim == 4 for group in world.caster.instances)
 
 
-def _ray_time(sensor: Sensor, frame: int, pulses: Firings, rays: int) -> NDArray[np.float32]:
-    """Times of the rays, 0 to 1 over the frame's window."""
+def _ray_time(sensor: Sensor, frame: int, pulses: Firings) -> NDArray[np.float32]:
+    """Ray times of the pulses, 0 to 1 over the frame's window."""
     start, stop = sensor.window_ns(frame)
-    share = ((pulses.time_ns - start) / (stop - start)).astype(np.float32)
-    return np.repeat(share, rays)
+    share: NDArray[np.float32] = ((pulses.time_ns - start) / (stop - start)).astype(np.float32)
+    return share

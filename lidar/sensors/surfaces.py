@@ -1,138 +1,109 @@
-"""What the rays of a frame meet, as far as a receiver sees it."""
+"""What the pulses of a frame meet, as far as a receiver sees it."""
 
 from __future__ import annotations
 
-import functools
+from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.classes import Class, materials
-from lidar.physics.echoes import Echoes, joined
+from geoscene.classes import Class
+from lidar.physics.echoes import Echoes, joined, merged
 from lidar.physics.effects import Effects
-from lidar.physics.fresnel import glint, mirrored, pane_reflection, surface_reflection
-from lidar.physics.random import normal_of
-from lidar.physics.reflect import RETRO, apparent, reflectance_table
+from lidar.physics.fresnel import mirrored, pane_reflection, surface_reflection
+from lidar.poses import Trajectory
 from lidar.raycast import Hits
-from lidar.sensors.motion import Rays
+from lidar.rig import Mount
+from lidar.sensors.beams import Firings
+from lidar.sensors.motion import Beam, Carrier, Rays
+from lidar.sensors.receive import Look, Receiver, shiny_codes
 from lidar.world import World
 
 Float = NDArray[np.float64]
 
 _PANES = 4  # panes a ray may pass one after another
 _CLEAR = 1e-3  # metres, how far beyond a surface the next ray starts
-
-
-@functools.cache
-def _codes() -> tuple[int, int]:
-    """Material codes of glass and water."""
-    known = materials()
-    return known["glass"].code, known["water"].code
+_BATCH = 1 << 15  # rays worked on at a time, so that their columns stay in the processor's cache
 
 
 def met(
-    rays: Rays,
+    pulses: Firings,
+    mount: Mount,
+    trajectory: Trajectory,
     world: World,
     *,
+    beam: Beam,
     far: float,
     wavelength_nm: float,
+    separation: float,
     time: NDArray[np.float32] | None,
     effects: Effects,
     seed: int,
     threads: int = 1,
 ) -> Echoes:
-    """The surfaces that rays meet within ``far`` metres, sorted by pulse.
+    """The echoes of pulses that a moving sensor fires, from within ``far`` metres, sorted by pulse and range.
 
-    time : (n,) ray times for things that move, or None
+    beam       : how pulses are spread over rays
+    separation : metres, surfaces closer than this are one echo
+    time       : (n,) ray times of the pulses, for things that move, or None
     """
-    hits = world.caster.cast_posed(
-        rays.poses,
-        rays.index,
-        rays.direction,
-        offsets=rays.origin,
-        far=far,
-        time=time,
-        order=rays.order,
-        threads=threads,
-    )
-    row = np.flatnonzero(hits.face >= 0).astype(np.int32)
-    look = _Look(world, wavelength_nm, effects, seed)
-    first, material = look.at(_rows(hits, row))
-    pulse, ray = np.divmod(row, np.int32(rays.per_pulse))
-    surfaces = Echoes(
-        pulse,
-        first.range,
-        first.apparent * rays.share[ray] if rays.per_pulse > 1 else first.apparent,
-        first.feature,
-        first.klass,
-        first.cosine,
-        first.true_range,
-        ray == 0,
-    )
-    if effects.mirrors:
-        shiny = row[np.isin(material, _codes())]
-        return joined(surfaces, *_beyond(rays, shiny, look, far, None if time is None else time[shiny]))
-    return surfaces
-
-
-class _Look:
-    """Surfaces as the receiver sees them."""
-
-    def __init__(self, world: World, wavelength_nm: float, effects: Effects, seed: int) -> None:
-        self.world, self.effects, self.seed = world, effects, seed
-        self.reflectance, self.specular = reflectance_table(wavelength_nm)
-
-    def _spread(self, feature: NDArray[np.int32]) -> Float:
-        """Factor of each feature's reflectance."""
-        if not len(feature):
-            return np.ones(0)
-        first = int(feature.min())
-        every = np.arange(first, int(feature.max()) + 1)
-        factor: Float = np.exp(self.effects.spread * normal_of(every, self.seed))[feature - first]
-        return factor
-
-    def at(self, hits: Hits) -> tuple[Echoes, NDArray[np.uint8]]:
-        """Rows for hits, numbered from 0 and all on the axis, and their materials."""
-        found = self.world.lookup(hits)
-        cosine = np.minimum(np.abs(hits.cosine).astype(np.float64), 1.0)
-        rho = self.reflectance[found.material]
-        if self.effects.spread:
-            one_off = rho * self._spread(found.feature)
-            rho = np.where(rho > RETRO, one_off, np.minimum(one_off, RETRO))
-        back = apparent(rho, cosine, specular=self.specular[found.material], law=self.effects.law)
-        if self.effects.mirrors:
-            water = np.flatnonzero(found.material == _codes()[1])
-            back[water] = glint(cosine[water])
-        n = len(hits.range)
-        rows = Echoes(
-            np.arange(n, dtype=np.int32),
-            hits.range,
-            back,
-            found.feature,
-            found.klass,
-            cosine,
-            hits.range,
-            np.ones(n, bool),
+    rays = len(beam)
+    batch = max(_BATCH // rays, 1)
+    look = Look(world, wavelength_nm, effects, seed)
+    carrier = Carrier(pulses, mount, trajectory, beam, batch=batch)
+    receiver = Receiver(look, beam.share, separation, batch=batch * rays)
+    beyond: list[Echoes] = []
+    for number, first in enumerate(range(0, len(pulses), batch)):
+        cast = carrier.rays(number)
+        moments = None if time is None else np.repeat(time[first : first + batch], rays)
+        hits = world.caster.cast_posed(
+            cast.poses,
+            cast.index,
+            cast.direction,
+            offsets=cast.origin,
+            far=far,
+            time=moments,
+            order=cast.order,
+            threads=threads,
         )
-        return rows, found.material
+        shiny = receiver.take(hits, first)
+        if len(shiny):
+            pulse, ray = np.divmod(shiny, np.int32(rays))
+            later = None if moments is None else moments[shiny]
+            beyond += _beyond(cast.take(shiny), pulse + np.int32(first), beam.share[ray], look, far, later)
+    echoes, surfaces = receiver.echoes()
+    if not len(surfaces):
+        return echoes
+    return _by_pulse(echoes, merged(joined(surfaces, *beyond), separation))
+
+
+def _by_pulse(one: Echoes, other: Echoes) -> Echoes:
+    """All rows by pulse; no pulse is in both."""
+    both = Echoes(*(np.concatenate([getattr(e, f.name) for e in (one, other)]) for f in fields(Echoes)))
+    return both.take(np.argsort(both.pulse, kind="stable"))
 
 
 def _beyond(
-    rays: Rays, row: NDArray[np.int32], look: _Look, far: float, time: NDArray[np.float32] | None
+    rays: Rays,
+    pulse: NDArray[np.int32],
+    power: Float,
+    look: Look,
+    far: float,
+    time: NDArray[np.float32] | None,
 ) -> list[Echoes]:
     """What rays meet that have met glass or water: behind it, and by way of the mirror image.
+
+    pulse, power : (n,) of each ray; time as in `met`
 
     The mirrored path is taken twice, so its power goes with the square of the reflected share; its echo
     appears on the ray's own direction, as far behind the mirror as the thing is before it, and is labelled
     noise.
     """
     caster = look.world.caster
-    pose = rays.poses.take(rays.index[row])
-    start, way = pose.place(rays.origin[row]), pose.directions(rays.direction[row])
-    pulse, sub = np.divmod(row, np.int32(rays.per_pulse))
-    power = rays.share[sub]
-    travelled = np.zeros(len(row))
-    glass, water = _codes()
+    pose = rays.poses.take(rays.index)
+    start, way = pose.place(rays.origin), pose.directions(rays.direction)
+    travelled = np.zeros(len(pulse))
+    glass, water = shiny_codes()
     found = []
     for layer in range(_PANES):
         hits = caster.cast(start, way, far=far, time=time, normals=True)
@@ -190,9 +161,7 @@ def _along(
     )
 
 
-def _rows(hits: Hits, rows: NDArray[np.int32] | NDArray[np.bool_]) -> Hits:
-    """Chosen rows, without a copy if that is all in order."""
-    if len(rows) == len(hits.range) and rows.dtype != np.bool_:
-        return hits
+def _rows(hits: Hits, rows: NDArray[np.bool_]) -> Hits:
+    """The rows of a mask."""
     normal = hits.normal[rows] if len(hits.normal) else hits.normal
     return Hits(hits.range[rows], hits.face[rows], hits.instance[rows], hits.cosine[rows], normal)
