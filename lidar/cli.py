@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +25,8 @@ app = App(
     lidar drive scene --route random --duration 20 -o drive
 
     lidar map drive -o map.laz
+
+    lidar rigs, lidar sensors and lidar settings list what there is to choose from.
     """,
 )
 app.register_install_completion_command()
@@ -36,7 +39,10 @@ def drive(
     scene: Path,
     /,
     *,
-    route: Annotated[list[str], Parameter(consume_multiple=True, negative=())],
+    route: Annotated[list[str] | None, Parameter(consume_multiple=True, negative=())] = None,
+    survey: str = "",
+    altitude: float | None = None,
+    overlap: float = 0.3,
     duration: float | None = None,
     rig: str = "seed",
     vehicle: str = "",
@@ -47,6 +53,8 @@ def drive(
     settings: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
     traffic: str | None = None,
     formats: Annotated[str, Parameter(name="--format", group=_OUTPUT)] = "pcd,laz",
+    labels: Annotated[str, Parameter(group=_OUTPUT)] = "",
+    deskew: Annotated[str, Parameter(group=_OUTPUT)] = "",
     crs: Annotated[str, Parameter(group=_OUTPUT)] = "utm",
     exact: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
@@ -68,35 +76,53 @@ def drive(
 
     lidar drive scene --route track.gpx --rig my_rig.toml -o drive
 
+    lidar drive scene --route drive/trajectory.csv --rig kitti --traffic on -o again
+
+    lidar drive scene --rig drone --survey all --altitude 80 -o flight
+
     Parameters
     ----------
     scene
         Directory of the scene.
     route
-        random, a GPX or GeoJSON file, or two or more waypoints as LAT,LON in degrees.
+        random, a GPX or GeoJSON file, two or more waypoints as LAT,LON in degrees, or the trajectory.csv or
+        poses.csv of an earlier drive, which is then driven again as it was.
+    survey
+        For what flies, instead of a route: all, W,S,E,N in degrees, or a GeoJSON file with a polygon, which
+        is flown over in strips.
+    altitude
+        Metres above the ground of a flight; by default heights in the route's file, or 60 (drone) or 600.
+    overlap
+        Share of a survey's strip that the next one covers too.
     duration
         Seconds to record; all of a given route, or 60 seconds of a random one, by default.
     rig
-        Sensors and where they sit: seed, vlp16 or another rig that comes along, or a TOML file.
+        Sensors and where they sit: a rig that comes along (lidar rigs lists them), or a TOML file.
     vehicle
-        car or another vehicle that comes along, or a TOML file; the rig's own by default.
+        car, van, robot, backpack, drone, aircraft, or a TOML file; the rig's own by default.
     side
         Side of the road that is driven on: right or left.
     seed
-        Of everything random.
+        Of everything random: a whole number from 0 on.
     start
         UTC time of the drive's start, ISO 8601 (2026-06-21T08:00:00); it sets the sun and the time stamps.
         By default 10:00 local solar time on 21 June 2026.
     fidelity
-        draft (one pose a frame, exact ranges), standard (a pose a pulse, exact ranges) or survey (beams with
-        a size, several echoes, noise, lost and false returns).
+        draft (one pose a frame, exact ranges, no shadows), standard (a pose a pulse, exact ranges) or survey
+        (beams with a size, several echoes, noise, lost and false returns; image noise).
     settings
-        One effect set apart from the level, NAME=VALUE; again for more. An unknown name lists them all.
+        One dial set apart from the level, NAME=VALUE; again for more. lidar settings lists them all.
     traffic
         Other road users: on, or densities such as vehicles=20,parked=0.5,walkers=5,cyclists=2 (vehicles and
         cyclists per km of lane, walkers per km of sidewalk, parked as a share of the places).
     formats
-        Formats of clouds, with commas: pcd, ply, csv (sensor frame), laz, las (georeferenced).
+        Formats of clouds, with commas: pcd, ply, csv, kitti, nuscenes (sensor frame), laz, las
+        (georeferenced).
+    labels
+        Files of labels in others' codes beside the clouds, with commas: semantickitti, nuscenes.
+    deskew
+        Clouds of the sensor frame a second time, all points brought to one moment of the frame: start, middle
+        or end.
     crs
         CRS of LAZ files: utm, scene, or an EPSG code.
     exact
@@ -113,15 +139,22 @@ def drive(
         No progress bars.
     """
     from geoscene.scene import open_scene  # noqa: PLC0415
-    from lidar.drive import DriveOptions  # noqa: PLC0415
     from lidar.drive import drive as record  # noqa: PLC0415
+    from lidar.options import DriveOptions  # noqa: PLC0415
 
+    if bool(route) == bool(survey):
+        raise InputError("give one of --route and --survey, such as --route random")
     options = DriveOptions(
-        route=_route(route),
+        route=_route(route or ["random"]),
+        survey=survey,
+        altitude=altitude,
+        overlap=overlap,
         duration=duration,
         rig=rig,
         vehicle=vehicle,
-        formats=tuple(f for f in formats.lower().split(",") if f),
+        formats=_words(formats),
+        labels=_words(labels),
+        deskew=deskew.lower(),
         seed=seed,
         start=_time(start) if start else None,
         crs=crs,
@@ -138,7 +171,9 @@ def drive(
         "path": str(summary.path),
         "frames": summary.frames,
         "resumed": summary.resumed,
-        "points": summary.points,
+        "points": sum(summary.points.values()),
+        "points_by_sensor": summary.points,
+        "written": summary.written,
         "duration_s": summary.duration,
         "length_m": round(summary.length, 2),
         "wall_s": round(summary.wall, 2),
@@ -147,11 +182,22 @@ def drive(
     if json:
         print_json(document)
     else:
+        total = sum(summary.points.values())
+        there = f" ({total - summary.written:,} were there)" if summary.resumed else ""
         print(
             f"{out}: {summary.duration:.1f} s, {summary.length:.0f} m, {summary.frames} frames,"
-            f" {summary.points:,} points in {summary.wall:.1f} s; next: lidar map {out} -o map.laz"
+            f" {total:,} points{there} in {summary.wall:.1f} s; next: lidar map {out} -o map.laz"
+        )
+    for name in (name for name, points in summary.points.items() if not points):
+        print(
+            f"lidar: {name} saw nothing in the whole drive; is anything within its range, where it looks?",
+            file=sys.stderr,
         )
     return 0
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word for word in text.lower().split(",") if word)
 
 
 def _route(words: list[str]) -> str | Path | list[tuple[float, float]]:
@@ -254,10 +300,102 @@ def map_(
             open_dataset(dataset), out, voxel=voxel, color=color, sensors=sensor or (), progress=progress
         )
     if json:
-        counts = {"points_in": summary.points_in, "points": summary.points, "frames": summary.frames}
+        counts: dict[str, Any] = {"points_in": summary.points_in, "points": summary.points}
+        counts |= {"frames": summary.frames, "missing_frames": summary.missing}
         print_json({"path": str(out), **counts})
     else:
         print(f"{out}: {summary.points:,} of {summary.points_in:,} points from {summary.frames} frames")
+    if summary.missing:
+        lost = ", ".join(f"{count} of {name}" for name, count in summary.missing.items())
+        print(
+            f"lidar: frames are missing: {lost}; was the drive stopped? The same command goes on with it",
+            file=sys.stderr,
+        )
+    return 0
+
+
+@app.command
+def rigs(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False) -> int:
+    """List the rigs that come along.
+
+    Parameters
+    ----------
+    json
+        Print them as JSON, with all there is to know.
+    """
+    from lidar.catalog import columns, rig_rows  # noqa: PLC0415
+
+    rows = rig_rows()
+    if json:
+        print_json({"rigs": rows})
+        return 0
+    cells = [["name", "vehicle", "scanners", "cameras", "source"]]
+    for row in rows:
+        scanners = " ".join(row["lidars"].values())
+        cells.append([row["name"], row["vehicle"], scanners, str(len(row["cameras"])), row["source"]])
+    print(columns(cells))
+    print("\nA rig of your own is a TOML file: lidar drive SCENE --rig FILE.toml (see docs/sensors.md).")
+    return 0
+
+
+@app.command
+def sensors(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False) -> int:
+    """List the laser scanners that come along.
+
+    Parameters
+    ----------
+    json
+        Print them as JSON, with the source of every number.
+    """
+    from lidar.catalog import columns, sensor_rows  # noqa: PLC0415
+
+    rows = sensor_rows()
+    if json:
+        print_json({"sensors": rows})
+        return 0
+    cells = [["name", "maker and model", "kind", "channels", "pulses/s", "Hz", "range m", "nm"]]
+    for row in rows:
+        reach = f"{row['min_range_m']:g}-{row['max_range_m']:g}"
+        figures = [str(row["channels"]), f"{row['pulses_per_s']:,}", f"{row['rate_hz']:g}", reach]
+        model = f"{row['maker']} {row['model']}"
+        cells.append([row["name"], model, row["kind"], *figures, f"{row['wavelength_nm']:g}"])
+    print(columns(cells))
+    print(
+        "\n--json adds the source of every number; a sensor of your own is a TOML file (see docs/sensors.md)."
+    )
+    return 0
+
+
+@app.command
+def settings(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False) -> int:
+    """List the dials of fidelity: their values at each level, and what they do.
+
+    Parameters
+    ----------
+    json
+        Print them as JSON.
+    """
+    from lidar.catalog import columns  # noqa: PLC0415
+    from lidar.settings import levels, list_dials  # noqa: PLC0415
+
+    dials = list_dials()
+    if json:
+        rows = [
+            {"name": d.name, "of": d.of, **dict(zip(levels(), d.values, strict=True)), "meaning": d.meaning}
+            for d in dials
+        ]
+        print_json({"settings": rows})
+        return 0
+    print(
+        columns(
+            [["name", "of", *levels(), "meaning"], *([d.name, d.of, *d.values, d.meaning] for d in dials)]
+        )
+    )
+    print(
+        "\nA level is chosen with --fidelity, one dial with --set NAME=VALUE. Options of their own: --exact"
+        "\n(the full projection for every point), --deskew, --crs; of scenes: geoscene build --lod, --dem,"
+        "\n--along."
+    )
     return 0
 
 

@@ -5,7 +5,8 @@ DATASET/
   poses.csv               the vehicle at each frame's start
   trajectory.csv          the vehicle at 100 Hz: what points are placed with
   calibration.json        mounts and intrinsics of every sensor
-  gnss.csv                fixes
+  gnss.csv, imu.csv       measured, by the receivers' and units' names
+  boxes.csv               road users in 3D, at the frames of the first scanner
   <sensor>/<format>/<frame>.<ext>
 """
 
@@ -161,11 +162,22 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
         path.mkdir(parents=True)
         return 0
     manifest = open_dataset(path).manifest
-    changed = sorted(k for k in recipe if manifest["recipe"].get(k) != json.loads(json.dumps(recipe[k])))
+    old, new = manifest["recipe"], json.loads(json.dumps(recipe))
+    changed = [k for k in new if old.get(k) != new[k]]
     if changed:
+        what = ", ".join(f"{k} {_said(old.get(k))} (now {_said(new[k])})" for k in changed)
         raise DatasetError(
-            f"{path}: holds a drive made with another {', '.join(changed)}; add --overwrite to replace it"
+            f"{path}: holds a drive made with other options: {what};"
+            " add --overwrite to replace it, or give another directory"
         )
     for left in path.rglob("*.part"):  # of a drive that was killed
         left.unlink()
     return int(manifest["frames_done"])
+
+
+def _said(value: Any) -> str:
+    """A value of a recipe in few words."""
+    if isinstance(value, list) and all(isinstance(v, str) for v in value):
+        value = ",".join(value)
+    text = "none" if value in (None, "", []) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

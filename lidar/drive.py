@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -18,96 +18,27 @@ from numpy.typing import NDArray
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from lidar import __version__
-from lidar.actors import Actors, TrafficOptions, populate
+from lidar.actors import Actors, populate
 from lidar.crowd import Worlds
 from lidar.dataset import prepare, write_json, write_trajectory
+from lidar.devices import Camera, Scanner, cameras, scanners
 from lidar.errors import InputError
+from lidar.gather import gather_boxes
 from lidar.georeference import Georeference, export_crs
-from lidar.physics.effects import effects_of
+from lidar.options import DriveOptions
 from lidar.poses import Trajectory
-from lidar.record import FORMATS, Camera, Recorder, Scanner, cameras, scanners
+from lidar.record import Recorder
 from lidar.rig import Rig, load_rig
-from lidar.route import Spec
-from lidar.sidecars import gather_boxes, write_sidecars
-from lidar.travel import Travel, plan_travel, road_graph
-from lidar.vehicle import load_vehicle
+from lidar.sidecars import write_sidecars
+from lidar.travel import plan_travel, road_graph
+from lidar.vehicle import Vehicle, load_vehicle
 
 Float = NDArray[np.float64]
 
+_RANDOM_SECONDS = 60.0
 _CHUNK = (
     200.0  # scene metres along each axis that a drive may cover before the world around it is moved along
 )
-
-
-@dataclass(frozen=True, slots=True)
-class DriveOptions:
-    """How a drive is made. Everything here is stored in the dataset and shapes its bytes, but ``workers``.
-
-    route      : ``random``, a GPX or GeoJSON file, or waypoints (latitude, longitude) in degrees
-    duration   : seconds; a whole route, or 60 seconds of a random one, by default
-    rig        : name of a rig, or a TOML file
-    vehicle    : name of a vehicle, or a TOML file; the rig's by default
-    formats    : of clouds, of `FORMATS`
-    seed       : of everything random
-    start      : UTC time of the drive's start; 10:00 local solar time on 21 June 2026 by default
-    crs        : of LAZ files: ``utm``, ``scene`` or any pyproj name
-    exact      : georeference every point through the projection instead of a bounded affine map
-    side       : side of the road
-    fidelity   : level of `lidar.physics.effects.LEVELS`: draft, standard or survey
-    traffic    : other road users and parked cars; none by default
-    settings   : single effects set apart from the level, as (name, text)
-    workers    : threads
-    """
-
-    route: Spec = "random"
-    duration: float | None = None
-    rig: str = "seed"
-    vehicle: str = ""
-    formats: tuple[str, ...] = ("pcd", "laz")
-    seed: int = 0
-    start: datetime | None = None
-    crs: str = "utm"
-    exact: bool = False
-    side: str = "right"
-    fidelity: str = "standard"
-    traffic: TrafficOptions | None = None
-    settings: tuple[tuple[str, str], ...] = ()
-    workers: int = 2
-
-    def __post_init__(self) -> None:
-        """Refuse options that cannot be meant."""
-        if not self.formats:
-            raise InputError(f"--format: give one or more of {','.join(FORMATS)}")
-        if unknown := sorted(set(self.formats) - set(FORMATS)):
-            raise InputError(f"--format {','.join(unknown)}: one or more of {','.join(FORMATS)}")
-        if self.duration is not None and not 0.1 <= self.duration <= 86400:
-            raise InputError(f"--duration {self.duration}: give 0.1 to 86400 seconds")
-        if self.side not in ("left", "right"):
-            raise InputError(f"--side {self.side}: left or right")
-        if not 1 <= self.workers <= 256:
-            raise InputError(f"--workers {self.workers}: give 1 to 256")
-        effects_of(self.fidelity, dict(self.settings))
-
-    def recipe(self, scene: Scene) -> dict[str, Any]:
-        """What the dataset's bytes depend on, as JSON."""
-        return {
-            "scene": scene.manifest.get("fingerprint", scene.path.name),
-            "route": str(self.route)
-            if isinstance(self.route, str | Path)
-            else [list(point) for point in self.route],
-            "duration": self.duration,
-            "rig": self.rig,
-            "vehicle": self.vehicle,
-            "formats": list(self.formats),
-            "seed": self.seed,
-            "start": self.start.isoformat() if self.start else None,
-            "crs": self.crs,
-            "exact": self.exact,
-            "side": self.side,
-            "fidelity": self.fidelity,
-            "traffic": asdict(self.traffic) if self.traffic else None,
-            "settings": [list(pair) for pair in self.settings],
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +47,9 @@ class DriveSummary:
 
     path      : the dataset
     frames    : frames of the first sensor
-    resumed   : frames that were there already
-    points    : returns written now
+    resumed   : frames of all sensors that were there already
+    points    : returns of each scanner, those that were there already among them
+    written   : returns written now
     duration  : seconds of simulated time
     length    : true metres driven
     wall      : seconds it took
@@ -127,7 +59,8 @@ class DriveSummary:
     path: Path
     frames: int
     resumed: int
-    points: int
+    points: dict[str, int]
+    written: int
     duration: float
     length: float
     wall: float
@@ -182,13 +115,11 @@ def drive(
     sensors: list[Scanner | Camera] = [*scanners(rig), *cameras(rig)]
     if not sensors and not rig.gnss:
         raise InputError(f"rig {rig.name} has no sensors")
-    travel = plan_travel(scene, options.route, options.vehicle or rig.vehicle, seed=options.seed,
-                         duration=options.duration, side=options.side, progress=progress)  # fmt: skip
-    trajectory = travel.trajectory
+    body = load_vehicle(options.vehicle or rig.vehicle)
+    trajectory = plan(scene, options, body, sensors, progress=progress)
     actors = None
     if options.traffic is not None:
         progress("traffic", 0, 0)
-        body = load_vehicle(options.vehicle or rig.vehicle)
         traffic = replace(options.traffic, side=cast("Literal['left', 'right']", options.side))
         actors = populate(scene, road_graph(scene), trajectory, body, seed=options.seed, options=traffic)
     geo = Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact)
@@ -197,13 +128,15 @@ def drive(
         raise InputError(f"the drive lasts {trajectory.duration_ns / 1e9:.2f} s, less than one frame")
 
     recipe = options.recipe(scene)
-    done = prepare(out, recipe, overwrite=overwrite)
-    manifest = _manifest(scene, rig, options, start, geo, travel, sensors, jobs) | {"recipe": recipe}
+    prepare(out, recipe, overwrite=overwrite)
+    length = _length(trajectory)
+    manifest = _manifest(scene, rig, options, start, geo, trajectory, length, jobs, sensors)
+    manifest["recipe"] = recipe
     if not (out / "dataset.json").exists():
         write_json(out / "dataset.json", manifest | {"frames_done": 0})
     write_trajectory(out / "trajectory.csv", trajectory)
     counts = manifest["sensor_frames"]
-    write_sidecars(out, scene, rig, sensors, trajectory, start, counts, seed=options.seed)
+    write_sidecars(out, scene, rig, sensors, trajectory, start, counts, options.contents())
     watch = Stopwatch()
     recorder = Recorder(
         out,
@@ -211,14 +144,17 @@ def drive(
         trajectory,
         start,
         geo,
-        options.formats,
-        options.seed,
-        effects_of(options.fidelity, dict(options.settings)),
+        options.contents(),
         watch,
         actors=actors,
         reach=max((s.reach for s in sensors), default=0.0),
     )
-    points = record_all(
+    there = [job for job in jobs if recorder.is_done(job.sensor, job.frame)]
+    points = dict.fromkeys((s.name for s in sensors if isinstance(s, Scanner)), 0)
+    for job in there:
+        if job.sensor.name in points:
+            points[job.sensor.name] += recorder.count(job.sensor, job.frame)
+    written = record_all(
         scene,
         trajectory,
         jobs,
@@ -228,19 +164,74 @@ def drive(
         workers=options.workers,
         progress=progress,
     )
+    points = {name: n + written.get(name, 0) for name, n in points.items()}
     if actors is not None:
         gather_boxes(out)
-    write_json(out / "dataset.json", manifest | {"frames_done": manifest["frames"]})
+    write_json(out / "dataset.json", manifest | {"points": points, "frames_done": manifest["frames"]})
     return DriveSummary(
         out,
         int(manifest["frames"]),
-        done,
+        len(there),
         points,
+        sum(written.values()),
         trajectory.duration_ns / 1e9,
-        travel.length,
+        length,
         time.perf_counter() - began,
         watch.seconds,
     )
+
+
+def plan(
+    scene: Scene,
+    options: DriveOptions,
+    body: Vehicle,
+    sensors: Sequence[Scanner | Camera],
+    *,
+    progress: Progress = silent,
+) -> Trajectory:
+    """Where the vehicle of a drive is over time.
+
+    Raises RouteError for a route that it cannot take.
+    """
+    from lidar.aerial import plan_flight  # noqa: PLC0415
+    from lidar.replay import read_replay  # noqa: PLC0415
+
+    route = options.route
+    if isinstance(route, Path) and route.suffix == ".csv" and not options.survey:
+        replayed = read_replay(route, scene.frame)
+        return replayed if options.duration is None else replayed.until(round(options.duration * 1e9))
+    if body.kind != "air":
+        if options.survey or options.altitude is not None:
+            option = "--survey" if options.survey else "--altitude"
+            raise InputError(
+                f"{option} is for what flies, and a {body.name} does not; add --vehicle drone or aircraft,"
+                " or a rig of such a craft"
+            )
+        name = options.vehicle or load_rig(options.rig).vehicle
+        return plan_travel(scene, route, name, seed=options.seed, duration=options.duration,
+                           side=options.side, progress=progress).trajectory  # fmt: skip
+    progress("planning", 0, 0)
+    seconds = options.duration
+    if seconds is None and route == "random" and not options.survey:
+        seconds = _RANDOM_SECONDS
+    return plan_flight(
+        scene,
+        route,
+        body,
+        sensors,
+        survey=options.survey,
+        altitude=options.altitude,
+        overlap=options.overlap,
+        seed=options.seed,
+        duration=seconds,
+    )
+
+
+def _length(trajectory: Trajectory) -> float:
+    """True metres that a trajectory covers."""
+    steps = np.diff(trajectory.position, axis=0)
+    steps[:, :2] /= trajectory.scale[1:, None]
+    return float(np.linalg.norm(steps, axis=1).sum())
 
 
 def _centre(bounds: tuple[float, float, float, float]) -> tuple[float, float]:
@@ -263,9 +254,10 @@ def _manifest(
     options: DriveOptions,
     start: datetime,
     geo: Georeference,
-    travel: Travel,
-    sensors: Sequence[Scanner | Camera],
+    trajectory: Trajectory,
+    length: float,
     jobs: Sequence[Job],
+    sensors: Sequence[Scanner | Camera],
 ) -> dict[str, Any]:
     frames = dict.fromkeys((s.name for s in sensors), 0)
     for job in jobs:
@@ -278,10 +270,13 @@ def _manifest(
         "frame": scene.frame.to_json(),
         "export_crs": geo.crs.to_wkt(),
         "start_time": start.isoformat(),
-        "duration_ns": travel.trajectory.duration_ns,
-        "length_m": round(travel.length, 3),
+        "duration_ns": trajectory.duration_ns,
+        "length_m": round(length, 3),
         "rig": rig.name,
         "formats": list(options.formats),
+        "labels": list(options.labels),
+        "deskew": options.deskew,
+        "fidelity": options.fidelity,
         "seed": options.seed,
         "frames": next(iter(frames.values()), 0),
         "sensor_frames": frames,
@@ -298,31 +293,35 @@ def record_all(
     actors: Actors | None = None,
     workers: int = 1,
     progress: Progress = silent,
-) -> int:
-    """Do all jobs that are not done yet, chunk by chunk of the route; return the number of points written."""
+) -> dict[str, int]:
+    """Do all jobs that are not done yet, chunk by chunk of the route; the points written, by sensor."""
     pending = [job for job in jobs if not recorder.is_done(job.sensor, job.frame)]
     progress("driving", len(jobs) - len(pending), len(jobs))
     reach = max((s.reach for s in sensors), default=0.0)
     worlds = Worlds(scene, reach, actors)
-    points = 0
+    points: dict[str, int] = {}
     done = len(jobs) - len(pending)
     with ThreadPoolExecutor(workers) as pool:
         for chunk, region in _chunks(pending, trajectory):
             with recorder.watch.stage("load"):
                 worlds.follow(region)
-            running: set[Future[int]] = set()
+            running: dict[Future[int], str] = {}
             for job in chunk:
-                running.add(pool.submit(recorder.record, job.sensor, job.frame, worlds))
+                running[pool.submit(recorder.record, job.sensor, job.frame, worlds)] = job.sensor.name
                 if len(running) >= 2 * workers:
-                    finished, running = wait(running, return_when=FIRST_COMPLETED)
-                    points += sum(f.result() for f in finished)
-                    done += len(finished)
+                    done += _take(running, points, wait(running, return_when=FIRST_COMPLETED).done)
                     progress("driving", done, len(jobs))
-            finished, running = wait(running)
-            points += sum(f.result() for f in finished)
-            done += len(finished)
+            done += _take(running, points, wait(running).done)
             progress("driving", done, len(jobs))
     return points
+
+
+def _take(running: dict[Future[int], str], points: dict[str, int], finished: set[Future[int]]) -> int:
+    """Move finished frames from ``running`` to the sums of points; return how many there were."""
+    for future in finished:
+        name = running.pop(future)
+        points[name] = points.get(name, 0) + future.result()
+    return len(finished)
 
 
 def _chunks(

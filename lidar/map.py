@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,12 +46,14 @@ class MapSummary:
     points_in : returns read
     points    : points written
     frames    : frames read
+    missing   : frames of the drive that are not there, by scanner
     path      : the file
     """
 
     points_in: int
     points: int
     frames: int
+    missing: dict[str, int]
     path: Path
 
 
@@ -100,7 +103,7 @@ def aggregate(
 
     stream = tables() if voxel is None else _voxels(tables(), voxel, out, source.geo.offset)
     written = _write(out, (_colored(t, color, limits) for t in stream), source)
-    return MapSummary(read, written, len(frames), out)
+    return MapSummary(read, written, len(frames), source.missing(), out)
 
 
 class _Source:
@@ -111,6 +114,7 @@ class _Source:
         self.geo = Georeference(dataset.frame, dataset.crs)
         self._trajectory: Trajectory | None = None
         self._lidars = dataset.lidars
+        self._names = list(names)
         order = list(self._lidars)
         self._files: list[tuple[int, str, int, str, Path]] = []
         for name in names:
@@ -124,6 +128,13 @@ class _Source:
 
     def __len__(self) -> int:
         return len(self._files)
+
+    def missing(self) -> dict[str, int]:
+        """Frames that the drive was to have and that are not there, by scanner."""
+        wanted = self.dataset.manifest.get("sensor_frames", {})
+        there = Counter(name for _, name, *_ in self._files)
+        short = {name: wanted.get(name, 0) - there[name] for name in self._names}
+        return {name: count for name, count in short.items() if count > 0}
 
     def tables(self, every: int = 1) -> Iterator[tuple[int, Table]]:
         for frame, name, index, kind, path in self._files[::every]:

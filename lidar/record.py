@@ -3,130 +3,113 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.classes import Class
 from geoscene.frames import Frame
-from lidar.actors import Actors, box_rows, count_points
+from lidar.actors import Actors, box_rows, count_points, image_boxes
+from lidar.camera.dials import PLAIN as SHARP
+from lidar.camera.dials import CameraDials
 from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
+from lidar.camera.render import Frame as Image
 from lidar.camera.render import exposure_times, optical_flow, render
 from lidar.camera.sun import sun_direction
 from lidar.cloud import Cloud
 from lidar.crowd import Worlds
 from lidar.dataset import write_columns
+from lidar.deskew import MOMENTS, deskewed
+from lidar.devices import Camera, Scanner
+from lidar.errors import InputError
+from lidar.formats.kitti import semantic_kitti_labels, write_labels, write_velodyne
 from lidar.formats.las import LasInfo, gps_seconds, write_las
+from lidar.formats.nuscenes import write_lidarseg, write_nuscenes
 from lidar.formats.pcd import write_pcd
 from lidar.formats.ply import write_ply
 from lidar.formats.table import Table, cloud_table
 from lidar.formats.text import write_csv
 from lidar.georeference import Georeference
-from lidar.physics.effects import Effects
-from lidar.poses import Trajectory
-from lidar.rig import CameraSpec, LidarSpec, Rig
-from lidar.sensors.beams import frame_ns
-from lidar.sensors.preset import Sensor, load_sensor
+from lidar.physics.effects import PLAIN, Effects
+from lidar.physics.random import generator
+from lidar.poses import Poses, Trajectory
+from lidar.sensors.doppler import radial_velocity, surface_velocity
 from lidar.sensors.scan import scan
+from lidar.tally import points_in
+from lidar.visibility import Visibility
 from lidar.world import World
 
-FORMATS = ("pcd", "ply", "csv", "laz", "las")
+FORMATS = ("pcd", "ply", "csv", "laz", "las", "kitti", "nuscenes")
 """Formats of clouds."""
 
+LABELS = ("semantickitti", "nuscenes")
+"""Files of labels alone, a row a point, in the codes of others."""
 
-@dataclass(frozen=True, slots=True)
-class Scanner:
-    """A laser scanner of the rig, ready to fire."""
+_WORLD = ("laz", "las")
+_WRITERS: dict[str, Callable[[Path, Table], None]] = {
+    "pcd": write_pcd,
+    "ply": write_ply,
+    "csv": write_csv,
+    "kitti": write_velodyne,
+    "nuscenes": write_nuscenes,
+}
+_PLACES = {
+    "kitti": ("velodyne", ".bin"),
+    "nuscenes": ("nuscenes", ".pcd.bin"),
+    "labels semantickitti": ("labels", ".label"),
+    "labels nuscenes": ("lidarseg", "_lidarseg.bin"),
+    "boxes": ("boxes", ".csv"),
+}
+"""Folder and ending of files; formats that are not here have a folder of their name, and end in it."""
 
-    spec: LidarSpec
-    sensor: Sensor
-
-    @property
-    def name(self) -> str:
-        """Name on the rig."""
-        return self.spec.name
-
-    @property
-    def reach(self) -> float:
-        """Metres beyond which nothing is seen."""
-        return self.sensor.max_range
-
-    @property
-    def period_ns(self) -> int:
-        """Nanoseconds a frame lasts, rounded down."""
-        return int(frame_ns(self.sensor.rate_hz))
-
-    def frame_start_ns(self, frame: int) -> int:
-        """Time at which a frame starts, since the drive's start."""
-        return self.sensor.frame_start_ns(frame)
-
-    def frame_count(self, duration_ns: int) -> int:
-        """Number of frames that end within a drive of that length."""
-        return self.sensor.frame_count(duration_ns)
-
-
-@dataclass(frozen=True, slots=True)
-class Camera:
-    """A camera of the rig."""
-
-    spec: CameraSpec
-
-    @property
-    def name(self) -> str:
-        """Name on the rig."""
-        return self.spec.name
-
-    @property
-    def reach(self) -> float:
-        """Metres beyond which nothing is seen."""
-        return self.spec.far
-
-    @property
-    def period_ns(self) -> int:
-        """Nanoseconds from frame to frame, rounded down."""
-        return int(frame_ns(self.spec.rate_hz))
-
-    def frame_start_ns(self, frame: int) -> int:
-        """Time at which the shutter opens, since the drive's start."""
-        return self.spec.time_offset_ns + int(frame * frame_ns(self.spec.rate_hz))
-
-    def frame_count(self, duration_ns: int) -> int:
-        """Number of frames whose period ends within a drive of that length, as for scanners."""
-        return max(0, int((duration_ns - self.spec.time_offset_ns) // frame_ns(self.spec.rate_hz)))
-
-
-def scanners(rig: Rig) -> list[Scanner]:
-    """The rig's laser scanners with their presets.
-
-    Raises RigError for a preset that is unknown or bad.
-    """
-    return [
-        Scanner(
-            s,
-            load_sensor(
-                s.preset,
-                name=s.name,
-                rate_hz=s.rate_hz,
-                return_mode=s.return_mode,
-                start_ns=s.time_offset_ns,
-            ),
-        )
-        for s in rig.lidars
-    ]
-
-
-def cameras(rig: Rig) -> list[Camera]:
-    """The rig's cameras."""
-    return [Camera(s) for s in rig.cameras]
+_SUN_NS = 10_000_000_000
+"""Nanoseconds for which the sun stands still in images: it goes 0.04 degrees meanwhile."""
 
 
 class _Watch(Protocol):
     def stage(self, name: str) -> AbstractContextManager[None]: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What is written of every frame, and how it is made.
+
+    formats : of clouds, of `FORMATS`
+    labels  : of `LABELS`
+    deskew  : moment, of `lidar.deskew.MOMENTS`, to which clouds are brought in files beside the raw ones
+    seed    : of everything random
+    effects : of scanners
+    dials   : of cameras
+    """
+
+    formats: tuple[str, ...] = ("pcd",)
+    labels: tuple[str, ...] = ()
+    deskew: str = ""
+    seed: int = 0
+    effects: Effects = PLAIN
+    dials: CameraDials = SHARP
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be written."""
+        if not self.formats:
+            raise InputError(f"--format: give one or more of {','.join(FORMATS)}")
+        if unknown := sorted(set(self.formats) - set(FORMATS)):
+            raise InputError(f"--format {','.join(unknown)}: one or more of {','.join(FORMATS)}")
+        if unknown := sorted(set(self.labels) - set(LABELS)):
+            raise InputError(f"--labels {','.join(unknown)}: one or more of {','.join(LABELS)}")
+        if self.deskew and self.deskew not in MOMENTS:
+            raise InputError(f"--deskew {self.deskew}: one of {', '.join(MOMENTS)}")
+        if self.deskew and not set(self.formats) - set(_WORLD):
+            raise InputError(
+                f"--deskew: {','.join(self.formats)} files hold points as they are in the world; add"
+                " a format of the sensor frame (pcd, ply, csv, kitti or nuscenes)"
+            )
 
 
 class Recorder:
@@ -139,9 +122,7 @@ class Recorder:
         trajectory: Trajectory,
         start: datetime,
         geo: Georeference,
-        formats: Sequence[str],
-        seed: int,
-        effects: Effects,
+        contents: Contents,
         watch: _Watch,
         *,
         actors: Actors | None = None,
@@ -152,55 +133,71 @@ class Recorder:
         self.trajectory = trajectory
         self.start = start
         self.geo = geo
-        self.formats = tuple(formats)
-        self.seed = seed
-        self.effects = effects
+        self.contents = contents
         self.watch = watch
         self.actors = actors
         self.reach = reach
+        self._visibility = None if actors is None else Visibility(actors)
         self._las = LasInfo(geo.crs, geo.offset, start)
 
     def paths(self, sensor: Scanner | Camera, frame: int) -> dict[str, Path]:
-        """Files of one frame by format or image kind."""
-        folder = self.out / sensor.name
-        if isinstance(sensor, Scanner):
-            return {kind: folder / kind / f"{frame:06d}.{kind}" for kind in self.formats}
-        return {kind: folder / kind / f"{frame:06d}.png" for kind in sensor.spec.images}
+        """Files of one frame by what is in them."""
+        folder, wanted = self.out / sensor.name, self.contents
+        kinds: list[str] = ["boxes"] if self.actors is not None else []
+        if isinstance(sensor, Camera):
+            found = {kind: folder / kind / f"{frame:06d}.png" for kind in sensor.spec.images}
+        else:
+            found = {}
+            kinds += [*wanted.formats, *(f"labels {name}" for name in wanted.labels)]
+        for kind in kinds:
+            inside, ending = _PLACES.get(kind, (kind, f".{kind}"))
+            found[kind] = folder / inside / f"{frame:06d}{ending}"
+            if wanted.deskew and kind in _WRITERS:
+                found[f"deskewed {kind}"] = folder / "deskewed" / f"{frame:06d}{ending}"
+        return found
 
     def is_done(self, sensor: Scanner | Camera, frame: int) -> bool:
-        """Whether all files of a frame are there."""
-        files = list(self.paths(sensor, frame).values())
-        if self.actors is not None and isinstance(sensor, Scanner):
-            files.append(self._boxes_path(sensor, frame))
-        return all(path.exists() and path.stat().st_size for path in files)
+        """Whether all files of a frame are there; a file of rows alone is empty where there are no points."""
+        rows_alone = ("kitti", "nuscenes", "labels semantickitti", "labels nuscenes")
+        return all(
+            path.exists() and (path.stat().st_size or kind.removeprefix("deskewed ") in rows_alone)
+            for kind, path in self.paths(sensor, frame).items()
+        )
 
-    def _boxes_path(self, scanner: Scanner, frame: int) -> Path:
-        return self.out / scanner.name / "boxes" / f"{frame:06d}.csv"
+    def count(self, sensor: Scanner | Camera, frame: int) -> int:
+        """Number of points of a frame that is done; 0 for an image."""
+        if isinstance(sensor, Camera):
+            return 0
+        kind = self.contents.formats[0]
+        return points_in(self.paths(sensor, frame)[kind], kind)
 
     def record(self, sensor: Scanner | Camera, frame: int, worlds: Worlds) -> int:
         """Sense one frame and write its files; return the number of points."""
-        start = sensor.frame_start_ns(frame)
-        if isinstance(sensor, Scanner):
-            world = worlds.during(*sensor.sensor.window_ns(frame))
-            cloud = self._record_cloud(sensor, frame, world)
-            if self.actors is not None:
-                self._record_boxes(self.actors, sensor, frame, cloud)
-            return len(cloud)
-        times = exposure_times(sensor.spec, start, samples=5 if sensor.spec.exposure_ns else 1)
-        end = max(int(times[-1]), start + 1)
-        self._record_images(sensor, frame, worlds.during(start, end), times, (times - start) / (end - start))
-        return 0
+        for path in self.paths(sensor, frame).values():
+            path.parent.mkdir(parents=True, exist_ok=True)
+        if isinstance(sensor, Camera):
+            self._record_images(sensor, frame, worlds)
+            return 0
+        world = worlds.during(*sensor.sensor.window_ns(frame))
+        cloud = self._record_cloud(sensor, frame, world)
+        if self.actors is not None:
+            with self.watch.stage("boxes"):
+                self._record_boxes(self.actors, sensor, frame, cloud, world)
+        return len(cloud)
 
-    def _record_boxes(self, actors: Actors, scanner: Scanner, frame: int, cloud: Cloud) -> None:
-        """Write the boxes of a frame, with the number of its points on each."""
-        begin = scanner.frame_start_ns(frame)
+    def _record_boxes(self, actors: Actors, scanner: Scanner, frame: int, cloud: Cloud, world: World) -> None:
+        """Write the 3D boxes of a frame, with the number of its points on each and how much of it is seen."""
+        begin, mount = scanner.frame_start_ns(frame), scanner.spec.mount
         columns = box_rows(actors, self.trajectory, begin, frame, reach=self.reach)
         points = count_points(actors, columns["id"], cloud.feature)
-        path = self._boxes_path(scanner, frame)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_columns(path, {**columns, "points": points})
+        eye = self.trajectory.at([begin]).mounted(mount.translation, mount.rotation).position[0]
+        assert self._visibility is not None  # noqa: S101
+        share = self._visibility.seen_from(eye, world, columns["id"], begin)
+        extra = {"points": points, "visibility": np.round(share, 4)}
+        write_columns(self.paths(scanner, frame)["boxes"], {**columns, **extra})
 
     def _record_cloud(self, scanner: Scanner, frame: int, world: World) -> Cloud:
+        wanted = self.contents
         with self.watch.stage("scan"):
             cloud = scan(
                 scanner.sensor,
@@ -208,75 +205,158 @@ class Recorder:
                 self.trajectory,
                 world,
                 frame,
-                seed=self.seed,
-                effects=self.effects,
+                seed=wanted.seed,
+                effects=wanted.effects,
             )
         begin = scanner.frame_start_ns(frame)
+        time_ns = cloud.start_ns + cloud.time_ns.astype(np.int64)
         paths = self.paths(scanner, frame)
-        for path in paths.values():
-            path.parent.mkdir(parents=True, exist_ok=True)
         table = cloud_table(cloud)
-        table["time_ns"] = (cloud.time_ns + (cloud.start_ns - begin)).astype(np.uint32)
-        for kind, write in (("pcd", write_pcd), ("ply", write_ply), ("csv", write_csv)):
-            if kind in paths:
-                with self.watch.stage(f"write {kind}"):
-                    write(paths[kind], table)
-        if world_kinds := [kind for kind in ("laz", "las") if kind in paths]:
+        table["time_ns"] = (time_ns - begin).astype(np.uint32)
+        world_kinds = [kind for kind in _WORLD if kind in paths]
+        placed = np.empty((0, 3))
+        if world_kinds or wanted.deskew or scanner.sensor.fmcw:
+            mount = scanner.spec.mount
             with self.watch.stage("georeference"):
-                placed = self._world_table(scanner, cloud, table)
+                placed = self.trajectory.place(
+                    cloud.xyz, time_ns, translation=mount.translation, rotation=mount.rotation
+                )
+        if scanner.sensor.fmcw:
+            with self.watch.stage("velocity"):
+                table["velocity"] = self._velocity(scanner, frame, cloud, placed, time_ns)
+        self._write_raw(paths, table)
+        if wanted.deskew:
+            self._write_raw(paths, table | self._at_once(scanner, frame, placed), prefix="deskewed ")
+        if world_kinds:
+            with self.watch.stage("georeference"):
+                east, north, up = self.geo.points(placed).T
+                gps = gps_seconds(self.start, time_ns)
+                moved = table | {"x": east, "y": north, "z": up, "gps_time": gps}
             for kind in world_kinds:
                 with self.watch.stage(f"write {kind}"):
-                    write_las(paths[kind], placed, self._las)
+                    write_las(paths[kind], moved, self._las)
+        self._write_labels(paths, cloud)
         return cloud
 
-    def _world_table(self, scanner: Scanner, cloud: Cloud, table: Table) -> Table:
-        mount, time_ns = scanner.spec.mount, cloud.start_ns + cloud.time_ns.astype(np.int64)
-        placed = self.trajectory.place(
-            cloud.xyz, time_ns, translation=mount.translation, rotation=mount.rotation
-        )
-        world = self.geo.points(placed)
-        return table | {
-            "x": world[:, 0],
-            "y": world[:, 1],
-            "z": world[:, 2],
-            "gps_time": gps_seconds(self.start, time_ns),
-        }
+    def _write_raw(self, paths: dict[str, Path], table: Table, *, prefix: str = "") -> None:
+        for kind, write in _WRITERS.items():
+            if prefix + kind in paths:
+                with self.watch.stage(f"write {kind}"):
+                    write(paths[prefix + kind], table)
 
-    def _record_images(
-        self, camera: Camera, frame: int, world: World, times: NDArray[np.int64], shares: NDArray[np.float64]
-    ) -> None:
-        spec = camera.spec
+    def _at_once(self, scanner: Scanner, frame: int, placed: NDArray[np.float64]) -> Table:
+        """Coordinates of a frame's points at the moment that is asked for."""
+        moment = scanner.frame_start_ns(frame) + int(MOMENTS[self.contents.deskew] * scanner.period_ns)
+        x, y, z = deskewed(placed, self.trajectory, scanner.spec.mount, moment).T
+        return {"x": x, "y": y, "z": z}
+
+    def _velocity(
+        self,
+        scanner: Scanner,
+        frame: int,
+        cloud: Cloud,
+        placed: NDArray[np.float64],
+        time_ns: NDArray[np.int64],
+    ) -> NDArray[np.float32]:
+        """Radial velocities as measured: with noise where ranges have it."""
+        moving = None
+        if self.actors is not None:
+            moving = surface_velocity(self.actors, cloud.feature, placed, time_ns)
+        velocity = radial_velocity(cloud, scanner.spec.mount, self.trajectory, moving=moving)
+        sigma, wanted = scanner.sensor.velocity_sigma, self.contents
+        if sigma and wanted.effects.range_noise != "none":
+            rng = generator(wanted.seed, scanner.name, frame, "velocity noise")
+            velocity = velocity + np.float32(sigma) * rng.standard_normal(len(velocity), np.float32)
+        return velocity
+
+    def _write_labels(self, paths: dict[str, Path], cloud: Cloud) -> None:
+        if (path := paths.get("labels semantickitti")) is not None:
+            thing, moving = np.zeros(len(cloud), np.int64), np.zeros(len(cloud), bool)
+            if self.actors is not None and len(self.actors):
+                row = cloud.feature.astype(np.int64) - int(self.actors.feature[0])
+                on = np.flatnonzero((row >= 0) & (row < len(self.actors)))
+                thing[on] = row[on] + 1
+                moving[on] = ~self.actors.parked[row[on]]
+            write_labels(path, semantic_kitti_labels(cloud.klass, thing, moving))
+        if (path := paths.get("labels nuscenes")) is not None:
+            write_lidarseg(path, cloud.klass)
+
+    def _record_images(self, camera: Camera, frame: int, worlds: Worlds) -> None:
+        spec, dials = camera.spec, self.contents.dials
+        start = camera.frame_start_ns(frame)
+        samples = dials.moments(spec)
+        times = exposure_times(spec, start, samples=samples)
+        end = max(int(times[-1]), start + 1)
+        world = worlds.during(start, end)
+        poses = self._seen_from(camera, times)
         with self.watch.stage("render"):
-            poses = self.trajectory.at(times).mounted(spec.mount.translation, spec.mount.rotation)
-            image = render(spec, poses, world, sun=self._sun(), times=None if self.actors is None else shares)
-        for kind, path in self.paths(camera, frame).items():
-            path.parent.mkdir(parents=True, exist_ok=True)
+            image = render(
+                spec,
+                poses,
+                world,
+                sun=self._sun(start),
+                times=None if self.actors is None else (times - start) / (end - start),
+                random=generator(self.contents.seed, camera.name, frame, "image"),
+                options=dials.options(spec),
+            )
+        rows = len(times) // samples
+        middle = (samples // 2) * rows + rows // 2
+        paths = self.paths(camera, frame)
+        if self.actors is not None:
+            with self.watch.stage("boxes"):
+                pose = poses.take([middle])
+                self._record_image_boxes(self.actors, camera, frame, pose, int(times[middle]), image)
+        for kind in spec.images:
             with self.watch.stage(f"write {kind}"):
                 if kind == "rgb" and image.rgb is not None:
-                    write_png(path, image.rgb)
+                    write_png(paths[kind], image.rgb)
                 elif kind == "depth":
-                    write_png(path, depth_to_counts(image.depth))
+                    write_png(paths[kind], depth_to_counts(image.depth))
                 elif kind == "semantic":
-                    write_png(path, image.klass)
+                    write_png(paths[kind], image.klass)
                 elif kind == "instance":
-                    write_png(path, feature_to_image(image.feature))
+                    write_png(paths[kind], feature_to_image(image.feature))
                 elif kind == "flow":
-                    write_png(path, flow_to_image(self._flow(camera, frame, world)))
+                    flow = self._flow(camera, worlds, int(times[middle]))
+                    write_png(paths[kind], flow_to_image(flow))
 
-    def _flow(self, camera: Camera, frame: int, world: World) -> NDArray[np.float32]:
+    def _record_image_boxes(
+        self, actors: Actors, camera: Camera, frame: int, pose: Poses, time_ns: int, image: Image
+    ) -> None:
+        """Write the 2D boxes of an image."""
+        found = image_boxes(actors, camera.spec, pose, time_ns, image.feature)
+        names = np.array([Class(int(k)).name.lower() for k in actors.klass[found.row]], np.str_)
+        sides = ("left", "top", "right", "bottom")
+        columns = {
+            "frame": np.full(len(found.row), frame),
+            "time_ns": np.full(len(found.row), time_ns),
+            "id": found.row,
+            "instance": actors.feature[found.row],
+            "class": names,
+            "kind": actors.kind[found.row],
+            **{side: np.round(found.box[:, k], 2) for k, side in enumerate(sides)},
+            **{f"seen_{side}": found.seen[:, k] for k, side in enumerate(sides)},
+            "pixels": found.pixels,
+            "visibility": np.round(found.visibility, 4),
+        }
+        write_columns(self.paths(camera, frame)["boxes"], columns)
+
+    def _seen_from(self, camera: Camera, times: NDArray[np.int64]) -> Poses:
         mount = camera.spec.mount
-        here, later = (
-            self.trajectory.at([camera.frame_start_ns(k)]).mounted(mount.translation, mount.rotation)
-            for k in (frame, frame + 1)
-        )
-        return optical_flow(camera.spec, here, later, world)
+        return self.trajectory.at(times).mounted(mount.translation, mount.rotation)
 
-    def _sun(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-        return _sun(self.frame, self.start, *self.trajectory.position[0, :2].tolist())
+    def _flow(self, camera: Camera, worlds: Worlds, time_ns: int) -> NDArray[np.float32]:
+        """Optical flow to the moment of the next frame; the thread's world is laid anew for it."""
+        later = time_ns + camera.period_ns
+        world = worlds.during(time_ns, later)
+        here, there = (self._seen_from(camera, np.array([t], np.int64)) for t in (time_ns, later))
+        return optical_flow(camera.spec, here, there, world)
+
+    def _sun(self, time_ns: int) -> NDArray[np.float64]:
+        when = self.start + timedelta(seconds=(time_ns // _SUN_NS) * _SUN_NS // 10**9)
+        return _sun(self.frame, when, *self.trajectory.position[0, :2].tolist())
 
 
 @functools.lru_cache(maxsize=4)
-def _sun(
-    frame: Frame, start: datetime, x: float, y: float
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    return sun_direction(frame, start, at=(x, y))
+def _sun(frame: Frame, when: datetime, x: float, y: float) -> NDArray[np.float64]:
+    return sun_direction(frame, when, at=(x, y))

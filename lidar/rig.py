@@ -70,6 +70,9 @@ class CameraSpec:
     images         : what is written, of `IMAGES`
     exposure_ns    : time the shutter is open for a row
     row_ns         : time from one row to the next; 0 for a global shutter
+    exposure_ev    : stops added to the exposure that the light asks for
+    full_well      : electrons of a pixel at full scale, which set the noise of light (if that is asked for)
+    read_noise     : electrons of noise in the dark
     model          : pinhole or fisheye
     """
 
@@ -89,6 +92,9 @@ class CameraSpec:
     images: tuple[str, ...] = ("rgb", "depth")
     exposure_ns: int = 0
     row_ns: int = 0
+    exposure_ev: float = 0.0
+    full_well: float = 10_000.0
+    read_noise: float = 4.0
     model: str = "pinhole"
 
 
@@ -221,6 +227,9 @@ def _camera(table: Table) -> CameraSpec:
         images=table.texts("images", ("rgb", "depth"), among=IMAGES),
         exposure_ns=table.integer("exposure_ns", 0, low=0),
         row_ns=table.integer("row_ns", 0, low=0),
+        exposure_ev=table.number("exposure_ev", 0.0, low=-20.0, high=20.0),
+        full_well=table.number("full_well", 10_000.0, above=0.0),
+        read_noise=table.number("read_noise", 4.0, low=0.0),
         model=model,
     )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -16,12 +15,14 @@ from geoscene.scene import Scene, write_atomically
 from lidar.attitude import euler_from_quat
 from lidar.camera.model import intrinsic_matrix
 from lidar.dataset import write_columns, write_json
+from lidar.devices import Camera, Scanner
+from lidar.formats import kitti
 from lidar.gnss import antenna_motion, epochs, gnss_columns, observe_gnss
 from lidar.imu import imu_columns, observe_imu
 from lidar.nmea import nmea
 from lidar.poses import Trajectory
-from lidar.record import Camera, Scanner
-from lidar.rig import GnssSpec, Mount, Rig
+from lidar.record import Contents
+from lidar.rig import OPTICAL, GnssSpec, Mount, Rig
 from lidar.sky import sky_view
 from lidar.world import World
 
@@ -74,11 +75,8 @@ def _quaternions(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _mounted(mount: Mount) -> dict[str, Any]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = mount.rotation
-    matrix[:3, 3] = mount.translation
     return {
-        "vehicle_from_sensor": matrix.tolist(),
+        "vehicle_from_sensor": _matrix(mount).tolist(),
         "translation": list(mount.translation),
         "quat_xyzw": list(mount.quat_xyzw),
     }
@@ -103,6 +101,8 @@ def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]
                 "min_range": s.min_range,
                 "max_range": s.max_range,
                 "range_quantum": s.range_quantum,
+                "return_mode": s.return_mode,
+                "fmcw": s.fmcw,
                 **_mounted(sensor.spec.mount),
             }
         else:
@@ -117,6 +117,8 @@ def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]
                 "K": intrinsic_matrix(c).tolist(),
                 "distortion": list(c.distortion),
                 "depth_counts_per_metre": 256,
+                "exposure_ns": c.exposure_ns,
+                "row_ns": c.row_ns,
                 **_mounted(c.mount),
             }
     return {
@@ -137,14 +139,16 @@ def write_sidecars(
     trajectory: Trajectory,
     start: datetime,
     frames: Mapping[str, int],
-    *,
-    seed: int,
+    contents: Contents,
 ) -> None:
     """Write all but clouds and images.
 
     ``poses.csv`` (a row a frame of the first sensor), ``calibration.json``, time stamps by sensor, and
-    ``<name>.csv`` of every receiver (also as NMEA sentences) and inertial unit of the rig.
+    ``<name>.csv`` of every receiver (also as NMEA sentences) and inertial unit of the rig; with KITTI's
+    clouds or labels what makes a sequence of each scanner's folder.
     """
+    seed = contents.seed
+    sequences = "kitti" in contents.formats or "semantickitti" in contents.labels
     write_json(out / "calibration.json", calibration(rig, sensors))
     for k, sensor in enumerate(sensors):
         times = np.array([sensor.frame_start_ns(f) for f in range(frames[sensor.name])], np.int64)
@@ -154,6 +158,8 @@ def write_sidecars(
         write_columns(folder / "timestamps.csv", stamps | {"timestamp": iso_times(start, times)})
         if k == 0:
             write_columns(out / "poses.csv", pose_columns(trajectory, scene.frame, start, times))
+        if sequences and isinstance(sensor, Scanner):
+            _write_sequence(folder, rig, sensor.spec.mount, trajectory, times)
     for receiver in rig.gnss:
         _write_fixes(out, scene, receiver, trajectory, start, seed)
     for unit in rig.imus:
@@ -178,14 +184,35 @@ def _write_fixes(
     write_atomically(out / f"{spec.name}.nmea", "".join(nmea(fixes, start)).encode("ascii"))
 
 
-def gather_boxes(out: Path) -> None:
-    """Write ``boxes.csv``: the boxes of all frames of the first scanner, in order."""
-    calibration = json.loads((out / "calibration.json").read_text("utf-8"))
-    scanners = [name for name, sensor in calibration["sensors"].items() if sensor["kind"] == "lidar"]
-    parts = sorted((out / scanners[0] / "boxes").glob("*.csv")) if scanners else []
-    lines: list[str] = []
-    for part in parts:
-        header, *rows = part.read_text("utf-8").splitlines()
-        lines += rows if lines else [header, *rows]
-    if lines:
-        write_atomically(out / "boxes.csv", ("\n".join(lines) + "\n").encode("utf-8"))
+def _write_sequence(
+    folder: Path, rig: Rig, mount: Mount, trajectory: Trajectory, times: NDArray[np.int64]
+) -> None:
+    """Write KITTI's calib.txt, times.txt and poses.txt.
+
+    The camera is the rig's first; without one, a camera at the scanner that looks along its x axis.
+    """
+    vehicle_from_lidar = _matrix(mount)
+    if rig.cameras:
+        camera = rig.cameras[0]
+        projection = np.column_stack([intrinsic_matrix(camera), np.zeros(3)])
+        camera_from_lidar = np.linalg.inv(_matrix(camera.mount)) @ vehicle_from_lidar
+    else:
+        projection = np.eye(3, 4)
+        camera_from_lidar = np.eye(4)
+        camera_from_lidar[:3, :3] = OPTICAL.T
+    kitti.write_calibration(folder / "calib.txt", projection, camera_from_lidar)
+    if not len(times):
+        return
+    kitti.write_times(folder / "times.txt", times)
+    at = trajectory.at(times).mounted(mount.translation, mount.rotation)
+    world_from_lidar = np.tile(np.eye(4), (len(times), 1, 1))
+    world_from_lidar[:, :3, :3] = at.rotation
+    world_from_lidar[:, :3, 3] = at.position / at.scale[0]  # true metres
+    kitti.write_poses(folder / "poses.txt", world_from_lidar, camera_from_lidar)
+
+
+def _matrix(mount: Mount) -> NDArray[np.float64]:
+    matrix = np.eye(4)
+    matrix[:3, :3] = mount.rotation
+    matrix[:3, 3] = mount.translation
+    return matrix

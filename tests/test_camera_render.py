@@ -392,14 +392,16 @@ def test_a_pixel_follows_its_flow_to_the_same_surface():
 
 @dataclass
 class ActorWorld:
-    """A world of one moving box."""
+    """A world of one box that moves by ``way`` from ray time 0 to ray time 1."""
 
     shift: tuple[float, float, float]
+    way: tuple[float, float, float]
 
     def __post_init__(self):
         self.mesh = box((-1, -1, -1), (1, 1, 1), feature=9)
         shape = Caster(self.mesh.vertices, self.mesh.faces)
-        transform = np.concatenate([np.eye(3), np.array(self.shift, float)[:, None]], axis=1)[None]
+        places = [np.array(self.shift, float), np.add(self.shift, self.way)]
+        transform = np.array([[np.column_stack([np.eye(3), place]) for place in places]])
         back = plate(50.0)
         self.back = MeshWorld(back)
         self.caster = Caster(
@@ -413,9 +415,9 @@ class ActorWorld:
 
 def test_flow_of_an_actor_is_its_own_motion():
     still = looking((0, 0, 0))
-    before, after = ActorWorld((11, 0, 0)), ActorWorld((11, -0.5, 0))
-    flow = optical_flow(CAMERA, still, still, before, later_world=after)
-    actor = render(CAMERA, still, before, sun=NOON).feature == 9
+    moving = ActorWorld((11, 0, 0), (0, -0.5, 0))
+    flow = optical_flow(CAMERA, still, still, moving)
+    actor = render(CAMERA, still, moving, sun=NOON).feature == 9
     assert actor.sum() == 20 * 20
     np.testing.assert_allclose(flow[actor], [[5.0, 0.0]] * actor.sum(), atol=1e-4)
     np.testing.assert_allclose(flow[~actor], 0, atol=1e-4)

@@ -291,8 +291,8 @@ def test_radial_velocity_is_that_of_approach():
     cloud = scan(sensor, mount, drive, world(plate(60.0, feature=5)), 0)
     ahead = cloud.xyz[:, 0] / np.linalg.norm(cloud.xyz, axis=1)
     assert radial_velocity(cloud, mount, drive) == pytest.approx(-10 * ahead, abs=1e-4)
-    moving = radial_velocity(cloud, mount, drive, features=np.array([5]), velocities=np.array([[12.0, 0, 0]]))
-    assert moving == pytest.approx(2 * ahead, abs=1e-4)
+    fleeing = np.tile([12.0, 0.0, 0.0], (len(cloud), 1))
+    assert radial_velocity(cloud, mount, drive, moving=fleeing) == pytest.approx(2 * ahead, abs=1e-4)
 
 
 def test_radial_velocity_counts_the_lever_arm_of_a_turning_vehicle():

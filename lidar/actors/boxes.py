@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class
 from lidar.actors.actors import Actors, States, alive, poses_of, rotations, states
 from lidar.camera.model import project
+from lidar.camera.outline import outline
 from lidar.poses import Poses, Trajectory
 from lidar.rig import CameraSpec
 
@@ -125,8 +125,8 @@ def image_boxes(
     pose     : the camera's one pose at the time of the image
     instance : (h, w) feature numbers of the image
 
-    The pixels of an unhidden actor are counted by its outline: the union of its projected triangles. What
-    reaches behind the camera is left out of it.
+    The pixels of an unhidden actor are those that its projected triangles cover. What reaches behind the
+    camera is left out of them.
     """
     rows = alive(actors, time_ns, time_ns)
     at = states(actors, rows, time_ns)
@@ -135,7 +135,6 @@ def image_boxes(
     ahead = (np.linalg.norm(away, axis=1) < camera.far + size) & (
         (away[:, 2] > -size) | np.full(len(rows), camera.model == "fisheye")
     )
-    frame = shapely.box(-0.5, -0.5, camera.width - 0.5, camera.height - 0.5)
     found: list[tuple[int, tuple[float, ...], tuple[float, ...], int, float]] = []
     body = poses_of(actors, rows, at)
     for k in np.flatnonzero(ahead).tolist():
@@ -144,16 +143,15 @@ def image_boxes(
         turn = rotations(at.angles[k : k + 1])[0]
         points = at.position[k] + (mesh.vertices * actors.stretch[row]) @ turn.T * pose.scale[0]
         pixels, _ = project(camera, ((points - pose.position) / pose.scale) @ pose.rotation[0])
-        corners = pixels[mesh.faces]
-        whole = corners[np.isfinite(corners).all(axis=(1, 2))]
-        if not len(whole):
+        box, whole = outline(pixels[mesh.faces], camera.width, camera.height)
+        if not np.isfinite(box[0]):
             continue
-        outline = shapely.intersection(shapely.union_all(shapely.polygons(whole)), frame)
-        if outline.is_empty:
-            continue
-        v, u = np.nonzero(instance == actors.feature[row])
+        u0, v0 = (max(int(side) - 1, 0) for side in box[:2])
+        part = instance[v0 : int(box[3]) + 3, u0 : int(box[2]) + 3]
+        v, u = np.nonzero(part == actors.feature[row])
+        v, u = v + v0, u + u0
         seen = (u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5) if len(u) else (np.nan,) * 4
-        found.append((row, shapely.bounds(outline), seen, len(u), min(len(u) / max(outline.area, 1.0), 1.0)))
+        found.append((row, box, seen, len(u), min(len(u) / max(whole, 1), 1.0)))
     return ImageBoxes(
         np.array([f[0] for f in found], np.int64),
         np.array([f[1] for f in found], float).reshape(-1, 4),

@@ -331,15 +331,13 @@ def _noisy(
     return noisy
 
 
-def optical_flow(
-    camera: CameraSpec, poses: Poses, later: Poses, world: World, *, later_world: World | None = None
-) -> NDArray[np.float32]:
+def optical_flow(camera: CameraSpec, poses: Poses, later: Poses, world: World) -> NDArray[np.float32]:
     """How far (h, w, 2) each pixel's surface point moves in the image to a later time, pixels right and down.
 
     NaN where it leaves the camera's field (not merely the image). Sky moves with the camera's turning alone.
+    Actors of the world move from where they are at ray time 0 to where they are at ray time 1.
 
-    poses, later : the camera's single pose at the two times; a rolling shutter is not taken into account
-    later_world  : the world with the same actors, moved; actors stand still without it
+    poses, later : the camera's single pose at ray times 0 and 1; a rolling shutter is not taken into account
 
     Raises InputError for more than one pose.
     """
@@ -349,8 +347,7 @@ def optical_flow(
     view = _view(still, poses, world, 0, 0, camera.height, None)
     hit = np.isfinite(view.hits.range)
     point = poses.position + np.where(hit, view.hits.range, 1.0)[:, None] * view.direction
-    if later_world is not None:
-        point = _carried(point, view.hits, world, later_world)
+    point = _carried(point, view.hits, world)
     away = np.where(hit[:, None], point - later.position, view.direction)
     seen = (away / later.scale) @ later.rotation[0]
     pixel, _ = project(camera, np.where(view.seen[:, None], seen, np.nan))
@@ -359,19 +356,14 @@ def optical_flow(
     return flow.reshape(camera.height, camera.width, 2)
 
 
-def _carried(point: Float, hits: Hits, world: World, later: World) -> Float:
-    """Points on instances, moved as those have moved from one world to a later one."""
-    before, after = (
-        np.concatenate([g.transform.reshape(len(g), -1, 3, 4)[:, 0] for g in w.caster.instances])
-        if w.caster.instances
-        else np.empty((0, 3, 4))
-        for w in (world, later)
-    )
-    if len(before) != len(after):
-        raise InputError(f"{len(before)} things at one time and {len(after)} later: flow needs the same ones")
+def _carried(point: Float, hits: Hits, world: World) -> Float:
+    """Points on instances, moved as those move from ray time 0 to ray time 1."""
+    moments = [g.transform.reshape(len(g), -1, 3, 4) for g in world.caster.instances]
     on = np.flatnonzero(hits.instance >= 0)
-    k = hits.instance[on]
-    body = np.linalg.solve(before[k, :, :3], (point[on] - before[k, :, 3])[..., None])
+    if not len(on):
+        return point
+    before, after = (np.concatenate([t[:, k] for t in moments])[hits.instance[on]] for k in (0, -1))
+    body = np.linalg.solve(before[:, :, :3], (point[on] - before[:, :, 3])[..., None])
     moved = point.copy()
-    moved[on] = (after[k, :, :3] @ body)[..., 0] + after[k, :, 3]
+    moved[on] = (after[:, :, :3] @ body)[..., 0] + after[:, :, 3]
     return moved

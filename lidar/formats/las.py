@@ -37,6 +37,8 @@ _EXTRA = {
     "instance": ("int32", "feature in the scene"),
     "range": ("float32", "metres, as reported"),
     "incidence": ("float32", "rad, beam to normal"),
+    "true_range": ("float32", "metres, without noise"),
+    "velocity": ("float32", "m/s along the beam, + away"),
 }
 
 
@@ -153,7 +155,8 @@ class LasWriter:
     """A LAS or LAZ file that takes tables one after the other and appears under its name when closed whole.
 
     Tables need x, y, z (projected, float64) and label; they may have gps_time, intensity, ring, instance,
-    range, incidence, echo, echoes (up to 15), source (point source id), red, green, blue.
+    range, incidence, true_range, velocity, echo, echoes (up to 15), source (point source id), red, green,
+    blue.
     """
 
     def __init__(self, path: Path, info: LasInfo, columns: tuple[str, ...]) -> None:

@@ -11,7 +11,9 @@ range      float32, metres
 label      uint16, `geoscene.classes.Class`
 instance   int32, feature number in the scene, -1 for none
 incidence  float32, radians
+true_range float32, metres, before noise and quantisation; 0 for a return of nothing
 echo, echoes  uint8
+velocity   float32, m/s along the beam, positive away; of scanners that measure it
 red, green, blue  uint8
 """
 
@@ -42,6 +44,7 @@ def cloud_table(cloud: Cloud) -> Table:
         "label": cloud.klass.astype(np.uint16),
         "instance": cloud.feature,
         "incidence": cloud.incidence,
+        "true_range": cloud.true_range.astype(np.float32),
         "echo": cloud.echo,
         "echoes": cloud.echoes,
     }

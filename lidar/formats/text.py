@@ -14,7 +14,16 @@ from geoscene.scene import write_atomically
 from lidar.errors import FormatError
 from lidar.formats.table import Table, rows
 
-_DECIMALS = {"x": 4, "y": 4, "z": 4, "range": 4, "intensity": 2, "incidence": 5}
+_DECIMALS = {
+    "x": 4,
+    "y": 4,
+    "z": 4,
+    "range": 4,
+    "true_range": 4,
+    "intensity": 2,
+    "incidence": 5,
+    "velocity": 4,
+}
 _TYPES: dict[str, Any] = {
     "intensity": np.float32,
     "time_ns": np.int64,

@@ -55,6 +55,7 @@ class Sensor:
     second_strongest : in dual mode, where one echo is strongest and last, the second strongest comes with it
     diffuse_code  : intensity code of a perfect white Lambertian target
     fmcw          : measures the radial velocity too
+    velocity_sigma : m/s, one standard deviation of that velocity
     pattern       : how it fires
     note          : what the preset does not model exactly
     source        : where each number of the preset comes from
@@ -86,6 +87,7 @@ class Sensor:
     diffuse_code: float
     fmcw: bool
     pattern: Pattern
+    velocity_sigma: float = 0.0
     note: str = ""
     source: dict[str, str] = field(default_factory=dict)
 
@@ -192,6 +194,7 @@ def _read(table: Table, name: str, rate_hz: float, return_mode: str, start_ns: i
         second_strongest=table.flag("second_strongest", False),
         diffuse_code=table.number("diffuse_code", 100.0, above=0.0, high=255.0),
         fmcw=table.flag("fmcw", False),
+        velocity_sigma=table.number("velocity_sigma", 0.0, low=0.0),
         pattern=_READERS[kind](table.table(kind), rate, rates),
         note=table.text("note", ""),
         source={key: table.table("source").text(key) for key in table.table("source", {}).data},

@@ -1,0 +1,70 @@
+"""How faithfully cameras render: the dials of a level of fidelity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidar.camera.render import RenderOptions
+from lidar.errors import InputError
+from lidar.rig import CameraSpec
+
+
+@dataclass(frozen=True, slots=True)
+class CameraDials:
+    """The dials of images. The defaults are a camera without noise, a ray a pixel.
+
+    shadows      : the sun casts shadows
+    detail       : windows, joints and grain are drawn where the map has flat colour
+    supersample  : rays along each side of a pixel, for colour: 1 to 16
+    blur         : moments of an exposure (the camera's ``exposure_ns``) that are averaged: motion blur
+    haze         : metres at which haze has taken 98 % of a contrast; inf for clear air
+    camera_noise : noise of counting and of reading electrons (the camera's ``full_well``, ``read_noise``)
+    """
+
+    shadows: bool = True
+    detail: bool = True
+    supersample: int = 1
+    blur: int = 5
+    haze: float = 20_000.0
+    camera_noise: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse settings that mean nothing, all faults in one message."""
+        faults = []
+        if not 1 <= self.supersample <= 16:
+            faults.append(f"supersample={self.supersample}: give 1 to 16")
+        if not 1 <= self.blur <= 64:
+            faults.append(f"blur={self.blur}: give 1 to 64")
+        if not self.haze > 0:
+            faults.append(f"haze={self.haze}: give metres above 0, or inf")
+        if faults:
+            raise InputError("; ".join(faults))
+
+    def moments(self, camera: CameraSpec) -> int:
+        """Moments of an exposure that are rendered."""
+        return self.blur if camera.exposure_ns else 1
+
+    def options(self, camera: CameraSpec) -> RenderOptions:
+        """The renderer's options for a camera."""
+        return RenderOptions(
+            shadows=self.shadows,
+            detail=self.detail,
+            supersample=self.supersample,
+            visibility=self.haze,
+            exposure=camera.exposure_ev,
+            full_well=camera.full_well if self.camera_noise else np.inf,
+            read_noise=camera.read_noise,
+        )
+
+
+PLAIN = CameraDials()
+"""A sharp, clean image."""
+
+LEVELS: dict[str, CameraDials] = {
+    "draft": CameraDials(shadows=False, detail=False, blur=1),
+    "standard": PLAIN,
+    "survey": CameraDials(supersample=2, blur=9, camera_noise=True),
+}
+"""Dials by level of fidelity."""
