@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import io
 import os
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,6 +16,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from pyproj import CRS
 
@@ -26,6 +29,9 @@ SCALE = 0.001
 
 INTENSITY_UNIT = 257.0
 """LAS intensity (16 bits) per unit of calibrated reflectivity (0 to 255)."""
+
+_FULL = 2**20
+"""Bytes of free space under which a disk is full for a compressor, which writes in large pieces."""
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 LEAP_SECONDS = 18
@@ -130,12 +136,26 @@ class _Uncompressed:
         self.dest.close()
 
 
+@contextmanager
+def _plainly(path: Path) -> Iterator[None]:
+    """Failures of the compressor, which hides their cause, as the OSError behind them."""
+    import lazrs  # noqa: PLC0415
+
+    try:
+        yield
+    except lazrs.LazrsError as error:
+        full = shutil.disk_usage(path.parent).free < _FULL
+        code = errno.ENOSPC if full else errno.EIO
+        raise OSError(code, os.strerror(code), str(path)) from error
+
+
 class _Compressed:
     """Points of a LAZ file."""
 
     def __init__(self, path: Path, layout: _Layout) -> None:
         import laspy  # noqa: PLC0415
 
+        self._path = path
         self._header = layout.header
         self._record: Any = laspy.ScaleAwarePointRecord
         self._writer: Any = laspy.open(path, mode="w", header=layout.header, do_compress=True)
@@ -144,11 +164,15 @@ class _Compressed:
     def write_points(self, points: NDArray[np.void]) -> None:
         """Append points."""
         h = self._header
-        self._writer.write_points(self._record(points, h.point_format, scales=h.scales, offsets=h.offsets))
+        with _plainly(self._path):
+            self._writer.write_points(
+                self._record(points, h.point_format, scales=h.scales, offsets=h.offsets)
+            )
 
     def close(self) -> None:
         """Write what is left."""
-        self._writer.close()
+        with _plainly(self._path):
+            self._writer.close()
 
 
 class LasWriter:
@@ -176,10 +200,8 @@ class LasWriter:
         """
         points = np.zeros(rows(table), self._layout.kinds)
         for k, axis in enumerate("xyz"):
-            counts = np.round((table[axis] - self._info.offset[k]) / SCALE)
-            if len(counts) and not np.abs(counts).max() < 2**31:
+            if not _count(np.asarray(table[axis], np.float64), self._info.offset[k], points[axis.upper()]):
                 raise FormatError(f"{self.path}: a point lies too far from {self._info.offset} for LAS")
-            points[axis.upper()] = counts
         points["classification"] = class_codes().asprs[table["label"]]
         one = np.ones(1, np.uint8)
         number, count = (np.minimum(table.get(name, one), 15) for name in ("echo", "echoes"))
@@ -208,11 +230,25 @@ class LasWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self._sink.dest.close()
-            self._part.unlink(missing_ok=True)
+        try:
+            if kind is None:
+                self.close()
+        finally:
+            if self._part.exists():
+                with suppress(OSError):
+                    self._sink.dest.close()
+                self._part.unlink()
+
+
+@njit(cache=True, nogil=True)
+def _count(place: Any, offset: float, counts: Any) -> bool:
+    """Fill in the whole number of `SCALE` from the offset to each place; whether all are numbers that fit."""
+    fits = True
+    for i in range(len(place)):
+        count = np.rint((place[i] - offset) / SCALE)
+        fits &= abs(count) < 2.0**31
+        counts[i] = np.int32(count)
+    return fits
 
 
 def write_las(path: Path, table: Table, info: LasInfo) -> None:

@@ -44,8 +44,8 @@ class Echoes:
         """Number of rows."""
         return len(self.pulse)
 
-    def take(self, rows: NDArray[Any]) -> Echoes:
-        """Chosen rows."""
+    def take(self, rows: NDArray[Any] | slice) -> Echoes:
+        """Chosen rows; those of a slice are not copied."""
         return Echoes(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def where(self, keep: NDArray[np.bool_]) -> Echoes:

@@ -6,7 +6,6 @@ import hashlib
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 Float = NDArray[np.float64]
 
@@ -18,10 +17,10 @@ def generator(seed: int, *words: object) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(key=int.from_bytes(digest, "little")))
 
 
-def normal_of(number: NDArray[np.integer], seed: int) -> Float:
-    """A standard normal deviate for each whole number, the same whenever it is asked for.
+def uniform_of(number: NDArray[np.integer], seed: int) -> Float:
+    """A number between 0 and 1, never one of them, for each whole number, the same whenever it is asked for.
 
-    SplitMix64 (Steele, Lea and Flood 2014) of number and seed, through the inverse normal distribution.
+    SplitMix64 (Steele, Lea and Flood 2014) of number and seed.
     """
     with np.errstate(over="ignore"):
         x = number.astype(np.uint64) + np.uint64(seed % 2**64) * np.uint64(0xD1342543DE82EF95)
@@ -29,6 +28,13 @@ def normal_of(number: NDArray[np.integer], seed: int) -> Float:
         x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         x ^= x >> np.uint64(31)
-    uniform = ((x >> np.uint64(11)).astype(np.float64) + 0.5) / 2.0**53
-    normal: Float = ndtri(uniform)
+    uniform: Float = ((x >> np.uint64(11)).astype(np.float64) + 0.5) / 2.0**53
+    return uniform
+
+
+def normal_of(number: NDArray[np.integer], seed: int) -> Float:
+    """A standard normal deviate for each whole number: `uniform_of` through the inverse distribution."""
+    from scipy.special import ndtri  # noqa: PLC0415  (0.2 s)
+
+    normal: Float = ndtri(uniform_of(number, seed))
     return normal

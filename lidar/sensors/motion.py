@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,6 +72,26 @@ class Rays:
         return Rays(self.poses, self.index[rows], self.direction[rows], self.origin[rows], none)
 
 
+class _Scratch(threading.local):
+    """Columns that a thread fills again and again: fresh memory takes longer to come by than to fill."""
+
+    def __init__(self) -> None:
+        self._grow(0)
+
+    def _grow(self, n: int) -> None:
+        self._columns = np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.int64)
+
+    def columns(self, n: int) -> tuple[NDArray[np.int64], Float, Float, NDArray[np.int64]]:
+        """Index, direction, origin and order of n rays, to be filled."""
+        if len(self._columns[0]) < n:
+            self._grow(n)
+        index, direction, origin, order = self._columns
+        return index[:n], direction[:n], origin[:n], order[:n]
+
+
+_scratch = _Scratch()
+
+
 class Carrier:
     """A moving sensor that fires pulses, some of them at a time.
 
@@ -98,14 +119,12 @@ class Carrier:
         _batches(firings.order, batch, self._order)
 
     def rays(self, batch: int) -> Rays:
-        """The rays of a batch, by its number."""
+        """The rays of a batch, by its number; good until this thread asks for others."""
         part = slice(batch * self._batch, (batch + 1) * self._batch)
         fired, beam = self._firings, self._beam
         work = self._order[part]
         n = len(work) * len(beam)
-        out = Rays(
-            self.poses, np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.int64)
-        )
+        out = Rays(self.poses, *_scratch.columns(n))
         _fill(
             fired.time_ns[part],
             self._start_ns,

@@ -97,59 +97,65 @@ class Receiver:
     look       : the surfaces
     share      : (rays,) of a pulse's power, by ray
     separation : metres, surfaces closer than this are one echo
-    batch      : rays at a time, at most
+    pulses     : of which there are so many in all
     """
 
-    def __init__(self, look: Look, share: Float, separation: float, *, batch: int) -> None:
+    def __init__(self, look: Look, share: Float, separation: float, *, pulses: int) -> None:
         self._look, self._share, self._separation = look, share, separation
-        self._columns = _columns(batch)
-        self._open, self._shiny = np.empty(batch, np.bool_), np.empty((2, batch), np.int32)
-        self._found: list[Echoes] = []
-        self._kept: list[NDArray[np.bool_]] = []
+        self._columns, self._open, self._count = _columns(pulses), np.empty(pulses, np.bool_), 0
 
     def take(self, hits: Hits, first: int) -> NDArray[np.int32]:
         """Take the hits of the rays of pulses from number ``first`` on; the rays that met glass or water.
 
         Pulses with such rays are kept apart, with their surfaces as they are.
         """
-        echoes, opened = self._columns, self._open
-        rays = hits.range, hits.face, hits.instance, hits.cosine
-        out = tuple(getattr(echoes, f.name) for f in fields(Echoes))
-        count, shiny = _receive(
-            rays,
+        n = len(hits.range)
+        self._make_room(n)
+        start, shiny = self._count, np.empty((2, n if self._look.effects.mirrors else 0), np.int32)
+        echoes = self._columns.take(slice(start, start + n))
+        count, met = _receive(
+            (hits.range, hits.face, hits.instance, hits.cosine),
             first,
             self._share,
             self._look.faces,
             self._look.optics,
             self._separation,
-            out,
-            opened,
-            self._shiny,
+            tuple(getattr(echoes, f.name) for f in fields(Echoes)),
+            self._open[start : start + n],
+            shiny,
         )
-        ray, row = self._shiny[:, :shiny]
-        if shiny:
+        self._count += count
+        ray, row = shiny[:, :met]
+        if met:
             wet = self._look.faces.what[_place(self._look.faces, hits, ray)] & 255 == shiny_codes()[1]
             echoes.apparent[row[wet]] = (
                 glint(echoes.cosine[row[wet]]) * self._share[ray[wet] % len(self._share)]
             )
-        self._found.append(Echoes(*(column[:count].copy() for column in out)))
-        self._kept.append(opened[:count].copy())
-        met: NDArray[np.int32] = ray.copy()
-        return met
+        shining: NDArray[np.int32] = ray
+        return shining
 
     def echoes(self) -> tuple[Echoes, Echoes]:
         """The echoes of the pulses that met neither glass nor water, and the surfaces of those that did."""
-        together = Echoes(
-            *(np.concatenate([getattr(e, f.name) for e in self._found]) for f in fields(Echoes))
-        )
-        kept = np.concatenate(self._kept)
+        together, kept = self._columns.take(slice(self._count)), self._open[: self._count]
         return together.where(~kept), together.take(kept)
+
+    def _make_room(self, rows: int) -> None:
+        """See that there are columns for so many more echoes."""
+        if self._count + rows <= len(self._open):
+            return
+        old, flags, size = self._columns, self._open, 2 * len(self._open) + rows
+        self._columns, self._open = _columns(size), np.empty(size, np.bool_)
+        for name in (f.name for f in fields(Echoes)):
+            getattr(self._columns, name)[: self._count] = getattr(old, name)[: self._count]
+        self._open[: self._count] = flags[: self._count]
 
 
 def _columns(n: int) -> Echoes:
-    numbers, places, flags = np.empty((2, n), np.int32), np.empty((4, n)), np.empty(n, np.bool_)
-    distance, apparent, cosine, true = places
-    return Echoes(numbers[0], distance, apparent, numbers[1], np.empty(n, np.uint8), cosine, true, flags)
+    """Columns yet to be filled."""
+    distance, apparent, cosine, true = (np.empty(n) for _ in range(4))
+    number, feature = np.empty(n, np.int32), np.empty(n, np.int32)
+    klass, axis = np.empty(n, np.uint8), np.empty(n, np.bool_)
+    return Echoes(number, distance, apparent, feature, klass, cosine, true, axis)
 
 
 def _place(faces: Faces, hits: Hits, ray: NDArray[np.int32]) -> NDArray[np.int64]:

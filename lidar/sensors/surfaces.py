@@ -51,7 +51,7 @@ def met(
     batch = max(_BATCH // rays, 1)
     look = Look(world, wavelength_nm, effects, seed)
     carrier = Carrier(pulses, mount, trajectory, beam, batch=batch)
-    receiver = Receiver(look, beam.share, separation, batch=batch * rays)
+    receiver = Receiver(look, beam.share, separation, pulses=len(pulses))
     beyond: list[Echoes] = []
     for number, first in enumerate(range(0, len(pulses), batch)):
         cast = carrier.rays(number)
