@@ -20,7 +20,16 @@ from lidar.drive import DriveOptions, drive
 from lidar.formats.las import read_las
 from lidar.formats.pcd import read_pcd
 from lidar.map import aggregate
-from lidar.picture import class_colors, cloud_picture, depth_picture, scene_picture, with_legend
+from lidar.picture import (
+    class_colors,
+    cloud_picture,
+    depth_picture,
+    scene_picture,
+    sweep_picture,
+    with_legend,
+)
+from lidar.rig import load_rig
+from lidar.vehicle import load_vehicle
 from lidar.world import World
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")
@@ -53,16 +62,16 @@ with progress_bar() as progress:
     say("driving for 20 seconds")
     options = DriveOptions(route="random", duration=20.0, seed=4, formats=("pcd", "ply", "csv", "laz"))
     summary = drive(scene, out / "drive", options, overwrite=True, progress=progress)
-    say(f"{summary.length:.0f} m, {summary.frames} frames, {summary.points:,} returns")
+    say(f"{summary.length:.0f} m, {summary.frames} frames, {summary.written:,} returns")
 
     # 4. One sweep by class, one camera frame.
     middle = f"{summary.frames // 2:06d}"
     sweep = read_pcd(out / "drive" / "lidar_top" / "pcd" / f"{middle}.pcd")
-    xyz = np.column_stack([sweep[axis] for axis in "xyz"])
-    near = np.abs(xyz[:, :2]).max(axis=1) < 60
+    mount = load_rig("seed").lidars[0].mount
+    xyz = np.column_stack([sweep[axis] for axis in "xyz"]) @ mount.rotation.T + mount.translation
     label = sweep["label"].astype(np.uint8)
-    image = cloud_picture(xyz[near], class_colors(label[near]), view="oblique", size=(1600, 1000), point=0.15)
-    write_png(pictures / "sweep_class.png", with_legend(image, label[near]))
+    image = sweep_picture(xyz, class_colors(label), vehicle=load_vehicle("car"))
+    write_png(pictures / "sweep_class.png", with_legend(image, label))
     camera = out / "drive" / "camera_front"
     write_png(pictures / "camera_rgb.png", read_png(camera / "rgb" / f"{middle}.png"))
     depth = counts_to_depth(read_png(camera / "depth" / f"{middle}.png"))

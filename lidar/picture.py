@@ -3,6 +3,7 @@
 # mypy: disallow-untyped-decorators=False
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from lidar.colors import ramp
 from lidar.errors import InputError
 from lidar.poses import Poses
 from lidar.rig import CameraSpec, Mount
+from lidar.vehicle import Vehicle
 from lidar.world import World
 
 Float = NDArray[np.float64]
@@ -208,10 +210,10 @@ def depth_picture(depth: NDArray[np.floating], *, near: float = 2.0, far: float 
     return picture
 
 
-def with_legend(image: Pixels, klass: NDArray[np.uint8], *, most: int = 12) -> Pixels:
-    """The image with a key of the classes that occur in ``klass`` (any shape), commonest first."""
+def with_legend(image: Pixels, klass: NDArray[np.uint8]) -> Pixels:
+    """The image with a key of all classes that occur in ``klass`` (any shape), commonest first."""
     codes, counts = np.unique(klass[klass != Class.SKY], return_counts=True)
-    ranked = codes[np.argsort(-counts, kind="stable")][:most]
+    ranked = codes[np.argsort(-counts, kind="stable")]
     names = [Class(code).name.lower().replace("_", " ") for code in ranked]
     return with_key(
         image, [(name, class_codes().color[code]) for name, code in zip(names, ranked, strict=True)]
@@ -219,10 +221,10 @@ def with_legend(image: Pixels, klass: NDArray[np.uint8], *, most: int = 12) -> P
 
 
 def with_key(image: Pixels, entries: Sequence[tuple[str, ArrayLike]]) -> Pixels:
-    """The image with a key of names and colours in its lower left corner."""
+    """The image with a key of names and colours in its lower left corner, small enough to hold them all."""
     if not entries:
         return image
-    line = max(12, round(image.shape[0] / 36))
+    line = max(8, min(round(image.shape[0] / 36), int(0.96 * image.shape[0] / (len(entries) + 1.3))))
     font = ImageFont.load_default(size=round(line * 0.72))
     wide = max(font.getlength(name) for name, _ in entries)
     box = (round(wide + 2.6 * line), round((len(entries) + 0.8) * line))
@@ -239,6 +241,81 @@ def with_key(image: Pixels, entries: Sequence[tuple[str, ArrayLike]]) -> Pixels:
         fill = tuple(int(c) for c in np.asarray(color))
         pen.rectangle((x, y + line // 6, x + line, y + line - line // 6), fill=fill)
         pen.text((x + 1.5 * line, y + line / 2), name, fill=(235, 235, 235), font=font, anchor="lm")
+    return np.asarray(picture).copy()
+
+
+def vehicle_outline(length: float, width: float, rear: float, *, step: float = 0.05) -> Float:
+    """Points (n, 3) along a vehicle's outline on the ground and an arrow to its front, vehicle frame, metres.
+
+    rear : metres from the rear axle, the frame's zero, to the back
+    """
+    back, front, side = -rear, length - rear, width / 2
+    tip = 0.35 * length
+    corners = [(back, -side), (front, -side), (front, side), (back, side), (back, -side)]
+    arrow = [(front - tip, side), (front, 0.0), (front - tip, -side)]
+    parts = []
+    for line in (corners, arrow):
+        for a, b in itertools.pairwise(np.array(line)):
+            share = np.linspace(0, 1, max(2, math.ceil(float(np.hypot(*(b - a))) / step)))[:, None]
+            parts.append(a + share * (b - a))
+    xy = np.concatenate(parts)
+    return np.column_stack([xy, np.full(len(xy), 0.05)])
+
+
+def range_rings(radii: Sequence[float], *, height: float = 0.0, step: float = 0.1) -> Float:
+    """Points (n, 3) on circles about the vertical through zero: a scale for pictures of a sweep, metres."""
+    parts = []
+    for radius in radii:
+        turn = np.linspace(0, 2 * np.pi, max(8, round(2 * np.pi * radius / step)), endpoint=False)
+        ring = radius * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        parts.append(np.column_stack([ring, np.full(len(turn), height)]))
+    return np.concatenate(parts)
+
+
+def sweep_picture(
+    points: ArrayLike,
+    colors: ArrayLike,
+    *,
+    vehicle: Vehicle | None = None,
+    reach: float = 60.0,
+    view: str | View = "oblique",
+    size: tuple[int, int] = (1600, 1000),
+    point: float = 0.15,
+) -> Pixels:
+    """A picture (h, w, 3) of one sweep about the vehicle, with the vehicle and a circle every so many metres.
+
+    points : (n, 3) metres in the vehicle frame
+    colors : (n, 3) uint8
+    reach  : metres to each side that are shown
+
+    Raises InputError for a cloud without points, or an unknown view.
+    """
+    xyz, rgb = np.asarray(points, float), np.asarray(colors, np.uint8)
+    near = np.abs(xyz[:, :2]).max(axis=1, initial=0.0) < reach
+    if not near.any():
+        raise InputError("a picture needs points")
+    step = next(s for s in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1e4) if reach / s <= 6)
+    low = float(np.percentile(xyz[near, 2], 2))
+    marks = [range_rings(np.arange(step, reach, step).tolist(), height=low)]
+    if vehicle is not None:
+        marks.append(vehicle_outline(vehicle.length, vehicle.width, vehicle.rear_overhang))
+    drawn = np.concatenate([xyz[near], *marks])
+    kinds = [(110, 116, 130), (255, 255, 255)]
+    marked = [np.tile(np.array(kind, np.uint8), (len(m), 1)) for kind, m in zip(kinds, marks, strict=False)]
+    box = np.percentile(xyz[near], [0.5, 99.5], axis=0)
+    box[:, :2] = [[-reach, -reach], [reach, reach]]
+    image = cloud_picture(
+        drawn, np.concatenate([rgb[near], *marked]), view=view, size=size, point=point, bounds=box
+    )
+    picture = Image.fromarray(image)
+    line = max(12, round(size[1] / 36))
+    ImageDraw.Draw(picture).text(
+        (size[0] - line, size[1] - line),
+        f"circles every {step:g} m",
+        fill=(200, 204, 214),
+        font=ImageFont.load_default(size=round(line * 0.72)),
+        anchor="rs",
+    )
     return np.asarray(picture).copy()
 
 
