@@ -23,8 +23,8 @@ app = App(
 
     A first scene, without a network:  geoscene build --demo -o scene
 
-    Then look at it (geoscene info scene), check it (geoscene validate scene), open scene/features.gpkg in
-    QGIS, or drive through it:  lidar drive scene --route random -o drive
+    Then look at it (geoscene view scene -o page.html), check it (geoscene validate scene), open
+    scene/features.gpkg in QGIS, or drive through it:  lidar drive scene --route random -o drive
     """,
 )
 app.register_install_completion_command()
@@ -362,6 +362,72 @@ def export(
     else:
         size = f"{summary.bytes / 1e6:.1f} MB"
         print(f"{summary.path}: {summary.kind}, {summary.objects} objects, {size}, {summary.crs}")
+        for note in summary.notes:
+            print(f"  {note}")
+    return 0
+
+
+@app.command
+def view(
+    scene: Path,
+    /,
+    *,
+    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
+    bbox: str | None = None,
+    layers: str = "",
+    max_size: float | None = None,
+    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+) -> int:
+    """Write a scene as one web page: turn it, click an object, read what is known of it and what is guessed.
+
+    For example:
+
+    geoscene view scene -o page.html
+
+    The page needs no network and no server; open it from disk with any browser that has WebGL 2.
+
+    Parameters
+    ----------
+    scene
+        Directory of the scene.
+    out
+        File to write.
+    bbox
+        W,S,E,N in degrees: only the tiles that meet it.
+    layers
+        Only these, with commas, such as ground,buildings,trees; all by default.
+    max_size
+        Megabytes that the page may have, 40 by default. A larger one is refused, with the bounds of a part
+        that fits.
+    overwrite
+        Replace what is there.
+    json
+        Print the summary as JSON.
+    quiet
+        No progress bars.
+    """
+    from geoscene.scene import open_scene  # noqa: PLC0415
+    from geoscene.view import MAX_MB, view_scene  # noqa: PLC0415
+
+    west, south, east, north = _numbers(bbox, "--bbox", "W,S,E,N") if bbox else (0.0,) * 4
+    with progress_bar(quiet=quiet) as progress:
+        summary = view_scene(
+            open_scene(scene),
+            out,
+            bounds_deg=(west, south, east, north) if bbox else None,
+            layers=tuple(name for name in layers.split(",") if name),
+            max_mb=MAX_MB if max_size is None else max_size,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    if json:
+        print_json({**asdict(summary), "path": str(summary.path)})
+    else:
+        print(
+            f"{summary.path}: {summary.faces} faces, {summary.objects} objects, {summary.bytes / 1e6:.1f} MB"
+        )
         for note in summary.notes:
             print(f"  {note}")
     return 0

@@ -1,0 +1,4 @@
+"""A scene as one web page that needs neither network nor server."""
+
+from geoscene.view.page import MAX_MB as MAX_MB
+from geoscene.view.page import view_scene as view_scene

@@ -1,0 +1,253 @@
+"""The page: scene, viewer and style in one HTML file."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from base64 import b64encode
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class, class_codes, materials
+from geoscene.errors import InputError
+from geoscene.export.files import Summary, append, size_of, spool, whole_file
+from geoscene.export.objects import attribution, read_features
+from geoscene.progress import Progress, silent
+from geoscene.scene import Scene
+from geoscene.view.attributes import tables
+from geoscene.view.lonlat import ACCURACY, lonlat_grid
+from geoscene.view.tiles import Groups, groups_of, gzip, only, pack_shapes, pack_tile
+
+MAX_MB = 40.0
+"""Megabytes of a page by default: some four million faces, which a common graphics card turns smoothly."""
+
+SCRIPTS = ("data.js", "camera.js", "shaders.js", "draw.js", "panel.js", "main.js")
+"""The viewer's parts, in the order in which they are joined."""
+
+_COPYRIGHT = "https://www.openstreetmap.org/copyright"
+
+Degrees = tuple[float, float, float, float]
+
+
+def view_scene(
+    scene: Scene,
+    out: Path,
+    *,
+    bounds_deg: Degrees | None = None,
+    layers: Sequence[str] = (),
+    max_mb: float = MAX_MB,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Summary:
+    """Write a scene as one web page that a browser opens from disk, and say what is in it.
+
+    bounds_deg : (west, south, east, north); only tiles that meet it, each whole
+    layers     : only these groups of `Groups.names`, all if empty
+    max_mb     : megabytes that the page may have
+
+    The page loads nothing: data, style and viewer (WebGL 2) are in it. Its bytes depend on the scene, the
+    bounds and the layers alone.
+
+    Raises InputError for a name that is taken, bounds without a tile, a layer that is not there, and a page
+    that would be too large, with the bounds of a part that is not.
+    """
+    _check(out, max_mb, overwrite=overwrite)
+    indices = _outwards(_tiles_within(scene, bounds_deg))
+    groups = groups_of(scene)
+    kept = _kept(groups, layers)
+    shapes, shape_bytes = pack_shapes(list(scene.shapes().values()))
+    present = np.zeros(len(groups.of) - 1, np.bool_)
+    told: list[dict[str, Any]] = []
+    ends: list[int] = []
+    faces = 0
+    with whole_file(out) as file, spool(out) as blobs:
+        _blob(blobs, "shapes", shape_bytes)
+        for done, (i, j) in enumerate(indices.tolist()):
+            progress("page", done, len(indices))
+            tile = only(scene.tile(i, j), groups, kept)
+            faces += len(tile.mesh)
+            for column in (tile.mesh.feature, tile.instances.feature):
+                present[column[column >= 0]] = True
+            entry, data = pack_tile(tile, groups)
+            told.append({"index": [i, j], **entry})
+            _blob(blobs, f"tile-{done}", data)
+            ends.append(blobs.tell())
+            if blobs.tell() > max_mb * 1e6:
+                break
+        _blob(blobs, "attributes", gzip(_json(tables(read_features(scene), present))))
+        if blobs.tell() > max_mb * 1e6:
+            raise InputError(_too_large(scene, indices, ends, blobs.tell(), max_mb))
+        head = _head(scene, told, groups, shapes)
+        _join(file, scene, head, blobs)
+    files, size = size_of(out)
+    notes = []
+    if len(told) < len(scene.tile_indices):
+        notes.append(
+            f"{len(told)} of the scene's {len(scene.tile_indices)} tiles, whole: those within the bounds"
+        )
+    if not kept.all():
+        left = [name for name, keep in zip(groups.names, kept, strict=True) if not keep]
+        notes.append(f"left out as asked: {', '.join(left)}")
+    if (error := head["lonlat"]["error"]) > ACCURACY:
+        notes.append(f"longitude and latitude under the cursor are within {error:.2g} m only")
+    return Summary(out, "html", files, size, int(present.sum()), 0, faces, scene.frame.name, tuple(notes))
+
+
+def _check(out: Path, max_mb: float, *, overwrite: bool) -> None:
+    if out.is_dir():
+        raise InputError(f"{out}: is a folder; name a file such as page.html")
+    if out.exists() and not overwrite:
+        raise InputError(f"{out}: is there already; add --overwrite to replace it")
+    if not max_mb > 0:
+        raise InputError(f"--max-size {max_mb:g}: must be more than 0")
+
+
+def _kept(groups: Groups, layers: Sequence[str]) -> NDArray[np.bool_]:
+    """Which groups (n,) are in the page."""
+    if unknown := sorted(set(layers) - set(groups.names)):
+        raise InputError(f"--layers: no {', '.join(unknown)} in the scene; it has {', '.join(groups.names)}")
+    return np.array([not layers or name in layers for name in groups.names])
+
+
+def _join(file: IO[bytes], scene: Scene, head: dict[str, Any], blobs: IO[bytes]) -> None:
+    """Write the page: the template with its words filled in, and the bytes of the scene where it has them."""
+    words = {
+        "title": html.escape(str(head["name"])),
+        "credit": _linked(" · ".join(_credits(scene))),
+        "style": _part("page.css"),
+        "scene": _json(head).decode().replace("<", "\\u003c"),
+        "script": "\n".join(_part(name) for name in SCRIPTS),
+    }
+    before, after = (Template(half).substitute(words).encode() for half in _part("page.html").split("$blobs"))
+    file.write(before)
+    append(file, blobs)
+    file.write(after)
+
+
+def _part(name: str) -> str:
+    return resources.files("geoscene.view").joinpath("page", name).read_text("utf-8")
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _blob(file: IO[bytes], name: str, data: bytes) -> None:
+    """Bytes as an element of the page that browsers neither run nor show."""
+    file.write(f'<script type="text/plain" id="{name}">'.encode() + b64encode(data) + b"</script>\n")
+
+
+def _tiles_within(scene: Scene, bounds_deg: Degrees | None) -> NDArray[np.int64]:
+    """(i, j) of the tiles (n, 2) whose squares meet the bounds."""
+    indices = np.array(scene.tile_indices, np.int64).reshape(-1, 2)
+    if bounds_deg is None:
+        return indices
+    west, south, east, north = bounds_deg
+    if not (west < east and south < north):
+        raise InputError(f"bounds {bounds_deg}: give west, south, east, north in degrees, in this order")
+    x, y = scene.frame.from_geographic([west, west, east, east], [south, north, south, north])
+    low = indices * scene.tile_size
+    high = low + scene.tile_size
+    meets = (low[:, 0] < x.max()) & (high[:, 0] > x.min()) & (low[:, 1] < y.max()) & (high[:, 1] > y.min())
+    if not meets.any():
+        xmin, ymin, xmax, ymax = scene.bounds
+        lon, lat = scene.frame.to_geographic([xmin, xmax], [ymin, ymax])
+        raise InputError(
+            f"bounds {bounds_deg}: the scene has nothing there; it covers "
+            f"{lon[0]:.5f},{lat[0]:.5f},{lon[1]:.5f},{lat[1]:.5f}"
+        )
+    chosen: NDArray[np.int64] = indices[meets]
+    return chosen
+
+
+def _middle(indices: NDArray[np.int64]) -> NDArray[np.int64]:
+    middle: NDArray[np.int64] = (indices.min(axis=0) + indices.max(axis=0)) // 2
+    return middle
+
+
+def _rings(indices: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many tiles each (n, 2) is from the middle one, along the axis on which it is more."""
+    rings: NDArray[np.int64] = np.abs(indices - _middle(indices)).max(axis=1)
+    return rings
+
+
+def _outwards(indices: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Tiles in the order in which a viewer should see them: from the middle."""
+    ordered: NDArray[np.int64] = indices[np.lexsort([indices[:, 1], indices[:, 0], _rings(indices)])]
+    return ordered
+
+
+def _too_large(
+    scene: Scene, indices: NDArray[np.int64], sizes: Sequence[int], size: int, max_mb: float
+) -> str:
+    """How large the page would be, and which part of it would not be too large."""
+    rings, share = _rings(indices), size / sizes[-1]
+    whole = size / len(sizes) * len(indices) / 1e6
+    message = f"the page would have about {max(whole, 1.01 * max_mb):.3g} MB and --max-size is {max_mb:g}"
+    ends = [int(np.flatnonzero(rings == ring)[-1]) for ring in range(int(rings[len(sizes) - 1]) + 1)]
+    fits = [ring for ring, end in enumerate(ends) if end < len(sizes) and sizes[end] * share < max_mb * 1e6]
+    if not fits:
+        return f"{message}; give more, leave out --layers, or build with smaller tiles (--tile-size)"
+    middle, size_m = _middle(indices), scene.tile_size
+    low = (middle - fits[-1]) * size_m + 1.0
+    high = (middle + fits[-1] + 1) * size_m - 1.0
+    lon, lat = scene.frame.to_geographic(
+        [low[0], low[0], high[0], high[0]], [low[1], high[1], low[1], high[1]]
+    )
+    inner = (max(lon[:2]), max(lat[0], lat[2]), min(lon[2:]), min(lat[1], lat[3]))
+    box = ",".join(f"{v:.5f}" for v in inner)
+    return f"{message}; the middle of it fits: --bbox={box} (or name fewer --layers)"
+
+
+def _head(
+    scene: Scene, told: list[dict[str, Any]], groups: Groups, shapes: list[list[int]]
+) -> dict[str, Any]:
+    """What the viewer must know before it reads the bytes."""
+    low = np.min([entry["low"] for entry in told], axis=0).tolist()
+    high = np.max([entry["high"] for entry in told], axis=0).tolist()
+    bounds = (low[0], low[1], high[0], high[1])
+    grid = lonlat_grid(scene.frame, bounds)
+    middle = scene.frame.to_geographic((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
+    colors = class_codes().color.tolist()
+    return {
+        "name": scene.manifest.get("name") or scene.path.name,
+        "frame": scene.frame.name,
+        "vertical": scene.frame.vertical,
+        "low": low,
+        "high": high,
+        "convergence": round(float(scene.frame.convergence(*middle)), 9),
+        "lonlat": {
+            "bounds": bounds,
+            "lon": grid.lon.tolist(),
+            "lat": grid.lat.tolist(),
+            "error": float(f"{grid.error:.2g}"),
+        },
+        "groups": groups.names,
+        "features": len(groups.of) - 1,
+        "classes": {int(code): [code.name.lower(), colors[code]] for code in Class},
+        "materials": {
+            material.code: [material.name, material.color, material.reflectance]
+            for material in materials().values()
+        },
+        "shapes": shapes,
+        "tiles": told,
+    }
+
+
+def _credits(scene: Scene) -> list[str]:
+    """Whom to credit, once each, in the order of the sources."""
+    named = [attribution(scene), *(str(s.get("attribution", "")) for s in scene.manifest.get("sources", ()))]
+    return list(dict.fromkeys(filter(None, named)))
+
+
+def _linked(text: str) -> str:
+    """Text as HTML, OpenStreetMap's page on copyright as a link."""
+    link = f'<a href="{_COPYRIGHT}" target="_blank" rel="noopener">openstreetmap.org/copyright</a>'
+    return re.sub(re.escape(_COPYRIGHT), link, html.escape(text)).replace("(c)", "©")

@@ -1,0 +1,231 @@
+// The scene as typed arrays.
+
+/** The inflated bytes of an element of the page, which is removed. */
+async function blobOf(id) {
+  const element = document.getElementById(id);
+  const text = atob(element.textContent);
+  element.remove();
+  const bytes = new Uint8Array(text.length);
+  for (let k = 0; k < bytes.length; k++) bytes[k] = text.charCodeAt(k);
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Response(stream).arrayBuffer();
+}
+
+/** Bytes of a vertex of the graphics card: position 4 x u16, feature i32, normal 4 x i8, codes and colour 4 x u8. */
+const VERTEX_BYTES = 24;
+
+/** Unit normal of a triangle, times 127, as int8 (zero without area). */
+function normalOf(a, b, c, out) {
+  const ux = b[0] - a[0], uy = b[1] - a[1], uz = b[2] - a[2];
+  const vx = c[0] - a[0], vy = c[1] - a[1], vz = c[2] - a[2];
+  const x = uy * vz - uz * vy, y = uz * vx - ux * vz, z = ux * vy - uy * vx;
+  const scale = 127 / (Math.hypot(x, y, z) || 1);
+  out[0] = Math.round(x * scale); out[1] = Math.round(y * scale); out[2] = Math.round(z * scale);
+}
+
+/** Columns of a tile's bytes; see `pack_tile` of geoscene.view.tiles. */
+function readTile(told, buffer) {
+  const n = told.vertices, m = told.ends[told.ends.length - 1];
+  const k = told.runs.reduce((sum, run) => sum + run[2], 0);
+  let at = 0;
+  const take = (Type, count) => {
+    const values = new Type(buffer, at, count);
+    at += values.byteLength;
+    return values;
+  };
+  return {
+    corners: take(Uint32Array, 3 * m), feature: take(Int32Array, m),
+    copied: take(Int32Array, k), transform: take(Float32Array, 12 * k),
+    vertices: take(Uint16Array, 3 * n),
+    klass: take(Uint8Array, m), material: take(Uint8Array, m), surface: take(Uint8Array, m),
+    color: take(Uint8Array, 3 * m),
+  };
+}
+
+/** Shapes that are copied, each with its columns and a box; see `pack_shapes` of geoscene.view.tiles. */
+function readShapes(counts, buffer) {
+  let at = 0;
+  return counts.map(([n, m]) => {
+    const take = (Type, count) => {
+      const values = new Type(buffer, at, count);
+      at += values.byteLength;
+      return values;
+    };
+    const shape = {
+      vertices: take(Float32Array, 3 * n), corners: take(Uint32Array, 3 * m),
+      klass: take(Uint8Array, m), material: take(Uint8Array, m), surface: take(Uint8Array, m),
+      color: take(Uint8Array, 3 * m),
+      low: [Infinity, Infinity, Infinity], high: [-Infinity, -Infinity, -Infinity],
+    };
+    at += -at & 3;
+    for (let v = 0; v < 3 * n; v++) {
+      shape.low[v % 3] = Math.min(shape.low[v % 3], shape.vertices[v]);
+      shape.high[v % 3] = Math.max(shape.high[v % 3], shape.vertices[v]);
+    }
+    return shape;
+  });
+}
+
+/**
+ * Three vertices a face, as VERTEX_BYTES says; each carries all of its face, so that shading is flat.
+ * Positions of shapes, which are not whole steps, are given apart as floats.
+ */
+function vertexBytes(part, step) {
+  const faces = part.klass.length;
+  const buffer = new ArrayBuffer(faces * 3 * VERTEX_BYTES);
+  const u16 = new Uint16Array(buffer), i32 = new Int32Array(buffer);
+  const i8 = new Int8Array(buffer), u8 = new Uint8Array(buffer);
+  const corner = [[0, 0, 0], [0, 0, 0], [0, 0, 0]], normal = [0, 0, 0];
+  for (let f = 0; f < faces; f++) {
+    for (let c = 0; c < 3; c++) {
+      const v = 3 * part.corners[3 * f + c];
+      for (let axis = 0; axis < 3; axis++) corner[c][axis] = part.vertices[v + axis] * step;
+    }
+    normalOf(corner[0], corner[1], corner[2], normal);
+    for (let c = 0; c < 3; c++) {
+      const v = 3 * part.corners[3 * f + c], at = (3 * f + c) * VERTEX_BYTES;
+      for (let axis = 0; axis < 3; axis++) {
+        u16[at / 2 + axis] = part.vertices[v + axis];
+        i8[at + 12 + axis] = normal[axis];
+        u8[at + 20 + axis] = part.color[3 * f + axis];
+      }
+      i32[at / 4 + 2] = part.feature ? part.feature[f] : -1;
+      u8[at + 16] = part.klass[f];
+      u8[at + 17] = part.material[f];
+      u8[at + 18] = part.surface[f];
+    }
+  }
+  return buffer;
+}
+
+/** Positions (3 a face, floats) of a shape, in the order of `vertexBytes`. */
+function shapePositions(shape) {
+  const out = new Float32Array(3 * shape.corners.length);
+  shape.corners.forEach((v, k) => out.set(shape.vertices.subarray(3 * v, 3 * v + 3), 3 * k));
+  return out;
+}
+
+/** Boxes of all features in scene metres: low and high as 3 floats each, empty where low > high. */
+class Boxes {
+  constructor(count) {
+    this.low = new Float32Array(3 * count).fill(Infinity);
+    this.high = new Float32Array(3 * count).fill(-Infinity);
+  }
+
+  add(feature, x, y, z) {
+    if (feature < 0) return;
+    const at = 3 * feature;
+    this.low[at] = Math.min(this.low[at], x); this.high[at] = Math.max(this.high[at], x);
+    this.low[at + 1] = Math.min(this.low[at + 1], y); this.high[at + 1] = Math.max(this.high[at + 1], y);
+    this.low[at + 2] = Math.min(this.low[at + 2], z); this.high[at + 2] = Math.max(this.high[at + 2], z);
+  }
+
+  addTile(told, tile, shapes) {
+    const base = told.base.map((b) => b * told.step);
+    for (let k = 0; k < tile.corners.length; k++) {
+      const v = 3 * tile.corners[k];
+      this.add(tile.feature[(k / 3) | 0], base[0] + tile.vertices[v] * told.step,
+        base[1] + tile.vertices[v + 1] * told.step, base[2] + tile.vertices[v + 2] * told.step);
+    }
+    let copy = 0;
+    for (const [, shape, count] of told.runs) {
+      const { low, high } = shapes[shape];
+      for (let n = 0; n < count; n++, copy++) {
+        const t = tile.transform.subarray(12 * copy, 12 * copy + 12);
+        for (let k = 0; k < 8; k++) {
+          const p = [0, 1, 2].map((axis) => ((k >> axis) & 1 ? high : low)[axis]);
+          const [x, y, z] = [0, 4, 8].map((r) => t[r] * p[0] + t[r + 1] * p[1] + t[r + 2] * p[2] + t[r + 3]);
+          this.add(tile.copied[copy], base[0] + x, base[1] + y, base[2] + z);
+        }
+      }
+    }
+  }
+
+  has(feature) {
+    return this.low[3 * feature] <= this.high[3 * feature];
+  }
+
+  middle(feature) {
+    return [0, 1, 2].map((axis) => (this.low[3 * feature + axis] + this.high[3 * feature + axis]) / 2);
+  }
+
+  size(feature) {
+    return Math.hypot(...[0, 1, 2].map((axis) => this.high[3 * feature + axis] - this.low[3 * feature + axis]));
+  }
+}
+
+/** What is known of the features, by feature number. */
+class Attributes {
+  constructor(tables) {
+    this.tables = tables;
+    this.rows = new Map(); // feature -> [table, row]
+    this.parts = new Map(); // building -> features of its parts
+    this.edges = new Map(); // OSM id -> features of the road edges made of it
+    this.surfaces = new Map(); // OSM id -> a feature of the road surfaces made of it
+    for (const table of tables) {
+      table.feature.forEach((feature, row) => {
+        this.rows.set(feature, [table, row]);
+        const ids = this.ids(feature);
+        if (table.layer === "building_parts") append(this.parts, this.value(feature, "building"), feature);
+        if (table.layer === "roads") ids.forEach((id) => append(this.edges, id, feature));
+        if (table.layer === "road_surfaces") ids.forEach((id) => this.addSurface(id, feature));
+      });
+    }
+  }
+
+  /** Of the surfaces of a way, its carriageway stands for it. */
+  addSurface(id, feature) {
+    if (!this.surfaces.has(id) || this.value(feature, "class") === "road") this.surfaces.set(id, feature);
+  }
+
+  layer(feature) {
+    return this.rows.has(feature) ? this.rows.get(feature)[0].layer : null;
+  }
+
+  names(feature) {
+    return this.rows.has(feature) ? Object.keys(this.rows.get(feature)[0].columns) : [];
+  }
+
+  /** The value in a column; null if it is not known. */
+  value(feature, column) {
+    if (!this.rows.has(feature)) return null;
+    const [table, row] = this.rows.get(feature);
+    const values = table.columns[column];
+    if (values === undefined) return null;
+    if (Array.isArray(values)) return values[row];
+    return values.index[row] < 0 ? null : values.words[values.index[row]];
+  }
+
+  /** OSM ids, such as way/123. */
+  ids(feature) {
+    return (this.value(feature, "osm_id") || "").split(";").filter(Boolean);
+  }
+
+  /** The feature that is seen in place of one without faces: a part's building, an edge's surface. */
+  seen(feature) {
+    const layer = this.layer(feature);
+    if (layer === "building_parts") return this.value(feature, "building");
+    if (layer === "roads") {
+      const id = this.ids(feature).find((way) => this.surfaces.has(way));
+      return id === undefined ? feature : this.surfaces.get(id);
+    }
+    return feature;
+  }
+}
+
+function append(map, key, value) {
+  if (!map.has(key)) map.set(key, []);
+  map.get(key).push(value);
+}
+
+/** Longitude and latitude in degrees of scene coordinates, bilinear. */
+function toLonLat(grid, x, y) {
+  const [xmin, ymin, xmax, ymax] = grid.bounds;
+  const last = grid.lon.length - 1;
+  let u = ((x - xmin) / (xmax - xmin)) * last, v = ((y - ymin) / (ymax - ymin)) * last;
+  const i = Math.max(0, Math.min(last - 1, Math.floor(u)));
+  const j = Math.max(0, Math.min(last - 1, Math.floor(v)));
+  u -= i; v -= j;
+  return [grid.lon, grid.lat].map((d) =>
+    (1 - u) * (1 - v) * d[j][i] + u * (1 - v) * d[j][i + 1] + (1 - u) * v * d[j + 1][i] + u * v * d[j + 1][i + 1]);
+}

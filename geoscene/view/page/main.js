@@ -1,0 +1,324 @@
+// Putting it together: reading, events, the loop that draws when something has changed.
+
+const $ = (id) => document.getElementById(id);
+const MODES = { look: 0, material: 1, class: 2, source: 3, sigma: 3 };
+
+async function start() {
+  if (!("DecompressionStream" in window)) throw new Error("This browser is too old: it cannot inflate the page's data.");
+  const head = JSON.parse($("scene").textContent);
+  const shapes = readShapes(head.shapes, await blobOf("shapes"));
+  const renderer = new Renderer($("canvas"), head, shapes);
+  const camera = new Camera(head.low, head.high);
+  const boxes = new Boxes(head.features);
+  const used = { material: new Set(), class: new Set() };
+  const view = { head, renderer, camera, boxes, used, dirty: true, cursor: null };
+  view.attributes = new Attributes(JSON.parse(new TextDecoder().decode(await blobOf("attributes"))));
+
+  loop(view);
+  let shown = performance.now();
+  for (const [k, told] of head.tiles.entries()) {
+    const tile = readTile(told, await blobOf(`tile-${k}`));
+    renderer.add(told, tile);
+    boxes.addTile(told, tile, shapes);
+    for (const part of [tile, ...new Set(told.runs.map((run) => shapes[run[1]]))]) {
+      part.material.forEach((code) => used.material.add(code));
+      part.klass.forEach((code) => used.class.add(code));
+    }
+    if (performance.now() - shown < 250) continue;
+    $("message").textContent = `Reading the scene … ${k + 1} of ${head.tiles.length} tiles`;
+    view.dirty = true;
+    await new Promise((done) => setTimeout(done));
+    shown = performance.now();
+  }
+  $("message").hidden = true;
+
+  listen(view);
+  layers(view);
+  color(view, "look");
+  fromAddress(view);
+  window.addEventListener("hashchange", () => location.hash !== view.address && fromAddress(view));
+  // For tests and for tinkering in the browser's console.
+  window.geoscene = {
+    ready: true,
+    pick: (x, y) => renderer.pick(camera, x, y),
+    click: (x, y) => click(view, x, y),
+    select: (text) => find(view, text),
+    color: (mode) => color(view, mode),
+    camera, attributes: view.attributes, boxes, head,
+    redraw: () => { view.dirty = true; },
+    lonLat: (x, y) => toLonLat(head.lonlat, x, y),
+    benchmark: (frames) => {
+      const began = performance.now();
+      for (let k = 0; k < frames; k++) {
+        camera.turn(0.01, 0);
+        renderer.render(camera);
+        renderer.gl.readPixels(0, 0, 1, 1, renderer.gl.RGBA, renderer.gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits for the picture
+      }
+      return (performance.now() - began) / frames;
+    },
+  };
+  document.documentElement.dataset.ready = "yes";
+}
+
+/** Draw whenever something has changed. */
+function loop(view) {
+  const step = () => {
+    if (view.dirty) {
+      view.dirty = false;
+      view.renderer.render(view.camera);
+      footer(view);
+    }
+    if (view.cursor) {
+      cursorText(view, view.cursor);
+      view.cursor = null;
+    }
+    requestAnimationFrame(step);
+  };
+  new ResizeObserver(() => { view.dirty = true; }).observe($("canvas"));
+  requestAnimationFrame(step);
+}
+
+/** Scale bar and north arrow. */
+function footer({ head, camera, renderer }) {
+  const pixel = camera.pixel(renderer.canvas.clientHeight);
+  const most = pixel * 120, power = 10 ** Math.floor(Math.log10(most));
+  const length = [5, 2, 1].map((k) => k * power).find((metres) => metres <= most);
+  $("bar").style.width = `${length / pixel}px`;
+  $("length").textContent = length >= 1000 ? `${length / 1000} km` : `${length} m`;
+  // True north lies at a grid azimuth of minus the convergence.
+  $("compass").style.transform = `rotate(${-camera.azimuth - head.convergence}rad)`;
+}
+
+function cursorText({ head, renderer, camera }, [x, y]) {
+  const hit = renderer.pick(camera, x, y);
+  if (!hit) {
+    $("cursor").textContent = "";
+    return;
+  }
+  const [lon, lat] = toLonLat(head.lonlat, hit.point[0], hit.point[1]);
+  const wrapped = ((lon + 540) % 360) - 180;
+  const [px, py, pz] = hit.point.map((v) => v.toFixed(2));
+  $("cursor").textContent = `${lat.toFixed(7)}, ${wrapped.toFixed(7)} (lat, lon)   x ${px}  y ${py}  z ${pz} m`;
+  const within = Math.max(head.lonlat.error, 1e-4);
+  $("cursor").title = `Latitude and longitude within ${within.toPrecision(2)} m of the projection's (${head.frame}); `
+    + `positions to ${(Math.max(...head.tiles.map((t) => t.step)) * 500).toFixed(1)} mm an axis; z is ${head.vertical}`;
+}
+
+/** Select what lies under a point of the canvas; nothing over the sky. */
+function click(view, x, y) {
+  const hit = view.renderer.pick(view.camera, x, y);
+  select(view, hit ? hit.feature : null, hit);
+  return hit;
+}
+
+function select(view, feature, hit) {
+  const { head, attributes, renderer } = view;
+  renderer.selected = feature === null ? -1 : feature;
+  view.dirty = true;
+  const panel = $("panel");
+  panel.hidden = feature === null;
+  if (feature === null) return;
+  const close = make("button", "×", { className: "close", title: "Close" });
+  close.onclick = () => select(view, null);
+  panel.replaceChildren(close, ...describe(head, attributes, feature, hit));
+  panel.dataset.feature = feature;
+}
+
+/** Select a feature and look at it. */
+function visit(view, feature) {
+  const { boxes, camera } = view;
+  if (boxes.has(feature)) camera.lookAt(boxes.middle(feature), Math.max(30, 2.5 * boxes.size(feature)));
+  select(view, feature);
+}
+
+/** Go to the first feature of an OSM id or name; whether there is one. */
+function find(view, text) {
+  const [first] = search(view.attributes, view.boxes, text);
+  if (first) visit(view, first[0]);
+  return Boolean(first);
+}
+
+function color(view, mode) {
+  const { head, attributes, renderer, used } = view;
+  if (!(mode in MODES)) return;
+  $("color").value = mode;
+  renderer.mode = MODES[mode];
+  let rows = [];
+  if (mode === "material") rows = byCode(head.materials, used.material);
+  if (mode === "class") rows = byCode(head.classes, used.class);
+  if (MODES[mode] === 3) {
+    const key = mode === "source" ? bySource(attributes) : bySigma(attributes);
+    renderer.colorFeatures(key.colorOf);
+    rows = key.rows;
+  }
+  showLegend($("legend"), rows);
+  view.dirty = true;
+}
+
+function layers(view) {
+  const { head, renderer } = view;
+  for (const group of head.groups) {
+    const box = make("input", [], { type: "checkbox", checked: true, id: `layer-${group}` });
+    box.onchange = () => {
+      if (box.checked) renderer.hidden.delete(group);
+      else renderer.hidden.add(group);
+      view.dirty = true;
+    };
+    $("layers").append(make("label", [box, ` ${words(group)}`]));
+  }
+}
+
+/** #view=…&color=…&off=a,b&shadows=0&select=way/1&pick=x,y, any of them. */
+function fromAddress(view) {
+  const given = new URLSearchParams(location.hash.slice(1));
+  if (given.has("color")) color(view, given.get("color"));
+  for (const group of (given.get("off") || "").split(",").filter(Boolean)) {
+    const box = $(`layer-${group}`);
+    if (box && box.checked) box.click();
+  }
+  if (given.has("shadows") && $("shadows").checked !== (given.get("shadows") !== "0")) $("shadows").click();
+  if (given.has("select")) find(view, given.get("select"));
+  if (given.has("view")) view.camera.fromText(given.get("view"));
+  if (given.has("pick")) click(view, ...given.get("pick").split(",").map(Number));
+  view.dirty = true;
+}
+
+/** Keep the view in the address, so that a reload or a link shows the same. */
+function toAddress(view) {
+  clearTimeout(view.timer);
+  view.timer = setTimeout(() => {
+    const given = new URLSearchParams(location.hash.slice(1));
+    given.delete("pick");
+    given.delete("select");
+    given.set("view", view.camera.toText());
+    view.address = `#${decodeURIComponent(given.toString())}`;
+    try {
+      history.replaceState(null, "", view.address);
+    } catch {
+      // Some browsers forbid it to pages from disk; the view is then not kept.
+    }
+  }, 400);
+}
+
+function listen(view) {
+  const { renderer, camera } = view;
+  const canvas = $("canvas");
+  const pointers = new Map();
+  let moved = 0;
+  const moving = () => {
+    view.dirty = true;
+    toAddress(view);
+  };
+  const place = (event) => [event.offsetX, event.offsetY];
+  const settle = () => {
+    const hit = renderer.pick(camera, canvas.clientWidth / 2, canvas.clientHeight / 2);
+    if (hit) camera.settle(hit.relative);
+  };
+
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.focus();
+    try {
+      canvas.setPointerCapture(event.pointerId);
+    } catch {
+      // The pointer is already gone; its events still come while it is over the canvas.
+    }
+    if (!pointers.size) {
+      moved = 0;
+      settle();
+    }
+    pointers.set(event.pointerId, place(event));
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const before = pointers.get(event.pointerId);
+    const [x, y] = place(event);
+    if (!before) {
+      view.cursor = [x, y];
+      return;
+    }
+    const [dx, dy] = [x - before[0], y - before[1]];
+    moved += Math.abs(dx) + Math.abs(dy);
+    if (pointers.size === 2) {
+      const other = [...pointers].find(([id]) => id !== event.pointerId)[1];
+      const [ax, ay, bx, by] = [before[0] - other[0], before[1] - other[1], x - other[0], y - other[1]];
+      camera.zoom((Math.hypot(ax, ay) || 1) / (Math.hypot(bx, by) || 1));
+      camera.turn(Math.atan2(ay, ax) - Math.atan2(by, bx), 0);
+      pan(dx / 2, dy / 2);
+    } else if (event.shiftKey || event.buttons & 6) pan(dx, dy);
+    else camera.turn(dx * 0.006, dy * 0.005);
+    pointers.set(event.pointerId, [x, y]);
+    if (moved > 4) moving();
+  });
+  const pan = (dx, dy) => {
+    const pixel = camera.pixel(canvas.clientHeight);
+    camera.move(-dx * pixel, (dy * pixel) / Math.max(0.2, Math.sin(camera.tilt)));
+  };
+  const release = (event) => {
+    if (pointers.delete(event.pointerId) && event.type === "pointerup" && moved <= 4 && event.button === 0) click(view, ...place(event));
+  };
+  canvas.addEventListener("pointerup", release);
+  canvas.addEventListener("pointercancel", release);
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+  canvas.addEventListener("dblclick", (event) => {
+    const hit = renderer.pick(camera, ...place(event));
+    if (hit) camera.lookAt(hit.point, Math.max(30, camera.distance / 2));
+    moving();
+  });
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    const lines = event.deltaMode === 1 ? 30 : 1;
+    const hit = renderer.pick(camera, ...place(event));
+    camera.zoom(Math.exp(Math.max(-240, Math.min(240, event.deltaY * lines)) * 0.002), hit ? hit.relative : undefined);
+    moving();
+  }, { passive: false });
+
+  document.addEventListener("keydown", (event) => {
+    if (/INPUT|SELECT/.test(event.target.tagName) || event.ctrlKey || event.metaKey || event.altKey) return;
+    const far = camera.distance / 20;
+    const action = {
+      ArrowLeft: () => camera.move(-far, 0), ArrowRight: () => camera.move(far, 0),
+      ArrowUp: () => camera.move(0, far), ArrowDown: () => camera.move(0, -far),
+      q: () => camera.turn(0.1, 0), e: () => camera.turn(-0.1, 0),
+      r: () => camera.turn(0, 0.08), f: () => camera.turn(0, -0.08),
+      "+": () => camera.zoom(0.85), "=": () => camera.zoom(0.85), "-": () => camera.zoom(1 / 0.85),
+      t: () => camera.turn(0, Math.PI), n: () => { camera.azimuth = 0; }, h: () => camera.whole(),
+      Escape: () => select(view, null),
+    }[event.key.length === 1 ? event.key.toLowerCase() : event.key];
+    if (!action) return;
+    event.preventDefault();
+    action();
+    moving();
+  });
+
+  $("color").onchange = () => color(view, $("color").value);
+  $("sun").oninput = () => {
+    renderer.sunAzimuth = ($("sun").value * Math.PI) / 180;
+    view.dirty = true;
+  };
+  $("sun").oninput();
+  $("shadows").onchange = () => {
+    renderer.shadows = $("shadows").checked;
+    view.dirty = true;
+  };
+  $("shadows").onchange();
+  const list = () => {
+    const found = search(view.attributes, view.boxes, $("search").value);
+    $("found").replaceChildren(...found.map(([feature, title]) => {
+      const item = make("li", title, { tabIndex: 0 });
+      item.onclick = () => visit(view, feature);
+      item.onkeydown = (event) => event.key === "Enter" && visit(view, feature);
+      return item;
+    }));
+    if (!found.length && $("search").value.trim()) $("found").append(make("p", "Not in this scene."));
+  };
+  $("search").oninput = list;
+  $("search").onkeydown = (event) => event.key === "Enter" && find(view, $("search").value);
+  canvas.addEventListener("webglcontextlost", () => fail(new Error("The graphics card gave up; reload the page.")));
+}
+
+function fail(error) {
+  $("message").hidden = false;
+  $("message").textContent = error.message;
+  document.documentElement.dataset.ready = "failed";
+}
+
+start().catch(fail);

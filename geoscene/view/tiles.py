@@ -1,0 +1,165 @@
+"""Tiles as compact bytes for the page: whole steps of a grid, columns one after another, deflated."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.mesh import Mesh
+from geoscene.scene import Instances, Scene, Tile
+
+STEP = 1 / 128
+"""Metres between the positions that vertices can have; a power of two, so that tiles share one grid and their
+seams stay shut. Doubled for a tile that spans more than 512 m, until 16 bits hold it."""
+
+GROUND = "ground"
+"""Name of the group of faces on the ground that are of no road: bare terrain, land cover, building pads."""
+
+_WITHIN = {"building_parts": "buildings", "landcover": GROUND, "roads": "road_surfaces"}
+
+
+def gzip(data: bytes) -> bytes:
+    """RFC 1952 bytes that depend on the data alone (no time stamp)."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, 31)
+    return packer.compress(data) + packer.flush()
+
+
+@dataclass(frozen=True, slots=True)
+class Groups:
+    """What a viewer shows or hides together.
+
+    names : of the groups, ground first
+    of    : (n + 1,) uint8, the group of each feature; the last one's is that of feature -1
+    """
+
+    names: tuple[str, ...]
+    of: NDArray[np.uint8]
+
+    def faces(self, mesh: Mesh) -> NDArray[np.uint8]:
+        """Group (m,) of each face."""
+        group: NDArray[np.uint8] = self.of[mesh.feature]
+        return np.where(mesh.klass == Class.BUILDING_PAD, np.uint8(0), group)
+
+
+def groups_of(scene: Scene) -> Groups:
+    """One group a layer that has faces or copies of its own, and the ground."""
+    ranges = sorted(scene.layers.items(), key=lambda item: item[1])
+    names = [GROUND, *(n for n, (a, b) in ranges if b > a and n not in _WITHIN)]
+    of = np.zeros(max((b for _, (_, b) in ranges), default=0) + 1, np.uint8)
+    for name, (start, stop) in ranges:
+        home = _WITHIN.get(name, name)
+        of[start:stop] = names.index(home) if home in names else 0
+    return Groups(tuple(names), of)
+
+
+def only(tile: Tile, groups: Groups, kept: NDArray[np.bool_]) -> Tile:
+    """The faces and copies of a tile that are in the groups (n,) kept."""
+    if kept.all():
+        return tile
+    copies = tile.instances
+    faces, whole = kept[groups.faces(tile.mesh)], kept[groups.of[copies.feature]]
+    chosen = Instances(copies.shape[whole], copies.transform[whole], copies.feature[whole])
+    return Tile(tile.origin, tile.mesh.take(faces), chosen)
+
+
+def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
+    """What to know of a tile to read its bytes, and the bytes, deflated.
+
+    Vertex q of the bytes lies at (base + q) * step in scene metres. Faces are in order of group, ``ends`` of
+    which are given; copies in order of group and shape, of which ``runs`` are (group, shape, number).
+    The bytes are little-endian columns: corners (m, 3) uint32, feature (m,) int32, the copies' feature (k,)
+    int32 and transform (k, 3, 4) float32 to metres from base * step, vertices (n, 3) uint16, class (m,),
+    material (m,), surface (m,) and sRGB colour (m, 3) uint8.
+    """
+    mesh, copies = tile.mesh, tile.instances
+    points = mesh.vertices + tile.origin
+    anchors = copies.transform[:, :, 3] + tile.origin
+    every = np.concatenate([points, anchors])
+    low, high = (every.min(axis=0), every.max(axis=0)) if len(every) else (tile.origin, tile.origin)
+    step = STEP
+    while (high - low).max() / step > 65_534:
+        step *= 2
+    base = np.floor(low / step).astype(np.int64)
+    vertices = np.rint(points / step).astype(np.int64) - base
+
+    group = groups.faces(mesh)
+    order = np.argsort(group, kind="stable")
+    home = groups.of[copies.feature].astype(np.int64)
+    rank = np.lexsort((copies.shape, home))
+    runs, counts = np.unique(np.column_stack([home, copies.shape]), axis=0, return_counts=True)
+    transform = copies.transform[rank].copy()
+    transform[:, :, 3] += tile.origin - base * step
+
+    told = {
+        "step": step,
+        "base": base.tolist(),
+        "low": np.floor(low).tolist(),
+        "high": np.ceil(high).tolist(),
+        "vertices": len(points),
+        "ends": np.cumsum(np.bincount(group, minlength=len(groups.names))).tolist(),
+        "runs": [[int(g), int(s), int(n)] for (g, s), n in zip(runs, counts, strict=True)],
+    }
+    columns: list[tuple[NDArray[Any], str]] = [
+        (mesh.faces[order], "<u4"),
+        (mesh.feature[order], "<i4"),
+        (copies.feature[rank], "<i4"),
+        (transform, "<f4"),
+        (vertices, "<u2"),
+        (mesh.klass[order], "u1"),
+        (mesh.material[order], "u1"),
+        (mesh.surface[order], "u1"),
+        (mesh.color[order], "u1"),
+    ]
+    return told, gzip(b"".join(values.astype(kind).tobytes() for values, kind in columns))
+
+
+def unpack_tile(told: dict[str, Any], data: bytes) -> Tile:
+    """The tile that `pack_tile` made, its faces in the page's order; ``closed`` is not kept."""
+    raw = zlib.decompress(data, 31)
+    at = 0
+
+    def column(kind: str, *shape: int) -> NDArray[Any]:
+        nonlocal at
+        count = int(np.prod(shape))
+        values = np.frombuffer(raw, kind, count, at).reshape(shape)
+        at += values.nbytes
+        return values
+
+    n, m, k = told["vertices"], told["ends"][-1], sum(run[2] for run in told["runs"])
+    faces, feature = column("<u4", m, 3), column("<i4", m)
+    copied, transform = column("<i4", k), column("<f4", k, 3, 4).astype(float)
+    vertices = column("<u2", n, 3) * told["step"]
+    klass, material, surface, color = column("u1", m), column("u1", m), column("u1", m), column("u1", m, 3)
+    mesh = Mesh.of(
+        vertices, faces, feature=feature, klass=klass, material=material, surface=surface, color=color
+    )
+    shape = np.repeat(
+        np.array([run[1] for run in told["runs"]], np.int32), [run[2] for run in told["runs"]]
+    ).astype(np.int32)
+    return Tile(np.array(told["base"]) * told["step"], mesh, Instances(shape, transform, copied))
+
+
+def pack_shapes(shapes: list[Mesh]) -> tuple[list[list[int]], bytes]:
+    """(vertices, faces) of each shape, and their deflated bytes, one shape after another.
+
+    Columns of a shape: vertices (n, 3) float32, corners (m, 3) uint32, then class, material, surface and
+    colour as in `pack_tile`, filled up to a multiple of four bytes.
+    """
+    parts = []
+    for mesh in shapes:
+        columns = [
+            mesh.vertices.astype("<f4"),
+            mesh.faces.astype("<u4"),
+            mesh.klass,
+            mesh.material,
+            mesh.surface,
+            mesh.color,
+        ]
+        raw = b"".join(np.ascontiguousarray(values).tobytes() for values in columns)
+        parts.append(raw + bytes(-len(raw) % 4))
+    return [[len(mesh.vertices), len(mesh)] for mesh in shapes], gzip(b"".join(parts))

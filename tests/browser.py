@@ -1,0 +1,159 @@
+"""A headless Chromium, driven by the W3C WebDriver protocol through chromedriver; nothing but Python."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None
+)
+DRIVER = shutil.which("chromedriver")
+
+_FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-dev-shm-usage",
+    "--disable-gpu",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+    "--window-size=1000,700",
+)
+
+
+class Browser:
+    """One window."""
+
+    def __init__(self, port: int) -> None:
+        self._base = f"http://127.0.0.1:{port}/session"
+
+    def _call(self, method: str, path: str, body: Any = None) -> Any:
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(  # noqa: S310  (to chromedriver on this machine)
+            self._base + path, data, {"Content-Type": "application/json"}, method=method
+        )
+        opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+        with opener.open(request, timeout=120) as answer:
+            return json.load(answer)["value"]
+
+    def begin(self, profile: Path) -> None:
+        """Open the window."""
+        options = {
+            "binary": CHROMIUM,
+            "args": [*_FLAGS, f"--user-data-dir={profile}"],
+            "perfLoggingPrefs": {"enableNetwork": True},
+        }
+        wanted = {
+            "goog:chromeOptions": options,
+            "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"},
+        }
+        told = self._call("POST", "", {"capabilities": {"alwaysMatch": wanted}})
+        self._base += f"/{told['sessionId']}"
+
+    def open(self, page: Path, address: str = "") -> None:
+        """Open a page from disk, anew, and wait until it says that it is ready."""
+        self._call("POST", "/url", {"url": "about:blank"})
+        self._call("POST", "/url", {"url": page.as_uri() + address})
+        end = time.monotonic() + 120
+        while (state := self.js("return document.documentElement.dataset.ready")) is None:
+            assert time.monotonic() < end, self.text("message")
+            time.sleep(0.05)
+        assert state == "yes", self.text("message")
+
+    def js(self, script: str, *args: Any) -> Any:
+        """What a script returns."""
+        return self._call("POST", "/execute/sync", {"script": script, "args": list(args)})
+
+    def text(self, element: str) -> str:
+        """The text of an element, "" where it is hidden."""
+        return str(self.js("return document.getElementById(arguments[0]).innerText", element))
+
+    def mouse(self, *actions: dict[str, Any]) -> None:
+        """Do what a mouse does."""
+        source = {"type": "pointer", "id": "mouse", "actions": list(actions)}
+        self._call("POST", "/actions", {"actions": [source]})
+
+    def click(self, x: float, y: float) -> None:
+        """Click at a point of the window."""
+        to = {"type": "pointerMove", "x": round(x), "y": round(y)}
+        self.mouse(to, {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0})
+
+    def drag(self, start: tuple[int, int], stop: tuple[int, int], button: int = 0) -> None:
+        """Press, move and release."""
+        first, last = ({"type": "pointerMove", "x": x, "y": y, "duration": 50} for x, y in (start, stop))
+        self.mouse(
+            first, {"type": "pointerDown", "button": button}, last, {"type": "pointerUp", "button": button}
+        )
+
+    def keys(self, *keys: str) -> None:
+        """Press keys, one after another."""
+        pressed = [{"type": kind, "value": key} for key in keys for kind in ("keyDown", "keyUp")]
+        self._call("POST", "/actions", {"actions": [{"type": "key", "id": "keys", "actions": pressed}]})
+
+    def write(self, text: str) -> None:
+        """Put text where the caret is, as an input method does; keys need a layout for that."""
+        command = {"cmd": "Input.insertText", "params": {"text": text}}
+        self._call("POST", "/goog/cdp/execute", command)
+
+    def settle(self) -> None:
+        """Wait until what has changed is drawn."""
+        script = (
+            "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done(1)))"
+        )
+        self._call("POST", "/execute/async", {"script": script, "args": []})
+
+    def screenshot(self) -> bytes:
+        """The window as PNG."""
+        self.settle()
+        return base64.b64decode(self._call("GET", "/screenshot"))
+
+    def complaints(self) -> list[str]:
+        """Warnings and errors of the browser's console since the last call."""
+        return [entry["message"] for entry in self._call("POST", "/se/log", {"type": "browser"})]
+
+    def requests(self) -> set[str]:
+        """Addresses that the browser has asked for since the last call."""
+        entries = [
+            json.loads(e["message"])["message"]
+            for e in self._call("POST", "/se/log", {"type": "performance"})
+        ]
+        return {e["params"]["request"]["url"] for e in entries if e["method"] == "Network.requestWillBeSent"}
+
+    def end(self) -> None:
+        """Close the window."""
+        self._call("DELETE", "")
+
+
+@contextmanager
+def browser(folder: Path) -> Iterator[Browser]:
+    """A window of its own, with an empty profile in a folder."""
+    with subprocess.Popen(
+        [DRIVER or "chromedriver", "--port=0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as driver:
+        try:
+            assert driver.stdout is not None
+            port = next(
+                m[1]
+                for line in driver.stdout
+                if (m := re.search(r"started successfully on port (\d+)", line))
+            )
+            window = Browser(int(port))
+            window.begin(folder / "profile")
+            try:
+                yield window
+            finally:
+                window.end()
+        finally:
+            driver.terminate()
