@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +14,7 @@ from geoscene import __version__
 from geoscene.console import FAILURE, print_json, progress_bar
 from geoscene.console import main as run
 from geoscene.errors import GeosceneError, InputError
+from geoscene.progress import Progress
 
 app = App(
     name="geoscene",
@@ -58,6 +59,7 @@ def build(
     cache: Annotated[Path | None, Parameter(group=_SOURCE)] = None,
     nominatim: Annotated[str | None, Parameter(group=_SOURCE)] = None,
     overpass: Annotated[str | None, Parameter(group=_SOURCE)] = None,
+    dem_server: str | None = None,
     crs: str = "local",
     lod: int = 2,
     dem: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
@@ -92,7 +94,7 @@ def build(
     place
         Name of a place, asked of Nominatim and fetched from Overpass (needs a network; answers are cached).
     bbox
-        W,S,E,N in degrees, fetched from Overpass, or cut out of --osm.
+        W,S,E,N in degrees, fetched from Overpass, or cut out of --osm or --demo.
     point
         LAT,LON in degrees, with --radius, fetched from Overpass.
     radius
@@ -100,7 +102,7 @@ def build(
     demo
         The extract of central Helsinki that comes along; needs no network.
     cache
-        Directory for answers of map servers; ~/.cache/geoscene by default.
+        Directory for answers of map servers and elevation tiles; ~/.cache/geoscene by default.
     nominatim
         Address of another Nominatim server.
     overpass
@@ -111,7 +113,10 @@ def build(
     lod
         Level of detail of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs.
     dem
-        Elevation files: GeoTIFF, .hgt or .hgt.zip, one or more, in any CRS. Level ground without.
+        Elevation files: GeoTIFF, .hgt or .hgt.zip, one or more, in any CRS; or the word tiles: public
+        elevation tiles of 5 to 10 m (needs a network; tiles are cached). Level ground without.
+    dem_server
+        Address of other tiles for --dem tiles, with {z}, {x} and {y} in it: terrarium PNGs of 256 pixels.
     dem_gaps
         Where they do not cover the scene: error, or nearest (take the nearest height and say so).
     only
@@ -142,10 +147,14 @@ def build(
     from geoscene.plan import KINDS  # noqa: PLC0415
 
     began = time.perf_counter()
+    kept = cache or Path.home() / ".cache" / "geoscene"
+    fetched = [str(path) for path in dem or ()] == ["tiles"]
+    if dem_server and not fetched:
+        raise InputError("--dem-server goes with --dem tiles")
     options = BuildOptions(
         crs=crs,
         lod=lod,
-        dem=tuple(map(str, dem or ())),
+        dem=() if fetched else tuple(map(str, dem or ())),
         dem_gaps=dem_gaps,
         only=tuple(k for k in only.split(",") if k) or KINDS,
         along=tuple(along or ()),
@@ -155,8 +164,10 @@ def build(
     )
     with progress_bar(quiet=quiet) as progress:
         progress("reading the map", 0, 0)
-        asked = {"cache_dir": cache or Path.home() / ".cache" / "geoscene"} | _servers(nominatim, overpass)
+        asked = {"cache_dir": kept} | _servers(nominatim, overpass)
         data = _read(osm, place, bbox, point, radius, asked, demo=demo)
+        if fetched:
+            options = replace(options, dem=(_elevation(data, kept, crs, dem_server, progress),))
         scene = build_scene(
             data, out, options, overwrite=overwrite, workers=_workers(workers), progress=progress
         )
@@ -165,7 +176,9 @@ def build(
         print_json(report)
     else:
         _print_scene(report)
-        print(f"\n{report['seconds']:.1f} s; next: lidar drive {out} --route random -o drive")
+        drive = f"lidar drive {out} --route random -o drive"
+        following = drive if report["counts"]["road_edges"] else f"geoscene export {out} -o scene.glb"
+        print(f"\n{report['seconds']:.1f} s; next: {following}")
     return 0
 
 
@@ -181,6 +194,14 @@ def _servers(nominatim: str | None, overpass: str | None) -> dict[str, Any]:
     from geoscene.sources import Servers  # noqa: PLC0415
 
     return {"servers": Servers(**given)}
+
+
+def _elevation(data: Any, cache: Path, crs: str, template: str | None, progress: Progress) -> str:
+    """The elevation file made of tiles for a map."""
+    from geoscene.sources import TileServer, fetch_elevation  # noqa: PLC0415
+
+    server = TileServer(template, credit=f"elevation tiles: {template}") if template else None
+    return str(fetch_elevation(data, cache_dir=cache, crs=crs, server=server, progress=progress))
 
 
 def _workers(given: int | None) -> int:
@@ -202,7 +223,7 @@ def _read(
     from geoscene import sources  # noqa: PLC0415
 
     given = [n for n, v in (("--osm", osm), ("--place", place), ("--point", point), ("--demo", demo)) if v]
-    if bbox and not osm:
+    if bbox and not (osm or demo):
         given.append("--bbox")
     if len(given) != 1:
         what = f"not {' and '.join(given)} together" if given else "none was given"
@@ -213,10 +234,8 @@ def _read(
         if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
             raise InputError(f"--bbox {bbox.strip()}: W,S,E,N must rise from west to east and south to north")
         box = (west, south, east, north)
-    if osm:
-        return sources.read_osm(osm, bounds=box)
-    if demo:
-        return sources.read_osm(sources.demo_path())
+    if osm or demo:
+        return sources.read_osm(osm or sources.demo_path(), bounds=box)
     if place:
         return sources.fetch_place(place, **asked)
     if point:
@@ -459,6 +478,11 @@ def _print_scene(report: dict[str, Any]) -> None:
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
     }
+    if report["options"]["along"]:
+        rows["along"] = (
+            f"{len(report['tiles'])} tiles are built, those seen from the route; solids and watertight count"
+            " what is in them, all else the whole map"
+        )
     print(report["name"] or report["path"])
     for title, text in rows.items():
         print(f"  {title:<10} {text}")

@@ -42,7 +42,10 @@ def scene_manifest(
                 "licence": "ODbL-1.0",
                 "attribution": ATTRIBUTION,
             },
-            *({"kind": "terrain", "from": name} for name in terrain.sources),
+            *(
+                {"kind": "terrain", "from": name} | ({"attribution": credit} if credit else {})
+                for name, credit in zip(terrain.sources, terrain.credits, strict=True)
+            ),
         ],
         "geographic_bounds": list(osm.bounds),
         "bounds": [xmin, ymin, xmax, ymax],

@@ -69,6 +69,7 @@ class Terrain:
     voids    : posts among them that held no height and were filled from their neighbours
     uncovered : share of the scene that no raster covers, which took the nearest height
     sources  : names of the files
+    credits  : what each file wants to be said where it is used, empty if it says nothing
     """
 
     frame: Frame
@@ -80,6 +81,7 @@ class Terrain:
     voids: int = 0
     uncovered: float = 0.0
     sources: tuple[str, ...] = ()
+    credits: tuple[str, ...] = ()
 
     @property
     def lines(self) -> float:
@@ -177,6 +179,7 @@ def open_terrain(
         sum(voids for _, _, _, voids in read),
         uncovered if uncovered > 1e-9 else 0.0,
         tuple(r.path.name for r in rasters),
+        tuple(r.credit for r in rasters),
     )
 
 
@@ -213,6 +216,7 @@ class _Raster:
     to_metres: tuple[float, float]
     vertical: Literal["orthometric", "ellipsoidal"]
     datum: str
+    credit: str
 
 
 def _gdal_name(path: Path) -> str:
@@ -249,7 +253,7 @@ def _open(path: Path, *, unit: str | None, vertical: Literal["orthometric", "ell
             factor = _UNITS.get((unit or stated).lower())
             if factor is None:
                 raise InputError(f"{path}: heights in {unit or stated!r}; say which unit: m, ft or us-ft")
-            a = source.transform
+            a, tags = source.transform, source.tags()
             step = np.array([[a.a, a.b], [a.d, a.e]])
             return _Raster(
                 path,
@@ -261,7 +265,8 @@ def _open(path: Path, *, unit: str | None, vertical: Literal["orthometric", "ell
                 source.nodata,
                 (source.scales[0] * factor, source.offsets[0] * factor),
                 vertical or kind or "orthometric",
-                datum if vertical is None else f"{vertical}, as told",
+                tags.get("VERTICAL_DATUM", datum) if vertical is None else f"{vertical}, as told",
+                tags.get("TIFFTAG_COPYRIGHT", ""),
             )
     except RasterioIOError as error:
         raise InputError(f"{path}: not a raster that GDAL reads ({error})") from error
@@ -295,10 +300,19 @@ def _not_covered(rasters: Sequence[_Raster], frame: Frame, bounds: Sequence[floa
     xmin, ymin, xmax, ymax = bounds
     lon, lat = frame.to_geographic([xmin, xmax, xmax, xmin], [ymin, ymin, ymax, ymax])
     return (
-        f"{', '.join(r.path.name for r in rasters)}: {100 * share:.2g} % of the scene lies outside; it spans "
-        f"W {lon.min():.5f} S {lat.min():.5f} E {lon.max():.5f} N {lat.max():.5f}; "
-        "add the files that cover it, or let what lies outside take the nearest height"
+        f"{', '.join(r.path.name for r in rasters)}: {_percent(share)} of the scene is not covered; it spans "
+        f"W {lon.min():.5f} S {lat.min():.5f} E {lon.max():.5f} N {lat.max():.5f}; add files that cover it"
+        + (", or let the rest take the nearest height (--dem-gaps nearest)" if share < 1.0 else "")
     )
+
+
+def _percent(share: float) -> str:
+    """A share in words that neither round a gap away nor call one the whole."""
+    if share >= 1.0:
+        return "all"
+    if share < 0.001:
+        return "less than 0.1 %"
+    return f"{min(100 * share, 99.9):.1f} %"
 
 
 def _shares_lattice(one: _Raster, other: _Raster) -> bool:

@@ -144,14 +144,16 @@ def test_a_model_that_does_not_cover_the_scene_is_an_error_or_a_counted_fallback
     east, _ = posts(corner, (60, 20))  # its eastern edge is 250 m west of the raster's middle
     path = write_dem(tmp_path / "a.tif", east - 499000, corner=corner)
     bounds = (-350.0, -200.0, 50.0, 200.0)
-    with pytest.raises(InputError, match=r"a\.tif: 7\d % of the scene lies outside.*W 8\.99.*nearest"):
+    with pytest.raises(
+        InputError, match=r"a\.tif: 7\d\.\d % of the scene is not covered.*W 8\.99.*--dem-gaps nearest"
+    ):
         open_terrain([path], FRAME, bounds=bounds)
     terrain = open_terrain([path], FRAME, bounds=bounds, outside="nearest")
     edge = corner[0] + 20 * 25
     west = FRAME.to_crs(UTM, bounds[0], 0)[0]
     assert terrain.uncovered == pytest.approx(1 - (edge - west) / 400, abs=1e-3)
     assert terrain.height(40, 0) == pytest.approx(east.max() - 499000)
-    with pytest.raises(InputError, match="outside"):
+    with pytest.raises(InputError, match=r"all of the scene is not covered.*add files that cover it$"):
         open_terrain([path], FRAME, bounds=(500, 0, 600, 100), outside="nearest")
 
 
@@ -237,5 +239,5 @@ def test_two_srtm_tiles_meet_without_a_seam_at_50_north(shared_dem):
     x, y = np.meshgrid(np.linspace(-1400, 1400, 30), np.arange(-200, 200, 1.0))
     step = np.abs(np.diff(terrain.height(x, y), axis=0))
     assert step.max() < 0.5
-    with pytest.raises(InputError, match="lies outside"):
+    with pytest.raises(InputError, match=r"48\.\d % of the scene is not covered"):
         open_terrain(paths[:1], frame, bounds=(-1500, -1500, 1500, 1500))

@@ -1,4 +1,4 @@
-"""Where maps come from: files, map servers, and the demo extract."""
+"""Where maps come from: files, map servers, and the demo extract; elevation tiles to go with them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from geoscene.sources.data import Way as Way
 
 if TYPE_CHECKING:
     from geoscene.sources.demo import demo_path as demo_path
+    from geoscene.sources.elevation import TileServer as TileServer
+    from geoscene.sources.elevation import fetch_elevation as fetch_elevation
     from geoscene.sources.files import read_osm as read_osm
     from geoscene.sources.network import Servers as Servers
     from geoscene.sources.network import fetch_bbox as fetch_bbox
@@ -25,7 +27,9 @@ _LATE = {
     "demo_path": "demo",
     "read_osm": "files",
     "Servers": "network",
+    "TileServer": "elevation",
     "fetch_bbox": "network",
+    "fetch_elevation": "elevation",
     "fetch_place": "network",
     "fetch_point": "network",
     "locate": "network",

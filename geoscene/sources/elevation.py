@@ -1,0 +1,283 @@
+"""Public elevation tiles: web-Mercator PNGs whose colours are heights, joined into one GeoTIFF."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene import __version__
+from geoscene.errors import InputError, NetworkError
+from geoscene.frames import Frame
+from geoscene.progress import Progress, silent
+from geoscene.scene import write_atomically
+from geoscene.sources.data import OsmData
+
+Float = NDArray[np.float64]
+Box = tuple[float, float, float, float]
+
+CREDIT = (
+    "Terrain Tiles (Mapzen, AWS open data): ArcticDEM, DigitalGlobe, Inc., imagery funded by National Science"
+    " Foundation awards 1043681, 1559691 and 1542736; © offene Daten Österreichs - Digitales Geländemodell"
+    " (DGM) Österreich; contains information licensed under the Open Government Licence - Canada; produced"
+    " using Copernicus data and information funded by the European Union - EU-DEM layers; ETOPO1, U.S."
+    " National Oceanic and Atmospheric Administration; source: INEGI, Continental relief, 2016; © 2011 Crown"
+    " copyright Land Information New Zealand and the New Zealand Government; © Kartverket; © Environment"
+    " Agency copyright and/or database right 2015; 3DEP, SRTM and GMTED2010 courtesy of the U.S. Geological"
+    " Survey"
+)
+"""What the data set's page on attribution asks to be said."""
+
+DATUM = "the geoids of the tiles' sources, mixed (EGM96, EGM2008, NAVD88, national)"
+
+_SIDE = 256  # pixels of a tile
+_HALF_WORLD = math.pi * 6378137.0  # metres from the middle of web Mercator to its edge (EPSG:3857)
+_COARSEST = 10.0  # metres between posts that the chosen zoom does not exceed; it is then over 5
+_LAST_LATITUDE = 85.0  # degrees; web Mercator's square ends at 85.05
+_AROUND = 8  # posts fetched beyond the box on each side
+_SHORE = 2  # posts from a coastline within which the sea's floor begins
+_CACHE_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class TileServer:
+    """Where elevation tiles come from, and how patiently they are asked for.
+
+    template   : address of a tile with {z}, {x} and {y}; 256-pixel PNGs in the terrarium encoding
+    credit     : whom to name, where the data are used
+    datum      : what heights are above, in words
+    user_agent : what the server is told of who asks
+    timeout    : seconds for one answer
+    attempts   : how often a tile is asked for while the server fails or says that it is busy
+    wait       : seconds before the second attempt, doubled before each further one
+    deepest    : the last zoom that the server has
+    most       : more tiles than that are not asked for
+    """
+
+    template: str = "https://s3.amazonaws.com/elevation-tiles-prod/terrarium/{z}/{x}/{y}.png"
+    credit: str = CREDIT
+    datum: str = DATUM
+    user_agent: str = f"geoscene/{__version__} (builds 3D scenes from OpenStreetMap)"
+    timeout: float = 30.0
+    attempts: int = 4
+    wait: float = 0.5
+    deepest: int = 15
+    most: int = 2000
+
+    def __post_init__(self) -> None:
+        """Refuse an address that does not name one tile."""
+        if not all(part in self.template for part in ("{z}", "{x}", "{y}")):
+            raise InputError(f"{self.template}: give the address of a tile with {{z}}, {{x}} and {{y}} in it")
+
+
+def zoom_at(lat_deg: float, *, deepest: int = 15) -> int:
+    """The first zoom whose pixels are at most 10 m wide on the ground at a latitude."""
+    whole = 2 * _HALF_WORLD * math.cos(math.radians(lat_deg)) / _SIDE
+    return min(max(math.ceil(math.log2(whole / _COARSEST)), 0), deepest)
+
+
+def decode_terrarium(rgb: NDArray[np.uint8]) -> Float:
+    """Metres (rows, columns) of terrarium colours (rows, columns, 3): R * 256 + G + B / 256 - 32768."""
+    return rgb.astype(np.float64) @ (256.0, 1.0, 1 / 256) - 32768.0
+
+
+def fetch_elevation(
+    osm: OsmData,
+    *,
+    cache_dir: Path,
+    crs: str = "local",
+    server: TileServer | None = None,
+    zoom: int | None = None,
+    progress: Progress = silent,
+) -> Path:
+    """A GeoTIFF of the ground under a map, made from elevation tiles; for `geoscene.terrain.open_terrain`.
+
+    The tiles also hold the sea's floor. Where the map has a coastline, negative heights that hang together
+    with it are set to 0, the level that the water has; land that lies deeper behind a dike keeps its
+    heights.
+
+    cache_dir : folder that keeps tiles and the GeoTIFF; each is asked for once
+    crs       : of the scene, as `geoscene.frames.Frame.at` takes it: its rectangle is what is covered
+    server    : the public tiles if None
+    zoom      : of the tiles; by default the first with pixels of at most 10 m (5 to 10 m)
+
+    Raises InputError for a map beyond 85° of latitude or larger than the server's limit, NetworkError if
+    a tile does not come.
+    """
+    server = server or TileServer()
+    west, south, east, north = _needed(osm, crs)
+    z = zoom_at((south + north) / 2, deepest=server.deepest) if zoom is None else zoom
+    (left, top), (right, bottom) = _pixels(np.array([[west, north], [east, south]]), z)
+    limit = 2**z - 1
+    x0, y0 = (int(np.clip((v - _AROUND) // _SIDE, 0, limit)) for v in (left, top))
+    x1, y1 = (int(np.clip((v + _AROUND) // _SIDE, 0, limit)) for v in (right, bottom))
+    names = [(x, y) for y in range(y0, y1 + 1) for x in range(x0, x1 + 1)]
+    if len(names) > server.most:
+        raise InputError(
+            f"{len(names):,} elevation tiles of zoom {z}, more than the {server.most:,} that may be asked"
+            " for; take a part of the map, or an elevation file (--dem FILE)"
+        )
+    coast = [way.lonlat for way in osm.ways if way.tags.get("natural") == "coastline"]
+    shore = np.concatenate(coast) if coast else np.empty((0, 2))
+    recipe = hashlib.sha256(f"{_CACHE_VERSION}\n{server}\n{z} {x0} {y0} {x1} {y1}\n".encode())
+    recipe.update(np.ascontiguousarray(shore).tobytes())
+    path = cache_dir / f"elevation-z{z}-{recipe.hexdigest()[:16]}.tif"
+    if path.exists():
+        return path
+    heights = np.empty(((y1 - y0 + 1) * _SIDE, (x1 - x0 + 1) * _SIDE))
+    for done, ((x, y), tile) in enumerate(zip(names, _tiles(names, z, cache_dir, server), strict=True), 1):
+        row, column = (y - y0) * _SIDE, (x - x0) * _SIDE
+        heights[row : row + _SIDE, column : column + _SIDE] = tile
+        progress("elevation tiles", done, len(names))
+    if len(shore):
+        heights = _without_sea_floor(heights, _pixels(shore, z) - (x0 * _SIDE, y0 * _SIDE))
+    write_atomically(path, _geotiff(heights, z, x0 * _SIDE, y0 * _SIDE, server))
+    return path
+
+
+def _needed(osm: OsmData, crs: str) -> Box:
+    """The box (degrees) of a scene's rectangle: the map's bounds and the buildings that reach over them."""
+    import shapely  # noqa: PLC0415 - slow to import
+
+    built = [a.geometry for a in osm.areas if "building" in a.tags or "building:part" in a.tags]
+    boxes = np.vstack([shapely.bounds(np.array(built, object)).reshape(-1, 4), osm.bounds])
+    west, south = np.nanmin(boxes[:, :2], axis=0)
+    east, north = np.nanmax(boxes[:, 2:], axis=0)
+    if max(abs(south), abs(north)) > _LAST_LATITUDE:
+        raise InputError(f"elevation tiles end at 85° of latitude; the map spans {south:.2f} to {north:.2f}")
+    frame = Frame.at((west + east) / 2, (south + north) / 2, crs)
+    rim = shapely.segmentize(shapely.box(west, south, east, north), max(east - west, north - south) / 8)
+    xy = np.column_stack(frame.from_geographic(*shapely.get_coordinates(rim).T))
+    (xmin, ymin), (xmax, ymax) = xy.min(axis=0), xy.max(axis=0)
+    side = max(xmax - xmin, ymax - ymin) / 8
+    square = shapely.get_coordinates(shapely.segmentize(shapely.box(xmin, ymin, xmax, ymax), side))
+    lon, lat = frame.to_geographic(*square.T)
+    return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
+
+
+def _pixels(lonlat: Float, z: int) -> Float:
+    """Fractional pixels (n, 2), x east and y south, of the world at a zoom."""
+    lon, lat = np.radians(lonlat).T
+    world = np.column_stack([lon, -np.arcsinh(np.tan(lat))]) / math.pi  # -1 to 1 each
+    pixels: Float = (world + 1) / 2 * _SIDE * 2**z
+    return pixels
+
+
+def _tiles(names: list[tuple[int, int]], z: int, cache_dir: Path, server: TileServer) -> Any:
+    """Heights (256, 256) of each tile in turn, from the cache or the server."""
+    import requests  # noqa: PLC0415 - heavy
+
+    folder = cache_dir / "tiles" / hashlib.sha256(server.template.encode()).hexdigest()[:16] / str(z)
+    folder.mkdir(parents=True, exist_ok=True)
+    with requests.Session() as session:
+        session.headers["User-Agent"] = server.user_agent
+        for x, y in names:
+            path = folder / f"{x}_{y}.png"
+            kept = _heights(path.read_bytes()) if path.exists() else None
+            if kept is None:
+                url = server.template.format(z=z, x=x, y=y)
+                content = _ask(session, url, server)
+                kept = _heights(content)
+                if kept is None:
+                    raise NetworkError(f"{url}: no elevation tile (a PNG of 256 x 256 pixels) but other data")
+                write_atomically(path, content)
+            yield kept
+
+
+def _heights(content: bytes) -> Float | None:
+    """Heights of a tile, NaN where it is void; None if the bytes are no such tile."""
+    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - slow to import
+
+    try:
+        with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
+            rgb = np.asarray(image.convert("RGB"))
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
+        return None
+    if rgb.shape != (_SIDE, _SIDE, 3):
+        return None
+    return np.where(rgb.any(axis=2), decode_terrarium(rgb), np.nan)
+
+
+def _ask(session: Any, url: str, server: TileServer) -> bytes:
+    """The bytes at an address, asked for again while the server fails or is busy."""
+    import requests  # noqa: PLC0415 - heavy
+
+    told, pause = "", server.wait
+    for attempt in range(server.attempts):
+        if attempt:
+            time.sleep(pause)
+            pause *= 2
+        try:
+            answer = session.get(url, timeout=server.timeout)
+        except requests.exceptions.RequestException as error:
+            told = _cause(error)
+            continue
+        if answer.status_code == 200:
+            return bytes(answer.content)
+        told = f"HTTP {answer.status_code}, {answer.reason}"
+        if answer.status_code not in {429, 500, 502, 503, 504}:
+            break
+        stated = answer.headers.get("Retry-After", "")
+        pause = min(float(stated), 30.0) if stated.isdigit() else pause
+    raise NetworkError(
+        f"no elevation tile from {urlsplit(url).netloc} ({url}: {told});"
+        " without a network, give an elevation file (--dem FILE) or build on level ground (no --dem)"
+    )
+
+
+def _cause(error: BaseException) -> str:
+    """The innermost reason of a failed request, in few words."""
+    while (inner := error.__cause__ or error.__context__) is not None:
+        error = inner
+    return " ".join(str(getattr(error, "strerror", None) or error).split())[:120] or type(error).__name__
+
+
+def _without_sea_floor(heights: Float, shore: Float) -> Float:
+    """Heights with 0 instead of less wherever negative posts hang together with those at a coastline.
+
+    shore : (n, 2) pixels (column, row) of the coastline's vertices, some outside
+    """
+    from scipy import ndimage  # noqa: PLC0415 - slow to import
+
+    low = heights < 0.0
+    pieces, _ = ndimage.label(low, structure=np.ones((3, 3)))
+    column, row = np.floor(shore).astype(int).T
+    inside = (row >= 0) & (row < heights.shape[0]) & (column >= 0) & (column < heights.shape[1])
+    near = np.zeros(heights.shape, np.bool_)
+    near[row[inside], column[inside]] = True
+    near = ndimage.binary_dilation(near, iterations=_SHORE, structure=np.ones((3, 3)))
+    return np.where(low & np.isin(pieces, np.unique(pieces[near & low])), 0.0, heights)
+
+
+def _geotiff(heights: Float, z: int, column: int, row: int, server: TileServer) -> bytes:
+    """The bytes of a GeoTIFF of heights (float32: the tiles' 1/256 m is exact) whose first pixel is given."""
+    import rasterio  # noqa: PLC0415 - slow to import
+    from rasterio.io import MemoryFile  # noqa: PLC0415
+    from rasterio.transform import Affine  # noqa: PLC0415
+
+    step = 2 * _HALF_WORLD / _SIDE / 2**z
+    profile: dict[str, Any] = {
+        "driver": "GTiff",
+        "dtype": "float32",
+        "count": 1,
+        "height": heights.shape[0],
+        "width": heights.shape[1],
+        "nodata": math.nan,
+        "crs": "EPSG:3857",
+        "transform": Affine(step, 0, column * step - _HALF_WORLD, 0, -step, _HALF_WORLD - row * step),
+        "compress": "deflate",
+        "predictor": 3,
+    }
+    with rasterio.Env(), MemoryFile() as file:
+        with file.open(**profile) as target:
+            target.write(heights.astype(np.float32), 1)
+            target.update_tags(TIFFTAG_COPYRIGHT=server.credit, VERTICAL_DATUM=server.datum)
+        return bytes(file.read())
