@@ -1,16 +1,15 @@
-"""What builds cost as cities grow, and what a build along a route saves.
+"""What builds cost as cities grow, and how fast buildings are made.
 
     python benchmarks/scale.py sizes [1000 10000 100000] [--workers 2] [--lod 2] [--folder DIR] [--json]
     python benchmarks/scale.py stages EXTRACT [EXTRACT ...] [--json]
-    python benchmarks/scale.py along EXTRACT --route LAT,LON LAT,LON [--reach 100] [--folder DIR] [--json]
 
 ``sizes`` makes cities (benchmarks/make_osm.py) and builds them with the program, one after another.
 ``stages`` times the stages of buildings in one process, tile by tile as the build does it, without parsing
-and without the ground. ``along`` builds the whole and the part seen from a route, drives the route through
-both with a 16-beam scanner for ten seconds and compares the clouds byte by byte.
+and without the ground: on level ground, and on a made-up terrain of hills that is asked for every base.
 
-CPU time is that of all processes. Memory is the greatest sum of proportional set sizes of the process and its
-children (what forked workers share counts once), looked at five times a second; Linux only.
+CPU time is that of all processes. ``peak_mib`` is the greatest sum of proportional set sizes of the process
+and its children (what forked workers share counts once), looked at five times a second; ``largest_mib`` is
+the greatest resident set of any one of them, shared pages included. Linux only.
 """
 
 from __future__ import annotations
@@ -24,31 +23,36 @@ import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from make_osm import make_city, write_city
+from numpy.typing import NDArray
 
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.frames import Frame
 from geoscene.plan import take_buildings
 from geoscene.scene import open_scene
 from geoscene.sources import read_osm
+from geoscene.terrain import base_heights
+
+Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one command: seconds by the clock, of all processors, and the peak of memory in MiB."""
+    """Of one command: seconds by the clock and of all processors, MiB at the peak of all and of one."""
 
     wall_s: float
     cpu_s: float
     peak_mib: int
+    largest_mib: int
 
 
-def run(command: list[str]) -> Cost:
-    """The cost of a command; raises CalledProcessError where it fails."""
+def run(command: list[str], *, errors: IO[bytes] | None = None) -> Cost:
+    """The cost of a command whose complaints go to a file; raises CalledProcessError where it fails."""
     began = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
     peak = 0
     while True:
         pid, status, usage = os.wait4(process.pid, os.WNOHANG)
@@ -60,7 +64,8 @@ def run(command: list[str]) -> Cost:
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command)
-    return Cost(round(wall, 2), round(usage.ru_utime + usage.ru_stime, 2), peak // 1024)
+    cpu = usage.ru_utime + usage.ru_stime
+    return Cost(round(wall, 2), round(cpu, 2), peak // 1024, usage.ru_maxrss // 1024)
 
 
 def _family(root: int) -> list[int]:
@@ -133,17 +138,31 @@ def stages(given: argparse.Namespace) -> list[dict[str, Any]]:
         count = table.count
         row: dict[str, Any] = {"extract": path.name, "buildings": count, "parse_s": round(parsed - began, 2)}
         row["read_s"] = round(read - parsed, 2)
-        for lod in (1, 2):
-            start = time.process_time()
-            for rows_, parts in _tiles(table):
-                build_solids(take_buildings(table, rows_, parts), base=np.zeros(len(rows_)), lod=lod)
-            spent = time.process_time() - start
-            row |= {
-                f"lod{lod}_solids_s": round(spent, 2),
-                f"lod{lod}_per_s": round(count / (spent + read - parsed)),
-            }
+        for ground, height in (("level", _level), ("hills", _hills)):
+            for lod in (1, 2):
+                start = time.process_time()
+                base = base_heights(table.footprint[:count], height)
+                for chosen, parts in _tiles(table):
+                    build_solids(take_buildings(table, chosen, parts), base=base[chosen], lod=lod)
+                spent = time.process_time() - start
+                row[f"lod{lod}_{ground}_per_s"] = round(count / (spent + read - parsed))
         rows.append(row)
     return rows
+
+
+def _level(x: Float, y: Float) -> Float:
+    return 0.0 * (x + y)
+
+
+def _hills(x: Float, y: Float) -> Float:
+    """Bilinear heights of a grid of 30 m, as an elevation model gives them: hills of 40 m, 2 km apart."""
+    axis = np.arange(-400, 401) * 30.0
+    grid = 20.0 * (np.sin(axis / 320.0)[:, None] + np.cos(axis / 320.0)[None, :])
+    u, v = (np.clip(c / 30.0 + 400.0, 0.0, 799.0) for c in (x, y))
+    i, j = u.astype(int), v.astype(int)
+    s, t = u - i, v - j
+    low = grid[i, j] * (1 - s) + grid[i + 1, j] * s
+    return low * (1 - t) + (grid[i, j + 1] * (1 - s) + grid[i + 1, j + 1] * s) * t
 
 
 def _tiles(table: Any) -> list[tuple[Any, Any]]:
@@ -165,33 +184,11 @@ def _tiles(table: Any) -> list[tuple[Any, Any]]:
     ]
 
 
-def along(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
-    """Cost of the whole build and of the one along a route, and whether what is there is the same."""
-    rows, clouds, tiles = [], [], []
-    extra = {"whole": [], "along": ["--along", *given.route, "--reach", str(given.reach)]}
-    for name, words in extra.items():
-        out, drive = folder / name, folder / f"{name}_drive"
-        cost = run(build_command(given.extract, out, "--workers", str(given.workers), *words))
-        command = [sys.executable, "-m", "lidar.cli", "drive", str(out), "--route", *given.route]
-        command += ["--rig", "vlp16", "--duration", "10", "--format", "pcd", "--out", str(drive)]
-        driven = run([*command, "--overwrite", "--quiet"])
-        found = {p.relative_to(drive): p.read_bytes() for p in sorted(drive.rglob("*.pcd"))}
-        clouds.append(found)
-        tiles.append({p.name: p.read_bytes() for p in (out / "tiles").iterdir()})
-        rows.append(
-            {"build": name, "tiles": len(tiles[-1]), **asdict(cost), "drive_s": driven.wall_s}
-            | {"clouds": len(found), "cloud_mib": sum(map(len, found.values())) >> 20}
-        )
-    whole, part = tiles
-    rows[1] |= {
-        "same_tiles": all(whole[name] == data for name, data in part.items()),
-        "same_clouds": bool(clouds[0]) and clouds[0] == clouds[1],
-    }
-    return rows
-
-
-def print_table(rows: list[dict[str, Any]]) -> None:
-    """Print rows under the names of their columns."""
+def show(rows: list[dict[str, Any]], *, as_json: bool) -> None:
+    """Print rows as JSON, or under the names of their columns."""
+    if as_json:
+        print(json.dumps(rows, indent=1))
+        return
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [names, *([str(row.get(name, "")) for name in names] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -210,11 +207,7 @@ def main() -> None:
     one.add_argument("--lod", type=int, default=2)
     two = kinds.add_parser("stages")
     two.add_argument("extract", type=Path, nargs="+")
-    three = kinds.add_parser("along")
-    three.add_argument("extract", type=Path)
-    three.add_argument("--route", nargs="+", required=True)
-    three.add_argument("--reach", type=float, default=100.0)
-    for kind in (one, two, three):
+    for kind in (one, two):
         kind.add_argument("--workers", type=int, default=2)
         kind.add_argument("--folder", type=Path)
         kind.add_argument("--json", action="store_true")
@@ -222,11 +215,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.folder or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        rows = stages(given) if given.kind == "stages" else globals()[given.kind](given, folder)
-    if given.json:
-        print(json.dumps(rows, indent=1))
-    else:
-        print_table(rows)
+        show(stages(given) if given.kind == "stages" else sizes(given, folder), as_json=given.json)
 
 
 if __name__ == "__main__":

@@ -77,20 +77,21 @@ def make_ground(plan: Plan, i: int, j: int) -> tuple[Mesh, Instances]:
     meshes = []
     if covered:
         ground = ground_tile(plan.ground, i, j, height=plan.height, levels=plan.levels)
-        meshes.append(ground.take(ground.klass != Class.TUNNEL))  # open where tunnels come out
-    trees = plan.trees.take(plan.of_tile("trees", i, j))
-    furniture = plan.furniture.take(plan.of_tile("furniture", i, j))
-    copies = [
-        tree_instances(trees, height=plan.height),
-        furniture_instances(furniture, height=plan.height),
-    ]
+        solid = ground.klass != Class.TUNNEL  # open where tunnels come out
+        meshes.append(ground if solid.all() else ground.take(solid))
+    copies = []
+    if len(rows := plan.of_tile("trees", i, j)):
+        copies.append(tree_instances(plan.trees.take(rows), height=plan.height))
+    if len(rows := plan.of_tile("furniture", i, j)):
+        copies.append(furniture_instances(plan.furniture.take(rows), height=plan.height))
     if covered and len(plan.needles):
         woods = forest_trees(plan.ground, i, j, needles=plan.needles)
-        copies.append(tree_instances(woods, height=plan.height))
-    meshes += barrier_meshes(plan.barriers.take(plan.of_tile("barriers", i, j)), height=plan.height)
-    meshes += structure_meshes(
-        plan.structures, plan.of_tile("structures", i, j), height=plan.height, openings=plan.openings
-    )
+        if len(woods):
+            copies.append(tree_instances(woods, height=plan.height))
+    if len(rows := plan.of_tile("barriers", i, j)):
+        meshes += barrier_meshes(plan.barriers.take(rows), height=plan.height)
+    if len(rows := plan.of_tile("structures", i, j)):
+        meshes += structure_meshes(plan.structures, rows, height=plan.height, openings=plan.openings)
     return concatenate(meshes), concatenate_instances(copies)
 
 

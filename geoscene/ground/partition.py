@@ -250,6 +250,16 @@ def values_at(column: NDArray[Any], row: NDArray[np.integer[Any]], base: object)
     return values
 
 
+def distinct(points: Float) -> tuple[Float, Int]:
+    """Points (k, 2) on the grid, sorted by x, then y, each once, and the number (n,) of each given one."""
+    grid = np.round(points / PRECISION).astype(np.int64)
+    low = grid.min(axis=0, initial=np.iinfo(np.int64).max)
+    grid -= low
+    height = int(grid[:, 1].max(initial=0)) + 1  # two sides of a tile in grid steps: far below 2**63
+    key, number = np.unique(grid[:, 0] * height + grid[:, 1], return_inverse=True)
+    return (np.stack(np.divmod(key, height), axis=1) + low) * PRECISION, number
+
+
 def _snap(values: Float) -> Float:
     snapped: Float = np.round(values / PRECISION) * PRECISION
     return snapped
@@ -364,8 +374,7 @@ class _Edges:
     def of(cls, cells: NDArray[np.object_]) -> _Edges:
         rings, owner = shapely.get_rings(cells, return_index=True)
         coords, ring = shapely.get_coordinates(rings, return_index=True)
-        points, number = np.unique(np.round(coords / PRECISION).astype(np.int64), axis=0, return_inverse=True)
-        number = number.reshape(-1)
+        points, number = distinct(coords)
         follows = ring[:-1] == ring[1:]
         a, b, cell = number[:-1][follows], number[1:][follows], owner[ring[:-1][follows]]
         there, back = a * len(points) + b, b * len(points) + a
@@ -373,7 +382,7 @@ class _Edges:
         place = np.minimum(np.searchsorted(there[order], back), len(order) - 1)
         twin = order[place]
         other = np.where(there[twin] == back, cell[twin], -1)
-        return cls(a, b, cell.astype(np.int64), other.astype(np.int64), points * PRECISION)
+        return cls(a, b, cell.astype(np.int64), other.astype(np.int64), points)
 
 
 def _without_slivers(

@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError
-from geoscene.ground.partition import PRECISION, Partition
+from geoscene.ground.partition import Partition, distinct
 
 Float = NDArray[np.float64]
 
@@ -44,10 +44,8 @@ def triangulate(partition: Partition) -> Triangles:
     found = shapely.constrained_delaunay_triangles(partition.polygon)
     triangles, cell = shapely.get_parts(found, return_index=True)
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
-    grid, number = np.unique(
-        np.round(corners.reshape(-1, 2) / PRECISION).astype(np.int64), axis=0, return_inverse=True
-    )
-    points, faces = grid * PRECISION, number.reshape(-1, 3)
+    points, number = distinct(corners.reshape(-1, 2))
+    faces = number.reshape(-1, 3)
     area = _signed_area(points, faces)
     faces = np.where((area < 0)[:, None], faces[:, ::-1], faces)
     covered = np.bincount(cell, np.abs(area), minlength=len(partition))

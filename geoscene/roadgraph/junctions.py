@@ -84,7 +84,8 @@ def build_junctions(roads: Carriageways, importance: NDArray[np.int64]) -> Junct
     disc = shapely.buffer(shapely.points(arms.node_xy), np.minimum(width, width[after]) / 2, quad_segs=_QUAD)
     rounded = np.where(np.abs(between - np.pi) > _ROUNDED, radius, 0.0)
     slanted = (count == 2) & (np.abs(between - np.pi) < _BENT) & (width[after] > width + _STEP)
-    taper = np.where(slanted, _tapers(roads, arms, after), disc)
+    taper = np.empty(len(stub), object)
+    taper[slanted] = _tapers(roads, arms, after)[slanted]
     corner = _corner(np.stack([stub, stub[after], disc, taper], axis=1)[keep], rounded[keep])
 
     walk_width = np.minimum(arms.walk[:, 0], arms.walk[after][:, 1])[keep]
@@ -230,9 +231,9 @@ def _tapers(roads: Carriageways, arms: _Arms, after: NDArray[np.int64]) -> NDArr
 
 
 def _corner(shapes: NDArray[np.object_], radius: Float) -> NDArray[np.object_]:
-    """Shapes (c, s) as one each, with inner corners rounded where the radius is not 0."""
-    count, each = shapes.shape
-    together = shapely.multipolygons(shapes.ravel(), indices=np.repeat(np.arange(count), each))
+    """Shapes (c, s), some None, as one each, with inner corners rounded where the radius is not 0."""
+    corner, nth = np.nonzero(~shapely.is_missing(shapes))
+    together = shapely.multipolygons(shapes[corner, nth], indices=corner)
     grown = shapely.buffer(together, radius, quad_segs=_QUAD, join_style="mitre", mitre_limit=2.0)
     closed: NDArray[np.object_] = shapely.buffer(grown, -radius, quad_segs=_QUAD)
     return closed

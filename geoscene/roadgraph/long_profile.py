@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import shapely
@@ -59,6 +60,10 @@ _FIRM, _RAMP, _LOOSE = 100.0, 1.0, 1e-6
 _RAMP_REACH = 150.0
 # A bridge or a tunnel is a string pulled taut rather than a sprung beam over more than this length, metres.
 _TAUT = 30.0
+_AROUND = 400.0
+"""Metres along roads from what does not lie still, within which heights are solved for at first."""
+_STILL, _MOVED = 1e-9, 1e-4
+"""What counts as lying still, in the units of cost and bounds, and as having moved, metres."""
 _HARD, _HARDEST = 1e8, 1e9
 """Of slopes; of heights, which come first where a short ramp cannot serve both."""
 _PORTAL, _WISHED = 15.0, 1e3
@@ -270,8 +275,36 @@ def _solve(
         (np.repeat([-1.0, 1.0], len(a)), (np.tile(row, 2), np.concatenate([a, b]))),
         shape=(len(a), len(terrain)),
     )
-    cost = (stiff + rise.T @ diags_array(taut / metres) @ rise + diags_array(weight)).tocsc()
-    return interior_point(cost, weight * terrain, bounds, terrain)
+    cost = (stiff + rise.T @ diags_array(taut / metres) @ rise + diags_array(weight)).tocsr()
+    pull = weight * terrain
+    # Where the terrain is best as it is, as on level ground far from any bridge, nothing has to be solved.
+    restless = np.abs(cost @ terrain - pull) > _STILL
+    short = np.flatnonzero(bounds.a @ terrain < bounds.b - _STILL)
+    restless[bounds.a[short].indices] = True
+    z, reach = terrain, _AROUND
+    while restless.any():
+        far = _distance(len(terrain), (a, b, metres), restless, reach)
+        free = far < reach
+        z = _solve_some(cost, pull, bounds, terrain, free)
+        rim = free & (far > reach / 2)
+        if free.all() or np.abs(z - terrain)[rim].max(initial=0.0) < _MOVED:
+            break
+        reach *= 2
+    return z
+
+
+def _solve_some(cost: Any, pull: Float, bounds: Bounds, terrain: Float, free: NDArray[np.bool_]) -> Float:
+    """Heights (v,) of least cost within the bounds, those that are not free on the terrain."""
+    held = np.where(free, 0.0, terrain)
+    columns = np.flatnonzero(free)
+    a = bounds.a[:, columns]
+    rows = np.flatnonzero(np.diff(a.indptr))
+    some = Bounds(a[rows], (bounds.b - bounds.a @ held)[rows], bounds.weight[rows])
+    z = held
+    z[columns] = interior_point(
+        cost[columns][:, columns].tocsc(), (pull - cost @ held)[columns], some, terrain[columns]
+    )
+    return z
 
 
 def _with_heights(graph: RoadGraph, stations: Stations, z: Float) -> RoadGraph:

@@ -1,0 +1,87 @@
+"""What a build along a route saves, and that a drive cannot tell it from the whole.
+
+    python benchmarks/along.py EXTRACT --route LAT,LON LAT,LON [...] [--reach 120] [--duration 20]
+                               [--workers 2] [--folder DIR] [--json]
+
+Builds the whole extract and the part that is seen from the route, drives the route through both with a
+16-beam scanner, and compares the tiles that both hold and the clouds, byte by byte. Costs as in
+benchmarks/scale.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from scale import build_command, run, show
+
+
+def along(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
+    """Cost of the whole build and of the one along a route, and whether what is there is the same."""
+    rows, clouds, tiles = [], [], []
+    extra = {"whole": [], "along": ["--along", *given.route, "--reach", str(given.reach)]}
+    for name, words in extra.items():
+        out, drive = folder / name, folder / f"{name}_drive"
+        cost = run(build_command(given.extract, out, "--workers", str(given.workers), *words))
+        command = [sys.executable, "-m", "lidar.cli", "drive", str(out), "--route", *given.route]
+        command += [
+            "--rig",
+            "vlp16",
+            "--duration",
+            str(given.duration),
+            "--format",
+            "pcd",
+            "--out",
+            str(drive),
+        ]
+        driven = run([*command, "--overwrite", "--quiet"])
+        clouds.append(_bytes(drive, "*.pcd"))
+        tiles.append(_bytes(out / "tiles", "*.npz"))
+        rows.append(
+            {"build": name, "tiles": len(tiles[-1]), "scene_mib": _mib(_bytes(out, "*")), **asdict(cost)}
+            | {f"drive_{key}": value for key, value in asdict(driven).items() if key != "largest_mib"}
+            | {"clouds": len(clouds[-1]), "cloud_mib": _mib(clouds[-1])}
+        )
+    whole, part = tiles
+    rows[1] |= {
+        "same_tiles": bool(part) and all(whole.get(name) == data for name, data in part.items()),
+        "same_clouds": bool(clouds[0]) and clouds[0] == clouds[1],
+    }
+    return rows
+
+
+def _bytes(folder: Path, pattern: str) -> dict[Path, bytes]:
+    """Files below a folder by their path in it."""
+    found = (path for path in sorted(folder.rglob(pattern)) if path.is_file())
+    return {path.relative_to(folder): path.read_bytes() for path in found}
+
+
+def _mib(files: dict[Path, bytes]) -> float:
+    return round(sum(map(len, files.values())) / 2**20, 1)
+
+
+def main() -> None:
+    """Measure the extract that the words name."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("extract", type=Path)
+    parser.add_argument("--route", nargs="+", required=True)
+    parser.add_argument("--reach", type=float, default=120.0)
+    parser.add_argument("--duration", type=float, default=20.0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--folder", type=Path)
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = given.folder or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        show(along(given, folder), as_json=given.json)
+
+
+if __name__ == "__main__":
+    main()
