@@ -281,15 +281,15 @@ def _solve(
     restless = np.abs(cost @ terrain - pull) > _STILL
     short = np.flatnonzero(bounds.a @ terrain < bounds.b - _STILL)
     restless[bounds.a[short].indices] = True
-    z, reach = terrain, _AROUND
+    z, radius = terrain, _AROUND
     while restless.any():
-        far = _distance(len(terrain), (a, b, metres), restless, reach)
-        free = far < reach
+        far = _distance(len(terrain), (a, b, metres), restless, radius)
+        free = far < radius
         z = _solve_some(cost, pull, bounds, terrain, free)
-        rim = free & (far > reach / 2)
+        rim = free & (far > radius / 2)
         if free.all() or np.abs(z - terrain)[rim].max(initial=0.0) < _MOVED:
             break
-        reach *= 2
+        radius *= 2
     return z
 
 
