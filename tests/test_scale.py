@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 import shapely
 
-from geoscene.build import BuildOptions, build
+from geoscene.build import BuildOptions, _tiles_along, build
 from geoscene.classes import Class
 from geoscene.ground import Layers, partition_tile, plan_ground
+from geoscene.plan import make_plan
+from geoscene.progress import silent
 from geoscene.sources import Way, read_osm
 from lidar.drive import DriveOptions, drive
 
@@ -140,6 +142,26 @@ def test_a_long_wall_is_seen_from_its_end(make_osm, town, tmp_path):
     x, y = walled.frame.from_geographic(*lonlat[2:].mean(axis=0))
     assert home == (x // 100, y // 100)
     assert (walled.tile(*home).mesh.klass == Class.WALL).any()
+
+
+def test_a_bridge_is_seen_from_its_end(town, tmp_path, monkeypatch):
+    monkeypatch.setattr("geoscene.build._BESIDE", 0.0)
+    monkeypatch.setattr("geoscene.build._CROWN", 0.0)
+    words = {"dem": (), "dem_gaps": "error", "tile_size": 50.0, "only": ("roads",), "progress": silent}
+    plan, _ = make_plan(read_osm(town), "local", **words)
+    found = 0
+    for home, rows in plan.rows["structures"].items():
+        square = shapely.box(*np.multiply(home, 50.0), *np.add(home, 1) * 50.0)
+        corners = shapely.points(shapely.get_coordinates(plan.structures.polygon[rows]))
+        away = shapely.distance(corners, square)
+        if away.max() > 2.0:
+            end = corners[away.argmax()]
+            there = "lon,lat\n{},{}\n".format(*plan.frame.to_geographic(end.x, end.y))
+            (tmp_path / "end.csv").write_text(there)
+            options = BuildOptions(tile_size=50.0, along=(str(tmp_path / "end.csv"),), reach=1.0)
+            assert home in _tiles_along(plan, options)
+            found += 1
+    assert found  # a bridge that sticks out of its tile
 
 
 def test_a_drive_is_the_same_bytes_on_the_tiles_along_its_route(make_osm, town, scene, tmp_path):
