@@ -227,8 +227,8 @@ def main() -> None:
         print(
             f"whole scene loaded in {quickest['load_s']:.2f} s (peer {PEER_LOAD} s),"
             f" process {quickest['peak_mib']:.0f} MiB (peer {PEER_MEMORY:.0f} MiB)\n"
-            "rays driven s  pulses   wall s  k pulses/s  x peer  without imports  x peer  per core s  1 worker"
-            "  peak MiB  same bytes"
+            "rays driven s  pulses   wall s  k pulses/s  x peer  without imports  x peer  per core s"
+            "  1 worker  peak MiB  same bytes"
         )
         rows = []
         for rays in options.rays:
@@ -239,7 +239,8 @@ def main() -> None:
             print(
                 f"{rays:4} {seconds:8.1f} {row['pulses']:8} {row['wall_s']:7.2f} {row['rate'] / 1e3:11.0f}"
                 f" {row['to_peer']:7.1f} {row['rate_loop'] / 1e3:16.0f} {row['to_peer_loop']:7.1f}"
-                f" {row['rate_cpu'] / 1e3:11.0f} {row['rate_one_worker'] / 1e3:9.0f} {row['peak_mib']:9.0f}  {row['same_bytes']}",
+                f" {row['rate_cpu'] / 1e3:11.0f} {row['rate_one_worker'] / 1e3:9.0f}"
+                f" {row['peak_mib']:9.0f}  {row['same_bytes']}",
                 flush=True,
             )
     if options.json:

@@ -10,7 +10,7 @@ from numba import cfunc, njit, types
 from numpy.typing import NDArray
 
 from lidar.raycast.columns import Rays, Target
-from lidar.raycast.kernels import first_bad, gather, load, meet, nudge, numbered, placed
+from lidar.raycast.kernels import first_bad, gather, meet, nudge, numbered, placed
 from lidar.raycast.library import ARGUMENT_FILTER, INVALID
 from lidar.raycast.memory import aligned, inlined, intersect1, pointer
 
@@ -132,16 +132,15 @@ def echoes(
     what = np.zeros(2 * room, np.int64)
     found, cosine = np.zeros(room), np.zeros(room)
     for at in range(lo, hi):
-        if not gather(target, rays, at, 1, 1, ids, work):
+        if not gather(target, rays, at, 1, 1, ids, work, f):
             return first_bad(1, ids, work)
-        load(1, rays.near, work, f)
         u[9] = rays.mask
         count = _resolve(target, _pass(target, f, u, kept, arguments), names, work, what, found, cosine)
         if count == 0 or cosine[0] < 0.0:
             nudge(1, 0, work, f, work[7])
             again = _resolve(target, _pass(target, f, u, kept, arguments), names, work, what, found, cosine)
             if again < count:  # the second look lost a face: the first one counts
-                load(1, rays.near, work, f)
+                gather(target, rays, at, 1, 1, ids, work, f)
                 _resolve(target, _pass(target, f, u, kept, arguments), names, work, what, found, cosine)
             count = max(count, again)
         i = ids[0]

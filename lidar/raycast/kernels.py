@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from lidar.raycast.columns import Rays, Target
 from lidar.raycast.memory import (
     aligned,
+    called,
     float32_at,
     float64_at,
     inlined,
@@ -67,10 +68,11 @@ def _posed(pose: Any, p: int, x: float, y: float, z: float) -> Any:
 
 
 @inlined
-def gather(target: Target, rays: Rays, at: int, m: int, W: int, ids: Any, work: Any) -> bool:
+def gather(target: Target, rays: Rays, at: int, m: int, W: int, ids: Any, work: Any, f: Any) -> bool:
     """Load rays ``at`` to ``at + m`` of the order, the last again in lanes left over; whether all will do.
 
     work : origin (3), direction (3), one over its length, far, time
+    f    : Embree's packet, which gets directions of length 1 and far rounded up
     """
     ordered, posed, timed, reach = rays.order.size, rays.pose.size, rays.time.size, rays.far.size > 1
     shifted, step = rays.offsets.shape[0] > 0, 1 if rays.offsets.shape[0] > 1 else 0
@@ -78,6 +80,7 @@ def gather(target: Target, rays: Rays, at: int, m: int, W: int, ids: Any, work: 
     order, pose_of, time = rays.order.ctypes.data, rays.pose.ctypes.data, rays.time.ctypes.data
     pose = (rays.position.ctypes.data, rays.matrix.ctypes.data)
     cx, cy, cz = target.origin[0], target.origin[1], target.origin[2]
+    bad, long = np.int64(0), np.int64(0)
     for k in range(W):
         i = at + min(k, m - 1)
         if ordered:
@@ -94,26 +97,45 @@ def gather(target: Target, rays: Rays, at: int, m: int, W: int, ids: Any, work: 
                 a, b, c = a + ox, b + oy, c + oz
         else:
             a, b, c = _vector(offsets, step * i)
-        work[k], work[W + k], work[2 * W + k] = a - cx, b - cy, c - cz
-        work[3 * W + k], work[4 * W + k], work[5 * W + k] = x, y, z
-        work[7 * W + k] = float64_at(far, i if reach else 0)
-        if timed:
-            work[8 * W + k] = float32_at(time, i)
-    usable, unit = True, True
-    for k in range(W):
-        x, y, z = work[3 * W + k], work[4 * W + k], work[5 * W + k]
+        a, b, c = a - cx, b - cy, c - cz
         squared = x * x + y * y + z * z
-        size = abs(work[k]) + abs(work[W + k]) + abs(work[2 * W + k])
-        usable &= (squared > 0.0) & (squared < _HUGE) & (size < _HUGE)
-        unit &= abs(squared - 1.0) < _UNIT
-        work[6 * W + k] = squared
-    if unit:
+        bad |= np.int64(not ((squared > 0.0) & (squared < _HUGE) & (abs(a) + abs(b) + abs(c) < _HUGE)))
+        long |= np.int64(not abs(squared - 1.0) < _UNIT)
+        work[k], work[W + k], work[2 * W + k] = a, b, c
+        work[3 * W + k], work[4 * W + k], work[5 * W + k] = x, y, z
+        f[k], f[W + k], f[2 * W + k] = a, b, c
+        f[4 * W + k], f[5 * W + k], f[6 * W + k] = x, y, z
+    if reach:
         for k in range(W):
-            work[6 * W + k] = 1.0
+            work[7 * W + k] = float64_at(far, ids[k])
     else:
+        limit = float64_at(far, 0)
         for k in range(W):
-            work[6 * W + k] = 1.0 / np.sqrt(work[6 * W + k])
-    return usable
+            work[7 * W + k] = limit
+    if timed:
+        for k in range(W):
+            work[8 * W + k] = float32_at(time, ids[k])
+    for k in range(W):
+        work[6 * W + k] = 1.0
+        f[3 * W + k] = rays.near
+        f[7 * W + k] = work[8 * W + k]
+        f[8 * W + k] = work[7 * W + k] * _UP
+    if long and not bad:
+        for k in range(W):
+            _shorten(W, k, work, f)
+    return bad == 0
+
+
+@inlined
+def _shorten(W: int, k: int, work: Any, f: Any) -> None:
+    """Give lane k of Embree's packet a direction of length 1."""
+    x, y, z = work[3 * W + k], work[4 * W + k], work[5 * W + k]
+    length = np.sqrt(x * x + y * y + z * z)
+    inverse = 1.0 / length
+    work[6 * W + k] = inverse
+    f[4 * W + k], f[5 * W + k], f[6 * W + k] = x * inverse, y * inverse, z * inverse
+    f[3 * W + k] = f[3 * W + k] * length
+    f[8 * W + k] = work[7 * W + k] * length * _UP
 
 
 @inlined
@@ -126,31 +148,6 @@ def first_bad(W: int, ids: Any, work: Any) -> int:
         if not (0.0 < squared < _HUGE and size < _HUGE):
             return int(ids[k])
     return -1
-
-
-@inlined
-def _copy(W: int, f: Any, to: int, work: Any, row: int) -> None:
-    for k in range(W):
-        f[to * W + k] = work[row * W + k]
-
-
-@inlined
-def _product(W: int, f: Any, to: int, work: Any, row: int) -> None:
-    for k in range(W):
-        f[to * W + k] = work[row * W + k] * work[6 * W + k]
-
-
-@inlined
-def load(W: int, near: float, work: Any, f: Any) -> None:
-    """Write the lanes of ``work`` into Embree's packet, with directions of length 1 and far rounded up."""
-    for row in range(3):
-        _copy(W, f, row, work, row)
-        _product(W, f, 4 + row, work, 3 + row)
-    for k in range(W):
-        f[3 * W + k] = near / work[6 * W + k]
-    _copy(W, f, 7, work, 8)
-    for k in range(W):
-        f[8 * W + k] = work[7 * W + k] / work[6 * W + k] * _UP
 
 
 @inlined
@@ -278,7 +275,7 @@ def plane_of(target: Target, row: int, prim: int, instance: int, time: float) ->
     return mx, my, mz, offset
 
 
-@inlined
+@called
 def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> Any:
     """Least and greatest ray parameter of a face's corners, measured along the ray."""
     ox, oy, oz, dx, dy, dz = ray
@@ -356,9 +353,8 @@ def cast(
         u[10 * W + k] = k
     for at in range(lo, hi, W):
         m = min(W, hi - at)
-        if not gather(target, rays, at, m, W, ids, work):
+        if not gather(target, rays, at, m, W, ids, work, f):
             return first_bad(W, ids, work)
-        load(W, rays.near, work, f)
         for k in range(W):
             valid[k] = -1 if k < m else 0
             u[18 * W + k] = _INVALID
@@ -422,9 +418,8 @@ def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_
         u[10 * W + k] = k
     for at in range(lo, hi, W):
         m = min(W, hi - at)
-        if not gather(target, rays, at, m, W, ids, work):
+        if not gather(target, rays, at, m, W, ids, work, f):
             return first_bad(W, ids, work)
-        load(W, rays.near, work, f)
         for k in range(W):
             valid[k] = -1 if k < m else 0
         together = _alike(W, work)

@@ -71,3 +71,8 @@ def inlined(function: Callable[..., Any]) -> Any:
     The caller holds the arrays; counting references for every ray takes ten times as long as the rest.
     """
     return njit(nogil=True, error_model="numpy", forceinline=True, **_UNCOUNTED)(function)
+
+
+def called(function: Callable[..., Any]) -> Any:
+    """The function compiled for callers who seldom need it; it too leaves references uncounted."""
+    return njit(nogil=True, error_model="numpy", **_UNCOUNTED)(function)
