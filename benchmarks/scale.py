@@ -1,14 +1,14 @@
 """What builds cost as cities grow, and how fast buildings are made.
 
     python benchmarks/scale.py sizes [1000 10000 100000] [--workers 2] [--lod 2] [--folder DIR] [--json]
-    python benchmarks/scale.py stages EXTRACT [EXTRACT ...] [--json]
+    python benchmarks/scale.py stages EXTRACT [EXTRACT ...] [--dem FILE [FILE ...]] [--json]
 
 ``sizes`` makes cities (benchmarks/make_osm.py) and builds them with the program, one after another.
 ``stages`` times the stages of buildings in one process, tile by tile as the build does it, without parsing
-and without the ground: on level ground, and on a made-up terrain of hills that is asked for every base.
+and without the ground; with elevation files also on their terrain, which is asked for every building's base.
 
 CPU time is that of all processes. ``peak_mib`` is the greatest sum of proportional set sizes of the process
-and its children (what forked workers share counts once), looked at five times a second; ``largest_mib`` is
+and its children (what forked workers share counts once), looked at twice a second; ``largest_mib`` is
 the greatest resident set of any one of them, shared pages included. Linux only.
 """
 
@@ -26,17 +26,15 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import shapely
 from make_osm import make_city, write_city
-from numpy.typing import NDArray
 
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.frames import Frame
 from geoscene.plan import take_buildings
 from geoscene.scene import open_scene
 from geoscene.sources import read_osm
-from geoscene.terrain import base_heights
-
-Float = NDArray[np.float64]
+from geoscene.terrain import base_heights, flat_terrain, open_terrain
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ def run(command: list[str], *, errors: IO[bytes] | None = None) -> Cost:
         if pid:
             break
         peak = max(peak, sum(map(_proportional_kib, _family(process.pid))))
-        time.sleep(0.2)
+        time.sleep(0.5)
     wall = time.perf_counter() - began
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
@@ -131,17 +129,24 @@ def stages(given: argparse.Namespace) -> list[dict[str, Any]]:
     for path in given.extract:
         began = time.process_time()
         osm = read_osm(path)
-        parsed = time.process_time()
+        parse = time.process_time() - began
         west, south, east, north = osm.bounds
-        table, _ = read_buildings(osm, Frame.at((west + east) / 2, (south + north) / 2))
+        frame = Frame.at((west + east) / 2, (south + north) / 2)
+        read_buildings(osm, frame)  # what is imported on the first call is not counted
+        parsed = time.process_time()
+        table, _ = read_buildings(osm, frame)
         read = time.process_time()
-        count = table.count
-        row: dict[str, Any] = {"extract": path.name, "buildings": count, "parse_s": round(parsed - began, 2)}
+        count, footprints = table.count, table.footprint[: table.count]
+        row: dict[str, Any] = {"extract": path.name, "buildings": count, "parse_s": round(parse, 2)}
         row["read_s"] = round(read - parsed, 2)
-        for ground, height in (("level", _level), ("hills", _hills)):
+        terrains = {"level": flat_terrain(frame)}
+        if given.dem:
+            bounds = tuple(shapely.total_bounds(footprints).tolist())
+            terrains["dem"] = open_terrain(given.dem, frame, bounds=bounds, outside="nearest")
+        for ground, terrain in terrains.items():
             for lod in (1, 2):
                 start = time.process_time()
-                base = base_heights(table.footprint[:count], height)
+                base = base_heights(footprints, terrain.height)
                 for chosen, parts in _tiles(table):
                     build_solids(take_buildings(table, chosen, parts), base=base[chosen], lod=lod)
                 spent = time.process_time() - start
@@ -150,25 +155,8 @@ def stages(given: argparse.Namespace) -> list[dict[str, Any]]:
     return rows
 
 
-def _level(x: Float, y: Float) -> Float:
-    return 0.0 * (x + y)
-
-
-def _hills(x: Float, y: Float) -> Float:
-    """Bilinear heights of a grid of 30 m, as an elevation model gives them: hills of 40 m, 2 km apart."""
-    axis = np.arange(-400, 401) * 30.0
-    grid = 20.0 * (np.sin(axis / 320.0)[:, None] + np.cos(axis / 320.0)[None, :])
-    u, v = (np.clip(c / 30.0 + 400.0, 0.0, 799.0) for c in (x, y))
-    i, j = u.astype(int), v.astype(int)
-    s, t = u - i, v - j
-    low = grid[i, j] * (1 - s) + grid[i + 1, j] * s
-    return low * (1 - t) + (grid[i, j + 1] * (1 - s) + grid[i + 1, j + 1] * s) * t
-
-
 def _tiles(table: Any) -> list[tuple[Any, Any]]:
     """Rows of buildings and of their parts by tiles of 250 m."""
-    import shapely  # noqa: PLC0415 - used here alone
-
     boxes = shapely.bounds(table.footprint[: table.count])
     home = np.floor((boxes[:, :2] + boxes[:, 2:]) / 500.0).astype(int)
     _, tile = np.unique(home, axis=0, return_inverse=True)
@@ -207,6 +195,7 @@ def main() -> None:
     one.add_argument("--lod", type=int, default=2)
     two = kinds.add_parser("stages")
     two.add_argument("extract", type=Path, nargs="+")
+    two.add_argument("--dem", nargs="+", default=[])
     for kind in (one, two):
         kind.add_argument("--workers", type=int, default=2)
         kind.add_argument("--folder", type=Path)
