@@ -62,12 +62,14 @@ MULTIPATH_TAU_S = 60.0
 """Correlation time of m, which changes as the surroundings pass by."""
 SETTLE_S = 3.0
 """Seconds that a better state must have been possible before the receiver reports it."""
-_LADDER = {  # state by mode, with the satellites it needs, best first
-    "ideal": (("ideal", 0),),
-    "single": (("single", 4),),
-    "sbas": (("sbas", 5), ("single", 4)),
-    "rtk": (("fixed", 6), ("float", 5), ("single", 4)),
+_LADDER = {  # states by mode, best first, with the satellites of one system and the dilution they need
+    "ideal": (("ideal", 0, np.inf),),
+    "single": (("single", 4, 25.0),),
+    "sbas": (("sbas", 5, 25.0), ("single", 4, 25.0)),
+    "rtk": (("fixed", 6, 4.0), ("float", 5, 8.0), ("single", 4, 25.0)),
 }
+"""Dilution in position beyond which there is no such fix: 25 is what u-blox receivers come set to; those of
+carrier phase are assumed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,8 @@ class Fixes:
     error     : (n, 3) metres east, north, up: reported less true
     true_lonlath : (n, 3) of the antenna
     true_velocity : (n, 3) m/s true east, north, up, of the antenna
-    used      : (n, 24) bool, satellites used
+    used      : (n, k) bool, satellites used
+    names     : (k,) of the satellites, such as G01
     """
 
     time_ns: NDArray[np.int64]
@@ -100,6 +103,7 @@ class Fixes:
     true_lonlath: Float
     true_velocity: Float
     used: NDArray[np.bool_]
+    names: NDArray[np.str_]
 
     def __len__(self) -> int:
         """Number of epochs."""
@@ -159,9 +163,9 @@ def observe_gnss(
     time_ns = epochs(spec, trajectory.duration_ns)
     position, velocity = antenna_motion(trajectory, frame, spec, time_ns)
     if sky is None:
-        sky = open_sky(frame, position, start, time_ns, mask_deg=spec.mask_deg)
-    dop = dilution(sky.azimuth, sky.elevation, sky.visible)
-    state = _states(spec, sky)
+        sky = open_sky(frame, position, start, time_ns, mask_deg=spec.mask_deg, systems=spec.constellations)
+    dop = dilution(sky.azimuth, sky.elevation, sky.visible, sky.names)
+    state = _states(spec, sky, dop[:, 2])
     error = _errors(spec, sky, dop, state, seed)
     sizes = np.array([STATES[name].speed for name in NAMES])[state]
     shake = generator(seed, spec.name, "velocity").standard_normal((len(time_ns), 3))
@@ -182,20 +186,21 @@ def observe_gnss(
         true_lonlath=true,
         true_velocity=velocity,
         used=sky.visible,
+        names=sky.names,
     )
 
 
-def _states(spec: GnssSpec, sky: Sky) -> NDArray[np.int64]:
+def _states(spec: GnssSpec, sky: Sky, pdop: Float) -> NDArray[np.int64]:
     """State (n,) at each epoch: worse at once, better after it has been possible for `SETTLE_S`."""
     ladder = _LADDER[spec.mode]
     rank = np.full(len(sky.count), len(ladder))
     for k in reversed(range(len(ladder))):
-        rank[sky.count >= ladder[k][1]] = k
+        rank[(sky.spare >= ladder[k][1]) & (pdop <= ladder[k][2])] = k
     # the best rank that held throughout the time to settle; before the start it is taken to have been as then
     wait = max(round(SETTLE_S * spec.rate_hz), 1)
     held = np.concatenate([np.full(wait - 1, rank[0]), rank]) if len(rank) else rank
     worst = np.lib.stride_tricks.sliding_window_view(held, wait).max(axis=1) if len(rank) else rank
-    names = [*(name for name, _ in ladder), "none"]
+    names = [*(name for name, _, _ in ladder), "none"]
     rows: NDArray[np.int64] = np.array([NAMES.index(name) for name in names])[worst]
     return rows
 
@@ -210,7 +215,7 @@ def _errors(spec: GnssSpec, sky: Sky, dop: Float, state: NDArray[np.int64], seed
         return np.column_stack([pairs[:, 0], pairs[:, 0], pairs[:, 1]])
 
     # what stands in the way also spoils the geometry: errors grow as the dilution does
-    whole = dilution(sky.azimuth, sky.elevation, sky.above)
+    whole = dilution(sky.azimuth, sky.elevation, sky.above, sky.names)
     with np.errstate(invalid="ignore"):
         worse = np.where(np.isfinite(dop[:, :2]), dop[:, :2] / whole[:, :2], 1.0)
     worse = np.where(np.isfinite(worse), worse, 1.0)[:, [0, 0, 1]]

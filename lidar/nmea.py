@@ -1,4 +1,4 @@
-"""NMEA 0183 sentences of fixes: GGA, RMC, VTG and GSA."""
+"""NMEA 0183 sentences of fixes: GGA, RMC, VTG and GSA, as version 4.10 has them for several systems."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from datetime import datetime, timedelta
 
-import numpy as np
-
 from lidar.gnss import Fixes
 
 KNOT = 1852.0 / 3600.0
 """Metres per second in a knot."""
+_SYSTEMS = {"G": ("GP", 1, 0), "R": ("GL", 2, 64), "E": ("GA", 3, 0), "C": ("GB", 4, 0)}
+"""Talker, system number and what is added to a satellite's own number, by the letter of the system."""
 _MODES = {0: "N", 1: "A", 2: "D", 4: "R", 5: "F"}  # NMEA's mode by fix quality
 
 
@@ -50,8 +50,11 @@ def _number(value: float, decimals: int) -> str:
     return f"{value:.{decimals}f}" if math.isfinite(value) else ""
 
 
-def nmea(fixes: Fixes, start: datetime, *, geoid: float | None = None, talker: str = "GP") -> list[str]:
-    """Four sentences for each fix: GGA, RMC, VTG and GSA, at most 82 characters each.
+def nmea(fixes: Fixes, start: datetime, *, geoid: float | None = None) -> list[str]:
+    """Sentences for each fix: GGA, RMC, VTG, and a GSA for each system; at most 82 characters each.
+
+    The talker is GN for a receiver of several systems, else that of the one. GSA names at most twelve
+    satellites of a system, those of GLONASS from 65 on, and ends with the number of the system.
 
     start : UTC of the drive's start; sentences carry UTC
     geoid : height of the geoid above the ellipsoid, metres. With it, heights of fixes are taken as
@@ -63,11 +66,11 @@ def nmea(fixes: Fixes, start: datetime, *, geoid: float | None = None, talker: s
     lines: list[str] = []
     for k in range(len(fixes)):
         when = start + timedelta(microseconds=round(int(fixes.time_ns[k]) / 1000))
-        lines += _epoch(fixes, k, when, geoid, talker)
+        lines += _epoch(fixes, k, when, geoid)
     return lines
 
 
-def _epoch(fixes: Fixes, k: int, when: datetime, geoid: float | None, talker: str) -> Sequence[str]:
+def _epoch(fixes: Fixes, k: int, when: datetime, geoid: float | None) -> Sequence[str]:
     lon, lat, h = fixes.lonlath[k].tolist()
     quality, fixed = int(fixes.quality[k]), math.isfinite(lon)
     hundredths = round(when.microsecond / 1e4)
@@ -82,9 +85,16 @@ def _epoch(fixes: Fixes, k: int, when: datetime, geoid: float | None, talker: st
     course = _number(math.degrees(fixes.course[k]) % 360.0, 1) if fixed else ""
     course = "0.0" if course == "360.0" else course
     mode = _MODES[quality]
-    used = (np.flatnonzero(fixes.used[k]) + 1).tolist()[:12] if fixed else []
-    prn = ",".join(f"{p:02d}" for p in used) + "," * (12 - max(len(used), 1))
+    used = fixes.names[fixes.used[k]].tolist() if fixed else []
+    letters = list(dict.fromkeys(name[0] for name in fixes.names.tolist()))
+    talker = "GN" if len(letters) > 1 else _SYSTEMS[letters[0]][0]
     dimension = 3 if fixed else 1
+    active = []
+    for letter in letters:
+        _, system, added = _SYSTEMS[letter]
+        own = [int(name[1:]) + added for name in used if name[0] == letter][:12]
+        prn = ",".join(f"{p:02d}" for p in own) + "," * (12 - max(len(own), 1))
+        active.append(sentence(f"{talker}GSA,A,{dimension},{prn},{pdop},{hdop},{vdop},{system}"))
     return [
         sentence(
             f"{talker}GGA,{clock},{place},{quality},{int(fixes.satellites[k]):02d},{hdop},"
@@ -97,7 +107,7 @@ def _epoch(fixes: Fixes, k: int, when: datetime, geoid: float | None, talker: st
         sentence(
             f"{talker}VTG,{course},T,,M,{_number(speed / KNOT, 3)},N,{_number(speed * 3.6, 3)},K,{mode}"
         ),
-        sentence(f"{talker}GSA,A,{dimension},{prn},{pdop},{hdop},{vdop}"),
+        *active,
     ]
 
 

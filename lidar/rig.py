@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from lidar.constellations import SYSTEMS
 from lidar.errors import RigError
 from lidar.sensors.table import Table, read_table
 
@@ -111,6 +112,7 @@ class GnssSpec:
     time_offset_ns : first fix after the drive's start
     mode           : single, sbas, rtk or ideal
     mask_deg       : elevation below which satellites are not used
+    constellations : systems that it receives, of gps, glonass, galileo, beidou
     """
 
     name: str
@@ -119,6 +121,7 @@ class GnssSpec:
     time_offset_ns: int = 0
     mode: str = "single"
     mask_deg: float = 10.0
+    constellations: tuple[str, ...] = SYSTEMS
 
 
 GNSS_MODES = ("single", "sbas", "rtk", "ideal")
@@ -242,6 +245,7 @@ def _gnss(table: Table) -> GnssSpec:
         time_offset_ns=table.integer("time_offset_ns", 0, low=0),
         mode=table.text("mode", "single", among=GNSS_MODES),
         mask_deg=table.number("mask_deg", 10.0, low=0.0, high=90.0),
+        constellations=table.texts("constellations", SYSTEMS, among=SYSTEMS),
     )
 
 

@@ -177,7 +177,8 @@ def _write_fixes(
     def world_at(region: tuple[float, float, float, float]) -> World:
         return World.load(scene, region=region)
 
-    sky = sky_view(scene.frame, antenna, start, times, world_at, mask_deg=spec.mask_deg)
+    sky = sky_view(scene.frame, antenna, start, times, world_at, mask_deg=spec.mask_deg,
+                   systems=spec.constellations)  # fmt: skip
     fixes = observe_gnss(trajectory, scene.frame, spec, seed=seed, start=start, sky=sky)
     stamped: dict[str, Any] = {"timestamp": iso_times(start, fixes.time_ns), **gnss_columns(fixes)}
     write_columns(out / f"{spec.name}.csv", stamped)

@@ -1,22 +1,17 @@
-"""The satellites overhead, and which of them a receiver sees between the buildings.
-
-The constellation is the baseline of 24 slots in 6 planes of the GPS Standard Positioning Service Performance
-Standard: circular orbits of 55 degrees inclination and half a sidereal day, held at their nominal places. It
-is a model sky, not an almanac: as many satellites, as high and as well spread as GPS gives, the same at the
-same sidereal time.
-"""
+"""The satellites overhead, and which of them a receiver sees between the buildings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.frames import Frame
+from lidar.constellations import SYSTEMS, satellite_names, satellites
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -24,26 +19,6 @@ Bool = NDArray[np.bool_]
 A, F = 6378137.0, 1 / 298.257223563
 """WGS 84: semi-major axis in metres, flattening."""
 E2 = F * (2 - F)
-_ORBIT = 26559.7e3  # metres, semi-major axis of the slots
-_MU = 3.986005e14  # m^3/s^2, as GPS interfaces use it
-_TILT = np.radians(55.0)
-_EPOCH = datetime(1993, 7, 1, tzinfo=UTC)
-_NODES_DEG = (
-    272.847,
-    332.847,
-    32.847,
-    92.847,
-    152.847,
-    212.847,
-)  # planes A to F, right ascension at the epoch
-_SLOTS_DEG = (  # argument of latitude at the epoch, four slots a plane
-    (268.126, 161.786, 11.676, 41.806),
-    (80.956, 173.336, 309.976, 204.376),
-    (111.876, 11.796, 339.666, 241.556),
-    (135.226, 265.446, 35.156, 167.356),
-    (197.046, 302.596, 66.066, 333.686),
-    (238.886, 345.226, 105.206, 135.346),
-)
 
 _RINGS = 6  # rings of the dome that is looked at for how much of it is blocked
 _SPOKES = 16
@@ -65,10 +40,11 @@ class _World(Protocol):
 class Sky:
     """What a receiver has overhead at each of n epochs.
 
-    azimuth, elevation : (n, 24) radians, azimuth clockwise from true north
-    visible : (n, 24) bool, above the mask and not blocked
-    above   : (n, 24) bool, above the mask
+    azimuth, elevation : (n, k) radians, azimuth clockwise from true north
+    visible : (n, k) bool, above the mask and not blocked
+    above   : (n, k) bool, above the mask
     blocked : (n,) share of the dome above the mask that something stands in front of, 0 in the open
+    names   : (k,) of the satellites; the first letter is their system's
     """
 
     azimuth: Float
@@ -76,12 +52,26 @@ class Sky:
     visible: Bool
     above: Bool
     blocked: Float
+    names: NDArray[np.str_]
 
     @property
     def count(self) -> NDArray[np.int64]:
         """Satellites in view (n,)."""
         count: NDArray[np.int64] = self.visible.sum(axis=1)
         return count
+
+    @property
+    def spare(self) -> NDArray[np.int64]:
+        """Satellites in view (n,) less one for each system after the first: for the offset of its clock."""
+        seen = [self.visible[:, rows].any(axis=1) for rows in systems_of(self.names)]
+        spare: NDArray[np.int64] = self.count - np.maximum(np.sum(seen, axis=0) - 1, 0)
+        return spare
+
+
+def systems_of(names: NDArray[np.str_]) -> list[NDArray[np.int64]]:
+    """The satellites of each system, in the order in which they come."""
+    letters = [str(name)[:1] for name in names]
+    return [np.flatnonzero(np.array(letters) == letter) for letter in dict.fromkeys(letters)]
 
 
 def ecef(lon_deg: ArrayLike, lat_deg: ArrayLike, h: ArrayLike) -> Float:
@@ -109,34 +99,17 @@ def enu_axes(lon_deg: ArrayLike, lat_deg: ArrayLike) -> Float:
     return out
 
 
-def sidereal_angle(seconds: ArrayLike) -> Float:
-    """Greenwich mean sidereal time in radians (IAU 1982, linear part), seconds after 2000-01-01 12:00 UTC."""
-    turns = 0.7790572732640 + 1.00273781191135448 * np.asarray(seconds, float) / 86400.0
-    angle: Float = 2 * np.pi * np.mod(turns, 1.0)
-    return angle
-
-
-def satellites(start: datetime, time_ns: NDArray[np.integer]) -> Float:
-    """Earth-fixed positions (n, 24, 3) in metres of the satellites at nanoseconds after a UTC start."""
-    t = np.asarray(time_ns, float) * 1e-9
-    since_epoch = (start - _EPOCH).total_seconds() + t
-    since_2000 = (start - datetime(2000, 1, 1, 12, tzinfo=UTC)).total_seconds() + t
-    motion = np.sqrt(_MU / _ORBIT**3)
-    u = np.radians(np.ravel(_SLOTS_DEG)) + np.mod(motion * since_epoch, 2 * np.pi)[:, None]
-    node = np.radians(np.repeat(_NODES_DEG, 4)) - sidereal_angle(since_2000)[:, None]
-    x, y = np.cos(u), np.sin(u) * np.cos(_TILT)
-    out: Float = _ORBIT * np.stack(
-        [x * np.cos(node) - y * np.sin(node), x * np.sin(node) + y * np.cos(node), np.sin(u) * np.sin(_TILT)],
-        axis=-1,
-    )
-    return out
-
-
 def look_up(
-    lon_deg: Float, lat_deg: Float, h: Float, start: datetime, time_ns: NDArray[np.integer]
+    lon_deg: Float,
+    lat_deg: Float,
+    h: Float,
+    start: datetime,
+    time_ns: NDArray[np.integer],
+    *,
+    systems: Sequence[str] = SYSTEMS,
 ) -> tuple[Float, Float]:
-    """True azimuth and elevation (n, 24) in radians of the satellites from n places, one a time."""
-    d = satellites(start, time_ns) - ecef(lon_deg, lat_deg, h)[:, None, :]
+    """True azimuth and elevation (n, k) in radians of the satellites from n places, one a time."""
+    d = satellites(start, time_ns, systems) - ecef(lon_deg, lat_deg, h)[:, None, :]
     e, n, u = np.moveaxis(np.einsum("nij,nkj->nki", enu_axes(lon_deg, lat_deg), d), -1, 0)
     return np.mod(np.arctan2(e, n), 2 * np.pi), np.arctan2(u, np.hypot(e, n))
 
@@ -151,13 +124,22 @@ def grid_directions(azimuth: Float, elevation: Float, convergence: Float) -> Flo
 
 
 def open_sky(
-    frame: Frame, antenna: Float, start: datetime, time_ns: NDArray[np.integer], *, mask_deg: float
+    frame: Frame,
+    antenna: Float,
+    start: datetime,
+    time_ns: NDArray[np.integer],
+    *,
+    mask_deg: float,
+    systems: Sequence[str] = SYSTEMS,
 ) -> Sky:
-    """The sky over antenna positions (n, 3) in scene metres, with nothing in the way."""
+    """The sky over antenna positions (n, 3) in scene metres, with nothing in the way.
+
+    systems : of `SYSTEMS`; raises InputError for others
+    """
     lon, lat = frame.to_geographic(antenna[:, 0], antenna[:, 1])
-    azimuth, elevation = look_up(lon, lat, antenna[:, 2], start, time_ns)
+    azimuth, elevation = look_up(lon, lat, antenna[:, 2], start, time_ns, systems=systems)
     above = elevation > np.radians(mask_deg)
-    return Sky(azimuth, elevation, above, above, np.zeros(len(antenna)))
+    return Sky(azimuth, elevation, above, above, np.zeros(len(antenna)), satellite_names(systems))
 
 
 def sky_view(
@@ -168,6 +150,7 @@ def sky_view(
     world_at: Callable[[tuple[float, float, float, float]], _World],
     *,
     mask_deg: float,
+    systems: Sequence[str] = SYSTEMS,
 ) -> Sky:
     """The sky over antenna positions (n, 3) between what stands around them.
 
@@ -177,7 +160,7 @@ def sky_view(
     world_at : the world that covers a region (xmin, ymin, xmax, ymax), such as `World.follow`; asked once for
                every hundred metres or so of the drive, with `REACH` around them
     """
-    sky = open_sky(frame, antenna, start, time_ns, mask_deg=mask_deg)
+    sky = open_sky(frame, antenna, start, time_ns, mask_deg=mask_deg, systems=systems)
     lon, lat = frame.to_geographic(antenna[:, 0], antenna[:, 1])
     turn = frame.convergence(lon, lat)
     ring = np.repeat((np.arange(_RINGS) + 0.5) / _RINGS, _SPOKES)  # equal steps of sine: equal areas
@@ -196,7 +179,7 @@ def sky_view(
         dome = grid_directions(spoke[None, :], rise[None, :], turn[rows, None]).reshape(-1, 3)
         hit = caster.occluded(np.repeat(antenna[rows], len(ring), axis=0), dome)
         blocked[rows] = hit.reshape(len(rows), -1).mean(axis=1)
-    return Sky(sky.azimuth, sky.elevation, visible, sky.above, blocked)
+    return Sky(sky.azimuth, sky.elevation, visible, sky.above, blocked, sky.names)
 
 
 def _blocks(antenna: Float) -> list[NDArray[np.int64]]:
@@ -206,20 +189,27 @@ def _blocks(antenna: Float) -> list[NDArray[np.int64]]:
     return np.split(np.arange(len(antenna)), np.flatnonzero(np.diff(block)) + 1)
 
 
-def dilution(azimuth: Float, elevation: Float, used: Bool) -> Float:
-    """Dilution of precision (n, 3): horizontal, vertical and in position; infinite where under 4 are used."""
-    h = np.stack(
-        [
-            np.sin(azimuth) * np.cos(elevation),
-            np.cos(azimuth) * np.cos(elevation),
-            np.sin(elevation),
-            np.ones_like(azimuth),
-        ],
-        axis=-1,
+def dilution(azimuth: Float, elevation: Float, used: Bool, names: NDArray[np.str_]) -> Float:
+    """Dilution of precision (n, 3): horizontal, vertical and in position; infinite where too few are used.
+
+    Each system in use has a clock of its own that must be solved for: three coordinates and a clock need four
+    satellites, and one more for each further system. ``names`` as of `Sky`.
+    """
+    systems = systems_of(names)
+    clocks = np.zeros((len(names), len(systems)))
+    for column, rows in enumerate(systems):
+        clocks[rows, column] = 1.0
+    toward = np.stack(
+        [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=-1
     )
+    h = np.concatenate([toward, np.broadcast_to(clocks, (*azimuth.shape, len(systems)))], axis=-1)
     normal = np.einsum("nki,nkj,nk->nij", h, h, used.astype(float))
+    idle = 3 + np.arange(len(systems))
+    unused = normal[:, idle, idle] == 0.0
+    normal[:, idle, idle] += unused  # the clock of a system that is not in use is nobody's unknown
     out = np.full((len(azimuth), 3), np.inf)
-    enough = (used.sum(axis=1) >= 4) & (np.linalg.cond(normal) < 1e8)
+    needed = 3 + (~unused).sum(axis=1)
+    enough = (used.sum(axis=1) >= np.maximum(needed, 4)) & (np.linalg.cond(normal) < 1e8)
     q = np.diagonal(np.linalg.inv(normal[enough]), axis1=1, axis2=2)
     out[enough] = np.sqrt(np.stack([q[:, 0] + q[:, 1], q[:, 2], q[:, :3].sum(axis=1)], axis=1))
     return out

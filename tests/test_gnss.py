@@ -11,6 +11,7 @@ from pyproj import Geod
 
 from geoscene.frames import Frame
 from lidar.attitude import quat_from_euler
+from lidar.constellations import SYSTEMS, constellations, satellite_names, satellites
 from lidar.errors import InputError
 from lidar.gnss import (
     NAMES,
@@ -25,7 +26,7 @@ from lidar.nmea import checksum, latitude, longitude, nmea, sentence
 from lidar.physics.random import generator
 from lidar.poses import Trajectory
 from lidar.rig import GnssSpec, Mount
-from lidar.sky import Sky, dilution, ecef, enu_axes, look_up, open_sky, satellites, sky_view
+from lidar.sky import Sky, dilution, ecef, enu_axes, look_up, open_sky, sky_view
 
 START = datetime(2026, 5, 1, 9, 30, tzinfo=UTC)
 FRAME = Frame.at(-76.3059, 36.8853, "EPSG:32618")  # convergence -0.78 degrees, scale 0.99977
@@ -174,29 +175,93 @@ def test_coordinates_agree_with_known_values():
 
 def test_the_constellation_repeats_every_sidereal_day_and_is_as_full_as_gps():
     day = round(86164.0905 * 1e9)
-    one, two = satellites(START, np.array([0, day]))
+    one, two = satellites(START, np.array([0, day]), ("gps",))
     # twice a period of 43077.3 s against the sidereal day: some hundred metres of 26 560 km
     assert np.linalg.norm(one - two, axis=1).max() < 100e3
     np.testing.assert_allclose(np.linalg.norm(one, axis=1), 26559.7e3)
     hours = np.arange(0, 24 * 3600, 600) * 10**9
     for lat in (0.0, 36.9, 60.2, -33.9, 85.0):
         full = np.full(len(hours), lat)
-        azimuth, elevation = look_up(np.zeros(len(hours)), full, 0 * full, START, hours)
+        azimuth, elevation = look_up(np.zeros(len(hours)), full, 0 * full, START, hours, systems=("gps",))
         count = (elevation > np.radians(5)).sum(axis=1)
         assert count.min() >= 5  # the baseline constellation's promise is four in view
         assert 7 <= count.mean() <= 10
         assert elevation.max() > np.radians(45 if lat > 80 else 70)
         used = elevation > np.radians(5)
-        assert np.median(dilution(azimuth, elevation, used)[:, 2]) < 3.5
+        assert np.median(dilution(azimuth, elevation, used, satellite_names(("gps",)))[:, 2]) < 3.5
 
 
 def test_dilution_of_four_satellites_is_that_of_the_textbook():
     # one overhead and three on the horizon, evenly round: HDOP = sqrt(4/3), VDOP = sqrt(4/3)
     azimuth = np.array([[0.0, 0.0, 2 * np.pi / 3, 4 * np.pi / 3]])
     elevation = np.array([[np.pi / 2, 0.0, 0.0, 0.0]])
-    dop = dilution(azimuth, elevation, np.ones((1, 4), bool))
+    one = np.array(["G01", "G02", "G03", "G04"])
+    dop = dilution(azimuth, elevation, np.ones((1, 4), bool), one)
     np.testing.assert_allclose(dop[0, :2], np.sqrt(4 / 3), atol=1e-12)
-    assert np.isinf(dilution(azimuth, elevation, np.array([[True, True, True, False]]))).all()
+    assert np.isinf(dilution(azimuth, elevation, np.array([[True, True, True, False]]), one)).all()
+    # a clock of a second system takes the satellite that would solve for it
+    two = np.array(["G01", "G02", "G03", "E01"])
+    assert np.isinf(dilution(azimuth, elevation, np.ones((1, 4), bool), two)).all()
+
+
+# days and nights per revolution, radius in km and inclination in degrees that the interface documents give
+ORBITS = {"gps": (24, 43077.3, 55.0), "glonass": (24, 40544.0, 64.8), "galileo": (24, 50680.7, 56.0)}
+
+
+@pytest.mark.parametrize("system", ORBITS)
+def test_orbits_have_the_published_periods_and_inclinations(system):
+    count, period, tilt = ORBITS[system]
+    time_ns = np.arange(0, 86_400, 300) * 10**9
+    place = satellites(START, time_ns, (system,))
+    assert place.shape[1] == count
+    # earth-fixed latitudes reach the inclination
+    top = np.degrees(np.arcsin(place[..., 2] / np.linalg.norm(place, axis=-1))).max()
+    assert top == pytest.approx(tilt, abs=0.1)
+    # after a period each is at the same height over the equator, on its way up or down again
+    later = satellites(START, time_ns + round(period * 1e9), (system,))
+    np.testing.assert_allclose(later[..., 2], place[..., 2], atol=150e3)
+
+
+def test_beidou_stands_over_asia_and_its_inclined_ones_draw_an_eight_there():
+    time_ns = np.arange(0, 86_164, 600) * 10**9
+    place = satellites(START, time_ns, ("beidou",))
+    assert place.shape[1] == 30
+    lon = np.degrees(np.arctan2(place[..., 1], place[..., 0]))
+    still, eight = lon[:, 24:27], lon[:, 27:]
+    np.testing.assert_allclose(still, np.broadcast_to([80.0, 110.5, 140.0], still.shape), atol=1.0)
+    crossing = np.abs(place[:, 27:, 2]) < 2e6
+    assert np.abs(eight[crossing] - 118.0).max() < 5.0
+
+
+def test_satellites_of_a_walker_constellation_keep_apart():
+    """No two are ever at one place, as a wrong phase between planes would have it."""
+    for system in ("glonass", "galileo"):
+        place = satellites(START, np.arange(0, 43_200, 900) * 10**9, (system,))
+        for moment in place:
+            gap = np.linalg.norm(moment[:, None] - moment[None], axis=-1)
+            assert gap[~np.eye(len(moment), dtype=bool)].min() > 5e5
+
+
+def test_four_systems_see_more_and_place_better_than_one():
+    hours = np.arange(0, 24 * 3600, 900) * 10**9
+    full = np.full(len(hours), 50.0)
+    median = {}
+    for systems in (("gps",), SYSTEMS):
+        azimuth, elevation = look_up(0 * full, full, 0 * full, START, hours, systems=systems)
+        used = elevation > np.radians(10)
+        median[len(systems)] = (
+            np.median(used.sum(axis=1)),
+            np.median(dilution(azimuth, elevation, used, satellite_names(systems))[:, 2]),
+        )
+    assert median[4][0] > 3 * median[1][0]
+    assert median[4][1] < 0.8 * median[1][1]
+    assert set(constellations()) == set(SYSTEMS)
+
+
+def test_systems_that_there_are_not_are_refused():
+    for systems in (("gps", "loran"), (), ("gps", "gps")):
+        with pytest.raises(InputError, match="give one or more of gps, glonass"):
+            satellites(START, np.array([0]), systems)
 
 
 @dataclass
@@ -227,7 +292,11 @@ def view(trajectory, s, height):
         asked.append(region)
         return Street(Walls(10.0, height))
 
-    return sky_view(FRAME, position, START, time_ns, world_at, mask_deg=s.mask_deg), asked, position
+    return (
+        sky_view(FRAME, position, START, time_ns, world_at, mask_deg=s.mask_deg, systems=s.constellations),
+        asked,
+        position,
+    )
 
 
 def test_high_walls_hide_the_satellites_beside_the_street_and_not_those_along_it():
@@ -256,7 +325,7 @@ def test_in_the_open_the_sky_is_whole():
 
 
 def test_a_street_canyon_spoils_fixes():
-    s = spec("single", rate=0.02, arm=(0.0, 0.0, 1.6))
+    s = spec("single", rate=0.02, arm=(0.0, 0.0, 1.6), constellations=("gps",))
     trajectory = standing(200_000.0)
     low, high = (view(trajectory, s, h)[0] for h in (1.0, 15.0))
     free, walled = (observe_gnss(trajectory, FRAME, s, seed=4, start=START, sky=k) for k in (low, high))
@@ -264,7 +333,21 @@ def test_a_street_canyon_spoils_fixes():
     assert 0.1 < fixed.mean() < 1.0
     assert np.nanstd(walled.error[fixed, :2]) > 2 * np.std(free.error[:, :2])
     assert np.isnan(walled.lonlath[~fixed]).all()
-    assert (walled.satellites[~fixed] < 4).all()
+    assert ((walled.satellites[~fixed] < 4) | (walled.dop[~fixed, 2] > 25.0)).all()
+
+
+def test_in_a_street_of_five_storeys_four_systems_nearly_always_have_a_fix():
+    """And fixes there are off by what receivers are off in street canyons: 5 to 10 m, where GPS has none."""
+    trajectory = standing(100_000.0)
+    shares, errors = {}, {}
+    for systems in (("gps",), SYSTEMS):
+        s = spec("single", rate=0.02, arm=(0.0, 0.0, 1.6), constellations=systems)
+        fixes = observe_gnss(trajectory, FRAME, s, seed=4, start=START, sky=view(trajectory, s, 17.0)[0])
+        shares[len(systems)] = (fixes.quality > 0).mean()
+        errors[len(systems)] = np.nanstd(fixes.error[:, :2])
+    assert shares[1] < 0.75
+    assert shares[4] > 0.98
+    assert 3.0 < errors[4] < 10.0
 
 
 def test_rtk_falls_at_once_and_recovers_after_it_has_settled():
@@ -274,7 +357,7 @@ def test_rtk_falls_at_once_and_recovers_after_it_has_settled():
     visible[50:60, 3:] = False  # three satellites for a second: a bridge
     elevation = np.tile(np.linspace(0.3, 1.4, 24), (n, 1))
     azimuth = np.tile(np.arange(24) * 2.4, (n, 1))
-    sky = Sky(azimuth, elevation, visible, np.ones((n, 24), bool), np.zeros(n))
+    sky = Sky(azimuth, elevation, visible, np.ones((n, 24), bool), np.zeros(n), satellite_names(("gps",)))
     fixes = observe_gnss(standing(19.9), FRAME, s, seed=0, start=START, sky=sky)
     assert (fixes.quality[:50] == 4).all()
     assert (fixes.quality[50:89] == 0).all()  # ten epochs under the bridge, three seconds to settle less one
@@ -298,7 +381,7 @@ def read(lines):
 
 @pytest.mark.parametrize("mode", ["single", "sbas", "rtk"])
 def test_another_reader_reads_the_fixes(mode):
-    fixes = observe_gnss(eastward(5.0), FRAME, spec(mode), seed=1, start=START)
+    fixes = observe_gnss(eastward(5.0), FRAME, spec(mode, constellations=("gps",)), seed=1, start=START)
     lines = nmea(fixes, START)
     assert max(map(len, lines)) <= 82
     assert all(line.endswith("\r\n") for line in lines)
@@ -324,8 +407,24 @@ def test_another_reader_reads_the_fixes(mode):
         assert gsa.navMode == 3
 
 
+def test_a_receiver_of_four_systems_names_the_satellites_of_each():
+    fixes = observe_gnss(eastward(1.0), FRAME, spec("single"), seed=1, start=START)
+    lines = nmea(fixes, START)
+    assert max(map(len, lines)) <= 82
+    assert all(line.startswith("$GN") for line in lines)
+    gga, _, _, *gsa = read(lines[:7])
+    assert gga.numSV == fixes.satellites[0] > 20
+    assert [int(m.systemId) for m in gsa] == [1, 2, 3, 4]
+    for message, letter, added in zip(gsa, "GREC", (0, 64, 0, 0), strict=True):
+        own = [int(n[1:]) + added for n in fixes.names[fixes.used[0]].tolist() if n[0] == letter]
+        said = [getattr(message, f"svid_{i:02d}") for i in range(1, 13)]
+        assert [int(p) for p in said if p != ""] == own[:12]
+
+
 def test_no_fix_leaves_fields_empty_and_says_so():
-    sky = Sky(*(np.full((6, 24), 0.5),) * 2, *(np.zeros((6, 24), bool),) * 2, np.ones(6))
+    sky = Sky(
+        *(np.full((6, 24), 0.5),) * 2, *(np.zeros((6, 24), bool),) * 2, np.ones(6), satellite_names(("gps",))
+    )
     fixes = observe_gnss(standing(0.5), FRAME, spec("single"), seed=0, start=START, sky=sky)
     gga, rmc, _, gsa = read(nmea(fixes, START)[:4])
     assert gga.quality == 0
