@@ -123,7 +123,7 @@ def gather(target: Target, rays: Rays, at: int, m: int, W: int, ids: Any, work: 
     if long and not bad:
         for k in range(W):
             _shorten(W, k, work, f)
-    return bad == 0
+    return bool(bad == 0)
 
 
 @inlined
