@@ -68,7 +68,7 @@ def _from_poses(path: Path, recorded: Frame, frame: Frame) -> Trajectory:
     spline = CubicSpline(
         seconds, np.column_stack([x, y, h]), bc_type="natural" if len(rows) > 2 else "not-a-knot"
     )
-    turn = Rotation.from_euler("z", _turn(recorded, frame, lon, lat)) * Rotation.from_quat(quat)
+    turn = _turn(recorded, frame, lon, lat) * Rotation.from_quat(quat)
     position = spline(at * 1e-9)
     scale = np.asarray(frame.scale_at(*position[:, :2].T), float)
     velocity = spline(at * 1e-9, 1)
@@ -84,18 +84,19 @@ def _nanoseconds(stamps: list[str]) -> NDArray[np.int64]:
     return since
 
 
-def _turn(recorded: Frame, frame: Frame, lon: Float, lat: Float) -> Float:
-    """Angles (n,) about the vertical from the axes of one frame to those of another."""
-    if recorded == frame:
-        return np.zeros(len(lon))
-    return frame.convergence(lon, lat) - recorded.convergence(lon, lat)
+def _turn(recorded: Frame, frame: Frame, lon: Float, lat: Float) -> Rotation:
+    """Turns (n,) about the vertical from the axes of one frame to those of another."""
+    angle = np.zeros((len(lon), 3))
+    if recorded != frame:
+        angle[:, 2] = frame.convergence(lon, lat) - recorded.convergence(lon, lat)
+    return Rotation.from_rotvec(angle)
 
 
 def _moved(old: Trajectory, recorded: Frame, frame: Frame) -> Trajectory:
     """A trajectory in another frame."""
     lon, lat = recorded.to_geographic(*old.position[:, :2].T)
     x, y = frame.from_geographic(lon, lat)
-    turn = Rotation.from_euler("z", _turn(recorded, frame, lon, lat))
+    turn = _turn(recorded, frame, lon, lat)
     return Trajectory(
         old.time_ns,
         np.column_stack([x, y, old.position[:, 2]]),

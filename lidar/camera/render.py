@@ -358,7 +358,7 @@ def optical_flow(camera: CameraSpec, poses: Poses, later: Poses, world: World) -
 
 def _carried(point: Float, hits: Hits, world: World) -> Float:
     """Points on instances, moved as those move from ray time 0 to ray time 1."""
-    moments = [g.transform.reshape(len(g), -1, 3, 4) for g in world.caster.instances]
+    moments = [g.transform if g.transform.ndim == 4 else g.transform[:, None] for g in world.caster.instances]
     on = np.flatnonzero(hits.instance >= 0)
     if not len(on):
         return point
