@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from lidar import __version__
-from lidar.actors import Actors, populate
+from lidar.actors import Actors, drive_among, populate
 from lidar.crowd import Worlds
 from lidar.dataset import prepare, write_json, write_trajectory
 from lidar.devices import Camera, Scanner, cameras, scanners
@@ -30,7 +30,7 @@ from lidar.poses import Trajectory
 from lidar.record import Recorder
 from lidar.rig import Rig, load_rig
 from lidar.sidecars import write_sidecars
-from lidar.travel import plan_travel, road_graph
+from lidar.travel import Travel, plan_travel, road_graph
 from lidar.vehicle import Vehicle, load_vehicle
 
 Float = NDArray[np.float64]
@@ -116,12 +116,20 @@ def drive(
     if not sensors and not rig.gnss:
         raise InputError(f"rig {rig.name} has no sensors")
     body = load_vehicle(options.vehicle or rig.vehicle)
-    trajectory = plan(scene, options, body, sensors, progress=progress)
+    planned = plan(scene, options, body, sensors, progress=progress)
+    trajectory = planned.trajectory if isinstance(planned, Travel) else planned
     actors = None
     if options.traffic is not None:
         progress("traffic", 0, 0)
         traffic = replace(options.traffic, side=cast("Literal['left', 'right']", options.side))
-        actors = populate(scene, road_graph(scene), trajectory, body, seed=options.seed, options=traffic)
+        graph = road_graph(scene)
+        if isinstance(planned, Travel):
+            trajectory, actors = drive_among(
+                scene, graph, planned.path, body, trajectory,
+                seed=options.seed, options=traffic, duration=planned.duration,
+            )  # fmt: skip
+        else:
+            actors = populate(scene, graph, trajectory, body, seed=options.seed, options=traffic)
     geo = Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact)
     jobs = schedule(sensors, trajectory.duration_ns)
     if sensors and not jobs:
@@ -188,8 +196,8 @@ def plan(
     sensors: Sequence[Scanner | Camera],
     *,
     progress: Progress = silent,
-) -> Trajectory:
-    """Where the vehicle of a drive is over time.
+) -> Trajectory | Travel:
+    """Where the vehicle of a drive is over time; on streets, with the path it takes.
 
     Raises RouteError for a route that it cannot take.
     """
@@ -209,7 +217,7 @@ def plan(
             )
         name = options.vehicle or load_rig(options.rig).vehicle
         return plan_travel(scene, route, name, seed=options.seed, duration=options.duration,
-                           side=options.side, progress=progress).trajectory  # fmt: skip
+                           side=options.side, progress=progress)  # fmt: skip
     progress("planning", 0, 0)
     seconds = options.duration
     if seconds is None and route == "random" and not options.survey:

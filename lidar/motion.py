@@ -85,7 +85,7 @@ def speed_limits(path: Path, vehicle: Vehicle) -> Float:
     """Speed (n,) in m/s that limits, bends, crests and the turning of the wheel allow along a path."""
     bend = np.abs(path.curvature)
     change = np.abs(_along(path, path.curvature))
-    crest = np.abs(_along(path, path.slope))
+    crest = np.abs(_along(path, _softened(path, vehicle)))
     with np.errstate(divide="ignore", over="ignore"):  # a straight allows any speed
         by_bend = np.sqrt(_SPARE * vehicle.lateral_acceleration / bend)
         by_wheel = np.cbrt(_SPARE * vehicle.lateral_jerk / change)
@@ -100,16 +100,28 @@ def speed_limits(path: Path, vehicle: Vehicle) -> Float:
     return limit
 
 
+def _softened(path: Path, vehicle: Vehicle) -> Float:
+    """Slopes as springs and wheelbase leave them: short bumps throw nobody up."""
+    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
+
+    out = path.slope.copy()
+    over = vehicle.turning_radius if vehicle.kind == "air" else max(vehicle.wheelbase, 1.0)
+    for first, last in legs_of(path):
+        gap = (path.s[last - 1] - path.s[first]) / max(last - first - 1, 1)
+        out[first:last] = gaussian_filter1d(path.slope[first:last], over / max(gap, 1e-6), mode="nearest")
+    return out
+
+
 def _along(path: Path, values: Float) -> Float:
     """Derivative of a column along the path, leg by leg."""
     out = np.zeros(len(path))
-    for first, last in _legs(path):
+    for first, last in legs_of(path):
         if last - first > 1:
             out[first:last] = np.gradient(values[first:last], path.s[first:last])
     return out
 
 
-def _legs(path: Path) -> list[tuple[int, int]]:
+def legs_of(path: Path) -> list[tuple[int, int]]:
     """First and last row (exclusive) of each leg."""
     cuts = [0, *(np.flatnonzero(np.diff(path.leg)) + 1).tolist(), len(path)]
     return list(itertools.pairwise(cuts))
@@ -123,7 +135,7 @@ def _all_legs(
     v: list[Float] = []
     leg: list[NDArray[np.int32]] = []
     rest = round(DWELL_S / dt)
-    for first, last in _legs(path):
+    for first, last in legs_of(path):
         ds, dv = _time_law(path.s[first:last] - path.s[first], limit[first:last], vehicle, dt)
         if s:
             ds, dv = np.concatenate([np.zeros(rest), ds[1:]]), np.concatenate([np.zeros(rest), dv[1:]])
@@ -255,10 +267,10 @@ def poses_along(path: Path, vehicle: Vehicle, motion: Motion) -> Trajectory:
     """The trajectory of a motion along a path; cubic between the path's rows, so velocity has no steps."""
     n = len(motion.s)
     position, heading = np.empty((n, 3)), np.empty(n)
-    columns = {name: np.empty(n) for name in ("slope", "bank", "scale", "curvature")}
+    columns = {name: np.empty(n) for name in ("slope", "pitch", "bank", "scale", "curvature")}
     gear = path.gear[motion.row].astype(float)
     leg = path.leg[motion.row]
-    for first, last in _legs(path):
+    for first, last in legs_of(path):
         here = leg == path.leg[first]
         if not here.any():
             continue
@@ -280,7 +292,7 @@ def poses_along(path: Path, vehicle: Vehicle, motion: Motion) -> Trajectory:
     roll = columns["bank"] + vehicle.roll_gradient * across
     pitch = -vehicle.pitch_gradient * motion.acceleration * gear
     if vehicle.kind != "air" or vehicle.cruise:  # what hovers climbs level
-        pitch = pitch - columns["slope"]
+        pitch = pitch - columns["pitch"]
     if any(vehicle.bob):
         shift = _gait(motion, vehicle, heading)
         seconds = motion.time_ns * 1e-9

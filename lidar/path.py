@@ -36,6 +36,10 @@ Surface = Callable[[Float, Float, Float], Float]
 MARGIN = 0.25
 """Metres that the body keeps from obstacles."""
 _REPAIRS = 16
+_SPRING = 0.5  # metres over which tyres and springs smooth the ground
+_AXLES = 0.5  # metres between axles below which a body does not pitch with the ground under them
+_STEEP = 0.35  # rise per metre that a wheel is expected to meet
+_WHEEL_STEP = 0.2  # metres: a kerb
 _PUSH = 4.0  # metres before and behind an obstacle over which the line is pushed aside
 _ASTRAY = 1.5  # turning radii from the middle of its lane beyond which a vehicle has left the street
 _WHEEL = 0.95  # share of the full lock that the line asks for, so that the wheel has some left to correct
@@ -50,6 +54,7 @@ class Path:
     heading   : (n,) radians, where the vehicle points, counter-clockwise from the scene's x axis, unwrapped
     curvature : (n,) 1/m, change of heading per true metre driven over ground; positive is a turn to the left
     slope     : (n,) radians, of the path where the vehicle points, positive uphill
+    pitch     : (n,) radians, of the vehicle on its wheels, positive uphill: from the ground under both axles
     bank      : (n,) radians, of the ground across the vehicle, positive where the left wheels stand higher
     scale     : (n,) scene metres per true metre
     gear      : (n,) int8, 1 forwards, -1 backwards
@@ -64,6 +69,7 @@ class Path:
     heading: Float
     curvature: Float
     slope: Float
+    pitch: Float
     bank: Float
     scale: Float
     gear: NDArray[np.int8]
@@ -222,7 +228,7 @@ def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Surf
     heights = _heights(legs, lines, setting, ground)
     parts = []
     start = 0.0
-    for number, (leg, line, (z, slope, bank)) in enumerate(zip(legs, lines, heights, strict=True)):
+    for number, (leg, line, (z, slope, pitch, bank)) in enumerate(zip(legs, lines, heights, strict=True)):
         over = np.full(len(z) - 1, leg.step)
         s = start + np.concatenate([[0.0], np.cumsum(np.hypot(over, np.diff(z)))])
         start = float(s[-1])
@@ -236,6 +242,7 @@ def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Surf
                 heading=leg.heading,
                 curvature=leg.curvature,
                 slope=slope,
+                pitch=pitch,
                 bank=bank,
                 scale=scale,
                 gear=np.full(len(s), leg.gear, np.int8),
@@ -253,8 +260,11 @@ def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Surf
 
 def _heights(
     legs: list[Track], lines: list[Line], setting: Setting, ground: Surface | None
-) -> list[tuple[Float, Float, Float]]:
-    """Height of the rear axle, slope ahead and bank of each leg, smoothed over the wheelbase."""
+) -> list[tuple[Float, Float, Float, Float]]:
+    """Height of the rear axle, slope of its path, pitch and bank of the body on its wheels, of each leg.
+
+    Wheels keep to the ground; without one, the route's profile is smoothed over the wheelbase.
+    """
     from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
 
     raw = [_raw_heights(leg, line, setting, ground) for leg, line in zip(legs, lines, strict=True)]
@@ -265,31 +275,57 @@ def _heights(
     once[starts] = False
     twice = np.cumsum(once) - 1
     body = setting.vehicle
-    width = (body.turning_radius if body.kind == "air" else max(body.wheelbase, 1.0)) / legs[0].step
-    z, rise, bank = (np.concatenate(column)[once] for column in zip(*raw, strict=True))
+    over = body.turning_radius if body.kind == "air" else max(body.wheelbase, 1.0)
+    width = (over if ground is None else _SPRING) / legs[0].step
+    z, tilt, bank = (np.concatenate(column)[once] for column in zip(*raw, strict=True))
     # beyond its ends the road goes on as steep as it was
     spare = math.ceil(4 * width) + 1
     z = gaussian_filter1d(np.pad(z, spare, mode="reflect", reflect_type="odd"), width)[spare : spare + len(z)]
-    rise, bank = (gaussian_filter1d(c, width, mode="mirror")[twice] for c in (rise, bank))
-    columns = [z[twice], np.arctan(rise), bank]
-    return list(zip(*(np.split(column, starts) for column in columns), strict=True))
+    tilt, bank = (gaussian_filter1d(c, width, mode="mirror")[twice] for c in (tilt, bank))
+    parts = [np.split(column, starts) for column in (z[twice], tilt, bank)]
+    out = []
+    for leg, height, ahead, across in zip(legs, *parts, strict=True):
+        slope = np.arctan(leg.gear * np.gradient(height, leg.step))
+        stands = ground is not None and body.wheelbase >= _AXLES
+        out.append((height, slope, np.arctan(ahead) if stands else slope, across))
+    return out
 
 
 def _raw_heights(
     leg: Track, line: Line, setting: Setting, ground: Surface | None
 ) -> tuple[Float, Float, Float]:
-    """Height, rise ahead per metre and bank at the rows of a leg, as the line or the ground has them."""
+    """Height, rise per metre to the front axle and bank at the rows of a leg, as line or ground have them."""
     heading = line_heading(line.xyz[:, :2])[leg.row]
     d = leg.xy - line.xyz[leg.row, :2]
     place = leg.row + (d[:, 0] * np.cos(heading) + d[:, 1] * np.sin(heading)) / line.gap
     # the last row may lie a little beyond the end of the line
     profile = np.append(line.xyz[:, 2], 2 * line.xyz[-1, 2] - line.xyz[-2, 2])
-    z, bank = np.interp(place, np.arange(len(profile)), profile), np.zeros(len(leg.row))
-    if ground is not None and len(z):
-        c, s = np.cos(leg.heading), np.sin(leg.heading)
-        x, y = leg.xy.T
-        track = max(setting.vehicle.track, 0.1)
-        half = track / 2 * setting.frame.scale_at(x, y)
-        left, right = ground(x - half * s, y + half * c, z), ground(x + half * s, y - half * c, z)
-        z, bank = 0.5 * (left + right), np.arctan2(left - right, track)
-    return z, leg.gear * np.gradient(z, leg.step), bank
+    z = np.interp(place, np.arange(len(profile)), profile)
+    rise = leg.gear * np.gradient(z, leg.step)
+    if ground is None or not len(z):
+        return z, rise, np.zeros(len(leg.row))
+    base = max(setting.vehicle.wheelbase, _AXLES)
+    rear, across = _axle(leg, z, 0.0, setting, ground)
+    front, twisted = _axle(leg, rear + base * np.clip(rise, -_STEEP, _STEEP), base, setting, ground)
+    # a rigid body on four wheels: the twist of the ground is left to the springs
+    return rear, (front - rear) / base, (across + twisted) / 2
+
+
+def _axle(leg: Track, z: Float, ahead: float, setting: Setting, ground: Surface) -> tuple[Float, Float]:
+    """Mean height of the ground under the wheels of an axle, and its bank, near heights (n,).
+
+    ahead : metres from the rear axle
+    """
+    c, s = np.cos(leg.heading), np.sin(leg.heading)
+    x, y = leg.xy.T
+    scale = setting.frame.scale_at(x, y)
+    track = max(setting.vehicle.track, 0.1)
+    x, y, half = x + ahead * scale * c, y + ahead * scale * s, track / 2 * scale
+    middle = ground(x, y, z)
+    under = []
+    for side in (1.0, -1.0):
+        wheel = ground(x - side * half * s, y + side * half * c, middle)
+        # what is higher or lower than a wheel goes is a wall or an edge that the wheel does not stand on
+        under.append(np.where(np.abs(wheel - middle) <= _WHEEL_STEP + _STEEP * track / 2, wheel, middle))
+    left, right = under
+    return 0.5 * (left + right), np.arctan2(left - right, track)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, cast
 
 import numpy as np
@@ -14,6 +14,7 @@ from geoscene.progress import Progress, silent
 from geoscene.roadgraph import read_graphml
 from geoscene.roads import RoadGraph
 from geoscene.scene import Scene
+from lidar.actors.among import drive_obeying
 from lidar.detour import plan_drive
 from lidar.errors import RouteError
 from lidar.motion import drive_path
@@ -36,14 +37,17 @@ Float = NDArray[np.float64]
 class Travel:
     """A planned drive.
 
-    route, path, trajectory : see `lidar.route`, `lidar.path` and `lidar.poses`
+    route, path, trajectory : see `lidar.route`, `lidar.path` and `lidar.poses`; the path's edges are those
+                 of the whole road graph
     length     : true metres that the trajectory covers
+    duration   : seconds that were asked for, if any were
     """
 
     route: Route
     path: Path
     trajectory: Trajectory
     length: float
+    duration: float | None
 
 
 def road_graph(scene: Scene) -> RoadGraph:
@@ -58,7 +62,13 @@ def road_graph(scene: Scene) -> RoadGraph:
 
 
 def covered(graph: RoadGraph, scene: Scene) -> RoadGraph:
-    """The part of a road graph that lies on the scene's tiles.
+    """The part of a road graph that lies on the scene's tiles; raises as `edges_on_tiles` does."""
+    kept = edges_on_tiles(graph, scene)
+    return graph if kept.all() else graph.take(kept)
+
+
+def edges_on_tiles(graph: RoadGraph, scene: Scene) -> NDArray[np.bool_]:
+    """Which edges (m,) of a road graph lie on the scene's tiles.
 
     Raises RouteError if none does.
     """
@@ -77,7 +87,8 @@ def covered(graph: RoadGraph, scene: Scene) -> RoadGraph:
     kept = np.bincount(edge, ~inside, minlength=len(graph)) == 0
     if not kept.any():
         raise RouteError(f"{scene.path}: no road lies within the tiles of this scene")
-    return graph if kept.all() else graph.take(kept)
+    on_tiles: NDArray[np.bool_] = kept
+    return on_tiles
 
 
 def standing_footprints(scene: Scene) -> NDArray[np.object_]:
@@ -118,14 +129,19 @@ def plan_travel(
     seed: int = 0,
     duration: float | None = None,
     side: str = "right",
+    obeys: bool = True,
     progress: Progress = silent,
 ) -> Travel:
     """The trajectory of a vehicle along a route through a scene.
 
+    obeys : whether it stops at red signals and stop signs
+
     Where a street is too narrow for the vehicle between its buildings, it is left out and the route planned
     again. Raises RouteError if no way is left.
     """
-    graph = covered(road_graph(scene), scene)
+    whole = road_graph(scene)
+    kept = edges_on_tiles(whole, scene)
+    graph = whole if kept.all() else whole.take(kept)
     body = load_vehicle(vehicle)
     obstacles = standing_footprints(scene)
     progress("planning", 0, 0)
@@ -141,10 +157,14 @@ def plan_travel(
         obstacles=obstacles,
         ground=road_surface(scene),
     )
-    trajectory = drive_path(path, body)
-    if seconds is not None:
-        trajectory = trajectory.until(round(seconds * 1e9))
-    return Travel(route, path, trajectory, _driven(trajectory))
+    path = replace(path, edge=np.where(path.edge >= 0, np.flatnonzero(kept)[path.edge], -1).astype(np.int32))
+    if obeys:
+        trajectory = drive_obeying(
+            path, body, whole, seed=seed, side=side, bounds=scene.bounds, duration=seconds
+        )
+    else:
+        trajectory = drive_path(path, body, duration=seconds)
+    return Travel(route, path, trajectory, _driven(trajectory), seconds)
 
 
 def _driven(trajectory: Trajectory) -> float:

@@ -174,6 +174,38 @@ def test_a_ground_that_is_given_lifts_and_banks_the_vehicle():
     np.testing.assert_allclose(path.slope[inner], np.arctan(0.05), atol=1e-6)
 
 
+def test_on_faceted_hairpins_each_wheel_keeps_to_the_ground():
+    """Rows of hillside facets that meet at edges, up to 20 % steep: neither afloat nor dug in."""
+    t = np.linspace(0.0, np.pi, 60)
+    bend = np.column_stack([60.0 + 9.0 * np.sin(t), 9.0 * (1 - np.cos(t)), 0 * t])
+    line = np.concatenate([[[0.0, 0.0, 0.0]], bend, [[0.0, 18.0, 0.0]]])
+
+    def ground(x, y, _near=None):
+        return np.interp(x, [0, 20, 35, 50, 58, 66, 80], [0, 1, 3.8, 5, 6.4, 6.8, 9]) + 0.1 * np.abs(y - 9.0)
+
+    path = plan_path(free_route(line), CAR, FRAME, ground=ground)
+    c, s = np.cos(path.heading), np.sin(path.heading)
+    off = []
+    for ahead in (0.0, CAR.wheelbase):
+        for left in (CAR.track / 2, -CAR.track / 2):
+            run, side = ahead * np.cos(path.pitch), left * np.cos(path.bank)
+            x, y = path.position[:, 0] + run * c - side * s, path.position[:, 1] + run * s + side * c
+            z = path.position[:, 2] + ahead * np.sin(path.pitch) + left * np.sin(path.bank)
+            off.append(z - ground(x, y))
+    assert np.percentile(np.abs(off), 95) < 0.03
+    assert np.abs(off).max() < 0.12
+    assert np.percentile(np.abs(np.mean(off, axis=0)), 95) < 0.01
+
+
+def test_a_wall_beside_the_road_does_not_tip_the_vehicle():
+    def ground(x, y, _near=None):
+        return np.where(np.abs(y) > 0.6, 1.2, 0.0) + 0.0 * x
+
+    path = plan_path(free_route([[0.0, 0, 0], [60.0, 0, 0]]), CAR, FRAME, ground=ground)
+    np.testing.assert_allclose(path.bank, 0.0, atol=1e-9)
+    np.testing.assert_allclose(path.position[:, 2], 0.0, atol=1e-9)
+
+
 def test_lengths_are_true_metres_where_the_projection_shrinks_them():
     frame = Frame.at(-75.0, 40.0, "EPSG:32618")  # on the zone's meridian: 0.9996
     lon, lat = frame.to_geographic(np.array([0.0, 1000.0]), np.zeros(2))

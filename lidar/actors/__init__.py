@@ -5,6 +5,8 @@ from lidar.actors.actors import actor_shapes as actor_shapes
 from lidar.actors.actors import actor_transforms as actor_transforms
 from lidar.actors.actors import states as states
 from lidar.actors.actors import velocities as velocities
+from lidar.actors.among import drive_among as drive_among
+from lidar.actors.among import drive_obeying as drive_obeying
 from lidar.actors.boxes import box_rows as box_rows
 from lidar.actors.boxes import count_points as count_points
 from lidar.actors.boxes import image_boxes as image_boxes

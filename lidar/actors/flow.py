@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from geoscene.roads import RoadGraph
 from geoscene.routing import edge_lines
 from lidar.actors.area import LEFT
+from lidar.actors.ego import EgoTrip
 from lidar.actors.junctions import Plan, road_rank, signal_group, zone_at
 from lidar.actors.lanes import STEP, Way
 from lidar.actors.simulate import Ego, Movers, run
-from lidar.actors.sweep import SQUARE, body_poses, squares_under, sweep
+from lidar.actors.sweep import SQUARE, squares_under, sweep
 from lidar.actors.traffic import Trip
 from lidar.poses import Trajectory
 
@@ -56,10 +57,12 @@ def simulate_trips(
     ego_box: tuple[float, float, float],
     *,
     reach: float,
+    obeys: bool = False,
 ) -> Flow:
     """Trips in time, from the drive's start to its end.
 
     ego_box : length, width and metres from the rear axle to the middle of the ego's box
+    obeys   : whether the ego's motion keeps to the signals; otherwise they are green when it comes
 
     Those whom the ego, whose motion is given, would run into do not take place.
     """
@@ -69,16 +72,43 @@ def simulate_trips(
     movers = _movers(trips, graph, plan)
     known = ego_on(ego, ego_box, graph)
     movers, known, squares = _numbered(movers, known)
-    signals = plan.signals._replace(window=green_windows(plan, known))
+    signals = plan.signals if obeys else plan.signals._replace(window=green_windows(plan, known))
     out = np.zeros(len(trips), bool)
     for _ in range(_ROUNDS):
-        log, met = run(movers, known, signals, out, squares, DT, len(known.x), _HORIZON, reach + LEFT)
+        log, met = run(movers, known, signals, out, squares, DT, len(known.x), _HORIZON, reach + LEFT, -1)
         if not met.any():
             break
         out |= met
     order = np.lexsort((log[:, 1], log[:, 0]))
     log = log[order]
     return Flow(log[:, 0].astype(np.int64), log[:, 1].astype(np.int64), log[:, 2], log[:, 3])
+
+
+def simulate_ego(
+    ego: EgoTrip, trips: Sequence[Trip], graph: RoadGraph, plan: Plan, *, seconds: float, reach: float
+) -> Float:
+    """Metres (t,) along its path that the ego gets by each step of `DT` as one of the traffic.
+
+    It follows, gives way and stops at signals and signs as the others do, and they know it as one of them.
+    """
+    movers = _movers([ego, *trips], graph, plan)
+    steps = int(np.ceil(seconds / DT)) + 1
+    x, y, heading, speed = np.zeros((4, steps))
+    none = np.empty(0, np.int64)
+    known = Ego(x, y, heading, speed, np.full(2, -np.inf), np.zeros(steps + 1, np.int64), none)
+    movers, known, squares = _numbered(movers, known)
+    out = np.zeros(len(trips) + 1, bool)
+    log, _ = run(movers, known, plan.signals, out, squares, DT, steps, _HORIZON, reach + LEFT, 0)
+    mine = log[:, 0] == 0
+    gone = np.zeros(steps)
+    gone[log[mine, 1].astype(int)] = log[mine, 2]
+    return np.maximum.accumulate(gone)
+
+
+def meets_control(ego: EgoTrip, graph: RoadGraph, plan: Plan) -> bool:
+    """Whether there are signals or stop signs on the ego's way."""
+    blocks = _blocks(ego, graph, plan, {})
+    return bool((blocks[:, 4] >= 0).any() or (blocks[:, 7] > 0).any())
 
 
 def ego_on(ego: Trajectory, box: tuple[float, float, float], graph: RoadGraph) -> Ego:
@@ -139,7 +169,7 @@ def green_windows(plan: Plan, ego: Ego) -> Float:
     return np.array(rows, float).reshape(-1, 4)
 
 
-def _movers(trips: Sequence[Trip], graph: RoadGraph, plan: Plan) -> Movers:
+def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, plan: Plan) -> Movers:
     """The tables of the simulation."""
     station, square, blocks = [0], [0], [0]
     columns: dict[str, list[NDArray[Any]]] = {
@@ -149,9 +179,9 @@ def _movers(trips: Sequence[Trip], graph: RoadGraph, plan: Plan) -> Movers:
     covered = graph.bridge | graph.tunnel
     for trip in trips:
         way = trip.way
-        xy, heading = body_poses(way, trip.axle)
+        xy, heading = trip.body()
         level = np.where(way.edge >= 0, covered[way.edge], False).astype(np.int64)
-        swept = sweep(way, trip.length, trip.width, trip.axle, level)
+        swept = sweep(xy, heading, trip.length, trip.width, level, scale=way.scale)
         found = _blocks(trip, graph, plan, ways)
         columns["wish"].append(trip.wish)
         columns["x"].append(xy[:, 0])
@@ -184,6 +214,7 @@ def _movers(trips: Sequence[Trip], graph: RoadGraph, plan: Plan) -> Movers:
         block_start=np.array(blocks),
         **{name: b[:, c].astype(np.int64) for c, name in enumerate(names)},
         block_rank=b[:, 6].copy(),
+        block_halt=b[:, 7] > 0,
         headway=of("headway"),
         pull=of("pull"),
         brake=of("brake"),
@@ -197,8 +228,8 @@ def _movers(trips: Sequence[Trip], graph: RoadGraph, plan: Plan) -> Movers:
     )
 
 
-def _blocks(trip: Trip, graph: RoadGraph, plan: Plan, ways: dict[tuple[int, ...], int]) -> Float:
-    """Stretches through junctions (b, 7): from, to, stop, zone, group, way, rank; see `Movers`."""
+def _blocks(trip: Trip | EgoTrip, graph: RoadGraph, plan: Plan, ways: dict[tuple[int, ...], int]) -> Float:
+    """Stretches through junctions (b, 8): from, to, stop, zone, group, way, rank, halt; see `Movers`."""
     way = trip.way
     zone = zone_at(plan.zones, way.xyz[:, :2])
     half = int(np.ceil((trip.length / 2 + 0.5) / STEP))
@@ -208,9 +239,9 @@ def _blocks(trip: Trip, graph: RoadGraph, plan: Plan, ways: dict[tuple[int, ...]
             z = int(zone[(first + last) // 2])
             group = signal_group(plan, z, float(way.heading[(first + last) // 2])) if z >= 0 else -1
             key = ways.setdefault((-1, number), len(ways))
-            rows.append([first, last, first - 1, z, group, key, 99.0])
+            rows.append([first, last, first - 1, z, group, key, 99.0, 0.0])
     if trip.walks:
-        return np.array(rows, float).reshape(-1, 7)
+        return np.array(rows, float).reshape(-1, 8)
     cuts = np.flatnonzero(np.diff(np.concatenate([[-2], zone, [-2]])))
     for a, b in itertools.pairwise(cuts.tolist()):
         z = int(zone[a])
@@ -224,18 +255,27 @@ def _blocks(trip: Trip, graph: RoadGraph, plan: Plan, ways: dict[tuple[int, ...]
         heading, entry = float(way.heading[before]), int(way.edge[before])
         start, end = a - half, b - 1 + half
         stop = min(start - 2, _stop_line(way, graph, entry, a) - half)
+        if stop < 4 and isinstance(trip, EgoTrip):  # it sets out from within
+            continue
         if rows and stop - rows[-1][1] < 2:  # no room to stand between two junctions
             rows[-1][1] = end
             rows[-1][5] = ways.setdefault((int(rows[-1][5]), -1, *through), len(ways))
             continue
         bend = (float(way.heading[behind]) - heading + np.pi) % (2 * np.pi) - np.pi
-        rank = 2.0 * road_rank(str(graph.highway[entry])) + (0.5 if abs(bend) > 0.5 else 0.0)
+        rank = 2.0 * road_rank(str(graph.highway[entry]) if entry >= 0 else "") + 0.5 * (abs(bend) > 0.5)
         signs = graph.control_kind[graph.control_edge == entry]
         rank += 3.0 if np.isin(signs, ("stop", "give_way")).any() else 0.0
-        rows.append(
-            [start, end, stop, z, signal_group(plan, z, heading), ways.setdefault(through, len(ways)), rank]
-        )
-    return np.array(rows, float).reshape(-1, 7)
+        group = signal_group(plan, z, heading)
+        halt = group < 0 and _stops(graph, entry)
+        rows.append([start, end, stop, z, group, ways.setdefault(through, len(ways)), rank, float(halt)])
+    return np.array(rows, float).reshape(-1, 8)
+
+
+def _stops(graph: RoadGraph, edge: int) -> bool:
+    """Whether there is a stop sign where an edge leads up to a junction."""
+    here = (graph.control_edge == edge) & (graph.control_kind == "stop")
+    near = graph.length[edge] - graph.control_offset[here] < _LINE_REACH
+    return edge >= 0 and bool(near.any() or graph.stop[graph.head[edge]])
 
 
 def _stop_line(way: Way, graph: RoadGraph, edge: int, station: int) -> int:

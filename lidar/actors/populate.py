@@ -16,7 +16,7 @@ from geoscene.scene import Scene
 from lidar.actors.actors import Actors, joined
 from lidar.actors.area import Area, area_of, ego_line
 from lidar.actors.flow import simulate_trips
-from lidar.actors.junctions import junction_plan
+from lidar.actors.junctions import Plan, junction_plan
 from lidar.actors.lanes import Lanes, beside, lane_shift, lanes_of
 from lidar.actors.parked import CARS, concatenated, kerb_spots, lot_spots, parked_actors
 from lidar.actors.sweep import body_poses, rectangles
@@ -73,6 +73,28 @@ class TrafficOptions:
             raise InputError("traffic: " + "; ".join(faults))
 
 
+@dataclass(frozen=True, slots=True)
+class Company:
+    """Who is about during a drive, before anybody moves.
+
+    plan, area : junctions, and the surroundings of the ego
+    trips      : those who move
+    standing   : footprints of what nobody goes or stands through
+    surfaces   : the scene's layer of roads and sidewalks
+    around     : the whole of the surroundings
+    scale      : scene metres per true metre
+    """
+
+    lanes: Lanes
+    plan: Plan
+    area: Area
+    trips: list[Trip]
+    standing: NDArray[np.object_]
+    surfaces: Layer | None
+    around: shapely.Geometry
+    scale: float
+
+
 def populate(
     scene: Scene,
     graph: RoadGraph,
@@ -84,12 +106,21 @@ def populate(
 ) -> Actors:
     """The road users around the ego vehicle for its whole drive; the same for the same seed and options.
 
-    ego     : the ego vehicle's trajectory, which is given: the others keep clear of it
+    ego     : the ego vehicle's trajectory, which is given: the others keep clear of it, signals are green
+              for it; see `drive_among` for an ego that is one of the traffic
     vehicle : its size
 
     Raises InputError for a scene whose features cannot be read.
     """
     options = options or TrafficOptions()
+    company = company_of(scene, graph, ego, seed=seed, options=options)
+    return settled(scene, graph, ego, vehicle, company, seed=seed, options=options, obeys=False)
+
+
+def company_of(
+    scene: Scene, graph: RoadGraph, ego: Trajectory, *, seed: int, options: TrafficOptions
+) -> Company:
+    """Those who are about in the surroundings of an ego that moves so."""
     lanes = lanes_of(graph, side=options.side, bounds=scene.bounds)
     plan = junction_plan(graph, lanes, seed=seed)
     scale = float(np.mean(np.asarray(scene.frame.scale_at(*ego.position[0, :2]), float)))
@@ -106,8 +137,28 @@ def populate(
     )
     walks = walks_of(lanes, area, _union(surfaces, ("sidewalk",), around, 0.0), standing)
     trips += walker_trips(lanes, area, walks, seed=seed, density=options.walkers)
+    return Company(lanes, plan, area, trips, standing, surfaces, around, scale)
+
+
+def settled(
+    scene: Scene,
+    graph: RoadGraph,
+    ego: Trajectory,
+    vehicle: Vehicle,
+    company: Company,
+    *,
+    seed: int,
+    options: TrafficOptions,
+    obeys: bool,
+) -> Actors:
+    """The actors of a company: where they go and stand about an ego whose motion is given.
+
+    obeys : whether that motion keeps to the signals; otherwise they are green when it comes
+    """
+    lanes, plan, area, trips = company.lanes, company.plan, company.area, company.trips
+    standing, surfaces, around, scale = company.standing, company.surfaces, company.around, company.scale
     box = (vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang)
-    flow = simulate_trips(trips, graph, plan, ego, box, reach=options.reach * scale)
+    flow = simulate_trips(trips, graph, plan, ego, box, reach=options.reach * scale, obeys=obeys)
 
     lots = _polygons(_layer(scene, "landcover"), ("parking",), around)
     structures = _layer(scene, "structures")

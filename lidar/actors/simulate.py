@@ -31,6 +31,8 @@ _BESIDE = 90.0  # metres from the ego within which what is held already is looke
 _COARSE = 3  # one square in so many is looked at: what stands there covers more
 _YIELD_S = 4.0  # seconds to arrival within which somebody with priority is waited for
 _PATIENCE = 20  # steps for which a mover waits for room to appear
+_HALT = 10  # steps at rest before a stop sign
+_AT_LINE = 3.0  # metres from where to stop within which one has stopped there
 _NOBODY = -1
 
 
@@ -50,6 +52,7 @@ class Movers(NamedTuple):
     block_zone, block_group : junction, and group of its signals, -1 for none
     block_way     : number of the way through the junction; movers of one number follow each other
     block_rank    : the lower goes first
+    block_halt    : whether there is a stop sign: one comes to rest before it
 
     headway, pull, brake, gap : time gap s, acceleration, comfortable braking m/s^2, standing gap m
     length, width : metres
@@ -76,6 +79,7 @@ class Movers(NamedTuple):
     block_group: Ints
     block_way: Ints
     block_rank: Float
+    block_halt: Flags
     headway: Float
     pull: Float
     brake: Float
@@ -130,6 +134,7 @@ class _State(NamedTuple):
     taken, left   : rows taken, and rows (in the order of leaving) given back
     station       : the last station that they hold
     block, granted : the next block, and whether they may enter it
+    rested        : steps for which they have stood at the stop sign of the next block
     """
 
     active: Flags
@@ -142,14 +147,26 @@ class _State(NamedTuple):
     station: Ints
     block: Ints
     granted: Flags
+    rested: Ints
 
 
 @njit(cache=True, nogil=True)
 def run(
-    m: Any, ego: Any, signals: Any, out: Any, squares: int, dt: float, steps: int, horizon: int, far: float
+    m: Any,
+    ego: Any,
+    signals: Any,
+    out: Any,
+    squares: int,
+    dt: float,
+    steps: int,
+    horizon: int,
+    far: float,
+    driver: int,
 ) -> Any:
     """Rows (mover, step, metres along the way, speed) by step, and which movers (n,) met the ego.
 
+    ego     : its motion, if that is given; else its place is filled in as it moves
+    driver  : the mover that is the ego, -1 for none: then the ego's motion is given
     out     : (n,) bool, movers to leave out
     squares : number of squares
     horizon : steps that the ego's way is known ahead
@@ -175,6 +192,7 @@ def run(
         np.full(n, -1, np.int64),
         m.block_start[:-1].copy(),
         np.zeros(n, np.bool_),
+        np.zeros(n, np.int64),
     )
     met = np.zeros(n, np.bool_)
     log = np.empty((4096, 4))
@@ -182,6 +200,9 @@ def run(
     for step in range(steps):
         for ahead in range(step + horizon if step else 0, step + horizon + 1):
             _expect_ego(g, ego, ahead, step * dt, dt)
+        if driver >= 0:
+            row = m.station_start[driver] + int(st.s[driver] / STEP)
+            ego.x[step], ego.y[step] = m.x[row], m.y[row]
         for i in range(n):
             if st.gone[i] or not (st.active[i] or _appears(i, step, step * dt, m, g, st)):
                 continue
@@ -280,15 +301,40 @@ def _leave(i: int, m: Any, g: Any, st: Any) -> None:
     b = st.block[i]
     if b == m.block_start[i + 1] or not (st.gone[i] or k > m.block_to[b]):
         return
+    _release(i, m, g, st)
+    st.rested[i] = 0
+    st.block[i] = b + 1
+
+
+@njit(cache=True, nogil=True)
+def _release(i: int, m: Any, g: Any, st: Any) -> None:
+    """Give back the way through a mover's next junction, if it has it."""
+    b = st.block[i]
     if st.granted[i]:
-        for q in range(q0, q1):
+        for q in range(m.square_start[i], m.square_start[i + 1]):
             if m.block_from[b] <= m.first[q] <= m.block_to[b]:
                 p = m.square[q]
                 g.holds[p] -= 1
                 if g.holds[p] == 0:
                     g.hold[p] = _NOBODY
     st.granted[i] = False
-    st.block[i] = b + 1
+
+
+@njit(cache=True, nogil=True)
+def _too_late(i: int, k: int, t: float, m: Any, st: Any, signals: Any) -> bool:
+    """Whether a signal will have changed before a mover that may enter its next junction gets there.
+
+    Not if it could no longer stop before it in comfort.
+    """
+    b, v = st.block[i], st.v[i]
+    metres = (m.block_stop[b] - k) * STEP
+    if m.whole[i] or m.block_group[b] < 0 or st.station[i] >= m.block_stop[b]:
+        return False
+    eta = metres / max(v, 3.0)
+    return bool(
+        v * v / (2 * m.brake[i]) + STEP < metres
+        and not is_green(m.block_zone[b], m.block_group[b], t + eta, signals)
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -302,10 +348,14 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
         st.ahead[i] += 1
     limit = end
     line = not m.leaves[i]
+    halts = False
     b = st.block[i]
+    if b < m.block_start[i + 1] and st.granted[i] and _too_late(i, k, t, m, st, signals):
+        _release(i, m, g, st)
     if b < m.block_start[i + 1] and not st.granted[i]:
         near = m.block_stop[b] - k <= (v * v / (1.3 * m.brake[i]) + 2.0 * v) / STEP + 12
-        if near and k <= m.block_from[b] and _may_enter(i, k, t, m, g, st, signals):
+        halts = m.block_halt[b] and st.rested[i] < _HALT
+        if near and not halts and k <= m.block_from[b] and _may_enter(i, k, t, m, g, st, signals):
             st.granted[i] = True
             for q in range(st.ahead[i], m.square_start[i + 1]):
                 if m.block_from[b] <= m.first[q] <= m.block_to[b]:
@@ -340,6 +390,9 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     room = min(st.station[i] - 1, end - 1) * STEP - s - v * dt / 2
     root = (dt / 2 * HARD) ** 2 + 2 * HARD * room
     new = min(new, max(math.sqrt(root) - dt / 2 * HARD, 0.0) if root > 0 else 0.0)
+    if halts and new < 0.4 and (m.block_stop[b] - k) * STEP < _AT_LINE:
+        st.rested[i] += 1
+        new = 0.0
     st.s[i] = min(s + (v + new) / 2 * dt, max(end - 1, k) * STEP)
     st.v[i] = new
     if m.leaves[i] and st.s[i] > (end - 3) * STEP:
@@ -387,7 +440,7 @@ def _may_enter(i: int, k: int, t: float, m: Any, g: Any, st: Any, signals: Any) 
     base = m.station_start[i]
     pace = max(st.v[i], 1.2 if m.whole[i] else 3.0)
     eta = max(m.block_stop[b] - k, 0) * STEP / pace
-    if group >= 0 and not is_green(zone, group, t + eta, signals):
+    if group >= 0 and not (is_green(zone, group, t, signals) and is_green(zone, group, t + eta, signals)):
         return False
     behind = False  # somebody on the same way through is ahead
     for q in range(st.ahead[i], m.square_start[i + 1]):

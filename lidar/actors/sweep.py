@@ -38,15 +38,17 @@ class Sweep:
     leave: NDArray[np.int32]
 
 
-def sweep(way: Way, length: float, width: float, axle: float, level: NDArray[np.int64]) -> Sweep:
+def sweep(
+    xy: Float, heading: Float, length: float, width: float, level: NDArray[np.int64], *, scale: float
+) -> Sweep:
     """What a body of that size covers along a way, a station at a time.
 
-    axle  : metres between the points of the body that stay on the way; they turn it
+    xy, heading : (n, 2) and (n,) of its middle
     level : (n,) 0 or 1: bridges and tunnels have squares of their own
+    scale : scene metres per true metre
     """
-    xy, heading = body_poses(way, axle)
     # a body between two stations lies within both, grown by half a step
-    half = np.array([length / 2 + STEP / 2, width / 2]) * way.scale + _SPARE
+    half = np.array([length / 2 + STEP / 2, width / 2]) * scale + _SPARE
     most = int(math.ceil(2 * half[0] / SQUARE) + 2) * int(math.ceil(2 * half[1] / SQUARE) + 2)
     square, first, last, count = _cover(xy, heading, half, level, most)
     square, first, last = square[:count], first[:count], last[:count]

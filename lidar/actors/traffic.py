@@ -114,6 +114,10 @@ class Trip:
         """Metres between the points of the body that stay on the way."""
         return self.shape.base * self.stretch[0]
 
+    def body(self) -> tuple[Float, Float]:
+        """Middle (n, 2) and heading (n,) of the body at each station."""
+        return body_poses(self.way, self.axle)
+
 
 def vehicle_trips(
     lanes: Lanes,
