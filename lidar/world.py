@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.classes import materials
+from geoscene.classes import Class, materials
 from geoscene.mesh import Mesh
 from geoscene.scene import Scene
+from geoscene.shapes import LEAF_AREA_DENSITY
 from lidar.errors import InputError
 from lidar.raycast import Caster, Geometry, Hits, Instances
 from lidar.raycast.geometry import split
@@ -53,8 +54,9 @@ class Faces(NamedTuple):
 
     start : (k + 1,) int64, first row of each instance's shape; the last is 0, the caster's own mesh
     named : (k,) int32, feature number of each instance
-    what  : (m,) int64, feature << 32 | class << 8 | material
+    what  : (m,) int64, feature << 32 | kind of leaves << 16 | class << 8 | material
     low, high : bounds of all feature numbers
+    leaves : (l,) float64, m2/m3, leaf area per volume behind a face by its kind of leaves; 0 for kind 0, none
     """
 
     start: NDArray[np.int64]
@@ -62,11 +64,14 @@ class Faces(NamedTuple):
     what: NDArray[np.int64]
     low: int
     high: int
+    leaves: Float
 
 
-def packed(surfaces: Surfaces) -> NDArray[np.int64]:
-    """The column `Faces.what` of surfaces."""
+def packed(surfaces: Surfaces, leaves: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
+    """The column `Faces.what` of surfaces and of their kinds of leaves (none by default)."""
     what = surfaces.feature.astype(np.int64) << 32
+    if leaves is not None:
+        what |= leaves.astype(np.int64) << 16
     what |= surfaces.klass.astype(np.int64) << 8
     what |= surfaces.material
     return what
@@ -121,8 +126,11 @@ class World:
     """
 
     def __init__(self, scene: Scene, *, margin: float = 0.0, actors: Sequence[Mesh] = ()) -> None:
-        shapes = list(scene.shapes().values())
+        named = scene.shapes()
+        shapes = list(named.values())
         self.scene = scene
+        self._names = tuple(named)
+        self._leaves: Mapping[str, float] = scene.manifest.get("leaf_area_density", LEAF_AREA_DENSITY)
         self.margin = margin
         self.region: Region | None = None
         self._shapes = tuple(_shape(mesh) for mesh in shapes)
@@ -229,11 +237,21 @@ class World:
                 for f in fields(Surfaces)
             )
         )
-        self._what = packed(self._surfaces)
+        self._what = packed(self._surfaces, self._leaves_of(starts[len(self._tiles) :]))
         feature = self._surfaces.feature
         self._bounds = int(feature.min()), int(feature.max())
         self._of_shape, self._of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes)])
         self._number()
+
+    def _leaves_of(self, starts: NDArray[np.integer]) -> NDArray[np.uint8]:
+        """Kinds of leaves of all rows of the tables; ``starts`` are those of the shapes."""
+        kinds, found = list(self._leaves), np.zeros(len(self._surfaces.klass), np.uint8)
+        for k, name in enumerate(self._names):
+            if name in kinds:
+                found[starts[k] : starts[k + 1]] = 1 + kinds.index(name)
+        if "hedge" in kinds:
+            found[self._surfaces.klass == Class.HEDGE] = 1 + kinds.index("hedge")
+        return found
 
     def _number(self) -> None:
         """Say where the tables of all copies start and what they are called."""
@@ -245,7 +263,8 @@ class World:
         low, high = self._bounds
         if len(self._feature):
             low, high = min(low, int(self._feature.min())), max(high, int(self._feature.max()))
-        self._faces = Faces(self._base, self._feature, self._what, low, high)
+        leaves = np.array([0.0, *self._leaves.values()])
+        self._faces = Faces(self._base, self._feature, self._what, low, high, leaves)
 
     def _instances(self) -> list[Instances]:
         tiles = self._tiles.values()

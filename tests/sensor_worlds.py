@@ -10,6 +10,8 @@ from lidar.poses import Trajectory
 from lidar.raycast import Caster
 from lidar.world import Faces, Surfaces, packed
 
+LEAVES = 0.8  # m2/m3 of leaves in boxes of class HEDGE
+
 _CORNERS = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 _FACES = np.array(
     [
@@ -31,9 +33,10 @@ class MeshWorld:
     @property
     def faces(self):
         m = self.mesh
-        what = packed(Surfaces(m.feature, m.klass, m.material, m.surface, m.color))
+        surfaces = Surfaces(m.feature, m.klass, m.material, m.surface, m.color)
+        what = np.append(packed(surfaces, m.klass == Class.HEDGE), np.int64(-1) << 32)
         low, high = int(m.feature.min()), int(m.feature.max())
-        return Faces(np.zeros(1, np.int64), np.empty(0, np.int32), what, low, high)
+        return Faces(np.zeros(1, np.int64), np.empty(0, np.int32), what, low, high, np.array([0.0, LEAVES]))
 
     def lookup(self, hits):
         seen, m = hits.face >= 0, self.mesh

@@ -29,6 +29,7 @@ class Effects:
     extinction   : 1/m, of the air, one way
     rays         : rays a pulse, of `FOOTPRINTS`: a beam with a size, mixed pixels, several echoes
     mirrors      : glass lets through and mirrors, water mirrors
+    foliage      : crowns and hedges let rays through between their leaves
     blooming     : pulses that pass close by a retro-reflector may return its range
     interference : number of other scanners whose pulses may be received
     false_alarms : noise may pass the threshold
@@ -49,6 +50,7 @@ class Effects:
     extinction: float = 0.0
     rays: int = 1
     mirrors: bool = False
+    foliage: bool = False
     blooming: bool = False
     interference: int = 0
     false_alarms: bool = False
@@ -90,6 +92,7 @@ LEVELS: dict[str, Effects] = {
         detection=True,
         rays=19,
         mirrors=True,
+        foliage=True,
         blooming=True,
         false_alarms=True,
         range_noise="signal",

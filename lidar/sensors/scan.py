@@ -63,6 +63,7 @@ def scan(
         time=_ray_time(sensor, frame, pulses) if _moving(world) else None,
         effects=effects,
         seed=seed,
+        leaf_seed=int(generator(seed, sensor.name, frame, "foliage").integers(2**63)),
         threads=threads,
     )
     echoes = echoes.where(echoes.range + offset >= sensor.min_range)

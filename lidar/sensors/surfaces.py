@@ -15,6 +15,7 @@ from lidar.poses import Trajectory
 from lidar.raycast import Hits
 from lidar.rig import Mount
 from lidar.sensors.beams import Firings
+from lidar.sensors.foliage import Leaves
 from lidar.sensors.motion import Beam, Carrier, Rays
 from lidar.sensors.receive import Look, Receiver, shiny_codes
 from lidar.world import World
@@ -39,6 +40,7 @@ def met(
     time: NDArray[np.float32] | None,
     effects: Effects,
     seed: int,
+    leaf_seed: int = 0,
     threads: int = 1,
 ) -> Echoes:
     """The echoes of pulses that a moving sensor fires, from within ``far`` metres, sorted by pulse and range.
@@ -46,12 +48,14 @@ def met(
     beam       : how pulses are spread over rays
     separation : metres, surfaces closer than this are one echo
     time       : (n,) ray times of the pulses, for things that move, or None
+    leaf_seed  : of the leaves that rays meet, with ``foliage``
     """
     rays = len(beam)
     batch = max(_BATCH // rays, 1)
     look = Look(world, wavelength_nm, effects, seed)
     carrier = Carrier(pulses, mount, trajectory, beam, batch=batch)
     receiver = Receiver(look, beam.share, separation, pulses=len(pulses))
+    leaves = Leaves(world.caster, world.faces, far, leaf_seed) if effects.foliage else None
     beyond: list[Echoes] = []
     for number, first in enumerate(range(0, len(pulses), batch)):
         cast = carrier.rays(number)
@@ -66,11 +70,18 @@ def met(
             order=cast.order,
             threads=threads,
         )
+        pierced = None if leaves is None else leaves.pierce(hits, cast, first * rays, moments)
         shiny = receiver.take(hits, first)
         if len(shiny):
             pulse, ray = np.divmod(shiny, np.int32(rays))
             later = None if moments is None else moments[shiny]
-            beyond += _beyond(cast.take(shiny), pulse + np.int32(first), beam.share[ray], look, far, later)
+            skip = np.zeros(len(shiny))
+            if pierced is not None:
+                among = np.isin(shiny, pierced)
+                skip[among] = hits.range[shiny[among]] - _CLEAR
+            beyond += _beyond(
+                cast.take(shiny), pulse + np.int32(first), beam.share[ray], look, far, later, skip
+            )
     echoes, surfaces = receiver.echoes()
     if not len(surfaces):
         return echoes
@@ -90,10 +101,12 @@ def _beyond(
     look: Look,
     far: float,
     time: NDArray[np.float32] | None,
+    skip: Float,
 ) -> list[Echoes]:
     """What rays meet that have met glass or water: behind it, and by way of the mirror image.
 
     pulse, power : (n,) of each ray; time as in `met`
+    skip         : (n,) metres from each ray's start that it has passed among leaves
 
     The mirrored path is taken twice, so its power goes with the square of the reflected share; its echo
     appears on the ray's own direction, as far behind the mirror as the thing is before it, and is labelled
@@ -102,7 +115,7 @@ def _beyond(
     caster = look.world.caster
     pose = rays.poses.take(rays.index)
     start, way = pose.place(rays.origin), pose.directions(rays.direction)
-    travelled = np.zeros(len(pulse))
+    start, travelled = start + skip[:, None] * way, skip
     glass, water = shiny_codes()
     found = []
     for layer in range(_PANES):
