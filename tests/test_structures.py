@@ -319,6 +319,55 @@ def test_a_building_stands_over_the_tunnel_that_would_run_into_it(tunnel):
     assert solid.vertices[:, 2].max() == pytest.approx(base[0] + buildings.height[0], abs=1e-3)
 
 
+def test_a_building_over_a_road_bridge_lets_its_traffic_through_and_one_beside_it_stays_whole(bridge):
+    points = bridge.centre_lines("bridge")
+    high = points[points[:, 2] > 2.0]
+    x = float(high[0, 0])
+    across = lonlat([(x, -15), (x + 12, -15), (x + 12, 15), (x, 15)])
+    beside = lonlat([(x, 3.5), (x + 12, 3.5), (x + 12, 15), (x, 15)])
+    base = np.zeros(1)
+    for outline, through in ((across, True), (beside, False)):
+        house = Area(
+            "way/900", {"building": "yes", "height": "20"}, shapely.Polygon(outline), np.empty(0, int)
+        )
+        buildings, _ = read_buildings(town(PLACES, OVER, [house]), FRAME)
+        over, problems = buildings_over(buildings, base, bridge.table)
+        assert [p.reason for p in problems] == (["over-bridge"] if through else [])
+        solid, _ = build_solids(over, base=base)
+        assert validate_mesh(solid).ok.all()
+        lane = points[(points[:, 0] > x - 5) & (points[:, 0] < x + 17)]
+        for up in (0.5, 4.0):
+            assert not crosses(solid, moved(lane[0], 0, 0, up), moved(lane[-1], 0, 0, up))
+        assert crosses(solid, np.array([x - 5, 10, 1.0]), np.array([x + 17, 10, 1.0]))
+
+
+def test_a_track_over_a_road_lies_on_a_deck_that_clears_the_road_and_stands_on_the_ground():
+    places = PLACES | {7: (-90, 20), 8: (-30, 20), 9: (30, 20), 10: (90, 20)}
+    track = {"railway": "rail"}
+    ways = [
+        (ROAD, [5, 6]),
+        (track, [7, 8]),
+        (track | {"bridge": "yes", "layer": "1"}, [8, 9]),
+        (track, [9, 10]),
+    ]
+    rail = Town(town(places, ways))
+    mesh = rail.mesh()
+    assert validate_mesh(mesh).ok.all()
+    line = np.concatenate(list(rail.table.line))
+    middle = line[np.abs(line[:, 0]) < 6, 2]
+    assert (middle >= SIZES.headroom + SIZES.deck - 1e-6).all()
+    slope = np.abs(np.diff(line[:, 2]) / np.diff(line[:, 0]))
+    assert slope.max() <= 0.025 + 1e-9  # trains climb no ramps
+    xy = np.array([[x, 20.0 + y] for x in (-20.0, 0.0, 20.0) for y in (-0.76, 0.0, 0.76)])
+    z, klass = first_below(mesh, np.column_stack([xy, np.full(len(xy), 50.0)]))
+    assert (z > SIZES.headroom).all()
+    assert klass.reshape(3, 3).tolist() == [[Class.RAIL, Class.BRIDGE, Class.RAIL]] * 3
+    foot = mesh.vertices[mesh.vertices[:, 2] < 0, 0]
+    assert foot.min() < -28  # an abutment at either end
+    assert foot.max() > 28
+    assert [p.reason for p in rail.problems] == ["no-ramp"]
+
+
 def test_a_footbridge_clears_the_road_and_its_parapets_are_railings():
     places = PLACES | {7: (-80, 20), 8: (80, 20)}
     ways = [(ROAD, [5, 6]), ({"highway": "footway", "bridge": "yes", "layer": "1"}, [7, 8])]

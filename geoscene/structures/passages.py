@@ -1,4 +1,4 @@
-"""Buildings that tunnels run through: they stand over them."""
+"""Buildings that roads in tunnels or on bridges run through: they stand over them."""
 
 from __future__ import annotations
 
@@ -17,49 +17,63 @@ from geoscene.structures.table import StructureOptions, Structures
 Float = NDArray[np.float64]
 
 _SCANT = 1.0
-"""Square metres; a smaller overlap of building and tunnel is left as it is."""
+"""Square metres; a smaller overlap of building and road is left as it is."""
 
 _OVER = 0.1
-"""Metres from a tunnel's roof to the underside of what stands over it."""
+"""Metres from a tunnel's roof, or a bridge's free height, to the underside of what stands over it."""
 
 
 def buildings_over(
     buildings: Buildings, base: Float, table: Structures, *, options: StructureOptions | None = None
 ) -> tuple[Buildings, list[Problem]]:
-    """The buildings with a passage where a tunnel would run into them, and which they are.
+    """The buildings with a passage where a tunnel or a road bridge would run into them, and which they are.
 
-    What stands over the tunnel becomes a part with its underside above the tunnel's roof; the rest becomes a
-    part that reaches down as before. Roofs of what is so divided are flat.
+    What stands over the road becomes a part with its underside above the tunnel's roof or the bridge's free
+    height; the rest becomes a part that reaches down as before. Roofs of what is so divided are flat. A
+    bridge counts where the middle of its road is within the building, not where its edge touches it, and a
+    footbridge not at all: it leads into the building.
 
     base : (count,) z in metres of each building's base
     """
     options = options or StructureOptions()
     rows = np.flatnonzero(buildings.drawn)
-    tunnels = np.flatnonzero(table.tunnel)
-    pair = shapely.STRtree(buildings.footprint[rows]).query(table.polygon[tunnels], predicate="intersects")
-    tunnel, row = tunnels[pair[0]], rows[pair[1]]
-    common = shapely.intersection(buildings.footprint[row], table.polygon[tunnel])
+    roads = np.flatnonzero(table.tunnel | (table.edge >= 0))
+    pair = shapely.STRtree(buildings.footprint[rows]).query(table.polygon[roads], predicate="intersects")
+    road, row = roads[pair[0]], rows[pair[1]]
+    common = shapely.intersection(buildings.footprint[row], table.polygon[road])
+    tunnel = table.tunnel[road]
+    free = np.where(tunnel, table.rise[road] + options.roof, options.headroom) + _OVER
     low, high = np.empty((2, len(row)))
-    for k, piece in enumerate(tunnel.tolist()):
+    for k, piece in enumerate(road.tolist()):
         z = surface_heights(table, piece, shapely.get_coordinates(common[k]).reshape(-1, 2))
         low[k] = z.min(initial=np.inf) - table.body[piece]
-        high[k] = z.max(initial=-np.inf) + table.rise[piece] + options.roof + _OVER
+        high[k] = z.max(initial=-np.inf) + free[k]
     stands = base[buildings.outline[row]]
-    met = shapely.area(common) > _SCANT
+    middle = np.array([shapely.LineString(line[:, :2]) for line in table.line[road]], object)
+    within = shapely.length(shapely.intersection(buildings.footprint[row], middle)) > _SCANT
+    met = (shapely.area(common) > _SCANT) & (tunnel | within)
     met &= (high > stands + buildings.min_height[row]) & (low < stands + buildings.height[row])
     if not met.any():
         return buildings, []
-    return _divided(buildings, row[met], table.polygon[tunnel[met]], (high - stands)[met])
+    corridor = table.polygon[road[met]]
+    return _divided(buildings, row[met], corridor, (high - stands)[met], tunnel=tunnel[met])
 
 
 def _divided(
-    buildings: Buildings, row: NDArray[np.int64], corridor: NDArray[np.object_], clear: Float
+    buildings: Buildings,
+    row: NDArray[np.int64],
+    corridor: NDArray[np.object_],
+    clear: Float,
+    *,
+    tunnel: NDArray[np.bool_],
 ) -> tuple[Buildings, list[Problem]]:
     """Rows (k,) divided along corridors (k,), what is in them standing ``clear`` (k,) over the base."""
     footprint, underside = buildings.footprint.copy(), buildings.min_height.copy()
     source: list[int] = []
     shape: list[shapely.Geometry] = []
     new_low: list[float] = []
+    over_what = np.where(tunnel, "tunnel", "bridge")
+    cause: list[str] = []
     for k in np.unique(row).tolist():
         rest, first = footprint[k], len(source)
         for there in np.flatnonzero(row == k).tolist():
@@ -69,18 +83,21 @@ def _divided(
                 source.append(k)
                 shape.append(over)
                 new_low.append(clear[there])
+                cause.append(str(over_what[there]))
         if buildings.is_part[k]:
             if rest.is_empty:  # all of it is over tunnels
                 rest, underside[k] = footprint[k], max(clear[row == k].max(), underside[k])
-                del source[first:], shape[first:], new_low[first:]
+                del source[first:], shape[first:], new_low[first:], cause[first:]
             footprint[k] = rest
         elif not rest.is_empty:
             source.append(k)
             shape.append(rest)
             new_low.append(buildings.min_height[k])
+            cause.append(str(buildings.min_height_source[k]))
     problems = [
-        Problem(str(buildings.osm_id[k]), "building", "repaired", "over-tunnel", "stands over a tunnel")
-        for k in np.unique(buildings.outline[row]).tolist()
+        Problem(str(buildings.osm_id[k]), "building", "repaired", f"over-{what}", f"stands over a {what}")
+        for what in ("tunnel", "bridge")
+        for k in np.unique(buildings.outline[row[over_what == what]]).tolist()
     ]
     extra = np.array(source, np.int64)
     added = {f.name: getattr(buildings, f.name)[extra] for f in fields(Buildings)}
@@ -89,7 +106,7 @@ def _divided(
         "is_part": np.ones(len(extra), np.bool_),
         "outline": buildings.outline[extra],
         "min_height": np.array(new_low, float),
-        "min_height_source": np.full(len(extra), "tunnel", object),
+        "min_height_source": np.array(cause, object),
         "roof_shape": np.full(len(extra), "flat", object),
         "roof_height": np.zeros(len(extra)),
         "roof_source": np.full(len(extra), "none", object),

@@ -1,4 +1,4 @@
-"""Bridges and tunnels that no car takes: footways, cycleways and private roads, with heights of their own."""
+"""Bridges and tunnels that no car takes (footways, cycleways, private roads, tracks) at their own heights."""
 
 from __future__ import annotations
 
@@ -35,6 +35,12 @@ _BESIDE = 4.0
 _SLOPE = 0.12
 """Greatest slope from where a path must be high or low; one in eight, a steep ramp. Assumed."""
 
+_TRACK_SLOPE = 0.025
+"""The same for railways (EN 15273 and the TSI for infrastructure have 2.5 % on main lines, 3.5 % at most)."""
+
+_BED = 4.4
+"""Metres: width of the deck under one track."""
+
 _HANGING = 0.5
 """Metres between a bridge's end and the ground that are reported."""
 
@@ -47,6 +53,7 @@ class _Net:
     rows   : per way, its stations in order
     a, b   : (s,) neighbouring stations
     metres : (s,) between them
+    slope  : (s,) float64, greatest slope between them
     """
 
     xy: Float
@@ -54,6 +61,7 @@ class _Net:
     a: Int
     b: Int
     metres: Float
+    slope: Float
 
 
 def path_members(
@@ -72,7 +80,9 @@ def path_members(
     the slope of a ramp.
     """
     own = np.flatnonzero(
-        (raised.edge < 0) & ~np.isin(raised.klass, (Class.RAIL, Class.LANE_MARKING)) & (raised.place > 0)
+        (raised.edge < 0)
+        & (raised.klass != Class.LANE_MARKING)
+        & ((raised.place == 1) | ((raised.place == 2) & (raised.klass != Class.RAIL)))
     )
     place = dict(zip(raised.osm_id[own].tolist(), raised.place[own].tolist(), strict=True))
     ways = [way for way in osm.ways if way.osm_id in place and len(way.nodes) > 1]
@@ -87,9 +97,11 @@ def path_members(
     tunnel = np.array([place[name] == 2 for name in ids.tolist()], np.bool_)
     rows = [own[raised.osm_id[own] == name] for name in ids.tolist()]
     level = np.array([raised.level[r[0]] for r in rows], np.int8)
-    net = _network(lines, [way.nodes for way in ways])
+    track = np.array([(raised.klass[r] == Class.RAIL).all() for r in rows], np.bool_)
+    net = _network(lines, [way.nodes for way in ways], np.where(track, _TRACK_SLOPE, _SLOPE))
     ends = _ends(net)
-    z = _heights(net, tunnel, level, ends, graph, osm, frame, height, options)
+    body = np.where(track, options.deck, options.slab)
+    z = _heights(net, tunnel, level, body, ends, graph, osm, frame, height, options)
 
     count = len(ways)
     line, approach, own_rows = (np.empty(count, object) for _ in range(3))
@@ -101,7 +113,7 @@ def path_members(
         line[k] = np.column_stack([net.xy[station], z[station]])
         own_rows[k] = rows[k]
         area = shapely.area(shapely.union_all(raised.polygon[rows[k]]))
-        width[k] = max(area / max(lines[k].length, 1.0), 0.5)
+        width[k] = _BED if track[k] else max(area / max(lines[k].length, 1.0), 0.5)
         landed[k] = ends[station[[0, -1]]]
         approach[k] = shapely.union_all(
             [_onward(line[k][:: 1 - 2 * e, :2], width[k]) for e in (0, 1) if landed[k, e]]
@@ -111,7 +123,7 @@ def path_members(
         if worst > _HANGING:
             detail = f"an end {worst:.1f} m from the ground"
             problems.append(Problem(str(ids[k]), "structure", "repaired", "no-ramp", detail))
-    foot_only = np.array([(raised.klass[r] != Class.ROAD).all() for r in rows], np.bool_)
+    foot_only = ~track & np.array([(raised.klass[r] != Class.ROAD).all() for r in rows], np.bool_)
     edge = np.full(count, -1, np.int32)
     return Members(line, tunnel, foot_only, width, own_rows, approach, landed, level, edge, ids), problems
 
@@ -128,8 +140,8 @@ def _onward(xy: Float, width: float) -> shapely.Geometry:
     return band.union(shapely.Point(xy[0]).buffer(width / 2))
 
 
-def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]]) -> _Net:
-    """Stations at the ends and along lines."""
+def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]], slope: Float) -> _Net:
+    """Stations at the ends and along lines, whose greatest slopes (n,) are given."""
     number: dict[int, int] = {}
     places: list[Float] = []
     rows, a, b, metres = [], [], [], []
@@ -163,8 +175,9 @@ def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]]) -> _Net
         metres.append(np.maximum(np.hypot(*np.diff(xy, axis=0).T), 1e-3))
     if not rows:
         none = np.empty(0, np.int64)
-        return _Net(np.empty((0, 2)), [], none, none, np.empty(0))
-    return _Net(np.array(places), rows, np.concatenate(a), np.concatenate(b), np.concatenate(metres))
+        return _Net(np.empty((0, 2)), [], none, none, np.empty(0), np.empty(0))
+    steep = np.repeat(slope, [len(part) for part in a])
+    return _Net(np.array(places), rows, np.concatenate(a), np.concatenate(b), np.concatenate(metres), steep)
 
 
 def _ends(net: _Net) -> NDArray[np.bool_]:
@@ -177,6 +190,7 @@ def _heights(
     net: _Net,
     tunnel: NDArray[np.bool_],
     level: NDArray[np.int8],
+    body: Float,
     ends: NDArray[np.bool_],
     graph: RoadGraph,
     osm: OsmData,
@@ -195,7 +209,7 @@ def _heights(
     on_road = _on_road_bridges(net, tunnel, level, graph)
     fixed = np.where(np.isnan(on_road), fixed, on_road)
     z = _even(net, fixed, ground)
-    need = _needs(net, tunnel, graph, osm, frame, height, options)
+    need = _needs(net, tunnel, level, body, graph, osm, frame, height, options)
     for sign, chosen in ((1.0, ~down), (-1.0, down)):
         bound = np.where(chosen, sign * need, -np.inf)
         bound[~np.isnan(on_road) | np.isnan(bound)] = -np.inf
@@ -242,6 +256,8 @@ def _even(net: _Net, fixed: Float, ground: Float) -> Float:
 def _needs(
     net: _Net,
     tunnel: NDArray[np.bool_],
+    level: NDArray[np.int8],
+    body: Float,
     graph: RoadGraph,
     osm: OsmData,
     frame: Frame,
@@ -254,18 +270,20 @@ def _needs(
     lines = np.concatenate([roads, obstacles.line])
     tree = shapely.STRtree(lines)
     need = np.full(len(net.xy), np.nan)
-    for rows, below in zip(net.rows, tunnel.tolist(), strict=True):
+    of_way = zip(net.rows, tunnel.tolist(), level.tolist(), body.tolist(), strict=True)
+    for rows, below, layer, thick in of_way:
         way = shapely.LineString(net.xy[rows])
         for other in tree.query(way, predicate="crosses").tolist():
             points = shapely.get_coordinates(shapely.intersection(way, lines[other]))
             for xy in points:
                 if other < len(roads):
                     z = float(foot(graph.geometry[other], xy[None])[0][0])
-                    over = z + options.headroom + options.slab
+                    over = z + options.headroom + thick
                 else:
                     z = float(_ground(xy[None], height)[0])
-                    over = z + float(obstacles.clear[other - len(roads)]) + options.slab
-                if other < len(roads) and (graph.tunnel[other] or (graph.bridge[other] and below)):
+                    over = z + float(obstacles.clear[other - len(roads)]) + thick
+                above = below or (other < len(roads) and graph.layer[other] > layer)
+                if other < len(roads) and (graph.tunnel[other] or (graph.bridge[other] and above)):
                     continue  # far below or above the ground that the path is near
                 under = z - options.passage - options.roof - 2 * options.margin
                 nearest = rows[np.hypot(*(net.xy[rows] - xy).T) < _STATION]
@@ -285,7 +303,7 @@ def _cones(net: _Net, bound: Float) -> Float:
     count, top = len(bound), float(bound[start].max())
     row = np.concatenate([net.a, np.full(len(start), count)])
     column = np.concatenate([net.b, start])
-    cost = np.concatenate([net.metres * _SLOPE, top - bound[start] + 1e-9])
+    cost = np.concatenate([net.metres * net.slope, top - bound[start] + 1e-9])
     links = csr_array((cost, (row, column)), shape=(count + 1, count + 1))
     reach: Float = top - dijkstra(links, directed=False, indices=count)[:count]
     return reach

@@ -32,6 +32,9 @@ _AROUND = 12.0
 _SIDE = 40.0
 """Metres: no carriageway reaches further from its centre line."""
 
+_BESIDE_RAILS = 1.45
+"""Metres of a railway bridge's deck beside each rail; over half the gauge: it is whole between the rails."""
+
 _OVERLAP = 0.003
 """Metres by which pieces of one carriageway overlap, so that rounding opens no crack between them."""
 
@@ -99,6 +102,8 @@ def _outlines(
         own = members.rows[m]
         own = own[raised.klass[own] != Class.LANE_MARKING]
         whole = _union(raised.polygon[own])
+        if len(own) and (raised.klass[own] == Class.RAIL).all():
+            whole = whole.buffer(_BESIDE_RAILS, cap_style="flat", join_style="mitre", mitre_limit=1.5)
         if members.tunnel[m] or not (raised.klass[own] == Class.BRIDGE).any():
             grow = options.margin + options.wall if members.tunnel[m] else options.rim
             grown = whole.buffer(grow, join_style="mitre", mitre_limit=1.5)

@@ -32,6 +32,9 @@ _LOW = 1.0
 _SHARE, _ALONG = 0.6, 1.0
 """A pier's width as a share of its bridge's, and its length along it in metres. Assumed."""
 
+_END = 0.9
+"""Metres from a bridge's end to the middle of the pier under it, where it does not lie on the ground."""
+
 _SHIFTS = (0.0, 2.0, -2.0, 4.0, -4.0, 6.0, -6.0, 8.0, -8.0, 10.0, -10.0)
 """Metres along the bridge by which a pier gives way."""
 
@@ -48,6 +51,7 @@ def place_piers(
     rail = ground.klass[rows] == Class.RAIL
     pieces = shapely.STRtree(table.polygon)
     pier, spacing = table.pier.copy(), table.pier_spacing.copy()
+    ends, solid = _ends(table), shapely.STRtree(ground.polygon[rows[~rail]])
     for k in np.flatnonzero(~table.tunnel).tolist():
         flat = shapely.LineString(table.line[k][:, :2])
         count = max(int(np.ceil(flat.length / options.pier_spacing)), 1)
@@ -63,9 +67,37 @@ def place_piers(
         free &= ~_on_pieces(table, k, pieces, shapes)
         free = free.reshape(tries.shape)
         first = free.argmax(axis=1) + np.arange(count) * tries.shape[1]
-        pier[k] = shapely.MultiPolygon(shapely.get_parts(shapes[first[free.any(axis=1)]]).tolist())
+        stands = [*shapes[first[free.any(axis=1)]], *_abutments(table, k, flat, ends, solid, height)]
+        pier[k] = shapely.MultiPolygon(shapely.get_parts(shapely.union_all(stands)).tolist())
     spacing[shapely.is_empty(pier)] = 0.0
     return replace(table, pier=pier, pier_spacing=spacing)
+
+
+def _ends(table: Structures) -> NDArray[np.bool_]:
+    """Whether no other piece goes on from the start and from the end of each piece's line (n, 2)."""
+    places = np.array([line[[0, -1], :2] for line in table.line]).reshape(-1, 2)
+    _, number, count = np.unique(np.round(places, 2), axis=0, return_inverse=True, return_counts=True)
+    ends: NDArray[np.bool_] = (count[number.ravel()] == 1).reshape(-1, 2)
+    return ends
+
+
+def _abutments(
+    table: Structures,
+    k: int,
+    flat: shapely.LineString,
+    ends: NDArray[np.bool_],
+    ways: shapely.STRtree,
+    height: Height | None,
+) -> list[shapely.Geometry]:
+    """Piers right at the ends of a piece that hang above the ground, as those of tracks without a bank do.
+
+    They keep free of roads and paths, not of the piece's own track, which ends before them.
+    """
+    at = np.array([_END, flat.length - _END])[ends[k]]
+    shapes = _piers(table, k, flat, at)
+    free = _stands_out(table, k, flat, at, height) & ~shapely.is_empty(shapes)
+    free[np.unique(ways.query(shapes, predicate="dwithin", distance=_FREE)[0])] = False
+    return list(shapes[free])
 
 
 def _piers(table: Structures, k: int, flat: shapely.LineString, at: Float) -> NDArray[np.object_]:
