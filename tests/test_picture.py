@@ -23,8 +23,10 @@ from lidar.picture import (
     depth_picture,
     scene_picture,
     sheet,
+    sweep_picture,
     with_legend,
 )
+from lidar.vehicle import load_vehicle
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 PLAIN = RenderOptions(detail=False, visibility=np.inf)
@@ -178,6 +180,35 @@ def test_the_legend_names_what_occurs_and_leaves_the_rest_alone():
     assert colors[Class.SKY].tolist() not in inside
     assert keyed.flags.writeable
     np.testing.assert_array_equal(image, class_colors(klass))
+
+
+def test_the_legend_names_every_class_even_where_many_occur():
+    classes = [k for k in Class if k != Class.SKY]
+    klass = np.repeat(np.array(classes, np.uint8), 4000)[: 300 * 400].reshape(300, 400)
+    keyed = with_legend(np.zeros((300, 400, 3), np.uint8), klass).reshape(-1, 3)
+    shown = {tuple(c) for c in keyed.tolist()}
+    present = np.unique(klass)
+    assert len(present) > 25
+    assert {tuple(class_codes().color[k].tolist()) for k in present} <= shown
+
+
+def test_a_sweep_shows_the_vehicle_and_how_far_things_are():
+    """Seen from above: an outline in the middle, circles about it, 10 m from one to the next."""
+    far = np.array([[55.0, 0.0, 0.0], [-55.0, 0.0, 0.0], [0.0, 55.0, 0.0], [90.0, 90.0, 0.0]])
+    colors = np.array([RED, RED, RED, BLUE], np.uint8)
+    image = sweep_picture(far, colors, vehicle=load_vehicle("car"), view="top", size=(600, 600))
+    u, v = _where(image, (255, 255, 255))
+    front = load_vehicle("car").length / 2 - load_vehicle("car").rear_overhang
+    per_metre = 600 * 0.98 / 120
+    assert (u - 299.5) / per_metre == pytest.approx(front, abs=1.5)
+    assert v == pytest.approx(299.5, abs=5)
+    row = (np.abs(image[299].astype(int) - (110, 116, 130)).max(axis=1) < 40) & (np.arange(600) > 340)
+    rings = np.flatnonzero(row)
+    rings = rings[np.append(True, np.diff(rings) > 4)]
+    np.testing.assert_allclose(np.diff(rings) / per_metre, 10, atol=0.6)
+    assert not (image == BLUE).all(axis=2).any()
+    with pytest.raises(InputError, match="points"):
+        sweep_picture(far[3:], colors[3:])
 
 
 def test_a_sheet_holds_its_pictures_in_order():
