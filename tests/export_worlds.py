@@ -131,7 +131,11 @@ def write_world(path, crs="utm"):
             shapely.points(np.array(TREES)[:, :2]),
             {"osm_id": np.array([f"node/{k}" for k in range(3)]), "height": np.array(TREES)[:, 2]},
         ),
-        Layer("barriers", shapely.box([57], [-80.5], [73], [-79.5]), {"osm_id": np.array(["way/77"])}),
+        Layer(
+            "barriers",
+            shapely.box([57], [-80.5], [73], [-79.5]),
+            {"osm_id": np.array(["way/77"]), "kind": np.array(["hedge"])},
+        ),
         Layer("roads", lines, {"osm_id": graph.osm_id, "lanes": graph.lanes, "bridge": graph.bridge}),
     ]
     x, y, height = np.array(TREES).T

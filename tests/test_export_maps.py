@@ -124,6 +124,8 @@ def test_geojson_is_where_rfc_7946_wants_it(scene, tmp_path):
     document = json.loads(path.read_text())
     kinds = [f["properties"]["kind"] for f in document["features"]]
     assert {kind: kinds.count(kind) for kind in kinds} == {n: b - a for n, (a, b) in scene.layers.items()}
+    hedge = next(f for f in document["features"] if f["properties"]["kind"] == "barriers")
+    assert hedge["properties"]["barriers_kind"] == "hedge"
     first = document["features"][0]
     assert first["properties"]["height_source"] == "tag"
     assert "levels" not in first["properties"]
@@ -137,6 +139,7 @@ def test_a_geoparquet_table_holds_all_layers(scene, tmp_path):
     table = geopandas.read_parquet(export_scene(scene, tmp_path / "a.parquet").path)
     assert table.crs == scene.frame.crs
     assert table["kind"].value_counts().to_dict() == {n: b - a for n, (a, b) in scene.layers.items()}
+    assert table["barriers_kind"].dropna().tolist() == ["hedge"]
     assert table["feature"].tolist() == list(range(len(table)))
     assert table.loc[table["kind"] == "trees", "height"].tolist() == [h for _, _, h in TREES]
     boxes = parquet.read_table(tmp_path / "a.parquet", columns=["bbox"])["bbox"].to_pylist()

@@ -125,7 +125,7 @@ def write_geojson(
         out.write(_json(head)[:-1] + b',"features":[')
         for _, chunk in _reading(scene, names, wgs84, "GeoJSON", progress):
             geometry = _for_geojson(chunk.geometry)
-            columns = {name: values.tolist() for name, values in chunk.columns.items()}
+            columns = {_told_as(chunk.layer, name): v.tolist() for name, v in chunk.columns.items()}
             for k, shape in enumerate(shapely.to_geojson(geometry).tolist()):
                 told = {name: plain(values[k]) for name, values in columns.items()}
                 properties = {"kind": chunk.layer, **{n: v for n, v in told.items() if v is not None}}
@@ -184,9 +184,10 @@ def write_geoparquet(
         for _, chunk in _reading(scene, names, target, "GeoParquet", progress):
             n = len(chunk.geometry)
             boxes = shapely.bounds(chunk.geometry)
+            own = {_told_as(chunk.layer, name): values for name, values in chunk.columns.items()}
             columns = {
                 "kind": pa.array([chunk.layer] * n),
-                **{name: _arrow(pa, chunk.columns.get(name), kind, n) for name, kind in kinds.items()},
+                **{name: _arrow(pa, own.get(name), kind, n) for name, kind in kinds.items()},
                 "bbox": pa.StructArray.from_arrays([pa.array(c) for c in boxes.T], fields=list(box)),
                 "geometry": pa.array(shapely.to_wkb(chunk.geometry, flavor="iso").tolist()),
             }
@@ -202,12 +203,17 @@ def write_geoparquet(
     return Summary(path, "geoparquet", files, size, count, crs=_named(target))
 
 
+def _told_as(layer: str, column: str) -> str:
+    """A column's name in a table of all layers, in which ``kind`` is the layer: ``structures_kind``."""
+    return f"{layer}_kind" if column == "kind" else column
+
+
 def _common_kinds(pa: Any, scene: Scene, names: list[str]) -> dict[str, Any]:
     """Arrow type of each column of any layer: text where layers differ, a double for numbers of two kinds."""
     found: dict[str, list[np.dtype[Any]]] = {}
     for name in names:
         for column, kind in kinds_of_columns(scene, name).items():
-            found.setdefault(column, []).append(kind)
+            found.setdefault(_told_as(name, column), []).append(kind)
     out = {}
     for column, dtypes in found.items():
         text = any(d.kind == "O" for d in dtypes) or len({d.kind == "b" for d in dtypes}) > 1
