@@ -1,5 +1,5 @@
 # make demo   set up, build the bundled real scene, drive it, write pictures and point clouds
-# make test   set up, tests
+# make test   set up, tests; those of the web page need chromium and chromedriver, and are skipped without
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin

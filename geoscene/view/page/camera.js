@@ -31,10 +31,12 @@ class Camera {
   /** See all of the scene. */
   whole() {
     const { low, high } = this;
-    this.target = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2] + (high[2] - low[2]) * 0.1];
-    this.distance = 0.9 * Math.max(100, Math.hypot(high[0] - low[0], high[1] - low[1]));
+    const across = Math.max(100, Math.hypot(high[0] - low[0], high[1] - low[1]));
     this.azimuth = -0.5; // of the direction of view, clockwise from grid north
     this.tilt = 0.75; // below the horizon
+    this.distance = 0.8 * across;
+    this.target = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2] + (high[2] - low[2]) * 0.1];
+    this.move(0, -0.08 * across); // what is near looks larger
   }
 
   axes() {

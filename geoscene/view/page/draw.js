@@ -7,7 +7,7 @@ class Renderer {
   constructor(canvas, head, shapes) {
     const gl = canvas.getContext("webgl2", { antialias: true });
     if (!gl) throw new Error("This browser has no WebGL 2, with which the page draws.");
-    Object.assign(this, { canvas, gl, head, tiles: [], mode: 0, selected: -1, shadows: false, sunAzimuth: 2.6 });
+    Object.assign(this, { canvas, gl, head, tiles: [], mode: 0, selected: -1, glow: 0, shadows: false, sunAzimuth: 2.6 });
     this.hidden = new Set();
     this.programs = {};
     for (const pass of ["VIEW", "PICK", "DEPTH"])
@@ -135,6 +135,7 @@ class Renderer {
       gl.uniform1i(at.uSunDepth, 2);
       gl.uniform3fv(at.uSun, this.sun());
       gl.uniform1i(at.uSelected, this.selected);
+      gl.uniform1f(at.uGlow, this.glow);
       gl.uniform1i(at.uShadows, this.shadows ? 1 : 0);
       gl.uniform1f(at.uSunPixel, this.sunPixel || 0);
       if (at.uSunMatrix) gl.uniformMatrix4fv(at.uSunMatrix, false, this.sunMatrix || new Float32Array(16));

@@ -31,6 +31,7 @@ async function start() {
     shown = performance.now();
   }
   $("message").hidden = true;
+  if (window.innerWidth <= 640) $("controls").open = false;
 
   listen(view);
   layers(view);
@@ -96,9 +97,8 @@ function cursorText({ head, renderer, camera }, [x, y]) {
     return;
   }
   const [lon, lat] = toLonLat(head.lonlat, hit.point[0], hit.point[1]);
-  const wrapped = ((lon + 540) % 360) - 180;
-  const [px, py, pz] = hit.point.map((v) => v.toFixed(2));
-  $("cursor").textContent = `${lat.toFixed(7)}, ${wrapped.toFixed(7)} (lat, lon)   x ${px}  y ${py}  z ${pz} m`;
+  const [px, py, pz] = hit.point.map(metres);
+  $("cursor").textContent = `${lat.toFixed(7)}, ${wrapped(lon).toFixed(7)} (lat, lon)   x ${px}  y ${py}  z ${pz} m`;
   const within = Math.max(head.lonlat.error, 1e-4);
   $("cursor").title = `Latitude and longitude within ${within.toPrecision(2)} m of the projection's (${head.frame}); `
     + `positions to ${(Math.max(...head.tiles.map((t) => t.step)) * 500).toFixed(1)} mm an axis; z is ${head.vertical}`;
@@ -114,6 +114,7 @@ function click(view, x, y) {
 function select(view, feature, hit) {
   const { head, attributes, renderer } = view;
   renderer.selected = feature === null ? -1 : feature;
+  renderer.glow = attributes.layer(feature) === "landcover" ? 0.25 : 0.7; // large areas must not blind
   view.dirty = true;
   const panel = $("panel");
   panel.hidden = feature === null;

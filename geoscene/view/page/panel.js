@@ -40,6 +40,16 @@ function make(tag, content = [], set = {}) {
   return element;
 }
 
+/** Centimetres, without a minus before zero. */
+function metres(value) {
+  return (Math.round(value * 100) / 100 + 0).toFixed(2);
+}
+
+/** Degrees from -180 to 180. */
+function wrapped(lon) {
+  return ((lon + 540) % 360) - 180;
+}
+
 function words(name) {
   return name.replaceAll("_", " ");
 }
@@ -91,7 +101,9 @@ function describe(head, attributes, feature, hit) {
     const face = [["class", words((head.classes[hit.klass] || ["unknown"])[0])], ["material", words(material)]];
     if (reflectance) face.push(["reflectance", `${reflectance[0]} at 905 nm, ${reflectance[2]} at 1550 nm`]);
     if (hit.surface) face.push(["surface", SURFACES[hit.surface]]);
-    face.push(["at", hit.point.map((v) => v.toFixed(2)).join(", ") + " m"]);
+    face.push(["x, y, z", `${hit.point.map((v) => metres(v)).join(", ")} m in ${head.frame}, heights ${head.vertical}`]);
+    const [lon, lat] = toLonLat(head.lonlat, hit.point[0], hit.point[1]);
+    face.push(["lat, lon", `${lat.toFixed(7)}, ${wrapped(lon).toFixed(7)}`]);
     out.push(make("h3", "The face clicked"), make("table", face.map((pair) => make("tr", pair.map((text) => make("td", text))))));
   }
   const related = [["part", attributes.parts.get(feature) || []]];

@@ -68,6 +68,7 @@ void main() {
 #else
 uniform vec3 uSun;      // towards the sun
 uniform int uSelected;
+uniform float uGlow;    // share of the selected one's colour that is replaced
 uniform int uShadows;
 uniform mat4 uSunMatrix;
 uniform float uSunPixel;  // metres
@@ -91,8 +92,8 @@ void main() {
   if (sun > 0.0) sun *= lit(normal);
   // Light of the sky from above, of the ground from below; shares chosen so that a roof in the sun keeps its colour.
   vec3 sky = mix(vec3(0.26, 0.24, 0.22), vec3(0.42, 0.46, 0.52), normal.z * 0.5 + 0.5);
-  vec3 base = pow(vColor, vec3(2.2));
-  if (vFeature == uSelected && vFeature >= 0) base = mix(base, vec3(0.0, 0.8, 1.0), 0.75);
+  vec3 base = max(pow(vColor, vec3(2.2)), vec3(0.012)); // edges of black walls stay visible
+  if (vFeature == uSelected && vFeature >= 0) base = mix(base, vec3(0.0, 0.8, 1.0), uGlow);
   color = vec4(pow(base * (sky + vec3(0.85, 0.8, 0.7) * sun), vec3(1.0 / 2.2)), 1.0);
 }
 #endif`;
