@@ -319,6 +319,34 @@ def test_a_building_stands_over_the_tunnel_that_would_run_into_it(tunnel):
     assert solid.vertices[:, 2].max() == pytest.approx(base[0] + buildings.height[0], abs=1e-3)
 
 
+def test_a_building_over_two_tunnels_that_cross_stands_over_the_upper_one():
+    places = {
+        1: (-400, 0),
+        2: (-90, 0),
+        3: (90, 0),
+        4: (400, 0),
+        5: (0, -600),
+        6: (0, -250),
+        7: (0, 250),
+        8: (0, 600),
+    }
+    upper, lower = ({"highway": "primary", "tunnel": "yes", "layer": layer} for layer in ("-1", "-2"))
+    ways = [(ROAD, [5, 6]), (lower, [6, 7]), (ROAD, [7, 8]), (ROAD, [1, 2]), (upper, [2, 3]), (ROAD, [3, 4])]
+    both = Town(town(places, ways))
+    points = both.centre_lines("tunnel")
+    near = points[np.abs(points[:, :2]).max(axis=1) < 14]
+    assert np.ptp(near[:, 2]) > SIZES.headroom
+    outline = lonlat([(-15, -15), (15, -15), (15, 15), (-15, 15)])
+    house = Area("way/900", {"building": "yes", "height": "40"}, shapely.Polygon(outline), np.empty(0, int))
+    buildings, _ = read_buildings(town(places, ways, [house]), FRAME)
+    base = np.full(1, near[:, 2].min() - 1)
+    solid, _ = build_solids(buildings_over(buildings, base, both.table)[0], base=base)
+    assert validate_mesh(solid).ok.all()
+    for along in (near[np.abs(near[:, 0]) < 0.1], near[np.abs(near[:, 1]) < 0.1]):
+        for up in (0.3, 4.5):
+            assert not crosses(solid, moved(along[0], 0, 0, up), moved(along[-1], 0, 0, up))
+
+
 def test_a_building_over_a_road_bridge_lets_its_traffic_through_and_one_beside_it_stays_whole(bridge):
     points = bridge.centre_lines("bridge")
     high = points[points[:, 2] > 2.0]

@@ -76,7 +76,8 @@ def _divided(
     cause: list[str] = []
     for k in np.unique(row).tolist():
         rest, first = footprint[k], len(source)
-        for there in np.flatnonzero(row == k).tolist():
+        # The highest first: where roads cross, the building stands over the upper one.
+        for there in sorted(np.flatnonzero(row == k).tolist(), key=lambda c: -clear[c]):
             over = _polygons(shapely.intersection(rest, corridor[there]))
             rest = _polygons(shapely.difference(rest, corridor[there]))
             if not over.is_empty and clear[there] < buildings.height[k] - _OVER:
