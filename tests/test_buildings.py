@@ -392,6 +392,16 @@ def test_an_unknown_height_follows_its_neighbours():
     assert 4 < lone[0] < 10
 
 
+def test_a_television_tower_says_nothing_of_the_houses_below():
+    xy = np.column_stack([np.arange(6) * 60.0, np.zeros(6)])
+    use, area_ = np.full(6, "yes", dtype=object), np.array([2324.0, 2000.0, 900.0, 300.0, 700.0, 4400.0])
+    alone = infer_heights(xy, use, area_, np.full(6, np.nan))[0]
+    beside = infer_heights(xy, use, area_, np.array([540.0, *[np.nan] * 5]))[0]
+    np.testing.assert_array_equal(beside[1:], alone[1:])
+    block = infer_heights(xy, use, area_, np.array([48.0, *[np.nan] * 5]))[0]
+    assert (block[1:3] > 1.2 * alone[1:3]).all()
+
+
 def test_a_building_does_not_inform_its_own_guess():
     xy = np.array([[0.0, 0.0], [10.0, 0.0]])
     use, area_ = np.array(["yes", "yes"], dtype=object), np.array([100.0, 100.0])
