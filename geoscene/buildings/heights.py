@@ -141,10 +141,10 @@ def infer_heights(
     The rule: a building's height is what is typical of its use and footprint area, times a factor. The factor
     is the weighted median of the factors of the 24 nearest buildings with known heights within reach (not
     itself) and of one pseudo-neighbour of factor 1 and weight 0.05. A neighbour weighs
-    (exp(-distance / 40 m) + 0.005) exp(-|ln(ratio of areas)|), four times that for the same use. Towers, eight
-    times as high as the root of their footprint's area or more, are nobody's neighbours. The standard deviation
-    is that of the neighbours' logarithms about the median, the pseudo-neighbour's being 0.6. The constants were
-    chosen by trial on eight cities, each building guessed from others.
+    (exp(-distance / 40 m) + 0.005) exp(-|ln(ratio of areas)|), four times that for the same use. Towers,
+    eight times as high as the root of their footprint's area or more, are nobody's neighbours. The standard
+    deviation is that of the neighbours' logarithms about the median, the pseudo-neighbour's being 0.6. The
+    constants were chosen by trial on eight cities, each building guessed from others.
     Rule names: ``inferred-neighbours`` where a neighbour counts, else ``inferred-type``.
 
     xy     : (n, 2) scene metres, any point of each building
