@@ -58,7 +58,7 @@ def motion_behind(
     parts: list[tuple[Float, Float, NDArray[np.int32]]] = []
     begin, dt, total = 0.0, 1.0 / rate_hz, float(time_s[-1])
     for first, last in legs_of(path):
-        if total - begin < 2 * STEP_S:
+        if parts and total - begin < 2 * STEP_S:
             break
         origin, end = float(path.s[first]), float(path.s[last - 1])
         allowed = np.clip(reach, origin, end) - origin

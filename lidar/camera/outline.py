@@ -39,6 +39,16 @@ def _bounds(corners: Any, right: float, bottom: float, out: Any) -> None:
     here, there = np.empty((8, 2)), np.empty((8, 2))
     limit = (-0.5, -0.5, right, bottom)
     for t in range(len(corners)):
+        low_x = min(corners[t, 0, 0], corners[t, 1, 0], corners[t, 2, 0])
+        low_y = min(corners[t, 0, 1], corners[t, 1, 1], corners[t, 2, 1])
+        high_x = max(corners[t, 0, 0], corners[t, 1, 0], corners[t, 2, 0])
+        high_y = max(corners[t, 0, 1], corners[t, 1, 1], corners[t, 2, 1])
+        if low_x > right or high_x < -0.5 or low_y > bottom or high_y < -0.5:
+            continue
+        if low_x >= -0.5 and high_x <= right and low_y >= -0.5 and high_y <= bottom:
+            out[0], out[1] = min(out[0], low_x), min(out[1], low_y)
+            out[2], out[3] = max(out[2], high_x), max(out[3], high_y)
+            continue
         here[:3] = corners[t]
         count = 3
         for side in range(4):
