@@ -69,7 +69,7 @@ class BuildOptions:
         if unknown := sorted(set(self.only) - set(KINDS)):
             raise InputError(f"--only {','.join(unknown)}: of {','.join(KINDS)}")
         if not 0 < self.reach < 1e6:
-            raise InputError(f"--reach {self.reach}: give metres")
+            raise InputError(f"--reach {self.reach:g}: give metres, more than 0 and less than a million")
         if not 50 <= self.tile_size <= 2000 or self.tile_size != int(self.tile_size):
             raise InputError(f"--tile-size {self.tile_size}: give whole metres from 50 to 2000")
 
