@@ -14,7 +14,7 @@ Float = NDArray[np.float64]
 ACCURACY = 0.01
 """Metres that interpolation may be off."""
 
-_MOST = 65
+_MOST = 129
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class LonLatGrid:
 
 
 def lonlat_grid(frame: Frame, bounds: tuple[float, float, float, float]) -> LonLatGrid:
-    """The coarsest grid of 2^k + 1 nodes a side that is within `ACCURACY`, or one of 65, with its error.
+    """The coarsest grid of 2^k + 1 nodes a side that is within `ACCURACY`, or one of 129, with its error.
 
     The error is taken at the middles of cells and of their sides, where a bilinear patch is furthest from a
     quadratic one.
