@@ -184,7 +184,7 @@ class World:
             detach=[number for rank in old.keys() - kept for number in old[rank].parts],
             attach={n: p for rank in ranks if rank not in kept for n, p in self._tiles[rank].parts.items()},
             first={n: self._first[rank] for rank in ranks for n in self._tiles[rank].parts},
-            instances=self._instances(),
+            instances=[self._still, self._moving[0]],
         )
 
     def place_actors(self, shape: NDArray[np.int32], transform: Float, feature: NDArray[np.int32]) -> None:
@@ -197,7 +197,7 @@ class World:
         """
         self._moving = Instances(self._actors, np.asarray(shape, np.int32), transform), feature
         self._number()
-        self.caster.update(instances=self._instances())
+        self.caster.update(instances=[self._still, self._moving[0]])
 
     def lookup(self, hits: Hits) -> Surfaces:
         """What the rays hit."""
@@ -240,6 +240,7 @@ class World:
         self._what = packed(self._surfaces, self._leaves_of(starts[len(self._tiles) :]))
         feature = self._surfaces.feature
         self._bounds = int(feature.min()), int(feature.max())
+        self._still = self._static()
         self._of_shape, self._of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes)])
         self._number()
 
@@ -255,9 +256,8 @@ class World:
 
     def _number(self) -> None:
         """Say where the tables of all copies start and what they are called."""
-        static = np.concatenate([np.empty(0, np.int32), *(tile.shape for tile in self._tiles.values())])
         moving, feature = self._moving
-        self._base = np.concatenate([self._of_shape[static], self._of_actor[moving.shape], [0]])
+        self._base = np.concatenate([self._of_shape[self._still.shape], self._of_actor[moving.shape], [0]])
         named = [np.asarray(rows, np.int32) for rows in (*(t.feature for t in self._tiles.values()), feature)]
         self._feature = np.concatenate(named)
         low, high = self._bounds
@@ -266,11 +266,11 @@ class World:
         leaves = np.array([0.0, *self._leaves.values()])
         self._faces = Faces(self._base, self._feature, self._what, low, high, leaves)
 
-    def _instances(self) -> list[Instances]:
+    def _static(self) -> Instances:
         tiles = self._tiles.values()
         shape = np.concatenate([np.empty(0, np.int32), *(tile.shape for tile in tiles)])
         transform = np.concatenate([np.empty((0, 3, 4)), *(tile.transform for tile in tiles)])
-        return [Instances(self._shapes, shape, transform), self._moving[0]]
+        return Instances(self._shapes, shape, transform)
 
 
 def _nothing(shapes: tuple[Caster, ...]) -> tuple[Instances, NDArray[np.int32]]:

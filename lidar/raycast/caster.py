@@ -26,8 +26,6 @@ log = logging.getLogger(__name__)
 
 _NOTHING: Mapping[int, Geometry] = {}
 _NUMBERS: Mapping[int, int] = {}
-_COPIES = 1 << 20
-"""Number of the first geometry of copies; parts of a mesh have lesser numbers."""
 
 
 @functools.cache
@@ -108,7 +106,7 @@ class Caster:
         if instances is not None:
             self.instances = tuple(instances)
             shapes: Any = [[shape.scene for shape in group.shapes] for group in self.instances]
-            self.scene.place(self.instances, shapes, _COPIES)
+            self.scene.place(self.instances, shapes)
         self.scene.commit()
 
     def cast(

@@ -9,6 +9,10 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
+COPIES = 256
+"""Numbers of an Embree scene's geometries for copies; those of its mesh follow. A commit looks at all
+numbers up to the highest."""
+
 
 class Target(NamedTuple):
     """What rays are cast at.

@@ -5,12 +5,14 @@ from __future__ import annotations
 import ctypes as c
 import weakref
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar.errors import InputError
 from lidar.raycast import kernels
-from lidar.raycast.columns import Rays, Target
+from lidar.raycast.columns import COPIES, Rays, Target
 from lidar.raycast.echoes import COLLECT, echoes
 from lidar.raycast.geometry import Geometry, Instances
 from lidar.raycast.hits import Echoes, Hits
@@ -46,6 +48,15 @@ def arguments(flags: int = 0, *, context: int = 0, collect: int = 0) -> NDArray[
     return words
 
 
+class _Group(NamedTuple):
+    """Copies of scenes' geometries: where they are, relative to the scene's origin, in so many geometries."""
+
+    copies: Instances
+    shapes: Sequence[EmbreeScene]
+    placed: Float
+    geometries: int
+
+
 class EmbreeScene:
     """An Embree scene of geometries, by number, and of copies of other scenes' geometries.
 
@@ -68,8 +79,9 @@ class EmbreeScene:
             # Only in scenes of low quality does Embree keep a tree for each geometry; those are made well.
             self._lib.call("rtcSetSceneBuildQuality", self.address, LOW)
         self.parts: dict[int, Geometry] = {}
-        self._copies: list[tuple[int, NDArray[np.intp]]] = []
-        self._groups: list[tuple[Instances, Sequence[EmbreeScene], Float]] = []
+        self._copies: list[NDArray[np.intp]] = []
+        self._groups: list[_Group] = []
+        self._own: tuple[list[Geometry], NDArray[np.int64]] = [], np.empty((0, 5), np.int64)
         self._packet, self._single = arguments(COHERENT), arguments()
         self.target: Target
 
@@ -88,32 +100,42 @@ class EmbreeScene:
         fill(self._lib, geometry, INDEX, 0, UINT3, part.faces.astype(np.uint32))
         self._lib.call("rtcSetGeometryMask", geometry, part.mask)
         self._lib.call("rtcSetGeometryBuildQuality", geometry, MEDIUM)
-        self._attach(geometry, number)
+        self._attach(geometry, COPIES + number)
 
     def detach(self, number: int) -> None:
         """Remove the geometry of a number."""
         if len(self.parts.pop(number)):
-            self._lib.call("rtcDetachGeometry", self.address, number)
+            self._lib.call("rtcDetachGeometry", self.address, COPIES + number)
 
-    def place(self, groups: Sequence[Instances], scenes: Sequence[Sequence[EmbreeScene]], first: int) -> None:
-        """Replace all copies; ``scenes`` holds each group's shapes, numbers from ``first`` on are free."""
-        for number, _ in self._copies:
+    def place(self, groups: Sequence[Instances], scenes: Sequence[Sequence[EmbreeScene]]) -> None:
+        """Replace all copies; ``scenes`` holds each group's shapes. The first groups, if the same, are kept.
+
+        Raises InputError for too many masks.
+        """
+        kept = 0
+        while kept < min(len(groups), len(self._groups)) and groups[kept] is self._groups[kept].copies:
+            kept += 1
+        count = sum(group.geometries for group in self._groups[:kept])
+        for number in range(count, len(self._copies)):
             self._lib.call("rtcDetachGeometry", self.address, number)
-        self._copies, self._groups = [], []
-        start = 0
-        for group, shapes in zip(groups, scenes, strict=True):
+        del self._copies[count:], self._groups[kept:]
+        start = sum(len(group.copies) for group in self._groups)
+        for group, shapes in zip(groups[kept:], scenes[kept:], strict=True):
             moments = group.transform if group.transform.ndim == 4 else group.transform[:, None]
             origins = np.array([shape.origin for shape in shapes]).reshape(-1, 3)[group.shape]
             placed = moments.copy()
             placed[..., 3] += np.einsum("ksij,kj->ksi", moments[..., :3], origins) - self.origin
-            self._groups.append((group, shapes, placed))
             mask = np.full(len(group), INVALID, np.uint32) if group.mask is None else group.mask
-            for bits in np.unique(mask):
+            masks = np.unique(mask)
+            if len(self._copies) + len(masks) > COPIES:
+                raise InputError(f"copies have more than {COPIES} different masks")
+            for bits in masks:
                 rows = np.flatnonzero(mask == bits)
-                copies = self._copy(shapes, group.shape[rows], placed[rows], int(bits))
-                number = first + len(self._copies)
-                self._attach(copies, number)
-                self._copies.append((number, rows + start))
+                self._attach(
+                    self._copy(shapes, group.shape[rows], placed[rows], int(bits)), len(self._copies)
+                )
+                self._copies.append(rows + start)
+            self._groups.append(_Group(group, shapes, placed, len(masks)))
             start += len(group)
 
     def _copy(self, shapes: Sequence[EmbreeScene], shape: NDArray[np.int32], placed: Float, mask: int) -> int:
@@ -136,34 +158,34 @@ class EmbreeScene:
     def commit(self) -> None:
         """Build what changed and tell the kernels."""
         self._lib.call("rtcCommitScene", self.address)
-        parts = [self.parts[number] for number in sorted(self.parts)]
-        rows = np.zeros(max(self.parts, default=-1) + 1, np.int32)
-        rows[sorted(self.parts)] = np.arange(len(parts))
-        starts = np.zeros(max((number for number, _ in self._copies), default=-1) + 1, np.int64)
-        place = 0
-        for number, copied in self._copies:
-            starts[number], place = place, place + len(copied)
+        numbers = sorted(self.parts)
+        parts = [self.parts[number] for number in numbers]
+        # Columns must live as long as their addresses.
+        self._own = parts, np.array([_addresses(part) for part in parts], np.int64).reshape(-1, 5)
+        kept = [self._own]
+        rows = np.zeros(COPIES + max(self.parts, default=-1) + 1, np.int32)
+        rows[COPIES + np.array(numbers, np.int64)] = np.arange(len(parts))
+        starts = np.cumsum([0, *(len(copied) for copied in self._copies)], dtype=np.int64)
         shape, steps, transforms = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty((0, 12))]
-        for group, shapes, placed in self._groups:
-            first = []
-            for one in shapes:
-                first.append(len(parts))
-                parts += [one.parts[number] for number in sorted(one.parts)]
-            shape.append(np.array(first, np.int64)[group.shape])
-            steps.append(np.full(len(group), placed.shape[1], np.int64))
-            transforms.append(placed.reshape(-1, 12))
+        for group in self._groups:
+            before = sum(len(own) for own, _ in kept)
+            kept += [one._own for one in group.shapes]  # noqa: SLF001
+            first = before + np.cumsum([0, *(len(one._own[0]) for one in group.shapes)])  # noqa: SLF001
+            shape.append(first[group.copies.shape])
+            steps.append(np.full(len(group.copies), group.placed.shape[1], np.int64))
+            transforms.append(group.placed.reshape(-1, 12))
         counts = np.concatenate(steps)
-        self._kept = parts  # their columns must live as long as their addresses
+        self._kept = kept
         self.target = Target(
             self.address,
             self._packet.ctypes.data,
             self._single.ctypes.data,
             (0,) * self._lib.width,
             self.origin,
-            np.array([_addresses(part) for part in parts], np.int64).reshape(-1, 5),
+            np.concatenate([addresses for _, addresses in kept]),
             rows,
             starts,
-            np.concatenate([np.empty(0, np.int32), *(copied for _, copied in self._copies)]).astype(np.int32),
+            np.concatenate([np.empty(0, np.int32), *self._copies]).astype(np.int32),
             np.concatenate(shape).astype(np.int32),
             np.cumsum(counts) - counts,
             counts,

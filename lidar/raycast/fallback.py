@@ -172,7 +172,6 @@ class EmbreexScene:
         self,
         groups: Sequence[Instances],
         scenes: Sequence[Sequence[Any]],
-        first: int,  # noqa: ARG002
     ) -> None:
         """Replace all copies; ``scenes`` holds each group's shapes."""
         self._groups = list(zip(groups, scenes, strict=True))

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lidar.raycast.columns import Rays, Target
+from lidar.raycast.columns import COPIES, Rays, Target
 from lidar.raycast.memory import (
     aligned,
     called,
@@ -243,7 +243,7 @@ def placed(target: Target, geom: Any, inst: Any, place: Any) -> Any:
     if inst == _INVALID:
         return np.int64(target.rows[np.int64(geom)]), np.int64(-1)
     instance = np.int64(target.numbers[target.starts[np.int64(inst)] + np.int64(place)])
-    return np.int64(target.shape[instance]) + np.int64(geom), instance
+    return np.int64(target.shape[instance]) + np.int64(geom) - COPIES, instance
 
 
 @inlined
