@@ -39,6 +39,7 @@ _REPAIRS = 16
 _SPRING = 0.5  # metres over which tyres and springs smooth the ground
 _AXLES = 0.5  # metres between axles below which a body does not pitch with the ground under them
 _STEEP = 0.35  # rise per metre that a wheel is expected to meet
+_JOINT = 0.25  # metres of a step in the road, between rows of a path, that is driven over as a ramp
 _WHEEL_STEP = 0.2  # metres: a kerb
 _PUSH = 4.0  # metres before and behind an obstacle over which the line is pushed aside
 _ASTRAY = 1.5  # turning radii from the middle of its lane beyond which a vehicle has left the street
@@ -265,7 +266,7 @@ def _heights(
 
     Wheels keep to the ground; without one, the route's profile is smoothed over the wheelbase.
     """
-    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
+    from scipy.ndimage import gaussian_filter1d, maximum_filter1d  # noqa: PLC0415
 
     raw = [_raw_heights(leg, line, setting, ground) for leg, line in zip(legs, lines, strict=True)]
     sizes = np.array([len(leg.row) for leg in legs])
@@ -279,8 +280,16 @@ def _heights(
     width = (over if ground is None else _SPRING) / legs[0].step
     z, tilt, bank = (np.concatenate(column)[once] for column in zip(*raw, strict=True))
     # beyond its ends the road goes on as steep as it was
-    spare = math.ceil(4 * width) + 1
-    z = gaussian_filter1d(np.pad(z, spare, mode="reflect", reflect_type="odd"), width)[spare : spare + len(z)]
+    spare, wide = math.ceil(4 * over / legs[0].step) + 1, over / legs[0].step
+    far = np.pad(z, spare, mode="reflect", reflect_type="odd")
+    near, soft = (gaussian_filter1d(far, w)[spare : spare + len(z)] for w in (width, wide))
+    if ground is not None:  # a step, as at the joint of a bridge, is taken as a ramp
+        step = (np.abs(np.gradient(z)) > _JOINT / 2).astype(float)
+        reach = 2 * math.ceil(wide) + 1
+        share = gaussian_filter1d(maximum_filter1d(step, reach), wide / 2)
+        near = near + share * (soft - near)
+        tilt = tilt + share * (gaussian_filter1d(tilt, wide, mode="mirror") - tilt)
+    z = near
     tilt, bank = (gaussian_filter1d(c, width, mode="mirror")[twice] for c in (tilt, bank))
     parts = [np.split(column, starts) for column in (z[twice], tilt, bank)]
     out = []

@@ -31,6 +31,7 @@ Float = NDArray[np.float64]
 
 _ROAD = ("road", "lane_marking", "crossing", "parking")
 _HEADROOM = 2.5  # metres under what stands out of a wall that one can stand below
+_HOUSE = 1.0  # square metres above which what stands there is a building
 _POST = 0.2  # metres, half the thickness of posts and trunks
 _BOUNDS = {
     "vehicles": (0, 60),
@@ -130,6 +131,8 @@ def company_of(
     surfaces = _layer(scene, "road_surfaces")
     road = _union(surfaces, _ROAD, around, 0.3)
     standing = _standing(scene, around)
+    if road is not None:
+        road = _passable(road, standing, lanes, area)
 
     trips = vehicle_trips(lanes, area, seed=seed, density=options.vehicles, ground=road)
     trips += vehicle_trips(
@@ -183,6 +186,18 @@ def settled(
         parked_actors(spots, scene, CARS, trees, seed=seed, scale=scale),
     ]
     return joined(groups, first_feature=max((stop for _, stop in scene.layers.values()), default=0))
+
+
+def _passable(
+    road: shapely.Geometry, standing: NDArray[np.object_], lanes: Lanes, area: Area
+) -> shapely.Geometry:
+    """Carriageways less the buildings that stand on them, but for bridges and what runs under buildings."""
+    houses = standing[shapely.area(standing) > _HOUSE]
+    over = np.flatnonzero(area.near & (lanes.graph.bridge | lanes.graph.tunnel))
+    free = shapely.buffer(area.lines[over], lanes.graph.width[over] / 2 * area.scale)
+    whole = shapely.union(shapely.difference(road, shapely.union_all(houses)), shapely.union_all(free))
+    shapely.prepare(whole)
+    return whole
 
 
 def _swept(trips: list[Trip]) -> NDArray[np.object_]:

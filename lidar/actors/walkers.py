@@ -22,7 +22,17 @@ _FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}
 """m/s, free walking: adults after Weidmann, "Transporttechnik der Fussgänger" (1993), 1.34 on average."""
 _WALK = Driver(radius=0.4, top=2.5, headway=0.5, pull=0.8, brake=1.2, gap=0.3)
 _LANE = 0.6  # metres beside a sidewalk's line on which people keep, on the side of traffic
-_OUT = (2.4, 1.9, 1.5, 1.1, 0.8)  # metres beyond the carriageway's edge where the line may run, best first
+_EDGE = 0.15  # metres from the edge of the sidewalk to the middle of who walks nearest to it
+_OUT = (
+    2.4,
+    2.1,
+    1.8,
+    1.5,
+    1.3,
+    1.1,
+    0.95,
+    0.8,
+)  # metres beyond the carriageway's edge where the line may run, best first
 _ROOM = 1.0  # metres from the lines to what stands there
 _PIECE = 12.0  # metres of a stretch of sidewalk that is worth walking
 
@@ -54,6 +64,9 @@ def walks_of(
         return out
     g = lanes.graph
     tree = shapely.STRtree(standing)
+    # people walk beside the line, and are to be on the sidewalk there
+    pavement = shapely.buffer(pavement, -(_LANE + _EDGE) * area.scale)
+    shapely.prepare(pavement)
     for e in np.flatnonzero(area.near).tolist():
         if 0 <= g.twin[e] < e or g.bridge[e] or g.tunnel[e] or g.length[e] < _PIECE:
             continue
