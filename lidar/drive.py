@@ -216,8 +216,12 @@ def plan(
                 " or a rig of such a craft"
             )
         name = options.vehicle or load_rig(options.rig).vehicle
-        return plan_travel(scene, route, name, seed=options.seed, duration=options.duration,
-                           side=options.side, progress=progress)  # fmt: skip
+        travel = plan_travel(scene, route, name, seed=options.seed, duration=options.duration,
+                             side=options.side, progress=progress)  # fmt: skip
+        if travel.duration is None:
+            return travel
+        # what cannot pull up within a short time is recorded until then
+        return replace(travel, trajectory=travel.trajectory.until(round(travel.duration * 1e9)))
     progress("planning", 0, 0)
     seconds = options.duration
     if seconds is None and route == "random" and not options.survey:
