@@ -46,6 +46,7 @@ class BuildOptions:
     along     : waypoints (LAT,LON words) or one file (GPX, GeoJSON, or CSV with lon and lat): only tiles are
                 built that a sensor of that reach can see from there
     reach     : metres, with ``along``
+    driving_side : ``left`` or ``right``; by default the map's ``driving_side`` tags, else the country's
     tile_size : metres, side of a tile
     name      : of the scene, for people
     """
@@ -57,6 +58,7 @@ class BuildOptions:
     only: tuple[str, ...] = KINDS
     along: tuple[str, ...] = ()
     reach: float = 120.0
+    driving_side: str = ""
     tile_size: float = 250.0
     name: str = ""
 
@@ -68,6 +70,8 @@ class BuildOptions:
             raise InputError(f"--dem-gaps {self.dem_gaps}: error or nearest")
         if unknown := sorted(set(self.only) - set(KINDS)):
             raise InputError(f"--only {','.join(unknown)}: of {','.join(KINDS)}")
+        if self.driving_side not in ("", "left", "right"):
+            raise InputError(f"--driving-side {self.driving_side}: left or right")
         if not 0 < self.reach < 1e6:
             raise InputError(f"--reach {self.reach:g}: give metres, more than 0 and less than a million")
         if not 50 <= self.tile_size <= 2000 or self.tile_size != int(self.tile_size):
@@ -102,6 +106,7 @@ def build(
             dem_gaps=cast("Literal['error', 'nearest']", options.dem_gaps),
             tile_size=options.tile_size,
             only=options.only,
+            driving_side=options.driving_side,
             progress=progress,
         )
         keys = _keys(osm, options)

@@ -64,6 +64,7 @@ def build(
     lod: int = 2,
     dem: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
     dem_gaps: str = "error",
+    driving_side: str = "",
     only: str = "",
     along: Annotated[list[str] | None, Parameter(consume_multiple=True, negative=())] = None,
     reach: float = 120.0,
@@ -119,6 +120,9 @@ def build(
         Address of other tiles for --dem tiles, with {z}, {x} and {y} in it: terrarium PNGs of 256 pixels.
     dem_gaps
         Where they do not cover the scene: error, or nearest (take the nearest height and say so).
+    driving_side
+        Side of the road that traffic keeps to: left or right. That of the map's tags or of the country
+        without.
     only
         What is built besides the ground, with commas: buildings, roads, landcover, trees, furniture,
         barriers.
@@ -156,6 +160,7 @@ def build(
         lod=lod,
         dem=() if fetched else tuple(map(str, dem or ())),
         dem_gaps=dem_gaps,
+        driving_side=driving_side,
         only=tuple(k for k in only.split(",") if k) or KINDS,
         along=tuple(along or ()),
         reach=reach,
@@ -311,7 +316,6 @@ def export(
     model: str | None = None,
     resolution: float | None = None,
     height_offset: float | None = None,
-    left_hand: Annotated[bool | None, Parameter(negative=())] = None,
     overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
@@ -350,8 +354,6 @@ def export(
         Of a GeoTIFF: metres a cell.
     height_offset
         Metres added to heights, such as the geoid's height for formats that want ellipsoidal ones.
-    left_hand
-        Of road networks: traffic keeps left.
     overwrite
         Replace what is there.
     json
@@ -372,7 +374,6 @@ def export(
             model=model,
             resolution=resolution,
             height_offset=height_offset,
-            left_hand=left_hand,
             overwrite=overwrite,
             progress=progress,
         )

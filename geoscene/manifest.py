@@ -66,7 +66,7 @@ def scene_manifest(
             "extent_area": (xmax - xmin) * (ymax - ymin),
             "open_area": _open_area(plan),
         },
-        "roads": {"driving_side": "right", "driving_side_source": "default"},
+        "roads": {"driving_side": plan.side[0], "driving_side_source": plan.side[1]},
         "counts": _counts(plan, reports, problems),
         "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
         "leaf_area_density": LEAF_AREA_DENSITY,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 import shapely
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from geoscene.barriers import Barriers, read_barriers
 from geoscene.buildings import Buildings, read_buildings
+from geoscene.driving_side import Side
+from geoscene.driving_side import driving_side as found_side
 from geoscene.errors import InputError
 from geoscene.features import (
     barrier_layer,
@@ -37,7 +39,7 @@ from geoscene.ground import (
 )
 from geoscene.progress import Progress
 from geoscene.report import Problem
-from geoscene.road_surfaces import RoadSurfaces, road_surfaces
+from geoscene.road_surfaces import RoadSurfaces, SurfaceOptions, road_surfaces
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roads import RoadGraph
 from geoscene.sources import OsmData
@@ -81,6 +83,7 @@ class Plan:
                 belong to each tile: those with the middle of their box in it; ``parts`` go with
                 their buildings
     graph     : roads, with heights
+    side      : of the road that traffic keeps to, and what says so (``tag``, ``place`` or ``option``)
     ground    : what lies on the ground
     levels    : how high its water stands
     trees     : mapped ones
@@ -97,6 +100,7 @@ class Plan:
     base: Float
     rows: dict[str, dict[tuple[int, int], NDArray[np.int64]]]
     graph: RoadGraph
+    side: tuple[Side, str]
     ground: GroundPlan
     levels: WaterLevels
     trees: Trees
@@ -130,6 +134,7 @@ def make_plan(
     dem_gaps: Literal["error", "nearest"],
     tile_size: float,
     only: Collection[str],
+    driving_side: str,
     progress: Progress,
 ) -> tuple[Plan, list[Problem]]:
     """Read all features of a map, and what was repaired or dropped on the way.
@@ -160,7 +165,13 @@ def make_plan(
     graph = profile(graph, terrain.height, obstacles=find_obstacles(osm, frame))
     uneven = bool(terrain.grids) or any(line[:, 2].any() for line in graph.geometry)
     height = graded_ground(graph, terrain.height) if uneven else None
-    surfaces, found = road_surfaces(osm if "roads" in only else _nothing(osm), graph, frame)
+    side, side_source = (cast("Side", driving_side), "option") if driving_side else found_side(osm)
+    surfaces, found = road_surfaces(
+        osm if "roads" in only else _nothing(osm),
+        graph,
+        frame,
+        options=SurfaceOptions(left_hand=side == "left"),
+    )
     problems += found
     structures, found = read_structures(surfaces, graph, osm, frame, height=height)
     problems += found
@@ -188,7 +199,7 @@ def make_plan(
     )
     levels = water_levels(ground.layers, osm.ways, frame, height=terrain.height)
 
-    trees, furniture, barriers, found = _standing(osm, frame, ground, only)
+    trees, furniture, barriers, found = _standing(osm, frame, ground, only, side)
     problems += found
     first = n + len(cover) + len(roads) + len(graph)
     trees = _numbered(trees, first)
@@ -222,6 +233,7 @@ def make_plan(
             "structures": _by_tile(structures.polygon, tile_size),
         },
         graph=graph,
+        side=(side, side_source),
         ground=ground,
         levels=levels,
         trees=trees,
@@ -295,12 +307,12 @@ def _surfaces(
 
 
 def _standing(
-    osm: OsmData, frame: Frame, ground: GroundPlan, only: Collection[str]
+    osm: OsmData, frame: Frame, ground: GroundPlan, only: Collection[str], side: Side
 ) -> tuple[Trees, Furniture, Barriers, list[Problem]]:
     """Trees, furniture and barriers that can stand where they are."""
     trees, problems = read_trees(osm, frame)
     trees, found = clear_of(ground, trees)
-    furniture, more = read_furniture(osm, frame, ground)
+    furniture, more = read_furniture(osm, frame, ground, left_hand=side == "left")
     barriers, still_more = read_barriers(osm, frame, ground)
     tables: list[Any] = [trees, furniture, barriers]
     kept = [table if kind in only else table.take(np.zeros(len(table), np.bool_))

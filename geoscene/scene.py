@@ -168,6 +168,11 @@ class Scene:
         """Layer name to its range [start, stop) of feature numbers."""
         return {name: (int(a), int(b)) for name, (a, b) in self.manifest["layers"].items()}
 
+    @property
+    def left_hand(self) -> bool:
+        """Traffic keeps left."""
+        return bool(self.manifest["roads"]["driving_side"] == "left")
+
     def tile(self, i: int, j: int) -> Tile:
         """Tile (i, j), read from disk."""
         return read_tile(self.path / "tiles" / f"{i}_{j}.npz")

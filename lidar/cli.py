@@ -46,7 +46,7 @@ def drive(
     duration: float | None = None,
     rig: str = "seed",
     vehicle: str = "",
-    side: str = "right",
+    side: str = "",
     seed: int = 0,
     start: str | None = None,
     fidelity: str = "standard",
@@ -101,7 +101,7 @@ def drive(
     vehicle
         car, van, robot, backpack, drone, aircraft, or a TOML file; the rig's own by default.
     side
-        Side of the road that is driven on: right or left.
+        Side of the road that is driven on, right or left; the scene's without.
     seed
         Of everything random: a whole number from 0 on.
     start

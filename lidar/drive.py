@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +121,7 @@ def drive(
     actors = None
     if options.traffic is not None:
         progress("traffic", 0, 0)
-        traffic = replace(options.traffic, side=cast("Literal['left', 'right']", options.side))
+        traffic = replace(options.traffic, side=options.keeps(scene))
         graph = road_graph(scene)
         if isinstance(planned, Travel):
             trajectory, actors = drive_among(
@@ -217,7 +217,7 @@ def plan(
             )
         name = options.vehicle or load_rig(options.rig).vehicle
         travel = plan_travel(scene, route, name, seed=options.seed, duration=options.duration,
-                             side=options.side, progress=progress)  # fmt: skip
+                             side=options.keeps(scene), progress=progress)  # fmt: skip
         if travel.duration is None:
             return travel
         # what cannot pull up within a short time is recorded until then

@@ -6,13 +6,13 @@ import hashlib
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from geoscene.scene import Scene
 from lidar.actors import TrafficOptions
 from lidar.errors import InputError
 from lidar.record import Contents
-from lidar.route import Spec
+from lidar.route import Side, Spec
 from lidar.settings import dials_of
 
 
@@ -36,7 +36,7 @@ class DriveOptions:
     start      : UTC time of the drive's start; 10:00 local solar time on 21 June 2026 by default
     crs        : of LAZ files: ``utm``, ``scene`` or any pyproj name
     exact      : georeference every point through the projection instead of a bounded affine map
-    side       : side of the road
+    side       : side of the road, left or right; the scene's by default
     fidelity   : level of `lidar.settings.levels`: draft, standard or survey
     traffic    : other road users and parked cars; none by default
     settings   : single dials set apart from the level, as (name, text)
@@ -57,7 +57,7 @@ class DriveOptions:
     start: datetime | None = None
     crs: str = "utm"
     exact: bool = False
-    side: str = "right"
+    side: str = ""
     fidelity: str = "standard"
     traffic: TrafficOptions | None = None
     settings: tuple[tuple[str, str], ...] = ()
@@ -67,7 +67,7 @@ class DriveOptions:
         """Refuse options that cannot be meant."""
         if self.duration is not None and not 0.1 <= self.duration <= 86400:
             raise InputError(f"--duration {self.duration}: give 0.1 to 86400 seconds")
-        if self.side not in ("left", "right"):
+        if self.side not in ("", "left", "right"):
             raise InputError(f"--side {self.side}: left or right")
         if not 1 <= self.workers <= 256:
             raise InputError(f"--workers {self.workers}: give 1 to 256")
@@ -78,6 +78,10 @@ class DriveOptions:
         if not 0 <= self.overlap < 1:
             raise InputError(f"--overlap {self.overlap:g}: give a share from 0 to less than 1")
         self.contents()
+
+    def keeps(self, scene: Scene) -> Side:
+        """The side of the road that is driven on."""
+        return cast("Side", self.side) if self.side else "left" if scene.left_hand else "right"
 
     def contents(self) -> Contents:
         """What is written of every frame; raises InputError for what cannot be."""
@@ -103,7 +107,7 @@ class DriveOptions:
             "start": self.start.isoformat() if self.start else None,
             "crs": self.crs,
             "exact": self.exact,
-            "side": self.side,
+            "side": self.keeps(scene),
             "fidelity": self.fidelity,
             "traffic": asdict(self.traffic) if self.traffic else None,
             "settings": [list(pair) for pair in self.settings],

@@ -159,7 +159,8 @@ def write_world(path, crs="utm"):
     )
     manifest = {
         "name": "world", "attribution": "(c) OpenStreetMap contributors", "fingerprint": "0f" * 10,
-        "options": {"lod": 2}, "sources": [{"timestamp": "2024-05-06T07:08:09Z"}],
+        "options": {"lod": 2}, "roads": {"driving_side": "right"},
+        "sources": [{"timestamp": "2024-05-06T07:08:09Z"}],
         "bounds": [-100, -100, 100, 100], "tile_size": size, "tiles": [[-1, -1], [-1, 0], [0, -1], [0, 0]],
     }  # fmt: skip
     with SceneWriter(path) as writer:

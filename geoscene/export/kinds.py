@@ -30,7 +30,7 @@ class Kind:
     options: frozenset[str]
 
 
-def _kind(title: str, writer: str, suffixes: str, options: str) -> Kind:
+def _kind(title: str, writer: str, suffixes: str, options: str = "") -> Kind:
     return Kind(title, writer, tuple(suffixes.split()), frozenset(options.split()))
 
 
@@ -45,8 +45,8 @@ KINDS: dict[str, Kind] = {
     "geojson": _kind("GeoJSON", "vector:write_geojson", ".geojson", "layers"),
     "geoparquet": _kind("GeoParquet", "vector:write_geoparquet", ".parquet .geoparquet", "crs layers"),
     "geotiff": _kind("GeoTIFF", "raster:write_geotiff", ".tif .tiff", "layers model resolution"),
-    "opendrive": _kind("OpenDRIVE 1.7", "opendrive:write_opendrive", ".xodr", "left_hand"),
-    "sumo": _kind("SUMO network", "sumo:write_sumo", ".net.xml", "left_hand"),
+    "opendrive": _kind("OpenDRIVE 1.7", "opendrive:write_opendrive", ".xodr"),
+    "sumo": _kind("SUMO network", "sumo:write_sumo", ".net.xml"),
 }
 """All formats by name."""
 
@@ -74,7 +74,6 @@ def export_scene(
     model: str | None = None,
     resolution: float | None = None,
     height_offset: float | None = None,
-    left_hand: bool | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Summary:
@@ -89,7 +88,6 @@ def export_scene(
     model  : GeoTIFF: ``surface`` (the default), ``terrain`` or ``classes``
     resolution : GeoTIFF: metres, default 0.5
     height_offset : 3D Tiles: metres that lift the scene's heights to ellipsoidal ones, default 0
-    left_hand : OpenDRIVE, SUMO: traffic keeps left
     overwrite : replace what is there
 
     Raises InputError for a kind or an option that cannot be, an option that the kind does not take, and a
@@ -107,14 +105,13 @@ def export_scene(
             ("model", model),
             ("resolution", resolution),
             ("height_offset", height_offset),
-            ("left_hand", left_hand),
         )
         if value is not None
     }
     foreign = sorted(set(given) - told.options)
     if foreign:
         names = ", ".join(f"--{key.replace('_', '-')}" for key in foreign)
-        takes = ", ".join(f"--{key.replace('_', '-')}" for key in sorted(told.options))
+        takes = ", ".join(f"--{key.replace('_', '-')}" for key in sorted(told.options)) or "none"
         raise InputError(f"{names} does not go with {told.title}, which takes {takes}")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: is there already; add --overwrite to replace it")

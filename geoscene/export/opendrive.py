@@ -49,9 +49,7 @@ _SIGNALS = {
 """Dynamic, country, type: OpenDRIVE's own code of a three-light signal, the numbers of the StVO's signs."""
 
 
-def write_opendrive(
-    scene: Scene, path: Path, *, left_hand: bool = False, progress: Progress = silent
-) -> Summary:
+def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) -> Summary:
     """Write the road graph as OpenDRIVE 1.7.
 
     Every carriageway is a road: its centre line with the corners rounded (lines and arcs, within 0.1 m of the
@@ -60,13 +58,12 @@ def write_opendrive(
     ``userData`` names the OpenStreetMap way. A lane that both directions share has the type
     ``bidirectional``.
 
-    left_hand : traffic keeps left
-
     Raises InputError for a scene without roads.
     """
     if not (scene.path / "roads.graphml").exists():
         raise InputError(f"{scene.path}: no drivable roads in it, so no OpenDRIVE")
     graph = read_graphml(scene.path / "roads.graphml", scene.frame)
+    left_hand = scene.left_hand
     net = road_net(graph, left_hand=left_hand)
     controls: dict[int, list[tuple[float, str]]] = defaultdict(list)
     for edge, offset, kind in zip(

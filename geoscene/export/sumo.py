@@ -16,13 +16,11 @@ from geoscene.scene import Scene
 _STAMP = re.compile(rb"<!--.*?-->\s*", re.DOTALL)
 
 
-def write_sumo(scene: Scene, path: Path, *, left_hand: bool = False, progress: Progress = silent) -> Summary:
+def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summary:
     """Write the road graph as a SUMO network (``.net.xml``).
 
     The network is what ``netconvert`` of the package eclipse-sumo makes of `write_opendrive`; its comments
     hold the time of day and are left out.
-
-    left_hand : traffic keeps left
 
     Raises MissingExtraError without eclipse-sumo, InputError for a scene without roads, GeosceneError with
     the last line of netconvert where that fails.
@@ -31,7 +29,7 @@ def write_sumo(scene: Scene, path: Path, *, left_hand: bool = False, progress: P
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".geoscene-") as folder:
         roads, net = Path(folder) / "roads.xodr", Path(folder) / "roads.net.xml"
-        told = write_opendrive(scene, roads, left_hand=left_hand, progress=progress)
+        told = write_opendrive(scene, roads, progress=progress)
         command: list[str | Path] = [
             home / "bin" / "netconvert",
             "--opendrive-files",
