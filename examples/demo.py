@@ -14,6 +14,7 @@ from geoscene.check import check_scene
 from geoscene.classes import class_codes
 from geoscene.console import progress_bar
 from geoscene.sources import demo_path, read_osm
+from geoscene.view import view_scene
 from lidar.camera.png import counts_to_depth, read_png, write_png
 from lidar.dataset import open_dataset
 from lidar.drive import DriveOptions, drive
@@ -53,7 +54,8 @@ with progress_bar() as progress:
     broken = len(report["broken"])
     say(f"{counts['solids']} buildings, {broken} solids broken; {counts['road_km']} km of road")
 
-    # 2. The scene from above and obliquely.
+    # 2. The scene as a page to turn and click, from above and obliquely.
+    view_scene(scene, out / "scene.html", overwrite=True, progress=progress)
     world = World.load(scene)
     write_png(pictures / "scene_top.png", scene_picture(world, view="top", size=(1400, 1400)))
     write_png(pictures / "scene_oblique.png", scene_picture(world, view="oblique", size=(1600, 1000)))
@@ -91,6 +93,7 @@ with progress_bar() as progress:
 
 say("done; open these:")
 for path, what in {
+    out / "scene.html": "the scene, to turn and click (any browser, no network)",
     pictures: "pictures of all of it",
     out / "scene" / "features.gpkg": "buildings, land cover, roads (QGIS)",
     out / "map.laz": "the map, in UTM (CloudCompare, QGIS)",

@@ -147,7 +147,14 @@ def test_a_long_wall_is_seen_from_its_end(make_osm, town, tmp_path):
 def test_a_bridge_is_seen_from_its_end(town, tmp_path, monkeypatch):
     monkeypatch.setattr("geoscene.build._BESIDE", 0.0)
     monkeypatch.setattr("geoscene.build._CROWN", 0.0)
-    words = {"dem": (), "dem_gaps": "error", "tile_size": 50.0, "only": ("roads",), "progress": silent}
+    words = {
+        "dem": (),
+        "dem_gaps": "error",
+        "tile_size": 50.0,
+        "only": ("roads",),
+        "driving_side": "",
+        "progress": silent,
+    }
     plan, _ = make_plan(read_osm(town), "local", **words)
     found = 0
     for home, rows in plan.rows["structures"].items():
