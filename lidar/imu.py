@@ -3,9 +3,9 @@
     gyro  = omega + b_g + n_g        omega: turning of the unit against the stars, rad/s
     accel = f + b_a + n_a            f = a - g: what a mass on springs in the unit feels, m/s^2
 
-both along the unit's own axes. n is white; b a random walk. At rest f is the gravity's reaction, upwards. The
-Earth turns under the unit (and the unit's own travel around it turns the vertical); both are in omega, and
-the Coriolis acceleration is in f.
+both along the unit's own axes. n is white; b a random walk and flicker (bias instability). At rest f is the
+gravity's reaction, upwards. The Earth turns under the unit (and the unit's own travel around it turns the
+vertical); both are in omega, and the Coriolis acceleration is in f.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ from lidar.sky import E2, A
 
 Float = NDArray[np.float64]
 
+_FLICKER_TIMES = 0.1 * np.exp(np.arange(12))
+"""Seconds, correlation times of the processes that add up to flicker: from 0.1 s to 100 minutes."""
+
 EARTH_RATE = 7.292115e-5
 """Turning of the Earth, rad/s (WGS 84)."""
 
@@ -38,6 +41,8 @@ class Noise:
     accel_noise: float
     accel_walk: float
     source: str
+    gyro_instability: float = 0.0
+    accel_instability: float = 0.0
 
 
 PRESETS = {
@@ -51,7 +56,13 @@ PRESETS = {
     ),
     "mti-g-700": Noise(1.745e-4, 0.0, 5.88e-4, 0.0, "Xsens MTi-G-700 data sheet (0.01 deg/s, 60 ug)"),
     "tactical": Noise(
-        1.75e-5, 1.71e-7, 1.0e-3, 1.56e-5, "a NovAtel-class unit: data sheet and Allan variance"
+        1.75e-5,
+        1.71e-7,
+        1.0e-3,
+        1.56e-5,
+        "a NovAtel-class unit: data sheet and Allan variance",
+        gyro_instability=2.18e-6,
+        accel_instability=7.35e-4,
     ),
 }
 """Noise of known units; a figure of 0 is one that the source does not give."""
@@ -138,12 +149,33 @@ def observe_imu(trajectory: Trajectory, frame: Frame, spec: ImuSpec, *, seed: in
 
 
 def inertial_noise(spec: ImuSpec, count: int, seed: int) -> Float:
-    """Errors (n, 6) of gyros, rad/s, and accelerometers, m/s^2: white noise plus a random walk from zero."""
+    """Errors (n, 6) of gyros, rad/s, and accelerometers, m/s^2: white noise, a random walk, flicker."""
     draw = generator(seed, spec.name, "imu").standard_normal((count, 12))
     dt = 1.0 / spec.rate_hz
     white = np.repeat([spec.gyro_noise, spec.accel_noise], 3) / np.sqrt(dt)
     walk = np.repeat([spec.gyro_walk, spec.accel_walk], 3) * np.sqrt(dt)
     total: Float = draw[:, :6] * white + np.cumsum(draw[:, 6:] * walk, axis=0)
+    for axes, instability in ((slice(0, 3), spec.gyro_instability), (slice(3, 6), spec.accel_instability)):
+        if instability:
+            total[:, axes] += instability * _flicker(count, dt, seed, f"{spec.name}/imu/{axes.start}")
+    return total
+
+
+def _flicker(count: int, dt: float, seed: int, name: str) -> Float:
+    """Three columns (n, 3) of noise whose spectrum is 1 / (2 pi f), with an Allan deviation of 0.664.
+
+    The sum of stationary first-order Gauss-Markov processes, a factor of e apart in correlation time, each of
+    variance 1 / pi: their spectra add up to it between the shortest and the longest time (IEEE Std 952-1997,
+    annex C, for the spectrum of bias instability and its Allan deviation, B sqrt(2 ln 2 / pi)).
+    """
+    from scipy.signal import lfilter  # noqa: PLC0415 - slow to import
+
+    total = np.zeros((count, 3))
+    for time in _FLICKER_TIMES:
+        kept = np.exp(-dt / time)
+        noise = generator(seed, name, time).standard_normal((count, 3)) / np.sqrt(np.pi)
+        noise[1:] *= np.sqrt(1 - kept**2)
+        total += lfilter([1.0], [1.0, -kept], noise, axis=0)
     return total
 
 

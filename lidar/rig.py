@@ -136,6 +136,7 @@ class ImuSpec:
     gyro_walk  : rad/s^2/sqrt(Hz)
     accel_noise : m/s^2/sqrt(Hz)
     accel_walk : m/s^3/sqrt(Hz)
+    gyro_instability, accel_instability : rad/s and m/s^2, of the bias (flicker)
     """
 
     name: str
@@ -146,6 +147,8 @@ class ImuSpec:
     gyro_walk: float = 1.9393e-5
     accel_noise: float = 2.0e-3
     accel_walk: float = 3.0e-3
+    gyro_instability: float = 0.0
+    accel_instability: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,16 +253,20 @@ def _gnss(table: Table) -> GnssSpec:
 
 
 def _imu(table: Table) -> ImuSpec:
-    plain = ImuSpec("imu", Mount())
+    from lidar.imu import PRESETS  # noqa: PLC0415 - it imports this module
+
+    plain = PRESETS[table.text("model", "adis16448", among=tuple(PRESETS))]
     return ImuSpec(
         name=table.text("name", "imu"),
         mount=_mount(table),
-        rate_hz=table.number("rate_hz", plain.rate_hz, above=0.0, high=1e5),
+        rate_hz=table.number("rate_hz", 100.0, above=0.0, high=1e5),
         time_offset_ns=table.integer("time_offset_ns", 0, low=0),
         gyro_noise=table.number("gyro_noise", plain.gyro_noise, low=0.0),
         gyro_walk=table.number("gyro_walk", plain.gyro_walk, low=0.0),
         accel_noise=table.number("accel_noise", plain.accel_noise, low=0.0),
         accel_walk=table.number("accel_walk", plain.accel_walk, low=0.0),
+        gyro_instability=table.number("gyro_instability", plain.gyro_instability, low=0.0),
+        accel_instability=table.number("accel_instability", plain.accel_instability, low=0.0),
     )
 
 

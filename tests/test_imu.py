@@ -117,6 +117,17 @@ def test_allan_deviation_is_that_of_the_parameters(name):
     assert np.diff(noise[:, 0]).std() / np.sqrt(2) == pytest.approx(p.gyro_noise * np.sqrt(20.0), rel=0.02)
 
 
+def test_the_bias_wanders_as_its_instability_says():
+    spec = ImuSpec(
+        "imu", Mount(), rate_hz=10.0, **SILENT, gyro_instability=2.18e-6, accel_instability=7.35e-4
+    )
+    noise = np.concatenate([inertial_noise(spec, 100_000, seed=seed) for seed in range(8)], axis=1)
+    measured = allan_deviation(noise, 10.0, np.array([20, 100, 400, 1500]))
+    for columns, b in ((slice(0, 3), 2.18e-6), (slice(3, 6), 7.35e-4)):
+        every = np.concatenate([measured[:, 6 * k :][:, columns] for k in range(8)], axis=1)
+        np.testing.assert_allclose(np.sqrt((every**2).mean(axis=1)), 0.664 * b, rtol=0.08)
+
+
 def test_white_and_walk_cross_where_they_should():
     p = PRESETS["adis16448"]
     assert np.sqrt(3) * p.gyro_noise / p.gyro_walk == pytest.approx(15.2, abs=0.1)

@@ -108,6 +108,12 @@ def test_a_user_adds_a_rig_without_python(tmp_path):
     assert (rig.cameras[0].cx, rig.cameras[0].cy) == (319.5, 239.5)
 
 
+def test_an_inertial_unit_goes_by_its_model(tmp_path):
+    text = RIG + '\n[[imu]]\nname = "unit"\nmodel = "tactical"\ngyro_walk = 0.5\n'
+    unit = load_rig(written(tmp_path, text)).imus[-1]
+    assert (unit.gyro_noise, unit.gyro_instability, unit.gyro_walk) == (1.75e-5, 2.18e-6, 0.5)
+
+
 def test_a_rig_names_a_sensor_file_beside_it(tmp_path):
     own = tmp_path / "own.toml"
     own.write_text(SENSOR)
