@@ -13,6 +13,8 @@ from shapely import affinity
 
 from geoscene.buildings import BuildingOptions, build_solids, read_buildings
 from geoscene.buildings.heights import infer_heights
+from geoscene.buildings.shells import prisms, sound
+from geoscene.buildings.unions import unite
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
 from geoscene.frames import Frame
@@ -400,6 +402,17 @@ def test_a_television_tower_says_nothing_of_the_houses_below():
     np.testing.assert_array_equal(beside[1:], alone[1:])
     block = infer_heights(xy, use, area_, np.array([48.0, *[np.nan] * 5]))[0]
     assert (block[1:3] > 1.2 * alone[1:3]).all()
+
+
+def test_bodies_that_meet_in_an_edge_of_a_hairline_gap_are_joined():
+    upper = shapely.Polygon([(0, 0), (10, 0.0005), (10, 10), (-10, 10), (-10, 0.0005)])
+    lower = shapely.Polygon([(0, 0), (-10, -0.0005), (-10, -10), (10, -10), (10, -0.0005)])
+    footprints = shapely.set_precision(np.array([upper, lower]), 1e-4)
+    shells = prisms(footprints, np.arange(2), np.zeros(2), np.full(2, 9.0))
+    body, told = unite(shells)
+    assert "joined by beads of" in told
+    assert sound(replace(body, piece=np.zeros(len(body), np.int64)), 1).all()
+    assert body.corners[..., 2].max() < 9.01
 
 
 def test_a_building_does_not_inform_its_own_guess():

@@ -14,11 +14,12 @@ from geoscene.validate import degenerate_faces, edge_uses, weld
 
 GROOVES = (2e-3, 2e-2, 1e-1)
 """Reach of the groove that parts two bodies of one building which meet in an edge only, metres; the next
-where the bodies leave the edge in so thin a wedge that the grid closes it again."""
+where the bodies leave the edge in so thin a wedge that the grid closes it again. Where none serves, beads of
+these sizes along the edges join the bodies instead."""
 
 
 def unite(shells: Triangles) -> tuple[Triangles, str] | None:
-    """The union of the closed shells of one building, and what grooves were cut or ""; None if there is none.
+    """The union of the closed shells of one building, and what became of its seams; None if there is none.
 
     Faces keep the piece and surface they come from.
     """
@@ -29,23 +30,24 @@ def unite(shells: Triangles) -> tuple[Triangles, str] | None:
     bodies = [_manifold(shells, piece, first + 4 * k, origin) for k, piece in enumerate(pieces)]
     if any(body is None for body in bodies):
         return None
-    body = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
-    cut = ""
-    for reach in (*GROOVES, None):
-        if body.status() != m3.Error.NoError or body.is_empty():
-            return None
-        corners, run = _triangles(body, first)
-        seams = _crowded_edges(corners)
-        if not len(seams):
-            known = (run >= 0) & (run < 4 * len(pieces))
-            piece = pieces[np.where(known, run // 4, 0)]
-            surface = np.where(known, run % 4, WALL).astype(np.uint8)
-            return Triangles(to_grid(corners + origin), piece, surface), cut
-        if reach is None:
-            break
-        cut = f"{len(seams)} edges where bodies only touched, parted by grooves of {1e3 * reach:.0f} mm"
-        cutters = [_cutter(a, b, reach) for a, b in seams]
-        body = m3.Manifold.batch_boolean([body, *cutters], m3.OpType.Subtract)
+    union = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
+    for operation, what in ((m3.OpType.Subtract, "parted by grooves"), (m3.OpType.Add, "joined by beads")):
+        body, told = union, ""
+        for reach in (*GROOVES, None):
+            if body.status() != m3.Error.NoError or body.is_empty():
+                return None
+            corners, run = _triangles(body, first)
+            seams = _crowded_edges(corners)
+            if not len(seams):
+                known = (run >= 0) & (run < 4 * len(pieces))
+                piece = pieces[np.where(known, run // 4, 0)]
+                surface = np.where(known, run % 4, WALL).astype(np.uint8)
+                return Triangles(to_grid(corners + origin), piece, surface), told
+            if reach is None:
+                break
+            told = f"{len(seams)} edges where bodies only touched, {what} of {1e3 * reach:.0f} mm"
+            about = [_cutter(a, b, reach) for a, b in seams]
+            body = m3.Manifold.batch_boolean([body, *about], operation)
     return None
 
 

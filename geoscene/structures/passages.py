@@ -22,6 +22,10 @@ _SCANT = 1.0
 _OVER = 0.1
 """Metres from a tunnel's roof, or a bridge's free height, to the underside of what stands over it."""
 
+_STEP = 0.05
+"""Metres: undersides are whole multiples of this over the base, so that pieces of road that are all but
+equally high do not leave a stair of micrometres, which the grid of solids would crush."""
+
 
 def buildings_over(
     buildings: Buildings, base: Float, table: Structures, *, options: StructureOptions | None = None
@@ -56,7 +60,8 @@ def buildings_over(
     if not met.any():
         return buildings, []
     corridor = table.polygon[road[met]]
-    return _divided(buildings, row[met], corridor, (high - stands)[met], tunnel=tunnel[met])
+    clear = np.ceil((high - stands)[met] / _STEP - 1e-3) * _STEP
+    return _divided(buildings, row[met], corridor, clear, tunnel=tunnel[met])
 
 
 def _divided(
