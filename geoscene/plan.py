@@ -175,7 +175,8 @@ def make_plan(
     problems += found
     structures, found = read_structures(surfaces, graph, osm, frame, height=height)
     problems += found
-    structures = structures.take(shapely.intersects(structures.polygon, shapely.box(*extent)))
+    inside = shapely.area(shapely.intersection(structures.polygon, shapely.box(*extent)))
+    structures = structures.take(inside >= 0.5 * shapely.area(structures.polygon))
     height = ground_below(structures, height or terrain.height) if len(structures) else height
     openings = find_openings(structures, height)
     footprints = buildings.footprint[: buildings.count]
