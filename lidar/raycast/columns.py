@@ -13,6 +13,9 @@ COPIES = 256
 """Numbers of an Embree scene's geometries for copies; those of its mesh follow. A commit looks at all
 numbers up to the highest."""
 
+CHUNK = 8192
+"""Rays that a thread takes at a time; a multiple of every packet width, so that packets stay as they are."""
+
 
 class Target(NamedTuple):
     """What rays are cast at.

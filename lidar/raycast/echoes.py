@@ -132,7 +132,7 @@ def echoes(
     what = np.zeros(2 * room, np.int64)
     found, cosine = np.zeros(room), np.zeros(room)
     for at in range(lo, hi):
-        if not gather(target, rays, at, 1, 1, ids, work, f):
+        if not gather(target, rays, at, 1, (0,), ids, work, f):
             return first_bad(1, ids, work)
         u[9] = rays.mask
         count = _resolve(target, _pass(target, f, u, kept, arguments), names, work, what, found, cosine)
@@ -140,7 +140,7 @@ def echoes(
             nudge(1, 0, work, f, work[7])
             again = _resolve(target, _pass(target, f, u, kept, arguments), names, work, what, found, cosine)
             if again < count:  # the second look lost a face: the first one counts
-                gather(target, rays, at, 1, 1, ids, work, f)
+                gather(target, rays, at, 1, (0,), ids, work, f)
                 _resolve(target, _pass(target, f, u, kept, arguments), names, work, what, found, cosine)
             count = max(count, again)
         i = ids[0]

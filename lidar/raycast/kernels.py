@@ -3,10 +3,12 @@
 Embree traces in float32; a hit tells which face was met, and the range is computed again in float64 from that
 face's plane. In robust mode no ray passes between two faces at their shared edge, but about 0.3 % of the rays
 aimed exactly at a vertex do. Such a ray misses, or meets the back of a face: it is traced once more with its
-direction turned by `_NUDGE`, and a nearer front face counts.
+direction turned by `_NUDGE`, and a nearer front face counts. Such rays wait until they fill a packet.
 
-Work on a packet goes step by step over all its lanes, so that the compiler can use wide registers. Columns of
-numbers a lane (``work``, ``hit``, ``what``) have their rows end to end, as wide as a packet.
+Work on a packet goes step by step over all its lanes, arithmetic on all at once (`lidar.raycast.lanes`).
+Rows of numbers, one a lane, lie end to end in ``work``. Of the ray: origin (0 to 2), direction (3 to 5), one
+over its length (6), far (7), time (8). Of what it met: the plane's normal and offset (9 to 12), the scale of
+the cosine (13), range (14) and cosine (15).
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lidar.raycast.columns import COPIES, Rays, Target
+from lidar.raycast.columns import CHUNK, COPIES, Rays, Target
+from lidar.raycast.lanes import GRAZING, HUGE, cross, move_float64, move_int32, narrow, settle
 from lidar.raycast.memory import (
     aligned,
     called,
@@ -42,9 +45,6 @@ _INVALID = np.uint32(0xFFFFFFFF)
 _NUDGE = 3e-7  # radians; the smallest that closed every leak among a million rays aimed at vertices
 _COHERENT = 0.985  # cosine; packets that fan out over more than 10° are faster as single rays
 _SPREAD = 4.0  # metres; so are packets whose origins lie farther apart
-_UNIT = 1e-12  # how far the squared length of a unit vector may be from 1
-_GRAZING = 1e-3  # cosine below which a range is held within the face's extent along the ray
-_HUGE = 1e100  # squared lengths and coordinates from here on cannot be cast
 _UP = 1.0 + 2.0**-23  # what lifts a float64 above the float32 it is rounded to
 _RAY, _ROWS = 12, 21  # 32-bit rows of RTCRayN and RTCRayHitN
 
@@ -68,65 +68,6 @@ def _posed(pose: Any, p: int, x: float, y: float, z: float) -> Any:
 
 
 @inlined
-def gather(target: Target, rays: Rays, at: int, m: int, W: int, ids: Any, work: Any, f: Any) -> bool:
-    """Load rays ``at`` to ``at + m`` of the order, the last again in lanes left over; whether all will do.
-
-    work : origin (3), direction (3), one over its length, far, time
-    f    : Embree's packet, which gets directions of length 1 and far rounded up
-    """
-    ordered, posed, timed, reach = rays.order.size, rays.pose.size, rays.time.size, rays.far.size > 1
-    shifted, step = rays.offsets.shape[0] > 0, 1 if rays.offsets.shape[0] > 1 else 0
-    directions, offsets, far = rays.directions.ctypes.data, rays.offsets.ctypes.data, rays.far.ctypes.data
-    order, pose_of, time = rays.order.ctypes.data, rays.pose.ctypes.data, rays.time.ctypes.data
-    pose = (rays.position.ctypes.data, rays.matrix.ctypes.data)
-    cx, cy, cz = target.origin[0], target.origin[1], target.origin[2]
-    bad, long = np.int64(0), np.int64(0)
-    for k in range(W):
-        i = at + min(k, m - 1)
-        if ordered:
-            i = int64_at(order, i)
-        ids[k] = i
-        x, y, z = _vector(directions, i)
-        if posed:
-            p = int64_at(pose_of, i)
-            x, y, z = _posed(pose, p, x, y, z)
-            a, b, c = _vector(pose[0], p)
-            if shifted:
-                ox, oy, oz = _vector(offsets, step * i)
-                ox, oy, oz = _posed(pose, p, ox, oy, oz)
-                a, b, c = a + ox, b + oy, c + oz
-        else:
-            a, b, c = _vector(offsets, step * i)
-        a, b, c = a - cx, b - cy, c - cz
-        squared = x * x + y * y + z * z
-        bad |= np.int64(not ((squared > 0.0) & (squared < _HUGE) & (abs(a) + abs(b) + abs(c) < _HUGE)))
-        long |= np.int64(not abs(squared - 1.0) < _UNIT)
-        work[k], work[W + k], work[2 * W + k] = a, b, c
-        work[3 * W + k], work[4 * W + k], work[5 * W + k] = x, y, z
-        f[k], f[W + k], f[2 * W + k] = a, b, c
-        f[4 * W + k], f[5 * W + k], f[6 * W + k] = x, y, z
-    if reach:
-        for k in range(W):
-            work[7 * W + k] = float64_at(far, ids[k])
-    else:
-        limit = float64_at(far, 0)
-        for k in range(W):
-            work[7 * W + k] = limit
-    if timed:
-        for k in range(W):
-            work[8 * W + k] = float32_at(time, ids[k])
-    for k in range(W):
-        work[6 * W + k] = 1.0
-        f[3 * W + k] = rays.near
-        f[7 * W + k] = work[8 * W + k]
-        f[8 * W + k] = work[7 * W + k] * _UP
-    if long and not bad:
-        for k in range(W):
-            _shorten(W, k, work, f)
-    return bool(bad == 0)
-
-
-@inlined
 def _shorten(W: int, k: int, work: Any, f: Any) -> None:
     """Give lane k of Embree's packet a direction of length 1."""
     x, y, z = work[3 * W + k], work[4 * W + k], work[5 * W + k]
@@ -145,9 +86,69 @@ def first_bad(W: int, ids: Any, work: Any) -> int:
         x, y, z = work[3 * W + k], work[4 * W + k], work[5 * W + k]
         squared = x * x + y * y + z * z
         size = abs(work[k]) + abs(work[W + k]) + abs(work[2 * W + k])
-        if not (0.0 < squared < _HUGE and size < _HUGE):
+        if not (0.0 < squared < HUGE and size < HUGE):
             return int(ids[k])
     return -1
+
+
+@inlined
+def gather(target: Target, rays: Rays, at: int, m: int, lanes: Any, ids: Any, work: Any, f: Any) -> bool:
+    """Load rays ``at`` to ``at + m`` of the order, the last again in lanes left over; whether all will do.
+
+    Embree's packet ``f`` gets directions of length 1 and far rounded up.
+    """
+    W = len(lanes)
+    ordered, posed, timed, reach = rays.order.size, rays.pose.size, rays.time.size, rays.far.size > 1
+    shifted, step = rays.offsets.shape[0] > 0, 1 if rays.offsets.shape[0] > 1 else 0
+    directions, offsets, far = rays.directions.ctypes.data, rays.offsets.ctypes.data, rays.far.ctypes.data
+    order, pose_of, time = rays.order.ctypes.data, rays.pose.ctypes.data, rays.time.ctypes.data
+    pose = (rays.position.ctypes.data, rays.matrix.ctypes.data)
+    cx, cy, cz = target.origin[0], target.origin[1], target.origin[2]
+    for k in range(W):
+        ids[k] = at + min(k, m - 1)
+    if ordered:
+        for k in range(W):
+            ids[k] = int64_at(order, ids[k])
+    if posed:
+        for k in range(W):
+            p = int64_at(pose_of, ids[k])
+            x, y, z = _vector(directions, ids[k])
+            work[3 * W + k], work[4 * W + k], work[5 * W + k] = _posed(pose, p, x, y, z)
+            work[k], work[W + k], work[2 * W + k] = _vector(pose[0], p)
+        if shifted:
+            for k in range(W):
+                x, y, z = _vector(offsets, step * ids[k])
+                x, y, z = _posed(pose, int64_at(pose_of, ids[k]), x, y, z)
+                work[k] += x
+                work[W + k] += y
+                work[2 * W + k] += z
+    else:
+        for k in range(W):
+            work[3 * W + k], work[4 * W + k], work[5 * W + k] = _vector(directions, ids[k])
+            work[k], work[W + k], work[2 * W + k] = _vector(offsets, step * ids[k])
+    plain = settle(lanes, work.ctypes.data, f.ctypes.data, cx, cy, cz)
+    if reach:
+        for k in range(W):
+            work[7 * W + k] = float64_at(far, ids[k])
+    else:
+        limit = float64_at(far, 0)
+        for k in range(W):
+            work[7 * W + k] = limit
+    if timed:
+        for k in range(W):
+            work[8 * W + k] = float32_at(time, ids[k])
+    for k in range(W):
+        work[6 * W + k] = 1.0
+        f[3 * W + k] = rays.near
+        f[7 * W + k] = work[8 * W + k]
+        f[8 * W + k] = work[7 * W + k] * _UP
+    if plain:
+        return True
+    if first_bad(W, ids, work) >= 0:
+        return False
+    for k in range(W):
+        _shorten(W, k, work, f)
+    return True
 
 
 @inlined
@@ -312,7 +313,7 @@ def meet(target: Target, W: int, k: int, row: int, prim: int, instance: int, wor
     cosine = -along * work[6 * W + k]
     if instance >= 0:
         cosine /= np.sqrt(nx * nx + ny * ny + nz * nz)
-    if not abs(cosine) >= _GRAZING:
+    if not abs(cosine) >= GRAZING:
         low, high = _extent(target, row, prim, instance, (ox, oy, oz, dx, dy, dz), work[8 * W + k])
         t = high if t > high else low if not t >= low else t
         cosine = cosine if cosine == cosine else 0.0  # noqa: PLR0124
@@ -325,6 +326,72 @@ def _normal(out: Float, i: int, x: float, y: float, z: float) -> None:
     length = np.sqrt(x * x + y * y + z * z)
     scale = 1.0 / length if length > 0.0 else 0.0
     out[i, 0], out[i, 1], out[i, 2] = scale * x, scale * y, scale * z
+
+
+@inlined
+def _name(target: Target, W: int, u: Any, work: Any, faces: Any, instances: Any) -> None:
+    """Planes and numbers of what lanes met; a lane that met nothing has a plane without a normal."""
+    for k in range(W):
+        geom, inst, prim = u[18 * W + k], u[19 * W + k], np.int64(u[17 * W + k])
+        work[13 * W + k] = work[6 * W + k]
+        if geom == _INVALID:
+            work[9 * W + k], work[10 * W + k], work[11 * W + k], work[12 * W + k] = 0.0, 0.0, 0.0, 0.0
+            faces[k], instances[k] = -1, -1
+        elif inst == _INVALID:
+            row = np.int64(target.rows[geom])
+            plane = int64_at(target.parts.ctypes.data, 5 * row) + 32 * prim
+            work[9 * W + k], work[10 * W + k] = float64_at(plane, 0), float64_at(plane, 1)
+            work[11 * W + k], work[12 * W + k] = float64_at(plane, 2), float64_at(plane, 3)
+            faces[k], instances[k] = numbered(target, row, prim), -1
+        else:
+            row, instance = placed(target, geom, inst, u[20 * W + k])
+            x, y, z, d = plane_of(target, row, prim, instance, work[8 * W + k])
+            work[9 * W + k], work[10 * W + k], work[11 * W + k], work[12 * W + k] = x, y, z, d
+            work[13 * W + k] /= np.sqrt(x * x + y * y + z * z)
+            faces[k], instances[k] = numbered(target, row, prim), instance
+
+
+@inlined
+def _second(
+    target: Target,
+    near: float,
+    m: int,
+    work: Any,
+    ids: Any,
+    f: Any,
+    valid: Any,
+    one: Any,
+    ranges: Any,
+    faces: Any,
+    instances: Any,
+    cosines: Any,
+    normals: Any,
+) -> None:
+    """Trace m rays once more, turned a little, and keep what they meet if it is nearer."""
+    W = len(target.lanes)
+    u = f.view(np.uint32)
+    for k in range(W):
+        f[k], f[W + k], f[2 * W + k] = work[k], work[W + k], work[2 * W + k]
+        f[3 * W + k], f[7 * W + k] = near / work[6 * W + k], work[8 * W + k]
+        nudge(W, k, work, f, min(work[7 * W + k], ranges[ids[k]]))
+        valid[k] = -1 if k < m else 0
+        u[18 * W + k] = _INVALID
+        u[19 * W + k] = _INVALID
+    _trace(target, W, _ROWS, f, valid, _alike(W, work), one)
+    for k in range(m):
+        if u[18 * W + k] == _INVALID:
+            continue
+        i = ids[k]
+        row, instance = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
+        prim = np.int64(u[17 * W + k])
+        t, cosine, x, y, z = meet(target, W, k, row, prim, instance, work)
+        if t <= work[7 * W + k] and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
+            ranges[i], cosines[i] = t, cosine
+            faces[i], instances[i] = numbered(target, row, prim), instance
+            if normals.size:
+                _normal(normals, i, x, y, z)
+    for k in range(W):
+        valid[k] = -1
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -347,61 +414,72 @@ def cast(
     packet = aligned(4 * _ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
     one, valid = aligned(128).view(np.float32), aligned(4 * W).view(np.int32)
-    work, ids = np.zeros(9 * W), np.zeros(W, np.int64)
+    work, ids = aligned(8 * 16 * W).view(np.float64), np.zeros(W, np.int64)
+    face, instance = aligned(4 * W).view(np.int32), aligned(4 * W).view(np.int32)
+    late, doubtful, waiting = np.zeros(18 * W), np.zeros(2 * W, np.int64), 0
     for k in range(W):
         u[9 * W + k] = rays.mask
         u[10 * W + k] = k
+        valid[k] = -1
     for at in range(lo, hi, W):
         m = min(W, hi - at)
-        if not gather(target, rays, at, m, W, ids, work, f):
+        if not gather(target, rays, at, m, target.lanes, ids, work, f):
             return first_bad(W, ids, work)
         for k in range(W):
-            valid[k] = -1 if k < m else 0
             u[18 * W + k] = _INVALID
             u[19 * W + k] = _INVALID
-        together = _alike(W, work)
-        _trace(target, W, _ROWS, f, valid, together, one)
-        doubtful = False
-        for k in range(m):
-            i = ids[k]
-            valid[k] = -1
-            if u[18 * W + k] != _INVALID:
-                row, instance = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
-                prim = np.int64(u[17 * W + k])
-                t, cosine, x, y, z = meet(target, W, k, row, prim, instance, work)
-                if t <= work[7 * W + k]:
-                    ranges[i], cosines[i] = t, cosine
-                    faces[i], instances[i] = numbered(target, row, prim), instance
-                    if normals.size:
-                        _normal(normals, i, x, y, z)
-                    if cosine < 0.0:
-                        doubtful = True
-                    else:
-                        valid[k] = 0
-                    continue
-            doubtful = True
-            ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
-            if normals.size:
-                _normal(normals, i, 0.0, 0.0, 0.0)
-        if not doubtful:
-            continue
-        for k in range(W):
-            if valid[k]:
-                u[18 * W + k] = _INVALID
-                u[19 * W + k] = _INVALID
-                nudge(W, k, work, f, min(work[7 * W + k], ranges[ids[k]]))
-        _trace(target, W, _ROWS, f, valid, together, one)
-        for k in range(m):
-            if valid[k] and u[18 * W + k] != _INVALID:
+        for k in range(m, W):
+            valid[k] = 0
+        _trace(target, W, _ROWS, f, valid, _alike(W, work), one)
+        _name(target, W, u, work, face, instance)
+        settled = cross(target.lanes, work.ctypes.data)
+        if m == W and not rays.order.size:
+            exact = work.ctypes.data + 8 * 14 * W
+            move_float64(target.lanes, exact, ranges.ctypes.data + 8 * at)
+            narrow(target.lanes, exact + 8 * W, cosines.ctypes.data + 4 * at)
+            move_int32(target.lanes, face.ctypes.data, faces.ctypes.data + 4 * at)
+            move_int32(target.lanes, instance.ctypes.data, instances.ctypes.data + 4 * at)
+        else:
+            for k in range(m):
                 i = ids[k]
-                row, instance = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
+                ranges[i], cosines[i] = work[14 * W + k], work[15 * W + k]
+                faces[i], instances[i] = face[k], instance[k]
+        if normals.size:
+            for k in range(m):
+                _normal(normals, ids[k], work[9 * W + k], work[10 * W + k], work[11 * W + k])
+        for k in range(0 if settled else m):
+            i = ids[k]
+            met = u[18 * W + k] != _INVALID
+            if met and not abs(work[15 * W + k]) >= GRAZING:
+                row, copy = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
                 prim = np.int64(u[17 * W + k])
-                t, cosine, x, y, z = meet(target, W, k, row, prim, instance, work)
-                if t <= work[7 * W + k] and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
-                    ranges[i], cosines[i] = t, cosine
-                    faces[i], instances[i] = numbered(target, row, prim), instance
-                    if normals.size:
-                        _normal(normals, i, x, y, z)
+                ranges[i], cosines[i], _, _, _ = meet(target, W, k, row, prim, copy, work)
+            if not (met and ranges[i] <= work[7 * W + k]):
+                ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
+                if normals.size:
+                    _normal(normals, i, 0.0, 0.0, 0.0)
+            elif cosines[i] >= 0.0:
+                continue
+            for r in range(9):
+                late[r * 2 * W + waiting] = work[r * W + k]
+            doubtful[waiting] = i
+            waiting += 1
+        # Threads take chunks: at the end of each, nothing waits, so that their number changes no packet.
+        last = hi - at <= W or (at - lo + W) % CHUNK == 0
+        while waiting >= W or (last and waiting > 0):
+            n = min(W, waiting)
+            for k in range(W):
+                for r in range(9):
+                    work[r * W + k] = late[r * 2 * W + min(k, n - 1)]
+                ids[k] = doubtful[min(k, n - 1)]
+            _second(
+                target, rays.near, n, work, ids, f, valid, one, ranges, faces, instances, cosines, normals
+            )
+            for k in range(W):
+                doubtful[k] = doubtful[W + k]
+                for r in range(9):
+                    late[r * 2 * W + k] = late[r * 2 * W + W + k]
+            waiting -= n
     return -1
 
 
@@ -418,7 +496,7 @@ def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_
         u[10 * W + k] = k
     for at in range(lo, hi, W):
         m = min(W, hi - at)
-        if not gather(target, rays, at, m, W, ids, work, f):
+        if not gather(target, rays, at, m, target.lanes, ids, work, f):
             return first_bad(W, ids, work)
         for k in range(W):
             valid[k] = -1 if k < m else 0

@@ -10,13 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from lidar.errors import InputError
 from lidar.poses import Poses
-from lidar.raycast.columns import Rays
+from lidar.raycast.columns import CHUNK, Rays
 from lidar.raycast.geometry import ALL
 
 Float = NDArray[np.float64]
-
-_CHUNK = 8192
-"""Rays that a thread takes at a time; a multiple of every packet width, so that packets stay as they are."""
 
 
 def _rows(values: ArrayLike, name: str) -> Float:
@@ -45,10 +42,11 @@ def posed_rays(
     index = np.ascontiguousarray(pose_index, np.int64)
     if len(o) not in (0, 1, len(d)) or index.shape != (len(d),):
         raise InputError(f"{len(d)} directions, {len(o)} offsets and {len(index)} pose numbers disagree")
-    if len(index) and not (index.min() >= 0 and index.max() < len(poses)):
+    if len(index) and not int(index.view(np.uint64).max()) < len(poses):  # what is below zero is huge
         raise InputError(f"a ray names a pose beyond the {len(poses)} there are")
-    matrix = np.ascontiguousarray(poses.scale[:, :, None] * poses.rotation, np.float64)
-    return _plain(d, o, index, np.ascontiguousarray(poses.position, np.float64), matrix)
+    level = bool((poses.scale == 1.0).all())
+    matrix = poses.rotation if level else poses.scale[:, :, None] * poses.rotation
+    return _plain(d, o, index, np.ascontiguousarray(poses.position, np.float64), np.ascontiguousarray(matrix))
 
 
 def _plain(d: Float, o: Float, pose: NDArray[np.int64], position: Float, matrix: Float) -> Rays:
@@ -126,10 +124,10 @@ def share(work: Callable[[int, int], int], rays: Rays, threads: int) -> None:
     Raises InputError for such a ray.
     """
     n = len(rays.directions)
-    if threads <= 1 or n <= _CHUNK:
+    if threads <= 1 or n <= CHUNK:
         bad = work(0, n)
     else:
         with ThreadPoolExecutor(threads) as pool:
-            bad = max(pool.map(lambda lo: work(lo, min(lo + _CHUNK, n)), range(0, n, _CHUNK)))
+            bad = max(pool.map(lambda lo: work(lo, min(lo + CHUNK, n)), range(0, n, CHUNK)))
     if bad >= 0:
         raise _refusal(rays, bad)

@@ -1,0 +1,148 @@
+"""Arithmetic on all lanes of a packet at once: vector instructions written out.
+
+A packet's numbers are rows of float64, one number a lane, end to end; `lidar.raycast.kernels` says which. Left
+to itself the compiler widens loops over lanes here and not there, as its estimate of their cost falls. Each
+function takes a tuple with an item for each lane, which makes their number a constant.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+GRAZING = 1e-3
+"""Cosine below which a range is held within the face's extent along the ray."""
+HUGE = 1e100
+"""Squared lengths and coordinates from here on cannot be cast."""
+UNIT = 1e-12
+"""How far the squared length of a unit vector may be from 1."""
+
+_DOUBLE, _FLOAT, _INT = ir.DoubleType(), ir.FloatType(), ir.IntType(32)
+
+
+class _Row:
+    """A row's numbers in code that is being built."""
+
+    def __init__(self, builder: Any, value: Any) -> None:
+        self.builder, self.value = builder, value
+
+    def __add__(self, other: _Row) -> _Row:
+        return _Row(self.builder, self.builder.fadd(self.value, other.value))
+
+    def __sub__(self, other: _Row) -> _Row:
+        return _Row(self.builder, self.builder.fsub(self.value, other.value))
+
+    def __mul__(self, other: _Row) -> _Row:
+        return _Row(self.builder, self.builder.fmul(self.value, other.value))
+
+    def __truediv__(self, other: _Row) -> _Row:
+        return _Row(self.builder, self.builder.fdiv(self.value, other.value))
+
+    def __neg__(self) -> _Row:
+        return _Row(self.builder, self.builder.fneg(self.value))
+
+    def __abs__(self) -> _Row:
+        row = self.value.type
+        function = self.builder.module.declare_intrinsic(
+            f"llvm.fabs.v{row.count}f64", (), ir.FunctionType(row, [row])
+        )
+        return _Row(self.builder, self.builder.call(function, [self.value]))
+
+    def all(self, relation: str, other: _Row) -> Any:
+        """Whether the relation holds in every lane; it does not where a number is NaN."""
+        flags = self.builder.fcmp_ordered(relation, self.value, other.value)
+        bits = ir.IntType(flags.type.count)
+        whole = ir.Constant(bits, 2**flags.type.count - 1)
+        return self.builder.icmp_unsigned("==", self.builder.bitcast(flags, bits), whole)
+
+
+class _Rows:
+    """Rows of numbers from an address on, end to end, in code that is being built."""
+
+    def __init__(self, builder: Any, lanes: Any, address: Any, kind: Any = _DOUBLE) -> None:
+        self.builder, self.lanes, self.kind = builder, lanes.count, ir.VectorType(kind, lanes.count)
+        self.size = 4 if kind in (_FLOAT, _INT) else 8
+        self.base = builder.inttoptr(address, self.kind.as_pointer())
+
+    def _place(self, row: int) -> Any:
+        return self.builder.gep(self.base, [ir.Constant(ir.IntType(64), row)])
+
+    def __getitem__(self, row: int) -> _Row:
+        return _Row(self.builder, self.builder.load(self._place(row), align=self.size))
+
+    def __setitem__(self, row: int, numbers: _Row) -> None:
+        value = numbers.value
+        if value.type != self.kind:
+            value = self.builder.fptrunc(value, self.kind)
+        self.builder.store(value, self._place(row), align=self.size)
+
+    def same(self, number: Any) -> _Row:
+        """A row of one number, a constant or a value of the code."""
+        if isinstance(number, float):
+            return _Row(self.builder, ir.Constant(self.kind, [number] * self.lanes))
+        one = self.builder.insert_element(ir.Constant(self.kind, ir.Undefined), number, ir.Constant(_INT, 0))
+        every = ir.Constant(ir.VectorType(_INT, self.lanes), [0] * self.lanes)
+        return _Row(self.builder, self.builder.shuffle_vector(one, one, every))
+
+
+def _row(kind: Any, kept: Any) -> Any:
+    @intrinsic
+    def move(context: Any, lanes: Any, source: Any, target: Any) -> Any:  # noqa: ARG001
+        def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+            _Rows(builder, lanes, values[2], kept)[0] = _Rows(builder, lanes, values[1], kind)[0]
+            return made.get_dummy_value()
+
+        return types.void(lanes, types.int64, types.int64), build
+
+    return move
+
+
+move_float64 = _row(_DOUBLE, _DOUBLE)
+move_int32 = _row(_INT, _INT)
+narrow = _row(_DOUBLE, _FLOAT)
+"""Copy a row from one address to another; `narrow` rounds to float32."""
+
+
+@intrinsic
+def _settle(context: Any, lanes: Any, work: Any, packet: Any, x: Any, y: Any, z: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        rows, rounded = _Rows(builder, lanes, values[1]), _Rows(builder, lanes, values[2], _FLOAT)
+        place = [rows[r] - rows.same(value) for r, value in enumerate(values[3:])]
+        way = [rows[3 + r] for r in range(3)]
+        for r in range(3):
+            rows[r] = rounded[r] = place[r]
+            rounded[4 + r] = way[r]
+        squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
+        near = (abs(place[0]) + abs(place[1]) + abs(place[2])).all("<", rows.same(HUGE))
+        unit = abs(squared - rows.same(1.0)).all("<", rows.same(UNIT))
+        return builder.and_(near, unit)
+
+    return types.boolean(lanes, types.int64, types.int64, *[types.float64] * 3), build
+
+
+settle: Any = _settle
+"""Make origins (rows 0 to 2) relative to a point, round them and directions (rows 3 to 5) to float32 for
+Embree's packet; whether all directions have length 1 and all origins are within reach."""
+
+
+@intrinsic
+def _cross(context: Any, lanes: Any, work: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        rows = _Rows(builder, lanes, values[1])
+        ox, oy, oz, dx, dy, dz = (rows[r] for r in range(6))
+        nx, ny, nz, d = (rows[r] for r in range(9, 13))
+        along = nx * dx + ny * dy + nz * dz
+        t = (d - nx * ox - ny * oy - nz * oz) / along
+        cosine = -along * rows[13]
+        rows[14], rows[15] = t, cosine
+        return builder.and_(cosine.all(">=", rows.same(GRAZING)), t.all("<=", rows[7]))
+
+    return types.boolean(lanes, types.int64), build
+
+
+cross: Any = _cross
+"""Ranges and cosines (rows 14 and 15) where rays meet planes (normals and offsets: rows 9 to 12, scale of the
+cosine: row 13); whether all are within far (row 7) and meet a front not too aslant."""
