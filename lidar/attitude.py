@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 Float = NDArray[np.float64]
 
@@ -38,8 +37,7 @@ def euler_from_quat(quat_xyzw: ArrayLike) -> Float:
     With the nose straight up or down roll and yaw cannot be told apart: alpha is then 0 and gamma takes both.
     """
     quat = np.asarray(quat_xyzw, float)
-    R = Rotation.from_quat(quat.reshape(-1, 4)).as_matrix()
-    out: Float = np.stack(_angles(R, 1.0), axis=-1).reshape(*quat.shape[:-1], 3)
+    out: Float = np.stack(_angles(matrix_from_quat(quat), 1.0), axis=-1)
     return out
 
 
@@ -64,8 +62,8 @@ def euler_from_quat_intrinsic(quat_xyzw: ArrayLike) -> Float:
     """Angles (..., 3) alpha, beta, gamma of R = Rx(alpha) Ry(beta) Rz(gamma), the order X-Y'-Z''."""
     quat = np.asarray(quat_xyzw, float)
     # the inverse of Rx Ry Rz is Rz(-gamma) Ry(-beta) Rx(-alpha)
-    R = np.swapaxes(Rotation.from_quat(quat.reshape(-1, 4)).as_matrix(), -1, -2)
-    out: Float = np.stack(_angles(R, -1.0), axis=-1).reshape(*quat.shape[:-1], 3)
+    R = np.swapaxes(matrix_from_quat(quat), -1, -2)
+    out: Float = np.stack(_angles(R, -1.0), axis=-1)
     return out
 
 
@@ -77,10 +75,32 @@ def quat_from_euler_intrinsic(alpha: ArrayLike, beta: ArrayLike, gamma: ArrayLik
 
 
 def matrix_from_quat(quat_xyzw: ArrayLike) -> Float:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4)."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any length above 0."""
     quat = np.asarray(quat_xyzw, float)
-    R: Float = Rotation.from_quat(quat.reshape(-1, 4)).as_matrix().reshape(*quat.shape[:-1], 3, 3)
-    return R
+    x, y, z, w = np.moveaxis(quat * np.sqrt(2.0 / (quat**2).sum(axis=-1, keepdims=True)), -1, 0)
+    rows = [
+        np.stack([1 - y * y - z * z, x * y - z * w, x * z + y * w], axis=-1),
+        np.stack([x * y + z * w, 1 - x * x - z * z, y * z - x * w], axis=-1),
+        np.stack([x * z - y * w, y * z + x * w, 1 - x * x - y * y], axis=-1),
+    ]
+    return np.stack(rows, axis=-2)
+
+
+def quat_product(first: ArrayLike, second: ArrayLike) -> Float:
+    """Quaternions (..., 4) of the turns ``first @ second``, with w >= 0."""
+    a, b, c, d = np.moveaxis(np.asarray(first, float), -1, 0)
+    x, y, z, w = np.moveaxis(np.asarray(second, float), -1, 0)
+    out = np.stack(
+        [
+            d * x + a * w + b * z - c * y,
+            d * y - a * z + b * w + c * x,
+            d * z + a * y - b * x + c * w,
+            d * w - a * x - b * y - c * z,
+        ],
+        axis=-1,
+    )
+    positive: Float = np.where(out[..., 3:] < 0, -out, out)
+    return positive
 
 
 def body_rates(time_s: ArrayLike, quat_xyzw: ArrayLike) -> Float:
@@ -88,6 +108,8 @@ def body_rates(time_s: ArrayLike, quat_xyzw: ArrayLike) -> Float:
 
     Central differences of the rotation vector, exact for a constant rate; one-sided at the ends.
     """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
     t, turn = np.asarray(time_s, float), Rotation.from_quat(np.asarray(quat_xyzw, float))
     half = (turn[:-1].inv() * turn[1:]).as_rotvec() / np.diff(t)[:, None]
     rates: Float = np.concatenate([half[:1], half]) * 0.5 + np.concatenate([half, half[-1:]]) * 0.5

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from lidar.attitude import quat_from_euler
 from lidar.errors import InputError
@@ -279,8 +278,8 @@ def poses_along(path: Path, vehicle: Vehicle, motion: Motion) -> Trajectory:
         tangent = np.column_stack(
             [run * np.cos(p.heading), run * np.sin(p.heading), np.sin(p.slope) * p.gear]
         )
-        position[here] = CubicHermiteSpline(p.s, p.position, tangent)(s)
-        heading[here] = CubicHermiteSpline(p.s, p.heading, p.curvature * np.cos(p.slope))(s)
+        position[here] = _hermite(p.s, p.position, tangent, s)
+        heading[here] = _hermite(p.s, p.heading[:, None], (p.curvature * np.cos(p.slope))[:, None], s)[:, 0]
         for name, column in columns.items():
             column[here] = np.interp(s, p.s, getattr(p, name))
     v = motion.speed * gear
@@ -301,6 +300,17 @@ def poses_along(path: Path, vehicle: Vehicle, motion: Motion) -> Trajectory:
     return Trajectory(
         motion.time_ns, position, quat_from_euler(roll, pitch, heading), velocity, columns["scale"]
     )
+
+
+def _hermite(knot: Float, value: Float, slope: Float, at: Float) -> Float:
+    """Values (k, c) at places (k,) of cubics between knots (n,) with values and slopes (n, c) there."""
+    i = np.clip(np.searchsorted(knot, at, side="right") - 1, 0, len(knot) - 2)
+    gap = (knot[i + 1] - knot[i])[:, None]
+    u = (at - knot[i])[:, None] / gap
+    rise = value[i + 1] - value[i]
+    first, last = gap * slope[i] - rise, rise - gap * slope[i + 1]
+    out: Float = value[i] + u * rise + u * (1 - u) * (first * (1 - u) + last * u)
+    return out
 
 
 def _gait(motion: Motion, vehicle: Vehicle, heading: Float) -> Float:

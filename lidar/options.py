@@ -12,6 +12,7 @@ from geoscene.scene import Scene
 from lidar.actors import TrafficOptions
 from lidar.errors import InputError
 from lidar.record import Contents
+from lidar.rig import load_rig, rig_digest
 from lidar.route import Side, Spec
 from lidar.settings import dials_of
 
@@ -98,8 +99,8 @@ class DriveOptions:
             "survey": _named(self.survey),
             "altitude": self.altitude,
             "overlap": self.overlap,
-            "rig": _named(self.rig),
-            "vehicle": _named(self.vehicle),
+            "rig": f"{self.rig} ({rig_digest(self.rig)})",
+            "vehicle": _named(self.vehicle or load_rig(self.rig).vehicle),
             "formats": list(self.formats),
             "labels": list(self.labels),
             "deskew": self.deskew,

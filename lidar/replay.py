@@ -6,16 +6,18 @@ import csv
 import json
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, Slerp
 
 from geoscene.frames import Frame
 from lidar.dataset import read_trajectory
 from lidar.errors import FormatError, RouteError
 from lidar.poses import Trajectory
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Float = NDArray[np.float64]
 
@@ -50,6 +52,9 @@ def read_replay(path: Path, frame: Frame) -> Trajectory:
 
 
 def _from_poses(path: Path, recorded: Frame, frame: Frame) -> Trajectory:
+    from scipy.interpolate import CubicSpline  # noqa: PLC0415
+    from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415
+
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     if len(rows) < 2:
@@ -86,6 +91,8 @@ def _nanoseconds(stamps: list[str]) -> NDArray[np.int64]:
 
 def _turn(recorded: Frame, frame: Frame, lon: Float, lat: Float) -> Rotation:
     """Turns (n,) about the vertical from the axes of one frame to those of another."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
     angle = np.zeros((len(lon), 3))
     if recorded != frame:
         angle[:, 2] = frame.convergence(lon, lat) - recorded.convergence(lon, lat)
@@ -94,6 +101,8 @@ def _turn(recorded: Frame, frame: Frame, lon: Float, lat: Float) -> Rotation:
 
 def _moved(old: Trajectory, recorded: Frame, frame: Frame) -> Trajectory:
     """A trajectory in another frame."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
     lon, lat = recorded.to_geographic(*old.position[:, :2].T)
     x, y = frame.from_geographic(lon, lat)
     turn = _turn(recorded, frame, lon, lat)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import tomllib
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from lidar.attitude import matrix_from_quat, quat_from_euler, quat_product
 from lidar.constellations import SYSTEMS
 from lidar.errors import RigError
 from lidar.sensors.table import Table, read_table
@@ -18,6 +20,7 @@ Float = NDArray[np.float64]
 
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Axes of a body (x forward, y left, z up) from those of the camera in it (x right, y down, z forward)."""
+_OPTICAL_QUAT = (-0.5, 0.5, -0.5, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +37,7 @@ class Mount:
     @property
     def rotation(self) -> Float:
         """Vehicle axes from sensor axes, (3, 3)."""
-        matrix: Float = Rotation.from_quat(self.quat_xyzw).as_matrix()
-        return matrix
+        return matrix_from_quat(self.quat_xyzw)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,14 +178,13 @@ def _mount(table: Table, *, camera: bool = False) -> Mount:
         w, x, y, z = table.numbers("quat_wxyz", count=4)
         if not 0.99 < w * w + x * x + y * y + z * z < 1.01:
             raise table.error("quat_wxyz", "not a unit quaternion")
-        turn = Rotation.from_quat([x, y, z, w])
+        turn = np.array([x, y, z, w]) / np.sqrt(w * w + x * x + y * y + z * z)
     else:
-        roll, pitch, yaw = table.numbers("rpy_deg", (0.0, 0.0, 0.0), count=3)
-        turn = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
+        turn = quat_from_euler(*np.radians(table.numbers("rpy_deg", (0.0, 0.0, 0.0), count=3)))
         if camera:
-            turn *= Rotation.from_matrix(OPTICAL)
+            turn = quat_product(turn, _OPTICAL_QUAT)
     a, b, c = translation
-    qx, qy, qz, qw = (float(q) for q in turn.as_quat())
+    qx, qy, qz, qw = (float(q) for q in turn)
     return Mount((a, b, c), (qx, qy, qz, qw))
 
 
@@ -307,6 +308,31 @@ def load_rig(name: str | Path) -> Rig:
     root.close()
     _check_names(tables)
     return rig
+
+
+def rig_digest(name: str | Path) -> str:
+    """A digest of what the files of a rig say: its own, its scanners' and their lists of directions.
+
+    Raises RigError as `load_rig` does, and for a scanner's file that cannot be read.
+    """
+    rig = load_rig(name)
+    inside, digest = resources.files("lidar"), hashlib.blake2b(digest_size=6)
+    parts: list[bytes] = []
+    try:
+        own = Path(name) if str(name).endswith(".toml") else inside / "rigs" / f"{name}.toml"
+        parts.append(own.read_bytes())
+        for spec in rig.lidars:
+            if not spec.preset.endswith(".toml"):
+                parts.append((inside / "sensors" / "presets" / f"{spec.preset}.toml").read_bytes())
+                continue
+            parts.append(Path(spec.preset).read_bytes())
+            listed = tomllib.loads(parts[-1].decode()).get("table", {}).get("file", "")
+            parts += [(Path(spec.preset).parent / listed).read_bytes()] if listed else []
+    except (OSError, ValueError, AttributeError, TypeError) as error:
+        raise RigError(f"rig {name}: a sensor's file cannot be read: {error}") from error
+    for part in parts:
+        digest.update(len(part).to_bytes(8) + part)
+    return digest.hexdigest()
 
 
 def _check_names(tables: dict[str, list[Table]]) -> None:

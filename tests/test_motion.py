@@ -1,5 +1,8 @@
 """Drives have no teleports: speed, acceleration, jerk and curvature are bounded, from rest to rest."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -191,3 +194,10 @@ def test_a_crest_is_taken_without_taking_off():
     at_top = np.argmin(np.abs(trajectory.position[:, 0] - 200.0))
     assert speed[at_top] == pytest.approx(np.sqrt(0.98 * 2.5 / (2 * 20.0 / 25.0**2)), rel=0.1)
     assert np.abs(lift).max() < 1.1 * CAR.lateral_acceleration
+
+
+def test_planning_a_drive_loads_no_splines_and_no_spatial_searches():
+    """They take a second to load, which is longer than planning takes."""
+    code = "import sys, lidar.motion, lidar.rig, lidar.replay, lidar.drive; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert not {"scipy.interpolate", "scipy.spatial", "scipy.optimize"} & set(loaded.split())

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidar.errors import RigError
-from lidar.rig import load_rig, rig_names
+from lidar.rig import load_rig, rig_digest, rig_names
 from lidar.sensors.preset import load_sensor, sensor_names
 
 
@@ -119,6 +119,22 @@ def test_a_rig_names_a_sensor_file_beside_it(tmp_path):
     own.write_text(SENSOR)
     rig = load_rig(written(tmp_path, RIG.replace('"xt32"', '"own.toml"')))
     assert load_sensor(rig.lidars[1].preset).model == "Own"
+
+
+def test_a_rigs_digest_tells_a_changed_sensor_file_and_a_changed_list_of_directions(tmp_path):
+    rig = written(tmp_path, RIG.replace('"xt32"', '"own.toml"'))
+    own, rows = tmp_path / "own.toml", tmp_path / "rows.csv"
+    own.write_text(SENSOR)
+    before = rig_digest(rig)
+    assert rig_digest(rig) == before
+    own.write_text(SENSOR + "# another\n")
+    changed = rig_digest(rig)
+    assert changed != before
+    own.write_text(SENSOR.replace("[spinning]", '[table]\nfile = "rows.csv"\n[spinning]'))
+    rows.write_text("0,0,90\n")
+    listed = rig_digest(rig)
+    rows.write_text("0,0,91\n")
+    assert len({before, changed, listed, rig_digest(rig)}) == 4
 
 
 @pytest.mark.parametrize(

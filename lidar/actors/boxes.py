@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class
 from lidar.actors.actors import Actors, States, alive, poses_of, rotations, states
@@ -44,6 +43,8 @@ def box_rows(
     ego_vx, ego_vy, ego_vz : the velocity along the ego vehicle's axes, not relative to the ego's own
     moving          : whether it ever moves
     """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
     rows = actors_near(actors, ego, time_ns, reach=reach)
     at = states(actors, rows, time_ns)
     turn = rotations(at.angles)
