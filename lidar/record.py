@@ -317,7 +317,8 @@ class Recorder:
                 elif kind == "instance":
                     write_png(paths[kind], feature_to_image(image.feature))
                 elif kind == "flow":
-                    flow = self._flow(camera, worlds, int(times[middle]))
+                    first = (samples // 2) * rows
+                    flow = self._flow(camera, worlds, times[first : first + rows])
                     write_png(paths[kind], flow_to_image(flow))
 
     def _record_image_boxes(
@@ -345,12 +346,17 @@ class Recorder:
         mount = camera.spec.mount
         return self.trajectory.at(times).mounted(mount.translation, mount.rotation)
 
-    def _flow(self, camera: Camera, worlds: Worlds, time_ns: int) -> NDArray[np.float32]:
-        """Optical flow to the moment of the next frame; the thread's world is laid anew for it."""
-        later = time_ns + camera.period_ns
-        world = worlds.during(time_ns, later)
-        here, there = (self._seen_from(camera, np.array([t], np.int64)) for t in (time_ns, later))
-        return optical_flow(camera.spec, here, there, world)
+    def _flow(self, camera: Camera, worlds: Worlds, times: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Optical flow to the next frame; the thread's world is laid anew for it.
+
+        times : of the rows in this frame, one for all without a rolling shutter
+        """
+        later = times + camera.period_ns
+        start, end = int(times[0]), int(later[-1])
+        world = worlds.during(start, end)
+        moments = [(t - start) / (end - start) for t in (times, later)]
+        here, there = (self._seen_from(camera, t) for t in (times, later))
+        return optical_flow(camera.spec, here, there, world, times=moments[0], later_times=moments[1])
 
     def _sun(self, time_ns: int) -> NDArray[np.float64]:
         when = self.start + timedelta(seconds=(time_ns // _SUN_NS) * _SUN_NS // 10**9)

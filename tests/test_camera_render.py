@@ -371,6 +371,26 @@ def test_flow_of_a_still_world_is_the_cameras_own_motion():
     np.testing.assert_allclose(flow[..., 1], 0, atol=1e-4)
 
 
+def test_flow_of_a_rolling_shutter_ends_on_the_row_that_sees_the_point():
+    camera = replace(CAMERA, row_ns=100_000)
+    rows, period = np.arange(120) * 1e-4, 0.1
+    up, left = 8.0, 3.0  # metres a second
+
+    def exposed(t):
+        return stacked([looking((0.0, left * s, 1.5 + up * s)) for s in t])
+
+    flow = optical_flow(camera, exposed(rows), exposed(rows + period), world(plate(10.0)))
+    # A point sinks by k pixels a second and is met d rows on, d k times later: d = k (period + d row).
+    k = 100 / 10 * up
+    down = k * period / (1 - k * 1e-4)
+    inside = np.arange(120) + down < 119
+    np.testing.assert_allclose(flow[inside, :, 1], down, atol=0.01)
+    np.testing.assert_allclose(flow[inside, :, 0], 100 / 10 * left * (period + down * 1e-4), atol=0.01)
+    assert down - k * period > 0.05
+    with pytest.raises(InputError, match="120 poses"):
+        optical_flow(camera, looking(), looking(), world(plate(10.0)))
+
+
 def test_the_sky_moves_with_turning_alone():
     sky = world(box((-5, -5, -100), (5, 5, -99)))
     np.testing.assert_allclose(optical_flow(CAMERA, looking(), looking((5, 3, 2)), sky), 0, atol=1e-4)
@@ -421,6 +441,12 @@ def test_flow_of_an_actor_is_its_own_motion():
     assert actor.sum() == 20 * 20
     np.testing.assert_allclose(flow[actor], [[5.0, 0.0]] * actor.sum(), atol=1e-4)
     np.testing.assert_allclose(flow[~actor], 0, atol=1e-4)
+
+
+def test_flow_between_ray_times_is_that_part_of_an_actors_motion():
+    still, part = looking((0, 0, 0)), {"times": np.array([0.2]), "later_times": np.array([0.8])}
+    flow = optical_flow(CAMERA, still, still, ActorWorld((11, 0, 0), (0, -0.5, 0)), **part)
+    assert np.nanmax(flow) == pytest.approx(3.0, abs=1e-4)
 
 
 def test_a_camera_that_does_not_record_colour_skips_it():

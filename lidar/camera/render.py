@@ -25,6 +25,9 @@ Float = NDArray[np.float64]
 _BAND = 1 << 16
 """Rays worked on at a time: their columns stay in the processor's cache."""
 
+_ROLLS = 5
+"""Times that the row a point lands on is found, from the time of the row before; each gains some digits."""
+
 _LIFT = 1e-3
 """Metres that a shadow ray starts off its surface; more at a distance."""
 
@@ -331,39 +334,76 @@ def _noisy(
     return noisy
 
 
-def optical_flow(camera: CameraSpec, poses: Poses, later: Poses, world: World) -> NDArray[np.float32]:
-    """How far (h, w, 2) each pixel's surface point moves in the image to a later time, pixels right and down.
+def optical_flow(
+    camera: CameraSpec,
+    poses: Poses,
+    later: Poses,
+    world: World,
+    *,
+    times: Float | None = None,
+    later_times: Float | None = None,
+) -> NDArray[np.float32]:
+    """How far (h, w, 2) each pixel's surface point moves in the image to a later one, pixels right and down.
 
     NaN where it leaves the camera's field (not merely the image). Sky moves with the camera's turning alone.
-    Actors of the world move from where they are at ray time 0 to where they are at ray time 1.
+    Of a rolling shutter, the later row is the one that is exposed when the point is on it.
 
-    poses, later : the camera's single pose at ray times 0 and 1; a rolling shutter is not taken into account
+    poses, later       : the camera's pose in either frame, or one a row for a rolling shutter
+    times, later_times : ray times 0 to 1 of these poses, for actors that move; 0 and 1 by default
 
-    Raises InputError for more than one pose.
+    Raises InputError for other numbers of poses.
     """
-    if len(poses) != 1 or len(later) != 1:
-        raise InputError(f"camera {camera.name}: optical flow needs one pose at each time")
-    still = replace(camera, row_ns=0)
-    view = _view(still, poses, world, 0, 0, camera.height, None)
+    rows = camera.height if camera.row_ns else 1
+    if len(poses) != rows or len(later) != rows:
+        raise InputError(f"camera {camera.name}: optical flow needs {rows} poses of each frame")
+    start = np.zeros(rows) if times is None else np.asarray(times, float)
+    end = np.ones(rows) if later_times is None else np.asarray(later_times, float)
+    view = _view(camera, poses, world, 0, 0, camera.height, start)
     hit = np.isfinite(view.hits.range)
-    point = poses.position + np.where(hit, view.hits.range, 1.0)[:, None] * view.direction
-    point = _carried(point, view.hits, world)
-    away = np.where(hit[:, None], point - later.position, view.direction)
-    seen = (away / later.scale) @ later.rotation[0]
-    pixel, _ = project(camera, np.where(view.seen[:, None], seen, np.nan))
+    point = view.origin[view.row] + np.where(hit, view.hits.range, 1.0)[:, None] * view.direction
+    body = _on_bodies(point, view.hits, world, start[view.row])
+    row = view.row
+    for _ in range(_ROLLS if rows > 1 else 1):
+        there = later.take(row if rows > 1 else [0])
+        moved = _off_bodies(point, body, view.hits, world, end[row])
+        away = np.where(hit[:, None], moved - there.position, view.direction)
+        seen = np.einsum("ni,nij->nj", away / there.scale, np.broadcast_to(there.rotation, (len(away), 3, 3)))
+        pixel, _ = project(camera, np.where(view.seen[:, None], seen, np.nan))
+        row = np.clip(np.rint(np.nan_to_num(pixel[:, 1])), 0, rows - 1).astype(np.int64)
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     flow: NDArray[np.float32] = (pixel - np.stack([u.ravel(), v.ravel()], axis=1)).astype(np.float32)
     return flow.reshape(camera.height, camera.width, 2)
 
 
-def _carried(point: Float, hits: Hits, world: World) -> Float:
-    """Points on instances, moved as those move from ray time 0 to ray time 1."""
-    moments = [g.transform if g.transform.ndim == 4 else g.transform[:, None] for g in world.caster.instances]
+def _on_bodies(point: Float, hits: Hits, world: World, time: Float) -> Float:
+    """Points (k, 3) that are on instances, in the instances' own frames, at ray times (n,)."""
     on = np.flatnonzero(hits.instance >= 0)
-    if not len(on):
-        return point
-    before, after = (np.concatenate([t[:, k] for t in moments])[hits.instance[on]] for k in (0, -1))
-    body = np.linalg.solve(before[:, :, :3], (point[on] - before[:, :, 3])[..., None])
+    place = _transforms(world, hits.instance[on], time[on])
+    offset = (point[on] - place[:, :, 3])[..., None]
+    body: Float = np.linalg.solve(place[:, :, :3], offset)[..., 0].astype(np.float64)
+    return body
+
+
+def _off_bodies(point: Float, body: Float, hits: Hits, world: World, time: Float) -> Float:
+    """The points (n, 3), those on instances (k, 3) where these have carried them at ray times (n,)."""
+    on = np.flatnonzero(hits.instance >= 0)
+    place = _transforms(world, hits.instance[on], time[on])
     moved = point.copy()
-    moved[on] = (after[:, :, :3] @ body)[..., 0] + after[:, :, 3]
+    moved[on] = np.einsum("nij,nj->ni", place[:, :, :3], body) + place[:, :, 3]
     return moved
+
+
+def _transforms(world: World, instance: NDArray[np.int32], time: Float) -> Float:
+    """Transforms (k, 3, 4) of instances at ray times (k,), linear between their moments."""
+    out = np.empty((len(instance), 3, 4))
+    start = 0
+    for group in world.caster.instances:
+        rows = np.flatnonzero((instance >= start) & (instance < start + len(group)))
+        moments = group.transform if group.transform.ndim == 4 else group.transform[:, None]
+        own, last = instance[rows] - start, moments.shape[1] - 1
+        place = time[rows] * last
+        step = np.minimum(place.astype(np.int64), max(last - 1, 0))
+        w = (place - step)[:, None, None]
+        out[rows] = moments[own, step] * (1 - w) + moments[own, np.minimum(step + 1, last)] * w
+        start += len(group)
+    return out
