@@ -23,7 +23,7 @@ from lidar.path import plan_path
 from lidar.poses import Trajectory
 from lidar.route import Route, Spec, plan_route
 from lidar.sensors.preset import firings
-from lidar.travel import covered, road_graph
+from lidar.travel import AHEAD_S, covered, road_graph
 from lidar.vehicle import Vehicle
 from lidar.waypoints import read_track
 from lidar.world import World
@@ -53,6 +53,7 @@ def plan_flight(
     overlap: float = 0.3,
     seed: int = 0,
     duration: float | None = None,
+    from_rest: bool = False,
 ) -> Trajectory:
     """The trajectory of a craft that flies over a scene.
 
@@ -63,6 +64,7 @@ def plan_flight(
                below each point. By default heights of the file (scene's heights), or `ALTITUDES`
     overlap  : share of a strip that the next one covers too
     duration : seconds; of a survey or a given route all of it by default
+    from_rest : whether a random flight too starts at rest
 
     Raises RouteError for a flight that cannot be flown or would meet what stands below.
     """
@@ -73,7 +75,8 @@ def plan_flight(
         route = _strips(scene, survey, vehicle, sensors, height, overlap, below)
     else:
         route = _along(scene, spec, vehicle, altitude, usual, seed, duration, below)
-    trajectory = drive_path(plan_path(route, vehicle, scene.frame), vehicle)
+    under_way = spec == "random" and not survey and not from_rest
+    trajectory = drive_path(plan_path(route, vehicle, scene.frame), vehicle, under_way=under_way)
     if duration is not None:
         trajectory = trajectory.until(round(duration * 1e9))
     _refuse_collisions(trajectory, below, scene)
@@ -146,7 +149,7 @@ def _along(
                 f"a craft that turns within {vehicle.turning_radius:.0f} m cannot follow streets; give"
                 " --survey all, --survey FILE or waypoints"
             )
-        length = vehicle.max_speed * (60.0 if duration is None else duration)
+        length = vehicle.max_speed * ((60.0 if duration is None else duration) + AHEAD_S)
         graph = covered(road_graph(scene), scene)
         line = plan_route(graph, scene.frame, "random", seed=seed, length=length).line
         xyz, given = np.array(line), False

@@ -44,10 +44,11 @@ def drive(
     altitude: float | None = None,
     overlap: float = 0.3,
     duration: float | None = None,
+    from_rest: Annotated[bool, Parameter(negative=())] = False,
     rig: str = "seed",
     vehicle: str = "",
     side: str = "",
-    seed: int = 0,
+    seed: Annotated[int, Parameter(converter=whole)] = 0,
     start: str | None = None,
     fidelity: str = "standard",
     settings: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
@@ -59,7 +60,7 @@ def drive(
     exact: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
     overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    workers: Annotated[int, Parameter(group=_OUTPUT)] = 2,
+    workers: Annotated[int, Parameter(group=_OUTPUT, converter=whole)] = 2,
     json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
 ) -> int:
@@ -96,6 +97,9 @@ def drive(
         Share of a survey's strip that the next one covers too.
     duration
         Seconds to record; all of a given route, or 60 seconds of a random one, by default.
+    from_rest
+        Start and end a random drive at rest, as drives along a given route do; by default it is under way
+        when the record starts and when it ends.
     rig
         Sensors and where they sit: a rig that comes along (lidar rigs lists them), or a TOML file.
     vehicle
@@ -150,6 +154,7 @@ def drive(
         altitude=altitude,
         overlap=overlap,
         duration=duration,
+        from_rest=from_rest,
         rig=rig,
         vehicle=vehicle,
         formats=_words(formats),

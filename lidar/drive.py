@@ -127,6 +127,7 @@ def drive(
             trajectory, actors = drive_among(
                 scene, graph, planned.path, body, trajectory,
                 seed=options.seed, options=traffic, duration=planned.duration,
+                under_way=planned.under_way,
             )  # fmt: skip
         else:
             actors = populate(scene, graph, trajectory, body, seed=options.seed, options=traffic)
@@ -216,8 +217,10 @@ def plan(
                 " or a rig of such a craft"
             )
         name = options.vehicle or load_rig(options.rig).vehicle
-        travel = plan_travel(scene, route, name, seed=options.seed, duration=options.duration,
-                             side=options.keeps(scene), progress=progress)  # fmt: skip
+        travel = plan_travel(
+            scene, route, name, seed=options.seed, duration=options.duration, side=options.keeps(scene),
+            from_rest=options.from_rest, progress=progress,
+        )  # fmt: skip
         if travel.duration is None:
             return travel
         # what cannot pull up within a short time is recorded until then
@@ -236,6 +239,7 @@ def plan(
         overlap=options.overlap,
         seed=options.seed,
         duration=seconds,
+        from_rest=options.from_rest,
     )
 
 

@@ -44,22 +44,35 @@ class Motion:
 
 
 def drive_path(
-    path: Path, vehicle: Vehicle, *, rate_hz: float = 100.0, duration: float | None = None
+    path: Path,
+    vehicle: Vehicle,
+    *,
+    rate_hz: float = 100.0,
+    duration: float | None = None,
+    under_way: bool = False,
 ) -> Trajectory:
     """The trajectory of a vehicle that drives a path, from rest to rest.
 
-    rate_hz  : poses a second
-    duration : seconds to record: a shorter drive ends sooner; on a longer one the vehicle pulls up in time
+    rate_hz   : poses a second
+    duration  : seconds to record: a shorter drive ends sooner; on a longer one the vehicle pulls up in time
+    under_way : it is at speed when the record starts, and drives on when it ends; the path's end is one to
+                stop at nevertheless
 
     Speed keeps to the limits and to what bends allow; its changes keep to the vehicle's acceleration,
     deceleration and jerk. The body's x axis is along the path at the rear axle, turned only by the lean of
     the body under acceleration. Raises InputError for a duration or rate that is not positive.
     """
-    return poses_along(path, vehicle, motion_along(path, vehicle, rate_hz=rate_hz, duration=duration))
+    motion = motion_along(path, vehicle, rate_hz=rate_hz, duration=duration, under_way=under_way)
+    return poses_along(path, vehicle, motion)
 
 
 def motion_along(
-    path: Path, vehicle: Vehicle, *, rate_hz: float = 100.0, duration: float | None = None
+    path: Path,
+    vehicle: Vehicle,
+    *,
+    rate_hz: float = 100.0,
+    duration: float | None = None,
+    under_way: bool = False,
 ) -> Motion:
     """Where along its path the vehicle is, and how fast, at every moment; arguments as for `drive_path`."""
     if not (rate_hz > 0 and (duration is None or duration > 0)):
@@ -67,9 +80,13 @@ def motion_along(
     limit = speed_limits(path, vehicle)
     fine = math.ceil(100.0 / rate_hz)
     dt = 1.0 / (rate_hz * fine)
-    s, v, leg = _all_legs(path, limit, vehicle, dt)
+    s, v, leg = _all_legs(path, limit, vehicle, dt, under_way=under_way)
     if duration is not None and len(s) * dt > duration:
-        s, v, leg = _within(path, limit, vehicle, dt, duration)
+        if under_way:
+            count = max(round(duration / dt), fine) + 1
+            s, v, leg = s[:count], v[:count], leg[:count]
+        else:
+            s, v, leg = _within(path, limit, vehicle, dt, duration)
     s, v, leg = s[::fine], v[::fine], leg[::fine]
     n = len(s)
     time_ns = np.round(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
@@ -127,15 +144,19 @@ def legs_of(path: Path) -> list[tuple[int, int]]:
 
 
 def _all_legs(
-    path: Path, limit: Float, vehicle: Vehicle, dt: float
+    path: Path, limit: Float, vehicle: Vehicle, dt: float, *, under_way: bool = False
 ) -> tuple[Float, Float, NDArray[np.int32]]:
-    """Distance, speed and leg at every ``dt`` of the whole path, with a rest between legs."""
+    """Distance, speed and leg at every ``dt`` of the whole path, with a rest between legs.
+
+    under_way : it is at speed at the start
+    """
     s: list[Float] = []
     v: list[Float] = []
     leg: list[NDArray[np.int32]] = []
     rest = round(DWELL_S / dt)
     for first, last in legs_of(path):
-        ds, dv = _time_law(path.s[first:last] - path.s[first], limit[first:last], vehicle, dt)
+        at_rest = (not vehicle.cruise and not (under_way and not first), not vehicle.cruise)
+        ds, dv = _time_law(path.s[first:last] - path.s[first], limit[first:last], vehicle, dt, at_rest)
         if s:
             ds, dv = np.concatenate([np.zeros(rest), ds[1:]]), np.concatenate([np.zeros(rest), dv[1:]])
         s.append(path.s[first] + ds)
@@ -172,8 +193,10 @@ def _within(
     )
 
 
-def _time_law(s: Float, limit: Float, vehicle: Vehicle, dt: float) -> tuple[Float, Float]:
-    """Distance and speed at every ``dt`` of a leg driven from rest to rest (or at the limit throughout).
+def _time_law(
+    s: Float, limit: Float, vehicle: Vehicle, dt: float, rest: tuple[bool, bool]
+) -> tuple[Float, Float]:
+    """Distance and speed at every ``dt`` of a leg, from rest and to rest where ``rest`` says so.
 
     The fastest profile under the limits and the accelerations (a forward and a backward pass) is averaged
     over a window in time. An average of speeds keeps the bounds of their accelerations, and its acceleration
@@ -191,7 +214,7 @@ def _time_law(s: Float, limit: Float, vehicle: Vehicle, dt: float) -> tuple[Floa
         s, limit = at, np.interp(at, s, limit)
     lowered = limit
     for _ in range(_FIT):
-        far, speed = _smooth_profile(s, lowered, (up, down), (window, brief), dt, cruise=vehicle.cruise)
+        far, speed = _smooth_profile(s, lowered, (up, down), (window, brief), dt, rest=rest)
         excess = speed / np.interp(far, s, limit)
         if excess.max() <= 1.0:
             return far, speed
@@ -209,22 +232,29 @@ def _smooth_profile(
     windows: tuple[int, int],
     dt: float,
     *,
-    cruise: bool,
+    rest: tuple[bool, bool],
 ) -> tuple[Float, Float]:
     """Distance and speed at every ``dt``: the fastest profile, averaged over two windows in time."""
-    v = _fastest(s, limit, *bounds, rest=not cruise)
+    v = _fastest(s, limit, *bounds, rest=rest)
     t = np.concatenate([[0.0], np.cumsum(np.diff(s) / np.maximum((v[1:] + v[:-1]) / 2, 1e-3))])
     raw = np.interp(dt * np.arange(math.ceil(t[-1] / dt) + 1), t, v)
     reach = sum(windows) // 2 - 1
-    if cruise:
-        pad = np.pad(raw, reach, mode="edge")
-    else:  # the averages of a drive from rest to rest reach beyond both of its ends
+    if rest[1]:
         raw[-1] = 0.0
-        pad = np.pad(raw, 2 * reach)
+    # the averages of a drive from rest to rest reach beyond both of its ends
+    before, behind = (
+        np.zeros(2 * reach) if still else np.full(reach, edge)
+        for still, edge in zip(rest, raw[[0, -1]], strict=True)
+    )
+    pad = np.concatenate([before, raw, behind])
     speed = np.maximum(_averaged(_averaged(pad, windows[0]), windows[1]), 0.0)
-    if not cruise:
-        speed[[0, -1]] = 0.0
+    for still, end in zip(rest, (0, -1), strict=True):
+        if still:
+            speed[end] = 0.0
     far = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) * (dt / 2))])
+    short = float(s[-1]) - far[-1]
+    if short > 0 and rest == (False, True):  # what is under way may be a little further on at first
+        return far + short, speed
     stretch = float(s[-1]) / far[-1]
     return far * stretch, speed * stretch
 
@@ -251,11 +281,12 @@ def _lowered(lowered: Float, s: Float, far: Float, excess: Float, reach: Float) 
     return out
 
 
-def _fastest(s: Float, limit: Float, up: float, down: float, *, rest: bool) -> Float:
-    """The highest speeds (n,) at distances s under a limit, accelerations up and down, from rest to rest."""
+def _fastest(s: Float, limit: Float, up: float, down: float, *, rest: tuple[bool, bool]) -> Float:
+    """The highest speeds (n,) at distances s under a limit and accelerations up and down."""
     square = limit**2
-    if rest:
-        square[[0, -1]] = 0.0
+    for still, end in zip(rest, (0, -1), strict=True):
+        if still:
+            square[end] = 0.0
     ahead = np.minimum.accumulate(square - 2 * up * s) + 2 * up * s
     back = np.minimum.accumulate((ahead + 2 * down * s)[::-1])[::-1] - 2 * down * s
     speed: Float = np.sqrt(np.maximum(back, 0.0))

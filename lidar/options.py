@@ -24,6 +24,8 @@ class DriveOptions:
     route      : ``random``, a GPX or GeoJSON file, waypoints (latitude, longitude) in degrees, or a poses.csv
                  or trajectory.csv of an earlier drive, which is then driven again as it was
     duration   : seconds; a whole route, or 60 seconds of a random one, by default
+    from_rest  : a random drive too starts and ends at rest, as drives along a given route do; by default it
+                 is under way when the record starts and when it ends
     survey     : area that a craft flies over in strips instead of a route: ``all``, W,S,E,N in degrees, or a
                  GeoJSON file
     altitude   : metres above the ground of a flight, see `lidar.aerial.plan_flight`
@@ -46,6 +48,7 @@ class DriveOptions:
 
     route: Spec = "random"
     duration: float | None = None
+    from_rest: bool = False
     survey: str = ""
     altitude: float | None = None
     overlap: float = 0.3
@@ -96,6 +99,7 @@ class DriveOptions:
             "scene": scene.manifest.get("fingerprint", scene.path.name),
             "route": _named(given) if isinstance(given, str | Path) else [list(point) for point in given],
             "duration": self.duration,
+            "from_rest": self.from_rest,
             "survey": _named(self.survey),
             "altitude": self.altitude,
             "overlap": self.overlap,

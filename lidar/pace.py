@@ -28,6 +28,7 @@ _COMFORT = 0.8  # share of the braking with which speed is brought down to lower
 _AGAIN = 8  # times that speed limits are looked up anew
 _SLACK = 0.005  # share of a limit by which speed may exceed it before it is looked up anew
 _TAIL_S = 10.0  # seconds beyond those on an empty road within which a leg is driven once it is allowed
+_SETTLING_S = 10.0  # seconds over which what starts at speed falls behind by a step
 _NEAR = 0.05  # metres from its end at which a leg has been driven
 _AROUND = 1.0  # metres about a place whose limits hold there
 
@@ -43,12 +44,19 @@ class _Knots:
 
 
 def motion_behind(
-    path: Path, vehicle: Vehicle, time_s: Float, reach: Float, *, rate_hz: float = 100.0
+    path: Path,
+    vehicle: Vehicle,
+    time_s: Float,
+    reach: Float,
+    *,
+    rate_hz: float = 100.0,
+    under_way: bool = False,
 ) -> Motion:
     """The motion along a path that never passes the distances allowed, from rest to rest.
 
-    time_s : (k,) rising seconds from 0
-    reach  : (k,) metres along the path that may be reached by then; never falling
+    time_s    : (k,) rising seconds from 0
+    reach     : (k,) metres along the path that may be reached by then; never falling
+    under_way : it is as fast at first as it may be, and need not rest when the times end
 
     It ends with the last of the times, or at the end of the path. Raises InputError for distances that fall.
     """
@@ -66,9 +74,12 @@ def motion_behind(
         needed = _TAIL_S + 1.5 * float((np.diff(path.s[first:last]) / limit[first : last - 1]).sum())
         until = max(float(time_s[there[0]]) - begin, 0.0) + needed if len(there) else math.inf
         t = STEP_S * np.arange(max(math.floor(min(total - begin, until) / STEP_S), 2) + 1)
+        rolls = under_way and not parts
         # a knot keeps to what is allowed at the one before: so does all in between
-        bounds = np.interp(begin + t - STEP_S, time_s, allowed)
-        knots = _best(path.s[first:last] - origin, limit[first:last], vehicle, bounds)
+        late = STEP_S * np.minimum(t / _SETTLING_S, 1.0) if rolls else STEP_S
+        bounds = np.interp(begin + t - late, time_s, allowed)
+        still = (not rolls, not under_way or until < total - begin)
+        knots = _best(path.s[first:last] - origin, limit[first:last], vehicle, bounds, still)
         s, v = _sampled(knots, end - origin, dt)
         driven = s[-1] > end - origin - 2 * _NEAR
         if driven and last < len(path):
@@ -105,18 +116,21 @@ def _braked(s: Float, limit: Float, vehicle: Vehicle) -> Float:
     return braked
 
 
-def _best(s: Float, limit: Float, vehicle: Vehicle, allowed: Float) -> _Knots:
-    """The knots of the best motion along a leg that stays behind ``allowed`` (k,) metres at its steps."""
+def _best(s: Float, limit: Float, vehicle: Vehicle, allowed: Float, rest: tuple[bool, bool]) -> _Knots:
+    """The knots of the best motion along a leg that stays behind ``allowed`` (k,) metres at its steps.
+
+    rest : whether it is at rest at the first of them, and at the last
+    """
     from scipy.ndimage import minimum_filter1d  # noqa: PLC0415
 
     gap = 0.25
     place = np.arange(0.0, s[-1] + gap, gap)
     strict = np.interp(place, s, limit)
     cautious = _braked(place, minimum_filter1d(strict, 2 * round(_AROUND / gap) + 1), vehicle)
-    allowed = _paced(allowed, place, cautious, vehicle)
+    allowed = _paced(allowed, place, cautious, vehicle, 0.0 if rest[0] else float(cautious[0]))
     cap = np.interp(allowed, place, cautious)
     for _ in range(_AGAIN):
-        knots = _solved(vehicle, allowed, cap)
+        knots = _solved(vehicle, allowed, cap, rest)
         excess = float((knots.v / np.interp(knots.s, place, strict)).max())
         if excess <= 1.0 + _SLACK:
             break
@@ -126,24 +140,26 @@ def _best(s: Float, limit: Float, vehicle: Vehicle, allowed: Float) -> _Knots:
     return _Knots(knots.s, knots.v / late, knots.a / late**2, knots.dt * late)
 
 
-def _paced(allowed: Float, place: Float, limit: Float, vehicle: Vehicle) -> Float:
+def _paced(allowed: Float, place: Float, limit: Float, vehicle: Vehicle, speed: float) -> Float:
     """Distances (k,) behind those allowed that are reached under speed limits and the vehicle's acceleration.
+
+    speed : m/s at the first of them
 
     They are near the solution, so that the limits found there are about those of the solution.
     """
     out = np.empty_like(allowed)
-    s, v, gap = 0.0, 0.0, float(place[1])
+    s, v, gap = 0.0, speed, float(place[1])
     table, most = limit.tolist(), len(limit) - 1
     for k, bound in enumerate(allowed.tolist()):
         v = min(v + _SPARE * vehicle.acceleration * STEP_S, table[min(int(s / gap), most)])
         ahead = min(s + v * STEP_S, bound) if k else min(s, bound)
-        v = (ahead - s) / STEP_S if k else 0.0
+        v = (ahead - s) / STEP_S if k else speed
         s = max(ahead, s)
         out[k] = s
     return out
 
 
-def _solved(vehicle: Vehicle, allowed: Float, cap: Float) -> _Knots:
+def _solved(vehicle: Vehicle, allowed: Float, cap: Float, rest: tuple[bool, bool]) -> _Knots:
     """The linear programme: greatest sum of distances under those allowed and caps (k,) on speed."""
     from scipy.optimize import linprog  # noqa: PLC0415
     from scipy.sparse import csr_array, diags_array, hstack, vstack  # noqa: PLC0415
@@ -163,7 +179,7 @@ def _solved(vehicle: Vehicle, allowed: Float, cap: Float) -> _Knots:
     up, down, jerk = (_SPARE * v for v in (vehicle.acceleration, vehicle.deceleration, vehicle.jerk))
     low = np.concatenate([np.zeros(2 * n), np.full(n, -down)])
     high = np.concatenate([np.maximum(allowed, 0.0), cap, np.full(n, up)])
-    ends = [0, n, 2 * n - 1, 2 * n, 3 * n - 1]  # from rest to rest
+    ends = [0, *((n, 2 * n) if rest[0] else ()), *((2 * n - 1, 3 * n - 1) if rest[1] else ())]
     low[ends] = high[ends] = 0.0
     found = linprog(
         np.concatenate([-np.ones(n), np.zeros(2 * n)]),

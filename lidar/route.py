@@ -27,6 +27,7 @@ U_TURN_S = 30.0
 """Seconds that turning round at a dead end costs in the search for the fastest way."""
 U_TURN = np.radians(150.0)
 """Change of direction at a node from which on the vehicle must turn round, in radians."""
+_SET_OUT = 0.25  # share of its first street that a random route leaves out
 _STEP = 0.3  # metres between the lanes of two streets from which on a change of lane is drawn out
 _STRAIGHT = 0.5  # cosine of the turn up to which a junction is gone straight over
 _KEEP = 0.2  # metres between the body and the kerb where the carriageway is narrow
@@ -96,7 +97,7 @@ def plan_route(
         if length is None and duration is None:
             seconds = 600.0
         edges = random_edges(graph, seed=seed, seconds=seconds, metres=target, avoid=avoid)
-        ends = (0.25 * float(graph.length[edges[0]]), 0.75 * float(graph.length[edges[-1]]))
+        ends = (_SET_OUT * float(graph.length[edges[0]]), 0.75 * float(graph.length[edges[-1]]))
         return lane_route(graph, edges, ends, side=side, body_width=body_width)
 
     from lidar.waypoints import match_track, read_track, through  # noqa: PLC0415  (they import this module)
@@ -190,6 +191,8 @@ def random_edges(
 ) -> NDArray[np.int32]:
     """Edges of a random drive that lasts ``seconds`` at the speed limits or ``metres``, whichever is sooner.
 
+    They are driven from the place `_SET_OUT` of the first one's length on.
+
     It stays in the largest part of the graph from which every street of it can be reached again, prefers
     streets it has not driven, and turns round only at dead ends, and only where the graph has no round trip
     without that worth the name (a fifth of what turning round would open).
@@ -218,7 +221,8 @@ def random_edges(
     best: list[int] = []
     for _ in range(1 if round_trip else 32):
         edge = int(rng.choice(len(graph), p=start))
-        walk, time, far = [edge], 0.0, 0.0
+        far = -_SET_OUT * graph.length[edge]
+        walk, time = [edge], far / graph.speed[edge]
         visits = np.zeros(len(graph))
         # a street without length must not hold the walk up for ever
         while far < metres and time < seconds and len(walk) < 1_000_000:

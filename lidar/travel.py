@@ -25,6 +25,10 @@ from lidar.vehicle import load_vehicle
 from lidar.world import World
 
 _RANDOM_SECONDS = 60.0
+AHEAD_S = 15.0
+"""Seconds at the speed limits by which the route of a drive that is under way is longer than its record.
+
+A car can pull up in them from any speed that streets allow."""
 _ABOVE = (
     1.5  # metres over the graph's height from which the surface under the wheels is looked for, and below it
 )
@@ -41,6 +45,7 @@ class Travel:
                  of the whole road graph
     length     : true metres that the trajectory covers
     duration   : seconds that were asked for, if any were
+    under_way  : whether it is at speed when it starts, and drives on when it ends
     """
 
     route: Route
@@ -48,6 +53,7 @@ class Travel:
     trajectory: Trajectory
     length: float
     duration: float | None
+    under_way: bool = False
 
 
 def road_graph(scene: Scene) -> RoadGraph:
@@ -130,11 +136,14 @@ def plan_travel(
     duration: float | None = None,
     side: str = "right",
     obeys: bool = True,
+    from_rest: bool = False,
     progress: Progress = silent,
 ) -> Travel:
     """The trajectory of a vehicle along a route through a scene.
 
-    obeys : whether it stops at red signals and stop signs
+    obeys     : whether it stops at red signals and stop signs
+    from_rest : whether a random drive too goes from rest to rest; else it is under way at both ends, along
+                a route that is longer than the record
 
     Where a street is too narrow for the vehicle between its buildings, it is left out and the route planned
     again. Raises RouteError if no way is left.
@@ -146,13 +155,14 @@ def plan_travel(
     obstacles = standing_footprints(scene)
     progress("planning", 0, 0)
     seconds = duration if duration is not None or spec != "random" else _RANDOM_SECONDS
+    under_way = spec == "random" and not from_rest
     route, path = plan_drive(
         graph,
         scene.frame,
         spec,
         body,
         seed=seed,
-        duration=seconds,
+        duration=None if seconds is None else seconds + (AHEAD_S if under_way else 0.0),
         side=cast("Literal['left', 'right']", side),
         obstacles=obstacles,
         ground=road_surface(scene),
@@ -160,11 +170,12 @@ def plan_travel(
     path = replace(path, edge=np.where(path.edge >= 0, np.flatnonzero(kept)[path.edge], -1).astype(np.int32))
     if obeys:
         trajectory = drive_obeying(
-            path, body, whole, seed=seed, side=side, bounds=scene.bounds, duration=seconds
-        )
+            path, body, whole, seed=seed, side=side, bounds=scene.bounds, duration=seconds,
+            under_way=under_way,
+        )  # fmt: skip
     else:
-        trajectory = drive_path(path, body, duration=seconds)
-    return Travel(route, path, trajectory, _driven(trajectory), seconds)
+        trajectory = drive_path(path, body, duration=seconds, under_way=under_way)
+    return Travel(route, path, trajectory, _driven(trajectory), seconds, under_way)
 
 
 def _driven(trajectory: Trajectory) -> float:

@@ -51,10 +51,13 @@ def check_gentle(ego):
     assert np.abs(np.diff(change)).max() * 100.0 <= CAR.jerk + 1e-2
 
 
+@pytest.mark.parametrize("under_way", [False, True])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_ego_enters_no_junction_on_red(seed):
+def test_the_ego_enters_no_junction_on_red(seed, under_way):
     graph = city(lit=True)
-    ego = drive_obeying(path_on(graph, seed, 80.0), CAR, graph, seed=seed, duration=80.0)
+    path = path_on(graph, seed, 95.0)
+    ego = drive_obeying(path, CAR, graph, seed=seed, duration=80.0, under_way=under_way)
+    assert (speed_of(ego)[0] > 1.0) == under_way
     plan = junction_plan(graph, lanes_of(graph), seed=seed)
     times = np.arange(0.0, 80.0, DT)
     middle, heading = middle_of(ego, times)

@@ -27,6 +27,7 @@ from lidar.dataset import open_dataset
 from lidar.drive import DriveOptions, drive
 from lidar.errors import DatasetError, InputError
 from lidar.formats.pcd import read_pcd
+from lidar.travel import plan_travel
 
 BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 
@@ -247,3 +248,18 @@ def test_traffic_is_labelled_boxed_and_the_same_for_any_number_of_workers(scene,
             [float(row[k]) / 2 + 0.15 for k in ("length", "width", "height")]
         )
         assert inside.all(axis=1).mean() > 0.98
+
+
+def test_a_random_drive_is_under_way_from_first_to_last_unless_it_is_to_be_from_rest(scene):
+    """Of a few seconds too: a record of a street is not one of a parked car."""
+    for seed in (0, 1, 2):
+        options = replace(OPTIONS, duration=3.0, seed=seed)
+        speeds = {}
+        for from_rest in (False, True):
+            travel = plan_travel(scene, "random", "car", seed=seed, duration=3.0, from_rest=from_rest)
+            speeds[from_rest] = np.linalg.norm(travel.trajectory.velocity, axis=1)
+        assert speeds[False][0] > 2.0
+        assert speeds[False].mean() > 2.0
+        assert speeds[True][0] == 0.0
+        assert speeds[True][-1] < 2e-3
+        assert options.recipe(scene) != replace(options, from_rest=True).recipe(scene)

@@ -12,7 +12,7 @@ from roadgrids import grid, road_graph
 from geoscene.frames import Frame
 from lidar.attitude import body_rates, euler_from_quat, matrix_from_quat
 from lidar.errors import InputError
-from lidar.motion import drive_path, motion_along
+from lidar.motion import drive_path, motion_along, speed_limits
 from lidar.path import plan_path
 from lidar.route import free_route, lane_route, plan_route
 from lidar.vehicle import load_vehicle
@@ -25,7 +25,7 @@ def straight(length, limit=13.9, grade=0.0):
     return free_route([[0.0, 0, 0], [length, 0, grade * length]], limit=limit)
 
 
-def assert_gentle(trajectory, vehicle):
+def assert_gentle(trajectory, vehicle, *, rests=True):
     """Bounds on what a passenger and a bystander measure, from positions and attitudes alone."""
     t = trajectory.time_ns * 1e-9
     dt = np.diff(t)
@@ -35,8 +35,9 @@ def assert_gentle(trajectory, vehicle):
     true = moved / np.column_stack([k, k, np.ones_like(k)])
     np.testing.assert_allclose(true, 0.5 * (velocity[1:] + velocity[:-1]), atol=0.03)
     speed = np.linalg.norm(velocity, axis=1)
-    assert speed[0] == 0.0
-    assert speed[-1] == 0.0
+    if rests:
+        assert speed[0] == 0.0
+        assert speed[-1] == 0.0
     R = matrix_from_quat(trajectory.quat_xyzw)
     level = np.column_stack([R[:, 0, 0], R[:, 1, 0]])
     forward = (velocity[:, :2] * level).sum(axis=1) / np.linalg.norm(level, axis=1)
@@ -68,6 +69,40 @@ def test_a_drive_through_town_is_gentle(seed, name, duration):
         np.testing.assert_allclose(trajectory.position[[0, -1]], path.position[[0, -1]], atol=1e-6)
     else:
         assert trajectory.duration_ns == round(duration * 1e9)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["car", "van", "robot"]), st.floats(0.5, 40.0))
+@settings(max_examples=12, deadline=None)
+def test_a_drive_that_is_under_way_is_gentle_too(seed, name, duration):
+    vehicle = load_vehicle(name)
+    route = plan_route(grid(4, 4), FRAME, "random", seed=seed, length=600.0)
+    path = plan_path(route, vehicle, FRAME)
+    trajectory = drive_path(path, vehicle, duration=duration, under_way=True)
+    assert_gentle(trajectory, vehicle, rests=False)
+    motion = motion_along(path, vehicle, duration=duration, under_way=True)
+    assert (motion.speed <= np.interp(motion.s, path.s, speed_limits(path, vehicle)) + 1e-6).all()
+    assert motion.time_ns[-1] == pytest.approx(duration * 1e9, abs=5.1e6)
+
+
+def test_what_is_under_way_is_at_the_limit_from_first_to_last():
+    path = plan_path(straight(1000.0), CAR, FRAME)
+    trajectory = drive_path(path, CAR, duration=30.0, under_way=True)
+    speed = np.linalg.norm(trajectory.velocity, axis=1)
+    np.testing.assert_allclose(speed, 13.9, rtol=3e-3)
+    assert np.ptp(trajectory.position[:, 0]) == pytest.approx(30.0 * 13.9, rel=3e-3)
+    whole = drive_path(path, CAR, under_way=True)  # but where the path ends it stops
+    assert whole.velocity[-1] == pytest.approx(0.0)
+    assert whole.position[-1, 0] == pytest.approx(1000.0, abs=1e-3)
+
+
+def test_before_a_bend_what_is_under_way_starts_slowly_enough_for_it():
+    corner = free_route([[0.0, 0, 0], [12.0, 0, 0], [12.0, 100.0, 0]], limit=13.9)
+    trajectory = drive_path(plan_path(corner, CAR, FRAME), CAR, under_way=True)
+    assert 2.0 < np.linalg.norm(trajectory.velocity[0]) < 8.0
+    bent = slice(0, len(trajectory.time_ns) // 2)
+    yaw = np.unwrap(euler_from_quat(trajectory.quat_xyzw)[:, 2])
+    across = np.gradient(yaw, 0.01) * np.linalg.norm(trajectory.velocity, axis=1)
+    assert np.abs(across[bent]).max() <= 1.02 * CAR.lateral_acceleration
 
 
 @given(

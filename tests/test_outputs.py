@@ -274,8 +274,8 @@ def test_radial_velocities_are_those_of_the_ego_and_of_what_is_hit(dataset):
         for row in (r for r in boxes if int(r["frame"]) == frame and r["moving"] == "True"):
             on = cloud["instance"] == int(row["instance"])
             velocity = np.array([float(row[k]) for k in ("vx", "vy", "vz")])
-            # a body that turns moves at its ends a little otherwise than in its middle
-            np.testing.assert_allclose(cloud["velocity"][on], expected[on] + way[on] @ velocity, atol=0.3)
+            # the ends of a body that turns move otherwise than its middle: a car's, 2.2 m away, at 0.3 rad/s
+            np.testing.assert_allclose(cloud["velocity"][on], expected[on] + way[on] @ velocity, atol=0.7)
             moving += int(on.sum()) if np.linalg.norm(velocity) > 1 else 0
     assert still > 10_000
     assert moving > 20

@@ -90,3 +90,28 @@ def test_what_is_sampled_is_one_motion():
 def test_distances_that_fall_are_refused():
     with pytest.raises(InputError, match="must not fall"):
         motion_behind(PATH, CAR, np.array([0.0, 1.0, 2.0]), np.array([0.0, 5.0, 4.0]))
+
+
+@settings(max_examples=10, deadline=None)
+@given(stops=st.lists(st.tuples(st.floats(30.0, 280.0), st.floats(3.0, 30.0)), max_size=3))
+def test_what_is_under_way_starts_and_ends_at_speed_and_stays_behind_too(stops):
+    time_s = np.arange(0.0, 18.0, 0.1)
+    free = motion_along(PATH, CAR, under_way=True)
+    reach = np.interp(time_s, free.time_ns * 1e-9, free.s - free.s[0])
+    for place, until in stops:
+        reach = np.minimum(reach, np.where(time_s < until, place, np.inf))
+    reach = np.maximum.accumulate(reach)
+    motion = motion_behind(PATH, CAR, time_s, reach, under_way=True)
+    at = motion.time_ns * 1e-9
+    assert (motion.s <= np.interp(at, time_s, reach) + 0.1).all()
+    assert (np.diff(motion.s) >= -1e-9).all()
+    change = np.diff(motion.speed) * 100.0
+    assert change.max() <= CAR.acceleration + 1e-6
+    assert change.min() >= -CAR.deceleration - 1e-6
+    assert np.abs(jerks(motion)).max() <= CAR.jerk + 1e-6
+    limit = np.interp(motion.s, PATH.s, speed_limits(PATH, CAR))
+    assert (motion.speed <= 1.01 * limit + 0.02).all()
+    if not stops:
+        assert motion.speed[0] > 0.9 * 13.9
+        assert motion.speed[-1] > 0.8 * np.interp(at[-1], free.time_ns * 1e-9, free.speed)
+        assert motion.s[-1] > 0.93 * reach[-1]

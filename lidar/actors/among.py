@@ -25,6 +25,7 @@ Float = NDArray[np.float64]
 _ROUNDS = 3  # times that the ego's drive is planned among those who are about during the last plan
 _SAME = 25.0  # metres between two plans that are about the same
 _LONGER = (2.0, 90.0)  # a drive to an end takes at most so many times as long as on empty roads, and seconds
+_ON_S = 10.0  # seconds that a drive that is under way is planned beyond the record's end
 
 
 def drive_obeying(
@@ -36,19 +37,20 @@ def drive_obeying(
     side: str = "right",
     bounds: tuple[float, float, float, float] | None = None,
     duration: float | None = None,
+    under_way: bool = False,
 ) -> Trajectory:
     """The trajectory of a vehicle that drives a path alone and stops at red signals and stop signs.
 
     seed     : of the signals, as for `junction_plan`
     side     : of the road that is driven on
     bounds   : of the map in scene metres
-    duration : as for `drive_path`
+    duration, under_way : as for `drive_path`
     """
-    alone = drive_path(path, vehicle, duration=duration)
+    alone = drive_path(path, vehicle, duration=duration, under_way=under_way)
     plan = junction_plan(graph, lanes_of(graph, side=side, bounds=bounds), seed=seed)
     if not meets_control(ego_trip(path, vehicle), graph, plan):
         return alone
-    return _driven(path, vehicle, graph, plan, [], alone, duration, reach=np.inf)
+    return _driven(path, vehicle, graph, plan, [], alone, duration, reach=np.inf, under_way=under_way)
 
 
 def drive_among(
@@ -61,11 +63,12 @@ def drive_among(
     seed: int,
     options: TrafficOptions | None = None,
     duration: float | None = None,
+    under_way: bool = False,
 ) -> tuple[Trajectory, Actors]:
     """The trajectory of a vehicle along a path as one of the traffic, and the others.
 
     first    : its trajectory without the others, such as `drive_obeying` gives
-    duration : as for `drive_path`
+    duration, under_way : as for `drive_path`
 
     The ego is simulated together with the others and keeps its distance as they do; its motion is then
     smoothed to what its body and its passengers bear, never ahead of what it was allowed, and the others are
@@ -76,7 +79,10 @@ def drive_among(
     for _ in range(_ROUNDS):
         company = company_of(scene, graph, ego, seed=seed, options=options)
         before, reach = ego, options.reach * company.scale
-        ego = _driven(path, vehicle, graph, company.plan, company.trips, first, duration, reach=reach)
+        ego = _driven(
+            path, vehicle, graph, company.plan, company.trips, first, duration,
+            reach=reach, under_way=under_way,
+        )  # fmt: skip
         if _apart(before, ego) < _SAME * company.scale:
             break
     return ego, settled(scene, graph, ego, vehicle, company, seed=seed, options=options, obeys=True)
@@ -92,13 +98,17 @@ def _driven(
     duration: float | None,
     *,
     reach: float,
+    under_way: bool,
 ) -> Trajectory:
     """The trajectory of the ego among trips; ``alone`` says how long it takes without them."""
     factor, more = _LONGER
     seconds = duration if duration is not None else factor * alone.duration_ns * 1e-9 + more
-    gone = simulate_ego(ego_trip(path, vehicle), trips, graph, plan, seconds=seconds, reach=reach)
+    if duration is not None and under_way:
+        seconds += _ON_S
+    trip = ego_trip(path, vehicle, under_way=under_way)
+    gone = simulate_ego(trip, trips, graph, plan, seconds=seconds, reach=reach)
     time_s: Float = DT * np.arange(len(gone), dtype=float)
-    motion = motion_behind(path, vehicle, time_s, gone.clip(max=path.length))
+    motion = motion_behind(path, vehicle, time_s, gone.clip(max=path.length), under_way=under_way)
     trajectory = poses_along(path, vehicle, motion)
     return trajectory if duration is None else trajectory.until(round(duration * 1e9))
 

@@ -48,8 +48,8 @@ class EgoTrip:
         return self.xy, self.heading
 
 
-def ego_trip(path: Path, vehicle: Vehicle) -> EgoTrip:
-    """The ego as a mover along its path; stations are `STEP` metres of the path apart."""
+def ego_trip(path: Path, vehicle: Vehicle, *, under_way: bool = False) -> EgoTrip:
+    """The ego as a mover along its path, from rest or under way; stations are `STEP` metres of it apart."""
     at = np.arange(0.0, path.length + STEP, STEP)
     # where the vehicle turns round the position stands twice
     s = path.s + 1e-9 * np.arange(len(path))
@@ -70,5 +70,7 @@ def ego_trip(path: Path, vehicle: Vehicle) -> EgoTrip:
     )
     brake, pull = _BRAKE * vehicle.deceleration, _PULL * vehicle.acceleration
     driver = Driver(vehicle.turning_radius, vehicle.max_speed, _HEADWAY_S, pull, brake, _GAP)
-    wish = np.minimum(np.interp(at, s, wished_speed(path, vehicle)), np.sqrt(2 * pull * (at + 0.2)))
+    wish = np.interp(at, s, wished_speed(path, vehicle))
+    if not under_way:
+        wish = np.minimum(wish, np.sqrt(2 * pull * (at + 0.2)))
     return EgoTrip(way, driver, wish, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading)
