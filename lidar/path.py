@@ -56,7 +56,7 @@ class Path:
     curvature : (n,) 1/m, change of heading per true metre driven over ground; positive is a turn to the left
     slope     : (n,) radians, of the path where the vehicle points, positive uphill
     pitch     : (n,) radians, of the vehicle on its wheels, positive uphill: from the ground under both axles
-    bank      : (n,) radians, of the ground across the vehicle, positive where the left wheels stand higher
+    bank      : (n,) radians, of the vehicle about its own x axis, positive where the left wheels stand higher
     scale     : (n,) scene metres per true metre
     gear      : (n,) int8, 1 forwards, -1 backwards
     leg       : (n,) int32, stretch between stops; at a stop the position stands twice
@@ -266,7 +266,7 @@ def _heights(
 
     Wheels keep to the ground; without one, the route's profile is smoothed over the wheelbase.
     """
-    from scipy.ndimage import gaussian_filter1d, maximum_filter1d  # noqa: PLC0415
+    from scipy.ndimage import gaussian_filter1d, maximum_filter1d, median_filter  # noqa: PLC0415
 
     raw = [_raw_heights(leg, line, setting, ground) for leg, line in zip(legs, lines, strict=True)]
     sizes = np.array([len(leg.row) for leg in legs])
@@ -284,7 +284,10 @@ def _heights(
     far = np.pad(z, spare, mode="reflect", reflect_type="odd")
     near, soft = (gaussian_filter1d(far, w)[spare : spare + len(z)] for w in (width, wide))
     if ground is not None:  # a step, as at the joint of a bridge, is taken as a ramp
-        step = (np.abs(np.gradient(z)) > _JOINT / 2).astype(float)
+        rise = np.gradient(z)
+        step = (
+            np.abs(rise - median_filter(rise, 2 * math.ceil(wide) + 1, mode="nearest")) > _JOINT / 2
+        ).astype(float)
         reach = 2 * math.ceil(wide) + 1
         share = gaussian_filter1d(maximum_filter1d(step, reach), wide / 2)
         near = near + share * (soft - near)
@@ -296,14 +299,18 @@ def _heights(
     for leg, height, ahead, across in zip(legs, *parts, strict=True):
         slope = np.arctan(leg.gear * np.gradient(height, leg.step))
         stands = ground is not None and body.wheelbase >= _AXLES
-        out.append((height, slope, np.arctan(ahead) if stands else slope, across))
+        pitch = np.arctan(ahead) if stands else slope
+        out.append((height, slope, pitch, np.arctan(across * np.cos(pitch))))
     return out
 
 
 def _raw_heights(
     leg: Track, line: Line, setting: Setting, ground: Surface | None
 ) -> tuple[Float, Float, Float]:
-    """Height, rise per metre to the front axle and bank at the rows of a leg, as line or ground have them."""
+    """Height, rise per metre ahead to the front axle and to the left, at the rows of a leg (n,).
+
+    As the ground has them, or, without one, the line.
+    """
     heading = line_heading(line.xyz[:, :2])[leg.row]
     d = leg.xy - line.xyz[leg.row, :2]
     place = leg.row + (d[:, 0] * np.cos(heading) + d[:, 1] * np.sin(heading)) / line.gap
@@ -315,15 +322,21 @@ def _raw_heights(
         return z, rise, np.zeros(len(leg.row))
     base = max(setting.vehicle.wheelbase, _AXLES)
     rear, across = _axle(leg, z, 0.0, setting, ground)
-    front, twisted = _axle(leg, rear + base * np.clip(rise, -_STEEP, _STEEP), base, setting, ground)
+    ahead = np.clip(rise, -_STEEP, _STEEP)
+    for _ in range(2):  # on a slope the front axle is less than the wheelbase ahead, in plan
+        reach = base / np.hypot(1.0, ahead)
+        front, twisted = _axle(leg, rear + reach * ahead, reach, setting, ground)
+        ahead = (front - rear) / reach
     # a rigid body on four wheels: the twist of the ground is left to the springs
-    return rear, (front - rear) / base, (across + twisted) / 2
+    return rear, ahead, (across + twisted) / 2
 
 
-def _axle(leg: Track, z: Float, ahead: float, setting: Setting, ground: Surface) -> tuple[Float, Float]:
-    """Mean height of the ground under the wheels of an axle, and its bank, near heights (n,).
+def _axle(
+    leg: Track, z: Float, ahead: Float | float, setting: Setting, ground: Surface
+) -> tuple[Float, Float]:
+    """Mean height of the ground under the wheels of an axle, and its rise to the left, near heights (n,).
 
-    ahead : metres from the rear axle
+    ahead : metres in plan from the rear axle
     """
     c, s = np.cos(leg.heading), np.sin(leg.heading)
     x, y = leg.xy.T
@@ -337,4 +350,4 @@ def _axle(leg: Track, z: Float, ahead: float, setting: Setting, ground: Surface)
         # what is higher or lower than a wheel goes is a wall or an edge that the wheel does not stand on
         under.append(np.where(np.abs(wheel - middle) <= _WHEEL_STEP + _STEEP * track / 2, wheel, middle))
     left, right = under
-    return 0.5 * (left + right), np.arctan2(left - right, track)
+    return 0.5 * (left + right), (left - right) / track
