@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -14,8 +15,21 @@ def _no_rows() -> NDArray[np.int32]:
     return np.empty(0, np.int32)
 
 
+def _no_objects() -> NDArray[np.object_]:
+    return np.empty(0, object)
+
+
 def _no_text() -> NDArray[np.str_]:
     return np.empty(0, np.str_)
+
+
+def rows_of(arrays: Iterable[NDArray[np.generic]]) -> NDArray[np.object_]:
+    """The arrays as a column of objects (n,), also where they are of one length."""
+    listed = list(arrays)
+    rows = np.empty(len(listed), object)
+    for k, array in enumerate(listed):
+        rows[k] = array
+    return rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +65,12 @@ class RoadGraph:
     turn_from, turn_to : (r,) int32 edges
     turn_via  : (r,) int32 node, head of ``turn_from`` and tail of ``turn_to``
     turn_kind : (r,) str, OSM's value: ``no_left_turn``, ``only_straight_on`` ...
+
+    Restrictions via ways, one row each:
+
+    chain_edges : (q,) object, each (k >= 3,) int32: edges that follow each other, not to be driven in this
+                  order, or the only ones that may follow the first
+    chain_kind  : (q,) str, as ``turn_kind``
 
     What drivers must heed along an edge, one row each:
 
@@ -88,6 +108,8 @@ class RoadGraph:
     turn_via: NDArray[np.int32] = field(default_factory=_no_rows)
     turn_to: NDArray[np.int32] = field(default_factory=_no_rows)
     turn_kind: NDArray[np.str_] = field(default_factory=_no_text)
+    chain_edges: NDArray[np.object_] = field(default_factory=_no_objects)
+    chain_kind: NDArray[np.str_] = field(default_factory=_no_text)
     control_edge: NDArray[np.int32] = field(default_factory=_no_rows)
     control_offset: Float = field(default_factory=lambda: np.empty(0))
     control_kind: NDArray[np.str_] = field(default_factory=_no_text)
@@ -115,11 +137,12 @@ class RoadGraph:
         columns = {name: getattr(self, name)[used] for name in per_node} | {
             f.name: getattr(self, f.name)[chosen]
             for f in fields(self)
-            if f.name not in apart and not f.name.startswith(("turn_", "control_"))
+            if f.name not in apart and not f.name.startswith(("turn_", "chain_", "control_"))
         }
         tail, head = ends.astype(np.int32).reshape(2, -1)
         whole = (edge[self.turn_from] >= 0) & (edge[self.turn_to] >= 0)
         there = edge[self.control_edge] >= 0
+        unbroken = np.array([bool((edge[chain] >= 0).all()) for chain in self.chain_edges], np.bool_)
         return replace(
             self,
             **columns,
@@ -130,6 +153,8 @@ class RoadGraph:
             turn_via=node[self.turn_via[whole]],
             turn_to=edge[self.turn_to[whole]],
             turn_kind=self.turn_kind[whole],
+            chain_edges=rows_of([edge[chain] for chain in self.chain_edges[unbroken]]),
+            chain_kind=self.chain_kind[unbroken],
             control_edge=edge[self.control_edge[there]],
             control_offset=self.control_offset[there],
             control_kind=self.control_kind[there],

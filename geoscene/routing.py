@@ -74,7 +74,8 @@ def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.i
     """The permitted turns as pairs of edges ``(from (t,), to (t,))``.
 
     Restrictions are respected (``no_*`` forbids its turn, ``only_*`` every other turn from its edge at its
-    node). Turning round into the street one comes from is permitted at dead ends alone unless ``u_turns``.
+    node) as far as pairs can say them; `turn_states` says the rest of those via ways. Turning round into the
+    street one comes from is permitted at dead ends alone unless ``u_turns``.
     """
     order = np.argsort(graph.tail, kind="stable").astype(np.int32)
     start = np.searchsorted(graph.tail[order], np.arange(len(graph.node_id) + 1))
@@ -83,16 +84,103 @@ def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.i
     rank = np.arange(len(before)) - np.repeat(np.cumsum(count) - count, count)
     after = order[start[graph.head[before]] + rank]
 
-    key = before.astype(np.int64) * len(graph) + after
-    restriction = graph.turn_from.astype(np.int64) * len(graph) + graph.turn_to
-    only = np.char.startswith(graph.turn_kind, "only_") if len(graph.turn_kind) else np.empty(0, np.bool_)
-    forbidden = np.isin(key, restriction[~only])
-    forbidden |= np.isin(before, graph.turn_from[only]) & ~np.isin(key, restriction[only])
+    only = _commands(graph.turn_kind)
+    begun = np.array([chain[:2] for chain in graph.chain_edges[_commands(graph.chain_kind)]], np.int32)
+    commanded = np.concatenate(
+        [np.column_stack([graph.turn_from[only], graph.turn_to[only]]), begun.reshape(-1, 2)]
+    )
+    forbidden = _among(graph, before, after, graph.turn_from[~only], graph.turn_to[~only])
+    forbidden |= np.isin(before, commanded[:, 0]) & ~_among(graph, before, after, *commanded.T)
     if not u_turns:
         round_ = graph.twin[before] == after
         ways_out = np.bincount(before[~round_], minlength=len(graph))
         forbidden |= round_ & (ways_out[before] > 0)
     return before[~forbidden], after[~forbidden]
+
+
+def _commands(kind: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """Which restrictions (r,) are ``only_*``."""
+    return np.char.startswith(kind, "only_") if len(kind) else np.empty(0, np.bool_)
+
+
+def _among(
+    graph: RoadGraph,
+    before: NDArray[np.int32],
+    after: NDArray[np.int32],
+    first: NDArray[np.int32],
+    second: NDArray[np.int32],
+) -> NDArray[np.bool_]:
+    """Which turns (t,) are one of the pairs (first, second)."""
+    key = before.astype(np.int64) * len(graph) + after
+    return np.isin(key, first.astype(np.int64) * len(graph) + second)
+
+
+@dataclass(frozen=True, slots=True)
+class TurnStates:
+    """Permitted turns between states: an edge, and what of a restriction via ways has been driven up to it.
+
+    edge          : (s,) int32, the edge of each state. The first states are the edges themselves, in their
+                    order, as a drive has them that begins there or has no such restriction behind it
+    before, after : (t,) int32, states that may follow each other
+    """
+
+    edge: NDArray[np.int32]
+    before: NDArray[np.int32]
+    after: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Number of states."""
+        return len(self.edge)
+
+
+def turn_states(graph: RoadGraph, *, u_turns: bool = False) -> TurnStates:
+    """The permitted turns with those that depend on the streets driven before.
+
+    A drive from state to state along them obeys every restriction. Those via ways bind who came along the
+    chain from its first edge: ``no_*`` forbids the last turn, ``only_*`` every turn off the chain. Without
+    them the turns are those of `turn_table`. The states beyond the edges are prefixes of chains; a drive is
+    in that of the longest that it ends with (Aho and Corasick 1975).
+    """
+    before, after = turn_table(graph, u_turns=u_turns)
+    forbidden: set[tuple[int, ...]] = set()
+    commanded: dict[tuple[int, ...], set[int]] = {}
+    prefixes: set[tuple[int, ...]] = set()
+    for edges, only in zip(graph.chain_edges, _commands(graph.chain_kind).tolist(), strict=True):
+        chain = tuple(edges.tolist())
+        prefixes |= {chain[:k] for k in range(2, len(chain))}
+        if only:
+            for k in range(2, len(chain)):
+                commanded.setdefault(chain[:k], set()).add(chain[k])
+        else:
+            forbidden.add(chain)
+    if not prefixes:
+        return TurnStates(np.arange(len(graph), dtype=np.int32), before, after)
+
+    ordered = sorted(prefixes)
+    number = {prefix: len(graph) + k for k, prefix in enumerate(ordered)}
+    watched = np.flatnonzero(_among(graph, before, after, *np.array([p[:2] for p in ordered], np.int32).T))
+    onward: dict[int, list[int]] = {}
+    for row in np.flatnonzero(np.isin(before, [prefix[-1] for prefix in ordered])).tolist():
+        onward.setdefault(int(before[row]), []).append(int(after[row]))
+    more: list[tuple[int, int]] = []
+    for prefix in ordered:
+        for edge in onward.get(prefix[-1], []):
+            driven = (*prefix, edge)
+            if any(driven[k:] in forbidden for k in range(len(prefix) - 1)):
+                continue
+            if any(edge not in commanded.get(prefix[k:], {edge}) for k in range(len(prefix) - 1)):
+                continue
+            ends = (driven[k:] for k in range(len(prefix)))
+            more.append((number[prefix], next((number[end] for end in ends if end in number), edge)))
+    after = after.copy()
+    for row in watched.tolist():
+        after[row] = number[int(before[row]), int(after[row])]
+    added = np.array(more, np.int32).reshape(-1, 2)
+    return TurnStates(
+        np.array([*range(len(graph)), *(prefix[-1] for prefix in ordered)], np.int32),
+        np.concatenate([before, added[:, 0]]),
+        np.concatenate([after, added[:, 1]]),
+    )
 
 
 def shortest_path(
@@ -111,7 +199,7 @@ def shortest_path(
     either_side : start and goal may as well lie on the opposite edge of a two-way street
     u_turns     : turning round is permitted at every node, not at dead ends alone
 
-    Dijkstra's algorithm over edges, not nodes, so that turn restrictions hold.
+    Dijkstra's algorithm over the states of `turn_states`, not over nodes, so that turn restrictions hold.
     """
     from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
     from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
@@ -128,19 +216,21 @@ def shortest_path(
                 if best is None or spent < best[0]:
                     best = (spent, [edge], offset, end)
 
-    before, after = turn_table(graph, u_turns=u_turns)
-    turns = csr_array((cost[after], (before, after)), shape=(len(graph), len(graph)))
+    states = turn_states(graph, u_turns=u_turns)
+    entered = states.edge[states.after]
+    turns = csr_array((cost[entered], (states.before, states.after)), shape=(len(states), len(states)))
     for edge, offset in starts:
         reach, came_from = dijkstra(turns, indices=edge, return_predecessors=True)
         left = cost[edge] * (1 - _share(graph, edge, offset))
         for target, end in goals:
-            into = before[after == target]
+            into = states.before[entered == target]
             if not len(into):
                 continue
             last = int(into[np.argmin(reach[into])])
             spent = left + reach[last] + cost[target] * _share(graph, target, end)
             if np.isfinite(spent) and (best is None or spent < best[0]):
-                best = (spent, [*_walk(came_from, edge, last), target], offset, end)
+                driven = states.edge[_walk(came_from, edge, last)].tolist()
+                best = (spent, [*driven, target], offset, end)
     return None if best is None else _path(graph, *best[1:])
 
 
@@ -176,11 +266,11 @@ def _sides(graph: RoadGraph, place: tuple[int, float], *, either_side: bool) -> 
 
 
 def _walk(came_from: NDArray[Any], first: int, last: int) -> list[int]:
-    """Edges from ``first`` to ``last`` along Dijkstra's predecessors."""
-    edges = [last]
-    while edges[-1] != first:
-        edges.append(int(came_from[edges[-1]]))
-    return edges[::-1]
+    """States from ``first`` to ``last`` along Dijkstra's predecessors."""
+    states = [last]
+    while states[-1] != first:
+        states.append(int(came_from[states[-1]]))
+    return states[::-1]
 
 
 def _path(graph: RoadGraph, edges: list[int], start: float, end: float) -> RoadPath:

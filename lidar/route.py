@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.frames import Frame
 from geoscene.roads import RoadGraph
-from geoscene.routing import edge_lines, turn_table
+from geoscene.routing import TurnStates, edge_lines, turn_states
 from lidar.errors import RouteError
 from lidar.physics.random import generator
 
@@ -144,40 +144,40 @@ def _end_headings(graph: RoadGraph) -> tuple[Float, Float]:
     return out[0], out[1]
 
 
-def permitted_turns(
-    graph: RoadGraph, avoid: Collection[tuple[int, int]]
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Pairs of edges (from, to) that may follow each other, less the turns and closed edges to avoid."""
-    before, after = turn_table(graph)
+def permitted_turns(graph: RoadGraph, avoid: Collection[tuple[int, int]]) -> TurnStates:
+    """The states that may follow each other, less the turns and closed edges to avoid."""
+    states = turn_states(graph)
     if not avoid:
-        return before, after
+        return states
     shut = np.array(sorted(avoid), np.int64).reshape(-1, 2)
     closed = shut[shut[:, 0] == shut[:, 1], 0]
+    before, after = states.edge[states.before], states.edge[states.after]
     key = before.astype(np.int64) * len(graph) + after
     bad = (
         np.isin(key, shut[:, 0] * len(graph) + shut[:, 1]) | np.isin(before, closed) | np.isin(after, closed)
     )
-    return before[~bad], after[~bad]
+    return replace(states, before=states.before[~bad], after=states.after[~bad])
 
 
 # ---------------------------------------------------------------------------------------------- random
 
 
 def _components(
-    graph: RoadGraph, before: NDArray[Any], after: NDArray[Any]
+    graph: RoadGraph, states: TurnStates, turns: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], Float]:
-    """Strongly connected component of each edge (m,), and the metres of street in each."""
+    """Strongly connected component of each state (s,) by some of the turns (t,), and its metres of street."""
     from scipy.sparse import csr_array  # noqa: PLC0415
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
-    m = len(graph)
-    links = csr_array((np.ones(len(before)), (before, after)), shape=(m, m))
+    before, after = states.before[turns], states.after[turns]
+    links = csr_array((np.ones(len(before)), (before, after)), shape=(len(states), len(states)))
     count, label = connected_components(links, directed=True, connection="strong")
     size = np.bincount(label, minlength=count)
-    metres = np.bincount(label, weights=graph.length, minlength=count)
+    part, edge = np.unique(np.column_stack([label, states.edge]), axis=0).T
+    metres = np.bincount(part, weights=graph.length[edge], minlength=count)
     loops = np.zeros(count, bool)
     loops[label[before[before == after]]] = True
-    metres[(size == 1) & ~loops] = 0.0  # one edge from which there is no way back to it
+    metres[(size == 1) & ~loops] = 0.0  # one state from which there is no way back to it
     return np.asarray(label, np.int64), np.asarray(metres, float)
 
 
@@ -198,29 +198,29 @@ def random_edges(
     without that worth the name (a fifth of what turning round would open).
     """
     rng = generator(seed, "route")
-    before, after = permitted_turns(graph, avoid)
-    back = turns_back(graph, before, after)
-    label, size = _components(graph, before[~back], after[~back])
-    label_back, size_back = _components(graph, before, after)
-    if size.max(initial=0.0) >= 0.2 * size_back.max(initial=0.0) and size.max(initial=0.0) > 0:
-        before, after = before[~back], after[~back]
-    else:
-        label, size = label_back, size_back
+    states = permitted_turns(graph, avoid)
+    edges = states.edge
+    use = ~turns_back(graph, edges[states.before], edges[states.after])
+    label, size = _components(graph, states, use)
+    label_back, size_back = _components(graph, states, np.ones(len(use), bool))
+    if not (size.max(initial=0.0) >= 0.2 * size_back.max(initial=0.0) and size.max(initial=0.0) > 0):
+        use[:], label, size = True, label_back, size_back
     # where there is none, one-way streets lead out of the map: drive until they do
     round_trip = size.max(initial=0.0) > 0
-    inside = label == int(np.argmax(size)) if round_trip else np.ones(len(graph), bool)
-    use = inside[before] & inside[after]
-    before, after = before[use], after[use]
+    inside = label == int(np.argmax(size)) if round_trip else np.ones(len(states), bool)
+    use &= inside[states.before] & inside[states.after]
+    before, after = states.before[use], states.after[use]
     order = np.argsort(before, kind="stable")
     after = after[order]
-    first = np.searchsorted(before[order], np.arange(len(graph) + 1))
+    first = np.searchsorted(before[order], np.arange(len(states) + 1))
 
     liking = np.where(np.isin(graph.highway, ("service", "track")), 0.1, 1.0)
-    start = graph.length * liking * inside
+    start = graph.length[edges] * liking[edges] * inside
     start = start / start.sum()
     best: list[int] = []
     for _ in range(1 if round_trip else 32):
-        edge = int(rng.choice(len(graph), p=start))
+        state = int(rng.choice(len(states), p=start))
+        edge = int(edges[state])
         far = -_SET_OUT * graph.length[edge]
         walk, time = [edge], far / graph.speed[edge]
         visits = np.zeros(len(graph))
@@ -230,11 +230,15 @@ def random_edges(
             visits[edge] += 1
             if graph.twin[edge] >= 0:
                 visits[graph.twin[edge]] += 1
-            ways = after[first[edge] : first[edge + 1]]
-            if not len(ways):
+            following = after[first[state] : first[state + 1]]
+            if not len(following):
                 break
+            ways = edges[following]
             weight = liking[ways] / (1.0 + visits[ways]) ** 4
-            edge = int(ways[np.searchsorted(np.cumsum(weight), rng.random() * weight.sum(), side="right")])
+            state = int(
+                following[np.searchsorted(np.cumsum(weight), rng.random() * weight.sum(), side="right")]
+            )
+            edge = int(edges[state])
             walk.append(edge)
         if len(walk) > len(best):
             best = walk

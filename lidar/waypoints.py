@@ -240,7 +240,10 @@ def _thinned(xy: Float, gap: float) -> Float:
 
 
 class _Search:
-    """Cheapest chains of places on a graph: dynamic programming over candidates, Dijkstra between them."""
+    """Cheapest chains of places on a graph: dynamic programming over candidates, Dijkstra between them.
+
+    A place is on a state of `geoscene.routing.turn_states`, so that restrictions via ways hold across places.
+    """
 
     def __init__(
         self,
@@ -253,14 +256,27 @@ class _Search:
     ) -> None:
         from scipy.sparse import csr_array  # noqa: PLC0415
 
-        self.graph, self.cost, self.slack = graph, np.maximum(cost, 1e-9), slack
-        before, after = permitted_turns(graph, avoid)
-        round_ = turns_back(graph, before, after)
-        m = len(graph)
+        states = permitted_turns(graph, avoid)
+        self.edge, self.length, self.slack = states.edge, graph.length[states.edge], slack
+        self.cost = np.maximum(cost, 1e-9)[states.edge]
+        self.watched = set(states.edge[len(graph) :].tolist())
+        round_ = turns_back(graph, states.edge[states.before], states.edge[states.after])
         # a step costs the edge it leaves behind, so that a target's own edge is not counted
-        weight = self.cost[before] + np.where(round_, u_turn, 0.0)
-        self.links = csr_array((weight, (before, after)), shape=(m, m))
-        self.next = csr_array((np.ones(len(before)), (before, after)), shape=(m, m))
+        weight = self.cost[states.before] + np.where(round_, u_turn, 0.0)
+        self.links = csr_array((weight, (states.before, states.after)), shape=(len(states), len(states)))
+
+    def _states(
+        self, candidates: list[list[Place]], own: list[Float]
+    ) -> tuple[list[list[Place]], list[Float]]:
+        """Places on states instead of edges, those after the first on every state of their edge."""
+        if not self.watched:
+            return candidates, own
+        places, costs = candidates[:1], own[:1]
+        for there, cost in zip(candidates[1:], own[1:], strict=True):
+            on = [np.flatnonzero(self.edge == e) if e in self.watched else [e] for e, _ in there]
+            places.append([(int(s), o) for states, (_, o) in zip(on, there, strict=True) for s in states])
+            costs.append(np.repeat(cost, [len(states) for states in on]))
+        return places, costs
 
     def _dijkstra(self, source: int, reach: float) -> tuple[Float, NDArray[np.int32]]:
         from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
@@ -270,7 +286,7 @@ class _Search:
 
     def _share(self, place: Place) -> float:
         edge, offset = place
-        return float(self.cost[edge] * min(max(offset / max(self.graph.length[edge], 1e-9), 0.0), 1.0))
+        return float(self.cost[edge] * min(max(offset / max(self.length[edge], 1e-9), 0.0), 1.0))
 
     def _costs(self, source: Place, targets: list[Place], reach: float) -> Float:
         """Cost from one place to each of others; infinite beyond reach."""
@@ -304,6 +320,7 @@ class _Search:
     ) -> tuple[NDArray[np.int32], tuple[float, float]] | int:
         """Edges and end offsets of the cheapest chain, or the number of the first place that none reaches."""
         total, choice = own[0], []
+        candidates, own = self._states(candidates, own)
         for k in range(1, len(candidates)):
             limit = np.inf if reach is None else float(reach[k - 1])
             step = np.array([self._costs(c, candidates[k], limit) for c in candidates[k - 1]])
@@ -320,7 +337,7 @@ class _Search:
         edges = [places[0][0]]
         for a, b in itertools.pairwise(places):
             edges += self._between(a, b)[1:]
-        return np.array(edges, np.int32), (places[0][1], places[-1][1])
+        return self.edge[edges], (places[0][1], places[-1][1])
 
     def _between(self, a: Place, b: Place) -> list[int]:
         """Edges of the cheapest way from one place to another, both included."""

@@ -14,6 +14,7 @@ from geoscene.errors import InputError
 from geoscene.export import export_scene
 from geoscene.export.planview import connecting_curve, cut, plan_view
 from geoscene.roadgraph import write_graphml
+from geoscene.roads import rows_of
 from geoscene.routing import turn_table
 
 
@@ -139,6 +140,17 @@ def test_lanes_meet_in_a_grid_of_any_width(scene, tmp_path, lanes, left_hand):
     graph = grid(width=9.0)
     graph = replace(graph, lanes=np.broadcast_to(np.asarray(lanes, float), len(graph)).copy())
     assert _check_links(_write(graph, _keeping(scene, left_hand), tmp_path)) > 100
+
+
+def test_restrictions_that_junctions_cannot_say_are_counted(tmp_path):
+    scene = write_world(tmp_path / "world")
+    assert export_scene(scene, tmp_path / "plain.xodr").notes == ()
+    chain = rows_of([np.array([0, 2, 3], np.int32)])
+    graph = replace(roads(), chain_edges=chain, chain_kind=np.array(["no_u_turn"]))
+    write_graphml(graph, scene.frame, scene.path / "roads.graphml")
+    (note,) = export_scene(scene, tmp_path / "bound.xodr").notes
+    assert note.startswith("1 turn restrictions via ways are not in it")
+    assert (tmp_path / "bound.xodr").read_bytes() == (tmp_path / "plain.xodr").read_bytes()
 
 
 def test_the_ways_through_a_junction_are_the_permitted_turns(scene, tmp_path):

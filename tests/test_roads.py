@@ -1,5 +1,6 @@
 """The drivable graph says what the map says, and routes obey it."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,7 +20,8 @@ from geoscene.roadgraph import (
 )
 from geoscene.roadgraph.speeds import speed_limit
 from geoscene.roadgraph.tags import drivable, read_street
-from geoscene.routing import edge_lines, nearest_edge, path_line, shortest_path, turn_table
+from geoscene.roads import rows_of
+from geoscene.routing import edge_lines, nearest_edge, path_line, shortest_path, turn_states, turn_table
 from geoscene.sources import read_osm
 from geoscene.sources.data import OsmData, Point, Relation, Way
 
@@ -259,6 +261,197 @@ def test_a_commanded_turn_forbids_all_others_and_exceptions_do_not_bind_cars():
     assert len(after[before == start]) == 3
 
 
+def via_ways(kind, way_in, ways, way_out, **tags):
+    members = [("way", way_in, "from"), *(("way", way, "via") for way in ways), ("way", way_out, "to")]
+    return {"type": "restriction", "restriction": kind} | tags, tuple(members)
+
+
+# Two carriageways, east at y = 0 and west at y = 20, joined at x = 0 by way 102 and at x = 100 by way 105.
+DUAL = {
+    1: (-100, 0),
+    2: (0, 0),
+    3: (100, 0),
+    4: (200, 0),
+    5: (200, 20),
+    6: (100, 20),
+    7: (0, 20),
+    8: (-100, 20),
+}
+DUAL |= {9: (0, -190), 10: (0, 190)}
+ONE_WAY = {"oneway": "yes"}
+CARRIAGEWAYS = [
+    (ONE_WAY | {"name": "east"}, [1, 2]),
+    (ONE_WAY | {"name": "west"}, [7, 8]),
+    ({"name": "link"}, [2, 7]),
+    (ONE_WAY | {"name": "east"}, [2, 3, 4]),
+    (ONE_WAY | {"name": "west"}, [5, 6, 7]),
+    ({"name": "far link"}, [3, 6]),
+    ({"name": "south"}, [9, 2]),
+    ({"name": "north"}, [7, 10]),
+]
+
+
+def driven_nodes(graph, path):
+    return [int(graph.node_id[graph.tail[path.edges[0]]]), *graph.node_id[graph.head[path.edges]].tolist()]
+
+
+def test_a_turn_forbidden_via_a_way_binds_only_who_came_from_its_first_street():
+    bound = graph_of(DUAL, CARRIAGEWAYS, (), [via_ways("no_u_turn", 100, [102], 101)])
+    assert [chain.tolist() for chain in bound.chain_edges] == [
+        [edge_between(bound, 1, 2), edge_between(bound, 2, 7), edge_between(bound, 7, 8)]
+    ]
+    assert not len(bound.turn_from)
+    home = (edge_between(bound, 7, 8), 50.0)
+    from_west = shortest_path(bound, (edge_between(bound, 1, 2), 50.0), home, either_side=False)
+    assert driven_nodes(bound, from_west) == [1, 2, 3, 6, 7, 8]
+    from_south = shortest_path(bound, (edge_between(bound, 9, 2), 20.0), home, either_side=False)
+    assert driven_nodes(bound, from_south) == [9, 2, 7, 8]
+    ahead = (edge_between(bound, 7, 10), 50.0)
+    onward = shortest_path(bound, (edge_between(bound, 1, 2), 50.0), ahead, either_side=False)
+    assert driven_nodes(bound, onward) == [1, 2, 7, 10]
+
+
+def test_a_turn_commanded_via_a_way_leaves_no_other():
+    bound = graph_of(DUAL, CARRIAGEWAYS, (), [via_ways("only_straight_on", 106, [102], 107)])
+    start = edge_between(bound, 9, 2)
+    before, after = turn_table(bound)
+    assert after[before == start].tolist() == [edge_between(bound, 2, 7)]
+    home = (edge_between(bound, 7, 8), 50.0)
+    ahead = (edge_between(bound, 7, 10), 50.0)
+    assert driven_nodes(bound, shortest_path(bound, (start, 20.0), ahead, either_side=False)) == [9, 2, 7, 10]
+    around = shortest_path(bound, (start, 20.0), home, either_side=False)
+    assert driven_nodes(bound, around) == [9, 2, 7, 10, 7, 8]
+    others = shortest_path(bound, (edge_between(bound, 1, 2), 50.0), home, either_side=False)
+    assert driven_nodes(bound, others) == [1, 2, 7, 8]
+
+
+def test_a_restriction_runs_over_all_of_its_ways_also_where_the_graph_joined_or_cut_them():
+    places = {k: (10 * k, 0) for k in range(7)} | {20: (20, 50), 30: (30, 50), 50: (60, 50), 60: (60, -50)}
+    ways = [
+        ({}, [0, 1]),  # 100, joined with 101
+        ({}, [1, 2, 3]),  # 101, cut at 2
+        ({}, [3, 4]),  # 102
+        ({}, [4, 6]),  # 103
+        ({}, [2, 20]),
+        ({}, [3, 30]),
+        ({}, [6, 50]),  # 106
+        ({}, [6, 60]),  # 107
+    ]
+    graph = graph_of(places, ways, (), [via_ways("no_left_turn", 100, [103, 101, 102], 106)])
+    assert graph.osm_id[edge_between(graph, 0, 2)] == "way/100;way/101"
+    expected = [edge_between(graph, *ends) for ends in ((0, 2), (2, 3), (3, 6), (6, 50))]
+    assert [chain.tolist() for chain in graph.chain_edges] == [expected]
+    goals = [(edge_between(graph, 6, n), 10.0) for n in (50, 60)]
+    left, right = (shortest_path(graph, (expected[0], 5.0), goal, either_side=False) for goal in goals)
+    assert driven_nodes(graph, right) == [0, 2, 3, 6, 60]
+    assert driven_nodes(graph, left) != [0, 2, 3, 6, 50]
+
+
+@pytest.mark.parametrize(
+    ("tags", "binds"),
+    [
+        ({"restriction": "no_left_turn"}, True),
+        ({"restriction": "no_left_turn", "except": "psv"}, True),
+        ({"restriction": "no_left_turn", "except": "bicycle; hgv"}, True),
+        ({"restriction": "no_left_turn", "except": "psv; motorcar"}, False),
+        ({"restriction": "no_left_turn", "except": "vehicle"}, False),
+        ({"restriction:hgv": "no_left_turn"}, False),
+        ({"restriction:hgv:conditional": "no_left_turn @ (22:00-06:00)"}, False),
+        ({"restriction:bus": "no_left_turn"}, False),
+        ({"type": "restriction:hgv", "restriction": "no_left_turn"}, False),
+        ({"type": "restriction:motorcar", "restriction": "no_left_turn"}, True),
+        ({"restriction:motorcar": "no_left_turn"}, True),
+        ({"restriction:motor_vehicle": "no_left_turn"}, True),
+        ({"restriction": "no_left_turn", "restriction:motorcar": "none"}, False),
+        ({"restriction": "give_way"}, False),
+    ],
+)
+@pytest.mark.parametrize("via", ["node", "way"])
+def test_what_binds_a_car(tags, binds, via):
+    if via == "node":
+        world = (CROSS, ARMS)
+        members = (("way", 100, "from"), ("node", 1, "via"), ("way", 103, "to"))
+    else:
+        world = (DUAL, CARRIAGEWAYS)
+        members = (("way", 100, "from"), ("way", 102, "via"), ("way", 101, "to"))
+    osm = town(*world, (), [({"type": "restriction"} | tags, members)])
+    graph, problems = build_road_graph(osm, FRAME)
+    assert len(graph.turn_from) + len(graph.chain_edges) == binds
+    assert not problems
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"restriction:conditional": "no_left_turn @ (Mo-Fr 07:00-09:00)"},
+        {"restriction:motorcar:conditional": "no_left_turn @ (Mo-Fr 07:00-09:00)"},
+        {"restriction": "no_left_turn", "hour_on": "07:00", "hour_off": "09:00"},
+    ],
+)
+def test_a_restriction_at_times_does_not_bind_but_is_reported(tags):
+    members = (("way", 100, "from"), ("node", 1, "via"), ("way", 103, "to"))
+    graph, problems = build_road_graph(
+        town(CROSS, ARMS, (), [({"type": "restriction"} | tags, members)]), FRAME
+    )
+    assert not len(graph.turn_from)
+    assert [(p.osm_id, p.kind, p.reason) for p in problems] == [("relation/0", "turn", "conditional")]
+
+
+def test_a_restriction_whose_ways_no_drive_can_follow_is_reported():
+    relations = [via_ways("no_u_turn", 101, [102], 100), via_ways("no_u_turn", 100, [999], 101)]
+    graph, problems = build_road_graph(town(DUAL, CARRIAGEWAYS, (), relations), FRAME)
+    assert not len(graph.chain_edges)
+    assert [(p.osm_id, p.reason) for p in problems] == [("relation/0", "via-way")]
+
+
+def obeys(edges, graph, pairs):
+    """Whether a drive takes permitted turns alone, by looking at every stretch of it."""
+    if any(turn not in pairs for turn in pairwise(edges)):
+        return False
+    only = {}
+    for chain, kind in zip(graph.chain_edges, graph.chain_kind, strict=True):
+        chain = tuple(chain.tolist())  # noqa: PLW2901
+        for at in range(len(edges)):
+            if kind.startswith("no_") and edges[at : at + len(chain)] == chain:
+                return False
+            if kind.startswith("only_"):
+                for k in range(1, len(chain)):
+                    if edges[at : at + k] == chain[:k] and at + k < len(edges):
+                        only.setdefault((at, k), set()).add(chain[k])
+    return all(edges[at + k] in onward for (at, k), onward in only.items())
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_drives_along_states_are_those_that_break_no_rule(data):
+    square = {1: (0, 0), 2: (50, 0), 3: (50, 50), 4: (0, 50), 5: (90, 0)}
+    base = graph_of(square, [({}, ends) for ends in ([1, 2], [2, 3], [3, 4], [4, 1], [1, 3], [2, 5])])
+    before, after = turn_table(base, u_turns=True)
+    onward = {e: after[before == e].tolist() for e in range(len(base))}
+    chains = []
+    for _ in range(data.draw(st.integers(1, 5))):
+        chain = [data.draw(st.integers(0, len(base) - 1))]
+        for _ in range(data.draw(st.integers(2, 4))):
+            chain.append(data.draw(st.sampled_from(onward[chain[-1]])))
+        chains.append(np.array(chain, np.int32))
+    kinds = data.draw(st.lists(st.sampled_from(["no_u_turn", "only_straight_on"]), min_size=5, max_size=5))
+    graph = replace(base, chain_edges=rows_of(chains), chain_kind=np.array(kinds[: len(chains)]))
+
+    states = turn_states(graph, u_turns=True)
+    np.testing.assert_array_equal(states.edge[: len(graph)], np.arange(len(graph)))
+    drives = {(edge,): {edge} for edge in range(len(graph))}
+    pairs = set(zip(before.tolist(), after.tolist(), strict=True))
+    for _ in range(4):
+        longer = {}
+        for drive, at in drives.items():
+            for state in states.after[np.isin(states.before, list(at))].tolist():
+                longer.setdefault((*drive, int(states.edge[state])), set()).add(state)
+        assert all(len(at) == 1 for at in longer.values())
+        expected = {(*d, e) for d in drives for e in onward[d[-1]] if obeys((*d, e), graph, pairs)}
+        assert set(longer) == expected
+        drives = longer
+
+
 def test_nobody_turns_round_but_at_a_dead_end():
     graph = graph_of(CROSS, ARMS)
     before, after = turn_table(graph)
@@ -423,6 +616,19 @@ def test_graphml_round_trip(tmp_path_factory, osm, tall):
             assert one.tolist() == two.tolist(), name
     write_graphml(graph, FRAME, path)
     assert path.read_bytes() == first
+
+
+def test_restrictions_via_ways_survive_graphml_and_a_cut(tmp_path):
+    relations = [via_ways("no_u_turn", 100, [102], 101), via_ways("only_straight_on", 106, [102], 107)]
+    graph = graph_of(DUAL, CARRIAGEWAYS, (), relations)
+    write_graphml(graph, FRAME, tmp_path / "roads.graphml")
+    back = read_graphml(tmp_path / "roads.graphml", FRAME)
+    assert [c.tolist() for c in back.chain_edges] == [c.tolist() for c in graph.chain_edges]
+    assert back.chain_kind.tolist() == ["no_u_turn", "only_straight_on"]
+    link = edge_between(graph, 3, 6)
+    cut = graph.take(np.arange(len(graph)) != link)
+    assert [c.tolist() for c in cut.chain_edges] == [(c - (c > link)).tolist() for c in graph.chain_edges]
+    assert len(graph.take(np.arange(len(graph)) != edge_between(graph, 7, 8)).chain_edges) == 1
 
 
 def test_osmnx_opens_what_we_write(tmp_path):

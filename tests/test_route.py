@@ -5,12 +5,14 @@ import json
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from roadgrids import grid, road_graph
 
 from geoscene.frames import Frame
 from geoscene.roadgraph import build_road_graph
+from geoscene.roads import rows_of
 from geoscene.routing import turn_table
 from geoscene.sources import read_osm
 from lidar.errors import FormatError, RouteError
@@ -136,6 +138,44 @@ def test_waypoints_respect_one_way_streets_and_forbidden_turns():
     )
     with pytest.raises(RouteError, match=r"waypoint 2 .* cannot be reached from waypoint 1"):
         plan_route(banned, FRAME, [lat_lon(50, 0), lat_lon(0, 50)])
+
+
+def chained(graph, *chains):
+    """The graph with chains of edges forbidden."""
+    edges = rows_of(np.array(chain, np.int32) for chain in chains)
+    return dataclasses.replace(graph, chain_edges=edges, chain_kind=np.full(len(chains), "no_u_turn"))
+
+
+def drives_along(edges, chain):
+    return any(np.array_equal(edges[k : k + len(chain)], chain) for k in range(len(edges)))
+
+
+def test_random_drives_take_no_turn_that_is_forbidden_via_a_way():
+    graph = grid(3, 3)
+    drives = [random_edges(graph, seed=seed, metres=3000.0) for seed in range(6)]
+    chains = [drive[k : k + 3] for drive in drives for k in (1, 9)]
+    assert all(any(drives_along(drive, chain) for drive in drives) for chain in chains)
+    bound = chained(graph, *chains)
+    for seed in range(6):
+        drive = random_edges(bound, seed=seed, metres=3000.0)
+        assert follows(bound, drive)
+        assert graph.length[drive].sum() >= 2900.0
+        assert not any(drives_along(drive, chain) for chain in chains)
+
+
+@pytest.mark.parametrize("between", [[], [(100, 50)], [(100, 25), (100, 75)]])
+def test_waypoints_take_no_turn_that_is_forbidden_via_a_way(between):
+    graph = grid(3, 2)
+    places = [lat_lon(*xy) for xy in [(50, 0), *between, (150, 100)]]
+    free = plan_route(graph, FRAME, [lat_lon(50, 0), lat_lon(100, 50), lat_lon(150, 100)])
+    assert len(free.edges) == 3
+    bound = chained(graph, free.edges)
+    route = plan_route(bound, FRAME, places)
+    assert not drives_along(route.edges, free.edges)
+    passed = shapely.distance(
+        shapely.LineString(route.line[:, :2]), shapely.points(np.reshape(between, (-1, 2)))
+    )
+    assert (passed < 4.0).all()
 
 
 def test_a_waypoint_off_the_streets_is_named_with_its_distance():

@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from roadgrids import grid, road_graph
 
+from geoscene.roads import rows_of
 from lidar.actors.area import area_of
 from lidar.actors.flow import DT, ego_on, green_windows, simulate_trips
 from lidar.actors.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
-from lidar.actors.lanes import STEP, lane_shift, lanes_of
+from lidar.actors.lanes import STEP, lane_shift, lanes_of, wander
 from lidar.actors.simulate import HARD
 from lidar.actors.sweep import body_poses, rectangles
 from lidar.actors.traffic import vehicle_trips
@@ -58,6 +59,23 @@ def flow_on(graph, ego, *, seed, density=25.0, reach=400.0, shares=None):
     area = area_of(lanes, ego, reach, 1.0)
     trips = vehicle_trips(lanes, area, seed=seed, density=density, shares=shares)
     return trips, simulate_trips(trips, graph, plan, ego, BOX, reach=reach), plan
+
+
+def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
+    graph = grid(3, 3)
+    everywhere = np.ones(len(graph), bool)
+
+    def drive(lanes, seed):
+        rng = np.random.default_rng(seed)
+        return wander(lanes, rng, seed % len(graph), 0, metres=2000.0, inside=everywhere, width=1.8)[0]
+
+    chains = {tuple(drive(lanes_of(graph), seed)[k : k + 3]) for seed in range(4) for k in (1, 6)}
+    edges = rows_of(np.array(chain, np.int32) for chain in chains)
+    bound = lanes_of(replace(graph, chain_edges=edges, chain_kind=np.full(len(chains), "no_u_turn")))
+    for seed in range(20):
+        driven = drive(bound, seed)
+        assert len(driven) > 15
+        assert chains.isdisjoint(zip(driven, driven[1:], driven[2:], strict=False))
 
 
 def tracks(trips, flow):

@@ -56,7 +56,7 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
     map's), its heights, its lanes in both directions, its speed limit, its signals and signs, bridges and
     tunnels. Where roads meet is a junction with a connecting road (paramPoly3) for every permitted turn.
     ``userData`` names the OpenStreetMap way. A lane that both directions share has the type
-    ``bidirectional``.
+    ``bidirectional``. Restrictions via ways are counted in the summary: junctions know pairs of roads alone.
 
     Raises InputError for a scene without roads.
     """
@@ -88,7 +88,17 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
         out.write("".join(_junctions(net, junctions, first, left_hand=left_hand)).encode())
         out.write(b"</OpenDRIVE>\n")
     files, size = size_of(path)
-    return Summary(path, "opendrive", files, size, len(net.roads), crs=scene.frame.name)
+    chains = len(graph.chain_edges)
+    notes = (f"{chains} turn restrictions via ways are not in it: it knows those via nodes alone",)
+    return Summary(
+        path,
+        "opendrive",
+        files,
+        size,
+        len(net.roads),
+        crs=scene.frame.name,
+        notes=notes if chains else (),
+    )
 
 
 def _n(value: float) -> str:

@@ -46,5 +46,5 @@ def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summ
             out.write(_STAMP.sub(b"", net.read_bytes()))
     warned = run.stderr.count("Warning")
     files, size = size_of(path)
-    notes = (f"netconvert gave {warned} warnings",) if warned else ()
+    notes = (*told.notes, *([f"netconvert gave {warned} warnings"] if warned else []))
     return Summary(path, "sumo", files, size, told.objects, crs=scene.frame.name, notes=notes)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from geoscene.errors import SceneFormatError
 from geoscene.frames import Frame
-from geoscene.roads import RoadGraph
+from geoscene.roads import RoadGraph, rows_of
 from geoscene.scene import write_atomically
 
 Float = NDArray[np.float64]
@@ -63,8 +63,8 @@ def write_graphml(graph: RoadGraph, frame: Frame, path: Path) -> None:
     metres, ``lanes`` those of both directions, ``geometry`` WKT in degrees. Where the graph has heights,
     nodes have ``elevation`` and lines are ``LINESTRING Z``, scene metres. Added keys: ``*_source``;
     ``lanes_ahead`` (this direction), ``edge`` (its number), ``twin`` (the number of the other direction),
-    ``turns`` (``no_left_turn 17`` names a restriction and the edge turned into) and ``controls``
-    (``12.5 stop``: metres from the tail).
+    ``turns`` (``no_left_turn 17`` names a restriction and the edge turned into, ``no_u_turn 12 17`` one via
+    other edges and these first) and ``controls`` (``12.5 stop``: metres from the tail).
     """
     write_atomically(path, "\n".join(_document(graph, frame)).encode())
 
@@ -158,6 +158,9 @@ def _lists(graph: RoadGraph) -> tuple[dict[int, list[str]], dict[int, list[str]]
         graph.turn_from.tolist(), graph.turn_to.tolist(), graph.turn_kind.tolist(), strict=True
     ):
         turns.setdefault(edge, []).append(f"{kind} {after}")
+    for chain, kind in zip(graph.chain_edges, graph.chain_kind.tolist(), strict=True):
+        edge, *others = chain.tolist()
+        turns.setdefault(edge, []).append(" ".join([kind, *map(str, others)]))
     controls: dict[int, list[str]] = {}
     for edge, offset, kind in zip(
         graph.control_edge.tolist(), graph.control_offset.tolist(), graph.control_kind.tolist(), strict=True
@@ -231,12 +234,14 @@ def _graph(nodes: dict[int, _Row], edges: list[tuple[int, int, _Row]], frame: Fr
     z = np.array([float(n.get("elevation", 0.0)) for n in nodes.values()])
     told = [node.get("controls", "").split(";") for node in nodes.values()]
     flags = {name: np.array([tag in tags for tags in told], np.bool_) for name, tag in _FLAGS.items()}
-    turns = [
-        (k, number[head], row_of[int(turn.split()[1])], turn.split()[0])
-        for k, (_, head, row) in enumerate(edges)
-        for turn in filter(None, row.get("turns", "").split(";"))
-        if int(turn.split()[1]) in row_of
+    told_turns = [
+        (k, kind, [row_of.get(int(edge), -1) for edge in others])
+        for k, row in enumerate(rows)
+        for kind, *others in map(str.split, filter(None, row.get("turns", "").split(";")))
     ]
+    whole = [turn for turn in told_turns if min(turn[2]) >= 0]
+    turns = [(k, number[edges[k][1]], after[0], kind) for k, kind, after in whole if len(after) == 1]
+    chains = [(np.array([k, *after], np.int32), kind) for k, kind, after in whole if len(after) > 1]
     controls = [
         (k, *control.split())
         for k, row in enumerate(rows)
@@ -270,6 +275,8 @@ def _graph(nodes: dict[int, _Row], edges: list[tuple[int, int, _Row]], frame: Fr
         turn_via=np.array([turn[1] for turn in turns], np.int32),
         turn_to=np.array([turn[2] for turn in turns], np.int32),
         turn_kind=np.array([turn[3] for turn in turns], np.str_),
+        chain_edges=rows_of(chain for chain, _ in chains),
+        chain_kind=np.array([kind for _, kind in chains], np.str_),
         control_edge=np.array([control[0] for control in controls], np.int32),
         control_offset=np.array([control[1] for control in controls], float),
         control_kind=np.array([control[2] for control in controls], np.str_),

@@ -1,72 +1,164 @@
-"""Turn restrictions of the map as pairs of edges."""
+"""Turn restrictions of the map as edges that follow each other."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from geoscene.report import Problem
-from geoscene.roads import RoadGraph
+from geoscene.roads import RoadGraph, rows_of
 from geoscene.sources.data import Relation, Tags
 
-# What a restriction may except and then does not bind a car.
-_CAR = frozenset({"motorcar", "motor_vehicle", "vehicle"})
+# What a car is, the most specific first: whose restrictions bind it, and what exempts it.
+_CAR = ("motorcar", "motor_vehicle", "vehicle")
+_KEYS = (*(f"restriction:{kind}" for kind in _CAR), "restriction")
+# An older way to say when a restriction holds.
+_HOURS = ("hour_on", "day_on")
 
 
 def add_turns(graph: RoadGraph, relations: Iterable[Relation], problems: list[Problem]) -> RoadGraph:
-    """The graph with the turns that relations forbid or command.
+    """The graph with the turns that relations forbid or command to cars.
 
-    A restriction via a node is kept. One via ways is dropped and reported: a pair of edges cannot carry it.
-    One at a place where the graph has no node, or with members that are not in the map, forbids nothing here.
+    A restriction via a node is a pair of edges, one via ways a chain of three or more. One at a place where
+    the graph has no node, or with members that are not in the graph, forbids nothing here. Those that hold at
+    times only are dropped and reported (``conditional``), as are those via ways that no drive can follow
+    (``via-way``).
     """
-    node = {int(osm): number for number, osm in enumerate(graph.node_id.tolist())}
-    via_nodes = {
-        node[member]
-        for relation in relations
-        if _kind(relation.tags)
-        for kind, member, role in relation.members
-        if role == "via" and kind == "node" and member in node
-    }
-    arriving: dict[tuple[int, str], list[int]] = {}
-    leaving: dict[tuple[int, str], list[int]] = {}
-    for edges, ends, last in ((arriving, graph.head, -1), (leaving, graph.tail, 0)):
-        for edge in np.flatnonzero(np.isin(ends, list(via_nodes))).tolist():
-            way = str(graph.osm_id[edge]).split(";")[last]
-            edges.setdefault((int(ends[edge]), way), []).append(edge)
-
-    found: set[tuple[int, int, int, str]] = set()
+    streets = _Streets.of(graph)
+    pairs: set[tuple[int, int, int, str]] = set()
+    chains: set[tuple[tuple[int, ...], str]] = set()
     for relation in relations:
-        value = _kind(relation.tags)
+        value, at_times = _kind(relation.tags)
+        if at_times:
+            problems.append(Problem(relation.osm_id, "turn", "dropped", "conditional", at_times))
         if not value:
             continue
-        by_role: dict[str, list[tuple[str, int]]] = {}
+        members: dict[str, list[str]] = defaultdict(list)
         for kind, member, role in relation.members:
-            by_role.setdefault(role, []).append((kind, member))
-        if any(kind == "way" for kind, _ in by_role.get("via", [])):
-            problems.append(Problem(relation.osm_id, "turn", "dropped", "via-way", value))
-            continue
-        for _, via in by_role.get("via", []):
-            at = node.get(via, -1)
-            for _, way_in in by_role.get("from", []):
-                for _, way_out in by_role.get("to", []):
-                    for edge in arriving.get((at, f"way/{way_in}"), []):
-                        for after in leaving.get((at, f"way/{way_out}"), []):
-                            found.add((edge, at, after, value))
-    rows = sorted(found)
+            members[role].append(f"{kind}/{member}")
+        via = {name for name in members["via"] if name.startswith("way/")}
+        if via:
+            trips = _trips(streets, members["from"], via, members["to"])
+            if not trips and streets.have(members["from"], members["to"]) and via <= streets.of_way.keys():
+                problems.append(Problem(relation.osm_id, "turn", "dropped", "via-way", value))
+        else:
+            trips = list(_turns(streets, members["from"], members["via"], members["to"]))
+        for trip in trips:
+            if len(trip) == 2:
+                pairs.add((trip[0], int(graph.head[trip[0]]), trip[1], value))
+            else:
+                chains.add((trip, value))
+    rows = sorted(pairs)
+    long = sorted(chains)
     return replace(
         graph,
         turn_from=np.array([row[0] for row in rows], np.int32),
         turn_via=np.array([row[1] for row in rows], np.int32),
         turn_to=np.array([row[2] for row in rows], np.int32),
         turn_kind=np.array([row[3] for row in rows], np.str_),
+        chain_edges=rows_of(np.array(trip, np.int32) for trip, _ in long),
+        chain_kind=np.array([value for _, value in long], np.str_),
     )
 
 
-def _kind(tags: Tags) -> str:
-    """``no_...`` or ``only_...`` where the relation binds cars at all times, else ""."""
-    value = tags.get("restriction:motorcar", tags.get("restriction", ""))
-    if not value.startswith(("no_", "only_")) or tags.get("type", "restriction") != "restriction":
-        return ""
-    return "" if _CAR & set(tags.get("except", "").split(";")) else value
+@dataclass(frozen=True, slots=True)
+class _Streets:
+    """The graph as restrictions name it.
+
+    ways    : for each edge the ways it was joined from, in driving direction
+    of_way  : the edges of each way
+    leaving : the edges that leave each node
+    node    : the graph's node of each OSM node
+    """
+
+    graph: RoadGraph
+    ways: Sequence[tuple[str, ...]]
+    of_way: Mapping[str, list[int]]
+    leaving: Mapping[int, list[int]]
+    node: Mapping[str, int]
+
+    @classmethod
+    def of(cls, graph: RoadGraph) -> _Streets:
+        ways = [tuple(text.split(";")) for text in graph.osm_id.tolist()]
+        of_way: dict[str, list[int]] = {}
+        leaving: dict[int, list[int]] = {}
+        for edge, (names, tail) in enumerate(zip(ways, graph.tail.tolist(), strict=True)):
+            for name in dict.fromkeys(names):
+                of_way.setdefault(name, []).append(edge)
+            leaving.setdefault(tail, []).append(edge)
+        node = {f"node/{osm}": number for number, osm in enumerate(graph.node_id.tolist())}
+        return cls(graph, ways, of_way, leaving, node)
+
+    def have(self, *members: Sequence[str]) -> bool:
+        return all(any(name in self.of_way for name in names) for names in members)
+
+
+def _turns(
+    streets: _Streets, sources: Sequence[str], via: Sequence[str], targets: Sequence[str]
+) -> Iterator[tuple[int, ...]]:
+    """Pairs of edges that turn at a node from one of the ways into another."""
+    graph, ways = streets.graph, streets.ways
+    for at in (streets.node[name] for name in via if name in streets.node):
+        for source in sources:
+            for edge in streets.of_way.get(source, []):
+                if graph.head[edge] == at and ways[edge][-1] == source:
+                    for after in streets.leaving.get(at, []):
+                        if ways[after][0] in targets:
+                            yield edge, after
+
+
+def _trips(
+    streets: _Streets, sources: Sequence[str], via: set[str], targets: Sequence[str]
+) -> list[tuple[int, ...]]:
+    """Chains of edges from one of the ways over all those of ``via`` into another.
+
+    They pass no node twice; of several from the same edge to the same edge the shortest is meant. Where the
+    map's ways were joined, the first edge may begin the way via, and the last may end it.
+    """
+    graph, ways = streets.graph, streets.ways
+    best: dict[tuple[int, int], tuple[float, tuple[int, ...]]] = {}
+    begun: list[tuple[tuple[int, ...], set[str], float]] = []
+    for source in sources:
+        for edge in streets.of_way.get(source, []):
+            rest = set(ways[edge][len(ways[edge]) - ways[edge][::-1].index(source) :])
+            if rest <= via:
+                begun.append(((edge,), rest, 0.0))
+    while begun:
+        trip, used, metres = begun.pop()
+        last = trip[-1]
+        passed = {int(graph.head[edge]) for edge in trip}
+        for edge in streets.leaving.get(int(graph.head[last]), []):
+            names = ways[edge]
+            if edge == graph.twin[last]:
+                continue
+            ends = [k for k, name in enumerate(names) if name in targets]
+            if ends and set(names[: ends[0]]) <= via and used | set(names[: ends[0]]) == via:
+                key = (trip[0], edge)
+                best[key] = min(best.get(key, (np.inf, ())), (metres, (*trip, edge)))
+            if set(names) <= via and int(graph.head[edge]) not in passed:
+                begun.append(((*trip, edge), used | set(names), metres + float(graph.length[edge])))
+    return [trip for _, trip in best.values()]
+
+
+def _kind(tags: Tags) -> tuple[str, str]:
+    """``no_...`` or ``only_...`` where the relation binds cars at all times, and what binds them at times.
+
+    The most specific of ``restriction:motorcar`` ... ``restriction`` counts; those for other vehicles
+    (``restriction:hgv``) do not. ``except`` exempts from the plain tag.
+    """
+    kind = tags.get("type", "restriction")
+    if kind != "restriction" and kind not in _KEYS:
+        return "", ""
+    exempt = {name.strip() for name in tags.get("except", "").split(";")}
+    if not exempt.isdisjoint(_CAR):
+        return "", ""
+    key = next((key for key in _KEYS if key in tags), "")
+    value = tags.get(key, "").strip()
+    value = value if value.startswith(("no_", "only_")) else ""
+    if value and any(hours in tags for hours in _HOURS):
+        return "", f"{value} at hours or on days"
+    at_times = next((tags[f"{key}:conditional"] for key in _KEYS if f"{key}:conditional" in tags), "")
+    return value, at_times

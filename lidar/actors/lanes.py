@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.roads import RoadGraph
-from geoscene.routing import turn_table
+from geoscene.routing import turn_states
 from lidar.steering import line_curvature, line_heading, relaxed
 
 Float = NDArray[np.float64]
@@ -34,10 +34,12 @@ class Lanes:
     count  : (m,) int64, lanes in the direction of each edge
     wide   : (m,) metres that a body may be wide on each edge
     side   : 1 where traffic keeps right, -1 where it keeps left
-    after  : for each edge the edges that may follow it
+    state  : (s,) the edge of each state of `geoscene.routing.turn_states`
+    after  : for each state the states that may follow it
+    onward : (s,) bool, the state leads on, or out of the map: whoever is in it does not end in a dead end
     leave, enter : (m,) headings in which an edge is left and entered, radians
     liking : (m,) how much traffic there is on an edge, relative
-    open   : (m,) bool, the edge leads on, or out of the map: whoever takes it does not end in a dead end
+    open   : (m,) bool, `onward` of who begins on the edge
     exit, entry : (m,) bool, the edge ends, or begins, at the map's edge
     """
 
@@ -45,7 +47,9 @@ class Lanes:
     count: Ints
     wide: Float
     side: int
+    state: Ints
     after: Sequence[Ints]
+    onward: NDArray[np.bool_]
     leave: Float
     enter: Float
     liking: Float
@@ -68,9 +72,10 @@ def lanes_of(
     each = np.where(shared, graph.width / 2, graph.width / total)
     alone = ~two_way & (graph.lanes < 2)
     wide = np.where(alone, graph.width - 2 * _KERB, each - _SIDE)
-    before, after = turn_table(graph)
+    states = turn_states(graph)
+    before, after, state = states.before, states.after, states.edge.astype(np.int64)
     order = np.argsort(before, kind="stable")
-    starts = np.searchsorted(before[order], np.arange(len(graph) + 1))
+    starts = np.searchsorted(before[order], np.arange(len(states) + 1))
     follow = [after[order[a:b]].astype(np.int64) for a, b in itertools.pairwise(starts)]
     leave, enter = np.empty(len(graph)), np.empty(len(graph))
     for k, line in enumerate(graph.geometry):
@@ -78,18 +83,20 @@ def lanes_of(
     liking = np.array([_QUIET.get(str(kind), 1.0) for kind in graph.highway])
     leads_out = _at_edge(graph, bounds, graph.head, graph.tail)
     leads_in = _at_edge(graph, bounds, graph.tail, graph.head)
-    straight_on = graph.twin[before] != after
-    leads_on = _leading_on(before[straight_on], after[straight_on], leads_out)
+    straight_on = graph.twin[state[before]] != state[after]
+    onward = _leading_on(before[straight_on], after[straight_on], leads_out[state])
     return Lanes(
         graph,
         np.maximum(np.floor(graph.lanes), 1.0).astype(np.int64),
         wide,
         1 if side == "right" else -1,
+        state,
         follow,
+        onward,
         leave,
         enter,
         liking,
-        leads_on,
+        onward[: len(graph)],
         leads_out,
         leads_in,
     )
@@ -112,7 +119,7 @@ def _at_edge(
 
 
 def _leading_on(before: Ints, after: Ints, leads_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Edges (m,) from which a drive can go on for ever, or to the map's edge."""
+    """States (s,) from which a drive can go on for ever, or to the map's edge."""
     leads_on = np.ones(len(leads_out), np.bool_)
     while True:
         further = leads_out.copy()
@@ -202,16 +209,18 @@ def wander(
     """
     edges, picked = [edge], [lane]
     far = float(lanes.graph.length[edge])
+    state = edge
     while far < metres:
-        ways = lanes.after[edge]
-        ways = ways[(lanes.wide[ways] >= width) & (lanes.liking[ways] > 0)]
-        ways = ways[lanes.graph.twin[edge] != ways]
+        states = lanes.after[state]
+        ways = lanes.state[states]
+        fit = (lanes.wide[ways] >= width) & (lanes.liking[ways] > 0) & (lanes.graph.twin[edge] != ways)
+        states, ways = states[fit], ways[fit]
         if not len(ways):
             break
         turns = np.array([turn(lanes, edge, int(w)) for w in ways])
         weight = lanes.liking[ways] * np.where(np.abs(turns) < _STRAIGHT, 3.0, 1.0)
         weight = weight * np.where(np.abs(turns) > np.radians(140), 0.02, 1.0)
-        weight = weight * np.where(lanes.open[ways], 1.0, 1e-9)
+        weight = weight * np.where(lanes.onward[states], 1.0, 1e-9)
         if lanes.count[edge] > 1:
             inward = turns * lanes.side > _STRAIGHT
             outward = turns * lanes.side < -_STRAIGHT
@@ -219,7 +228,7 @@ def wander(
             weight = np.where((lane < lanes.count[edge] - 1) & inward, 1e-6 * weight, weight)
         k = int(np.searchsorted(np.cumsum(weight), rng.random() * weight.sum(), side="right"))
         k = min(k, len(ways) - 1)
-        following = int(ways[k])
+        state, following = int(states[k]), int(ways[k])
         most = int(lanes.count[following]) - 1
         if turns[k] * lanes.side > _STRAIGHT:
             lane = most
