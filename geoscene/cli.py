@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from cyclopts import App, Group, Parameter, validators
 
 from geoscene import __version__
-from geoscene.console import FAILURE, print_json, progress_bar
+from geoscene.console import FAILURE, print_json, progress_bar, whole
 from geoscene.console import main as run
 from geoscene.errors import GeosceneError, InputError
 from geoscene.progress import Progress
@@ -61,7 +61,7 @@ def build(
     overpass: Annotated[str | None, Parameter(group=_SOURCE)] = None,
     dem_server: str | None = None,
     crs: str = "local",
-    lod: int = 2,
+    lod: Annotated[int, Parameter(converter=whole)] = 2,
     dem: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
     dem_gaps: str = "error",
     driving_side: str = "",
@@ -72,7 +72,7 @@ def build(
     name: str = "",
     out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
     overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    workers: Annotated[int | None, Parameter(group=_OUTPUT)] = None,
+    workers: Annotated[int | None, Parameter(group=_OUTPUT, converter=whole)] = None,
     json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
 ) -> int:
@@ -381,7 +381,8 @@ def export(
         print_json({**asdict(summary), "path": str(summary.path)})
     else:
         size = f"{summary.bytes / 1e6:.1f} MB"
-        print(f"{summary.path}: {summary.kind}, {summary.objects} objects, {size}, {summary.crs}")
+        what = "cells" if summary.kind == "geotiff" else "objects"
+        print(f"{summary.path}: {summary.kind}, {summary.objects} {what}, {size}, {summary.crs}")
         for note in summary.notes:
             print(f"  {note}")
     return 0

@@ -12,13 +12,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from cyclopts import App
+from cyclopts import App, CycloptsError, Token
 
 from geoscene.progress import Progress, silent
 
 DONE, FAILURE, USAGE = 0, 1, 2
 """Exit codes: it worked, it failed, the input or the options cannot be used."""
 
+_HINTS = {
+    errno.ENOSPC: "; free some space and run the same command again",
+    errno.EDQUOT: "; free some space and run the same command again",
+    errno.EACCES: "; name a place that you may write to and files that you may read",
+    errno.EPERM: "; name a place that you may write to and files that you may read",
+    errno.EROFS: "; name a place that you may write to",
+}
 _INTERRUPTED = 130
 _NUMBERS = re.compile(r"-\d+(\.\d*)?(,-?\d+(\.\d*)?)+")
 
@@ -26,6 +33,14 @@ _NUMBERS = re.compile(r"-\d+(\.\d*)?(,-?\d+(\.\d*)?)+")
 def _guard_numbers(words: Sequence[str]) -> list[str]:
     """Put a blank before ``-30.1,-51.2``, which would be taken for an option; number parsers ignore it."""
     return [f" {word}" if _NUMBERS.fullmatch(word) else word for word in words]
+
+
+def whole(_: object, tokens: Sequence[Token]) -> int:
+    """A whole number of the command line, for options: 1.5 is refused, not rounded."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError("give a whole number") from None
 
 
 def main(app: App, roots: tuple[type[Exception], ...], usage: tuple[type[Exception], ...]) -> None:
@@ -38,7 +53,12 @@ def main(app: App, roots: tuple[type[Exception], ...], usage: tuple[type[Excepti
         level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
     try:
-        code = app(_guard_numbers(sys.argv[1:]), result_action="return_value")
+        words = _guard_numbers(sys.argv[1:])
+        code = app(words, result_action="return_value", exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        what = str(error).rstrip(".")
+        _complain(app, f"{what}; see {app.name[0]} {_command(app)}--help")
+        sys.exit(USAGE)
     except roots as error:
         _complain(app, error)
         sys.exit(USAGE if isinstance(error, usage) else FAILURE)
@@ -49,10 +69,18 @@ def main(app: App, roots: tuple[type[Exception], ...], usage: tuple[type[Excepti
         _complain(app, "out of memory; take a smaller area or fewer workers")
         sys.exit(FAILURE)
     except OSError as error:
-        hint = "; free some space and run the same command again" if error.errno == errno.ENOSPC else ""
-        _complain(app, f"{error.filename or 'the system'}: {error.strerror or error}{hint}")
+        # Files are written under names of their own at first: <name>.<process>.part
+        name = re.sub(r"\.\d+\.part(?=$|\.)|\.part$", "", str(error.filename or "the system"))
+        hint = _HINTS.get(error.errno or 0, "")
+        _complain(app, f"{name}: {error.strerror or error}{hint}")
         sys.exit(FAILURE)
     sys.exit(code if isinstance(code, int) else DONE)
+
+
+def _command(app: App) -> str:
+    """The name of the command that was asked for and a blank, if it is one."""
+    asked = sys.argv[1] if len(sys.argv) > 1 else ""
+    return f"{asked} " if asked in app else ""
 
 
 def _complain(app: App, what: object) -> None:

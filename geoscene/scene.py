@@ -100,7 +100,7 @@ def read_tile(path: Path) -> Tile:
     Raises SceneFormatError if the file is missing or damaged.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             mesh = Mesh(**{f.name: archive[f.name] for f in fields(Mesh)})
             instances = Instances(**{f.name: archive[f"instance_{f.name}"] for f in fields(Instances)})
             return Tile(archive["origin"], mesh, instances)
@@ -127,7 +127,7 @@ def read_shapes(path: Path) -> dict[str, Mesh]:
 
 
 def _shapes(path: Path) -> dict[str, Mesh]:
-    with np.load(path, allow_pickle=False) as archive:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         return {
             str(name): Mesh(**{f.name: archive[f"{name}/{f.name}"] for f in fields(Mesh)})
             for name in archive["names"]

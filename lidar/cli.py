@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from cyclopts import App, Group, Parameter
 
 from geoscene.console import main as run
-from geoscene.console import print_json, progress_bar
+from geoscene.console import print_json, progress_bar, whole
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
 from lidar import __version__
@@ -269,6 +269,8 @@ def map_(
     voxel: float | None = None,
     color: str = "class",
     sensor: Annotated[list[str] | None, Parameter(consume_multiple=True, negative=())] = None,
+    noise: Annotated[bool, Parameter(negative=())] = False,
+    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
 ) -> int:
@@ -292,6 +294,10 @@ def map_(
         What colours show: class, height, intensity or sensor.
     sensor
         Names of the scanners to take; all by default.
+    noise
+        Keep returns from where nothing is: false alarms, mirror images.
+    overwrite
+        Replace a file that is there.
     json
         Print the summary as JSON.
     quiet
@@ -302,14 +308,23 @@ def map_(
 
     with progress_bar(quiet=quiet) as progress:
         summary = aggregate(
-            open_dataset(dataset), out, voxel=voxel, color=color, sensors=sensor or (), progress=progress
+            open_dataset(dataset),
+            out,
+            voxel=voxel,
+            color=color,
+            sensors=sensor or (),
+            noise=noise,
+            overwrite=overwrite,
+            progress=progress,
         )
     if json:
         counts: dict[str, Any] = {"points_in": summary.points_in, "points": summary.points}
+        counts["noise_left_out"] = summary.noise
         counts |= {"frames": summary.frames, "missing_frames": summary.missing}
         print_json({"path": str(out), **counts})
     else:
-        print(f"{out}: {summary.points:,} of {summary.points_in:,} points from {summary.frames} frames")
+        left = f"; {summary.noise:,} of noise left out (--noise keeps them)" if summary.noise else ""
+        print(f"{out}: {summary.points:,} of {summary.points_in:,} points from {summary.frames} frames{left}")
     if summary.missing:
         lost = ", ".join(f"{count} of {name}" for name, count in summary.missing.items())
         print(

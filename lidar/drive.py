@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import GeosceneError
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from lidar import __version__
@@ -22,7 +24,7 @@ from lidar.actors import Actors, drive_among, populate
 from lidar.crowd import Worlds
 from lidar.dataset import prepare, write_json, write_trajectory
 from lidar.devices import Camera, Scanner, cameras, scanners
-from lidar.errors import InputError
+from lidar.errors import InputError, LidarError
 from lidar.gather import gather_boxes
 from lidar.georeference import Georeference, export_crs
 from lidar.options import DriveOptions
@@ -141,42 +143,43 @@ def drive(
     length = _length(trajectory)
     manifest = _manifest(scene, rig, options, start, geo, trajectory, length, jobs, sensors)
     manifest["recipe"] = recipe
-    if not (out / "dataset.json").exists():
-        write_json(out / "dataset.json", manifest | {"frames_done": 0})
-    write_trajectory(out / "trajectory.csv", trajectory)
-    counts = manifest["sensor_frames"]
-    write_sidecars(out, scene, rig, sensors, trajectory, start, counts, options.contents())
-    watch = Stopwatch()
-    recorder = Recorder(
-        out,
-        scene.frame,
-        trajectory,
-        start,
-        geo,
-        options.contents(),
-        watch,
-        actors=actors,
-        reach=max((s.reach for s in sensors), default=0.0),
-    )
-    there = [job for job in jobs if recorder.is_done(job.sensor, job.frame)]
-    points = dict.fromkeys((s.name for s in sensors if isinstance(s, Scanner)), 0)
-    for job in there:
-        if job.sensor.name in points:
-            points[job.sensor.name] += recorder.count(job.sensor, job.frame)
-    written = record_all(
-        scene,
-        trajectory,
-        jobs,
-        sensors,
-        recorder,
-        actors=actors,
-        workers=options.workers,
-        progress=progress,
-    )
-    points = {name: n + written.get(name, 0) for name, n in points.items()}
-    if actors is not None:
-        gather_boxes(out)
-    write_json(out / "dataset.json", manifest | {"points": points, "frames_done": manifest["frames"]})
+    with _nothing_half_made(out):
+        if not (out / "dataset.json").exists():
+            write_json(out / "dataset.json", manifest | {"frames_done": 0})
+        write_trajectory(out / "trajectory.csv", trajectory)
+        counts = manifest["sensor_frames"]
+        write_sidecars(out, scene, rig, sensors, trajectory, start, counts, options.contents())
+        watch = Stopwatch()
+        recorder = Recorder(
+            out,
+            scene.frame,
+            trajectory,
+            start,
+            geo,
+            options.contents(),
+            watch,
+            actors=actors,
+            reach=max((s.reach for s in sensors), default=0.0),
+        )
+        there = [job for job in jobs if recorder.is_done(job.sensor, job.frame)]
+        points = dict.fromkeys((s.name for s in sensors if isinstance(s, Scanner)), 0)
+        for job in there:
+            if job.sensor.name in points:
+                points[job.sensor.name] += recorder.count(job.sensor, job.frame)
+        written = record_all(
+            scene,
+            trajectory,
+            jobs,
+            sensors,
+            recorder,
+            actors=actors,
+            workers=options.workers,
+            progress=progress,
+        )
+        points = {name: n + written.get(name, 0) for name, n in points.items()}
+        if actors is not None:
+            gather_boxes(out)
+        write_json(out / "dataset.json", manifest | {"points": points, "frames_done": manifest["frames"]})
     return DriveSummary(
         out,
         int(manifest["frames"]),
@@ -188,6 +191,18 @@ def drive(
         time.perf_counter() - began,
         watch.seconds,
     )
+
+
+@contextmanager
+def _nothing_half_made(out: Path) -> Iterator[None]:
+    """Remove a dataset that was begun here if an error ends the drive before any frame is recorded."""
+    begun = not (out / "dataset.json").exists()
+    try:
+        yield
+    except (GeosceneError, LidarError):
+        if begun and not any(out.glob("*/*/*")):
+            shutil.rmtree(out)
+        raise
 
 
 def plan(

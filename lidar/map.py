@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.classes import class_codes
+from geoscene.classes import Class, class_codes
 from geoscene.progress import Progress, silent
 from lidar.colors import distinct, ramp
 from lidar.dataset import Dataset
@@ -45,6 +45,7 @@ class MapSummary:
 
     points_in : returns read
     points    : points written
+    noise     : returns left out because nothing is there
     frames    : frames read
     missing   : frames of the drive that are not there, by scanner
     path      : the file
@@ -52,6 +53,7 @@ class MapSummary:
 
     points_in: int
     points: int
+    noise: int
     frames: int
     missing: dict[str, int]
     path: Path
@@ -64,6 +66,8 @@ def aggregate(
     voxel: float | None = None,
     color: str = "class",
     sensors: Sequence[str] = (),
+    noise: bool = False,
+    overwrite: bool = False,
     progress: Progress = silent,
 ) -> MapSummary:
     """Write the map of a dataset as LAS, LAZ, PLY or PCD, by the suffix of ``out``.
@@ -74,6 +78,8 @@ def aggregate(
     voxel   : side in metres of cubes that keep the return nearest to their centre; all returns by default
     color   : what red, green and blue show
     sensors : names of the scanners to take; all by default
+    noise   : keep returns of class NOISE: false alarms and mirror images
+    overwrite : replace what is there
 
     Raises InputError for options that cannot be and DatasetError where there are no clouds.
     """
@@ -83,6 +89,8 @@ def aggregate(
         raise InputError(f"--color {color}: one of {', '.join(COLORS)}")
     if voxel is not None and not (np.isfinite(voxel) and voxel > 0):
         raise InputError(f"--voxel {voxel}: give a positive number of metres")
+    if out.exists() and not overwrite:
+        raise InputError(f"{out}: is there already; add --overwrite to replace it")
     lidars = dataset.lidars
     if unknown := sorted(set(sensors) - set(lidars)):
         raise InputError(f"no scanner {', '.join(unknown)} in {dataset.path}; there are {', '.join(lidars)}")
@@ -90,20 +98,24 @@ def aggregate(
     source = _Source(dataset, chosen)
     limits = source.height_range() if color == "height" else (0.0, 0.0)
 
-    read = 0
+    read = dropped = 0
     frames: set[int] = set()
 
     def tables() -> Iterator[Table]:
-        nonlocal read
+        nonlocal read, dropped
         for k, (frame, table) in enumerate(source.tables()):
             read += rows(table)
             frames.add(frame)
             progress("reading clouds", k + 1, len(source))
+            real = table["label"] != Class.NOISE
+            if not noise and not real.all():
+                dropped += int(np.count_nonzero(~real))
+                table = {name: column[real] for name, column in table.items()}  # noqa: PLW2901
             yield table
 
     stream = tables() if voxel is None else _voxels(tables(), voxel, out, source.geo.offset)
     written = _write(out, (_colored(t, color, limits) for t in stream), source)
-    return MapSummary(read, written, len(frames), source.missing(), out)
+    return MapSummary(read, written, dropped, len(frames), source.missing(), out)
 
 
 class _Source:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, cast
@@ -114,7 +114,7 @@ class DriveOptions:
             "exact": self.exact,
             "side": self.keeps(scene),
             "fidelity": self.fidelity,
-            "traffic": asdict(self.traffic) if self.traffic else None,
+            "traffic": asdict(replace(self.traffic, side=self.keeps(scene))) if self.traffic else None,
             "settings": [list(pair) for pair in self.settings],
         }
 

@@ -190,18 +190,21 @@ def _write_sequence(
 ) -> None:
     """Write KITTI's calib.txt, times.txt and poses.txt.
 
-    The camera is the rig's first; without one, a camera at the scanner that looks along its x axis.
+    The cameras are the rig's first four; without one, a camera at the scanner that looks along its x axis.
     """
     vehicle_from_lidar = _matrix(mount)
     if rig.cameras:
-        camera = rig.cameras[0]
-        projection = np.column_stack([intrinsic_matrix(camera), np.zeros(3)])
-        camera_from_lidar = np.linalg.inv(_matrix(camera.mount)) @ vehicle_from_lidar
+        first = _matrix(rig.cameras[0].mount)
+        projections = [
+            intrinsic_matrix(camera) @ (np.linalg.inv(_matrix(camera.mount)) @ first)[:3]
+            for camera in rig.cameras
+        ]
+        camera_from_lidar = np.linalg.inv(first) @ vehicle_from_lidar
     else:
-        projection = np.eye(3, 4)
+        projections = [np.eye(3, 4)]
         camera_from_lidar = np.eye(4)
         camera_from_lidar[:3, :3] = OPTICAL.T
-    kitti.write_calibration(folder / "calib.txt", projection, camera_from_lidar)
+    kitti.write_calibration(folder / "calib.txt", projections, camera_from_lidar)
     if not len(times):
         return
     kitti.write_times(folder / "times.txt", times)

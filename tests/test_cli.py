@@ -86,6 +86,9 @@ def test_a_drive_and_its_map(scene, tmp_path):
         ("geoscene", ["build", "--bbox", "1,2,3", "-o", "x"], "W,S,E,N"),
         ("geoscene", ["build", "--demo", "--crs", "EPSG:4326", "-o", "x"], "EPSG:4326"),
         ("geoscene", ["build", "--demo", "--lod", "9", "-o", "x"], "--lod 9"),
+        ("geoscene", ["build", "--demo", "--lod", "1.4", "-o", "x"], "--lod"),
+        ("geoscene", ["build", "--demo", "--wrokers", "2", "-o", "x"], "--wrokers"),
+        ("geoscene", ["bild"], "bild"),
         ("geoscene", ["build", "--demo", "--dem", "nowhere.tif", "-o", "x"], "nowhere.tif"),
         ("geoscene", ["build", "--demo", "--dem-server", "http://x/", "-o", "x"], "--dem tiles"),
         ("geoscene", ["build", "--demo", "--reach", "nan", "-o", "x"], "--reach nan"),
@@ -93,6 +96,7 @@ def test_a_drive_and_its_map(scene, tmp_path):
         ("geoscene", ["info", "nowhere"], "nowhere"),
         ("geoscene", ["validate", "nowhere"], "nowhere"),
         ("lidar", ["drive", "nowhere", "--route", "random", "-o", "x"], "nowhere"),
+        ("lidar", ["drive", "nowhere", "--seed", "1.5", "-o", "x"], "--seed"),
         ("lidar", ["map", "nowhere", "-o", "x.laz"], "nowhere"),
     ],
 )

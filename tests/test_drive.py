@@ -4,6 +4,7 @@ import csv
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,13 +20,14 @@ from scipy.spatial.transform import Rotation
 
 from geoscene.build import BuildOptions, build
 from geoscene.classes import Class
+from geoscene.errors import GeosceneError
 from geoscene.scene import open_scene
 from geoscene.sources import demo_path, read_osm
 from lidar.actors import TrafficOptions
 from lidar.attitude import quat_from_euler
 from lidar.dataset import open_dataset
 from lidar.drive import DriveOptions, drive
-from lidar.errors import DatasetError, InputError
+from lidar.errors import DatasetError, InputError, LidarError
 from lidar.formats.pcd import read_pcd
 from lidar.travel import plan_travel
 
@@ -208,6 +210,16 @@ def test_what_cannot_be_driven_is_said_in_one_line(scene, tmp_path, change, word
         drive(scene, tmp_path / "x", replace(OPTIONS, **change))
     assert "\n" not in str(error.value)
     assert not (tmp_path / "x").exists()
+
+
+def test_a_drive_that_fails_before_its_first_frame_leaves_nothing(scene, tmp_path):
+    broken = tmp_path / "broken"
+    shutil.copytree(scene.path, broken)
+    for tile in (broken / "tiles").iterdir():
+        tile.write_bytes(tile.read_bytes()[:300])
+    with pytest.raises((GeosceneError, LidarError)):
+        drive(open_scene(broken), tmp_path / "d", replace(OPTIONS, duration=1.0))
+    assert not (tmp_path / "d").exists()
 
 
 def test_a_scene_opens_again(scene):

@@ -18,7 +18,7 @@ from geoscene.frames import Frame
 from lidar.dataset import open_dataset, read_trajectory, write_json, write_trajectory
 from lidar.errors import DatasetError, InputError
 from lidar.formats.las import LasInfo, gps_seconds, write_las
-from lidar.formats.pcd import write_pcd
+from lidar.formats.pcd import read_pcd, write_pcd
 from lidar.georeference import Georeference
 from lidar.map import aggregate
 from lidar.poses import Trajectory
@@ -160,9 +160,9 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path, monkeypatch, v
     peaks = []
     for frames in (10, 60):
         data = dataset(tmp_path / f"d{frames}", first=100, frames=frames, n=5000)  # at rest
-        aggregate(data, tmp_path / "warm.laz", voxel=voxel)
+        aggregate(data, tmp_path / "warm.laz", voxel=voxel, overwrite=True)
         tracemalloc.start()
-        aggregate(data, tmp_path / "m.laz", voxel=voxel)
+        aggregate(data, tmp_path / f"{frames}.laz", voxel=voxel)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 2 * peaks[0]  # six times the frames
@@ -188,6 +188,26 @@ def test_the_same_dataset_gives_the_same_bytes(tmp_path):
 def test_bad_options_are_named(tmp_path, out, change, words):
     with pytest.raises(InputError, match=words):
         aggregate(dataset(tmp_path / "d"), tmp_path / out, **change)
+
+
+def test_noise_is_left_out_and_counted_unless_it_is_asked_for(tmp_path):
+    data = dataset(tmp_path / "d", frames=2, kinds=("pcd",))
+    path = tmp_path / "d" / "top" / "pcd" / "000001.pcd"
+    table = dict(read_pcd(path))
+    write_pcd(path, table | {"label": np.where(np.arange(400) < 7, Class.NOISE, table["label"])})
+    summary = aggregate(data, tmp_path / "m.laz")
+    assert (summary.points, summary.noise, summary.points_in) == (793, 7, 800)
+    kept = aggregate(data, tmp_path / "n.laz", noise=True)
+    assert (kept.points, kept.noise) == (800, 0)
+
+
+def test_a_map_that_is_there_is_replaced_only_when_asked(tmp_path):
+    data = dataset(tmp_path / "d", frames=1)
+    (tmp_path / "m.ply").write_text("mine")
+    with pytest.raises(InputError, match="--overwrite"):
+        aggregate(data, tmp_path / "m.ply")
+    assert (tmp_path / "m.ply").read_text() == "mine"
+    assert aggregate(data, tmp_path / "m.ply", overwrite=True).points == 400
 
 
 def test_a_dataset_without_clouds_is_named(tmp_path):

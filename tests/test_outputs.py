@@ -362,6 +362,18 @@ def test_a_scanners_folder_is_a_sequence_that_kittis_loaders_place(dataset):
     # a point straight ahead of the scanner falls where the first camera sees it
     camera_from_lidar = np.linalg.inv(mounts(dataset)[1]["front"]) @ mount
     np.testing.assert_allclose(calib["Tr"], camera_from_lidar, atol=1e-9)
+    # a point in the first camera's frame falls where each camera says; there are four for every loader
+    calibration, mount = mounts(dataset)
+    assert sorted(calib) == ["P0", "P1", "P2", "P3", "Tr"]
+    point = np.array([0.3, -0.2, 12.0, 1.0])
+    cameras = [s for s in calibration.values() if s["kind"] == "camera"]
+    for k, camera in enumerate(cameras):
+        seen = (
+            np.array(camera["K"])
+            @ (np.linalg.inv(camera["vehicle_from_sensor"]) @ mount["front"] @ point)[:3]
+        )
+        there = (calib[f"P{k}"] @ point)[:3]
+        np.testing.assert_allclose(there[:2] / there[2], seen[:2] / seen[2], atol=1e-6)
 
 
 def test_a_scanners_points_lie_at_the_depth_of_their_pixels_on_a_real_drive(dataset):
@@ -487,7 +499,7 @@ def test_a_map_says_which_frames_are_missing(scene, rig, tmp_path):
     drive(scene, tmp_path / "d", options)
     assert aggregate(open_dataset(tmp_path / "d"), tmp_path / "m.ply").missing == {}
     (tmp_path / "d" / "top" / "pcd" / "000002.pcd").unlink()
-    assert aggregate(open_dataset(tmp_path / "d"), tmp_path / "m.ply").missing == {"top": 1}
+    assert aggregate(open_dataset(tmp_path / "d"), tmp_path / "n.ply").missing == {"top": 1}
 
 
 @pytest.mark.parametrize(

@@ -181,7 +181,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
         if not (data.ways or data.areas or data.points):
             raise SourceNotFoundError(
                 f"{source}: nothing within {','.join(f'{v:g}' for v in bounds)};"
-                f" it covers {','.join(f'{v:.5g}' for v in extent)} (west, south, east, north)"
+                f" it covers {','.join(f'{v:.7g}' for v in extent)} (west, south, east, north)"
             )
     return data
 

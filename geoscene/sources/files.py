@@ -128,6 +128,8 @@ def read_osm(path: str | Path, *, bounds: Bounds | None = None, progress: Progre
         taken = _collect(path, progress)
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}; {_HELP}") from None
+    except PermissionError as error:
+        raise InputError(f"{path}: may not be read; give its permissions to this user") from error
     except (RuntimeError, OSError, ValueError, EOFError) as error:
         cause = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: damaged, cut short or no OpenStreetMap file ({cause}); {_HELP}") from error

@@ -6,6 +6,7 @@ Behley et al. 2019. Rows are in the same order in both files of a frame.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -64,11 +65,17 @@ def write_labels(path: Path, labels: NDArray[np.uint32]) -> None:
     write_atomically(path, labels.astype("<u4").tobytes())
 
 
-def write_calibration(path: Path, projection: ArrayLike, camera_from_lidar: Float) -> None:
-    """Write ``calib.txt``: the camera's projection (3, 4) as P0 and the way from scanner to camera as Tr."""
+def write_calibration(path: Path, projections: Sequence[ArrayLike], camera_from_lidar: Float) -> None:
+    """Write ``calib.txt``: P0 to P3, and the way from scanner to the first camera as Tr.
+
+    projections : (3, 4) each, from the first camera's frame to the pixels of each camera. Loaders want four:
+                  the first stands for those that are not there, and a fifth is left out
+    """
+    four = [*projections[:4], *[projections[0]] * (4 - len(projections))]
+    named = [*((f"P{k}", projection) for k, projection in enumerate(four)), ("Tr", camera_from_lidar)]
     lines = [
         f"{name}: " + " ".join(f"{v:.12e}" for v in np.asarray(matrix, float)[:3].ravel())
-        for name, matrix in (("P0", projection), ("Tr", camera_from_lidar))
+        for name, matrix in named
     ]
     write_atomically(path, ("\n".join(lines) + "\n").encode("ascii"))
 
