@@ -24,6 +24,9 @@ Float = NDArray[np.float64]
 Place = tuple[int, float]
 """An edge and the true metres from its tail."""
 
+_NAMED = 3
+"""Waypoints off the streets that an error names."""
+
 DENSE_M = 60.0
 """Median metres between a file's points up to which they are a track; farther apart, they are waypoints."""
 SIGMA_M = 6.0
@@ -131,8 +134,8 @@ def through(
 
     One-way streets and turn restrictions hold; the vehicle passes waypoints without turning round.
 
-    Raises RouteError naming every waypoint that is farther than ``tolerance`` metres from a street, or the
-    first that cannot be reached.
+    Raises RouteError naming waypoints that are farther than ``tolerance`` metres from a street, or the first
+    that cannot be reached.
     """
     if len(points) < 2:
         raise RouteError("a route needs two waypoints or more, each as LAT,LON")
@@ -145,13 +148,13 @@ def through(
     scale = frame.scale(lon, lat)
     far = np.flatnonzero(~(distance <= tolerance * scale))
     if len(far):
-        raise RouteError(
-            "; ".join(
-                f"waypoint {k + 1} ({lat[k]:.6f}, {lon[k]:.6f}) is {distance[k]:.0f} m from the nearest"
-                f" drivable street, more than {tolerance:.0f} m"
-                for k in far
-            )
-        )
+        named = [
+            f"waypoint {k + 1} ({lat[k]:.6f}, {lon[k]:.6f}) is {distance[k]:.0f} m from the nearest"
+            f" drivable street, more than {tolerance:.0f} m"
+            for k in far[:_NAMED]
+        ]
+        rest = [f"and so are {len(far) - _NAMED} more"] if len(far) > _NAMED else []
+        raise RouteError("; ".join(named + rest))
     candidates = [_both_sides(graph, int(e), float(o)) for e, o in zip(edge, offset, strict=True)]
     chain = _Search(graph, graph.travel_time, avoid, u_turn=U_TURN_S)
 
@@ -207,8 +210,8 @@ def match_track(
         lon, lat = frame.to_geographic(*xy[lost[0]])
         raise RouteError(
             f"{len(lost)} of {len(xy)} points of the track have no drivable street within {tolerance:.0f} m,"
-            f" the first at {float(lat):.6f}, {float(lon):.6f}; follow the track as it is, or give a larger"
-            " tolerance"
+            f" the first at {float(lat):.6f}, {float(lon):.6f}; cut the track to the scene's streets, or build"
+            " a scene that holds it"
         )
     straight = np.hypot(*np.diff(xy, axis=0).T)
 
@@ -222,7 +225,7 @@ def match_track(
         lon, lat = frame.to_geographic(*xy[best])
         raise RouteError(
             f"the track cannot be driven along the streets near {float(lat):.6f}, {float(lon):.6f} (against a"
-            " one-way street, or over a gap); follow it as it is"
+            " one-way street, or over a gap); mend the track there, or drive it in two parts"
         )
     return best
 

@@ -146,6 +146,17 @@ def test_parts_replace_the_outline_they_cover():
     assert problems == []
 
 
+def test_a_building_is_as_uncertain_as_its_highest_part():
+    table, *_ = built(
+        house(1, box(0, 0, 20, 10)),
+        part(2, box(0, 0, 10, 10), height="12"),
+        part(3, box(10, 0, 10, 10), **{"building:levels": "20"}),
+    )
+    assert table.height[0] == pytest.approx(60)
+    assert table.height_source[0] == "parts"
+    assert table.height_sigma[0] == pytest.approx(0.15 * 60)
+
+
 def test_what_parts_leave_of_the_outline_stays_with_its_own_height():
     table, _, verdict, problems = built(
         house(1, box(0, 0, 20, 10), height="6"), part(2, box(0, 0, 5, 10), height="30")

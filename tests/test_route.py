@@ -178,6 +178,11 @@ def test_waypoints_take_no_turn_that_is_forbidden_via_a_way(between):
     assert (passed < 4.0).all()
 
 
+def test_of_many_waypoints_off_the_streets_three_are_named_and_the_rest_counted():
+    with pytest.raises(RouteError, match=r"^waypoint 1 .*; waypoint 2 .*; waypoint 3 .*; and so are 37 more$"):
+        plan_route(grid(2, 2), FRAME, [(36.5, -76.0)] * 40)
+
+
 def test_a_waypoint_off_the_streets_is_named_with_its_distance():
     with pytest.raises(RouteError, match=r"waypoint 2 \(36\.\d+, -76\.\d+\) is 200 m from the nearest"):
         plan_route(grid(2, 2), FRAME, [lat_lon(50, 0), lat_lon(300, 50)])

@@ -120,11 +120,14 @@ def _settle_wholes(
     options: BuildingOptions,
 ) -> None:
     """Fill in the heights of buildings, in place: at least as high as their highest part, else inferred."""
-    own = is_part & np.isfinite(h.high) & ~np.array([r.is_rest for r in rows], np.bool_)
-    tops = np.full(len(rows), -np.inf)
-    np.maximum.at(tops, outline[own], h.high[own])
-    higher = ~is_part & np.isfinite(tops) & ~(h.high >= tops)
-    h.high[higher], h.source[higher], h.sigma[higher] = tops[higher], "parts", options.level_height
+    own = np.flatnonzero(is_part & np.isfinite(h.high) & ~np.array([r.is_rest for r in rows], np.bool_))
+    own = own[np.argsort(h.high[own], kind="stable")]
+    top = np.full(len(rows), -1)
+    top[outline[own]] = own  # the last, and highest, stays
+    higher = np.flatnonzero(~is_part & (top >= 0))
+    higher = higher[~(h.high[higher] >= h.high[top[higher]])]
+    h.high[higher], h.source[higher] = h.high[top[higher]], "parts"
+    h.sigma[higher] = h.sigma[top[higher]]
 
     whole = np.flatnonzero(~is_part)
     footprint = gathered([rows[k].footprint for k in whole.tolist()])
