@@ -17,6 +17,12 @@ STEP = 1 / 128
 """Metres between the positions that vertices can have; a power of two, so that tiles share one grid and their
 seams stay shut. Doubled for a tile that spans more than 512 m, until 16 bits hold it."""
 
+TURN = 2 * np.pi / 2048
+"""Radians between the headings that upright copies can have: 5 mm at the rim of a crown of 7 m across."""
+
+SCALE = 1 / 256
+"""Between the scales that upright copies can have: 2 mm of a shape of a metre."""
+
 GROUND = "ground"
 """Name of the group of faces on the ground that are of no road: bare terrain, land cover, building pads."""
 
@@ -71,10 +77,13 @@ def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
     """What to know of a tile to read its bytes, and the bytes, deflated.
 
     Vertex q of the bytes lies at (base + q) * step in scene metres. Faces are in order of group, ``ends`` of
-    which are given; copies in order of group and shape, of which ``runs`` are (group, shape, number).
+    which are given; copies in order of group, shape and x, of which ``runs`` are (group, shape, number).
     The bytes are little-endian columns: corners (m, 3) uint32, feature (m,) int32, the copies' feature (k,)
-    int32 and transform (k, 3, 4) float32 to metres from base * step, vertices (n, 3) uint16, class (m,),
-    material (m,), surface (m,) and sRGB colour (m, 3) uint8.
+    int32, vertices (n, 3) uint16, class (m,), material (m,), surface (m,) and sRGB colour (m, 3) uint8. Last
+    are the copies' places: where all are ``upright`` (a scale across, one upwards, a turn about the vertical)
+    six columns of uint16, the low bytes of each before the high ones: steps from base in x (less that of the
+    copy before), y and z, turn in `TURN`, scales in `SCALE`. Else they are the twelve columns of
+    transforms (k, 3, 4) float32 to metres from base * step, bytes of equal rank together, too.
     """
     mesh, copies = tile.mesh, tile.instances
     points = mesh.vertices + tile.origin
@@ -90,10 +99,11 @@ def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
     group = groups.faces(mesh)
     order = np.argsort(group, kind="stable")
     home = groups.of[copies.feature].astype(np.int64)
-    rank = np.lexsort((copies.shape, home))
+    rank = np.lexsort((anchors[:, 0], copies.shape, home))
     runs, counts = np.unique(np.column_stack([home, copies.shape]), axis=0, return_counts=True)
     transform = copies.transform[rank].copy()
     transform[:, :, 3] += tile.origin - base * step
+    upright = _upright(transform, step)
 
     told = {
         "step": step,
@@ -103,19 +113,56 @@ def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
         "vertices": len(points),
         "ends": np.cumsum(np.bincount(group, minlength=len(groups.names))).tolist(),
         "runs": [[int(g), int(s), int(n)] for (g, s), n in zip(runs, counts, strict=True)],
+        "upright": upright is not None,
     }
+    places = transform.reshape(-1, 12).T.astype("<f4") if upright is None else upright.astype("<u2")
+    planes = np.moveaxis(
+        np.ascontiguousarray(places).view(np.uint8).reshape(*places.shape, places.itemsize), 2, 1
+    )
     columns: list[tuple[NDArray[Any], str]] = [
         (mesh.faces[order], "<u4"),
         (mesh.feature[order], "<i4"),
         (copies.feature[rank], "<i4"),
-        (transform, "<f4"),
         (vertices, "<u2"),
         (mesh.klass[order], "u1"),
         (mesh.material[order], "u1"),
         (mesh.surface[order], "u1"),
         (mesh.color[order], "u1"),
+        (planes, "u1"),
     ]
     return told, gzip(b"".join(values.astype(kind).tobytes() for values, kind in columns))
+
+
+def _upright(transform: NDArray[np.float64], step: float) -> NDArray[np.int64] | None:
+    """Columns (6, k) of whole steps for transforms (k, 3, 4), or None where they do not say all of them."""
+    along, lift = np.hypot(transform[:, 0, 0], transform[:, 1, 0]), transform[:, 2, 2]
+    turn = np.arctan2(transform[:, 1, 0], transform[:, 0, 0])
+    told = _turned(along, lift, turn)
+    if not np.allclose(told, transform[:, :, :3], rtol=0, atol=1e-5) or (lift <= 0).any():
+        return None
+    steps = np.rint(transform[:, :, 3].T / step).astype(np.int64)
+    steps[0] = np.diff(steps[0], prepend=0) % 65_536
+    whole = np.vstack([steps, np.rint(turn / TURN) % 2048, np.rint(along / SCALE), np.rint(lift / SCALE)])
+    return None if whole.max(initial=0) > 65_535 else whole.astype(np.int64)
+
+
+def _transforms(columns: NDArray[np.uint16], step: float) -> NDArray[np.float64]:
+    """Transforms (k, 3, 4) of the columns of upright copies."""
+    x, y, z, turn, along, lift = columns.astype(np.int64)
+    place = np.column_stack([np.cumsum(x) % 65_536, y, z]) * step
+    return np.dstack([_turned(along * SCALE, lift * SCALE, turn * TURN), place[:, :, None]])
+
+
+def _turned(
+    along: NDArray[np.float64], lift: NDArray[np.float64], turn: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Matrices (k, 3, 3) that scale across and upwards and turn about the vertical."""
+    matrix = np.zeros((len(turn), 3, 3))
+    matrix[:, 0, 0] = matrix[:, 1, 1] = along * np.cos(turn)
+    matrix[:, 1, 0] = along * np.sin(turn)
+    matrix[:, 0, 1] = -matrix[:, 1, 0]
+    matrix[:, 2, 2] = lift
+    return matrix
 
 
 def unpack_tile(told: dict[str, Any], data: bytes) -> Tile:
@@ -132,9 +179,15 @@ def unpack_tile(told: dict[str, Any], data: bytes) -> Tile:
 
     n, m, k = told["vertices"], told["ends"][-1], sum(run[2] for run in told["runs"])
     faces, feature = column("<u4", m, 3), column("<i4", m)
-    copied, transform = column("<i4", k), column("<f4", k, 3, 4).astype(float)
+    copied = column("<i4", k)
     vertices = column("<u2", n, 3) * told["step"]
     klass, material, surface, color = column("u1", m), column("u1", m), column("u1", m), column("u1", m, 3)
+    columns, size, kind = (6, 2, "<u2") if told["upright"] else (12, 4, "<f4")
+    planes = np.moveaxis(column("u1", columns, size, k), 1, 2)
+    places = np.ascontiguousarray(planes).view(kind).reshape(columns, k)
+    transform = (
+        _transforms(places, told["step"]) if told["upright"] else places.T.reshape(k, 3, 4).astype(float)
+    )
     mesh = Mesh.of(
         vertices, faces, feature=feature, klass=klass, material=material, surface=surface, color=color
     )

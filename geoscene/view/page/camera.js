@@ -44,6 +44,12 @@ class Camera {
     return { right: [ca, -sa, 0], up: [sa * st, ca * st, ct], forward: [sa * ct, ca * ct, -st] };
   }
 
+  /** Where the camera is, in scene metres. */
+  eye() {
+    const { forward } = this.axes();
+    return this.target.map((t, k) => t - this.distance * forward[k]);
+  }
+
   /** Clip coordinates from metres relative to the target. */
   matrix(aspect) {
     const { right, up, forward } = this.axes();

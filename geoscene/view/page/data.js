@@ -35,11 +35,36 @@ function readTile(told, buffer) {
   };
   return {
     corners: take(Uint32Array, 3 * m), feature: take(Int32Array, m),
-    copied: take(Int32Array, k), transform: take(Float32Array, 12 * k),
+    copied: take(Int32Array, k),
     vertices: take(Uint16Array, 3 * n),
     klass: take(Uint8Array, m), material: take(Uint8Array, m), surface: take(Uint8Array, m),
     color: take(Uint8Array, 3 * m),
+    transform: told.upright ? readUpright(take(Uint8Array, 12 * k), k, told.step) : readTransforms(take(Uint8Array, 48 * k), k),
   };
+}
+
+/** Transforms (rows of 3 x 4) of copies that are scaled and turned about the vertical alone. */
+function readUpright(bytes, k, step) {
+  const out = new Float32Array(12 * k);
+  const column = (c, copy) => bytes[2 * c * k + copy] | (bytes[(2 * c + 1) * k + copy] << 8);
+  let x = 0;
+  for (let copy = 0; copy < k; copy++) {
+    x = (x + column(0, copy)) & 65535;
+    const turn = (column(3, copy) * Math.PI) / 1024, along = column(4, copy) / 256;
+    const c = along * Math.cos(turn), s = along * Math.sin(turn);
+    const rows = [c, -s, 0, x * step, s, c, 0, column(1, copy) * step, 0, 0, column(5, copy) / 256, column(2, copy) * step];
+    for (let n = 0; n < 12; n++) out[12 * copy + n] = rows[n];
+  }
+  return out;
+}
+
+/** Transforms of any other copies: twelve columns of floats, their bytes by rank. */
+function readTransforms(bytes, k) {
+  const out = new Float32Array(12 * k), raw = new Uint8Array(out.buffer);
+  for (let c = 0; c < 12; c++)
+    for (let b = 0; b < 4; b++)
+      for (let copy = 0; copy < k; copy++) raw[48 * copy + 4 * c + b] = bytes[(4 * c + b) * k + copy];
+  return out;
 }
 
 /** Shapes that are copied, each with its columns and a box; see `pack_shapes` of geoscene.view.tiles. */
@@ -64,6 +89,35 @@ function readShapes(counts, buffer) {
     }
     return shape;
   });
+}
+
+/** What stands for a shape far away: eight faces between the middles of its box's sides, of its mean colour. */
+function farShape(shape) {
+  const { low, high } = shape, middle = low.map((v, k) => (v + high[k]) / 2);
+  const points = [0, 1, 2].flatMap((axis) => [low, high].map((end) => middle.map((v, k) => (k === axis ? end[k] : v))));
+  const corners = [];
+  for (const x of [0, 1]) for (const y of [2, 3]) for (const z of [4, 5])
+    corners.push(...((x + y + z) % 2 ? [x, y, z] : [y, x, z]));
+  const faces = shape.klass.length, color = [0, 0, 0];
+  for (let k = 0; k < 3 * faces; k++) color[k % 3] += shape.color[k] / faces;
+  const eight = (value) => new Uint8Array(8).fill(value);
+  return {
+    low, high, vertices: new Float32Array(points.flat()), corners: new Uint32Array(corners),
+    klass: eight(shape.klass[0]), material: eight(shape.material[0]), surface: eight(shape.surface[0]),
+    color: new Uint8Array(Array.from({ length: 8 }, () => color).flat()),
+  };
+}
+
+/** Metres of the longest and of the second side of the largest of some copies of a shape. */
+function sidesOf(shape, transform, first, count) {
+  const sides = [0, 0, 0];
+  for (let copy = first; copy < first + count; copy++)
+    for (let axis = 0; axis < 3; axis++) {
+      const at = 12 * copy + axis;
+      const scale = Math.hypot(transform[at], transform[at + 4], transform[at + 8]);
+      sides[axis] = Math.max(sides[axis], scale * (shape.high[axis] - shape.low[axis]));
+    }
+  return sides.sort((a, b) => b - a);
 }
 
 /**

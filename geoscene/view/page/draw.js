@@ -2,6 +2,8 @@
 
 const SKY = [0.725, 0.812, 0.894, 1];
 const SUN_PIXELS = 2048;
+const FAR_PIXELS = 12; // copies smaller than that are drawn as `farShape`s
+const LEAST_PIXELS = 0.3; // copies whose second side is smaller are not drawn
 
 class Renderer {
   constructor(canvas, head, shapes) {
@@ -12,9 +14,10 @@ class Renderer {
     this.programs = {};
     for (const pass of ["VIEW", "PICK", "DEPTH"])
       this.programs[pass] = [programOf(gl, pass), programOf(gl, pass, "COPIES")];
-    this.shapes = shapes.map((shape) => ({
+    const onCard = (shape) => ({
       bytes: this.buffer(vertexBytes(shape, 1)), positions: this.buffer(shapePositions(shape)), count: shape.corners.length,
-    }));
+    });
+    this.shapes = shapes.map((shape) => ({ shape, near: onCard(shape), far: onCard(farShape(shape)) }));
     this.codes = this.texture();
     const codes = new Uint8Array(256 * 2 * 4);
     for (const [code, [, rgb]] of Object.entries(head.materials)) codes.set(rgb, 4 * code);
@@ -69,30 +72,41 @@ class Renderer {
     const runs = [];
     const transforms = this.buffer(tile.transform), features = this.buffer(tile.copied);
     let first = 0;
-    for (const [group, shape, count] of told.runs) {
-      const array = gl.createVertexArray();
-      gl.bindVertexArray(array);
-      gl.bindBuffer(gl.ARRAY_BUFFER, this.shapes[shape].bytes);
-      this.perVertex(false);
-      gl.bindBuffer(gl.ARRAY_BUFFER, this.shapes[shape].positions);
-      gl.enableVertexAttribArray(0);
-      gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
-      gl.bindBuffer(gl.ARRAY_BUFFER, transforms);
-      for (let row = 0; row < 3; row++) {
-        gl.enableVertexAttribArray(5 + row);
-        gl.vertexAttribPointer(5 + row, 4, gl.FLOAT, false, 48, 48 * first + 16 * row);
-        gl.vertexAttribDivisor(5 + row, 1);
-      }
-      gl.bindBuffer(gl.ARRAY_BUFFER, features);
-      gl.enableVertexAttribArray(1);
-      gl.vertexAttribIPointer(1, 1, gl.INT, 4, 4 * first);
-      gl.vertexAttribDivisor(1, 1);
-      runs.push({ group, array, vertices: this.shapes[shape].count, count });
+    for (const [group, number, count] of told.runs) {
+      const { shape, near, far } = this.shapes[number];
+      const [nearArray, farArray] = [near, far].map((drawn) => this.copies(drawn, transforms, features, first));
+      runs.push({
+        group, count, sides: sidesOf(shape, tile.transform, first, count),
+        near: { array: nearArray, vertices: near.count }, far: { array: farArray, vertices: far.count },
+      });
       first += count;
     }
     gl.bindVertexArray(null);
     this.tiles.push({ told, faces, runs, origin: told.base.map((b) => b * told.step) });
     this.stale = true;
+  }
+
+  /** Attributes of copies, from the first on. */
+  copies(shape, transforms, features, first) {
+    const { gl } = this;
+    const array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, shape.bytes);
+    this.perVertex(false);
+    gl.bindBuffer(gl.ARRAY_BUFFER, shape.positions);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
+    gl.bindBuffer(gl.ARRAY_BUFFER, transforms);
+    for (let row = 0; row < 3; row++) {
+      gl.enableVertexAttribArray(5 + row);
+      gl.vertexAttribPointer(5 + row, 4, gl.FLOAT, false, 48, 48 * first + 16 * row);
+      gl.vertexAttribDivisor(5 + row, 1);
+    }
+    gl.bindBuffer(gl.ARRAY_BUFFER, features);
+    gl.enableVertexAttribArray(1);
+    gl.vertexAttribIPointer(1, 1, gl.INT, 4, 4 * first);
+    gl.vertexAttribDivisor(1, 1);
+    return array;
   }
 
   /** Attributes of the bound buffer that `vertexBytes` made; those of tiles with position and feature. */
@@ -121,8 +135,9 @@ class Renderer {
   }
 
   /** Draw what is not hidden and may be in view. */
-  draw(pass, matrix, target) {
+  draw(pass, matrix, camera) {
     const { gl, head } = this;
+    const { target } = camera, eye = camera.eye(), pixel = camera.pixel(this.canvas.clientHeight) / camera.distance;
     const seen = this.tiles
       .map((tile) => ({ ...tile, offset: tile.origin.map((v, k) => v - target[k]) }))
       .filter(({ told }) => boxSeen(matrix, told.low.map((v, k) => v - target[k]), told.high.map((v, k) => v - target[k])));
@@ -142,10 +157,12 @@ class Renderer {
       for (const { told, faces, runs, offset } of seen) {
         gl.uniform3fv(at.uOffset, offset);
         if (copies) {
-          for (const run of runs) {
-            if (this.hidden.has(head.groups[run.group])) continue;
-            gl.bindVertexArray(run.array);
-            gl.drawArraysInstanced(gl.TRIANGLES, 0, run.vertices, run.count);
+          const metres = pixel * Math.hypot(...eye.map((v, k) => v - Math.min(told.high[k], Math.max(told.low[k], v))));
+          for (const { group, sides, near, far, count } of runs) {
+            if (this.hidden.has(head.groups[group]) || sides[1] < LEAST_PIXELS * metres) continue;
+            const drawn = sides[0] < FAR_PIXELS * metres && far.vertices < near.vertices ? far : near;
+            gl.bindVertexArray(drawn.array);
+            gl.drawArraysInstanced(gl.TRIANGLES, 0, drawn.vertices, count);
           }
           continue;
         }
@@ -184,7 +201,7 @@ class Renderer {
     gl.viewport(0, 0, width, height);
     gl.clearColor(...SKY);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    this.draw("VIEW", camera.matrix(width / height), camera.target);
+    this.draw("VIEW", camera.matrix(width / height), camera);
     this.stale = true;
   }
 
@@ -202,7 +219,7 @@ class Renderer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.sunFrame);
     gl.viewport(0, 0, SUN_PIXELS, SUN_PIXELS);
     gl.clear(gl.DEPTH_BUFFER_BIT);
-    this.draw("DEPTH", this.sunMatrix, camera.target);
+    this.draw("DEPTH", this.sunMatrix, camera);
   }
 
   /** What lies under a point of the canvas: feature, class, material, surface and point; null for the sky. */
@@ -245,7 +262,7 @@ class Renderer {
     gl.clearBufferuiv(gl.COLOR, 0, new Uint32Array(4));
     gl.clearBufferuiv(gl.COLOR, 1, new Uint32Array(4));
     gl.clear(gl.DEPTH_BUFFER_BIT);
-    this.draw("PICK", camera.matrix(width / height), camera.target);
+    this.draw("PICK", camera.matrix(width / height), camera);
     this.stale = false;
   }
 }
