@@ -17,7 +17,7 @@ from geoscene.scene import Scene
 from lidar.camera.model import unproject
 from lidar.devices import Camera, Scanner
 from lidar.errors import InputError, RouteError
-from lidar.flight import survey_flight, waypoint_flight
+from lidar.flight import Flight, survey_flight, survey_lines, times_on_lines, waypoint_flight
 from lidar.motion import drive_path
 from lidar.path import plan_path
 from lidar.poses import Trajectory
@@ -54,8 +54,9 @@ def plan_flight(
     seed: int = 0,
     duration: float | None = None,
     from_rest: bool = False,
-) -> Trajectory:
-    """The trajectory of a craft that flies over a scene.
+    turns: bool = False,
+) -> Flight:
+    """The flight of a craft over a scene.
 
     spec     : ``random`` (over streets), a file of waypoints, or waypoints (latitude, longitude); not used
                with a survey
@@ -65,6 +66,7 @@ def plan_flight(
     overlap  : share of a strip that the next one covers too
     duration : seconds; of a survey or a given route all of it by default
     from_rest : whether a random flight too starts at rest
+    turns    : whether scanners work between the lines of a survey too
 
     Raises RouteError for a flight that cannot be flown or would meet what stands below.
     """
@@ -72,7 +74,7 @@ def plan_flight(
     below = _Below(scene)
     if survey:
         height = usual if altitude is None else altitude
-        route = _strips(scene, survey, vehicle, sensors, height, overlap, below)
+        route, lines, spacing = _strips(scene, survey, vehicle, sensors, height, overlap, below)
     else:
         route = _along(scene, spec, vehicle, altitude, usual, seed, duration, below)
     under_way = spec == "random" and not survey and not from_rest
@@ -80,7 +82,15 @@ def plan_flight(
     if duration is not None:
         trajectory = trajectory.until(round(duration * 1e9))
     _refuse_collisions(trajectory, below, scene)
-    return trajectory
+    if not survey or turns:
+        return Flight(trajectory)
+    on = times_on_lines(trajectory, lines, beside=spacing / 2)
+    if not len(on):
+        raise RouteError(
+            f"the record of {trajectory.duration_ns / 1e9:.1f} s ends before the first line of the survey;"
+            " record longer, or scan on the way there too (--turns)"
+        )
+    return Flight(trajectory, on)
 
 
 class _Below:
@@ -182,8 +192,8 @@ def _strips(
     height: float,
     overlap: float,
     below: _Below,
-) -> Route:
-    """The route to and fro over an area, strips along its longer side."""
+) -> tuple[Route, Float, float]:
+    """The route to and fro over an area, strips along its longer side; these (k, 2, 2), and their spacing."""
     area = survey_area(scene, survey)
     if not 0.0 <= overlap < 1.0:
         raise InputError(f"--overlap {overlap:g}: a share from 0 to less than 1")
@@ -193,16 +203,18 @@ def _strips(
     sides = np.diff(corner[:3], axis=0)
     dx, dy = sides[int(np.argmax(np.hypot(*sides.T)))]
     stop = 0.0 if vehicle.cruise else vehicle.max_speed**2 / (2 * vehicle.acceleration)
-    return survey_flight(
+    heading_deg = math.degrees(math.atan2(dx, dy))
+    route = survey_flight(
         area,
         spacing=spacing,
         height=height,
         radius=vehicle.turning_radius * 1.1 * scale,
-        heading_deg=math.degrees(math.atan2(dx, dy)),
+        heading_deg=heading_deg,
         run_out=stop,
         ground=below.ground,
         limit=vehicle.max_speed,
     )
+    return route, survey_lines(area, spacing=spacing, heading_deg=heading_deg), spacing
 
 
 def survey_area(scene: Scene, text: str) -> Any:

@@ -43,6 +43,7 @@ def drive(
     survey: str = "",
     altitude: float | None = None,
     overlap: float = 0.3,
+    turns: Annotated[bool, Parameter(negative=())] = False,
     duration: float | None = None,
     from_rest: Annotated[bool, Parameter(negative=())] = False,
     rig: str = "seed",
@@ -95,6 +96,9 @@ def drive(
         Metres above the ground of a flight; by default heights in the route's file, or 60 (drone) or 600.
     overlap
         Share of a survey's strip that the next one covers too.
+    turns
+        Scan in the turns between a survey's strips too; by default scanners work from a second before each
+        strip to a second after it, as survey crews have it, and the clouds between are empty.
     duration
         Seconds to record; all of a given route, or 60 seconds of a random one, by default.
     from_rest
@@ -153,6 +157,7 @@ def drive(
         survey=survey,
         altitude=altitude,
         overlap=overlap,
+        turns=turns,
         duration=duration,
         from_rest=from_rest,
         rig=rig,

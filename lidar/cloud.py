@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,3 +55,24 @@ class Cloud:
     def __len__(self) -> int:
         """Number of returns."""
         return len(self.xyz)
+
+    def where(self, keep: NDArray[np.bool_]) -> Cloud:
+        """The returns (n,) to keep."""
+        return Cloud(self.start_ns, *(getattr(self, f.name)[keep] for f in fields(self)[1:]))
+
+
+def no_returns(start_ns: int) -> Cloud:
+    """The cloud of a scanner that is off."""
+    kinds = (
+        np.int32,
+        np.uint16,
+        np.int32,
+        np.float64,
+        np.float32,
+        np.uint8,
+        np.int32,
+        np.float32,
+        np.float64,
+    )
+    rest: list[Any] = [np.empty(0, kind) for kind in (*kinds, np.uint8, np.uint8)]
+    return Cloud(start_ns, np.empty((0, 3), np.float32), *rest)

@@ -25,6 +25,7 @@ from lidar.crowd import Worlds
 from lidar.dataset import prepare, write_json, write_trajectory
 from lidar.devices import Camera, Scanner, cameras, scanners
 from lidar.errors import InputError, LidarError
+from lidar.flight import Flight
 from lidar.gather import gather_boxes
 from lidar.georeference import Georeference, export_crs
 from lidar.options import DriveOptions
@@ -119,7 +120,8 @@ def drive(
         raise InputError(f"rig {rig.name} has no sensors")
     body = load_vehicle(options.vehicle or rig.vehicle)
     planned = plan(scene, options, body, sensors, progress=progress)
-    trajectory = planned.trajectory if isinstance(planned, Travel) else planned
+    trajectory = planned if isinstance(planned, Trajectory) else planned.trajectory
+    on = planned.on if isinstance(planned, Flight) else None
     actors = None
     if options.traffic is not None:
         progress("traffic", 0, 0)
@@ -142,6 +144,8 @@ def drive(
     prepare(out, recipe, overwrite=overwrite)
     length = _length(trajectory)
     manifest = _manifest(scene, rig, options, start, geo, trajectory, length, jobs, sensors)
+    if on is not None:
+        manifest["scanners_on_ns"] = np.clip(on, 0, trajectory.duration_ns).tolist()
     manifest["recipe"] = recipe
     with _nothing_half_made(out):
         if not (out / "dataset.json").exists():
@@ -160,6 +164,7 @@ def drive(
             watch,
             actors=actors,
             reach=max((s.reach for s in sensors), default=0.0),
+            on=on,
         )
         there = [job for job in jobs if recorder.is_done(job.sensor, job.frame)]
         points = dict.fromkeys((s.name for s in sensors if isinstance(s, Scanner)), 0)
@@ -212,8 +217,8 @@ def plan(
     sensors: Sequence[Scanner | Camera],
     *,
     progress: Progress = silent,
-) -> Trajectory | Travel:
-    """Where the vehicle of a drive is over time; on streets, with the path it takes.
+) -> Trajectory | Travel | Flight:
+    """Where the vehicle of a drive is over time; on streets with its path, in flight with when it scans.
 
     Raises RouteError for a route that it cannot take.
     """
@@ -255,6 +260,7 @@ def plan(
         seed=options.seed,
         duration=seconds,
         from_rest=options.from_rest,
+        turns=options.turns,
     )
 
 

@@ -30,6 +30,7 @@ class DriveOptions:
                  GeoJSON file
     altitude   : metres above the ground of a flight, see `lidar.aerial.plan_flight`
     overlap    : share of a survey's strip that the next one covers too
+    turns      : scanners work in the turns between a survey's strips too, and on the way there
     rig        : name of a rig, or a TOML file
     vehicle    : name of a vehicle, or a TOML file; the rig's by default
     formats    : of clouds, of `lidar.record.FORMATS`
@@ -52,6 +53,7 @@ class DriveOptions:
     survey: str = ""
     altitude: float | None = None
     overlap: float = 0.3
+    turns: bool = False
     rig: str = "seed"
     vehicle: str = ""
     formats: tuple[str, ...] = ("pcd", "laz")
@@ -103,6 +105,7 @@ class DriveOptions:
             "survey": _named(self.survey),
             "altitude": self.altitude,
             "overlap": self.overlap,
+            "turns": self.turns,
             "rig": f"{self.rig} ({rig_digest(self.rig)})",
             "vehicle": _named(self.vehicle or load_rig(self.rig).vehicle),
             "formats": list(self.formats),

@@ -22,7 +22,7 @@ from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, w
 from lidar.camera.render import Frame as Image
 from lidar.camera.render import exposure_times, optical_flow, render
 from lidar.camera.sun import sun_direction
-from lidar.cloud import Cloud
+from lidar.cloud import Cloud, no_returns
 from lidar.crowd import Worlds
 from lidar.dataset import write_columns
 from lidar.deskew import MOMENTS, deskewed
@@ -127,6 +127,7 @@ class Recorder:
         *,
         actors: Actors | None = None,
         reach: float = 0.0,
+        on: NDArray[np.int64] | None = None,
     ) -> None:
         self.out = out
         self.frame = frame
@@ -137,6 +138,7 @@ class Recorder:
         self.watch = watch
         self.actors = actors
         self.reach = reach
+        self.on = on
         self._visibility = None if actors is None else Visibility(actors)
         self._las = LasInfo(geo.crs, geo.offset, start)
 
@@ -196,7 +198,11 @@ class Recorder:
         extra = {"points": points, "visibility": np.round(share, 4)}
         write_columns(self.paths(scanner, frame)["boxes"], {**columns, **extra})
 
-    def _record_cloud(self, scanner: Scanner, frame: int, world: World) -> Cloud:
+    def _scanned(self, scanner: Scanner, frame: int, world: World) -> Cloud:
+        """What a scanner reports in a frame, while it works."""
+        start, end = scanner.sensor.window_ns(frame)
+        if self.on is not None and not ((self.on[:, 0] <= end) & (self.on[:, 1] >= start)).any():
+            return no_returns(start)
         wanted = self.contents
         with self.watch.stage("scan"):
             cloud = scan(
@@ -208,6 +214,15 @@ class Recorder:
                 seed=wanted.seed,
                 effects=wanted.effects,
             )
+        if self.on is None:
+            return cloud
+        time = cloud.start_ns + cloud.time_ns.astype(np.int64)
+        first = np.searchsorted(self.on[:, 0], time, side="right") - 1
+        return cloud.where((first >= 0) & (time <= np.maximum.accumulate(self.on[:, 1])[first]))
+
+    def _record_cloud(self, scanner: Scanner, frame: int, world: World) -> Cloud:
+        wanted = self.contents
+        cloud = self._scanned(scanner, frame, world)
         begin = scanner.frame_start_ns(frame)
         time_ns = cloud.start_ns + cloud.time_ns.astype(np.int64)
         paths = self.paths(scanner, frame)

@@ -19,6 +19,7 @@ from lidar.dataset import open_dataset, read_trajectory
 from lidar.devices import cameras, scanners
 from lidar.drive import drive, plan
 from lidar.errors import InputError, RouteError
+from lidar.formats.pcd import read_pcd
 from lidar.options import DriveOptions
 from lidar.replay import read_replay
 from lidar.rig import load_rig
@@ -42,7 +43,39 @@ def scene_utm(tmp_path_factory):
 def flight(scene, rig="drone", **change):
     options = DriveOptions(rig=rig, **change)
     kit = load_rig(rig)
+    return planned(scene, options, kit).trajectory
+
+
+def planned(scene, options, kit):
     return plan(scene, options, load_vehicle(kit.vehicle), [*scanners(kit), *cameras(kit)])
+
+
+def test_between_the_lines_of_a_survey_scanners_are_off_unless_asked_for(scene, tmp_path):
+    options = DriveOptions(rig="drone", survey="all", altitude=90.0, overlap=0.0, formats=("pcd",))
+    kit = load_rig("drone")
+    whole = planned(scene, options, kit)
+    xy = whole.trajectory.position[:, :2]
+    since = whole.trajectory.time_ns[:, None]
+    on = ((since >= whole.on[:, 0]) & (since <= whole.on[:, 1])).any(axis=1)
+    track = shapely.linestrings(xy[on])
+    half = swath(scanners(kit), 90.0) / 2
+    area = survey_area(scene, "all")
+    assert shapely.difference(area, shapely.buffer(track, half)).area < 0.002 * area.area
+    course = np.arctan2(*whole.trajectory.velocity[:, 1::-1].T)
+    turning = np.abs(np.gradient(np.unwrap(course), 0.01)) > 0.2
+    assert not on[turning & (np.hypot(*whole.trajectory.velocity[:, :2].T) > 1.0)].any()
+    assert 0.2 < on.mean() < 0.95
+    assert planned(scene, replace(options, turns=True), kit).on is None
+    with pytest.raises(RouteError, match="before the first line"):
+        planned(scene, replace(options, duration=0.5), kit)
+
+    first = int(whole.on[0, 0]) / 1e9
+    summary = drive(scene, tmp_path / "x", replace(options, duration=first + 1.35))
+    files = sorted((tmp_path / "x").glob("*/pcd/*.pcd"))
+    assert len(files) == summary.frames
+    sizes = [len(read_pcd(file)["x"]) for file in files]
+    assert sizes[:3] == [0, 0, 0]
+    assert sizes[-1] > 0
 
 
 def test_a_survey_flies_over_every_part_of_its_area(scene):
@@ -212,7 +245,19 @@ def test_a_scene_without_roads_can_be_flown_over_but_not_driven_through(scene, t
     done = program("drive", "bare", "--route", "random", "-o", "x", cwd=tmp_path)
     assert done.returncode == 2
     assert "no roads" in done.stderr
-    words = ["--rig", "drone", "--survey", "all", "--altitude", "90", "--duration", "0.3", "--format", "laz"]
+    words = [
+        "--rig",
+        "drone",
+        "--survey",
+        "all",
+        "--altitude",
+        "90",
+        "--duration",
+        "0.3",
+        "--format",
+        "laz",
+        "--turns",
+    ]
     done = program("drive", "bare", *words, "-o", "x", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["frames"] == 3
