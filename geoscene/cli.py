@@ -476,7 +476,7 @@ def _print_scene(report: dict[str, Any]) -> None:
         "watertight": f"{counts['watertight']} of {counts['closed_objects']} closed objects",
         "standing": f"{counts['trees']} mapped trees, {counts['furniture']} pieces of furniture,"
         f" {counts['barriers']} barriers",
-        "roads": f"{counts['road_km']:.1f} km in {counts['road_edges']} edges",
+        "roads": f"{counts['road_km']:.1f} km in {counts['road_edges']} edges" + _steep_roads(counts),
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
     }
@@ -492,6 +492,13 @@ def _print_scene(report: dict[str, Any]) -> None:
         for kind, reasons in kinds.items():
             print(f"  {action:<10} {kind}: {_listed(reasons)}")
     print(f"  {report['attribution']}")
+
+
+def _steep_roads(counts: dict[str, Any]) -> str:
+    if counts["road_km_steep"] < 0.005 * counts["road_km"]:
+        return ""
+    steep = counts["road_km_steep"]
+    return f", {steep:.1f} km steeper than 20 %; is the terrain model coarser than the streets?"
 
 
 def _listed(counts: dict[str, int]) -> str:

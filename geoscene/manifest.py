@@ -6,15 +6,20 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import shapely
 
 from geoscene import __version__
 from geoscene.plan import Plan
 from geoscene.report import Problem, summarise
 from geoscene.roadgraph import find_components
+from geoscene.roads import RoadGraph
 from geoscene.shapes import LEAF_AREA_DENSITY
 from geoscene.sources import ATTRIBUTION, OsmData
 from geoscene.tiles import TileReport
+
+STEEP = 0.2
+"""Slope of a road that is worth a word: few streets are steeper (1 in 5)."""
 
 
 def scene_manifest(
@@ -81,6 +86,15 @@ def _open_area(plan: Plan) -> float:
     return float(shapely.intersection(shapely.union_all(openings), shapely.box(*plan.extent)).area)
 
 
+def steep_metres(graph: RoadGraph) -> float:
+    """Metres of road that climb or fall by more than `STEEP`."""
+    total = 0.0
+    for line in graph.geometry:
+        metres = np.hypot(*np.diff(line[:, :2], axis=0).T)
+        total += float(metres[np.abs(np.diff(line[:, 2])) > STEEP * metres].sum())
+    return total
+
+
 def _counts(plan: Plan, reports: Sequence[TileReport], problems: Sequence[Problem]) -> dict[str, Any]:
     count = plan.buildings.count
     summary = summarise(problems)
@@ -97,6 +111,7 @@ def _counts(plan: Plan, reports: Sequence[TileReport], problems: Sequence[Proble
         "faces": sum(r.faces for r in reports),
         "road_edges": len(plan.graph),
         "road_km": round(float(plan.graph.length.sum()) / 1000, 3),
+        "road_km_steep": round(steep_metres(plan.graph) / 1000, 3),
         "road_components": int(components.strong.max(initial=-1)) + 1,
         "road_largest_component_share": round(components.largest_strong_share, 4),
         "trees": len(plan.trees),

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_array, diags_array
 
 from geoscene.frames import Frame
+from geoscene.manifest import steep_metres
 from geoscene.roadgraph import ProfileOptions, build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.quadratic import Bounds, interior_point
 from geoscene.roadgraph.stations import find_crossings, place_stations
@@ -142,6 +143,15 @@ def test_on_the_ground_a_road_follows_the_terrain():
         assert np.diff(line[:, 0] + line[:, 1] * 1e-6).size > 10  # stations between the ends
         np.testing.assert_allclose(line[:, 2], hills(line[:, 0], line[:, 1]), atol=0.3)
     assert steps_beyond(graph, hills).max() <= OPTIONS.step + 1e-3
+
+
+def test_metres_steeper_than_a_fifth_are_told():
+    def cliff(x, y):
+        return np.where(x > 0, 0.3 * x, 0.1 * x) + 0 * y
+
+    graph = profile(graph_of(OVER, [(ROAD | {"oneway": "yes"}, [1, 4])]), cliff)
+    assert steep_metres(graph) == pytest.approx(400, abs=25)
+    assert steep_metres(profile(graph, lambda x, y: 0.15 * x + 0 * y)) == 0
 
 
 def test_both_edges_of_a_street_have_the_same_heights():
