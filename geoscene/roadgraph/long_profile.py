@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.roadgraph.overlaps import find_overlaps
 from geoscene.roadgraph.quadratic import Bounds, interior_point
 from geoscene.roadgraph.stations import Stations, find_crossings, place_stations
 from geoscene.roads import RoadGraph
@@ -64,8 +65,13 @@ _AROUND = 400.0
 """Metres along roads from what does not lie still, within which heights are solved for at first."""
 _STILL, _MOVED = 1e-9, 1e-4
 """What counts as lying still, in the units of cost and bounds, and as having moved, metres."""
-_HARD, _HARDEST = 1e8, 1e9
-"""Of slopes; of heights, which come first where a short ramp cannot serve both."""
+_HARD, _STEADY, _HARDEST = 1e8, 4e9, 1e9
+"""Of slopes; of changes of slope, of stations at full spacing; of heights, which come first where a
+short ramp cannot serve all."""
+_CLOSE = 1.0
+"""Metres: stations nearer to each other count as so far apart."""
+_BESIDE, _CROSSFALL = 1e6, 0.01
+"""Of carriageways that overlap side by side, below slopes; the slope across them where they are one."""
 _PORTAL, _WISHED = 15.0, 1e3
 """Metres from a tunnel's mouth within which it should be covered; what that counts, well below the others."""
 
@@ -161,16 +167,32 @@ def _bounds(
     on_ground[a[structure]] = on_ground[b[structure]] = False
     allowed = (options.step + np.where(on_ground[p] & on_ground[q] & on_ground[r], np.abs(bend), 0.0)) * near
     turn = [(p, near / before), (q, -near / before - near / after), (r, near / after)]
-    rows.add(turn, -allowed, _HARD)
-    rows.add([(station, -factor) for station, factor in turn], -allowed, _HARD)
+    # A jolt is one of slope: between stations close together a few centimetres make it.
+    firm = _STEADY * (options.spacing / np.clip(near, _CLOSE, options.spacing)) ** 2
+    rows.add(turn, -allowed, firm)
+    rows.add([(station, -factor) for station, factor in turn], -allowed, firm)
 
     high = options.clearance + options.deck
     upper, on_upper, lower, on_lower, margin = find_crossings(graph, stations)
-    i, j, t = stations.at(lower, on_lower)
     length = stations.along[np.searchsorted(stations.edge, upper, side="right") - 1]
     for shift in (-margin, 0.0 * margin, margin):
         k, m, s = stations.at(upper, np.clip(on_upper + shift, 0.0, length))
+        place = stations.xy[k] * (1 - s)[:, None] + stations.xy[m] * s[:, None]
+        i, j, t = stations.at(lower, _nearest(graph, lower, place, on_lower))
         rows.add([(k, 1 - s), (m, s), (i, t - 1), (j, -t)], np.full(len(upper), high), _HARDEST)
+
+    room, parting = _parting(high, options)
+    beside = find_overlaps(graph, stations, (upper, lower), room)
+    terms: list[tuple[Int, Float]] = [
+        (beside.station, np.ones(len(beside.station))),
+        (beside.before, beside.share - 1),
+        (beside.after, -beside.share),
+    ]
+    above = np.where(beside.side > 0, parting(beside.fork), -_CROSSFALL * beside.away)
+    below = np.where(beside.side < 0, parting(beside.fork), -_CROSSFALL * beside.away)
+    for sign, least, chosen in ((1.0, above, beside.side >= 0), (-1.0, below, beside.side <= 0)):
+        factors = [(station[chosen], sign * share[chosen]) for station, share in terms]
+        rows.add(factors, least[chosen], _BESIDE)
 
     bridge, tunnel = (_mouth_distance(graph, stations, kind, options) for kind in ("bridge", "tunnel"))
     deck = np.flatnonzero(np.isfinite(bridge))
@@ -192,6 +214,31 @@ def _bounds(
     return rows.bounds()
 
 
+def _parting(high: float, options: ProfileOptions) -> tuple[float, Callable[[Float], Float]]:
+    """How roads that fork part: metres along both until they are ``high`` apart, and how far before that.
+
+    One rises and one falls, each bending by the greatest change of slope until it has the greatest slope.
+    """
+    bend = 0.5 * options.step / options.spacing
+    bent = options.slope / bend
+    steep = max(high - bend / 2 * bent**2, 0.0) / options.slope
+
+    def apart(metres: Float) -> Float:
+        near = np.minimum(metres, bent)
+        return np.minimum(bend / 2 * near**2 + options.slope * (np.minimum(metres, 1e6) - near), high)
+
+    return bent + steep, apart
+
+
+def _nearest(graph: RoadGraph, edge: Int, xy: Float, along: Float) -> Float:
+    """Metres along edges (k,) of the places nearest to points (k, 2), not far from ``along``."""
+    lines = np.array([shapely.linestrings(graph.geometry[e][:, :2]) for e in edge.tolist()], object)
+    found = shapely.line_locate_point(lines, shapely.points(xy)) if len(edge) else along
+    # Where a line comes near once more, as loops do, the place where they cross is meant.
+    far = np.hypot(*(xy - shapely.get_coordinates(shapely.line_interpolate_point(lines, along))).T)
+    return np.clip(found, along - far, along + far)
+
+
 class _Rows:
     """Collects rows ``a z >= b``."""
 
@@ -202,13 +249,13 @@ class _Rows:
         self._right: list[Float] = []
         self._weight: list[Float] = []
 
-    def add(self, terms: Sequence[tuple[Int, Float | float]], right: Float, weight: float) -> None:
+    def add(self, terms: Sequence[tuple[Int, Float | float]], right: Float, weight: Float | float) -> None:
         """Add rows: the sum of factor times height over the terms is at least ``right``."""
         number = self._count + np.arange(len(right))
         for station, factor in terms:
             self._entries.append((number, station, np.broadcast_to(factor, len(right)).astype(float)))
         self._right.append(right)
-        self._weight.append(np.full(len(right), weight))
+        self._weight.append(np.broadcast_to(weight, len(right)).astype(float))
         self._count += len(right)
 
     def bounds(self) -> Bounds:

@@ -4,6 +4,7 @@ from geoscene.structures.meeting import find_openings as find_openings
 from geoscene.structures.meeting import ground_below as ground_below
 from geoscene.structures.meeting import opening_layers as opening_layers
 from geoscene.structures.passages import buildings_over as buildings_over
+from geoscene.structures.pieces import within_extent as within_extent
 from geoscene.structures.read import read_structures as read_structures
 from geoscene.structures.solids import structure_meshes as structure_meshes
 from geoscene.structures.table import StructureOptions as StructureOptions

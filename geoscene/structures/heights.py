@@ -15,6 +15,9 @@ _FADE = 1.5
 SHEET = 2.5
 """Metres: carriageways that meet in plan and differ less in height are one, else one is over the other."""
 
+SHARED, PARTED = 0.5, 1.0
+"""Metres of difference in height up to which carriageways share one surface, and from which on they part."""
+
 
 def foot(line: Float, xy: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
     """Of the nearest place on a line (k, 3) to points (n, 2): its z, how far it is, whether it is no end."""
@@ -32,8 +35,8 @@ def foot(line: Float, xy: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
 def surface_heights(table: Structures, piece: int, xy: Float) -> Float:
     """Heights (n,) of a piece's carriageway at points (n, 2).
 
-    Level across its centre line. Where carriageways join, they share the surface by the inverse square of
-    their distance, so that each centre line has its own height.
+    Level across its centre line. Where carriageways join, they share the surface by the inverse fourth power
+    of their distance, so that each centre line has its own height.
     """
     own, metres, _ = foot(table.around[piece], xy)
     weight = _weight(metres, float(table.half[piece]))
@@ -43,7 +46,8 @@ def surface_heights(table: Structures, piece: int, xy: Float) -> Float:
             continue  # the same line further on
         theirs, metres, beside = foot(table.around[other], xy)
         weight = _weight(metres, float(table.half[other]))
-        weight = np.where(beside & (np.abs(theirs - own) < SHEET), weight, 0.0)
+        alike = np.clip((PARTED - np.abs(theirs - own)) / (PARTED - SHARED), 0.0, 1.0)
+        weight = np.where(beside, weight * alike, 0.0)
         total, z = total + weight, z + weight * theirs
     heights: Float = z / total
     return heights
@@ -51,5 +55,5 @@ def surface_heights(table: Structures, piece: int, xy: Float) -> Float:
 
 def _weight(metres: Float, half: float) -> Float:
     share = np.clip(1.0 - (metres - half) / _FADE, 1e-4, 1.0)
-    weight: Float = share**2 / (metres + 1e-3) ** 2
+    weight: Float = share**2 / (metres + 0.03) ** 4
     return weight

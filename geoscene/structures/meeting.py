@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,19 +11,19 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.ground.layers import PADS, Layers
+from geoscene.ground.layers import PADS, Layers, concatenate_layers
 from geoscene.roadgraph.junctions import cut_line
 from geoscene.structures.heights import surface_heights
-from geoscene.structures.table import StructureOptions, Structures
+from geoscene.structures.table import THINNEST, StructureOptions, Structures
 
 Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
 
-OPENING = PADS + 100.0
-"""Priority of openings: nothing lies over them."""
+OPENING, LOW = PADS + 100.0, PADS + 50.0
+"""Priority of openings: nothing lies over them; and of the ground in decks, which nobody sees."""
 
-LIP, THINNEST = 0.05, 0.15
-"""Metres: how far a tunnel's roof stands out of open ground or lies under other; its least thickness."""
+LIP = 0.05
+"""Metres: how far a tunnel's roof stands out of open ground or lies under other."""
 
 _FALL = 0.25
 """Slope at which the ground leaves a deck, from its end on, until it is below."""
@@ -32,6 +33,9 @@ _BELOW = 0.1
 
 _STEP = 2.0
 """Metres along a tunnel at which the ground above it is looked at."""
+
+_EDGE = 0.05
+"""Metres from a deck's outside to the outline along which the ground falls away below it."""
 
 _INTO = 0.1
 """Metres by which the ground reaches into a tunnel's wall beside an opening."""
@@ -63,6 +67,49 @@ def ground_below(table: Structures, height: Height) -> Height:
     return lowered
 
 
+def find_low_decks(table: Structures, height: Height | None) -> Structures:
+    """The table with the places (``low``) where the ground would stand in a bridge's deck.
+
+    height : of the ground before `ground_below` lowers it
+    """
+    low = table.low.copy()
+    for k in np.flatnonzero(~table.tunnel).tolist():
+        strips = _strips(table, k)
+        xy, strip, ground = _ground_on(strips, height)
+        high = ground > surface_heights(table, k, xy) - table.body[k]
+        met = strips[np.bincount(strip[high], minlength=len(strips)) > 0]
+        within = table.polygon[k].buffer(-_EDGE, join_style="mitre")
+        low[k] = _areal(shapely.union_all(shapely.buffer(met, 1e-3)).intersection(within))
+    return replace(table, low=low)
+
+
+def _strips(table: Structures, k: int) -> NDArray[np.object_]:
+    """A piece's outline cut across."""
+    flat = shapely.LineString(table.line[k][:, :2])
+    reach = float(table.half[k]) + 5.0
+    cuts = np.linspace(0.0, flat.length, max(int(np.ceil(flat.length / _STEP)), 1) + 1)
+    strips = [
+        shapely.LineString(cut_line(table.line[k], a, b)[:, :2]).buffer(reach, cap_style="flat")
+        for a, b in pairwise(cuts)
+    ]
+    rest = table.polygon[k].difference(shapely.union_all(strips))  # beyond the line's ends, as at bends
+    across = shapely.intersection(np.array(strips, object), table.polygon[k])
+    return np.append(across, shapely.get_parts(_areal(rest)))
+
+
+def _ground_on(strips: NDArray[np.object_], height: Height | None) -> tuple[Float, NDArray[np.int64], Float]:
+    """Places (n, 2) around strips, the strip of each, and the ground's height there."""
+    xy, strip = shapely.get_coordinates(shapely.segmentize(strips, _STEP), return_index=True)
+    return xy, strip, np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
+
+
+def _areal(shape: shapely.Geometry) -> shapely.MultiPolygon:
+    """The polygons of a shape, without crumbs."""
+    parts = shapely.get_parts(shape)
+    areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0.01)
+    return shapely.MultiPolygon(parts[areal].tolist())
+
+
 def find_openings(table: Structures, height: Height | None) -> NDArray[np.object_]:
     """Where the ground must be open over each piece (n,): shapely polygons, None where it need not be.
 
@@ -70,41 +117,43 @@ def find_openings(table: Structures, height: Height | None) -> NDArray[np.object
     """
     openings = np.empty(len(table), object)
     for k in np.flatnonzero(table.tunnel).tolist():
-        flat = shapely.LineString(table.line[k][:, :2])
-        half = float(table.half[k])
-        cuts = np.linspace(0.0, flat.length, max(int(np.ceil(flat.length / _STEP)), 1) + 1)
-        strips = np.array(
-            [
-                shapely.LineString(cut_line(table.line[k], a, b)[:, :2]).buffer(half + 5.0, cap_style="flat")
-                for a, b in pairwise(cuts)
-            ]
-        )
-        strips = shapely.intersection(strips, table.polygon[k])
-        xy, strip = shapely.get_coordinates(shapely.segmentize(strips, _STEP), return_index=True)
-        ground = np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
+        strips = _strips(table, k)
+        xy, strip, ground = _ground_on(strips, height)
         covered = ground > surface_heights(table, k, xy) + table.rise[k] + THINNEST + 2 * LIP
         open_ = np.bincount(strip[~covered], minlength=len(strips)) > 0
         if open_.any():
             within = table.inner[k].buffer(table.body[k] - _INTO, join_style="mitre")
             shape = shapely.union_all(shapely.buffer(strips[open_], 1e-3)).intersection(table.polygon[k])
-            parts = shapely.get_parts(shapely.intersection(shape, within))
-            parts = parts[
-                (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0.01)
-            ]
-            openings[k] = shapely.MultiPolygon(parts.tolist()) if len(parts) else None
+            opening = _areal(shape.intersection(within))
+            openings[k] = None if opening.is_empty else opening
     return openings
 
 
 def opening_layers(table: Structures, openings: NDArray[np.object_]) -> Layers:
-    """Rows of class TUNNEL for `geoscene.ground`: cells to leave out of the ground."""
+    """Rows for `geoscene.ground`: class TUNNEL is to leave out, class TERRAIN bare soil under low decks.
+
+    These are there for their outlines, along which the ground can fall away below the deck.
+    """
     rows = np.flatnonzero([shape is not None for shape in openings])
-    return Layers.of(
-        openings[rows],
-        klass=Class.TUNNEL,
-        material=materials()["concrete"].code,
-        priority=OPENING,
-        osm_id=table.osm_id[rows],
-        feature=table.feature[rows],
+    low = np.flatnonzero(~shapely.is_empty(table.low))
+    return concatenate_layers(
+        [
+            Layers.of(
+                openings[rows],
+                klass=Class.TUNNEL,
+                material=materials()["concrete"].code,
+                priority=OPENING,
+                osm_id=table.osm_id[rows],
+                feature=table.feature[rows],
+            ),
+            Layers.of(
+                table.low[low],
+                klass=Class.TERRAIN,
+                material=materials()["soil"].code,
+                priority=LOW,
+                osm_id=table.osm_id[low],
+            ),
+        ]
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -31,6 +32,9 @@ _STATION = 5.0
 
 _BESIDE = 4.0
 """Metres from a road bridge's carriageway within which a path of the same layer is on that bridge."""
+
+_JOINED = 0.05
+"""Metres within which a way and a road meet in a node."""
 
 _SLOPE = 0.12
 """Greatest slope from where a path must be high or low; one in eight, a steep ramp. Assumed."""
@@ -202,17 +206,13 @@ def _heights(
     if not len(net.xy):
         return np.empty(0)
     ground = _ground(net.xy, height)
-    down = np.zeros(len(net.xy), np.bool_)
-    for rows, below in zip(net.rows, tunnel.tolist(), strict=True):
-        down[rows] |= below
     fixed = np.where(ends, ground, np.nan)
     on_road = _on_road_bridges(net, tunnel, level, graph)
     fixed = np.where(np.isnan(on_road), fixed, on_road)
     z = _even(net, fixed, ground)
-    need = _needs(net, tunnel, level, body, graph, osm, frame, height, options)
-    for sign, chosen in ((1.0, ~down), (-1.0, down)):
-        bound = np.where(chosen, sign * need, -np.inf)
-        bound[~np.isnan(on_road) | np.isnan(bound)] = -np.inf
+    least, most = _needs(net, tunnel, level, body, graph, osm, frame, height, options)
+    for sign, need in ((1.0, least), (-1.0, most)):
+        bound = np.where(np.isnan(on_road) & ~np.isnan(need), sign * need, -np.inf)
         z = sign * np.maximum(sign * z, _cones(net, bound))
     return np.where(np.isnan(on_road), z, on_road)
 
@@ -220,8 +220,8 @@ def _heights(
 def _on_road_bridges(
     net: _Net, tunnel: NDArray[np.bool_], level: NDArray[np.int8], graph: RoadGraph
 ) -> Float:
-    """Height (v,) of the road bridge or tunnel of the same layer that a station is beside, NaN if none."""
-    z = np.full(len(net.xy), np.nan)
+    """Height (v,) of the nearest road bridge or tunnel of the same layer beside a station, NaN if none."""
+    z, nearest = np.full(len(net.xy), np.nan), np.full(len(net.xy), np.inf)
     edges = np.flatnonzero(graph.bridge | graph.tunnel)
     if not len(edges):
         return z
@@ -229,12 +229,14 @@ def _on_road_bridges(
     for rows, below, layer in zip(net.rows, tunnel.tolist(), level.tolist(), strict=True):
         point, found = tree.query(shapely.points(net.xy[rows]), predicate="dwithin", distance=20.0)
         edge = edges[found]
-        same = (graph.layer[edge] == layer) & (graph.tunnel[edge] == below)
-        for e in np.unique(edge[same]).tolist():
-            at = rows[np.unique(point[same & (edge == e)])]
+        alike = graph.tunnel[edge] == below
+        for e in np.unique(edge[alike]).tolist():
+            at = rows[np.unique(point[alike & (edge == e)])]
             high, away, beside = foot(graph.geometry[e], net.xy[at])
-            near = (beside | (away < 1.0)) & (away < graph.width[e] / 2 + _BESIDE)
-            z[at[near]] = high[near]
+            # Of another layer it is where the way leaves the road, at a node of both.
+            within = graph.width[e] / 2 + _BESIDE if graph.layer[e] == layer else 0.0
+            near = ((beside & (away < within)) | (away < _JOINED)) & (away < nearest[at])
+            z[at[near]], nearest[at[near]] = high[near], away[near]
     return z
 
 
@@ -263,33 +265,46 @@ def _needs(
     frame: Frame,
     height: Height | None,
     options: StructureOptions,
-) -> Float:
-    """How high stations of bridges must be at least and those of tunnels at most; NaN where anything goes."""
+) -> tuple[Float, Float]:
+    """How high stations (v,) must be at least and at most; NaN where anything goes."""
     obstacles = find_obstacles(osm, frame)
     roads = edge_lines(graph)
+    rank = _rank(graph.layer, graph.bridge, graph.tunnel)
     lines = np.concatenate([roads, obstacles.line])
     tree = shapely.STRtree(lines)
-    need = np.full(len(net.xy), np.nan)
+    least, most = np.full((2, len(net.xy)), np.nan)
     of_way = zip(net.rows, tunnel.tolist(), level.tolist(), body.tolist(), strict=True)
     for rows, below, layer, thick in of_way:
         way = shapely.LineString(net.xy[rows])
+        own = int(_rank(layer, not below, below))
         for other in tree.query(way, predicate="crosses").tolist():
-            points = shapely.get_coordinates(shapely.intersection(way, lines[other]))
-            for xy in points:
-                if other < len(roads):
-                    z = float(foot(graph.geometry[other], xy[None])[0][0])
-                    over = z + options.headroom + thick
+            is_road = other < len(roads)
+            over = own > rank[other] if is_road else not below
+            for xy in shapely.get_coordinates(shapely.intersection(way, lines[other])):
+                near = np.hypot(*(net.xy[rows] - xy).T)
+                if is_road and own == rank[other]:
+                    continue  # they meet
+                at = rows[near < _STATION]
+                z = float(
+                    foot(graph.geometry[other], xy[None])[0][0] if is_road else _ground(xy[None], height)[0]
+                )
+                if over and is_road:
+                    need = z + options.headroom + thick + (options.roof if graph.tunnel[other] else 0.0)
+                elif over:
+                    need = z + float(obstacles.clear[other - len(roads)]) + thick
                 else:
-                    z = float(_ground(xy[None], height)[0])
-                    over = z + float(obstacles.clear[other - len(roads)]) + thick
-                above = below or (other < len(roads) and graph.layer[other] > layer)
-                if other < len(roads) and (graph.tunnel[other] or (graph.bridge[other] and above)):
-                    continue  # far below or above the ground that the path is near
-                under = z - options.passage - options.roof - 2 * options.margin
-                nearest = rows[np.hypot(*(net.xy[rows] - xy).T) < _STATION]
-                bound = np.fmin if below else np.fmax
-                need[nearest] = bound(need[nearest], under if below else over)
-    return need
+                    carried = options.deck if is_road and graph.bridge[other] else 2 * options.margin
+                    need = z - options.passage - carried - (options.roof if below else 0.0)
+                if over:
+                    least[at] = np.fmax(least[at], need)
+                else:
+                    most[at] = np.fmin(most[at], need)
+    return least, most
+
+
+def _rank(layer: Any, bridge: Any, tunnel: Any) -> Any:
+    """What is higher where ways cross: by layer, then a bridge over the ground over a tunnel."""
+    return np.asarray(layer, np.int64) * 2 + np.where(tunnel, -1, np.asarray(bridge, np.int64))
 
 
 def _cones(net: _Net, bound: Float) -> Float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,28 +13,29 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.roadgraph.junctions import cut_line
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.structures.heights import SHEET, foot
+from geoscene.structures.heights import PARTED, SHEET, foot
 from geoscene.structures.layered import PRECISION
 from geoscene.structures.members import Members
-from geoscene.structures.table import StructureOptions, Structures
+from geoscene.structures.sheets import Sheets, find_sheets, part_outlines, where_same
+from geoscene.structures.table import THINNEST, StructureOptions, Structures
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
-_STRIP = 4.0
-"""Metres along a carriageway at which its height is compared with another's."""
-
-_TOUCH = 1.0
-"""Metres within which pieces meet."""
-
 _AROUND = 12.0
 """Metres by which a piece's centre line is known beyond its ends."""
+
+_MET = 0.1
+"""Metres between an end and a line that are joined there."""
 
 _SIDE = 40.0
 """Metres: no carriageway reaches further from its centre line."""
 
 _BESIDE_RAILS = 1.45
 """Metres of a railway bridge's deck beside each rail; over half the gauge: it is whole between the rails."""
+
+_VEHICLE = 1.3
+"""Metres on both sides of a centre line that one vehicle needs."""
 
 _OVERLAP = 0.003
 """Metres by which pieces of one carriageway overlap, so that rounding opens no crack between them."""
@@ -49,11 +51,15 @@ def cut_pieces(members: Members, raised: SurfaceRows, options: StructureOptions)
     """
     member, polygon, line, around, half = _outlines(members, raised, options)
     tunnel = members.tunnel[member]
-    near, partly = _neighbours(polygon, around, tunnel)
-    inner = _inner(polygon, near, members.approach[member], np.where(tunnel, options.wall, options.rim))
-    polygon = _territories(polygon, around, near, partly)
     foot_only = members.foot[member]
     body = np.where(tunnel, options.wall, np.where(foot_only, options.slab, options.deck))
+    free = np.where(foot_only, options.passage, options.headroom) + np.where(tunnel, THINNEST, 0.0)
+    polygon = part_outlines(polygon, around, half, tunnel, free=free, body=body)
+    sheets = find_sheets(polygon, around, tunnel)
+    near = sheets.near
+    rim = np.where(tunnel, options.wall, options.rim)
+    inner = _inner(polygon, line, around, half, sheets, members.approach[member], rim)
+    polygon = _territories(polygon, around, sheets)
     rise = np.where(
         tunnel,
         np.where(foot_only, options.passage, options.headroom),
@@ -80,6 +86,7 @@ def cut_pieces(members: Members, raised: SurfaceRows, options: StructureOptions)
         inner=inner,
         approach=members.approach[member],
         pier=none,
+        low=none.copy(),
         pier_spacing=np.zeros(len(member)),
         level=members.level[member],
         edge=members.edge[member],
@@ -95,43 +102,83 @@ def _outlines(
     members: Members, raised: SurfaceRows, options: StructureOptions
 ) -> tuple[Int, NDArray[np.object_], NDArray[np.object_], NDArray[np.object_], Float]:
     """Pieces before they are told apart: member, outline, line, line with its surroundings, half-width."""
+    lines = [_without_crumbs(line) for line in members.line]
+    whole, half = _wholes(members, lines, raised, options)
     rows: list[tuple[int, object, Float, Float, float]] = []
-    for m in range(len(members)):
-        line = members.line[m]
-        flat = shapely.LineString(line[:, :2])
-        own = members.rows[m]
-        own = own[raised.klass[own] != Class.LANE_MARKING]
-        whole = _union(raised.polygon[own])
-        if len(own) and (raised.klass[own] == Class.RAIL).all():
-            whole = whole.buffer(_BESIDE_RAILS, cap_style="flat", join_style="mitre", mitre_limit=1.5)
-        if members.tunnel[m] or not (raised.klass[own] == Class.BRIDGE).any():
-            grow = options.margin + options.wall if members.tunnel[m] else options.rim
-            grown = whole.buffer(grow, join_style="mitre", mitre_limit=1.5)
-            whole = grown.intersection(flat.buffer(_SIDE, cap_style="flat", join_style="mitre"))
-        half = _half(whole, flat)
-        count = max(int(np.ceil(flat.length / options.piece)), 1)
-        cuts = np.linspace(0.0, flat.length, count + 1)
+    for m, line in enumerate(lines):
+        length = _length(line)
+        count = max(int(np.ceil(length / options.piece)), 1)
+        cuts = np.linspace(0.0, length, count + 1)
         for k, (start, end) in enumerate(pairwise(cuts)):
-            part = cut_line(line, start, end)
-            outline = whole
+            part = _without_crumbs(cut_line(line, start, end))
+            outline = whole[m]
             if count > 1:
-                reach = shapely.LineString(part[:, :2]).buffer(_SIDE, cap_style="flat", join_style="mitre")
+                reach = _flat(part).buffer(2 * half[m] + 5.0, cap_style="flat", join_style="mitre")
                 ends = [p for p, last in ((part[0], k == 0), (part[-1], k == count - 1)) if last]
                 discs = [shapely.Point(p[:2]).buffer(_SIDE / 2) for p in ends]
-                wedges = [shapely.Point(p[:2]).buffer(half + 1.0) for p in (part[0], part[-1])]
-                outline = whole.intersection(shapely.union_all([reach, *discs, *wedges]))
-            rows.append((m, outline, part, cut_line(line, start - _AROUND, end + _AROUND), half))
-    columns = np.empty((3, len(rows)), object)
+                wedges = [shapely.Point(p[:2]).buffer(half[m] + 1.0) for p in (part[0], part[-1])]
+                outline = outline.intersection(shapely.union_all([reach, *discs, *wedges]))
+            rows.append((m, outline, part, cut_line(line, start - _AROUND, end + _AROUND), half[m]))
+    columns: NDArray[np.object_] = np.empty((3, len(rows)), object)
     for k, row in enumerate(rows):
-        columns[:, k] = row[1:4]
-    outline, line, around = columns
+        columns[0, k], columns[1, k], columns[2, k] = row[1:4]
     return (
         np.array([r[0] for r in rows], np.int64),
-        outline,
-        line,
-        around,
+        columns[0],
+        columns[1],
+        columns[2],
         np.array([r[4] for r in rows], float),
     )
+
+
+def _wholes(
+    members: Members, lines: list[Float], raised: SurfaceRows, options: StructureOptions
+) -> tuple[list[shapely.Geometry], Float]:
+    """Outlines of members with their rims, and metres from their lines to the outside.
+
+    A member ends square, but round where another one goes on from its end, so that no gap is left between
+    them on the outside of the bend.
+    """
+    whole, half = [], np.empty(len(lines))
+    for m, line in enumerate(lines):
+        flat = _flat(line)
+        own = members.rows[m]
+        own = own[raised.klass[own] != Class.LANE_MARKING]
+        shape = _union(raised.polygon[own])
+        if len(own) and (raised.klass[own] == Class.RAIL).all():
+            shape = shape.buffer(_BESIDE_RAILS, cap_style="flat", join_style="mitre", mitre_limit=1.5)
+        if members.tunnel[m] or not (raised.klass[own] == Class.BRIDGE).any():
+            grow = options.margin + options.wall if members.tunnel[m] else options.rim
+            grown = shape.buffer(grow, join_style="mitre", mitre_limit=1.5)
+            shape = grown.intersection(flat.buffer(_SIDE, cap_style="flat", join_style="mitre"))
+        half[m] = _half(shape, flat)
+        whole.append(shape)
+    flats = np.array([_flat(line) for line in lines], object)
+    ends = np.array([line[e] for line in lines for e in (0, -1)]).reshape(-1, 3)
+    end, other = shapely.STRtree(flats).query(shapely.points(ends[:, :2]), predicate="dwithin", distance=_MET)
+    for row, q in zip(end.tolist(), other.tolist(), strict=True):
+        m = row // 2
+        if q == m or members.tunnel[q] != members.tunnel[m] or members.landed[m, row % 2]:
+            continue
+        if abs(foot(lines[q], ends[row, None, :2])[0][0] - ends[row, 2]) < PARTED:
+            disc = shapely.Point(ends[row, :2]).buffer(min(half[m], half[q]))
+            whole[m] = _union([whole[m], disc])
+    return whole, half
+
+
+def _flat(line: Float) -> shapely.LineString:
+    return shapely.LineString(line[:, :2])
+
+
+def _length(line: Float) -> float:
+    return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
+
+
+def _without_crumbs(line: Float) -> Float:
+    """A line (k, 3) less the vertices right beside its ends: caps of buffers would stand askew on them."""
+    inner = line[1:-1]
+    clear = [np.hypot(*(inner - end)[:, :2].T) > _MET for end in (line[0], line[-1])]
+    return np.concatenate([line[:1], inner[clear[0] & clear[1]], line[-1:]])
 
 
 def _half(outline: shapely.Geometry, line: shapely.LineString) -> float:
@@ -145,80 +192,73 @@ def _half(outline: shapely.Geometry, line: shapely.LineString) -> float:
     return max(float(shapely.length(hit).max(initial=0.0)) / 2, 0.5)
 
 
-def _neighbours(
-    polygon: NDArray[np.object_], around: NDArray[np.object_], tunnel: NDArray[np.bool_]
-) -> tuple[NDArray[np.object_], set[tuple[int, int]]]:
-    """For each piece, its neighbours on one carriageway; and which pairs of them overlie in part."""
-    one, two = shapely.STRtree(polygon).query(polygon, predicate="dwithin", distance=_TOUCH)
-    keep = (one < two) & (tunnel[one] == tunnel[two])
-    one, two = one[keep], two[keep]
-    grown = shapely.buffer(polygon, _TOUCH, quad_segs=2)
-    common = shapely.segmentize(shapely.intersection(grown[one], grown[two]), _STRIP)
-    least, most = np.empty((2, len(one)))
-    for row, (p, q) in enumerate(zip(one.tolist(), two.tolist(), strict=True)):
-        places = shapely.get_coordinates([common[row], common[row].representative_point()])
-        apart = np.abs(foot(around[p], places)[0] - foot(around[q], places)[0])
-        least[row], most[row] = apart.min(), apart.max()
-    same, over = least < SHEET, (least < SHEET) & (most >= SHEET)
-    partly = set(zip(one[over].tolist(), two[over].tolist(), strict=True))
-    one, two = np.concatenate([one[same], two[same]]), np.concatenate([two[same], one[same]])
-    order = np.lexsort([two, one])
-    ends = np.searchsorted(one[order], np.arange(len(polygon) + 1))
-    near = np.empty(len(polygon), object)
-    near[:] = [two[order[a:b]] for a, b in pairwise(ends)]
-    return near, partly
-
-
-def _where_same(line: Float, other: Float) -> shapely.Geometry:
-    """Where, beside a line, it is as high as another one, in strips."""
-    flat = shapely.LineString(line[:, :2])
-    cuts = np.linspace(0.0, flat.length, max(int(np.ceil(flat.length / _STRIP)), 1) + 1)
-    strips = []
-    for start, end in pairwise(cuts):
-        part = cut_line(line, start, end)
-        middle = part.mean(axis=0, keepdims=True)
-        if abs(foot(other, middle[:, :2])[0][0] - middle[0, 2]) < SHEET:
-            strips.append(shapely.LineString(part[:, :2]).buffer(_SIDE, cap_style="flat"))
-    return _union(strips)
-
-
 def _inner(
-    polygon: NDArray[np.object_], near: NDArray[np.object_], approach: NDArray[np.object_], rim: Float
+    polygon: NDArray[np.object_],
+    line: NDArray[np.object_],
+    around: NDArray[np.object_],
+    half: Float,
+    sheets: Sheets,
+    approach: NDArray[np.object_],
+    rim: Float,
 ) -> NDArray[np.object_]:
     """What is within the rim of a piece and its neighbours, and open to the ground's roads."""
     inner = np.empty(len(polygon), object)
+    near = sheets.near
     for k, others in enumerate(near):
         # Neighbours' neighbours too, so that no rim stands where the next piece but one begins.
-        beyond = np.unique(np.concatenate([[k], others, *(near[q] for q in others)]).astype(np.int64))
-        whole = _union([*polygon[beyond], *approach[np.r_[k, others].astype(np.int64)]])
+        beyond = np.unique(np.concatenate([others, *(near[q] for q in others)]).astype(np.int64))
+        shapes = [polygon[k]]
+        for q in beyond[beyond != k].tolist():
+            if sheets.apart(k, q):
+                continue
+            shape = polygon[q]
+            if (min(k, q), max(k, q)) in sheets.parted:
+                shape = shape.intersection(where_same(around[k], around[q], PARTED))
+            shapes.append(shape)
+        whole = _union([*shapes, *approach[np.r_[k, others].astype(np.int64)]])
         closed = whole.buffer(0.05, join_style="mitre").buffer(-0.05 - rim[k], join_style="mitre")
-        inner[k] = closed.intersection(polygon[k].buffer(1.0))
+        # Where two are squeezed together so that a wall would stand in the middle of the road, there is none.
+        wide = min(_VEHICLE, float(half[k]) / 2)
+        middle = _flat(cut_line(line[k], wide, _length(line[k]) - wide)).buffer(wide, cap_style="flat")
+        inner[k] = _union([closed, middle]).intersection(polygon[k].buffer(1.0))
     return inner
 
 
 def _territories(
-    polygon: NDArray[np.object_],
-    around: NDArray[np.object_],
-    near: NDArray[np.object_],
-    partly: set[tuple[int, int]],
+    polygon: NDArray[np.object_], around: NDArray[np.object_], sheets: Sheets
 ) -> NDArray[np.object_]:
     """Outlines less those of smaller neighbours, so that none is covered altogether."""
     rank = np.empty(len(polygon), np.int64)
     rank[np.argsort(shapely.area(polygon), kind="stable")] = np.arange(len(polygon))
     out = np.empty(len(polygon), object)
-    for k, others in enumerate(near):
+    for k, others in enumerate(sheets.near):
         rest = polygon[k]
         for earlier in others[rank[others] < rank[k]].tolist():
             taken = polygon[earlier].buffer(-_OVERLAP, join_style="mitre")
-            if (min(earlier, k), max(earlier, k)) in partly:
-                taken = taken.intersection(_where_same(around[k], around[earlier]))
+            if (min(earlier, k), max(earlier, k)) in sheets.over:
+                taken = taken.intersection(where_same(around[k], around[earlier], SHEET))
             rest = rest.difference(taken)
-        # Opened a little: what hangs together in a point only, or by a hair, does not belong together.
-        rest = rest.buffer(-0.005, join_style="mitre").buffer(0.005, join_style="mitre")
-        parts = shapely.get_parts(shapely.set_precision(rest, PRECISION))
-        areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > _CRUMB)
-        out[k] = shapely.MultiPolygon(parts[areal].tolist())
+        out[k] = _clean(rest)
     return out
+
+
+def within_extent(table: Structures, extent: tuple[float, float, float, float]) -> Structures:
+    """The pieces cut square where they leave (xmin, ymin, xmax, ymax): a scene ends at its extent."""
+    box = shapely.box(*extent)
+    out = np.flatnonzero(~shapely.covered_by(table.polygon, box))
+    polygon, pier = table.polygon.copy(), table.pier.copy()
+    for k in out.tolist():
+        polygon[k] = _clean(polygon[k].intersection(box))
+        pier[k] = _clean(pier[k].intersection(box))
+    return replace(table, polygon=polygon, pier=pier).take(~shapely.is_empty(polygon))
+
+
+def _clean(shape: shapely.Geometry) -> shapely.MultiPolygon:
+    """A shape on the grid, opened a little: what hangs together by a hair does not belong together."""
+    opened = shape.buffer(-0.005, join_style="mitre").buffer(0.005, join_style="mitre")
+    parts = shapely.get_parts(shapely.set_precision(opened, PRECISION))
+    areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > _CRUMB)
+    return shapely.MultiPolygon(parts[areal].tolist())
 
 
 def _union(polygons: Sequence[object] | NDArray[np.object_]) -> shapely.Geometry:

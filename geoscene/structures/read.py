@@ -12,6 +12,7 @@ from geoscene.report import Problem
 from geoscene.road_surfaces import RoadSurfaces
 from geoscene.roads import RoadGraph
 from geoscene.sources.data import OsmData
+from geoscene.structures.meeting import find_low_decks
 from geoscene.structures.members import concatenate_members, road_members
 from geoscene.structures.paths import path_members
 from geoscene.structures.pieces import cut_pieces
@@ -40,4 +41,5 @@ def read_structures(
     raised = surfaces.raised
     paths, problems = path_members(raised, osm, frame, graph, height=height, options=options)
     table = cut_pieces(concatenate_members([road_members(graph, raised), paths]), raised, options)
-    return place_piers(table, surfaces, height=height, options=options), problems
+    table = place_piers(table, surfaces, height=height, options=options)
+    return find_low_decks(table, height), problems

@@ -11,6 +11,9 @@ from geoscene.roadgraph.surface_rows import SurfaceRows
 
 Float = NDArray[np.float64]
 
+THINNEST = 0.15
+"""Metres: least thickness of a tunnel's roof."""
+
 
 @dataclass(frozen=True, slots=True)
 class StructureOptions:
@@ -63,6 +66,7 @@ class Structures:
     inner     : (n,) object, shapely: what parapets or walls stand around
     approach  : (n,) object, shapely: the roads' first metres beyond its end, where it has one
     pier      : (n,) object, shapely MultiPolygon, its piers
+    low       : (n,) object, shapely MultiPolygon, where the ground would stand in its deck
     pier_spacing : (n,) float64 metres, nominal; 0 without piers
     level     : (n,) int8, OSM layer
     edge      : (n,) int32, edge of the road graph, the first of a street's two; -1 for paths
@@ -85,6 +89,7 @@ class Structures:
     inner: NDArray[np.object_]
     approach: NDArray[np.object_]
     pier: NDArray[np.object_]
+    low: NDArray[np.object_]
     pier_spacing: Float
     level: NDArray[np.int8]
     edge: NDArray[np.int32]

@@ -1,0 +1,209 @@
+"""Which carriageways are one surface, which lie over each other, and where they part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.roadgraph.junctions import cut_line
+from geoscene.structures.heights import PARTED, SHEET, foot
+
+Float = NDArray[np.float64]
+Int = NDArray[np.int64]
+Pair = tuple[int, int]
+
+_STRIP = 4.0
+"""Metres along a carriageway at which its height is compared with another's."""
+
+_LAP = 0.5
+"""Metres by which strips overlap, so that none is missing on the outside of a bend."""
+
+_TOUCH = 1.0
+"""Metres within which pieces meet."""
+
+_SIDE = 40.0
+"""Metres: no carriageway reaches further from its centre line."""
+
+_PARALLEL = 0.85
+"""Cosine of the greatest angle at which one carriageway runs beside another rather than across it."""
+
+_TIGHT = 0.05
+"""Metres of free height whose lack is of no account."""
+
+_SCANT = 0.1
+"""Square metres of overlap of no account."""
+
+_SAMPLE = 0.5
+"""Metres between the points by which ground is divided among carriageways."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sheets:
+    """How pieces lie to each other.
+
+    near   : (n,) object, (k,) int64 rows that are one carriageway with this one, if only in part
+    over   : pairs of rows of which one is, if only in part, over the other
+    parted : pairs that are not equally high all over, those of `over` among them
+    """
+
+    near: NDArray[np.object_]
+    over: set[Pair]
+    parted: set[Pair]
+
+    def apart(self, one: int, two: int) -> bool:
+        """Whether two pieces meet in plan, but are nowhere one carriageway."""
+        return _pair(one, two) in self.parted and two not in self.near[one]
+
+
+def _pair(one: int, two: int) -> Pair:
+    return min(one, two), max(one, two)
+
+
+def find_sheets(
+    polygon: NDArray[np.object_], around: NDArray[np.object_], tunnel: NDArray[np.bool_]
+) -> Sheets:
+    """Which pieces are one carriageway, by their heights where their outlines meet."""
+    one, two = shapely.STRtree(polygon).query(polygon, predicate="dwithin", distance=_TOUCH)
+    keep = (one < two) & (tunnel[one] == tunnel[two])
+    one, two = one[keep], two[keep]
+    grown = shapely.buffer(polygon, _TOUCH, quad_segs=2)
+    common = shapely.segmentize(shapely.intersection(grown[one], grown[two]), _STRIP)
+    least, most = np.empty((2, len(one)))
+    for row, (p, q) in enumerate(zip(one.tolist(), two.tolist(), strict=True)):
+        places = shapely.get_coordinates([common[row], common[row].representative_point()])
+        apart = np.abs(foot(around[p], places)[0] - foot(around[q], places)[0])
+        least[row], most[row] = apart.min(), apart.max()
+    same = least < SHEET
+    over, parted = (
+        set(zip(one[rows].tolist(), two[rows].tolist(), strict=True))
+        for rows in (most >= SHEET, most >= PARTED)
+    )
+    one, two = np.concatenate([one[same], two[same]]), np.concatenate([two[same], one[same]])
+    order = np.lexsort([two, one])
+    ends = np.searchsorted(one[order], np.arange(len(polygon) + 1))
+    near = np.empty(len(polygon), object)
+    near[:] = [two[order[a:b]] for a, b in pairwise(ends)]
+    return Sheets(near, over, parted)
+
+
+def where_same(line: Float, other: Float, within: float) -> shapely.Geometry:
+    """Where, beside a line, it is less than ``within`` metres higher or lower than another one, in strips."""
+    strips = []
+    for part in _parts(line):
+        middle = part.mean(axis=0, keepdims=True)
+        if abs(foot(other, middle[:, :2])[0][0] - middle[0, 2]) < within:
+            strips.append(shapely.LineString(part[:, :2]).buffer(_SIDE, cap_style="flat"))
+    return shapely.union_all(strips)
+
+
+def part_outlines(
+    polygon: NDArray[np.object_],
+    around: NDArray[np.object_],
+    half: Float,
+    tunnel: NDArray[np.bool_],
+    *,
+    free: Float,
+    body: Float,
+) -> NDArray[np.object_]:
+    """Outlines (n,) none of which reaches into the free space of one that runs beside it.
+
+    Widths on maps are rough: carriageways side by side overlap by a metre or two. Where they do, and one is
+    higher but not so high that the other fits under it, each keeps what is nearer to it.
+
+    half : (n,) metres from centre lines to the outside
+    free : (n,) metres of free height over a carriageway
+    body : (n,) metres of what lies under it
+    """
+    lost: dict[int, list[shapely.Geometry]] = {}
+    one, two = shapely.STRtree(polygon).query(polygon, predicate="intersects")
+    keep = one < two
+    common = shapely.intersection(polygon[one[keep]], polygon[two[keep]])
+    for p, q, meeting in zip(one[keep].tolist(), two[keep].tolist(), common, strict=True):
+        shared = _areal(meeting)
+        if shared.area < _SCANT:
+            continue
+        least = PARTED if tunnel[p] == tunnel[q] else 0.0
+        strips = [
+            *_in_conflict(
+                around[p], around[q], half[p] + half[q], (free[q] + body[p], free[p] + body[q]), least
+            ),
+            *_in_conflict(
+                around[q], around[p], half[p] + half[q], (free[p] + body[q], free[q] + body[p]), least
+            ),
+        ]
+        where = _areal(shapely.union_all(strips).intersection(shared))
+        if where.area < _SCANT:
+            continue
+        theirs = _nearer(where, around[q], float(half[q]), around[p], float(half[p]))
+        lost.setdefault(p, []).append(theirs)
+        lost.setdefault(q, []).append(where.difference(theirs))
+    out = polygon.copy()
+    for k, shapes in lost.items():
+        out[k] = polygon[k].difference(shapely.union_all(shapes))
+    return out
+
+
+def _areal(shape: shapely.Geometry) -> shapely.Geometry:
+    """The polygons of a shape."""
+    parts = shapely.get_parts(shape)
+    return shapely.MultiPolygon(parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON].tolist())
+
+
+def _in_conflict(
+    line: Float, other: Float, reach: float, needs: tuple[float, float], least: float
+) -> list[shapely.Geometry]:
+    """Strips along a line where another runs beside it at a height that lets neither pass the other.
+
+    needs : metres that the line must be above the other to pass over it, and below it to pass under
+    """
+    strips = []
+    flat = shapely.LineString(other[:, :2])
+    for part in _parts(line):
+        middle = part.mean(axis=0, keepdims=True)
+        z, away, beside = foot(other, middle[:, :2])
+        up = float(middle[0, 2] - z[0])
+        if not beside[0] or away[0] > reach or not least <= abs(up) < needs[int(up < 0)] - _TIGHT:
+            continue
+        ends = shapely.line_locate_point(flat, shapely.points(part[[0, -1], :2]))
+        if abs(ends[1] - ends[0]) > _PARALLEL * np.hypot(*(part[-1] - part[0])[:2]):
+            strips.append(shapely.LineString(part[:, :2]).buffer(reach, cap_style="flat"))
+    return strips
+
+
+def _parts(line: Float) -> list[Float]:
+    """A line in parts of a strip's length, which overlap a little."""
+    length = float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
+    cuts = np.linspace(0.0, length, max(int(np.ceil(length / _STRIP)), 1) + 1)
+    return [cut_line(line, start - _LAP, end + _LAP) for start, end in pairwise(cuts)]
+
+
+def _nearer(
+    where: shapely.Geometry, line: Float, half: float, other: Float, other_half: float
+) -> shapely.Geometry:
+    """What of an area is further within the one carriageway than within the other.
+
+    By the Voronoi cells of points along the narrower one's centre line, and along the other as far from its
+    outside.
+    """
+    around = where.envelope.buffer(half + other_half)
+    points = []
+    for road, wide, own in ((line, half, 0), (other, other_half, 1)):
+        core = shapely.LineString(road[:, :2])
+        inset = wide - min(half, other_half)
+        if inset > _SAMPLE:
+            core = shapely.union_all([core, core.buffer(inset, cap_style="flat").boundary])
+        xy = shapely.get_coordinates(shapely.segmentize(core.intersection(around), _SAMPLE))
+        points.append(np.column_stack([np.round(xy, 3), np.full(len(xy), own)]))
+    rows = np.concatenate(points)
+    xy, first = np.unique(rows[:, :2], axis=0, return_index=True)
+    own = rows[first, 2] == 0
+    cells = shapely.get_parts(
+        shapely.voronoi_polygons(shapely.MultiPoint(xy.tolist()), extend_to=around.envelope)
+    )
+    point, cell = shapely.STRtree(cells).query(shapely.points(xy), predicate="intersects")
+    mine = shapely.union_all(cells[np.unique(cell[own[point]])])
+    return mine.intersection(where)
