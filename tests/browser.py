@@ -104,8 +104,35 @@ class Browser:
 
     def write(self, text: str) -> None:
         """Put text where the caret is, as an input method does; keys need a layout for that."""
-        command = {"cmd": "Input.insertText", "params": {"text": text}}
-        self._call("POST", "/goog/cdp/execute", command)
+        self.tell("Input.insertText", text=text)
+
+    def tell(self, command: str, **params: Any) -> None:
+        """Give a command of the browser's own protocol."""
+        self._call("POST", "/goog/cdp/execute", {"cmd": command, "params": params})
+
+    def phone(self, width: int, height: int) -> None:
+        """Be a telephone with a touch screen; with width 0 what it was before."""
+        if width:
+            self.tell(
+                "Emulation.setDeviceMetricsOverride",
+                width=width,
+                height=height,
+                deviceScaleFactor=2,
+                mobile=True,
+            )
+        else:
+            self.tell("Emulation.clearDeviceMetricsOverride")
+        self.tell("Emulation.setTouchEmulationEnabled", enabled=bool(width), maxTouchPoints=5)
+
+    def touch(self, *steps: list[tuple[float, float]]) -> None:
+        """Put fingers down where the first step says, move them through the others, and lift them."""
+        for number, places in enumerate(steps):
+            points = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(places)]
+            kind = "touchMove" if number else "touchStart"
+            self.tell("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+            self.settle()
+        self.tell("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        self.settle()
 
     def settle(self) -> None:
         """Wait until what has changed is drawn."""

@@ -205,6 +205,75 @@ def test_mouse_and_keys_turn_move_and_zoom(opened):
     assert zoomed[1] == pytest.approx(np.pi / 2)
 
 
+@pytest.fixture
+def phone(window, page):
+    """The page newly opened on a telephone."""
+    window.phone(390, 844)
+    window.open(page)
+    yield window
+    window.phone(0, 0)
+
+
+def camera_of(window):
+    names = ("azimuth", "tilt", "distance", "x", "y")
+    script = "const c = geoscene.camera; return [c.azimuth, c.tilt, c.distance, ...c.target.slice(0, 2)]"
+    return dict(zip(names, window.js(script), strict=True))
+
+
+def test_fingers_turn_move_zoom_and_ask(scene, phone):
+    first = camera_of(phone)
+    phone.touch([(200, 400)], [(240, 420)], [(280, 440)])
+    turned = camera_of(phone)
+    assert turned["azimuth"] != first["azimuth"]
+    assert turned["tilt"] > first["tilt"]
+    phone.touch([(170, 400), (230, 400)], [(150, 400), (250, 400)], [(110, 400), (290, 400)])
+    pinched = camera_of(phone)
+    assert pinched["distance"] == pytest.approx(turned["distance"] / 3, rel=0.25)
+    assert pinched["azimuth"] == pytest.approx(turned["azimuth"], abs=0.02)
+    phone.touch([(150, 300), (250, 300)], [(150, 340), (250, 340)], [(150, 400), (250, 400)])
+    moved = camera_of(phone)
+    assert np.hypot(moved["x"] - pinched["x"], moved["y"] - pinched["y"]) > 3.0
+    assert moved["distance"] == pytest.approx(pinched["distance"], rel=0.1)
+    phone.touch([(150, 400), (250, 400)], [(160, 350), (240, 450)], [(200, 340), (200, 460)])
+    twisted = camera_of(phone)
+    assert abs(twisted["azimuth"] - moved["azimuth"]) > 0.7
+    _, feature, _ = tall_house(scene, phone)
+    phone.touch([tuple(look_down(phone, feature))])
+    assert int(phone.js("return document.getElementById('panel').dataset.feature")) == feature
+
+
+def test_on_a_telephone_the_scene_is_in_sight_and_nothing_sticks_out(scene, phone):
+    assert phone.js("return innerWidth") == 390
+    assert phone.js("return document.documentElement.scrollWidth") == 390
+    _, feature, _ = tall_house(scene, phone)
+    phone.touch([tuple(look_down(phone, feature))])
+    boxes = [
+        phone.js(
+            "const b = document.getElementById(arguments[0]).getBoundingClientRect();"
+            "return [b.left, b.top, b.right, b.bottom]",
+            name,
+        )
+        for name in ("controls", "panel", "foot")
+    ]
+    for left, top, right, bottom in boxes:
+        assert left >= 0
+        assert right <= 390
+        assert top >= 0
+        assert bottom <= 844
+    controls, panel, foot = boxes
+    assert panel[1] > controls[3]
+    assert panel[3] <= foot[1] + 1
+    covered = sum((right - left) * (bottom - top) for left, top, right, bottom in boxes)
+    assert covered < 0.6 * 390 * 844
+    small = phone.js(
+        "document.getElementById('controls').open = true;"
+        "const seen = [...document.querySelectorAll('input, select, summary, .close')];"
+        "const target = (e) => (e.closest('label') || e).getBoundingClientRect().height;"
+        "return seen.filter((e) => e.offsetParent).map((e) => [e.id || e.className || e.tagName, target(e)]);"
+    )
+    assert [name for name, height in small if height < 24] == []  # WCAG 2.2, target size
+
+
 def test_shadows_darken_and_the_sun_moves_them(opened):
     with_shadows = middle(opened)
     opened.js("document.getElementById('shadows').click()")

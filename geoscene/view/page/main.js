@@ -15,7 +15,7 @@ async function start() {
   view.attributes = new Attributes(JSON.parse(new TextDecoder().decode(await blobOf("attributes"))));
 
   loop(view);
-  let shown = performance.now();
+  let shown = performance.now(), pause = 250;
   for (const [k, told] of head.tiles.entries()) {
     const tile = readTile(told, await blobOf(`tile-${k}`));
     renderer.add(told, tile);
@@ -24,11 +24,16 @@ async function start() {
       part.material.forEach((code) => used.material.add(code));
       part.klass.forEach((code) => used.class.add(code));
     }
-    if (performance.now() - shown < 250) continue;
+    if (performance.now() - shown < pause) continue;
     $("message").textContent = `Reading the scene … ${k + 1} of ${head.tiles.length} tiles`;
     view.dirty = true;
-    await new Promise((done) => setTimeout(done));
+    const waited = performance.now();
+    await new Promise((done) => {
+      requestAnimationFrame(() => requestAnimationFrame(done));
+      setTimeout(done, 3000); // pages that are not seen have no frames
+    });
     shown = performance.now();
+    pause = Math.max(250, 8 * (shown - waited)); // a slow card must not draw more than it reads
   }
   $("message").hidden = true;
   if (window.innerWidth <= 640) $("controls").open = false;
