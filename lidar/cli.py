@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -140,7 +141,7 @@ def drive(
     overwrite
         Replace a dataset that is there.
     workers
-        Threads; the bytes do not depend on it.
+        Threads, a frame each, no more than there are cores; the bytes do not depend on it.
     json
         Print the summary as JSON.
     quiet
@@ -335,6 +336,59 @@ def map_(
         print(
             f"lidar: frames are missing: {lost}; was the drive stopped? The same command goes on with it",
             file=sys.stderr,
+        )
+    return 0
+
+
+@app.command
+def export(
+    dataset: Path,
+    /,
+    *,
+    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
+    to: str = "nuscenes",
+    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+) -> int:
+    """Write a recorded drive in the layout of another dataset, for its development kit.
+
+    For example:
+
+    lidar drive scene --rig nuscenes --traffic on --format pcd -o drive
+
+    lidar export drive --to nuscenes -o nuscenes
+
+    Parameters
+    ----------
+    dataset
+        Directory of the dataset.
+    out
+        Directory to make.
+    to
+        Layout: nuscenes (samples and sweeps with all tables, two key frames a second).
+    overwrite
+        Replace a directory that is there.
+    json
+        Print the summary as JSON.
+    quiet
+        No progress bars.
+    """
+    from lidar.dataset import open_dataset  # noqa: PLC0415
+    from lidar.formats.nuscenes_tables import VERSION, export_nuscenes  # noqa: PLC0415
+
+    if to != "nuscenes":
+        raise InputError(
+            f"--to {to}: there is nuscenes; KITTI's files are written by lidar drive --format kitti"
+        )
+    with progress_bar(quiet=quiet) as progress:
+        summary = export_nuscenes(open_dataset(dataset), out, overwrite=overwrite, progress=progress)
+    if json:
+        print_json({**asdict(summary), "path": str(out)})
+    else:
+        print(
+            f"{out}: {summary.samples} samples, {summary.clouds} clouds, {summary.images} images,"
+            f" {summary.annotations} boxes; open it with NuScenes('{VERSION}', '{out}')"
         )
     return 0
 

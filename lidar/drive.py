@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import threading
 import time
@@ -338,6 +339,7 @@ def record_all(
     worlds = Worlds(scene, reach, actors)
     points: dict[str, int] = {}
     done = len(jobs) - len(pending)
+    workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
     with ThreadPoolExecutor(workers) as pool:
         for chunk, region in _chunks(pending, trajectory):
             with recorder.watch.stage("load"):

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -275,3 +276,18 @@ def test_a_random_drive_is_under_way_from_first_to_last_unless_it_is_to_be_from_
         assert speeds[True][0] == 0.0
         assert speeds[True][-1] < 2e-3
         assert options.recipe(scene) != replace(options, from_rest=True).recipe(scene)
+
+
+def test_no_more_threads_work_than_there_are_cores(scene, tmp_path, monkeypatch):
+    sizes = []
+
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, size):
+            sizes.append(size)
+            super().__init__(size)
+
+    monkeypatch.setattr("lidar.drive.ThreadPoolExecutor", Pool)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    for workers in (1, 64):
+        drive(scene, tmp_path / str(workers), replace(OPTIONS, duration=0.2, workers=workers))
+    assert sizes == [1, 2]
