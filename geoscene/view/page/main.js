@@ -9,6 +9,7 @@ async function start() {
   const shapes = readShapes(head.shapes, await blobOf("shapes"));
   const renderer = new Renderer($("canvas"), head, shapes);
   const camera = new Camera(head.low, head.high);
+  camera.whole(busyBox(head), window.innerWidth / window.innerHeight);
   const boxes = new Boxes(head.features);
   const used = { material: new Set(), class: new Set() };
   const view = { head, renderer, camera, boxes, used, dirty: true, cursor: null };
@@ -286,7 +287,7 @@ function listen(view) {
       q: () => camera.turn(0.1, 0), e: () => camera.turn(-0.1, 0),
       r: () => camera.turn(0, 0.08), f: () => camera.turn(0, -0.08),
       "+": () => camera.zoom(0.85), "=": () => camera.zoom(0.85), "-": () => camera.zoom(1 / 0.85),
-      t: () => camera.turn(0, Math.PI), n: () => { camera.azimuth = 0; }, h: () => camera.whole(),
+      t: () => camera.turn(0, Math.PI), n: () => { camera.azimuth = 0; }, h: () => camera.whole(camera, window.innerWidth / window.innerHeight),
       Escape: () => select(view, null),
     }[event.key.length === 1 ? event.key.toLowerCase() : event.key];
     if (!action) return;
