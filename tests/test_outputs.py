@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import resource
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import laspy
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from sensor_worlds import driven, plate, world
 
@@ -26,9 +28,11 @@ from lidar.deskew import MOMENTS, deskewed
 from lidar.drive import drive
 from lidar.errors import DatasetError, InputError
 from lidar.formats.kitti import read_velodyne, semantic_kitti_labels
+from lidar.formats.nuscenes_tables import CATEGORIES, VERSION, export_nuscenes
 from lidar.formats.pcd import read_pcd
 from lidar.formats.ply import read_ply
 from lidar.formats.text import read_csv
+from lidar.georeference import Georeference
 from lidar.map import aggregate
 from lidar.options import DriveOptions
 from lidar.record import Contents
@@ -492,6 +496,88 @@ def test_dials_of_cameras_are_reached_and_leave_truth_as_it_is(scene, rig, tmp_p
 
 def dataset_start(hour):
     return datetime(2026, 6, 21, hour, tzinfo=UTC)
+
+
+def _resolve(tables, row, key):
+    """The row that a token of a table names."""
+    return tables[key.removesuffix("_token")][row[key]]
+
+
+def test_nuscenes_tables_lead_from_a_sample_to_points_boxes_and_pixels(dataset, tmp_path):
+    summary = export_nuscenes(dataset, tmp_path / "n")
+    root = tmp_path / "n"
+    tables = {p.stem: {r["token"]: r for r in json.loads(p.read_text())} for p in (root / VERSION).iterdir()}
+    for name, rows in tables.items():  # every token leads somewhere, chains are whole
+        for row in rows.values():
+            for key in row:
+                if key.endswith("_token") and key not in ("first_sample_token", "last_sample_token"):
+                    if "annotation_token" in key:
+                        assert row[key] in tables["sample_annotation"]
+                    else:
+                        _resolve(tables, row, key)
+            for way, back in (("next", "prev"), ("prev", "next")):
+                if row.get(way):
+                    assert rows[row[way]][back] == row["token"], name
+    samples = sorted(tables["sample"].values(), key=lambda s: s["timestamp"])
+    assert len(samples) == summary.samples == 8  # two a second for four seconds
+    assert np.diff([s["timestamp"] for s in samples]).tolist() == [500_000] * 7
+    data = list(tables["sample_data"].values())
+    assert summary.clouds + summary.images == len(data)
+    channels = {d["filename"].split("/")[1] for d in data}
+    assert channels == {"LIDAR_TOP", "AHEAD", "FRONT", "SIDE"}
+    for channel in channels:
+        keys = [d for d in data if d["is_key_frame"] and f"/{channel}/" in d["filename"]]
+        assert len({d["sample_token"] for d in keys}) == len(keys) == 8
+        assert all((root / d["filename"]).exists() for d in keys)
+    inside = total = 0
+    place = np.array([dataset.trajectory().scale[0]] * 2 + [1.0])
+    walls = []
+    for row in data:
+        if not (row["is_key_frame"] and "/LIDAR_TOP/" in row["filename"]):
+            continue
+        points = np.fromfile(root / row["filename"], "<f4").reshape(-1, 5)[:, :3].astype(float)
+        labels = np.fromfile(root / f"lidarseg/{VERSION}/{row['token']}_lidarseg.bin", np.uint8)
+        assert len(labels) == len(points)
+        for step in ("calibrated_sensor_token", "ego_pose_token"):
+            pose = _resolve(tables, row, step)
+            turn = Rotation.from_quat(np.roll(pose["rotation"], -1))
+            points = turn.apply(points) + pose["translation"]
+        walls.append(points[labels == CATEGORIES.index("static.manmade")])
+        for box in tables["sample_annotation"].values():
+            if box["sample_token"] != row["sample_token"] or box["num_lidar_pts"] < 20:
+                continue
+            thing = tables["instance"][box["instance_token"]]
+            kind = tables["category"][thing["category_token"]]["name"]
+            local = Rotation.from_quat(np.roll(box["rotation"], -1)).inv().apply(points - box["translation"])
+            size = np.array(box["size"])[[1, 0, 2]] / 2 + [1.4, 0.05, 0.03]  # driven on during the frame
+            held = (np.abs(local) < size).all(axis=1) & (labels == CATEGORIES.index(kind))
+            inside, total = inside + held.sum(), total + box["num_lidar_pts"]
+    assert total > 200
+    assert inside == pytest.approx(total, rel=0.03)
+    # As far from each other as in the drive's own clouds on Earth.
+    scene = tables["scene"].popitem()[1]["description"]
+    east, north = map(float, re.search(r"zero at (-?[\d.]+), (-?[\d.]+) of", scene).groups())
+    earth = np.concatenate(walls) * place + [east, north, 0.0] - [*dataset.frame.origin, 0.0]
+    there = []
+    for frame in range(0, 40, 5):
+        cloud = laspy.read(dataset.path / "top" / "laz" / f"{frame:06d}.laz")
+        there.append(np.column_stack([cloud.x, cloud.y, cloud.z])[np.asarray(cloud.label) == Class.BUILDING])
+    geo = Georeference(dataset.frame, dataset.crs, exact=True)
+    away, _ = cKDTree(np.concatenate(there)).query(geo.points(earth))
+    assert np.quantile(away, 0.9) < 0.002
+
+
+def test_what_cannot_be_a_nuscenes_dataset_is_said(dataset, scene, tmp_path):
+    (tmp_path / "n").mkdir()
+    with pytest.raises(InputError, match="--overwrite"):
+        export_nuscenes(dataset, tmp_path / "n")
+    options = replace(
+        OPTIONS, rig="vlp16", duration=0.3, traffic=None, formats=("laz",), labels=(), deskew=""
+    )
+    drive(scene, tmp_path / "d", options)
+    with pytest.raises(DatasetError, match="--format pcd"):
+        export_nuscenes(open_dataset(tmp_path / "d"), tmp_path / "m")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "n"]
 
 
 def test_a_map_says_which_frames_are_missing(scene, rig, tmp_path):
