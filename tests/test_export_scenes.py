@@ -238,6 +238,89 @@ def test_boxes_of_tiles_hold_their_content_and_errors_fall(tiles):
     assert any("copies" in uri for uri in contents)
 
 
+NODE = {"boundingVolume", "geometricError", "refine", "transform", "content", "children"}
+
+
+def test_a_tileset_keeps_to_the_schema_and_children_lie_within_their_parents(tiles):
+    document = json.loads((tiles / "tileset.json").read_text())
+    assert set(document) == {"asset", "geometricError", "root"}
+
+    def walk(node, outer):
+        assert {"boundingVolume", "geometricError"} <= set(node) <= NODE
+        assert node.get("refine", "ADD") == "ADD"
+        assert node["geometricError"] >= 0
+        assert set(node["boundingVolume"]) == {"box"}
+        box = np.array(node["boundingVolume"]["box"])
+        assert box.shape == (12,)
+        low, high = box[:3] - box[[3, 7, 11]], box[:3] + box[[3, 7, 11]]
+        assert (low < high).all()
+        if outer:
+            assert (low >= outer[0] - 1e-6).all()
+            assert (high <= outer[1] + 1e-6).all()
+        assert node.get("children") != []  # a leaf has no list of children
+        assert "transform" not in node or outer is None
+        for child in node.get("children", []):
+            walk(child, (low, high))
+
+    walk(document["root"], None)
+    matrix = np.array(document["root"]["transform"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix[3], [0, 0, 0, 1])
+    np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
+
+
+def test_points_of_tiles_are_where_the_projection_says(scene, tiles):
+    import pyproj  # noqa: PLC0415
+
+    document = json.loads((tiles / "tileset.json").read_text())
+    matrix = np.array(document["root"]["transform"]).reshape(4, 4).T
+    points = np.concatenate([_points(path) for path in sorted(tiles.rglob("*.glb"))])
+    earth = points @ matrix[:3, :3].T + matrix[:3, 3]
+    lon, lat, height = pyproj.Transformer.from_crs(4978, 4979, always_xy=True).transform(*earth.T)
+    x, y = scene.frame.from_geographic(lon, lat)
+    found = np.column_stack([x, y, height])
+    expected = np.concatenate(
+        [scene.tile(*index).mesh.vertices + scene.tile(*index).origin for index in scene.tile_indices]
+    )
+    gap = np.array([np.linalg.norm(found - point, axis=1).min() for point in expected[::7]])
+    assert gap.max() < 2e-3
+
+
+def test_tables_of_tiles_have_as_many_rows_as_they_say(tiles):
+    seen = 0
+    for path in sorted(tiles.rglob("*.glb")):
+        document, buffer = _glb(path)
+        views = document["bufferViews"]
+        tables = document.get("extensions", {}).get("EXT_structural_metadata", {}).get("propertyTables", [])
+        for table in tables:
+            for told in table["properties"].values():
+                values = views[told["values"]]
+                assert values["byteOffset"] + values["byteLength"] <= len(buffer)
+                if "stringOffsets" in told:
+                    view = views[told["stringOffsets"]]
+                    kind = {"UINT8": "u1", "UINT16": "<u2", "UINT32": "<u4", "UINT64": "<u8"}[
+                        told.get("stringOffsetType", "UINT32")
+                    ]
+                    offsets = np.frombuffer(
+                        buffer, kind, view["byteLength"] // np.dtype(kind).itemsize, view["byteOffset"]
+                    )
+                    assert len(offsets) == table["count"] + 1
+                    assert (np.diff(offsets.astype(np.int64)) >= 0).all()
+                    assert max(offsets[-1], 1) == values["byteLength"]  # no view may be empty
+                else:
+                    assert values["byteLength"] % table["count"] == 0
+                seen += 1
+        for mesh in document["meshes"]:
+            for primitive in mesh["primitives"]:
+                told = primitive.get("extensions", {}).get("EXT_mesh_features", {}).get("featureIds", [])
+                for ids in (entry for entry in told if "attribute" in entry):
+                    rows = _values(
+                        document, buffer, primitive["attributes"][f"_FEATURE_ID_{ids['attribute']}"]
+                    )
+                    assert 0 <= rows.min() <= rows.max() < tables[ids["propertyTable"]]["count"]
+    assert seen > 10
+
+
 def test_a_folder_that_is_not_ours_is_not_replaced(scene, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years")

@@ -217,9 +217,9 @@ class GlbWriter:
         for view in self._views.values():
             if not view.tell():
                 view.write(b"\0" * 16)  # no view may be empty, and their numbers stand
-        sizes = [view.tell() + -view.tell() % 8 for view in self._views.values()]
-        sizes += [len(data) + -len(data) % 8 for data in self._columns]
-        starts = np.cumsum([0, *sizes]).tolist()
+        # a view is as long as what is in it, and begins at a multiple of eight bytes
+        sizes = [*(view.tell() for view in self._views.values()), *map(len, self._columns)]
+        starts = np.cumsum([0, *(size + -size % 8 for size in sizes)]).tolist()
         if starts[-1] > _LARGEST - 2**28:
             raise InputError(
                 f"{starts[-1] / 2**30:.1f} GiB are more than one .glb holds; take 3D Tiles or fewer layers"
