@@ -114,6 +114,61 @@ def test_three_levels_stand_above_each_other():
     assert max(line[:, 2].max() for line in graph.geometry) >= 2 * HIGH - 0.02
 
 
+def test_bridges_one_above_the_other_keep_their_distance_though_their_lines_never_cross():
+    places = dict(enumerate(
+        [(x, y) for y in (0.0, 2.0) for x in (-600, -150, 150, 600)], start=1))  # fmt: skip
+    upper = BRIDGE | {"layer": "2"}
+    ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), (ROAD, [5, 6]), (upper, [6, 7]), (ROAD, [7, 8])]
+    graph = profile(graph_of(places, ways), flat)
+    low, high = (graph.geometry[int(np.flatnonzero(graph.osm_id == f"way/{w}")[0])] for w in (101, 104))
+    at = np.linspace(-140, 140, 57)
+    apart = np.interp(at, *high[np.argsort(high[:, 0])][:, [0, 2]].T)
+    apart -= np.interp(at, *low[np.argsort(low[:, 0])][:, [0, 2]].T)
+    assert apart.min() > HIGH - 0.05
+
+
+def test_branches_are_equally_high_where_they_fork_and_part_where_they_are_clear_of_each_other():
+    places = {1: (-500, 0), 2: (-100, 0), 3: (0, 0), 4: (250, 25), 5: (250, -25), 6: (600, 60), 7: (600, -60)}
+    way = {"oneway": "yes", "lanes": "2"}
+    ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (BRIDGE | way, [3, 4]), (BRIDGE | way | {"layer": "2"}, [3, 5]),
+            (ROAD | way, [4, 6]), (ROAD | way, [5, 7])]  # fmt: skip
+
+    def ground(x, y):
+        return np.where((x > 200) & (y < 0), 12.0, np.where(x > 200, -8.0, 0.0)) + 0.0 * y
+
+    graph = profile(graph_of(places, ways), ground)
+    one, two = (graph.geometry[int(np.flatnonzero(graph.osm_id == f"way/{w}")[0])] for w in (102, 103))
+    at = np.arange(0.0, 250.0, 2.0)
+    apart = np.abs(np.interp(at, one[:, 0], one[:, 2]) - np.interp(at, two[:, 0], two[:, 2]))
+    overlap = 0.2 * at < graph.width[graph.osm_id == "way/102"][0] - 1.0
+    assert overlap.sum() > 10
+    assert apart[overlap].max() < 0.2
+    assert apart[at > 240].max() > 5.0
+    assert steps_beyond(graph, ground).max() < OPTIONS.step + 2e-3
+
+
+@pytest.mark.parametrize("angle_deg", [30, 45])
+def test_a_bridge_that_crosses_at_an_angle_clears_all_of_the_road_below(angle_deg):
+    c, s = 300 * np.cos(np.radians(angle_deg)), 300 * np.sin(np.radians(angle_deg))
+    places = {1: (-600, 0), 2: (-160, 0), 3: (160, 0), 4: (600, 0), 5: (-c, -s), 6: (c, s)}
+
+    def slope(x, y):
+        return 0.15 * y + 0.0 * x
+
+    ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), (ROAD, [5, 6])]
+    graph = profile(graph_of(places, ways), slope)
+    over = graph.geometry[int(np.flatnonzero(graph.osm_id == "way/101")[0])]
+    under = graph.geometry[int(np.flatnonzero(graph.osm_id == "way/103")[0])]
+    # The places of the lower road, level across, that lie straight under the upper one's middle.
+    reach = float(graph.width[graph.osm_id == "way/103"][0]) / 2 / np.sin(np.radians(angle_deg))
+    at = np.linspace(-reach, reach, 21)
+    along = at * np.cos(np.radians(angle_deg))
+    way = under[np.argsort(under[:, 0])]
+    low = np.interp(along * np.cos(np.radians(angle_deg)), way[:, 0], way[:, 2])
+    high = np.interp(at, *over[np.argsort(over[:, 0])][:, [0, 2]].T)
+    assert (high - low).min() > HIGH - 0.1
+
+
 def test_a_bridge_clears_railways_and_rivers():
     osm = town(OVER, [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), ({"railway": "rail"}, [5, 6])])
     graph, _ = build_road_graph(osm, FRAME)

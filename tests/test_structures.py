@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.classes import Class
 from geoscene.frames import Frame
+from geoscene.ground import concatenate_layers, ground_tile, plan_ground
+from geoscene.ground.layers import Layers
 from geoscene.mesh import Mesh, concatenate
 from geoscene.road_surfaces import road_surfaces
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
@@ -21,8 +23,10 @@ from geoscene.structures import (
     buildings_over,
     find_openings,
     ground_below,
+    opening_layers,
     read_structures,
     structure_meshes,
+    within_extent,
 )
 from geoscene.structures.layered import Plan, cut_plan, raise_shell
 from geoscene.terrain import open_terrain
@@ -440,6 +444,189 @@ def test_every_guess_has_its_source(bridge, tunnel):
     assert bridge.table.pier_spacing.max() <= SIZES.pier_spacing
     assert set(bridge.table.osm_id) == {"way/101"}
     assert set(tunnel.table.osm_id) == {"way/101"}
+
+
+def lane(town, name, aside=0.0, step=2.0, ends=0.5):
+    """Points (n, 3) along a way, some metres to its left."""
+    edge = int(np.flatnonzero(town.graph.osm_id == name)[0])
+    line = town.graph.geometry[edge]
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T)))
+    at = np.arange(ends, along[-1] - ends, step)
+    points = np.column_stack([np.interp(at, along, column) for column in line.T])
+    way = np.gradient(points[:, :2], axis=0)
+    way /= np.hypot(*way.T)[:, None]
+    return points + aside * np.column_stack([-way[:, 1], way[:, 0], 0 * at])
+
+
+def blocked(mesh, points, up=1.0):
+    """How often the way from one point to the next meets a solid."""
+    return sum(crosses(mesh, moved(a, 0, 0, up), moved(b, 0, 0, up)) for a, b in pairwise(points))
+
+
+def test_tunnels_that_fork_have_one_room_there_and_no_wall_in_the_way():
+    # A branch rises beside the street that goes on down; they overlap for 60 m.
+    places = {1: (-400, 0), 2: (-120, 0), 3: (0, 0), 4: (160, 0), 5: (160, 20), 6: (500, 0), 7: (500, 80)}
+    branch = TUNNEL | {"oneway": "yes", "width": "5"}
+    ways = [
+        (ROAD, [1, 2]),
+        (TUNNEL, [2, 3]),
+        (TUNNEL, [3, 4]),
+        (branch, [3, 5]),
+        (ROAD, [4, 6]),
+        (ROAD, [5, 7]),
+    ]
+
+    def hill(x, y):
+        return 12 * np.exp(-(((x - 60) / 90) ** 2)) + np.where((x > 120) & (y > 8), 10.0, -6.0 * (x > 120))
+
+    fork = Town(town(places, ways), ground=hill)
+    mesh = fork.mesh()
+    assert validate_mesh(mesh).ok.all()
+    left, right = lane(fork, "way/103"), lane(fork, "way/102")
+    assert np.abs(left[-20:, 2] - right[-20:, 2]).min() > 2.0  # they do part
+    street = [lane(fork, "way/102", aside, ends=3.0) for aside in (-1.7, 0.0, 1.7)]
+    for points in (left, *street, *(lane(fork, "way/101", aside) for aside in (-1.7, 0.0, 1.7))):
+        assert blocked(mesh, points) == 0
+        z, _ = first_below(mesh, moved(points, 0, 0, 1.5))
+        np.testing.assert_allclose(z, points[:, 2], atol=0.05)
+        assert (first_above(mesh, moved(points, 0, 0, 0.3)) > points[:, 2] + 4.5).all()
+
+
+@pytest.mark.parametrize("arms_deg", [(-144, 39, 87), (7, 58, 77), (-84, 92, -9)])
+def test_tunnels_that_meet_at_any_angle_leave_no_wall_at_the_bend(arms_deg):
+    places, ways = {1: (0.0, 0.0)}, []
+    for k, arm in enumerate(np.radians(arms_deg)):
+        for n, far in ((10, 200), (20, 500)):
+            places[n + k] = (far * np.cos(arm), far * np.sin(arm))
+        ways += [(TUNNEL, [1, 10 + k]), (ROAD, [10 + k, 20 + k])]
+    meeting = Town(town(places, ways))
+    mesh = meeting.mesh()
+    assert validate_mesh(mesh).ok.all()
+    for k in range(len(arms_deg)):
+        for aside in (-1.5, 0.0, 1.5):
+            assert blocked(mesh, lane(meeting, f"way/{100 + 2 * k}", aside, step=1.0, ends=0.05)) == 0
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.floats(0, 180), st.sampled_from([120.0, 160.0, 200.0]))
+def test_pieces_of_a_straight_tunnel_cover_all_of_it(angle_deg, length):
+    way = np.array([np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))])
+    places = {k: tuple(way * at) for k, at in enumerate((-400, 0, length, length + 400), start=1)}
+    straight = Town(town(places, [(ROAD, [1, 2]), (TUNNEL, [2, 3]), (ROAD, [3, 4])]))
+    assert len(straight.table) >= 2
+    whole = shapely.LineString([(0, 0), way * length]).buffer(float(straight.table.half[0]), cap_style="flat")
+    covered = shapely.union_all(straight.table.polygon)
+    assert covered.symmetric_difference(whole).area < 0.5
+
+
+def test_carriageways_side_by_side_part_in_the_middle_between_them():
+    # On maps they overlap by two metres; the northern one is two metres higher.
+    places = dict(enumerate(
+        [(x, y) for y in (0.0, 5.0) for x in (-300, -60, 60, 300)], start=1))  # fmt: skip
+    width, upper = {"width": "7", "oneway": "yes"}, {"layer": "2"}
+    ways = [(ROAD | width, [1, 2]), (BRIDGE | width, [2, 3]), (ROAD | width, [3, 4]),
+            (ROAD | width, [5, 6]), (BRIDGE | width | upper, [6, 7]), (ROAD | width, [7, 8])]  # fmt: skip
+    both = Town(town(places, ways), ground=lambda x, y: 0.4 * np.clip(y, 0, 5) + 0 * x)
+    mesh = both.mesh()
+    assert validate_mesh(mesh).ok.all()
+    one, two = both.table.polygon[both.table.level == 1], both.table.polygon[both.table.level == 2]
+    assert shapely.union_all(one).intersection(shapely.union_all(two)).area < 0.1
+    for name in ("way/101", "way/104"):
+        for aside in (-1.7, 0.0, 1.7):
+            points = lane(both, name, aside, ends=8.0)
+            assert blocked(mesh, points) == 0
+            z, _ = first_below(mesh, moved(points, 0, 0, 1.5))
+            np.testing.assert_allclose(z, points[:, 2], atol=0.02)
+
+
+def ground_mesh(town, extent):
+    """The ground of a map's extent, cut along lines 10 m apart, with what its structures ask for."""
+    bare = Layers.of([shapely.box(*extent)], klass=Class.GRASS, material=7, priority=1.0)
+    layers = concatenate_layers([bare, opening_layers(town.table, town.openings)])
+    plan = plan_ground(extent, layers, lines=10.0)
+    return concatenate([ground_tile(plan, int(i), int(j), height=town.height) for i, j in plan.tiles])
+
+
+def test_ground_on_a_steep_slope_stays_below_a_low_deck():
+    hill = Town(town(PLACES, OVER[:3]), ground=lambda x, y: 0.6 * (y - 4.0) + 0 * x)
+    extent = (-120.0, -40.0, 120.0, 40.0)
+    points = np.concatenate([lane(hill, "way/101", aside) for aside in (-2.5, 0.0, 2.5)])
+    assert (0.6 * (points[:, 1] - 4.0) > points[:, 2]).any()  # it would stand over the deck
+    top, klass = first_below(concatenate([hill.mesh(), ground_mesh(hill, extent)]), moved(points, 0, 0, 20))
+    np.testing.assert_allclose(top, points[:, 2], atol=0.02)
+    assert set(klass) <= {Class.ROAD, Class.LANE_MARKING}
+
+
+def test_a_scene_ends_at_its_extent_and_so_do_its_structures(bridge, tunnel):
+    extent = (-55.0, -100.0, 20.0, 100.0)
+    for whole in (bridge, tunnel):
+        cut = within_extent(whole.table, extent)
+        meshes = structure_meshes(cut, height=whole.height, openings=find_openings(cut, whole.height))
+        solid = numbered(meshes)
+        assert validate_mesh(solid).ok.all()
+        assert solid.vertices[:, 0].min() == pytest.approx(-55.0, abs=2e-3)
+        assert solid.vertices[:, 0].max() == pytest.approx(20.0, abs=2e-3)
+        kept = shapely.intersection(shapely.union_all(whole.table.polygon), shapely.box(*extent))
+        assert shapely.union_all(cut.polygon).symmetric_difference(kept).area < 0.1
+        points = whole.centre_lines("bridge" if whole is bridge else "tunnel")
+        inside = points[(points[:, 0] > -54) & (points[:, 0] < 19)]
+        assert blocked(solid, [moved(inside[0], -5, 0, 0), *inside, moved(inside[-1], 5, 0, 0)]) == 0
+    everything = within_extent(bridge.table, (-1e3, -1e3, 1e3, 1e3))
+    assert all(a.equals(b) for a, b in zip(everything.polygon, bridge.table.polygon, strict=True))
+    assert len(within_extent(bridge.table, (100.0, 0.0, 200.0, 50.0))) == 0
+
+
+def test_a_foot_tunnel_passes_under_a_road_tunnel_of_a_higher_layer_and_joins_one_at_its_node():
+    places = PLACES | {7: (0, -60), 8: (0, 60), 9: (30, 40)}
+    walk = {"highway": "footway", "tunnel": "yes"}
+    road = [(ROAD, [1, 2]), (TUNNEL, [2, 10, 3]), (ROAD, [3, 4])]
+    places[10] = (30, 0)
+    under = Town(town(places, [*road, (walk | {"layer": "-2"}, [7, 8])]))
+    foot = np.concatenate(
+        [line for line, edge in zip(under.table.line, under.table.edge, strict=True) if edge < 0]
+    )
+    at = np.abs(foot[:, 1]) < 4.0
+    carriageway = lane(under, "way/101")
+    z = float(np.interp(0.0, carriageway[:, 0], carriageway[:, 2]))
+    assert (foot[at, 2] + SIZES.passage < z).all()
+    assert blocked(under.mesh(), carriageway) == 0
+    joined = Town(town(places, [*road, (walk | {"layer": "-2"}, [10, 9])]))
+    carriageway = lane(joined, "way/101")
+    ends = np.concatenate(
+        [line[[0, -1]] for line, edge in zip(joined.table.line, joined.table.edge, strict=True) if edge < 0]
+    )
+    z = float(np.interp(30.0, carriageway[:, 0], carriageway[:, 2]))
+    assert ends[np.abs(ends[:, 1]) < 0.1, 2] == pytest.approx(z, abs=0.01)
+
+
+def test_undersides_over_a_tunnel_in_pieces_come_in_whole_steps():
+    places = {1: (-500, 0), 2: (-130, 0), 3: (-20, 0), 4: (25, 0), 5: (130, 0), 6: (500, 0)}
+    ways = [(ROAD, [1, 2]), (TUNNEL, [2, 3]), (TUNNEL, [3, 4]), (TUNNEL, [4, 5]), (ROAD, [5, 6])]
+    boxes = [(-110, -20, 110, 20), (-110, -20, -30, 20), (-30, -20, 40, 20), (40, -20, 110, 20)]
+    tags = [
+        {"building": "train_station", "height": "20"},
+        *({"building:part": "yes", "height": h} for h in "987"),
+    ]
+    station = [
+        Area(
+            f"way/{900 + k}", tag, shapely.Polygon(lonlat(shapely.box(*b).exterior.coords)), np.empty(0, int)
+        )
+        for k, (b, tag) in enumerate(zip(boxes, tags, strict=True))
+    ]
+    line = Town(town(places, ways))
+    buildings, _ = read_buildings(town(places, ways, station), FRAME)
+    base = np.full(buildings.count, line.centre_lines("tunnel")[:, 2].min() - 1.0)
+    over, problems = buildings_over(buildings, base, line.table)
+    assert [p.reason for p in problems] == ["over-tunnel"]
+    steps = over.min_height[over.min_height_source == "tunnel"] / 0.05
+    assert len(steps) >= 5
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
+    solid, _ = build_solids(over, base=base)
+    assert validate_mesh(solid).ok.all()
+    points = line.centre_lines("tunnel")
+    inside = points[np.abs(points[:, 0]) < 105]
+    for up in (0.3, 4.6):
+        assert blocked(solid, inside, up) == 0
 
 
 @pytest.mark.shared

@@ -15,6 +15,9 @@ _FADE = 1.5
 SHEET = 2.5
 """Metres: carriageways that meet in plan and differ less in height are one, else one is over the other."""
 
+_MERGED, _LEVEL = 1.0, 0.02
+"""Metres from one centre line to another that is beside it, and in height that make a slope between them."""
+
 SHARED, PARTED = 0.5, 1.0
 """Metres of difference in height up to which carriageways share one surface, and from which on they part."""
 
@@ -51,6 +54,18 @@ def surface_heights(table: Structures, piece: int, xy: Float) -> Float:
         total, z = total + weight, z + weight * theirs
     heights: Float = z / total
     return heights
+
+
+def slopes_across(table: Structures, piece: int) -> bool:
+    """Whether a piece's carriageway shares its surface with one beside it that is not as high."""
+    for other in table.near[piece]:
+        line = table.around[other]
+        z, metres, beside = foot(table.around[piece], line[:, :2])
+        shared = beside & (metres > _MERGED) & (metres < table.half[piece] + table.half[other])
+        apart = np.abs(z - line[:, 2])
+        if (shared & (apart > _LEVEL) & (apart < PARTED)).any():
+            return True
+    return False
 
 
 def _weight(metres: Float, half: float) -> Float:

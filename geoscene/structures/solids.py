@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.mesh import FLOOR, OTHER, ROOF, WALL, Mesh
-from geoscene.structures.heights import surface_heights
+from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.layered import SIDE, Plan, Shell, cut_plan, raise_shell
 from geoscene.structures.meeting import tunnel_roof
 from geoscene.structures.table import StructureOptions, Structures
@@ -103,9 +103,13 @@ def _linework(table: Structures, k: int, openings: NDArray[np.object_] | None) -
     ]
     if openings is not None and openings[k] is not None:
         lines.append(shapely.boundary(openings[k]))
+    sloped = slopes_across(table, k)
     for piece in (k, *table.near[k].tolist()):
         line = table.around[piece]
-        lines.append(shapely.LineString(line[:, :2]))
+        flat = shapely.LineString(line[:, :2])
+        lines.append(flat)
+        if sloped:  # level as far as the middle of lanes, whence it slopes to the next carriageway
+            lines.append(flat.buffer(float(table.half[piece]) / 2, cap_style="flat").boundary)
         lines += list(_ribs(line, float(table.half[piece]) + 1.0))
     out = np.empty(len(lines), object)
     out[:] = lines
