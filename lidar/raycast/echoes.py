@@ -10,9 +10,10 @@ from numba import cfunc, njit, types
 from numpy.typing import NDArray
 
 from lidar.raycast.columns import Rays, Target
-from lidar.raycast.kernels import first_bad, gather, meet, nudge, numbered, placed
 from lidar.raycast.library import ARGUMENT_FILTER, INVALID
 from lidar.raycast.memory import aligned, inlined, intersect1, pointer
+from lidar.raycast.packets import first_bad, gather, nudge
+from lidar.raycast.planes import meet, numbered, placed
 
 Float = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 """Arithmetic on all lanes of a packet at once: vector instructions written out.
 
-A packet's numbers are rows of float64, one number a lane, end to end; `lidar.raycast.kernels` names them.
+A packet's numbers are rows of float64, one number a lane, end to end; `lidar.raycast.packets` names them.
 Left to itself the compiler widens loops over lanes here and not there, as its estimate of their cost falls.
 Each function takes a tuple with an item for each lane, which makes their number a constant.
 """

@@ -1,0 +1,124 @@
+"""Faces that rays have met: their numbers, their planes, and where a ray crosses these, in float64."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lidar.raycast.columns import COPIES, Target
+from lidar.raycast.lanes import GRAZING
+from lidar.raycast.memory import called, float64_at, inlined, int32_at, int64_at, vector
+
+INVALID = np.uint32(0xFFFFFFFF)
+"""Embree's number for no geometry and no instance."""
+
+
+@inlined
+def transform_of(target: Target, instance: int, time: float) -> Any:
+    """The transform of an instance at a ray time: twelve numbers, row by row."""
+    M = target.transforms.ctypes.data + 96 * target.first[instance]
+    steps = target.steps[instance]
+    w = 0.0
+    if steps > 1:
+        place = min(max(time, 0.0), 1.0) * (steps - 1)
+        step = min(int(place), steps - 2)
+        M += 96 * step
+        w = place - step
+    N = M + 96 if w > 0.0 else M
+    return (
+        float64_at(M, 0) + w * (float64_at(N, 0) - float64_at(M, 0)),
+        float64_at(M, 1) + w * (float64_at(N, 1) - float64_at(M, 1)),
+        float64_at(M, 2) + w * (float64_at(N, 2) - float64_at(M, 2)),
+        float64_at(M, 3) + w * (float64_at(N, 3) - float64_at(M, 3)),
+        float64_at(M, 4) + w * (float64_at(N, 4) - float64_at(M, 4)),
+        float64_at(M, 5) + w * (float64_at(N, 5) - float64_at(M, 5)),
+        float64_at(M, 6) + w * (float64_at(N, 6) - float64_at(M, 6)),
+        float64_at(M, 7) + w * (float64_at(N, 7) - float64_at(M, 7)),
+        float64_at(M, 8) + w * (float64_at(N, 8) - float64_at(M, 8)),
+        float64_at(M, 9) + w * (float64_at(N, 9) - float64_at(M, 9)),
+        float64_at(M, 10) + w * (float64_at(N, 10) - float64_at(M, 10)),
+        float64_at(M, 11) + w * (float64_at(N, 11) - float64_at(M, 11)),
+    )
+
+
+@inlined
+def placed(target: Target, geom: Any, inst: Any, place: Any) -> Any:
+    """Row of ``parts`` and instance of what Embree names by geometry, instance geometry and place in it."""
+    if inst == INVALID:
+        return np.int64(target.rows[np.int64(geom)]), np.int64(-1)
+    instance = np.int64(target.numbers[target.starts[np.int64(inst)] + np.int64(place)])
+    return np.int64(target.shape[instance]) + np.int64(geom) - COPIES, instance
+
+
+@inlined
+def numbered(target: Target, row: int, prim: int) -> Any:
+    """The number of a face."""
+    part = target.parts.ctypes.data + 40 * row
+    numbers = int64_at(part, 3)
+    return int64_at(part, 4) + (prim if numbers == 0 else np.int64(int32_at(numbers, prim)))
+
+
+@inlined
+def plane_of(target: Target, row: int, prim: int, instance: int, time: float) -> Any:
+    """A face's plane in the caster's axes: normal (a unit vector for the own mesh) and offset."""
+    plane = int64_at(target.parts.ctypes.data, 5 * row) + 32 * prim
+    nx, ny, nz, d = float64_at(plane, 0), float64_at(plane, 1), float64_at(plane, 2), float64_at(plane, 3)
+    if instance < 0:
+        return nx, ny, nz, d
+    a, b, c, x, e, f, g, y, h, i, j, z = transform_of(target, instance, time)
+    # Normals turn with the cofactors; a point of the plane is its offset times its unit normal.
+    mx = (f * j - g * i) * nx + (g * h - e * j) * ny + (e * i - f * h) * nz
+    my = (c * i - b * j) * nx + (a * j - c * h) * ny + (b * h - a * i) * nz
+    mz = (b * g - c * f) * nx + (c * e - a * g) * ny + (a * f - b * e) * nz
+    px, py, pz = d * nx, d * ny, d * nz
+    offset = (
+        mx * (a * px + b * py + c * pz + x)
+        + my * (e * px + f * py + g * pz + y)
+        + mz * (h * px + i * py + j * pz + z)
+    )
+    return mx, my, mz, offset
+
+
+@called
+def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> Any:
+    """Least and greatest ray parameter of a face's corners, measured along the ray."""
+    ox, oy, oz, dx, dy, dz = ray
+    vertices, faces = target.parts[row, 1], target.parts[row, 2]
+    low, high = np.inf, -np.inf
+    for k in range(3):
+        x, y, z = vector(vertices, np.int64(int32_at(faces, 3 * prim + k)))
+        if instance >= 0:
+            M = transform_of(target, instance, time)
+            x, y, z = (
+                M[0] * x + M[1] * y + M[2] * z + M[3],
+                M[4] * x + M[5] * y + M[6] * z + M[7],
+                M[8] * x + M[9] * y + M[10] * z + M[11],
+            )
+        t = ((x - ox) * dx + (y - oy) * dy + (z - oz) * dz) / (dx * dx + dy * dy + dz * dz)
+        low, high = min(low, t), max(high, t)
+    return low, high
+
+
+@inlined
+def meet(target: Target, W: int, k: int, row: int, prim: int, instance: int, work: Any) -> Any:
+    """Range, cosine and normal (not unit), in float64, where lane k's ray meets the plane of a face."""
+    ox, oy, oz, dx, dy, dz = (
+        work[k],
+        work[W + k],
+        work[2 * W + k],
+        work[3 * W + k],
+        work[4 * W + k],
+        work[5 * W + k],
+    )
+    nx, ny, nz, d = plane_of(target, row, prim, instance, work[8 * W + k])
+    along = nx * dx + ny * dy + nz * dz
+    t = (d - nx * ox - ny * oy - nz * oz) / along
+    cosine = -along * work[6 * W + k]
+    if instance >= 0:
+        cosine /= np.sqrt(nx * nx + ny * ny + nz * nz)
+    if not abs(cosine) >= GRAZING:
+        low, high = _extent(target, row, prim, instance, (ox, oy, oz, dx, dy, dz), work[8 * W + k])
+        t = high if t > high else low if not t >= low else t
+        cosine = cosine if cosine == cosine else 0.0  # noqa: PLR0124
+    return t, cosine, nx, ny, nz
