@@ -146,6 +146,13 @@ def test_parts_replace_the_outline_they_cover():
     assert problems == []
 
 
+@pytest.mark.parametrize(("use", "storeys", "low", "high"), [("church", "1", 10, 30), ("house", "1", 2, 4)])
+def test_the_one_storey_of_a_hall_says_nothing_of_its_height(use, storeys, low, high):
+    table, *_ = built(house(1, box(0, 0, 40, 20), building=use, **{"building:levels": storeys}))
+    assert low < table.height[0] < high
+    assert table.height_source[0] == ("inferred-type" if use == "church" else "levels")
+
+
 def test_a_building_is_as_uncertain_as_its_highest_part():
     table, *_ = built(
         house(1, box(0, 0, 20, 10)),

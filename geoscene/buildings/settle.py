@@ -17,6 +17,12 @@ from geoscene.buildings.table import BuildingOptions, Float, Texts
 from geoscene.report import Problem
 from geoscene.sources.data import Tags
 
+_HALLS = (
+    "church", "cathedral", "chapel", "mosque", "synagogue", "temple", "stadium", "sports_hall", "hangar",
+    "train_station",
+)  # fmt: skip
+"""Uses of buildings whose single storey says nothing of their height."""
+
 _OPEN_BELOW = ("roof", "carport", "canopy")
 
 
@@ -69,6 +75,10 @@ def settle_heights(
         texts([t.minimum_source or "default" for t in tagged]),
         texts([t.roof_source for t in tagged]),
     )
+    use = texts([r.use for r in rows])
+    # The one storey of a hall is as high as the hall.
+    hall = np.isin(use, _HALLS) & (h.source == "levels") & (np.array([t.levels for t in tagged]) <= 1)
+    h.high[hall], h.sigma[hall], h.source[hall] = np.nan, np.nan, ""
     _settle_roofs(rows, roofs, h)
     is_part = np.array([r.is_part for r in rows], np.bool_)
     outline = np.array([r.outline for r in rows], np.int64)
@@ -87,7 +97,6 @@ def settle_heights(
         h.low[k], h.low_source[k] = 0.0, "default"
 
     lifted = h.high - np.minimum(h.roof, h.high) - options.canopy
-    use = texts([r.use for r in rows])
     open_below = np.isin(use, _OPEN_BELOW) & (h.low_source == "default") & (lifted > 0.5)
     h.low[open_below], h.low_source[open_below] = lifted[open_below], "canopy"
 
