@@ -37,6 +37,9 @@ _STEP = 2.0
 _EDGE = 0.05
 """Metres from a deck's outside to the outline along which the ground falls away below it."""
 
+_HIGH = 1.0
+"""Metres over the ground around it at which a deck is over the ground below it as well."""
+
 _INTO = 0.1
 """Metres by which the ground reaches into a tunnel's wall beside an opening."""
 
@@ -74,6 +77,9 @@ def find_low_decks(table: Structures, height: Height | None) -> Structures:
     """
     low = table.low.copy()
     for k in np.flatnonzero(~table.tunnel).tolist():
+        xy, _, ground = _ground_on(np.array([table.polygon[k]], object), height)
+        if (ground < surface_heights(table, k, xy) - table.body[k] - _HIGH).all():
+            continue
         strips = _strips(table, k)
         xy, strip, ground = _ground_on(strips, height)
         high = ground > surface_heights(table, k, xy) - table.body[k]

@@ -92,12 +92,11 @@ def find_sheets(
 
 def where_same(line: Float, other: Float, within: float) -> shapely.Geometry:
     """Where, beside a line, it is less than ``within`` metres higher or lower than another one, in strips."""
-    strips = []
-    for part in _parts(line):
-        middle = part.mean(axis=0, keepdims=True)
-        if abs(foot(other, middle[:, :2])[0][0] - middle[0, 2]) < within:
-            strips.append(shapely.LineString(part[:, :2]).buffer(_SIDE, cap_style="flat"))
-    return shapely.union_all(strips)
+    cuts, middle = _strip_cuts(line)
+    same = np.abs(foot(other, middle[:, :2])[0] - middle[:, 2]) < within
+    return shapely.union_all(
+        [_flat_part(line, cuts, k).buffer(_SIDE, cap_style="flat") for k in np.flatnonzero(same).tolist()]
+    )
 
 
 def part_outlines(
@@ -160,25 +159,32 @@ def _in_conflict(
 
     needs : metres that the line must be above the other to pass over it, and below it to pass under
     """
-    strips = []
-    flat = shapely.LineString(other[:, :2])
-    for part in _parts(line):
-        middle = part.mean(axis=0, keepdims=True)
-        z, away, beside = foot(other, middle[:, :2])
-        up = float(middle[0, 2] - z[0])
-        if not beside[0] or away[0] > reach or not least <= abs(up) < needs[int(up < 0)] - _TIGHT:
-            continue
-        ends = shapely.line_locate_point(flat, shapely.points(part[[0, -1], :2]))
-        if abs(ends[1] - ends[0]) > _PARALLEL * np.hypot(*(part[-1] - part[0])[:2]):
-            strips.append(shapely.LineString(part[:, :2]).buffer(reach, cap_style="flat"))
+    cuts, middle = _strip_cuts(line)
+    z, away, beside = foot(other, middle[:, :2])
+    up = middle[:, 2] - z
+    short = (np.abs(up) >= least) & (np.abs(up) < np.where(up < 0, needs[1], needs[0]) - _TIGHT)
+    strips, flat = [], shapely.LineString(other[:, :2])
+    for k in np.flatnonzero(short & beside & (away <= reach)).tolist():
+        part = _flat_part(line, cuts, k)
+        start, end = shapely.line_locate_point(
+            flat, [shapely.Point(part.coords[0]), shapely.Point(part.coords[-1])]
+        )
+        if abs(end - start) > _PARALLEL * part.length:
+            strips.append(part.buffer(reach, cap_style="flat"))
     return strips
 
 
-def _parts(line: Float) -> list[Float]:
-    """A line in parts of a strip's length, which overlap a little."""
-    length = float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
-    cuts = np.linspace(0.0, length, max(int(np.ceil(length / _STRIP)), 1) + 1)
-    return [cut_line(line, start - _LAP, end + _LAP) for start, end in pairwise(cuts)]
+def _strip_cuts(line: Float) -> tuple[Float, Float]:
+    """Metres along a line at which strips begin and end, and the middle (n, 3) of each strip."""
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T)))
+    cuts = np.linspace(0.0, along[-1], max(int(np.ceil(along[-1] / _STRIP)), 1) + 1)
+    at = (cuts[:-1] + cuts[1:]) / 2
+    return cuts, np.stack([np.interp(at, along, column) for column in line.T], axis=1)
+
+
+def _flat_part(line: Float, cuts: Float, k: int) -> shapely.LineString:
+    """The line of a strip, which overlaps the next a little."""
+    return shapely.LineString(cut_line(line, cuts[k] - _LAP, cuts[k + 1] + _LAP)[:, :2])
 
 
 def _nearer(
