@@ -1,6 +1,7 @@
 """Rays: exact wherever the scene lies, no leaks, the same whoever casts them."""
 
 import logging
+import multiprocessing
 import subprocess
 import sys
 
@@ -426,3 +427,23 @@ def test_a_lone_copy_is_the_shape_it_says():
     caster = Caster(instances=[Instances(shapes, np.array([2], np.int32), stay)])
     hits = caster.cast([[0.0, 0.0, 10.0]], [[0.0, 0.0, -1.0]])
     assert hits.range[0] == 7.0
+
+
+def _cast_in_child(solid, start, way, out):
+    out.put(solid.cast(start, way, threads=2).range)
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_forked_process_casts_with_threads_of_its_own():
+    rng = np.random.default_rng(0)
+    solid = Caster(*soup(rng, 200))
+    way, start = directions(rng, 20_000), np.zeros((20_000, 3))
+    before = solid.cast(start, way, threads=2).range
+    context = multiprocessing.get_context("fork")
+    out = context.Queue()
+    child = context.Process(target=_cast_in_child, args=(solid, start, way, out))
+    child.start()
+    np.testing.assert_array_equal(out.get(timeout=30), before)
+    child.join(30)
+    assert child.exitcode == 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -118,6 +120,16 @@ def _refusal(rays: Rays, bad: int) -> InputError:
     )
 
 
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads that stay: starting them takes as long as a small frame."""
+    return ThreadPoolExecutor(threads, "rays")
+
+
+if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
 def share(work: Callable[[int, int], int], rays: Rays, threads: int) -> None:
     """Have threads do the rays in chunks of the order; ``work`` returns a ray that cannot be cast, or -1.
 
@@ -127,7 +139,7 @@ def share(work: Callable[[int, int], int], rays: Rays, threads: int) -> None:
     if threads <= 1 or n <= CHUNK:
         bad = work(0, n)
     else:
-        with ThreadPoolExecutor(threads) as pool:
-            bad = max(pool.map(lambda lo: work(lo, min(lo + CHUNK, n)), range(0, n, CHUNK)))
+        chunks = range(0, n, CHUNK)
+        bad = max(_pool(threads).map(lambda lo: work(lo, min(lo + CHUNK, n)), chunks))
     if bad >= 0:
         raise _refusal(rays, bad)
