@@ -17,8 +17,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lidar.raycast.columns import CHUNK, Rays, Target
-from lidar.raycast.lanes import GRAZING, cross, move_float64, move_int32, narrow
-from lidar.raycast.memory import aligned, float64_at, inlined, int64_at
+from lidar.raycast.lanes import GRAZING, cross, move_float64, move_int32, narrow, same
+from lidar.raycast.memory import aligned, float64_at, inlined, int32_at, int64_at
 from lidar.raycast.packets import RAY, ROWS, alike, first_bad, gather, nudge, trace
 from lidar.raycast.planes import INVALID, meet, numbered, placed, plane_of
 
@@ -37,8 +37,27 @@ def _normal(out: Float, i: int, x: float, y: float, z: float) -> None:
 def _name(target: Target, W: int, u: Any, work: Any, faces: Any, instances: Any) -> None:
     """Planes and numbers of what lanes met; a lane that met nothing has a plane without a normal."""
     for k in range(W):
-        geom, inst, prim = u[18 * W + k], u[19 * W + k], np.int64(u[17 * W + k])
         work[13 * W + k] = work[6 * W + k]
+    geometry, copies = u.ctypes.data + 4 * 18 * W, u.ctypes.data + 4 * 19 * W
+    own = u[18 * W] != INVALID and u[19 * W] == INVALID
+    if own and same(target.lanes, geometry) and same(target.lanes, copies):
+        # The common case, all lanes on one mesh, without looking up for each what holds for all.
+        part = target.parts.ctypes.data + 40 * np.int64(target.rows[u[18 * W]])
+        planes, numbers, first = int64_at(part, 0), int64_at(part, 3), int64_at(part, 4)
+        for k in range(W):
+            prim = np.int64(u[17 * W + k])
+            plane = planes + 32 * prim
+            work[9 * W + k], work[10 * W + k] = float64_at(plane, 0), float64_at(plane, 1)
+            work[11 * W + k], work[12 * W + k] = float64_at(plane, 2), float64_at(plane, 3)
+            faces[k] = first + prim
+        if numbers:
+            for k in range(W):
+                faces[k] = first + np.int64(int32_at(numbers, np.int64(u[17 * W + k])))
+        for k in range(W):
+            instances[k] = -1
+        return
+    for k in range(W):
+        geom, inst, prim = u[18 * W + k], u[19 * W + k], np.int64(u[17 * W + k])
         if geom == INVALID:
             work[9 * W + k], work[10 * W + k], work[11 * W + k], work[12 * W + k] = 0.0, 0.0, 0.0, 0.0
             faces[k], instances[k] = -1, -1

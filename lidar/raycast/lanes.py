@@ -107,6 +107,22 @@ narrow = _row(_DOUBLE, _FLOAT)
 
 
 @intrinsic
+def _same(context: Any, lanes: Any, source: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        row = _Rows(builder, lanes, values[1], _INT)[0].value
+        first = builder.extract_element(row, ir.Constant(_INT, 0))
+        differ = builder.icmp_unsigned("!=", row, _Rows(builder, lanes, values[1], _INT).same(first).value)
+        bits = ir.IntType(lanes.count)
+        return builder.icmp_unsigned("==", builder.bitcast(differ, bits), ir.Constant(bits, 0))
+
+    return types.boolean(lanes, types.int64), build
+
+
+same: Any = _same
+"""Whether all 32-bit numbers of a row are the same."""
+
+
+@intrinsic
 def _settle(context: Any, lanes: Any, work: Any, packet: Any, x: Any, y: Any, z: Any) -> Any:  # noqa: ARG001
     def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         rows, rounded = _Rows(builder, lanes, values[1]), _Rows(builder, lanes, values[2], _FLOAT)
