@@ -657,8 +657,8 @@ def test_real_bridges_and_tunnels(shared_osm, shared_dem, name, bounds, dem):
             continue
         points = real.centre_lines(kind)
         z, _ = first_below(mesh, moved(points, 0, 0, 2))
-        # A few of Monaco's tunnels fork and part in height while their carriageways still overlap.
-        assert (np.abs(z - points[:, 2]) < 0.02).mean() > (0.98 if dem else 0.999)
+        # Two of Monaco's tunnels fork and part in height while their carriageways still overlap.
+        assert (np.abs(z - points[:, 2]) < 0.02).mean() > (0.995 if dem else 0.999)
         if kind == "tunnel":
             above = first_above(mesh, moved(points, 0, 0, 2))
             assert (np.abs(above - points[:, 2] - SIZES.headroom) < 0.02).mean() > 0.98

@@ -17,6 +17,9 @@ Float = NDArray[np.float64]
 _APPROACH = 6.0
 """Metres of the road on the ground that tell which way a bridge or tunnel opens."""
 
+_SILL = 0.05
+"""Metres by which what opens reaches in, so that it is open on the outside of a bend at the mouth too."""
+
 _WALK = 5.0
 """Metres beside a carriageway that its sidewalk and parapet take up at most."""
 
@@ -80,8 +83,11 @@ def road_members(graph: RoadGraph, raised: SurfaceRows) -> Members:
         ends = [arms[int(node)] for node in (graph.tail[edge], graph.head[edge])]
         landed[k] = [any(other == 0 for other, _, _ in found) for found in ends]
         bands = [
-            _band(first, max(width, graph.width[edge]))
-            for found in ends
+            _band(
+                np.concatenate([cut_line(inward[:, :2], 0.0, _SILL)[1:], first]),
+                max(width, graph.width[edge]),
+            )
+            for inward, found in zip((line[k], line[k][::-1]), ends, strict=True)
             for other, first, width in found
             if other != kind
         ]

@@ -75,8 +75,11 @@ def find_sheets(
     least, most = np.empty((2, len(one)))
     for row, (p, q) in enumerate(zip(one.tolist(), two.tolist(), strict=True)):
         places = shapely.get_coordinates([common[row], common[row].representative_point()])
-        apart = np.abs(foot(around[p], places)[0] - foot(around[q], places)[0])
-        least[row], most[row] = apart.min(), apart.max()
+        (z, _, beside), (other_z, _, other_beside) = foot(around[p], places), foot(around[q], places)
+        apart = np.abs(z - other_z)
+        least[row] = apart.min()
+        # Beyond its end a line has no slope, however steep: one that goes on from it is no other one.
+        most[row] = apart[beside & other_beside].max(initial=least[row])
     same = least < SHEET
     over, parted = (
         set(zip(one[rows].tolist(), two[rows].tolist(), strict=True))
@@ -93,7 +96,8 @@ def find_sheets(
 def where_same(line: Float, other: Float, within: float) -> shapely.Geometry:
     """Where, beside a line, it is less than ``within`` metres higher or lower than another one, in strips."""
     cuts, middle = _strip_cuts(line)
-    same = np.abs(foot(other, middle[:, :2])[0] - middle[:, 2]) < within
+    z, _, beside = foot(other, middle[:, :2])
+    same = (np.abs(z - middle[:, 2]) < within) | ~beside
     return shapely.union_all(
         [_flat_part(line, cuts, k).buffer(_SIDE, cap_style="flat") for k in np.flatnonzero(same).tolist()]
     )
