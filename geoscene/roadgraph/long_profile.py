@@ -90,9 +90,9 @@ def profile(
     only, so they run on from their ramps. Bounds: a road is above one that it crosses by clearance and deck;
     bridges and tunnels that overlap a road beside them are as high as it or that far over or under it;
     a bridge is above obstacles and the ground; a tunnel is under the ground, deeper with the distance from
-    its mouth, and if slopes allow wholly so after 15 m; slopes; changes of slope. Bounds that
-    contradict each other (a ramp too short for its
-    slope) give way, carriageways side by side before slopes before heights. Solved by an interior-point method.
+    its mouth, and if slopes allow wholly so after 15 m; slopes; changes of slope. Bounds that contradict each
+    other (a ramp too short for its slope) give way, carriageways side by side before slopes before heights.
+    Solved by an interior-point method.
 
     ground    : height of the terrain; what it returns is kept to where nothing stands against it
     obstacles : what else bridges cross
