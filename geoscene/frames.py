@@ -78,13 +78,9 @@ class Frame:
         try:
             parsed = CRS.from_user_input(utm_crs(lon_deg, lat_deg) if crs == "utm" else crs)
         except CRSError as error:
-            raise FrameError(
-                f"--crs {crs}: pyproj does not know it; give utm or EPSG:<number>"
-            ) from error
+            raise FrameError(f"--crs {crs}: pyproj does not know it; give utm or EPSG:<number>") from error
         if not parsed.is_projected:
-            raise FrameError(
-                f"--crs {crs} ({parsed.name}) is not projected; give utm or EPSG:<number>"
-            )
+            raise FrameError(f"--crs {crs} ({parsed.name}) is not projected; give utm or EPSG:<number>")
         if any(axis.unit_conversion_factor != 1.0 for axis in parsed.axis_info[:2]):
             raise FrameError(f"--crs {crs} ({parsed.name}) is not in metres")
         frame = cls(str(parsed.to_wkt()), (0.0, 0.0), vertical)

@@ -50,6 +50,7 @@ from geoscene.structures import (
     ground_below,
     opening_layers,
     read_structures,
+    within_extent,
 )
 from geoscene.terrain import Terrain, base_heights, flat_terrain, open_terrain
 from geoscene.urban import paved_fabric
@@ -175,8 +176,7 @@ def make_plan(
     problems += found
     structures, found = read_structures(surfaces, graph, osm, frame, height=height)
     problems += found
-    inside = shapely.area(shapely.intersection(structures.polygon, shapely.box(*extent)))
-    structures = structures.take(inside >= 0.5 * shapely.area(structures.polygon))
+    structures = within_extent(structures, extent)
     height = ground_below(structures, height or terrain.height) if len(structures) else height
     openings = find_openings(structures, height)
     footprints = buildings.footprint[: buildings.count]

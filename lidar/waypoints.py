@@ -210,8 +210,8 @@ def match_track(
         lon, lat = frame.to_geographic(*xy[lost[0]])
         raise RouteError(
             f"{len(lost)} of {len(xy)} points of the track have no drivable street within {tolerance:.0f} m,"
-            f" the first at {float(lat):.6f}, {float(lon):.6f}; cut the track to the scene's streets, or build"
-            " a scene that holds it"
+            f" the first at {float(lat):.6f}, {float(lon):.6f}; cut the track to the scene's streets, or"
+            " build a scene that holds it"
         )
     straight = np.hypot(*np.diff(xy, axis=0).T)
 

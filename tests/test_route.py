@@ -179,7 +179,8 @@ def test_waypoints_take_no_turn_that_is_forbidden_via_a_way(between):
 
 
 def test_of_many_waypoints_off_the_streets_three_are_named_and_the_rest_counted():
-    with pytest.raises(RouteError, match=r"^waypoint 1 .*; waypoint 2 .*; waypoint 3 .*; and so are 37 more$"):
+    said = r"^waypoint 1 .*; waypoint 2 .*; waypoint 3 .*; and so are 37 more$"
+    with pytest.raises(RouteError, match=said):
         plan_route(grid(2, 2), FRAME, [(36.5, -76.0)] * 40)
 
 
