@@ -71,7 +71,7 @@ _OPENINGS = {"gate": 3.0, "lift_gate": 4.0, "swing_gate": 4.0, "sliding_gate": 4
 
 _APART = 0.005
 """Metres by which bands that touch themselves in a point are made narrower on each side."""
-_PASSABLE = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.RAIL)
+_PASSABLE = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.RAIL, Class.TUNNEL)
 """A barrier drawn across these is open there."""
 
 

@@ -13,6 +13,7 @@ from geoscene.ground import Layers, building_pads, concatenate_layers, plan_grou
 from geoscene.shapes import expand, shapes
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData, Point, Way
+from geoscene.structures.meeting import OPENING
 
 FRAME = Frame.at(9.0, 50.0)
 EXTENT = (-100.0, -100.0, 100.0, 100.0)
@@ -38,9 +39,10 @@ def osm_of(*features):
     return OsmData((8.9, 49.9, 9.1, 50.1), kinds[Way], kinds[Area], kinds[Point], [])
 
 
-def plan_with(roads=(), houses=()):
+def plan_with(roads=(), houses=(), mouths=()):
     road = Layers.of(list(roads), klass=Class.ROAD, material=1, priority=130.0)
-    return plan_ground(EXTENT, concatenate_layers([road, building_pads(list(houses))]))
+    mouth = Layers.of(list(mouths), klass=Class.TUNNEL, material=1, priority=OPENING)
+    return plan_ground(EXTENT, concatenate_layers([road, building_pads(list(houses)), mouth]))
 
 
 STREET = shapely.box(-100, -3, 100, 3)
@@ -191,6 +193,13 @@ def test_a_barrier_is_open_where_a_road_passes_and_ends_at_houses():
     assert volume(mesh) == pytest.approx((100 - 6 - 20) * 0.8 * 1.3, rel=1e-6)
     assert [(p.osm_id, p.reason) for p in problems] == [("way/1", "across-road")]
     assert len(shapely.get_parts(barriers.polygon[0])) == 2
+
+
+def test_a_barrier_over_a_tunnels_mouth_does_not_bar_it():
+    wall = way(1, [(-20, 0), (20, 0)], barrier="wall", height="2.2", width="0.5")
+    barriers, problems = read_barriers(osm_of(wall), FRAME, plan_with(mouths=[shapely.box(-4, -10, 5, 10)]))
+    assert barriers.polygon[0].area == pytest.approx((40 - 9) * 0.5)
+    assert [p.reason for p in problems] == ["across-road"]
 
 
 def test_a_barrier_follows_the_ground():
