@@ -123,7 +123,8 @@ def drive(
         One dial set apart from the level, NAME=VALUE; again for more. lidar settings lists them all.
     traffic
         Other road users: on, or densities such as vehicles=20,parked=0.5,walkers=5,cyclists=2 (vehicles and
-        cyclists per km of lane, walkers per km of sidewalk, parked as a share of the places).
+        cyclists per km of lane, walkers per km of sidewalk, parked as a share of the places); or a file that
+        sumo --fcd-output wrote, with net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed.
     formats
         Formats of clouds, with commas: pcd, ply, csv, kitti, nuscenes (sensor frame), laz, las
         (georeferenced).
@@ -236,10 +237,13 @@ def _point(word: str) -> tuple[float, float] | None:
 def _traffic(text: str | None) -> Any:
     if text is None or text == "off":
         return None
-    from lidar.actors import TrafficOptions  # noqa: PLC0415
+    from lidar.actors import TrafficFile, TrafficOptions  # noqa: PLC0415
 
     if text == "on":
         return TrafficOptions()
+    file, *words = text.split(",")
+    if file.lower().endswith((".xml", ".xml.gz")):
+        return TrafficFile(Path(file), **_words_of_file(text, words))
     known = ("vehicles", "cyclists", "walkers", "parked", "reach")
     pairs = [_setting(word) for word in text.split(",")] if "=" in text else [(text, "")]
     if unknown := [name for name, _ in pairs if name not in known]:
@@ -247,6 +251,17 @@ def _traffic(text: str | None) -> Any:
     try:
         given: dict[str, Any] = {name: float(value) for name, value in pairs}
         return TrafficOptions(**given)
+    except ValueError as error:
+        raise InputError(f"--traffic {text}: {error}") from None
+
+
+def _words_of_file(text: str, words: list[str]) -> dict[str, Any]:
+    known = {"net": Path, "begin": float, "parked": float, "reach": float}
+    given = dict(_setting(word) for word in words)
+    if unknown := given.keys() - known.keys():
+        raise InputError(f"--traffic {text}: {', '.join(sorted(unknown))} is none of {', '.join(known)}")
+    try:
+        return {name: known[name](value) for name, value in given.items()}
     except ValueError as error:
         raise InputError(f"--traffic {text}: {error}") from None
 

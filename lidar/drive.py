@@ -21,7 +21,7 @@ from geoscene.errors import GeosceneError
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from lidar import __version__
-from lidar.actors import Actors, drive_among, populate
+from lidar.actors import Actors, TrafficFile, drive_among, populate, replay
 from lidar.crowd import Worlds
 from lidar.dataset import prepare, write_json, write_trajectory
 from lidar.devices import Camera, Scanner, cameras, scanners
@@ -128,7 +128,9 @@ def drive(
         progress("traffic", 0, 0)
         traffic = replace(options.traffic, side=options.keeps(scene))
         graph = road_graph(scene)
-        if isinstance(planned, Travel):
+        if isinstance(traffic, TrafficFile):
+            actors = replay(scene, graph, trajectory, body, seed=options.seed, options=traffic)
+        elif isinstance(planned, Travel):
             trajectory, actors = drive_among(
                 scene, graph, planned.path, body, trajectory,
                 seed=options.seed, options=traffic, duration=planned.duration,

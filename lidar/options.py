@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from geoscene.scene import Scene
-from lidar.actors import TrafficOptions
+from lidar.actors import TrafficFile, TrafficOptions
 from lidar.errors import InputError
 from lidar.record import Contents
 from lidar.rig import load_rig, rig_digest
@@ -42,7 +42,7 @@ class DriveOptions:
     exact      : georeference every point through the projection instead of a bounded affine map
     side       : side of the road, left or right; the scene's by default
     fidelity   : level of `lidar.settings.levels`: draft, standard or survey
-    traffic    : other road users and parked cars; none by default
+    traffic    : other road users and parked cars, as densities or a file of SUMO; none by default
     settings   : single dials set apart from the level, as (name, text)
     workers    : threads
     """
@@ -65,7 +65,7 @@ class DriveOptions:
     exact: bool = False
     side: str = ""
     fidelity: str = "standard"
-    traffic: TrafficOptions | None = None
+    traffic: TrafficOptions | TrafficFile | None = None
     settings: tuple[tuple[str, str], ...] = ()
     workers: int = 2
 
@@ -117,9 +117,15 @@ class DriveOptions:
             "exact": self.exact,
             "side": self.keeps(scene),
             "fidelity": self.fidelity,
-            "traffic": asdict(replace(self.traffic, side=self.keeps(scene))) if self.traffic else None,
+            "traffic": self._traffic(scene),
             "settings": [list(pair) for pair in self.settings],
         }
+
+    def _traffic(self, scene: Scene) -> dict[str, Any] | None:
+        if self.traffic is None:
+            return None
+        told = asdict(replace(self.traffic, side=self.keeps(scene)))
+        return {name: _named(value) if isinstance(value, Path) else value for name, value in told.items()}
 
 
 def _named(what: str | Path) -> str:

@@ -10,5 +10,7 @@ from lidar.actors.among import drive_obeying as drive_obeying
 from lidar.actors.boxes import box_rows as box_rows
 from lidar.actors.boxes import count_points as count_points
 from lidar.actors.boxes import image_boxes as image_boxes
+from lidar.actors.fcd import TrafficFile as TrafficFile
 from lidar.actors.populate import TrafficOptions as TrafficOptions
 from lidar.actors.populate import populate as populate
+from lidar.actors.replayed import replay as replay

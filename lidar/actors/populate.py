@@ -158,34 +158,58 @@ def settled(
 
     obeys : whether that motion keeps to the signals; otherwise they are green when it comes
     """
-    lanes, plan, area, trips = company.lanes, company.plan, company.area, company.trips
-    standing, surfaces, around, scale = company.standing, company.surfaces, company.around, company.scale
+    trips, plan = company.trips, company.plan
     box = (vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang)
-    flow = simulate_trips(trips, graph, plan, ego, box, reach=options.reach * scale, obeys=obeys)
+    flow = simulate_trips(trips, graph, plan, ego, box, reach=options.reach * company.scale, obeys=obeys)
+    return joined(
+        [
+            moving_actors(trips, flow, scene, scale=company.scale),
+            parked_about(scene, ego, vehicle, company, _swept(trips), seed=seed, share=options.parked),
+        ],
+        first_feature=first_feature(scene),
+    )
 
+
+def first_feature(scene: Scene) -> int:
+    """The first number that no feature of a scene bears."""
+    return max((stop for _, stop in scene.layers.values()), default=0)
+
+
+def parked_about(
+    scene: Scene,
+    ego: Trajectory,
+    vehicle: Vehicle,
+    company: Company,
+    swept: NDArray[np.object_],
+    *,
+    seed: int,
+    share: float,
+) -> Actors:
+    """Vehicles that stand along kerbs and in parking lots.
+
+    swept : what those who move cover, as polygons in plan
+    share : of the places that are taken
+    """
+    surfaces, around, lanes = company.surfaces, company.around, company.lanes
     lots = _polygons(_layer(scene, "landcover"), ("parking",), around)
     structures = _layer(scene, "structures")
     crossings = shapely.buffer(_polygons(surfaces, ("crossing",), around), 2.0)
     free = [
-        _ego_boxes(ego, vehicle, scale),
-        _swept(trips),
-        _strips(lanes, area),
-        shapely.buffer(plan.zones.polygon, 3.0),
+        _ego_boxes(ego, vehicle, company.scale),
+        swept,
+        _strips(lanes, company.area),
+        shapely.buffer(company.plan.zones.polygon, 3.0),
         crossings,
         np.empty(0, object) if structures is None else shapely.buffer(structures.geometry, 0.5),
     ]
-    trees = [shapely.STRtree(part) for part in (standing, np.concatenate(free))]
+    trees = [shapely.STRtree(part) for part in (company.standing, np.concatenate(free))]
     spots = concatenated(
         [
-            kerb_spots(lanes, area.near, seed=seed, share=options.parked),
-            lot_spots(lots, seed=seed, share=options.parked),
+            kerb_spots(lanes, company.area.near, seed=seed, share=share),
+            lot_spots(lots, seed=seed, share=share),
         ]
     )
-    groups = [
-        moving_actors(trips, flow, scene, scale=scale),
-        parked_actors(spots, scene, CARS, trees, seed=seed, scale=scale),
-    ]
-    return joined(groups, first_feature=max((stop for _, stop in scene.layers.values()), default=0))
+    return parked_actors(spots, scene, CARS, trees, seed=seed, scale=company.scale)
 
 
 def _passable(

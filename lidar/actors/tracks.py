@@ -83,7 +83,7 @@ def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: flo
     present, counts = np.unique(flow.trip, return_counts=True)
     ends = np.concatenate([[0], np.cumsum(counts)])
     n = len(flow.trip)
-    middle, yaw, hint, axle, track = np.empty((n, 2)), *np.empty((4, n))
+    middle, yaw, hint = np.empty((n, 2)), np.empty(n), np.empty(n)
     for k, row in enumerate(present.tolist()):
         trip, part = trips[row], slice(ends[k], ends[k + 1])
         at = flow.gone[part] / STEP
@@ -92,30 +92,66 @@ def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: flo
         middle[part] = np.stack([np.interp(at, stations, xy[:, c]) for c in (0, 1)], axis=1)
         yaw[part] = np.interp(at, stations, heading)
         hint[part] = np.interp(at, stations, trip.way.xyz[:, 2])
-        axle[part], track[part] = trip.axle, _TRACK * trip.width
-    z, pitch, roll, _ = standing(scene, middle, yaw, hint, axle=axle, track=track, scale=scale)
-    speed, course = flow.speed * scale, np.empty(n)
-    for k, row in enumerate(present.tolist()):
-        part = slice(ends[k], ends[k + 1])
-        course[part] = _course(middle[part], yaw[part])
-        for column in (z, pitch, roll):
-            column[part] = _settled(column[part], flow.gone[part])
-        kind = trips[row].shape.kind
-        pitch[part] *= kind not in _UPRIGHT
-        roll[part] *= kind not in _UPRIGHT and kind not in _LEANING
-    climb = np.zeros(n)
-    for k in range(len(present)):
-        part = slice(ends[k], ends[k + 1])
-        climb[part] = _rate(z[part])
-    return table(
+    return tracked(
+        scene,
         [trips[row].shape for row in present],
         [trips[row].stretch for row in present],
         counts,
-        np.round(flow.step * DT * 1e9).astype(np.int64),
+        flow.step,
+        middle,
+        yaw,
+        hint,
+        speed=flow.speed,
+        gone=flow.gone,
+        scale=scale,
+    )
+
+
+def tracked(
+    scene: Scene,
+    shapes: Sequence[Shape],
+    stretch: Sequence[tuple[float, float, float]],
+    knots: NDArray[np.int64],
+    step: NDArray[np.int64],
+    middle: Float,
+    yaw: Float,
+    hint: Float,
+    *,
+    speed: Float,
+    gone: Float,
+    scale: float,
+) -> Actors:
+    """Actors (n) that go along tracks in plan, put on the scene's ground.
+
+    knots        : (n,) how many each has of the following (k) rows, which are `DT` apart
+    step         : (k,) `DT` since the drive's start
+    middle, yaw  : (k, 2) scene metres and (k,) radians, unwrapped
+    hint         : (k,) height near which the ground is; NaN to take the topmost
+    speed, gone  : (k,) m/s and metres covered
+    """
+    ends = np.concatenate([[0], np.cumsum(knots)])
+    axle = np.repeat([s.base * g[0] for s, g in zip(shapes, stretch, strict=True)], knots)
+    track = np.repeat([_TRACK * s.width * g[1] for s, g in zip(shapes, stretch, strict=True)], knots)
+    z, pitch, roll, _ = standing(scene, middle, yaw, hint, axle=axle, track=track, scale=scale)
+    course, climb = np.empty(len(z)), np.empty(len(z))
+    for k, shape in enumerate(shapes):
+        part = slice(ends[k], ends[k + 1])
+        course[part] = _course(middle[part], yaw[part])
+        for column in (z, pitch, roll):
+            column[part] = _settled(column[part], gone[part])
+        pitch[part] *= shape.kind not in _UPRIGHT
+        roll[part] *= shape.kind not in _UPRIGHT and shape.kind not in _LEANING
+        climb[part] = _rate(z[part])
+    v = speed * scale
+    return table(
+        shapes,
+        stretch,
+        knots,
+        np.round(step * DT * 1e9).astype(np.int64),
         np.column_stack([middle, z]),
         np.column_stack([yaw, pitch, roll]),
-        np.column_stack([speed * np.cos(course), speed * np.sin(course), climb]),
-        flow.gone,
+        np.column_stack([v * np.cos(course), v * np.sin(course), climb]),
+        gone,
         parked=False,
         scale=scale,
     )

@@ -1,0 +1,313 @@
+"""Traffic recorded by SUMO: floating car data (``--fcd-output``), the network it belongs to, its types.
+
+See "FCD Output", "Vehicle Type Parameter Defaults" and "Geo-Coordinates" in SUMO's documentation.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.errors import FormatError, InputError
+
+Float = NDArray[np.float64]
+
+_HEAD = 1 << 16  # bytes at a file's start in which SUMO notes its options
+_OPTION = re.compile(
+    r'<(net-file|route-files|additional-files|fcd-output\.geo|fcd-output\.utm) value="([^"]*)"'
+)
+_UNDONE = ("", "!", "-", ".")  # what a network says of its projection where that cannot be undone
+
+_LENGTHS = {
+    "passenger": 5.0,
+    "taxi": 5.0,
+    "emergency": 6.5,
+    "delivery": 6.5,
+    "truck": 7.1,
+    "trailer": 16.5,
+    "bus": 12.0,
+    "coach": 14.0,
+    "motorcycle": 2.2,
+    "moped": 2.1,
+    "bicycle": 1.6,
+    "pedestrian": 0.215,
+}
+"""Metres of a vehicle of a class, by SUMO's defaults."""
+
+_WORDS = (
+    *(("trailer", "trailer"), ("truck", "truck"), ("lorry", "truck"), ("hgv", "truck"), ("coach", "coach")),
+    *(("tram", ""), ("rail", ""), ("train", ""), ("subway", ""), ("ship", ""), ("container", "")),
+    *(("motorcycle", "motorcycle"), ("motorbike", "motorcycle"), ("moped", "moped"), ("scooter", "moped")),
+    *(("bicycle", "bicycle"), ("bike", "bicycle"), ("cyclist", "bicycle"), ("ped", "pedestrian")),
+    *(("person", "pedestrian"), ("delivery", "delivery"), ("van", "delivery"), ("emergency", "emergency")),
+    *(("taxi", "taxi"), ("bus", "bus")),
+)
+"""Words in the names of types, the first that fits counts, and their classes; "" for what is left out."""
+_OTHER = {"private": "passenger", "evehicle": "passenger", "hov": "passenger", "vip": "passenger",
+          "army": "truck", "authority": "passenger", "wheelchair": "pedestrian"}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficFile:
+    """Traffic from a file of SUMO, and who else is about.
+
+    path   : floating car data, ``.xml`` or ``.xml.gz``
+    net    : SUMO's network, of which its coordinates are; by default the one that the file names, and none is
+             needed for longitudes and latitudes (``--fcd-output.geo``)
+    begin  : SUMO's time in seconds at which the drive starts; the first in the file by default
+    parked : share of the places along kerbs and in parking lots that are taken
+    reach  : true metres from the ego vehicle within which there are road users
+    side   : side of the road that traffic keeps to
+    """
+
+    path: Path
+    net: Path | None = None
+    begin: float | None = None
+    parked: float = 0.6
+    reach: float = 200.0
+    side: Literal["right", "left"] = "right"
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        if not 0 <= self.parked <= 1:
+            raise InputError(f"traffic: parked = {self.parked} is not within 0 to 1")
+        if not 50 <= self.reach <= 1000:
+            raise InputError(f"traffic: reach = {self.reach} is not within 50 to 1000")
+
+
+@dataclass(frozen=True, slots=True)
+class Fcd:
+    """What SUMO recorded, a row a vehicle or person and time step, by vehicle and in time.
+
+    name     : (n,) its id, ``first`` (n + 1,) its rows
+    vclass   : (n,) its class: a key of `length_of`
+    length   : (n,) metres
+    time     : (k,) seconds
+    lon, lat : (k,) degrees, WGS 84, middle of the front bumper
+    ahead    : (k, 2) longitude and latitude of a place about a metre ahead of it
+    speed    : (k,) m/s, NaN where the file has none
+    """
+
+    name: tuple[str, ...]
+    first: NDArray[np.int64]
+    vclass: tuple[str, ...]
+    length: Float
+    time: Float
+    lon: Float
+    lat: Float
+    ahead: Float
+    speed: Float
+
+
+def read_fcd(path: Path, *, net: Path | None = None) -> Fcd:
+    """The vehicles and persons of a file; what runs on rails or swims is left out.
+
+    Raises FormatError for a file that is missing, broken or another one, and where the place of its network
+    on Earth cannot be told.
+    """
+    noted = _noted(path)
+    rows, names, kinds = _rows(path)
+    if not len(rows):
+        raise FormatError(f"{path}: nobody is in it; is it what sumo --fcd-output wrote?")
+    number, time, x, y, angle, speed = rows.T
+    geo = noted.get("fcd-output.geo") == "true"
+    net = net or _beside(path, noted.get("net-file", ""))
+    if not geo and net is None and (np.abs(x) <= 180).all() and (np.abs(y) <= 90).all():
+        geo = True
+    c, s = np.sin(np.radians(angle)), np.cos(np.radians(angle))  # east and north from degrees clockwise
+    if geo:
+        metre = 1 / 111_320.0
+        lon, lat = x, y
+        ahead = np.column_stack([lon + metre * c / np.cos(np.radians(lat)), lat + metre * s])
+    elif net is None:
+        raise FormatError(
+            f"{path}: x and y are of a network that is not there; add net=FILE.net.xml, or run sumo with"
+            " --fcd-output.geo"
+        )
+    else:
+        shift, unproject = _placed(net)
+        if noted.get("fcd-output.utm") == "true":
+            shift = np.zeros(2)
+        at = np.column_stack([x, y]) - shift
+        lon, lat = unproject(at)
+        ahead = np.column_stack(unproject(at + np.column_stack([c, s])))
+    known = _types(path, noted)
+    classes = [known.get(kind, ("", None)) for kind in kinds]
+    vclass = [given or _class_of(kind) for (given, _), kind in zip(classes, kinds, strict=True)]
+    length = [
+        metres if metres is not None else _LENGTHS.get(c, 5.0)
+        for (_, metres), c in zip(classes, vclass, strict=True)
+    ]
+    order = np.lexsort((time, number))
+    order = order[np.isin(number[order], [k for k, c in enumerate(vclass) if c in _LENGTHS])]
+    used, counts = np.unique(number[order].astype(int), return_counts=True)
+    return Fcd(
+        tuple(names[k] for k in used),
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        tuple(vclass[k] for k in used),
+        np.array([length[k] for k in used], float),
+        time[order],
+        lon[order],
+        lat[order],
+        ahead[order],
+        speed[order],
+    )
+
+
+def _class_of(kind: str) -> str:
+    """SUMO's class of a type by its name; "" for what is left out."""
+    name = kind.lower()
+    return next((c for word, c in _WORDS if word in name), "passenger")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
+    """A file of XML, packed or not; FormatError for one that cannot be read."""
+    try:
+        with path.open("rb") as raw, gzip.open(raw) as unpacked:
+            packed = raw.read(2) == b"\x1f\x8b"
+            raw.seek(0)
+            yield cast("IO[bytes]", unpacked) if packed else raw
+    except FileNotFoundError:
+        raise FormatError(f"{path} does not exist") from None
+    except (OSError, EOFError) as error:
+        raise FormatError(f"{path}: cannot be read: {error}") from None
+    except ET.ParseError as error:
+        raise FormatError(f"{path}: broken XML ({error}); had sumo ended when it was copied?") from None
+
+
+def _noted(path: Path) -> dict[str, str]:
+    """The options that SUMO noted at the file's start."""
+    with _opened(path) as file:
+        head = file.read(_HEAD).decode("utf-8", "replace")
+    head, _, _ = head.partition("<fcd-export")
+    return dict(_OPTION.findall(head))
+
+
+def _beside(path: Path, named: str) -> Path | None:
+    """A file that another one names, beside it or where it says."""
+    found = [p for p in (path.parent / named, Path(named)) if named and p.is_file()]
+    return found[0] if found else None
+
+
+def _elements(file: IO[bytes], tag: str) -> Iterator[ET.Element]:
+    """Elements of a tag, forgotten when the next is asked for; the file's root first."""
+    events = ET.iterparse(file, events=("start", "end"))  # noqa: S314  (expat bounds what entities expand to)
+    _, root = next(events)
+    yield root
+    depth = 1
+    for event, element in events:
+        depth += 1 if event == "start" else -1
+        if event == "end" and element.tag == tag:
+            yield element
+        if event == "end" and depth == 1:
+            root.clear()
+
+
+def _rows(path: Path) -> tuple[Float, list[str], list[str]]:
+    """Rows (k, 6) of number, time, x, y, angle and speed; ids and types by number."""
+    rows: list[tuple[float, ...]] = []
+    numbers: dict[tuple[str, str], int] = {}
+    kinds: list[str] = []
+    with _opened(path) as file:
+        steps = _elements(file, "timestep")
+        root = next(steps)
+        if root.tag != "fcd-export":
+            raise FormatError(f"{path}: <{root.tag}> is not floating car data; run sumo with --fcd-output")
+        for step in steps:
+            time = _number(path, step, "time", "a time step")
+            for mover in step:
+                if mover.tag not in ("vehicle", "person"):
+                    continue
+                name = mover.get("id", "")
+                where = f"{mover.tag} {name!r} at {time:g} s"
+                key = (mover.tag, name)
+                if key not in numbers:
+                    numbers[key] = len(numbers)
+                    kinds.append(mover.get("type", "") if mover.tag == "vehicle" else "pedestrian")
+                x, y, angle = (_number(path, mover, a, where) for a in ("x", "y", "angle"))
+                speed = _number(path, mover, "speed", where) if "speed" in mover.attrib else np.nan
+                rows.append((numbers[key], time, x, y, angle, speed))
+    return np.array(rows, float).reshape(-1, 6), [name for _, name in numbers], kinds
+
+
+def _number(path: Path, element: ET.Element, attribute: str, where: str) -> float:
+    text = element.get(attribute)
+    try:
+        value = float(text if text is not None else "")
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        said = "is missing" if text is None else f"= {text!r} is no number"
+        raise FormatError(f"{path}: {where}: {attribute} {said}")
+    return value
+
+
+def _placed(net: Path) -> tuple[Float, _Unproject]:
+    """Where a network lies: its offset (2,), and what makes longitudes and latitudes of the rest."""
+    with _opened(net) as file:
+        places = _elements(file, "location")
+        root = next(places)
+        place = next(places, None) if root.tag == "net" else None
+    if place is None:
+        raise FormatError(f"{net}: not a SUMO network with a <location>")
+    proj = place.get("projParameter", "")
+    try:
+        shift = np.array([float(v) for v in place.get("netOffset", "").split(",")])
+    except ValueError:
+        shift = np.empty(0)
+    if shift.shape != (2,):
+        raise FormatError(f"{net}: netOffset = {place.get('netOffset')!r} is not two numbers")
+    if proj in _UNDONE:
+        raise FormatError(
+            f"{net}: has no projection that can be undone ({proj!r}); run sumo with a network that"
+            " geoscene export --to sumo or netconvert --proj made"
+        )
+    return shift, _Unproject(net, proj)
+
+
+class _Unproject:
+    """Longitudes and latitudes of points in a projection given in PROJ's words."""
+
+    def __init__(self, net: Path, proj: str) -> None:
+        from pyproj import CRS, Transformer  # noqa: PLC0415
+        from pyproj.exceptions import CRSError  # noqa: PLC0415
+
+        try:
+            self._transformer = Transformer.from_crs(CRS(proj), "EPSG:4326", always_xy=True)
+        except CRSError as error:
+            raise FormatError(f"{net}: projParameter = {proj!r}: {error}") from None
+
+    def __call__(self, xy: Float) -> tuple[Float, Float]:
+        """Degrees (n,) and (n,) of points (n, 2)."""
+        lon, lat = self._transformer.transform(*xy.T)
+        return np.asarray(lon, float), np.asarray(lat, float)
+
+
+def _types(path: Path, noted: dict[str, str]) -> dict[str, tuple[str, float | None]]:
+    """Class and length of the types in the files of routes that SUMO read, as far as they are there."""
+    out: dict[str, tuple[str, float | None]] = {}
+    named = f"{noted.get('route-files', '')},{noted.get('additional-files', '')}"
+    for name in named.split(","):
+        source = _beside(path, name.strip())
+        if source is None:
+            continue
+        with _opened(source) as file:
+            types = _elements(file, "vType")
+            next(types)
+            for element in types:
+                vclass = element.get("vClass", "passenger")
+                vclass = _OTHER.get(vclass, vclass)
+                where = f"vType {element.get('id')!r}"
+                length = _number(source, element, "length", where) if "length" in element.attrib else None
+                out[element.get("id", "")] = vclass if vclass in _LENGTHS else "left out", length
+    return out
