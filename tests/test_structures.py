@@ -599,6 +599,44 @@ def test_a_foot_tunnel_passes_under_a_road_tunnel_of_a_higher_layer_and_joins_on
     assert ends[np.abs(ends[:, 1]) < 0.1, 2] == pytest.approx(z, abs=0.01)
 
 
+def roofs(made):
+    """Places (n, 3) of the shells' upward faces of class TUNNEL."""
+    mesh = made.mesh()
+    corner = mesh.vertices[mesh.faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    up = (normal[:, 2] > 0.7 * np.linalg.norm(normal, axis=1)) & (mesh.klass == Class.TUNNEL)
+    return corner[up].mean(axis=1)
+
+
+def test_a_foot_tunnel_goes_down_from_the_street_and_stays_below_even_to_a_dead_end():
+    places = {1: (-300, 0), 2: (-200, 0), 3: (200, 0)}
+    walk = {"highway": "footway"}
+    under = Town(town(places, [(walk, [1, 2]), (walk | {"tunnel": "yes", "layer": "-1"}, [2, 3])]))
+    line = np.concatenate([z for z, edge in zip(under.table.line, under.table.edge, strict=True) if edge < 0])
+    mouth = np.abs(line[:, 0] + 200) < 1
+    assert line[mouth, 2] == pytest.approx(0.0, abs=0.01)
+    slope = np.abs(np.diff(line[:, 2]) / np.maximum(np.diff(line[:, 0]), 0.1))
+    assert slope.max() < 0.125
+    top = roofs(under)
+    assert (top[top[:, 0] > -160, 2] < -0.05).all()  # 4 m down take a ramp of 33 m
+    assert (line[line[:, 0] > -160, 2] < -(SIZES.passage + SIZES.roof)).all()
+    assert not any(o is not None and o.bounds[2] > -155 for o in under.openings)
+
+
+@pytest.mark.parametrize(("house", "level"), [((-30, -20, 30, 20), True), ((300, 300, 320, 320), False)])
+def test_a_tunnel_of_no_layer_is_level_within_a_house_and_else_below_the_ground(house, level):
+    corners = np.array(
+        [(house[0], house[1]), (house[2], house[1]), (house[2], house[3]), (house[0], house[3])]
+    )
+    shape = shapely.MultiPolygon([shapely.Polygon(lonlat(corners.tolist()))])
+    places = {1: (-90, 0), 2: (-25, 0), 3: (25, 0), 4: (90, 0)}
+    walk = {"highway": "footway"}
+    ways = [(walk, [1, 2]), (walk | {"tunnel": "yes"}, [2, 3]), (walk, [3, 4])]
+    made = Town(town(places, ways, areas=[Area("way/9", {"building": "yes"}, shape, None)]))
+    lowest = min(z[:, 2].min() for z in made.table.line)
+    assert (lowest == pytest.approx(0.0, abs=0.01)) == level
+
+
 def test_undersides_over_a_tunnel_in_pieces_come_in_whole_steps():
     places = {1: (-500, 0), 2: (-130, 0), 3: (-20, 0), 4: (25, 0), 5: (130, 0), 6: (500, 0)}
     ways = [(ROAD, [1, 2]), (TUNNEL, [2, 3]), (TUNNEL, [3, 4]), (TUNNEL, [4, 5]), (ROAD, [5, 6])]

@@ -16,9 +16,10 @@ from geoscene.report import Problem
 from geoscene.roadgraph import find_obstacles
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
+from geoscene.roadgraph.tags import is_tunnel, read_layer
 from geoscene.roads import RoadGraph
 from geoscene.routing import edge_lines
-from geoscene.sources.data import OsmData
+from geoscene.sources.data import OsmData, Way
 from geoscene.structures.heights import foot
 from geoscene.structures.members import Members
 from geoscene.structures.table import StructureOptions
@@ -32,6 +33,9 @@ _STATION = 5.0
 
 _BESIDE = 4.0
 """Metres from a road bridge's carriageway within which a path of the same layer is on that bridge."""
+
+_COVER = 0.3
+"""Metres of ground over the roof of a tunnel for people on foot."""
 
 _JOINED = 0.05
 """Metres within which a way and a road meet in a node."""
@@ -81,7 +85,8 @@ def path_members(
 
     Their heights: beside a road bridge of the same layer, that bridge's; else they run evenly from ground to
     ground, but as far over (or under) roads, tracks and water as these need, and from there fall (rise) by
-    the slope of a ramp.
+    the slope of a ramp. Tunnels below the ground go down by that slope from where they meet ways on
+    the surface, until the ground covers them, and stay there.
     """
     own = np.flatnonzero(
         (raised.edge < 0)
@@ -103,9 +108,14 @@ def path_members(
     level = np.array([raised.level[r[0]] for r in rows], np.int8)
     track = np.array([(raised.klass[r] == Class.RAIL).all() for r in rows], np.bool_)
     net = _network(lines, [way.nodes for way in ways], np.where(track, _TRACK_SLOPE, _SLOPE))
-    ends = _ends(net)
+    foot_only = ~track & np.array([(raised.klass[r] != Class.ROAD).all() for r in rows], np.bool_)
+    sunk = tunnel & _sunk(osm, ways)
+    joined = _joined(osm, ways)
+    ends = _ends(net, sunk, joined)
+    free = np.where(foot_only, options.passage, options.headroom)
+    depth = _depths(net, sunk, joined, free + options.roof + _COVER)
     body = np.where(track, options.deck, options.slab)
-    z = _heights(net, tunnel, level, body, ends, graph, osm, frame, height, options)
+    z = _heights(net, tunnel, level, body, ends, depth, graph, osm, frame, height, options)
 
     count = len(ways)
     line, approach, own_rows = (np.empty(count, object) for _ in range(3))
@@ -127,7 +137,6 @@ def path_members(
         if worst > _HANGING:
             detail = f"an end {worst:.1f} m from the ground"
             problems.append(Problem(str(ids[k]), "structure", "repaired", "no-ramp", detail))
-    foot_only = ~track & np.array([(raised.klass[r] != Class.ROAD).all() for r in rows], np.bool_)
     edge = np.full(count, -1, np.int32)
     return Members(line, tunnel, foot_only, width, own_rows, approach, landed, level, edge, ids), problems
 
@@ -184,10 +193,59 @@ def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]], slope: 
     return _Net(np.array(places), rows, np.concatenate(a), np.concatenate(b), np.concatenate(metres), steep)
 
 
-def _ends(net: _Net) -> NDArray[np.bool_]:
-    """Whether a station (v,) is an end at which no other of the ways goes on."""
+def _sunk(osm: OsmData, ways: list[Way]) -> NDArray[np.bool_]:
+    """Whether tunnels (n,) are below the ground: by layer; without one where less than half is in houses."""
+    houses = np.array([area.geometry for area in osm.areas if "building" in area.tags], object)
+    tree = shapely.STRtree(houses)
+    out = np.zeros(len(ways), np.bool_)
+    for k, way in enumerate(ways):
+        layer, source = read_layer(way.tags, [])
+        if source in ("layer", "level"):
+            out[k] = layer < 0
+            continue
+        line = shapely.LineString(way.lonlat)
+        over = houses[tree.query(line, predicate="intersects")]
+        out[k] = line.intersection(shapely.union_all(over)).length < 0.5 * line.length
+    return out
+
+
+def _joined(osm: OsmData, ways: list[Way]) -> NDArray[np.int8]:
+    """What start and end (n, 2) of ways meet of others: 0 nothing, 1 what is underground, 2 the surface."""
+    own = {way.osm_id for way in ways}
+    kind: dict[int, int] = {}
+    for way in osm.ways:
+        if way.osm_id in own or not ("highway" in way.tags or "railway" in way.tags):
+            continue
+        met = 1 if is_tunnel(way.tags) else 2
+        for node in way.nodes.tolist():
+            kind[node] = max(kind.get(node, 0), met)
+    at = [[kind.get(int(node), 0) for node in way.nodes[[0, -1]]] for way in ways]
+    return np.array(at, np.int8).reshape(-1, 2)
+
+
+def _ends(net: _Net, sunk: NDArray[np.bool_], joined: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """Whether a station (v,) is an end at which no other of the ways goes on, dead ends underground apart."""
     ends: NDArray[np.bool_] = np.bincount(np.concatenate([net.a, net.b]), minlength=len(net.xy)) == 1
+    for k in np.flatnonzero(sunk).tolist():
+        station = net.rows[k][[0, -1]]
+        ends[station[joined[k] == 0]] = False
     return ends
+
+
+def _depths(net: _Net, sunk: NDArray[np.bool_], joined: NDArray[np.int8], full: Float) -> Float:
+    """Metres (v,) that stations are under the ground at least: ``full`` (n,) but for ramps; else NaN."""
+    depth = np.full(len(net.xy), np.nan)
+    mouth = np.zeros(len(net.xy), np.bool_)
+    for k, rows in enumerate(net.rows):
+        if sunk[k]:
+            depth[rows] = np.fmax(depth[rows], full[k])
+            mouth[rows[[0, -1]][joined[k] == 2]] = True
+        else:
+            mouth[rows] = True
+    if np.isnan(depth).all():
+        return depth
+    ramped: Float = np.minimum(depth, -_cones(net, np.where(mouth, 0.0, -np.inf)))
+    return ramped
 
 
 def _heights(
@@ -196,6 +254,7 @@ def _heights(
     level: NDArray[np.int8],
     body: Float,
     ends: NDArray[np.bool_],
+    depth: Float,
     graph: RoadGraph,
     osm: OsmData,
     frame: Frame,
@@ -211,7 +270,7 @@ def _heights(
     fixed = np.where(np.isnan(on_road), fixed, on_road)
     z = _even(net, fixed, ground)
     least, most = _needs(net, tunnel, level, body, graph, osm, frame, height, options)
-    for sign, need in ((1.0, least), (-1.0, most)):
+    for sign, need in ((1.0, least), (-1.0, np.fmin(most, ground - depth))):
         bound = np.where(np.isnan(on_road) & ~np.isnan(need), sign * need, -np.inf)
         z = sign * np.maximum(sign * z, _cones(net, bound))
     return np.where(np.isnan(on_road), z, on_road)
