@@ -270,7 +270,8 @@ def _heights(
     fixed = np.where(np.isnan(on_road), fixed, on_road)
     z = _even(net, fixed, ground)
     least, most = _needs(net, tunnel, level, body, graph, osm, frame, height, options)
-    for sign, need in ((1.0, least), (-1.0, np.fmin(most, ground - depth))):
+    # What crosses comes after the cover: a path over a tunnel may have too little of it.
+    for sign, need in ((-1.0, ground - depth), (1.0, least), (-1.0, most)):
         bound = np.where(np.isnan(on_road) & ~np.isnan(need), sign * need, -np.inf)
         z = sign * np.maximum(sign * z, _cones(net, bound))
     return np.where(np.isnan(on_road), z, on_road)
