@@ -37,6 +37,9 @@ _BESIDE = 4.0
 _COVER = 0.3
 """Metres of ground over the roof of a tunnel for people on foot."""
 
+_SPARE = 0.6
+"""Metres of cover and roof that a path over a tunnel may do without; what is left is still ground."""
+
 _JOINED = 0.05
 """Metres within which a way and a road meet in a node."""
 
@@ -270,7 +273,9 @@ def _heights(
     fixed = np.where(np.isnan(on_road), fixed, on_road)
     z = _even(net, fixed, ground)
     least, most = _needs(net, tunnel, level, body, graph, osm, frame, height, options)
-    # What crosses comes after the cover: a path over a tunnel may have too little of it.
+    # What crosses comes after the cover: a path over a tunnel may have less of it, but does not come out.
+    under = np.where(np.isnan(depth), np.inf, ground - np.maximum(depth - _SPARE, 0.0))
+    least = np.minimum(least, under)
     for sign, need in ((-1.0, ground - depth), (1.0, least), (-1.0, most)):
         bound = np.where(np.isnan(on_road) & ~np.isnan(need), sign * need, -np.inf)
         z = sign * np.maximum(sign * z, _cones(net, bound))
