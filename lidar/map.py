@@ -18,11 +18,11 @@ from geoscene.progress import Progress, silent
 from lidar.colors import distinct, ramp
 from lidar.dataset import Dataset
 from lidar.errors import DatasetError, InputError
+from lidar.formats.clouds import CLOUD_READERS, placed_returns
 from lidar.formats.las import LasInfo, LasWriter, gps_seconds, read_las
-from lidar.formats.pcd import encode_pcd, read_pcd
-from lidar.formats.ply import ply_header, ply_table, read_ply
+from lidar.formats.pcd import encode_pcd
+from lidar.formats.ply import ply_header, ply_table
 from lidar.formats.table import Table, records, rows
-from lidar.formats.text import read_csv
 from lidar.georeference import Georeference
 from lidar.poses import Trajectory
 from lidar.sensors.beams import frame_ns
@@ -31,7 +31,6 @@ Float = NDArray[np.float64]
 COLORS = ("class", "height", "intensity", "sensor")
 """What the colours of a map may show."""
 
-_READERS = {"pcd": read_pcd, "ply": read_ply, "csv": read_csv}
 _COLUMNS = ("x", "y", "z", "intensity", "gps_time", "ring", "label", "instance", "source")
 _SUFFIXES = (".las", ".laz", ".ply", ".pcd")
 _BUCKET = 64.0  # metres: side of the squares that voxels are gathered in
@@ -158,21 +157,15 @@ class _Source:
                         | {"source": np.full(rows(table), index, np.uint16)},
                     )
             else:
-                yield frame, self._placed(_READERS[kind](path), name, index, frame)
+                yield frame, self._placed(CLOUD_READERS[kind](path), name, index, frame)
 
     def _placed(self, table: Table, name: str, index: int, frame: int) -> Table:
         if self._trajectory is None:
             self._trajectory = self.dataset.trajectory()
         sensor = self._lidars[name]
         start = int(sensor["time_offset_ns"]) + int(frame * frame_ns(sensor["rate_hz"]))
-        time_ns = start + table["time_ns"].astype(np.int64)
         mount = np.array(sensor["vehicle_from_sensor"])
-        placed = self._trajectory.place(
-            np.column_stack([table[k] for k in "xyz"]),
-            time_ns,
-            translation=mount[:3, 3],
-            rotation=mount[:3, :3],
-        )
+        placed, time_ns = placed_returns(table, self._trajectory, start, mount)
         world = self.geo.points(placed)
         return {
             "x": world[:, 0],

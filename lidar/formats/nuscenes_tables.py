@@ -25,10 +25,8 @@ from geoscene.scene import write_atomically
 from lidar.camera.png import write_png
 from lidar.dataset import Dataset
 from lidar.errors import DatasetError, InputError
+from lidar.formats.clouds import CLOUD_READERS, placed_returns
 from lidar.formats.nuscenes import write_lidarseg, write_nuscenes
-from lidar.formats.pcd import read_pcd
-from lidar.formats.ply import read_ply
-from lidar.formats.text import read_csv
 from lidar.poses import Poses, Trajectory
 
 Float = NDArray[np.float64]
@@ -58,7 +56,6 @@ _ATTRIBUTES = (
     "pedestrian.standing",
 )  # fmt: skip
 _VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
-_READERS = {"pcd": read_pcd, "ply": read_ply, "csv": read_csv}
 _MARGIN = 200.0
 """Metres from the drive to the zero of the tables' frame, whose coordinates are positive."""
 _WALKS, _DRIVES = 0.2, 0.5
@@ -130,7 +127,7 @@ def _streams(dataset: Dataset) -> list[_Stream]:
         if sensor["kind"] not in ("lidar", "camera"):
             continue
         if sensor["kind"] == "lidar":
-            kind = next((k for k in _READERS if any(dataset.files(name, k))), None)
+            kind = next((k for k in CLOUD_READERS if any(dataset.files(name, k))), None)
             found = list(dataset.files(name, kind)) if kind else []
         else:
             images = sorted((dataset.path / name / "rgb").glob("*.png"))
@@ -294,14 +291,9 @@ class _Export:
         self, stream: _Stream, source: Path, time: int, path: Path, token: str, *, labelled: bool
     ) -> None:
         """Write a cloud as from one moment, and of a key frame's points their classes."""
-        table = dict(_READERS[source.suffix[1:]](source))
+        table = dict(CLOUD_READERS[source.suffix[1:]](source))
         mount = np.array(stream.sensor["vehicle_from_sensor"])
-        placed = self.trajectory.place(
-            np.column_stack([table[k] for k in "xyz"]),
-            time + table["time_ns"].astype(np.int64),
-            translation=mount[:3, 3],
-            rotation=mount[:3, :3],
-        )
+        placed, _ = placed_returns(table, self.trajectory, time, mount)
         here: Poses = self.trajectory.at([time]).mounted(mount[:3, 3], mount[:3, :3])
         still = ((placed - here.position[0]) / here.scale[0]) @ here.rotation[0]
         write_nuscenes(path, table | {axis: still[:, k] for k, axis in enumerate("xyz")})
