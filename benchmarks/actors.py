@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.scene import open_scene
-from lidar.actors.shapes import catalogue
-from lidar.world import World
+from lidar.world.actor_shapes import catalogue
+from lidar.world.world import World
 
 _REACH = 200.0  # metres around the scene's middle
 _FIRST = 10**6  # feature number of the first actor

@@ -13,10 +13,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from geoscene.frames import Frame
-from lidar.imu import PRESETS
 from lidar.physics.fresnel import WATER, fresnel
-from lidar.rig import load_rig
-from lidar.sensors.preset import firings, load_sensor
+from lidar.rig.imu_grades import PRESETS
+from lidar.rig.scanner import firings, load_sensor
+from lidar.rig.specs import load_rig
 
 Row = tuple[str, float, float, str, str]
 """Quantity, expected, got, unit, source."""

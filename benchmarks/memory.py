@@ -20,15 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.scene import open_scene
-from lidar.world import World
+from lidar.world.world import World
 
 STEP = 100.0
 """Metres between the places from which rays are cast."""
 
 
 def _route(scene_path: Path, km: float, queue: multiprocessing.Queue[NDArray[np.float64]]) -> None:
-    from lidar.route import plan_route  # noqa: PLC0415
-    from lidar.travel import road_graph  # noqa: PLC0415
+    from lidar.planning.route import plan_route  # noqa: PLC0415
+    from lidar.planning.travel import road_graph  # noqa: PLC0415
 
     scene = open_scene(scene_path)
     queue.put(plan_route(road_graph(scene), scene.frame, "random", seed=1, length=1000 * km).line)

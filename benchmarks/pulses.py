@@ -45,11 +45,13 @@ _START = datetime(2026, 6, 21, 10, tzinfo=UTC)
 def convert(city: Path, out: Path) -> None:
     """Write the generator's city as a scene directory ``out`` / scene and its route as a trajectory."""
     from geoscene.classes import Class, materials  # noqa: PLC0415
+    from geoscene.files import write_json  # noqa: PLC0415
     from geoscene.frames import Frame  # noqa: PLC0415
     from geoscene.mesh import Mesh  # noqa: PLC0415
-    from geoscene.scene import SCHEMA, Tile, write_shapes, write_tile  # noqa: PLC0415
-    from lidar.dataset import write_json, write_trajectory  # noqa: PLC0415
-    from lidar.poses import Trajectory  # noqa: PLC0415
+    from geoscene.scene.layout import SCHEMA  # noqa: PLC0415
+    from geoscene.scene.tile_files import Tile, write_shapes, write_tile  # noqa: PLC0415
+    from lidar.geometry.poses import Trajectory  # noqa: PLC0415
+    from lidar.geometry.trajectory_csv import write_trajectory  # noqa: PLC0415
 
     made = np.load(city / "city.npz")
     vertices, faces, built, building = made["V"], made["F"], made["part"] == 1, made["bid"]
@@ -103,14 +105,14 @@ def convert(city: Path, out: Path) -> None:
 def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) -> dict[str, float]:
     """Record the drive; seconds of the stages and the number of points."""
     began = time.perf_counter()
-    from geoscene.scene import open_scene  # noqa: PLC0415
-    from lidar.dataset import read_trajectory  # noqa: PLC0415
-    from lidar.devices import scanners  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene  # noqa: PLC0415
+    from lidar.dataset.record import Contents, Recorder  # noqa: PLC0415
     from lidar.drive import Stopwatch, record_all, schedule  # noqa: PLC0415
-    from lidar.georeference import Georeference, export_crs  # noqa: PLC0415
+    from lidar.geometry.georeference import Georeference, export_crs  # noqa: PLC0415
+    from lidar.geometry.trajectory_csv import read_trajectory  # noqa: PLC0415
     from lidar.physics.effects import effects_of  # noqa: PLC0415
-    from lidar.record import Contents, Recorder  # noqa: PLC0415
-    from lidar.rig import load_rig  # noqa: PLC0415
+    from lidar.rig.devices import scanners  # noqa: PLC0415
+    from lidar.rig.specs import load_rig  # noqa: PLC0415
 
     imported, imported_cpu = time.perf_counter(), time.process_time()
     scene = open_scene(work / "scene")
@@ -134,8 +136,8 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
 
 def load(work: Path) -> dict[str, float]:
     """Load the whole scene; seconds it took, without imports."""
-    from geoscene.scene import open_scene  # noqa: PLC0415
-    from lidar.world import World  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene  # noqa: PLC0415
+    from lidar.world.world import World  # noqa: PLC0415
 
     began = time.perf_counter()
     world = World.load(open_scene(work / "scene"))
@@ -154,10 +156,10 @@ def child(arguments: dict[str, Any]) -> dict[str, float]:
 
 def pulses(work: Path, seconds: float) -> int:
     """Pulses fired in the drive."""
-    from lidar.dataset import read_trajectory  # noqa: PLC0415
-    from lidar.devices import scanners  # noqa: PLC0415
-    from lidar.rig import load_rig  # noqa: PLC0415
-    from lidar.sensors.preset import firings  # noqa: PLC0415
+    from lidar.geometry.trajectory_csv import read_trajectory  # noqa: PLC0415
+    from lidar.rig.devices import scanners  # noqa: PLC0415
+    from lidar.rig.scanner import firings  # noqa: PLC0415
+    from lidar.rig.specs import load_rig  # noqa: PLC0415
 
     duration = read_trajectory(work / "trajectory.csv").until(round(seconds * 1e9)).duration_ns
     (scanner,) = scanners(load_rig("vlp16"))

@@ -35,7 +35,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from lidar.poses import Poses
+from lidar.geometry.poses import Poses
 from lidar.raycast import Caster
 from lidar.raycast.library import library
 

@@ -31,10 +31,10 @@ from make_osm import make_city, write_city
 
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.frames import Frame
+from geoscene.ground.terrain import base_heights, flat_terrain, open_terrain
 from geoscene.plan import take_buildings
 from geoscene.scene import open_scene
 from geoscene.sources import read_osm
-from geoscene.terrain import base_heights, flat_terrain, open_terrain
 
 
 @dataclass(frozen=True)

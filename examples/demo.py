@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.build import BuildOptions, build
-from geoscene.check import check_scene
 from geoscene.classes import class_codes
 from geoscene.console import progress_bar
+from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
 from geoscene.view import view_scene
 from lidar.camera.png import counts_to_depth, read_png, write_png
-from lidar.dataset import open_dataset
+from lidar.dataset.formats.las import read_las
+from lidar.dataset.formats.pcd import read_pcd
+from lidar.dataset.layout import open_dataset
 from lidar.drive import DriveOptions, drive
-from lidar.formats.las import read_las
-from lidar.formats.pcd import read_pcd
-from lidar.map import aggregate
-from lidar.picture import (
+from lidar.maps.aggregate import aggregate
+from lidar.maps.picture import (
     class_colors,
     cloud_picture,
     depth_picture,
@@ -29,9 +29,9 @@ from lidar.picture import (
     sweep_picture,
     with_legend,
 )
-from lidar.rig import load_rig
-from lidar.vehicle import load_vehicle
-from lidar.world import World
+from lidar.rig.specs import load_rig
+from lidar.rig.vehicle import load_vehicle
+from lidar.world.world import World
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")
 pictures = out / "pictures"

@@ -16,15 +16,15 @@ import shapely
 from geoscene import __version__
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.manifest import scene_manifest
+from geoscene.objects.shapes import shapes
 from geoscene.plan import KINDS, Plan, make_plan
 from geoscene.progress import Progress, silent
-from geoscene.reach import route_line
 from geoscene.report import Problem
 from geoscene.roadgraph import write_graphml
+from geoscene.roadgraph.reach import route_line
 from geoscene.scene import Scene, open_scene
-from geoscene.shapes import shapes
+from geoscene.scene.writer import SceneWriter
 from geoscene.sources import OsmData
-from geoscene.store import SceneWriter
 from geoscene.tiles import Keys, TileReport, build_tiles, tiles_document
 
 _BESIDE = 15.0

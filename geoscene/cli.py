@@ -268,7 +268,7 @@ def info(
     json
         Print as JSON.
     """
-    from geoscene.scene import open_scene  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene  # noqa: PLC0415
 
     opened = open_scene(scene)
     report = opened.manifest | {"path": str(scene), "extent": _extent(opened.manifest)}
@@ -290,8 +290,8 @@ def validate(scene: Path, /, *, json: Annotated[bool, Parameter(negative=())] = 
     json
         Print the verdicts as JSON.
     """
-    from geoscene.check import check_scene  # noqa: PLC0415
-    from geoscene.scene import open_scene  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene  # noqa: PLC0415
+    from geoscene.scene.validate import check_scene  # noqa: PLC0415
 
     report = check_scene(open_scene(scene))
     if json:
@@ -362,7 +362,7 @@ def export(
         No progress bars.
     """
     from geoscene.export import export_scene  # noqa: PLC0415
-    from geoscene.scene import open_scene  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene  # noqa: PLC0415
 
     with progress_bar(quiet=quiet) as progress:
         summary = export_scene(
@@ -429,7 +429,7 @@ def view(
     quiet
         No progress bars.
     """
-    from geoscene.scene import open_scene  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from geoscene.view import MAX_MB, view_scene  # noqa: PLC0415
 
     west, south, east, north = _numbers(bbox, "--bbox", "W,S,E,N") if bbox else (0.0,) * 4

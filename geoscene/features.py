@@ -8,15 +8,15 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.barriers import Barriers
 from geoscene.buildings import Buildings
 from geoscene.classes import Class, materials
-from geoscene.furniture import Furniture
-from geoscene.geopackage import Layer
 from geoscene.ground import Layers
-from geoscene.roads import RoadGraph
+from geoscene.objects.barriers import Barriers
+from geoscene.objects.furniture import Furniture
+from geoscene.objects.vegetation import Trees
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.scene.geopackage import Layer
 from geoscene.structures import Structures
-from geoscene.vegetation import Trees
 
 
 def building_layers(buildings: Buildings, base: NDArray[np.float64]) -> list[Layer]:

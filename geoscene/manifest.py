@@ -10,11 +10,11 @@ import numpy as np
 import shapely
 
 from geoscene import __version__
+from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.plan import Plan
 from geoscene.report import Problem, summarise
 from geoscene.roadgraph import find_components
-from geoscene.roads import RoadGraph
-from geoscene.shapes import LEAF_AREA_DENSITY
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.sources import ATTRIBUTION, OsmData
 from geoscene.tiles import TileReport
 

@@ -119,3 +119,26 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         np.concatenate([m.faces + np.int32(s) for m, s in zip(meshes, starts, strict=True)]),
         **columns,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Instances:
+    """Copies of shapes, such as trees.
+
+    shape     : (k,) int32, index into the scene's shapes
+    transform : (k, 3, 4) float64, shape to tile: rotation and scale, then shift
+    feature   : (k,) int32
+    """
+
+    shape: NDArray[np.int32]
+    transform: Float
+    feature: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Number of copies."""
+        return len(self.shape)
+
+    @classmethod
+    def empty(cls) -> Instances:
+        """No copies."""
+        return cls(np.empty(0, np.int32), np.empty((0, 3, 4)), np.empty(0, np.int32))

@@ -10,10 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.barriers import Barriers, read_barriers
 from geoscene.buildings import Buildings, read_buildings
-from geoscene.driving_side import Side
-from geoscene.driving_side import driving_side as found_side
 from geoscene.errors import InputError
 from geoscene.features import (
     barrier_layer,
@@ -25,8 +22,6 @@ from geoscene.features import (
     tree_layer,
 )
 from geoscene.frames import Frame
-from geoscene.furniture import Furniture, read_furniture
-from geoscene.geopackage import Layer
 from geoscene.ground import (
     GroundPlan,
     Layers,
@@ -37,11 +32,19 @@ from geoscene.ground import (
     plan_ground,
     water_levels,
 )
+from geoscene.ground.terrain import Terrain, base_heights, flat_terrain, open_terrain
+from geoscene.ground.urban import paved_fabric
+from geoscene.objects.barriers import Barriers, read_barriers
+from geoscene.objects.furniture import Furniture, read_furniture
+from geoscene.objects.vegetation import Trees, clear_of, needle_shares, read_trees
 from geoscene.progress import Progress
 from geoscene.report import Problem
-from geoscene.road_surfaces import RoadSurfaces, SurfaceOptions, road_surfaces
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
-from geoscene.roads import RoadGraph
+from geoscene.roadgraph.driving_side import Side
+from geoscene.roadgraph.driving_side import driving_side as found_side
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, road_surfaces
+from geoscene.scene.geopackage import Layer
 from geoscene.sources import OsmData
 from geoscene.structures import (
     Structures,
@@ -52,9 +55,6 @@ from geoscene.structures import (
     read_structures,
     within_extent,
 )
-from geoscene.terrain import Terrain, base_heights, flat_terrain, open_terrain
-from geoscene.urban import paved_fabric
-from geoscene.vegetation import Trees, clear_of, needle_shares, read_trees
 
 Float = NDArray[np.float64]
 Bounds = tuple[float, float, float, float]

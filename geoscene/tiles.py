@@ -15,19 +15,20 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.barriers import barrier_meshes
 from geoscene.buildings import build_solids
 from geoscene.classes import Class
-from geoscene.furniture import furniture_instances
+from geoscene.files import write_atomically
 from geoscene.ground import ground_tile, tile_place
-from geoscene.mesh import Mesh, concatenate
+from geoscene.mesh import Instances, Mesh, concatenate
+from geoscene.objects.barriers import barrier_meshes
+from geoscene.objects.furniture import furniture_instances
+from geoscene.objects.shapes import concatenate_instances
+from geoscene.objects.vegetation import forest_trees, tree_instances
 from geoscene.plan import Plan, take_buildings
 from geoscene.report import Problem
-from geoscene.scene import Instances, Tile, read_tile, write_atomically, write_tile
-from geoscene.shapes import concatenate_instances
+from geoscene.scene.tile_files import Tile, read_tile, write_tile
 from geoscene.structures import structure_meshes
-from geoscene.validate import validate_mesh
-from geoscene.vegetation import forest_trees, tree_instances
+from geoscene.watertight import validate_mesh
 
 
 @dataclass(frozen=True, slots=True)

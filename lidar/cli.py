@@ -148,7 +148,7 @@ def drive(
     quiet
         No progress bars.
     """
-    from geoscene.scene import open_scene  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from lidar.drive import drive as record  # noqa: PLC0415
     from lidar.options import DriveOptions  # noqa: PLC0415
 
@@ -237,7 +237,8 @@ def _point(word: str) -> tuple[float, float] | None:
 def _traffic(text: str | None) -> Any:
     if text is None or text == "off":
         return None
-    from lidar.actors import TrafficFile, TrafficOptions  # noqa: PLC0415
+    from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415
+    from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415
 
     if text == "on":
         return TrafficOptions()
@@ -324,8 +325,8 @@ def map_(
     quiet
         No progress bars.
     """
-    from lidar.dataset import open_dataset  # noqa: PLC0415
-    from lidar.map import aggregate  # noqa: PLC0415
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.maps.aggregate import aggregate  # noqa: PLC0415
 
     with progress_bar(quiet=quiet) as progress:
         summary = aggregate(
@@ -389,8 +390,8 @@ def export(
     quiet
         No progress bars.
     """
-    from lidar.dataset import open_dataset  # noqa: PLC0415
-    from lidar.formats.nuscenes_tables import VERSION, export_nuscenes  # noqa: PLC0415
+    from lidar.dataset.export.nuscenes import VERSION, export_nuscenes  # noqa: PLC0415
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
 
     if to != "nuscenes":
         raise InputError(
@@ -417,7 +418,7 @@ def rigs(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False
     json
         Print them as JSON, with all there is to know.
     """
-    from lidar.catalog import columns, rig_rows  # noqa: PLC0415
+    from lidar.rig.catalog import columns, rig_rows  # noqa: PLC0415
 
     rows = rig_rows()
     if json:
@@ -441,7 +442,7 @@ def sensors(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = Fa
     json
         Print them as JSON, with the source of every number.
     """
-    from lidar.catalog import columns, sensor_rows  # noqa: PLC0415
+    from lidar.rig.catalog import columns, sensor_rows  # noqa: PLC0415
 
     rows = sensor_rows()
     if json:
@@ -469,7 +470,7 @@ def settings(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = F
     json
         Print them as JSON.
     """
-    from lidar.catalog import columns  # noqa: PLC0415
+    from lidar.rig.catalog import columns  # noqa: PLC0415
     from lidar.settings import levels, list_dials  # noqa: PLC0415
 
     dials = list_dials()

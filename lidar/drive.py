@@ -18,24 +18,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError
+from geoscene.files import write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from lidar import __version__
-from lidar.actors import Actors, TrafficFile, drive_among, populate, replay
-from lidar.crowd import Worlds
-from lidar.dataset import prepare, write_json, write_trajectory
-from lidar.devices import Camera, Scanner, cameras, scanners
+from lidar.dataset.box_tables import gather_boxes
+from lidar.dataset.layout import prepare
+from lidar.dataset.metadata import write_sidecars
+from lidar.dataset.record import Recorder
 from lidar.errors import InputError, LidarError
-from lidar.flight import Flight
-from lidar.gather import gather_boxes
-from lidar.georeference import Georeference, export_crs
+from lidar.geometry.georeference import Georeference, export_crs
+from lidar.geometry.poses import Trajectory
+from lidar.geometry.trajectory_csv import write_trajectory
 from lidar.options import DriveOptions
-from lidar.poses import Trajectory
-from lidar.record import Recorder
-from lidar.rig import Rig, load_rig
-from lidar.sidecars import write_sidecars
-from lidar.travel import Travel, plan_travel, road_graph
-from lidar.vehicle import Vehicle, load_vehicle
+from lidar.planning.flight import Flight
+from lidar.planning.travel import Travel, plan_travel, road_graph
+from lidar.rig.devices import Camera, Scanner, cameras, scanners
+from lidar.rig.specs import Rig, load_rig
+from lidar.rig.vehicle import Vehicle, load_vehicle
+from lidar.traffic.among import drive_among, drive_obeying
+from lidar.traffic.fcd import TrafficFile
+from lidar.traffic.populate import populate
+from lidar.traffic.replayed import replay
+from lidar.world.actors import Actors
+from lidar.world.thread_worlds import Worlds
 
 Float = NDArray[np.float64]
 
@@ -96,6 +102,14 @@ class Stopwatch:
 
 
 @dataclass(frozen=True, slots=True)
+class RoadDrive:
+    """A drive on roads: its path, and its trajectory without other road users."""
+
+    travel: Travel
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True, slots=True)
 class Job:
     """One frame of one sensor."""
 
@@ -130,11 +144,11 @@ def drive(
         graph = road_graph(scene)
         if isinstance(traffic, TrafficFile):
             actors = replay(scene, graph, trajectory, body, seed=options.seed, options=traffic)
-        elif isinstance(planned, Travel):
+        elif isinstance(planned, RoadDrive):
             trajectory, actors = drive_among(
-                scene, graph, planned.path, body, trajectory,
-                seed=options.seed, options=traffic, duration=planned.duration,
-                under_way=planned.under_way,
+                scene, graph, planned.travel.path, body, trajectory,
+                seed=options.seed, options=traffic, duration=planned.travel.duration,
+                under_way=planned.travel.under_way,
             )  # fmt: skip
         else:
             actors = populate(scene, graph, trajectory, body, seed=options.seed, options=traffic)
@@ -220,13 +234,13 @@ def plan(
     sensors: Sequence[Scanner | Camera],
     *,
     progress: Progress = silent,
-) -> Trajectory | Travel | Flight:
+) -> Trajectory | RoadDrive | Flight:
     """Where the vehicle of a drive is over time; on streets with its path, in flight with when it scans.
 
     Raises RouteError for a route that it cannot take.
     """
-    from lidar.aerial import plan_flight  # noqa: PLC0415
-    from lidar.replay import read_replay  # noqa: PLC0415
+    from lidar.planning.aerial import plan_flight  # noqa: PLC0415
+    from lidar.planning.replay import read_replay  # noqa: PLC0415
 
     route = options.route
     if isinstance(route, Path) and route.suffix == ".csv" and not options.survey:
@@ -244,10 +258,13 @@ def plan(
             scene, route, name, seed=options.seed, duration=options.duration, side=options.keeps(scene),
             from_rest=options.from_rest, progress=progress,
         )  # fmt: skip
-        if travel.duration is None:
-            return travel
-        # what cannot pull up within a short time is recorded until then
-        return replace(travel, trajectory=travel.trajectory.until(round(travel.duration * 1e9)))
+        trajectory = drive_obeying(
+            travel.path, body, road_graph(scene), seed=options.seed, side=options.keeps(scene),
+            bounds=scene.bounds, duration=travel.duration, under_way=travel.under_way,
+        )  # fmt: skip
+        if travel.duration is not None:  # what cannot pull up within a short time is recorded until then
+            trajectory = trajectory.until(round(travel.duration * 1e9))
+        return RoadDrive(travel, trajectory)
     progress("planning", 0, 0)
     seconds = options.duration
     if seconds is None and route == "random" and not options.survey:

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any, cast
 
 from geoscene.scene import Scene
-from lidar.actors import TrafficFile, TrafficOptions
+from lidar.dataset.record import Contents
 from lidar.errors import InputError
-from lidar.record import Contents
-from lidar.rig import load_rig, rig_digest
-from lidar.route import Side, Spec
+from lidar.planning.route import Side, Spec
+from lidar.rig.specs import load_rig, rig_digest
 from lidar.settings import dials_of
+from lidar.traffic.fcd import TrafficFile
+from lidar.traffic.populate import TrafficOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,13 +29,13 @@ class DriveOptions:
                  is under way when the record starts and when it ends
     survey     : area that a craft flies over in strips instead of a route: ``all``, W,S,E,N in degrees, or a
                  GeoJSON file
-    altitude   : metres above the ground of a flight, see `lidar.aerial.plan_flight`
+    altitude   : metres above the ground of a flight, see `lidar.planning.aerial.plan_flight`
     overlap    : share of a survey's strip that the next one covers too
     turns      : scanners work in the turns between a survey's strips too, and on the way there
     rig        : name of a rig, or a TOML file
     vehicle    : name of a vehicle, or a TOML file; the rig's by default
-    formats    : of clouds, of `lidar.record.FORMATS`
-    labels     : files of labels in others' codes, of `lidar.record.LABELS`
+    formats    : of clouds, of `lidar.dataset.record.FORMATS`
+    labels     : files of labels in others' codes, of `lidar.dataset.record.LABELS`
     deskew     : moment (start, middle, end) to which clouds are brought in further files; none by default
     seed       : of everything random, 0 or more
     start      : UTC time of the drive's start; 10:00 local solar time on 21 June 2026 by default

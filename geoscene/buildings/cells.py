@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.shells import boundary, lift, triangulate
 from geoscene.buildings.skeleton import Skeleton, loops, polygons_of
-from geoscene.validate import weld
+from geoscene.watertight import weld
 
 Float = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from shapely.errors import GEOSException
 
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.mesh import FLOOR, ROOF, WALL
-from geoscene.validate import degenerate_faces, edge_uses, weld
+from geoscene.watertight import degenerate_faces, edge_uses, weld
 
 Float = NDArray[np.float64]
 Ids = NDArray[np.int64]

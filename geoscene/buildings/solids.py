@@ -18,7 +18,7 @@ from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.mesh import ROOF, Mesh
 from geoscene.report import Problem
-from geoscene.validate import weld
+from geoscene.watertight import weld
 
 Float = NDArray[np.float64]
 Ids = NDArray[np.int64]

@@ -10,7 +10,7 @@ import numpy as np
 from geoscene.buildings.footprints import to_grid
 from geoscene.buildings.shells import Float, Ids, Triangles
 from geoscene.mesh import WALL
-from geoscene.validate import degenerate_faces, edge_uses, weld
+from geoscene.watertight import degenerate_faces, edge_uses, weld
 
 GROOVES = (2e-3, 2e-2, 1e-1)
 """Reach of the groove that parts two bodies of one building which meet in an edge only, metres; the next

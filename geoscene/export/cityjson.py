@@ -28,9 +28,9 @@ from geoscene.export.objects import (
 )
 from geoscene.export.shells import bodies, shell_numbers
 from geoscene.frames import Frame, utm_crs
-from geoscene.mesh import FLOOR, ROOF, WALL, Mesh
+from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh
 from geoscene.progress import Progress, silent
-from geoscene.scene import Instances, Scene
+from geoscene.scene import Scene
 
 Float = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.export.files import plain
-from geoscene.mesh import Mesh, concatenate
-from geoscene.scene import Instances, Scene
+from geoscene.mesh import Instances, Mesh, concatenate
+from geoscene.scene import Scene
 
 Float = NDArray[np.float64]
 
@@ -144,7 +144,7 @@ def wanted_rows(
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What a tile holds of the wanted layers, in tile coordinates; see `geoscene.scene.Tile`."""
+    """What a tile holds of the wanted layers, in tile coordinates; see `geoscene.scene.tile_files.Tile`."""
 
     index: tuple[int, int]
     origin: Float

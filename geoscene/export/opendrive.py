@@ -17,7 +17,7 @@ from geoscene.export.objects import attribution
 from geoscene.export.roadnet import END, START, Carriageway, Connection, RoadNet, road_net
 from geoscene.progress import Progress, silent
 from geoscene.roadgraph import read_graphml
-from geoscene.roads import RoadGraph
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 
 Float = NDArray[np.float64]

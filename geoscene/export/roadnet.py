@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.export.planview import Curve, PlanView, connecting_curve, cut, plan_view
-from geoscene.roads import RoadGraph
-from geoscene.routing import turn_table
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import turn_table
 
 Float = NDArray[np.float64]
 Lane = tuple[int, float, float]
@@ -94,7 +94,7 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
     """The road graph as carriageways and junctions.
 
     A node where two roads of the same lanes meet within 0.05 degrees is a joint; any other where roads meet
-    is a junction, with a way through for every turn that the graph permits (`geoscene.routing.turn_table`).
+    is a junction, with a way through for every turn that the graph permits (`routing.turn_table`).
     """
     firsts = [k for k in range(len(graph)) if not 0 <= graph.twin[k] < k and _span(graph.geometry[k]) > 0.05]
     number = {edge: k for k, edge in enumerate(firsts)}

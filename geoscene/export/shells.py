@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.validate import edge_uses
+from geoscene.watertight import edge_uses
 
 Ids = NDArray[np.int64]
 Float = NDArray[np.float64]

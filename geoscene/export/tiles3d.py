@@ -16,9 +16,10 @@ from geoscene.export.files import Summary, size_of, whole_file, whole_folder
 from geoscene.export.globe import Globe
 from geoscene.export.gltf import GlbWriter, y_up
 from geoscene.export.objects import Features, Part, attribution, expand, parts, pieces, read_features
-from geoscene.mesh import Mesh
+from geoscene.files import write_atomically
+from geoscene.mesh import Instances, Mesh
 from geoscene.progress import Progress, silent
-from geoscene.scene import Instances, Scene, write_atomically
+from geoscene.scene import Scene
 
 Float = NDArray[np.float64]
 

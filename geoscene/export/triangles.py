@@ -15,7 +15,7 @@ from geoscene.export.objects import attribution, expand, klass_name, parts, piec
 from geoscene.mesh import Mesh, concatenate
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
-from geoscene.validate import degenerate_faces, validate_mesh
+from geoscene.watertight import degenerate_faces, validate_mesh
 
 Float = NDArray[np.float64]
 

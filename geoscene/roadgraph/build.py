@@ -13,9 +13,9 @@ from geoscene.frames import Frame
 from geoscene.report import Problem
 from geoscene.roadgraph.chains import Chain, Runs, find_cuts, link_chains
 from geoscene.roadgraph.controls import add_controls
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.restrictions import add_turns
 from geoscene.roadgraph.tags import Street, drivable, read_street
-from geoscene.roads import RoadGraph
 from geoscene.sources.data import OsmData, Way
 
 Float = NDArray[np.float64]

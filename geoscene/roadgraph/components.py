@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.roads import RoadGraph
+from geoscene.roadgraph.graph import RoadGraph
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.roadgraph.chains import Chain
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.tags import CLASSES
-from geoscene.roads import RoadGraph
 from geoscene.sources.data import Point, Tags, Way
 
 Float = NDArray[np.float64]

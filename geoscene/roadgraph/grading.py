@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from geoscene.frames import Frame
 from geoscene.roadgraph.carriageways import place_of
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.long_profile import Height, Obstacles
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
-from geoscene.roads import RoadGraph
 from geoscene.sources.data import OsmData, Tags
 
 Float = NDArray[np.float64]

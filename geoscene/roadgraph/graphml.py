@@ -16,9 +16,9 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.errors import SceneFormatError
+from geoscene.files import write_atomically
 from geoscene.frames import Frame
-from geoscene.roads import RoadGraph, rows_of
-from geoscene.scene import write_atomically
+from geoscene.roadgraph.graph import RoadGraph, rows_of
 
 Float = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.overlaps import find_overlaps
 from geoscene.roadgraph.quadratic import Bounds, interior_point
 from geoscene.roadgraph.stations import Stations, find_crossings, place_stations
-from geoscene.roads import RoadGraph
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.roadgraph.carriageways import PAVED, Carriageways
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import cut_line, junction_reach
+from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.roads import RoadGraph
-from geoscene.routing import edge_lines
 
 Float = NDArray[np.float64]
 

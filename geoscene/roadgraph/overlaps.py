@@ -8,8 +8,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.stations import Stations
-from geoscene.roads import RoadGraph
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geoscene.report import Problem
-from geoscene.roads import RoadGraph, rows_of
+from geoscene.roadgraph.graph import RoadGraph, rows_of
 from geoscene.sources.data import Relation, Tags
 
 # What a car is, the most specific first: whose restrictions bind it, and what exempts it.

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.roads import RoadGraph
+from geoscene.roadgraph.graph import RoadGraph
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from geoscene import __version__
 from geoscene.errors import InputError, NetworkError
+from geoscene.files import write_atomically
 from geoscene.frames import Frame
 from geoscene.progress import Progress, silent
-from geoscene.scene import write_atomically
 from geoscene.sources.data import OsmData
 
 Float = NDArray[np.float64]
@@ -98,7 +98,7 @@ def fetch_elevation(
     zoom: int | None = None,
     progress: Progress = silent,
 ) -> Path:
-    """A GeoTIFF of the ground under a map, made from elevation tiles; for `geoscene.terrain.open_terrain`.
+    """A GeoTIFF of the ground under a map, made from elevation tiles; for `ground.terrain.open_terrain`.
 
     The tiles also hold the sea's floor. Where the map has a coastline, negative heights that hang together
     with it are set to 0, the level that the water has; land that lies deeper behind a dike keeps its

@@ -22,7 +22,7 @@ import numpy as np
 
 from geoscene import __version__
 from geoscene.errors import InputError, NetworkError, SourceNotFoundError
-from geoscene.scene import write_atomically
+from geoscene.files import write_atomically
 from geoscene.sources.assemble import Bounds, checked_bounds, features
 from geoscene.sources.data import OsmData
 from geoscene.sources.elements import Collector

@@ -8,9 +8,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import cut_line
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.roads import RoadGraph
 
 Float = NDArray[np.float64]
 

@@ -14,11 +14,11 @@ from geoscene.classes import Class
 from geoscene.frames import Frame
 from geoscene.report import Problem
 from geoscene.roadgraph import find_obstacles
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.paths import way_lines
+from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.roadgraph.tags import is_tunnel, read_layer
-from geoscene.roads import RoadGraph
-from geoscene.routing import edge_lines
 from geoscene.sources.data import OsmData, Way
 from geoscene.structures.heights import foot
 from geoscene.structures.members import Members

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from geoscene.frames import Frame
 from geoscene.report import Problem
-from geoscene.road_surfaces import RoadSurfaces
-from geoscene.roads import RoadGraph
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.surfaces import RoadSurfaces
 from geoscene.sources.data import OsmData
 from geoscene.structures.meeting import find_low_decks
 from geoscene.structures.members import concatenate_members, road_members

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.mesh import Mesh
-from geoscene.scene import Instances, Scene, Tile
+from geoscene.mesh import Instances, Mesh
+from geoscene.scene import Scene
+from geoscene.scene.tile_files import Tile
 
 STEP = 1 / 128
 """Metres between the positions that vertices can have; a power of two, so that tiles share one grid and their

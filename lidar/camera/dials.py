@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar.camera.render import RenderOptions
 from lidar.errors import InputError
-from lidar.rig import CameraSpec
+from lidar.rig.specs import CameraSpec
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from geoscene.classes import Class
 from geoscene.mesh import WALL
 from lidar.camera.texture import covered, hashed, pulses, span
 from lidar.raycast import Caster, Geometry, Hits
-from lidar.world import World
+from lidar.world.world import World
 
 Float = NDArray[np.float64]
 

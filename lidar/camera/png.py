@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
-from geoscene.scene import write_atomically
+from geoscene.files import write_atomically
 from lidar.errors import FormatError
 
 DEPTH_SCALE = 256.0

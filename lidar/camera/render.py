@@ -13,12 +13,12 @@ from geoscene.classes import Class
 from lidar.camera import shade
 from lidar.camera.facades import Facades, facades_of
 from lidar.camera.light import Light, daylight
-from lidar.camera.model import pixel_rays, project
 from lidar.errors import InputError
-from lidar.poses import Poses
+from lidar.geometry.poses import Poses
 from lidar.raycast import Hits
-from lidar.rig import CameraSpec
-from lidar.world import Surfaces, World
+from lidar.rig.camera_model import pixel_rays, project
+from lidar.rig.specs import CameraSpec
+from lidar.world.world import Surfaces, World
 
 Float = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ class Echoes:
     range    : (m,) float64, metres from the beam's start, along the beam's axis
     apparent : (m,) float64, reflectance of the white Lambertian target, square on and as large as the beam,
                that would send back as much
-    feature, klass, cosine : (m,) of the surface, as in `lidar.cloud.Cloud`; cosine of the incidence
+    feature, klass, cosine : (m,) of the surface, as in `lidar.sensors.cloud.Cloud`; cosine of the incidence
     true_range : (m,) float64, metres to the surface whose number and class the row bears
     axis       : (m,) bool, the beam's axis itself meets that surface
     """

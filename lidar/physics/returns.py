@@ -12,10 +12,10 @@ from lidar.physics.echoes import Echoes
 from lidar.physics.effects import Effects
 from lidar.physics.link import amplitude, apparent_of, daylight_noise, false_alarm_probability
 from lidar.physics.measure import quantised, signal_sigma, stretch_sigma, walk
-from lidar.physics.random import generator
 from lidar.physics.reflect import RETRO
-from lidar.sensors.beams import Firings
-from lidar.sensors.preset import Sensor
+from lidar.random_streams import generator
+from lidar.rig.patterns.beams import Firings
+from lidar.rig.scanner import Sensor
 
 Float = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lidar.errors import BackendError, InputError
-from lidar.poses import Poses
+from lidar.geometry.poses import Poses
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.fallback import EmbreexScene
 from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split

@@ -56,7 +56,7 @@ class Rays(NamedTuple):
     offsets    : (n, 3) float64, origins in the pose's frame; (1, 3) serves all, (0, 3) is the frame's zero
     pose       : (n,) int64, row of the poses; empty: directions and offsets are in the caster's frame
     position   : (p, 3) float64, of the poses
-    matrix     : (p, 3, 3) float64, scale * rotation of the poses (see `lidar.poses.Poses`)
+    matrix     : (p, 3, 3) float64, scale * rotation of the poses (see `lidar.geometry.poses.Poses`)
     order      : (n,) int64, order of work; empty: as they come
     time       : (n,) float32, ray times; empty: all 0
     near       : ray parameter

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lidar.errors import InputError
-from lidar.poses import Poses
+from lidar.geometry.poses import Poses
 from lidar.raycast.columns import CHUNK, Rays
 from lidar.raycast.geometry import ALL
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar.actors.actors import Actors, rotations, states
-from lidar.cloud import Cloud
-from lidar.poses import Trajectory
-from lidar.rig import Mount
+from lidar.geometry.mounts import Mount
+from lidar.geometry.poses import Trajectory
+from lidar.sensors.cloud import Cloud
+from lidar.world.actors import Actors, rotations, states
 
 Float = NDArray[np.float64]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar.physics.random import uniform_of
+from lidar.random_streams import uniform_of
 from lidar.raycast import Caster, Hits
 from lidar.sensors.motion import Rays
-from lidar.world import Faces
+from lidar.world.world import Faces
 
 Float = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lidar.geometry.mounts import Mount
+from lidar.geometry.poses import KNOT_NS, Poses, Trajectory
 from lidar.physics.footprint import bundle
-from lidar.poses import KNOT_NS, Poses, Trajectory
-from lidar.rig import Mount
-from lidar.sensors.beams import Firings
+from lidar.rig.patterns.beams import Firings
 
 Float = NDArray[np.float64]
 

@@ -14,10 +14,10 @@ from geoscene.classes import materials
 from lidar.physics.echoes import Echoes, gather, insert
 from lidar.physics.effects import Effects
 from lidar.physics.fresnel import glint
-from lidar.physics.random import normal_of
 from lidar.physics.reflect import INCIDENCE_LAWS, RETRO, apparent, reflectance_table, sent_back
+from lidar.random_streams import normal_of
 from lidar.raycast import Hits
-from lidar.world import Faces, World
+from lidar.world.world import Faces, World
 
 Float = NDArray[np.float64]
 

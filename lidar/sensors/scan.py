@@ -9,19 +9,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lidar.cloud import Cloud
+from lidar.geometry.mounts import Mount
+from lidar.geometry.poses import Trajectory
 from lidar.physics.echoes import Echoes, joined, numbered, reported
 from lidar.physics.effects import PLAIN, Effects
 from lidar.physics.intensity import reflectivity_code
-from lidar.physics.random import generator
 from lidar.physics.returns import detected, false_echoes, measured_range, received
-from lidar.poses import Trajectory
-from lidar.rig import Mount
-from lidar.sensors.beams import Firings
+from lidar.random_streams import generator
+from lidar.rig.patterns.beams import Firings
+from lidar.rig.scanner import Sensor, firings
+from lidar.sensors.cloud import Cloud
 from lidar.sensors.motion import beam_of
-from lidar.sensors.preset import Sensor, firings
 from lidar.sensors.surfaces import met
-from lidar.world import World
+from lidar.world.world import World
 
 Float = NDArray[np.float64]
 

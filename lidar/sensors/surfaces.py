@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from lidar.geometry.mounts import Mount
+from lidar.geometry.poses import Trajectory
 from lidar.physics.echoes import Echoes, joined, merged
 from lidar.physics.effects import Effects
 from lidar.physics.fresnel import mirrored, pane_reflection, surface_reflection
-from lidar.poses import Trajectory
 from lidar.raycast import Hits
-from lidar.rig import Mount
-from lidar.sensors.beams import Firings
+from lidar.rig.patterns.beams import Firings
 from lidar.sensors.foliage import Leaves
 from lidar.sensors.motion import Beam, Carrier, Rays
 from lidar.sensors.receive import Look, Receiver, shiny_codes
-from lidar.world import World
+from lidar.world.world import World
 
 Float = NDArray[np.float64]
 

@@ -1,0 +1,261 @@
+"""Small closed solids that a scene holds once and copies: crowns, trunks, poles, signs, benches."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.classes import Class, materials
+from geoscene.mesh import Instances, Mesh, concatenate
+
+Float = NDArray[np.float64]
+
+LEAF_AREA_DENSITY: dict[str, float] = {
+    "crown_broadleaved": 1.1,
+    "crown_needleleaved": 1.5,
+    "crown_palm": 0.8,
+    "hedge": 2.0,
+}
+"""One-sided leaf area per volume, m2/m3, of the shapes that let light through, and of faces of class HEDGE.
+
+A default tree's leaf area index over the mean depth of its crown: 5.1 (temperate broadleaved forest) over
+two thirds of a crown of 7 m, 5.5 (temperate needle-leaved forest) over a third of one of 11 m; indices
+from Asner, Scurlock and Hicke, "Global synthesis of leaf area index observations" (2003). Palms and
+clipped hedges: assumed.
+"""
+
+_SIDES = 8
+
+_BALL = ((0, 0), (0.65, 0.13), (0.97, 0.38), (0.97, 0.62), (0.65, 0.87), (0, 1))
+"""Diameters and heights of a crown like a ball: 64 faces."""
+
+_CONE = ((0, 0), (1, 0.05), (0, 1))
+
+
+def prism(
+    outline: Float, bottom: float, top: float, *, taper: float = 1.0
+) -> tuple[Float, NDArray[np.int32]]:
+    """Vertices and faces of the closed solid over a convex outline (n, 2), counter-clockwise, metres.
+
+    taper : the upper outline's size against the lower's, about the origin, over 0
+    """
+    n = len(outline)
+    ring = np.arange(n)
+    ahead = np.roll(ring, -1)
+    points = np.vstack(
+        [np.column_stack([outline, np.full(n, bottom)]), np.column_stack([outline * taper, np.full(n, top)])]
+    )
+    sides = [np.column_stack([ring, ahead, ahead + n]), np.column_stack([ring, ahead + n, ring + n])]
+    lid = np.column_stack([np.full(n - 2, n), ring[1:-1] + n, ring[2:] + n])
+    floor = np.column_stack([np.zeros(n - 2, int), ring[2:], ring[1:-1]])
+    return points, np.vstack([*sides, lid, floor]).astype(np.int32)
+
+
+def lathe(profile: Sequence[tuple[float, float]], *, sides: int = _SIDES) -> tuple[Float, NDArray[np.int32]]:
+    """Vertices and faces of the closed solid that a profile of (diameter, z), from pole to pole, turns out.
+
+    The first and last diameter are not used: there the solid comes to a point. Between, each ring has the
+    area of the circle.
+    """
+    rings = len(profile) - 2
+    points = [np.array([[0.0, 0.0, profile[0][1]]])]
+    for diameter, z in profile[1:-1]:
+        points.append(np.column_stack([circle(diameter, sides), np.full(sides, z)]))
+    points.append(np.array([[0.0, 0.0, profile[-1][1]]]))
+    ring = np.arange(sides)
+    ahead = np.roll(ring, -1)
+    low = 1 + sides * np.arange(rings - 1)[:, None]
+    top = 1 + sides * (rings - 1)
+    faces = [
+        np.column_stack([np.zeros(sides, int), ahead + 1, ring + 1]),
+        np.stack([low + ring, low + ahead, low + ahead + sides], axis=-1).reshape(-1, 3),
+        np.stack([low + ring, low + ahead + sides, low + ring + sides], axis=-1).reshape(-1, 3),
+        np.column_stack([ring + top, ahead + top, np.full(sides, top + sides)]),
+    ]
+    return np.vstack(points), np.vstack(faces).astype(np.int32)
+
+
+def circle(diameter: float, sides: int = _SIDES) -> Float:
+    """A regular polygon (sides, 2), counter-clockwise, with the area of the circle of that diameter."""
+    turn = 2 * np.pi * np.arange(sides) / sides
+    radius = diameter / 2 * np.sqrt(2 * np.pi / sides / np.sin(2 * np.pi / sides))
+    outline: Float = radius * np.column_stack([np.cos(turn), np.sin(turn)])
+    return outline
+
+
+def rectangle(width: float, depth: float, *, x: float = 0.0, y: float = 0.0) -> Float:
+    """A rectangle (4, 2) about (x, y), counter-clockwise."""
+    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width / 2, depth / 2) + (x, y)
+
+
+def solid(points: Float, faces: NDArray[np.integer], klass: Class, material: str) -> Mesh:
+    """A closed mesh of one class and material, in the material's colour."""
+    of = materials()[material]
+    return Mesh.of(points, faces, klass=klass, material=of.code, color=of.color, closed=True)
+
+
+@functools.cache
+def shapes() -> dict[str, Mesh]:
+    """All shapes by name, in the order of their numbers in `Instances.shape`.
+
+    Crowns and trunks are of unit size (x and y from -0.5 to 0.5, z from 0 to 1), to be scaled; the rest is in
+    metres and of its usual size, x the way it faces, z up from the ground. Every shape is one or more closed
+    solids.
+    """
+    return {
+        "trunk": solid(*prism(circle(1.0, 6), 0.0, 1.0, taper=0.7), Class.TRUNK, "bark"),
+        "crown_broadleaved": solid(*lathe(_BALL), Class.TREE_CROWN, "foliage"),
+        "crown_needleleaved": solid(*lathe(_CONE), Class.TREE_CROWN, "conifer"),
+        "crown_palm": solid(*lathe(_BALL), Class.TREE_CROWN, "foliage"),
+        "street_lamp": _street_lamp(),
+        "traffic_signals": _traffic_signals(),
+        "sign_round": _sign(circle(0.6, 12), 2.5),
+        "sign_triangle": _sign(circle(0.9, 3) @ _QUARTER, 2.5),
+        "sign_give_way": _sign(circle(0.9, 3) @ -_QUARTER, 2.5),
+        "sign_stop": _sign(circle(0.75, 8) @ _eighth(), 2.5),
+        "sign_rectangle": _sign(rectangle(0.6, 0.6), 2.5),
+        "bollard": solid(*prism(circle(0.12), -0.2, 0.9), Class.BOLLARD, "metal"),
+        "bench": _bench(),
+        "utility_pole": solid(*prism(circle(0.28), -0.3, 9.0, taper=0.7), Class.POLE, "wood"),
+        "flagpole": solid(*prism(circle(0.12), -0.2, 8.0, taper=0.6), Class.POLE, "metal"),
+        "hydrant": solid(*prism(circle(0.25), -0.2, 0.8), Class.BOLLARD, "metal"),
+    }
+
+
+def shape_numbers() -> dict[str, int]:
+    """Number of each shape by name."""
+    return {name: k for k, name in enumerate(shapes())}
+
+
+_QUARTER = np.array([[0.0, 1.0], [-1.0, 0.0]])
+"""Turns row vectors by a quarter, counter-clockwise: a triangle's corner from the right to the top."""
+
+
+def _eighth() -> Float:
+    """Turns row vectors by an eighth of a quarter, so that an octagon stands on an edge."""
+    c, s = np.cos(np.pi / 8), np.sin(np.pi / 8)
+    return np.array([[c, s], [-s, c]])
+
+
+def _street_lamp() -> Mesh:
+    """A mast of 8 m, an arm of 1.5 m the way it faces, a head at its end."""
+    pole = solid(*prism(circle(0.16), -0.3, 8.0, taper=0.6), Class.POLE, "metal")
+    arm = solid(*prism(rectangle(1.5, 0.06, x=0.75), 7.9, 7.98), Class.POLE, "metal")
+    head = solid(*prism(rectangle(0.7, 0.25, x=1.6), 7.82, 7.95), Class.POLE, "metal")
+    return concatenate([pole, arm, head])
+
+
+def _traffic_signals() -> Mesh:
+    """A mast of 3.4 m and a head of three lamps that faces x."""
+    pole = solid(*prism(circle(0.11), -0.3, 3.4), Class.POLE, "metal")
+    head = solid(*prism(rectangle(0.2, 0.3, x=0.16), 2.4, 3.35), Class.TRAFFIC_LIGHT, "metal")
+    visor = solid(*prism(rectangle(0.12, 0.26, x=0.32), 2.45, 3.3), Class.TRAFFIC_LIGHT, "glass")
+    return concatenate([pole, head, visor])
+
+
+def _sign(outline: Float, height: float) -> Mesh:
+    """A plate of 4 mm whose centre is at a height, on a pole; the side towards x sends light back."""
+    pole = solid(*prism(circle(0.06), -0.3, height + 0.4), Class.POLE, "metal")
+    points, faces = prism(outline, 0.0, 0.004)
+    # The plate stands up: its plane's x becomes y, its y becomes z, what was above it is in front.
+    points = np.column_stack([points[:, 2] + 0.035, points[:, 0], points[:, 1] + height])
+    plate = solid(points, faces, Class.TRAFFIC_SIGN, "metal")
+    front = plate.normals()[:, 0] > 0.5
+    sheet = materials()["retroreflector"]
+    return concatenate(
+        [
+            pole,
+            replace(
+                plate,
+                material=np.where(front, sheet.code, plate.material).astype(np.uint8),
+                color=np.where(front[:, None], sheet.color, plate.color).astype(np.uint8),
+            ),
+        ]
+    )
+
+
+def _bench() -> Mesh:
+    """A bench of 1.8 m that one sits on facing x: seat, back, two legs."""
+    boxes = [
+        (rectangle(0.45, 1.8), 0.41, 0.46, "wood"),
+        (rectangle(0.05, 1.8, x=-0.26), 0.5, 0.85, "wood"),
+        (rectangle(0.4, 0.08, y=-0.7), -0.1, 0.4, "metal"),
+        (rectangle(0.4, 0.08, y=0.7), -0.1, 0.4, "metal"),
+        (rectangle(0.04, 0.06, x=-0.31, y=-0.7), -0.1, 0.8, "metal"),
+        (rectangle(0.04, 0.06, x=-0.31, y=0.7), -0.1, 0.8, "metal"),
+    ]
+    return concatenate([solid(*prism(o, low, high), Class.BENCH, m) for o, low, high, m in boxes])
+
+
+def place(
+    name: str | Sequence[str] | NDArray[np.str_],
+    position: Float,
+    *,
+    size: ArrayLike = (1.0, 1.0, 1.0),
+    heading: ArrayLike = 0.0,
+    feature: ArrayLike = -1,
+) -> Instances:
+    """Copies of shapes at positions (k, 3), scene metres.
+
+    name    : one name, or one a copy
+    size    : factor along the shape's x, y and z, (3,) or (k, 3)
+    heading : radians counter-clockwise from east, where the shape's x points, one or (k,)
+    """
+    k = len(position)
+    size = np.broadcast_to(np.asarray(size, float), (k, 3))
+    heading = np.broadcast_to(np.asarray(heading, float), (k,))
+    c, s, o = np.cos(heading), np.sin(heading), np.zeros(k)
+    turn = np.stack([c, -s, o, s, c, o, o, o, o + 1.0], axis=1).reshape(k, 3, 3)
+    transform = np.concatenate([turn * size[:, None, :], np.reshape(position, (k, 3, 1))], axis=2)
+    names = np.broadcast_to(np.asarray(name, np.str_), (k,))
+    known, which = np.unique(names, return_inverse=True)
+    number = np.array([shape_numbers()[str(n)] for n in known], np.int32)[which.reshape(-1)]
+    return Instances(
+        number.astype(np.int32), transform, np.broadcast_to(np.asarray(feature, np.int32), (k,)).copy()
+    )
+
+
+def concatenate_instances(parts: Sequence[Instances]) -> Instances:
+    """All copies of all parts, in order."""
+    return Instances(
+        *(
+            np.concatenate([getattr(part, f.name) for part in [Instances.empty(), *parts]])
+            for f in fields(Instances)
+        )
+    )
+
+
+def shifted_instances(instances: Instances, offset: ArrayLike) -> Instances:
+    """The copies moved by ``offset`` (3,), metres, as from the scene to a tile's own coordinates."""
+    transform = instances.transform.copy()
+    transform[:, :, 3] += np.asarray(offset, float)
+    return replace(instances, transform=transform)
+
+
+def expand(instances: Instances) -> Mesh:
+    """The copies as one mesh, each face with its copy's feature: for formats without instancing."""
+    parts = []
+    library = list(shapes().values())
+    for number in np.unique(instances.shape):
+        chosen = instances.shape == number
+        shape, transform = library[number], instances.transform[chosen]
+        k, n = len(transform), len(shape.vertices)
+        points = np.einsum("kij,nj->kni", transform[:, :, :3], shape.vertices) + transform[:, None, :, 3]
+        faces = shape.faces + (np.arange(k) * n)[:, None, None]
+        parts.append(
+            Mesh.of(
+                points.reshape(-1, 3),
+                faces.reshape(-1, 3),
+                feature=np.repeat(instances.feature[chosen], len(shape)),
+                klass=np.tile(shape.klass, k),
+                material=np.tile(shape.material, k),
+                surface=np.tile(shape.surface, k),
+                color=np.tile(shape.color, (k, 1)),
+                closed=np.tile(shape.closed, k),
+            )
+        )
+    return concatenate(parts)

@@ -1,0 +1,344 @@
+"""Trees: those on the map, those of its rows, and those that its woods must have."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.frames import Frame
+from geoscene.ground.partition import GroundPlan, rows_near, tile_box, values_at, winners
+from geoscene.mesh import Instances
+from geoscene.objects.shapes import concatenate_instances, place
+from geoscene.report import Problem
+from geoscene.sources.data import OsmData, Tags
+from geoscene.tags import parse_length, parse_number
+
+Float = NDArray[np.float64]
+Height = Callable[[Float, Float], Float]
+
+HEIGHT = {"broadleaved": 12.0, "needleleaved": 12.0, "palm": 8.0}
+"""Height of a tree of which nothing is known, metres.
+
+12 m is the median of the 19 heights given for 4,717 mapped trees of two dozen extracts; palms: assumed."""
+
+CROWN = {"broadleaved": 0.67, "needleleaved": 0.4, "palm": 0.45}
+"""Crown's diameter over height: 0.67 is the median of the 13 trees with both, the others are assumed."""
+
+TRUNK = 0.0284
+"""Trunk's diameter over height: the median of 17 trees with both, 0.089 of the height around."""
+
+_CROWN_BASE = {"broadleaved": 0.3, "needleleaved": 0.1, "palm": 0.75}
+"""Height of the crown's lower end over the tree's: assumed."""
+
+_PALMS = frozenset(
+    {"areca", "phoenix", "washingtonia", "trachycarpus", "chamaerops", "cocos", "roystonea", "sabal"}
+)
+_CONIFERS = frozenset(
+    {"abies", "araucaria", "cedrus", "chamaecyparis", "cryptomeria", "cupressus", "juniperus", "larix",
+     "metasequoia", "picea", "pinus", "pseudotsuga", "sequoia", "sequoiadendron", "taxodium", "taxus",
+     "thuja", "tsuga"}
+)  # fmt: skip
+
+_TALLEST, _WIDEST, _THICKEST = 116.0, 60.0, 36.0
+"""Metres of the tallest tree known (Hyperion), the widest crown and the greatest girth: beyond is a slip."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trees:
+    """Trees as columns, one row a tree.
+
+    xy      : (n, 2) float64, scene metres
+    height  : (n,) float64 metres
+    crown   : (n,) float64 metres, diameter
+    trunk   : (n,) float64 metres, diameter at breast height
+    form    : (n,) str: ``broadleaved``, ``needleleaved`` or ``palm``
+    height_source : (n,) str: ``height``, ``diameter_crown``, ``circumference``, ``default`` or ``sampled``
+    crown_source : (n,) str: ``diameter_crown`` or ``height`` (by its ratio to the height)
+    form_source : (n,) str: ``leaf_type``, ``genus`` or ``default``
+    osm_id  : (n,) str: the tree's node, or its row's or wood's way or relation
+    feature : (n,) int32, -1 for none
+    """
+
+    xy: Float
+    height: Float
+    crown: Float
+    trunk: Float
+    form: NDArray[np.str_]
+    height_source: NDArray[np.str_]
+    crown_source: NDArray[np.str_]
+    form_source: NDArray[np.str_]
+    osm_id: NDArray[np.str_]
+    feature: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Number of trees."""
+        return len(self.height)
+
+    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Trees:
+        """The chosen trees, in the given order."""
+        return Trees(*(getattr(self, f.name)[keep] for f in fields(self)))
+
+
+def read_trees(osm: OsmData, frame: Frame, *, spacing: float = 8.0) -> tuple[Trees, list[Problem]]:
+    """The map's single trees and those of its tree rows, and what could not be used of their tags.
+
+    Sizes come from ``height``, ``diameter_crown`` (metres) and ``circumference`` (metres; a value over
+    36, more than any trunk, is taken as centimetres); what is missing follows from what there is by
+    `CROWN` and `TRUNK`, and the form from ``leaf_type``, else the genus.
+
+    spacing : metres between trees of a row
+    """
+    problems: list[Problem] = []
+    lonlat: list[tuple[float, float]] = []
+    tags: list[Tags] = []
+    ids: list[str] = []
+    for point in osm.points:
+        if point.tags.get("natural") == "tree":
+            lonlat.append((point.lon, point.lat))
+            tags.append(point.tags)
+            ids.append(point.osm_id)
+    x, y = frame.from_geographic(*np.array(lonlat).reshape(-1, 2).T)
+    places = [np.column_stack([x, y])]
+    for way in osm.ways:
+        if way.tags.get("natural") == "tree_row" and len(way.lonlat) > 1:
+            row = _along(np.column_stack(frame.from_geographic(*way.lonlat.T)), spacing)
+            places.append(row)
+            tags += [way.tags] * len(row)
+            ids += [way.osm_id] * len(row)
+    rows = [_sizes(tag, osm_id, problems) for tag, osm_id in zip(tags, ids, strict=True)]
+    columns: list[Any] = list(zip(*rows, strict=True)) if rows else [[]] * 6
+    height, crown, trunk = (np.array(columns[k], float) for k in range(3))
+    height_source, form, form_source = (np.array(columns[k], np.str_) for k in range(3, 6))
+    mapped = np.isfinite(crown)
+    ratio = np.array([CROWN[str(f)] for f in form])
+    return Trees(
+        np.concatenate(places),
+        height,
+        np.where(mapped, crown, height * ratio),
+        np.where(np.isfinite(trunk), trunk, height * TRUNK),
+        form,
+        height_source,
+        np.where(mapped, "diameter_crown", "height"),
+        form_source,
+        np.array(ids, np.str_),
+        np.full(len(ids), -1, np.int32),
+    ), _each_once(problems)
+
+
+def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
+    """The trees that can stand where they are, and the others by id.
+
+    A mapped tree within a building, and a tree that a row would put on a road, a track, water or a
+    building, are dropped; trees outside the ground's extent go without a word.
+    """
+    xmin, ymin, xmax, ymax = plan.extent
+    x, y = trees.xy.T
+    inside = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
+    trees = trees.take(inside)
+    klass = values_at(plan.layers.klass, winners(plan, *trees.xy.T), plan.base[0])
+    single = np.char.startswith(trees.osm_id, "node/")
+    built = klass == Class.BUILDING_PAD
+    blocked = built | (~single & np.isin(klass, [Class.ROAD, Class.LANE_MARKING, Class.RAIL, Class.WATER]))
+    problems = [
+        Problem(str(osm_id), "tree", "dropped", "in-building" if b else "on-road")
+        for osm_id, b in zip(trees.osm_id[blocked], built[blocked], strict=True)
+    ]
+    return trees.take(~blocked), _each_once(problems)
+
+
+def needle_shares(plan: GroundPlan, osm: OsmData) -> Float:
+    """Share (n,) of needle-leaved trees in each row of the plan's layers, by ``leaf_type``; 0 without."""
+    share = {"needleleaved": 1.0, "mixed": 0.5, "coniferous": 1.0}
+    known = {
+        area.osm_id: share[kind]
+        for area in osm.areas
+        if (kind := area.tags.get("leaf_type", area.tags.get("wood", ""))) in share
+    }
+    return np.array([known.get(str(osm_id), 0.0) for osm_id in plan.layers.osm_id], float)
+
+
+def forest_trees(
+    plan: GroundPlan,
+    i: int,
+    j: int,
+    *,
+    density: float = 0.02,
+    seed: int = 0,
+    needles: Float | None = None,
+) -> Trees:
+    """Trees of the woods in tile (i, j): one in each square of 1 / density m2 whose trunk finds forest floor.
+
+    Place, size and kind are drawn for each square of one lattice over the plane from (seed, column, row)
+    alone: a tree depends neither on tiles nor on other woods. Their feature is their wood's.
+
+    density : trees per m2; 0.02 (200 to the hectare) is a closed stand of grown trees
+    needles : (rows of the plan's layers,) share of needle-leaved trees, from `needle_shares`; none by default
+    """
+    side = 1.0 / np.sqrt(density)
+    xmin, ymin, xmax, ymax = tile_box(plan, i, j)
+    if not (plan.layers.klass[rows_near(plan, xmin, ymin, xmax, ymax)] == Class.FOREST_FLOOR).any():
+        return _none()
+    column, row = (
+        grid.ravel()
+        for grid in np.meshgrid(
+            np.arange(np.floor(xmin / side), np.ceil(xmax / side)).astype(np.int64),
+            np.arange(np.floor(ymin / side), np.ceil(ymax / side)).astype(np.int64),
+        )
+    )
+    draw = _uniform(seed, column, row, 4)
+    x, y = (column + 0.1 + 0.8 * draw[0]) * side, (row + 0.1 + 0.8 * draw[1]) * side
+    owner = winners(plan, x, y)
+    stands = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
+    stands &= values_at(plan.layers.klass, owner, Class.UNLABELED) == Class.FOREST_FLOOR
+    x, y, draw, owner = x[stands], y[stands], draw[:, stands], owner[stands]
+    # A trunk needs room: there must be forest half a metre away on all sides.
+    dx, dy = np.array([(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)]).T[:, :, None]
+    beside = values_at(
+        plan.layers.klass, winners(plan, (x + dx).ravel(), (y + dy).ravel()), Class.UNLABELED
+    ).reshape(4, -1)
+    roomy = (beside == Class.FOREST_FLOOR).all(axis=0)
+    x, y, draw, owner = x[roomy], y[roomy], draw[:, roomy], owner[roomy]
+    share = np.zeros(len(plan.layers)) if needles is None else needles
+    form = np.where(draw[3] < share[owner], "needleleaved", "broadleaved")
+    height = np.where(form == "needleleaved", HEIGHT["needleleaved"], HEIGHT["broadleaved"])
+    height = height * (0.8 + 0.4 * draw[2])
+    crown = height * np.where(form == "needleleaved", CROWN["needleleaved"], CROWN["broadleaved"])
+    n = len(x)
+    return Trees(
+        np.column_stack([x, y]),
+        height,
+        np.minimum(crown, 1.2 * side),  # neighbours leave each other no more
+        height * TRUNK,
+        form,
+        np.full(n, "sampled"),
+        np.full(n, "height"),
+        np.where(share[owner] > 0, "leaf_type", "default"),
+        plan.layers.osm_id[owner],
+        plan.layers.feature[owner],
+    )
+
+
+def _none() -> Trees:
+    """No trees."""
+    text, number = np.empty(0, np.str_), np.empty(0)
+    return Trees(
+        np.empty((0, 2)), number, number, number, text, text, text, text, text, np.empty(0, np.int32)
+    )
+
+
+def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
+    """Two copies of shapes a tree, trunk then crown, in scene coordinates, standing on the terrain.
+
+    The trunk begins 0.3 m under the ground, so that it meets a slope, and ends in the middle of the crown.
+    """
+    n = len(trees)
+    z = np.zeros(n) if height is None else np.asarray(height(*trees.xy.T), float)
+    base = trees.height * np.array([_CROWN_BASE[str(form)] for form in trees.form], float)
+    middle = (base + trees.height) / 2
+    trunks = place(
+        "trunk",
+        np.column_stack([trees.xy, z - 0.3]),
+        size=np.column_stack([trees.trunk, trees.trunk, middle + 0.3]),
+        feature=trees.feature,
+    )
+    column, row = np.floor(trees.xy.T * 100).astype(np.int64)
+    heading = 2 * np.pi * _uniform(0, column, row, 1)[0]
+    crowns = place(
+        np.char.add("crown_", trees.form),
+        np.column_stack([trees.xy, z + base]),
+        size=np.column_stack([trees.crown, trees.crown, trees.height - base]),
+        heading=heading,
+        feature=trees.feature,
+    )
+    return concatenate_instances([trunks, crowns])
+
+
+def _uniform(seed: int, column: NDArray[np.int64], row: NDArray[np.int64], count: int) -> Float:
+    """Numbers (count, n) in [0, 1) that depend on (seed, column, row) and nothing else.
+
+    SplitMix64's finaliser (Steele, Lea and Flood 2014) over the three, which is what makes one draw for each
+    square of an endless lattice cheap.
+    """
+
+    def mix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
+        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        return state ^ (state >> np.uint64(31))
+
+    golden = np.uint64(0x9E3779B97F4A7C15)
+    with np.errstate(over="ignore"):
+        state = mix(column.astype(np.uint64) + golden * np.uint64(seed + 1))
+        state = mix(state ^ (row.astype(np.uint64) * golden))
+        draws = [mix(state + golden * np.uint64(k + 1)) >> np.uint64(11) for k in range(count)]
+    return np.stack(draws) * 2.0**-53
+
+
+def _along(line: Float, spacing: float) -> Float:
+    """Places (k, 2) along a line, evenly, both ends included, about ``spacing`` apart."""
+    geometry = shapely.LineString(line)
+    count = max(round(geometry.length / spacing), 1) + 1
+    stations = np.linspace(0.0, geometry.length, count)
+    places: Float = shapely.get_coordinates(shapely.line_interpolate_point(geometry, stations))
+    return places
+
+
+def _form(tags: Tags) -> tuple[str, str]:
+    """(form, source) of a tree's tags."""
+    genus = (tags.get("genus") or tags.get("species") or tags.get("taxon") or "").split(" ")[0].lower()
+    if genus in _PALMS or tags.get("leaf_type") == "palm":
+        return "palm", "genus" if genus in _PALMS else "leaf_type"
+    if tags.get("leaf_type") in {"broadleaved", "needleleaved"}:
+        return tags["leaf_type"], "leaf_type"
+    if genus in _CONIFERS:
+        return "needleleaved", "genus"
+    return "broadleaved", "genus" if genus else "default"
+
+
+def _sizes(tags: Tags, osm_id: str, problems: list[Problem]) -> tuple[float, float, float, str, str, str]:
+    """(height, crown or NaN, trunk or NaN, height source, form, form source) of one tree's tags."""
+    form, form_source = _form(tags)
+    crown = _metres(tags, "diameter_crown", _WIDEST, osm_id, problems)
+    girth = _girth(tags, osm_id, problems)
+    height = _metres(tags, "height", _TALLEST, osm_id, problems)
+    source = "height"
+    if not np.isfinite(height):
+        if np.isfinite(crown):
+            height, source = crown / CROWN[form], "diameter_crown"
+        elif np.isfinite(girth):
+            height, source = girth / np.pi / TRUNK, "circumference"
+        else:
+            height, source = HEIGHT[form], "default"
+        height = float(np.clip(height, 1.5, 40.0))
+    return height, crown, girth / np.pi, source, form, form_source
+
+
+def _metres(tags: Tags, key: str, most: float, osm_id: str, problems: list[Problem]) -> float:
+    """A length in metres, NaN where there is none that a tree can have."""
+    if key not in tags:
+        return np.nan
+    metres = parse_length(tags[key])
+    if metres is not None and 0.0 < metres <= most:
+        return metres
+    problems.append(Problem(osm_id, "tree", "repaired", f"unusable-{key}", f"{key}={tags[key]!r}"))
+    return np.nan
+
+
+def _girth(tags: Tags, osm_id: str, problems: list[Problem]) -> float:
+    """A trunk's circumference in metres; a bare number beyond any trunk's metres is centimetres."""
+    number = parse_number(tags.get("circumference"))
+    if number is None or not _THICKEST < number <= 100 * _THICKEST:
+        return _metres(tags, "circumference", _THICKEST, osm_id, problems)
+    detail = f"circumference={tags['circumference']!r} read as centimetres"
+    problems.append(Problem(osm_id, "tree", "repaired", "circumference-in-centimetres", detail))
+    return number / 100.0
+
+
+def _each_once(problems: list[Problem]) -> list[Problem]:
+    """Problems without repetition, in order: a row's tags are read for each of its trees."""
+    return list(dict.fromkeys(problems))

@@ -1,0 +1,281 @@
+"""Where on the road graph a point is, and the best way between two places on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.errors import InputError
+from geoscene.roadgraph.graph import RoadGraph
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class RoadPath:
+    """A way through the graph: edge after edge, in driving direction.
+
+    edges  : (k,) int32; the head of one is the tail of the next
+    start  : true metres in plan from the first edge's tail to where the path begins
+    end    : true metres in plan from the last edge's tail to where the path ends
+    length : true metres in plan
+    time   : seconds at the speed limits
+    """
+
+    edges: NDArray[np.int32]
+    start: float
+    end: float
+    length: float
+    time: float
+
+
+def edge_lines(graph: RoadGraph) -> NDArray[np.object_]:
+    """The edges' centre lines in plan, as shapely LineStrings (m,)."""
+    if not len(graph):
+        return np.empty(0, object)
+    sizes = [len(line) for line in graph.geometry]
+    lines: NDArray[np.object_] = shapely.linestrings(
+        np.concatenate(list(graph.geometry))[:, :2], indices=np.repeat(np.arange(len(sizes)), sizes)
+    )
+    return lines
+
+
+def nearest_edge(
+    graph: RoadGraph, xy: ArrayLike, *, tree: shapely.STRtree | None = None
+) -> tuple[NDArray[np.int32], Float, Float]:
+    """The nearest edge of each point: ``(edge (q,), offset (q,), distance (q,))``.
+
+    The offset is in true metres in plan from the edge's tail; the distance in scene metres. Of the two edges
+    of a two-way street the lower-numbered one comes back; `shortest_path` considers both.
+
+    xy   : (q, 2) scene metres
+    tree : `shapely.STRtree` of `edge_lines`, to spare building it at every call
+
+    Raises InputError where the graph has no edges.
+    """
+    if not len(graph):
+        raise InputError("the road graph has no edges: the map holds no drivable roads here")
+    points = shapely.points(np.asarray(xy, float).reshape(-1, 2))
+    tree = shapely.STRtree(edge_lines(graph)) if tree is None else tree
+    (query, found), _ = tree.query_nearest(points, all_matches=True, return_distance=True)
+    first = np.full(len(points), len(graph), np.int64)
+    np.minimum.at(first, query, found)
+    lines = tree.geometries[first]
+    plan = np.maximum(shapely.length(lines), 1e-9)  # nodes may share a place
+    along = shapely.line_locate_point(lines, points) / plan
+    return first.astype(np.int32), along * graph.length[first], shapely.distance(lines, points)
+
+
+def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """The permitted turns as pairs of edges ``(from (t,), to (t,))``.
+
+    Restrictions are respected (``no_*`` forbids its turn, ``only_*`` every other turn from its edge at its
+    node) as far as pairs can say them; `turn_states` says the rest of those via ways. Turning round into the
+    street one comes from is permitted at dead ends alone unless ``u_turns``.
+    """
+    order = np.argsort(graph.tail, kind="stable").astype(np.int32)
+    start = np.searchsorted(graph.tail[order], np.arange(len(graph.node_id) + 1))
+    count = (start[1:] - start[:-1])[graph.head]
+    before = np.repeat(np.arange(len(graph), dtype=np.int32), count)
+    rank = np.arange(len(before)) - np.repeat(np.cumsum(count) - count, count)
+    after = order[start[graph.head[before]] + rank]
+
+    only = _commands(graph.turn_kind)
+    begun = np.array([chain[:2] for chain in graph.chain_edges[_commands(graph.chain_kind)]], np.int32)
+    commanded = np.concatenate(
+        [np.column_stack([graph.turn_from[only], graph.turn_to[only]]), begun.reshape(-1, 2)]
+    )
+    forbidden = _among(graph, before, after, graph.turn_from[~only], graph.turn_to[~only])
+    forbidden |= np.isin(before, commanded[:, 0]) & ~_among(graph, before, after, *commanded.T)
+    if not u_turns:
+        round_ = graph.twin[before] == after
+        ways_out = np.bincount(before[~round_], minlength=len(graph))
+        forbidden |= round_ & (ways_out[before] > 0)
+    return before[~forbidden], after[~forbidden]
+
+
+def _commands(kind: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """Which restrictions (r,) are ``only_*``."""
+    return np.char.startswith(kind, "only_") if len(kind) else np.empty(0, np.bool_)
+
+
+def _among(
+    graph: RoadGraph,
+    before: NDArray[np.int32],
+    after: NDArray[np.int32],
+    first: NDArray[np.int32],
+    second: NDArray[np.int32],
+) -> NDArray[np.bool_]:
+    """Which turns (t,) are one of the pairs (first, second)."""
+    key = before.astype(np.int64) * len(graph) + after
+    return np.isin(key, first.astype(np.int64) * len(graph) + second)
+
+
+@dataclass(frozen=True, slots=True)
+class TurnStates:
+    """Permitted turns between states: an edge, and what of a restriction via ways has been driven up to it.
+
+    edge          : (s,) int32, the edge of each state. The first states are the edges themselves, in their
+                    order, as a drive has them that begins there or has no such restriction behind it
+    before, after : (t,) int32, states that may follow each other
+    """
+
+    edge: NDArray[np.int32]
+    before: NDArray[np.int32]
+    after: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Number of states."""
+        return len(self.edge)
+
+
+def turn_states(graph: RoadGraph, *, u_turns: bool = False) -> TurnStates:
+    """The permitted turns with those that depend on the streets driven before.
+
+    A drive from state to state along them obeys every restriction. Those via ways bind who came along the
+    chain from its first edge: ``no_*`` forbids the last turn, ``only_*`` every turn off the chain. Without
+    them the turns are those of `turn_table`. The states beyond the edges are prefixes of chains; a drive is
+    in that of the longest that it ends with (Aho and Corasick 1975).
+    """
+    before, after = turn_table(graph, u_turns=u_turns)
+    forbidden: set[tuple[int, ...]] = set()
+    commanded: dict[tuple[int, ...], set[int]] = {}
+    prefixes: set[tuple[int, ...]] = set()
+    for edges, only in zip(graph.chain_edges, _commands(graph.chain_kind).tolist(), strict=True):
+        chain = tuple(edges.tolist())
+        prefixes |= {chain[:k] for k in range(2, len(chain))}
+        if only:
+            for k in range(2, len(chain)):
+                commanded.setdefault(chain[:k], set()).add(chain[k])
+        else:
+            forbidden.add(chain)
+    if not prefixes:
+        return TurnStates(np.arange(len(graph), dtype=np.int32), before, after)
+
+    ordered = sorted(prefixes)
+    number = {prefix: len(graph) + k for k, prefix in enumerate(ordered)}
+    watched = np.flatnonzero(_among(graph, before, after, *np.array([p[:2] for p in ordered], np.int32).T))
+    onward: dict[int, list[int]] = {}
+    for row in np.flatnonzero(np.isin(before, [prefix[-1] for prefix in ordered])).tolist():
+        onward.setdefault(int(before[row]), []).append(int(after[row]))
+    more: list[tuple[int, int]] = []
+    for prefix in ordered:
+        for edge in onward.get(prefix[-1], []):
+            driven = (*prefix, edge)
+            if any(driven[k:] in forbidden for k in range(len(prefix) - 1)):
+                continue
+            if any(edge not in commanded.get(prefix[k:], {edge}) for k in range(len(prefix) - 1)):
+                continue
+            ends = (driven[k:] for k in range(len(prefix)))
+            more.append((number[prefix], next((number[end] for end in ends if end in number), edge)))
+    after = after.copy()
+    for row in watched.tolist():
+        after[row] = number[int(before[row]), int(after[row])]
+    added = np.array(more, np.int32).reshape(-1, 2)
+    return TurnStates(
+        np.array([*range(len(graph)), *(prefix[-1] for prefix in ordered)], np.int32),
+        np.concatenate([before, added[:, 0]]),
+        np.concatenate([after, added[:, 1]]),
+    )
+
+
+def shortest_path(
+    graph: RoadGraph,
+    start: tuple[int, float],
+    goal: tuple[int, float],
+    *,
+    weight: Literal["time", "length"] = "time",
+    either_side: bool = True,
+    u_turns: bool = False,
+) -> RoadPath | None:
+    """The best path between two places on the graph, or None if there is none.
+
+    start, goal : (edge, offset), as `nearest_edge` gives them
+    weight      : ``time`` at the speed limits, or ``length``
+    either_side : start and goal may as well lie on the opposite edge of a two-way street
+    u_turns     : turning round is permitted at every node, not at dead ends alone
+
+    Dijkstra's algorithm over the states of `turn_states`, not over nodes, so that turn restrictions hold.
+    """
+    from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
+    from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
+
+    cost = np.maximum(graph.travel_time if weight == "time" else graph.length, 1e-9)
+    starts = _sides(graph, start, either_side=either_side)
+    goals = _sides(graph, goal, either_side=either_side)
+    best: tuple[float, list[int], float, float] | None = None
+
+    for edge, offset in starts:
+        for target, end in goals:
+            if edge == target and end >= offset:
+                spent = cost[edge] * _share(graph, edge, end - offset)
+                if best is None or spent < best[0]:
+                    best = (spent, [edge], offset, end)
+
+    states = turn_states(graph, u_turns=u_turns)
+    entered = states.edge[states.after]
+    turns = csr_array((cost[entered], (states.before, states.after)), shape=(len(states), len(states)))
+    for edge, offset in starts:
+        reach, came_from = dijkstra(turns, indices=edge, return_predecessors=True)
+        left = cost[edge] * (1 - _share(graph, edge, offset))
+        for target, end in goals:
+            into = states.before[entered == target]
+            if not len(into):
+                continue
+            last = int(into[np.argmin(reach[into])])
+            spent = left + reach[last] + cost[target] * _share(graph, target, end)
+            if np.isfinite(spent) and (best is None or spent < best[0]):
+                driven = states.edge[_walk(came_from, edge, last)].tolist()
+                best = (spent, [*driven, target], offset, end)
+    return None if best is None else _path(graph, *best[1:])
+
+
+def path_line(graph: RoadGraph, path: RoadPath) -> Float:
+    """The centre line (k, 3) of a path in the scene frame, cut at its start and its end."""
+    parts = [graph.geometry[e] for e in path.edges]
+    first, last = path.edges[0], path.edges[-1]
+    line = np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1))])
+    begin = _share(graph, first, path.start) * _plan(parts[0])
+    end = along[-1] - (1 - _share(graph, last, path.end)) * _plan(parts[-1])
+    inside = (along > begin) & (along < end)
+    at = np.concatenate([[begin], along[inside], [end]])
+    return np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
+
+
+def _plan(line: Float) -> float:
+    return float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
+
+
+def _share(graph: RoadGraph, edge: int, offset: float) -> float:
+    length = float(graph.length[edge])
+    return min(max(offset / length, 0.0), 1.0) if length > 0 else 0.0
+
+
+def _sides(graph: RoadGraph, place: tuple[int, float], *, either_side: bool) -> list[tuple[int, float]]:
+    """The place, and the same place on the street's other edge."""
+    edge, offset = int(place[0]), float(np.clip(place[1], 0.0, graph.length[place[0]]))
+    twin = int(graph.twin[edge])
+    if either_side and twin >= 0:
+        return [(edge, offset), (twin, float(graph.length[edge]) - offset)]
+    return [(edge, offset)]
+
+
+def _walk(came_from: NDArray[Any], first: int, last: int) -> list[int]:
+    """States from ``first`` to ``last`` along Dijkstra's predecessors."""
+    states = [last]
+    while states[-1] != first:
+        states.append(int(came_from[states[-1]]))
+    return states[::-1]
+
+
+def _path(graph: RoadGraph, edges: list[int], start: float, end: float) -> RoadPath:
+    rows = np.array(edges, np.int32)
+    driven = graph.length[rows].copy()
+    driven[-1] = end
+    driven[0] -= start
+    return RoadPath(rows, start, end, float(driven.sum()), float((driven / graph.speed[rows]).sum()))

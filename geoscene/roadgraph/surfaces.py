@@ -1,0 +1,189 @@
+"""What roads look like from above: carriageways, kerbs, sidewalks, paths, markings, crossings and rails."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.frames import Frame
+from geoscene.report import Problem
+from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, read_carriageways
+from geoscene.roadgraph.crossings import crossing_rows
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.junctions import build_junctions, carriageway
+from geoscene.roadgraph.markings import marking_rows, stop_rows
+from geoscene.roadgraph.paths import path_surfaces, rail_surfaces, square_surfaces
+from geoscene.roadgraph.routing import edge_lines
+from geoscene.roadgraph.surface_rows import SurfaceRows, concatenate_rows
+from geoscene.roadgraph.tags import CLASSES
+from geoscene.sources.data import OsmData
+
+_SIDEWALK, _KERB, _CARRIAGEWAY = 112.0, 120.0, 130.0
+# A bridge is wider than what it carries: room for the parapet on each side, metres. Assumed.
+_PARAPET = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceOptions:
+    """What roads are made of where the map does not say.
+
+    sidewalks : ``urban`` gives paved streets of built-up places (up to 60 km/h) sidewalks where the map does
+                not speak of them and shows no footway beside them; ``mapped`` gives them none
+    left_hand : traffic keeps left
+    """
+
+    sidewalks: Literal["mapped", "urban"] = "urban"
+    left_hand: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RoadSurfaces(SurfaceRows):
+    """`SurfaceRows` of the ground, priorities 100 to 200.
+
+    raised : the surfaces on bridges and in tunnels: their carriageways, kerbs, sidewalks and markings, and
+             (class BRIDGE, lowest) the outline of the deck
+    """
+
+    raised: SurfaceRows
+
+
+def road_surfaces(
+    osm: OsmData, graph: RoadGraph, frame: Frame, *, options: SurfaceOptions | None = None
+) -> tuple[RoadSurfaces, list[Problem]]:
+    """The surfaces of roads, paths and rails in plan, and what could not be taken as it came.
+
+    Surfaces overlap: the kerb reaches under the carriageway and the sidewalk under the kerb, so that cutting
+    the plane by priority leaves neither gaps nor slivers between them.
+    """
+    options = options or SurfaceOptions()
+    roads = read_carriageways(osm, frame, sidewalks=options.sidewalks, left_hand=options.left_hand)
+    edge = _edges_below(roads, graph)
+    crossings = crossing_rows(osm, roads, frame)
+    strips = crossings.polygon[crossings.priority == crossings.priority.min(initial=np.inf)]
+    rows = concatenate_rows(
+        [
+            square_surfaces(osm, frame),
+            path_surfaces(osm, frame),
+            *_carriageway_rows(roads, edge),
+            crossings,
+            marking_rows(roads, edge, left_hand=options.left_hand),
+            stop_rows(graph, roads, strips, left_hand=options.left_hand),
+            rail_surfaces(osm, frame),
+        ]
+    )
+    ground = rows.take(rows.place == 0)
+    return RoadSurfaces(**ground.columns(), raised=rows.take(rows.place != 0)), []
+
+
+def _edges_below(roads: Carriageways, graph: RoadGraph) -> NDArray[np.int32]:
+    """The edge of the graph that runs along each carriageway (k,), the first of a street's two, or -1."""
+    edge = np.full(len(roads), -1, np.int32)
+    if not len(graph) or not len(roads):
+        return edge
+    middle = shapely.line_interpolate_point(roads.line, 0.5, normalized=True)
+    row, found = shapely.STRtree(edge_lines(graph)).query(middle, predicate="dwithin", distance=1e-3)
+    for k, e in zip(row[::-1].tolist(), found[::-1].tolist(), strict=True):
+        if roads.osm_id[k] in str(graph.osm_id[e]).split(";") and (edge[k] < 0 or e < edge[k]):
+            edge[k] = e
+    return edge
+
+
+def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[SurfaceRows]:
+    if not len(roads):
+        return []
+    importance = np.array(
+        [len(CLASSES) - CLASSES.index(s.highway) if s.highway in CLASSES else 0 for s in roads.street]
+    )
+    place, level = roads.place, roads.layer
+    half = roads.width / 2
+    common = {"osm_id": roads.osm_id, "place": place, "level": level, "edge": edge}
+
+    def at(rows: NDArray[np.integer]) -> dict[str, NDArray[np.generic]]:
+        return {name: column[rows] for name, column in common.items()}
+
+    source = np.array(
+        [f"{s.width_source}/{m}" for s, m in zip(roads.street, roads.material_source, strict=True)]
+    )
+    joints = build_junctions(roads, importance)
+    out = [
+        SurfaceRows.of(
+            carriageway(roads.line, half),
+            klass=Class.ROAD,
+            material=roads.material,
+            priority=_CARRIAGEWAY + importance,
+            source=source,
+            **common,
+        ),
+        SurfaceRows.of(
+            joints.polygon,
+            klass=Class.ROAD,
+            material=roads.material[joints.main],
+            priority=_CARRIAGEWAY + importance[joints.main] + 0.5,
+            source=source[joints.main],
+            **at(joints.main),
+        ),
+    ]
+    walk_material = np.where(np.isin(roads.material, list(PAVED)), "paving", "gravel")
+    for klass, priority, material, shape in (
+        (Class.KERB, _KERB, np.full(len(roads), "concrete"), "kerb"),
+        (Class.SIDEWALK, _SIDEWALK, walk_material, "walk"),
+    ):
+        extra = np.where(roads.walk > 0, KERB + (roads.walk if shape == "walk" else 0.0), 0.0)
+        for rows, bands in _beside(roads, half, extra):
+            out.append(
+                SurfaceRows.of(
+                    bands,
+                    klass=klass,
+                    material=material[rows],
+                    priority=priority,
+                    source=np.char.add(_walk_source(roads)[rows], "/default"),
+                    **at(rows),
+                )
+            )
+        corner = joints.corner_main
+        out.append(
+            SurfaceRows.of(
+                getattr(joints, shape),
+                klass=klass,
+                material=material[corner],
+                priority=priority,
+                source=np.char.add(_walk_source(roads)[corner], "/default"),
+                **at(corner),
+            )
+        )
+    bridge = np.flatnonzero(place == 1)
+    out.append(
+        SurfaceRows.of(
+            carriageway(roads.line[bridge], half[bridge] + (roads.walk.max(axis=1) + _PARAPET)[bridge]),
+            klass=Class.BRIDGE,
+            material="concrete",
+            priority=101.0,
+            **at(bridge),
+        )
+    )
+    return out
+
+
+def _walk_source(roads: Carriageways) -> NDArray[np.str_]:
+    """Source of each carriageway's sidewalks; ``sidewalk`` if either is mapped."""
+    return np.where((roads.walk_source == "sidewalk").any(axis=1), "sidewalk", "default")
+
+
+def _beside(
+    roads: Carriageways, half: NDArray[np.float64], extra: NDArray[np.float64]
+) -> list[tuple[NDArray[np.integer], NDArray[np.object_]]]:
+    """Bands that reach ``extra`` (k, 2) beyond the carriageway on the left and right, with their rows."""
+    both = np.flatnonzero((extra[:, 0] == extra[:, 1]) & (extra[:, 0] > 0))
+    out: list[tuple[NDArray[np.integer], NDArray[np.object_]]] = []
+    out.append((both, carriageway(roads.line[both], half[both] + extra[both, 0])))
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        one = np.flatnonzero((extra[:, 0] != extra[:, 1]) & (extra[:, side] > 0))
+        far = sign * (half[one] + extra[one, side])
+        bands = shapely.buffer(roads.line[one], far, single_sided=True, join_style="mitre", mitre_limit=1.1)
+        out.append((one, bands))
+    return out

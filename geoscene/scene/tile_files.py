@@ -1,0 +1,96 @@
+"""Tiles of a scene and the shapes that their instances copy, as .npz."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.errors import SceneFormatError
+from geoscene.files import write_atomically
+from geoscene.mesh import Instances, Mesh
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """A square of the scene. A building lies wholly in the tile of its representative point; ground is cut.
+
+    origin    : (3,) float64, whole metres: tile coordinates + origin = scene coordinates
+    mesh      : in tile coordinates
+    instances : in tile coordinates
+    """
+
+    origin: Float
+    mesh: Mesh
+    instances: Instances = field(default_factory=Instances.empty)
+
+
+def pack(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """A compressed .npz whose bytes depend on the arrays alone (no time stamps)."""
+    out = BytesIO()
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            buffer = BytesIO()
+            np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
+            archive.writestr(entry, buffer.getvalue(), compresslevel=1)
+    return out.getvalue()
+
+
+def _mesh_arrays(mesh: Mesh) -> dict[str, NDArray[Any]]:
+    return {f.name: getattr(mesh, f.name) for f in fields(Mesh)}
+
+
+def write_tile(path: Path, tile: Tile) -> None:
+    """Write one tile as .npz."""
+    instances = {f"instance_{f.name}": getattr(tile.instances, f.name) for f in fields(Instances)}
+    write_atomically(path, pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances}))
+
+
+def read_tile(path: Path) -> Tile:
+    """The tile that `write_tile` wrote.
+
+    Raises SceneFormatError if the file is missing or damaged.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            mesh = Mesh(**{f.name: archive[f.name] for f in fields(Mesh)})
+            instances = Instances(**{f.name: archive[f"instance_{f.name}"] for f in fields(Instances)})
+            return Tile(archive["origin"], mesh, instances)
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise SceneFormatError(f"{path}: not a readable tile ({error}); build the scene again") from error
+
+
+def write_shapes(path: Path, shapes: Mapping[str, Mesh]) -> None:
+    """Write the shapes that instances copy, as one .npz."""
+    arrays: dict[str, NDArray[Any]] = {"names": np.array(list(shapes), dtype=np.str_)}
+    for name, mesh in shapes.items():
+        arrays |= {f"{name}/{key}": value for key, value in _mesh_arrays(mesh).items()}
+    write_atomically(path, pack(arrays))
+
+
+def read_shapes(path: Path) -> dict[str, Mesh]:
+    """The shapes that `write_shapes` wrote, in order; none if there is no such file."""
+    if not path.exists():
+        return {}
+    try:
+        return _shapes(path)
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise SceneFormatError(f"{path}: damaged ({error}); build the scene again") from error
+
+
+def _shapes(path: Path) -> dict[str, Mesh]:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        return {
+            str(name): Mesh(**{f.name: archive[f"{name}/{f.name}"] for f in fields(Mesh)})
+            for name in archive["names"]
+        }

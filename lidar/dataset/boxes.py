@@ -1,0 +1,162 @@
+"""Boxes of road users: in the scene, about the ego vehicle, in clouds and in images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.classes import Class
+from lidar.camera.outline import outline
+from lidar.geometry.poses import Poses, Trajectory
+from lidar.rig.camera_model import project
+from lidar.rig.specs import CameraSpec
+from lidar.world.actors import Actors, States, alive, poses_of, rotations, states
+
+Float = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def actors_near(actors: Actors, ego: Trajectory, time_ns: int, *, reach: float) -> Ints:
+    """Actors (k,) that are there at a time, within ``reach`` true metres of the ego vehicle."""
+    rows = alive(actors, time_ns, time_ns)
+    away = states(actors, rows, time_ns).position - ego.at([time_ns]).position
+    near: Ints = rows[np.hypot(*away[:, :2].T) <= reach * actors.scale]
+    return near
+
+
+def box_rows(
+    actors: Actors, ego: Trajectory, time_ns: int, frame: int, *, reach: float = np.inf
+) -> dict[str, NDArray[Any]]:
+    """Boxes at a time as columns, one row an actor within reach, by id.
+
+    frame, time_ns  : as given
+    id, instance    : number among the actors, and the number that points and pixels bear
+    class, kind     : as in `geoscene.classes.Class` and `lidar.world.actor_shapes.KINDS`
+    x, y, z         : the box's middle, scene metres
+    qx, qy, qz, qw  : scene axes from the box's (x forward, y left, z up); ``yaw`` in radians from the x axis
+    length, width, height : true metres
+    vx, vy, vz      : true m/s along the scene's axes
+    ego_x, ego_y, ego_z, ego_yaw : the middle in the ego vehicle's frame, true metres, and the yaw about its z
+    ego_vx, ego_vy, ego_vz : the velocity along the ego vehicle's axes, not relative to the ego's own
+    moving          : whether it ever moves
+    """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    rows = actors_near(actors, ego, time_ns, reach=reach)
+    at = states(actors, rows, time_ns)
+    turn = rotations(at.angles)
+    middle = _middles(actors, rows, at)
+    quat = Rotation.from_matrix(turn).as_quat(canonical=True) if len(rows) else np.empty((0, 4))
+    velocity = at.velocity / [actors.scale, actors.scale, 1.0]
+    pose = ego.at([time_ns])
+    body = pose.rotation[0].T
+    local = ((middle - pose.position) / pose.scale) @ body.T
+    forward = turn[:, :, 0] @ body.T
+    moved = velocity @ body.T
+    n = len(rows)
+    names = np.array([Class(int(k)).name.lower() for k in actors.klass[rows]], np.str_)
+    triples = {"": middle, "v": velocity, "ego_": local, "ego_v": moved}
+    out: dict[str, NDArray[Any]] = {
+        "frame": np.full(n, frame),
+        "time_ns": np.full(n, time_ns),
+        "id": rows,
+        "instance": actors.feature[rows],
+        "class": names,
+        "kind": actors.kind[rows],
+        **dict(zip(("length", "width", "height"), actors.size[rows].T, strict=True)),
+        "yaw": np.arctan2(turn[:, 1, 0], turn[:, 0, 0]),
+        "ego_yaw": np.arctan2(forward[:, 1], forward[:, 0]),
+        **dict(zip(("qx", "qy", "qz", "qw"), quat.T, strict=True)),
+        "moving": ~actors.parked[rows],
+    }
+    for name, values in triples.items():
+        out |= {f"{name}{axis}": values[:, c] for c, axis in enumerate("xyz")}
+    return {name: out[name] for name in COLUMNS}
+
+
+COLUMNS = (
+    *("frame", "time_ns", "id", "instance", "class", "kind", "x", "y", "z", "yaw", "qx", "qy", "qz", "qw"),
+    *("length", "width", "height", "vx", "vy", "vz", "ego_x", "ego_y", "ego_z", "ego_yaw"),
+    *("ego_vx", "ego_vy", "ego_vz", "moving"),
+)
+"""Columns of `box_rows`, in order."""
+
+
+def _middles(actors: Actors, rows: Ints, at: States) -> Float:
+    """Middles (k, 3) of boxes: half the height along the body's own z axis above where it stands."""
+    up = rotations(at.angles)[:, :, 2] * [actors.scale, actors.scale, 1.0]
+    middle: Float = at.position + up * actors.size[rows, 2:] / 2
+    return middle
+
+
+def count_points(actors: Actors, rows: ArrayLike, feature: NDArray[np.integer]) -> Ints:
+    """How many points (k,) lie on each of the actors ``rows`` in a cloud with that feature column."""
+    low = int(actors.feature[0]) if len(actors) else 0
+    mine = feature[(feature >= low) & (feature < low + len(actors))] - low
+    counts: Ints = np.bincount(mine, minlength=len(actors))[np.asarray(rows, np.int64)]
+    return counts
+
+
+@dataclass(frozen=True, slots=True)
+class ImageBoxes:
+    """Actors as a camera sees them, one row each.
+
+    row        : (k,) int64, the actor
+    box        : (k, 4) float64 pixels: left, top, right and bottom of what lies in the image, hidden or not
+    seen       : (k, 4) float64 pixels, of what is visible; NaN where nothing is
+    pixels     : (k,) int64, visible ones
+    visibility : (k,) 0 to 1, visible pixels against those it would have if nothing stood before it
+    """
+
+    row: Ints
+    box: Float
+    seen: Float
+    pixels: Ints
+    visibility: Float
+
+
+def image_boxes(
+    actors: Actors, camera: CameraSpec, pose: Poses, time_ns: int, instance: NDArray[np.integer]
+) -> ImageBoxes:
+    """Actors in an image.
+
+    pose     : the camera's one pose at the time of the image
+    instance : (h, w) feature numbers of the image
+
+    The pixels of an unhidden actor are those that its projected triangles cover. What reaches behind the
+    camera is left out of them.
+    """
+    rows = alive(actors, time_ns, time_ns)
+    at = states(actors, rows, time_ns)
+    away = ((at.position - pose.position) / pose.scale) @ pose.rotation[0]
+    size = np.linalg.norm(actors.size[rows], axis=1)
+    ahead = (np.linalg.norm(away, axis=1) < camera.far + size) & (
+        (away[:, 2] > -size) | np.full(len(rows), camera.model == "fisheye")
+    )
+    found: list[tuple[int, tuple[float, ...], tuple[float, ...], int, float]] = []
+    body = poses_of(actors, rows, at)
+    for k in np.flatnonzero(ahead).tolist():
+        row = int(rows[k])
+        mesh = actors.shapes[body[k]].mesh
+        turn = rotations(at.angles[k : k + 1])[0]
+        points = at.position[k] + (mesh.vertices * actors.stretch[row]) @ turn.T * pose.scale[0]
+        pixels, _ = project(camera, ((points - pose.position) / pose.scale) @ pose.rotation[0])
+        box, whole = outline(pixels[mesh.faces], camera.width, camera.height)
+        if not np.isfinite(box[0]):
+            continue
+        u0, v0 = (max(int(side) - 1, 0) for side in box[:2])
+        part = instance[v0 : int(box[3]) + 3, u0 : int(box[2]) + 3]
+        v, u = np.nonzero(part == actors.feature[row])
+        v, u = v + v0, u + u0
+        seen = (u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5) if len(u) else (np.nan,) * 4
+        found.append((row, box, seen, len(u), min(len(u) / max(whole, 1), 1.0)))
+    return ImageBoxes(
+        np.array([f[0] for f in found], np.int64),
+        np.array([f[1] for f in found], float).reshape(-1, 4),
+        np.array([f[2] for f in found], float).reshape(-1, 4),
+        np.array([f[3] for f in found], np.int64),
+        np.array([f[4] for f in found], float),
+    )

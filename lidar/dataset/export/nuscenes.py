@@ -1,0 +1,443 @@
+"""A recorded drive as a nuScenes dataset: samples, sweeps and the tables that its development kit opens.
+
+Caesar et al. 2020; the schema is that of nuscenes-devkit 1.1. Two samples a second are key frames. Clouds are
+as measured at one moment, the start of their frame, and boxes are those of that moment.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import shutil
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class, class_codes
+from geoscene.files import write_atomically
+from geoscene.progress import Progress, silent
+from lidar.camera.png import write_png
+from lidar.dataset.formats.clouds import CLOUD_READERS, placed_returns
+from lidar.dataset.formats.nuscenes import write_lidarseg, write_nuscenes
+from lidar.dataset.layout import Dataset
+from lidar.errors import DatasetError, InputError
+from lidar.geometry.poses import Poses, Trajectory
+
+Float = NDArray[np.float64]
+Row = dict[str, Any]
+
+VERSION = "v1.0-mini"
+"""Name of the folder of tables: the one that the development kit takes by default."""
+
+KEY_NS = 500_000_000
+"""Between key frames."""
+
+CATEGORIES = (
+    "noise", "animal", "human.pedestrian.adult", "human.pedestrian.child",
+    "human.pedestrian.construction_worker", "human.pedestrian.personal_mobility",
+    "human.pedestrian.police_officer", "human.pedestrian.stroller", "human.pedestrian.wheelchair",
+    "movable_object.barrier", "movable_object.debris", "movable_object.pushable_pullable",
+    "movable_object.trafficcone", "static_object.bicycle_rack", "vehicle.bicycle", "vehicle.bus.bendy",
+    "vehicle.bus.rigid", "vehicle.car", "vehicle.construction", "vehicle.emergency.ambulance",
+    "vehicle.emergency.police", "vehicle.motorcycle", "vehicle.trailer", "vehicle.truck",
+    "flat.driveable_surface", "flat.other", "flat.sidewalk", "flat.terrain", "static.manmade",
+    "static.other", "static.vegetation", "vehicle.ego",
+)  # fmt: skip
+"""nuScenes-lidarseg's categories by their numbers."""
+
+_ATTRIBUTES = (
+    "vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "pedestrian.moving",
+    "pedestrian.standing",
+)  # fmt: skip
+_VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
+_MARGIN = 200.0
+"""Metres from the drive to the zero of the tables' frame, whose coordinates are positive."""
+_WALKS, _DRIVES = 0.2, 0.5
+"""Metres a second from which on someone walks and something drives."""
+
+
+@dataclass(frozen=True)
+class NuscenesSummary:
+    """What was written.
+
+    samples     : key frames
+    clouds      : of all scanners, sweeps included
+    images      : of all cameras, sweeps included
+    annotations : boxes
+    path        : the directory
+    """
+
+    samples: int
+    clouds: int
+    images: int
+    annotations: int
+    path: Path
+
+
+@dataclass(frozen=True)
+class _Stream:
+    """A sensor's frames: numbers, times (nanoseconds since the start) and files."""
+
+    name: str
+    channel: str
+    modality: str
+    sensor: Row
+    frames: list[int]
+    times: list[int]
+    files: list[Path]
+
+
+def export_nuscenes(
+    dataset: Dataset, out: Path, *, overwrite: bool = False, progress: Progress = silent
+) -> NuscenesSummary:
+    """Write a finished drive as a nuScenes dataset into a new directory.
+
+    Positions are true metres east and north of a point south-west of the drive, which the scene's description
+    names. There is one scene; the map's mask is empty.
+
+    Raises InputError if the directory is there, and DatasetError for a drive without clouds in the sensor
+    frame (pcd, ply or csv).
+    """
+    if out.exists() and not overwrite:
+        raise InputError(f"{out}: is there already; add --overwrite to replace it")
+    streams = _streams(dataset)
+    part = out.with_name(f"{out.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        counts = _Export(dataset, streams, part).write(progress)
+        if out.exists():
+            shutil.rmtree(out)
+        part.replace(out)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return NuscenesSummary(*counts, out)
+
+
+def _streams(dataset: Dataset) -> list[_Stream]:
+    """Scanners, the first as LIDAR_TOP, and cameras with colour images."""
+    calibration = json.loads((dataset.path / "calibration.json").read_text("utf-8"))
+    streams: list[_Stream] = []
+    for name, sensor in calibration["sensors"].items():
+        if sensor["kind"] not in ("lidar", "camera"):
+            continue
+        if sensor["kind"] == "lidar":
+            kind = next((k for k in CLOUD_READERS if any(dataset.files(name, k))), None)
+            found = list(dataset.files(name, kind)) if kind else []
+        else:
+            images = sorted((dataset.path / name / "rgb").glob("*.png"))
+            found = [(int(path.stem), path) for path in images]
+        if not found:
+            continue
+        lidar = sensor["kind"] == "lidar"
+        first = lidar and not any(s.modality == "lidar" for s in streams)
+        stamps = _rows(dataset.path / name / "timestamps.csv")
+        at = {int(row["frame"]): int(row["time_ns"]) for row in stamps}
+        frames = [frame for frame, _ in found]
+        streams.append(
+            _Stream(
+                name,
+                "LIDAR_TOP" if first else name.upper(),
+                sensor["kind"],
+                sensor,
+                frames,
+                [at[frame] for frame in frames],
+                [path for _, path in found],
+            )
+        )
+    if not any(s.modality == "lidar" for s in streams):
+        raise DatasetError(
+            f"{dataset.path}: no clouds in the sensor frame; drive with --format pcd, ply or csv too"
+        )
+    return streams
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except OSError as error:
+        raise DatasetError(f"{path}: {error.strerror}; was the drive finished?") from error
+
+
+def _token(*what: object) -> str:
+    """The same 32 hexadecimal digits for the same words."""
+    return hashlib.blake2b("/".join(map(str, what)).encode(), digest_size=16).hexdigest()
+
+
+def _chained(rows: Sequence[Row]) -> None:
+    """Link rows to the ones before and after."""
+    for k, row in enumerate(rows):
+        row["prev"] = rows[k - 1]["token"] if k else ""
+        row["next"] = rows[k + 1]["token"] if k + 1 < len(rows) else ""
+
+
+class _Export:
+    """The tables of one drive, and where they lie."""
+
+    def __init__(self, dataset: Dataset, streams: Sequence[_Stream], out: Path) -> None:
+        self.dataset, self.streams, self.out = dataset, streams, out
+        self.trajectory: Trajectory = dataset.trajectory()
+        self.scale = np.array([self.trajectory.scale[0], self.trajectory.scale[0], 1.0])
+        places = self.trajectory.position / self.scale
+        self.zero = np.append(np.floor(places[:, :2].min(axis=0) - _MARGIN), 0.0)
+        self.name = dataset.path.resolve().name
+        self.tables: dict[str, list[Row]] = defaultdict(list)
+
+    def write(self, progress: Progress) -> tuple[int, int, int, int]:
+        """Write all; numbers of samples, clouds, images and boxes."""
+        top = next(s for s in self.streams if s.modality == "lidar")
+        keys = _key_frames(top.times)
+        samples = [
+            {"token": _token(self.name, "sample", top.frames[k]), "timestamp": self._stamp(top.times[k])}
+            for k in keys
+        ]
+        _chained(samples)
+        key_times = np.array([top.times[k] for k in keys], np.int64)
+        counts = {"lidar": 0, "camera": 0}
+        total = sum(len(s.files) for s in self.streams)
+        for stream in self.streams:
+            self._add_sensor(stream)
+            rows = []
+            near = _nearest(stream.times, key_times)
+            for k, frame in enumerate(stream.frames):
+                rows.append(self._sample_data(stream, k, frame, samples, key_times, near))
+                counts[stream.modality] += 1
+                progress("nuScenes", sum(counts.values()), total)
+            _chained(rows)
+            self.tables["sample_data"] += rows
+        self._annotate(top, keys, samples)
+        self._describe(samples)
+        (self.out / VERSION).mkdir(parents=True, exist_ok=True)
+        for name in (*_TABLES, *(("lidarseg",) if self.tables["lidarseg"] else ())):
+            document = json.dumps(self.tables[name], indent=0)
+            write_atomically(self.out / VERSION / f"{name}.json", document.encode("utf-8"))
+        return len(samples), counts["lidar"], counts["camera"], len(self.tables["sample_annotation"])
+
+    def _stamp(self, time_ns: int) -> int:
+        """Microseconds since 1970."""
+        return round(self.dataset.start.timestamp() * 1e6) + time_ns // 1000
+
+    def _place(self, position: Float) -> list[float]:
+        """Where something is in the tables' frame."""
+        place: list[float] = (position / self.scale - self.zero).tolist()
+        return place
+
+    def _add_sensor(self, stream: _Stream) -> None:
+        token = _token("sensor", stream.channel)
+        self.tables["sensor"].append({"token": token, "channel": stream.channel, "modality": stream.modality})
+        mount = np.array(stream.sensor["vehicle_from_sensor"])
+        self.tables["calibrated_sensor"].append(
+            {
+                "token": _token(self.name, "calibrated", stream.channel),
+                "sensor_token": token,
+                "translation": mount[:3, 3].tolist(),
+                "rotation": _wxyz(mount[:3, :3]),
+                "camera_intrinsic": stream.sensor.get("K", []),
+            }
+        )
+
+    def _sample_data(
+        self,
+        stream: _Stream,
+        k: int,
+        frame: int,
+        samples: Sequence[Row],
+        key_times: NDArray[np.int64],
+        near: NDArray[np.int64],
+    ) -> Row:
+        """Write a frame's cloud or image, with its pose; its row."""
+        time, source = stream.times[k], stream.files[k]
+        token = _token(self.name, stream.channel, frame)
+        key = bool((near == k).any())
+        sample = int(np.flatnonzero(near == k)[0]) if key else int(_nearest(key_times.tolist(), [time])[0])
+        pose = self.trajectory.at([time])
+        self.tables["ego_pose"].append(
+            {
+                "token": token,
+                "timestamp": self._stamp(time),
+                "translation": self._place(pose.position[0]),
+                "rotation": _wxyz(pose.rotation[0]),
+            }
+        )
+        suffix = ".pcd.bin" if stream.modality == "lidar" else ".png"
+        folder = "samples" if key else "sweeps"
+        name = f"{folder}/{stream.channel}/{self.name}__{stream.channel}__{self._stamp(time)}{suffix}"
+        path = self.out / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if stream.modality == "lidar":
+            self._write_cloud(stream, source, time, path, token, labelled=key)
+        else:
+            shutil.copyfile(source, path)
+        return {
+            "token": token,
+            "sample_token": samples[sample]["token"],
+            "ego_pose_token": token,
+            "calibrated_sensor_token": _token(self.name, "calibrated", stream.channel),
+            "timestamp": self._stamp(time),
+            "fileformat": "pcd" if stream.modality == "lidar" else "png",
+            "is_key_frame": key,
+            "height": stream.sensor.get("height", 0),
+            "width": stream.sensor.get("width", 0),
+            "filename": name,
+        }
+
+    def _write_cloud(
+        self, stream: _Stream, source: Path, time: int, path: Path, token: str, *, labelled: bool
+    ) -> None:
+        """Write a cloud as from one moment, and of a key frame's points their classes."""
+        table = dict(CLOUD_READERS[source.suffix[1:]](source))
+        mount = np.array(stream.sensor["vehicle_from_sensor"])
+        placed, _ = placed_returns(table, self.trajectory, time, mount)
+        here: Poses = self.trajectory.at([time]).mounted(mount[:3, 3], mount[:3, :3])
+        still = ((placed - here.position[0]) / here.scale[0]) @ here.rotation[0]
+        write_nuscenes(path, table | {axis: still[:, k] for k, axis in enumerate("xyz")})
+        if labelled:
+            name = f"lidarseg/{VERSION}/{token}_lidarseg.bin"
+            (self.out / name).parent.mkdir(parents=True, exist_ok=True)
+            write_lidarseg(self.out / name, table["label"].astype(np.int64))
+            self.tables["lidarseg"].append({"token": token, "sample_data_token": token, "filename": name})
+
+    def _annotate(self, top: _Stream, keys: Sequence[int], samples: Sequence[Row]) -> None:
+        """Boxes that the scanner sees in key frames, and the things they are of."""
+        path = self.dataset.path / top.name / "boxes.csv"
+        if not path.exists():
+            return
+        sample_of = {top.frames[k]: sample for k, sample in zip(keys, samples, strict=True)}
+        things: dict[str, list[Row]] = defaultdict(list)
+        category: dict[str, str] = {}
+        for box in _rows(path):
+            sample = sample_of.get(int(box["frame"]))
+            if sample is None or (int(box["points"]) == 0 and float(box["visibility"]) == 0.0):
+                continue
+            kind = CATEGORIES[int(class_codes().nuscenes[Class[box["class"].upper()]])]
+            instance = _token(self.name, "instance", box["id"])
+            category[instance] = kind
+            seen = int(np.searchsorted([0.4, 0.6, 0.8], float(box["visibility"]), side="right"))
+            things[instance].append(
+                {
+                    "token": _token(self.name, "annotation", box["id"], box["frame"]),
+                    "sample_token": sample["token"],
+                    "instance_token": instance,
+                    "visibility_token": str(seen + 1),
+                    "attribute_tokens": [_token("attribute", name) for name in _attributes(kind, box)],
+                    "translation": self._place(np.array([float(box[k]) for k in "xyz"])),
+                    "size": [float(box[k]) for k in ("width", "length", "height")],
+                    "rotation": [float(box[k]) for k in ("qw", "qx", "qy", "qz")],
+                    "num_lidar_pts": int(box["points"]),
+                    "num_radar_pts": 0,
+                }
+            )
+        for instance, rows in things.items():
+            _chained(rows)
+            self.tables["sample_annotation"] += rows
+            self.tables["instance"].append(
+                {
+                    "token": instance,
+                    "category_token": _token("category", category[instance]),
+                    "nbr_annotations": len(rows),
+                    "first_annotation_token": rows[0]["token"],
+                    "last_annotation_token": rows[-1]["token"],
+                }
+            )
+
+    def _describe(self, samples: Sequence[Row]) -> None:
+        """The tables that hold for the whole drive."""
+        manifest = self.dataset.manifest
+        log, place = _token(self.name, "log"), str(manifest["scene"]["name"] or manifest["scene"]["path"])
+        east, north = (self.zero * self.scale)[:2] + self.dataset.frame.origin
+        self.tables["sample"] = list(samples)
+        self.tables["scene"] = [
+            {
+                "token": _token(self.name, "scene"),
+                "log_token": log,
+                "nbr_samples": len(samples),
+                "first_sample_token": samples[0]["token"],
+                "last_sample_token": samples[-1]["token"],
+                "name": "scene-0001",
+                "description": f"simulated in {place}; zero at {east:.3f}, {north:.3f} of"
+                f" {self.dataset.frame.name}; (c) OpenStreetMap contributors, ODbL",
+            }
+        ]
+        date = self.dataset.start.date().isoformat()
+        self.tables["log"] = [
+            {
+                "token": log,
+                "logfile": self.name,
+                "vehicle": manifest["rig"],
+                "date_captured": date,
+                "location": place,
+            }
+        ]
+        mask = "maps/empty.png"
+        (self.out / "maps").mkdir(parents=True, exist_ok=True)
+        write_png(self.out / mask, np.zeros((1, 1), np.uint8))
+        self.tables["map"] = [
+            {
+                "token": _token(self.name, "map"),
+                "log_tokens": [log],
+                "category": "semantic_prior",
+                "filename": mask,
+            }
+        ]
+        self.tables["category"] = _named("category", CATEGORIES, numbered=True)
+        self.tables["attribute"] = _named("attribute", _ATTRIBUTES)
+        self.tables["visibility"] = [
+            {"token": str(k + 1), "level": level, "description": f"visibility {level[1:]} %"}
+            for k, level in enumerate(_VISIBILITY)
+        ]
+
+
+_TABLES = (
+    "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample",
+    "sample_annotation", "sample_data", "scene", "sensor", "visibility",
+)  # fmt: skip
+
+
+def _named(table: str, names: Iterable[str], *, numbered: bool = False) -> list[Row]:
+    return [
+        {"token": _token(table, name), "name": name, "description": name} | ({"index": k} if numbered else {})
+        for k, name in enumerate(names)
+    ]
+
+
+def _wxyz(rotation: Float) -> list[float]:
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
+    return [w, x, y, z]
+
+
+def _key_frames(times: Sequence[int]) -> list[int]:
+    """Frames nearest to every half second, each once."""
+    wanted = np.arange(times[0], times[-1] + 1, KEY_NS)
+    return sorted({int(k) for k in _nearest(times, wanted)})
+
+
+def _nearest(times: Sequence[int], wanted: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
+    """Of rising times the index nearest to each wanted one, the earlier of equals."""
+    have = np.asarray(times, np.int64)
+    target = np.asarray(wanted, np.int64)
+    after = np.clip(np.searchsorted(have, target), 1, max(len(have) - 1, 1))
+    if len(have) == 1:
+        return np.zeros(len(target), np.int64)
+    return after - (target - have[after - 1] <= have[after] - target)
+
+
+def _attributes(kind: str, box: dict[str, str]) -> list[str]:
+    """What a road user is doing, in nuScenes' words."""
+    speed = float(np.hypot(float(box["vx"]), float(box["vy"])))
+    if kind.startswith("human"):
+        return ["pedestrian.moving" if speed > _WALKS else "pedestrian.standing"]
+    if kind in ("vehicle.bicycle", "vehicle.motorcycle"):
+        return ["cycle.with_rider"]
+    if kind.startswith("vehicle"):
+        if speed > _DRIVES:
+            return ["vehicle.moving"]
+        return ["vehicle.stopped" if box["moving"] == "True" else "vehicle.parked"]
+    return []

@@ -1,0 +1,296 @@
+"""LAS 1.4 and LAZ through laspy: world coordinates, CRS as WKT, ASPRS classes, GPS time."""
+
+from __future__ import annotations
+
+import errno
+import functools
+import io
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from geoscene.classes import class_codes
+from lidar.dataset.formats.table import Table, rows
+from lidar.errors import FormatError
+
+SCALE = 0.001
+"""Metres per count of a coordinate; a point is at most half of this off along each axis."""
+
+INTENSITY_UNIT = 257.0
+"""LAS intensity (16 bits) per unit of calibrated reflectivity (0 to 255)."""
+
+_FULL = 2**20
+"""Bytes of free space under which a disk is full for a compressor, which writes in large pieces."""
+
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
+LEAP_SECONDS = 18
+"""GPS minus UTC since 2017-01-01 (IERS Bulletin C 52); none has been announced since."""
+
+_EXTRA = {
+    "ring": ("uint16", "beam, 0 = lowest elevation"),
+    "label": ("uint8", "geoscene class"),
+    "instance": ("int32", "feature in the scene"),
+    "range": ("float32", "metres, as reported"),
+    "incidence": ("float32", "rad, beam to normal"),
+    "true_range": ("float32", "metres, without noise"),
+    "velocity": ("float32", "m/s along the beam, + away"),
+}
+
+
+def gps_seconds(start: datetime, time_ns: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Adjusted standard GPS time (seconds since 1980-01-06 minus 1e9) of nanoseconds after a UTC start."""
+    base = (start - GPS_EPOCH).total_seconds() + LEAP_SECONDS - 1e9
+    return base + np.asarray(time_ns, np.float64) * 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class LasInfo:
+    """What every file of a dataset shares.
+
+    crs     : of the coordinates; written as WKT
+    offset  : (3,) whole metres near the data
+    created : date in the header; the drive's, so that the same drive is the same bytes
+    """
+
+    crs: CRS
+    offset: tuple[float, float, float]
+    created: datetime
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """What all files with the same columns share.
+
+    header : laspy's, with its CRS
+    start  : bytes of an uncompressed file before its points, for a file without points
+    kinds  : of a point
+    """
+
+    header: Any
+    start: bytes
+    kinds: np.dtype[np.void]
+
+
+@functools.lru_cache(maxsize=16)
+def _layout(info: LasInfo, extra: tuple[str, ...], colour: bool) -> _Layout:  # noqa: FBT001
+    import laspy  # noqa: PLC0415  (0.4 s)
+
+    header = laspy.LasHeader(version="1.4", point_format=7 if colour else 6)
+    header.scales = np.full(3, SCALE)
+    header.offsets = np.asarray(info.offset, float)
+    header.add_crs(info.crs)
+    header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
+    header.creation_date = info.created.date()
+    header.system_identifier = "simulated"
+    header.generating_software = "geoscene lidar"
+    header.add_extra_dims([laspy.ExtraBytesParams(n, _EXTRA[n][0], _EXTRA[n][1]) for n in extra])
+    for one in header.vlrs.get("ExtraBytesVlr"):
+        for column in one.extra_bytes_structs:
+            column.options &= ~0b110  # no bounds of values: laspy takes those of one point for those of all
+    start = io.BytesIO()
+    laspy.LasWriter(start, header, do_compress=False, closefd=False).close()
+    return _Layout(header, start.getvalue(), header.point_format.dtype())
+
+
+class _Uncompressed:
+    """Points of a LAS file, as they are; what the header says of them is filled in at the end.
+
+    Places are those of the public header block of LAS 1.4 R15 (ASPRS 2019), table 3.
+    """
+
+    def __init__(self, path: Path, layout: _Layout) -> None:
+        self.dest = path.open("wb")
+        self.dest.write(layout.start)
+        self._offset = layout.header.offsets
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
+        self._by_return = np.zeros(16, np.uint64)
+
+    def write_points(self, points: NDArray[np.void]) -> None:
+        """Append points."""
+        if not len(points):
+            return
+        counts = [points[axis] for axis in "XYZ"]
+        self._low = np.minimum(self._low, [c.min() * SCALE for c in counts] + self._offset)
+        self._high = np.maximum(self._high, [c.max() * SCALE for c in counts] + self._offset)
+        self._by_return += np.bincount(points["bit_fields"] & 15, minlength=16).astype(np.uint64)
+        self.dest.write(points.data)
+
+    def close(self) -> None:
+        """Say in the header what was written."""
+        if count := int(self._by_return.sum()):
+            self.dest.seek(179)
+            self.dest.write(np.stack([self._high, self._low], axis=1).astype("<f8").tobytes())
+            self.dest.seek(247)
+            self.dest.write(np.array([count, *self._by_return[1:]], "<u8").tobytes())
+        self.dest.close()
+
+
+@contextmanager
+def _plainly(path: Path) -> Iterator[None]:
+    """Failures of the compressor, which hides their cause, as the OSError behind them."""
+    import lazrs  # noqa: PLC0415
+
+    try:
+        yield
+    except lazrs.LazrsError as error:
+        full = shutil.disk_usage(path.parent).free < _FULL
+        code = errno.ENOSPC if full else errno.EIO
+        raise OSError(code, os.strerror(code), str(path)) from error
+
+
+class _Compressed:
+    """Points of a LAZ file."""
+
+    def __init__(self, path: Path, layout: _Layout) -> None:
+        import laspy  # noqa: PLC0415
+
+        self._path = path
+        self._header = layout.header
+        self._record: Any = laspy.ScaleAwarePointRecord
+        self._writer: Any = laspy.open(path, mode="w", header=layout.header, do_compress=True)
+        self.dest = self._writer.dest
+
+    def write_points(self, points: NDArray[np.void]) -> None:
+        """Append points."""
+        h = self._header
+        with _plainly(self._path):
+            self._writer.write_points(
+                self._record(points, h.point_format, scales=h.scales, offsets=h.offsets)
+            )
+
+    def close(self) -> None:
+        """Write what is left."""
+        with _plainly(self._path):
+            self._writer.close()
+
+
+class LasWriter:
+    """A LAS or LAZ file that takes tables one after the other and appears under its name when closed whole.
+
+    Tables need x, y, z (projected, float64) and label; they may have gps_time, intensity, ring, instance,
+    range, incidence, true_range, velocity, echo, echoes (up to 15), source (point source id), red, green,
+    blue.
+    """
+
+    def __init__(self, path: Path, info: LasInfo, columns: tuple[str, ...]) -> None:
+        self.path = path
+        self._info = info
+        self._extra = tuple(n for n in _EXTRA if n in columns)
+        self._colour = "red" in columns
+        self._layout = _layout(info, self._extra, self._colour)
+        self._part = path.with_name(f"{path.name}.{os.getpid()}.part")
+        sink = _Compressed if path.suffix.lower() == ".laz" else _Uncompressed
+        self._sink = sink(self._part, self._layout)
+
+    def write(self, table: Table) -> None:
+        """Append a table.
+
+        Raises FormatError for coordinates too far from the offset to be counted in millimetres.
+        """
+        points = np.zeros(rows(table), self._layout.kinds)
+        for k, axis in enumerate("xyz"):
+            if not _count(np.asarray(table[axis], np.float64), self._info.offset[k], points[axis.upper()]):
+                raise FormatError(f"{self.path}: a point lies too far from {self._info.offset} for LAS")
+        points["classification"] = class_codes().asprs[table["label"]]
+        one = np.ones(1, np.uint8)
+        number, count = (np.minimum(table.get(name, one), 15) for name in ("echo", "echoes"))
+        points["bit_fields"] = number | count << 4
+        if "intensity" in table:
+            points["intensity"] = np.clip(np.rint(table["intensity"] * INTENSITY_UNIT), 0, 65535)
+        if "gps_time" in table:
+            points["gps_time"] = table["gps_time"]
+        if "source" in table:
+            points["point_source_id"] = table["source"]
+        for name in self._extra:
+            points[name] = table[name]
+        if self._colour:
+            for name in ("red", "green", "blue"):
+                points[name] = table[name].astype(np.uint16) * 257
+        self._sink.write_points(points)
+
+    def close(self) -> None:
+        """Finish the file and move it to its name."""
+        self._sink.close()
+        self._part.replace(self.path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                self.close()
+        finally:
+            if self._part.exists():
+                with suppress(OSError):
+                    self._sink.dest.close()
+                self._part.unlink()
+
+
+@njit(cache=True, nogil=True)
+def _count(place: Any, offset: float, counts: Any) -> bool:
+    """Fill in the whole number of `SCALE` from the offset to each place; whether all are numbers that fit."""
+    fits = True
+    for i in range(len(place)):
+        count = np.rint((place[i] - offset) / SCALE)
+        fits &= abs(count) < 2.0**31
+        counts[i] = np.int32(count)
+    return fits
+
+
+def write_las(path: Path, table: Table, info: LasInfo) -> None:
+    """Write one table as LAS or LAZ, by the suffix."""
+    with LasWriter(path, info, tuple(table)) as writer:
+        writer.write(table)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    import laspy  # noqa: PLC0415
+    import lazrs  # noqa: PLC0415
+
+    try:
+        with laspy.open(path) as reader:
+            yield reader
+    except (laspy.errors.LaspyException, lazrs.LazrsError, OSError, ValueError) as error:
+        raise FormatError(f"{path}: not a readable LAS or LAZ file ({error})") from error
+
+
+def read_las(path: Path, *, chunk: int = 1_000_000) -> Iterator[Table]:
+    """The tables of a LAS or LAZ file, ``chunk`` points at a time, coordinates in its CRS.
+
+    Raises FormatError for a file that laspy cannot read.
+    """
+    with _opened(path) as reader:
+        for points in reader.chunk_iterator(chunk):
+            table: Table = {axis: np.asarray(points[axis], np.float64) for axis in ("x", "y", "z")}
+            table["intensity"] = (np.asarray(points.intensity) / INTENSITY_UNIT).astype(np.float32)
+            table["gps_time"] = np.asarray(points.gps_time)
+            table["classification"] = np.asarray(points.classification)
+            table["echo"] = np.asarray(points.return_number)
+            table["echoes"] = np.asarray(points.number_of_returns)
+            table["source"] = np.asarray(points.point_source_id)
+            for name in (*_EXTRA, "red", "green", "blue"):
+                if name in points.array.dtype.names:
+                    table[name] = np.asarray(points[name])
+            yield table
+
+
+def read_crs(path: Path) -> CRS | None:
+    """The CRS a LAS or LAZ file states, if any."""
+    with _opened(path) as reader:
+        crs: CRS | None = reader.header.parse_crs()
+        return crs

@@ -1,0 +1,142 @@
+"""A dataset on disk: what a drive writes and everything later reads.
+
+DATASET/
+  dataset.json            schema, scene, rig, options, seed, frames, licence; updated last
+  poses.csv               the vehicle at each frame's start
+  trajectory.csv          the vehicle at 100 Hz: what points are placed with
+  calibration.json        mounts and intrinsics of every sensor
+  gnss.csv, imu.csv       measured, by the receivers' and units' names
+  boxes.csv               road users in 3D, at the frames of the first scanner
+  <sensor>/<format>/<frame>.<ext>
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from pyproj import CRS
+
+from geoscene.frames import Frame
+from lidar.errors import DatasetError
+from lidar.geometry.poses import Trajectory
+from lidar.geometry.trajectory_csv import read_trajectory
+
+SCHEMA = 1
+"""Version of the dataset directory; a reader refuses others."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset directory, opened.
+
+    path     : the directory
+    manifest : what ``dataset.json`` holds
+    """
+
+    path: Path
+    manifest: dict[str, Any]
+
+    @property
+    def frame(self) -> Frame:
+        """The scene frame that poses are in."""
+        return Frame.from_json(self.manifest["frame"])
+
+    @property
+    def start(self) -> datetime:
+        """UTC time of the drive's start."""
+        return datetime.fromisoformat(self.manifest["start_time"])
+
+    @property
+    def crs(self) -> CRS:
+        """The CRS of LAZ files."""
+        return CRS.from_user_input(self.manifest["export_crs"])
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of the whole drive."""
+        return int(self.manifest["frames"])
+
+    @property
+    def lidars(self) -> dict[str, dict[str, Any]]:
+        """Laser scanners by name, as ``calibration.json`` describes them."""
+        calibration = json.loads((self.path / "calibration.json").read_text("utf-8"))
+        return {name: sensor for name, sensor in calibration["sensors"].items() if sensor["kind"] == "lidar"}
+
+    def trajectory(self) -> Trajectory:
+        """The vehicle's poses."""
+        return read_trajectory(self.path / "trajectory.csv")
+
+    def files(self, sensor: str, kind: str) -> Iterator[tuple[int, Path]]:
+        """(frame number, path) of a sensor's files of one format, in order."""
+        for path in sorted((self.path / sensor / kind).glob(f"*.{kind}")):
+            if path.stem.isdigit():
+                yield int(path.stem), path
+
+
+def open_dataset(path: str | Path) -> Dataset:
+    """Open a dataset directory, finished or not.
+
+    Raises DatasetError if it is none or has another schema version.
+    """
+    folder = Path(path)
+    manifest_path = folder / "dataset.json"
+    if not manifest_path.exists():
+        raise DatasetError(
+            f"{folder}: no dataset.json in it; make one with: lidar drive SCENE --route random -o {folder}"
+        )
+    try:
+        manifest = json.loads(manifest_path.read_text("utf-8"))
+        schema = manifest["schema"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DatasetError(f"{manifest_path}: damaged ({error})") from error
+    if schema != SCHEMA:
+        raise DatasetError(f"{folder}: schema version {schema}, this program reads {SCHEMA}; drive again")
+    return Dataset(folder, manifest)
+
+
+def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
+    """Make a directory ready for a drive made by ``recipe``; return how many frames it already holds.
+
+    A directory that holds a drive of the same recipe is kept, so that a killed drive goes on; with another
+    recipe, or with other files, it is refused unless ``overwrite``, which deletes a former dataset.
+
+    Raises DatasetError if the directory may not be used.
+    """
+    manifest_path = path / "dataset.json"
+    if path.exists() and not path.is_dir():
+        raise DatasetError(f"{path}: is a file; give a directory")
+    if not path.exists() or not any(path.iterdir()):
+        path.mkdir(parents=True, exist_ok=True)
+        return 0
+    if not manifest_path.exists():
+        raise DatasetError(f"{path}: is not empty and not a dataset; give another directory")
+    if overwrite:
+        shutil.rmtree(path)
+        path.mkdir(parents=True)
+        return 0
+    manifest = open_dataset(path).manifest
+    old, new = manifest["recipe"], json.loads(json.dumps(recipe))
+    changed = [k for k in new if old.get(k) != new[k]]
+    if changed:
+        what = ", ".join(f"{k} {_said(old.get(k))} (now {_said(new[k])})" for k in changed)
+        raise DatasetError(
+            f"{path}: holds a drive made with other options: {what};"
+            " add --overwrite to replace it, or give another directory"
+        )
+    for left in path.rglob("*.part"):  # of a drive that was killed
+        left.unlink()
+    return int(manifest["frames_done"])
+
+
+def _said(value: Any) -> str:
+    """A value of a recipe in few words."""
+    if isinstance(value, list) and all(isinstance(v, str) for v in value):
+        value = ",".join(value)
+    text = "none" if value in (None, "", []) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

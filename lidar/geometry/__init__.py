@@ -1,0 +1,1 @@
+"""Poses, attitude, mounts and georeferencing."""

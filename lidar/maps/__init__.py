@@ -1,0 +1,1 @@
+"""Aggregated maps and pictures."""

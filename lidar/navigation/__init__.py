@@ -1,0 +1,1 @@
+"""GNSS and IMU."""

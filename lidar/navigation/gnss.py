@@ -1,0 +1,290 @@
+"""A satellite receiver: where it truly is and what it reports.
+
+    measured = antenna + b + m + w
+
+w is white; b a first-order Gauss-Markov process (what atmosphere, orbits and clocks leave); m another one for
+the reflections and detours between buildings, in proportion to the share of the sky that is blocked.
+Everything is in metres along true east, true north and up.
+
+Heights are the scene's: above the assumed level ground in a ``flat`` scene, above the geoid in an
+``orthometric`` one, above the ellipsoid in an ``ellipsoidal`` one; see `Frame.vertical`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from lidar.errors import InputError
+from lidar.geometry.attitude import body_rates
+from lidar.geometry.poses import Trajectory
+from lidar.navigation.satellite_visibility import Sky, dilution, open_sky
+from lidar.random_streams import generator
+from lidar.rig.specs import GnssSpec
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Size of a receiver's errors; one standard deviation along each of east and north, and up.
+
+    white, bias, blocked : (horizontal, vertical) metres: of w, of b, and of m where the whole sky is blocked
+    tau      : seconds, correlation time of b
+    speed    : m/s along each axis, white
+    quality  : what NMEA sentences call the fix
+    """
+
+    white: tuple[float, float]
+    bias: tuple[float, float]
+    tau: float
+    blocked: tuple[float, float]
+    speed: float
+    quality: int
+
+
+STATES = {
+    "none": Errors((np.nan, np.nan), (0.0, 0.0), 1.0, (0.0, 0.0), np.nan, 0),
+    "single": Errors((0.3, 0.6), (1.5, 2.5), 600.0, (7.5, 15.0), 0.05, 1),
+    "sbas": Errors((0.2, 0.4), (0.6, 1.0), 300.0, (7.5, 15.0), 0.05, 2),
+    "float": Errors((0.05, 0.10), (0.25, 0.4), 200.0, (0.5, 1.0), 0.03, 5),
+    "fixed": Errors((0.008, 0.015), (0.006, 0.010), 100.0, (0.02, 0.04), 0.02, 4),
+    "ideal": Errors((0.0, 0.0), (0.0, 0.0), 1.0, (0.0, 0.0), 0.0, 1),
+}
+"""Typical magnitudes, not those of any one model; ``blocked`` is what street canyons do."""
+NAMES = tuple(STATES)
+MULTIPATH_TAU_S = 60.0
+"""Correlation time of m, which changes as the surroundings pass by."""
+SETTLE_S = 3.0
+"""Seconds that a better state must have been possible before the receiver reports it."""
+_LADDER = {  # states by mode, best first, with the satellites of one system and the dilution they need
+    "ideal": (("ideal", 0, np.inf),),
+    "single": (("single", 4, 25.0),),
+    "sbas": (("sbas", 5, 25.0), ("single", 4, 25.0)),
+    "rtk": (("fixed", 6, 4.0), ("float", 5, 8.0), ("single", 4, 25.0)),
+}
+"""Dilution in position beyond which there is no such fix: 25 is what u-blox receivers come set to; those of
+carrier phase are assumed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fixes:
+    """What a receiver reports, and the truth; a row an epoch. Without a fix the reported numbers are NaN.
+
+    time_ns   : (n,) int64, since the drive's start
+    state     : (n,) int8, row of `NAMES`
+    quality   : (n,) int8, NMEA's: 0 none, 1 single, 2 differential, 4 fixed, 5 float
+    satellites : (n,) int8, used
+    dop       : (n, 3) dilution of precision, horizontal, vertical, in position
+    lonlath   : (n, 3) degrees, degrees, metres, reported
+    speed     : (n,) m/s over ground, reported
+    course    : (n,) radians clockwise from true north, reported; as before while standing
+    error     : (n, 3) metres east, north, up: reported less true
+    true_lonlath : (n, 3) of the antenna
+    true_velocity : (n, 3) m/s true east, north, up, of the antenna
+    used      : (n, k) bool, satellites used
+    names     : (k,) of the satellites, such as G01
+    """
+
+    time_ns: NDArray[np.int64]
+    state: NDArray[np.int8]
+    quality: NDArray[np.int8]
+    satellites: NDArray[np.int8]
+    dop: Float
+    lonlath: Float
+    speed: Float
+    course: Float
+    error: Float
+    true_lonlath: Float
+    true_velocity: Float
+    used: NDArray[np.bool_]
+    names: NDArray[np.str_]
+
+    def __len__(self) -> int:
+        """Number of epochs."""
+        return len(self.time_ns)
+
+
+def epochs(spec: GnssSpec, duration_ns: int) -> NDArray[np.int64]:
+    """Times (n,) of a receiver's fixes in a drive of that length, nanoseconds since its start."""
+    last = (duration_ns - spec.time_offset_ns) * spec.rate_hz / 1e9
+    count = int(np.floor(last + 1e-9)) + 1 if last >= 0 else 0
+    return np.round(np.arange(count) * (1e9 / spec.rate_hz)).astype(np.int64) + spec.time_offset_ns
+
+
+def antenna_motion(
+    trajectory: Trajectory, frame: Frame, spec: GnssSpec, time_ns: NDArray[np.int64]
+) -> tuple[Float, Float]:
+    """Position (n, 3) in scene metres and velocity (n, 3) in m/s true east, north, up of the antenna."""
+    poses = trajectory.at(time_ns)
+    arm = np.asarray(spec.mount.translation, float)
+    position = poses.mounted(arm, np.eye(3)).position
+    seconds = trajectory.time_ns * 1e-9
+    rates = body_rates(seconds, trajectory.quat_xyzw)
+    at = np.asarray(time_ns, float) * 1e-9
+    rate = np.stack([np.interp(at, seconds, rates[:, k]) for k in range(3)], axis=1)
+    velocity = np.stack([np.interp(at, seconds, trajectory.velocity[:, k]) for k in range(3)], axis=1)
+    velocity = velocity + np.einsum("nij,nj->ni", poses.rotation, np.cross(rate, arm))
+    lon, lat = frame.to_geographic(position[:, 0], position[:, 1])
+    return position, _true_from_grid(velocity, frame.convergence(lon, lat))
+
+
+def _true_from_grid(vectors: Float, convergence: Float) -> Float:
+    """East, north, up (n, 3) of vectors along the scene's axes, whose y axis is grid north."""
+    c, s = np.cos(convergence), np.sin(convergence)
+    x, y, z = vectors.T
+    return np.stack([x * c + y * s, y * c - x * s, z], axis=1)
+
+
+def observe_gnss(
+    trajectory: Trajectory,
+    frame: Frame,
+    spec: GnssSpec,
+    *,
+    seed: int,
+    start: datetime,
+    sky: Sky | None = None,
+) -> Fixes:
+    """The fixes of a receiver along a drive.
+
+    start : UTC of the drive's start, which says where the satellites are
+    sky   : of `sky_view` at `epochs` and `antenna_motion`; the open sky by default
+
+    Random numbers are keyed by seed and receiver and drawn epoch by epoch from the start, so that a shorter
+    drive has the same first fixes, bit for bit. Raises InputError for a mode that there is not.
+    """
+    if spec.mode not in _LADDER:
+        raise InputError(f"receiver {spec.name}: no mode {spec.mode}; there are {', '.join(_LADDER)}")
+    time_ns = epochs(spec, trajectory.duration_ns)
+    position, velocity = antenna_motion(trajectory, frame, spec, time_ns)
+    if sky is None:
+        sky = open_sky(frame, position, start, time_ns, mask_deg=spec.mask_deg, systems=spec.constellations)
+    dop = dilution(sky.azimuth, sky.elevation, sky.visible, sky.names)
+    state = _states(spec, sky, dop[:, 2])
+    error = _errors(spec, sky, dop, state, seed)
+    sizes = np.array([STATES[name].speed for name in NAMES])[state]
+    shake = generator(seed, spec.name, "velocity").standard_normal((len(time_ns), 3))
+    moving = velocity + sizes[:, None] * shake
+    lon, lat = frame.to_geographic(position[:, 0], position[:, 1])
+    true = np.column_stack([lon, lat, position[:, 2]])
+    speed = np.hypot(moving[:, 0], moving[:, 1])
+    return Fixes(
+        time_ns=time_ns,
+        state=state.astype(np.int8),
+        quality=np.array([STATES[name].quality for name in NAMES], np.int8)[state],
+        satellites=sky.count.astype(np.int8),
+        dop=dop,
+        lonlath=_shifted(frame, position, error),
+        speed=speed,
+        course=_course(moving, speed, 3.0 * np.nan_to_num(sizes) + 0.01),
+        error=error,
+        true_lonlath=true,
+        true_velocity=velocity,
+        used=sky.visible,
+        names=sky.names,
+    )
+
+
+def _states(spec: GnssSpec, sky: Sky, pdop: Float) -> NDArray[np.int64]:
+    """State (n,) at each epoch: worse at once, better after it has been possible for `SETTLE_S`."""
+    ladder = _LADDER[spec.mode]
+    rank = np.full(len(sky.count), len(ladder))
+    for k in reversed(range(len(ladder))):
+        rank[(sky.spare >= ladder[k][1]) & (pdop <= ladder[k][2])] = k
+    # the best rank that held throughout the time to settle; before the start it is taken to have been as then
+    wait = max(round(SETTLE_S * spec.rate_hz), 1)
+    held = np.concatenate([np.full(wait - 1, rank[0]), rank]) if len(rank) else rank
+    worst = np.lib.stride_tricks.sliding_window_view(held, wait).max(axis=1) if len(rank) else rank
+    names = [*(name for name, _, _ in ladder), "none"]
+    rows: NDArray[np.int64] = np.array([NAMES.index(name) for name in names])[worst]
+    return rows
+
+
+def _errors(spec: GnssSpec, sky: Sky, dop: Float, state: NDArray[np.int64], seed: int) -> Float:
+    """Errors (n, 3) in metres east, north, up."""
+    n = len(state)
+    table = [STATES[name] for name in NAMES]
+
+    def sizes(name: str) -> Float:
+        pairs = np.array([getattr(row, name) for row in table])[state]
+        return np.column_stack([pairs[:, 0], pairs[:, 0], pairs[:, 1]])
+
+    # what stands in the way also spoils the geometry: errors grow as the dilution does
+    whole = dilution(sky.azimuth, sky.elevation, sky.above, sky.names)
+    with np.errstate(invalid="ignore"):
+        worse = np.where(np.isfinite(dop[:, :2]), dop[:, :2] / whole[:, :2], 1.0)
+    worse = np.where(np.isfinite(worse), worse, 1.0)[:, [0, 0, 1]]
+    white = generator(seed, spec.name, "white").standard_normal((n, 3))
+    tau = np.array([row.tau for row in table])[state]
+    bias = gauss_markov(generator(seed, spec.name, "bias"), 1.0 / spec.rate_hz, tau)
+    path = gauss_markov(generator(seed, spec.name, "path"), 1.0 / spec.rate_hz, np.full(n, MULTIPATH_TAU_S))
+    near = worse * (sizes("white") * white + sizes("bias") * bias)
+    total: Float = near + sizes("blocked") * sky.blocked[:, None] * path
+    return total
+
+
+def gauss_markov(rng: np.random.Generator, dt: float, tau: Float) -> Float:
+    """Three independent first-order Gauss-Markov processes (n, 3) of unit variance, from their steady state.
+
+    u[k] = phi u[k-1] + sqrt(1 - phi^2) N(0, 1) with phi = exp(-dt / tau[k]), computed in order from the
+    first.
+    """
+    noise = rng.standard_normal((len(tau), 3))
+    phi = np.exp(-dt / tau)
+    drive = np.sqrt(1.0 - phi**2)[:, None] * noise
+    out = np.empty_like(noise)
+    u = np.zeros(3)
+    for k in range(len(tau)):
+        u = phi[k] * u + drive[k] if k else noise[0]
+        out[k] = u
+    return out
+
+
+def _shifted(frame: Frame, position: Float, error: Float) -> Float:
+    """Longitude, latitude and height (n, 3) of positions displaced by metres east, north and up."""
+    lon, lat = frame.to_geographic(position[:, 0], position[:, 1])
+    turn, scale = frame.convergence(lon, lat), frame.scale(lon, lat)
+    c, s = np.cos(turn), np.sin(turn)
+    known = np.asarray(np.isfinite(error).all(axis=1))
+    e, n = np.where(known[:, None], error[:, :2], 0.0).T
+    x, y = position[:, 0] + scale * (e * c - n * s), position[:, 1] + scale * (e * s + n * c)
+    lon, lat = frame.to_geographic(x, y)
+    out = np.column_stack([lon, lat, position[:, 2] + error[:, 2]])
+    out[~known] = np.nan
+    return out
+
+
+def _course(velocity: Float, speed: Float, least: Float) -> Float:
+    """Course (n,) clockwise from true north; below the least speed the last one known, 0 before any."""
+    course = np.asarray(np.mod(np.arctan2(velocity[:, 0], velocity[:, 1]), 2 * np.pi))
+    known: NDArray[np.int64] = np.where(speed > least, np.arange(len(speed)), -1)
+    last: NDArray[np.int64] = np.maximum.accumulate(known)
+    held: Float = np.where(last >= 0, course[np.maximum(last, 0)], 0.0)
+    return held
+
+
+def gnss_columns(fixes: Fixes) -> dict[str, NDArray[Any]]:
+    """Columns of ``gnss.csv``: measured and, with the prefix ``true_``, true; degrees, metres, m/s."""
+    return {
+        "time_ns": fixes.time_ns,
+        "lon": fixes.lonlath[:, 0],
+        "lat": fixes.lonlath[:, 1],
+        "h": fixes.lonlath[:, 2],
+        "speed": fixes.speed,
+        "course_deg": np.degrees(fixes.course),
+        "quality": fixes.quality,
+        "satellites": fixes.satellites,
+        "hdop": fixes.dop[:, 0],
+        "vdop": fixes.dop[:, 1],
+        "true_lon": fixes.true_lonlath[:, 0],
+        "true_lat": fixes.true_lonlath[:, 1],
+        "true_h": fixes.true_lonlath[:, 2],
+        "true_east": fixes.true_velocity[:, 0],
+        "true_north": fixes.true_velocity[:, 1],
+        "true_up": fixes.true_velocity[:, 2],
+    }

@@ -1,0 +1,163 @@
+"""An inertial unit: the rates and specific forces that it truly feels and what it reports.
+
+    gyro  = omega + b_g + n_g        omega: turning of the unit against the stars, rad/s
+    accel = f + b_a + n_a            f = a - g: what a mass on springs in the unit feels, m/s^2
+
+both along the unit's own axes. n is white; b a random walk and flicker (bias instability). At rest f is the
+gravity's reaction, upwards. The Earth turns under the unit (and the unit's own travel around it turns the
+vertical); both are in omega, and the Coriolis acceleration is in f.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.frames import Frame
+from lidar.geometry.attitude import body_rates, matrix_from_quat
+from lidar.geometry.poses import Trajectory
+from lidar.navigation.satellite_visibility import E2, A
+from lidar.random_streams import generator
+from lidar.rig.specs import ImuSpec
+
+Float = NDArray[np.float64]
+
+_FLICKER_TIMES = 0.1 * np.exp(np.arange(12))
+"""Seconds, correlation times of the processes that add up to flicker: from 0.1 s to 100 minutes."""
+
+EARTH_RATE = 7.292115e-5
+"""Turning of the Earth, rad/s (WGS 84)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Inertial:
+    """What a unit reports, and the truth, in its own axes; a row a moment.
+
+    time_ns     : (n,) int64, since the drive's start
+    gyro, accel : (n, 3) rad/s and m/s^2, reported
+    true_gyro, true_accel : (n, 3) without noise and bias
+    """
+
+    time_ns: NDArray[np.int64]
+    gyro: Float
+    accel: Float
+    true_gyro: Float
+    true_accel: Float
+
+
+def normal_gravity(lat_deg: ArrayLike, h: ArrayLike) -> Float:
+    """Gravity in m/s^2 (Somigliana, WGS 84) less 3.086e-6 a metre of height."""
+    s2 = np.sin(np.radians(np.asarray(lat_deg, float))) ** 2
+    at_zero = 9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - E2 * s2)
+    gravity: Float = at_zero - 3.086e-6 * np.asarray(h, float)
+    return gravity
+
+
+def true_inertial(
+    trajectory: Trajectory, frame: Frame, spec: ImuSpec, time_ns: NDArray[np.int64]
+) -> tuple[Float, Float]:
+    """Angular rate (n, 3) and specific force (n, 3) that a unit feels, in its own axes.
+
+    From central differences of the trajectory's attitudes and of the unit's velocity, linear between its
+    rows.
+    """
+    seconds = trajectory.time_ns * 1e-9
+    R = matrix_from_quat(trajectory.quat_xyzw)
+    turn = body_rates(seconds, trajectory.quat_xyzw)
+    arm = np.asarray(spec.mount.translation, float)
+    velocity = trajectory.velocity + np.einsum("nij,nj->ni", R, np.cross(turn, arm))
+    acceleration = np.gradient(velocity, seconds, axis=0)
+    earth, travel, gravity = _planet(trajectory, frame, velocity)
+    felt = acceleration + np.cross(2 * earth + travel, velocity)
+    felt[:, 2] += gravity
+    rate = turn + np.einsum("nji,nj->ni", R, earth + travel)
+    force = np.einsum("nji,nj->ni", R, felt)
+    at = np.asarray(time_ns, float) * 1e-9
+    own = spec.mount.rotation
+    out = [np.stack([np.interp(at, seconds, v[:, k]) for k in range(3)], axis=1) @ own for v in (rate, force)]
+    return out[0], out[1]
+
+
+def _planet(trajectory: Trajectory, frame: Frame, velocity: Float) -> tuple[Float, Float, Float]:
+    """Turning (n, 3) of the Earth and of the vertical as one travels, scene axes; and gravity (n,)."""
+    x, y, z = trajectory.position.T
+    lon, lat = frame.to_geographic(x, y)
+    turn, phi = frame.convergence(lon, lat), np.radians(lat)
+    # true north lies ``turn`` to the left of grid north
+    north = np.stack([-np.sin(turn), np.cos(turn), np.zeros_like(turn)], axis=1)
+    up = np.array([0.0, 0.0, 1.0])
+    earth = EARTH_RATE * (np.cos(phi)[:, None] * north + np.sin(phi)[:, None] * up)
+    w = np.sqrt(1 - E2 * np.sin(phi) ** 2)
+    east = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
+    to_east, to_north = (velocity * east).sum(axis=1), (velocity * north).sum(axis=1)
+    # about the vertical the axes of the grid keep their direction, where those of true north would turn
+    travel = (to_east / (A / w + z))[:, None] * north - (to_north / (A * (1 - E2) / w**3 + z))[:, None] * east
+    return earth, travel, normal_gravity(lat, z)
+
+
+def observe_imu(trajectory: Trajectory, frame: Frame, spec: ImuSpec, *, seed: int) -> Inertial:
+    """What an inertial unit reports along a drive.
+
+    Random numbers are keyed by seed and unit and drawn moment by moment from the start, so that a shorter
+    drive has the same first rows, bit for bit.
+    """
+    step = 1e9 / spec.rate_hz
+    count = int(np.floor((trajectory.duration_ns - spec.time_offset_ns) / step + 1e-9)) + 1
+    time_ns = np.round(np.arange(max(count, 0)) * step).astype(np.int64) + spec.time_offset_ns
+    rate, force = true_inertial(trajectory, frame, spec, time_ns)
+    noise = inertial_noise(spec, len(time_ns), seed)
+    return Inertial(time_ns, rate + noise[:, :3], force + noise[:, 3:], rate, force)
+
+
+def inertial_noise(spec: ImuSpec, count: int, seed: int) -> Float:
+    """Errors (n, 6) of gyros, rad/s, and accelerometers, m/s^2: white noise, a random walk, flicker."""
+    draw = generator(seed, spec.name, "imu").standard_normal((count, 12))
+    dt = 1.0 / spec.rate_hz
+    white = np.repeat([spec.gyro_noise, spec.accel_noise], 3) / np.sqrt(dt)
+    walk = np.repeat([spec.gyro_walk, spec.accel_walk], 3) * np.sqrt(dt)
+    total: Float = draw[:, :6] * white + np.cumsum(draw[:, 6:] * walk, axis=0)
+    for axes, instability in ((slice(0, 3), spec.gyro_instability), (slice(3, 6), spec.accel_instability)):
+        if instability:
+            total[:, axes] += instability * _flicker(count, dt, seed, f"{spec.name}/imu/{axes.start}")
+    return total
+
+
+def _flicker(count: int, dt: float, seed: int, name: str) -> Float:
+    """Three columns (n, 3) of noise whose spectrum is 1 / (2 pi f), with an Allan deviation of 0.664.
+
+    The sum of stationary first-order Gauss-Markov processes, a factor of e apart in correlation time, each of
+    variance 1 / pi: their spectra add up to it between the shortest and the longest time (IEEE Std 952-1997,
+    annex C, for the spectrum of bias instability and its Allan deviation, B sqrt(2 ln 2 / pi)).
+    """
+    from scipy.signal import lfilter  # noqa: PLC0415 - slow to import
+
+    total = np.zeros((count, 3))
+    for time in _FLICKER_TIMES:
+        kept = np.exp(-dt / time)
+        noise = generator(seed, name, time).standard_normal((count, 3)) / np.sqrt(np.pi)
+        noise[1:] *= np.sqrt(1 - kept**2)
+        total += lfilter([1.0], [1.0, -kept], noise, axis=0)
+    return total
+
+
+def allan_deviation(rate: Float, rate_hz: float, windows: NDArray[np.integer]) -> Float:
+    """Overlapping Allan deviation (w, k) of readings (n, k) for averaging windows of so many readings."""
+    total = np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(rate, axis=0)]) / rate_hz
+    out = np.empty((len(windows), rate.shape[1]))
+    for row, m in enumerate(windows):
+        second = total[2 * m :] - 2 * total[m:-m] + total[: -2 * m]
+        out[row] = np.sqrt((second**2).mean(axis=0) / 2) * rate_hz / m
+    return out
+
+
+def imu_columns(rows: Inertial) -> dict[str, NDArray[Any]]:
+    """Columns of ``imu.csv``: measured and, with the prefix ``true_``, true; rad/s and m/s^2."""
+    out: dict[str, NDArray[Any]] = {"time_ns": rows.time_ns}
+    for prefix in ("", "true_"):
+        for name in ("gyro", "accel"):
+            values = getattr(rows, prefix + name)
+            out |= {f"{prefix}{name}_{axis}": values[:, k] for k, axis in enumerate("xyz")}
+    return out

@@ -1,0 +1,115 @@
+"""NMEA 0183 sentences of fixes: GGA, RMC, VTG and GSA, as version 4.10 has them for several systems."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+
+from lidar.navigation.gnss import Fixes
+
+KNOT = 1852.0 / 3600.0
+"""Metres per second in a knot."""
+_SYSTEMS = {"G": ("GP", 1, 0), "R": ("GL", 2, 64), "E": ("GA", 3, 0), "C": ("GB", 4, 0)}
+"""Talker, system number and what is added to a satellite's own number, by the letter of the system."""
+_MODES = {0: "N", 1: "A", 2: "D", 4: "R", 5: "F"}  # NMEA's mode by fix quality
+
+
+def checksum(body: str) -> str:
+    """Two hexadecimal digits: the exclusive or of the characters between $ and *."""
+    total = 0
+    for byte in body.encode("ascii"):
+        total ^= byte
+    return f"{total:02X}"
+
+
+def sentence(body: str) -> str:
+    """A whole sentence, with checksum, carriage return and line feed."""
+    return f"${body}*{checksum(body)}\r\n"
+
+
+def latitude(deg: float) -> str:
+    """Latitude in degrees as ``ddmm.mmmmmm,N``; nothing but the comma where it is not known."""
+    return _angle(deg, 2, "NS")
+
+
+def longitude(deg: float) -> str:
+    """Longitude in degrees as ``dddmm.mmmmmm,E``; nothing but the comma where it is not known."""
+    return _angle(deg, 3, "EW")
+
+
+def _angle(deg: float, digits: int, signs: str) -> str:
+    if not math.isfinite(deg):
+        return ","
+    micro = round(abs(deg) * 60e6)  # whole millionths of a minute, so that 59.9999999 never prints as 60
+    degrees, minutes = divmod(micro, 60_000_000)
+    return f"{degrees:0{digits}d}{minutes / 1e6:09.6f},{signs[deg < 0]}"
+
+
+def _number(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}" if math.isfinite(value) else ""
+
+
+def nmea(fixes: Fixes, start: datetime, *, geoid: float | None = None) -> list[str]:
+    """Sentences for each fix: GGA, RMC, VTG, and a GSA for each system; at most 82 characters each.
+
+    The talker is GN for a receiver of several systems, else that of the one. GSA names at most twelve
+    satellites of a system, those of GLONASS from 65 on, and ends with the number of the system.
+
+    start : UTC of the drive's start; sentences carry UTC
+    geoid : height of the geoid above the ellipsoid, metres. With it, heights of fixes are taken as
+            ellipsoidal and GGA gives height above the geoid and the separation; without it, they are given as
+            they are and the separation is left empty
+
+    Without a fix, the fields that it would fill are empty.
+    """
+    lines: list[str] = []
+    for k in range(len(fixes)):
+        when = start + timedelta(microseconds=round(int(fixes.time_ns[k]) / 1000))
+        lines += _epoch(fixes, k, when, geoid)
+    return lines
+
+
+def _epoch(fixes: Fixes, k: int, when: datetime, geoid: float | None) -> Sequence[str]:
+    lon, lat, h = fixes.lonlath[k].tolist()
+    quality, fixed = int(fixes.quality[k]), math.isfinite(lon)
+    hundredths = round(when.microsecond / 1e4)
+    if hundredths == 100:
+        when, hundredths = when + timedelta(seconds=1), 0
+    clock, day = f"{when:%H%M%S}.{hundredths:02d}", f"{when:%d%m%y}"
+    place = f"{latitude(lat)},{longitude(lon)}"
+    pdop, hdop, vdop = (_dop(fixes.dop[k, i]) for i in (2, 0, 1))
+    height = _number(h - (geoid or 0.0), 3)
+    separation = "" if geoid is None or not fixed else f"{geoid:.1f}"
+    speed = float(fixes.speed[k]) if fixed else math.nan
+    course = _number(math.degrees(fixes.course[k]) % 360.0, 1) if fixed else ""
+    course = "0.0" if course == "360.0" else course
+    mode = _MODES[quality]
+    used = fixes.names[fixes.used[k]].tolist() if fixed else []
+    letters = list(dict.fromkeys(name[0] for name in fixes.names.tolist()))
+    talker = "GN" if len(letters) > 1 else _SYSTEMS[letters[0]][0]
+    dimension = 3 if fixed else 1
+    active = []
+    for letter in letters:
+        _, system, added = _SYSTEMS[letter]
+        own = [int(name[1:]) + added for name in used if name[0] == letter][:12]
+        prn = ",".join(f"{p:02d}" for p in own) + "," * (12 - max(len(own), 1))
+        active.append(sentence(f"{talker}GSA,A,{dimension},{prn},{pdop},{hdop},{vdop},{system}"))
+    return [
+        sentence(
+            f"{talker}GGA,{clock},{place},{quality},{int(fixes.satellites[k]):02d},{hdop},"
+            f"{height},M,{separation},M,,"
+        ),
+        sentence(
+            f"{talker}RMC,{clock},{'A' if fixed else 'V'},{place},{_number(speed / KNOT, 3)},"
+            f"{course},{day},,,{mode}"
+        ),
+        sentence(
+            f"{talker}VTG,{course},T,,M,{_number(speed / KNOT, 3)},N,{_number(speed * 3.6, 3)},K,{mode}"
+        ),
+        *active,
+    ]
+
+
+def _dop(value: float) -> str:
+    return f"{min(value, 99.9):.1f}" if math.isfinite(value) else ""

@@ -1,0 +1,216 @@
+"""The satellites overhead, and which of them a receiver sees between the buildings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.frames import Frame
+from lidar.navigation.constellations import satellite_names, satellites
+from lidar.rig.specs import SYSTEMS
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+A, F = 6378137.0, 1 / 298.257223563
+"""WGS 84: semi-major axis in metres, flattening."""
+E2 = F * (2 - F)
+
+_RINGS = 6  # rings of the dome that is looked at for how much of it is blocked
+_SPOKES = 16
+_BLOCK_M = 100.0  # metres of road whose epochs share one world
+REACH = 400.0
+"""Metres within which buildings are held against the satellites."""
+
+
+class _Caster(Protocol):
+    def occluded(self, origins: ArrayLike, directions: ArrayLike) -> Bool: ...
+
+
+class _World(Protocol):
+    @property
+    def caster(self) -> _Caster: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Sky:
+    """What a receiver has overhead at each of n epochs.
+
+    azimuth, elevation : (n, k) radians, azimuth clockwise from true north
+    visible : (n, k) bool, above the mask and not blocked
+    above   : (n, k) bool, above the mask
+    blocked : (n,) share of the dome above the mask that something stands in front of, 0 in the open
+    names   : (k,) of the satellites; the first letter is their system's
+    """
+
+    azimuth: Float
+    elevation: Float
+    visible: Bool
+    above: Bool
+    blocked: Float
+    names: NDArray[np.str_]
+
+    @property
+    def count(self) -> NDArray[np.int64]:
+        """Satellites in view (n,)."""
+        count: NDArray[np.int64] = self.visible.sum(axis=1)
+        return count
+
+    @property
+    def spare(self) -> NDArray[np.int64]:
+        """Satellites in view (n,) less one for each system after the first: for the offset of its clock."""
+        seen = [self.visible[:, rows].any(axis=1) for rows in systems_of(self.names)]
+        spare: NDArray[np.int64] = self.count - np.maximum(np.sum(seen, axis=0) - 1, 0)
+        return spare
+
+
+def systems_of(names: NDArray[np.str_]) -> list[NDArray[np.int64]]:
+    """The satellites of each system, in the order in which they come."""
+    letters = [str(name)[:1] for name in names]
+    return [np.flatnonzero(np.array(letters) == letter) for letter in dict.fromkeys(letters)]
+
+
+def ecef(lon_deg: ArrayLike, lat_deg: ArrayLike, h: ArrayLike) -> Float:
+    """Earth-centred, earth-fixed coordinates (..., 3) in metres of WGS 84 degrees and ellipsoidal heights."""
+    lon, lat = np.radians(np.asarray(lon_deg, float)), np.radians(np.asarray(lat_deg, float))
+    n = A / np.sqrt(1 - E2 * np.sin(lat) ** 2)
+    h = np.asarray(h, float)
+    out: Float = np.stack(
+        [
+            (n + h) * np.cos(lat) * np.cos(lon),
+            (n + h) * np.cos(lat) * np.sin(lon),
+            (n * (1 - E2) + h) * np.sin(lat),
+        ],
+        axis=-1,
+    )
+    return out
+
+
+def enu_axes(lon_deg: ArrayLike, lat_deg: ArrayLike) -> Float:
+    """Rotations (..., 3, 3) whose rows are east, north and up in earth-centred axes."""
+    lon, lat = np.radians(np.asarray(lon_deg, float)), np.radians(np.asarray(lat_deg, float))
+    cl, sl, cp, sp = np.cos(lon), np.sin(lon), np.cos(lat), np.sin(lat)
+    rows = [[-sl, cl, np.zeros_like(cl)], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]]
+    out: Float = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return out
+
+
+def look_up(
+    lon_deg: Float,
+    lat_deg: Float,
+    h: Float,
+    start: datetime,
+    time_ns: NDArray[np.integer],
+    *,
+    systems: Sequence[str] = SYSTEMS,
+) -> tuple[Float, Float]:
+    """True azimuth and elevation (n, k) in radians of the satellites from n places, one a time."""
+    d = satellites(start, time_ns, systems) - ecef(lon_deg, lat_deg, h)[:, None, :]
+    e, n, u = np.moveaxis(np.einsum("nij,nkj->nki", enu_axes(lon_deg, lat_deg), d), -1, 0)
+    return np.mod(np.arctan2(e, n), 2 * np.pi), np.arctan2(u, np.hypot(e, n))
+
+
+def grid_directions(azimuth: Float, elevation: Float, convergence: Float) -> Float:
+    """Unit vectors (..., 3) in scene axes of true azimuths and elevations; convergence as of `Frame`."""
+    grid, elevation = np.broadcast_arrays(azimuth - convergence, elevation)
+    out: Float = np.stack(
+        [np.sin(grid) * np.cos(elevation), np.cos(grid) * np.cos(elevation), np.sin(elevation)], axis=-1
+    )
+    return out
+
+
+def open_sky(
+    frame: Frame,
+    antenna: Float,
+    start: datetime,
+    time_ns: NDArray[np.integer],
+    *,
+    mask_deg: float,
+    systems: Sequence[str] = SYSTEMS,
+) -> Sky:
+    """The sky over antenna positions (n, 3) in scene metres, with nothing in the way.
+
+    systems : of `SYSTEMS`; raises InputError for others
+    """
+    lon, lat = frame.to_geographic(antenna[:, 0], antenna[:, 1])
+    azimuth, elevation = look_up(lon, lat, antenna[:, 2], start, time_ns, systems=systems)
+    above = elevation > np.radians(mask_deg)
+    return Sky(azimuth, elevation, above, above, np.zeros(len(antenna)), satellite_names(systems))
+
+
+def sky_view(
+    frame: Frame,
+    antenna: Float,
+    start: datetime,
+    time_ns: NDArray[np.integer],
+    world_at: Callable[[tuple[float, float, float, float]], _World],
+    *,
+    mask_deg: float,
+    systems: Sequence[str] = SYSTEMS,
+) -> Sky:
+    """The sky over antenna positions (n, 3) between what stands around them.
+
+    Each satellite above the mask is a ray, and so are 96 directions that share the dome above the mask
+    evenly.
+
+    world_at : the world that covers a region (xmin, ymin, xmax, ymax), such as `World.follow`; asked once for
+               every hundred metres or so of the drive, with `REACH` around them
+    """
+    sky = open_sky(frame, antenna, start, time_ns, mask_deg=mask_deg, systems=systems)
+    lon, lat = frame.to_geographic(antenna[:, 0], antenna[:, 1])
+    turn = frame.convergence(lon, lat)
+    ring = np.repeat((np.arange(_RINGS) + 0.5) / _RINGS, _SPOKES)  # equal steps of sine: equal areas
+    low = np.sin(np.radians(mask_deg))
+    rise = np.arcsin(low + (1 - low) * ring)
+    spoke = np.tile(2 * np.pi * np.arange(_SPOKES) / _SPOKES, _RINGS) + np.repeat(np.arange(_RINGS), _SPOKES)
+    visible, blocked = sky.above.copy(), np.zeros(len(antenna))
+    for rows in _blocks(antenna):
+        x, y = antenna[rows, 0], antenna[rows, 1]
+        caster = world_at((x.min() - REACH, y.min() - REACH, x.max() + REACH, y.max() + REACH)).caster
+        k, satellite = np.nonzero(sky.above[rows])
+        way = grid_directions(
+            sky.azimuth[rows][k, satellite], sky.elevation[rows][k, satellite], turn[rows][k]
+        )
+        visible[rows[k], satellite] = ~caster.occluded(antenna[rows[k]], way)
+        dome = grid_directions(spoke[None, :], rise[None, :], turn[rows, None]).reshape(-1, 3)
+        hit = caster.occluded(np.repeat(antenna[rows], len(ring), axis=0), dome)
+        blocked[rows] = hit.reshape(len(rows), -1).mean(axis=1)
+    return Sky(sky.azimuth, sky.elevation, visible, sky.above, blocked, sky.names)
+
+
+def _blocks(antenna: Float) -> list[NDArray[np.int64]]:
+    """Rows in order, cut where the way since the last cut exceeds a block."""
+    step = np.hypot(*np.diff(antenna[:, :2], axis=0).T) if len(antenna) > 1 else np.empty(0)
+    block = np.floor(np.concatenate([[0.0], np.cumsum(step)]) / _BLOCK_M)
+    return np.split(np.arange(len(antenna)), np.flatnonzero(np.diff(block)) + 1)
+
+
+def dilution(azimuth: Float, elevation: Float, used: Bool, names: NDArray[np.str_]) -> Float:
+    """Dilution of precision (n, 3): horizontal, vertical and in position; infinite where too few are used.
+
+    Each system in use has a clock of its own that must be solved for: three coordinates and a clock need four
+    satellites, and one more for each further system. ``names`` as of `Sky`.
+    """
+    systems = systems_of(names)
+    clocks = np.zeros((len(names), len(systems)))
+    for column, rows in enumerate(systems):
+        clocks[rows, column] = 1.0
+    toward = np.stack(
+        [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=-1
+    )
+    h = np.concatenate([toward, np.broadcast_to(clocks, (*azimuth.shape, len(systems)))], axis=-1)
+    normal = np.einsum("nki,nkj,nk->nij", h, h, used.astype(float))
+    idle = 3 + np.arange(len(systems))
+    unused = normal[:, idle, idle] == 0.0
+    normal[:, idle, idle] += unused  # the clock of a system that is not in use is nobody's unknown
+    out = np.full((len(azimuth), 3), np.inf)
+    needed = 3 + (~unused).sum(axis=1)
+    enough = (used.sum(axis=1) >= np.maximum(needed, 4)) & (np.linalg.cond(normal) < 1e8)
+    q = np.diagonal(np.linalg.inv(normal[enough]), axis1=1, axis2=2)
+    out[enough] = np.sqrt(np.stack([q[:, 0] + q[:, 1], q[:, 2], q[:, :3].sum(axis=1)], axis=1))
+    return out

@@ -1,0 +1,1 @@
+"""From a route to the trajectory of the ego vehicle."""

@@ -1,0 +1,298 @@
+"""Flights over a scene: over waypoints, along its streets, or to and fro over an area."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.scene import Scene
+from lidar.errors import InputError, RouteError
+from lidar.geometry.poses import Trajectory
+from lidar.planning.flight import Flight, survey_flight, survey_lines, times_on_lines, waypoint_flight
+from lidar.planning.motion import drive_path
+from lidar.planning.path import plan_path
+from lidar.planning.route import Route, Spec, plan_route
+from lidar.planning.travel import AHEAD_S, covered, road_graph
+from lidar.planning.waypoints import read_track
+from lidar.rig.camera_model import unproject
+from lidar.rig.devices import Camera, Scanner
+from lidar.rig.scanner import firings
+from lidar.rig.vehicle import Vehicle
+from lidar.world.world import World
+
+Float = NDArray[np.float64]
+
+ALTITUDES = {"slow": 60.0, "fast": 600.0}
+"""Metres above the ground that a craft flies where nothing else is said: below and above 30 m/s."""
+
+_STREET_RADIUS = 20.0  # metres of the least turn with which a craft can follow streets
+_HIGH = 1e4
+_LAYERS = 16  # surfaces above one another between the sky and the ground, at most
+_CLEAR = 2.0  # metres between the craft and what is below it, at least
+_STEEPEST = 0.2  # least sine of a beam's way down that counts for the swath
+_STEP = 10.0
+_GROUND = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD]
+
+
+def plan_flight(
+    scene: Scene,
+    spec: Spec,
+    vehicle: Vehicle,
+    sensors: Sequence[Scanner | Camera],
+    *,
+    survey: str = "",
+    altitude: float | None = None,
+    overlap: float = 0.3,
+    seed: int = 0,
+    duration: float | None = None,
+    from_rest: bool = False,
+    turns: bool = False,
+) -> Flight:
+    """The flight of a craft over a scene.
+
+    spec     : ``random`` (over streets), a file of waypoints, or waypoints (latitude, longitude); not used
+               with a survey
+    survey   : ``all``, W,S,E,N in degrees, or a GeoJSON file with a polygon: the area is flown over in strips
+    altitude : metres above the ground: of a survey, above the highest ground under it; else above the ground
+               below each point. By default heights of the file (scene's heights), or `ALTITUDES`
+    overlap  : share of a strip that the next one covers too
+    duration : seconds; of a survey or a given route all of it by default
+    from_rest : whether a random flight too starts at rest
+    turns    : whether scanners work between the lines of a survey too
+
+    Raises RouteError for a flight that cannot be flown or would meet what stands below.
+    """
+    usual = ALTITUDES["slow" if vehicle.max_speed < 30.0 else "fast"]
+    below = _Below(scene)
+    if survey:
+        height = usual if altitude is None else altitude
+        route, lines, spacing = _strips(scene, survey, vehicle, sensors, height, overlap, below)
+    else:
+        route = _along(scene, spec, vehicle, altitude, usual, seed, duration, below)
+    under_way = spec == "random" and not survey and not from_rest
+    trajectory = drive_path(plan_path(route, vehicle, scene.frame), vehicle, under_way=under_way)
+    if duration is not None:
+        trajectory = trajectory.until(round(duration * 1e9))
+    _refuse_collisions(trajectory, below, scene)
+    if not survey or turns:
+        return Flight(trajectory)
+    on = times_on_lines(trajectory, lines, beside=spacing / 2)
+    if not len(on):
+        raise RouteError(
+            f"the record of {trajectory.duration_ns / 1e9:.1f} s ends before the first line of the survey;"
+            " record longer, or scan on the way there too (--turns)"
+        )
+    return Flight(trajectory, on)
+
+
+class _Below:
+    """What lies below points of a scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._world: World | None = None
+
+    def _load(self, x: Float, y: Float) -> World:
+        xmin, ymin, xmax, ymax = self._scene.bounds
+        region = (
+            float(np.clip(x.min(), xmin, xmax)),
+            float(np.clip(y.min(), ymin, ymax)),
+            float(np.clip(x.max(), xmin, xmax)),
+            float(np.clip(y.max(), ymin, ymax)),
+        )
+        if self._world is None:
+            self._world = World.load(self._scene, region=region)
+        else:
+            self._world.follow(region)
+        return self._world
+
+    def top(self, x: Float, y: Float) -> Float:
+        """Height (n,) of the uppermost surface; -inf where there is none."""
+        world = self._load(x, y)
+        origin = np.column_stack([x, y, np.full(len(x), _HIGH)])
+        hits = world.caster.cast(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
+        height: Float = _HIGH - hits.range
+        return height
+
+    def ground(self, x: Float, y: Float) -> Float:
+        """Height (n,) of the ground under all that stands on it; the mean of the rest where there is none."""
+        world = self._load(x, y)
+        origin = np.column_stack([x, y, np.full(len(x), _HIGH)])
+        found = np.full(len(x), np.nan)
+        left = np.arange(len(x))
+        for _ in range(_LAYERS):
+            hits = world.caster.cast(origin[left], np.broadcast_to([0.0, 0.0, -1.0], (len(left), 3)))
+            hit = np.isfinite(hits.range)
+            ground = hit & np.isin(world.lookup(hits).klass, _GROUND)
+            origin[left[hit], 2] -= hits.range[hit]
+            found[left[ground]] = origin[left[ground], 2]
+            left = left[hit & ~ground]
+            if not len(left):
+                break
+            origin[left, 2] -= 1e-3
+        mean = float(np.nanmean(found)) if np.isfinite(found).any() else 0.0
+        return np.where(np.isfinite(found), found, mean)
+
+
+def _along(
+    scene: Scene,
+    spec: Spec,
+    vehicle: Vehicle,
+    altitude: float | None,
+    usual: float,
+    seed: int,
+    duration: float | None,
+    below: _Below,
+) -> Route:
+    """The route over waypoints or over streets."""
+    if isinstance(spec, str) and spec == "random":
+        if vehicle.turning_radius > _STREET_RADIUS:
+            raise RouteError(
+                f"a craft that turns within {vehicle.turning_radius:.0f} m cannot follow streets; give"
+                " --survey all, --survey FILE or waypoints"
+            )
+        length = vehicle.max_speed * ((60.0 if duration is None else duration) + AHEAD_S)
+        graph = covered(road_graph(scene), scene)
+        line = plan_route(graph, scene.frame, "random", seed=seed, length=length).line
+        xyz, given = np.array(line), False
+    elif isinstance(spec, str | Path):
+        track = read_track(Path(spec), scene.frame)
+        xyz, given = track.xyz, bool(track.xyz[:, 2].any())
+    else:
+        lat, lon = np.array(spec, float).T
+        x, y = scene.frame.from_geographic(lon, lat)
+        xyz, given = np.column_stack([x, y, np.zeros(len(x))]), False
+    if altitude is None and given:
+        return waypoint_flight(xyz, limit=vehicle.max_speed)
+    xy = _dense(xyz[:, :2])
+    above = usual if altitude is None else altitude
+    level = np.column_stack([xy, np.full(len(xy), above)])
+    return waypoint_flight(level, ground=below.ground, limit=vehicle.max_speed)
+
+
+def _dense(xy: Float) -> Float:
+    """A line (n, 2) with points every ten metres or closer, so that a flight follows the ground."""
+    dense: Float = shapely.get_coordinates(shapely.segmentize(shapely.linestrings(xy), _STEP))
+    return dense
+
+
+def _strips(
+    scene: Scene,
+    survey: str,
+    vehicle: Vehicle,
+    sensors: Sequence[Scanner | Camera],
+    height: float,
+    overlap: float,
+    below: _Below,
+) -> tuple[Route, Float, float]:
+    """The route to and fro over an area, strips along its longer side; these (k, 2, 2), and their spacing."""
+    area = survey_area(scene, survey)
+    if not 0.0 <= overlap < 1.0:
+        raise InputError(f"--overlap {overlap:g}: a share from 0 to less than 1")
+    scale = float(np.asarray(scene.frame.scale_at(area.centroid.x, area.centroid.y)))
+    spacing = swath(sensors, height) * (1.0 - overlap) * scale
+    corner = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))
+    sides = np.diff(corner[:3], axis=0)
+    dx, dy = sides[int(np.argmax(np.hypot(*sides.T)))]
+    stop = 0.0 if vehicle.cruise else vehicle.max_speed**2 / (2 * vehicle.acceleration)
+    heading_deg = math.degrees(math.atan2(dx, dy))
+    route = survey_flight(
+        area,
+        spacing=spacing,
+        height=height,
+        radius=vehicle.turning_radius * 1.1 * scale,
+        heading_deg=heading_deg,
+        run_out=stop,
+        ground=below.ground,
+        limit=vehicle.max_speed,
+    )
+    return route, survey_lines(area, spacing=spacing, heading_deg=heading_deg), spacing
+
+
+def survey_area(scene: Scene, text: str) -> Any:
+    """The polygon, scene metres, that ``all``, W,S,E,N or a GeoJSON file names.
+
+    Raises RouteError for a file without a polygon and for an area that does not touch the scene.
+    """
+    whole = shapely.box(*scene.bounds)
+    if text == "all":
+        return whole
+    try:
+        west, south, east, north = (float(v) for v in text.split(","))
+        area = shapely.box(west, south, east, north)
+    except ValueError:
+        area = _polygon(Path(text))
+    area = shapely.segmentize(
+        area, 1e-3
+    )  # degrees: sides stay straight on the map where they are in the file
+    area = shapely.transform(area, lambda p: np.column_stack(scene.frame.from_geographic(*p.T)))
+    if not shapely.intersects(area, whole):
+        raise RouteError(f"--survey {text}: the area does not touch the scene")
+    return area
+
+
+def _polygon(path: Path) -> Any:
+    if not path.is_file():
+        raise RouteError(f"--survey {path}: neither all, W,S,E,N in degrees, nor a GeoJSON file")
+    try:
+        document = json.loads(path.read_text("utf-8-sig"))
+        parts = [f.get("geometry") or f for f in document.get("features", [document])]
+        shapes = [shapely.from_geojson(json.dumps(part)) for part in parts]
+    except (ValueError, AttributeError, shapely.errors.GEOSException) as error:
+        raise RouteError(f"--survey {path}: not readable as GeoJSON ({error})") from error
+    areas = shapely.union_all([s for s in shapes if s.geom_type in ("Polygon", "MultiPolygon")])
+    if areas.is_empty:
+        raise RouteError(f"--survey {path}: no polygon in it")
+    return areas if areas.geom_type == "Polygon" else areas.convex_hull
+
+
+def swath(sensors: Sequence[Scanner | Camera], height: float) -> float:
+    """Metres across the track that all scanners (or, if there are none, all cameras) see from a height.
+
+    Raises RouteError where a sensor does not look down, or not that far.
+    """
+    lidars = [s for s in sensors if isinstance(s, Scanner)]
+    return min(_swath(s, height) for s in lidars or sensors)
+
+
+def _swath(sensor: Scanner | Camera, height: float) -> float:
+    if isinstance(sensor, Scanner):
+        way = firings(sensor.sensor, 0).direction
+    else:
+        c = sensor.spec
+        edge = [[0.0, 0.0], [c.width - 1.0, 0.0], [c.width - 1.0, c.height - 1.0], [0.0, c.height - 1.0]]
+        way = unproject(c, edge)
+    way = way @ sensor.spec.mount.rotation.T
+    down = way[-way[:, 2] > _STEEPEST]
+    if height >= sensor.reach:
+        raise RouteError(
+            f"--altitude {height:g}: {sensor.name} sees {sensor.reach:g} m; fly lower, or take another sensor"
+        )
+    if not len(down):
+        raise RouteError(f"{sensor.name} does not look down; a survey needs a rig such as drone or aircraft")
+    aside = down[:, 1] / -down[:, 2] * height
+    furthest = math.sqrt(sensor.reach**2 - height**2)
+    left, right = np.percentile(aside, 98), -np.percentile(aside, 2)
+    return 2.0 * float(min(left, right, furthest))
+
+
+def _refuse_collisions(trajectory: Trajectory, below: _Below, scene: Scene) -> None:
+    """Raise RouteError where the craft comes too close to what is below it, or meets it."""
+    xyz = trajectory.position[::10]
+    top = below.top(xyz[:, 0], xyz[:, 1])
+    short = top + _CLEAR - xyz[:, 2]
+    worst = int(np.argmax(short))
+    if short[worst] > 0:
+        lon, lat = scene.frame.to_geographic(*xyz[worst, :2])
+        raise RouteError(
+            f"the flight would meet what reaches up to z = {top[worst]:.0f} m at {float(lat):.6f},"
+            f" {float(lon):.6f}; fly {math.ceil(short[worst])} m higher (--altitude)"
+        )

@@ -1,0 +1,180 @@
+"""What a vehicle's body sweeps along a track, and the obstacles that it meets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from lidar.errors import BlockedError
+from lidar.planning.steering import Pose, Track
+from lidar.rig.vehicle import Vehicle
+
+Float = NDArray[np.float64]
+
+ASIDE = 4.0
+"""Metres that a line may be pushed aside to get past an obstacle."""
+_NEAR = 12.0  # metres from a junction within which its turn is to blame
+_SWEEP = 0.5  # metres between the poses at which the body is held against obstacles
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What a path is planned for.
+
+    tree   : obstacles, polygons in scene metres
+    margin : metres that the body keeps from them
+    step   : true metres between the rows of a track
+    side   : of the street that is driven on
+    """
+
+    vehicle: Vehicle
+    frame: Frame
+    tree: shapely.STRtree
+    margin: float
+    step: float
+    side: str
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A route's line at an even spacing.
+
+    xyz   : (n, 3) scene metres
+    edge, limit, free : as for `Route`
+    turn  : (n,) bool, the vehicle turns round after this point
+    """
+
+    xyz: Float
+    edge: NDArray[np.int32]
+    limit: Float
+    free: NDArray[np.bool_]
+    turn: NDArray[np.bool_]
+
+    @property
+    def gap(self) -> float:
+        """Mean distance between points in plan, scene metres."""
+        return float(np.hypot(*np.diff(self.xyz[:, :2], axis=0).T).mean())
+
+    def take(self, keep: slice) -> Line:
+        """Chosen rows."""
+        return Line(self.xyz[keep], self.edge[keep], self.limit[keep], self.free[keep], self.turn[keep])
+
+
+def body_outlines(
+    xy: Float, heading: Float, vehicle: Vehicle, margin: float = 0.0, aside: float = 0.0
+) -> NDArray[np.object_]:
+    """Outlines (n,) of the body in plan, longer by the margin at each end and wider by both on each side.
+
+    xy      : (n, 2) scene metres of the rear axle
+    heading : (n,) radians
+    """
+    back, front, half = -vehicle.rear_overhang - margin, vehicle.front + margin, vehicle.width / 2 + margin
+    half += aside
+    box = np.array([[back, -half], [front, -half], [front, half], [back, half]])
+    c, s = np.cos(heading), np.sin(heading)
+    turn = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], axis=1)
+    corners = xy[:, None, :] + np.einsum("nij,kj->nki", turn, box)
+    shapes: NDArray[np.object_] = shapely.polygons(corners)
+    return shapes
+
+
+def touching(
+    track: Track, line: Line, setting: Setting
+) -> tuple[NDArray[np.int64], NDArray[np.object_], NDArray[np.object_]]:
+    """Rows of a track where the body touches an obstacle, its outlines there, and the obstacles."""
+    every = max(round(_SWEEP / track.step), 1)
+    rows = np.unique(np.append(np.arange(0, len(track.row), every), len(track.row) - 1))
+    rows = rows[~line.free[track.row[rows]]]
+    bodies = body_outlines(track.xy[rows], track.heading[rows], setting.vehicle, setting.margin)
+    body, obstacle = setting.tree.query(bodies, predicate="intersects")
+    return rows[body], bodies[body], setting.tree.geometries[obstacle]
+
+
+def pushes(track: Track, line: Line, setting: Setting) -> tuple[Float, NDArray[np.int64]]:
+    """How far the line must move, positive to the left, and at which of its rows, to free the body.
+
+    Not a number where no place beside the line within `ASIDE` is free.
+    """
+    rows = np.unique(touching(track, line, setting)[0])
+    if not len(rows):
+        return np.empty(0), np.empty(0, np.int64)
+    half = setting.vehicle.width / 2 + setting.margin
+    strips = body_outlines(track.xy[rows], track.heading[rows], setting.vehicle, setting.margin, aside=ASIDE)
+    strip, obstacle = setting.tree.query(strips, predicate="intersects")
+    parts, of = shapely.get_parts(
+        shapely.intersection(strips[strip], setting.tree.geometries[obstacle]), return_index=True
+    )
+    points, part = shapely.get_coordinates(parts, return_index=True)
+    k = strip[of][part]
+    c, s = np.cos(track.heading[rows])[k], np.sin(track.heading[rows])[k]
+    d = points - track.xy[rows][k]
+    ahead, across = d[:, 0] * c + d[:, 1] * s, d[:, 1] * c - d[:, 0] * s
+    low, high = np.full(len(parts), np.inf), np.full(len(parts), -np.inf)
+    np.minimum.at(low, part, across)
+    np.maximum.at(high, part, across)
+    near = np.full(len(rows), -np.inf)
+    body = np.abs(across) <= half
+    np.maximum.at(near, k[body], ahead[body])
+    push = np.array([_way_out(low[strip[of] == r], high[strip[of] == r], half) for r in range(len(rows))])
+    at = track.row[rows] + np.round(np.clip(near, 0.0, setting.vehicle.front) / line.gap).astype(np.int64)
+    return push, np.minimum(at, len(line.edge) - 1)
+
+
+def _way_out(low: Float, high: Float, half: float) -> float:
+    """The least shift sideways that takes a body of a half width clear of intervals; NaN if none does."""
+    ways = np.concatenate([high + half, low - half])
+    ways += np.copysign(0.05, ways)
+    free = ((ways[:, None] - half >= high) | (ways[:, None] + half <= low)).all(axis=1) & (
+        np.abs(ways) < ASIDE
+    )
+    return float(ways[free][np.argmin(np.abs(ways[free]))]) if free.any() else np.nan
+
+
+def turns_at(line: Line, rows: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """What to avoid so as not to pass rows of a line: the turn at hand, else the edge itself."""
+    near = math.ceil(_NEAR / line.gap)
+    change = np.flatnonzero(line.edge[1:] != line.edge[:-1]) + 1
+    found = set()
+    for row in np.unique(rows).tolist():
+        k = change[np.abs(change - row) <= near]
+        at = int(k[np.argmin(np.abs(k - row))]) if len(k) else 0
+        found.add((int(line.edge[at - 1]), int(line.edge[at])) if at else (int(line.edge[row]),) * 2)
+    return sorted(found)
+
+
+def turn_round(pose: Pose, line: Line, setting: Setting) -> list[Track]:
+    """Arcs, forwards and backwards in turn, after which the vehicle points the other way: 3, 5, 7 or 9.
+
+    Raises BlockedError if the body touches an obstacle whatever their number.
+    """
+    radius, step = 1.02 * setting.vehicle.turning_radius, setting.step
+    scale = float(setting.frame.scale_at(pose[0], pose[1]))
+    hand = 1.0 if setting.side == "right" else -1.0
+    here = len(line.edge) - 1
+    for arcs in (3, 5, 7, 9):
+        tracks: list[Track] = []
+        x, y, th = pose
+        for k in range(arcs):
+            gear = 1 if k % 2 == 0 else -1
+            n = max(math.ceil(math.pi / arcs * radius / step), 4) + 1
+            heading = th + hand * np.linspace(0.0, math.pi / arcs, n)
+            # the axle's centre runs on a circle about a point to its left (hand 1) when going forwards
+            r = hand * gear * radius * scale
+            cx, cy = x - r * math.sin(th), y + r * math.cos(th)
+            xy = np.stack([cx + r * np.sin(heading), cy - r * np.cos(heading)], axis=1)
+            span = math.pi / arcs * radius / (n - 1)
+            tracks.append(Track(xy, heading, np.full(n, hand / radius), np.full(n, here), gear, span))
+            x, y, th = tracks[-1].end
+        if not any(len(touching(t, line, setting)[0]) for t in tracks):
+            return tracks
+    edge = int(line.edge[-1])
+    raise BlockedError(
+        f"the {setting.vehicle.name} has no room to turn round near scene x {pose[0]:.1f}, y {pose[1]:.1f}"
+        f" (edge {edge})",
+        [(edge, edge)],
+    )

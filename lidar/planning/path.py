@@ -1,0 +1,353 @@
+"""The path a vehicle drives along a route: drivable by construction, clear of obstacles, on the ground.
+
+The route's line has kinks and a vehicle has a steering wheel. The line is relaxed (a smoothing spline that
+gives way where it bends too tightly), then a kinematic vehicle follows it: a point on the rear axle whose
+curvature never exceeds what the vehicle can steer and changes no faster than the wheel turns. What comes out
+has continuous position, heading and curvature and no side slip, whatever went in. Where the body would touch
+an obstacle the line is pushed aside and followed again; where that does not help, a RouteError says so.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from lidar.errors import BlockedError, RouteError
+from lidar.planning.clearance import ASIDE, Line, Setting, pushes, turn_round, turns_at
+from lidar.planning.route import Route
+from lidar.planning.steering import Pose, Track, follow, line_heading, relaxed
+from lidar.rig.vehicle import Vehicle
+
+Float = NDArray[np.float64]
+Ground = Callable[[Float, Float], Float]
+"""z (n,) of the ground at scene x (n,), y (n,)."""
+
+Surface = Callable[[Float, Float, Float], Float]
+"""z (n,) of the surface that wheels stand on at scene x, y (n,), near heights z (n,)."""
+
+MARGIN = 0.25
+"""Metres that the body keeps from obstacles."""
+_REPAIRS = 16
+_SPRING = 0.5  # metres over which tyres and springs smooth the ground
+_AXLES = 0.5  # metres between axles below which a body does not pitch with the ground under them
+_STEEP = 0.35  # rise per metre that a wheel is expected to meet
+_JOINT = 0.25  # metres of a step in the road, between rows of a path, that is driven over as a ramp
+_WHEEL_STEP = 0.2  # metres: a kerb
+_PUSH = 4.0  # metres before and behind an obstacle over which the line is pushed aside
+_ASTRAY = 1.5  # turning radii from the middle of its lane beyond which a vehicle has left the street
+_WHEEL = 0.95  # share of the full lock that the line asks for, so that the wheel has some left to correct
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Where the rear axle goes; a row every few decimetres.
+
+    s         : (n,) true metres driven from the start, along the slope
+    position  : (n, 3) scene metres, the rear axle's centre on the ground
+    heading   : (n,) radians, where the vehicle points, counter-clockwise from the scene's x axis, unwrapped
+    curvature : (n,) 1/m, change of heading per true metre driven over ground; positive is a turn to the left
+    slope     : (n,) radians, of the path where the vehicle points, positive uphill
+    pitch     : (n,) radians, of the vehicle on its wheels, positive uphill: from the ground under both axles
+    bank      : (n,) radians, of the vehicle about its own x axis, positive where the left wheels stand higher
+    scale     : (n,) scene metres per true metre
+    gear      : (n,) int8, 1 forwards, -1 backwards
+    leg       : (n,) int32, stretch between stops; at a stop the position stands twice
+    limit     : (n,) m/s, speed limit
+    edge      : (n,) int32, edge of the road graph, -1 for none
+    offset    : (n,) true metres from the route's line, positive to its left
+    """
+
+    s: Float
+    position: Float
+    heading: Float
+    curvature: Float
+    slope: Float
+    pitch: Float
+    bank: Float
+    scale: Float
+    gear: NDArray[np.int8]
+    leg: NDArray[np.int32]
+    limit: Float
+    edge: NDArray[np.int32]
+    offset: Float
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.s)
+
+    @property
+    def length(self) -> float:
+        """True metres driven."""
+        return float(self.s[-1])
+
+    def take(self, keep: NDArray[Any] | slice) -> Path:
+        """Chosen rows."""
+        return Path(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+
+def plan_path(
+    route: Route,
+    vehicle: Vehicle,
+    frame: Frame,
+    *,
+    obstacles: Sequence[Any] | NDArray[np.object_] | shapely.STRtree | None = None,
+    ground: Surface | None = None,
+    margin: float = MARGIN,
+) -> Path:
+    """The path of a vehicle along a route.
+
+    obstacles : polygons in scene metres that the body must not touch (footprints of buildings that stand on
+                the ground); they do not hold on bridges and in tunnels
+    ground    : the surface near the heights of the route's line; without it, those heights are the ground
+    margin    : metres that the body keeps from obstacles
+
+    Raises BlockedError where the vehicle cannot follow the route, or cannot without touching an obstacle: its
+    ``turns`` say what a detour must avoid. Raises RouteError for a route too short to drive.
+    """
+    if not isinstance(obstacles, shapely.STRtree):
+        obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))
+    # what flies has no lane and bends on another scale
+    step = vehicle.turning_radius / 17 if vehicle.kind == "air" else min(0.25, vehicle.turning_radius / 8)
+    setting = Setting(vehicle, frame, obstacles, margin, step, route.side)
+    line = _resampled(route, 2 * step if vehicle.kind == "air" else min(0.5, 2 * step))
+    cuts = [0, *(np.flatnonzero(line.turn) + 1).tolist(), len(line.edge)]
+    legs: list[Track] = []
+    lines: list[Line] = []
+    pose: Pose | None = None
+    for first, last in itertools.pairwise(cuts):
+        part = line.take(slice(first, last))
+        turns_back = last < len(line.edge)
+        if turns_back:
+            part = _shortened(part, vehicle)
+        tracks = [_clear_track(part, setting, pose)]
+        if turns_back:
+            tracks += turn_round(tracks[-1].end, part, setting)
+        pose = tracks[-1].end
+        legs += tracks
+        lines += [part] * len(tracks)
+    return _joined(legs, lines, setting, ground)
+
+
+def _resampled(route: Route, spacing: float) -> Line:
+    """The route's line with points about ``spacing`` apart; its turning points stay points."""
+    parts = []
+    ends = [0, *(np.asarray(route.turns, int) + 1).tolist(), len(route.line)]
+    for first, last in itertools.pairwise(ends):
+        xyz = route.line[first:last]
+        s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))])
+        keep = np.append(np.diff(s) > 1e-9, True)  # of points that coincide the last says what comes
+        xyz, s = xyz[keep], s[keep]
+        if len(s) < 2 or s[-1] < 2 * spacing:
+            raise RouteError(f"the route has a stretch of {s[-1]:.2f} m; too short to drive")
+        at = np.linspace(0.0, s[-1], max(math.ceil(s[-1] / spacing), 4) + 1)
+        index = np.arange(first, last)[keep][np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(s) - 1)]
+        turn = np.zeros(len(at), bool)
+        turn[-1] = last < len(route.line)
+        new = np.stack([np.interp(at, s, xyz[:, k]) for k in range(3)], axis=1)
+        parts.append(Line(new, route.edge[index], route.limit[index], route.free[index], turn))
+    return Line(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Line)))
+
+
+def _shortened(line: Line, vehicle: Vehicle) -> Line:
+    """The line without its last metres, so that the front of the body ends where the line did."""
+    spare = min(round(vehicle.front / line.gap), len(line.edge) - 5)
+    return line.take(slice(0, len(line.edge) - max(spare, 0)))
+
+
+def _clear_track(line: Line, setting: Setting, pose: Pose | None) -> Track:
+    """A leg along the line on which the body touches no obstacle, from a pose if one is given.
+
+    Raises BlockedError if the line cannot be pushed clear, or bends too tightly.
+    """
+    from scipy.ndimage import gaussian_filter1d, maximum_filter1d  # noqa: PLC0415
+
+    vehicle = setting.vehicle
+    cap = _WHEEL / vehicle.turning_radius
+    reach = 0.47 * vehicle.turning_radius
+    middle = line.xyz[len(line.xyz) // 2]
+    scale = float(setting.frame.scale_at(middle[0], middle[1]))
+    base, gap = line.xyz[:, :2], line.gap
+    heading = gaussian_filter1d(line_heading(base), 2.0 / gap, mode="nearest")
+    left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+    shift = np.zeros(len(base))
+    for _ in range(_REPAIRS):
+        pushed = base + shift[:, None] * left
+        xy = relaxed(pushed, cap / scale, reach)
+        track = follow(xy, vehicle, scale, pose=pose, step=setting.step)
+        lost = _lost(track, line, pushed, vehicle)
+        if len(lost):
+            x, y = base[lost[0]]
+            raise BlockedError(
+                f"the {vehicle.name} cannot follow the route near scene x {x:.1f}, y {y:.1f} (edge"
+                f" {line.edge[lost[0]]}): it bends too tightly for a turning radius of"
+                f" {vehicle.turning_radius} m",
+                turns_at(line, lost),
+            )
+        push, at = pushes(track, line, setting)
+        if not len(at):
+            return track
+        if np.isnan(push).any():
+            break
+        for sign in (1.0, -1.0):
+            bump = np.zeros(len(base))
+            np.maximum.at(bump, at, np.maximum(sign * push, 0.0))
+            wide = maximum_filter1d(bump, 2 * math.ceil(_PUSH / gap) + 1)
+            shift += sign * gaussian_filter1d(wide, 0.5 * _PUSH / gap, mode="nearest")
+        shift = np.clip(shift, -ASIDE, ASIDE)
+    stuck = np.isnan(push)
+    at = at[stuck] if stuck.any() else at
+    worst = at[0]
+    x, y, _ = line.xyz[worst]
+    raise BlockedError(
+        f"the {vehicle.name} ({vehicle.length} x {vehicle.width} m) does not pass between the buildings near"
+        f" scene x {x:.1f}, y {y:.1f} (edge {line.edge[worst]}); choose another route or a smaller vehicle",
+        turns_at(line, at),
+    )
+
+
+def _lost(track: Track, line: Line, xy: Float, vehicle: Vehicle) -> NDArray[np.int64]:
+    """The row of the line, pushed to ``xy`` (n, 2), where the track leaves it; none if it does not."""
+    if track.row[-1] < len(line.edge) - 1:
+        return track.row[-1:]
+    d = track.xy - xy[track.row]
+    astray = (line.edge[track.row] >= 0) & (np.hypot(*d.T) > _ASTRAY * vehicle.turning_radius)
+    rows = track.row[astray]
+    worst = int(np.argmax(np.hypot(*d.T)))
+    return track.row[worst : worst + 1] if len(rows) else rows
+
+
+def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Surface | None) -> Path:
+    """One path of all legs, with the ground under it."""
+    heights = _heights(legs, lines, setting, ground)
+    parts = []
+    start = 0.0
+    for number, (leg, line, (z, slope, pitch, bank)) in enumerate(zip(legs, lines, heights, strict=True)):
+        over = np.full(len(z) - 1, leg.step)
+        s = start + np.concatenate([[0.0], np.cumsum(np.hypot(over, np.diff(z)))])
+        start = float(s[-1])
+        scale = np.asarray(setting.frame.scale_at(leg.xy[:, 0], leg.xy[:, 1]), float)
+        heading = line_heading(line.xyz[:, :2])[leg.row]
+        d = leg.xy - line.xyz[leg.row, :2]
+        parts.append(
+            Path(
+                s=s,
+                position=np.column_stack([leg.xy, z]),
+                heading=leg.heading,
+                curvature=leg.curvature,
+                slope=slope,
+                pitch=pitch,
+                bank=bank,
+                scale=scale,
+                gear=np.full(len(s), leg.gear, np.int8),
+                leg=np.full(len(s), number, np.int32),
+                limit=line.limit[leg.row],
+                edge=line.edge[leg.row],
+                offset=(d[:, 1] * np.cos(heading) - d[:, 0] * np.sin(heading)) / scale,
+            )
+        )
+    whole = Path(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Path)))
+    # a leg may have begun from its line's own heading, whole turns away from where the leg before it ended
+    turns = np.concatenate([[0.0], np.cumsum(np.round(np.diff(whole.heading) / (2 * np.pi)) * 2 * np.pi)])
+    return replace(whole, heading=whole.heading - turns)
+
+
+def _heights(
+    legs: list[Track], lines: list[Line], setting: Setting, ground: Surface | None
+) -> list[tuple[Float, Float, Float, Float]]:
+    """Height of the rear axle, slope of its path, pitch and bank of the body on its wheels, of each leg.
+
+    Wheels keep to the ground; without one, the route's profile is smoothed over the wheelbase.
+    """
+    from scipy.ndimage import gaussian_filter1d, maximum_filter1d, median_filter  # noqa: PLC0415
+
+    raw = [_raw_heights(leg, line, setting, ground) for leg, line in zip(legs, lines, strict=True)]
+    sizes = np.array([len(leg.row) for leg in legs])
+    starts = np.cumsum(sizes)[:-1]
+    # where a leg begins the position stands twice: smooth the rows that differ, then say them twice again
+    once = np.ones(int(sizes.sum()), bool)
+    once[starts] = False
+    twice = np.cumsum(once) - 1
+    body = setting.vehicle
+    over = body.turning_radius if body.kind == "air" else max(body.wheelbase, 1.0)
+    width = (over if ground is None else _SPRING) / legs[0].step
+    z, tilt, bank = (np.concatenate(column)[once] for column in zip(*raw, strict=True))
+    # beyond its ends the road goes on as steep as it was
+    spare, wide = math.ceil(4 * over / legs[0].step) + 1, over / legs[0].step
+    far = np.pad(z, spare, mode="reflect", reflect_type="odd")
+    near, soft = (gaussian_filter1d(far, w)[spare : spare + len(z)] for w in (width, wide))
+    if ground is not None:  # a step, as at the joint of a bridge, is taken as a ramp
+        rise = np.gradient(z)
+        step = (
+            np.abs(rise - median_filter(rise, 2 * math.ceil(wide) + 1, mode="nearest")) > _JOINT / 2
+        ).astype(float)
+        reach = 2 * math.ceil(wide) + 1
+        share = gaussian_filter1d(maximum_filter1d(step, reach), wide / 2)
+        near = near + share * (soft - near)
+        tilt = tilt + share * (gaussian_filter1d(tilt, wide, mode="mirror") - tilt)
+    z = near
+    tilt, bank = (gaussian_filter1d(c, width, mode="mirror")[twice] for c in (tilt, bank))
+    parts = [np.split(column, starts) for column in (z[twice], tilt, bank)]
+    out = []
+    for leg, height, ahead, across in zip(legs, *parts, strict=True):
+        slope = np.arctan(leg.gear * np.gradient(height, leg.step))
+        stands = ground is not None and body.wheelbase >= _AXLES
+        pitch = np.arctan(ahead) if stands else slope
+        out.append((height, slope, pitch, np.arctan(across * np.cos(pitch))))
+    return out
+
+
+def _raw_heights(
+    leg: Track, line: Line, setting: Setting, ground: Surface | None
+) -> tuple[Float, Float, Float]:
+    """Height, rise per metre ahead to the front axle and to the left, at the rows of a leg (n,).
+
+    As the ground has them, or, without one, the line.
+    """
+    heading = line_heading(line.xyz[:, :2])[leg.row]
+    d = leg.xy - line.xyz[leg.row, :2]
+    place = leg.row + (d[:, 0] * np.cos(heading) + d[:, 1] * np.sin(heading)) / line.gap
+    # the last row may lie a little beyond the end of the line
+    profile = np.append(line.xyz[:, 2], 2 * line.xyz[-1, 2] - line.xyz[-2, 2])
+    z = np.interp(place, np.arange(len(profile)), profile)
+    rise = leg.gear * np.gradient(z, leg.step)
+    if ground is None or not len(z):
+        return z, rise, np.zeros(len(leg.row))
+    base = max(setting.vehicle.wheelbase, _AXLES)
+    rear, across = _axle(leg, z, 0.0, setting, ground)
+    ahead = np.clip(rise, -_STEEP, _STEEP)
+    for _ in range(2):  # on a slope the front axle is less than the wheelbase ahead, in plan
+        reach = base / np.hypot(1.0, ahead)
+        front, twisted = _axle(leg, rear + reach * ahead, reach, setting, ground)
+        ahead = (front - rear) / reach
+    # a rigid body on four wheels: the twist of the ground is left to the springs
+    return rear, ahead, (across + twisted) / 2
+
+
+def _axle(
+    leg: Track, z: Float, ahead: Float | float, setting: Setting, ground: Surface
+) -> tuple[Float, Float]:
+    """Mean height of the ground under the wheels of an axle, and its rise to the left, near heights (n,).
+
+    ahead : metres in plan from the rear axle
+    """
+    c, s = np.cos(leg.heading), np.sin(leg.heading)
+    x, y = leg.xy.T
+    scale = setting.frame.scale_at(x, y)
+    track = max(setting.vehicle.track, 0.1)
+    x, y, half = x + ahead * scale * c, y + ahead * scale * s, track / 2 * scale
+    middle = ground(x, y, z)
+    under = []
+    for side in (1.0, -1.0):
+        wheel = ground(x - side * half * s, y + side * half * c, middle)
+        # what is higher or lower than a wheel goes is a wall or an edge that the wheel does not stand on
+        under.append(np.where(np.abs(wheel - middle) <= _WHEEL_STEP + _STEEP * track / 2, wheel, middle))
+    left, right = under
+    return 0.5 * (left + right), (left - right) / track

@@ -1,0 +1,115 @@
+"""Drives along the poses of an earlier one."""
+
+from __future__ import annotations
+
+import csv
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from lidar.errors import FormatError, RouteError
+from lidar.geometry.poses import Trajectory
+from lidar.geometry.trajectory_csv import read_trajectory
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+Float = NDArray[np.float64]
+
+_STEP_NS = 10_000_000
+_QUAT = ("qx", "qy", "qz", "qw")
+
+
+def read_replay(path: Path, frame: Frame) -> Trajectory:
+    """The trajectory that a ``trajectory.csv`` or ``poses.csv`` of a dataset holds, in a scene's frame.
+
+    The vehicle is where it was at the same time after the start. Heights are taken as they are. The first is
+    followed exactly in a scene of the same frame; between the rows of the second, positions are interpolated
+    by a cubic spline and rotations by great arcs. The frame that they were recorded in is read from the
+    ``dataset.json`` beside them; without it, axes are taken as those of this scene.
+
+    Raises RouteError for a file that is missing or holds too few poses and FormatError for another table.
+    """
+    if not path.is_file():
+        raise RouteError(f"{path} does not exist")
+    with path.open(encoding="utf-8") as file:
+        names = file.readline().strip().split(",")
+    manifest = path.with_name("dataset.json")
+    recorded = frame
+    if manifest.is_file():
+        recorded = Frame.from_json(json.loads(manifest.read_text("utf-8"))["frame"])
+    if names[0] == "time_ns":
+        found = read_trajectory(path)
+        return found if recorded == frame else _moved(found, recorded, frame)
+    if not {"timestamp", "lon", "lat", "h", *_QUAT} <= set(names):
+        raise FormatError(f"{path}: neither a poses.csv nor a trajectory.csv of a dataset")
+    return _from_poses(path, recorded, frame)
+
+
+def _from_poses(path: Path, recorded: Frame, frame: Frame) -> Trajectory:
+    from scipy.interpolate import CubicSpline  # noqa: PLC0415
+    from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415
+
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    if len(rows) < 2:
+        raise RouteError(f"{path}: {len(rows)} poses; a drive needs two or more")
+    try:
+        time = _nanoseconds([row["timestamp"] for row in rows])
+        lon, lat, h = (np.array([float(row[k]) for row in rows]) for k in ("lon", "lat", "h"))
+        quat = np.array([[float(row[k]) for k in _QUAT] for row in rows])
+    except (ValueError, TypeError) as error:
+        raise FormatError(f"{path}: a row that cannot be read ({error})") from error
+    if (np.diff(time) <= 0).any():
+        raise FormatError(f"{path}: its times do not rise")
+    x, y = frame.from_geographic(lon, lat)
+    seconds = time * 1e-9
+    at = np.append(np.arange(0, time[-1], _STEP_NS), time[-1])
+    spline = CubicSpline(
+        seconds, np.column_stack([x, y, h]), bc_type="natural" if len(rows) > 2 else "not-a-knot"
+    )
+    turn = _turn(recorded, frame, lon, lat) * Rotation.from_quat(quat)
+    position = spline(at * 1e-9)
+    scale = np.asarray(frame.scale_at(*position[:, :2].T), float)
+    velocity = spline(at * 1e-9, 1)
+    velocity[:, :2] /= scale[:, None]
+    return Trajectory(at, position, Slerp(seconds, turn)(at * 1e-9).as_quat(), velocity, scale)
+
+
+def _nanoseconds(stamps: list[str]) -> NDArray[np.int64]:
+    """Nanoseconds of ISO 8601 UTC time stamps after the first."""
+    datetime.fromisoformat(stamps[0][:19])  # numpy's own message is of no help
+    times = np.array([stamp.removesuffix("Z") for stamp in stamps], "datetime64[ns]").astype(np.int64)
+    since: NDArray[np.int64] = times - times[0]
+    return since
+
+
+def _turn(recorded: Frame, frame: Frame, lon: Float, lat: Float) -> Rotation:
+    """Turns (n,) about the vertical from the axes of one frame to those of another."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    angle = np.zeros((len(lon), 3))
+    if recorded != frame:
+        angle[:, 2] = frame.convergence(lon, lat) - recorded.convergence(lon, lat)
+    return Rotation.from_rotvec(angle)
+
+
+def _moved(old: Trajectory, recorded: Frame, frame: Frame) -> Trajectory:
+    """A trajectory in another frame."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    lon, lat = recorded.to_geographic(*old.position[:, :2].T)
+    x, y = frame.from_geographic(lon, lat)
+    turn = _turn(recorded, frame, lon, lat)
+    return Trajectory(
+        old.time_ns,
+        np.column_stack([x, y, old.position[:, 2]]),
+        (turn * Rotation.from_quat(old.quat_xyzw)).as_quat(),
+        turn.apply(old.velocity),
+        np.asarray(frame.scale(lon, lat), float),
+    )

@@ -1,0 +1,391 @@
+"""Routes: which streets a vehicle takes, and the middle of the lane it keeps to on them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.frames import Frame
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import TurnStates, edge_lines, turn_states
+from lidar.errors import RouteError
+from lidar.random_streams import generator
+
+Float = NDArray[np.float64]
+Side = Literal["right", "left"]
+Spec = str | Path | Sequence[tuple[float, float]]
+
+TOLERANCE = 50.0
+"""Metres within which a waypoint must lie of a drivable street."""
+U_TURN_S = 30.0
+"""Seconds that turning round at a dead end costs in the search for the fastest way."""
+U_TURN = np.radians(150.0)
+"""Change of direction at a node from which on the vehicle must turn round, in radians."""
+_SET_OUT = 0.25  # share of its first street that a random route leaves out
+_STEP = 0.3  # metres between the lanes of two streets from which on a change of lane is drawn out
+_STRAIGHT = 0.5  # cosine of the turn up to which a junction is gone straight over
+_KEEP = 0.2  # metres between the body and the kerb where the carriageway is narrow
+
+
+@dataclass(frozen=True, slots=True)
+class Route:
+    """A way to drive.
+
+    line  : (n, 3) float64 scene metres: the middle of the lane, in driving direction
+    edge  : (n,) int32 edge of the road graph under each point, -1 off the graph
+    limit : (n,) m/s, speed limit from each point on
+    free  : (n,) bool, on a bridge or in a tunnel: buildings and the ground's height do not matter there
+    turns : (t,) int64 rows of `line` after which the vehicle turns round
+    edges : (k,) int32 edges in the order driven
+    side  : side of the street that is driven on
+    """
+
+    line: Float
+    edge: NDArray[np.int32]
+    limit: Float
+    free: NDArray[np.bool_]
+    turns: NDArray[np.int64]
+    edges: NDArray[np.int32]
+    side: Side = "right"
+
+    @property
+    def length(self) -> float:
+        """Scene metres of the line in plan."""
+        return float(np.hypot(*np.diff(self.line[:, :2], axis=0).T).sum())
+
+
+def plan_route(
+    graph: RoadGraph,
+    frame: Frame,
+    spec: Spec,
+    *,
+    seed: int = 0,
+    duration: float | None = None,
+    length: float | None = None,
+    side: Side = "right",
+    body_width: float = 1.82,
+    tolerance: float = TOLERANCE,
+    as_is: bool = False,
+    avoid: Collection[tuple[int, int]] = (),
+) -> Route:
+    """A route over the road graph.
+
+    spec       : ``random``, a GPX or GeoJSON file, or two or more waypoints (latitude, longitude) in degrees
+    seed       : of a random route
+    duration   : seconds that a random route takes at least at the speed limits; with neither this nor
+                 `length`, 600
+    length     : true metres of a random route
+    side       : side of two-way streets that is driven on
+    body_width : metres of the vehicle, which keeps it inside narrow carriageways
+    tolerance  : metres within which waypoints and tracks must lie of a drivable street
+    as_is      : drive a file's track as it is, off the graph, instead of along the streets it follows
+    avoid      : turns (edge, edge) not to take; (edge, edge) of one edge twice closes it
+
+    Raises RouteError for a waypoint off the streets, one that cannot be reached, an unreadable file, or a
+    graph without streets.
+    """
+    if spec == "random":
+        _need_streets(graph)
+        target = np.inf if length is None else length
+        seconds = np.inf if duration is None else duration
+        if length is None and duration is None:
+            seconds = 600.0
+        edges = random_edges(graph, seed=seed, seconds=seconds, metres=target, avoid=avoid)
+        ends = (_SET_OUT * float(graph.length[edges[0]]), 0.75 * float(graph.length[edges[-1]]))
+        return lane_route(graph, edges, ends, side=side, body_width=body_width)
+
+    from lidar.planning.waypoints import match_track, read_track, through  # noqa: PLC0415  (they import this module)
+
+    if isinstance(spec, str | Path):
+        track = read_track(Path(spec), frame)
+        if as_is:
+            return free_route(track.xyz, side=side)
+        _need_streets(graph)
+        if track.dense:
+            edges, ends = match_track(graph, track, frame, tolerance=tolerance, avoid=avoid)
+            return lane_route(graph, edges, ends, side=side, body_width=body_width)
+        points = track.lat_lon
+    else:
+        points = [(float(lat), float(lon)) for lat, lon in spec]
+    _need_streets(graph)
+    edges, ends = through(graph, frame, points, tolerance=tolerance, avoid=avoid)
+    return lane_route(graph, edges, ends, side=side, body_width=body_width)
+
+
+def _need_streets(graph: RoadGraph) -> None:
+    if not len(graph):
+        raise RouteError("the scene has no drivable streets; build one of a place with roads")
+
+
+def turns_back(graph: RoadGraph, before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether (k,) going from one edge to the next turns the vehicle round: by `U_TURN` or more."""
+    leave, enter = _end_headings(graph)
+    turn = np.abs((enter[after] - leave[before] + np.pi) % (2 * np.pi) - np.pi)
+    back: NDArray[np.bool_] = (graph.twin[before] == after) | (turn > U_TURN)
+    return back
+
+
+def _end_headings(graph: RoadGraph) -> tuple[Float, Float]:
+    """Headings (m,) in which each edge is left and entered, over its last and first five metres."""
+    out = np.empty((2, len(graph)))
+    for k, line in enumerate(graph.geometry):
+        xy = line[:, :2]
+        for row, part in enumerate((xy[::-1], xy)):
+            far = np.flatnonzero(np.hypot(*(part - part[0]).T) >= 5.0)
+            d = part[far[0] if len(far) else -1] - part[0]
+            d = -d if row == 0 else d
+            out[row, k] = np.arctan2(d[1], d[0])
+    return out[0], out[1]
+
+
+def permitted_turns(graph: RoadGraph, avoid: Collection[tuple[int, int]]) -> TurnStates:
+    """The states that may follow each other, less the turns and closed edges to avoid."""
+    states = turn_states(graph)
+    if not avoid:
+        return states
+    shut = np.array(sorted(avoid), np.int64).reshape(-1, 2)
+    closed = shut[shut[:, 0] == shut[:, 1], 0]
+    before, after = states.edge[states.before], states.edge[states.after]
+    key = before.astype(np.int64) * len(graph) + after
+    bad = (
+        np.isin(key, shut[:, 0] * len(graph) + shut[:, 1]) | np.isin(before, closed) | np.isin(after, closed)
+    )
+    return replace(states, before=states.before[~bad], after=states.after[~bad])
+
+
+# ---------------------------------------------------------------------------------------------- random
+
+
+def _components(
+    graph: RoadGraph, states: TurnStates, turns: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], Float]:
+    """Strongly connected component of each state (s,) by some of the turns (t,), and its metres of street."""
+    from scipy.sparse import csr_array  # noqa: PLC0415
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    before, after = states.before[turns], states.after[turns]
+    links = csr_array((np.ones(len(before)), (before, after)), shape=(len(states), len(states)))
+    count, label = connected_components(links, directed=True, connection="strong")
+    size = np.bincount(label, minlength=count)
+    part, edge = np.unique(np.column_stack([label, states.edge]), axis=0).T
+    metres = np.bincount(part, weights=graph.length[edge], minlength=count)
+    loops = np.zeros(count, bool)
+    loops[label[before[before == after]]] = True
+    metres[(size == 1) & ~loops] = 0.0  # one state from which there is no way back to it
+    return np.asarray(label, np.int64), np.asarray(metres, float)
+
+
+def random_edges(
+    graph: RoadGraph,
+    *,
+    seed: int,
+    seconds: float = np.inf,
+    metres: float = np.inf,
+    avoid: Collection[tuple[int, int]] = (),
+) -> NDArray[np.int32]:
+    """Edges of a random drive that lasts ``seconds`` at the speed limits or ``metres``, whichever is sooner.
+
+    They are driven from the place `_SET_OUT` of the first one's length on.
+
+    It stays in the largest part of the graph from which every street of it can be reached again, prefers
+    streets it has not driven, and turns round only at dead ends, and only where the graph has no round trip
+    without that worth the name (a fifth of what turning round would open).
+    """
+    rng = generator(seed, "route")
+    states = permitted_turns(graph, avoid)
+    edges = states.edge
+    use = ~turns_back(graph, edges[states.before], edges[states.after])
+    label, size = _components(graph, states, use)
+    label_back, size_back = _components(graph, states, np.ones(len(use), bool))
+    if not (size.max(initial=0.0) >= 0.2 * size_back.max(initial=0.0) and size.max(initial=0.0) > 0):
+        use[:], label, size = True, label_back, size_back
+    # where there is none, one-way streets lead out of the map: drive until they do
+    round_trip = size.max(initial=0.0) > 0
+    inside = label == int(np.argmax(size)) if round_trip else np.ones(len(states), bool)
+    use &= inside[states.before] & inside[states.after]
+    before, after = states.before[use], states.after[use]
+    order = np.argsort(before, kind="stable")
+    after = after[order]
+    first = np.searchsorted(before[order], np.arange(len(states) + 1))
+
+    liking = np.where(np.isin(graph.highway, ("service", "track")), 0.1, 1.0)
+    start = graph.length[edges] * liking[edges] * inside
+    start = start / start.sum()
+    best: list[int] = []
+    for _ in range(1 if round_trip else 32):
+        state = int(rng.choice(len(states), p=start))
+        edge = int(edges[state])
+        far = -_SET_OUT * graph.length[edge]
+        walk, time = [edge], far / graph.speed[edge]
+        visits = np.zeros(len(graph))
+        # a street without length must not hold the walk up for ever
+        while far < metres and time < seconds and len(walk) < 1_000_000:
+            time, far = time + graph.length[edge] / graph.speed[edge], far + graph.length[edge]
+            visits[edge] += 1
+            if graph.twin[edge] >= 0:
+                visits[graph.twin[edge]] += 1
+            following = after[first[state] : first[state + 1]]
+            if not len(following):
+                break
+            ways = edges[following]
+            weight = liking[ways] / (1.0 + visits[ways]) ** 4
+            state = int(
+                following[np.searchsorted(np.cumsum(weight), rng.random() * weight.sum(), side="right")]
+            )
+            edge = int(edges[state])
+            walk.append(edge)
+        if len(walk) > len(best):
+            best = walk
+    return np.array(best, np.int32)
+
+
+# ------------------------------------------------------------------------------------------------ lanes
+
+
+def lane_offset(graph: RoadGraph, body_width: float) -> Float:
+    """Metres (m,) from each carriageway's centre line to the middle of the outer lane of its direction.
+
+    The outermost lane is the one at the kerb. Where the carriageway is narrow the body stays inside it, and
+    where it is narrower than the body it takes the middle.
+    """
+    two_way = graph.twin >= 0
+    other = np.where(two_way, graph.lanes[graph.twin], 0.0)
+    lanes = np.maximum(graph.lanes + other, 1.0)
+    middle = graph.width / 2 - graph.width / lanes / 2
+    shared = two_way & (lanes < 2)  # one lane for both directions: keep aside where there is room
+    middle = np.where(shared, graph.width / 4, middle)
+    offset: Float = np.clip(np.minimum(middle, graph.width / 2 - body_width / 2 - _KEEP), 0.0, None)
+    return offset
+
+
+def _beside(line: Float, offset: float) -> Float:
+    """A line (k, 3) beside another, ``offset`` scene metres to its left, negative to its right."""
+    centre = shapely.linestrings(line[:, :2])
+    if offset == 0.0 or centre.length < 1e-6:
+        return line
+    moved = shapely.offset_curve(centre, offset, join_style="mitre", mitre_limit=2.0)
+    if moved.geom_type != "LineString" or moved.is_empty or moved.length < 0.5 * centre.length:
+        d = np.gradient(line[:, :2], axis=0)
+        unit = d / np.maximum(np.hypot(*d.T), 1e-9)[:, None]
+        return np.column_stack(
+            [line[:, :2] + offset * np.stack([-unit[:, 1], unit[:, 0]], axis=1), line[:, 2]]
+        )
+    xy = shapely.get_coordinates(moved)
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+    z = np.interp(shapely.line_locate_point(centre, shapely.points(xy)), along, line[:, 2])
+    return np.column_stack([xy, z])
+
+
+def _cut(line: Float, begin: float, end: float) -> Float:
+    """The part of a line (k, 3) between two shares of its length in plan."""
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+    begin, end = begin * along[-1], end * along[-1]
+    inside = (along > begin) & (along < end)
+    at = np.concatenate([[begin], along[inside], [end]])
+    return np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
+
+
+def _meet(a: Float, b: Float, reach: float, change: float) -> tuple[Float, Float]:
+    """Two lanes that follow each other, joined within ``reach``.
+
+    Straight on, a lane that lies ``change`` metres further out than the other is left over five times that
+    length. In a turn the lanes are cut where they cross, or extended to where they meet.
+    """
+    u, v = a[-1, :2] - a[-2, :2], b[1, :2] - b[0, :2]
+    u, v = u / max(float(np.hypot(*u)), 1e-9), v / max(float(np.hypot(*v)), 1e-9)
+    if abs(change) > _STEP and u @ v > _STRAIGHT:
+        long_a, long_b = (float(np.hypot(*np.diff(x[:, :2], axis=0).T).sum()) for x in (a, b))
+        taper = 2.5 * abs(change)
+        return _cut(a, 0.0, max(1 - taper / long_a, 0.6)), _cut(b, min(taper / long_b, 0.4), 1.0)
+    one, two = shapely.linestrings(a[:, :2]), shapely.linestrings(b[:, :2])
+    cross = shapely.get_coordinates(shapely.intersection(one, two))
+    if len(cross):
+        points = shapely.points(cross)
+        spent = one.length - shapely.line_locate_point(one, points)
+        spent = spent + shapely.line_locate_point(two, points)
+        k = int(np.argmin(spent))
+        if spent[k] <= 2 * reach:
+            at_one = float(shapely.line_locate_point(one, points[k]) / one.length)
+            at_two = float(shapely.line_locate_point(two, points[k]) / two.length)
+            return _cut(a, 0.0, max(at_one, 1e-6)), _cut(b, min(at_two, 1 - 1e-6), 1.0)
+    sine = u[0] * v[1] - u[1] * v[0]
+    if abs(sine) > 0.2:
+        gap = b[0, :2] - a[-1, :2]
+        on_a, on_b = (gap[0] * v[1] - gap[1] * v[0]) / sine, (gap[0] * u[1] - gap[1] * u[0]) / sine
+        if 0 < on_a < reach and -reach < on_b < 0:
+            corner = np.append(a[-1, :2] + on_a * u, 0.5 * (a[-1, 2] + b[0, 2]))
+            return np.concatenate([a, corner[None]]), b
+    return a, b
+
+
+def lane_route(
+    graph: RoadGraph,
+    edges: ArrayLike,
+    ends: tuple[float, float],
+    *,
+    side: Side = "right",
+    body_width: float = 1.82,
+) -> Route:
+    """The route along edges, in the outer lane of each.
+
+    edges : (k,) each follows from the one before
+    ends  : true metres from the first edge's tail to the start, and from the last one's tail to the end
+    """
+    order = np.asarray(edges, np.int32)
+    offset = lane_offset(graph, body_width) * (-1.0 if side == "right" else 1.0)
+    lanes: list[Float] = []
+    for k, e in enumerate(order):
+        lane = _beside(graph.geometry[e], float(offset[e]))
+        whole = max(float(graph.length[e]), 1e-9)
+        begin = min(max(ends[0] / whole, 0.0), 1.0) if k == 0 else 0.0
+        end = min(max(ends[1] / whole, 0.0), 1.0) if k == len(order) - 1 else 1.0
+        lanes.append(_cut(lane, begin, max(end, begin + 1e-6)))
+    turns: list[int] = []
+    rounds = np.append(turns_back(graph, order[:-1], order[1:]), False)
+    for k in range(len(order) - 1):
+        if not rounds[k]:
+            reach = 2.0 * max(abs(float(offset[order[k]])), abs(float(offset[order[k + 1]])), 1.0)
+            change = float(offset[order[k + 1]] - offset[order[k]])
+            lanes[k], lanes[k + 1] = _meet(lanes[k], lanes[k + 1], reach, change)
+    sizes = np.array([len(lane) for lane in lanes])
+    last = np.cumsum(sizes) - 1
+    turns = last[rounds].tolist()
+    under = np.repeat(order, sizes).astype(np.int32)
+    covered = graph.bridge | graph.tunnel
+    return Route(
+        np.concatenate(lanes),
+        under,
+        graph.speed[under],
+        covered[under],
+        np.array(turns, np.int64),
+        order,
+        side,
+    )
+
+
+def free_route(xyz: ArrayLike, *, limit: float = np.inf, side: Side = "right") -> Route:
+    """A route along a line (n, 3) of scene metres, off any road graph; the vehicle's own speed holds."""
+    line = np.asarray(xyz, float).reshape(-1, 3)
+    if len(line) < 2 or not np.isfinite(line).all():
+        raise RouteError("a route needs two points or more, all of them finite")
+    n = len(line)
+    return Route(
+        line,
+        np.full(n, -1, np.int32),
+        np.full(n, float(limit)),
+        np.zeros(n, bool),
+        np.empty(0, np.int64),
+        np.empty(0, np.int32),
+        side,
+    )
+
+
+def street_tree(graph: RoadGraph) -> shapely.STRtree:
+    """Search tree over the edges' centre lines."""
+    return shapely.STRtree(edge_lines(graph))

@@ -1,0 +1,211 @@
+"""The best motion that stays behind a given one: how a smooth driver follows what the traffic lets him do.
+
+What signals, queues and other traffic allow is a distance that must not be passed at each moment. The motion
+is the one that is as far on as possible at all times, under the limits of speed, acceleration and jerk: a
+linear programme over even steps of time, whose unknowns are accelerations at the steps, linear in between.
+Speed limits depend on the place; they are taken where the last solution was, and the programme solved again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.errors import InputError
+from lidar.planning.motion import DWELL_S, Motion, legs_of, speed_limits
+from lidar.planning.path import Path
+from lidar.rig.vehicle import Vehicle
+
+Float = NDArray[np.float64]
+
+STEP_S = 0.2
+"""Seconds between the knots of a motion."""
+_SPARE = 0.98  # share of the limits of acceleration that is used, so that sampling stays within them
+_COMFORT = 0.8  # share of the braking with which speed is brought down to lower limits
+_AGAIN = 8  # times that speed limits are looked up anew
+_SLACK = 0.005  # share of a limit by which speed may exceed it before it is looked up anew
+_TAIL_S = 10.0  # seconds beyond those on an empty road within which a leg is driven once it is allowed
+_SETTLING_S = 10.0  # seconds over which what starts at speed falls behind by a step
+_NEAR = 0.05  # metres from its end at which a leg has been driven
+_AROUND = 1.0  # metres about a place whose limits hold there
+
+
+@dataclass(frozen=True, slots=True)
+class _Knots:
+    """A motion at even steps: metres, m/s and m/s^2, linear in acceleration between; ``dt`` seconds apart."""
+
+    s: Float
+    v: Float
+    a: Float
+    dt: float
+
+
+def motion_behind(
+    path: Path,
+    vehicle: Vehicle,
+    time_s: Float,
+    reach: Float,
+    *,
+    rate_hz: float = 100.0,
+    under_way: bool = False,
+) -> Motion:
+    """The motion along a path that never passes the distances allowed, from rest to rest.
+
+    time_s    : (k,) rising seconds from 0
+    reach     : (k,) metres along the path that may be reached by then; never falling
+    under_way : it is as fast at first as it may be, and need not rest when the times end
+
+    It ends with the last of the times, or at the end of the path. Raises InputError for distances that fall.
+    """
+    if len(time_s) < 2 or (np.diff(reach) < -1e-9).any():
+        raise InputError("the distances that a motion must stay behind must not fall")
+    limit = speed_limits(path, vehicle)
+    parts: list[tuple[Float, Float, NDArray[np.int32]]] = []
+    begin, dt, total = 0.0, 1.0 / rate_hz, float(time_s[-1])
+    for first, last in legs_of(path):
+        if parts and total - begin < 2 * STEP_S:
+            break
+        origin, end = float(path.s[first]), float(path.s[last - 1])
+        allowed = np.clip(reach, origin, end) - origin
+        there = np.flatnonzero(allowed >= end - origin - 1e-6)
+        needed = _TAIL_S + 1.5 * float((np.diff(path.s[first:last]) / limit[first : last - 1]).sum())
+        until = max(float(time_s[there[0]]) - begin, 0.0) + needed if len(there) else math.inf
+        t = STEP_S * np.arange(max(math.floor(min(total - begin, until) / STEP_S), 2) + 1)
+        rolls = under_way and not parts
+        # a knot keeps to what is allowed at the one before: so does all in between
+        late = STEP_S * np.minimum(t / _SETTLING_S, 1.0) if rolls else STEP_S
+        bounds = np.interp(begin + t - late, time_s, allowed)
+        still = (not rolls, not under_way or until < total - begin)
+        knots = _best(path.s[first:last] - origin, limit[first:last], vehicle, bounds, still)
+        s, v = _sampled(knots, end - origin, dt)
+        driven = s[-1] > end - origin - 2 * _NEAR
+        if driven and last < len(path):
+            rest = round(DWELL_S / dt)
+            s, v = np.append(s, np.full(rest, s[-1])), np.append(v, np.zeros(rest))
+        parts.append((origin + s, v, np.full(len(s), path.leg[first], np.int32)))
+        begin += len(s) * dt
+        if not driven:
+            break
+    s, v, leg = (np.concatenate(column) for column in zip(*parts, strict=True))
+    time_ns = np.round(np.arange(len(s)) * (1e9 / rate_hz)).astype(np.int64)
+    low = np.searchsorted(path.leg, leg, side="left")
+    high = np.searchsorted(path.leg, leg, side="right") - 1
+    row = np.clip(np.searchsorted(path.s, s, side="right") - 1, low, high)
+    return Motion(time_ns, s, v, np.gradient(v, dt), row)
+
+
+def wished_speed(path: Path, vehicle: Vehicle) -> Float:
+    """Speed (n,) in m/s that suits a path: limits, braked for in time, and rest at the end of each leg."""
+    limit = speed_limits(path, vehicle)
+    out = np.empty(len(limit))
+    for first, last in legs_of(path):
+        wished = limit[first:last].copy()
+        wished[-1] = 0.0
+        out[first:last] = _braked(path.s[first:last], wished, vehicle)
+    return out
+
+
+def _braked(s: Float, limit: Float, vehicle: Vehicle) -> Float:
+    """Limits (n,) at distances (n,) from which there is braking in comfort for those that follow."""
+    ramp = 2 * _COMFORT * vehicle.deceleration * s
+    square = np.minimum.accumulate((limit**2 + ramp)[::-1])[::-1] - ramp
+    braked: Float = np.sqrt(np.maximum(square, 0.0))
+    return braked
+
+
+def _best(s: Float, limit: Float, vehicle: Vehicle, allowed: Float, rest: tuple[bool, bool]) -> _Knots:
+    """The knots of the best motion along a leg that stays behind ``allowed`` (k,) metres at its steps.
+
+    rest : whether it is at rest at the first of them, and at the last
+    """
+    from scipy.ndimage import minimum_filter1d  # noqa: PLC0415
+
+    gap = 0.25
+    place = np.arange(0.0, s[-1] + gap, gap)
+    strict = np.interp(place, s, limit)
+    cautious = _braked(place, minimum_filter1d(strict, 2 * round(_AROUND / gap) + 1), vehicle)
+    allowed = _paced(allowed, place, cautious, vehicle, 0.0 if rest[0] else float(cautious[0]))
+    cap = np.interp(allowed, place, cautious)
+    for _ in range(_AGAIN):
+        knots = _solved(vehicle, allowed, cap, rest)
+        excess = float((knots.v / np.interp(knots.s, place, strict)).max())
+        if excess <= 1.0 + _SLACK:
+            break
+        cap = np.interp(knots.s, place, cautious)
+    # slower throughout by what is left over, everything is within bounds
+    late = max(excess, 1.0)
+    return _Knots(knots.s, knots.v / late, knots.a / late**2, knots.dt * late)
+
+
+def _paced(allowed: Float, place: Float, limit: Float, vehicle: Vehicle, speed: float) -> Float:
+    """Distances (k,) behind those allowed that are reached under speed limits and the vehicle's acceleration.
+
+    speed : m/s at the first of them
+
+    They are near the solution, so that the limits found there are about those of the solution.
+    """
+    out = np.empty_like(allowed)
+    s, v, gap = 0.0, speed, float(place[1])
+    table, most = limit.tolist(), len(limit) - 1
+    for k, bound in enumerate(allowed.tolist()):
+        v = min(v + _SPARE * vehicle.acceleration * STEP_S, table[min(int(s / gap), most)])
+        ahead = min(s + v * STEP_S, bound) if k else min(s, bound)
+        v = (ahead - s) / STEP_S if k else speed
+        s = max(ahead, s)
+        out[k] = s
+    return out
+
+
+def _solved(vehicle: Vehicle, allowed: Float, cap: Float, rest: tuple[bool, bool]) -> _Knots:
+    """The linear programme: greatest sum of distances under those allowed and caps (k,) on speed."""
+    from scipy.optimize import linprog  # noqa: PLC0415
+    from scipy.sparse import csr_array, diags_array, hstack, vstack  # noqa: PLC0415
+
+    n, dt = len(allowed), STEP_S
+    m = n - 1
+    here = diags_array([np.ones(m)], offsets=[0], shape=(m, n))
+    change = diags_array([-np.ones(m), np.ones(m)], offsets=[0, 1], shape=(m, n))
+    following = here + change
+    none = csr_array((m, n))
+    # acceleration is linear in a step: speed and distance follow from it
+    speeds = hstack([none, change, -dt / 2 * (here + following)])
+    places = hstack([change, -dt * here, -(dt**2) * (here / 3 + following / 6)])
+    jerks = hstack([none, none, change])
+    # and speed, a parabola in a step, is not below the third of its control values: never backwards
+    forwards = hstack([none, here, dt / 2 * here])
+    up, down, jerk = (_SPARE * v for v in (vehicle.acceleration, vehicle.deceleration, vehicle.jerk))
+    low = np.concatenate([np.zeros(2 * n), np.full(n, -down)])
+    high = np.concatenate([np.maximum(allowed, 0.0), cap, np.full(n, up)])
+    ends = [0, *((n, 2 * n) if rest[0] else ()), *((2 * n - 1, 3 * n - 1) if rest[1] else ())]
+    low[ends] = high[ends] = 0.0
+    found = linprog(
+        np.concatenate([-np.ones(n), np.zeros(2 * n)]),
+        A_ub=vstack([jerks, -jerks, -forwards]),
+        b_ub=np.concatenate([np.full(2 * m, jerk * dt), np.zeros(m)]),
+        A_eq=vstack([speeds, places]),
+        b_eq=np.zeros(2 * m),
+        bounds=np.column_stack([low, high]),
+        method="highs-ds",
+    )
+    if found.status != 0:
+        raise InputError(f"no smooth motion stays behind what is allowed: {found.message}")
+    s, v, a = np.split(found.x, 3)
+    return _Knots(s, np.maximum(v, 0.0), a, dt)
+
+
+def _sampled(knots: _Knots, end: float, dt: float) -> tuple[Float, Float]:
+    """Distance and speed at every ``dt`` until the knots end, or the vehicle rests at the end of its leg."""
+    last = len(knots.s) - 1
+    resting = np.flatnonzero((knots.s > end - _NEAR) & (knots.v < 1e-3))
+    if len(resting):
+        last = int(resting[0])
+    t = np.arange(0.0, last * knots.dt + 1e-9, dt)
+    i = np.minimum((t / knots.dt).astype(int), len(knots.s) - 2)
+    u = t - i * knots.dt
+    jerk = (knots.a[i + 1] - knots.a[i]) / knots.dt
+    v = knots.v[i] + knots.a[i] * u + jerk * u**2 / 2
+    s = knots.s[i] + knots.v[i] * u + knots.a[i] * u**2 / 2 + jerk * u**3 / 6
+    return np.maximum.accumulate(np.clip(s, 0.0, end)), np.maximum(v, 0.0)

@@ -1,0 +1,142 @@
+"""Steering: lines that a vehicle can follow, and the way it goes when it does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.rig.vehicle import Vehicle
+
+Float = NDArray[np.float64]
+Pose = tuple[float, float, float]
+"""Scene x and y of the rear axle, and heading in radians."""
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Where a vehicle goes along a line, without heights.
+
+    xy        : (n, 2) scene metres, the rear axle
+    heading   : (n,) radians, where the vehicle points
+    curvature : (n,) 1/m, true, change of heading per metre driven
+    row       : (n,) int64, the nearest row of the line
+    gear      : 1 forwards, -1 backwards
+    step      : true metres between rows
+    """
+
+    xy: Float
+    heading: Float
+    curvature: Float
+    row: NDArray[np.int64]
+    gear: int
+    step: float
+
+    @property
+    def end(self) -> Pose:
+        """The last pose."""
+        return float(self.xy[-1, 0]), float(self.xy[-1, 1]), float(self.heading[-1])
+
+
+def relaxed(xy: Float, cap: float, reach: float) -> Float:
+    """Points (n, 2) near the given ones whose curvature stays below ``cap`` (1/m) where that is possible.
+
+    Minimises the sum of w |p - xy|^2 + reach^4 |p''|^2; w starts at 1 and falls where the line still bends
+    too much.
+    """
+    from scipy.ndimage import maximum_filter1d  # noqa: PLC0415
+    from scipy.sparse import diags_array  # noqa: PLC0415
+    from scipy.sparse.linalg import spsolve  # noqa: PLC0415
+
+    n = len(xy)
+    gap = float(np.mean(np.hypot(*np.diff(xy, axis=0).T)))
+    second = diags_array(
+        [np.ones(n - 2), np.full(n - 2, -2.0), np.ones(n - 2)], offsets=[0, 1, 2], shape=(n - 2, n)
+    )
+    bend = (reach / gap) ** 4 * (second.T @ second)
+    weight = np.ones(n)
+    weight[[0, -1]] = 1e3
+    out = xy
+    for _ in range(25):
+        out = np.asarray(spsolve((bend + diags_array([weight], offsets=[0])).tocsc(), weight[:, None] * xy))
+        bad = np.abs(line_curvature(out)) > cap
+        loose = np.hypot(*(out - xy).T) > 1.5 / cap
+        if not (bad & ~loose).any():
+            break
+        near = maximum_filter1d((bad & ~loose).astype(np.uint8), 2 * math.ceil(1.0 / (cap * gap)) + 1) > 0
+        weight = np.where(near, weight * 0.6, weight)
+    return out
+
+
+def line_heading(xy: Float) -> Float:
+    """Unwrapped heading of a line at its points (n, 2)."""
+    d = np.gradient(xy, axis=0)
+    heading: Float = np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
+    return heading
+
+
+def line_curvature(xy: Float) -> Float:
+    """Curvature of a line at its points (n, 2), positive to the left."""
+    a, b = xy[1:-1] - xy[:-2], xy[2:] - xy[1:-1]
+    cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    dot = (a * b).sum(axis=1)
+    inner = 2.0 * np.arctan2(cross, dot) / np.maximum(np.hypot(*a.T) + np.hypot(*b.T), 1e-9)
+    return np.concatenate([inner[:1], inner, inner[-1:]])
+
+
+def follow(xy: Float, vehicle: Vehicle, scale: float, *, step: float, pose: Pose | None = None) -> Track:
+    """The way of a vehicle that follows a line (m, 2), from the line's start or a pose, to its end.
+
+    Feed-forward of the line's curvature and feedback of lateral and heading error, both within what the wheel
+    can do: the curvature stays within the turning radius and changes by at most ``vehicle.steering`` per
+    metre.
+
+    scale : scene metres per true metre
+    step  : true metres between the track's rows
+
+    The track of a vehicle that does not get to the end stops at the row of the line at which it gave up.
+    """
+    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
+
+    most, rate = 1.0 / vehicle.turning_radius, vehicle.steering
+    gap = float(np.mean(np.hypot(*np.diff(xy, axis=0).T)))
+    heading, bend = line_heading(xy), line_curvature(xy) * scale
+    # the wheel starts to turn half its turning time ahead of the bend
+    bend = gaussian_filter1d(bend, max(0.5 * most / rate / gap, 0.5), mode="nearest")
+    length = 1.2 * most / rate
+    near, turn_in = 1.0 / length**2, 2.0 / length
+    lx, ly, lh, lk = xy[:, 0].tolist(), xy[:, 1].tolist(), heading.tolist(), bend.tolist()
+    m = len(lx)
+    x, y, th = pose if pose is not None else (lx[0], ly[0], lh[0])
+    j = 0 if pose is None else int(np.argmin(np.hypot(xy[:, 0] - x, xy[:, 1] - y)))
+    k = 0.0 if pose is not None else max(-most, min(most, lk[0]))
+    out: list[tuple[float, float, float, float, int]] = []
+    stride = step * scale
+    budget = int(3 * m * gap / stride) + 400
+    for _ in range(budget):
+        while (
+            j + 1 < m and (x - lx[j + 1]) ** 2 + (y - ly[j + 1]) ** 2 <= (x - lx[j]) ** 2 + (y - ly[j]) ** 2
+        ):
+            j += 1
+        out.append((x, y, th, k, j))
+        c, s = math.cos(lh[j]), math.sin(lh[j])
+        along, aside = (x - lx[j]) * c + (y - ly[j]) * s, ((y - ly[j]) * c - (x - lx[j]) * s) / scale
+        if j == m - 1 and along >= -0.5 * stride:
+            break
+        # between the line's points its heading turns on and its side moves over
+        bend_here = lk[j] + (lk[min(j + 1, m - 1)] - lk[j]) * max(-0.5, min(1.5, along / gap))
+        aside -= 0.5 * bend_here * (along / scale) ** 2
+        off = math.remainder(th - lh[j] - bend_here * along / scale, 2 * math.pi)
+        pull = 1.2 * length * math.tanh(aside / (1.2 * length))
+        want = bend_here - near * pull - turn_in * math.sin(max(-1.5, min(1.5, off)))
+        want = max(-most, min(most, want))
+        new = k + max(-rate * step, min(rate * step, want - k))
+        mean = 0.5 * (k + new)
+        half = 0.5 * mean * step
+        chord = stride * (1.0 - half * half / 6.0)  # of an arc; the next term is below 1e-9 m
+        x, y = x + chord * math.cos(th + half), y + chord * math.sin(th + half)
+        th, k = th + mean * step, new
+    rows = np.array(out)
+    return Track(rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4].astype(np.int64), 1, step)

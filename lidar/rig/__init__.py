@@ -1,0 +1,1 @@
+"""Specifications of sensors and vehicles, read from TOML."""

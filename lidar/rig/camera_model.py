@@ -1,0 +1,207 @@
+"""Camera models: which way each pixel looks, and where a point is seen."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lidar.rig.specs import CameraSpec
+
+Float = NDArray[np.float64]
+
+_STEPS = 30
+_TOLERANCE = 1e-12
+
+
+def intrinsic_matrix(camera: CameraSpec) -> Float:
+    """K (3, 3): pixels (u, v, 1) of normalised image coordinates (x, y, 1)."""
+    return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+def pixel_rays(camera: CameraSpec) -> Float:
+    """Unit directions (height * width, 3) of the pixels' centres, row by row, in the camera frame.
+
+    NaN where a pixel sees nothing: outside a fisheye's circle, or where a distortion folds over. The array is
+    shared between calls and cannot be written to.
+    """
+    return _pixel_rays(
+        camera.model,
+        camera.width,
+        camera.height,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        camera.distortion,
+    )
+
+
+@functools.lru_cache(maxsize=4)
+def _pixel_rays(
+    model: str,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    distortion: tuple[float, ...],
+) -> Float:
+    x, y = np.meshgrid((np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy)
+    distorted = np.stack([x.ravel(), y.ravel()], axis=1)
+    directions = _fisheye_rays(distorted, distortion) if model == "fisheye" else _rays(distorted, distortion)
+    directions.flags.writeable = False
+    return directions
+
+
+def unproject(camera: CameraSpec, pixels: ArrayLike) -> Float:
+    """Unit directions (n, 3) in the camera frame in which pixels (n, 2) look; NaN where none does."""
+    uv = np.asarray(pixels, float)
+    distorted = (uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    if camera.model == "fisheye":
+        return _fisheye_rays(distorted, camera.distortion)
+    return _rays(distorted, camera.distortion)
+
+
+def project(camera: CameraSpec, points: ArrayLike) -> tuple[Float, Float]:
+    """Pixels (n, 2) at which points (n, 3) of the camera frame appear, and their depth z (n,), metres.
+
+    NaN where a point is not seen: behind a pinhole, or beyond the field in which the distortion is one to
+    one. Pixels may lie outside the image; the centre of its top-left pixel is (0, 0).
+    """
+    p = np.asarray(points, float)
+    distorted = (
+        _fisheye_distort(p, camera.distortion)
+        if camera.model == "fisheye"
+        else _distort(p, camera.distortion)
+    )
+    return distorted * [camera.fx, camera.fy] + [camera.cx, camera.cy], p[:, 2]
+
+
+# Pinhole with the distortion of Brown (Photogrammetric Engineering 32, 1966) as OpenCV writes it.
+
+
+def _distortion(x: Float, y: Float, k: tuple[float, ...]) -> tuple[Float, Float, Float, Float, Float]:
+    """Distorted x and y and the Jacobian's xx, xy, yy at normalised coordinates."""
+    k1, k2, p1, p2, k3 = k
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    xx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    xy = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    yy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return xd, yd, xx, xy, yy
+
+
+def _reach(k: tuple[float, ...]) -> float:
+    """Square of the radius up to which the radial part rises; inf if it always does."""
+    k1, k2, _, _, k3 = k
+    return _first_root(7 * k3, 5 * k2, 3 * k1, 1.0)
+
+
+def _first_root(*coefficients: float) -> float:
+    """Least positive root of a polynomial, highest power first; inf if there is none."""
+    # Coefficients too small to matter within any field of view would overflow the companion matrix.
+    roots = np.roots([c if abs(c) > 1e-15 else 0.0 for c in coefficients])
+    real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
+    return float(real.min()) if len(real) else float("inf")
+
+
+def _distort(points: Float, k: tuple[float, ...]) -> Float:
+    z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
+    x, y = points[:, 0] / z, points[:, 1] / z
+    if not any(k):
+        return np.stack([x, y], axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        xd, yd, xx, xy, yy = _distortion(x, y, k)
+        seen = (x * x + y * y < _reach(k)) & (xx * yy - xy * xy > 0) & (xx > 0)
+    return np.where(seen[:, None], np.stack([xd, yd], axis=1), np.nan)
+
+
+def _rays(distorted: Float, k: tuple[float, ...]) -> Float:
+    """Unit directions of distorted coordinates (n, 2), by Newton's method from the middle outwards."""
+    x, y = distorted.T.copy()
+    if any(k):
+        x, y = _undistort(distorted, k)
+    rays = np.stack([x, y, np.ones_like(x)], axis=1)
+    unit: Float = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit
+
+
+def _undistort(distorted: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
+    xd, yd = distorted.T
+    x, y = xd.copy(), yd.copy()
+    limit = _reach(k)
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        # A start beyond the fold would lead away: begin inside it.
+        far = x * x + y * y >= limit
+        shrink = np.where(far, 0.9 * np.sqrt(limit / np.where(far, x * x + y * y, 1.0)), 1.0)
+        x *= shrink
+        y *= shrink
+        for _ in range(_STEPS):
+            fx, fy, xx, xy, yy = _distortion(x, y, k)
+            ex, ey = fx - xd, fy - yd
+            det = xx * yy - xy * xy
+            dx, dy = (yy * ex - xy * ey) / det, (xx * ey - xy * ex) / det
+            x -= dx
+            y -= dy
+            if np.nanmax(np.abs(dx) + np.abs(dy), initial=0.0) < _TOLERANCE:
+                break
+        fx, fy, xx, xy, yy = _distortion(x, y, k)
+        found = (np.hypot(fx - xd, fy - yd) < 1e-9) & (x * x + y * y < limit)
+        found &= (xx * yy - xy * xy > 0) & (xx > 0)
+    return np.where(found, x, np.nan), np.where(found, y, np.nan)
+
+
+# Fisheye: Kannala and Brandt (IEEE PAMI 28, 2006) as OpenCV writes it; equidistant without coefficients.
+
+
+def _fisheye_radius(theta: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
+    """Distorted angle and its derivative at angles theta from the optical axis."""
+    k1, k2, k3, k4 = k
+    t2 = theta * theta
+    radius = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    return radius, slope
+
+
+def _fisheye_reach(k: tuple[float, ...]) -> float:
+    """Angle from the axis up to which the distorted angle rises, at most pi."""
+    k1, k2, k3, k4 = k
+    return float(min(np.pi, np.sqrt(_first_root(9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0))))
+
+
+def _fisheye_distort(points: Float, k: tuple[float, ...]) -> Float:
+    flat = np.hypot(points[:, 0], points[:, 1])
+    theta = np.arctan2(flat, points[:, 2])
+    radius, _ = _fisheye_radius(theta, k)
+    seen = (theta < _fisheye_reach(k)) & ((flat > 0) | (points[:, 2] > 0))
+    factor = np.where(seen, radius / np.where(flat > 0, flat, 1.0), np.nan)
+    distorted: Float = points[:, :2] * factor[:, None]
+    return distorted
+
+
+def _fisheye_rays(distorted: Float, k: tuple[float, ...]) -> Float:
+    radius = np.hypot(distorted[:, 0], distorted[:, 1])
+    limit = _fisheye_reach(k)
+    edge, _ = _fisheye_radius(np.array(limit), k)
+    # The distorted angle rises from 0 to the edge, so the root is bracketed: Newton's step, or half the
+    # bracket where that leaves it.
+    low, high = np.zeros_like(radius), np.full_like(radius, limit)
+    theta = np.minimum(radius, 0.5 * limit)
+    for _ in range(60):
+        value, slope = _fisheye_radius(theta, k)
+        low, high = np.where(value < radius, theta, low), np.where(value < radius, high, theta)
+        step = (value - radius) / np.where(slope > 1e-6, slope, 1e-6)
+        newton = theta - step
+        inside = (newton >= low) & (newton <= high)
+        theta = np.where(inside, newton, 0.5 * (low + high))
+        if np.abs(step[radius < edge]).max(initial=0.0) < _TOLERANCE:
+            break
+    scale = np.where(radius < edge, np.sin(theta) / np.where(radius > 0, radius, 1.0), np.nan)
+    z = np.where(radius < edge, np.cos(theta), np.nan)
+    return np.concatenate([distorted * scale[:, None], z[:, None]], axis=1)

@@ -1,0 +1,1 @@
+"""Firing patterns of laser scanners."""

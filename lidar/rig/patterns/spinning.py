@@ -1,0 +1,146 @@
+"""Scanners that turn a column of lasers about the vertical."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.rig.patterns.beams import Firings, blocks, frame_ns, frozen, ranks
+from lidar.rig.toml_table import Table
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Spinning:
+    """Lasers k fire at times ``fire_ns[k]`` into a block; blocks follow each other without a pause.
+
+    At the time t of a firing the encoder stands at ``start + turn * 2 pi t / period``; the beam leaves at
+    that angle plus ``azimuth[k]`` (in the direction of rotation), at ``elevation[k]``.
+
+    elevation, azimuth : (k,) radians
+    fire_ns  : (k,) nanoseconds
+    block_ns : nanoseconds from block to block; 0 where ``columns`` says it
+    columns  : blocks a revolution for scanners whose blocks are locked to the encoder, else 0
+    turn     : -1 clockwise seen from above, 1 counter-clockwise
+    start    : radians, encoder's angle when a frame starts, counter-clockwise from forward
+    forward  : (k,) metres, start of the beam ahead of the axis, along the encoder's angle
+    left     : (k,) metres, start of the beam to the left, seen along the beam
+    up       : (k,) metres
+    range_offset : metres the sensor adds to the distance from the beam's start
+    """
+
+    elevation: Float
+    azimuth: Float
+    fire_ns: NDArray[np.int64]
+    block_ns: Fraction
+    columns: int
+    turn: int
+    start: float
+    forward: Float
+    left: Float
+    up: Float
+    range_offset: float
+
+    @functools.cached_property
+    def tail_ns(self) -> int:
+        """Nanoseconds after the end of its frame by which the last pulse may be late."""
+        return int(self.fire_ns.max())
+
+    @functools.cached_property
+    def _central(self) -> bool:
+        """Whether all beams start on the axis."""
+        return not (self.forward.any() or self.left.any())
+
+    def _starts(self, encoder: Any, late: Any, ahead: Any) -> Float:
+        """Where the beams start, (blocks * lasers, 3)."""
+        origin = np.empty((len(encoder), len(late), 3))
+        x = self.forward * np.cos(late) - self.left * np.sin(ahead)
+        y = self.forward * np.sin(late) + self.left * np.cos(ahead)
+        _turned(encoder, x, y, out=origin)
+        origin[:, :, 2] = self.up
+        return origin.reshape(-1, 3)
+
+    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+        """The pulses of revolution ``frame``; no two have the same azimuths unless encoder-locked."""
+        period = frame_ns(rate_hz)
+        block = blocks(frame, rate_hz, period / self.columns if self.columns else self.block_ns, start_ns)
+        turned = block.phase + block.step * np.arange(len(block), dtype=np.float64)
+        encoder = self.start + self.turn * 2 * np.pi * turned
+        late = self.turn * (2 * np.pi / float(period)) * self.fire_ns.astype(np.float64)
+        ahead = late + self.turn * self.azimuth
+        level = np.cos(self.elevation)
+        direction = np.empty((len(block), len(late), 3))
+        _turned(encoder, level * np.cos(ahead), level * np.sin(ahead), out=direction)
+        direction[:, :, 2] = np.sin(self.elevation)
+        ring, column, channel, order, up = _labels(self, len(block))
+        origin = up if self._central else self._starts(encoder, late, ahead)
+        time = (block.time_ns[:, None] + self.fire_ns).ravel()
+        return Firings(time, direction.reshape(-1, 3), origin, ring, column, channel, order)
+
+
+@functools.lru_cache(maxsize=64)
+def _labels(
+    pattern: Spinning, count: int
+) -> tuple[NDArray[np.uint16], NDArray[np.int32], NDArray[np.uint16], NDArray[np.int32], Float]:
+    """Ring, column, channel, ring-major order and beams' starts on the axis of ``count`` blocks."""
+    lasers = len(pattern.elevation)
+    rank = ranks(pattern.elevation)
+    number = np.arange(count * lasers, dtype=np.int32).reshape(count, lasers)
+    return (
+        frozen(np.tile(rank, count)),
+        frozen(np.repeat(np.arange(count, dtype=np.int32), lasers)),
+        frozen(np.tile(np.arange(lasers, dtype=np.uint16), count)),
+        frozen(number[:, np.argsort(rank)].T.ravel()),
+        frozen(np.tile(np.stack([0 * pattern.up, 0 * pattern.up, pattern.up], axis=1), (count, 1))),
+    )
+
+
+def _turned(angle: Any, x: Any, y: Any, *, out: Float) -> None:
+    """Write (x, y) of each laser, turned by the angle of each block, into ``out[:, :, :2]``."""
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    out[:, :, 0] = c * x - s * y
+    out[:, :, 1] = s * x + c * y
+
+
+def read_spinning(table: Table) -> Spinning:
+    """The pattern that a ``[spinning]`` table describes.
+
+    Raises RigError for keys that are missing, unknown or out of bounds.
+    """
+    elevation = np.radians(table.numbers("elevation_deg"))
+    if (np.abs(elevation) >= np.pi / 2).any():
+        raise table.error("elevation_deg", "elevations are to be within 90 degrees")
+    k = len(elevation)
+    columns = table.integer("columns", 0, low=0, high=1 << 20)
+    block_us = Fraction(str(table.number("block_us", 0.0 if columns else ..., low=0.0)))
+    if not columns and block_us <= 0:
+        raise table.error("block_us", "is not over 0; give it, or columns for an encoder-locked scanner")
+    if columns and block_us:
+        raise table.error("block_us", "give block_us or columns, not both")
+    fire_us = np.array(table.numbers("fire_us", 0.0, count=k, spread=True))
+    up = table.numbers("origin_up", 0.0, count=k, spread=True)
+    if table.has("focal_offset"):
+        if table.has("origin_up"):
+            raise table.error("origin_up", "give origin_up or focal_offset, not both")
+        up = tuple(-table.number("focal_offset") * np.tan(elevation))
+    pattern = Spinning(
+        elevation=elevation,
+        azimuth=np.radians(table.numbers("azimuth_offset_deg", 0.0, count=k, spread=True)),
+        fire_ns=np.round(fire_us * 1000).astype(np.int64),
+        block_ns=block_us * 1000,
+        columns=columns,
+        turn=-1 if table.flag("clockwise", True) else 1,
+        start=float(np.radians(table.number("start_deg", 0.0, low=-360.0, high=360.0))),
+        forward=np.array(table.numbers("origin_forward", 0.0, count=k, spread=True)),
+        left=np.array(table.numbers("origin_left", 0.0, count=k, spread=True)),
+        up=np.array(up),
+        range_offset=table.number("range_offset", 0.0),
+    )
+    table.close()
+    return pattern

@@ -1,0 +1,130 @@
+"""Patterns given by a law or by a list of directions: sweeps and tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.rig.patterns.beams import Firings, blocks, frame_ns, numbers
+from lidar.rig.toml_table import Table
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Lines that take turns; the azimuth turns evenly while the elevation goes up and down.
+
+    azimuth = 2 pi f_a t, elevation = middle + half tri(f_e t + line / lines), tri a triangle wave, -1 to 1.
+
+    low, high : radians, elevations
+    lines     : beams, pulse by pulse one after the other
+    """
+
+    azimuth_hz: float
+    elevation_hz: float
+    low: float
+    high: float
+    lines: int
+    pulse_hz: Fraction
+    range_offset: float = 0.0
+    tail_ns: int = 0
+
+    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+        """The pulses of frame ``frame``; the pattern goes on from frame to frame."""
+        block = blocks(frame, rate_hz, 10**9 / self.pulse_hz, start_ns)
+        number = block.first + np.arange(len(block))
+        seconds = number / float(self.pulse_hz)
+        line = (number % self.lines).astype(np.uint16)
+        turn = np.mod(self.elevation_hz * seconds + line / self.lines, 1.0)
+        triangle = 4 * np.abs(turn - 0.5) - 1
+        elevation = (self.low + self.high) / 2 + (self.high - self.low) / 2 * triangle
+        azimuth = 2 * np.pi * np.mod(self.azimuth_hz * seconds, 1.0)
+        column, _ = numbers(len(block), 1)
+        return _pulses(block.time_ns, azimuth, elevation, column, line)
+
+
+@dataclass(frozen=True, eq=False)
+class Listed:
+    """A list of directions that is gone through again and again.
+
+    after_ns : (n,) int64 nanoseconds after the start of the list, rising
+    azimuth, elevation : (n,) radians, counter-clockwise from forward, and up
+    period_ns : nanoseconds from one start of the list to the next
+    """
+
+    after_ns: NDArray[np.int64]
+    azimuth: Float
+    elevation: Float
+    period_ns: int
+    range_offset: float = 0.0
+    tail_ns: int = 0
+
+    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+        """The pulses of frame ``frame``; the list goes on from frame to frame."""
+        first, stop = (-(-k * frame_ns(rate_hz) // 1) for k in (frame, frame + 1))
+        rounds = np.arange(first // self.period_ns, stop // self.period_ns + 1, dtype=np.int64)
+        time = (rounds[:, None] * self.period_ns + self.after_ns).ravel()
+        rows = np.flatnonzero((time >= first) & (time < stop))
+        entry = rows % len(self.after_ns)
+        column, channel = numbers(len(rows), 1)
+        return _pulses(start_ns + time[rows], self.azimuth[entry], self.elevation[entry], column, channel)
+
+
+def _pulses(
+    time: NDArray[np.int64],
+    azimuth: Float,
+    elevation: Float,
+    column: NDArray[np.int32],
+    channel: NDArray[np.uint16],
+) -> Firings:
+    level = np.cos(elevation)
+    direction = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
+    order = np.arange(len(time), dtype=np.int32)
+    return Firings(time, direction, np.zeros_like(direction), channel, column, channel, order)
+
+
+def read_sweep(table: Table) -> Sweep:
+    """The pattern that a ``[sweep]`` table describes.
+
+    Raises RigError for keys that are missing, unknown or out of bounds.
+    """
+    low, high = np.radians(table.numbers("elevation_deg", count=2))
+    if not -np.pi / 2 <= low < high <= np.pi / 2:
+        raise table.error(
+            "elevation_deg", "the lowest and the highest elevation are wanted, within 90 degrees"
+        )
+    pattern = Sweep(
+        azimuth_hz=table.number("azimuth_hz"),
+        elevation_hz=table.number("elevation_hz"),
+        low=float(low),
+        high=float(high),
+        lines=table.integer("lines", 1, low=1, high=1024),
+        pulse_hz=Fraction(str(table.number("pulse_hz", above=0.0, high=1e7))),
+    )
+    table.close()
+    return pattern
+
+
+def read_listed(table: Table) -> Listed:
+    """The pattern that a ``[table]`` table describes: a CSV file beside the preset, and its period.
+
+    The file has a header and the columns time in seconds, azimuth and zenith angle in degrees, as the pattern
+    files that Livox publishes. Raises RigError if it cannot be read or its times do not rise.
+    """
+    name = table.text("file")
+    path = Path(table.path).parent / name
+    try:
+        rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 1, 2), ndmin=2)
+    except (OSError, ValueError) as error:
+        raise table.error("file", f"{path} cannot be read: {error}") from error
+    after = np.round(rows[:, 0] * 1e9).astype(np.int64)
+    period_ns = round(table.number("period_s", above=0.0) * 1e9)
+    if len(after) == 0 or (np.diff(after) < 0).any() or after[0] < 0 or after[-1] >= period_ns:
+        raise table.error("file", f"the times of {path} do not rise from 0 to less than period_s")
+    table.close()
+    return Listed(after, np.radians(rows[:, 1]), np.radians(90 - rows[:, 2]), period_ns)

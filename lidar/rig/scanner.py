@@ -1,0 +1,214 @@
+"""A scanner: how it fires, how far it sees and how well it measures, read from a TOML file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from lidar.errors import RigError
+from lidar.rig.patterns.beams import Firings, Pattern, frame_ns
+from lidar.rig.patterns.flash import read_flash
+from lidar.rig.patterns.line import read_line
+from lidar.rig.patterns.prisms import read_prisms
+from lidar.rig.patterns.scanner2d import read_scan2d
+from lidar.rig.patterns.spinning import read_spinning
+from lidar.rig.patterns.sweep import read_listed, read_sweep
+from lidar.rig.toml_table import Table, read_table
+
+RETURN_MODES = ("strongest", "last", "first", "dual", "all")
+"""What a sensor can report of the echoes of a pulse."""
+
+KINDS = ("spinning", "prism", "sweep", "table", "flash", "scan2d", "line")
+"""Kinds of scanner; a preset has a table of that name."""
+
+_FWHM = 1.699
+"""1/e^2 full angle of a Gaussian beam over its full width at half maximum, sqrt(2 / ln 2)."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A scanner set to one rate and one return mode.
+
+    name          : its name on the rig; random numbers are keyed by it
+    kind          : of `KINDS`
+    wavelength_nm : nanometres
+    rate_hz       : revolutions or frames a second
+    start_ns      : time frame 0 starts, since the drive's start
+    min_range, max_range : metres, hard limits of the range as reported
+    range_quantum : metres, step of the reported range; 0 for none
+    range_sigma   : metres, one standard deviation of a single measurement on a good target
+    bias_sigma    : metres, spread of the lasers' constant errors
+    angle_sigma   : radians, one standard deviation of the beam's angle
+    reference_range, reference_reflectance : a Lambertian target of that reflectance, square on and larger
+                    than the beam, is seen at that range, metres, with probability 1/2 (dark, clear air)
+    noise_ratio   : standard deviation of the receiver's noise over its threshold
+    divergence    : (2,) radians, full angles, level and upright, at which power has fallen to 1/e^2
+    aperture      : (2,) metres, the beam's size where it leaves
+    pulse_ns      : nanoseconds, the pulse's full width at half maximum
+    echo_separation : metres, echoes closer than this are one
+    max_echoes    : most echoes of a pulse that are told apart
+    return_mode   : of `RETURN_MODES`
+    second_strongest : in dual mode, where one echo is strongest and last, the second strongest comes with it
+    diffuse_code  : intensity code of a perfect white Lambertian target
+    fmcw          : measures the radial velocity too
+    velocity_sigma : m/s, one standard deviation of that velocity
+    pattern       : how it fires
+    note          : what the preset does not model exactly
+    source        : where each number of the preset comes from
+    """
+
+    name: str
+    kind: str
+    maker: str
+    model: str
+    wavelength_nm: float
+    rate_hz: float
+    start_ns: int
+    min_range: float
+    max_range: float
+    range_quantum: float
+    range_sigma: float
+    bias_sigma: float
+    angle_sigma: float
+    reference_range: float
+    reference_reflectance: float
+    noise_ratio: float
+    divergence: tuple[float, float]
+    aperture: tuple[float, float]
+    pulse_ns: float
+    echo_separation: float
+    max_echoes: int
+    return_mode: str
+    second_strongest: bool
+    diffuse_code: float
+    fmcw: bool
+    pattern: Pattern
+    velocity_sigma: float = 0.0
+    note: str = ""
+    source: dict[str, str] = field(default_factory=dict)
+
+    def frame_start_ns(self, frame: int) -> int:
+        """Time at which a frame starts, nanoseconds since the drive's start."""
+        return self.start_ns + int(frame * frame_ns(self.rate_hz))
+
+    def window_ns(self, frame: int) -> tuple[int, int]:
+        """Times within which all pulses of a frame are fired, nanoseconds since the drive's start."""
+        return self.frame_start_ns(frame), self.frame_start_ns(frame + 1) + self.pattern.tail_ns
+
+    def footprint(self, distance: float) -> tuple[float, float]:
+        """Width and height in metres of the beam at a distance in metres."""
+        wide, high = (a + distance * b for a, b in zip(self.aperture, self.divergence, strict=True))
+        return wide, high
+
+    def frame_count(self, duration_ns: int) -> int:
+        """Number of frames that end within a drive of that length."""
+        return max(0, int((duration_ns - self.start_ns) // frame_ns(self.rate_hz)))
+
+
+def firings(sensor: Sensor, frame: int) -> Firings:
+    """The pulses of frame ``frame`` of a drive, in the order they are fired."""
+    return sensor.pattern.fire(frame, sensor.rate_hz, sensor.start_ns)
+
+
+def sensor_names() -> list[str]:
+    """Names of the presets that come with the package."""
+    folder = resources.files("lidar.rig") / "sensors"
+    return sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml"))
+
+
+def load_sensor(
+    preset: str | Path,
+    *,
+    name: str = "",
+    rate_hz: float = 0.0,
+    return_mode: str = "",
+    start_ns: int = 0,
+) -> Sensor:
+    """A scanner from a preset (one of `sensor_names`) or a TOML file.
+
+    name        : its name on the rig; the preset's by default
+    rate_hz     : revolutions or frames a second; 0 for the first of the preset's rates
+    return_mode : the first of the preset's modes by default
+    start_ns    : time frame 0 starts
+
+    Raises RigError, naming file, line and key, for anything missing, unknown or out of bounds.
+    """
+    if str(preset).endswith(".toml"):
+        path = Path(preset)
+        if not path.is_file():
+            raise RigError(
+                f"{path}: no such sensor file; presets that come along: {', '.join(sensor_names())}"
+            )
+        table = read_table(path)
+    else:
+        if str(preset) not in sensor_names():
+            raise RigError(f"sensor {preset!r} is not known: {', '.join(sensor_names())}, or a .toml file")
+        file = resources.files("lidar.rig") / "sensors" / f"{preset}.toml"
+        table = read_table(file, name=f"presets/{preset}.toml")
+    return _read(table, name or Path(preset).stem, rate_hz, return_mode, start_ns)
+
+
+def _read(table: Table, name: str, rate_hz: float, return_mode: str, start_ns: int) -> Sensor:
+    kind = table.text("kind", among=KINDS)
+    rates = table.numbers("rates_hz")
+    rate = rate_hz or rates[0]
+    if min(rates) <= 0 or not min(rates) <= rate <= max(rates):
+        raise table.error("rates_hz", f"{rate:g} Hz is not within {min(rates):g} to {max(rates):g}")
+    modes = table.texts("return_modes", ("strongest",), among=RETURN_MODES)
+    mode = return_mode or modes[0]
+    if mode not in modes:
+        raise table.error("return_modes", f"{mode!r} is not a mode of this sensor: {', '.join(modes)}")
+    near = table.number("min_range", low=0.0)
+    far = table.number("max_range", above=near, high=1e5)
+    pulse_ns = table.number("pulse_ns", above=0.0)
+    broad = _FWHM if table.text("divergence_at", "1/e2", among=("1/e2", "fwhm")) == "fwhm" else 1.0
+    across, along = (broad * b / 1000 for b in table.numbers("divergence_mrad", count=2, spread=True))
+    wide, high = (a / 1000 for a in table.numbers("aperture_mm", 0.0, count=2, spread=True))
+    sensor = Sensor(
+        name=name,
+        kind=kind,
+        maker=table.text("maker"),
+        model=table.text("model"),
+        wavelength_nm=table.number("wavelength_nm", low=300.0, high=11000.0),
+        rate_hz=rate,
+        start_ns=start_ns,
+        min_range=near,
+        max_range=far,
+        range_quantum=table.number("range_quantum", 0.0, low=0.0),
+        range_sigma=table.number("range_sigma", low=0.0),
+        bias_sigma=table.number("bias_sigma", 0.0, low=0.0),
+        angle_sigma=float(np.radians(table.number("angle_sigma_deg", 0.0, low=0.0, high=10.0))),
+        reference_range=table.number("reference_range", above=0.0),
+        reference_reflectance=table.number("reference_reflectance", above=0.0),
+        noise_ratio=table.number("noise_ratio", 0.18, above=0.0, high=1.0),
+        divergence=(across, along),
+        aperture=(wide, high),
+        pulse_ns=pulse_ns,
+        echo_separation=table.number("echo_separation", 0.299792458 * pulse_ns / 2, low=0.0),
+        max_echoes=table.integer("max_echoes", 1, low=1, high=64),
+        return_mode=mode,
+        second_strongest=table.flag("second_strongest", False),
+        diffuse_code=table.number("diffuse_code", 100.0, above=0.0, high=255.0),
+        fmcw=table.flag("fmcw", False),
+        velocity_sigma=table.number("velocity_sigma", 0.0, low=0.0),
+        pattern=_READERS[kind](table.table(kind), rate, rates),
+        note=table.text("note", ""),
+        source={key: table.table("source").text(key) for key in table.table("source", {}).data},
+    )
+    table.close()
+    return sensor
+
+
+_READERS: dict[str, Callable[[Table, float, tuple[float, ...]], Pattern]] = {
+    "spinning": lambda table, _rate, _rates: read_spinning(table),
+    "prism": lambda table, _rate, _rates: read_prisms(table),
+    "sweep": lambda table, _rate, _rates: read_sweep(table),
+    "table": lambda table, _rate, _rates: read_listed(table),
+    "flash": lambda table, rate, _rates: read_flash(table, rate),
+    "line": lambda table, _rate, _rates: read_line(table),
+    "scan2d": read_scan2d,
+}

@@ -1,0 +1,330 @@
+"""What a vehicle carries: sensors, where they sit and when they work, read from TOML."""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.errors import RigError
+from lidar.geometry.attitude import quat_from_euler, quat_product
+from lidar.geometry.mounts import OPTICAL_QUAT, Mount
+from lidar.rig.imu_grades import PRESETS
+from lidar.rig.toml_table import Table, read_table
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class LidarSpec:
+    """A laser scanner on the rig.
+
+    preset         : name of a built-in preset, or the path of a TOML file
+    mount          : vehicle from sensor (x forward, y left, z up)
+    rate_hz        : revolutions or frames a second; 0 for the preset's own
+    time_offset_ns : start of frame 0 after the drive's start
+    return_mode    : one of the preset's modes; empty for its first
+    """
+
+    name: str
+    preset: str
+    mount: Mount = Mount()  # noqa: RUF009 - frozen
+    rate_hz: float = 0.0
+    time_offset_ns: int = 0
+    return_mode: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSpec:
+    """A camera on the rig.
+
+    mount          : vehicle from camera (z forward, x right, y down)
+    width, height  : pixels
+    fx, fy, cx, cy : pixels; the centre of the top-left pixel is (0, 0)
+    distortion     : pinhole: k1, k2, p1, p2, k3 (Brown-Conrady); fisheye: k1, k2, k3, k4 (equidistant)
+    near, far      : metres along the optical axis within which surfaces are seen
+    rate_hz        : frames a second
+    time_offset_ns : frame 0 after the drive's start
+    images         : what is written, of `IMAGES`
+    exposure_ns    : time the shutter is open for a row
+    row_ns         : time from one row to the next; 0 for a global shutter
+    exposure_ev    : stops added to the exposure that the light asks for
+    full_well      : electrons of a pixel at full scale, which set the noise of light (if that is asked for)
+    read_noise     : electrons of noise in the dark
+    model          : pinhole or fisheye
+    """
+
+    name: str
+    mount: Mount
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    near: float = 0.1
+    far: float = 200.0
+    rate_hz: float = 10.0
+    time_offset_ns: int = 0
+    images: tuple[str, ...] = ("rgb", "depth")
+    exposure_ns: int = 0
+    row_ns: int = 0
+    exposure_ev: float = 0.0
+    full_well: float = 10_000.0
+    read_noise: float = 4.0
+    model: str = "pinhole"
+
+
+SYSTEMS = ("gps", "glonass", "galileo", "beidou")
+"""Names of the systems, in the order of satellites."""
+
+IMAGES = ("rgb", "depth", "semantic", "instance", "flow")
+"""What a camera can write."""
+
+
+@dataclass(frozen=True, slots=True)
+class GnssSpec:
+    """A satellite receiver on the rig.
+
+    mount          : its translation is the lever arm to the antenna
+    rate_hz        : fixes a second
+    time_offset_ns : first fix after the drive's start
+    mode           : single, sbas, rtk or ideal
+    mask_deg       : elevation below which satellites are not used
+    constellations : systems that it receives, of gps, glonass, galileo, beidou
+    """
+
+    name: str
+    mount: Mount
+    rate_hz: float = 10.0
+    time_offset_ns: int = 0
+    mode: str = "single"
+    mask_deg: float = 10.0
+    constellations: tuple[str, ...] = SYSTEMS
+
+
+GNSS_MODES = ("single", "sbas", "rtk", "ideal")
+"""What a receiver can be."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSpec:
+    """An inertial unit on the rig, noise as Allan parameters; the defaults are EuRoC's for its ADIS16448.
+
+    gyro_noise : rad/s/sqrt(Hz)
+    gyro_walk  : rad/s^2/sqrt(Hz)
+    accel_noise : m/s^2/sqrt(Hz)
+    accel_walk : m/s^3/sqrt(Hz)
+    gyro_instability, accel_instability : rad/s and m/s^2, of the bias (flicker)
+    """
+
+    name: str
+    mount: Mount
+    rate_hz: float = 100.0
+    time_offset_ns: int = 0
+    gyro_noise: float = 1.6968e-4
+    gyro_walk: float = 1.9393e-5
+    accel_noise: float = 2.0e-3
+    accel_walk: float = 3.0e-3
+    gyro_instability: float = 0.0
+    accel_instability: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Everything one vehicle carries.
+
+    vehicle : kind of vehicle the mounts are meant for (car, drone, ...)
+    source  : where the mounts come from
+    """
+
+    name: str
+    lidars: tuple[LidarSpec, ...] = ()
+    cameras: tuple[CameraSpec, ...] = ()
+    gnss: tuple[GnssSpec, ...] = ()
+    imus: tuple[ImuSpec, ...] = ()
+    vehicle: str = "car"
+    source: str = ""
+
+
+def _mount(table: Table, *, camera: bool = False) -> Mount:
+    translation = table.numbers("translation", (0.0, 0.0, 0.0), count=3)
+    if table.has("quat_wxyz"):
+        if table.has("rpy_deg"):
+            raise table.error("rpy_deg", "give rpy_deg or quat_wxyz, not both")
+        w, x, y, z = table.numbers("quat_wxyz", count=4)
+        if not 0.99 < w * w + x * x + y * y + z * z < 1.01:
+            raise table.error("quat_wxyz", "not a unit quaternion")
+        turn = np.array([x, y, z, w]) / np.sqrt(w * w + x * x + y * y + z * z)
+    else:
+        turn = quat_from_euler(*np.radians(table.numbers("rpy_deg", (0.0, 0.0, 0.0), count=3)))
+        if camera:
+            turn = quat_product(turn, OPTICAL_QUAT)
+    a, b, c = translation
+    qx, qy, qz, qw = (float(q) for q in turn)
+    return Mount((a, b, c), (qx, qy, qz, qw))
+
+
+def _lidar(table: Table, folder: Path) -> LidarSpec:
+    preset = table.text("preset")
+    return LidarSpec(
+        name=table.text("name"),
+        preset=str(folder / preset) if preset.endswith(".toml") else preset,
+        mount=_mount(table),
+        rate_hz=table.number("rate_hz", 0.0, low=0.0, high=1e4),
+        time_offset_ns=table.integer("time_offset_ns", 0, low=0),
+        return_mode=table.text("return_mode", ""),
+    )
+
+
+def _camera(table: Table) -> CameraSpec:
+    model = table.text("model", "pinhole", among=("pinhole", "fisheye"))
+    width, height = (table.integer(key, low=1, high=65535) for key in ("width", "height"))
+    if table.has("fx"):
+        if table.has("fov_deg"):
+            raise table.error("fov_deg", "give fx or fov_deg, not both")
+        fx = table.number("fx", above=0.0)
+    else:
+        half = np.radians(table.number("fov_deg", above=0.0, high=180.0 if model == "pinhole" else 360.0)) / 2
+        if model == "pinhole" and half > np.radians(89.5):
+            raise table.error(
+                "fov_deg", "a pinhole camera cannot see 179 degrees or more; use model = 'fisheye'"
+            )
+        fx = float(width / 2 / (np.tan(half) if model == "pinhole" else half))
+    near = table.number("near", 0.1, above=0.0)
+    return CameraSpec(
+        name=table.text("name"),
+        mount=_mount(table, camera=True),
+        width=width,
+        height=height,
+        fx=fx,
+        fy=table.number("fy", fx, above=0.0),
+        cx=table.number("cx", (width - 1) / 2),
+        cy=table.number("cy", (height - 1) / 2),
+        distortion=table.numbers(
+            "distortion", (0.0,) * (5 if model == "pinhole" else 4), count=5 if model == "pinhole" else 4
+        ),
+        near=near,
+        far=table.number("far", 200.0, above=near),
+        rate_hz=table.number("rate_hz", 10.0, above=0.0, high=1e4),
+        time_offset_ns=table.integer("time_offset_ns", 0, low=0),
+        images=table.texts("images", ("rgb", "depth"), among=IMAGES),
+        exposure_ns=table.integer("exposure_ns", 0, low=0),
+        row_ns=table.integer("row_ns", 0, low=0),
+        exposure_ev=table.number("exposure_ev", 0.0, low=-20.0, high=20.0),
+        full_well=table.number("full_well", 10_000.0, above=0.0),
+        read_noise=table.number("read_noise", 4.0, low=0.0),
+        model=model,
+    )
+
+
+def _gnss(table: Table) -> GnssSpec:
+    return GnssSpec(
+        name=table.text("name", "gnss"),
+        mount=_mount(table),
+        rate_hz=table.number("rate_hz", 10.0, above=0.0, high=1e3),
+        time_offset_ns=table.integer("time_offset_ns", 0, low=0),
+        mode=table.text("mode", "single", among=GNSS_MODES),
+        mask_deg=table.number("mask_deg", 10.0, low=0.0, high=90.0),
+        constellations=table.texts("constellations", SYSTEMS, among=SYSTEMS),
+    )
+
+
+def _imu(table: Table) -> ImuSpec:
+    plain = PRESETS[table.text("model", "adis16448", among=tuple(PRESETS))]
+    return ImuSpec(
+        name=table.text("name", "imu"),
+        mount=_mount(table),
+        rate_hz=table.number("rate_hz", 100.0, above=0.0, high=1e5),
+        time_offset_ns=table.integer("time_offset_ns", 0, low=0),
+        gyro_noise=table.number("gyro_noise", plain.gyro_noise, low=0.0),
+        gyro_walk=table.number("gyro_walk", plain.gyro_walk, low=0.0),
+        accel_noise=table.number("accel_noise", plain.accel_noise, low=0.0),
+        accel_walk=table.number("accel_walk", plain.accel_walk, low=0.0),
+        gyro_instability=table.number("gyro_instability", plain.gyro_instability, low=0.0),
+        accel_instability=table.number("accel_instability", plain.accel_instability, low=0.0),
+    )
+
+
+def rig_names() -> list[str]:
+    """Names of the rigs that come with the package."""
+    folder = resources.files("lidar.rig") / "rigs"
+    return sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml"))
+
+
+def load_rig(name: str | Path) -> Rig:
+    """A rig by name (one of `rig_names`) or from a TOML file.
+
+    A preset given as a path ending in ``.toml`` is looked for beside the rig's file. Raises RigError, naming
+    file, line and key, for anything missing, unknown or out of bounds.
+    """
+    folder = Path(name).parent
+    if str(name).endswith(".toml"):
+        path = Path(name)
+        if not path.is_file():
+            raise RigError(f"{path}: no such rig file; rigs that come along: {', '.join(rig_names())}")
+        root = read_table(path)
+    else:
+        if str(name) not in rig_names():
+            raise RigError(
+                f"rig {name!r} is not known: {', '.join(rig_names())}, or the path of a .toml file"
+            )
+        root = read_table(resources.files("lidar.rig") / "rigs" / f"{name}.toml", name=f"rigs/{name}.toml")
+    tables = {key: root.tables(key) for key in ("lidar", "camera", "gnss", "imu")}
+    rig = Rig(
+        name=root.text("name", Path(name).stem),
+        lidars=tuple(_lidar(t, folder) for t in tables["lidar"]),
+        cameras=tuple(_camera(t) for t in tables["camera"]),
+        gnss=tuple(_gnss(t) for t in tables["gnss"]),
+        imus=tuple(_imu(t) for t in tables["imu"]),
+        vehicle=root.text("vehicle", "car"),
+        source=root.text("source", ""),
+    )
+    root.close()
+    _check_names(tables)
+    return rig
+
+
+def rig_digest(name: str | Path) -> str:
+    """A digest of what the files of a rig say: its own, its scanners' and their lists of directions.
+
+    Raises RigError as `load_rig` does, and for a scanner's file that cannot be read.
+    """
+    rig = load_rig(name)
+    inside, digest = resources.files("lidar.rig"), hashlib.blake2b(digest_size=6)
+    parts: list[bytes] = []
+    try:
+        own = Path(name) if str(name).endswith(".toml") else inside / "rigs" / f"{name}.toml"
+        parts.append(own.read_bytes())
+        for spec in rig.lidars:
+            if not spec.preset.endswith(".toml"):
+                parts.append((inside / "sensors" / f"{spec.preset}.toml").read_bytes())
+                continue
+            parts.append(Path(spec.preset).read_bytes())
+            listed = tomllib.loads(parts[-1].decode()).get("table", {}).get("file", "")
+            parts += [(Path(spec.preset).parent / listed).read_bytes()] if listed else []
+    except (OSError, ValueError, AttributeError, TypeError) as error:
+        raise RigError(f"rig {name}: a sensor's file cannot be read: {error}") from error
+    for part in parts:
+        digest.update(len(part).to_bytes(8) + part)
+    return digest.hexdigest()
+
+
+def _check_names(tables: dict[str, list[Table]]) -> None:
+    """Refuse unknown keys, and names that are taken twice or cannot be the name of a folder."""
+    seen: set[str] = set()
+    for kind, group in tables.items():
+        for table in group:
+            table.close()
+            name = table.data.get("name", kind)
+            if not name or not all(c.isalnum() or c in "_-" for c in name):
+                raise table.error("name", f"{name!r}: letters, digits, _ and - only (it names a folder)")
+            if name in seen:
+                raise table.error("name", f"{name!r} is taken by another sensor of the rig")
+            seen.add(name)

@@ -1,0 +1,139 @@
+"""Vehicles as data: size, what they can do and how they lean."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import MISSING, dataclass, fields
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from lidar.errors import InputError
+
+KINDS = ("road", "foot", "air")
+"""How a vehicle moves: on the carriageway, on the ground without one, or through the air."""
+
+_POSITIVE = (
+    *("length", "width", "turning_radius", "steering", "max_speed"),
+    *("acceleration", "deceleration", "jerk", "lateral_acceleration", "lateral_jerk"),
+)
+
+_SIGNED = ("roll_gradient", "pitch_gradient")
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """A vehicle. Its frame has the origin at the rear axle's centre on the ground, x forward, y left, z up.
+
+    kind            : road, foot or air
+    length, width, height : metres of the box around it
+    wheelbase, rear_overhang, track : metres; rear_overhang is from the rear axle to the back of the box
+    turning_radius  : least radius of the rear axle's centre, metres
+    steering        : largest change of curvature per metre driven, 1/m^2
+    max_speed       : m/s
+    acceleration, deceleration, jerk : largest along the path, m/s^2, m/s^2, m/s^3
+    lateral_acceleration, lateral_jerk : largest across the path, m/s^2, m/s^3
+    roll_gradient, pitch_gradient : lean of the body in radians for 1 m/s^2 across and along; positive leans
+                                    out
+                      of bends and back under acceleration (springs), negative into them and forward (lift)
+    cruise          : whether it is already at speed when the drive starts and still when it ends (aircraft)
+    bob             : metres of sway to each side, metres of rise at each step, and steps a second at full
+                      speed
+    source          : where the numbers come from
+    """
+
+    name: str
+    kind: str
+    length: float
+    width: float
+    height: float
+    wheelbase: float
+    rear_overhang: float
+    track: float
+    turning_radius: float
+    steering: float
+    max_speed: float
+    acceleration: float
+    deceleration: float
+    jerk: float
+    lateral_acceleration: float
+    lateral_jerk: float
+    roll_gradient: float
+    pitch_gradient: float
+    source: str
+    cruise: bool = False
+    bob: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def front(self) -> float:
+        """Metres from the rear axle to the front of the box."""
+        return self.length - self.rear_overhang
+
+
+def rear_axle_radius(turning_circle: float, wheelbase: float, track: float) -> float:
+    """Least radius of the rear axle's centre of a car with a kerb-to-kerb turning circle, metres.
+
+    turning_circle : a diameter. The outer front wheel runs on the circle; front wheels steer about a point on
+                     the rear axle's line (Ackermann).
+    """
+    return float(np.sqrt((turning_circle / 2) ** 2 - wheelbase**2) - track / 2)
+
+
+def vehicle_names() -> list[str]:
+    """Names of the built-in vehicles."""
+    folder = resources.files("lidar.rig").joinpath("vehicles")
+    return sorted(p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml"))
+
+
+def load_vehicle(name: str | Path) -> Vehicle:
+    """A built-in vehicle by name, or one from a TOML file with the keys of `Vehicle`.
+
+    Raises InputError for an unknown name, an unknown or missing key, or a value out of range: all in one
+    message.
+    """
+    path = Path(name)
+    if path.suffix == ".toml":
+        if not path.exists():
+            raise InputError(f"{path} does not exist; built-in vehicles are {', '.join(vehicle_names())}")
+        text = path.read_text("utf-8")
+    elif str(name) in vehicle_names():
+        text = resources.files("lidar.rig").joinpath("vehicles", f"{name}.toml").read_text("utf-8")
+    else:
+        raise InputError(
+            f"no vehicle {name}; there are {', '.join(vehicle_names())}, or give a .toml file of your own"
+        )
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{name}: not valid TOML: {error}") from error
+    return _checked(table, str(name))
+
+
+def _checked(table: dict[str, object], name: str) -> Vehicle:
+    """A vehicle from a table of keys; every fault in one InputError."""
+    known = {f.name: f for f in fields(Vehicle)}
+    faults = [
+        f"unknown key {key}; known are {', '.join(known)}" for key in sorted(table.keys() - known.keys())
+    ]
+    missing = [key for key, f in known.items() if f.default is MISSING and key not in table]
+    faults += [f"missing {', '.join(missing)}"] if missing else []
+    values: dict[str, object] = {}
+    for key in known.keys() & table.keys():
+        value, kind = table[key], str(known[key].type)
+        if kind == "float" and isinstance(value, (int, float)) and not isinstance(value, bool):
+            values[key] = float(value)
+            if not np.isfinite(float(value)) or (float(value) < 0 and key not in _SIGNED):
+                faults.append(f"{key} = {value} must be a number of at least 0")
+        elif kind.startswith("tuple") and isinstance(value, list) and len(value) == 3:
+            values[key] = tuple(float(v) for v in value)
+        elif (kind, type(value)) in (("str", str), ("bool", bool)):
+            values[key] = value
+        else:
+            faults.append(f"{key} = {value!r} must be a {kind}")
+    if values.get("kind", "road") not in KINDS:
+        faults.append(f"kind = {values['kind']!r} must be one of {', '.join(KINDS)}")
+    faults += [f"{key} must be above 0" for key in _POSITIVE if values.get(key) == 0.0]
+    if faults:
+        raise InputError(f"vehicle {name}: " + "; ".join(faults))
+    return Vehicle(**values)  # type: ignore[arg-type]

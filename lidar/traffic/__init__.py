@@ -1,0 +1,1 @@
+"""Other road users: simulated, parked, or replayed."""

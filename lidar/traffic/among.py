@@ -1,0 +1,121 @@
+"""The ego's drive among the traffic: signals, signs and the others slow it down as they do each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.scene import Scene
+from lidar.geometry.poses import Trajectory
+from lidar.planning.motion import drive_path, poses_along
+from lidar.planning.path import Path
+from lidar.planning.speed_profile import motion_behind
+from lidar.rig.vehicle import Vehicle
+from lidar.traffic.ego import ego_trip
+from lidar.traffic.flow import DT, meets_control, simulate_ego
+from lidar.traffic.junctions import Plan, junction_plan
+from lidar.traffic.lanes import lanes_of
+from lidar.traffic.populate import TrafficOptions, company_of, settled
+from lidar.traffic.traffic import Trip
+from lidar.world.actors import Actors
+
+Float = NDArray[np.float64]
+
+_ROUNDS = 3  # times that the ego's drive is planned among those who are about during the last plan
+_SAME = 25.0  # metres between two plans that are about the same
+_LONGER = (2.0, 90.0)  # a drive to an end takes at most so many times as long as on empty roads, and seconds
+_ON_S = 10.0  # seconds that a drive that is under way is planned beyond the record's end
+
+
+def drive_obeying(
+    path: Path,
+    vehicle: Vehicle,
+    graph: RoadGraph,
+    *,
+    seed: int,
+    side: str = "right",
+    bounds: tuple[float, float, float, float] | None = None,
+    duration: float | None = None,
+    under_way: bool = False,
+) -> Trajectory:
+    """The trajectory of a vehicle that drives a path alone and stops at red signals and stop signs.
+
+    seed     : of the signals, as for `junction_plan`
+    side     : of the road that is driven on
+    bounds   : of the map in scene metres
+    duration, under_way : as for `drive_path`
+    """
+    alone = drive_path(path, vehicle, duration=duration, under_way=under_way)
+    plan = junction_plan(graph, lanes_of(graph, side=side, bounds=bounds), seed=seed)
+    if not meets_control(ego_trip(path, vehicle), graph, plan):
+        return alone
+    return _driven(path, vehicle, graph, plan, [], alone, duration, reach=np.inf, under_way=under_way)
+
+
+def drive_among(
+    scene: Scene,
+    graph: RoadGraph,
+    path: Path,
+    vehicle: Vehicle,
+    first: Trajectory,
+    *,
+    seed: int,
+    options: TrafficOptions | None = None,
+    duration: float | None = None,
+    under_way: bool = False,
+) -> tuple[Trajectory, Actors]:
+    """The trajectory of a vehicle along a path as one of the traffic, and the others.
+
+    first    : its trajectory without the others, such as `drive_obeying` gives
+    duration, under_way : as for `drive_path`
+
+    The ego is simulated together with the others and keeps its distance as they do; its motion is then
+    smoothed to what its body and its passengers bear, never ahead of what it was allowed, and the others are
+    simulated once more around it. Raises InputError for a scene whose features cannot be read.
+    """
+    options = options or TrafficOptions()
+    ego = first
+    for _ in range(_ROUNDS):
+        company = company_of(scene, graph, ego, seed=seed, options=options)
+        before, reach = ego, options.reach * company.scale
+        ego = _driven(
+            path, vehicle, graph, company.plan, company.trips, first, duration,
+            reach=reach, under_way=under_way,
+        )  # fmt: skip
+        if _apart(before, ego) < _SAME * company.scale:
+            break
+    return ego, settled(scene, graph, ego, vehicle, company, seed=seed, options=options, obeys=True)
+
+
+def _driven(
+    path: Path,
+    vehicle: Vehicle,
+    graph: RoadGraph,
+    plan: Plan,
+    trips: list[Trip],
+    alone: Trajectory,
+    duration: float | None,
+    *,
+    reach: float,
+    under_way: bool,
+) -> Trajectory:
+    """The trajectory of the ego among trips; ``alone`` says how long it takes without them."""
+    factor, more = _LONGER
+    seconds = duration if duration is not None else factor * alone.duration_ns * 1e-9 + more
+    if duration is not None and under_way:
+        seconds += _ON_S
+    trip = ego_trip(path, vehicle, under_way=under_way)
+    gone = simulate_ego(trip, trips, graph, plan, seconds=seconds, reach=reach)
+    time_s: Float = DT * np.arange(len(gone), dtype=float)
+    motion = motion_behind(path, vehicle, time_s, gone.clip(max=path.length), under_way=under_way)
+    trajectory = poses_along(path, vehicle, motion)
+    return trajectory if duration is None else trajectory.until(round(duration * 1e9))
+
+
+def _apart(one: Trajectory, other: Trajectory) -> float:
+    """Largest distance in plan between two trajectories at one time, while both last; scene metres."""
+    until = min(one.duration_ns, other.duration_ns)
+    time = np.linspace(0, until, max(int(until / 1e9), 1) + 1).astype(np.int64)
+    d = one.at(time).position[:, :2] - other.at(time).position[:, :2]
+    return float(np.hypot(*d.T).max())

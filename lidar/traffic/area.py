@@ -1,0 +1,97 @@
+"""The surroundings of the ego vehicle, in which there are road users, as they move along with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.roadgraph.routing import edge_lines
+from lidar.geometry.poses import Trajectory
+from lidar.traffic.lanes import Lanes
+
+Float = NDArray[np.float64]
+
+LEFT = 100.0
+"""Metres beyond its reach at which what was around the ego is forgotten."""
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """Where there are road users: within ``reach`` of the ego.
+
+    lines  : (m,) the graph's edges in plan
+    near   : (m,) bool, edges that ever come within reach
+    time   : (t,) seconds, about one apart
+    ego    : (t, 2) scene metres, the ego vehicle then
+    reach  : true metres
+    scale  : scene metres per true metre
+    """
+
+    lines: NDArray[np.object_]
+    near: NDArray[np.bool_]
+    time: Float
+    ego: Float
+    reach: float
+    scale: float
+
+    def visits(self, xy: Float) -> list[tuple[float, float]]:
+        """Seconds from and until which a place (2,) is in the surroundings of the ego, visit by visit."""
+        away = np.hypot(*(self.ego - xy).T) / self.scale
+        out: list[tuple[float, float]] = []
+        inside = False
+        for t, d in zip(self.time.tolist(), away.tolist(), strict=True):
+            if not inside and d <= self.reach:
+                out.append((t, float(self.time[-1])))
+                inside = True
+            elif inside and d > self.reach + LEFT:
+                out[-1] = (out[-1][0], t)
+                inside = False
+        return out
+
+    def until(self, xy: Float, start: float) -> float:
+        """Seconds until which a place (2,) that is in the surroundings at ``start`` stays in them."""
+        away = np.hypot(*(self.ego - xy).T) / self.scale
+        left = (self.time > start) & (away > self.reach + LEFT)
+        return float(self.time[np.argmax(left)] if left.any() else self.time[-1])
+
+
+def area_of(lanes: Lanes, ego: Trajectory, reach: float, scale: float) -> Area:
+    """The surroundings of the ego along its way."""
+    lines = edge_lines(lanes.graph)
+    seconds = ego.duration_ns * 1e-9
+    time = np.linspace(0.0, seconds, max(int(np.ceil(seconds)), 1) + 1)
+    xy = ego.at(np.round(time * 1e9).astype(np.int64)).position[:, :2]
+    return Area(lines, shapely.dwithin(lines, ego_line(ego), reach * scale), time, xy, reach, scale)
+
+
+def ego_line(ego: Trajectory) -> shapely.Geometry:
+    """The ego's way in plan."""
+    xy = ego.position[:: max(len(ego.position) // 5000, 1), :2]
+    return shapely.linestrings(xy).simplify(0.2) if np.ptp(xy, axis=0).max() > 0.5 else shapely.points(xy[0])
+
+
+def entrances(lanes: Lanes, area: Area, t: float) -> list[tuple[int, float]]:
+    """Where traffic comes into the surroundings of the ego at a time: edges, and shares of their lengths.
+
+    That is where edges cross the rim inwards, and where they come into the map.
+    """
+    here = np.array([np.interp(t, area.time, area.ego[:, c]) for c in (0, 1)])
+    rim = shapely.Point(here).buffer(area.reach * area.scale, quad_segs=16).exterior
+    rows = np.flatnonzero(area.near & (lanes.liking > 0) & lanes.open)
+    found: list[tuple[int, float]] = []
+    cut = shapely.intersection(area.lines[rows], rim)
+    points, owner = shapely.get_parts(cut, return_index=True)
+    for point, k in zip(points, rows[owner].tolist(), strict=True):
+        if point.geom_type != "Point":
+            continue
+        share = float(shapely.line_locate_point(area.lines[k], point, normalized=True))
+        length = max(area.lines[k].length, 1e-9)
+        ahead = shapely.line_interpolate_point(area.lines[k], min(share + 2.0 / length, 1.0), normalized=True)
+        if np.hypot(ahead.x - here[0], ahead.y - here[1]) < area.reach * area.scale:
+            found.append((k, share))
+    begins = np.array([line.coords[0] for line in area.lines[rows]]).reshape(-1, 2)
+    within = np.hypot(*(begins - here).T) < area.reach * area.scale
+    return found + [(k, 0.0) for k in rows[within & lanes.entry[rows]].tolist()]

@@ -1,0 +1,76 @@
+"""The ego vehicle as one of the traffic: what signals, signs and the others let it do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.planning.path import Path
+from lidar.planning.speed_profile import wished_speed
+from lidar.rig.vehicle import Vehicle
+from lidar.traffic.lanes import STEP, Way
+from lidar.traffic.traffic import Driver
+
+Float = NDArray[np.float64]
+
+_ROOM = (0.4, 0.2)
+"""Metres by which the ego's box is longer and wider to the others, for what its driver does less exactly."""
+_BRAKE = 0.7  # share of its braking that the driver uses for what is ahead, and
+_PULL = 0.8  # of its acceleration
+_HEADWAY_S, _GAP = 1.4, 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class EgoTrip:
+    """The ego's way, in the columns of `lidar.traffic.traffic.Trip`.
+
+    xy, heading : (n, 2) and (n,) of the box's middle at each station
+    """
+
+    way: Way
+    driver: Driver
+    wish: Float
+    length: float
+    width: float
+    xy: Float
+    heading: Float
+    begin: int = 0
+    appear_s: float = 0.0
+    leaves: bool = False
+    walks: bool = False
+    crossing: Sequence[tuple[int, int, int]] = ()
+
+    def body(self) -> tuple[Float, Float]:
+        """Middle and heading at each station."""
+        return self.xy, self.heading
+
+
+def ego_trip(path: Path, vehicle: Vehicle, *, under_way: bool = False) -> EgoTrip:
+    """The ego as a mover along its path, from rest or under way; stations are `STEP` metres of it apart."""
+    at = np.arange(0.0, path.length + STEP, STEP)
+    # where the vehicle turns round the position stands twice
+    s = path.s + 1e-9 * np.arange(len(path))
+    scale = float(path.scale.mean())
+    heading = np.interp(at, s, path.heading)
+    ahead = scale * (vehicle.length / 2 - vehicle.rear_overhang)
+    axle = np.stack([np.interp(at, s, path.position[:, c]) for c in range(3)], axis=1)
+    xy = axle[:, :2] + ahead * np.column_stack([np.cos(heading), np.sin(heading)])
+    row = np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(path) - 1)
+    way = Way(
+        np.column_stack([xy, axle[:, 2]]),
+        heading,
+        path.curvature[row],
+        path.edge[row].astype(np.int64),
+        np.zeros(len(at), np.int64),
+        path.limit[row],
+        scale,
+    )
+    brake, pull = _BRAKE * vehicle.deceleration, _PULL * vehicle.acceleration
+    driver = Driver(vehicle.turning_radius, vehicle.max_speed, _HEADWAY_S, pull, brake, _GAP)
+    wish = np.interp(at, s, wished_speed(path, vehicle))
+    if not under_way:
+        wish = np.minimum(wish, np.sqrt(2 * pull * (at + 0.2)))
+    return EgoTrip(way, driver, wish, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading)

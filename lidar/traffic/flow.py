@@ -1,0 +1,294 @@
+"""Trips in time: the tables of the simulation, and what comes of them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import edge_lines
+from lidar.geometry.poses import Trajectory
+from lidar.traffic.area import LEFT
+from lidar.traffic.ego import EgoTrip
+from lidar.traffic.junctions import Plan, road_rank, signal_group, zone_at
+from lidar.traffic.lanes import STEP, Way
+from lidar.traffic.simulate import Ego, Movers, run
+from lidar.traffic.sweep import SQUARE, squares_under, sweep
+from lidar.traffic.traffic import Trip
+
+Float = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+DT = 0.1
+"""Seconds of a step of the simulation."""
+_HORIZON = 60  # steps that the ego's way is known ahead: 6 s
+_KEEP = (0.8, 0.3)  # metres that others keep from the ego's box before and beside it
+_ROUNDS = 30
+_NEAR = 6.0  # metres in plan from an edge's middle within which the ego may be on it
+_LINE_REACH = 20.0  # metres before a junction within which lines to stop at are heeded
+_LINE_ROOM = 4.0  # metres before the middle of a crossing, or a signal, at which the front of a vehicle stops
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """What became of trips: the knots of those that came to be, by trip and in time.
+
+    trip, step : (k,) int64
+    gone, speed : (k,) metres along the way of the body's middle, m/s
+    """
+
+    trip: Ints
+    step: Ints
+    gone: Float
+    speed: Float
+
+
+def simulate_trips(
+    trips: Sequence[Trip],
+    graph: RoadGraph,
+    plan: Plan,
+    ego: Trajectory,
+    ego_box: tuple[float, float, float],
+    *,
+    reach: float,
+    obeys: bool = False,
+) -> Flow:
+    """Trips in time, from the drive's start to its end.
+
+    ego_box : length, width and metres from the rear axle to the middle of the ego's box
+    obeys   : whether the ego's motion keeps to the signals; otherwise they are green when it comes
+
+    Those whom the ego, whose motion is given, would run into do not take place.
+    """
+    if not trips:
+        none = np.empty(0, np.int64)
+        return Flow(none, none, np.empty(0), np.empty(0))
+    movers = _movers(trips, graph, plan)
+    known = ego_on(ego, ego_box, graph)
+    movers, known, squares = _numbered(movers, known)
+    signals = plan.signals if obeys else plan.signals._replace(window=green_windows(plan, known))
+    out = np.zeros(len(trips), bool)
+    for _ in range(_ROUNDS):
+        log, met = run(movers, known, signals, out, squares, DT, len(known.x), _HORIZON, reach + LEFT, -1)
+        if not met.any():
+            break
+        out |= met
+    order = np.lexsort((log[:, 1], log[:, 0]))
+    log = log[order]
+    return Flow(log[:, 0].astype(np.int64), log[:, 1].astype(np.int64), log[:, 2], log[:, 3])
+
+
+def simulate_ego(
+    ego: EgoTrip, trips: Sequence[Trip], graph: RoadGraph, plan: Plan, *, seconds: float, reach: float
+) -> Float:
+    """Metres (t,) along its path that the ego gets by each step of `DT` as one of the traffic.
+
+    It follows, gives way and stops at signals and signs as the others do, and they know it as one of them.
+    """
+    movers = _movers([ego, *trips], graph, plan)
+    steps = int(np.ceil(seconds / DT)) + 1
+    x, y, heading, speed = np.zeros((4, steps))
+    none = np.empty(0, np.int64)
+    known = Ego(x, y, heading, speed, np.full(2, -np.inf), np.zeros(steps + 1, np.int64), none)
+    movers, known, squares = _numbered(movers, known)
+    out = np.zeros(len(trips) + 1, bool)
+    log, _ = run(movers, known, plan.signals, out, squares, DT, steps, _HORIZON, reach + LEFT, 0)
+    mine = log[:, 0] == 0
+    gone = np.zeros(steps)
+    gone[log[mine, 1].astype(int)] = log[mine, 2]
+    return np.maximum.accumulate(gone)
+
+
+def meets_control(ego: EgoTrip, graph: RoadGraph, plan: Plan) -> bool:
+    """Whether there are signals or stop signs on the ego's way."""
+    blocks = _blocks(ego, graph, plan, {})
+    return bool((blocks[:, 4] >= 0).any() or (blocks[:, 7] > 0).any())
+
+
+def ego_on(ego: Trajectory, box: tuple[float, float, float], graph: RoadGraph) -> Ego:
+    """What the others know of the ego vehicle; ``box`` as in `simulate_trips`."""
+    length, width, ahead = box
+    steps = int(ego.duration_ns * 1e-9 / DT) + 2
+    time = np.round(np.arange(steps) * DT * 1e9).astype(np.int64)
+    poses = ego.at(time)
+    forward = poses.rotation[:, :, 0]
+    middle = poses.position + poses.scale * forward * ahead
+    heading = np.arctan2(forward[:, 1], forward[:, 0])
+    speed = np.interp(time, ego.time_ns, np.hypot(*ego.velocity[:, :2].T))
+    level = _levels(middle, graph)
+    grown = np.column_stack([length / 2 + _KEEP[0] + speed * DT / 2, np.full(steps, width / 2 + _KEEP[1])])
+    under = np.empty(int(4 * np.prod(grown.max(axis=0) / SQUARE + 2)), np.int64)
+    events = []
+    for k in range(steps):
+        n = squares_under(middle[k, 0], middle[k, 1], heading[k], grown[k], level[k], under)
+        events.append(under[:n].copy())
+    start = np.concatenate([[0], np.cumsum([len(e) for e in events])])
+    half = np.array([length / 2 + 0.2, width / 2 + 0.1])
+    return Ego(middle[:, 0], middle[:, 1], heading, speed, half, start, np.concatenate(events))
+
+
+def _levels(xyz: Float, graph: RoadGraph) -> Ints:
+    """1 for points (n, 3) on bridges and in tunnels, 0 for others: by the edge nearest in height."""
+    covered = graph.bridge | graph.tunnel
+    out = np.zeros(len(xyz), np.int64)
+    if not covered.any():
+        return out
+    lines = edge_lines(graph)
+    points = shapely.points(xyz[:, :2])
+    row, edge = shapely.STRtree(lines).query(points, predicate="dwithin", distance=_NEAR)
+    share = shapely.line_locate_point(lines[edge], points[row], normalized=True)
+    solid = np.array([shapely.linestrings(graph.geometry[e]) for e in edge.tolist()], object)
+    z = shapely.get_z(shapely.line_interpolate_point(solid, share, normalized=True))
+    order = np.argsort(-np.abs(z - xyz[row, 2]), kind="stable")
+    out[row[order]] = covered[edge[order]]
+    return out
+
+
+def _numbered(movers: Movers, ego: Ego) -> tuple[Movers, Ego, int]:
+    """The tables with squares numbered from 0, and how many there are."""
+    used, number = np.unique(np.concatenate([movers.square, ego.event_square]), return_inverse=True)
+    mine, its = np.split(number.astype(np.int32), [len(movers.square)])
+    return movers._replace(square=mine), ego._replace(event_square=its), len(used)
+
+
+def green_windows(plan: Plan, ego: Ego) -> Float:
+    """Windows (w, 4) in which signals are green for the ego: from 8 s before it reaches a junction."""
+    zone = zone_at(plan.zones, np.column_stack([ego.x, ego.y]))
+    rows = []
+    cuts = np.flatnonzero(np.diff(np.concatenate([[-2], zone, [-2]])))
+    for a, b in itertools.pairwise(cuts.tolist()):
+        z = int(zone[a])
+        if z >= 0 and plan.lit[z]:
+            rows.append((z, signal_group(plan, z, float(ego.heading[a])), a * DT - 8.0, b * DT))
+    return np.array(rows, float).reshape(-1, 4)
+
+
+def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, plan: Plan) -> Movers:
+    """The tables of the simulation."""
+    station, square, blocks = [0], [0], [0]
+    columns: dict[str, list[NDArray[Any]]] = {
+        name: [] for name in ("wish", "x", "y", "heading", "square", "first", "last", "leave", "block")
+    }
+    ways: dict[tuple[int, ...], int] = {}
+    covered = graph.bridge | graph.tunnel
+    for trip in trips:
+        way = trip.way
+        xy, heading = trip.body()
+        level = np.where(way.edge >= 0, covered[way.edge], False).astype(np.int64)
+        swept = sweep(xy, heading, trip.length, trip.width, level, scale=way.scale)
+        found = _blocks(trip, graph, plan, ways)
+        columns["wish"].append(trip.wish)
+        columns["x"].append(xy[:, 0])
+        columns["y"].append(xy[:, 1])
+        columns["heading"].append(heading)
+        for name in ("square", "first", "last", "leave"):
+            columns[name].append(getattr(swept, name))
+        columns["block"].append(found)
+        station.append(station[-1] + len(way))
+        square.append(square[-1] + len(swept.square))
+        blocks.append(blocks[-1] + len(found))
+    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    b = whole["block"]
+
+    def of(name: str) -> Float:
+        return np.array([getattr(t.driver, name) for t in trips])
+
+    names = ("block_from", "block_to", "block_stop", "block_zone", "block_group", "block_way")
+    return Movers(
+        station_start=np.array(station),
+        wish=whole["wish"],
+        x=whole["x"],
+        y=whole["y"],
+        heading=whole["heading"],
+        square_start=np.array(square),
+        square=whole["square"],
+        first=whole["first"],
+        last=whole["last"],
+        leave=whole["leave"],
+        block_start=np.array(blocks),
+        **{name: b[:, c].astype(np.int64) for c, name in enumerate(names)},
+        block_rank=b[:, 6].copy(),
+        block_halt=b[:, 7] > 0,
+        headway=of("headway"),
+        pull=of("pull"),
+        brake=of("brake"),
+        gap=of("gap"),
+        length=np.array([t.length for t in trips]),
+        width=np.array([t.width for t in trips]),
+        appear=np.array([int(t.appear_s / DT) for t in trips]),
+        begin=np.array([t.begin for t in trips]),
+        leaves=np.array([t.leaves for t in trips]),
+        whole=np.array([t.walks for t in trips]),
+    )
+
+
+def _blocks(trip: Trip | EgoTrip, graph: RoadGraph, plan: Plan, ways: dict[tuple[int, ...], int]) -> Float:
+    """Stretches through junctions (b, 8): from, to, stop, zone, group, way, rank, halt; see `Movers`."""
+    way = trip.way
+    zone = zone_at(plan.zones, way.xyz[:, :2])
+    half = int(np.ceil((trip.length / 2 + 0.5) / STEP))
+    rows: list[list[float]] = []
+    for first, last, number in trip.crossing:
+        if last >= trip.begin:
+            z = int(zone[(first + last) // 2])
+            group = signal_group(plan, z, float(way.heading[(first + last) // 2])) if z >= 0 else -1
+            key = ways.setdefault((-1, number), len(ways))
+            rows.append([first, last, first - 1, z, group, key, 99.0, 0.0])
+    if trip.walks:
+        return np.array(rows, float).reshape(-1, 8)
+    cuts = np.flatnonzero(np.diff(np.concatenate([[-2], zone, [-2]])))
+    for a, b in itertools.pairwise(cuts.tolist()):
+        z = int(zone[a])
+        if z < 0 or b - 1 + half < trip.begin:
+            continue
+        before, behind = max(a - 1, 0), min(b, len(way) - 1)
+        through = (
+            z,
+            *(int(v) for v in (way.edge[before], way.lane[before], way.edge[behind], way.lane[behind])),
+        )
+        heading, entry = float(way.heading[before]), int(way.edge[before])
+        start, end = a - half, b - 1 + half
+        stop = min(start - 2, _stop_line(way, graph, entry, a) - half)
+        if stop < 4 and isinstance(trip, EgoTrip):  # it sets out from within
+            continue
+        if rows and stop - rows[-1][1] < 2:  # no room to stand between two junctions
+            rows[-1][1] = end
+            rows[-1][5] = ways.setdefault((int(rows[-1][5]), -1, *through), len(ways))
+            continue
+        bend = (float(way.heading[behind]) - heading + np.pi) % (2 * np.pi) - np.pi
+        rank = 2.0 * road_rank(str(graph.highway[entry]) if entry >= 0 else "") + 0.5 * (abs(bend) > 0.5)
+        signs = graph.control_kind[graph.control_edge == entry]
+        rank += 3.0 if np.isin(signs, ("stop", "give_way")).any() else 0.0
+        group = signal_group(plan, z, heading)
+        halt = group < 0 and _stops(graph, entry)
+        rows.append([start, end, stop, z, group, ways.setdefault(through, len(ways)), rank, float(halt)])
+    return np.array(rows, float).reshape(-1, 8)
+
+
+def _stops(graph: RoadGraph, edge: int) -> bool:
+    """Whether there is a stop sign where an edge leads up to a junction."""
+    here = (graph.control_edge == edge) & (graph.control_kind == "stop")
+    near = graph.length[edge] - graph.control_offset[here] < _LINE_REACH
+    return edge >= 0 and bool(near.any() or graph.stop[graph.head[edge]])
+
+
+def _stop_line(way: Way, graph: RoadGraph, edge: int, station: int) -> int:
+    """Station of the first line to stop at, on the edge that leads up to a junction at a station."""
+    here = graph.control_edge == edge
+    offset = graph.control_offset[here]
+    offset = offset[graph.length[edge] - offset < _LINE_REACH]
+    if not len(offset):
+        return station
+    line = graph.geometry[edge][:, :2]
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    at = float(offset.min()) / max(float(graph.length[edge]), 1e-9) * along[-1]
+    point = np.array([np.interp(at, along, line[:, c]) for c in (0, 1)])
+    first = max(station - int(2 * _LINE_REACH / STEP), 0)
+    distance = np.hypot(*(way.xyz[first : station + 1, :2] - point).T)
+    return first + int(np.argmin(distance)) - int(_LINE_ROOM / STEP)

@@ -1,0 +1,377 @@
+"""Lanes of the road graph, and the ways that vehicles take along them."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import turn_states
+from lidar.planning.steering import line_curvature, line_heading, relaxed
+
+Float = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+STEP = 0.5
+"""True metres between the stations of a way."""
+_KERB = 0.25  # metres that a body keeps from the edge of the carriageway where it can
+_SIDE = 0.55  # metres that two bodies in neighbouring lanes have between them at least
+_QUIET = {"service": 0.02, "track": 0.0, "living_street": 0.2}
+"""How much less traffic likes a road of this kind."""
+_STRAIGHT = np.radians(30.0)
+_EDGE = 60.0  # metres from the bounds of the map within which a street that ends is one that leaves it
+
+
+@dataclass(frozen=True, slots=True)
+class Lanes:
+    """Lanes of a road graph.
+
+    graph  : the road graph
+    count  : (m,) int64, lanes in the direction of each edge
+    wide   : (m,) metres that a body may be wide on each edge
+    side   : 1 where traffic keeps right, -1 where it keeps left
+    state  : (s,) the edge of each state of `geoscene.roadgraph.routing.turn_states`
+    after  : for each state the states that may follow it
+    onward : (s,) bool, the state leads on, or out of the map: whoever is in it does not end in a dead end
+    leave, enter : (m,) headings in which an edge is left and entered, radians
+    liking : (m,) how much traffic there is on an edge, relative
+    open   : (m,) bool, `onward` of who begins on the edge
+    exit, entry : (m,) bool, the edge ends, or begins, at the map's edge
+    """
+
+    graph: RoadGraph
+    count: Ints
+    wide: Float
+    side: int
+    state: Ints
+    after: Sequence[Ints]
+    onward: NDArray[np.bool_]
+    leave: Float
+    enter: Float
+    liking: Float
+    open: NDArray[np.bool_]
+    exit: NDArray[np.bool_]
+    entry: NDArray[np.bool_]
+
+
+def lanes_of(
+    graph: RoadGraph, *, side: str = "right", bounds: tuple[float, float, float, float] | None = None
+) -> Lanes:
+    """The lanes of a road graph.
+
+    bounds : (xmin, ymin, xmax, ymax) of the map in scene metres: streets that end near them go on beyond
+    """
+    two_way = graph.twin >= 0
+    other = np.where(two_way, graph.lanes[graph.twin], 0.0)
+    total = np.maximum(graph.lanes + other, 1.0)
+    shared = two_way & (total < 2)
+    each = np.where(shared, graph.width / 2, graph.width / total)
+    alone = ~two_way & (graph.lanes < 2)
+    wide = np.where(alone, graph.width - 2 * _KERB, each - _SIDE)
+    states = turn_states(graph)
+    before, after, state = states.before, states.after, states.edge.astype(np.int64)
+    order = np.argsort(before, kind="stable")
+    starts = np.searchsorted(before[order], np.arange(len(states) + 1))
+    follow = [after[order[a:b]].astype(np.int64) for a, b in itertools.pairwise(starts)]
+    leave, enter = np.empty(len(graph)), np.empty(len(graph))
+    for k, line in enumerate(graph.geometry):
+        enter[k], leave[k] = _heading(line[:, :2], first=True), _heading(line[:, :2], first=False)
+    liking = np.array([_QUIET.get(str(kind), 1.0) for kind in graph.highway])
+    leads_out = _at_edge(graph, bounds, graph.head, graph.tail)
+    leads_in = _at_edge(graph, bounds, graph.tail, graph.head)
+    straight_on = graph.twin[state[before]] != state[after]
+    onward = _leading_on(before[straight_on], after[straight_on], leads_out[state])
+    return Lanes(
+        graph,
+        np.maximum(np.floor(graph.lanes), 1.0).astype(np.int64),
+        wide,
+        1 if side == "right" else -1,
+        state,
+        follow,
+        onward,
+        leave,
+        enter,
+        liking,
+        onward[: len(graph)],
+        leads_out,
+        leads_in,
+    )
+
+
+def _at_edge(
+    graph: RoadGraph,
+    bounds: tuple[float, float, float, float] | None,
+    end: NDArray[np.int32],
+    other: NDArray[np.int32],
+) -> NDArray[np.bool_]:
+    """Edges (m,) one end of which lies near the map's edge and joins no other street."""
+    if bounds is None:
+        return np.zeros(len(graph), np.bool_)
+    xy = graph.node_xyz[end, :2]
+    within = np.minimum(xy - bounds[:2], np.array(bounds[2:]) - xy).min(axis=1)
+    joining = np.bincount(other, minlength=len(graph.node_id))[end]
+    out: NDArray[np.bool_] = (within < _EDGE) & (joining - (graph.twin >= 0) < 1)
+    return out
+
+
+def _leading_on(before: Ints, after: Ints, leads_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """States (s,) from which a drive can go on for ever, or to the map's edge."""
+    leads_on = np.ones(len(leads_out), np.bool_)
+    while True:
+        further = leads_out.copy()
+        further[before[leads_on[after]]] = True
+        if np.array_equal(further, leads_on):
+            return leads_on
+        leads_on = further
+
+
+def _heading(xy: Float, *, first: bool) -> float:
+    """Heading of a line over its first or last five metres."""
+    line = xy if first else xy[::-1]
+    far = np.flatnonzero(np.hypot(*(line - line[0]).T) >= 5.0)
+    d = line[far[0] if len(far) else -1] - line[0]
+    d = d if first else -d
+    return float(np.arctan2(d[1], d[0]))
+
+
+def turn(lanes: Lanes, a: int, b: int) -> float:
+    """Change of heading in radians from edge a to edge b, positive to the left."""
+    return float((lanes.enter[b] - lanes.leave[a] + np.pi) % (2 * np.pi) - np.pi)
+
+
+def lane_shift(lanes: Lanes, edge: int, lane: int, width: float, *, kerb: bool = False) -> float:
+    """Metres from an edge's centre line to a lane's middle, positive on the side that traffic keeps to.
+
+    Lane 0 is the one at the kerb. A body of that width stays inside the carriageway where there is room; with
+    ``kerb`` it keeps to the kerb within its lane.
+    """
+    g = lanes.graph
+    other = float(g.lanes[g.twin[edge]]) if g.twin[edge] >= 0 else 0.0
+    total = max(float(g.lanes[edge]) + other, 1.0)
+    whole = float(g.width[edge])
+    shared = other > 0 and total < 2
+    middle = whole / 4 if shared else whole / 2 - (lane + 0.5) * whole / total
+    if kerb and lane == 0:
+        middle = whole / 2 - width / 2 - 2 * _KERB
+    room = max(whole / 2 - width / 2 - _KERB, 0.0)
+    return float(np.clip(middle, -room, room))
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """Where a mover's middle goes, a row every `STEP` true metres.
+
+    xyz       : (n, 3) scene metres
+    heading   : (n,) radians, unwrapped
+    curvature : (n,) 1/m, true
+    edge      : (n,) int64 edge of the graph, -1 off it
+    lane      : (n,) int64 lane on the edge
+    limit     : (n,) m/s
+    scale     : scene metres per true metre
+    """
+
+    xyz: Float
+    heading: Float
+    curvature: Float
+    edge: Ints
+    lane: Ints
+    limit: Float
+    scale: float
+
+    def __len__(self) -> int:
+        """Number of stations."""
+        return len(self.xyz)
+
+    def part(self, first: int, last: int) -> Way:
+        """The stations from the first up to, not including, the last."""
+        columns = {f.name: getattr(self, f.name)[first:last] for f in fields(self) if f.name != "scale"}
+        return replace(self, **columns)
+
+
+def wander(
+    lanes: Lanes,
+    rng: np.random.Generator,
+    edge: int,
+    lane: int,
+    *,
+    metres: float,
+    inside: NDArray[np.bool_],
+    width: float,
+) -> tuple[list[int], list[int]]:
+    """Edges and lanes of a random drive from an edge on, until ``metres`` or the last edge ``inside``.
+
+    Who is in the kerb's lane goes straight on or turns towards the kerb, who is in the innermost lane
+    straight on or the other way, where there is such a way. Going straight on is preferred.
+    """
+    edges, picked = [edge], [lane]
+    far = float(lanes.graph.length[edge])
+    state = edge
+    while far < metres:
+        states = lanes.after[state]
+        ways = lanes.state[states]
+        fit = (lanes.wide[ways] >= width) & (lanes.liking[ways] > 0) & (lanes.graph.twin[edge] != ways)
+        states, ways = states[fit], ways[fit]
+        if not len(ways):
+            break
+        turns = np.array([turn(lanes, edge, int(w)) for w in ways])
+        weight = lanes.liking[ways] * np.where(np.abs(turns) < _STRAIGHT, 3.0, 1.0)
+        weight = weight * np.where(np.abs(turns) > np.radians(140), 0.02, 1.0)
+        weight = weight * np.where(lanes.onward[states], 1.0, 1e-9)
+        if lanes.count[edge] > 1:
+            inward = turns * lanes.side > _STRAIGHT
+            outward = turns * lanes.side < -_STRAIGHT
+            weight = np.where((lane > 0) & outward, 1e-6 * weight, weight)
+            weight = np.where((lane < lanes.count[edge] - 1) & inward, 1e-6 * weight, weight)
+        k = int(np.searchsorted(np.cumsum(weight), rng.random() * weight.sum(), side="right"))
+        k = min(k, len(ways) - 1)
+        state, following = int(states[k]), int(ways[k])
+        most = int(lanes.count[following]) - 1
+        if turns[k] * lanes.side > _STRAIGHT:
+            lane = most
+        elif turns[k] * lanes.side < -_STRAIGHT:
+            lane = 0
+        else:
+            lane = min(lane, most)
+        edge = following
+        edges.append(edge)
+        picked.append(lane)
+        far += float(lanes.graph.length[edge])
+        if not inside[edge]:
+            break
+    return edges, picked
+
+
+def way_along(
+    lanes: Lanes,
+    edges: Sequence[int],
+    picked: Sequence[int],
+    *,
+    width: float,
+    radius: float,
+    scale: float,
+    kerb: bool = False,
+) -> Way:
+    """The way along lanes of edges that follow each other, rounded to bends of ``radius`` and more.
+
+    width  : metres of the body
+    radius : true metres
+    kerb   : keep to the kerb within the lane
+    """
+    parts, owner = [], []
+    graph = lanes.graph
+    lines = [
+        beside(graph.geometry[e], -lanes.side * scale * lane_shift(lanes, e, k, width, kerb=kerb))
+        for e, k in zip(edges, picked, strict=True)
+    ]
+    for k, line in enumerate(lines):
+        if k + 1 < len(lines):
+            line, following, joint = _joint(line, lines[k + 1], radius)  # noqa: PLW2901
+            lines[k + 1] = following
+        else:
+            joint = np.empty((0, 3))
+        parts += [line, joint]
+        owner += [np.full(len(line), k), np.full(len(joint), k)]
+    xyz, own = np.concatenate(parts), np.concatenate(owner)
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))])
+    keep = np.concatenate([[True], np.diff(along) > 1e-6])
+    xyz, own, along = xyz[keep], own[keep], along[keep]
+    gap = STEP * scale
+    at = np.arange(0.0, max(along[-1], 6 * gap), gap)
+    line = np.stack([np.interp(at, along, xyz[:, c]) for c in range(3)], axis=1)
+    row = own[np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(own) - 1)]
+    edge, lane = np.asarray(edges, np.int64)[row], np.asarray(picked, np.int64)[row]
+    return rounded(line, edge, lane, graph.speed[edge], radius=radius, scale=scale)
+
+
+def rounded(line: Float, edge: Ints, lane: Ints, limit: Float, *, radius: float, scale: float) -> Way:
+    """The way along a line (n, 3) of evenly spaced points, rounded to bends of ``radius`` and more.
+
+    radius            : true metres
+    edge, lane, limit : columns of `Way` at the points
+    """
+    gap = STEP * scale
+    smooth = relaxed(line[:, :2], 0.95 / radius / scale, 0.45 * radius)
+    # corners that were rounded are shorter: even spacing again
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(smooth, axis=0).T))])
+    even = np.arange(0.0, length[-1], gap)
+    near = np.clip(np.searchsorted(length, even), 0, len(line) - 1)
+    out = np.column_stack(
+        [*(np.interp(even, length, smooth[:, c]) for c in (0, 1)), np.interp(even, length, line[:, 2])]
+    )
+    return Way(
+        out,
+        line_heading(out[:, :2]),
+        line_curvature(out[:, :2]) * scale,
+        edge[near],
+        lane[near],
+        limit[near],
+        scale,
+    )
+
+
+def beside(line: Float, offset: float) -> Float:
+    """A line (k, 3) beside another, ``offset`` scene metres to its left, with mitred corners."""
+    d = np.diff(line[:, :2], axis=0)
+    size = np.hypot(*d.T)
+    d = d[size > 1e-9] / size[size > 1e-9, None]
+    keep = np.concatenate([[True], size > 1e-9])
+    if offset == 0.0 or not len(d):
+        kept: Float = line[keep]
+        return kept
+    normal = np.column_stack([-d[:, 1], d[:, 0]])
+    before, after = np.vstack([normal[:1], normal]), np.vstack([normal, normal[-1:]])
+    mitre = (before + after) / np.maximum(1 + (before * after).sum(axis=1), 0.5)[:, None]
+    moved: Float = line[keep].copy()
+    moved[:, :2] += offset * mitre
+    return moved
+
+
+def _joint(a: Float, b: Float, radius: float) -> tuple[Float, Float, Float]:
+    """Two lanes cut back where they meet, and the curve (c, 3) between them."""
+    u, v = _unit(a[-1, :2] - a[-2, :2]), _unit(b[1, :2] - b[0, :2])
+    gap = b[0, :2] - a[-1, :2]
+    sine, cosine = float(u[0] * v[1] - u[1] * v[0]), float(u @ v)
+    long_a, long_b = _length(a), _length(b)
+    if abs(sine) > 0.25:
+        on_a = (gap[0] * v[1] - gap[1] * v[0]) / sine  # metres beyond a's end to where the lanes cross
+        on_b = (gap[0] * u[1] - gap[1] * u[0]) / sine  # metres after b's start
+        angle = abs(float(np.arctan2(sine, cosine)))
+        back = 1.15 * radius * np.tan(min(angle, 2.4) / 2)
+        cut_a, cut_b = back - on_a, back + on_b
+    else:
+        aside = abs(float(u[0] * gap[1] - u[1] * gap[0]))
+        cut_a = cut_b = 0.0 if aside < 0.05 else max(4.0 * aside, 2.0) + max(-float(gap @ u), 0.0)
+    a = _within(a, 0.0, max(long_a - max(cut_a, 0.0), 0.55 * long_a))
+    b = _within(b, min(max(cut_b, 0.0), 0.45 * long_b), long_b)
+    p, q = a[-1], b[0]
+    u, v = _unit(a[-1, :2] - a[-2, :2]), _unit(b[1, :2] - b[0, :2])
+    reach = float(np.hypot(*(q - p)[:2]))
+    if reach < 0.2:
+        return a, b, np.empty((0, 3))
+    t = np.linspace(0.0, 1.0, max(int(reach / 0.5), 2) + 1)[1:-1, None]
+    pull = 0.4 * reach
+    p1, q1 = p[:2] + pull * u, q[:2] - pull * v
+    xy = (1 - t) ** 3 * p[:2] + 3 * t * (1 - t) ** 2 * p1 + 3 * t**2 * (1 - t) * q1 + t**3 * q[:2]
+    return a, b, np.column_stack([xy, p[2] + t * (q[2] - p[2])])
+
+
+def _unit(d: Float) -> Float:
+    unit: Float = d / max(float(np.hypot(*d)), 1e-9)
+    return unit
+
+
+def _length(line: Float) -> float:
+    return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
+
+
+def _within(line: Float, begin: float, end: float) -> Float:
+    """The part of a line between two lengths along it."""
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+    inside = (along > begin + 1e-6) & (along < end - 1e-6)
+    at = np.concatenate([[begin], along[inside], [max(end, begin + 1e-3)]])
+    part: Float = np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
+    return part

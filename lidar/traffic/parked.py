@@ -1,0 +1,179 @@
+"""Cars that stand: along kerbs and in parking lots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.scene import Scene
+from lidar.random_streams import generator
+from lidar.traffic.lanes import Lanes, beside, lane_shift
+from lidar.traffic.sweep import rectangles
+from lidar.traffic.tracks import standing, table
+from lidar.traffic.traffic import pick
+from lidar.world.actors import Actors
+
+Float = NDArray[np.float64]
+
+CARS = {"hatchback": 0.38, "sedan": 0.30, "suv": 0.22, "van": 0.10}
+"""Shares of what parks: assumed."""
+_FREE = 1.3  # metres from the middle of the lane that a parked car leaves free: half a car and a hand
+_OVER = 0.35  # metres by which a car's middle may stand beyond the kerb where the street is that narrow
+_ROOM, _BETWEEN = 0.2, 0.4  # metres to what stands there, and to each other
+_QUIET = ("residential", "living_street", "unclassified", "tertiary", "service")
+_BUSY = ("secondary", "primary")
+_FAST = 14.5  # m/s from which on nobody parks at the kerb
+_SLOT = (2.5, 5.2)  # metres of a place in a parking lot
+_AISLE = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class Spots:
+    """Where bodies may stand.
+
+    xy      : (n, 2) scene metres, the middle of the box
+    heading : (n,) radians
+    hint    : (n,) metres, height near which the ground is; NaN for the topmost
+    """
+
+    xy: Float
+    heading: Float
+    hint: Float
+
+
+def concatenated(parts: Sequence[Spots]) -> Spots:
+    """All spots, in order."""
+    return Spots(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Spots)))
+
+
+def kerb_spots(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: float) -> Spots:
+    """Places along kerbs on the edges ``near``, a share of them, at random."""
+    g = lanes.graph
+    xy, heading, hint = [], [], []
+    for e in np.flatnonzero(near).tolist():
+        kind = str(g.highway[e])
+        slow = g.speed[e] < _FAST and not (g.bridge[e] or g.tunnel[e])
+        if not slow or g.length[e] < 15.0 or kind not in (*_QUIET, *_BUSY):
+            continue
+        rng = generator(seed, "parked", "kerb", e)
+        lane = lane_shift(lanes, e, 0, 1.82)
+        # the inner side of a one-way street of several lanes is a median as likely as not
+        alone = g.twin[e] < 0 and lanes.count[e] == 1 and kind in _QUIET
+        both = (lanes.side, -lanes.side) if alone else (lanes.side,)
+        for side in both:
+            inner = lane if side == lanes.side else -lane
+            out = max(float(g.width[e]) / 2 - 0.92 - 0.15, inner + _FREE + 0.92)
+            if out > float(g.width[e]) / 2 + (_OVER if kind in _QUIET else -0.9):
+                continue
+            line = beside(g.geometry[e], -side * out)
+            along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+            at = np.arange(4.0 + rng.uniform(0, 2.0), along[-1] - 4.0, 5.9)
+            at = at + rng.uniform(-0.25, 0.25, len(at))
+            at = at[rng.random(len(at)) < share]
+            d = [
+                np.interp(at + 0.5, along, line[:, c]) - np.interp(at - 0.5, along, line[:, c])
+                for c in (0, 1)
+            ]
+            turned = np.pi if side != lanes.side else 0.0
+            xy.append(np.stack([np.interp(at, along, line[:, c]) for c in (0, 1)], axis=1))
+            heading.append(np.arctan2(d[1], d[0]) + turned + rng.normal(0.0, 0.012, len(at)))
+            hint.append(np.interp(at, along, line[:, 2]))
+    if not xy:
+        return Spots(np.empty((0, 2)), np.empty(0), np.empty(0))
+    return Spots(np.concatenate(xy), np.concatenate(heading), np.concatenate(hint))
+
+
+def lot_spots(lots: NDArray[np.object_], *, seed: int, share: float) -> Spots:
+    """Places in parking lots: rows across the lot's longer side, with aisles between pairs of rows."""
+    xy, heading = [], []
+    wide, deep = _SLOT
+    for number, lot in enumerate(lots):
+        rng = generator(seed, "parked", "lot", number)
+        frame = shapely.minimum_rotated_rectangle(lot)
+        if frame.geom_type != "Polygon" or lot.area < 30:
+            continue
+        ring = shapely.get_coordinates(frame)
+        sides = np.diff(ring[:3], axis=0)
+        long = int(np.argmax(np.hypot(*sides.T)))
+        u = sides[long] / np.hypot(*sides[long])
+        v = sides[1 - long] / np.hypot(*sides[1 - long])
+        origin = ring[1] if long == 1 else ring[0]
+        v = v if long == 0 else -v
+        size = (float(np.hypot(*sides[long])), float(np.hypot(*sides[1 - long])))
+        rows, flips, y = [], [], 0.3
+        while y + deep <= size[1]:
+            rows.append(y + deep / 2)
+            flips.append(len(rows) % 2 == 0)
+            y += deep + (_AISLE if len(rows) % 2 else 0.3)
+        for y, flip in zip(rows, flips, strict=True):
+            at = np.arange(0.4 + wide / 2, size[0] - wide / 2, wide)
+            points = origin + at[:, None] * u + y * v
+            angle = np.arctan2(v[1], v[0]) + (np.pi if flip else 0.0)
+            slot = rectangles(points, np.full(len(at), angle), deep, wide - 0.2)
+            fits = shapely.covered_by(slot, lot) & (rng.random(len(at)) < share)
+            backwards = np.where(rng.random(len(at)) < 0.3, np.pi, 0.0)
+            xy.append(points[fits])
+            heading.append((angle + backwards + rng.normal(0.0, 0.02, len(at)))[fits])
+    if not xy:
+        return Spots(np.empty((0, 2)), np.empty(0), np.empty(0))
+    whole = np.concatenate(xy)
+    return Spots(whole, np.concatenate(heading), np.full(len(whole), np.nan))
+
+
+def parked_actors(
+    spots: Spots,
+    scene: Scene,
+    kinds: dict[str, float],
+    trees: Sequence[shapely.STRtree],
+    *,
+    seed: int,
+    scale: float,
+) -> Actors:
+    """Vehicles on the spots where all wheels have ground and they touch nothing, nor each other.
+
+    kinds : shares of the kinds of vehicles
+    trees : what stands there, and what must stay free, as polygons in plan
+    """
+    n = len(spots.xy)
+    rng = generator(seed, "parked", *kinds)
+    names, chance = list(kinds), np.array(list(kinds.values()))
+    shapes = [pick(names[k], rng) for k in rng.choice(len(names), size=n, p=chance / chance.sum())]
+    grow = 1 + rng.uniform(-0.03, 0.03, (n, 3))
+    size = np.array([[s.length, s.width, s.base] for s in shapes]).reshape(-1, 3)
+    length, width, base = size[:, 0] * grow[:, 0], size[:, 1] * grow[:, 1], size[:, 2] * grow[:, 0]
+    boxes = rectangles(spots.xy, spots.heading, length * scale, width * scale)
+    keep = np.ones(n, bool)
+    for tree in trees:
+        if len(tree):
+            keep[np.unique(tree.query(boxes, predicate="dwithin", distance=_ROOM)[0])] = False
+    a, b = shapely.STRtree(boxes).query(boxes, predicate="dwithin", distance=_BETWEEN)
+    for first, second in zip(a[a < b].tolist(), b[a < b].tolist(), strict=True):
+        keep[second] &= not keep[first]
+    rows = np.flatnonzero(keep)
+    *pose, sound = standing(
+        scene,
+        spots.xy[rows],
+        spots.heading[rows],
+        spots.hint[rows],
+        axle=base[rows],
+        track=0.8 * width[rows],
+        scale=scale,
+    )
+    rows = rows[sound]
+    height, pitch, roll = (column[sound] for column in pose)
+    return table(
+        [shapes[k] for k in rows],
+        grow[rows],
+        np.ones(len(rows), np.int64),
+        np.zeros(len(rows), np.int64),
+        np.column_stack([spots.xy[rows], height]),
+        np.column_stack([spots.heading[rows], pitch, roll]),
+        np.zeros((len(rows), 3)),
+        np.zeros(len(rows)),
+        parked=True,
+        scale=scale,
+    )

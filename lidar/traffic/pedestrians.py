@@ -1,0 +1,238 @@
+"""People on foot: along sidewalks and over crossings."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from lidar.random_streams import generator
+from lidar.traffic.area import Area
+from lidar.traffic.lanes import STEP, Lanes, Way, beside, rounded
+from lidar.traffic.traffic import Driver, Trip, pick, varied
+
+Float = NDArray[np.float64]
+
+_KINDS = {"adult": 0.5, "small_adult": 0.38, "child": 0.12}
+_FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}
+"""m/s, free walking: adults after Weidmann, "Transporttechnik der Fussgänger" (1993), 1.34 on average."""
+_WALK = Driver(radius=0.4, top=2.5, headway=0.5, pull=0.8, brake=1.2, gap=0.3)
+_LANE = 0.6  # metres beside a sidewalk's line on which people keep, on the side of traffic
+_EDGE = 0.15  # metres from the edge of the sidewalk to the middle of who walks nearest to it
+_OUT = (
+    2.4,
+    2.1,
+    1.8,
+    1.5,
+    1.3,
+    1.1,
+    0.95,
+    0.8,
+)  # metres beyond the carriageway's edge where the line may run, best first
+_ROOM = 1.0  # metres from the lines to what stands there
+_PIECE = 12.0  # metres of a stretch of sidewalk that is worth walking
+
+
+@dataclass(frozen=True, slots=True)
+class Walks:
+    """Stretches of sidewalk along streets.
+
+    line  : (w,) object, each (k, 3) float64 scene metres, in the direction of its edge
+    edge  : (w,) int64
+    side  : (w,) 1 to the left of the edge, -1 to its right
+    """
+
+    line: list[Float]
+    edge: list[int]
+    side: list[int]
+
+
+def walks_of(
+    lanes: Lanes, area: Area, pavement: shapely.Geometry | None, standing: NDArray[np.object_]
+) -> Walks:
+    """Stretches of sidewalk around the ego's way, clear of what stands there.
+
+    pavement : the sidewalks, None for none
+    standing : polygons of buildings, poles and trunks
+    """
+    out = Walks([], [], [])
+    if pavement is None:
+        return out
+    g = lanes.graph
+    tree = shapely.STRtree(standing)
+    # people walk beside the line, and are to be on the sidewalk there
+    pavement = shapely.buffer(pavement, -(_LANE + _EDGE) * area.scale)
+    shapely.prepare(pavement)
+    for e in np.flatnonzero(area.near).tolist():
+        if 0 <= g.twin[e] < e or g.bridge[e] or g.tunnel[e] or g.length[e] < _PIECE:
+            continue
+        for side in (1, -1):
+            best: list[Float] = []
+            for wide in _OUT:
+                aside = (float(g.width[e]) / 2 + wide) * area.scale
+                line = beside(g.geometry[e], side * aside)
+                pieces = _clear(line, pavement, tree)
+                if sum(map(_plan, pieces)) > 1.3 * sum(map(_plan, best)):
+                    best = pieces
+            out.line.extend(best)
+            out.edge.extend([e] * len(best))
+            out.side.extend([side] * len(best))
+    return out
+
+
+def _clear(line: Float, pavement: shapely.Geometry, tree: shapely.STRtree) -> list[Float]:
+    """Pieces of a line on the pavement, away from what stands there."""
+    whole = shapely.linestrings(line)
+    if len(tree):
+        near = tree.geometries[tree.query(whole, predicate="dwithin", distance=_ROOM)]
+        if len(near):
+            whole = shapely.difference(whole, shapely.union_all(shapely.buffer(near, _ROOM)))
+    parts = shapely.get_parts(shapely.intersection(whole, pavement))
+    pieces = [shapely.get_coordinates(p, include_z=True) for p in parts if p.geom_type == "LineString"]
+    return [p for p in pieces if _plan(p) >= _PIECE]
+
+
+def _plan(line: Float) -> float:
+    return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
+
+
+def walker_trips(lanes: Lanes, area: Area, walks: Walks, *, seed: int, density: float) -> list[Trip]:
+    """People at random places on the sidewalks; half of those who come to a crossing take it.
+
+    density : people per kilometre of sidewalk
+    """
+    if not walks.line:
+        return []
+    metres = np.array([_plan(line) for line in walks.line])
+    crossings = _crossings(lanes, walks)
+    names, chance = list(_KINDS), np.array(list(_KINDS.values()))
+    trips = []
+    for number in range(round(density * float(metres.sum()) / 1000)):
+        rng = generator(seed, "traffic", "walker", number)
+        walk = int(rng.choice(len(metres), p=metres / metres.sum()))
+        begin = rng.uniform(1.0, metres[walk] - 1.0)
+        kind = names[int(rng.choice(len(names), p=chance / chance.sum()))]
+        shape, grow = pick(kind, rng), varied(rng)
+        pace = _FREE[kind] * float(np.clip(rng.normal(1.0, 0.12), 0.7, 1.4))
+        place = shapely.line_interpolate_point(shapely.linestrings(walks.line[walk][:, :2]), begin)
+        for start, end in area.visits(shapely.get_coordinates(place)[0]):
+            line, over = _stroll(walks, crossings, walk, begin, pace * (end - start) + 20.0, lanes.side, rng)
+            way, crossed = _way(line, over, area.scale)
+            wish = np.full(len(way), pace)
+            trips.append(
+                Trip(shape, grow, way, _WALK, wish, 0, start, leaves=False, walks=True, crossing=crossed)
+            )
+    return trips
+
+
+def _stroll(
+    walks: Walks,
+    crossings: Mapping[int, list[tuple[int, float, float, int]]],
+    walk: int,
+    begin: float,
+    metres: float,
+    side: int,
+    rng: np.random.Generator,
+) -> tuple[list[Float], list[tuple[int, int]]]:
+    """Lines that somebody walks one after the other, and which of them are followed by which crossing.
+
+    They go to the end of a stretch of sidewalk and back, or over a crossing on the way, and so on.
+    """
+    parts: list[Float] = []
+    over: list[tuple[int, int]] = []
+    forwards, far = bool(rng.random() < 0.5), 0.0
+    while far < metres or (over and over[-1][0] == len(parts) - 1):
+        own = walks.line[walk]
+        end = _plan(own) - 0.7 if forwards else 0.7
+        ahead = [c for c in crossings.get(walk, []) if min(begin, end) + 3.0 < c[1] < max(begin, end) - 1.0]
+        taken = ahead[int(rng.integers(len(ahead)))] if ahead and rng.random() < 0.5 else None
+        stop = end if taken is None else taken[1]
+        if abs(stop - begin) > 0.5:
+            parts.append(_lane(own, begin, stop, side))
+            far += abs(stop - begin)
+        if taken is None:
+            begin, forwards = stop, not forwards
+        else:
+            if parts:
+                over.append((len(parts) - 1, taken[3]))
+            walk, begin = taken[0], taken[2]
+            forwards = bool(rng.random() < 0.5)
+            far += 5.0
+    return parts, over
+
+
+def _crossings(lanes: Lanes, walks: Walks) -> dict[int, list[tuple[int, float, float, int]]]:
+    """Crossings by the stretch of sidewalk from which they start.
+
+    Each is the stretch opposite, metres along the one and the other, and the crossing's number.
+    """
+    g = lanes.graph
+    edge, offset = (
+        g.control_edge[g.control_kind == "crossing"],
+        g.control_offset[g.control_kind == "crossing"],
+    )
+    other = (g.twin[edge] >= 0) & (g.twin[edge] < edge)
+    offset = np.where(other, g.length[edge] - offset, offset)
+    edge = np.where(other, g.twin[edge], edge)
+    by_edge: dict[int, list[int]] = {}
+    for k, e in enumerate(walks.edge):
+        by_edge.setdefault(e, []).append(k)
+    found: dict[int, list[tuple[int, float, float, int]]] = {}
+    for number, (e, at) in enumerate(
+        sorted(set(zip(edge.tolist(), np.round(offset, 1).tolist(), strict=True)))
+    ):
+        share = at / max(float(g.length[e]), 1e-9)
+        middle = shapely.line_interpolate_point(
+            shapely.linestrings(g.geometry[e][:, :2]), share, normalized=True
+        )
+        reach = float(g.width[e]) / 2 + _OUT[0] + 0.5
+        ends = []
+        for k in by_edge.get(e, []):
+            line = shapely.linestrings(walks.line[k][:, :2])
+            if shapely.distance(line, middle) < reach:
+                ends.append((k, float(shapely.line_locate_point(line, middle))))
+        for (a, at_a), (b, at_b) in itertools.permutations(ends, 2):
+            if walks.side[a] != walks.side[b]:
+                found.setdefault(a, []).append((b, at_a, at_b, number))
+    return found
+
+
+def _way(
+    parts: list[Float], over: list[tuple[int, int]], scale: float
+) -> tuple[Way, tuple[tuple[int, int, int], ...]]:
+    """The way along lines, and the stations between which it is on the crossings that follow some of them."""
+    line = np.concatenate(parts)
+    ends = np.cumsum([len(p) for p in parts])
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+    gap = STEP * scale
+    even = np.arange(0.0, along[-1], gap)
+    keep = np.concatenate([[True], np.diff(along) > 1e-6])
+    points = np.stack([np.interp(even, along[keep], line[keep, c]) for c in range(3)], axis=1)
+    nowhere = np.full(len(even), -1, np.int64)
+    way = rounded(points, nowhere, nowhere, np.full(len(even), np.inf), radius=_WALK.radius, scale=scale)
+    crossed = []
+    for part, number in over:
+        # rounded corners shorten the way a little: the crossing is found by its ends
+        first, last = (_nearest(way, line[k, :2], along[k] / gap) for k in (ends[part] - 1, ends[part]))
+        crossed.append((first + 1, max(last - 1, first + 2), number))
+    return way, tuple(crossed)
+
+
+def _nearest(way: Way, point: Float, about: float) -> int:
+    """The station of a way nearest to a point, near a guess."""
+    low = int(np.clip(about - 16, 0, len(way) - 1))
+    part = way.xyz[low : int(about) + 17, :2]
+    return low + int(np.argmin(np.hypot(*(part - point).T)))
+
+
+def _lane(line: Float, begin: float, end: float, side: int) -> Float:
+    """A stretch of a sidewalk's line from one length along it to another, a little to one's own side."""
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+    low, high = min(begin, end), max(begin, end)
+    at = np.concatenate([[low], along[(along > low) & (along < high)], [max(high, low + 0.1)]])
+    part = np.stack([np.interp(at, along, line[:, c]) for c in range(3)], axis=1)
+    return beside(part if end >= begin else part[::-1], -side * _LANE)

@@ -1,0 +1,304 @@
+"""A scene's road users for a drive: traffic, parked vehicles, people."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.errors import SceneFormatError
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.scene import Scene
+from geoscene.scene.geopackage import Layer, read_layer
+from lidar.errors import InputError
+from lidar.geometry.poses import Trajectory
+from lidar.rig.vehicle import Vehicle
+from lidar.traffic.area import Area, area_of, ego_line
+from lidar.traffic.flow import simulate_trips
+from lidar.traffic.junctions import Plan, junction_plan
+from lidar.traffic.lanes import Lanes, beside, lane_shift, lanes_of
+from lidar.traffic.parked import CARS, concatenated, kerb_spots, lot_spots, parked_actors
+from lidar.traffic.pedestrians import walker_trips, walks_of
+from lidar.traffic.sweep import body_poses, rectangles
+from lidar.traffic.tracks import moving_actors
+from lidar.traffic.traffic import Trip, vehicle_trips
+from lidar.world.actors import Actors, joined
+
+Float = NDArray[np.float64]
+
+_ROAD = ("road", "lane_marking", "crossing", "parking")
+_HEADROOM = 2.5  # metres under what stands out of a wall that one can stand below
+_HOUSE = 1.0  # square metres above which what stands there is a building
+_POST = 0.2  # metres, half the thickness of posts and trunks
+_BOUNDS = {
+    "vehicles": (0, 60),
+    "cyclists": (0, 30),
+    "walkers": (0, 400),
+    "parked": (0, 1),
+    "reach": (50, 1000),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficOptions:
+    """How busy a place is.
+
+    vehicles : moving vehicles per kilometre of lane
+    cyclists : per kilometre of lane
+    walkers  : people per kilometre of sidewalk
+    parked   : share of the places along kerbs and in parking lots that are taken
+    reach    : true metres from the ego vehicle within which there are road users
+    side     : side of the road that traffic keeps to
+    """
+
+    vehicles: float = 12.0
+    cyclists: float = 1.0
+    walkers: float = 15.0
+    parked: float = 0.6
+    reach: float = 200.0
+    side: Literal["right", "left"] = "right"
+
+    def __post_init__(self) -> None:
+        """Refuse densities that cannot be meant."""
+        faults = [
+            f"{name} = {getattr(self, name)} is not within {low} to {high}"
+            for name, (low, high) in _BOUNDS.items()
+            if not low <= getattr(self, name) <= high
+        ]
+        if self.side not in ("left", "right"):
+            faults.append(f"side = {self.side!r} is neither left nor right")
+        if faults:
+            raise InputError("traffic: " + "; ".join(faults))
+
+
+@dataclass(frozen=True, slots=True)
+class Company:
+    """Who is about during a drive, before anybody moves.
+
+    plan, area : junctions, and the surroundings of the ego
+    trips      : those who move
+    standing   : footprints of what nobody goes or stands through
+    surfaces   : the scene's layer of roads and sidewalks
+    around     : the whole of the surroundings
+    scale      : scene metres per true metre
+    """
+
+    lanes: Lanes
+    plan: Plan
+    area: Area
+    trips: list[Trip]
+    standing: NDArray[np.object_]
+    surfaces: Layer | None
+    around: shapely.Geometry
+    scale: float
+
+
+def populate(
+    scene: Scene,
+    graph: RoadGraph,
+    ego: Trajectory,
+    vehicle: Vehicle,
+    *,
+    seed: int,
+    options: TrafficOptions | None = None,
+) -> Actors:
+    """The road users around the ego vehicle for its whole drive; the same for the same seed and options.
+
+    ego     : the ego vehicle's trajectory, which is given: the others keep clear of it, signals are green
+              for it; see `drive_among` for an ego that is one of the traffic
+    vehicle : its size
+
+    Raises InputError for a scene whose features cannot be read.
+    """
+    options = options or TrafficOptions()
+    company = company_of(scene, graph, ego, seed=seed, options=options)
+    return settled(scene, graph, ego, vehicle, company, seed=seed, options=options, obeys=False)
+
+
+def company_of(
+    scene: Scene, graph: RoadGraph, ego: Trajectory, *, seed: int, options: TrafficOptions
+) -> Company:
+    """Those who are about in the surroundings of an ego that moves so."""
+    lanes = lanes_of(graph, side=options.side, bounds=scene.bounds)
+    plan = junction_plan(graph, lanes, seed=seed)
+    scale = float(np.mean(np.asarray(scene.frame.scale_at(*ego.position[0, :2]), float)))
+    area = area_of(lanes, ego, options.reach, scale)
+    around = shapely.buffer(ego_line(ego), (options.reach + 30.0) * scale)
+    shapely.prepare(around)
+    surfaces = _layer(scene, "road_surfaces")
+    road = _union(surfaces, _ROAD, around, 0.3)
+    standing = _standing(scene, around)
+    if road is not None:
+        road = _passable(road, standing, lanes, area)
+
+    trips = vehicle_trips(lanes, area, seed=seed, density=options.vehicles, ground=road)
+    trips += vehicle_trips(
+        lanes, area, seed=seed, density=options.cyclists, shares={"cyclist": 1.0}, ground=road
+    )
+    walks = walks_of(lanes, area, _union(surfaces, ("sidewalk",), around, 0.0), standing)
+    trips += walker_trips(lanes, area, walks, seed=seed, density=options.walkers)
+    return Company(lanes, plan, area, trips, standing, surfaces, around, scale)
+
+
+def settled(
+    scene: Scene,
+    graph: RoadGraph,
+    ego: Trajectory,
+    vehicle: Vehicle,
+    company: Company,
+    *,
+    seed: int,
+    options: TrafficOptions,
+    obeys: bool,
+) -> Actors:
+    """The actors of a company: where they go and stand about an ego whose motion is given.
+
+    obeys : whether that motion keeps to the signals; otherwise they are green when it comes
+    """
+    trips, plan = company.trips, company.plan
+    box = (vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang)
+    flow = simulate_trips(trips, graph, plan, ego, box, reach=options.reach * company.scale, obeys=obeys)
+    return joined(
+        [
+            moving_actors(trips, flow, scene, scale=company.scale),
+            parked_about(scene, ego, vehicle, company, _swept(trips), seed=seed, share=options.parked),
+        ],
+        first_feature=first_feature(scene),
+    )
+
+
+def first_feature(scene: Scene) -> int:
+    """The first number that no feature of a scene bears."""
+    return max((stop for _, stop in scene.layers.values()), default=0)
+
+
+def parked_about(
+    scene: Scene,
+    ego: Trajectory,
+    vehicle: Vehicle,
+    company: Company,
+    swept: NDArray[np.object_],
+    *,
+    seed: int,
+    share: float,
+) -> Actors:
+    """Vehicles that stand along kerbs and in parking lots.
+
+    swept : what those who move cover, as polygons in plan
+    share : of the places that are taken
+    """
+    surfaces, around, lanes = company.surfaces, company.around, company.lanes
+    lots = _polygons(_layer(scene, "landcover"), ("parking",), around)
+    structures = _layer(scene, "structures")
+    crossings = shapely.buffer(_polygons(surfaces, ("crossing",), around), 2.0)
+    free = [
+        _ego_boxes(ego, vehicle, company.scale),
+        swept,
+        _strips(lanes, company.area),
+        shapely.buffer(company.plan.zones.polygon, 3.0),
+        crossings,
+        np.empty(0, object) if structures is None else shapely.buffer(structures.geometry, 0.5),
+    ]
+    trees = [shapely.STRtree(part) for part in (company.standing, np.concatenate(free))]
+    spots = concatenated(
+        [
+            kerb_spots(lanes, company.area.near, seed=seed, share=share),
+            lot_spots(lots, seed=seed, share=share),
+        ]
+    )
+    return parked_actors(spots, scene, CARS, trees, seed=seed, scale=company.scale)
+
+
+def _passable(
+    road: shapely.Geometry, standing: NDArray[np.object_], lanes: Lanes, area: Area
+) -> shapely.Geometry:
+    """Carriageways less the buildings that stand on them, but for bridges and what runs under buildings."""
+    houses = standing[shapely.area(standing) > _HOUSE]
+    over = np.flatnonzero(area.near & (lanes.graph.bridge | lanes.graph.tunnel))
+    free = shapely.buffer(area.lines[over], lanes.graph.width[over] / 2 * area.scale)
+    whole = shapely.union(shapely.difference(road, shapely.union_all(houses)), shapely.union_all(free))
+    shapely.prepare(whole)
+    return whole
+
+
+def _swept(trips: list[Trip]) -> NDArray[np.object_]:
+    """Boxes of movers along their ways, with some room."""
+    parts = [np.empty(0, object)]
+    for trip in trips:
+        xy, heading = body_poses(trip.way, trip.axle)
+        every = slice(0, None, 2 if trip.walks else 4)
+        parts.append(rectangles(xy[every], heading[every], max(trip.length, 1.0) + 0.5, trip.width + 0.3))
+    return np.concatenate(parts)
+
+
+def _strips(lanes: Lanes, area: Area) -> NDArray[np.object_]:
+    """Lanes around the ego's way as wide as a car."""
+    lines = [
+        beside(lanes.graph.geometry[e], -lanes.side * lane_shift(lanes, e, lane, 1.82))[:, :2]
+        for e in np.flatnonzero(area.near & (lanes.liking > 0)).tolist()
+        for lane in range(int(lanes.count[e]))
+    ]
+    strips: NDArray[np.object_] = shapely.buffer(
+        [shapely.linestrings(xy) for xy in lines], 1.0, cap_style="flat"
+    )
+    return strips
+
+
+def _ego_boxes(ego: Trajectory, vehicle: Vehicle, scale: float) -> NDArray[np.object_]:
+    """Boxes of the ego vehicle along its way, grown by what is kept from it."""
+    moved = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ego.position[:, :2], axis=0).T))])
+    rows = np.unique(np.searchsorted(moved, np.arange(0.0, moved[-1] + 1.0, 1.0)).clip(0, len(moved) - 1))
+    poses = ego.at(ego.time_ns[rows])
+    forward = poses.rotation[:, :2, 0]
+    middle = poses.position[:, :2] + scale * forward * (vehicle.length / 2 - vehicle.rear_overhang)
+    heading = np.arctan2(forward[:, 1], forward[:, 0])
+    return rectangles(middle, heading, vehicle.length + 1.2, vehicle.width + 0.5)
+
+
+def _layer(scene: Scene, name: str) -> Layer | None:
+    try:
+        return read_layer(scene.path / "features.gpkg", name, scene.frame)
+    except SceneFormatError:
+        return None  # a scene without such features has no such layer
+
+
+def _polygons(layer: Layer | None, classes: tuple[str, ...], area: shapely.Geometry) -> NDArray[np.object_]:
+    """Polygons of some classes that touch an area."""
+    if layer is None:
+        return np.empty(0, object)
+    kept = layer.geometry[np.isin(layer.columns["class"].astype(str), classes)]
+    parts: NDArray[np.object_] = shapely.get_parts(kept[shapely.intersects(area, kept)])
+    return parts
+
+
+def _union(
+    layer: Layer | None, classes: tuple[str, ...], area: shapely.Geometry, grow: float
+) -> shapely.Geometry | None:
+    """Surfaces of some classes around an area as one, grown; None where there are none."""
+    parts = _polygons(layer, classes, area)
+    if not len(parts):
+        return None
+    whole = shapely.buffer(shapely.union_all(parts), grow)
+    shapely.prepare(whole)
+    return whole
+
+
+def _standing(scene: Scene, area: shapely.Geometry) -> NDArray[np.object_]:
+    """Footprints in an area of buildings that reach down to the ground, of posts, trunks and the like."""
+    parts: list[NDArray[np.object_]] = [np.empty(0, object)]
+    buildings = _layer(scene, "buildings")
+    if buildings is not None:
+        low = np.asarray(buildings.columns["min_height"], float)
+        parts.append(buildings.geometry[low < _HEADROOM])
+    for i, j in scene.tile_indices:
+        corner = np.array([i, j]) * scene.tile_size
+        if shapely.intersects(area, shapely.box(*corner, *(corner + scene.tile_size))):
+            tile = scene.tile(i, j)
+            posts = tile.instances.transform[:, :2, 3] + tile.origin[:2]
+            parts.append(shapely.buffer(shapely.points(posts), _POST))
+    whole = np.concatenate(parts)
+    kept: NDArray[np.object_] = whole[shapely.intersects(area, whole)]
+    return kept

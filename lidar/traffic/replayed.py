@@ -1,0 +1,335 @@
+"""Road users that go as a file of SUMO says."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import edge_lines
+from geoscene.scene import Scene
+from lidar.errors import InputError
+from lidar.geometry.poses import Trajectory
+from lidar.random_streams import generator
+from lidar.rig.vehicle import Vehicle
+from lidar.traffic.area import LEFT
+from lidar.traffic.fcd import Fcd, TrafficFile, read_fcd
+from lidar.traffic.flow import DT
+from lidar.traffic.populate import Company, TrafficOptions, company_of, first_feature, parked_about
+from lidar.traffic.sweep import rectangles
+from lidar.traffic.tracks import tracked
+from lidar.traffic.traffic import MOTOR_SHARES, pick, varied
+from lidar.world.actor_shapes import Shape
+from lidar.world.actors import Actors, alive, joined, states
+
+Float = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_KINDS: dict[str, tuple[str, ...]] = {
+    "passenger": ("sedan", "hatchback", "suv"),
+    "taxi": ("sedan",),
+    "emergency": ("van",),
+    "delivery": ("van",),
+    "truck": ("truck",),
+    "trailer": ("truck",),
+    "bus": ("bus",),
+    "coach": ("bus",),
+    "motorcycle": ("motorcycle",),
+    "moped": ("motorcycle",),
+    "bicycle": ("cyclist",),
+    "pedestrian": ("adult", "small_adult"),
+}
+"""Kinds of bodies of SUMO's classes; cars by their shares of the traffic."""
+_SHORTER = 0.85  # least factor by which a body is made as short as SUMO's
+_JUMP = (2.0, 8.0)  # one who covers more than so many times its way, and metres, between steps was moved
+_SLOW, _FAST = 5.0, 20.0  # m/s that one is taken to be able to go at least, and where the file has no speeds
+_PAUSE = 1.5  # steps between rows beyond which one was away meanwhile
+_ASIDE = (1.0, 2.0)  # metres in a step, and m/s, sideways: a change of lane at one go
+_CHANGE_S = 3.0  # seconds over which such a change is spread
+_NEAR = 12.0  # metres in plan within which the road is that one is on
+_AGAINST = 8.0  # metres that a road counts as farther for running across
+_ROOM = (0.6, 0.3)  # metres that the ego's box is longer and wider than it is to who would touch it
+
+
+def replay(
+    scene: Scene,
+    graph: RoadGraph,
+    ego: Trajectory,
+    vehicle: Vehicle,
+    *,
+    seed: int,
+    options: TrafficFile,
+) -> Actors:
+    """The road users of a file of SUMO around the ego vehicle, and parked vehicles out of their way.
+
+    Between SUMO's steps positions are cubic, never backwards, and headings linear; changes of lane that SUMO
+    makes at one go are spread over three seconds. Whom the ego would touch is left out: those of the file
+    do not know of it. Looks follow from the seed and from SUMO's ids.
+
+    Raises FormatError for a file that is none, InputError if nobody of it comes into the scene or near.
+    """
+    fcd = read_fcd(options.path, net=options.net)
+    others = TrafficOptions(
+        vehicles=0.0, cyclists=0.0, walkers=0.0, parked=options.parked, reach=options.reach, side=options.side
+    )
+    company = company_of(scene, graph, ego, seed=seed, options=others)
+    begin = float(fcd.time.min()) if options.begin is None else options.begin
+    moving = _moving(fcd, begin, scene, graph, ego, vehicle, company, seed=seed)
+    parked = parked_about(scene, ego, vehicle, company, _covered(moving), seed=seed, share=options.parked)
+    return joined([moving, parked], first_feature=first_feature(scene))
+
+
+def _moving(
+    fcd: Fcd,
+    begin: float,
+    scene: Scene,
+    graph: RoadGraph,
+    ego: Trajectory,
+    vehicle: Vehicle,
+    company: Company,
+    *,
+    seed: int,
+) -> Actors:
+    """Those of a file who move in the ego's surroundings."""
+    scale = company.scale
+    front, heading = _in_scene(fcd, scene)
+    shapes, stretch, parts = [], [], []
+    anybody = False
+    for k, name in enumerate(fcd.name):
+        rows = slice(fcd.first[k], fcd.first[k + 1])
+        rng = generator(seed, "traffic", "fcd", name)
+        shape, grow = _body(fcd.vclass[k], float(fcd.length[k]), rng)
+        back = shape.length * grow[0] / 2 * scale if fcd.vclass[k] != "pedestrian" else 0.0
+        time = fcd.time[rows] - begin
+        for run in _runs(time, front[rows], fcd.speed[rows], scale):
+            yaw = np.unwrap(heading[rows][run])
+            middle = front[rows][run] - back * np.column_stack([np.cos(yaw), np.sin(yaw)])
+            track = _sampled(time[run], middle, yaw, ego.duration_ns * 1e-9)
+            anybody |= len(track) > 0 and bool(_inside(track[:, 1:3], scene.bounds).any())
+            for part in _about(track, scene, ego, company.area.reach * scale):
+                shapes.append(shape)
+                stretch.append(grow)
+                parts.append(part)
+    if not parts:
+        raise InputError(_nobody(fcd, begin, anybody=anybody))
+    knots = np.array([len(part) for part in parts], np.int64)
+    step, x, y, yaw, gone = np.concatenate(parts).T
+    speed = np.concatenate([_monotone(np.diff(part[:, 4]) / DT) for part in parts]) / scale
+    middle = np.column_stack([x, y])
+    foot = np.repeat([shape.kind in _KINDS["pedestrian"] for shape in shapes], knots)
+    actors = tracked(
+        scene,
+        shapes,
+        stretch,
+        knots,
+        np.round(step).astype(np.int64),
+        middle,
+        yaw,
+        _hints(graph, middle, yaw, foot),
+        speed=speed,
+        gone=gone / scale,
+        scale=scale,
+    )
+    return _without(actors, _touched(actors, ego, vehicle))
+
+
+def _nobody(fcd: Fcd, begin: float, *, anybody: bool) -> str:
+    """Why a file gave nobody."""
+    if anybody:
+        return "traffic: nobody of the file comes near the ego vehicle; raise reach or choose another route"
+    first, last = float(fcd.time.min()), float(fcd.time.max())
+    if begin >= last or begin < first - 86_400:
+        return f"traffic: begin={begin:g}: the file has seconds {first:g} to {last:g}"
+    lat, lon = float(np.median(fcd.lat)), float(np.median(fcd.lon))
+    return (
+        f"traffic: nobody of the {len(fcd.name)} in the file is in the scene during the drive; they are about"
+        f" {lat:.4f},{lon:.4f}: is the network one of this place?"
+    )
+
+
+def _in_scene(fcd: Fcd, scene: Scene) -> tuple[Float, Float]:
+    """Middles of front bumpers (k, 2) in scene metres, and headings (k,) in radians from the x axis."""
+    front = np.column_stack(scene.frame.from_geographic(fcd.lon, fcd.lat))
+    d = np.column_stack(scene.frame.from_geographic(*fcd.ahead.T)) - front
+    return front, np.arctan2(d[:, 1], d[:, 0])
+
+
+def _body(vclass: str, length: float, rng: np.random.Generator) -> tuple[Shape, tuple[float, float, float]]:
+    """A body of a class, no longer than SUMO's as far as that goes, and its factors."""
+    kinds = _KINDS[vclass]
+    weight = np.cumsum([MOTOR_SHARES.get(kind, 1.0) for kind in kinds])
+    shape = pick(kinds[int(np.searchsorted(weight, rng.random() * weight[-1], side="right"))], rng)
+    x, y, z = varied(rng)
+    if vclass != "pedestrian":
+        x = max(min(x, length / shape.length), _SHORTER)
+    return shape, (x, y, z)
+
+
+def _runs(time: Float, front: Float, speed: Float, scale: float) -> list[slice]:
+    """Rows of one mover between which it moves on its own: not away meanwhile, not put elsewhere."""
+    if len(time) < 2:
+        return []
+    dt = np.diff(time)
+    moved = np.hypot(*np.diff(front, axis=0).T) / scale
+    told = np.maximum(speed[:-1], speed[1:])
+    most = np.where(np.isfinite(told), np.maximum(told, _SLOW), max(_FAST, float(np.median(moved / dt))))
+    cut = (dt > _PAUSE * np.median(dt)) | (moved > _JUMP[0] * most * dt + _JUMP[1]) | (dt <= 0)
+    ends = [0, *(np.flatnonzero(cut) + 1).tolist(), len(time)]
+    return [slice(a, b) for a, b in itertools.pairwise(ends) if b - a > 1]
+
+
+def _sampled(time: Float, middle: Float, yaw: Float, until: float) -> Float:
+    """Rows (k, 5) of step, x, y, yaw and scene metres covered, every `DT` of the drive."""
+    spread, aside = _changes(time, middle, yaw)
+    chord = np.hypot(*np.diff(spread, axis=0).T)
+    slope = chord / np.diff(time)
+    speed = _monotone(slope)
+    velocity = speed[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    first, last = max(int(np.ceil(time[0] / DT - 1e-6)), 0), int(np.floor(min(time[-1], until) / DT + 1e-6))
+    step = np.arange(first, last + 1)
+    if len(step) < 2:
+        return np.empty((0, 5))
+    t = step * DT
+    low = np.clip(np.searchsorted(time, t, side="right") - 1, 0, len(time) - 2)
+    h = (time[low + 1] - time[low])[:, None]
+    w = np.clip((t - time[low])[:, None] / h, 0.0, 1.0)
+    xy = (
+        (1 + 2 * w) * (1 - w) ** 2 * spread[low]
+        + w * (1 - w) ** 2 * h * velocity[low]
+        + w**2 * (3 - 2 * w) * spread[low + 1]
+        - w**2 * (1 - w) * h * velocity[low + 1]
+    )
+    for moment, offset in aside:
+        u = np.clip((t - moment) / _CHANGE_S + 0.5, 0.0, 1.0)
+        xy += (u**3 * (10 - 15 * u + 6 * u**2))[:, None] * offset
+    gone = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    return np.column_stack([step, xy, np.interp(t, time, yaw), gone])
+
+
+def _monotone(slope: Float) -> Float:
+    """Speeds (n + 1,) between those (n,) of even steps, with which a cubic never goes backwards.
+
+    Harmonic means: Fritsch and Butland, "A method for constructing local monotone piecewise cubic
+    interpolants", 1984.
+    """
+    a, b = slope[:-1], slope[1:]
+    middle = np.divide(2 * a * b, a + b, out=np.zeros_like(a), where=(a > 1e-3) & (b > 1e-3))
+    return np.concatenate([slope[:1], middle, slope[-1:]])
+
+
+def _changes(time: Float, middle: Float, yaw: Float) -> tuple[Float, list[tuple[float, Float]]]:
+    """The middles (n, 2) without changes of lane at one go, and those: second of its middle, and offset."""
+    d, dt = np.diff(middle, axis=0), np.diff(time)
+    mean = (yaw[:-1] + yaw[1:]) / 2
+    left = np.column_stack([-np.sin(mean), np.cos(mean)])
+    sideways = (d * left).sum(axis=1)
+    straight = np.abs(np.diff(yaw)) < np.radians(15.0)
+    rows = np.flatnonzero(straight & (np.abs(sideways) > np.maximum(_ASIDE[0], _ASIDE[1] * dt)))
+    out = middle.copy()
+    found = []
+    for k in rows.tolist():
+        offset = sideways[k] * left[k]
+        out[k + 1 :] -= offset
+        found.append((float(time[k] + time[k + 1]) / 2, offset))
+    return out, found
+
+
+def _inside(xy: Float, bounds: tuple[float, float, float, float]) -> NDArray[np.bool_]:
+    return np.asarray(((xy >= bounds[:2]) & (xy <= bounds[2:])).all(axis=1), np.bool_)
+
+
+def _about(track: Float, scene: Scene, ego: Trajectory, reach: float) -> list[Float]:
+    """Parts of a track on the map that come within reach of the ego, from there to where they leave it."""
+    if not len(track):
+        return []
+    at = ego.at(np.round(track[:, 0] * DT * 1e9).astype(np.int64).clip(max=ego.duration_ns)).position[:, :2]
+    away = np.hypot(*(track[:, 1:3] - at).T)
+    here = _inside(track[:, 1:3], scene.bounds) & (away <= reach + LEFT)
+    cuts = np.flatnonzero(np.diff(np.concatenate([[False], here, [False]]).astype(int)))
+    return [
+        track[a:b]
+        for a, b in zip(cuts[::2].tolist(), cuts[1::2].tolist(), strict=True)
+        if b - a > 1 and away[a:b].min() <= reach
+    ]
+
+
+def _hints(graph: RoadGraph, xy: Float, yaw: Float, foot: NDArray[np.bool_]) -> Float:
+    """Height (n,) of the road that each place is on, NaN where there is none: the nearest that runs that way.
+
+    foot : who goes in any direction
+    """
+    lines = edge_lines(graph)
+    points = shapely.points(xy)
+    row, edge = shapely.STRtree(lines).query(points, predicate="dwithin", distance=_NEAR)
+    out = np.full(len(xy), np.nan)
+    if not len(row):
+        return out
+    along = shapely.line_locate_point(lines[edge], points[row])
+    length = shapely.length(lines[edge])
+    a, b = (
+        shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], np.clip(along + d, 0, length)))
+        for d in (-0.5, 0.5)
+    )
+    course = np.arctan2(*(b - a).T[::-1])
+    cost = shapely.distance(lines[edge], points[row])
+    cost += np.where(foot[row], 0.0, _AGAINST / 2 * (1 - np.cos(yaw[row] - course)))
+    solid = np.array([shapely.linestrings(line) for line in graph.geometry], object)
+    share = np.divide(along, length, out=np.zeros_like(along), where=length > 0)
+    z = shapely.get_z(shapely.line_interpolate_point(solid[edge], share, normalized=True))
+    order = np.lexsort((-cost, row))
+    out[row[order]] = z[order]
+    return out
+
+
+def _touched(actors: Actors, ego: Trajectory, vehicle: Vehicle) -> Ints:
+    """Actors whose box the ego's touches at some time."""
+    hit: list[Ints] = []
+    scale = actors.scale
+    length, width = (size + room for size, room in zip((vehicle.length, vehicle.width), _ROOM, strict=True))
+    for t in range(0, ego.duration_ns + 1, round(DT * 1e9)):
+        pose = ego.at([t])
+        forward = pose.rotation[0, :2, 0]
+        rows = alive(actors, t, t)
+        at = states(actors, rows, t)
+        near = (
+            np.hypot(*(at.position[:, :2] - pose.position[0, :2]).T) < (actors.size[rows, 0] + 10.0) * scale
+        )
+        near &= np.abs(at.position[:, 2] - pose.position[0, 2]) < 3.0
+        if not near.any():
+            continue
+        middle = pose.position[0, :2] + scale * forward * (vehicle.length / 2 - vehicle.rear_overhang)
+        own = rectangles(middle[None], np.arctan2(forward[1:], forward[:1]), length * scale, width * scale)[0]
+        size = actors.size[rows[near]] * scale
+        boxes = rectangles(at.position[near, :2], at.angles[near, 0], size[:, 0], size[:, 1])
+        hit.append(rows[near][shapely.intersects(boxes, own)])
+    return np.unique(np.concatenate(hit)) if hit else np.empty(0, np.int64)
+
+
+def _without(actors: Actors, rows: Ints) -> Actors:
+    """The actors less some of them."""
+    keep = np.ones(len(actors), bool)
+    keep[rows] = False
+    knots = np.diff(actors.first)
+    kept = np.repeat(keep, knots)
+    each = ("shape", "poses", "stride", "kind", "klass", "size", "stretch", "parked", "feature")
+    every = ("time_ns", "position", "angles", "velocity", "gone")
+    return replace(
+        actors,
+        **{name: getattr(actors, name)[keep] for name in each},
+        **{name: getattr(actors, name)[kept] for name in every},
+        first=np.concatenate([[0], np.cumsum(knots[keep])]).astype(np.int64),
+    )
+
+
+def _covered(actors: Actors) -> NDArray[np.object_]:
+    """What actors cover as they go, with some room: a box every fifth knot."""
+    owner = np.repeat(np.arange(len(actors)), np.diff(actors.first))[::5]
+    size = actors.size[owner] * actors.scale
+    room = np.hypot(*actors.velocity[::5, :2].T) * DT * 5
+    return rectangles(
+        actors.position[::5, :2], actors.angles[::5, 0], size[:, 0] + room + 0.5, size[:, 1] + 0.3
+    )

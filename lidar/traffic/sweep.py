@@ -1,0 +1,122 @@
+"""The ground that a moving body covers, as squares of a grid with the stations at which it covers them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from lidar.traffic.lanes import STEP, Way
+
+Float = NDArray[np.float64]
+
+SQUARE = 0.3
+"""Metres of a square's side. Two bodies that share no square do not touch: squares are taken whose middle
+lies within half a diagonal of the body."""
+_MANY = 1 << 30  # squares along a side of the grid: 322,000 km
+_SPARE = 0.05 + SQUARE * math.sqrt(0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """Squares that a body covers along its way, in the order of ``first``.
+
+    square : (q,) int64, the square's row, column and level as one number
+    first  : (q,) int32, station at which the body begins to cover it
+    last   : (q,) int32, station until which it covers it
+    leave  : (q,) int32, rows of the above in the order of ``last``
+    """
+
+    square: NDArray[np.int64]
+    first: NDArray[np.int32]
+    last: NDArray[np.int32]
+    leave: NDArray[np.int32]
+
+
+def sweep(
+    xy: Float, heading: Float, length: float, width: float, level: NDArray[np.int64], *, scale: float
+) -> Sweep:
+    """What a body of that size covers along a way, a station at a time.
+
+    xy, heading : (n, 2) and (n,) of its middle
+    level : (n,) 0 or 1: bridges and tunnels have squares of their own
+    scale : scene metres per true metre
+    """
+    # a body between two stations lies within both, grown by half a step
+    half = np.array([length / 2 + STEP / 2, width / 2]) * scale + _SPARE
+    most = int(math.ceil(2 * half[0] / SQUARE) + 2) * int(math.ceil(2 * half[1] / SQUARE) + 2)
+    square, first, last, count = _cover(xy, heading, half, level, most)
+    square, first, last = square[:count], first[:count], last[:count]
+    return Sweep(square, first, last, np.argsort(last, kind="stable").astype(np.int32))
+
+
+def body_poses(way: Way, axle: float) -> tuple[Float, Float]:
+    """Middle (n, 2) and heading (n,) of a body at each station, whose axles stay on the way."""
+    reach = axle / 2 / STEP
+    rows = np.arange(len(way), dtype=float)
+    ends = [np.stack([_extended(way.xyz[:, c], rows + s * reach) for c in (0, 1)], axis=1) for s in (1, -1)]
+    d = ends[0] - ends[1]
+    return (ends[0] + ends[1]) / 2, np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
+
+
+def _extended(values: Float, rows: Float) -> Float:
+    """Values at fractional rows, going on straight beyond the ends."""
+    n = len(values)
+    low = np.clip(np.floor(rows).astype(int), 0, n - 2)
+    out: Float = values[low] + (rows - low) * (values[low + 1] - values[low])
+    return out
+
+
+def rectangles(xy: Float, heading: Float, length: ArrayLike, width: ArrayLike) -> NDArray[np.object_]:
+    """Outlines (n,) in plan of boxes about points (n, 2); length and width one number or (n,)."""
+    forward = np.column_stack([np.cos(heading), np.sin(heading)]) * np.reshape(length, (-1, 1)) / 2
+    left = np.column_stack([-np.sin(heading), np.cos(heading)]) * np.reshape(width, (-1, 1)) / 2
+    corners = [xy + a * forward + b * left for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
+    boxes: NDArray[np.object_] = shapely.polygons(np.stack(corners, axis=1))
+    return boxes
+
+
+@njit(cache=True, nogil=True)
+def squares_under(x: float, y: float, heading: float, half: Any, level: int, out: Any) -> int:
+    """Fill ``out`` with the squares whose middle lies in a rectangle; return their number."""
+    c, s, hl, hw = math.cos(heading), math.sin(heading), half[0], half[1]
+    ex, ey = abs(c) * hl + abs(s) * hw, abs(s) * hl + abs(c) * hw
+    n = 0
+    for j in range(math.ceil((y - ey) / SQUARE - 0.5), math.floor((y + ey) / SQUARE - 0.5) + 1):
+        for i in range(math.ceil((x - ex) / SQUARE - 0.5), math.floor((x + ex) / SQUARE - 0.5) + 1):
+            dx, dy = (i + 0.5) * SQUARE - x, (j + 0.5) * SQUARE - y
+            if abs(dx * c + dy * s) <= hl and abs(dy * c - dx * s) <= hw:
+                out[n] = (level * _MANY + j + _MANY // 2) * _MANY + i + _MANY // 2
+                n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _cover(xy: Any, heading: Any, half: Any, level: Any, most: int) -> Any:
+    """Squares with their first and last stations, by first station."""
+    n = len(xy)
+    square = np.empty(most + 64 * n, np.int64)
+    first, last = np.empty(len(square), np.int32), np.empty(len(square), np.int32)
+    under = np.empty(most, np.int64)
+    seen = {np.int64(-1): 0}  # row of each square last seen
+    count = 0
+    for k in range(n):
+        found = squares_under(xy[k, 0], xy[k, 1], heading[k], half, level[k], under)
+        if count + found > len(square):
+            square = np.concatenate((square, np.empty_like(square)))
+            first, last = np.concatenate((first, first)), np.concatenate((last, last))
+        for m in range(found):
+            p = under[m]
+            row = seen[p] if p in seen else -1  # noqa: SIM401  (numba's would be optional)
+            if row >= 0 and last[row] == k - 1:
+                last[row] = k
+            else:
+                square[count], first[count], last[count] = p, k, k
+                seen[p] = count
+                count += 1
+    return square, first, last, count

@@ -1,0 +1,222 @@
+"""From what moved along ways to actors with tracks on the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.scene import Scene
+from lidar.traffic.flow import DT, Flow
+from lidar.traffic.ground import ground_heights
+from lidar.traffic.lanes import STEP
+from lidar.traffic.sweep import body_poses
+from lidar.traffic.traffic import Trip
+from lidar.world.actor_shapes import STRIDE, Shape, catalogue
+from lidar.world.actors import Actors
+
+Float = NDArray[np.float64]
+
+_POSES = {"cyclist": STRIDE, "adult": STRIDE, "small_adult": STRIDE, "child": STRIDE}
+_STRIDE = {"cyclist": 5.6, "adult": 1.45, "small_adult": 1.35, "child": 1.05}
+"""Metres in a stride of two steps, and in a turn of a bicycle's pedals: typical."""
+
+_UPRIGHT = ("adult", "small_adult", "child")
+_LEANING = ("cyclist", "motorcycle", "bicycle")
+_TRACK = 0.8  # metres between wheels for each of width
+_SKY = 1e4  # metres above and below zero between which the ground lies
+_STEP_UP = 0.5  # metres by which the ground under a wheel may differ from that under the middle
+_STEEP, _BANKED = 0.3, 0.15  # radians
+
+
+def table(
+    shapes: Sequence[Shape],
+    stretch: ArrayLike,
+    knots: NDArray[np.int64],
+    time_ns: NDArray[np.int64],
+    position: Float,
+    angles: Float,
+    velocity: Float,
+    gone: Float,
+    *,
+    parked: bool,
+    scale: float,
+) -> Actors:
+    """Actors (n) of bodies; ``knots`` (n) is how many knots each has. Features are left at zero."""
+    known = catalogue()
+    names: dict[str, int] = {}
+    first = []
+    for shape in shapes:
+        count = 1 if parked else _POSES.get(shape.kind, 1)
+        stem = shape.name.rsplit("/", 1)[0] if count > 1 else ""
+        wanted = [f"{stem}/{k}" for k in range(count)] if count > 1 else [shape.name]
+        for name in wanted:
+            names.setdefault(name, len(names))
+        first.append(names[wanted[0]])
+    grow = np.reshape(np.asarray(stretch, float), (-1, 3))
+    size = np.array([[s.length, s.width, s.height] for s in shapes]).reshape(-1, 3) * grow
+    kinds = [s.kind for s in shapes]
+    return Actors(
+        shapes=tuple(known[name] for name in names),
+        shape=np.array(first, np.int32),
+        poses=np.array([1 if parked else _POSES.get(k, 1) for k in kinds], np.int32),
+        stride=np.array([_STRIDE.get(k, 1.0) for k in kinds], float),
+        kind=np.array(kinds, np.str_),
+        klass=np.array([int(s.klass) for s in shapes], np.uint8),
+        size=size,
+        stretch=grow,
+        parked=np.full(len(kinds), parked),
+        feature=np.zeros(len(kinds), np.int32),
+        first=np.concatenate([[0], np.cumsum(knots)]).astype(np.int64),
+        time_ns=time_ns.astype(np.int64),
+        position=position.reshape(-1, 3),
+        angles=angles.reshape(-1, 3),
+        velocity=velocity.reshape(-1, 3),
+        gone=gone,
+        scale=scale,
+    )
+
+
+def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: float) -> Actors:
+    """Actors of the trips that took place."""
+    present, counts = np.unique(flow.trip, return_counts=True)
+    ends = np.concatenate([[0], np.cumsum(counts)])
+    n = len(flow.trip)
+    middle, yaw, hint = np.empty((n, 2)), np.empty(n), np.empty(n)
+    for k, row in enumerate(present.tolist()):
+        trip, part = trips[row], slice(ends[k], ends[k + 1])
+        at = flow.gone[part] / STEP
+        xy, heading = body_poses(trip.way, trip.axle)
+        stations = np.arange(len(xy))
+        middle[part] = np.stack([np.interp(at, stations, xy[:, c]) for c in (0, 1)], axis=1)
+        yaw[part] = np.interp(at, stations, heading)
+        hint[part] = np.interp(at, stations, trip.way.xyz[:, 2])
+    return tracked(
+        scene,
+        [trips[row].shape for row in present],
+        [trips[row].stretch for row in present],
+        counts,
+        flow.step,
+        middle,
+        yaw,
+        hint,
+        speed=flow.speed,
+        gone=flow.gone,
+        scale=scale,
+    )
+
+
+def tracked(
+    scene: Scene,
+    shapes: Sequence[Shape],
+    stretch: Sequence[tuple[float, float, float]],
+    knots: NDArray[np.int64],
+    step: NDArray[np.int64],
+    middle: Float,
+    yaw: Float,
+    hint: Float,
+    *,
+    speed: Float,
+    gone: Float,
+    scale: float,
+) -> Actors:
+    """Actors (n) that go along tracks in plan, put on the scene's ground.
+
+    knots        : (n,) how many each has of the following (k) rows, which are `DT` apart
+    step         : (k,) `DT` since the drive's start
+    middle, yaw  : (k, 2) scene metres and (k,) radians, unwrapped
+    hint         : (k,) height near which the ground is; NaN to take the topmost
+    speed, gone  : (k,) m/s and metres covered
+    """
+    ends = np.concatenate([[0], np.cumsum(knots)])
+    axle = np.repeat([s.base * g[0] for s, g in zip(shapes, stretch, strict=True)], knots)
+    track = np.repeat([_TRACK * s.width * g[1] for s, g in zip(shapes, stretch, strict=True)], knots)
+    z, pitch, roll, _ = standing(scene, middle, yaw, hint, axle=axle, track=track, scale=scale)
+    course, climb = np.empty(len(z)), np.empty(len(z))
+    for k, shape in enumerate(shapes):
+        part = slice(ends[k], ends[k + 1])
+        course[part] = _course(middle[part], yaw[part])
+        for column in (z, pitch, roll):
+            column[part] = _settled(column[part], gone[part])
+        pitch[part] *= shape.kind not in _UPRIGHT
+        roll[part] *= shape.kind not in _UPRIGHT and shape.kind not in _LEANING
+        climb[part] = _rate(z[part])
+    v = speed * scale
+    return table(
+        shapes,
+        stretch,
+        knots,
+        np.round(step * DT * 1e9).astype(np.int64),
+        np.column_stack([middle, z]),
+        np.column_stack([yaw, pitch, roll]),
+        np.column_stack([v * np.cos(course), v * np.sin(course), climb]),
+        gone,
+        parked=False,
+        scale=scale,
+    )
+
+
+def standing(
+    scene: Scene, middle: Float, yaw: Float, hint: Float, *, axle: Float, track: Float, scale: float
+) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
+    """Height (n,), pitch (nose down positive) and roll of bodies that stand on the ground on four wheels.
+
+    The last column says whether there is ground under the middle and under each wheel.
+
+    middle, yaw : (n, 2) scene metres and (n,) radians
+    hint        : (n,) height near which the ground is; NaN to take the topmost
+    axle, track : (n,) true metres between axles and between wheels
+
+    Wheels that would hang over an edge are taken to stand as high as the middle, and the middle where there
+    is no ground as high as the hint.
+    """
+    known = np.isfinite(hint)
+    points = np.column_stack([middle, np.where(known, hint, 0.0)])
+    under = np.empty(len(points))
+    under[known] = ground_heights(scene, points[known])
+    under[~known] = ground_heights(scene, points[~known], above=_SKY, below=_SKY)
+    sound = np.isfinite(under)
+    points[sound, 2] = under[sound]
+    c, s = np.cos(yaw) * scale / 2, np.sin(yaw) * scale / 2
+    z = np.empty((len(points), 2, 2))
+    for a, fore in enumerate((1, -1)):
+        for b, left in enumerate((1, -1)):
+            wheel = points.copy()
+            wheel[:, 0] += fore * axle * c - left * track * s
+            wheel[:, 1] += fore * axle * s + left * track * c
+            under = ground_heights(scene, wheel, above=_STEP_UP, below=_STEP_UP)
+            sound &= np.isfinite(under)
+            z[:, a, b] = np.where(np.isfinite(under), under, points[:, 2])
+    pitch = np.arctan2(z[:, 1].mean(axis=1) - z[:, 0].mean(axis=1), axle)
+    roll = np.arctan2(z[:, :, 0].mean(axis=1) - z[:, :, 1].mean(axis=1), track)
+    steep = (np.abs(pitch) > _STEEP) | (np.abs(roll) > _BANKED)
+    height = np.where(steep, points[:, 2], z.mean(axis=(1, 2)))
+    return height, np.clip(pitch, -_STEEP, _STEEP), np.clip(roll, -_BANKED, _BANKED), sound & ~steep
+
+
+def _rate(values: Float) -> Float:
+    """Change of values at knots `DT` apart, per second."""
+    rate: Float = np.gradient(values, DT) if len(values) > 1 else np.zeros(len(values))
+    return rate
+
+
+def _course(middle: Float, yaw: Float) -> Float:
+    """Direction (n,) in which the middle moves: along the track, and along the body where it stands."""
+    d = np.gradient(middle, axis=0) if len(middle) > 1 else np.zeros_like(middle)
+    moves = np.hypot(*d.T) > 0.02
+    course: Float = np.where(moves, np.arctan2(d[:, 1], d[:, 0]), yaw)
+    return course
+
+
+def _settled(values: Float, gone: Float) -> Float:
+    """Values at metres ``gone``, averaged over a metre: tyres and springs take steps softly."""
+    if len(values) < 2 or gone[-1] - gone[0] < 0.5:
+        return np.full(len(values), values.mean()) if len(values) else values
+    even = np.arange(gone[0] - 1.0, gone[-1] + 1.0, 0.25)
+    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
+
+    smooth: Float = np.interp(
+        gone, even, gaussian_filter1d(np.interp(even, gone, values), 3.0, mode="nearest")
+    )
+    return smooth

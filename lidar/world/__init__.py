@@ -1,0 +1,1 @@
+"""What rays can meet: the static scene and the road users in it."""

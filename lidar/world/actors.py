@@ -1,0 +1,220 @@
+"""Everything that moves or stands about besides the ego vehicle, as columns, and where it is at any time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.mesh import Mesh
+from lidar.world.actor_shapes import Shape
+
+Float = NDArray[np.float64]
+Region = tuple[float, float, float, float]
+
+_AGE = 1 << 50
+"""Nanoseconds between the time axes of two actors laid end to end: 13 days."""
+
+
+@dataclass(frozen=True, slots=True)
+class Actors:
+    """Actors, one row each, and the knots of their tracks.
+
+    shapes  : the bodies in use
+    shape   : (n,) int32 body of each actor; of a walker or rider the first pose
+    poses   : (n,) int32 poses that its body goes through as it moves: bodies from ``shape`` on
+    stride  : (n,) metres that it moves in one round of its poses
+    kind    : (n,) str, of `lidar.world.actor_shapes.KINDS`
+    klass   : (n,) uint8, `geoscene.classes.Class`
+    size    : (n, 3) metres: length, width and height of its box
+    stretch : (n, 3) factors along x, y and z from the body's size to the actor's
+    parked  : (n,) bool, it never moves
+    feature : (n,) int32, beyond the scene's own numbers: what points and pixels of the actor bear
+    first   : (n + 1,) int64 rows of the knots below
+
+    Knots, a few or many for each actor, times rising; an actor is there from its first to its last knot, one
+    that is parked always:
+
+    time_ns  : (k,) int64, nanoseconds since the drive's start
+    position : (k, 3) scene metres, the middle of the box, on the ground
+    angles   : (k, 3) radians: yaw from the x axis (unwrapped), pitch (nose down positive), roll
+    velocity : (k, 3) scene metres a second
+    gone     : (k,) metres covered
+    scale    : scene metres per true metre
+    """
+
+    shapes: tuple[Shape, ...]
+    shape: NDArray[np.int32]
+    poses: NDArray[np.int32]
+    stride: Float
+    kind: NDArray[np.str_]
+    klass: NDArray[np.uint8]
+    size: Float
+    stretch: Float
+    parked: NDArray[np.bool_]
+    feature: NDArray[np.int32]
+    first: NDArray[np.int64]
+    time_ns: NDArray[np.int64]
+    position: Float
+    angles: Float
+    velocity: Float
+    gone: Float
+    scale: float
+
+    def __len__(self) -> int:
+        """Number of actors."""
+        return len(self.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class States:
+    """Actors at one moment each.
+
+    position : (k, 3) scene metres, middle of the box, on the ground
+    angles   : (k, 3) yaw, pitch, roll in radians
+    velocity : (k, 3) scene metres a second
+    gone     : (k,) metres covered
+    """
+
+    position: Float
+    angles: Float
+    velocity: Float
+    gone: Float
+
+
+def alive(actors: Actors, start_ns: int, end_ns: int) -> NDArray[np.int64]:
+    """Actors (k,) that are there at some time of a span."""
+    begin = actors.time_ns[actors.first[:-1]]
+    end = actors.time_ns[actors.first[1:] - 1]
+    return np.flatnonzero(actors.parked | ((begin <= end_ns) & (end >= start_ns)))
+
+
+def states(actors: Actors, rows: ArrayLike, time_ns: ArrayLike) -> States:
+    """Where actors (k,) are at times (k,); held at the ends of their tracks.
+
+    Cubic between knots in position (Hermite, with the knots' velocities), linear in angles.
+    """
+    which = np.asarray(rows, np.int64)
+    t = np.broadcast_to(np.asarray(time_ns, np.int64), which.shape)
+    first, last = actors.first[which], actors.first[which + 1] - 1
+    axis = actors.time_ns + _AGE * np.repeat(np.arange(len(actors)), np.diff(actors.first))
+    t = np.clip(t, actors.time_ns[first], actors.time_ns[last])
+    low = np.clip(
+        np.searchsorted(axis, t + _AGE * which, side="right") - 1, first, np.maximum(last - 1, first)
+    )
+    high = np.minimum(low + 1, last)
+    span = np.maximum(actors.time_ns[high] - actors.time_ns[low], 1) * 1e-9
+    w = ((t - actors.time_ns[low]) * 1e-9 / span)[:, None]
+    h = span[:, None]
+    p0, p1, v0, v1 = actors.position[low], actors.position[high], actors.velocity[low], actors.velocity[high]
+    position = (
+        (1 + 2 * w) * (1 - w) ** 2 * p0
+        + w * (1 - w) ** 2 * h * v0
+        + w**2 * (3 - 2 * w) * p1
+        - w**2 * (1 - w) * h * v1
+    )
+    velocity = 6 * w * (1 - w) * (p1 - p0) / h + (1 - w) * (1 - 3 * w) * v0 + w * (3 * w - 2) * v1
+    return States(
+        position,
+        actors.angles[low] + w * (actors.angles[high] - actors.angles[low]),
+        velocity,
+        actors.gone[low] + w[:, 0] * (actors.gone[high] - actors.gone[low]),
+    )
+
+
+def velocities(actors: Actors, time_ns: int) -> Float:
+    """Velocities (n, 3) of all actors at a time, scene metres a second."""
+    return states(actors, np.arange(len(actors)), time_ns).velocity
+
+
+def rotations(angles: Float) -> Float:
+    """Scene axes from body axes (k, 3, 3) for yaw, pitch and roll (k, 3): turned about z, then y, then x."""
+    (cy, cp, cr), (sy, sp, sr) = np.cos(angles).T, np.sin(angles).T
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def actor_shapes(actors: Actors) -> list[Mesh]:
+    """The bodies, for ``World.load(..., actors=...)``."""
+    return [shape.mesh for shape in actors.shapes]
+
+
+def poses_of(actors: Actors, rows: NDArray[np.int64], at: States) -> NDArray[np.int32]:
+    """Bodies (k,) of actors in their states: walkers and riders take the pose of their stride."""
+    step = at.gone / actors.stride[rows] * actors.poses[rows]
+    shape: NDArray[np.int32] = actors.shape[rows] + step.astype(np.int32) % actors.poses[rows]
+    return shape
+
+
+def actor_transforms(
+    actors: Actors,
+    start_ns: int,
+    end_ns: int,
+    *,
+    region: Region | None = None,
+    moments: int = 3,
+    which: Literal["all", "moving", "parked"] = "all",
+) -> tuple[NDArray[np.int32], Float, NDArray[np.int32]]:
+    """Bodies (k,), transforms (k, moments, 3, 4) and features (k,) over a span, for `World.place_actors`.
+
+    start_ns, end_ns : the times that ray times 0 and 1 stand for
+    region  : (xmin, ymin, xmax, ymax) outside which actors are left out
+    which   : those that ever move, those that never do, or all
+    moments : poses within the span; a car that turns at 0.5 rad/s is off by 0.1 mm between three in 0.1 s
+    """
+    rows = alive(actors, start_ns, end_ns)
+    if which != "all":
+        rows = rows[actors.parked[rows] == (which == "parked")]
+    times = np.linspace(start_ns, end_ns, moments).astype(np.int64)
+    k = len(rows)
+    at = states(actors, np.repeat(rows, moments), np.tile(times, k))
+    turn = rotations(at.angles) * actors.stretch[np.repeat(rows, moments), None, :]
+    turn[:, :2] *= actors.scale
+    transform = np.concatenate([turn, at.position[:, :, None]], axis=2).reshape(k, moments, 3, 4)
+    shape = poses_of(actors, rows, States(*(getattr(at, f.name)[::moments] for f in fields(States))))
+    if region is not None:
+        x, y = transform[:, 0, :2, 3].T
+        reach = actors.size[rows, 0]
+        near = (
+            (x > region[0] - reach)
+            & (x < region[2] + reach)
+            & (y > region[1] - reach)
+            & (y < region[3] + reach)
+        )
+        shape, transform, rows = shape[near], transform[near], rows[near]
+    return shape.astype(np.int32), transform, actors.feature[rows]
+
+
+def joined(groups: Sequence[Actors], *, first_feature: int) -> Actors:
+    """Actors of several groups as one, features numbered from ``first_feature``."""
+    shapes: dict[str, Shape] = {}
+    for group in groups:
+        shapes |= {shape.name: shape for shape in group.shapes}
+    number = {name: k for k, name in enumerate(shapes)}
+    columns = {
+        name: np.concatenate([getattr(g, name) for g in groups])
+        for name in ("poses", "stride", "kind", "klass", "size", "stretch", "parked",
+                     "time_ns", "position", "angles", "velocity", "gone")
+    }  # fmt: skip
+    shape = np.concatenate(
+        [
+            np.array([number[s.name] for s in g.shapes], np.int32)[g.shape] if len(g) else g.shape
+            for g in groups
+        ]
+    )
+    knots = np.concatenate([np.diff(g.first) for g in groups])
+    return Actors(
+        shapes=tuple(shapes.values()),
+        shape=shape,
+        feature=(first_feature + np.arange(len(shape))).astype(np.int32),
+        first=np.concatenate([[0], np.cumsum(knots)]).astype(np.int64),
+        scale=groups[0].scale,
+        **columns,
+    )

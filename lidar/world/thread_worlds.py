@@ -1,0 +1,55 @@
+"""The world of a frame: the static scene, and the actors where they are during it."""
+
+from __future__ import annotations
+
+import threading
+
+from geoscene.scene import Scene
+from lidar.world.actors import Actors, actor_shapes, actor_transforms
+from lidar.world.world import Region, World
+
+
+class Worlds:
+    """Worlds for the threads of a drive: one for all where nothing moves, else one each.
+
+    scene  : what stands still
+    margin : reach of the sensors, metres
+    actors : what moves; none by default
+    """
+
+    def __init__(self, scene: Scene, margin: float, actors: Actors | None = None) -> None:
+        self.scene = scene
+        self.margin = margin
+        self.actors = actors if actors is not None and len(actors) else None
+        self._region: Region | None = None
+        self._shared: World | None = None
+        self._own = threading.local()
+
+    def follow(self, region: Region) -> None:
+        """Move on to another region; to be called while no thread uses a world."""
+        self._region = region
+        if self.actors is None:
+            self._shared = self._moved(self._shared, region)
+
+    def during(self, start_ns: int, end_ns: int) -> World:
+        """The world of this thread until its next call; ray times 0 and 1 are ``start_ns`` and ``end_ns``."""
+        if self._shared is not None:
+            return self._shared
+        region = self._region
+        assert region is not None, "follow comes before during"  # noqa: S101
+        world: World | None = getattr(self._own, "world", None)
+        if world is None or self._own.region != region:
+            world = self._moved(world, region)
+            self._own.world, self._own.region = world, region
+        if self.actors is not None:
+            m = self.margin
+            around = (region[0] - m, region[1] - m, region[2] + m, region[3] + m)
+            world.place_actors(*actor_transforms(self.actors, start_ns, end_ns, region=around))
+        return world
+
+    def _moved(self, world: World | None, region: Region) -> World:
+        if world is None:
+            shapes = actor_shapes(self.actors) if self.actors is not None else ()
+            return World.load(self.scene, region=region, margin=self.margin, actors=shapes)
+        world.follow(region)
+        return world

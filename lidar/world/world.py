@@ -1,0 +1,286 @@
+"""The scene around a vehicle as rays see it: static tiles that come and go, actors that move."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class, materials
+from geoscene.mesh import Mesh
+from geoscene.objects.shapes import LEAF_AREA_DENSITY
+from geoscene.scene import Scene
+from lidar.errors import InputError
+from lidar.raycast import Caster, Geometry, Hits, Instances
+from lidar.raycast.geometry import split
+
+Float = NDArray[np.float64]
+Region = tuple[float, float, float, float]
+
+SOLID, GLASS, FOLIAGE, WATER = 1, 2, 4, 8
+"""Mask bits of a world's faces, by material: cast with ``mask=ALL & ~GLASS`` to look through windows."""
+
+_SEEN_THROUGH = {"glass": GLASS, "foliage": FOLIAGE, "conifer": FOLIAGE, "water": WATER}
+_OVERHANG = 50.0  # metres by which a building may stand out of the tile it belongs to and still be loaded
+_GRID = 2048.0  # metres between the origins that float32 coordinates may be relative to
+_PARTS = 8  # numbers a tile has for its parts, one for each mask
+
+
+@dataclass(frozen=True, slots=True)
+class Surfaces:
+    """What rays hit, one row a ray; a miss has feature -1 and zero elsewhere.
+
+    feature  : (n,) int32, feature number of the scene, or of the actor
+    klass    : (n,) uint8, code of `geoscene.classes.Class`
+    material : (n,) uint8, code of `geoscene.classes.Material`
+    surface  : (n,) uint8, OTHER, WALL, ROOF or FLOOR of `geoscene.mesh`
+    color    : (n, 3) uint8, sRGB
+    """
+
+    feature: NDArray[np.int32]
+    klass: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    surface: NDArray[np.uint8]
+    color: NDArray[np.uint8]
+
+
+class Faces(NamedTuple):
+    """What the faces of a world are, for compiled code.
+
+    A hit is on row ``face + start[instance]`` of ``what``, a miss (both -1) on its last.
+
+    start : (k + 1,) int64, first row of each instance's shape; the last is 0, the caster's own mesh
+    named : (k,) int32, feature number of each instance
+    what  : (m,) int64, feature << 32 | kind of leaves << 16 | class << 8 | material
+    low, high : bounds of all feature numbers
+    leaves : (l,) float64, m2/m3, leaf area per volume behind a face by its kind of leaves; 0 for kind 0, none
+    """
+
+    start: NDArray[np.int64]
+    named: NDArray[np.int32]
+    what: NDArray[np.int64]
+    low: int
+    high: int
+    leaves: Float
+
+
+def packed(surfaces: Surfaces, leaves: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
+    """The column `Faces.what` of surfaces and of their kinds of leaves (none by default)."""
+    what = surfaces.feature.astype(np.int64) << 32
+    if leaves is not None:
+        what |= leaves.astype(np.int64) << 16
+    what |= surfaces.klass.astype(np.int64) << 8
+    what |= surfaces.material
+    return what
+
+
+def _surfaces(mesh: Mesh) -> Surfaces:
+    return Surfaces(mesh.feature, mesh.klass, mesh.material, mesh.surface, mesh.color)
+
+
+_MISS = Surfaces(
+    np.full(1, -1, np.int32),
+    np.zeros(1, np.uint8),
+    np.zeros(1, np.uint8),
+    np.zeros(1, np.uint8),
+    np.zeros((1, 3), np.uint8),
+)
+
+
+def _bits(material: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Mask bits of materials."""
+    table = np.full(256, SOLID, np.uint32)
+    known = materials()
+    for name, bit in _SEEN_THROUGH.items():
+        table[known[name].code] = bit
+    return table[material]
+
+
+def _shape(mesh: Mesh) -> Caster:
+    return Caster(mesh.vertices, mesh.faces, mask=_bits(mesh.material))
+
+
+@dataclass(frozen=True, slots=True)
+class _Tile:
+    """A loaded tile: its parts by number, what its faces are, and its copies of shapes in scene metres."""
+
+    parts: Mapping[int, Geometry]
+    surfaces: Surfaces
+    shape: NDArray[np.int32]
+    transform: Float
+    feature: NDArray[np.int32]
+
+
+class World:
+    """The part of a scene that rays can reach; coordinates are scene metres.
+
+    ``world.caster`` casts the rays (see `lidar.raycast.Caster`), `lookup` says what they hit. `follow` moves
+    the part along and `place_actors` puts moving things into it, both in place: look up hits before either.
+
+    scene  : the scene
+    margin : metres around every region: the reach of the sensors
+    actors : shapes of the things that may move (see `place_actors`), closed, in their own frames
+    """
+
+    def __init__(self, scene: Scene, *, margin: float = 0.0, actors: Sequence[Mesh] = ()) -> None:
+        named = scene.shapes()
+        shapes = list(named.values())
+        self.scene = scene
+        self._names = tuple(named)
+        self._leaves: Mapping[str, float] = scene.manifest.get("leaf_area_density", LEAF_AREA_DENSITY)
+        self.margin = margin
+        self.region: Region | None = None
+        self._shapes = tuple(_shape(mesh) for mesh in shapes)
+        self._actors = tuple(_shape(mesh) for mesh in actors)
+        self._copied = [_surfaces(mesh) for mesh in (*shapes, *actors)]
+        self._tiles: dict[int, _Tile] = {}
+        self._moving: tuple[Instances, NDArray[np.int32]] = _nothing(self._actors)
+        self.caster = Caster(origin=np.zeros(3), dynamic=True)
+        self._lay()
+
+    @classmethod
+    def load(
+        cls, scene: Scene, *, region: Region | None = None, margin: float = 0.0, actors: Sequence[Mesh] = ()
+    ) -> World:
+        """The world of the tiles that touch a region.
+
+        region : (xmin, ymin, xmax, ymax) in scene metres; the whole scene by default
+        margin : metres to add on every side: the reach of the sensors
+        actors : shapes of the things that may move later (see `place_actors`)
+
+        Raises InputError if no tile touches the region.
+        """
+        world = cls(scene, margin=margin, actors=actors)
+        world.follow(scene.bounds if region is None else region)
+        return world
+
+    def follow(self, region: Region) -> None:
+        """Make this the world of another region, in place; tiles of both stay as they are.
+
+        What rays hit depends on the region alone, not on the regions before.
+        """
+        ranks = _touching(self.scene, region, self.margin + _OVERHANG)
+        if not ranks:
+            raise InputError(
+                f"no tile of {self.scene.path} lies in {tuple(round(float(v), 1) for v in region)};"
+                f" the scene covers {self.scene.bounds}"
+            )
+        xmin, ymin, xmax, ymax = region
+        origin = np.array([(xmin + xmax) / 2, (ymin + ymax) / 2, 0.0])
+        origin = np.round(origin / _GRID) * _GRID
+        if not np.array_equal(origin, self.caster.origin):
+            self.caster, self._tiles = Caster(origin=origin, dynamic=True), {}
+        elif ranks == list(self._tiles):
+            self.region = region
+            return
+        old, kept = self._tiles, self._tiles.keys() & set(ranks)
+        self._tiles = {rank: old[rank] if rank in kept else self._read(rank) for rank in ranks}
+        self.region = region
+        self._lay()
+        self.caster.update(
+            detach=[number for rank in old.keys() - kept for number in old[rank].parts],
+            attach={n: p for rank in ranks if rank not in kept for n, p in self._tiles[rank].parts.items()},
+            first={n: self._first[rank] for rank in ranks for n in self._tiles[rank].parts},
+            instances=[self._still, self._moving[0]],
+        )
+
+    def place_actors(self, shape: NDArray[np.int32], transform: Float, feature: NDArray[np.int32]) -> None:
+        """Put actors into this world, in place of those there were; its static part is not built again.
+
+        shape     : (k,) int32, index into the ``actors`` of the world
+        transform : (k, 3, 4) float64, scene from actor; or (k, s, 3, 4) at s >= 2 moments evenly spaced over
+                    the ray times 0 to 1: each ray meets the actor where it is at the ray's own time
+        feature   : (k,) int32, numbers to find in `Surfaces.feature`
+        """
+        self._moving = Instances(self._actors, np.asarray(shape, np.int32), transform), feature
+        self._number()
+        self.caster.update(instances=[self._still, self._moving[0]])
+
+    def lookup(self, hits: Hits) -> Surfaces:
+        """What the rays hit."""
+        rows = hits.face + self._base[hits.instance]
+        found = {f.name: getattr(self._surfaces, f.name)[rows] for f in fields(Surfaces)}
+        copied = np.flatnonzero(hits.instance >= 0)
+        found["feature"][copied] = self._feature[hits.instance[copied]]
+        return Surfaces(**found)
+
+    @property
+    def faces(self) -> Faces:
+        """What the faces are that rays hit, for compiled code."""
+        return self._faces
+
+    def _read(self, rank: int) -> _Tile:
+        tile = self.scene.tile(*self.scene.tile_indices[rank])
+        mesh, copies = tile.mesh, tile.instances
+        parts = split(mesh.vertices + (tile.origin - self.caster.origin), mesh.faces, _bits(mesh.material))
+        transform = copies.transform.copy()
+        transform[:, :, 3] += tile.origin
+        return _Tile(
+            {_PARTS * rank + k: part for k, part in enumerate(parts)},
+            _surfaces(mesh),
+            copies.shape,
+            transform,
+            copies.feature,
+        )
+
+    def _lay(self) -> None:
+        """Lay the tables of tiles and shapes end to end, a miss last, where index -1 finds it."""
+        tables = [*(tile.surfaces for tile in self._tiles.values()), *self._copied]
+        starts = np.cumsum([0, *(len(table.klass) for table in tables)])
+        self._first = dict(zip(self._tiles, starts.tolist(), strict=False))
+        self._surfaces = Surfaces(
+            *(
+                np.concatenate([*(getattr(t, f.name) for t in tables), getattr(_MISS, f.name)])
+                for f in fields(Surfaces)
+            )
+        )
+        self._what = packed(self._surfaces, self._leaves_of(starts[len(self._tiles) :]))
+        feature = self._surfaces.feature
+        self._bounds = int(feature.min()), int(feature.max())
+        self._still = self._static()
+        self._of_shape, self._of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes)])
+        self._number()
+
+    def _leaves_of(self, starts: NDArray[np.integer]) -> NDArray[np.uint8]:
+        """Kinds of leaves of all rows of the tables; ``starts`` are those of the shapes."""
+        kinds, found = list(self._leaves), np.zeros(len(self._surfaces.klass), np.uint8)
+        for k, name in enumerate(self._names):
+            if name in kinds:
+                found[starts[k] : starts[k + 1]] = 1 + kinds.index(name)
+        if "hedge" in kinds:
+            found[self._surfaces.klass == Class.HEDGE] = 1 + kinds.index("hedge")
+        return found
+
+    def _number(self) -> None:
+        """Say where the tables of all copies start and what they are called."""
+        moving, feature = self._moving
+        self._base = np.concatenate([self._of_shape[self._still.shape], self._of_actor[moving.shape], [0]])
+        named = [np.asarray(rows, np.int32) for rows in (*(t.feature for t in self._tiles.values()), feature)]
+        self._feature = np.concatenate(named)
+        low, high = self._bounds
+        if len(self._feature):
+            low, high = min(low, int(self._feature.min())), max(high, int(self._feature.max()))
+        leaves = np.array([0.0, *self._leaves.values()])
+        self._faces = Faces(self._base, self._feature, self._what, low, high, leaves)
+
+    def _static(self) -> Instances:
+        tiles = self._tiles.values()
+        shape = np.concatenate([np.empty(0, np.int32), *(tile.shape for tile in tiles)])
+        transform = np.concatenate([np.empty((0, 3, 4)), *(tile.transform for tile in tiles)])
+        return Instances(self._shapes, shape, transform)
+
+
+def _nothing(shapes: tuple[Caster, ...]) -> tuple[Instances, NDArray[np.int32]]:
+    none = np.empty(0, np.int32)
+    return Instances(shapes, none, np.empty((0, 3, 4))), none
+
+
+def _touching(scene: Scene, region: Region, margin: float) -> list[int]:
+    """Ranks among the scene's tiles of those that touch a region grown by a margin."""
+    ij = np.array(scene.tile_indices, float).reshape(-1, 2)
+    low, high = ij * scene.tile_size, (ij + 1) * scene.tile_size
+    near = (low <= np.array(region[2:]) + margin) & (high >= np.array(region[:2]) - margin)
+    return [int(k) for k in np.flatnonzero(near.all(axis=1))]

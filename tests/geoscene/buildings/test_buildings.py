@@ -1,0 +1,455 @@
+"""From map areas to solids: nothing is lost, doubled, open or guessed in silence."""
+
+import random
+from dataclasses import replace
+
+import manifold3d as m3
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely import affinity
+
+from geoscene.buildings import BuildingOptions, build_solids, read_buildings
+from geoscene.buildings.heights import infer_heights
+from geoscene.buildings.shells import prisms, sound
+from geoscene.buildings.unions import unite
+from geoscene.classes import Class, materials
+from geoscene.errors import InputError
+from geoscene.frames import Frame
+from geoscene.mesh import FLOOR, ROOF, WALL
+from geoscene.report import summarise
+from geoscene.sources.data import Area, OsmData, Relation
+from geoscene.watertight import validate_mesh
+
+FRAME = Frame.at(8.7, 49.4)
+
+
+def box(x, y, width, depth):
+    return shapely.box(x, y, x + width, y + depth)
+
+
+def area(osm_id, shape, **tags):
+    """A map area whose scene coordinates are those of shape; ``__`` in a key stands for a colon."""
+    lonlat = shapely.transform(shape, lambda xy: np.column_stack(FRAME.to_geographic(xy[:, 0], xy[:, 1])))
+    tags = {key.replace("__", ":"): value for key, value in tags.items()}
+    return Area(osm_id, tags, lonlat, np.empty(0, np.int64))
+
+
+def house(number, shape, **tags):
+    return area(f"way/{number}", shape, **({"building": "yes"} | tags))
+
+
+def part(number, shape, **tags):
+    return area(f"way/{number}", shape, **({"building__part": "yes"} | tags))
+
+
+def osm(*areas, relations=()):
+    return OsmData((8.6, 49.3, 8.8, 49.5), [], list(areas), [], list(relations))
+
+
+def built(*areas, relations=(), base=0.0, lod=2, options=None):
+    """Table, mesh and problems of a map."""
+    table, problems = read_buildings(osm(*areas, relations=relations), FRAME, options=options)
+    mesh, more = build_solids(table, base=np.full(table.count, base), lod=lod)
+    verdict = validate_mesh(mesh)
+    assert verdict.ok.all()
+    assert verdict.feature.tolist() == list(range(table.count))
+    return table, mesh, verdict, problems + more
+
+
+def manifold(mesh, feature):
+    """The solid of a feature as manifold3d sees it after its own check."""
+    mine = mesh.take(mesh.feature == feature)
+    body = m3.Manifold(m3.Mesh64(mine.vertices, mine.faces.astype(np.uint64)))
+    assert body.status() == m3.Error.NoError
+    return body
+
+
+def reasons(problems):
+    return {(p.osm_id, p.action, p.reason) for p in problems}
+
+
+@st.composite
+def blocks(draw):
+    """Unions of boxes, turned, often with courtyards, with a decimal number of metres nowhere."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    corner, size = rng.uniform(-20, 20, (5, 2)), rng.uniform(1, 25, (5, 2))
+    shape = shapely.union_all([shapely.box(*c, *(c + s)) for c, s in zip(corner, size, strict=True)])
+    return affinity.rotate(shape, float(rng.uniform(0, 90)))
+
+
+@given(blocks(), st.floats(1, 300), st.floats(-50, 500))
+@settings(max_examples=40, deadline=None)
+def test_a_flat_building_has_the_volume_of_its_footprint_times_its_height(shape, height, base):
+    table, mesh, verdict, _ = built(house(1, shape, height=f"{height:.2f}"), base=base)
+    top, bottom = np.round(base + round(height, 2), 4), np.round(base, 4)
+    assert verdict.volume[0] == pytest.approx(shapely.area(table.footprint[0]) * (top - bottom), rel=1e-9)
+    assert manifold(mesh, 0).volume() == pytest.approx(verdict.volume[0], rel=1e-9)
+    assert mesh.vertices[:, 2].min() == bottom
+    assert mesh.vertices[:, 2].max() == top
+    np.testing.assert_array_equal(mesh.vertices, np.round(mesh.vertices, 4))
+
+
+def test_faces_say_what_they_are():
+    table, mesh, _, _ = built(
+        house(1, box(0, 0, 10, 8), height="9", building__colour="#102030", roof__material="slate"),
+        house(2, box(30, 0, 10, 8), height="9", roof__shape="gabled"),
+    )
+    up, down = mesh.normals()[:, 2] > 0.1, mesh.normals()[:, 2] < -0.9
+    assert (mesh.surface[up] == ROOF).all()
+    assert (mesh.surface[down] == FLOOR).all()
+    assert (mesh.surface[~up & ~down] == WALL).all()
+    assert (mesh.klass == Class.BUILDING).all()
+    first = mesh.feature == 0
+    assert (mesh.color[first & (mesh.surface == WALL)] == (0x10, 0x20, 0x30)).all()
+    assert (mesh.material[first & (mesh.surface == ROOF)] == materials()["slate"].code).all()
+    assert (mesh.material[~first & (mesh.surface == ROOF)] == materials()["roof_tile"].code).all()
+    assert table.wall_source.tolist() == ["tag", "default"]
+    assert table.roof_look_source.tolist() == ["tag", "default"]
+
+
+@pytest.mark.parametrize(
+    ("tags", "height", "source"),
+    [
+        ({"height": "48.5 m"}, 48.5, "tag"),
+        ({"height": "574'"}, 574 * 0.3048, "tag"),
+        ({"building__height": "9,5"}, 9.5, "tag"),
+        ({"height": "tall", "building__levels": "4"}, 12.0, "levels"),
+        ({"est_height": "20"}, 20.0, "est_height"),
+        ({"building__levels": "3", "roof__levels": "2"}, 15.0, "levels"),
+        ({"building__levels": "3", "roof__height": "2", "roof__shape": "hipped"}, 11.0, "levels"),
+        ({"height": "-5"}, None, "inferred-type"),
+        ({"height": "20000"}, None, "inferred-type"),
+        ({}, None, "inferred-type"),
+    ],
+)
+def test_where_a_height_comes_from_is_said(tags, height, source):
+    table, mesh, _, _ = built(house(1, box(0, 0, 10, 10), **tags))
+    assert table.height_source[0] == source
+    assert 0 < table.height_sigma[0] < table.height[0]
+    if height is not None:
+        assert table.height[0] == pytest.approx(height)
+        assert mesh.vertices[:, 2].max() == pytest.approx(height, abs=1e-4)
+
+
+def test_parts_replace_the_outline_they_cover():
+    table, _, verdict, problems = built(
+        house(1, box(0, 0, 20, 10), height="30"),
+        part(2, box(0, 0, 10, 10), height="30", min_height="10"),
+        part(3, box(10, 0, 10, 10), height="12"),
+    )
+    assert table.count == 1
+    assert table.drawn.tolist() == [False, True, True]
+    assert verdict.volume[0] == pytest.approx(10 * 10 * 20 + 10 * 10 * 12, rel=1e-6)
+    assert problems == []
+
+
+@pytest.mark.parametrize(("use", "storeys", "low", "high"), [("church", "1", 10, 30), ("house", "1", 2, 4)])
+def test_the_one_storey_of_a_hall_says_nothing_of_its_height(use, storeys, low, high):
+    table, *_ = built(house(1, box(0, 0, 40, 20), building=use, **{"building:levels": storeys}))
+    assert low < table.height[0] < high
+    assert table.height_source[0] == ("inferred-type" if use == "church" else "levels")
+
+
+def test_a_building_is_as_uncertain_as_its_highest_part():
+    table, *_ = built(
+        house(1, box(0, 0, 20, 10)),
+        part(2, box(0, 0, 10, 10), height="12"),
+        part(3, box(10, 0, 10, 10), **{"building:levels": "20"}),
+    )
+    assert table.height[0] == pytest.approx(60)
+    assert table.height_source[0] == "parts"
+    assert table.height_sigma[0] == pytest.approx(0.15 * 60)
+
+
+def test_what_parts_leave_of_the_outline_stays_with_its_own_height():
+    table, _, verdict, problems = built(
+        house(1, box(0, 0, 20, 10), height="6"), part(2, box(0, 0, 5, 10), height="30")
+    )
+    assert table.height.tolist() == [30.0, 30.0, 6.0]
+    assert table.osm_id.tolist() == ["way/1", "way/2", "way/1"]
+    assert table.outline.tolist() == [0, 0, 0]
+    assert verdict.volume[0] == pytest.approx(5 * 10 * 30 + 15 * 10 * 6, rel=1e-6)
+    assert reasons(problems) == {("way/1", "repaired", "partly-covered")}
+
+
+def test_a_part_without_height_takes_its_buildings_and_one_without_colour_its_colour():
+    table, *_ = built(
+        house(1, box(0, 0, 20, 10), height="21", building__colour="red"),
+        part(2, box(0, 0, 10, 10)),
+        part(3, box(10, 0, 10, 10), height="5", building__colour="blue"),
+    )
+    assert table.height.tolist() == [21.0, 21.0, 5.0]
+    assert table.height_source.tolist() == ["tag", "outline", "tag"]
+    assert table.wall_color[1:].tolist() == [[255, 0, 0], [0, 0, 255]]
+
+
+def test_parts_without_an_outline_become_a_building():
+    table, _, verdict, problems = built(
+        part(5, box(0, 0, 10, 10), height="4"), part(6, box(2, 2, 3, 3), height="9", min_height="4")
+    )
+    assert table.count == 1
+    assert verdict.volume[0] == pytest.approx(400 + 45, rel=1e-6)
+    assert reasons(problems) == {("way/5", "repaired", "parts-without-outline")}
+
+
+def test_a_relation_gives_a_part_to_its_building_though_it_lies_beside_it():
+    relation = Relation("relation/9", {"type": "building"}, (("way", 1, "outline"), ("way", 3, "part")))
+    areas = (
+        house(1, box(0, 0, 10, 10), height="9"),
+        house(2, box(10, 0, 10, 10), height="9"),
+        part(3, box(11, 1, 3, 3), height="15", min_height="10"),
+    )
+    assert built(*areas, relations=[relation])[0].outline.tolist()[2] == 0
+    assert built(*areas)[0].outline.tolist()[2] == 1
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_any_pile_of_parts_is_one_sound_body_of_the_volume_of_their_union(seed):
+    rng = np.random.default_rng(seed)
+    # coordinates on a coarse grid, so that faces, edges and corners coincide as often as they can
+    areas, bodies = [], []
+    for number in range(int(rng.integers(2, 9))):
+        (x, y), (w, d) = rng.integers(0, 6, 2), rng.integers(1, 4, 2)
+        low, tall = int(rng.integers(0, 4)), int(rng.integers(1, 4))
+        areas.append(part(number, box(x, y, w, d), height=str(low + tall), min_height=str(low)))
+        bodies.append(m3.Manifold.cube((w, d, tall)).translate((float(x), float(y), float(low))))
+    _, mesh, verdict, _ = built(
+        house(99, box(0, 0, 9, 9), height="3"), *areas, options=BuildingOptions(covered=0.0)
+    )
+    union = m3.Manifold.batch_boolean(bodies, m3.OpType.Add).volume()
+    # a groove of some millimetres along an edge takes less than a litre
+    assert verdict.volume[0] == pytest.approx(union, abs=2e-3)
+    manifold(mesh, 0)
+
+
+def test_bodies_that_meet_in_an_edge_are_parted_and_reported():
+    _, _, verdict, problems = built(
+        house(1, box(0, 0, 20, 20), height="5"),
+        part(2, box(0, 0, 10, 10), height="5"),
+        part(3, box(10, 10, 10, 10), height="5"),
+        options=BuildingOptions(covered=0.4),
+    )
+    assert verdict.volume[0] == pytest.approx(500 + 500, rel=1e-6)
+    assert ("way/1", "repaired", "touching-bodies") in reasons(problems)
+
+
+SQUARE = [(0, 0), (10, 0), (10, 10), (0, 10)]
+TOUCHING = [(0, 5), (4, 3), (4, 7)]
+
+
+@pytest.mark.parametrize(
+    ("shape", "size", "reason"),
+    [
+        (shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)]), 50, "invalid-footprint"),
+        (shapely.Polygon([*SQUARE[:3], (5, 10), (5, 20), (5, 10), (0, 10)]), 100, "invalid-footprint"),
+        (shapely.Polygon([(0, 0), (10, 0), (10, 0), (10, 10), (0, 10)]), 100, None),
+        (shapely.Polygon([(0, 0), (0, 10), (10, 10), (10, 0)]), 100, None),
+        # a courtyard that touches the outline in a corner
+        (shapely.Polygon(SQUARE, [TOUCHING]), 92, "invalid-footprint"),
+        (shapely.Polygon([*SQUARE, (0, 5)], [TOUCHING]), 92, "invalid-footprint"),
+        (shapely.Polygon(SQUARE, [[(8, 4), (12, 4), (12, 6), (8, 6)]]), 96, "invalid-footprint"),
+        (shapely.MultiPolygon([box(0, 0, 5, 5), box(5, 5, 5, 5)]), 50, "invalid-footprint"),
+        (shapely.MultiPolygon([box(0, 0, 5, 5), box(8, 8, 5, 5)]), 50, None),
+    ],
+)  # fmt: skip
+def test_bad_footprints_become_sound_solids(shape, size, reason):
+    _, mesh, verdict, problems = built(house(1, shape, height="10"))
+    assert verdict.volume[0] == pytest.approx(10 * size, abs=0.01)
+    assert {p.reason for p in problems} == ({reason} if reason else set())
+    manifold(mesh, 0)
+
+
+@pytest.mark.parametrize(
+    "shape", [shapely.Polygon([(0, 0), (5, 0), (10, 0)]), box(0, 0, 0.3, 0.3), shapely.Polygon()]
+)
+def test_footprints_of_no_size_are_dropped_and_reported(shape):
+    table, _, _, problems = built(house(1, shape, height="10"), house(2, box(30, 0, 10, 10)))
+    assert table.osm_id.tolist() == ["way/2"]
+    assert reasons(problems) == {("way/1", "dropped", "too-small")}
+
+
+def test_duplicates_leave_the_one_that_is_known_better():
+    shape = box(0, 0, 10, 10)
+    table, _, _, problems = built(
+        house(1, shape), house(2, shape, height="12"), house(3, affinity.translate(shape, 0.2, 0.1))
+    )
+    assert table.osm_id.tolist() == ["way/2"]
+    assert summarise(problems)["dropped"]["building"] == {"duplicate": 2}
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=25, deadline=None)
+def test_overlapping_buildings_share_no_volume_and_leave_no_hole(seed):
+    rng = np.random.default_rng(seed)
+    shapes = []
+    for _ in range(5):
+        corner, size = rng.uniform(0, 20, 2), rng.uniform(4, 15, 2)
+        shapes.append(affinity.rotate(shapely.box(*corner, *(corner + size)), float(rng.uniform(0, 90))))
+    table, _, verdict, problems = built(*(house(i, s, height="10") for i, s in enumerate(shapes)))
+    total = shapely.area(shapely.union_all(shapes))
+    lost = sum(shapes[int(p.osm_id[4:])].area for p in problems if p.action == "dropped")
+    assert verdict.volume.sum() / 10 <= total + 0.01
+    # slivers narrower than 4 cm between cuts are let go
+    assert verdict.volume.sum() / 10 >= total - lost - 0.02 * sum(s.length for s in shapes)
+    for i in range(len(table)):
+        for j in range(i):
+            assert shapely.intersection(table.footprint[i], table.footprint[j]).area < 1e-2
+
+
+def test_a_bridge_between_houses_may_pass_over_another():
+    table, _, verdict, problems = built(
+        house(1, box(0, 0, 10, 10), height="5"), house(2, box(0, 4, 10, 2), height="12", min_height="8")
+    )
+    assert problems == []
+    assert verdict.volume.tolist() == pytest.approx([500, 80], rel=1e-6)
+    assert table.min_height.tolist() == [0.0, 8.0]
+
+
+def test_neighbours_keep_their_common_wall():
+    shared = [(10, 0), (10.00004, 3.3333), (9.7, 10)]
+    left = shapely.Polygon([(0, 0), *shared, (0, 10)])
+    right = shapely.Polygon([*shared[::-1], (20, 0), (20, 10)][::-1])
+    table, *_ = built(house(1, left, height="8"), house(2, right.buffer(0), height="9"))
+    corners = [set(map(tuple, shapely.get_coordinates(f))) for f in table.footprint]
+    assert len(corners[0] & corners[1]) == 3
+
+
+def test_a_canopy_hangs_and_an_underground_building_is_left_out():
+    table, _, verdict, problems = built(
+        house(1, box(0, 0, 10, 10), building="roof", height="5"),
+        house(2, box(20, 0, 10, 10), location="underground"),
+    )
+    assert table.min_height_source[0] == "canopy"
+    assert verdict.volume[0] == pytest.approx(100 * BuildingOptions().canopy, rel=1e-6)
+    assert reasons(problems) == {("way/2", "dropped", "underground")}
+
+
+def test_nonsense_heights_of_parts_are_put_right_and_reported():
+    _, _, verdict, problems = built(
+        house(1, box(0, 0, 10, 10), height="10"),
+        part(2, box(0, 0, 10, 10), height="8", min_height="9"),
+        house(3, box(20, 0, 10, 10), height="4", roof__shape="pyramidal", roof__height="7"),
+        house(4, box(40, 0, 10, 10), height="4", roof__shape="9.0"),
+    )
+    assert verdict.volume.tolist() == pytest.approx([800, 400 / 3, 400], rel=1e-3)
+    assert reasons(problems) == {
+        ("way/2", "repaired", "underside-over-top"),
+        ("way/3", "repaired", "roof-over-height"),
+        ("way/4", "repaired", "unknown-roof-shape"),
+    }
+
+
+def test_the_order_of_the_map_does_not_matter():
+    rng = np.random.default_rng(3)
+    shapes = [affinity.rotate(box(*rng.uniform(0, 60, 2), *rng.uniform(4, 15, 2)), 30) for _ in range(40)]
+    areas = [house(i, s) if i % 3 else house(i, s, height=str(5 + i)) for i, s in enumerate(shapes)]
+    _, one, _, first = built(*areas)
+    random.Random(5).shuffle(areas)
+    _, other, _, second = built(*areas)
+    assert first == second
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+    np.testing.assert_array_equal(one.faces, other.faces)
+
+
+def test_levels_of_detail_get_finer():
+    areas = (
+        house(1, box(0, 0, 20, 10), height="12", roof__shape="gabled", roof__height="4"),
+        house(2, box(40, 0, 20, 10)),
+        part(3, box(40, 0, 10, 10), height="6"),
+        part(4, box(50, 0, 10, 10), height="12", min_height="6"),
+    )
+    volumes = [built(*areas, lod=lod)[2].volume for lod in (0, 1, 2)]
+    assert volumes[0].tolist() == pytest.approx([2400, 200 * 9], rel=1e-6)
+    assert volumes[1].tolist() == pytest.approx([2400, 600 + 600], rel=1e-6)
+    assert volumes[2].tolist() == pytest.approx([200 * 10, 600 + 600], rel=1e-6)
+
+
+def test_the_base_lifts_a_building_with_all_its_parts():
+    areas = (
+        house(1, box(0, 0, 20, 10)),
+        part(2, box(0, 0, 20, 10), height="6"),
+        house(3, box(50, 0, 5, 5), height="3"),
+    )
+    table, _ = read_buildings(osm(*areas), FRAME)
+    mesh, _ = build_solids(table, base=np.array([100.0, -7.25]))
+    for feature, low, high in ((0, 100.0, 106.0), (1, -7.25, -4.25)):
+        z = mesh.take(mesh.feature == feature).vertices[:, 2]
+        assert (z.min(), z.max()) == (low, high)
+
+
+def test_a_roof_direction_is_from_true_north():
+    frame = Frame.at(8.7, 49.4, crs="EPSG:32633")  # a zone too far east: grid north is well off true north
+    lon, lat = 8.7, 49.4
+    square = shapely.box(lon - 1e-4, lat - 6e-5, lon + 1e-4, lat + 6e-5)
+    tags = {"building": "yes", "height": "9", "roof:shape": "skillion", "roof:direction": "180"}
+    data = replace(osm(Area("way/1", tags, square, np.empty(0, np.int64))), bounds=square.bounds)
+    table, _ = read_buildings(data, frame)
+    south = np.subtract(frame.from_geographic(lon, lat - 1e-4), frame.from_geographic(lon, lat))
+    assert abs(frame.convergence(lon, lat)) > 0.05
+    assert np.exp(1j * table.roof_direction[0]) == pytest.approx(
+        complex(*south) / abs(complex(*south)), abs=1e-5
+    )
+
+
+def test_an_unknown_height_follows_its_neighbours():
+    rng = np.random.default_rng(0)
+    n = 200
+    xy = rng.uniform(0, 400, (n, 2))
+    use, area_ = np.full(n, "house", dtype=object), np.full(n, 120.0)
+    truth = np.where(xy[:, 0] < 200, 6.0, 18.0)
+    known = np.where(rng.random(n) < 0.5, truth, np.nan)
+    height, sigma, rule = infer_heights(xy, use, area_, known)
+    hidden = np.isnan(known) & (np.abs(xy[:, 0] - 200) > 60)
+    assert np.abs(height - truth)[hidden].max() < 1.0
+    assert set(rule) == {"inferred-neighbours"}
+    lone, lone_sigma, lone_rule = infer_heights(xy[:1], use[:1], area_[:1], np.array([np.nan]))
+    assert lone_rule[0] == "inferred-type"
+    assert lone_sigma[0] / lone[0] > 2 * np.median(sigma[hidden] / height[hidden])
+    assert 4 < lone[0] < 10
+
+
+def test_a_television_tower_says_nothing_of_the_houses_below():
+    xy = np.column_stack([np.arange(6) * 60.0, np.zeros(6)])
+    use, area_ = np.full(6, "yes", dtype=object), np.array([2324.0, 2000.0, 900.0, 300.0, 700.0, 4400.0])
+    alone = infer_heights(xy, use, area_, np.full(6, np.nan))[0]
+    beside = infer_heights(xy, use, area_, np.array([540.0, *[np.nan] * 5]))[0]
+    np.testing.assert_array_equal(beside[1:], alone[1:])
+    block = infer_heights(xy, use, area_, np.array([48.0, *[np.nan] * 5]))[0]
+    assert (block[1:3] > 1.2 * alone[1:3]).all()
+
+
+def test_bodies_that_meet_in_an_edge_of_a_hairline_gap_are_joined():
+    upper = shapely.Polygon([(0, 0), (10, 0.0005), (10, 10), (-10, 10), (-10, 0.0005)])
+    lower = shapely.Polygon([(0, 0), (-10, -0.0005), (-10, -10), (10, -10), (10, -0.0005)])
+    footprints = shapely.set_precision(np.array([upper, lower]), 1e-4)
+    shells = prisms(footprints, np.arange(2), np.zeros(2), np.full(2, 9.0))
+    body, told = unite(shells)
+    assert "joined by beads of" in told
+    assert sound(replace(body, piece=np.zeros(len(body), np.int64)), 1).all()
+    assert body.corners[..., 2].max() < 9.01
+
+
+def test_a_building_does_not_inform_its_own_guess():
+    xy = np.array([[0.0, 0.0], [10.0, 0.0]])
+    use, area_ = np.array(["yes", "yes"], dtype=object), np.array([100.0, 100.0])
+    first, _, _ = infer_heights(xy, use, area_, np.array([30.0, np.nan]))
+    again, _, _ = infer_heights(xy, use, area_, np.array([60.0, np.nan]))
+    assert first[0] == again[0]
+    assert again[1] > 1.5 * first[1]
+
+
+def test_an_empty_map_has_no_buildings():
+    table, mesh, _, problems = built()
+    assert len(table) == table.count == len(mesh) == len(problems) == 0
+
+
+def test_wrong_options_are_refused():
+    table, _ = read_buildings(osm(house(1, box(0, 0, 5, 5))), FRAME)
+    with pytest.raises(InputError, match="level of detail 3"):
+        build_solids(table, base=np.zeros(1), lod=3)
+    with pytest.raises(InputError, match="2 bases for 1 buildings"):
+        build_solids(table, base=np.zeros(2))

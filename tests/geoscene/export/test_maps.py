@@ -1,0 +1,199 @@
+"""Rasters and tables of a scene: where things are, how high, what they are, and in which CRS."""
+
+import json
+
+import geopandas
+import numpy as np
+import pyogrio
+import pytest
+import rasterio
+import shapely
+from helpers.export_worlds import NAMES, SLOPE, TREES, write_world
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pyarrow import parquet
+
+from geoscene.classes import Class
+from geoscene.errors import InputError, MissingExtraError
+from geoscene.export import KINDS, export_scene, files, kind_of
+from geoscene.export.zbuffer import draw_triangles
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_world(tmp_path_factory.mktemp("scene") / "world")
+
+
+def _raster(scene, tmp_path, **options):
+    with rasterio.open(export_scene(scene, tmp_path / "a.tif", **options).path) as raster:
+        x, y = np.meshgrid(np.arange(raster.width) + 0.5, np.arange(raster.height) + 0.5)
+        told = raster.transform
+        east, north = told.c + told.a * x, told.f + told.e * y
+        place = east - scene.frame.origin[0], north - scene.frame.origin[1]
+        return raster.read(1), *place, raster.profile, raster.tags(ns="IMAGE_STRUCTURE")
+
+
+def test_the_terrain_model_is_the_ground_under_all_that_stands_on_it(scene, tmp_path):
+    height, x, _, profile, layout = _raster(scene, tmp_path, model="terrain", resolution=0.5)
+    assert height.shape == (400, 400)
+    np.testing.assert_allclose(height, SLOPE * x, atol=1e-5)
+    assert profile["crs"].to_epsg() == 32633
+    assert profile["tiled"]
+    assert layout["LAYOUT"] == "COG"
+
+
+def test_the_surface_model_is_the_roof_over_the_ground(scene, tmp_path):
+    height, x, y, _, _ = _raster(scene, tmp_path, model="surface", resolution=0.5)
+    box = (np.abs(x - 12.5) < 5) & (np.abs(y + 20.25) < 10)
+    assert box.sum() == 20 * 39  # two more rows lie on the edge
+    assert (height[box] == 30).all()
+    field = (x > 60) & (y < -85)
+    np.testing.assert_allclose(height[field], SLOPE * x[field], atol=1e-5)
+    tree_x, tree_y, tall = TREES[2]
+    crown = np.hypot(x - tree_x, y - tree_y) < 1
+    assert (height[crown] > 0.8 * tall).all()
+
+
+def test_the_class_map_names_what_is_seen_from_above(scene, tmp_path):
+    klass, x, y, profile, _ = _raster(scene, tmp_path, model="classes", resolution=1.0)
+    box = (np.abs(x - 12.5) < 5) & (np.abs(y + 20.25) < 10)
+    assert set(klass[box]) == {Class.BUILDING}
+    road = (np.abs(y) < 4) & (x > 50)
+    assert set(klass[road]) == {Class.ROAD}
+    assert set(klass[(x > 60) & (y < -85)]) == {Class.TERRAIN}
+    assert Class.TREE_CROWN in klass
+    assert profile["nodata"] == 0
+    with rasterio.open(tmp_path / "a.tif") as raster:
+        assert raster.colormap(1)[Class.ROAD][:3] == (128, 64, 128)
+        assert raster.tags(1)["class_14"] == "building"
+
+
+@pytest.mark.parametrize("resolution", [0, -1, np.nan, np.inf, 1e-4])
+def test_a_resolution_that_cannot_be_is_refused(scene, tmp_path, resolution):
+    with pytest.raises(InputError, match="--resolution"):
+        export_scene(scene, tmp_path / "a.tif", resolution=resolution)
+    assert list(tmp_path.iterdir()) == []
+
+
+triangles = st.lists(
+    st.tuples(*[st.tuples(*[st.integers(-40, 200).map(lambda v: v / 8)] * 3)] * 3), min_size=1, max_size=6
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(triangles)
+def test_the_grid_is_the_highest_plane_over_each_middle(corners):
+    corners = np.array(corners, float)
+    height, labels = np.full((20, 20), np.nan, np.float32), np.zeros((20, 20), np.uint8)
+    draw_triangles(corners, np.arange(1, len(corners) + 1, dtype=np.uint8), height, labels)
+    x, y = np.meshgrid(np.arange(20) + 0.5, np.arange(20) + 0.5)
+    middles = shapely.points(x, y)
+    wanted = np.full((20, 20), -np.inf)
+    for a, b, c in corners:
+        triangle = shapely.Polygon([a[:2], b[:2], c[:2]])
+        normal = np.cross(b - a, c - a)
+        if triangle.area < 1e-9:
+            continue
+        z = a[2] - ((x - a[0]) * normal[0] + (y - a[1]) * normal[1]) / normal[2]
+        wanted = np.where(shapely.intersects(triangle, middles), np.maximum(wanted, z), wanted)
+    assert (np.isfinite(height) == np.isfinite(wanted)).all()
+    drawn = np.isfinite(height)
+    np.testing.assert_allclose(height[drawn], wanted[drawn], rtol=1e-5, atol=1e-4)
+    assert ((labels > 0) == drawn).all()
+
+
+def test_a_geopackage_has_every_layer_with_its_columns(scene, tmp_path):
+    path = export_scene(scene, tmp_path / "a.gpkg").path
+    assert pyogrio.list_layers(path)[:, 0].tolist() == [*scene.layers, "building_solids"]
+    plan, solids = (geopandas.read_file(path, layer=name) for name in ("buildings", "building_solids"))
+    assert plan.crs.to_epsg() == solids.crs.to_epsg() == 32633
+    assert plan["osm_id"].tolist() == list(NAMES)
+    assert dict(zip(solids["osm_id"], solids["height_source"], strict=True)) == dict(
+        zip(plan["osm_id"], plan["height_source"], strict=True)
+    )
+    assert plan["name"][0] == "Rathaus «Süd»"
+    assert np.isnan(plan["levels"][0])
+    moved = geopandas.read_file(
+        export_scene(scene, tmp_path / "b.gpkg", crs="EPSG:25833").path, layer="roads"
+    )
+    assert moved.crs.to_epsg() == 25833
+
+
+def test_geojson_is_where_rfc_7946_wants_it(scene, tmp_path):
+    path = export_scene(scene, tmp_path / "a.geojson").path
+    document = json.loads(path.read_text())
+    kinds = [f["properties"]["kind"] for f in document["features"]]
+    assert {kind: kinds.count(kind) for kind in kinds} == {n: b - a for n, (a, b) in scene.layers.items()}
+    hedge = next(f for f in document["features"] if f["properties"]["kind"] == "barriers")
+    assert hedge["properties"]["barriers_kind"] == "hedge"
+    first = document["features"][0]
+    assert first["properties"]["height_source"] == "tag"
+    assert "levels" not in first["properties"]
+    footprint = shapely.from_geojson(json.dumps(first["geometry"]))
+    assert footprint.exterior.is_ccw
+    x, y = scene.frame.from_geographic(*shapely.get_coordinates(footprint).T)
+    assert (min(x), max(x), min(y), max(y)) == pytest.approx((0, 20, -30, 0), abs=1e-3)
+
+
+def test_a_geoparquet_table_holds_all_layers(scene, tmp_path):
+    table = geopandas.read_parquet(export_scene(scene, tmp_path / "a.parquet").path)
+    assert table.crs == scene.frame.crs
+    assert table["kind"].value_counts().to_dict() == {n: b - a for n, (a, b) in scene.layers.items()}
+    assert table["barriers_kind"].dropna().tolist() == ["hedge"]
+    assert table["feature"].tolist() == list(range(len(table)))
+    assert table.loc[table["kind"] == "trees", "height"].tolist() == [h for _, _, h in TREES]
+    boxes = parquet.read_table(tmp_path / "a.parquet", columns=["bbox"])["bbox"].to_pylist()
+    np.testing.assert_array_equal([list(box.values()) for box in boxes], table.bounds.to_numpy())
+    x, y = scene.frame.origin
+    some = geopandas.read_parquet(tmp_path / "a.parquet", bbox=(x + 5, y - 25, x + 6, y - 24))
+    assert some["osm_id"].tolist() == ["way/1"]
+
+
+def test_one_layer_alone(scene, tmp_path):
+    summary = export_scene(scene, tmp_path / "a.geojson", layers=["trees"])
+    assert summary.objects == len(TREES)
+    with pytest.raises(InputError, match=r"no layer tress; this scene has .*trees"):
+        export_scene(scene, tmp_path / "b.geojson", layers=["tress"])
+    with pytest.raises(InputError, match=r"no layer tress; this scene has .*terrain"):
+        export_scene(scene, tmp_path / "b.glb", layers=["tress"])
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [(f"Some.Name{s}", k) for k, told in KINDS.items() for s in told.suffixes] + [("A.GLB", "glb")],
+)
+def test_the_suffix_says_the_kind(tmp_path, name, kind):
+    assert kind_of(tmp_path / name) == kind
+
+
+def test_what_cannot_be_meant_is_said_before_anything_is_written(scene, tmp_path):
+    with pytest.raises(InputError, match="does not say what to write"):
+        export_scene(scene, tmp_path / "a.json")
+    with pytest.raises(InputError, match="--to dwg"):
+        export_scene(scene, tmp_path / "a", "dwg")
+    with pytest.raises(InputError, match=r"--resolution does not go with PLY, which takes --layers"):
+        export_scene(scene, tmp_path / "a.ply", resolution=1)
+    with pytest.raises(InputError, match="EPSG:99999"):
+        export_scene(scene, tmp_path / "a.gpkg", crs="EPSG:99999")
+    with pytest.raises(InputError, match="projected CRS"):
+        export_scene(scene, tmp_path / "a.city.json", crs="EPSG:4326")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "a.ply").write_text("mine")
+    with pytest.raises(InputError, match="--overwrite"):
+        export_scene(scene, tmp_path / "a.ply")
+    assert (tmp_path / "a.ply").read_text() == "mine"
+    assert export_scene(scene, tmp_path / "a.ply", overwrite=True).bytes > 1000
+
+
+def test_without_sumo_the_extra_is_named(scene, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "sumo", None)
+    with pytest.raises(MissingExtraError, match=r"geoscene\[sumo\]"):
+        export_scene(scene, tmp_path / "a.net.xml")
+
+
+def test_a_file_that_failed_leaves_the_old_one(tmp_path):
+    (tmp_path / "a").write_bytes(b"old")
+    with pytest.raises(ZeroDivisionError), files.whole_file(tmp_path / "a") as out:
+        out.write(bytes(1 // 0))
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+    assert (tmp_path / "a").read_bytes() == b"old"

@@ -1,0 +1,281 @@
+"""OpenDRIVE: lanes meet where roads meet, and only permitted turns can be taken."""
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.export_worlds import roads, write_world
+from helpers.roadgrids import grid, road_graph
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geoscene.errors import InputError
+from geoscene.export import export_scene
+from geoscene.export.planview import connecting_curve, cut, plan_view
+from geoscene.roadgraph import write_graphml
+from geoscene.roadgraph.graph import rows_of
+from geoscene.roadgraph.routing import turn_table
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_world(tmp_path_factory.mktemp("scene") / "world")
+
+
+def _number(element, name):
+    return float(element.get(name))
+
+
+def _place(geometry, ds):
+    """Position and heading on one piece of a reference line, by the standard's formulae."""
+    x, y, h, length = (_number(geometry, name) for name in ("x", "y", "hdg", "length"))
+    shape = geometry[0]
+    if shape.tag == "line":
+        return x + ds * np.cos(h), y + ds * np.sin(h), h
+    if shape.tag == "arc":
+        k = _number(shape, "curvature")
+        return x + (np.sin(h + k * ds) - np.sin(h)) / k, y - (np.cos(h + k * ds) - np.cos(h)) / k, h + k * ds
+    p = ds / length
+    (u, v), (du, dv) = (
+        [
+            np.polynomial.Polynomial([_number(shape, f"{c}{axis}") for c in "abcd"]).deriv(n)(p)
+            for axis in "UV"
+        ]
+        for n in (0, 1)
+    )
+    return x + u * np.cos(h) - v * np.sin(h), y + u * np.sin(h) + v * np.cos(h), h + np.arctan2(dv, du)
+
+
+class _Road:
+    """One road of a file: its ends with their lanes' edges in space."""
+
+    def __init__(self, element):
+        self.element, self.id = element, element.get("id")
+        self.length = _number(element, "length")
+        pieces = list(element.find("planView"))
+        self.pieces = pieces
+        self.ends = _place(pieces[0], 0.0), _place(pieces[-1], _number(pieces[-1], "length"))
+
+    def height(self, end):
+        s = self.length * end
+        piece = [e for e in self.element.find("elevationProfile") if _number(e, "s") <= s + 1e-9][-1]
+        ds = s - _number(piece, "s")
+        return sum(_number(piece, c) * ds**k for k, c in enumerate("abcd"))
+
+    def lanes(self, end):
+        """Both edges (2, 3) of each lane at one end."""
+        x, y, h = self.ends[end]
+        offset = self.element.find("lanes/laneOffset")
+        out = {}
+        for side, sign in (("left", 1), ("right", -1)):
+            t = _number(offset, "a") if offset is not None else 0.0
+            found = self.element.findall(f"lanes/laneSection/{side}/lane")
+            for lane in sorted(found, key=lambda e: abs(int(e.get("id")))):
+                width = lane.find("width")
+                wide = _number(width, "a") + _number(width, "b") * self.length * end
+                edges = [
+                    (x - s * np.sin(h), y + s * np.cos(h), self.height(end)) for s in (t, t + sign * wide)
+                ]
+                out[int(lane.get("id"))] = np.array(edges)
+                t += sign * wide
+        return out
+
+
+def _roads(path):
+    document = ET.parse(path).getroot()  # noqa: S314  (our own file)
+    return document, {e.get("id"): _Road(e) for e in document.iter("road")}
+
+
+def _keeping(scene, left_hand):
+    """The scene with traffic on the left or the right."""
+    roads = {"driving_side": "left" if left_hand else "right"}
+    return replace(scene, manifest={**scene.manifest, "roads": roads})
+
+
+def _write(graph, scene, folder, **options):
+    """A graph as OpenDRIVE, by way of a scene that has it."""
+    path = folder / "scene"
+    if not path.exists():
+        write_world(path)
+    write_graphml(graph, scene.frame, path / "roads.graphml")
+    return export_scene(replace(scene, path=path), folder / "a.xodr", overwrite=True, **options).path
+
+
+def _check_links(path):
+    """Every connecting road begins and ends at the edges of the lanes that it joins; how many lanes."""
+    _, found = _roads(path)
+    joined = 0
+    for road in found.values():
+        for a, b in zip(road.pieces, road.pieces[1:], strict=False):
+            np.testing.assert_allclose(_place(a, _number(a, "length"))[:2], _place(b, 0.0)[:2], atol=1e-6)
+        for word, end in (("predecessor", 0), ("successor", 1)):
+            link = road.element.find(f"link/{word}")
+            if link is None or link.get("elementType") == "junction":
+                continue
+            other = found[link.get("elementId")]
+            there = 0 if link.get("contactPoint") == "start" else 1
+            mine, theirs = road.lanes(end), other.lanes(there)
+            for lane in road.element.iter("lane"):
+                target = lane.find(f"link/{word}")
+                if target is None:
+                    continue
+                edges, wanted = mine[int(lane.get("id"))], theirs[int(target.get("id"))]
+                # the edges of a lane that is driven against its road's direction come in the other order
+                gap = min(np.abs(edges - wanted).max(), np.abs(edges - wanted[::-1]).max())
+                assert gap < 1e-6
+                joined += 1
+    return joined
+
+
+@pytest.mark.parametrize("left_hand", [False, True])
+def test_lanes_meet_in_junctions(scene, tmp_path, left_hand):
+    path = export_scene(_keeping(scene, left_hand), tmp_path / "a.xodr").path
+    assert _check_links(path) >= 12
+
+
+@pytest.mark.parametrize("lanes", [0.5, 1.0, 2.0, [2, 1] * 24])
+@pytest.mark.parametrize("left_hand", [False, True])
+def test_lanes_meet_in_a_grid_of_any_width(scene, tmp_path, lanes, left_hand):
+    graph = grid(width=9.0)
+    graph = replace(graph, lanes=np.broadcast_to(np.asarray(lanes, float), len(graph)).copy())
+    assert _check_links(_write(graph, _keeping(scene, left_hand), tmp_path)) > 100
+
+
+def test_restrictions_that_junctions_cannot_say_are_counted(tmp_path):
+    scene = write_world(tmp_path / "world")
+    assert export_scene(scene, tmp_path / "plain.xodr").notes == ()
+    chain = rows_of([np.array([0, 2, 3], np.int32)])
+    graph = replace(roads(), chain_edges=chain, chain_kind=np.array(["no_u_turn"]))
+    write_graphml(graph, scene.frame, scene.path / "roads.graphml")
+    (note,) = export_scene(scene, tmp_path / "bound.xodr").notes
+    assert note.startswith("1 turn restrictions via ways are not in it")
+    assert (tmp_path / "bound.xodr").read_bytes() == (tmp_path / "plain.xodr").read_bytes()
+
+
+def test_the_ways_through_a_junction_are_the_permitted_turns(scene, tmp_path):
+    document, found = _roads(export_scene(scene, tmp_path / "a.xodr").path)
+    graph = roads()
+    before, after = turn_table(graph)
+    name = {}
+    ways = {
+        e.find("userData").get("value"): k
+        for k, e in ((r.id, r.element) for r in found.values())
+        if e.find("userData") is not None
+    }
+    for edge in range(len(graph)):
+        first = edge if not 0 <= graph.twin[edge] < edge else graph.twin[edge]
+        name[edge] = ways[f"way/{first}"]
+    wanted = sorted(
+        (name[a], name[b]) for a, b in zip(before.tolist(), after.tolist(), strict=True) if name[a] != name[b]
+    )
+    taken = []
+    for connection in document.iter("connection"):
+        road = found[connection.get("connectingRoad")].element
+        taken.append((connection.get("incomingRoad"), road.find("link/successor").get("elementId")))
+        assert road.find("link/predecessor").get("elementId") == connection.get("incomingRoad")
+        links = [(e.get("from"), e.get("to")) for e in connection.iter("laneLink")]
+        assert links == [
+            (e.find("link/predecessor").get("id"), e.get("id"))
+            for e in road.iter("lane")
+            if e.get("id") != "0"
+        ]
+    assert sorted(taken) == wanted
+    assert (name[0], name[6]) not in taken  # the left turn that the map forbids
+
+
+def test_signs_stand_beside_the_traffic_they_are_for(scene, tmp_path):
+    document, _ = _roads(export_scene(scene, tmp_path / "a.xodr").path)
+    told = {
+        s.get("name"): (s.get("orientation"), _number(s, "t"), _number(s, "s"), r.get("length"))
+        for r in document.iter("road")
+        for s in r.iter("signal")
+    }
+    orientation, t, s, length = told["traffic_signals"]
+    assert (orientation, t) == ("+", -4.0)
+    assert s <= float(length)
+    assert told["stop"][:2] == ("-", 4.0)
+
+
+def test_the_file_says_where_it_is(scene, tmp_path):
+    document, found = _roads(export_scene(scene, tmp_path / "a.xodr").path)
+    header = document.find("header")
+    assert "+proj=utm +zone=33" in header.find("geoReference").text
+    offset = header.find("offset")
+    assert (_number(offset, "x"), _number(offset, "y")) == scene.frame.origin
+    assert header.get("date") == "2024-05-06T07:08:09"
+    heights = [road.height(end) for road in found.values() for end in (0, 1)]
+    assert min(heights) == pytest.approx(-2)
+    assert max(heights) == pytest.approx(2)
+    speeds = {_number(e, "max") for e in document.iter("speed")}
+    assert speeds == {13.9}
+
+
+def test_bridges_and_shared_lanes_are_told(scene, tmp_path):
+    graph = road_graph([(0, 0), (100, 0), (200, 50)], [(0, 1), (1, 2)], lanes=0.5, width=4.0)
+    graph = replace(graph, bridge=np.array([True, True, False, False]))
+    document, _ = _roads(_write(graph, scene, tmp_path))
+    assert len(list(document.iter("bridge"))) == 1
+    kinds = [
+        lane.get("type")
+        for r in document.iter("road")
+        if r.get("junction") == "-1"
+        for lane in r.iter("lane")
+    ]
+    assert sorted(kinds) == ["bidirectional", "bidirectional", "none", "none"]
+
+
+def test_a_scene_without_roads_says_so(scene, tmp_path):
+    folder = tmp_path / "none"
+    folder.mkdir()
+    with pytest.raises(InputError, match="no drivable roads"):
+        export_scene(replace(scene, path=folder), tmp_path / "a.xodr")
+
+
+steps = st.lists(st.tuples(st.floats(0.5, 60), st.floats(-3.0, 3.0)), min_size=1, max_size=8)
+
+
+@settings(max_examples=80, deadline=None)
+@given(steps)
+def test_a_reference_line_is_smooth_and_near_its_polyline(steps):
+    lengths, turns = np.array(steps).T
+    heading = np.cumsum(turns)
+    points = np.concatenate(
+        [[[0, 0]], np.cumsum(np.column_stack([np.cos(heading), np.sin(heading)]) * lengths[:, None], axis=0)]
+    )
+    plan = plan_view(points)
+    assert (np.diff(plan.at) > 0).all()
+    assert plan.at[-1] == pytest.approx(plan.total, abs=1e-4)
+    assert plan.total <= lengths.sum() + 1e-9
+    k, ds = plan.curvature, plan.length
+    bent = np.abs(k) > 0
+    r = np.divide(1, k, out=np.zeros_like(k), where=bent)
+    end = plan.heading + k * ds
+    dx = np.where(bent, r * (np.sin(end) - np.sin(plan.heading)), ds * np.cos(plan.heading))
+    dy = np.where(bent, -r * (np.cos(end) - np.cos(plan.heading)), ds * np.sin(plan.heading))
+    np.testing.assert_allclose((plan.x + dx)[:-1], plan.x[1:], atol=1e-5)
+    np.testing.assert_allclose((plan.y + dy)[:-1], plan.y[1:], atol=1e-5)
+    np.testing.assert_allclose([plan.x[-1] + dx[-1], plan.y[-1] + dy[-1]], points[-1], atol=1e-5)
+    kinks = (end[:-1] - plan.heading[1:] + np.pi) % (2 * np.pi) - np.pi
+    sharp = (np.abs((turns[1:] + np.pi) % (2 * np.pi) - np.pi) > 1.2).sum()
+    assert (np.abs(kinks) > 1e-6).sum() <= sharp
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-3, 3), st.floats(-2.8, 2.8), st.floats(2, 60))
+def test_a_connecting_curve_is_near_an_arc_and_as_long_as_it_says(heading, turn, chord):
+    direction = heading + turn / 2
+    end = chord * np.array([np.cos(direction), np.sin(direction)])
+    curve = connecting_curve(np.zeros(2), heading, end, heading + turn)
+    p = np.linspace(0, 1, 20001)
+    u, v = (np.polynomial.polynomial.polyval(p, c) for c in (curve.u, curve.v))
+    assert curve.length == pytest.approx(np.hypot(np.diff(u), np.diff(v)).sum(), rel=1e-5)
+    arc = chord * (turn / 2) / np.sin(turn / 2) if abs(turn) > 1e-6 else chord
+    assert curve.length == pytest.approx(arc, rel=0.06)
+    c, s = np.cos(heading), np.sin(heading)
+    np.testing.assert_allclose([c * u[-1] - s * v[-1], s * u[-1] + c * v[-1]], end, atol=1e-9)
+
+
+def test_cutting_keeps_heights_in_place():
+    line = cut(np.array([[0, 0, 0], [10, 0, 1], [10, 30, 4.0]]), 5.0, 10.0)
+    np.testing.assert_allclose(line, [[5, 0, 0.5], [10, 0, 1], [10, 20, 3]])

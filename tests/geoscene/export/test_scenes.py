@@ -1,0 +1,337 @@
+"""What else a CityJSON, a GLB and a 3D Tiles folder must say."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from helpers.export_worlds import SLOPE, TREES, write_world
+
+from geoscene.errors import InputError
+from geoscene.export import export_scene
+from geoscene.export.cityjson import LOD
+from geoscene.mesh import Mesh
+from geoscene.objects.shapes import shapes
+from geoscene.watertight import validate_mesh
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_world(tmp_path_factory.mktemp("scene") / "world")
+
+
+@pytest.fixture(scope="module")
+def city(scene, tmp_path_factory):
+    return json.loads(export_scene(scene, tmp_path_factory.mktemp("out") / "a.city.json").path.read_text())
+
+
+@pytest.fixture(scope="module")
+def tiles(scene, tmp_path_factory):
+    return export_scene(scene, tmp_path_factory.mktemp("out") / "tiles", "3dtiles").path
+
+
+def _glb(path):
+    """JSON and buffer of a binary glTF, after its lengths have been checked."""
+    data = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
+    rest, name = struct.unpack_from("<I4s", data, 20 + size)
+    assert (rest + 28 + size, name) == (len(data), b"BIN\0")
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def _values(document, buffer, number):
+    accessor = document["accessors"][number]
+    view = document["bufferViews"][accessor["bufferView"]]
+    kind = {5123: "<u2", 5125: "<u4", 5126: "<f4"}[accessor["componentType"]]
+    width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+    start = view["byteOffset"] + accessor["byteOffset"]
+    values = np.frombuffer(buffer, kind, accessor["count"] * width, start)
+    return values.reshape(-1, width).astype(float)
+
+
+def _z_up(points):
+    return np.column_stack([points[:, 0], -points[:, 2], points[:, 1]])
+
+
+def _points(path):
+    """All points of a GLB, x east, y north, z up: those of its meshes and those of its copies."""
+    document, buffer = _glb(path)
+    parents = {c: k for k, node in enumerate(document["nodes"]) for c in node.get("children", [])}
+    out = []
+    for k, node in enumerate(document["nodes"]):
+        if "mesh" not in node:
+            continue
+        shift, at = np.zeros(3), k
+        while at is not None:
+            shift = shift + document["nodes"][at].get("translation", [0, 0, 0])
+            at = parents.get(at)
+        primitive = document["meshes"][node["mesh"]]["primitives"][0]
+        points = _values(document, buffer, primitive["attributes"]["POSITION"])
+        copies = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
+        if copies is None:
+            out.append(points + shift)
+            continue
+        moves, turns, sizes = (
+            _values(document, buffer, copies["attributes"][name])
+            for name in ("TRANSLATION", "ROTATION", "SCALE")
+        )
+        for move, (x, y, z, w), size in zip(moves, turns, sizes, strict=True):
+            axis, scaled = np.array([x, y, z]), points * size
+            turned = scaled + 2 * np.cross(axis, np.cross(axis, scaled) + w * scaled)
+            out.append(turned + move + shift)
+    return _z_up(np.concatenate(out))
+
+
+def test_surfaces_of_a_building_say_what_they_are(city):
+    tower = city["CityObjects"]["relation/4"]
+    geometry = tower["geometry"][0]
+    assert (tower["type"], geometry["type"], geometry["lod"]) == ("Building", "Solid", LOD[2])
+    assert tower["attributes"]["height"] == 140
+    assert tower["attributes"]["height_source"] == "tag"
+    assert "name" in tower["attributes"]
+    names = [s["type"] for s in geometry["semantics"]["surfaces"]]
+    points = np.array(city["vertices"]) * city["transform"]["scale"]
+    for face, value in zip(geometry["boundaries"][0], geometry["semantics"]["values"][0], strict=True):
+        height = points[face[0], 2]
+        wanted = (
+            "RoofSurface"
+            if (height == 140).all()
+            else "GroundSurface"
+            if (height == 2).all()
+            else "WallSurface"
+        )
+        assert names[value] == wanted
+    looks = {m["name"] for m in city["appearance"]["materials"]}
+    assert {"roof_tile", "brick", "asphalt"} <= looks
+
+
+def test_bodies_and_cavities_are_shells_of_their_own(city):
+    objects = city["CityObjects"]
+    pair, hollow = objects["way/2"], objects["way/3"]["geometry"][0]
+    assert pair["geometry"] == []
+    assert pair["attributes"]["height_source"] == "default"
+    for name in pair["children"]:
+        assert (objects[name]["type"], objects[name]["parents"]) == ("BuildingPart", ["way/2"])
+        assert [len(shell) for shell in objects[name]["geometry"][0]["boundaries"]] == [12]
+    assert len(pair["children"]) == 2
+    assert hollow["type"] == "Solid"
+    assert [len(shell) for shell in hollow["boundaries"]] == [12, 12]
+    assert [len(v) for v in hollow["semantics"]["values"]] == [12, 12]
+    points = np.array(city["vertices"]) * city["transform"]["scale"]
+    outer, inner = (np.array([face[0] for face in shell]) for shell in hollow["boundaries"])
+    assert np.ptp(points[outer][..., 2]) == pytest.approx(20)
+    verdict = validate_mesh(Mesh.of(points, inner[:, ::-1], feature=0, closed=True))
+    np.testing.assert_allclose(verdict.volume, 1000)
+
+
+# Geometry types that the schema of CityJSON 2.0 lets the kinds have that occur here.
+ALLOWED = {
+    "Building": {"Solid"},
+    "BuildingPart": {"Solid"},
+    "PlantCover": {"MultiSolid", "MultiSurface"},
+    "Road": {"MultiSurface", "CompositeSurface"},
+    "TINRelief": {"CompositeSurface"},
+    "SolitaryVegetationObject": {"GeometryInstance"},
+}
+
+
+def test_every_kind_of_object_has_a_geometry_that_the_schema_lets_it_have(city):
+    for told in city["CityObjects"].values():
+        assert {g["type"] for g in told["geometry"]} <= ALLOWED[told["type"]]
+    assert {told["type"] for told in city["CityObjects"].values()} == set(ALLOWED)
+
+
+def test_a_tree_in_cityjson_stands_where_it_grows(city, scene):
+    trees = {n: o for n, o in city["CityObjects"].items() if o["type"] == "SolitaryVegetationObject"}
+    assert len(trees) == len(TREES)
+    templates = city["geometry-templates"]
+    corners = np.array(templates["vertices-templates"])
+    told = city["transform"]
+    found = []
+    for tree in trees.values():
+        highest = []
+        for copy in tree["geometry"]:
+            shape = templates["templates"][copy["template"]]
+            used = corners[np.unique(shape["boundaries"])]
+            matrix = np.array(copy["transformationMatrix"]).reshape(4, 4)
+            anchor = np.array(city["vertices"][copy["boundaries"][0]]) * told["scale"] + told["translate"]
+            points = used @ matrix[:3, :3].T + matrix[:3, 3] + anchor
+            highest.append(points[:, 2].max())
+        found.append([*(anchor[:2] - scene.frame.origin), max(highest)])
+    wanted = [[x, y, SLOPE * x + height] for x, y, height in TREES]
+    np.testing.assert_allclose(sorted(found), sorted(wanted), atol=2e-4)
+
+
+def test_every_vertex_of_cityjson_is_used_and_every_index_exists(city):
+    used = set()
+
+    def walk(value):
+        for v in value:
+            walk(v) if isinstance(v, list) else used.add(v)
+
+    for told in city["CityObjects"].values():
+        for geometry in told["geometry"]:
+            walk(geometry["boundaries"])
+    assert used == set(range(len(city["vertices"])))
+    low, high = np.array(city["vertices"]).min(axis=0), np.array(city["vertices"]).max(axis=0)
+    extent = np.array(city["metadata"]["geographicalExtent"]).reshape(2, 3)
+    told = city["transform"]
+    np.testing.assert_allclose(
+        extent, [v * told["scale"] + told["translate"] for v in (low, high)], atol=1e-4
+    )
+
+
+def test_a_glb_node_has_its_name_its_attributes_and_its_row(scene, tmp_path):
+    document, buffer = _glb(export_scene(scene, tmp_path / "a.glb").path)
+    node = next(n for n in document["nodes"] if n["name"] == "way/1")
+    assert node["extras"]["height"] == 30
+    assert node["extras"]["height_source"] == "tag"
+    primitive = document["meshes"][node["mesh"]]["primitives"][0]
+    told = primitive["extensions"]["EXT_mesh_features"]["featureIds"][0]
+    rows = _values(document, buffer, primitive["attributes"]["_FEATURE_ID_0"])
+    assert (rows == 0).all()
+    metadata = document["extensions"]["EXT_structural_metadata"]
+    table = metadata["propertyTables"][told["propertyTable"]]
+    assert table["name"] == "buildings"
+    view = document["bufferViews"][table["properties"]["name"]["values"]]
+    assert buffer[view["byteOffset"] :].startswith("Rathaus «Süd»".encode())
+    root = document["nodes"][document["scenes"][0]["nodes"][0]]
+    east, north = scene.frame.origin
+    assert root["translation"] == [east, 0, -north]
+    assert root["extras"]["crs"] == "EPSG:32633"
+
+
+def test_copies_in_a_glb_stand_where_trees_grow(scene, tmp_path):
+    path = export_scene(scene, tmp_path / "a.glb", layers=["trees"]).path
+    document, _ = _glb(path)
+    assert document["extensionsRequired"] == ["EXT_mesh_gpu_instancing"]
+    points = _points(path) - [*scene.frame.origin, 0]
+    for x, y, height in TREES:
+        near = np.hypot(*(points[:, :2] - (x, y)).T) < 0.1
+        assert points[near, 2].max() == pytest.approx(SLOPE * x + height, abs=1e-4)
+        assert points[near, 2].min() == pytest.approx(SLOPE * x + 0.3 * height, abs=1e-4)
+    assert len(points) == len(TREES) * sum(len(shapes()[n].vertices) for n in ("trunk", "crown_broadleaved"))
+
+
+def test_boxes_of_tiles_hold_their_content_and_errors_fall(tiles):
+    document = json.loads((tiles / "tileset.json").read_text())
+    assert document["asset"]["version"] == "1.1"
+    contents = []
+
+    def walk(node, boxes, error):
+        assert node["geometricError"] < error or node["geometricError"] == error == 0
+        boxes = [*boxes, node["boundingVolume"]["box"]]
+        if "content" in node:
+            contents.append(node["content"]["uri"])
+            points = _points(tiles / node["content"]["uri"])
+            for box in [*boxes, node["content"]["boundingVolume"]["box"]]:
+                middle, half = np.array(box[:3]), np.diag(np.array(box[3:]).reshape(3, 3))
+                assert (np.abs(points - middle) <= half).all()
+            inner = np.abs(points - middle).max(axis=0)
+            np.testing.assert_allclose(inner, half, atol=0.01)
+        for child in node.get("children", []):
+            walk(child, boxes, node["geometricError"])
+
+    walk(document["root"], [], document["geometricError"] + 1)
+    assert sorted(contents) == sorted(p.relative_to(tiles).as_posix() for p in tiles.rglob("*.glb"))
+    assert any("copies" in uri for uri in contents)
+
+
+NODE = {"boundingVolume", "geometricError", "refine", "transform", "content", "children"}
+
+
+def test_a_tileset_keeps_to_the_schema_and_children_lie_within_their_parents(tiles):
+    document = json.loads((tiles / "tileset.json").read_text())
+    assert set(document) == {"asset", "geometricError", "root"}
+
+    def walk(node, outer):
+        assert {"boundingVolume", "geometricError"} <= set(node) <= NODE
+        assert node.get("refine", "ADD") == "ADD"
+        assert node["geometricError"] >= 0
+        assert set(node["boundingVolume"]) == {"box"}
+        box = np.array(node["boundingVolume"]["box"])
+        assert box.shape == (12,)
+        low, high = box[:3] - box[[3, 7, 11]], box[:3] + box[[3, 7, 11]]
+        assert (low < high).all()
+        if outer:
+            assert (low >= outer[0] - 1e-6).all()
+            assert (high <= outer[1] + 1e-6).all()
+        assert node.get("children") != []  # a leaf has no list of children
+        assert "transform" not in node or outer is None
+        for child in node.get("children", []):
+            walk(child, (low, high))
+
+    walk(document["root"], None)
+    matrix = np.array(document["root"]["transform"]).reshape(4, 4).T
+    np.testing.assert_allclose(matrix[3], [0, 0, 0, 1])
+    np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
+
+
+def test_points_of_tiles_are_where_the_projection_says(scene, tiles):
+    import pyproj  # noqa: PLC0415
+
+    document = json.loads((tiles / "tileset.json").read_text())
+    matrix = np.array(document["root"]["transform"]).reshape(4, 4).T
+    points = np.concatenate([_points(path) for path in sorted(tiles.rglob("*.glb"))])
+    earth = points @ matrix[:3, :3].T + matrix[:3, 3]
+    lon, lat, height = pyproj.Transformer.from_crs(4978, 4979, always_xy=True).transform(*earth.T)
+    x, y = scene.frame.from_geographic(lon, lat)
+    found = np.column_stack([x, y, height])
+    expected = np.concatenate(
+        [scene.tile(*index).mesh.vertices + scene.tile(*index).origin for index in scene.tile_indices]
+    )
+    gap = np.array([np.linalg.norm(found - point, axis=1).min() for point in expected[::7]])
+    assert gap.max() < 2e-3
+
+
+def test_tables_of_tiles_have_as_many_rows_as_they_say(tiles):
+    seen = 0
+    for path in sorted(tiles.rglob("*.glb")):
+        document, buffer = _glb(path)
+        views = document["bufferViews"]
+        tables = document.get("extensions", {}).get("EXT_structural_metadata", {}).get("propertyTables", [])
+        for table in tables:
+            for told in table["properties"].values():
+                values = views[told["values"]]
+                assert values["byteOffset"] + values["byteLength"] <= len(buffer)
+                if "stringOffsets" in told:
+                    view = views[told["stringOffsets"]]
+                    kind = {"UINT8": "u1", "UINT16": "<u2", "UINT32": "<u4", "UINT64": "<u8"}[
+                        told.get("stringOffsetType", "UINT32")
+                    ]
+                    offsets = np.frombuffer(
+                        buffer, kind, view["byteLength"] // np.dtype(kind).itemsize, view["byteOffset"]
+                    )
+                    assert len(offsets) == table["count"] + 1
+                    assert (np.diff(offsets.astype(np.int64)) >= 0).all()
+                    assert max(offsets[-1], 1) == values["byteLength"]  # no view may be empty
+                else:
+                    assert values["byteLength"] % table["count"] == 0
+                seen += 1
+        for mesh in document["meshes"]:
+            for primitive in mesh["primitives"]:
+                told = primitive.get("extensions", {}).get("EXT_mesh_features", {}).get("featureIds", [])
+                for ids in (entry for entry in told if "attribute" in entry):
+                    rows = _values(
+                        document, buffer, primitive["attributes"][f"_FEATURE_ID_{ids['attribute']}"]
+                    )
+                    assert 0 <= rows.min() <= rows.max() < tables[ids["propertyTable"]]["count"]
+    assert seen > 10
+
+
+def test_a_folder_that_is_not_ours_is_not_replaced(scene, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("years")
+    with pytest.raises(InputError, match=r"holds no tileset\.json"):
+        export_scene(scene, tmp_path / "mine", "3dtiles", overwrite=True)
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
+
+
+def test_heights_are_lifted_to_the_ellipsoid_on_request(scene, tmp_path, tiles):
+    low, high = (
+        np.array(json.loads((path / "tileset.json").read_text())["root"]["transform"])[12:15]
+        for path in (tiles, export_scene(scene, tmp_path / "t", "3dtiles", height_offset=39.5).path)
+    )
+    assert np.linalg.norm(high - low) == pytest.approx(39.5)

@@ -1,0 +1,290 @@
+"""What the map draws becomes ground of the right class, the sea lies right of coasts, water is level."""
+
+import numpy as np
+import pytest
+import shapely
+
+from geoscene.classes import Class, materials
+from geoscene.frames import Frame
+from geoscene.ground import (
+    Layers,
+    building_pads,
+    concatenate_layers,
+    ground_tile,
+    landcover,
+    partition,
+    plan_ground,
+    water_levels,
+)
+from geoscene.ground.coast import sea
+from geoscene.ground.terrain import open_terrain
+from geoscene.mesh import concatenate
+from geoscene.report import Problem
+from geoscene.sources import read_osm
+from geoscene.sources.data import Area, OsmData, Way
+
+FRAME = Frame.at(9.0, 50.0)
+EXTENT = (-100.0, -100.0, 100.0, 100.0)
+NONE = np.empty(0, np.int64)
+
+
+def lonlat(xy):
+    return np.column_stack(FRAME.to_geographic(*np.asarray(xy, float).T))
+
+
+def area(number, polygon, **tags):
+    return Area(f"way/{number}", tags, shapely.transform(polygon, lonlat), NONE)
+
+
+def way(number, xy, **tags):
+    return Way(f"way/{number}", tags, np.arange(len(xy)), lonlat(xy))
+
+
+def osm_of(*features):
+    ways = [f for f in features if isinstance(f, Way)]
+    areas = [f for f in features if isinstance(f, Area)]
+    return OsmData((8.9, 49.9, 9.1, 50.1), ways, areas, [], [])
+
+
+def cover(*features):
+    return landcover(osm_of(*features), FRAME, extent=EXTENT)
+
+
+def names(layers):
+    by_code = {m.code: name for name, m in materials().items()}
+    return [(Class(k).name, by_code[m]) for k, m in zip(layers.klass, layers.material, strict=True)]
+
+
+BOX = shapely.box(-50, -50, 50, 50)
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({"landuse": "forest"}, ("FOREST_FLOOR", "soil")),
+        ({"natural": "beach"}, ("SAND", "sand")),
+        ({"natural": "beach", "surface": "gravel"}, ("SAND", "gravel")),
+        ({"amenity": "parking"}, ("PARKING", "asphalt")),
+        ({"amenity": "parking", "surface": "grass_paver"}, ("PARKING", "grass")),
+        ({"natural": "water", "surface": "asphalt"}, ("WATER", "water")),
+        ({"leisure": "park", "landuse": "grass"}, ("GRASS", "grass")),
+    ],
+)
+def test_tags_decide_class_and_material(tags, expected):
+    layers, problems = cover(area(1, BOX, **tags))
+    assert names(layers) == [expected]
+    assert layers.source[0] == ("surface" if "surface" in tags and expected[1] != "water" else "tags")
+    assert problems == []
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"amenity": "parking", "parking": "underground"},
+        {"amenity": "parking", "building": "yes"},
+        {"natural": "water", "tunnel": "culvert"},
+        {"leisure": "swimming_pool", "location": "roof"},
+        {"landuse": "nonsense"},
+    ],
+)
+def test_what_is_not_on_the_ground_is_not_drawn_on_it(tags):
+    assert len(cover(area(1, BOX, **tags))[0]) == 0
+
+
+def test_water_that_flows_is_told_from_water_that_stands():
+    layers, _ = cover(
+        area(1, BOX, natural="water", water="river"),
+        area(2, BOX, natural="water", water="lake"),
+        area(3, BOX, waterway="riverbank"),
+    )
+    assert layers.body.tolist() == ["river", "standing", "river"]
+
+
+def test_lines_are_as_wide_as_their_tag_or_their_kind():
+    line = [(-300, 0), (300, 0)]
+    layers, problems = cover(
+        way(1, line, waterway="stream", width="5"),
+        way(2, line, waterway="river"),
+        way(3, line, waterway="stream", width="narrow"),
+        way(4, line, railway="rail", tunnel="yes"),
+        way(5, line, railway="rail"),
+    )
+    within = shapely.area(shapely.intersection(layers.polygon, shapely.box(*EXTENT))) / 200
+    np.testing.assert_allclose(within, [5, 12, 2, 3.6], rtol=1e-6)
+    assert layers.source.tolist() == ["width", "default-width", "default-width", "default-width"]
+    assert [(p.osm_id, p.reason) for p in problems] == [("way/3", "unreadable-width")]
+
+
+def test_the_smaller_of_two_areas_of_a_kind_lies_above():
+    big, small = (
+        area(1, BOX, landuse="grass"),
+        area(2, shapely.box(0, 0, 9, 9), leisure="garden", surface="sand"),
+    )
+    for features in ([big, small], [small, big]):
+        cells = partition(EXTENT, cover(*features)[0])
+        sand = shapely.area(cells.polygon[cells.material == materials()["sand"].code]).sum()
+        assert sand == pytest.approx(81, rel=1e-5)
+
+
+def test_cover_outside_the_extent_is_left_out():
+    layers, _ = cover(area(1, shapely.box(200, 0, 300, 50), landuse="grass"), area(2, BOX, landuse="grass"))
+    assert layers.osm_id.tolist() == ["way/2"]
+
+
+def sea_area(coasts, extent=EXTENT):
+    polygons, problems = sea([np.array(c, float) for c in coasts], extent)
+    return shapely.union_all(polygons), problems
+
+
+def test_the_sea_lies_right_of_the_coast():
+    north_going = [(20, -300), (20, 300)]
+    water, problems = sea_area([north_going])
+    assert water.equals(shapely.box(20, -100, 100, 100))
+    assert sea_area([north_going[::-1]])[0].equals(shapely.box(-100, -100, 20, 100))
+    assert problems == []
+
+
+def test_islands_and_lagoons_follow_the_direction_of_their_ring():
+    coast = [(20, -300), (20, 300)]
+    ring = [(50, -10), (70, -10), (70, 10), (50, 10), (50, -10)]  # land inside
+    water, _ = sea_area([coast, ring])
+    assert water.area == pytest.approx(80 * 200 - 400)
+    alone, _ = sea_area([ring])  # an island: the sea is all around it
+    assert alone.area == pytest.approx(200 * 200 - 400)
+
+
+def test_a_coast_in_pieces_is_one_and_one_cut_short_is_led_to_the_edge():
+    pieces = [[(20, 0), (20, 300)], [(20, -300), (20, -50)], [(20, -50), (20, 0)]]
+    assert sea_area(pieces)[0].equals(shapely.box(20, -100, 100, 100))
+    water, problems = sea_area([[(20, -300), (20, 60)]])
+    assert [p.reason for p in problems] == ["open-end"]
+    assert water.area == pytest.approx(80 * 200, rel=1e-3)  # straight on is the shortest way to the edge
+
+
+def test_no_coast_no_sea():
+    assert sea_area([])[0].is_empty
+    assert sea_area([[(500, -300), (500, 300)]])[0].is_empty
+
+
+def test_a_coast_that_contradicts_itself_is_told():
+    _, problems = sea_area([[(-20, -300), (-20, 300)], [(20, -300), (20, 300)]])
+    assert [p.reason for p in problems] == ["conflict"]
+    assert isinstance(problems[0], Problem)
+
+
+def rising(x, y):
+    """A slope to the east, with bumps."""
+    return 50 + 0.2 * np.asarray(x) + np.sin(np.asarray(y) / 7)
+
+
+def wet_layers(*bodies):
+    polygons, kinds = zip(*bodies, strict=True)
+    return Layers.of(polygons, klass=Class.WATER, material=11, priority=40, body=kinds)
+
+
+@pytest.mark.parametrize("size", [30.0, 64.0, 500.0])
+def test_lakes_are_level_and_the_ground_closes_on_them_across_tiles(size):
+    lake = shapely.Point(3, 4).buffer(37)
+    touching_the_side = shapely.box(60, 30, 90, 60)
+    layers = wet_layers((lake, "standing"), (touching_the_side, "standing"))
+    plan = plan_ground(EXTENT, layers, tile_size=size, lines=15.0)
+    levels = water_levels(layers, [], FRAME, height=rising)
+    mesh = concatenate([ground_tile(plan, i, j, height=rising, levels=levels) for i, j in plan.tiles])
+    water = mesh.klass == Class.WATER
+    z = mesh.vertices[mesh.faces][water][..., 2]
+    east = mesh.vertices[mesh.faces][water][..., 0].mean(axis=1) > 50
+    shore = shapely.get_coordinates(shapely.segmentize(lake.exterior, 1.0))
+    assert np.ptp(z[~east]) == 0.0
+    assert np.ptp(z[east]) == 0.0
+    assert z[~east][0, 0] == pytest.approx(rising(*shore.T).min(), abs=0.5)
+    # One surface in space: an edge that has one face lies on the extent's border.
+    points, number = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = number.reshape(-1)[mesh.faces]
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    ends = points[unique[count == 1]][:, :, :2]
+    assert (np.abs(ends) == 100).all(axis=1).any(axis=1).all()
+    assert set(count) == {1, 2}
+
+
+def test_waters_that_touch_stand_equally_high_and_at_the_seas_level_beside_it():
+    layers = wet_layers(
+        (shapely.box(-90, -90, -50, 90), "sea"),
+        (shapely.box(-50, 0, -20, 20), "standing"),
+        (shapely.box(-20, 5, 0, 10), "standing"),
+        (shapely.box(40, 0, 60, 20), "standing"),
+        (shapely.box(80, -90, 90, 90), "sea"),
+    )
+    level = water_levels(layers, [], FRAME, height=rising).level
+    assert level[0] == level[1] == level[2] == level[4]
+    assert level[3] == pytest.approx(rising(40, 0), abs=0.01)  # the lowest of its corners
+
+
+def test_a_river_never_flows_uphill_and_is_turned_if_drawn_so():
+    """The map draws it eastward, up the slope; the water falls to the west."""
+    stream = way(1, [(-90, 0), (0, 5), (90, 0)], waterway="river")
+    layers, _ = cover(stream)
+    levels = water_levels(layers, [stream], FRAME, height=rising)
+    assert levels.reversed == ("way/1",)
+    order = np.argsort(-levels.station[:, 0])
+    assert (np.diff(levels.height[order]) <= 0).all()
+    assert (levels.height <= rising(*levels.station.T) + 1e-9).all()
+    plan = plan_ground(EXTENT, layers, tile_size=50.0, lines=10.0)
+    mesh = concatenate([ground_tile(plan, i, j, height=rising, levels=levels) for i, j in plan.tiles])
+    corners = mesh.vertices[mesh.faces][mesh.klass == Class.WATER].reshape(-1, 3)
+    assert np.abs(corners[:, 2] - (50 + 0.2 * corners[:, 0])).max() < 3.5
+
+
+REAL = ["helsinki_center.osm.pbf", "nyc_lower_east_side.osm.pbf", "monaco.osm.pbf", "gibraltar.osm.pbf"]
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", REAL)
+def test_the_ground_of_real_places_is_one_surface(shared_osm, name):
+    osm = read_osm(shared_osm(name))
+    west, south, east, north = osm.bounds
+    frame = Frame.at((west + east) / 2, (south + north) / 2)
+    x, y = frame.from_geographic([west, east], [south, north])
+    extent = (x.min(), y.min(), x.max(), y.max())
+    layers, _ = landcover(osm, frame, extent=extent)
+    houses = [a.geometry for a in osm.areas if "building" in a.tags]
+    houses = shapely.transform(
+        np.array(houses, object), lambda c: np.column_stack(frame.from_geographic(*c.T))
+    )
+    plan = plan_ground(extent, concatenate_layers([layers, building_pads(houses)]))
+    mesh = concatenate([ground_tile(plan, i, j) for i, j in plan.tiles])
+    points, number = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = number.reshape(-1)[mesh.faces]
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    assert set(count) == {1, 2}
+    xmin, ymin, xmax, ymax = plan.extent
+    ends = points[unique[count == 1]][:, :, :2]
+    assert ((ends == (xmin, ymin)).all(axis=1) | (ends == (xmax, ymax)).all(axis=1)).any(axis=1).all()
+    (ux, uy), (vx, vy) = ((points[faces[:, k]] - points[faces[:, 0]])[:, :2].T for k in (1, 2))
+    area_m2 = (ux * vy - uy * vx) / 2
+    assert (area_m2 > 0).all()
+    assert area_m2.sum() == pytest.approx((xmax - xmin) * (ymax - ymin), rel=1e-9)
+    pads = shapely.union_all(shapely.intersection(houses, shapely.box(*plan.extent))).area
+    assert area_m2[mesh.klass == Class.BUILDING_PAD].sum() == pytest.approx(pads, rel=1e-4)
+
+
+@pytest.mark.shared
+def test_monaco_lies_on_the_sea_and_rises_behind_it(shared_osm, shared_dem):
+    osm = read_osm(shared_osm("monaco.osm.pbf"))
+    frame = Frame.at(7.42, 43.735)
+    extent = (-600.0, -600.0, 1000.0, 600.0)
+    terrain = open_terrain([shared_dem("N43E007.hgt.zip")], frame, bounds=extent)
+    layers, _ = landcover(osm, frame, extent=extent)
+    plan = plan_ground(extent, layers, lines=terrain.lines)
+    levels = water_levels(layers, osm.ways, frame, height=terrain.height)
+    mesh = concatenate([ground_tile(plan, i, j, height=terrain.height, levels=levels) for i, j in plan.tiles])
+    middle = mesh.vertices[mesh.faces].mean(axis=1)
+    harbour = (np.abs(middle[:, 0] - 450) < 60) & (np.abs(middle[:, 1]) < 60)
+    assert (mesh.klass[harbour] == Class.WATER).any()
+    z = mesh.vertices[mesh.faces][:, :, 2]
+    assert np.abs(z[harbour & (mesh.klass == Class.WATER)]).max() < 1.0
+    land = ~np.isin(mesh.klass, [Class.WATER])
+    error = middle[land, 2] - terrain.height(middle[land, 0], middle[land, 1])
+    assert np.median(np.abs(error)) < 0.3
+    assert z.max() > 100.0

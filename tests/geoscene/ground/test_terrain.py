@@ -1,0 +1,243 @@
+"""Heights are the elevation model's, bilinear between its posts, whatever its grid, unit and tiling."""
+
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+import rasterio
+import shapely
+from rasterio.transform import Affine
+
+from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.frames import Frame
+from geoscene.ground.terrain import base_heights, flat_terrain, open_terrain
+
+FRAME = Frame.at(9.0, 50.0)
+BOUNDS = (-200.0, -200.0, 200.0, 200.0)
+UTM = "EPSG:32632"  # 9 E is its meridian: easting 500,000
+
+
+def write_dem(path, values, *, corner, step=25.0, crs=UTM, nodata=None, unit=None, dtype="float32"):
+    """A GeoTIFF whose first pixel's outer corner is ``corner``, north up."""
+    values = np.asarray(values, dtype)
+    with rasterio.open(
+        path, "w", driver="GTiff", width=values.shape[1], height=values.shape[0], count=1, dtype=dtype,
+        crs=crs, transform=Affine(step, 0, corner[0], 0, -step, corner[1]), nodata=nodata,
+    ) as target:  # fmt: skip
+        target.write(values, 1)
+        if unit:
+            target.units = [unit]
+    return path
+
+
+def posts(corner, shape, step=25.0):
+    rows, columns = np.indices(shape)
+    return corner[0] + (columns + 0.5) * step, corner[1] - (rows + 0.5) * step
+
+
+def around(shape=(60, 60), step=25.0):
+    """A corner such that a raster of that shape is centred on the frame's centre."""
+    east, north = FRAME.to_crs(UTM, 0.0, 0.0)
+    return float(east) - shape[1] * step / 2 + 3.7, float(north) + shape[0] * step / 2 - 8.1
+
+
+def sample(count=500, seed=0):
+    return np.random.default_rng(seed).uniform(-200, 200, (2, count))
+
+
+def test_a_slope_comes_back_exactly_at_every_place(tmp_path):
+    """Bilinear interpolation reproduces a plane: to float32's step, only if posts are at pixels' middles."""
+    corner = around()
+    east, north = posts(corner, (60, 60))
+    path = write_dem(
+        tmp_path / "a.tif", 100 + 0.1 * (east - 500000) - 0.05 * (north - 5538000), corner=corner
+    )
+    terrain = open_terrain([path], FRAME, bounds=BOUNDS)
+    x, y = sample()
+    e, n = FRAME.to_crs(UTM, x, y)
+    np.testing.assert_allclose(
+        terrain.height(x, y), 100 + 0.1 * (e - 500000) - 0.05 * (n - 5538000), atol=1e-4
+    )
+    assert terrain.spacing == pytest.approx(25.0, rel=1e-3)
+    assert terrain.vertical == "orthometric"
+
+
+def test_between_four_posts_the_height_is_bilinear(tmp_path):
+    corner = around((4, 4))
+    values = np.zeros((4, 4))
+    values[1, 1], values[1, 2], values[2, 1], values[2, 2] = 10, 20, 30, 80
+    path = write_dem(tmp_path / "a.tif", values, corner=corner)
+    e, n = (grid[1, 1] for grid in posts(corner, (4, 4)))
+    u, v = 0.25, 0.6
+    x, y = FRAME.from_crs(UTM, e + u * 25, n - v * 25)
+    terrain = open_terrain([path], FRAME, bounds=(-20, -20, 20, 20))
+    assert terrain.height(x, y) == pytest.approx(
+        10 * 0.75 * 0.4 + 20 * 0.25 * 0.4 + 30 * 0.75 * 0.6 + 80 * 0.25 * 0.6
+    )
+
+
+def test_tiles_of_one_model_are_as_one_raster_in_any_order(tmp_path):
+    """No seam: the strip between the last posts of one tile and the first of the next is interpolated too."""
+    corner = around()
+    values = np.random.default_rng(1).uniform(0, 50, (60, 60))
+    whole = write_dem(tmp_path / "whole.tif", values, corner=corner)
+    middle = corner[0] + 30 * 25.0
+    left = write_dem(tmp_path / "left.tif", values[:, :30], corner=corner)
+    right = write_dem(tmp_path / "right.tif", values[:, 30:], corner=(middle, corner[1]))
+    x, y = sample(3000)
+    assert (np.abs(FRAME.to_crs(UTM, x, y)[0] - middle) < 12).sum() > 50
+    expected = open_terrain([whole], FRAME, bounds=BOUNDS).height(x, y)
+    for order in ([left, right], [right, left]):
+        np.testing.assert_allclose(
+            open_terrain(order, FRAME, bounds=BOUNDS).height(x, y), expected, atol=1e-9
+        )
+
+
+def test_a_finer_model_goes_before_a_coarser_one(tmp_path):
+    coarse = write_dem(tmp_path / "coarse.tif", np.full((60, 60), 5.0), corner=around())
+    shape = (10, 10)
+    fine = write_dem(tmp_path / "fine.tif", np.full(shape, 9.0), corner=around(shape, 10.0), step=10.0)
+    terrain = open_terrain([coarse, fine], FRAME, bounds=BOUNDS)
+    np.testing.assert_allclose(terrain.height([0.0, 150.0], [0.0, 150.0]), [9.0, 5.0])
+    assert terrain.spacing == pytest.approx(10.0, rel=1e-3)
+
+
+def test_voids_are_filled_from_around_and_counted(tmp_path):
+    corner = around()
+    east, _ = posts(corner, (60, 60))
+    slope = 0.1 * (east - 500000) + 300
+    values = slope.copy()
+    values[28:32, 28:32] = -9999
+    values[35, 35] = np.nan
+    values[33, 25] = 3e38  # a void that nothing marks
+    path = write_dem(tmp_path / "a.tif", values, corner=corner, nodata=-9999)
+    terrain = open_terrain([path], FRAME, bounds=BOUNDS)
+    assert terrain.voids == 18
+    x, y = sample(2000)
+    expected = 0.1 * (FRAME.to_crs(UTM, x, y)[0] - 500000) + 300
+    assert np.abs(terrain.height(x, y) - expected).max() < 5.0
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("ft", 0.3048), ("us-ft", 1200 / 3937), ("m", 1.0)])
+def test_feet_become_metres(tmp_path, unit, factor):
+    path = write_dem(tmp_path / "a.tif", np.full((60, 60), 1000.0), corner=around(), unit=unit)
+    assert open_terrain([path], FRAME, bounds=BOUNDS).height(0, 0) == pytest.approx(1000 * factor)
+    silent = write_dem(tmp_path / "b.tif", np.full((60, 60), 1000.0), corner=around())
+    assert open_terrain([silent], FRAME, bounds=BOUNDS, unit=unit).height(0, 0) == pytest.approx(
+        1000 * factor
+    )
+
+
+def test_a_vertical_crs_says_what_heights_are_above_and_in_which_unit(tmp_path):
+    values = np.full((60, 60), 100.0)
+    navd = write_dem(tmp_path / "navd.tif", values, corner=around(), crs="EPSG:32632+6360")  # NAVD88, US feet
+    terrain = open_terrain([navd], FRAME, bounds=BOUNDS)
+    assert (terrain.vertical, terrain.datum) == ("orthometric", "NAVD88 height (ftUS)")
+    assert terrain.height(0, 0) == pytest.approx(100 * 1200 / 3937)
+    told = open_terrain([navd], FRAME, bounds=BOUNDS, vertical="ellipsoidal")
+    assert told.vertical == "ellipsoidal"
+
+
+def test_a_model_that_does_not_cover_the_scene_is_an_error_or_a_counted_fallback(tmp_path):
+    corner = around()
+    east, _ = posts(corner, (60, 20))  # its eastern edge is 250 m west of the raster's middle
+    path = write_dem(tmp_path / "a.tif", east - 499000, corner=corner)
+    bounds = (-350.0, -200.0, 50.0, 200.0)
+    with pytest.raises(
+        InputError, match=r"a\.tif: 7\d\.\d % of the scene is not covered.*W 8\.99.*--dem-gaps nearest"
+    ):
+        open_terrain([path], FRAME, bounds=bounds)
+    terrain = open_terrain([path], FRAME, bounds=bounds, outside="nearest")
+    edge = corner[0] + 20 * 25
+    west = FRAME.to_crs(UTM, bounds[0], 0)[0]
+    assert terrain.uncovered == pytest.approx(1 - (edge - west) / 400, abs=1e-3)
+    assert terrain.height(40, 0) == pytest.approx(east.max() - 499000)
+    with pytest.raises(InputError, match=r"all of the scene is not covered.*add files that cover it$"):
+        open_terrain([path], FRAME, bounds=(500, 0, 600, 100), outside="nearest")
+
+
+def test_files_that_cannot_serve_are_refused_by_name(tmp_path):
+    with pytest.raises(SourceNotFoundError, match=r"none\.tif"):
+        open_terrain([tmp_path / "none.tif"], FRAME, bounds=BOUNDS)
+    text = tmp_path / "text.tif"
+    text.write_text("not a raster")
+    with pytest.raises(InputError, match=r"text\.tif: not a raster"):
+        open_terrain([text], FRAME, bounds=BOUNDS)
+    bad_zip = tmp_path / "bad.hgt.zip"
+    bad_zip.write_text("not an archive")
+    with pytest.raises(InputError, match="not a zip"):
+        open_terrain([bad_zip], FRAME, bounds=BOUNDS)
+    empty = tmp_path / "empty.zip"
+    with zipfile.ZipFile(empty, "w"):
+        pass
+    with pytest.raises(InputError, match="0 rasters"):
+        open_terrain([empty], FRAME, bounds=BOUNDS)
+    nowhere = write_dem(tmp_path / "nowhere.tif", np.zeros((60, 60)), corner=around(), crs=None)
+    with pytest.raises(InputError, match="no CRS"):
+        open_terrain([nowhere], FRAME, bounds=BOUNDS)
+    odd = write_dem(tmp_path / "odd.tif", np.zeros((60, 60)), corner=around(), unit="fathom")
+    with pytest.raises(InputError, match="fathom"):
+        open_terrain([odd], FRAME, bounds=BOUNDS)
+    void = write_dem(tmp_path / "void.tif", np.full((60, 60), -1.0), corner=around(), nodata=-1)
+    with pytest.raises(InputError, match="only voids"):
+        open_terrain([void], FRAME, bounds=BOUNDS)
+
+
+def test_a_terrain_goes_to_workers(tmp_path):
+    path = write_dem(tmp_path / "a.tif", np.random.default_rng(2).uniform(0, 9, (60, 60)), corner=around())
+    terrain = open_terrain([path], FRAME, bounds=BOUNDS)
+    x, y = sample(50)
+    before = terrain.height(x, y)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(terrain)).height(x, y), before)  # noqa: S301
+
+
+def test_flat_ground_is_at_zero():
+    terrain = flat_terrain(FRAME)
+    assert (terrain.height(np.zeros((2, 3)), 7.0) == np.zeros((2, 3))).all()
+    assert terrain.vertical == "flat"
+    assert terrain.lines == 0.0
+
+
+def test_a_building_stands_on_the_lowest_ground_along_its_outline(tmp_path):
+    corner = around()
+    east, _ = posts(corner, (60, 60))
+    path = write_dem(tmp_path / "a.tif", np.abs(east - east[0, 30]), corner=corner)
+    terrain = open_terrain([path], FRAME, bounds=BOUNDS)
+    x0 = float(FRAME.from_crs(UTM, east[0, 30], FRAME.to_crs(UTM, 0, 0)[1])[0])
+    across = shapely.box(x0 - 30, -10, x0 + 50, 10)  # no corner lies in the valley, its sides cross it
+    base = base_heights([across, None, shapely.box(x0 + 20, 0, x0 + 30, 5)], terrain.height)
+    assert base[0] == pytest.approx(0.0, abs=1.1)
+    assert np.isnan(base[1])
+    assert base[2] == pytest.approx(20.0, abs=0.1)
+
+
+SPOTS = [
+    ("N43E007.hgt.zip", 7.42, 43.735, 19),
+    ("N43E007.hgt.zip", 7.41, 43.74, 225),
+    ("heidelberg_srtm3_utm32n.tif", 8.71, 49.412, 132),
+    ("N49E011.hgt.zip", 11.58, 49.985, 413),
+    ("N50E011.hgt.zip", 11.55, 50.02, 360),
+]
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(("name", "lon", "lat", "metres"), SPOTS)
+def test_known_heights_of_real_places(shared_dem, name, lon, lat, metres):
+    terrain = open_terrain([shared_dem(name)], Frame.at(lon, lat), bounds=(-100, -100, 100, 100))
+    assert terrain.height(0, 0) == pytest.approx(metres, abs=0.5)
+
+
+@pytest.mark.shared
+def test_two_srtm_tiles_meet_without_a_seam_at_50_north(shared_dem):
+    """Along a line across the tiles' border steps are as small as anywhere else."""
+    frame = Frame.at(11.55, 50.0)
+    paths = [shared_dem("N49E011.hgt.zip"), shared_dem("N50E011.hgt.zip")]
+    terrain = open_terrain(paths, frame, bounds=(-1500, -1500, 1500, 1500))
+    assert len(terrain.grids) == 1
+    assert (terrain.vertical, terrain.datum) == ("orthometric", "EGM96")
+    x, y = np.meshgrid(np.linspace(-1400, 1400, 30), np.arange(-200, 200, 1.0))
+    step = np.abs(np.diff(terrain.height(x, y), axis=0))
+    assert step.max() < 0.5
+    with pytest.raises(InputError, match=r"48\.\d % of the scene is not covered"):
+        open_terrain(paths[:1], frame, bounds=(-1500, -1500, 1500, 1500))

@@ -1,0 +1,238 @@
+"""Street furniture stands beside the road and faces whom it is for; barriers leave roads open."""
+
+import manifold3d
+import numpy as np
+import pytest
+import shapely
+
+from geoscene.classes import Class, materials
+from geoscene.frames import Frame
+from geoscene.ground import Layers, building_pads, concatenate_layers, plan_ground
+from geoscene.objects.barriers import barrier_meshes, read_barriers
+from geoscene.objects.furniture import furniture_instances, read_furniture, shape_of
+from geoscene.objects.shapes import expand, shapes
+from geoscene.sources import read_osm
+from geoscene.sources.data import Area, OsmData, Point, Way
+from geoscene.structures.meeting import OPENING
+
+FRAME = Frame.at(9.0, 50.0)
+EXTENT = (-100.0, -100.0, 100.0, 100.0)
+EAST, NORTH, WEST, SOUTH = 0.0, np.pi / 2, np.pi, -np.pi / 2
+
+
+def lonlat(xy):
+    return np.column_stack(FRAME.to_geographic(*np.asarray(xy, float).reshape(-1, 2).T))
+
+
+def node(number, xy, **tags):
+    lon, lat = lonlat(xy)[0]
+    return Point(f"node/{number}", tags, lon, lat)
+
+
+def way(number, xy, nodes=None, **tags):
+    nodes = np.arange(len(xy)) + 1000 * number if nodes is None else np.array(nodes)
+    return Way(f"way/{number}", tags, nodes, lonlat(xy))
+
+
+def osm_of(*features):
+    kinds = {kind: [f for f in features if isinstance(f, kind)] for kind in (Way, Area, Point)}
+    return OsmData((8.9, 49.9, 9.1, 50.1), kinds[Way], kinds[Area], kinds[Point], [])
+
+
+def plan_with(roads=(), houses=(), mouths=()):
+    road = Layers.of(list(roads), klass=Class.ROAD, material=1, priority=130.0)
+    mouth = Layers.of(list(mouths), klass=Class.TUNNEL, material=1, priority=OPENING)
+    return plan_ground(EXTENT, concatenate_layers([road, building_pads(list(houses)), mouth]))
+
+
+STREET = shapely.box(-100, -3, 100, 3)
+"""A street from west to east, six metres wide."""
+
+
+def street(**tags):
+    return way(1, [(-100, 0), (20, 0), (100, 0)], nodes=[1, 2, 3], highway="residential", **tags)
+
+
+def read(*features, roads=(STREET,), houses=(), **options):
+    return read_furniture(osm_of(*features), FRAME, plan_with(roads, houses), **options)
+
+
+def facing(table):
+    return np.column_stack([np.cos(table.heading), np.sin(table.heading)])
+
+
+def test_signals_on_a_two_way_street_stand_on_both_sides_facing_their_traffic():
+    table, problems = read(street(), node(2, (20, 0), highway="traffic_signals"))
+    np.testing.assert_allclose(
+        table.xy, [(20, -3.5), (20, 3.5)], atol=0.26
+    )  # right of eastbound, of westbound
+    np.testing.assert_allclose(facing(table), [(-1, 0), (1, 0)], atol=1e-6)
+    assert table.place_source.tolist() == ["roadside", "roadside"]
+    assert problems == []
+
+
+@pytest.mark.parametrize(
+    ("tags", "way_tags", "left_hand", "place", "heading"),
+    [
+        ({"direction": "forward"}, {}, False, (20, -3.5), WEST),
+        ({"direction": "backward"}, {}, False, (20, 3.5), EAST),
+        ({"traffic_signals:direction": "forward"}, {}, True, (20, 3.5), WEST),
+        ({}, {"oneway": "yes"}, False, (20, -3.5), WEST),
+        ({}, {"oneway": "-1"}, False, (20, 3.5), EAST),
+    ],
+)
+def test_direction_oneway_and_side_decide_where_a_signal_stands(tags, way_tags, left_hand, place, heading):
+    signal = node(2, (20, 0), highway="traffic_signals", **tags)
+    table, _ = read(street(**way_tags), signal, left_hand=left_hand)
+    assert len(table) == 1
+    np.testing.assert_allclose(table.xy[0], place, atol=0.26)
+    assert np.cos(table.heading[0] - heading) == pytest.approx(1.0)
+
+
+def test_at_a_crossing_of_streets_signals_stand_at_corners_off_both():
+    cross = shapely.box(17, -100, 23, 100)
+    table, _ = read(street(), node(2, (20, 0), highway="traffic_signals"), roads=[STREET, cross])
+    assert len(table) == 2
+    for spot in shapely.points(table.xy):
+        assert 0.2 < spot.distance(shapely.union(STREET, cross)) < 1.0
+
+
+def test_a_lamp_beside_the_road_leans_over_it_and_keeps_its_place():
+    lamps = [node(7, (0, 5), highway="street_lamp"), node(8, (0, -5), highway="street_lamp", direction="E")]
+    table, _ = read(street(), *lamps)
+    np.testing.assert_allclose(table.xy, [(0, 5), (0, -5)], atol=1e-6)
+    np.testing.assert_allclose(facing(table), [(0, -1), (1, 0)], atol=1e-4)
+    assert table.heading_source.tolist() == ["road", "direction"]
+    lit = expand(furniture_instances(table))
+    arm = lit.vertices[lit.faces[: len(shapes()["street_lamp"])]].reshape(-1, 3)
+    assert arm[:, 1].min() < 4.0  # over the street, south of the mast
+
+
+def test_a_sign_on_the_right_faces_oncoming_traffic():
+    table, _ = read(
+        street(), node(7, (0, -5), traffic_sign="maxspeed"), node(8, (0, 5), traffic_sign="hazard")
+    )
+    np.testing.assert_allclose(facing(table), [(-1, 0), (1, 0)], atol=1e-6)
+    assert table.shape.tolist() == ["sign_round", "sign_triangle"]
+
+
+def test_height_tags_stretch_the_shape():
+    table, problems = read(
+        node(7, (0, 5), highway="street_lamp", height="12"),
+        node(8, (9, 5), highway="street_lamp", height="very"),
+    )
+    mesh = expand(furniture_instances(table, height=lambda x, y: 0 * x * y + 40.0))
+    assert mesh.vertices[:, 2].max() == pytest.approx(52.0)
+    assert table.height_source.tolist() == ["height", "default"]
+    assert [(p.osm_id, p.reason) for p in problems] == [("node/8", "unusable-height")]
+
+
+def test_what_is_not_in_the_open_on_the_ground_is_left_out():
+    house = shapely.box(40, 40, 60, 60)
+    table, problems = read(
+        node(4, (50, 50), amenity="bench"),
+        node(5, (0, 9), highway="street_lamp", tunnel="yes"),
+        node(6, (0, 9), highway="street_lamp", layer="1"),
+        node(7, (500, 9), highway="street_lamp"),
+        node(8, (0, 9), amenity="bench"),
+        houses=[house],
+    )
+    assert table.osm_id.tolist() == ["node/8"]
+    assert [(p.osm_id, p.reason) for p in problems] == [("node/4", "in-building")]
+
+
+@pytest.mark.parametrize(
+    ("tags", "shape"),
+    [
+        ({"traffic_sign": "stop"}, "sign_stop"),
+        ({"traffic_sign": "DE:206"}, "sign_rectangle"),
+        ({"barrier": "bollard"}, "bollard"),
+        ({"power": "pole"}, "utility_pole"),
+        ({"amenity": "cafe"}, None),
+        ({}, None),
+    ],
+)
+def test_tags_choose_the_shape(tags, shape):
+    assert shape_of(tags) == shape
+
+
+def volume(mesh):
+    part = manifold3d.Manifold(manifold3d.Mesh64(mesh.vertices, mesh.faces.astype(np.uint64)))
+    assert part.status() == manifold3d.Error.NoError
+    return part.volume()
+
+
+def solids(*features, roads=(), houses=(), height=None):
+    barriers, problems = read_barriers(osm_of(*features), FRAME, plan_with(roads, houses))
+    return barriers, barrier_meshes(barriers, height=height), problems
+
+
+def test_a_wall_is_a_solid_as_long_wide_and_high_as_it_is_drawn():
+    wall = way(1, [(-20, 0), (20, 0)], barrier="wall", height="2.2", width="0.5", material="brick")
+    barriers, [mesh], problems = solids(wall)
+    assert volume(mesh) == pytest.approx(40 * 0.5 * (2.2 + 0.3), rel=1e-6)
+    assert mesh.vertices[:, 2].max() == pytest.approx(2.2)
+    assert set(mesh.klass) == {Class.WALL}
+    assert set(mesh.material) == {materials()["brick"].code}
+    assert (barriers.height_source[0], barriers.width_source[0], problems) == ("height", "width", [])
+
+
+def test_a_fence_round_a_garden_is_one_ring_with_a_gate():
+    ring = [(0, 0), (30, 0), (30, 20), (0, 20), (0, 0)]
+    fence = way(1, ring, nodes=[1, 2, 3, 4, 1], barrier="fence")
+    _, [closed], _ = solids(fence)
+    assert volume(closed) == pytest.approx(100 * 0.05 * 1.8, rel=1e-3)
+    _, [open_], _ = solids(fence, node(2, (30, 0), barrier="gate", width="4"))
+    assert volume(open_) == pytest.approx(96 * 0.05 * 1.8, rel=1e-3)
+
+
+def test_a_barrier_is_open_where_a_road_passes_and_ends_at_houses():
+    hedge = way(1, [(-40, 50), (-40, -50)], barrier="hedge", height="1")
+    house = shapely.box(-45, 30, -35, 60)
+    barriers, [mesh], problems = solids(hedge, roads=[STREET], houses=[house])
+    assert volume(mesh) == pytest.approx((100 - 6 - 20) * 0.8 * 1.3, rel=1e-6)
+    assert [(p.osm_id, p.reason) for p in problems] == [("way/1", "across-road")]
+    assert len(shapely.get_parts(barriers.polygon[0])) == 2
+
+
+def test_a_barrier_over_a_tunnels_mouth_does_not_bar_it():
+    wall = way(1, [(-20, 0), (20, 0)], barrier="wall", height="2.2", width="0.5")
+    barriers, problems = read_barriers(osm_of(wall), FRAME, plan_with(mouths=[shapely.box(-4, -10, 5, 10)]))
+    assert barriers.polygon[0].area == pytest.approx((40 - 9) * 0.5)
+    assert [p.reason for p in problems] == ["across-road"]
+
+
+def test_a_barrier_follows_the_ground():
+    def hill(x, y):
+        return 10 + 0.3 * np.asarray(x) + 0 * np.asarray(y)
+
+    _, [mesh], _ = solids(way(1, [(-20, 0), (20, 0)], barrier="wall"), height=hill)
+    above = mesh.vertices[:, 2] - hill(mesh.vertices[:, 0], mesh.vertices[:, 1])
+    assert sorted(set(np.round(above, 9))) == [-0.3, 1.8]
+    assert volume(mesh) == pytest.approx(40 * 0.25 * 2.1, rel=1e-6)
+
+
+def test_hedges_drawn_as_areas_and_broken_numbers():
+    area = Area(
+        "way/9",
+        {"barrier": "hedge", "height": "-3"},
+        shapely.transform(shapely.box(0, 0, 9, 4), lonlat),
+        None,
+    )
+    barriers, [mesh], problems = solids(area)
+    assert volume(mesh) == pytest.approx(36 * 1.8, rel=1e-6)
+    assert barriers.width_source[0] == "area"
+    assert [(p.osm_id, p.reason) for p in problems] == [("way/9", "unusable-height")]
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["helsinki_center.osm.pbf", "monaco.osm.pbf"])
+def test_every_barrier_of_a_real_place_is_closed(shared_osm, name):
+    osm = read_osm(shared_osm(name))
+    west, south, east, north = osm.bounds
+    frame = Frame.at((west + east) / 2, (south + north) / 2)
+    x, y = frame.from_geographic([west, east], [south, north])
+    plan = plan_ground((x.min(), y.min(), x.max(), y.max()), concatenate_layers([]))
+    barriers, _ = read_barriers(osm, frame, plan)
+    assert len(barriers) > 50
+    assert all(volume(mesh) > 0 for mesh in barrier_meshes(barriers))

@@ -1,0 +1,165 @@
+"""Trees stand where they can, are as high as the map says, and are the same whoever builds which tile."""
+
+import manifold3d
+import numpy as np
+import pytest
+import shapely
+
+from geoscene.classes import Class, materials
+from geoscene.frames import Frame
+from geoscene.ground import Layers, building_pads, concatenate_layers, plan_ground
+from geoscene.mesh import Mesh
+from geoscene.objects.shapes import LEAF_AREA_DENSITY, expand, place, shape_numbers, shapes
+from geoscene.objects.vegetation import clear_of, forest_trees, read_trees, tree_instances
+from geoscene.sources.data import OsmData, Point, Way
+
+FRAME = Frame.at(11.0, 50.0)
+
+
+def osm_of(trees=(), ways=()):
+    points = [
+        Point(f"node/{k}", {"natural": "tree", **tags}, *lonlat) for k, (lonlat, tags) in enumerate(trees)
+    ]
+    return OsmData((10.9, 49.9, 11.1, 50.1), list(ways), [], points, [])
+
+
+def lonlat_of(*xy):
+    return np.column_stack(FRAME.to_geographic(*np.array(xy, float).T))
+
+
+def wood_plan(extent=(-100, -100, 200, 100), **options):
+    road = Layers.of([shapely.box(-200, -3, 300, 3)], klass=Class.ROAD, material=1, priority=100.0)
+    wood = Layers.of(
+        [shapely.box(-150, -150, 120, 80)],
+        klass=Class.FOREST_FLOOR,
+        material=9,
+        priority=24.0,
+        osm_id="way/9",
+    )
+    house = building_pads([shapely.box(30, 30, 60, 60)])
+    return plan_ground(extent, concatenate_layers([wood, road, house]), **options)
+
+
+@pytest.mark.parametrize("name", shapes())
+def test_every_shape_is_made_of_closed_solids_facing_outward(name):
+    shape = shapes()[name]
+    part = manifold3d.Manifold(
+        manifold3d.Mesh(shape.vertices.astype(np.float32), shape.faces.astype(np.uint32))
+    )
+    assert part.status() == manifold3d.Error.NoError
+    assert all(piece.volume() > 0 for piece in part.decompose())
+    assert shape.closed.all()
+    assert len(shape) <= 100
+
+
+@pytest.mark.parametrize("name", ["crown_broadleaved", "crown_needleleaved", "crown_palm", "trunk"])
+def test_shapes_to_be_scaled_are_of_unit_size(name):
+    low, high = shapes()[name].vertices.min(axis=0), shapes()[name].vertices.max(axis=0)
+    assert low[2] == 0.0
+    assert high[2] == 1.0
+    assert np.abs([low[:2], high[:2]]).max() == pytest.approx(0.5, abs=0.06)
+
+
+def test_crowns_let_light_through_and_nothing_else_does():
+    leafy = {name for name, shape in shapes().items() if (shape.klass == Class.TREE_CROWN).any()}
+    assert leafy | {"hedge"} == set(LEAF_AREA_DENSITY)
+
+
+def test_signs_face_the_way_they_are_turned():
+    """The retro-reflecting side looks along the heading."""
+    sign = expand(place("sign_round", np.zeros((1, 3)), heading=np.radians(120)))
+    front = sign.material == materials()["retroreflector"].code
+    normal = sign.normals()[front].mean(axis=0)
+    np.testing.assert_allclose(normal, [np.cos(np.radians(120)), np.sin(np.radians(120)), 0], atol=1e-12)
+
+
+def test_a_tree_is_as_high_and_wide_as_its_tags_say():
+    trees, problems = read_trees(osm_of([((11.0, 50.0), {"height": "21 m", "diameter_crown": "9"})]), FRAME)
+    mesh = expand(tree_instances(trees, height=lambda x, y: 0 * x * y + 300.0))
+    assert problems == []
+    crown = mesh.vertices[mesh.faces[mesh.klass == Class.TREE_CROWN]].reshape(-1, 3)
+    assert crown[:, 2].max() == pytest.approx(321.0)
+    assert np.ptp(crown[:, 0]) == pytest.approx(9.0, rel=0.05)
+    trunk = mesh.vertices[mesh.faces[mesh.klass == Class.TRUNK]].reshape(-1, 3)
+    assert trunk[:, 2].min() < 300.0 < crown[:, 2].min() < trunk[:, 2].max()
+
+
+def test_what_is_missing_follows_from_what_is_there_and_says_so():
+    tags = [
+        {},
+        {"diameter_crown": "8"},
+        {"circumference": "1.5"},
+        {"circumference": "150"},
+        {"height": "tall"},
+    ]
+    trees, problems = read_trees(osm_of([((11.0, 50.0), t) for t in tags]), FRAME)
+    sources = ["default", "diameter_crown", "circumference", "circumference", "default"]
+    assert trees.height_source.tolist() == sources
+    assert trees.height[2] == trees.height[3] == pytest.approx(1.5 / np.pi / 0.0284)
+    assert {(p.osm_id, p.reason) for p in problems} == {
+        ("node/3", "circumference-in-centimetres"),
+        ("node/4", "unusable-height"),
+    }
+
+
+def test_the_genus_decides_the_form():
+    tags = [
+        {"genus": "Picea"},
+        {"species": "Phoenix canariensis"},
+        {"leaf_type": "needleleaved"},
+        {"genus": "Tilia"},
+    ]
+    trees, _ = read_trees(osm_of([((11.0, 50.0), t) for t in tags]), FRAME)
+    assert trees.form.tolist() == ["needleleaved", "palm", "needleleaved", "broadleaved"]
+    crowns = tree_instances(trees).shape[4:]
+    names = ["crown_needleleaved", "crown_palm", "crown_needleleaved", "crown_broadleaved"]
+    assert crowns.tolist() == [shape_numbers()[name] for name in names]
+
+
+def test_a_row_has_a_tree_at_both_ends_and_none_on_the_road_that_crosses_it():
+    row = Way("way/5", {"natural": "tree_row"}, np.arange(2), lonlat_of((0, -40), (0, 40)))
+    trees, _ = read_trees(osm_of(ways=[row]), FRAME, spacing=8.0)
+    np.testing.assert_allclose(trees.xy[:, 1], np.linspace(-40, 40, 11), atol=1e-6)
+    left, problems = clear_of(wood_plan(), trees)
+    assert len(left) == 10
+    assert [(p.osm_id, p.reason) for p in problems] == [("way/5", "on-road")]
+
+
+def test_a_mapped_tree_in_a_building_is_dropped_one_on_a_road_stays():
+    places = lonlat_of((45, 45), (10, 0), (10, 50))
+    trees, _ = read_trees(osm_of([(tuple(p), {}) for p in places]), FRAME)
+    left, problems = clear_of(wood_plan(), trees)
+    assert left.osm_id.tolist() == ["node/1", "node/2"]
+    assert [(p.osm_id, p.action, p.reason) for p in problems] == [("node/0", "dropped", "in-building")]
+
+
+def test_woods_are_filled_to_their_density_and_leave_roads_and_houses_free():
+    plan = wood_plan(tile_size=400.0)
+    trees = np.vstack([forest_trees(plan, i, j, density=0.02).xy for i, j in plan.tiles])
+    x, y = trees.T
+    assert (x < 120).all()
+    assert (y < 80).all()
+    assert (np.abs(y) > 3.5 - 1e-9).all()
+    assert not ((x > 29.6) & (x < 60.4) & (y > 29.6) & (y < 60.4)).any()
+    area = 220 * 180 - 220 * 7 - 31 * 31
+    assert len(trees) == pytest.approx(area * 0.02, rel=0.05)
+
+
+def test_a_wood_is_the_same_whatever_the_tiles_and_another_with_another_seed():
+    def all_trees(size, seed=0):
+        plan = wood_plan(tile_size=size)
+        found = [forest_trees(plan, i, j, seed=seed) for i, j in plan.tiles]
+        table = np.concatenate([np.column_stack([t.xy, t.height]) for t in found])
+        return table[np.lexsort(table.T)]
+
+    np.testing.assert_array_equal(all_trees(50.0), all_trees(170.0))
+    assert not np.isin(all_trees(50.0, seed=1), all_trees(50.0)).any()
+
+
+def test_expanded_copies_are_the_shapes_moved():
+    copies = place(["bench", "bollard"], np.array([[1.0, 2, 3], [4, 5, 6]]), feature=[7, 8])
+    mesh = expand(copies)
+    assert isinstance(mesh, Mesh)
+    bollard = mesh.take(mesh.feature == 8)
+    np.testing.assert_allclose(bollard.vertices, shapes()["bollard"].shifted((4, 5, 6)).vertices)
+    assert len(mesh) == len(shapes()["bench"]) + len(shapes()["bollard"])

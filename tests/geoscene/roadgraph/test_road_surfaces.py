@@ -1,0 +1,255 @@
+"""Road surfaces cover what roads cover, wide as they are, and what is painted lies on them."""
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geoscene.classes import Class, materials
+from geoscene.frames import Frame
+from geoscene.roadgraph import build_road_graph
+from geoscene.roadgraph.surfaces import SurfaceOptions, road_surfaces
+from geoscene.sources import read_osm
+from geoscene.sources.data import OsmData, Point, Way
+
+FRAME = Frame.at(10.0, 50.0)
+PAINT = materials()["lane_paint"].code
+
+
+def surfaces_of(places, ways, points=(), **options):
+    lonlat = {n: np.array(FRAME.to_geographic(*xy)) for n, xy in places.items()}
+    osm = OsmData(
+        bounds=(9.9, 49.9, 10.1, 50.1),
+        ways=[
+            Way(f"way/{100 + k}", tags, np.array(nodes, np.int64), np.array([lonlat[n] for n in nodes]))
+            for k, (tags, nodes) in enumerate(ways)
+        ],
+        areas=[],
+        points=[Point(f"node/{n}", tags, *lonlat[n]) for n, tags in points],
+        relations=[],
+    )
+    graph, _ = build_road_graph(osm, FRAME)
+    return road_surfaces(osm, graph, FRAME, options=SurfaceOptions(**options))[0]
+
+
+def visible(rows, klass):
+    """What is seen of a class when the higher priority wins."""
+    own = shapely.union_all(rows.polygon[rows.klass == klass])
+    over = rows.priority > rows.priority[rows.klass == klass].max(initial=-1)
+    return shapely.difference(own, shapely.union_all(rows.polygon[over]))
+
+
+STREET = {"highway": "residential", "width": "6", "sidewalk": "no"}
+CROSS = {1: (0, 0), 2: (100, 0), 3: (0, 100), 4: (-100, 0), 5: (0, -100)}
+
+
+def test_a_straight_street_has_the_area_that_its_tags_give_it():
+    rows = surfaces_of({1: (0, 0), 2: (100, 0)}, [(STREET | {"sidewalk": "left"}, [1, 2])])
+    assert shapely.area(rows.polygon[rows.klass == Class.ROAD]).sum() == pytest.approx(600, abs=0.1)
+    assert visible(rows, Class.SIDEWALK).area == pytest.approx(200, abs=0.1)
+    assert visible(rows, Class.KERB).area == pytest.approx(15, abs=0.1)
+    assert visible(rows, Class.SIDEWALK).bounds[1] == pytest.approx(3.15, abs=1e-3)  # north is the left
+    assert set(rows.source[rows.klass == Class.SIDEWALK]) == {"sidewalk/default"}
+
+
+def test_corners_are_rounded_with_the_radius_of_their_class():
+    rows = surfaces_of(CROSS, [(STREET, [2, 1, 4]), (STREET, [3, 1, 5])])
+    road = shapely.union_all(rows.polygon[rows.klass == Class.ROAD])
+    plain = 2 * 200 * 6 - 36
+    # Each corner adds a square of the radius (4 m) without its quarter disc, drawn with 6 chords.
+    disc = 24 / 2 * 16 * np.sin(2 * np.pi / 24)
+    assert road.area == pytest.approx(plain + 4 * 16 - disc, abs=0.1)
+    assert road.geom_type == "Polygon"
+    assert not road.interiors
+
+
+def test_round_the_corner_the_sidewalk_goes_on():
+    both = STREET | {"sidewalk": "both"}
+    rows = surfaces_of(CROSS, [(both, [2, 1, 4]), (both, [3, 1, 5])])
+    walk = visible(rows, Class.SIDEWALK)
+    assert len(walk.geoms) == 4  # one round each block, none across the road
+    assert min(part.area for part in walk.geoms) > 2 * 90 * 2
+
+
+@pytest.mark.parametrize("angle_deg", [15, 40, 90, 140, 175])
+def test_joints_leave_no_gaps(angle_deg):
+    a = np.radians(angle_deg)
+    places = {1: (0, 0), 2: (80, 0), 3: (80 * np.cos(a), 80 * np.sin(a)), 4: (-80, 1)}
+    wide = STREET | {"width": "9", "name": "other"}
+    rows = surfaces_of(places, [(STREET, [1, 2]), (wide, [1, 3]), (STREET, [4, 1])])
+    road = shapely.union_all(rows.polygon[rows.klass == Class.ROAD])
+    assert road.geom_type == "Polygon"
+    assert not road.interiors
+    assert shapely.union_all([shapely.LineString([places[1], places[k]]) for k in (2, 3, 4)]).within(
+        road.buffer(0.01)
+    )
+
+
+def test_lines_are_painted_between_lanes_but_not_across_junctions():
+    main = {"highway": "primary", "lanes": "4", "width": "14", "sidewalk": "both"}
+    rows = surfaces_of(CROSS, [(main, [2, 1, 4]), (STREET, [3, 1, 5])])
+    paint = rows.polygon[rows.klass == Class.LANE_MARKING]
+    assert len(paint)
+    lines = shapely.union_all(paint)
+    assert lines.distance(shapely.Point(0, 0)) > 7
+    ys = np.unique(np.round(shapely.get_coordinates(shapely.centroid(paint))[:, 1], 1))
+    np.testing.assert_allclose(ys, [-3.5, 0, 3.5], atol=0.05)
+    solid = paint[np.abs(shapely.get_coordinates(shapely.centroid(paint))[:, 1]) < 0.1]
+    assert shapely.area(solid).max() > 0.12 * 70
+    dashes = paint[np.abs(shapely.get_coordinates(shapely.centroid(paint))[:, 1]) > 0.1]
+    np.testing.assert_allclose(shapely.area(dashes), 3 * 0.12, atol=0.01)
+
+
+def test_a_driveway_does_not_interrupt_the_paint():
+    main = {"highway": "primary", "lanes": "2", "width": "7", "sidewalk": "both"}
+    rows = surfaces_of(CROSS, [(main, [2, 1, 4]), ({"highway": "service"}, [1, 3])])
+    lines = shapely.union_all(rows.polygon[rows.klass == Class.LANE_MARKING])
+    assert lines.buffer(0.1).covers(shapely.LineString([(-95, 0), (95, 0)]))
+
+
+@pytest.mark.parametrize(("left_hand", "side"), [(False, -1), (True, 1)])
+def test_stop_lines_lie_across_the_lanes_of_those_who_stop(left_hand, side):
+    street = STREET | {"width": "8", "lanes": "2"}
+    ways = [(street, [2, 1]), (street, [1, 4]), (street | {"highway": "primary"}, [3, 1, 5])]
+    rows = surfaces_of(CROSS, ways, [(1, {"highway": "stop"})], left_hand=left_hand)
+    stop = rows.polygon[rows.source == "control/default"]
+    middle = shapely.get_coordinates(shapely.centroid(stop))
+    assert len(stop) == 2  # the side streets stop
+    west = middle[middle[:, 0] < 0][0]  # who comes from the west drives east
+    assert -15 < west[0] < -5
+    assert np.sign(west[1]) == side
+
+
+def test_a_zebra_spans_its_road_and_belongs_to_it():
+    places = {1: (0, 0), 2: (100, 0), 3: (50, -8), 4: (50, 8), 5: (50, 0)}
+    crossing = {"highway": "footway", "footway": "crossing", "crossing": "zebra"}
+    rows = surfaces_of(places, [(STREET, [1, 5, 2]), (crossing, [3, 5, 4])])
+    strip = rows.polygon[(rows.klass == Class.CROSSING) & (rows.material != PAINT)]
+    stripes = rows.polygon[(rows.klass == Class.CROSSING) & (rows.material == PAINT)]
+    assert [round(s.area, 2) for s in strip] == [18.0]  # 6 m of road by 3 m
+    assert len(stripes) == 6
+    assert strip[0].buffer(1e-3).covers(shapely.union_all(stripes))
+    np.testing.assert_allclose(shapely.area(stripes), 1.5, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("tags", "painted"),
+    [({"crossing": "unmarked"}, 0), ({"crossing": "traffic_signals"}, 2), ({"crossing": "uncontrolled"}, 6)],
+)
+def test_a_crossing_node_is_painted_as_it_is_tagged(tags, painted):
+    places = {1: (0, 0), 2: (100, 0), 5: (50, 0)}
+    rows = surfaces_of(places, [(STREET, [1, 5, 2])], [(5, {"highway": "crossing"} | tags)])
+    assert ((rows.klass == Class.CROSSING) & (rows.material == PAINT)).sum() == painted
+
+
+def test_bridges_and_tunnels_leave_the_ground_alone():
+    places = {1: (0, 0), 2: (100, 0), 3: (50, -50), 4: (50, 50), 5: (0, 200), 6: (100, 200)}
+    ways = [
+        (STREET, [1, 2]),
+        (STREET | {"bridge": "yes", "layer": "2"}, [3, 4]),
+        (STREET | {"tunnel": "yes"}, [5, 6]),
+    ]
+    rows = surfaces_of(places, ways)
+    assert set(rows.osm_id) == {"way/100"}
+    assert (rows.place == 0).all()
+    deck = rows.raised.take(rows.raised.place == 1)
+    assert set(deck.level) == {2}
+    assert (deck.edge >= 0).all()
+    assert {Class.ROAD, Class.BRIDGE} == set(deck.klass)
+    assert set(rows.raised.osm_id[rows.raised.place == 2]) == {"way/102"}
+
+
+def test_sidewalks_are_guessed_in_town_and_not_beside_a_mapped_footway():
+    plain = {"highway": "residential", "width": "6"}
+    places = {1: (0, 0), 2: (100, 0), 3: (0, 5.5), 4: (100, 5.5)}
+    footway = {"highway": "footway", "footway": "sidewalk"}
+    guessed = surfaces_of(places, [(plain, [1, 2]), (footway, [3, 4])])
+    band = guessed.polygon[(guessed.klass == Class.SIDEWALK) & (guessed.osm_id == "way/100")]
+    assert visible(guessed, Class.KERB).area == pytest.approx(15, abs=0.1)  # the south side alone
+    assert shapely.union_all(band).bounds[1] == pytest.approx(-5.15, abs=0.01)
+    mapped = surfaces_of(places, [(plain, [1, 2])], sidewalks="mapped")
+    fast = surfaces_of(places, [(plain | {"maxspeed": "100"}, [1, 2])])
+    for rows in (mapped, fast):
+        assert set(rows.klass) == {Class.ROAD}
+
+
+def test_what_a_road_is_made_of():
+    rows = surfaces_of({1: (0, 0), 2: (50, 0)}, [(STREET | {"surface": "sett"}, [1, 2])])
+    assert set(rows.material) == {materials()["stone"].code}
+    assert set(rows.source) == {"width/surface"}
+
+
+def test_two_rails_a_gauge_apart():
+    rows = surfaces_of({1: (0, 0), 2: (50, 0)}, [({"railway": "rail", "gauge": "1000"}, [1, 2])])
+    assert set(rows.klass) == {Class.RAIL}
+    ys = np.sort(shapely.get_coordinates(shapely.centroid(rows.polygon))[:, 1])
+    np.testing.assert_allclose(ys, [-0.536, 0.536], atol=1e-3)
+
+
+def check_rows(rows):
+    assert shapely.is_valid(rows.polygon).all()
+    assert (shapely.get_type_id(rows.polygon) == shapely.GeometryType.POLYGON).all()
+    xy = shapely.get_coordinates(rows.polygon) * 1e4
+    assert np.abs(xy - np.round(xy)).max(initial=0) < 1e-3
+    assert ((rows.priority >= 100) & (rows.priority < 200)).all()
+    assert all("/" in source for source in set(rows.source))
+
+
+@st.composite
+def networks(draw):
+    """Random streets over few places, some of them the same place."""
+    places = {n: (draw(st.integers(-60, 60)), draw(st.integers(-60, 60))) for n in range(8)}
+    tags = st.fixed_dictionaries(
+        {
+            "highway": st.sampled_from(
+                ["primary", "residential", "service", "footway", "track", "motorway_link"]
+            )
+        },
+        optional={
+            "lanes": st.sampled_from(["1", "2", "3", "5"]),
+            "oneway": st.just("yes"),
+            "sidewalk": st.sampled_from(["left", "both", "no"]),
+            "bridge": st.just("yes"),
+            "footway": st.just("crossing"),
+        },
+    )
+    way = st.tuples(tags, st.lists(st.integers(0, 7), min_size=2, max_size=6))
+    ways = draw(st.lists(way, min_size=1, max_size=6))
+    kinds = st.sampled_from(["crossing", "stop", "traffic_signals", "give_way"])
+    return places, ways, [(n, {"highway": draw(kinds)}) for n in range(4)]
+
+
+@settings(max_examples=50, deadline=None)
+@given(networks())
+def test_whatever_the_network_polygons_are_valid_and_cover_their_lines(network):
+    places, ways, points = network
+    rows = surfaces_of(places, ways, points)
+    check_rows(rows)
+    check_rows(rows.raised)
+    roads = [
+        shapely.LineString([places[n] for n in nodes])
+        for tags, nodes in ways
+        if tags["highway"] != "footway" and "bridge" not in tags
+    ]
+    covered = shapely.buffer(shapely.union_all(rows.polygon[rows.klass == Class.ROAD]), 0.01)
+    assert shapely.length(shapely.difference(shapely.union_all(roads), covered)) < 0.05
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", ["monaco.osm.pbf", "norfolk_odu_roads.osm.gz", "berlin_neukoelln.osm.gz"])
+def test_real_places(shared_osm, name):
+    osm = read_osm(shared_osm(name))
+    west, south, east, north = osm.bounds
+    frame = Frame.at((west + east) / 2, (south + north) / 2)
+    graph, _ = build_road_graph(osm, frame)
+    rows, _ = road_surfaces(osm, graph, frame)
+    check_rows(rows)
+    check_rows(rows.raised)
+    again, _ = road_surfaces(osm, graph, frame)
+    assert shapely.equals_exact(rows.polygon, again.polygon, 0.0).all()
+    ground = ~graph.bridge & ~graph.tunnel & (graph.layer_source != "level")
+    lines = [shapely.LineString(graph.geometry[e][:, :2]) for e in np.flatnonzero(ground)]
+    road = shapely.union_all(rows.polygon[rows.klass == Class.ROAD])
+    outside = shapely.length(shapely.difference(shapely.union_all(lines), shapely.buffer(road, 0.01)))
+    assert outside < 1e-3 * shapely.length(np.array(lines)).sum()

@@ -1,0 +1,276 @@
+"""Roads are smooth, bridges clear what they cross, tunnels run under the ground."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import csr_array, diags_array
+
+from geoscene.frames import Frame
+from geoscene.ground.terrain import open_terrain
+from geoscene.manifest import steep_metres
+from geoscene.roadgraph import ProfileOptions, build_road_graph, find_obstacles, graded_ground, profile
+from geoscene.roadgraph.quadratic import Bounds, interior_point
+from geoscene.roadgraph.stations import find_crossings, place_stations
+from geoscene.sources import read_osm
+from geoscene.sources.data import OsmData, Way
+
+FRAME = Frame.at(10.0, 50.0)
+OPTIONS = ProfileOptions()
+HIGH = OPTIONS.clearance + OPTIONS.deck
+
+
+def flat(x, y):
+    return 0 * (x + y)
+
+
+def town(places, ways):
+    lonlat = {n: np.array(FRAME.to_geographic(*xy)) for n, xy in places.items()}
+    return OsmData(
+        bounds=(9.9, 49.9, 10.1, 50.1),
+        ways=[
+            Way(f"way/{100 + k}", tags, np.array(nodes, np.int64), np.array([lonlat[n] for n in nodes]))
+            for k, (tags, nodes) in enumerate(ways)
+        ],
+        areas=[],
+        points=[],
+        relations=[],
+    )
+
+
+def graph_of(places, ways):
+    return build_road_graph(town(places, ways), FRAME)[0]
+
+
+def heights(graph):
+    """Stations of a graph with heights, and their heights."""
+    stations = place_stations(graph, spacing=1e9)
+    z = np.zeros(len(stations.xy))
+    z[stations.row] = np.concatenate([graph.geometry[e][:, 2] for e in np.unique(stations.edge)])
+    return stations, z
+
+
+def clearances(graph):
+    stations, z = heights(graph)
+    upper, over, lower, under, _ = find_crossings(graph, stations)
+    found = []
+    for edge, along in ((upper, over), (lower, under)):
+        i, j, share = stations.at(edge, along)
+        found.append(z[i] * (1 - share) + z[j] * share)
+    return found[0] - found[1]
+
+
+def steps_beyond(graph, ground):
+    """Changes of slope from one station to the next, beyond the ground's own where all three lie on it."""
+    stations, z = heights(graph)
+    terrain = np.asarray(ground(*stations.xy.T), float)
+    a, b, _, edge = stations.segments
+    aloft = np.zeros(len(z), bool)
+    structure = graph.bridge[edge] | graph.tunnel[edge]
+    aloft[a[structure]] = aloft[b[structure]] = True
+    p, q, r, before, after = stations.triples
+    step, own = ((h[r] - h[q]) / after - (h[q] - h[p]) / before for h in (z, terrain))
+    return np.abs(step) - np.where(aloft[p] | aloft[q] | aloft[r], 0.0, np.abs(own))
+
+
+ROAD = {"highway": "secondary"}
+BRIDGE = ROAD | {"bridge": "yes", "layer": "1"}
+TUNNEL = ROAD | {"tunnel": "yes", "layer": "-1"}
+OVER = {1: (-400, 0), 2: (-60, 0), 3: (60, 0), 4: (400, 0), 5: (0, -300), 6: (0, 300)}
+
+
+def test_a_bridge_clears_the_road_below_and_comes_down_again():
+    graph = profile(graph_of(OVER, [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), (ROAD, [5, 6])]), flat)
+    assert clearances(graph).min() >= HIGH - 0.01
+    assert np.abs(graph.node_xyz[np.isin(graph.node_id, [1, 4]), 2]).max() < 0.05
+    assert steps_beyond(graph, flat).max() <= OPTIONS.step + 1e-3
+    below = [line for line, name in zip(graph.geometry, graph.osm_id, strict=True) if name == "way/103"]
+    assert np.abs(np.concatenate(below)[:, 2]).max() < 0.5  # it is the bridge that gives way
+    top = max(line[:, 2].max() for line in graph.geometry)
+    assert top < HIGH + 1.0
+
+
+def test_a_tunnel_dives_under_the_road_above_and_stays_under_the_ground():
+    places = OVER | {2: (-150, 0), 3: (150, 0)}
+    graph = profile(
+        graph_of(places, [(ROAD, [1, 2]), (TUNNEL, [2, 3]), (ROAD, [3, 4]), (ROAD, [5, 6])]), flat
+    )
+    assert clearances(graph).min() >= HIGH - 0.01
+    bore = graph.geometry[np.flatnonzero(graph.tunnel)[0]]
+    assert (bore[1:-1, 2] < 0).all()
+    assert np.interp(0, bore[:, 0], bore[:, 2]) < -HIGH + 0.5
+
+
+def test_three_levels_stand_above_each_other():
+    places = OVER | {7: (-300, -300), 8: (300, 300)}
+    ways = [
+        (ROAD | {"bridge": "yes", "layer": "1"}, [1, 4]),
+        (ROAD, [5, 6]),
+        (ROAD | {"bridge": "yes", "layer": "2"}, [7, 8]),
+    ]
+    graph = profile(graph_of(places, ways), flat)
+    assert len(clearances(graph)) == 3
+    assert clearances(graph).min() >= HIGH - 0.01
+    assert max(line[:, 2].max() for line in graph.geometry) >= 2 * HIGH - 0.02
+
+
+def test_bridges_one_above_the_other_keep_their_distance_though_their_lines_never_cross():
+    places = dict(enumerate(
+        [(x, y) for y in (0.0, 2.0) for x in (-600, -150, 150, 600)], start=1))  # fmt: skip
+    upper = BRIDGE | {"layer": "2"}
+    ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), (ROAD, [5, 6]), (upper, [6, 7]), (ROAD, [7, 8])]
+    graph = profile(graph_of(places, ways), flat)
+    low, high = (graph.geometry[int(np.flatnonzero(graph.osm_id == f"way/{w}")[0])] for w in (101, 104))
+    at = np.linspace(-140, 140, 57)
+    apart = np.interp(at, *high[np.argsort(high[:, 0])][:, [0, 2]].T)
+    apart -= np.interp(at, *low[np.argsort(low[:, 0])][:, [0, 2]].T)
+    assert apart.min() > HIGH - 0.05
+
+
+def test_branches_are_equally_high_where_they_fork_and_part_where_they_are_clear_of_each_other():
+    places = {1: (-500, 0), 2: (-100, 0), 3: (0, 0), 4: (250, 25), 5: (250, -25), 6: (600, 60), 7: (600, -60)}
+    way = {"oneway": "yes", "lanes": "2"}
+    ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (BRIDGE | way, [3, 4]), (BRIDGE | way | {"layer": "2"}, [3, 5]),
+            (ROAD | way, [4, 6]), (ROAD | way, [5, 7])]  # fmt: skip
+
+    def ground(x, y):
+        return np.where((x > 200) & (y < 0), 12.0, np.where(x > 200, -8.0, 0.0)) + 0.0 * y
+
+    graph = profile(graph_of(places, ways), ground)
+    one, two = (graph.geometry[int(np.flatnonzero(graph.osm_id == f"way/{w}")[0])] for w in (102, 103))
+    at = np.arange(0.0, 250.0, 2.0)
+    apart = np.abs(np.interp(at, one[:, 0], one[:, 2]) - np.interp(at, two[:, 0], two[:, 2]))
+    overlap = 0.2 * at < graph.width[graph.osm_id == "way/102"][0] - 1.0
+    assert overlap.sum() > 10
+    assert apart[overlap].max() < 0.2
+    assert apart[at > 240].max() > 5.0
+    assert steps_beyond(graph, ground).max() < OPTIONS.step + 2e-3
+
+
+@pytest.mark.parametrize("angle_deg", [30, 45])
+def test_a_bridge_that_crosses_at_an_angle_clears_all_of_the_road_below(angle_deg):
+    c, s = 300 * np.cos(np.radians(angle_deg)), 300 * np.sin(np.radians(angle_deg))
+    places = {1: (-600, 0), 2: (-160, 0), 3: (160, 0), 4: (600, 0), 5: (-c, -s), 6: (c, s)}
+
+    def slope(x, y):
+        return 0.15 * y + 0.0 * x
+
+    ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), (ROAD, [5, 6])]
+    graph = profile(graph_of(places, ways), slope)
+    over = graph.geometry[int(np.flatnonzero(graph.osm_id == "way/101")[0])]
+    under = graph.geometry[int(np.flatnonzero(graph.osm_id == "way/103")[0])]
+    # The places of the lower road, level across, that lie straight under the upper one's middle.
+    reach = float(graph.width[graph.osm_id == "way/103"][0]) / 2 / np.sin(np.radians(angle_deg))
+    at = np.linspace(-reach, reach, 21)
+    along = at * np.cos(np.radians(angle_deg))
+    way = under[np.argsort(under[:, 0])]
+    low = np.interp(along * np.cos(np.radians(angle_deg)), way[:, 0], way[:, 2])
+    high = np.interp(at, *over[np.argsort(over[:, 0])][:, [0, 2]].T)
+    assert (high - low).min() > HIGH - 0.1
+
+
+def test_a_bridge_clears_railways_and_rivers():
+    osm = town(OVER, [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), ({"railway": "rail"}, [5, 6])])
+    graph, _ = build_road_graph(osm, FRAME)
+    low, high = (profile(graph, flat, obstacles=o) for o in (None, find_obstacles(osm, FRAME)))
+    middle = [
+        float(np.interp(0, line[:, 0], line[:, 2]))
+        for g in (low, high)
+        for line in [g.geometry[np.flatnonzero(g.bridge)[0]]]
+    ]
+    assert middle[0] < 2
+    assert middle[1] >= 5.7 + OPTIONS.deck - 0.01
+
+
+def test_without_structures_on_level_ground_nothing_changes():
+    graph = graph_of(OVER, [(ROAD, [1, 2, 3, 4])])
+    same = profile(graph, lambda x, y: 7.0 + flat(x, y))
+    for one, two in zip(graph.geometry, same.geometry, strict=True):
+        np.testing.assert_allclose(two, one + [0, 0, 7.0], atol=1e-6)  # noqa: RUF005  (a sum of arrays)
+
+
+def test_on_the_ground_a_road_follows_the_terrain():
+    def hills(x, y):
+        return 20 * np.sin(x / 120) + 0.02 * y
+
+    graph = profile(graph_of(OVER, [(ROAD, [1, 4]), (ROAD, [5, 6])]), hills)
+    for line in graph.geometry:
+        assert np.diff(line[:, 0] + line[:, 1] * 1e-6).size > 10  # stations between the ends
+        np.testing.assert_allclose(line[:, 2], hills(line[:, 0], line[:, 1]), atol=0.3)
+    assert steps_beyond(graph, hills).max() <= OPTIONS.step + 1e-3
+
+
+def test_metres_steeper_than_a_fifth_are_told():
+    def cliff(x, y):
+        return np.where(x > 0, 0.3 * x, 0.1 * x) + 0 * y
+
+    graph = profile(graph_of(OVER, [(ROAD | {"oneway": "yes"}, [1, 4])]), cliff)
+    assert steep_metres(graph) == pytest.approx(400, abs=25)
+    assert steep_metres(profile(graph, lambda x, y: 0.15 * x + 0 * y)) == 0
+
+
+def test_both_edges_of_a_street_have_the_same_heights():
+    graph = profile(graph_of(OVER, [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), (ROAD, [5, 6])]), flat)
+    for edge, twin in enumerate(graph.twin):
+        np.testing.assert_array_equal(graph.geometry[edge], graph.geometry[twin][::-1])
+        np.testing.assert_array_equal(graph.geometry[edge][0], graph.node_xyz[graph.tail[edge]])
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(-0.06, 0.06), st.floats(60, 200), st.floats(30, 150), st.sampled_from([BRIDGE, TUNNEL]))
+def test_the_ground_is_built_up_and_cut_down_to_the_road(slope, half, angle_deg, kind):
+    def ground(x, y):
+        return slope * y + 0 * x
+
+    c, s = np.cos(np.radians(angle_deg)) * 400, np.sin(np.radians(angle_deg)) * 400
+    places = {1: (-500, 0), 2: (-half, 0), 3: (half, 0), 4: (500, 0), 5: (-c, -s), 6: (c, s)}
+    graph = profile(
+        graph_of(places, [(ROAD, [1, 2]), (kind, [2, 3]), (ROAD, [3, 4]), (ROAD, [5, 6])]), ground
+    )
+    assert clearances(graph).min() >= HIGH - 0.02
+    graded = graded_ground(graph, ground)
+    line = graph.geometry[np.flatnonzero(graph.osm_id == "way/100")[0]]
+    for side in (-2.0, 0.0, 2.0):
+        np.testing.assert_allclose(graded(line[:, 0], line[:, 1] + side), line[:, 2], atol=0.05)
+    far = np.array([[-300.0, 100.0], [300.0, -60.0]])
+    np.testing.assert_allclose(graded(*far.T), ground(*far.T))
+    # No cliff: over the batter the ground passes evenly from the road to the terrain.
+    across = np.linspace(-30, 30, 601)
+    cut = graded(np.full(601, line[-1, 0] - 1.0), across)
+    rise = abs(float(line[-1, 2]) - ground(0.0, 0.0))
+    assert np.abs(np.diff(cut)).max() < 0.1 * (1.5 * (rise + 1.0) / 8.0 + abs(slope) + 0.05)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 12))
+def test_interior_point_finds_the_constrained_minimum(seed, n, k):
+    rng = np.random.default_rng(seed)
+    cost = csr_array(diags_array(rng.uniform(0.5, 5, n)))
+    pull, a, b = rng.normal(size=n), rng.normal(size=(k, n)), rng.normal(size=k)
+    weight = 10.0 ** rng.uniform(0, 4, k)
+    z = interior_point(cost, pull, Bounds(csr_array(a), b, weight), np.zeros(n))
+    # At the minimum the slope of cost and penalties together is 0.
+    slope = cost @ z - pull + a.T @ (weight * np.minimum(a @ z - b, 0))
+    scale = 1 + np.abs(pull).max() + np.abs(a.T * weight).max()
+    assert np.abs(slope).max() < 1e-3 * scale
+
+
+@pytest.mark.shared
+def test_monaco_on_its_terrain(shared_osm, shared_dem):
+    osm = read_osm(shared_osm("monaco.osm.pbf"))
+    west, south, east, north = osm.bounds
+    frame = Frame.at((west + east) / 2, (south + north) / 2)
+    flat_graph, _ = build_road_graph(osm, frame)
+    xy = np.concatenate([line[:, :2] for line in flat_graph.geometry])
+    terrain = open_terrain([shared_dem("N43E007.hgt.zip")], frame, bounds=(*xy.min(axis=0), *xy.max(axis=0)))
+    graph = profile(flat_graph, terrain.height)
+    assert len(clearances(graph)) > 50
+    assert clearances(graph).min() >= HIGH - 0.01
+    steps = steps_beyond(graph, terrain.height)
+    # A few ramps are too short for what they must climb.
+    assert (steps > OPTIONS.step + 1e-3).mean() < 0.005
+    stations, z = heights(graph)
+    a, _, _, edge = stations.segments
+    ground = terrain.height(*stations.xy.T)
+    inside = np.unique(a[graph.tunnel[edge]])
+    assert (z[inside] <= ground[inside] + 0.05).mean() > 0.99

@@ -1,0 +1,395 @@
+"""Map servers, spoken to over real HTTP: a server on the loopback answers from the demo extract."""
+
+import json
+import re
+import socket
+import subprocess
+import sys
+import threading
+import urllib.parse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import osmium
+import osmnx
+import pytest
+from helpers.extracts import same
+
+from geoscene.errors import InputError, NetworkError, SourceNotFoundError
+from geoscene.sources import Servers, demo_path, fetch_bbox, fetch_place, fetch_point, read_osm
+from geoscene.sources.network import locate
+from geoscene.sources.overpass import RELATIONS
+
+BOX = (24.9420, 60.1658, 24.9495, 60.1696)
+"""A part of the demo extract."""
+
+KINDS = {"n": "node", "w": "way", "r": "relation"}
+
+
+class Extract:
+    """The demo extract as Overpass would hold it."""
+
+    def __init__(self) -> None:
+        self.nodes, self.ways, self.relations = {}, {}, {}
+        for item in osmium.FileProcessor(demo_path()):
+            tags = {tag.k: tag.v for tag in item.tags}
+            if item.is_node():
+                place = {"lat": item.location.lat, "lon": item.location.lon}
+                self.nodes[item.id] = {"type": "node", "id": item.id, **place, "tags": tags}
+            elif item.is_way():
+                refs = [node.ref for node in item.nodes]
+                self.ways[item.id] = {"type": "way", "id": item.id, "nodes": refs, "tags": tags}
+            else:
+                members = [{"type": KINDS[m.type], "ref": m.ref, "role": m.role} for m in item.members]
+                self.relations[item.id] = {
+                    "type": "relation",
+                    "id": item.id,
+                    "members": members,
+                    "tags": tags,
+                }
+
+    def answer(self, query: str) -> dict:
+        """What Overpass answers to the query that geoscene sends; any other query is a fault."""
+        south, west, north, east = map(float, re.search(r"way\(([^)]*)\)", query)[1].split(","))
+        box = f"({south:.7f},{west:.7f},{north:.7f},{east:.7f})"
+        assert re.sub(r"timeout:\d+", "timeout:20", query) == (
+            f'[out:json][timeout:20];way{box}->.w;rel{box}["type"~"^({RELATIONS})$"]->.r;'
+            'rel.r["type"="multipolygon"]->.m;(.w;way(r.m););out body qt;'
+            f"(node(w);node{box}(if:count_tags()>0););out body qt;.r out body qt;"
+        )
+
+        def within(node: int) -> bool:
+            place = self.nodes.get(node)
+            return bool(place) and west <= place["lon"] <= east and south <= place["lat"] <= north
+
+        def meets(way: dict) -> bool:  # by its box: more than Overpass sends, never less
+            known = [self.nodes[n] for n in way["nodes"] if n in self.nodes]
+            lon, lat = [n["lon"] for n in known], [n["lat"] for n in known]
+            return (
+                bool(known)
+                and min(lon) <= east
+                and max(lon) >= west
+                and min(lat) <= north
+                and max(lat) >= south
+            )
+
+        ways = {i for i, way in self.ways.items() if meets(way)}
+        relations = [
+            r for r in self.relations.values()
+            if any((m["type"] == "way" and m["ref"] in ways) or (m["type"] == "node" and within(m["ref"]))
+                   for m in r["members"])
+        ]  # fmt: skip
+        for relation in relations:
+            if relation["tags"]["type"] == "multipolygon":
+                ways |= {m["ref"] for m in relation["members"] if m["ref"] in self.ways}
+        nodes = {n for way in ways for n in self.ways[way]["nodes"] if n in self.nodes}
+        nodes |= {i for i, node in self.nodes.items() if node["tags"] and within(i)}
+        elements = [*map(self.ways.get, ways), *map(self.nodes.get, nodes), *relations]
+        stamp = {"timestamp_osm_base": "2019-04-21T09:50:14Z"}
+        return {"version": 0.6, "osm3s": stamp, "elements": elements}
+
+
+PLACES = {
+    "Esplanadi, Helsinki": [
+        {
+            "boundingbox": ["60.167", "60.167", "24.945", "24.945"],
+            "importance": 0.9,
+            "display_name": "a point",
+        },
+        {
+            "boundingbox": [str(BOX[1]), str(BOX[3]), str(BOX[0]), str(BOX[2])],
+            "importance": 0.5,
+            "display_name": "Esplanadi, Helsinki, Finland",
+            "geojson": {"type": "Polygon", "coordinates": []},
+        },
+    ],
+    "a bench": [{"boundingbox": ["60.167", "60.167", "24.945", "24.945"], "importance": 0.1}],
+}
+
+
+class MapServer(ThreadingHTTPServer):
+    """Nominatim and Overpass under one address.
+
+    asked   : the requests, as (path, user agent)
+    refuse  : statuses to refuse the next requests for data with, in order
+    """
+
+    def __init__(self, extract: Extract) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.extract = extract
+        self.asked: list[tuple[str, str]] = []
+        self.refuse: list[int] = []
+        self.remark = ""
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+    def asked_for(self, path: str) -> int:
+        return sum(p.startswith(path) for p, _ in self.asked)
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: MapServer
+
+    def _send(self, status: int, body: bytes, kind: str = "application/json") -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        if status == 429:
+            self.send_header("Retry-After", "0")
+        self.end_headers()
+        self.wfile.write(body)
+
+    def _refused(self) -> bool:
+        if not self.server.refuse:
+            return False
+        self._send(self.server.refuse.pop(0), b"<html>no</html>", "text/html")
+        return True
+
+    def do_GET(self) -> None:
+        self.server.asked.append((self.path, self.headers["User-Agent"]))
+        url = urllib.parse.urlsplit(self.path)
+        if url.path == "/api/status":
+            self._send(
+                200,
+                b"Connected as: 1\nCurrent time: x\nRate limit: 2\n\n2 slots available now.\n",
+                "text/plain",
+            )
+        elif not self._refused():
+            name = urllib.parse.parse_qs(url.query)["q"][0]
+            self._send(200, json.dumps(PLACES.get(name, [])).encode())
+
+    def do_POST(self) -> None:
+        self.server.asked.append((self.path, self.headers["User-Agent"]))
+        body = self.rfile.read(int(self.headers["Content-Length"])).decode()
+        if self._refused():
+            return
+        answer = self.server.extract.answer(urllib.parse.parse_qs(body)["data"][0])
+        if self.server.remark:
+            answer["remark"] = self.server.remark
+        self._send(200, json.dumps(answer).encode())
+
+    def log_message(self, *args: object) -> None:
+        """Quiet."""
+
+
+@pytest.fixture(scope="module")
+def extract() -> Extract:
+    return Extract()
+
+
+@pytest.fixture
+def start(extract) -> Iterator[Callable[[], MapServer]]:
+    running = []
+
+    def make() -> MapServer:
+        server = MapServer(extract)
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        running.append(server)
+        return server
+
+    yield make
+    for server in running:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.fixture
+def server(start) -> MapServer:
+    return start()
+
+
+def servers_at(*servers: MapServer) -> Servers:
+    return Servers(
+        nominatim=servers[0].url,
+        overpass=tuple(f"{s.url}/api" for s in servers),
+        timeout=20,
+        wait=0.0,
+    )
+
+
+def nowhere() -> str:
+    """An address at which nobody listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"http://127.0.0.1:{probe.getsockname()[1]}"
+
+
+@contextmanager
+def osmnx_untouched() -> Iterator[None]:
+    """Assert that osmnx and the resolver of names are left as they were."""
+    before = {k: v for k, v in vars(osmnx.settings).items() if not k.startswith("_")}
+    resolver = socket.getaddrinfo
+    yield
+    assert {k: v for k, v in vars(osmnx.settings).items() if not k.startswith("_")} == before
+    assert socket.getaddrinfo is resolver
+
+
+def assert_is_the_box(data) -> None:
+    expected = read_osm(demo_path(), bounds=BOX)
+    same(expected, data)
+    assert data.timestamp == expected.timestamp
+    assert len(data.areas) > 50
+    assert len(data.ways) > 200
+    assert len(data.relations) > 1
+
+
+def test_a_place_is_found_fetched_and_the_same_as_from_a_file(server, tmp_path):
+    with osmnx_untouched():
+        data = fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers_at(server))
+    assert_is_the_box(data)
+    assert data.source == "OpenStreetMap, Esplanadi, Helsinki, Finland"
+    assert all(agent.startswith("geoscene/") for _, agent in server.asked)
+    assert server.asked_for("/api/status") == 1
+
+
+def test_what_was_fetched_once_comes_from_the_cache(server, tmp_path):
+    servers = servers_at(server)
+    first = fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers)
+    asked = len(server.asked)
+    same(first, fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers))
+    assert len(server.asked) == asked
+    for path in tmp_path.iterdir():
+        path.write_bytes(path.read_bytes()[:-9])  # a damaged cache is asked for again
+    same(first, fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers))
+    assert len(server.asked) == 2 * asked
+
+
+def test_a_large_area_is_asked_for_in_parts_and_is_the_same(server):
+    parts = []
+    servers = replace(servers_at(server), max_query_km2=0.05)
+    data = fetch_bbox(*BOX, servers=servers, progress=lambda items: [parts.append(i) or i for i in items])
+    assert server.asked_for("/api/interpreter") == len(parts) >= 4
+    assert_is_the_box(data)
+
+
+def test_a_point_is_fetched_with_its_surroundings(server):
+    data = fetch_point(60.1675, 24.9455, 100, servers=servers_at(server))
+    west, south, east, north = data.bounds
+    assert (north - south) * 111_195 == pytest.approx(200)
+    assert (east - west) * 111_195 * 0.4975 == pytest.approx(200, rel=1e-3)
+    same(data, read_osm(demo_path(), bounds=data.bounds))
+
+
+def test_a_place_that_is_a_point_is_widened_to_a_scene(server):
+    (west, south, east, north), _ = locate("a bench", servers=servers_at(server))
+    assert (north - south) * 111_195 == pytest.approx(400)
+    assert west < 24.945 < east
+
+
+def test_a_busy_server_is_asked_again(server):
+    server.refuse = [429, 504]
+    with osmnx_untouched():
+        data = fetch_bbox(*BOX, servers=servers_at(server))
+    assert_is_the_box(data)
+    assert server.asked_for("/api/interpreter") == 3
+
+
+def test_a_busy_server_is_not_asked_for_ever(server):
+    server.refuse = [429] * 99
+    with osmnx_untouched(), pytest.raises(NetworkError, match="HTTP 429"):
+        fetch_bbox(*BOX, servers=servers_at(server))
+    assert server.asked_for("/api/interpreter") == 3
+
+
+def test_a_server_that_fails_gives_way_to_the_next(start):
+    first, second = start(), start()
+    first.refuse = [500]
+    data = fetch_bbox(*BOX, servers=servers_at(first, second))
+    assert_is_the_box(data)
+    assert (first.asked_for("/api/interpreter"), second.asked_for("/api/interpreter")) == (1, 1)
+
+
+def test_a_server_that_fails_is_named_and_nothing_is_kept(server, tmp_path):
+    server.refuse = [500]
+    with pytest.raises(NetworkError, match=r"127\.0\.0\.1:\d+: HTTP 500.*--osm FILE.*--demo"):
+        fetch_bbox(*BOX, cache_dir=tmp_path, servers=servers_at(server))
+    server.remark = "runtime error: Query run out of memory using about 2048 MB of RAM."
+    with pytest.raises(NetworkError, match="out of memory"):
+        fetch_bbox(*BOX, cache_dir=tmp_path, servers=servers_at(server))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_network_one_line_says_what_to_do():
+    servers = Servers(nominatim=nowhere(), overpass=(f"{nowhere()}/api", "http://map.invalid/api"), wait=0.0)
+    for fetch in (
+        lambda: fetch_place("Norfolk, VA", servers=servers),
+        lambda: fetch_bbox(*BOX, servers=servers),
+    ):
+        with osmnx_untouched(), pytest.raises(NetworkError) as caught:
+            fetch()
+        message = str(caught.value)
+        assert "\n" not in message
+        assert "Connection refused" in message
+        assert "--osm FILE" in message
+        assert "--demo" in message
+
+
+def test_a_place_nobody_knows_is_not_found(server):
+    with pytest.raises(SourceNotFoundError, match="no place called 'Atlantis'"):
+        fetch_place("Atlantis", servers=servers_at(server))
+    with pytest.raises(SourceNotFoundError, match="nothing"):
+        fetch_bbox(0.0, 0.0, 0.01, 0.01, servers=servers_at(server))
+
+
+def test_what_cannot_be_asked_for_is_refused_before_asking(server):
+    servers = servers_at(server)
+    with pytest.raises(InputError, match="km²"):
+        fetch_bbox(20, 60, 25, 65, servers=servers)
+    with pytest.raises(InputError, match="latitude"):
+        fetch_point(120, 24, 100, servers=servers)
+    with pytest.raises(InputError, match="radius"):
+        fetch_point(60, 24, -1, servers=servers)
+    with pytest.raises(InputError, match="west is not less than east"):
+        fetch_bbox(25, 60, 24, 61, servers=servers)
+    assert server.asked == []
+
+
+def test_the_program_builds_a_place_asked_of_the_servers_and_asks_once(server, tmp_path):
+    place = next(iter(name for name, found in PLACES.items() if found))
+    command = [
+        sys.executable,
+        "-m",
+        "geoscene.cli",
+        "build",
+        "--place",
+        place,
+        "--cache",
+        str(tmp_path / "c"),
+    ]
+    command += ["--nominatim", server.url, "--overpass", f"{server.url}/api", "--json"]
+    done = subprocess.run([*command, "-o", str(tmp_path / "a")], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["counts"]["buildings"] > 10
+    asked = len(server.asked)
+    done = subprocess.run([*command, "-o", str(tmp_path / "b")], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert server.asked_for("/api/interpreter") == 1
+    assert len(server.asked) == asked
+    same_bytes = (tmp_path / "a" / "roads.graphml").read_bytes() == (
+        tmp_path / "b" / "roads.graphml"
+    ).read_bytes()
+    assert same_bytes
+
+
+def test_the_program_without_a_network_says_so_and_names_the_ways_out(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "geoscene.cli",
+        "build",
+        "--place",
+        "Norfolk, VA",
+        "--nominatim",
+        nowhere(),
+    ]
+    command += ["--cache", str(tmp_path / "c"), "-o", str(tmp_path / "a")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert "--osm" in done.stderr
+    assert "--demo" in done.stderr
+    assert not (tmp_path / "a").exists()

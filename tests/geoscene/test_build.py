@@ -1,0 +1,255 @@
+"""A scene is whole, closed, in its place, and the same every time."""
+
+import json
+import shutil
+
+import geopandas
+import numpy as np
+import pytest
+import shapely
+
+import geoscene.tiles
+from geoscene.build import BuildOptions, build
+from geoscene.classes import Class
+from geoscene.errors import InputError, SceneFormatError, SourceNotFoundError
+from geoscene.mesh import concatenate
+from geoscene.scene import open_scene
+from geoscene.scene.tile_files import Tile, write_tile
+from geoscene.scene.validate import check_scene
+from geoscene.sources import OsmData, demo_path, read_osm
+from geoscene.watertight import validate_mesh
+
+BOX = (24.9405, 60.1655, 24.9475, 60.1690)
+
+
+@pytest.fixture(scope="module")
+def osm():
+    return read_osm(demo_path(), bounds=BOX)
+
+
+@pytest.fixture(scope="module")
+def scene(osm, tmp_path_factory):
+    return build(osm, tmp_path_factory.mktemp("scene") / "demo", BuildOptions(name="demo"))
+
+
+def test_every_solid_is_closed_oriented_and_of_positive_volume(scene):
+    report = check_scene(scene)
+    assert report["broken"] == []
+    counts = scene.manifest["counts"]
+    assert report["solids"] == counts["closed_objects"] == counts["watertight"] > counts["solids"] > 20
+    assert report["volume"] > 1e5
+
+
+def test_a_broken_solid_is_found_and_named(scene, tmp_path):
+    shutil.copytree(scene.path, tmp_path / "broken")
+    broken = open_scene(tmp_path / "broken")
+    i, j = next(k for k in broken.tile_indices if broken.tile(*k).mesh.closed.any())
+    tile = broken.tile(i, j)
+    keep = np.ones(len(tile.mesh), bool)
+    keep[np.flatnonzero(tile.mesh.closed)[5]] = False
+    write_tile(broken.path / "tiles" / f"{i}_{j}.npz", Tile(tile.origin, tile.mesh.take(keep)))
+    report = check_scene(broken)
+    assert [row["fault"] for row in report["broken"]] == ["not-closed"]
+    assert report["broken"][0]["osm_id"].startswith(("way/", "relation/"))
+
+
+def test_the_ground_covers_the_extent_once(scene):
+    xmin, ymin, xmax, ymax = scene.bounds
+    area = 0.0
+    for tile in scene.tiles():
+        ground = ~tile.mesh.closed
+        a, b, c = (tile.mesh.vertices[tile.mesh.faces[ground, k]][:, :2] for k in range(3))
+        u, v = b - a, c - a
+        area += float((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / 2)
+    open_area = scene.manifest["ground"]["open_area"]
+    assert area + open_area == pytest.approx((xmax - xmin) * (ymax - ymin), rel=1e-6)
+
+
+def test_ground_triangles_meet_edge_to_edge_over_all_tiles(scene):
+    ground = concatenate([t.mesh.take(~t.mesh.closed).shifted(t.origin) for t in scene.tiles()])
+    _, number = np.unique(
+        np.round(ground.vertices[:, :2] * 2**13).astype(np.int64), axis=0, return_inverse=True
+    )
+    corners = number.ravel()[ground.faces]
+    edges = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    assert set(count.tolist()) <= {1, 2}
+    where = np.zeros((number.max() + 1, 2))
+    where[number.ravel()] = ground.vertices[:, :2]
+    xmin, ymin, xmax, ymax = scene.bounds
+    p, q = where[unique[count == 1, 0]], where[unique[count == 1, 1]]
+    on_rim = np.zeros(len(p), bool)
+    for axis, value in ((0, xmin), (0, xmax), (1, ymin), (1, ymax)):
+        on_rim |= (np.abs(p[:, axis] - value) < 1e-3) & (np.abs(q[:, axis] - value) < 1e-3)
+    # The ground is open where tunnels come out of it.
+    structures = geopandas.read_file(scene.path / "features.gpkg", layer="structures")
+    tunnels = structures.geometry[structures.kind == "tunnel"].union_all().buffer(0.01)
+    at = shapely.points(*scene.frame.to_projected(*((p + q) / 2).T))
+    assert (on_rim | shapely.within(at, tunnels)).all()
+
+
+def test_footprints_in_the_geopackage_are_where_openstreetmap_has_them(scene, osm):
+    layer = geopandas.read_file(scene.path / "features.gpkg", layer="buildings").to_crs(4326)
+    mapped = {area.osm_id: area.geometry for area in osm.areas}
+    shares = []
+    for osm_id, footprint in zip(layer.osm_id, layer.geometry, strict=True):
+        there = mapped[osm_id]
+        shares.append(there.intersection(footprint).area / there.union(footprint).area)
+    assert np.median(shares) > 0.9999
+
+
+def test_face_features_are_rows_of_the_geopackage(scene):
+    start, stop = scene.layers["buildings"]
+    layer = geopandas.read_file(scene.path / "features.gpkg", layer="buildings")
+    assert layer.feature.tolist() == list(range(start, stop))
+    for tile in scene.tiles():
+        mesh = tile.mesh
+        built = mesh.klass == Class.BUILDING
+        assert ((mesh.feature[built] >= start) & (mesh.feature[built] < stop)).all()
+        assert mesh.closed[built].all()
+        for feature in np.unique(mesh.feature[built])[:3]:
+            corners = mesh.vertices[mesh.faces[mesh.feature == feature]] + tile.origin
+            row = layer.iloc[int(feature)]
+            assert corners[..., 2].max() == pytest.approx(row.height, abs=0.01)
+
+
+def test_heights_say_where_they_come_from(scene):
+    layer = geopandas.read_file(scene.path / "features.gpkg", layer="buildings")
+    assert (layer.height > 0).all()
+    assert (layer.height_source != "").all()
+    assert scene.manifest["heights"] == layer.height_source.value_counts().sort_index().to_dict()
+    guessed = layer.height_source.str.startswith("inferred")
+    if guessed.any() and (layer.height_source == "tag").any():
+        assert layer.height_sigma[guessed].min() > layer.height_sigma[layer.height_source == "tag"].max()
+
+
+def same_files(a, b):
+    names = sorted(p.relative_to(a) for p in a.rglob("*") if p.is_file())
+    assert names == sorted(p.relative_to(b) for p in b.rglob("*") if p.is_file())
+    for name in names:
+        assert (a / name).read_bytes() == (b / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_same_map_is_the_same_bytes_for_any_number_of_workers(osm, scene, tmp_path, workers):
+    again = build(osm, tmp_path / "again", BuildOptions(name="demo"), workers=workers)
+    same_files(scene.path, again.path)
+
+
+def test_a_killed_build_goes_on_and_ends_with_the_same_bytes(osm, scene, tmp_path, monkeypatch):
+    made = []
+    whole = geoscene.tiles.build_tile
+
+    def dying(*args, **options):
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        made.append(args)
+        return whole(*args, **options)
+
+    monkeypatch.setattr(geoscene.tiles, "build_tile", dying)
+    with pytest.raises(KeyboardInterrupt):
+        build(osm, tmp_path / "scene", BuildOptions(name="demo"))
+    assert not (tmp_path / "scene").exists()
+    monkeypatch.setattr(geoscene.tiles, "build_tile", lambda *a, **o: made.append(a) or whole(*a, **o))
+    again = build(osm, tmp_path / "scene", BuildOptions(name="demo"))
+    assert len(made) == len(scene.tile_indices)  # no tile twice
+    same_files(scene.path, again.path)
+    assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+
+
+@pytest.mark.parametrize(
+    ("change", "grounds"), [({"lod": 1}, 0), ({"name": "other"}, 0), ({"tile_size": 200}, 1)]
+)
+def test_a_rebuild_makes_anew_only_what_the_options_change(
+    osm, scene, tmp_path, monkeypatch, change, grounds
+):
+    shutil.copytree(scene.path, tmp_path / "scene")
+    made = []
+    whole = geoscene.tiles.ground_tile
+    monkeypatch.setattr(geoscene.tiles, "ground_tile", lambda *a, **o: made.append(a) or whole(*a, **o))
+    options = BuildOptions(**({"name": "demo"} | change))
+    again = build(osm, tmp_path / "scene", options, overwrite=True)
+    assert len(made) == grounds * len(again.tile_indices)
+    same_files(build(osm, tmp_path / "fresh", options).path, again.path)
+
+
+def test_tiles_along_a_route_are_the_tiles_of_the_whole_scene(osm, tmp_path):
+    along = ("60.1665,24.9420", "60.1668,24.9440")
+    options = BuildOptions(name="demo", along=along, reach=20.0, tile_size=100.0)
+    part = build(osm, tmp_path / "part", options)
+    whole = build(osm, tmp_path / "whole", BuildOptions(name="demo", tile_size=100.0))
+    assert 0 < len(part.tile_indices) < len(whole.tile_indices)
+    for i, j in part.tile_indices:
+        name = f"tiles/{i}_{j}.npz"
+        assert (part.path / name).read_bytes() == (whole.path / name).read_bytes()
+
+
+def test_only_what_is_asked_for_is_built(osm, tmp_path):
+    scene = build(osm, tmp_path / "s", BuildOptions(only=("buildings",)))
+    counts = scene.manifest["counts"]
+    assert counts["solids"] > 20
+    assert counts["trees"] == counts["furniture"] == counts["barriers"] == counts["road_edges"] == 0
+    ground = scene.manifest["ground"]
+    assert ground["area"] + ground["open_area"] == pytest.approx(ground["extent_area"], rel=1e-6)
+
+
+def test_a_scene_is_not_written_over_unless_asked(osm, scene, tmp_path):
+    with pytest.raises(SceneFormatError, match="--overwrite"):
+        build(osm, scene.path)
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "a.txt").write_text("dear")
+    with pytest.raises(SceneFormatError, match="not a scene"):
+        build(osm, tmp_path / "letters", overwrite=True)
+    assert (tmp_path / "letters" / "a.txt").exists()
+
+
+def test_a_build_that_fails_leaves_nothing(osm, tmp_path, monkeypatch):
+    monkeypatch.setattr("geoscene.tiles.ground_tile", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        build(osm, tmp_path / "half")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_to_build_is_said(tmp_path):
+    with pytest.raises(SourceNotFoundError, match="nothing"):
+        build(OsmData((24.9, 60.1, 24.91, 60.11), [], [], [], []), tmp_path / "x")
+
+
+@pytest.mark.parametrize("change", [{"lod": 3}, {"tile_size": 10.5}, {"tile_size": 1e6}])
+def test_options_out_of_bounds_are_refused(change):
+    with pytest.raises(InputError, match="--"):
+        BuildOptions(**change)
+
+
+def test_damaged_scenes_are_named(tmp_path):
+    with pytest.raises(SceneFormatError, match="no such scene"):
+        open_scene(tmp_path / "nowhere")
+    (tmp_path / "scene.json").write_text("{")
+    with pytest.raises(SceneFormatError, match="damaged"):
+        open_scene(tmp_path)
+    (tmp_path / "scene.json").write_text(json.dumps({"schema": 99}))
+    with pytest.raises(SceneFormatError, match="schema version 99"):
+        open_scene(tmp_path)
+
+
+SMALL = [
+    "berlin_siegessaeule.osm.gz",
+    "berlin_neukoelln.osm.gz",
+    "singapore_bayfront.osm.pbf",
+    "oslo_skoyen.osm.pbf",
+    "st_petersburg_galernaya.osm.gz",
+    "norfolk_east_28th_buildings.osm.gz",
+]
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", SMALL)
+def test_real_places_build_watertight(name, shared_osm, tmp_path):
+    scene = build(read_osm(shared_osm(name)), tmp_path / "s")
+    counts = scene.manifest["counts"]
+    assert counts["solids"] == counts["buildings"] - counts["dropped"]
+    assert counts["watertight"] == counts["closed_objects"] >= counts["solids"]
+    meshes = [tile.mesh for tile in scene.tiles()]
+    assert all(validate_mesh(mesh).ok.all() for mesh in meshes)
+    ground = scene.manifest["ground"]
+    assert ground["area"] + ground["open_area"] == pytest.approx(ground["extent_area"], rel=1e-6)

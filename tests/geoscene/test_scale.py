@@ -1,0 +1,189 @@
+"""Large scenes: what a tile costs and gives does not depend on what lies elsewhere; killed builds go on."""
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from geoscene.build import BuildOptions, _tiles_along, build
+from geoscene.classes import Class
+from geoscene.ground import Layers, partition_tile, plan_ground
+from geoscene.plan import make_plan
+from geoscene.progress import silent
+from geoscene.sources import Way, read_osm
+from lidar.drive import DriveOptions, drive
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def make_osm():
+    spec = importlib.util.spec_from_file_location("make_osm", ROOT / "benchmarks" / "make_osm.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["make_osm"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def town(make_osm, tmp_path_factory):
+    path = tmp_path_factory.mktemp("town") / "town.osm.pbf"
+    make_osm.write_city(make_osm.make_city(150, seed=1), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(town, tmp_path_factory):
+    options = BuildOptions(tile_size=100.0, lod=1)
+    return build(read_osm(town), tmp_path_factory.mktemp("whole") / "scene", options)
+
+
+def files_of(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_a_made_up_city_is_the_same_each_time_and_grows_with_its_number(make_osm, town, tmp_path):
+    make_osm.write_city(make_osm.make_city(150, seed=1), tmp_path / "again.osm.pbf")
+    assert (tmp_path / "again.osm.pbf").read_bytes() == town.read_bytes()
+    small, large = (read_osm(town), make_osm.make_city(1500, seed=1))
+    assert 150 <= sum("building" in area.tags for area in small.areas) <= 170
+    assert 1500 <= large.buildings <= 1520
+    assert np.ptp(large.places, axis=0).min() > 2 * 111_195 * (small.bounds[3] - small.bounds[1]) / 2
+
+
+def test_a_made_up_city_builds_without_a_repair(scene):
+    counts = scene.manifest["counts"]
+    assert counts["watertight"] == counts["closed_objects"] >= counts["solids"] == counts["buildings"]
+    assert counts["dropped"] == 0
+    assert counts["trees"] >= 20
+    assert scene.layers["structures"][1] > scene.layers["structures"][0]
+
+
+def test_who_holds_a_place_is_found_without_looking_at_what_is_far(monkeypatch):
+    prepared = []
+    whole = shapely.prepare
+    monkeypatch.setattr(
+        shapely, "prepare", lambda polygons: prepared.append(len(polygons)) or whole(polygons)
+    )
+    x, y = np.mgrid[0:100, 0:100].reshape(2, -1) * 10.0
+    layers = Layers.of(shapely.box(x, y, x + 9.0, y + 9.0), klass=1, material=1, priority=0.0)
+    plan = plan_ground((0, 0, 1000, 1000), layers, tile_size=50.0)
+    cells = partition_tile(plan, 3, 4)
+    assert len(cells) == 26  # five by five squares and what is between them
+    assert 25 <= sum(prepared) <= 49
+    assert not shapely.is_prepared(layers.polygon).any()  # nothing stays behind
+
+
+def build_words(town, out):
+    words = [sys.executable, "-m", "geoscene.cli", "build", "--osm", str(town), "--out", str(out)]
+    return [*words, "--tile-size", "100", "--lod", "1", "--workers", "2", "--quiet"]
+
+
+def alive(group):
+    """Processes of a group."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                state, _, mine = (entry / "stat").read_text().rsplit(")", 1)[1].split()[:3]
+            except OSError:
+                continue
+            if int(mine) == group and state != "Z":
+                found.append(int(entry.name))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+def test_a_build_killed_outright_goes_on_and_ends_with_the_same_bytes(town, scene, tmp_path):
+    out = tmp_path / "scene"
+    process = subprocess.Popen(build_words(town, out), start_new_session=True, stdout=subprocess.DEVNULL)
+    tiles = tmp_path / "scene.part" / "tiles"
+    while process.poll() is None and len(list(tiles.glob("*.npz"))) < 5:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    deadline = time.monotonic() + 20
+    while alive(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert alive(process.pid) == []  # its workers have ended with it
+    left = {p.name: p.stat().st_mtime_ns for p in tiles.glob("*.npz")}
+    assert not out.exists()
+    assert 5 <= len(left) < len(scene.tile_indices)
+    # what a kill in the middle of writing leaves, and a tile that another build had made
+    (tiles / "0_0.npz.123.part").write_bytes(b"half")
+    (tiles / "99_99.npz").write_bytes(b"old")
+    (tiles.parent / "features.123.part.gpkg").write_bytes(b"half")
+
+    subprocess.run(build_words(town, out), check=True, stdout=subprocess.DEVNULL)
+    assert files_of(out) == files_of(scene.path)
+    taken = {name for name, written in left.items() if (out / "tiles" / name).stat().st_mtime_ns == written}
+    assert taken  # tiles in the journal are not made again
+
+
+def test_a_long_wall_is_seen_from_its_end(make_osm, town, tmp_path):
+    lonlat = make_osm.on_globe(np.array([(-300.0, 0.0), (-60.0, 0.0), (-180.0, 15.0), (-180.0, 265.0)]))
+    route = tuple(f"{lat},{lon}" for lon, lat in lonlat[:2].tolist())
+    options = BuildOptions(tile_size=100.0, lod=0, along=route, reach=10.0, only=("roads", "barriers"))
+    osm = read_osm(town)
+    wall = Way("way/999999", {"barrier": "wall"}, np.array([-1, -2]), lonlat[2:])
+    without, walled = (
+        build(replace(osm, ways=ways), tmp_path / name, options)
+        for name, ways in (("without", osm.ways), ("walled", [*osm.ways, wall]))
+    )
+    (home,) = set(walled.tile_indices) - set(without.tile_indices)
+    x, y = walled.frame.from_geographic(*lonlat[2:].mean(axis=0))
+    assert home == (x // 100, y // 100)
+    assert (walled.tile(*home).mesh.klass == Class.WALL).any()
+
+
+def test_a_bridge_is_seen_from_its_end(town, tmp_path, monkeypatch):
+    monkeypatch.setattr("geoscene.build._BESIDE", 0.0)
+    monkeypatch.setattr("geoscene.build._CROWN", 0.0)
+    words = {
+        "dem": (),
+        "dem_gaps": "error",
+        "tile_size": 50.0,
+        "only": ("roads",),
+        "driving_side": "",
+        "progress": silent,
+    }
+    plan, _ = make_plan(read_osm(town), "local", **words)
+    found = 0
+    for home, rows in plan.rows["structures"].items():
+        square = shapely.box(*np.multiply(home, 50.0), *np.add(home, 1) * 50.0)
+        corners = shapely.points(shapely.get_coordinates(plan.structures.polygon[rows]))
+        away = shapely.distance(corners, square)
+        if away.max() > 2.0:
+            end = corners[away.argmax()]
+            there = "lon,lat\n{},{}\n".format(*plan.frame.to_geographic(end.x, end.y))
+            (tmp_path / "end.csv").write_text(there)
+            options = BuildOptions(tile_size=50.0, along=(str(tmp_path / "end.csv"),), reach=1.0)
+            assert home in _tiles_along(plan, options)
+            found += 1
+    assert found  # a bridge that sticks out of its tile
+
+
+def test_a_drive_is_the_same_bytes_on_the_tiles_along_its_route(make_osm, town, scene, tmp_path):
+    lonlat = make_osm.on_globe(np.array([(-300.0, 0.0), (-60.0, 0.0)]))
+    route = tuple((lat, lon) for lon, lat in lonlat.tolist())
+    along = tuple(f"{lat},{lon}" for lat, lon in route)
+    options = BuildOptions(tile_size=100.0, lod=1, along=along, reach=100.0)
+    part = build(read_osm(town), tmp_path / "part", options)
+    assert len(part.tile_indices) < 0.7 * len(scene.tile_indices)
+    assert part.layers == scene.layers
+    for i, j in part.tile_indices:
+        name = f"tiles/{i}_{j}.npz"
+        assert (part.path / name).read_bytes() == (scene.path / name).read_bytes()
+    words = DriveOptions(route=route, rig="vlp16", duration=2.0, formats=("pcd",))
+    drives = [drive(s, tmp_path / s.path.name / "drive", words).path for s in (scene, part)]
+    clouds = [{p.relative_to(d): p.read_bytes() for p in d.rglob("*.pcd")} for d in drives]
+    assert len(clouds[0]) == 20
+    assert clouds[0] == clouds[1]

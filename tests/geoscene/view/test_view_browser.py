@@ -1,0 +1,291 @@
+"""The page in a real browser: it draws, it answers a click, and it asks nothing of the network."""
+
+import os
+from io import BytesIO
+
+import numpy as np
+import pytest
+from helpers.browser import CHROMIUM, DRIVER, browser
+from PIL import Image
+
+from geoscene.build import BuildOptions, build
+from geoscene.classes import Class
+from geoscene.cli import app
+from geoscene.scene.geopackage import read_layer
+from geoscene.sources import demo_path, read_osm
+
+BOX = (24.9405, 60.1655, 24.9450, 60.1680)
+SKY = (185, 207, 228)
+
+# Software rendering reads pixels back slowly and says so.
+SLOW = "GPU stall due to ReadPixels"
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    osm = read_osm(demo_path(), bounds=BOX)
+    return build(osm, tmp_path_factory.mktemp("browser") / "demo", BuildOptions(name="demo", tile_size=200.0))
+
+
+@pytest.fixture(scope="module")
+def page(scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("page") / "a page.html"
+    with pytest.raises(SystemExit) as ended:
+        app(["view", str(scene.path), "-o", str(out), "--json", "-q"])
+    assert ended.value.code == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def window(tmp_path_factory):
+    if not (CHROMIUM and DRIVER):
+        message = (
+            "no chromium and chromedriver here: the page is not tried (Debian: chromium chromium-driver)"
+        )
+        if os.environ.get("CI") == "true":
+            pytest.fail(message)
+        pytest.skip(message)
+    with browser(tmp_path_factory.mktemp("chromium")) as opened:
+        yield opened
+
+
+@pytest.fixture
+def opened(window, page):
+    """The window with the page newly opened; it must neither complain nor ask the network."""
+    window.complaints(), window.requests()
+    window.open(page)
+    yield window
+    assert [text for text in window.complaints() if SLOW not in text] == []
+    asked = {address.split(":")[0] for address in window.requests()}
+    assert asked <= {"file", "about", "data", "blob"}
+
+
+def picture(window):
+    return np.asarray(Image.open(BytesIO(window.screenshot())).convert("RGB")).astype(int)
+
+
+def middle(window):
+    """The part of the window that has no boxes over it."""
+    return picture(window)[100:560, 300:640]
+
+
+def tall_house(scene, window):
+    """(row, feature, columns) of the highest house in the page that is a way."""
+    buildings = read_layer(scene.path / "features.gpkg", "buildings", scene.frame).columns
+    for row in np.argsort(-buildings["height"]):
+        feature = int(buildings["feature"][row])
+        if buildings["osm_id"][row].startswith("way/") and window.js(
+            "return geoscene.boxes.has(arguments[0])", feature
+        ):
+            return row, feature, buildings
+    raise AssertionError
+
+
+def look_down(window, feature):
+    """Look at a feature from above; the point of the window where its middle is."""
+    window.js(
+        "const v = geoscene; v.camera.lookAt(v.boxes.middle(arguments[0]), 2.5 * v.boxes.size(arguments[0]));"
+        "v.camera.tilt = 1.5; v.redraw();",
+        feature,
+    )
+    window.settle()
+    return window.js("return [innerWidth / 2, innerHeight / 2]")
+
+
+def test_the_scene_is_drawn_with_many_colours_and_shades(opened):
+    assert opened.js("return document.getElementById('message').hidden")
+    assert "WebGL 2.0" in opened.js(
+        "return document.getElementById('canvas').getContext('webgl2').getParameter(0x1F02)"
+    )
+    seen = middle(opened)
+    assert (np.abs(seen - SKY).max(axis=2) > 12).mean() > 0.5
+    assert len(np.unique(seen.reshape(-1, 3), axis=0)) > 300
+
+
+def test_a_click_on_a_roof_tells_its_osm_id_and_where_its_height_is_from(scene, opened):
+    row, feature, buildings = tall_house(scene, opened)
+    opened.click(*look_down(opened, feature))
+    opened.settle()
+    told = opened.text("panel")
+    assert int(opened.js("return document.getElementById('panel').dataset.feature")) == feature
+    assert buildings["osm_id"][row] in told
+    assert f"{buildings['height'][row]:.2f}".rstrip("0").rstrip(".") in told
+    assert buildings["height_source"][row].replace("-", " ") in told
+    assert f"± {buildings['height_sigma'][row]:.2f}".rstrip("0").rstrip(".") in told
+    link = opened.js("return document.querySelector('#panel a').href")
+    assert link == f"https://www.openstreetmap.org/{buildings['osm_id'][row]}"
+
+
+def test_the_point_under_a_pixel_is_on_the_scene_and_its_degrees_are_the_frame_s(scene, opened):
+    _, feature, _ = tall_house(scene, opened)
+    x, y = look_down(opened, feature)
+    hit = opened.js("return geoscene.pick(arguments[0], arguments[1])", x, y)
+    low, high = opened.js(
+        "const b = geoscene.boxes, f = 3 * arguments[0];"
+        "return [[...b.low.slice(f, f + 3)], [...b.high.slice(f, f + 3)]]",
+        feature,
+    )
+    assert hit["feature"] == feature
+    assert np.all(np.array(hit["point"]) >= np.array(low) - 0.02)
+    assert np.all(np.array(hit["point"]) <= np.array(high) + 0.02)
+    assert np.hypot(*(np.array(hit["point"][:2]) - (np.array(low) + high)[:2] / 2)) < 3.0
+    told = opened.js("return geoscene.lonLat(arguments[0], arguments[1])", *hit["point"][:2])
+    true = scene.frame.to_geographic(*hit["point"][:2])
+    assert np.allclose(told, np.asarray(true, float), atol=2e-7)
+
+
+def test_a_layer_that_is_switched_off_is_not_drawn_and_not_picked(scene, opened):
+    _, feature, _ = tall_house(scene, opened)
+    x, y = look_down(opened, feature)
+    before = middle(opened)
+    opened.js("document.getElementById('layer-buildings').click()")
+    opened.settle()
+    hit = opened.js("return geoscene.pick(arguments[0], arguments[1])", x, y)
+    assert hit["klass"] == Class.BUILDING_PAD  # the ground that the house stands on
+    assert (np.abs(middle(opened) - before).max(axis=2) > 12).mean() > 0.2
+    opened.js("document.getElementById('layer-buildings').click()")
+    opened.settle()
+    assert np.array_equal(middle(opened), before)
+
+
+def test_search_by_id_goes_there(scene, opened):
+    row, feature, buildings = tall_house(scene, opened)
+    opened.js("document.getElementById('search').focus()")
+    opened.write(buildings["osm_id"][row])
+    opened.keys("\ue007")
+    opened.settle()
+    assert int(opened.js("return document.getElementById('panel').dataset.feature")) == feature
+    assert buildings["osm_id"][row] in opened.text("found")
+    target = np.array(opened.js("return geoscene.camera.target"))
+    assert np.allclose(target, opened.js("return geoscene.boxes.middle(arguments[0])", feature), atol=1e-6)
+
+
+def test_search_by_name_finds_and_says_when_there_is_none(scene, opened):
+    names = read_layer(scene.path / "features.gpkg", "buildings", scene.frame).columns["name"]
+    name = next(name for name in names if name)
+    assert opened.js("return geoscene.select(arguments[0])", name.upper())
+    assert name in opened.text("panel")
+    opened.js("document.getElementById('search').focus()")
+    opened.write("way/1")
+    assert "Not in this scene" in opened.text("found")
+
+
+def test_what_was_guessed_has_its_own_colours_and_a_legend(scene, opened):
+    before = middle(opened)
+    opened.js("const c = document.getElementById('color'); c.value = 'source'; c.onchange();")
+    assert (np.abs(middle(opened) - before).max(axis=2) > 12).mean() > 0.1
+    legend = opened.text("legend")
+    sources = read_layer(scene.path / "features.gpkg", "buildings", scene.frame).columns["height_source"]
+    assert f"from its storeys ({(sources == 'levels').sum()})" in legend
+    for mode in ("material", "class", "sigma", "look"):
+        opened.js("const c = document.getElementById('color'); c.value = arguments[0]; c.onchange();", mode)
+        assert (mode == "look") == (opened.text("legend") == "")
+    assert np.array_equal(middle(opened), before)
+
+
+def test_mouse_and_keys_turn_move_and_zoom(opened):
+    def state():
+        opened.settle()
+        return opened.js("const c = geoscene.camera; return [c.azimuth, c.tilt, c.distance, ...c.target]")
+
+    first = state()
+    opened.drag((500, 350), (600, 380))
+    turned = state()
+    assert turned[0] != first[0] and turned[1] > first[1]  # noqa: PT018
+    assert opened.js("return document.getElementById('panel').hidden")
+    opened.drag((500, 350), (540, 380), button=2)
+    moved = state()
+    assert moved[:2] == turned[:2]
+    assert moved[3:5] != turned[3:5]
+    opened.js("document.getElementById('canvas').focus()")
+    opened.keys("+", "+", "n", "t")
+    zoomed = state()
+    assert zoomed[2] < moved[2]
+    assert zoomed[0] == 0
+    assert zoomed[1] == pytest.approx(np.pi / 2)
+
+
+@pytest.fixture
+def phone(window, page):
+    """The page newly opened on a telephone."""
+    window.phone(390, 844)
+    window.open(page)
+    yield window
+    window.phone(0, 0)
+
+
+def camera_of(window):
+    names = ("azimuth", "tilt", "distance", "x", "y")
+    script = "const c = geoscene.camera; return [c.azimuth, c.tilt, c.distance, ...c.target.slice(0, 2)]"
+    return dict(zip(names, window.js(script), strict=True))
+
+
+def test_fingers_turn_move_zoom_and_ask(scene, phone):
+    first = camera_of(phone)
+    phone.touch([(200, 400)], [(240, 420)], [(280, 440)])
+    turned = camera_of(phone)
+    assert turned["azimuth"] != first["azimuth"]
+    assert turned["tilt"] > first["tilt"]
+    phone.touch([(170, 400), (230, 400)], [(150, 400), (250, 400)], [(110, 400), (290, 400)])
+    pinched = camera_of(phone)
+    assert pinched["distance"] == pytest.approx(turned["distance"] / 3, rel=0.25)
+    assert pinched["azimuth"] == pytest.approx(turned["azimuth"], abs=0.02)
+    phone.touch([(150, 300), (250, 300)], [(150, 340), (250, 340)], [(150, 400), (250, 400)])
+    moved = camera_of(phone)
+    assert np.hypot(moved["x"] - pinched["x"], moved["y"] - pinched["y"]) > 3.0
+    assert moved["distance"] == pytest.approx(pinched["distance"], rel=0.1)
+    phone.touch([(150, 400), (250, 400)], [(160, 350), (240, 450)], [(200, 340), (200, 460)])
+    twisted = camera_of(phone)
+    assert abs(twisted["azimuth"] - moved["azimuth"]) > 0.7
+    _, feature, _ = tall_house(scene, phone)
+    phone.touch([tuple(look_down(phone, feature))])
+    assert int(phone.js("return document.getElementById('panel').dataset.feature")) == feature
+
+
+def test_on_a_telephone_the_scene_is_in_sight_and_nothing_sticks_out(scene, phone):
+    assert phone.js("return innerWidth") == 390
+    assert phone.js("return document.documentElement.scrollWidth") == 390
+    _, feature, _ = tall_house(scene, phone)
+    phone.touch([tuple(look_down(phone, feature))])
+    boxes = [
+        phone.js(
+            "const b = document.getElementById(arguments[0]).getBoundingClientRect();"
+            "return [b.left, b.top, b.right, b.bottom]",
+            name,
+        )
+        for name in ("controls", "panel", "foot")
+    ]
+    for left, top, right, bottom in boxes:
+        assert left >= 0
+        assert right <= 390
+        assert top >= 0
+        assert bottom <= 844
+    controls, panel, foot = boxes
+    assert panel[1] > controls[3]
+    assert panel[3] <= foot[1] + 1
+    covered = sum((right - left) * (bottom - top) for left, top, right, bottom in boxes)
+    assert covered < 0.6 * 390 * 844
+    small = phone.js(
+        "document.getElementById('controls').open = true;"
+        "const seen = [...document.querySelectorAll('input, select, summary, .close')];"
+        "const target = (e) => (e.closest('label') || e).getBoundingClientRect().height;"
+        "return seen.filter((e) => e.offsetParent).map((e) => [e.id || e.className || e.tagName, target(e)]);"
+    )
+    assert [name for name, height in small if height < 24] == []  # WCAG 2.2, target size
+
+
+def test_shadows_darken_and_the_sun_moves_them(opened):
+    with_shadows = middle(opened)
+    opened.js("document.getElementById('shadows').click()")
+    assert middle(opened).mean() > with_shadows.mean() + 1
+    opened.js("document.getElementById('shadows').click()")
+    assert np.array_equal(middle(opened), with_shadows)
+    opened.js("const s = document.getElementById('sun'); s.value = 330; s.oninput();")
+    assert (np.abs(middle(opened) - with_shadows).max(axis=2) > 12).mean() > 0.2
+
+
+def test_a_browser_without_decompression_is_told_so(window, page, tmp_path):
+    text = page.read_text("utf-8").replace('"DecompressionStream" in window', '"Nothing" in window')
+    (tmp_path / "old.html").write_text(text, "utf-8")
+    with pytest.raises(AssertionError, match="too old"):
+        window.open(tmp_path / "old.html")

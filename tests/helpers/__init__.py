@@ -1,0 +1,1 @@
+"""Worlds, grids of roads and a browser for tests."""

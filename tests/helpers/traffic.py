@@ -1,0 +1,36 @@
+"""A car, a flat frame, and the bodies of simulated traffic over time."""
+
+import numpy as np
+
+from lidar.rig.vehicle import load_vehicle
+from lidar.traffic.lanes import STEP
+from lidar.traffic.sweep import body_poses, rectangles
+
+CAR = load_vehicle("car")
+BOX = (CAR.length, CAR.width, CAR.length / 2 - CAR.rear_overhang)
+
+
+class Plane:
+    """A frame in which a metre is a metre."""
+
+    def scale_at(self, x, y):
+        return np.ones(np.broadcast_shapes(np.shape(x), np.shape(y)))
+
+
+def tracks(trips, flow):
+    """Middles and headings (steps, trips, 3) of bodies; NaN where they are not there."""
+    out = np.full((int(flow.step.max()) + 1, len(trips), 3), np.nan)
+    for k in np.unique(flow.trip):
+        rows = flow.trip == k
+        xy, heading = body_poses(trips[k].way, trips[k].axle)
+        at = flow.gone[rows] / STEP
+        for c, column in enumerate((*xy.T, heading)):
+            out[flow.step[rows], k, c] = np.interp(at, np.arange(len(xy)), column)
+    return out
+
+
+def boxes_at(trips, poses):
+    there = np.flatnonzero(np.isfinite(poses[:, 0]))
+    length = np.array([trips[k].length for k in there])
+    width = np.array([trips[k].width for k in there])
+    return rectangles(poses[there, :2], poses[there, 2], length, width)

@@ -1,0 +1,111 @@
+"""Attitudes convert without loss, and the table of poses says what its documentation says."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from geoscene.frames import Frame
+from lidar.dataset.metadata import pose_columns
+from lidar.geometry.attitude import (
+    body_rates,
+    euler_from_quat,
+    euler_from_quat_intrinsic,
+    matrix_from_quat,
+    quat_from_euler,
+    quat_from_euler_intrinsic,
+)
+from lidar.geometry.poses import Trajectory
+
+angles = st.one_of(st.floats(-np.pi, np.pi), st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi, 1e-9]))
+
+
+def rx(a):
+    return np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+
+
+def ry(b):
+    return np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
+
+
+def rz(g):
+    return np.array([[np.cos(g), -np.sin(g), 0], [np.sin(g), np.cos(g), 0], [0, 0, 1]])
+
+
+@given(angles, angles, angles)
+@settings(max_examples=200, deadline=None)
+def test_the_matrix_is_what_the_convention_says(a, b, g):
+    np.testing.assert_allclose(matrix_from_quat(quat_from_euler(a, b, g)), rz(g) @ ry(b) @ rx(a), atol=1e-12)
+    np.testing.assert_allclose(
+        matrix_from_quat(quat_from_euler_intrinsic(a, b, g)), rx(a) @ ry(b) @ rz(g), atol=1e-12
+    )
+
+
+@given(angles, angles, angles)
+@settings(max_examples=200, deadline=None)
+def test_angles_survive_the_round_trip_even_with_the_nose_straight_up(a, b, g):
+    for there, back in (
+        (quat_from_euler, euler_from_quat),
+        (quat_from_euler_intrinsic, euler_from_quat_intrinsic),
+    ):
+        quat = there(a, b, g)
+        again = there(*back(quat))
+        turned = np.linalg.norm((Rotation.from_quat(quat).inv() * Rotation.from_quat(again)).as_rotvec())
+        assert turned < 1e-6
+        assert np.linalg.norm(quat) == pytest.approx(1.0, abs=1e-12)
+        assert quat[3] >= 0.0
+
+
+def test_both_conventions_agree_with_another_implementation_and_differ_at_large_angles():
+    quat = Rotation.random(500, np.random.default_rng(1)).as_quat()
+    np.testing.assert_allclose(euler_from_quat(quat), Rotation.from_quat(quat).as_euler("xyz"), atol=1e-12)
+    np.testing.assert_allclose(
+        euler_from_quat_intrinsic(quat), Rotation.from_quat(quat).as_euler("XYZ"), atol=1e-12
+    )
+    one, two = quat_from_euler(0.5, 0.6, 0.7), quat_from_euler_intrinsic(0.5, 0.6, 0.7)
+    assert np.linalg.norm((Rotation.from_quat(one).inv() * Rotation.from_quat(two)).as_rotvec()) > 0.3
+
+
+def test_signs_are_those_of_a_car():
+    forward = np.array([1.0, 0, 0])
+    left = np.array([0, 1.0, 0])
+    nose_down = matrix_from_quat(quat_from_euler(0.0, 0.1, 0.0))
+    assert (nose_down @ forward)[2] < 0
+    left_up = matrix_from_quat(quat_from_euler(0.1, 0.0, 0.0))
+    assert (left_up @ left)[2] > 0
+    north = matrix_from_quat(quat_from_euler(0.0, 0.0, np.pi / 2))
+    np.testing.assert_allclose(north @ forward, [0, 1, 0], atol=1e-12)
+
+
+def test_body_rates_of_a_steady_spin_are_exact():
+    t = np.linspace(0.0, 2.0, 101)
+    rate = np.array([0.3, -0.2, 1.1])
+    quat = (Rotation.from_euler("xyz", [0.4, 0.2, 1.0]) * Rotation.from_rotvec(t[:, None] * rate)).as_quat()
+    np.testing.assert_allclose(body_rates(t, quat), np.broadcast_to(rate, (101, 3)), atol=1e-12)
+
+
+def test_the_table_of_poses_puts_the_vehicle_where_it_is():
+    frame = Frame.at(-76.3059, 36.8853, "EPSG:32618")
+    n = 11
+    quat = quat_from_euler(np.full(n, 0.02), np.full(n, -0.05), np.linspace(0.0, 3.0, n))
+    position = np.column_stack([np.linspace(0, 50, n), np.linspace(0, 20, n), np.linspace(3, 4, n)])
+    trajectory = Trajectory(np.arange(n) * 10**8, position, quat, np.zeros((n, 3)), np.full(n, 0.99976683))
+    start = datetime(2026, 5, 1, 12, 0, 0, 250000, UTC)
+    table = pose_columns(trajectory, frame, start, np.array([0, 5 * 10**8, 10**9]))
+    assert list(table) == [
+        *("timestamp", "frame", "x", "y", "z", "alpha", "beta", "gamma"),
+        *("qx", "qy", "qz", "qw", "lon", "lat", "h"),
+    ]
+    assert table["timestamp"][1] == "2026-05-01T12:00:00.750000000Z"
+    assert datetime.fromisoformat(table["timestamp"][1]) == datetime(2026, 5, 1, 12, 0, 0, 750000, UTC)
+    np.testing.assert_allclose(table["gamma"], [0.0, 1.5, 3.0], atol=1e-12)
+    np.testing.assert_allclose(table["beta"], -0.05, atol=1e-12)
+    x, y = frame.from_geographic(table["lon"], table["lat"])
+    np.testing.assert_allclose(np.column_stack([x, y]), position[[0, 5, 10], :2], atol=1e-6)
+    quat = np.column_stack([table[k] for k in ("qx", "qy", "qz", "qw")])
+    for row in range(3):
+        R = rz(table["gamma"][row]) @ ry(table["beta"][row]) @ rx(table["alpha"][row])
+        np.testing.assert_allclose(matrix_from_quat(quat[row]), R, atol=1e-12)

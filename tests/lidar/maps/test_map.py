@@ -1,0 +1,225 @@
+"""A map is all that was recorded, where it was recorded, and needs no more memory for a longer drive."""
+
+import json
+import tracemalloc
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import trimesh
+from pypcd4 import PointCloud
+from pyproj import CRS
+
+from geoscene.classes import Class, class_codes
+from geoscene.files import write_json
+from geoscene.frames import Frame
+from lidar.dataset.formats.las import LasInfo, gps_seconds, write_las
+from lidar.dataset.formats.pcd import read_pcd, write_pcd
+from lidar.dataset.layout import open_dataset
+from lidar.errors import DatasetError, InputError
+from lidar.geometry.georeference import Georeference
+from lidar.geometry.poses import Trajectory
+from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
+from lidar.maps.aggregate import aggregate
+
+START = datetime(2026, 6, 21, 8, tzinfo=UTC)
+FRAME = Frame.at(24.945, 60.167)
+CRS_OUT = CRS.from_epsg(32635)
+MOUNT = np.array([[0.0, -1, 0, 1.0], [1, 0, 0, 0.2], [0, 0, 1, 1.9], [0, 0, 0, 1]])
+
+
+def trajectory():
+    """Ten seconds at 10 m/s in a bend."""
+    t = np.linspace(0, 10, 1001)
+    yaw = 0.3 * t
+    position = np.column_stack([np.sin(yaw), 1 - np.cos(yaw), 0 * t]) * 10 / 0.3
+    quat = np.column_stack([0 * t, 0 * t, np.sin(yaw / 2), np.cos(yaw / 2)])
+    velocity = 10 * np.column_stack([np.cos(yaw), np.sin(yaw), 0 * t])
+    return Trajectory((t * 1e9).astype(np.int64), position, quat, velocity, np.ones(len(t)))
+
+
+def world_points(k, n):
+    """Points of frame k around the vehicle, scene metres, on a 1 cm lattice off voxel borders."""
+    rng = np.random.default_rng(k)
+    centre = trajectory().at([k * 100_000_000]).position[0]
+    return np.round(centre + rng.uniform(-15, 15, (n, 3)) * [1, 1, 0.05] + [0, 0, 1], 2) + 0.0002
+
+
+def dataset(path, *, first=0, frames=6, n=400, kinds=("laz",)):
+    """A dataset of points known in the world, written as a drive would."""
+    path.mkdir()
+    write_json(
+        path / "dataset.json",
+        {
+            "schema": 1,
+            "frame": FRAME.to_json(),
+            "export_crs": CRS_OUT.to_wkt(),
+            "start_time": START.isoformat(),
+            "frames": frames,
+            "recipe": {},
+        },
+    )
+    sensor = {"kind": "lidar", "rate_hz": 10.0, "time_offset_ns": 0, "vehicle_from_sensor": MOUNT.tolist()}
+    write_json(path / "calibration.json", {"sensors": {"top": sensor, "camera": {"kind": "camera"}}})
+    write_trajectory(path / "trajectory.csv", trajectory())
+    geo = Georeference(FRAME, CRS_OUT, exact=True)
+    for k in range(first, first + frames):
+        xyz = world_points(k, n)
+        time_ns = np.linspace(0, 99_000_000, n).astype(np.uint32)
+        base = {
+            "intensity": np.linspace(0, 100, n).astype(np.float32),
+            "time_ns": time_ns,
+            "ring": np.zeros(n, np.uint16),
+            "label": np.resize([Class.ROAD, Class.BUILDING], n).astype(np.uint16),
+            "instance": np.arange(n, dtype=np.int32),
+        }
+        if "laz" in kinds:
+            east, north, up = geo.points(xyz).T
+            gps = gps_seconds(START, time_ns + np.int64(k * 100_000_000))
+            (path / "top" / "laz").mkdir(parents=True, exist_ok=True)
+            table = {"x": east, "y": north, "z": up, "gps_time": gps} | base
+            write_las(path / "top" / "laz" / f"{k:06d}.laz", table, LasInfo(CRS_OUT, geo.offset, START))
+        if "pcd" in kinds:
+            poses = (
+                trajectory()
+                .at(k * 100_000_000 + time_ns.astype(np.int64))
+                .mounted(MOUNT[:3, 3], MOUNT[:3, :3])
+            )
+            local = np.einsum("nji,nj->ni", poses.rotation, xyz - poses.position).astype(np.float32)
+            (path / "top" / "pcd").mkdir(parents=True, exist_ok=True)
+            table = {"x": local[:, 0], "y": local[:, 1], "z": local[:, 2]} | base
+            write_pcd(path / "top" / "pcd" / f"{k:06d}.pcd", table)
+    return open_dataset(path)
+
+
+def expected(frames=6, n=400):
+    xyz = np.concatenate([world_points(k, n) for k in range(frames)])
+    return Georeference(FRAME, CRS_OUT, exact=True).points(xyz)
+
+
+def test_trajectories_come_back_exactly(tmp_path):
+    write_trajectory(tmp_path / "t.csv", trajectory())
+    back = read_trajectory(tmp_path / "t.csv")
+    for name in ("time_ns", "position", "quat_xyzw", "velocity", "scale"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(trajectory(), name))
+
+
+@pytest.mark.parametrize("kinds", [("laz",), ("pcd",)])
+def test_points_are_in_the_map_where_they_are_in_the_world(tmp_path, kinds):
+    summary = aggregate(dataset(tmp_path / "d", kinds=kinds), tmp_path / "m.laz")
+    las = laspy.read(tmp_path / "m.laz")
+    assert summary.points == summary.points_in == len(las) == 2400
+    assert las.header.parse_crs().to_epsg() == 32635
+    found = np.column_stack([las.x, las.y, las.z])
+    assert np.abs(found - expected()).max() < 0.002
+    seconds = np.asarray(las.gps_time) - gps_seconds(START, np.zeros(1, np.int64))
+    assert (np.diff(seconds) >= -1e-6).all()
+    road = np.asarray(las.label) == Class.ROAD
+    assert (np.asarray(las.red)[road] == 257 * int(class_codes().color[Class.ROAD, 0])).all()
+
+
+def test_ply_and_pcd_maps_hold_the_same_points(tmp_path):
+    data = dataset(tmp_path / "d")
+    aggregate(data, tmp_path / "m.ply", color="height")
+    aggregate(data, tmp_path / "m.pcd", color="intensity")
+    ply = np.asarray(trimesh.load(tmp_path / "m.ply").vertices)
+    assert np.abs(ply - expected()).max() < 0.001
+    pcd = PointCloud.from_path(tmp_path / "m.pcd")
+    comment = (tmp_path / "m.pcd").read_bytes().splitlines()[1].decode()
+    offset = np.array([float(v) for v in comment.split()[2:5]])
+    found = np.column_stack([pcd.pc_data[k] for k in "xyz"]).astype(float) + offset
+    assert np.abs(found - expected()).max() < 0.001
+
+
+@pytest.mark.parametrize("voxel", [0.5003, 2.0007, 100.0001])  # no border on the millimetres of LAZ
+def test_a_voxel_keeps_the_one_return_nearest_to_its_centre(tmp_path, voxel):
+    data = dataset(tmp_path / "d")
+    aggregate(data, tmp_path / "m.laz", voxel=voxel)
+    las = laspy.read(tmp_path / "m.laz")
+    offset = np.array(Georeference(FRAME, CRS_OUT).offset)
+    kept = np.round(np.column_stack([las.x, las.y, las.z]) - offset, 3)
+    points = np.round(expected() - offset, 3)  # what the LAZ files hold
+    cells = {}
+    for p in points:
+        cell = tuple(np.floor(p / voxel))
+        away = ((p - (np.array(cell) + 0.5) * voxel) ** 2).sum()
+        if cell not in cells or away < cells[cell][0] - 1e-9:
+            cells[cell] = (away, p)
+    assert len(kept) == len(cells)
+    for p in kept:
+        away, _ = cells[tuple(np.floor(p / voxel))]
+        centre = (np.floor(p / voxel) + 0.5) * voxel
+        assert ((p - centre) ** 2).sum() == pytest.approx(away, abs=1e-6)
+    assert not [p for p in tmp_path.iterdir() if "voxels" in p.name or "part" in p.name]
+
+
+@pytest.mark.parametrize("voxel", [None, 0.5])
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path, monkeypatch, voxel):
+    monkeypatch.setattr("lidar.maps.aggregate._SHRINK_AT", 200_000)
+    peaks = []
+    for frames in (10, 60):
+        data = dataset(tmp_path / f"d{frames}", first=100, frames=frames, n=5000)  # at rest
+        aggregate(data, tmp_path / "warm.laz", voxel=voxel, overwrite=True)
+        tracemalloc.start()
+        aggregate(data, tmp_path / f"{frames}.laz", voxel=voxel)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 2 * peaks[0]  # six times the frames
+
+
+def test_the_same_dataset_gives_the_same_bytes(tmp_path):
+    data = dataset(tmp_path / "d")
+    for name in ("a.laz", "b.laz"):
+        aggregate(data, tmp_path / name, voxel=0.3)
+    assert (tmp_path / "a.laz").read_bytes() == (tmp_path / "b.laz").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("out", "change", "words"),
+    [
+        ("m.xyz", {}, "m.xyz"),
+        ("m.laz", {"voxel": 0.0}, "--voxel"),
+        ("m.laz", {"voxel": float("nan")}, "--voxel"),
+        ("m.laz", {"color": "mood"}, "--color mood"),
+        ("m.laz", {"sensors": ("bottom",)}, "no scanner bottom"),
+    ],
+)
+def test_bad_options_are_named(tmp_path, out, change, words):
+    with pytest.raises(InputError, match=words):
+        aggregate(dataset(tmp_path / "d"), tmp_path / out, **change)
+
+
+def test_noise_is_left_out_and_counted_unless_it_is_asked_for(tmp_path):
+    data = dataset(tmp_path / "d", frames=2, kinds=("pcd",))
+    path = tmp_path / "d" / "top" / "pcd" / "000001.pcd"
+    table = dict(read_pcd(path))
+    write_pcd(path, table | {"label": np.where(np.arange(400) < 7, Class.NOISE, table["label"])})
+    summary = aggregate(data, tmp_path / "m.laz")
+    assert (summary.points, summary.noise, summary.points_in) == (793, 7, 800)
+    kept = aggregate(data, tmp_path / "n.laz", noise=True)
+    assert (kept.points, kept.noise) == (800, 0)
+
+
+def test_a_map_that_is_there_is_replaced_only_when_asked(tmp_path):
+    data = dataset(tmp_path / "d", frames=1)
+    (tmp_path / "m.ply").write_text("mine")
+    with pytest.raises(InputError, match="--overwrite"):
+        aggregate(data, tmp_path / "m.ply")
+    assert (tmp_path / "m.ply").read_text() == "mine"
+    assert aggregate(data, tmp_path / "m.ply", overwrite=True).points == 400
+
+
+def test_a_dataset_without_clouds_is_named(tmp_path):
+    data = dataset(tmp_path / "d", frames=0)
+    with pytest.raises(DatasetError, match="no clouds"):
+        aggregate(data, tmp_path / "m.laz")
+    with pytest.raises(DatasetError, match=r"no dataset\.json"):
+        open_dataset(tmp_path)
+    manifest = json.loads((data.path / "dataset.json").read_text())
+    (data.path / "dataset.json").write_text(json.dumps(manifest | {"schema": 7}))
+    with pytest.raises(DatasetError, match="schema version 7"):
+        open_dataset(data.path)
+    assert isinstance(replace(data, path=Path("x")).path, Path)

@@ -1,0 +1,271 @@
+"""Flights over scenes, and drives along the poses of earlier ones."""
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pytest
+import shapely
+
+from geoscene.build import BuildOptions, build
+from geoscene.sources import demo_path, read_osm
+from lidar.dataset.formats.pcd import read_pcd
+from lidar.dataset.layout import open_dataset
+from lidar.drive import drive, plan
+from lidar.errors import InputError, RouteError
+from lidar.geometry.trajectory_csv import read_trajectory
+from lidar.options import DriveOptions
+from lidar.planning.aerial import survey_area, swath
+from lidar.planning.replay import read_replay
+from lidar.rig.devices import cameras, scanners
+from lidar.rig.specs import load_rig
+from lidar.rig.vehicle import load_vehicle
+
+BOX = (24.9405, 60.1655, 24.9475, 60.1690)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "demo"
+    return build(read_osm(demo_path(), bounds=BOX), folder, BuildOptions())
+
+
+@pytest.fixture(scope="module")
+def scene_utm(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "utm"
+    return build(read_osm(demo_path(), bounds=BOX), folder, BuildOptions(crs="utm"))
+
+
+def flight(scene, rig="drone", **change):
+    options = DriveOptions(rig=rig, **change)
+    kit = load_rig(rig)
+    return planned(scene, options, kit).trajectory
+
+
+def planned(scene, options, kit):
+    return plan(scene, options, load_vehicle(kit.vehicle), [*scanners(kit), *cameras(kit)])
+
+
+def test_between_the_lines_of_a_survey_scanners_are_off_unless_asked_for(scene, tmp_path):
+    options = DriveOptions(rig="drone", survey="all", altitude=90.0, overlap=0.0, formats=("pcd",))
+    kit = load_rig("drone")
+    whole = planned(scene, options, kit)
+    xy = whole.trajectory.position[:, :2]
+    since = whole.trajectory.time_ns[:, None]
+    on = ((since >= whole.on[:, 0]) & (since <= whole.on[:, 1])).any(axis=1)
+    track = shapely.linestrings(xy[on])
+    half = swath(scanners(kit), 90.0) / 2
+    area = survey_area(scene, "all")
+    assert shapely.difference(area, shapely.buffer(track, half)).area < 0.002 * area.area
+    course = np.arctan2(*whole.trajectory.velocity[:, 1::-1].T)
+    turning = np.abs(np.gradient(np.unwrap(course), 0.01)) > 0.2
+    assert not on[turning & (np.hypot(*whole.trajectory.velocity[:, :2].T) > 1.0)].any()
+    assert 0.2 < on.mean() < 0.95
+    assert planned(scene, replace(options, turns=True), kit).on is None
+    with pytest.raises(RouteError, match="before the first line"):
+        planned(scene, replace(options, duration=0.5), kit)
+
+    first = int(whole.on[0, 0]) / 1e9
+    summary = drive(scene, tmp_path / "x", replace(options, duration=first + 1.35))
+    files = sorted((tmp_path / "x").glob("*/pcd/*.pcd"))
+    assert len(files) == summary.frames
+    sizes = [len(read_pcd(file)["x"]) for file in files]
+    assert sizes[:3] == [0, 0, 0]
+    assert sizes[-1] > 0
+
+
+def test_a_survey_flies_over_every_part_of_its_area(scene):
+    trajectory = flight(scene, survey="all", altitude=90.0, overlap=0.2)
+    kit = load_rig("drone")
+    half = swath([*scanners(kit), *cameras(kit)], 90.0) / 2
+    track = shapely.linestrings(trajectory.position[:, :2])
+    area = survey_area(scene, "all")
+    assert shapely.difference(area, shapely.buffer(track, half)).area < 0.002 * area.area
+    assert np.ptp(trajectory.position[:, 2]) < 1e-6
+    assert trajectory.position[0, 2] == pytest.approx(90.0, abs=3.0)  # the scene is level
+
+
+def test_the_swath_is_that_of_the_sensor():
+    aircraft = load_rig("aircraft")
+    # 30 degrees to each side
+    assert swath(scanners(aircraft), 600.0) == pytest.approx(2 * 600 * np.tan(np.radians(30)), rel=0.05)
+    with pytest.raises(RouteError, match="sees 6000 m"):
+        swath(scanners(aircraft), 7000.0)
+
+
+def test_more_overlap_is_more_strips_and_files_and_boxes_name_areas(scene, tmp_path):
+    wide, narrow = (flight(scene, survey="all", altitude=90.0, overlap=o) for o in (0.0, 0.7))
+    assert narrow.duration_ns > 2 * wide.duration_ns
+    west, south, east, north = 24.942, 60.166, 24.945, 60.168
+    ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    (tmp_path / "a.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    of_file = survey_area(scene, str(tmp_path / "a.geojson"))
+    of_box = survey_area(scene, f"{west},{south},{east},{north}")
+    assert shapely.symmetric_difference(of_file, of_box).area < 1e-6 * of_box.area
+    assert of_box.area == pytest.approx(166.7 * 222.7, rel=0.01)
+
+
+def test_waypoints_are_flown_over_above_the_ground(scene, tmp_path):
+    places = [(60.1660, 24.9420), (60.1680, 24.9450), (60.1670, 24.9465)]
+    trajectory = flight(scene, route=places, altitude=70.0)
+    x, y = scene.frame.from_geographic(*np.array(places)[:, ::-1].T)
+    for place in zip(x, y, strict=True):
+        assert np.hypot(*(trajectory.position[:, :2] - place).T).min() < 5.0
+    assert trajectory.position[:, 2] == pytest.approx(70.0, abs=3.0)
+    line = {"type": "LineString", "coordinates": [[lon, lat, 95.0] for lat, lon in places]}
+    (tmp_path / "way.geojson").write_text(json.dumps(line))
+    assert flight(scene, route=tmp_path / "way.geojson").position[:, 2] == pytest.approx(95.0, abs=1e-6)
+
+
+def test_a_drone_without_more_words_flies_over_streets_and_sees_them(scene, tmp_path):
+    summary = drive(scene, tmp_path / "d", DriveOptions(rig="drone", duration=1.0, formats=("laz",)))
+    assert summary.points["lidar_down"] > 50_000
+    las = laspy.read(next((tmp_path / "d" / "lidar_down" / "laz").glob("*5.laz")))
+    assert np.isin(11, las.classification)  # road surface
+    position = open_dataset(tmp_path / "d").trajectory().position
+    assert position[:, 2].min() > 55.0
+
+
+@pytest.mark.parametrize(
+    ("rig", "change", "says"),
+    [
+        ("drone", {"survey": "all", "altitude": 12.0}, "would meet what reaches up"),
+        ("vlp16", {"survey": "all"}, "a car does not"),
+        ("vlp16", {"altitude": 50.0}, "--altitude is for what flies"),
+        ("aircraft", {"route": "random"}, "cannot follow streets"),
+        ("drone", {"survey": "nowhere.geojson"}, "neither all"),
+        ("drone", {"survey": "3,4,5,6"}, "does not touch"),
+        ("drone", {"survey": "all", "altitude": 800.0}, "sees 450 m"),
+    ],
+)
+def test_flights_that_cannot_be_are_refused_in_one_line(scene, rig, change, says):
+    with pytest.raises(InputError, match=says) as error:
+        flight(scene, rig, **change)
+    assert "\n" not in str(error.value)
+
+
+# ---------------------------------------------------------------------------------------------- replays
+
+
+@pytest.fixture(scope="module")
+def driven(scene, tmp_path_factory):
+    out = tmp_path_factory.mktemp("drive") / "a"
+    drive(scene, out, DriveOptions(rig="vlp16", duration=6.0, seed=3, formats=("pcd",)))
+    return out
+
+
+def test_a_trajectory_is_driven_again_bit_for_bit(scene, driven, tmp_path):
+    options = DriveOptions(rig="vlp16", route=driven / "trajectory.csv", formats=("pcd",), duration=2.0)
+    drive(scene, tmp_path / "b", options)
+    again = read_trajectory(tmp_path / "b" / "trajectory.csv")
+    first = read_trajectory(driven / "trajectory.csv").until(2_000_000_000)
+    np.testing.assert_array_equal(again.position, first.position)
+    for k in (0, 19):
+        name = f"lidar_top/pcd/{k:06d}.pcd"
+        assert (tmp_path / "b" / name).read_bytes() == (driven / name).read_bytes()
+
+
+def test_poses_are_driven_again_to_within_centimetres(scene, driven):
+    again = read_replay(driven / "poses.csv", scene.frame)
+    first = read_trajectory(driven / "trajectory.csv")
+    span = again.time_ns[again.time_ns < 5_800_000_000]
+    np.testing.assert_allclose(again.at(span).position, first.at(span).position, atol=0.02)
+    np.testing.assert_allclose(again.at(span).rotation, first.at(span).rotation, atol=0.01)
+
+
+@pytest.mark.parametrize("name", ["trajectory.csv", "poses.csv"])
+def test_a_drive_in_one_frame_is_at_the_same_places_on_earth_in_another(scene, scene_utm, driven, name):
+    here, there = read_replay(driven / name, scene.frame), read_replay(driven / name, scene_utm.frame)
+    lon, lat = scene.frame.to_geographic(*here.position[::100, :2].T)
+    np.testing.assert_allclose(
+        scene_utm.frame.to_geographic(*there.position[::100, :2].T), (lon, lat), atol=1e-9
+    )
+    # one metre ahead of the vehicle is the same place too: axes are turned by the convergence
+    ahead = np.tile([1.0, 0.0, 0.0], (len(lon), 1))
+    one, other = (t.at(t.time_ns[::100]).place(ahead) for t in (here, there))
+    found = scene.frame.from_geographic(*scene_utm.frame.to_geographic(*other[:, :2].T))
+    np.testing.assert_allclose(np.column_stack(found), one[:, :2], atol=1e-4)
+
+
+def test_tables_that_are_no_poses_are_refused(scene, tmp_path):
+    (tmp_path / "x.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match=r"neither a poses.csv nor a trajectory.csv"):
+        read_replay(tmp_path / "x.csv", scene.frame)
+    with pytest.raises(RouteError, match="does not exist"):
+        read_replay(tmp_path / "y.csv", scene.frame)
+
+
+def test_poses_of_other_programs_need_no_dataset(scene, driven, tmp_path):
+    shutil.copy(driven / "poses.csv", tmp_path / "poses.csv")
+    with (tmp_path / "poses.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    trajectory = read_replay(tmp_path / "poses.csv", scene.frame)
+    assert trajectory.position[0, 0] == pytest.approx(float(rows[0]["x"]), abs=1e-6)
+
+
+# ------------------------------------------------------------------------------------- the command line
+
+
+def program(*words, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "lidar.cli", *map(str, words)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=cwd,
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--route", "random", "--seed", "-1"], "--seed -1"),
+        (["--route", "random", "--set", "ray=7"], "is rays"),
+        (["--route", "random", "--survey", "all"], "one of --route and --survey"),
+        ([], "one of --route and --survey"),
+        (["--survey", "all", "--rig", "vlp16"], "a car does not"),
+        (["--route", "random", "--deskew", "noon"], "start, middle, end"),
+    ],
+)
+def test_words_that_cannot_be_are_one_line_and_exit_code_two(scene, tmp_path, words, says):
+    done = program("drive", scene.path, *words, "-o", "x", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert says in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_scene_without_roads_can_be_flown_over_but_not_driven_through(scene, tmp_path):
+    shutil.copytree(scene.path, tmp_path / "bare")
+    (tmp_path / "bare" / "roads.graphml").unlink()
+    done = program("drive", "bare", "--route", "random", "-o", "x", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "no roads" in done.stderr
+    words = [
+        "--rig",
+        "drone",
+        "--survey",
+        "all",
+        "--altitude",
+        "90",
+        "--duration",
+        "0.3",
+        "--format",
+        "laz",
+        "--turns",
+    ]
+    done = program("drive", "bare", *words, "-o", "x", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["frames"] == 3
+
+
+def test_options_of_flights_are_part_of_the_recipe(scene):
+    plain = DriveOptions(rig="drone", survey="all")
+    assert plain.recipe(scene) != replace(plain, altitude=70.0).recipe(scene)
+    with pytest.raises(InputError, match="overlap"):
+        replace(plain, overlap=1.0)

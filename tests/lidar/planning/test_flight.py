@@ -1,0 +1,111 @@
+"""Flights and walks: strips cover the area, wings lean into bends, walkers sway."""
+
+import numpy as np
+import pytest
+import shapely
+
+from geoscene.frames import Frame
+from lidar.errors import InputError, RouteError
+from lidar.geometry.attitude import euler_from_quat
+from lidar.planning.flight import survey_flight, waypoint_flight
+from lidar.planning.motion import drive_path
+from lidar.planning.path import plan_path
+from lidar.planning.route import free_route
+from lidar.rig.vehicle import load_vehicle, rear_axle_radius, vehicle_names
+
+FRAME = Frame.at(-76.3, 36.88)
+AREA = shapely.Polygon([(0, 0), (900, 100), (800, 700), (100, 500)])
+
+
+@pytest.mark.parametrize(
+    ("name", "spacing", "run_out"), [("drone", 60.0, 20.0), ("drone", 4.0, 20.0), ("aircraft", 250.0, 600.0)]
+)
+@pytest.mark.parametrize("heading", [90.0, 30.0])
+def test_strips_cover_the_area_and_can_be_flown(name, spacing, run_out, heading):
+    craft = load_vehicle(name)
+    area = AREA if spacing > 10 else shapely.box(0, 0, 200, 30)
+    route = survey_flight(
+        area,
+        spacing=spacing,
+        height=80.0,
+        radius=1.3 * craft.turning_radius,
+        heading_deg=heading,
+        run_out=run_out,
+    )
+    path = plan_path(route, craft, FRAME)
+    assert np.abs(path.curvature).max() <= 1 / craft.turning_radius + 1e-9
+    flown = shapely.LineString(path.position[:, :2])
+    inside = shapely.intersection(flown, shapely.buffer(area, spacing))
+    missed = shapely.difference(area, shapely.buffer(inside, 0.5 * spacing + 0.03 * spacing))
+    assert missed.area < 1e-3 * area.area
+    np.testing.assert_allclose(path.position[:, 2], 80.0, atol=1e-9)
+    away = (
+        shapely.distance(shapely.points(path.position[:, :2]), area)
+        > 3 * spacing + run_out + 4 * craft.turning_radius
+    )
+    assert not away.any()
+
+
+def test_an_aircraft_keeps_its_speed_and_banks_into_turns():
+    craft = load_vehicle("aircraft")
+    route = survey_flight(AREA, spacing=400.0, height=500.0, radius=700.0, run_out=400.0)
+    trajectory = drive_path(plan_path(route, craft, FRAME), craft, rate_hz=20.0)
+    speed = np.linalg.norm(trajectory.velocity, axis=1)
+    assert speed.min() > 30.0  # slower only to limit the roll rate
+    yaw = np.unwrap(euler_from_quat(trajectory.quat_xyzw)[:, 2])
+    roll = euler_from_quat(trajectory.quat_xyzw)[:, 0]
+    across = speed * np.gradient(yaw, 0.05)
+    steep = np.abs(across) > 3.0
+    assert steep.any()
+    # coordinated: the bank that balances the turn, the left wing down in a left turn
+    np.testing.assert_allclose(roll[steep], -np.arctan(across[steep] / 9.81), atol=0.06)
+
+
+def test_a_drone_climbs_level_and_tips_forward_to_speed_up():
+    craft = load_vehicle("drone")
+    points = [(0, 0, 10), (100, 0, 40), (100, 80, 40), (200, 80, 5)]
+    path = plan_path(waypoint_flight(points), craft, FRAME)
+    trajectory = drive_path(path, craft)
+    np.testing.assert_allclose(trajectory.position[[0, -1]], [points[0], points[-1]], atol=0.3)
+    pitch = euler_from_quat(trajectory.quat_xyzw)[:, 1]
+    speed = np.linalg.norm(trajectory.velocity, axis=1)
+    change = np.gradient(speed, 0.01)
+    np.testing.assert_allclose(pitch, 0.102 * change, atol=1e-3)
+    assert trajectory.velocity[:, 2].max() > 1.5
+    high = plan_path(waypoint_flight(points, ground=lambda x, _y: 0.1 * x), craft, FRAME)
+    assert high.position[-1, 2] == pytest.approx(25.0, abs=0.2)
+
+
+def test_a_walker_sways_and_rises_with_every_step():
+    walker = load_vehicle("backpack")
+    trajectory = drive_path(plan_path(free_route([[0.0, 0, 0], [60.0, 0, 0]]), walker, FRAME), walker)
+    middle = slice(1000, 3000)
+    sway, rise = trajectory.position[middle, 1], trajectory.position[middle, 2]
+    assert (sway.min(), sway.max()) == (pytest.approx(-0.02, abs=1e-3), pytest.approx(0.02, abs=1e-3))
+    assert (rise.min(), rise.max()) == (pytest.approx(0.0, abs=1e-3), pytest.approx(0.045, abs=1e-3))
+    tops = np.sum((rise[1:-1] > rise[:-2]) & (rise[1:-1] >= rise[2:]))
+    assert tops / 20.0 == pytest.approx(1.9, abs=0.1)
+    moved = np.diff(trajectory.position[middle], axis=0) / 0.01
+    np.testing.assert_allclose(
+        moved, 0.5 * (trajectory.velocity[middle][1:] + trajectory.velocity[middle][:-1]), atol=0.01
+    )
+
+
+def test_every_vehicle_is_whole_and_a_bad_one_is_refused_with_every_fault(tmp_path):
+    for name in vehicle_names():
+        assert load_vehicle(name).name == name
+        assert len(load_vehicle(name).source) > 20
+    assert rear_axle_radius(11.4, 2.71, 1.55) == pytest.approx(load_vehicle("car").turning_radius, abs=0.01)
+    with pytest.raises(InputError, match="no vehicle tank; there are aircraft, backpack, car"):
+        load_vehicle("tank")
+    path = tmp_path / "mine.toml"
+    path.write_text('name = "mine"\nkind = "boat"\nlength = -1\nwings = 2\nsteering = "soft"\n')
+    with pytest.raises(InputError) as caught:
+        load_vehicle(path)
+    for word in ("unknown key wings", "missing width", "boat", "length = -1", "steering = 'soft'"):
+        assert word in str(caught.value)
+
+
+def test_a_survey_of_nothing_is_refused():
+    with pytest.raises(RouteError, match="above zero"):
+        survey_flight(shapely.box(0, 0, 1, 1), spacing=0.0, height=10.0, radius=5.0)

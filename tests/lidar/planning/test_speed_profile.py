@@ -1,0 +1,117 @@
+"""A driver who is held up drives as smoothly as one who is not, and never ahead of what he is allowed."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidar.errors import InputError
+from lidar.planning.motion import motion_along, poses_along, speed_limits
+from lidar.planning.path import plan_path
+from lidar.planning.route import Route
+from lidar.planning.speed_profile import motion_behind
+from lidar.rig.vehicle import load_vehicle
+
+CAR = load_vehicle("car")
+
+
+class Plane:
+    """A frame in which a metre is a metre."""
+
+    def scale_at(self, x, y):
+        return np.ones(np.broadcast_shapes(np.shape(x), np.shape(y)))
+
+
+def bent(length=300.0, speed=13.9):
+    """A street that bends by 60 degrees halfway."""
+    half, turn = length / 2, np.radians(60.0)
+    line = np.array([[0, 0, 0], [half, 0, 0], [half * (1 + np.cos(turn)), half * np.sin(turn), 0]], float)
+    route = Route(
+        line,
+        np.full(3, -1, np.int32),
+        np.full(3, speed),
+        np.zeros(3, bool),
+        np.empty(0, np.int64),
+        np.empty(0, np.int32),
+    )
+    return plan_path(route, CAR, Plane())
+
+
+PATH = bent()
+
+
+def jerks(motion):
+    return np.diff(motion.speed, 2) * 1e4
+
+
+@settings(max_examples=12, deadline=None)
+@given(stops=st.lists(st.tuples(st.floats(5.0, 280.0), st.floats(3.0, 90.0)), max_size=4))
+def test_whatever_it_is_held_up_by_the_drive_is_gentle_and_stays_behind(stops):
+    """A stop is a place that must not be passed before a time."""
+    time_s = np.arange(0.0, 150.0, 0.1)
+    free = motion_along(PATH, CAR)
+    reach = np.interp(time_s, free.time_ns * 1e-9, free.s)
+    for place, until in stops:
+        reach = np.minimum(reach, np.where(time_s < until, place, np.inf))
+    reach = np.maximum.accumulate(np.minimum(reach, PATH.length))
+    motion = motion_behind(PATH, CAR, time_s, reach)
+    at = motion.time_ns * 1e-9
+    assert (motion.s <= np.interp(at, time_s, reach) + 1e-6).all()
+    assert (np.diff(motion.s) >= -1e-9).all()
+    assert (motion.speed >= 0.0).all()
+    assert motion.speed[[0, -1]] == pytest.approx([0.0, 0.0], abs=2e-3)
+    change = np.diff(motion.speed) * 100.0
+    assert change.max() <= CAR.acceleration + 1e-6
+    assert change.min() >= -CAR.deceleration - 1e-6
+    assert np.abs(jerks(motion)).max() <= CAR.jerk + 1e-6
+    limit = np.interp(motion.s, PATH.s, speed_limits(PATH, CAR))
+    assert (motion.speed <= 1.01 * limit + 0.02).all()
+    assert motion.s[-1] == pytest.approx(PATH.length, abs=0.1)
+
+
+def test_who_is_not_held_up_is_about_as_fast_as_on_an_empty_road():
+    free = motion_along(PATH, CAR)
+    time_s = np.arange(0.0, 120.0, 0.1)
+    motion = motion_behind(PATH, CAR, time_s, np.where(time_s > 0, PATH.length, 0.0))
+    assert motion.time_ns[-1] < 1.05 * free.time_ns[-1]
+
+
+def test_what_is_sampled_is_one_motion():
+    """Speed is the rate of distance, and the poses' velocity that of their positions."""
+    time_s = np.arange(0.0, 60.0, 0.1)
+    motion = motion_behind(PATH, CAR, time_s, np.clip(6.0 * (time_s - 2.0), 0.0, 120.0))
+    np.testing.assert_allclose(np.gradient(motion.s, 0.01)[2:-2], motion.speed[2:-2], atol=2e-3)
+    there = poses_along(PATH, CAR, motion)
+    np.testing.assert_allclose(
+        np.gradient(there.position, 0.01, axis=0)[2:-2], there.velocity[2:-2], atol=2e-2
+    )
+
+
+def test_distances_that_fall_are_refused():
+    with pytest.raises(InputError, match="must not fall"):
+        motion_behind(PATH, CAR, np.array([0.0, 1.0, 2.0]), np.array([0.0, 5.0, 4.0]))
+
+
+@settings(max_examples=10, deadline=None)
+@given(stops=st.lists(st.tuples(st.floats(30.0, 280.0), st.floats(3.0, 30.0)), max_size=3))
+def test_what_is_under_way_starts_and_ends_at_speed_and_stays_behind_too(stops):
+    time_s = np.arange(0.0, 18.0, 0.1)
+    free = motion_along(PATH, CAR, under_way=True)
+    reach = np.interp(time_s, free.time_ns * 1e-9, free.s - free.s[0])
+    for place, until in stops:
+        reach = np.minimum(reach, np.where(time_s < until, place, np.inf))
+    reach = np.maximum.accumulate(reach)
+    motion = motion_behind(PATH, CAR, time_s, reach, under_way=True)
+    at = motion.time_ns * 1e-9
+    assert (motion.s <= np.interp(at, time_s, reach) + 0.1).all()
+    assert (np.diff(motion.s) >= -1e-9).all()
+    change = np.diff(motion.speed) * 100.0
+    assert change.max() <= CAR.acceleration + 1e-6
+    assert change.min() >= -CAR.deceleration - 1e-6
+    assert np.abs(jerks(motion)).max() <= CAR.jerk + 1e-6
+    limit = np.interp(motion.s, PATH.s, speed_limits(PATH, CAR))
+    assert (motion.speed <= 1.01 * limit + 0.02).all()
+    if not stops:
+        assert motion.speed[0] > 0.9 * 13.9
+        assert motion.speed[-1] > 0.8 * np.interp(at[-1], free.time_ns * 1e-9, free.speed)
+        assert motion.s[-1] > 0.93 * reach[-1]

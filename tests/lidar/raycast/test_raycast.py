@@ -1,0 +1,449 @@
+"""Rays: exact wherever the scene lies, no leaks, the same whoever casts them."""
+
+import logging
+import multiprocessing
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from lidar.errors import BackendError, InputError
+from lidar.geometry.poses import Poses
+from lidar.raycast import ALL, Caster, Instances, caster, library
+from lidar.raycast.reference import Reference
+
+FAR_AWAY = st.sampled_from([(0.0, 0.0, 0.0), (500_000.37, 4_080_000.61, 0.0), (-3e6, 9.9e6, 2500.25)])
+BACKENDS = pytest.mark.parametrize("backend", ["embree", "embreex"])
+
+
+def sheet(normal, point, size=1e5):
+    """A square of four triangles through a point, seen from the side the normal points to."""
+    n = np.asarray(normal) / np.linalg.norm(normal)
+    u = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
+    u /= np.linalg.norm(u)
+    v = np.cross(n, u)
+    ring = [u, v, -u, -v]
+    vertices = np.array([np.zeros(3), *(size * w for w in ring)]) + point
+    return vertices, np.array([[0, k + 1, (k + 1) % 4 + 1] for k in range(4)])
+
+
+def soup(rng, count, spread=10.0):
+    """Random triangles: vertices (3 count, 3) and faces."""
+    middle = rng.normal(size=(count, 1, 3)) * spread
+    return (middle + rng.normal(size=(count, 3, 3)) * 2).reshape(-1, 3), np.arange(3 * count).reshape(-1, 3)
+
+
+def turns(rng, count):
+    return Rotation.from_rotvec(rng.normal(size=(count, 3))).as_matrix()
+
+
+def placed(rng, count, steps=None, spread=15.0):
+    """Random transforms (count, 3, 4), or (count, steps, 3, 4) that drift without turning."""
+    out = np.empty((count, steps or 1, 3, 4))
+    out[..., :3] = turns(rng, count)[:, None] * rng.uniform(0.5, 2, (count, 1, 1, 1))
+    out[..., 3] = rng.normal(size=(count, steps or 1, 3)) * spread
+    return out if steps else out[:, 0]
+
+
+def directions(rng, count):
+    return rng.normal(size=(count, 3)) * rng.uniform(0.1, 3, (count, 1))
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    FAR_AWAY,
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([(1.0, 1e-9), (30.0, 1e-9), (1e3, 1e-8), (1e4, 1e-6)]),
+)
+def test_ranges_are_exact_at_every_distance_and_wherever_the_scene_lies(place, seed, reach):
+    rng = np.random.default_rng(seed)
+    distance, tolerance = reach
+    origin = np.array(place)
+    normal = rng.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    vertices, faces = sheet(normal, origin - distance * normal)
+    way = -normal + rng.uniform(-0.9, 0.9, (50, 3)) * 0.5
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    hits = Caster(vertices, faces, origin=np.round(origin)).cast(origin, way)
+    # The plane the mesh really has, given vertices rounded to float64 so far from zero.
+    corners = vertices[faces][hits.face] - origin
+    true = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    expected = np.einsum("ij,ij->i", true, corners[:, 0]) / np.einsum("ij,ij->i", true, way)
+    np.testing.assert_allclose(hits.range, expected, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(hits.cosine, -way @ normal, atol=1e-6)
+
+
+@pytest.mark.parametrize("angle_deg", [89.9, 89.99, 89.999])
+def test_ranges_are_exact_at_grazing_incidence(angle_deg):
+    height = 12.345678
+    vertices, faces = sheet([0, 0, 1], np.zeros(3), size=2e6)
+    azimuth = np.linspace(0, 2 * np.pi, 100)
+    down = np.radians(90 - angle_deg)
+    way = np.stack(
+        [np.cos(azimuth) * np.cos(down), np.sin(azimuth) * np.cos(down), np.full(100, -np.sin(down))], 1
+    )
+    hits = Caster(vertices, faces).cast([0, 0, height], way)
+    np.testing.assert_allclose(hits.range, height / np.sin(down), rtol=1e-12)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32 - 1), FAR_AWAY)
+def test_first_hits_are_those_of_the_float64_reference(seed, place):
+    rng = np.random.default_rng(seed)
+    vertices, faces = soup(rng, 400)
+    origins, way = rng.normal(size=(1000, 3)) * 20, directions(rng, 1000)
+    hits = Caster(vertices + place, faces).cast(origins + place, way)
+    ranges, found = Reference((vertices + place)[faces] - np.round(place)).cast(
+        origins + place - np.round(place), way
+    )
+    # A ray within float32's reach of a triangle's rim may go either way.
+    agree = hits.face == found[:, 0]
+    assert agree.mean() > 0.999
+    met = agree & (hits.face >= 0)
+    assert met.sum() > 100
+    np.testing.assert_allclose(hits.range[met], ranges[met, 0], rtol=0, atol=1e-8)
+
+
+@BACKENDS
+@pytest.mark.parametrize("solid", ["box", "turned box", "ball"])
+def test_no_ray_leaves_a_closed_solid_through_its_edges_and_vertices(solid, backend):
+    rng = np.random.default_rng(3)
+    box = trimesh.creation.box([20, 30, 10])
+    mesh = {
+        "box": box,
+        "turned box": box.copy().apply_transform(trimesh.transformations.euler_matrix(0.3, 0.6, 0.2)),
+        "ball": trimesh.creation.icosphere(subdivisions=4, radius=10.0),
+    }[solid]
+    n = 200_000
+    ends = mesh.vertices[mesh.edges_unique][rng.integers(0, len(mesh.edges_unique), n)]
+    along = rng.random((n, 1)) * (np.arange(n) % 2)[:, None]  # every other ray exactly at a vertex
+    aim = ends[:, 0] + along * (ends[:, 1] - ends[:, 0])
+    inside = Caster(mesh.vertices, mesh.faces, backend=backend)
+    origins = rng.uniform(-2, 2, (n, 3))
+    out = inside.cast(origins, aim - origins)
+    assert np.isfinite(out.range).all()
+    np.testing.assert_allclose(out.range, 1.0, atol=2e-5)
+    assert inside.occluded(origins, aim - origins).all()
+
+
+def test_no_ray_from_outside_passes_through_the_near_side_of_a_solid():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
+    rng = np.random.default_rng(4)
+    eye = np.array([100.0, 3.0, 2.0])
+    near = ball.vertices[(ball.vertices @ eye) > 15 * np.linalg.norm(eye) / 2]
+    aim = near[rng.integers(0, len(near), 100_000)]
+    hits = Caster(ball.vertices, ball.faces).cast(eye + rng.normal(size=(len(aim), 3)) * 1e-3, aim - eye)
+    assert (hits.range < 1.001).all()
+    assert (hits.cosine > 0).all()
+
+
+def test_the_number_of_threads_changes_nothing():
+    rng = np.random.default_rng(5)
+    vertices, faces = soup(rng, 3000)
+    way = directions(rng, 50_000)
+    way = way[np.argsort(np.arctan2(way[:, 1], way[:, 0]))]
+    cast = Caster(vertices, faces)
+    order = rng.permutation(len(way))
+    for one, two in zip(
+        [cast.cast([0, 0, 0], way, normals=True), cast.cast_all([0, 0, 0], way, k=3)],
+        [cast.cast([0, 0, 0], way, normals=True, threads=2), cast.cast_all([0, 0, 0], way, k=3, threads=3)],
+        strict=True,
+    ):
+        for name in one.__slots__:
+            np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    np.testing.assert_array_equal(
+        cast.occluded([0, 0, 0], way, 9.0), cast.occluded([0, 0, 0], way, 9.0, threads=2)
+    )
+    shuffled = cast.cast([0, 0, 0], way, order=order, threads=2)
+    np.testing.assert_allclose(shuffled.range, cast.cast([0, 0, 0], way).range, atol=1e-6)
+
+
+def test_coherent_packets_and_single_rays_agree():
+    rng = np.random.default_rng(6)
+    vertices, faces = soup(rng, 3000)
+    azimuth = np.linspace(0, 2 * np.pi, 20_000)
+    way = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(len(azimuth), 0.1)], axis=1)
+    cast = Caster(vertices, faces)
+    scan, shuffled = cast.cast([0, 0, 0], way), cast.cast([0, 0, 0], way, order=rng.permutation(len(way)))
+    assert (scan.face == shuffled.face).mean() > 0.9999
+    np.testing.assert_allclose(scan.range, shuffled.range, atol=1e-6)
+
+
+def crowd(rng, backend, steps=None):
+    """A soup with masks and copies of a box, at rest and moving, some hidden from some masks."""
+    vertices, faces = soup(rng, 500)
+    box = trimesh.creation.box([2, 3, 4])
+    shape = Caster(box.vertices + 1000.0, box.faces, mask=np.arange(12) % 2 + 1, backend=backend)
+    far_box = np.eye(3, 4)
+    far_box[:, 3] = -1000.0
+
+    def near(transforms):
+        out = transforms.copy()
+        out[..., 3] += transforms[..., :3] @ far_box[:, 3]
+        return out
+
+    groups = [Instances((shape,), np.zeros(6, np.int32), near(placed(rng, 6)))]
+    bits = np.array([1, 2, 3, 1], np.uint32)
+    if steps:
+        groups.append(Instances((shape,), np.zeros(4, np.int32), near(placed(rng, 4, steps)), mask=bits))
+    return Caster(vertices, faces, mask=rng.integers(1, 4, 500), instances=groups, backend=backend)
+
+
+@pytest.mark.parametrize("mask", [ALL, 1, 2])
+@pytest.mark.parametrize(("near", "far"), [(0.0, np.inf), (0.5, 7.0)])
+def test_plain_embreex_gives_the_same_hits(mask, near, far):
+    origins, way = np.random.default_rng(8).normal(size=(2, 5000, 3)) * [[[20]], [[1]]]
+    time = np.linspace(0, 1, 5000)
+    steps = None if mask == 2 else 3
+    fast, slow = (
+        crowd(np.random.default_rng(7), backend, steps).cast(
+            origins, way, mask=mask, near=near, far=far, time=time, normals=True
+        )
+        for backend in ("embree", "embreex")
+    )
+    assert (fast.instance >= 0).any()
+    assert (fast.face >= 0).sum() > 200
+    np.testing.assert_array_equal(fast.face, slow.face)
+    np.testing.assert_array_equal(fast.instance, slow.instance)
+    np.testing.assert_allclose(fast.range, slow.range, atol=1e-9)
+    np.testing.assert_allclose(fast.normal, slow.normal, atol=1e-9)
+    np.testing.assert_allclose(fast.cosine, slow.cosine, atol=1e-6)
+
+
+@BACKENDS
+def test_all_surfaces_along_a_ray_are_found_in_order(backend):
+    rng = np.random.default_rng(9)
+    vertices, faces = soup(rng, 400, spread=4.0)
+    origins, way = rng.normal(size=(2000, 3)) * 20, directions(rng, 2000)
+    way = -origins + rng.normal(size=way.shape) * 5
+    echoes = Caster(vertices, faces, backend=backend).cast_all(origins, way, k=5, far=1.2)
+    ranges, found = Reference(vertices[faces]).cast(origins, way, k=5, far=1.2)
+    assert (echoes.count == 5).sum() > 100
+    assert (echoes.count < 5).sum() > 100
+    np.testing.assert_array_equal(echoes.count, (found >= 0).sum(axis=1))
+    assert (echoes.face == found).mean() > 0.9999
+    np.testing.assert_allclose(echoes.range, ranges, atol=1e-6)
+    assert (echoes.range[:, 1:] >= echoes.range[:, :-1]).all()
+
+
+def test_echoes_count_every_copy_of_a_shape():
+    leaf = Caster(*sheet([0, 0, 1], np.zeros(3), size=1.0))
+    stack = np.tile(np.eye(3, 4), (6, 1, 1))
+    stack[:, 2, 3] = [3, 1, 5, 2, 6, 4]
+    cast = Caster(instances=[Instances((leaf,), np.zeros(6, np.int32), stack)])
+    echoes = cast.cast_all([[0.1, 0.2, 0.0]], [[0, 0, 1.0]], k=4)
+    np.testing.assert_allclose(echoes.range, [[1, 2, 3, 4]])
+    np.testing.assert_array_equal(echoes.instance, [[1, 3, 0, 5]])
+    np.testing.assert_allclose(echoes.cosine, -1)
+
+
+@BACKENDS
+def test_each_ray_meets_a_moving_thing_where_it_is_at_the_rays_time(backend):
+    wall = Caster(*sheet([-1, 0, 0], np.zeros(3), size=5.0), backend=backend)
+    path = np.tile(np.eye(3, 4), (1, 3, 1, 1))
+    path[0, :, 0, 3] = [10, 20, 20]
+    cast = Caster(instances=[Instances((wall,), np.zeros(1, np.int32), path)], backend=backend)
+    time = np.linspace(0, 1, 101)
+    hits = cast.cast([0, 0.1, 0.2], np.tile([1.0, 0, 0], (101, 1)), time=time)
+    np.testing.assert_allclose(hits.range, np.minimum(10 + 20 * time, 20), atol=1e-5)  # times are float32
+    assert (hits.cosine == 1).all()
+
+
+@BACKENDS
+def test_a_mirrored_copy_still_faces_outwards(backend):
+    box = trimesh.creation.box([2, 2, 2])
+    shape = Caster(box.vertices, box.faces, backend=backend)
+    mirror = np.array([[[-1.0, 0, 0, 10], [0, 3, 0, 0], [0, 0, 1, 0]]])
+    hits = Caster(instances=[Instances((shape,), np.zeros(1, np.int32), mirror)], backend=backend).cast(
+        [0, 2.5, 0.3], [[1.0, 0, 0]], normals=True
+    )
+    np.testing.assert_allclose(hits.range, 9)
+    # The mirror turns every face inside out, and so the cosine says.
+    np.testing.assert_allclose(hits.normal, [[1, 0, 0]], atol=1e-12)
+    assert hits.cosine == pytest.approx(-1)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.9, 1.1), st.integers(0, 2**32 - 1))
+def test_ranges_of_posed_rays_are_true_distances_on_a_stretched_map(k, seed):
+    """A room of known size is drawn on a map with point scale k; a sensor in it measures true metres."""
+    rng = np.random.default_rng(seed)
+    room = trimesh.creation.box([20, 14, 6])
+    drawn = room.vertices * [k, k, 1] + [500_000.0, 4e6, 100.0]
+    where = rng.uniform(-2, 2, (3, 3))
+    scale = np.tile([k, k, 1.0], (3, 1))
+    poses = Poses(where * scale + [500_000.0, 4e6, 100.0], turns(rng, 3), scale)
+    index = np.arange(600) % 3
+    way = rng.normal(size=(600, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    offsets = rng.uniform(-0.1, 0.1, (600, 3))
+    hits = Caster(drawn, room.faces).cast_posed(poses, index, way, offsets=offsets)
+    true_way = np.einsum("nij,nj->ni", poses.rotation[index], way)
+    start = where[index] + np.einsum("nij,nj->ni", poses.rotation[index], offsets)
+    with np.errstate(divide="ignore"):
+        walls = (np.array([10, 7, 3]) * np.sign(true_way) - start) / true_way
+    np.testing.assert_allclose(hits.range, walls.min(axis=1), atol=1e-8)
+
+
+def test_one_posed_ray_starts_at_its_offset():
+    poses = Poses(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)))
+    cast = Caster(*sheet([0, 0, 1], np.array([0, 0, -5.0])))
+    way = np.array([[0.0, 0, -1]])
+    assert cast.cast_posed(poses, np.zeros(1, int), way).range == pytest.approx(5)
+    assert cast.cast_posed(
+        poses, np.zeros(1, int), way, offsets=np.array([[0, 0, -2.0]])
+    ).range == pytest.approx(3)
+
+
+@BACKENDS
+def test_bounds_hold(backend):
+    cast = Caster(*sheet([0, 0, 1], np.zeros(3)), backend=backend)
+    down = [[0, 0, -2.0]]
+    assert cast.cast([0.3, 0.2, 10], down).range == pytest.approx(5)
+    assert np.isinf(cast.cast([0.3, 0.2, 10], down, far=4.999).range)
+    assert np.isinf(cast.cast([0.3, 0.2, 10], down, near=5.001).range)
+    assert cast.cast([0.3, 0.2, 10], down, near=4.9, far=5.0).range == pytest.approx(5)
+    assert cast.occluded([0.3, 0.2, 10], down, 5.1)
+    assert not cast.occluded([0.3, 0.2, 10], down, 4.9)
+
+
+@BACKENDS
+def test_rays_that_cannot_be_cast_are_refused_by_number(backend):
+    cast = Caster(*sheet([0, 0, 1], np.zeros(3)), backend=backend)
+    good = np.tile([0.0, 0, -1], (30, 1))
+    for bad in ([np.nan, 0, 1], [0, 0, 0], [np.inf, 0, 0]):
+        way = good.copy()
+        way[17] = bad
+        with pytest.raises(InputError, match="ray 17 of 30"):
+            cast.cast([0, 0, 1], way)
+        with pytest.raises(InputError, match="ray 17 of 30"):
+            cast.occluded([0, 0, 1], way)
+        with pytest.raises(InputError, match="ray 17 of 30"):
+            cast.cast_all([0, 0, 1], way)
+    with pytest.raises(InputError, match="cannot be cast"):
+        cast.cast([0, 0, np.nan], good)
+    with pytest.raises(InputError, match="permutation"):
+        cast.cast([0, 0, 1], good, order=np.zeros(30, int))
+    with pytest.raises(InputError, match="near"):
+        cast.cast([0, 0, 1], good, near=np.nan)
+    with pytest.raises(InputError, match="times"):
+        cast.cast([0, 0, 1], good, time=np.full(30, 2.0))
+
+
+def test_meshes_that_cannot_be_cast_at_are_refused():
+    with pytest.raises(InputError, match="vertex 1 of 3"):
+        Caster([[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    with pytest.raises(InputError, match="face 0 names"):
+        Caster(np.zeros((3, 3)), [[0, 1, 3]])
+    shape = Caster(*sheet([0, 0, 1], np.zeros(3)))
+    with pytest.raises(InputError, match="beyond the 1"):
+        Instances((shape,), np.ones(1, np.int32), np.eye(3, 4)[None])
+
+
+@BACKENDS
+def test_an_empty_mesh_is_missed(backend):
+    hits = Caster(backend=backend).cast([0, 0, 0], np.eye(3))
+    assert np.isinf(hits.range).all()
+    assert (hits.face == -1).all()
+    assert len(Caster(backend=backend).cast([0, 0, 0], np.empty((0, 3)))) == 0
+
+
+def test_hits_depend_on_the_parts_not_on_their_history():
+    """Parts that come and go leave the same hits as building the final set at once."""
+    rng = np.random.default_rng(11)
+    parts = {k: caster.split(*caster.checked(*soup(rng, 50)))[0] for k in range(8)}
+    way = directions(rng, 20_000)
+    moved = Caster(origin=np.zeros(3), dynamic=True)
+    moved.update(attach={k: parts[k] for k in (0, 3, 5, 6)})
+    moved.update(detach=[3, 0], attach={7: parts[7]})
+    moved.update(attach={1: parts[1]}, detach=[6])
+    fresh = Caster(origin=np.zeros(3), dynamic=True)
+    fresh.update(attach={k: parts[k] for k in (7, 5, 1)})
+    for a, b in zip(
+        (moved.cast([0, 0, 0], way, normals=True),), (fresh.cast([0, 0, 0], way, normals=True),), strict=True
+    ):
+        for name in a.__slots__:
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        assert (a.face >= 0).mean() > 0.05
+
+
+def test_without_the_library_rays_are_cast_by_embreex_and_that_is_said_once(monkeypatch, caplog):
+    def missing():
+        raise BackendError("no Embree 4 library")
+
+    monkeypatch.setattr(caster, "library", missing)
+    caster._works.cache_clear()
+    try:
+        with caplog.at_level(logging.WARNING):
+            hits = [
+                Caster(*sheet([0, 0, 1], np.zeros(3))).cast([0, 0.1, 3], [[0, 0.1, -1.0]]) for _ in range(3)
+            ]
+        assert [record.levelname for record in caplog.records] == ["WARNING"]
+        assert hits[2].range == pytest.approx(3)
+        with pytest.raises(BackendError, match="no Embree 4"):
+            Caster(backend="embree")
+    finally:
+        caster._works.cache_clear()
+
+
+def test_a_wrong_library_is_refused(monkeypatch, tmp_path):
+    fake = tmp_path / "libembree4.so"
+    fake.write_bytes(b"not a library")
+    monkeypatch.setattr(library, "_path", lambda: fake)
+    library.library.cache_clear()
+    try:
+        with pytest.raises(BackendError, match="not a usable Embree 4"):
+            library.library()
+    finally:
+        library.library.cache_clear()
+
+
+def test_a_caster_works_in_a_forked_process():
+    code = """
+import os, numpy as np
+from lidar.raycast import Caster
+c = Caster([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+assert c.cast([0.2, 0.2, 1], [[0, 0, -1.0]]).range[0] == 1
+child = os.fork()
+if child == 0:
+    again = Caster(np.eye(3) * 9, [[0, 1, 2]])
+    ok = c.cast([0.2, 0.2, 2], [[0, 0, -1.0]]).range[0] == 2
+    ok &= again.cast([1, 1, 1], [[1, 1, 1.0]]).face[0] == 0
+    os._exit(0 if ok else 1)
+raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_a_lone_copy_is_the_shape_it_says():
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
+    shapes = [Caster(corners + np.array([0.0, 0.0, height]), [[0, 1, 2]]) for height in (1.0, 2.0, 3.0)]
+    stay = np.eye(3, 4)[None]
+    caster = Caster(instances=[Instances(shapes, np.array([2], np.int32), stay)])
+    hits = caster.cast([[0.0, 0.0, 10.0]], [[0.0, 0.0, -1.0]])
+    assert hits.range[0] == 7.0
+
+
+def _cast_in_child(solid, start, way, out):
+    out.put(solid.cast(start, way, threads=2).range)
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_forked_process_casts_with_threads_of_its_own():
+    rng = np.random.default_rng(0)
+    solid = Caster(*soup(rng, 200))
+    way, start = directions(rng, 20_000), np.zeros((20_000, 3))
+    before = solid.cast(start, way, threads=2).range
+    context = multiprocessing.get_context("fork")
+    out = context.Queue()
+    child = context.Process(target=_cast_in_child, args=(solid, start, way, out))
+    child.start()
+    np.testing.assert_array_equal(out.get(timeout=30), before)
+    child.join(30)
+    assert child.exitcode == 0

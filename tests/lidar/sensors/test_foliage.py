@@ -1,0 +1,102 @@
+"""Rays through crowns and hedges."""
+
+import numpy as np
+import pytest
+from helpers.sensor_worlds import LEAVES, box, driven, plate, world
+
+from geoscene.classes import Class
+from lidar.geometry.mounts import Mount
+from lidar.physics.effects import Effects
+from lidar.rig.scanner import load_sensor
+from lidar.sensors.foliage import PROJECTION
+from lidar.sensors.scan import scan
+
+HERE = Mount((0.0, 0.0, 0.0))
+BARE, LEAFY = Effects(), Effects(foliage=True)
+
+
+def hedge(low, high, feature=7):
+    return box(low, high, feature=feature, klass=Class.HEDGE, material="foliage")
+
+
+def seen(scene, effects=LEAFY, *, name="hdl64e_s3", frame=0, seed=1, start=(0, 0, 0), **options):
+    return scan(
+        load_sensor(name), HERE, driven(start=start), scene, frame, seed=seed, effects=effects, **options
+    )
+
+
+def along(cloud):
+    """Cosine of each beam with the x axis."""
+    xyz = cloud.xyz.astype(float)
+    return xyz[:, 0] / np.linalg.norm(xyz, axis=1)
+
+
+@pytest.mark.parametrize("depth", [0.5, 2.0, 5.0])
+def test_the_share_that_passes_falls_as_beer_and_lambert_say(depth):
+    slab, wall = hedge((10, -40, -40), (10 + depth, 40, 40)), plate(30.0, feature=3)
+    cloud = seen(world(slab, wall))
+    ahead = along(cloud) > 0.7
+    length = depth / along(cloud)[ahead]
+    passed = cloud.feature[ahead] == 3
+    expected = np.exp(-PROJECTION * LEAVES * length)
+    spread = np.sqrt((expected * (1 - expected)).sum()) / len(expected)
+    assert len(expected) > 20_000
+    assert passed.mean() == pytest.approx(expected.mean(), abs=4 * spread)
+
+
+def test_leaves_are_met_at_depths_that_fall_off_exponentially_and_face_all_ways():
+    cloud = seen(world(hedge((10, -400, -400), (200, 400, 400))))
+    front = along(cloud) > 0.7
+    depth = cloud.range[front] - 10 / along(cloud)[front]
+    assert depth.min() >= -0.02  # beams start a little off the middle
+    mean = 1 / (PROJECTION * LEAVES)
+    assert depth.mean() == pytest.approx(mean, rel=0.03)
+    assert np.quantile(depth, 0.9) == pytest.approx(mean * np.log(10), rel=0.03)
+    assert np.cos(cloud.incidence[front]).mean() == pytest.approx(2 / 3, rel=0.02)
+    assert (cloud.klass[front] == Class.HEDGE).all()
+    assert (cloud.feature[front] == 7).all()
+
+
+def test_what_lies_behind_keeps_its_exact_range():
+    slab, wall = hedge((10, -40, -40), (11, 40, 40)), plate(30.0, feature=3)
+    through, bare = seen(world(slab, wall)), seen(world(wall), BARE)
+    behind = through.feature == 3
+    key = {(int(r), int(t)): d for r, t, d in zip(bare.ring, bare.time_ns, bare.range, strict=True)}
+    ranges = [key[int(r), int(t)] for r, t in zip(through.ring[behind], through.time_ns[behind], strict=True)]
+    assert through.range[behind] == pytest.approx(ranges, abs=1e-9)
+
+
+def test_a_ray_that_starts_among_leaves_meets_one_or_comes_out():
+    around = world(hedge((-2, -2, -2), (2, 2, 2)), plate(30.0, feature=3))
+    cloud = seen(around, name="vlp16")
+    passed = (along(cloud) > 0.9) & (cloud.feature == 3)
+    # The scanner sees nothing within its least range: what passed is counted against what was fired.
+    fired = along(seen(world(plate(30.0, feature=3)), BARE, name="vlp16"))
+    expected = np.exp(-PROJECTION * LEAVES * 2 / fired[fired > 0.9])
+    assert passed.sum() / len(expected) == pytest.approx(expected.mean(), abs=0.03)
+
+
+def test_crowns_that_overlap_are_as_dense_as_both():
+    both = world(
+        hedge((10, -40, -40), (12, 40, 40), 7),
+        hedge((10.5, -39, -39), (12.5, 39, 39), 8),
+        plate(30.0, feature=3),
+    )
+    cloud = seen(both)
+    ahead = along(cloud) > 0.9
+    expected = np.exp(-PROJECTION * LEAVES * 4 / along(cloud)[ahead])
+    assert (cloud.feature[ahead] == 3).mean() == pytest.approx(expected.mean(), abs=0.01)
+
+
+def test_leaves_stay_where_they_are_for_any_number_of_threads_and_change_from_frame_to_frame():
+    scene = world(hedge((10, -40, -40), (12, 40, 40)), plate(30.0, feature=3))
+    one, two = seen(scene), seen(scene, threads=2)
+    assert np.array_equal(one.range, two.range)
+    other = seen(scene, frame=1)
+    assert not np.array_equal(one.range[:1000], other.range[:1000])
+    assert not np.array_equal(one.range, seen(scene, seed=2).range)
+
+
+def test_hedges_are_walls_unless_asked_for():
+    cloud = seen(world(hedge((10, -40, -40), (12, 40, 40)), plate(30.0, feature=3)), BARE)
+    assert (cloud.feature[along(cloud) > 0.9] == 7).all()

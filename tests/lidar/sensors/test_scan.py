@@ -1,0 +1,146 @@
+"""What a scanner reports of a small world."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from helpers.sensor_worlds import box, driven, plate, world
+
+from geoscene.classes import Class, materials
+from lidar.geometry.mounts import Mount
+from lidar.physics.effects import LEVELS, PLAIN, Effects
+from lidar.rig.scanner import firings, load_sensor
+from lidar.rig.specs import load_rig
+from lidar.sensors.scan import scan
+
+ROOF = Mount((1.2, 0.0, 1.9))
+ROOM = world(
+    box((-40, -30, -1), (40, 30, 0), feature=7, klass=Class.ROAD, material="asphalt"),
+    box((12, -20, 0), (15, 25, 9), feature=8),
+    box((-30, 6, 0), (10, 7, 3), feature=9, klass=Class.WALL, material="concrete"),
+)
+
+
+def same(a, b):
+    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+
+
+def placed(cloud, mount, trajectory):
+    """Scene coordinates of a cloud's points, each from the pose of its own time."""
+    poses = trajectory.at(cloud.start_ns + cloud.time_ns.astype(np.int64)).mounted(
+        mount.translation, mount.rotation
+    )
+    return poses.place(cloud.xyz.astype(float))
+
+
+def test_points_of_a_moving_turning_vehicle_lie_on_the_surfaces():
+    drive = driven((20.0, 3.0, 0.0), yaw_rate=0.8, start=(-20, -10, 0))
+    sensor = load_sensor("vlp16")
+    cloud = scan(sensor, ROOF, drive, ROOM, 3)
+    p = placed(cloud, ROOF, drive)
+    assert len(cloud) > 5000
+    on = {
+        7: np.abs(p[:, 2]),
+        8: np.min(np.abs(p[:, [0, 0, 1, 1, 2]] - [12, 15, -20, 25, 9]), axis=1),
+        9: np.min(np.abs(p[:, [0, 0, 1, 1, 2]] - [-30, 10, 6, 7, 3]), axis=1),
+    }
+    for feature, off in on.items():
+        mine = cloud.feature == feature
+        assert mine.any()
+        assert off[mine].max() < 2e-5  # float32 metres
+
+
+def test_one_pose_a_frame_smears_the_same_drive():
+    drive = driven((20.0, 0.0, 0.0), start=(-20, -10, 0))
+    cloud = scan(load_sensor("vlp16"), ROOF, drive, ROOM, 3, effects=LEVELS["draft"])
+    assert not cloud.time_ns.any()
+    late = replace(cloud, time_ns=np.full(len(cloud), 90_000_000, np.int32))
+    moved = placed(late, ROOF, drive) - placed(cloud, ROOF, drive)
+    assert moved[:, 0] == pytest.approx(1.8, abs=1e-4)
+
+
+def test_ranges_are_true_metres_where_the_projection_stretches():
+    """A wall 10 true metres ahead of the sensor is 10.4 grid metres ahead in a grid of scale 1.04."""
+    scale = 1.04
+    cloud = scan(load_sensor("utm30lx"), Mount(), driven(scale=scale), world(plate(10 * scale)), 0)
+    ahead = np.argmin(np.abs(cloud.xyz[:, 1]))
+    assert cloud.range[ahead] == pytest.approx(10.0, abs=1e-9)
+
+
+def test_intensity_is_reflectance_times_cosine():
+    cloud = scan(load_sensor("vlp16"), Mount((0, 0, 2.0)), driven(), world(plate(8.0, material="brick")), 0)
+    expected = 100 * materials()["brick"].reflectance[0] * np.cos(cloud.incidence)
+    assert cloud.intensity == pytest.approx(expected, rel=1e-5)
+    assert cloud.intensity.max() > 39
+    # Square on, the beam's own direction is the wall's normal.
+    x = cloud.xyz - firings(load_sensor("vlp16"), 0).origin[0]
+    assert np.cos(cloud.incidence) == pytest.approx(cloud.xyz[:, 0] / np.linalg.norm(x, axis=1), abs=5e-3)
+
+
+def test_the_range_has_hard_limits():
+    vlp16 = load_sensor("vlp16")
+    near = scan(vlp16, Mount(), driven(), world(plate(0.49)), 0)
+    assert near.range.min() >= 0.5
+    far = scan(vlp16, Mount(), driven(), world(plate(99.0)), 0)
+    # No beam is level: the nearest points are at 1 degree.
+    assert far.range.min() == pytest.approx(99.0 / np.cos(np.radians(1)), abs=1e-3)
+    assert far.range.max() <= 100.0
+    assert len(scan(vlp16, Mount(), driven(), world(plate(100.01)), 0)) == 0
+
+
+def test_something_within_the_blind_zone_still_hides_what_is_behind():
+    blocked = world(box((0.1, -5, -5), (0.2, 5, 5)), plate(10.0, feature=3))
+    cloud = scan(load_sensor("vlp16"), Mount(), driven(), blocked, 0)
+    assert np.abs(cloud.xyz[cloud.feature == 3, 1]).min(initial=99) > 5
+
+
+def test_a_frame_alone_is_the_frame_of_a_run():
+    sensor = load_sensor("vlp16")
+    drive = driven((10.0, 0.0, 0.0), start=(-20, -10, 0))
+    run = [scan(sensor, ROOF, drive, ROOM, k, seed=5, effects=LEVELS["survey"]) for k in range(3)]
+    alone = scan(load_sensor("vlp16"), ROOF, drive, ROOM, 2, seed=5, effects=LEVELS["survey"], threads=2)
+    assert same(run[2], alone)
+    assert not np.array_equal(
+        run[2].range, scan(sensor, ROOF, drive, ROOM, 2, seed=6, effects=LEVELS["survey"]).range
+    )
+
+
+def test_every_effect_changes_the_returns_and_none_is_on_by_default():
+    """Each dial turned alone does something, in a world where it can."""
+    sensor = load_sensor("vlp16", return_mode="dual")
+    scene = world(
+        ROOM.mesh,
+        box((5, -8, 0), (5.2, -6, 3), feature=10, material="glass"),
+        box((3, 3, 0), (3.5, 3.1, 2.5), feature=11, klass=Class.TRAFFIC_SIGN, material="retroreflector"),
+    )
+    turned = {
+        "motion": False,
+        "law": "oren-nayar",
+        "spread": 0.2,
+        "link": True,
+        "detection": True,
+        "rays": 7,
+        "mirrors": True,
+        "blooming": True,
+        "interference": 2000,
+        "range_noise": "signal",
+        "stretch": True,
+        "bias": True,
+        "walk": True,
+        "quantise": True,
+    }
+    drive = driven((10.0, 0.0, 0.0), start=(-20, -10, 0))
+    plain = scan(sensor, ROOF, drive, scene, 0, effects=PLAIN)
+    assert np.array_equal(plain.range, plain.true_range)
+    for name, value in turned.items():
+        assert getattr(Effects(), name) == type(value)() or name in ("motion", "law", "rays", "range_noise")
+        other = scan(sensor, ROOF, drive, scene, 0, effects=Effects(**{name: value}))
+        assert not same(plain, other), name
+
+
+def test_the_seed_rig_scans():
+    rig = load_rig("seed")
+    drive = driven((5.0, 0.0, 0.0), start=(-10, -5, 0))
+    for spec in rig.lidars:
+        sensor = load_sensor(spec.preset, name=spec.name, rate_hz=spec.rate_hz)
+        assert len(scan(sensor, spec.mount, drive, ROOM, 0)) > 500

@@ -1,0 +1,98 @@
+"""Dials of fidelity, and what is listed of them."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import fields
+
+import pytest
+
+from lidar.camera.dials import CameraDials
+from lidar.errors import InputError
+from lidar.physics.effects import Effects
+from lidar.rig.catalog import rig_rows, sensor_rows
+from lidar.rig.scanner import load_sensor, sensor_names
+from lidar.rig.specs import load_rig, rig_names
+from lidar.settings import dials_of, levels, list_dials
+
+
+def program(*words, cwd=None):
+    return subprocess.run(
+        [sys.executable, "-m", "lidar.cli", *words], capture_output=True, text=True, check=False, cwd=cwd
+    )
+
+
+def test_every_dial_is_listed_with_its_value_at_each_level_and_a_meaning():
+    dials = list_dials()
+    assert [d.name for d in dials] == [f.name for kind in (Effects, CameraDials) for f in fields(kind)]
+    for dial in dials:
+        assert len(dial.values) == len(levels()) == 3
+        assert len(dial.meaning) > 10
+        assert "\n" not in dial.meaning
+    by_name = {d.name: d for d in dials}
+    assert by_name["rays"].values == ("1", "1", "19")
+    assert by_name["camera_noise"].values == ("off", "off", "on")
+    assert "oren-nayar" in by_name["law"].meaning
+
+
+def test_each_listed_value_can_be_set_and_comes_back():
+    for k, level in enumerate(levels()):
+        pairs = [(d.name, d.values[k]) for d in list_dials()]
+        assert dials_of("standard", pairs) == dials_of(level)
+
+
+@pytest.mark.parametrize(
+    ("level", "given", "says"),
+    [
+        ("standard", [("ray", "7")], "is rays"),
+        ("standard", [("shadow", "off")], "shadows"),
+        ("standard", [("qqq", "1")], "lidar settings lists all"),
+        ("standard", [("rays", "many")], "whole number"),
+        ("standard", [("shadows", "perhaps")], "on or off"),
+        ("standard", [("supersample", "99")], "supersample=99"),
+        ("best", [], "draft, standard, survey"),
+    ],
+)
+def test_dials_that_cannot_be_are_named_with_what_is_near(level, given, says):
+    with pytest.raises(InputError, match=re.escape(says)) as error:
+        dials_of(level, given)
+    assert "\n" not in str(error.value)
+
+
+def test_listings_name_all_that_comes_along():
+    assert [row["name"] for row in sensor_rows()] == sensor_names()
+    assert [row["name"] for row in rig_rows()] == rig_names()
+    vlp16 = next(row for row in sensor_rows() if row["name"] == "vlp16")
+    assert (vlp16["channels"], vlp16["rate_hz"], vlp16["max_range_m"]) == (16, 10.0, 100.0)
+    # the maker's 300,000 points a second, less the time of the blocks' recharge
+    assert vlp16["pulses_per_s"] == pytest.approx(16 / 55.296e-6, rel=1e-3)
+    for row in sensor_rows():
+        assert row["source"]
+    assert load_rig("aircraft").vehicle == "aircraft"
+    assert load_sensor(load_rig("aircraft").lidars[0].preset).kind == "line"
+
+
+@pytest.mark.parametrize(
+    ("command", "key"), [("rigs", "rigs"), ("sensors", "sensors"), ("settings", "settings")]
+)
+def test_listings_are_for_people_and_for_programs(command, key):
+    rows = json.loads(program(command, "--json").stdout)[key]
+    text = program(command).stdout
+    assert len(rows) > 4
+    for row in rows:
+        assert row["name"] in text
+
+
+def test_a_bad_rig_or_sensor_is_named_with_line_and_key(tmp_path):
+    (tmp_path / "mine.toml").write_text(
+        'name = "mine"\n\n[[lidar]]\nname = "top"\npreset = "s.toml"\n\n[[camera]]\nname = "c"\nwidht = 10\n'
+    )
+    (tmp_path / "s.toml").write_text('kind = "flash"\nmaker = "a"\nmodel = "b"\nwavelength_nm = 20.0\n')
+    with pytest.raises(InputError, match=r"mine.toml, line \d+: camera.width: .*is widht meant"):
+        load_rig(tmp_path / "mine.toml")
+    with pytest.raises(InputError, match=r"s.toml(, line \d+)?: rates_hz: this key is missing"):
+        load_sensor(tmp_path / "s.toml")
+    (tmp_path / "s.toml").write_text('kind = "flash"\nrates_hz = [10.0]\nmin_range = "near"\n')
+    with pytest.raises(InputError, match=r"s.toml, line 3: min_range: 'near' is not a number"):
+        load_sensor(tmp_path / "s.toml")

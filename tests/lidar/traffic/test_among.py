@@ -1,0 +1,145 @@
+"""The ego is one of the traffic: it stops at red and at stop signs, keeps its distance, and is gentle."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from helpers.roadgrids import grid, road_graph
+from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks
+
+from lidar.planning.motion import drive_path, poses_along
+from lidar.planning.path import plan_path
+from lidar.planning.route import plan_route
+from lidar.planning.speed_profile import motion_behind
+from lidar.traffic.among import drive_obeying
+from lidar.traffic.area import area_of
+from lidar.traffic.ego import ego_trip
+from lidar.traffic.flow import DT, simulate_ego, simulate_trips
+from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
+from lidar.traffic.lanes import STEP, lanes_of
+from lidar.traffic.sweep import rectangles
+from lidar.traffic.traffic import vehicle_trips
+
+BOUNDS = (-30.0, -30.0, 300.0, 300.0)
+
+
+def city(*, lit, **columns):
+    graph = grid(4, 4, 90.0, speed=13.9)
+    return replace(graph, signals=np.full(len(graph.node_id), lit), **columns)
+
+
+def path_on(graph, seed, seconds):
+    return plan_path(plan_route(graph, Plane(), "random", seed=seed, duration=seconds), CAR, Plane())
+
+
+def middle_of(ego, times):
+    at = ego.at((times * 1e9).astype(np.int64))
+    forward = at.rotation[:, :2, 0]
+    return at.position[:, :2] + BOX[2] * forward, np.arctan2(forward[:, 1], forward[:, 0])
+
+
+def speed_of(ego):
+    return np.hypot(*ego.velocity[:, :2].T)
+
+
+def check_gentle(ego):
+    speed = speed_of(ego)
+    change = np.diff(speed) * 100.0
+    assert change.max() <= CAR.acceleration + 1e-3
+    assert change.min() >= -CAR.deceleration - 1e-3
+    assert np.abs(np.diff(change)).max() * 100.0 <= CAR.jerk + 1e-2
+
+
+@pytest.mark.parametrize("under_way", [False, True])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_ego_enters_no_junction_on_red(seed, under_way):
+    graph = city(lit=True)
+    path = path_on(graph, seed, 95.0)
+    ego = drive_obeying(path, CAR, graph, seed=seed, duration=80.0, under_way=under_way)
+    assert (speed_of(ego)[0] > 1.0) == under_way
+    plan = junction_plan(graph, lanes_of(graph), seed=seed)
+    times = np.arange(0.0, 80.0, DT)
+    middle, heading = middle_of(ego, times)
+    front = middle + CAR.length / 2 * np.column_stack([np.cos(heading), np.sin(heading)])
+    zone = zone_at(plan.zones, front)
+    entries = np.flatnonzero((np.diff(zone) != 0) & (zone[1:] >= 0)) + 1
+    assert len(entries) >= 2
+    for k in entries[times[entries] > 5.0]:
+        group = signal_group(plan, int(zone[k]), float(heading[k]))
+        ago = np.arange(0.0, AMBER, 0.5)  # let in while it was green, or a little late by smoothness
+        assert any(is_green(int(zone[k]), group, float(times[k] - a), plan.signals) for a in ago)
+    check_gentle(ego)
+    assert (speed_of(ego)[500:-500] < 0.05).any()  # it did have to wait
+
+
+def test_at_stop_signs_the_ego_stops_and_goes_on():
+    graph = city(lit=False)
+    edges = np.arange(len(graph), dtype=np.int32)
+    signs = replace(
+        graph,
+        control_edge=edges,
+        control_offset=graph.length - 6.0,
+        control_kind=np.full(len(graph), "stop"),
+    )
+    path = path_on(graph, 4, 90.0)
+    ego = drive_obeying(path, CAR, signs, seed=1, duration=90.0)
+    plan = junction_plan(graph, lanes_of(graph), seed=1)
+    times = np.arange(0.0, 90.0, DT)
+    middle, _ = middle_of(ego, times)
+    zone = zone_at(plan.zones, middle)
+    speed = np.interp(times, ego.time_ns * 1e-9, speed_of(ego))
+    entries = np.flatnonzero((np.diff(zone) != 0) & (zone[1:] >= 0)) + 1
+    assert len(entries) >= 3
+    for k in entries[times[entries] > 8.0]:
+        assert speed[max(k - 60, 0) : k].min() < 0.15
+    check_gentle(ego)
+    free = drive_obeying(path, CAR, graph, seed=1, duration=90.0)
+    assert speed_of(free)[300:-500].min() > 1.0  # without signs it does not stop
+
+
+def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
+    graph = road_graph([(0.0, 0.0), (600.0, 0.0)], [(0, 1)], twoway=False, width=4.0)
+    lanes = lanes_of(graph, bounds=(-30.0, -30.0, 700.0, 30.0))
+    path = path_on(graph, 1, 60.0)
+    free = drive_path(path, CAR, duration=60.0)
+    trips = vehicle_trips(lanes, area_of(lanes, free, 400.0, 1.0), seed=1, density=10.0)
+    slow = [replace(t, wish=np.minimum(t.wish, 4.0)) for t in trips if t.appear_s == 0.0 and t.begin > 60]
+    plan = junction_plan(graph, lanes, seed=1)
+    gone = simulate_ego(ego_trip(path, CAR), slow, graph, plan, seconds=60.0, reach=600.0)
+    motion = motion_behind(path, CAR, np.arange(len(gone)) * DT, np.minimum(gone, path.length))
+    ego = poses_along(path, CAR, motion)
+    flow = simulate_trips(slow, graph, plan, ego, BOX, reach=600.0, obeys=True)
+    assert len(np.unique(flow.trip)) == len(slow)  # nobody had to be taken out of its way
+    check_gentle(ego)
+    ahead = min((k for k in range(len(slow))), key=lambda k: slow[k].begin)
+    rows = flow.trip == ahead
+    tail = slow[ahead].way.xyz[0, 0] + flow.gone[rows] - slow[ahead].length / 2
+    middle, _ = middle_of(ego, flow.step[rows] * DT)
+    gap = tail - middle[:, 0] - CAR.length / 2
+    assert gap.min() > 1.5
+    assert gap[300:].max() < 25.0  # it has caught up and follows
+    assert speed_of(ego)[4000:5000].mean() == pytest.approx(4.0, abs=1.0)
+
+
+@pytest.mark.parametrize(("seed", "lit"), [(1, True), (2, False), (3, True)])
+def test_among_traffic_the_ego_touches_nobody_and_nobody_is_taken_out_for_it(seed, lit):
+    graph = city(lit=lit)
+    lanes = lanes_of(graph, bounds=BOUNDS)
+    plan = junction_plan(graph, lanes, seed=seed)
+    path = path_on(graph, seed, 60.0)
+    alone = drive_path(path, CAR, duration=60.0)
+    trips = vehicle_trips(lanes, area_of(lanes, alone, 300.0, 1.0), seed=seed, density=20.0)
+    gone = simulate_ego(ego_trip(path, CAR), trips, graph, plan, seconds=60.0, reach=300.0)
+    motion = motion_behind(path, CAR, np.arange(len(gone)) * DT, np.minimum(gone, path.length))
+    ego = poses_along(path, CAR, motion)
+    check_gentle(ego)
+    flow = simulate_trips(trips, graph, plan, ego, BOX, reach=300.0, obeys=True)
+    poses = tracks(trips, flow)
+    times = np.arange(len(poses)) * DT
+    own = rectangles(*middle_of(ego, times), BOX[0], BOX[1])
+    for mine, moment in zip(own[::2], poses[::2], strict=True):
+        if np.isfinite(moment).any():
+            assert not shapely.intersects(mine, boxes_at(trips, moment)).any()
+    assert gone[-1] > 80.0  # it gets on
+    assert STEP < gone[-1] <= path.length + STEP

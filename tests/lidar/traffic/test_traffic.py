@@ -1,0 +1,268 @@
+"""Traffic keeps its distance, its lane and the lights, and out of the way of the ego vehicle."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from helpers.roadgrids import grid, road_graph
+from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geoscene.roadgraph.graph import rows_of
+from lidar.geometry.poses import Trajectory
+from lidar.planning.motion import drive_path
+from lidar.planning.path import plan_path
+from lidar.planning.route import plan_route
+from lidar.traffic.area import area_of
+from lidar.traffic.flow import DT, ego_on, green_windows, simulate_trips
+from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
+from lidar.traffic.lanes import STEP, lane_shift, lanes_of, wander
+from lidar.traffic.simulate import HARD
+from lidar.traffic.sweep import body_poses, rectangles
+from lidar.traffic.traffic import vehicle_trips
+
+
+def standing(xy, seconds):
+    """An ego that stands at a place."""
+    time = np.array([0, int(seconds * 1e9)])
+    position = np.array([[*xy, 0.0]] * 2)
+    quat = np.array([[0.0, 0.0, 0.0, 1.0]] * 2)
+    return Trajectory(time, position, quat, np.zeros((2, 3)), np.ones(2))
+
+
+def driving(graph, seed, seconds):
+    route = plan_route(graph, Plane(), "random", seed=seed, duration=seconds)
+    return drive_path(plan_path(route, CAR, Plane()), CAR).until(int(seconds * 1e9))
+
+
+def city(*, lit, lanes=1.0, width=7.0):
+    graph = grid(4, 4, 90.0, lanes=lanes, width=width, speed=13.9)
+    return replace(graph, signals=np.full(len(graph.node_id), lit))
+
+
+def flow_on(graph, ego, *, seed, density=25.0, reach=400.0, shares=None):
+    lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
+    plan = junction_plan(graph, lanes, seed=seed)
+    area = area_of(lanes, ego, reach, 1.0)
+    trips = vehicle_trips(lanes, area, seed=seed, density=density, shares=shares)
+    return trips, simulate_trips(trips, graph, plan, ego, BOX, reach=reach), plan
+
+
+def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
+    graph = grid(3, 3)
+    everywhere = np.ones(len(graph), bool)
+
+    def drive(lanes, seed):
+        rng = np.random.default_rng(seed)
+        return wander(lanes, rng, seed % len(graph), 0, metres=2000.0, inside=everywhere, width=1.8)[0]
+
+    chains = {tuple(drive(lanes_of(graph), seed)[k : k + 3]) for seed in range(4) for k in (1, 6)}
+    edges = rows_of(np.array(chain, np.int32) for chain in chains)
+    bound = lanes_of(replace(graph, chain_edges=edges, chain_kind=np.full(len(chains), "no_u_turn")))
+    drives = [drive(bound, seed) for seed in range(20)]
+    for driven in drives:
+        assert chains.isdisjoint(zip(driven, driven[1:], driven[2:], strict=False))
+    # Two of them make a trap of a corner, where a drive ends; the others go on.
+    assert np.mean([len(driven) > 15 for driven in drives]) > 0.9
+
+
+def overlaps(boxes):
+    a, b = shapely.STRtree(boxes).query(boxes, predicate="intersects")
+    return int((a < b).sum())
+
+
+@settings(max_examples=4, deadline=None)
+@given(seed=st.integers(0, 10_000), lit=st.booleans(), lanes=st.sampled_from([1.0, 2.0]))
+def test_no_two_vehicles_ever_touch_and_none_jumps(seed, lit, lanes):
+    graph = city(lit=lit, lanes=lanes, width=7.0 * lanes)
+    trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 65.0), seed=seed, reach=600.0)
+    assert len(np.unique(flow.trip)) > 15
+    assert flow.step.max() * DT > 60
+    poses = tracks(trips, flow)
+    for moment in poses[::3]:
+        assert overlaps(boxes_at(trips, moment)) == 0
+    moved = np.hypot(*np.diff(poses[:, :, :2], axis=0).transpose(2, 0, 1))
+    assert np.nanmax(moved) < 13.9 * 1.1 * DT + 0.1
+
+
+def test_not_even_reckless_drivers_touch():
+    """Who keeps no gap and no headway still stops within the ground that is his."""
+    graph = city(lit=False)
+    ego = standing((400.0, 400.0), 45.0)
+    lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
+    trips = vehicle_trips(lanes, area_of(lanes, ego, 600.0, 1.0), seed=9, density=30.0)
+    wild = [
+        replace(
+            t, driver=replace(t.driver, headway=0.0, gap=0.0, brake=50.0, pull=4.0), wish=0 * t.wish + 16.0
+        )
+        for t in trips
+    ]
+    flow = simulate_trips(wild, graph, junction_plan(graph, lanes, seed=9), ego, BOX, reach=600.0)
+    for moment in tracks(wild, flow)[::2]:
+        assert overlaps(boxes_at(wild, moment)) == 0
+    assert flow.speed.max() > 14.0
+
+
+def test_speed_changes_as_a_vehicle_can():
+    trips, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=3, reach=600.0)
+    for k in np.unique(flow.trip):
+        speed = flow.speed[flow.trip == k]
+        change = np.diff(speed) / DT
+        assert change.max(initial=0.0) <= trips[k].driver.pull + 1e-6
+        assert change.min(initial=0.0) >= -HARD - 1e-6
+        gone = np.diff(flow.gone[flow.trip == k])
+        np.testing.assert_allclose(gone, (speed[1:] + speed[:-1]) / 2 * DT, atol=0.02)
+        assert (gone >= -1e-9).all()
+
+
+def test_braking_is_mild_almost_always():
+    _, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=5, reach=600.0)
+    same = np.diff(flow.trip) == 0
+    change = np.diff(flow.speed)[same] / DT
+    assert (change < -4.0).mean() < 0.01
+    assert flow.speed.mean() > 2.0  # and yet they get on
+
+
+@settings(max_examples=3, deadline=None)
+@given(seed=st.integers(0, 1000), lit=st.booleans())
+def test_the_ego_is_never_touched(seed, lit):
+    graph = city(lit=lit)
+    ego = driving(graph, seed, 30.0)
+    trips, flow, _ = flow_on(graph, ego, seed=seed, reach=300.0)
+    poses = tracks(trips, flow)
+    times = (np.arange(len(poses)) * DT * 1e9).astype(np.int64)
+    at = ego.at(times)
+    forward = at.rotation[:, :2, 0]
+    own = rectangles(
+        at.position[:, :2] + BOX[2] * forward, np.arctan2(forward[:, 1], forward[:, 0]), BOX[0], BOX[1]
+    )
+    for mine, moment in zip(own, poses, strict=True):
+        if np.isfinite(moment).any():
+            assert not shapely.intersects(mine, boxes_at(trips, moment)).any()
+
+
+def test_vehicles_queue_behind_an_ego_that_stands_in_their_lane():
+    graph = road_graph([(0.0, 0.0), (400.0, 0.0)], [(0, 1)], speed=13.9)
+    trips, flow, _ = flow_on(graph, standing((300.0, -1.75), 60.0), seed=2, density=15.0, reach=400.0)
+    poses = tracks(trips, flow)
+    last = poses[-1]
+    behind = np.isfinite(last[:, 0]) & (last[:, 1] < 0) & (last[:, 0] < 300.0)
+    assert behind.sum() >= 2
+    nose = max(last[k, 0] + trips[k].length / 2 for k in np.flatnonzero(behind))
+    tail = 300.0 - CAR.rear_overhang
+    assert 0.8 < tail - nose < 8.0
+
+
+def test_the_gap_to_a_leader_grows_with_speed():
+    """At rest bodies are some 2 m apart; on a free road followers keep a second and more."""
+    graph = road_graph([(0.0, 0.0), (2000.0, 0.0)], [(0, 1)], twoway=False, width=4.0, speed=13.9)
+    trips, flow, _ = flow_on(graph, standing((400.0, 500.0), 40.0), seed=1, density=20.0, reach=1500.0)
+    poses = tracks(trips, flow)
+    speed = np.full(poses.shape[:2], np.nan)
+    speed[flow.step, flow.trip] = flow.speed
+    gaps = []
+    for moment, v in zip(poses[150:], speed[150:], strict=True):
+        there = np.flatnonzero(np.isfinite(moment[:, 0]))
+        there = there[np.argsort(moment[there, 0])]
+        for a, b in itertools.pairwise(there):
+            space = moment[b, 0] - moment[a, 0] - (trips[a].length + trips[b].length) / 2
+            gaps.append((v[a], space))
+    v, space = np.array(gaps).T
+    assert space.min() > 1.0
+    fast = v > 8.0
+    assert fast.any()
+    assert np.percentile(space[fast] / v[fast], 2) > 0.9
+
+
+def test_nobody_enters_a_junction_on_red():
+    graph = city(lit=True)
+    trips, flow, plan = flow_on(graph, standing((400.0, 400.0), 70.0), seed=4, reach=600.0)
+    poses = tracks(trips, flow)
+    entered = 0
+    for k in np.unique(flow.trip):
+        rows = flow.trip == k
+        zone = zone_at(plan.zones, trips[k].way.xyz[:, :2])
+        front = np.minimum(flow.gone[rows] / STEP + trips[k].length / 2 / STEP, len(zone) - 1).astype(int)
+        here = zone[front]
+        for i in np.flatnonzero((np.diff(here) != 0) & (here[1:] >= 0)):
+            z = int(here[i + 1])
+            group = signal_group(plan, z, float(trips[k].way.heading[front[i]]))
+            t = float(flow.step[rows][i + 1]) * DT
+            # green now or, for who was let in while it was, within amber and clearing
+            lately = [is_green(z, group, t - ago, plan.signals) for ago in np.arange(0.0, AMBER, 0.5)]
+            if i > 20:
+                assert any(lately)
+                entered += 1
+    assert entered > 10
+    assert np.isfinite(poses).any()
+
+
+def test_both_groups_of_signals_have_green_but_never_together():
+    graph = city(lit=True)
+    plan = junction_plan(graph, lanes_of(graph), seed=1)
+    times = np.arange(0.0, 120.0, 0.25)
+    for z in range(len(plan.zones.polygon)):
+        green = np.array([[is_green(z, g, float(t), plan.signals) for g in (0, 1)] for t in times])
+        assert not green.all(axis=1).any()
+        assert (green.mean(axis=0) > 0.3).all()
+
+
+def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
+    graph = city(lit=False, lanes=2.0, width=14.0)
+    road = shapely.union_all([shapely.LineString(line[:, :2]).buffer(7.3) for line in graph.geometry])
+    for side, sign in (("right", 1), ("left", -1)):
+        lanes = lanes_of(graph, side=side, bounds=(-30.0, -30.0, 300.0, 300.0))
+        area = area_of(lanes, standing((400.0, 400.0), 30.0), 600.0, 1.0)
+        trips = vehicle_trips(lanes, area, seed=1, density=10.0, ground=road)
+        assert len(trips) > 10
+        for trip in trips:
+            xy, heading = body_poses(trip.way, trip.axle)
+            assert shapely.covers(road, rectangles(xy, heading, trip.length, trip.width)).all()
+            line = shapely.LineString(graph.geometry[trip.way.edge[trip.begin]][:, :2])
+            ring = shapely.LinearRing([*line.coords, trip.way.xyz[trip.begin, :2]])
+            if abs(trip.way.curvature[trip.begin]) < 1e-3:
+                assert ring.is_ccw == (sign < 0)
+
+
+def test_lanes_lie_side_by_side():
+    graph = road_graph([(0.0, 0.0), (100.0, 0.0)], [(0, 1)], lanes=2.0, width=14.0)
+    lanes = lanes_of(graph)
+    assert [lane_shift(lanes, 0, k, 1.8) for k in (0, 1)] == pytest.approx([5.25, 1.75])
+
+
+def test_the_same_seed_gives_the_same_traffic():
+    graph = city(lit=True)
+    ego = driving(graph, 1, 20.0)
+    first, second, other = (flow_on(graph, ego, seed=s, reach=200.0)[1] for s in (7, 7, 8))
+    for name in ("trip", "step", "gone", "speed"):
+        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
+    assert first.gone.tobytes() != other.gone.tobytes()
+
+
+def test_more_density_is_more_traffic():
+    graph = city(lit=False)
+    ego = standing((135.0, 135.0), 5.0)
+    few, many = (len(flow_on(graph, ego, seed=1, density=d)[0]) for d in (5.0, 20.0))
+    assert many > 2.5 * few
+    assert flow_on(graph, ego, seed=1, density=0.0)[0] == []
+
+
+def test_signals_are_green_for_the_ego_when_it_comes():
+    graph = city(lit=True)
+    ego = driving(graph, 3, 40.0)
+    lanes = lanes_of(graph)
+    plan = junction_plan(graph, lanes, seed=11)
+    signals = plan.signals._replace(window=green_windows(plan, ego_on(ego, BOX, graph)))
+    times = np.arange(0.0, 40.0, 0.1)
+    at = ego.at((times * 1e9).astype(np.int64))
+    zone = zone_at(plan.zones, at.position[:, :2])
+    entries = np.flatnonzero((np.diff(zone) != 0) & (zone[1:] >= 0)) + 1
+    assert len(entries) >= 2
+    for k in entries:
+        forward = at.rotation[k, :2, 0]
+        group = signal_group(plan, int(zone[k]), float(np.arctan2(forward[1], forward[0])))
+        assert is_green(int(zone[k]), group, float(times[k]), signals)
+        assert not is_green(int(zone[k]), 1 - group, float(times[k]), signals)

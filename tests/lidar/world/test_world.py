@@ -1,0 +1,194 @@
+"""The scene around a vehicle: tiles in place, copies named, actors met where they are."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from geoscene.classes import Class, materials
+from geoscene.frames import Frame
+from geoscene.mesh import WALL, Instances, Mesh
+from geoscene.scene import open_scene
+from geoscene.scene.tile_files import Tile, write_shapes, write_tile
+from lidar.errors import InputError
+from lidar.geometry.poses import Poses
+from lidar.raycast import ALL
+from lidar.world.world import FOLIAGE, GLASS, World
+
+TILE = 100.0
+DOWN = np.array([[0.0, 0.0, -1.0]])
+
+
+def ground(origin):
+    corners = np.array([[0, 0, 0], [TILE, 0, 0], [TILE, TILE, 0], [0, TILE, 0]], float)
+    return Mesh.of(
+        corners - [TILE / 2, TILE / 2, 0], [[0, 1, 2], [0, 2, 3]], klass=Class.TERRAIN, feature=origin
+    )
+
+
+def box(size, at, **columns):
+    solid = trimesh.creation.box(size)
+    return Mesh.of(solid.vertices + at, solid.faces, closed=True, **columns)
+
+
+def tile(i, j, rank):
+    """Ground, a house of 20 m with one glass front to the south, and a tree standing 1.5 times its size."""
+    house = box([10, 10, 20], [20.0, 20.0, 10.0], klass=Class.BUILDING, feature=100 + rank, surface=WALL)
+    material = house.material.copy()
+    material[house.normals()[:, 1] < -0.5] = materials()["glass"].code
+    house.material[:] = material
+    parts = [ground(rank), house]
+    mesh = Mesh(
+        np.concatenate([m.vertices for m in parts]),
+        np.concatenate([parts[0].faces, parts[1].faces + 4]),
+        *(
+            np.concatenate([getattr(m, name) for m in parts])
+            for name in ("feature", "klass", "material", "surface", "color", "closed")
+        ),
+    )
+    tree = np.zeros((1, 3, 4))
+    tree[0, :, :3] = np.eye(3) * 1.5
+    tree[0, :, 3] = [-20, -20, 0]
+    copies = Instances(np.zeros(1, np.int32), tree, np.array([1000 + rank], np.int32))
+    return Tile(np.array([(i + 0.5) * TILE, (j + 0.5) * TILE, 0.0]), mesh, copies)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """Six tiles in a row and one above, from x = -200 to 400."""
+    folder = tmp_path_factory.mktemp("scene")
+    (folder / "tiles").mkdir()
+    indices = [(i, 0) for i in range(-2, 4)] + [(0, 1)]
+    for rank, (i, j) in enumerate(indices):
+        write_tile(folder / "tiles" / f"{i}_{j}.npz", tile(i, j, rank))
+    crown = box([4, 4, 4], [0, 0, 4.0], klass=Class.TREE_CROWN, material=materials()["foliage"].code)
+    write_shapes(folder / "shapes.npz", {"tree": crown})
+    manifest = {
+        "schema": 1,
+        "frame": Frame.at(2.0, 48.0).to_json(),
+        "bounds": [-200, 0, 400, 200],
+        "tile_size": TILE,
+        "tiles": indices,
+        "layers": {},
+    }
+    (folder / "scene.json").write_text(json.dumps(manifest))
+    return open_scene(folder)
+
+
+def test_rays_meet_what_the_tiles_hold_and_know_what_it_is(scene):
+    world = World.load(scene)
+    above = np.array([[50.0, 50, 30], [70, 70, 30], [30, 30, 30], [-170, 30, 30], [450, 50, 30]])
+    hits = world.caster.cast(above, np.repeat(DOWN, 5, 0), normals=True)
+    np.testing.assert_allclose(hits.range, [30, 10, 21, 21, np.inf])
+    found = world.lookup(hits)
+    kinds = [Class.TERRAIN, Class.BUILDING, Class.TREE_CROWN, Class.TREE_CROWN, Class.UNLABELED]
+    assert found.klass.tolist() == kinds
+    assert found.feature.tolist() == [2, 102, 1002, 1000, -1]
+    assert found.surface.tolist() == [0, WALL, 0, 0, 0]
+    np.testing.assert_allclose(hits.normal, [[0, 0, 1]] * 4 + [[0, 0, 0]])
+
+
+def test_masks_look_through_glass_and_foliage(scene):
+    world = World.load(scene)
+    into_house = world.caster.cast([70, 0, 5], [[0.0, 1, 0]])
+    assert into_house.range == pytest.approx(65)
+    assert world.lookup(into_house).material.tolist() == [materials()["glass"].code]
+    assert world.caster.cast([70, 0, 5], [[0.0, 1, 0]], mask=ALL & ~GLASS).range == pytest.approx(75)
+    assert world.caster.cast([30, 30, 30], DOWN, mask=ALL & ~FOLIAGE).range == pytest.approx(30)
+
+
+def test_a_region_brings_its_own_tiles_only(scene):
+    world = World.load(scene, region=(110, 50, 120, 60), margin=10)
+    down = world.caster.cast(
+        [[150.0, 50, 30], [50, 50, 30], [250, 50, 30], [-150, 50, 30], [350, 50, 30]], [[0, 0, -1.0]] * 5
+    )
+    assert np.isfinite(down.range).tolist() == [True, True, False, False, False]
+    with pytest.raises(InputError, match="no tile of"):
+        World.load(scene, region=(5000, 0, 5010, 10))
+
+
+def test_what_rays_hit_does_not_depend_on_where_the_world_was_before(scene):
+    rng = np.random.default_rng(1)
+    way = rng.normal(size=(20_000, 3))
+    eye = np.array([155.0, 52.0, 3.0])
+    region = (eye[0], eye[1], eye[0], eye[1])
+    roamed = World.load(scene, region=(-150, 50, -150, 50), margin=30)
+    for x in (-50.0, 50.0, 390.0, 60.0):
+        roamed.follow((x, 50, x, 50))
+    roamed.follow(region)
+    fresh = World.load(scene, region=region, margin=30)
+    one, two = (world.caster.cast(eye, way, normals=True) for world in (roamed, fresh))
+    for name in one.__slots__:
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    for name in ("feature", "klass", "material"):
+        np.testing.assert_array_equal(getattr(roamed.lookup(one), name), getattr(fresh.lookup(two), name))
+    assert (one.instance >= 0).any()
+    assert len(set(roamed.lookup(one).feature.tolist())) > 4
+
+
+def test_following_keeps_only_the_tiles_around(scene):
+    world = World.load(scene, region=(-150, 50, -150, 50), margin=30)
+    for x in np.arange(-150, 350, 20.0):
+        world.follow((x, 50, x, 50))
+        assert len(world.caster.scene.parts) <= 2 * 4
+        assert world.caster.cast([x, 50, 3], DOWN).range == pytest.approx(3)
+
+
+def test_the_float32_origin_follows_over_long_ways_and_ranges_stay_exact(tmp_path):
+    (tmp_path / "tiles").mkdir()
+    indices = [(0, 0), (400, 7)]
+    for rank, (i, j) in enumerate(indices):
+        write_tile(tmp_path / "tiles" / f"{i}_{j}.npz", tile(i, j, rank))
+    write_shapes(tmp_path / "shapes.npz", {"tree": box([4, 4, 4], [0, 0, 4.0])})
+    (tmp_path / "scene.json").write_text(
+        json.dumps(
+            {
+                "schema": 1,
+                "frame": Frame.at(2.0, 48.0).to_json(),
+                "bounds": [0, 0, 40100, 800],
+                "tile_size": TILE,
+                "tiles": indices,
+                "layers": {},
+            }
+        )
+    )
+    world = World.load(open_scene(tmp_path), region=(50, 50, 50, 50))
+    world.follow((40050, 750, 40050, 750))
+    hits = world.caster.cast([40070.0, 700, 5], [[0.0, 1.0, 0.0]])
+    np.testing.assert_allclose(hits.range, 65, rtol=0, atol=1e-9)
+    assert world.lookup(hits).feature.tolist() == [101]
+
+
+def test_actors_are_met_where_they_are_at_each_rays_time(scene):
+    car = box([4, 2, 1.5], [0, 0, 0.75], klass=Class.CAR, feature=7)
+    world = World.load(scene, actors=[car])
+    before = world.caster.cast([150.0, 50, 1], [[-1.0, 0, 0]] * 5)
+    drive = np.tile(np.eye(3, 4), (1, 11, 1, 1))
+    drive[0, :, :, 3] = [120, 50, 0]
+    drive[0, :, 0, 3] += np.linspace(0, 10, 11)
+    world.place_actors(np.zeros(1, np.int32), drive, np.array([5000], np.int32))
+    time = np.array([0, 0.25, 0.5, 0.75, 1])
+    poses = Poses(np.array([[150.0, 50, 1]]), np.eye(3)[None], np.ones((1, 3)))
+    hits = world.caster.cast_posed(poses, np.zeros(5, int), np.tile([[-1.0, 0, 0]], (5, 1)), time=time)
+    np.testing.assert_allclose(hits.range, 30 - 10 * time - 2)
+    found = world.lookup(hits)
+    assert set(found.feature.tolist()) == {5000}
+    assert set(found.klass.tolist()) == {Class.CAR}
+    tree = world.lookup(world.caster.cast([30, 30, 30], DOWN))
+    assert tree.feature.tolist() == [1002]
+    world.place_actors(np.empty(0, np.int32), np.empty((0, 3, 4)), np.empty(0, np.int32))
+    np.testing.assert_array_equal(world.caster.cast([150.0, 50, 1], [[-1.0, 0, 0]] * 5).range, before.range)
+
+
+def test_actors_stay_when_the_world_moves_on(scene):
+    car = box([4, 2, 1.5], [0, 0, 0.75], klass=Class.CAR)
+    world = World.load(scene, region=(50, 50, 50, 50), margin=10, actors=[car])
+    here = np.eye(3, 4)[None].copy()
+    here[0, :, 3] = [150, 50, 0]
+    world.place_actors(np.zeros(1, np.int32), here, np.array([9], np.int32))
+    for x in (150.0, 250.0, 150.0):
+        world.follow((x, 50, x, 50))
+        hits = world.caster.cast([150, 50, 10], DOWN)
+        assert hits.range == pytest.approx(8.5)
+        assert world.lookup(hits).feature.tolist() == [9]
