@@ -53,7 +53,7 @@ def main() -> None:
             transform = driving(count, frame, 0.7)
             transform[:, :, :2, 3] += (x, y)
             began = time.thread_time()
-            world.place_actors(shape, transform, feature)
+            world.place_actors(shape, transform, feature=feature)
             spent.append(time.thread_time() - began)
         print(f"{count:6} {1e3 * statistics.median(spent):11.2f}")
 

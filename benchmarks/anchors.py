@@ -68,7 +68,7 @@ def physics() -> Iterator[Row]:
 
 def frames() -> Iterator[Row]:
     """Projections of the Earth and of cameras."""
-    frame = Frame.at(-76.3059, 36.8853, "utm")
+    frame = Frame.at(-76.3059, 36.8853, crs="utm")
     east, north = frame.to_projected(*frame.from_geographic(-76.3059, 36.8853))
     yield "UTM 18N of Norfolk, E", 383629.0124, float(east), "m", "transverse Mercator, WGS 84"
     yield "UTM 18N of Norfolk, N", 4082944.5213, float(north), "m", "transverse Mercator, WGS 84"

@@ -45,7 +45,7 @@ def measured(
         route="random", duration=seconds, seed=2, rig=rig, formats=("pcd",), fidelity=level, workers=workers
     )
     began, spent = time.perf_counter(), time.process_time()
-    summary = drive(scene, folder / "drive", options, overwrite=True)
+    summary = drive(scene, folder / "drive", options=options, overwrite=True)
     wall, cpu = time.perf_counter() - began, time.process_time() - spent
     total = sum(summary.stages.values())
     shares = {name: part / total for name, part in sorted(summary.stages.items(), key=lambda s: -s[1])}

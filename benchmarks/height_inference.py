@@ -50,7 +50,7 @@ def errors(path: Path) -> list[dict[str, float]]:
             hidden = rng.permutation(known)[:count]
             left = truth.copy()
             left[hidden] = np.nan
-            height, sigma, _ = infer_heights(xy, use, area, left)
+            height, sigma, _ = infer_heights(xy, use, area=area, height=left)
             error = np.abs(height[hidden] - truth[hidden])
             wrong.append(error)
             inside.append(error < sigma[hidden])

@@ -31,7 +31,7 @@ def _route(scene_path: Path, km: float, queue: multiprocessing.Queue[NDArray[np.
     from lidar.planning.travel import road_graph  # noqa: PLC0415
 
     scene = open_scene(scene_path)
-    queue.put(plan_route(road_graph(scene), scene.frame, "random", seed=1, length=1000 * km).line)
+    queue.put(plan_route(road_graph(scene), scene.frame, spec="random", seed=1, length=1000 * km).line)
 
 
 def resident() -> float:

@@ -121,9 +121,23 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
     geo = Georeference(scene.frame, export_crs(scene.frame))
     effects = effects_of("standard", {"rays": str(rays)})
     watch = Stopwatch()
-    recorder = Recorder(out, scene.frame, trajectory, _START, geo, Contents(("las",), effects=effects), watch)
-    points = record_all(scene, trajectory, schedule(sensors, trajectory.duration_ns), sensors, recorder,
-                        workers=workers)  # fmt: skip
+    recorder = Recorder(
+        out,
+        scene.frame,
+        trajectory=trajectory,
+        start=_START,
+        geo=geo,
+        contents=Contents(("las",), effects=effects),
+        watch=watch,
+    )
+    points = record_all(
+        scene,
+        trajectory,
+        jobs=schedule(sensors, trajectory.duration_ns),
+        sensors=sensors,
+        recorder=recorder,
+        workers=workers,
+    )
     ended = time.perf_counter()
     return {
         "import_s": imported - began,

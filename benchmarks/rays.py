@@ -216,7 +216,7 @@ def paths(vertices: Float, faces: NDArray[np.int32], threads: int) -> dict[str, 
     """Name to a function of (poses, pose numbers, directions) that casts them all."""
     caster = Caster(vertices, faces)
     out: dict[str, Callable[..., object]] = {
-        "lidar": lambda p, k, d: caster.cast_posed(p, k, d, threads=threads),
+        "lidar": lambda p, k, d: caster.cast_posed(p, k, directions=d, threads=threads),
     }
     loop, lib = native(), library()
     if loop is not None and lib.width == 16:

@@ -158,7 +158,7 @@ def stages(given: argparse.Namespace) -> list[dict[str, Any]]:
 def _solids(table: Any, base: Any, lod: int, tiles: list[tuple[Any, Any]]) -> None:
     """Make the solids of tiles and let go of them."""
     for chosen, parts in tiles:
-        build_solids(take_buildings(table, chosen, parts), base=base[chosen], lod=lod)
+        build_solids(take_buildings(table, chosen, parts=parts), base=base[chosen], lod=lod)
 
 
 def _tiles(table: Any) -> list[tuple[Any, Any]]:

@@ -48,7 +48,11 @@ with progress_bar() as progress:
     # 1. OpenStreetMap becomes a scene.
     say("building the scene of the bundled extract")
     scene = build(
-        read_osm(demo_path()), out / "scene", BuildOptions(name="Helsinki"), overwrite=True, progress=progress
+        read_osm(demo_path()),
+        out / "scene",
+        options=BuildOptions(name="Helsinki"),
+        overwrite=True,
+        progress=progress,
     )
     counts, report = scene.manifest["counts"], check_scene(scene)
     broken = len(report["broken"])
@@ -63,7 +67,7 @@ with progress_bar() as progress:
     # 3. A drive with a 3D scanner, a 2D scanner, a camera and a satellite receiver.
     say("driving for 20 seconds")
     options = DriveOptions(route="random", duration=20.0, seed=4, formats=("pcd", "ply", "csv", "laz"))
-    summary = drive(scene, out / "drive", options, overwrite=True, progress=progress)
+    summary = drive(scene, out / "drive", options=options, overwrite=True, progress=progress)
     say(f"{summary.length:.0f} m, {summary.frames} frames, {summary.written:,} returns")
 
     # 4. One sweep by class, one camera frame.

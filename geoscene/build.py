@@ -81,8 +81,8 @@ class BuildOptions:
 def build(
     osm: OsmData,
     out: Path,
-    options: BuildOptions | None = None,
     *,
+    options: BuildOptions | None = None,
     overwrite: bool = False,
     workers: int = 1,
     progress: Progress = silent,
@@ -113,20 +113,28 @@ def build(
         tiles = _tiles_along(plan, options)
         reports: list[TileReport] = []
         for report in build_tiles(
-            plan, writer.folder, tiles, lod=options.lod, keys=keys, workers=workers, former=writer.former
+            plan,
+            writer.folder,
+            tiles=tiles,
+            lod=options.lod,
+            keys=keys,
+            workers=workers,
+            former=writer.former,
         ):
             reports.append(report)
-            progress("tiles", len(reports), len(tiles))
+            progress("tiles", len(reports), total=len(tiles))
         problems += _tile_problems(reports)
         if len(plan.graph):
-            write_graphml(plan.graph, plan.frame, writer.folder / "roads.graphml")
+            write_graphml(plan.graph, plan.frame, path=writer.folder / "roads.graphml")
         writer.finish(
             frame=plan.frame,
             layers=plan.layers,
             shapes=shapes(),
             problems=problems,
             tiles=tiles_document(keys, reports),
-            manifest=scene_manifest(osm, asdict(options), plan, reports, problems, fingerprint=_digest(keys)),
+            manifest=scene_manifest(
+                osm, asdict(options), plan=plan, reports=reports, problems=problems, fingerprint=_digest(keys)
+            ),
         )
     return open_scene(out)
 
@@ -140,7 +148,7 @@ def _tiles_along(plan: Plan, options: BuildOptions) -> list[tuple[int, int]]:
     tiles = plan.tiles()
     if not options.along:
         return tiles
-    line = route_line(options.along, plan.graph, plan.frame)
+    line = route_line(options.along, plan.graph, frame=plan.frame)
     shapely.prepare(line)
     reach = options.reach + _BESIDE
     size = options.tile_size

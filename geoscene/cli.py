@@ -36,7 +36,7 @@ _OUTPUT = Group("Output", sort_key=3)
 Numbers = Annotated[str | None, Parameter(group=_SOURCE)]
 
 
-def _numbers(text: str, option: str, names: str) -> list[float]:
+def _numbers(text: str, option: str, *, names: str) -> list[float]:
     count = names.count(",") + 1
     try:
         values = [float(v) for v in text.split(",")]
@@ -168,13 +168,15 @@ def build(
         name=name,
     )
     with progress_bar(quiet=quiet) as progress:
-        progress("reading the map", 0, 0)
+        progress("reading the map", 0, total=0)
         asked = {"cache_dir": kept} | _servers(nominatim, overpass)
-        data = _read(osm, place, bbox, point, radius, asked, demo=demo)
+        data = _read(osm, place, bbox=bbox, point=point, radius=radius, asked=asked, demo=demo)
         if fetched:
-            options = replace(options, dem=(_elevation(data, kept, crs, dem_server, progress),))
+            options = replace(
+                options, dem=(_elevation(data, kept, crs=crs, template=dem_server, progress=progress),)
+            )
         scene = build_scene(
-            data, out, options, overwrite=overwrite, workers=_workers(workers), progress=progress
+            data, out, options=options, overwrite=overwrite, workers=_workers(workers), progress=progress
         )
     report = scene.manifest | {"path": str(out), "seconds": round(time.perf_counter() - began, 2)}
     if json:
@@ -201,7 +203,7 @@ def _servers(nominatim: str | None, overpass: str | None) -> dict[str, Any]:
     return {"servers": Servers(**given)}
 
 
-def _elevation(data: Any, cache: Path, crs: str, template: str | None, progress: Progress) -> str:
+def _elevation(data: Any, cache: Path, *, crs: str, template: str | None, progress: Progress) -> str:
     """The elevation file made of tiles for a map."""
     from geoscene.sources import TileServer, fetch_elevation  # noqa: PLC0415
 
@@ -218,11 +220,11 @@ def _workers(given: int | None) -> int:
 def _read(
     osm: Path | None,
     place: str | None,
+    *,
     bbox: str | None,
     point: str | None,
     radius: float,
     asked: dict[str, Any],
-    *,
     demo: bool,
 ) -> Any:
     from geoscene import sources  # noqa: PLC0415
@@ -235,7 +237,7 @@ def _read(
         raise InputError(f"give one of --osm FILE, --place NAME, --bbox, --point or --demo; {what}")
     box = None
     if bbox:
-        west, south, east, north = _numbers(bbox, "--bbox", "W,S,E,N")
+        west, south, east, north = _numbers(bbox, "--bbox", names="W,S,E,N")
         if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
             raise InputError(f"--bbox {bbox.strip()}: W,S,E,N must rise from west to east and south to north")
         box = (west, south, east, north)
@@ -244,12 +246,12 @@ def _read(
     if place:
         return sources.fetch_place(place, **asked)
     if point:
-        lat, lon = _numbers(point, "--point", "LAT,LON")
+        lat, lon = _numbers(point, "--point", names="LAT,LON")
         if not (abs(lat) <= 90 and abs(lon) <= 180):
             raise InputError(f"--point {point.strip()}: not a latitude and longitude in degrees")
-        return sources.fetch_point(lat, lon, radius, **asked)
+        return sources.fetch_point(lat, lon, radius=radius, **asked)
     assert box is not None  # noqa: S101  (the only source left)
-    return sources.fetch_bbox(*box, **asked)
+    return sources.fetch_bbox(box, **asked)
 
 
 @app.command
@@ -368,7 +370,7 @@ def export(
         summary = export_scene(
             open_scene(scene),
             out,
-            to,
+            kind=to,
             crs=crs,
             layers=tuple(layers.split(",")) if layers else None,
             model=model,
@@ -432,7 +434,7 @@ def view(
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from geoscene.view import MAX_MB, view_scene  # noqa: PLC0415
 
-    west, south, east, north = _numbers(bbox, "--bbox", "W,S,E,N") if bbox else (0.0,) * 4
+    west, south, east, north = _numbers(bbox, "--bbox", names="W,S,E,N") if bbox else (0.0,) * 4
     with progress_bar(quiet=quiet) as progress:
         summary = view_scene(
             open_scene(scene),
@@ -507,7 +509,7 @@ def _listed(counts: dict[str, int]) -> str:
 
 def main() -> None:
     """Run the program."""
-    run(app, (GeosceneError,), (InputError,))
+    run(app, (GeosceneError,), usage=(InputError,))
 
 
 if __name__ == "__main__":

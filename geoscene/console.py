@@ -43,7 +43,7 @@ def whole(_: object, tokens: Sequence[Token]) -> int:
         raise ValueError("give a whole number") from None
 
 
-def main(app: App, roots: tuple[type[Exception], ...], usage: tuple[type[Exception], ...]) -> None:
+def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exception], ...]) -> None:
     """Run a program and exit with its code.
 
     roots : errors that are shown as one line, exit code 1
@@ -115,7 +115,7 @@ def _bar_callback(bars: Any) -> Progress:
     tasks: dict[str, Any] = {}
     began: dict[str, float] = {}
 
-    def note(stage: str, done: int, total: int) -> None:
+    def note(stage: str, done: int, *, total: int) -> None:
         now = time.monotonic()
         if stage not in tasks:
             if now - began.setdefault(stage, now) < 1.0:

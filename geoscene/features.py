@@ -24,12 +24,14 @@ def building_layers(buildings: Buildings, base: NDArray[np.float64]) -> list[Lay
     count = buildings.count
     rows = np.arange(len(buildings))
     return [
-        _building_layer("buildings", buildings, rows[:count], base),
-        _building_layer("building_parts", buildings, rows[count:], base),
+        _building_layer("buildings", buildings, rows=rows[:count], base=base),
+        _building_layer("building_parts", buildings, rows=rows[count:], base=base),
     ]
 
 
-def _building_layer(name: str, b: Buildings, rows: NDArray[np.integer], base: NDArray[np.float64]) -> Layer:
+def _building_layer(
+    name: str, b: Buildings, *, rows: NDArray[np.integer], base: NDArray[np.float64]
+) -> Layer:
     columns: dict[str, NDArray[Any]] = {
         "osm_id": b.osm_id[rows],
         "use": b.use[rows],

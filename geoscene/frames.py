@@ -63,7 +63,7 @@ class Frame:
     vertical: str = "flat"
 
     @classmethod
-    def at(cls, lon_deg: float, lat_deg: float, crs: str = "local", vertical: str = "flat") -> Frame:
+    def at(cls, lon_deg: float, lat_deg: float, *, crs: str = "local", vertical: str = "flat") -> Frame:
         """The frame of a scene centred on a point.
 
         crs : ``local`` (transverse Mercator with scale 1 on the centre), ``utm`` (the zone of the centre),
@@ -128,13 +128,13 @@ class Frame:
         """Easting and northing in the CRS (metres, any shape) of scene coordinates."""
         return np.asarray(x, float) + self.origin[0], np.asarray(y, float) + self.origin[1]
 
-    def to_crs(self, crs: str | CRS, x: ArrayLike, y: ArrayLike) -> tuple[Any, Any]:
+    def to_crs(self, x: ArrayLike, y: ArrayLike, *, crs: str | CRS) -> tuple[Any, Any]:
         """Easting and northing (or longitude and latitude) in another CRS of scene coordinates."""
         other = Transformer.from_crs(self.crs, CRS.from_user_input(crs), always_xy=True)
         east, north = other.transform(*self.to_projected(x, y))
         return east, north
 
-    def from_crs(self, crs: str | CRS, east: ArrayLike, north: ArrayLike) -> tuple[Any, Any]:
+    def from_crs(self, east: ArrayLike, north: ArrayLike, *, crs: str | CRS) -> tuple[Any, Any]:
         """Scene x, y of coordinates in another CRS (x or longitude first)."""
         other = Transformer.from_crs(CRS.from_user_input(crs), self.crs, always_xy=True)
         x, y = other.transform(np.asarray(east, float), np.asarray(north, float))

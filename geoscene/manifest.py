@@ -25,10 +25,10 @@ STEEP = 0.2
 def scene_manifest(
     osm: OsmData,
     options: Mapping[str, Any],
+    *,
     plan: Plan,
     reports: Sequence[TileReport],
     problems: Sequence[Problem],
-    *,
     fingerprint: str,
 ) -> dict[str, Any]:
     """Sources, options, counts, where heights come from, repairs and drops."""
@@ -72,7 +72,7 @@ def scene_manifest(
             "open_area": _open_area(plan),
         },
         "roads": {"driving_side": plan.side[0], "driving_side_source": plan.side[1]},
-        "counts": _counts(plan, reports, problems),
+        "counts": _counts(plan, reports, problems=problems),
         "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
         "leaf_area_density": LEAF_AREA_DENSITY,
         "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),
@@ -95,7 +95,7 @@ def steep_metres(graph: RoadGraph) -> float:
     return total
 
 
-def _counts(plan: Plan, reports: Sequence[TileReport], problems: Sequence[Problem]) -> dict[str, Any]:
+def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Problem]) -> dict[str, Any]:
     count = plan.buildings.count
     summary = summarise(problems)
     dropped = summary["dropped"].get("building", {})

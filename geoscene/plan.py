@@ -122,7 +122,7 @@ class Plan:
         ground = {(int(i), int(j)) for i, j in self.ground.tiles}
         return sorted(ground.union(*self.rows.values()))
 
-    def of_tile(self, kind: str, i: int, j: int) -> NDArray[np.int64]:
+    def of_tile(self, kind: str, i: int, *, j: int) -> NDArray[np.int64]:
         """Rows of a kind that belong to tile (i, j), rising."""
         return self.rows[kind].get((i, j), np.empty(0, np.int64))
 
@@ -150,17 +150,17 @@ def make_plan(
             f"{osm.source}: {area:,.0f} km2, more than the {LARGEST_KM2:,.0f} of one scene;"
             " cut a part out (--bbox)"
         )
-    frame = Frame.at((west + east) / 2, (south + north) / 2, crs)
+    frame = Frame.at((west + east) / 2, (south + north) / 2, crs=crs)
     problems: list[Problem] = list(osm.problems)
 
-    progress("buildings", 0, 0)
+    progress("buildings", 0, total=0)
     buildings, found = read_buildings(osm if "buildings" in only else _without_areas(osm), frame)
     problems += found
-    extent = _extent(frame, osm.bounds, buildings)
+    extent = _extent(frame, osm.bounds, buildings=buildings)
     terrain = open_terrain(dem, frame, bounds=extent, outside=dem_gaps) if dem else flat_terrain(frame)
     frame = replace(frame, vertical=terrain.vertical)
 
-    progress("roads", 0, 0)
+    progress("roads", 0, total=0)
     graph, found = build_road_graph(osm if "roads" in only else _without_ways(osm), frame)
     problems += found
     graph = profile(graph, terrain.height, obstacles=find_obstacles(osm, frame))
@@ -170,22 +170,24 @@ def make_plan(
     surfaces, found = road_surfaces(
         osm if "roads" in only else _nothing(osm),
         graph,
-        frame,
+        frame=frame,
         options=SurfaceOptions(left_hand=side == "left"),
     )
     problems += found
-    structures, found = read_structures(surfaces, graph, osm, frame, height=height)
+    structures, found = read_structures(surfaces, graph, osm=osm, frame=frame, height=height)
     problems += found
     structures = within_extent(structures, extent)
     height = ground_below(structures, height or terrain.height) if len(structures) else height
     openings = find_openings(structures, height)
     footprints = buildings.footprint[: buildings.count]
     base = base_heights(footprints, height or terrain.height)
-    buildings, found = buildings_over(buildings, base, structures)
+    buildings, found = buildings_over(buildings, base, table=structures)
     problems += found
 
-    progress("ground", 0, 0)
-    cover, roads, pads, found = _surfaces(osm, frame, extent, buildings, surfaces, only)
+    progress("ground", 0, total=0)
+    cover, roads, pads, found = _surfaces(
+        osm, frame, extent=extent, buildings=buildings, surfaces=surfaces, only=only
+    )
     problems += found
     n = len(buildings)
     cover, roads = _numbered(cover, n), _numbered(roads, n + len(cover))
@@ -198,9 +200,9 @@ def make_plan(
         ruled=_graded_tiles(graph, tile_size, level=not terrain.grids),
         coarse=terrain.lines,
     )
-    levels = water_levels(ground.layers, osm.ways, frame, height=terrain.height)
+    levels = water_levels(ground.layers, osm.ways, frame=frame, height=terrain.height)
 
-    trees, furniture, barriers, found = _standing(osm, frame, ground, only, side)
+    trees, furniture, barriers, found = _standing(osm, frame, ground=ground, only=only, side=side)
     problems += found
     first = n + len(cover) + len(roads) + len(graph)
     trees = _numbered(trees, first)
@@ -260,7 +262,7 @@ def _nothing(osm: OsmData) -> OsmData:
     return replace(osm, areas=[], ways=[], relations=[], points=[])
 
 
-def _extent(frame: Frame, bounds: Bounds, buildings: Buildings) -> Bounds:
+def _extent(frame: Frame, bounds: Bounds, *, buildings: Buildings) -> Bounds:
     """The ground's rectangle: around the extract's bounds and all buildings, out to whole metres."""
     west, south, east, north = bounds
     step = max((east - west) / 8, (north - south) / 8, 1e-6)
@@ -277,6 +279,7 @@ def _extent(frame: Frame, bounds: Bounds, buildings: Buildings) -> Bounds:
 def _surfaces(
     osm: OsmData,
     frame: Frame,
+    *,
     extent: Bounds,
     buildings: Buildings,
     surfaces: RoadSurfaces,
@@ -308,13 +311,13 @@ def _surfaces(
 
 
 def _standing(
-    osm: OsmData, frame: Frame, ground: GroundPlan, only: Collection[str], side: Side
+    osm: OsmData, frame: Frame, *, ground: GroundPlan, only: Collection[str], side: Side
 ) -> tuple[Trees, Furniture, Barriers, list[Problem]]:
     """Trees, furniture and barriers that can stand where they are."""
     trees, problems = read_trees(osm, frame)
     trees, found = clear_of(ground, trees)
-    furniture, more = read_furniture(osm, frame, ground, left_hand=side == "left")
-    barriers, still_more = read_barriers(osm, frame, ground)
+    furniture, more = read_furniture(osm, frame, plan=ground, left_hand=side == "left")
+    barriers, still_more = read_barriers(osm, frame, plan=ground)
     tables: list[Any] = [trees, furniture, barriers]
     kept = [table if kind in only else table.take(np.zeros(len(table), np.bool_))
             for kind, table in zip(KINDS[3:], tables, strict=True)]  # fmt: skip
@@ -359,7 +362,7 @@ def _by_tile(
     }
 
 
-def take_buildings(buildings: Buildings, rows: NDArray[np.int64], parts: NDArray[np.int64]) -> Buildings:
+def take_buildings(buildings: Buildings, rows: NDArray[np.int64], *, parts: NDArray[np.int64]) -> Buildings:
     """The chosen buildings (rows below ``count``, rising) with all their parts (rows), as a table."""
     keep = np.concatenate([rows, parts])
     columns = {f.name: getattr(buildings, f.name)[keep] for f in fields(Buildings)}

@@ -62,52 +62,57 @@ class Keys:
     solids: str
 
 
-def make_solids(plan: Plan, i: int, j: int, lod: int) -> tuple[Mesh, list[Problem]]:
+def make_solids(plan: Plan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, list[Problem]]:
     """Buildings of tile (i, j), scene coordinates, numbered as in the plan."""
-    rows = plan.of_tile("buildings", i, j)
+    i, j = tile
+    rows = plan.of_tile("buildings", i, j=j)
     if not len(rows):
         return Mesh.empty(), []
-    chosen = take_buildings(plan.buildings, rows, plan.of_tile("parts", i, j))
+    chosen = take_buildings(plan.buildings, rows, parts=plan.of_tile("parts", i, j=j))
     mesh, problems = build_solids(chosen, base=plan.base[rows], lod=lod)
     return replace(mesh, feature=rows[mesh.feature].astype(np.int32)), problems
 
 
-def make_ground(plan: Plan, i: int, j: int) -> tuple[Mesh, Instances]:
+def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances]:
     """Ground, barriers, bridges, tunnels, trees and furniture of tile (i, j), scene coordinates."""
-    covered = tile_place(plan.ground, i, j) is not None
+    i, j = tile
+    covered = tile_place(plan.ground, i, j=j) is not None
     meshes = []
     if covered:
-        ground = ground_tile(plan.ground, i, j, height=plan.height, levels=plan.levels)
+        ground = ground_tile(plan.ground, i, j=j, height=plan.height, levels=plan.levels)
         solid = ground.klass != Class.TUNNEL  # open where tunnels come out
         meshes.append(ground if solid.all() else ground.take(solid))
     copies = []
-    if len(rows := plan.of_tile("trees", i, j)):
+    if len(rows := plan.of_tile("trees", i, j=j)):
         copies.append(tree_instances(plan.trees.take(rows), height=plan.height))
-    if len(rows := plan.of_tile("furniture", i, j)):
+    if len(rows := plan.of_tile("furniture", i, j=j)):
         copies.append(furniture_instances(plan.furniture.take(rows), height=plan.height))
     if covered and len(plan.needles):
-        woods = forest_trees(plan.ground, i, j, needles=plan.needles)
+        woods = forest_trees(plan.ground, i, j=j, needles=plan.needles)
         if len(woods):
             copies.append(tree_instances(woods, height=plan.height))
-    if len(rows := plan.of_tile("barriers", i, j)):
+    if len(rows := plan.of_tile("barriers", i, j=j)):
         meshes += barrier_meshes(plan.barriers.take(rows), height=plan.height)
-    if len(rows := plan.of_tile("structures", i, j)):
+    if len(rows := plan.of_tile("structures", i, j=j)):
         meshes += structure_meshes(plan.structures, rows, height=plan.height, openings=plan.openings)
     return concatenate(meshes), concatenate_instances(copies)
 
 
-def tile_path(folder: Path, i: int, j: int) -> Path:
-    """Where a tile lies."""
+def tile_path(folder: Path, tile: tuple[int, int]) -> Path:
+    """Path of tile (i, j) within a scene directory."""
+    i, j = tile
     return folder / "tiles" / f"{i}_{j}.npz"
 
 
-def build_tile(plan: Plan, folder: Path, i: int, j: int, *, lod: int, former: Path | None) -> TileReport:
+def build_tile(
+    plan: Plan, folder: Path, *, tile: tuple[int, int], lod: int, former: Path | None
+) -> TileReport:
     """Make tile (i, j), write it into ``folder`` and say what is in it.
 
     former : a tile whose ground is the same and is taken from it
     """
     size = plan.ground.tile_size
-    solids, problems = make_solids(plan, i, j, lod)
+    solids, problems = make_solids(plan, tile, lod=lod)
     if former is not None:
         old = read_tile(former)
         rest = old.mesh.take(~_is_building(old.mesh, plan)).shifted(old.origin)
@@ -115,18 +120,17 @@ def build_tile(plan: Plan, folder: Path, i: int, j: int, *, lod: int, former: Pa
         transform[:, :, 3] += old.origin
         copies = replace(old.instances, transform=transform)
     else:
-        rest, copies = make_ground(plan, i, j)
+        rest, copies = make_ground(plan, tile)
     mesh = concatenate([solids, rest])
     low = float(np.floor(mesh.vertices[:, 2].min(initial=0.0)))
-    origin = np.array([i * size, j * size, low])
+    origin = np.array([tile[0] * size, tile[1] * size, low])
     moved = copies.transform.copy()
     moved[:, :, 3] -= origin
-    write_tile(tile_path(folder, i, j), Tile(origin, mesh.shifted(-origin), replace(copies, transform=moved)))
+    write_tile(tile_path(folder, tile), Tile(origin, mesh.shifted(-origin), replace(copies, transform=moved)))
     verdict = validate_mesh(mesh)
     built = verdict.feature < plan.buildings.count
     return TileReport(
-        i,
-        j,
+        *tile,
         len(verdict),
         int(verdict.ok.sum()),
         int(built.sum()),
@@ -150,8 +154,8 @@ def _plan_area(mesh: Mesh) -> float:
 def build_tiles(
     plan: Plan,
     folder: Path,
-    tiles: Sequence[tuple[int, int]],
     *,
+    tiles: Sequence[tuple[int, int]],
     lod: int,
     keys: Keys,
     workers: int,
@@ -166,7 +170,7 @@ def build_tiles(
     (folder / "tiles").mkdir(parents=True, exist_ok=True)
     wanted = set(tiles)
     known = {tile: report for tile, report in _known(folder, keys).items() if tile in wanted}
-    kept = {tile_path(folder, *tile) for tile in known}
+    kept = {tile_path(folder, tile) for tile in known}
     for path in (folder / "tiles").iterdir():
         if path not in kept:  # of another build, or half written
             path.unlink()
@@ -179,12 +183,12 @@ def build_tiles(
             fork = multiprocessing.get_context("fork")
             with ProcessPoolExecutor(workers, mp_context=fork, initializer=_end_with_parent) as pool:
                 for task in as_completed([pool.submit(_work, tile) for tile in todo]):
-                    yield _noted(folder, keys, task.result())
+                    yield _noted(folder, keys, report=task.result())
         finally:
             _shared.clear()
     else:
         for tile in todo:
-            yield _noted(folder, keys, source.build(plan, folder, tile, lod))
+            yield _noted(folder, keys, report=source.build(plan, folder, tile=tile, lod=lod))
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,15 +212,15 @@ class _Former:
         both = ground and document["keys"]["solids"] == keys.solids
         return cls(folder, frozenset(reports), ground=ground, all=both, reports=reports)
 
-    def build(self, plan: Plan, folder: Path, tile: tuple[int, int], lod: int) -> TileReport:
+    def build(self, plan: Plan, folder: Path, *, tile: tuple[int, int], lod: int) -> TileReport:
         old = None
         if self.folder is not None and self.ground and tile in self.tiles:
-            old = tile_path(self.folder, *tile)
+            old = tile_path(self.folder, tile)
             if self.all and old.exists():
-                write_atomically(tile_path(folder, *tile), old.read_bytes())
+                write_atomically(tile_path(folder, tile), old.read_bytes())
                 return self.reports[tile]
         return build_tile(
-            plan, folder, *tile, lod=lod, former=old if old is not None and old.exists() else None
+            plan, folder, tile=tile, lod=lod, former=old if old is not None and old.exists() else None
         )
 
 
@@ -238,14 +242,14 @@ def _end_with_parent() -> None:
 
 def _work(tile: tuple[int, int]) -> TileReport:
     plan, folder, lod, source = _shared[0]
-    return source.build(plan, folder, tile, lod)
+    return source.build(plan, folder, tile=tile, lod=lod)
 
 
 def _report(document: dict[str, Any]) -> TileReport:
     return TileReport(**(document | {"problems": tuple(Problem(**p) for p in document["problems"])}))
 
 
-def _noted(folder: Path, keys: Keys, report: TileReport) -> TileReport:
+def _noted(folder: Path, keys: Keys, *, report: TileReport) -> TileReport:
     """Append a report to the folder's journal."""
     with (folder / "tiles.jsonl").open("a", encoding="utf-8") as journal:
         journal.write(json.dumps({"keys": asdict(keys), **asdict(report)}) + "\n")
@@ -261,7 +265,10 @@ def _known(folder: Path, keys: Keys) -> dict[tuple[int, int], TileReport]:
             document = json.loads(line)
         except ValueError:  # the last line of a build that was killed
             continue
-        if document.pop("keys") == asdict(keys) and tile_path(folder, document["i"], document["j"]).exists():
+        if (
+            document.pop("keys") == asdict(keys)
+            and tile_path(folder, (document["i"], document["j"])).exists()
+        ):
             known[document["i"], document["j"]] = _report(document)
     return known
 

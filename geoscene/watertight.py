@@ -129,7 +129,7 @@ def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
     degenerate = np.bincount(owner_of, weights=degenerate_faces(points, triangles, grid=grid), minlength=n)
 
     volume = np.full(n, np.nan)
-    volume[finite] = _volumes(points, triangles, owner_of, n)[finite]
+    volume[finite] = _volumes(points, triangles, owner=owner_of, n=n)[finite]
     return Verdict(
         feature.astype(np.int32),
         np.bincount(owner, minlength=n),
@@ -142,7 +142,7 @@ def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
     )
 
 
-def _volumes(points: Float, triangles: Ids, owner: Ids, n: int) -> Float:
+def _volumes(points: Float, triangles: Ids, *, owner: Ids, n: int) -> Float:
     """Signed volume (n,) of each owner's triangles, summed about its own first vertex to keep digits."""
     if not len(triangles):
         return np.zeros(n)

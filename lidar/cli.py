@@ -178,7 +178,7 @@ def drive(
         workers=workers,
     )
     with progress_bar(quiet=quiet) as progress:
-        summary = record(open_scene(scene), out, options, overwrite=overwrite, progress=progress)
+        summary = record(open_scene(scene), out, options=options, overwrite=overwrite, progress=progress)
     document: dict[str, Any] = {
         "path": str(summary.path),
         "frames": summary.frames,
@@ -496,7 +496,7 @@ def settings(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = F
 
 def main() -> None:
     """Run the program."""
-    run(app, (LidarError, GeosceneError), (InputError, SceneInputError))
+    run(app, (LidarError, GeosceneError), usage=(InputError, SceneInputError))
 
 
 if __name__ == "__main__":

@@ -120,7 +120,7 @@ class Job:
 
 
 def drive(
-    scene: Scene, out: Path, options: DriveOptions, *, overwrite: bool = False, progress: Progress = silent
+    scene: Scene, out: Path, *, options: DriveOptions, overwrite: bool = False, progress: Progress = silent
 ) -> DriveSummary:
     """Drive a route through a scene and write the dataset; an unfinished one of the same options is finished.
 
@@ -134,24 +134,30 @@ def drive(
     if not sensors and not rig.gnss:
         raise InputError(f"rig {rig.name} has no sensors")
     body = load_vehicle(options.vehicle or rig.vehicle)
-    planned = plan(scene, options, body, sensors, progress=progress)
+    planned = plan(scene, options, body=body, sensors=sensors, progress=progress)
     trajectory = planned if isinstance(planned, Trajectory) else planned.trajectory
     on = planned.on if isinstance(planned, Flight) else None
     actors = None
     if options.traffic is not None:
-        progress("traffic", 0, 0)
+        progress("traffic", 0, total=0)
         traffic = replace(options.traffic, side=options.keeps(scene))
         graph = road_graph(scene)
         if isinstance(traffic, TrafficFile):
-            actors = replay(scene, graph, trajectory, body, seed=options.seed, options=traffic)
+            actors = replay(scene, graph, ego=trajectory, vehicle=body, seed=options.seed, options=traffic)
         elif isinstance(planned, RoadDrive):
             trajectory, actors = drive_among(
-                scene, graph, planned.travel.path, body, trajectory,
-                seed=options.seed, options=traffic, duration=planned.travel.duration,
+                scene,
+                graph,
+                path=planned.travel.path,
+                vehicle=body,
+                first=trajectory,
+                seed=options.seed,
+                options=traffic,
+                duration=planned.travel.duration,
                 under_way=planned.travel.under_way,
-            )  # fmt: skip
+            )
         else:
-            actors = populate(scene, graph, trajectory, body, seed=options.seed, options=traffic)
+            actors = populate(scene, graph, ego=trajectory, vehicle=body, seed=options.seed, options=traffic)
     geo = Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact)
     jobs = schedule(sensors, trajectory.duration_ns)
     if sensors and not jobs:
@@ -160,7 +166,17 @@ def drive(
     recipe = options.recipe(scene)
     prepare(out, recipe, overwrite=overwrite)
     length = _length(trajectory)
-    manifest = _manifest(scene, rig, options, start, geo, trajectory, length, jobs, sensors)
+    manifest = _manifest(
+        scene,
+        rig,
+        options=options,
+        start=start,
+        geo=geo,
+        trajectory=trajectory,
+        length=length,
+        jobs=jobs,
+        sensors=sensors,
+    )
     if on is not None:
         manifest["scanners_on_ns"] = np.clip(on, 0, trajectory.duration_ns).tolist()
     manifest["recipe"] = recipe
@@ -169,16 +185,25 @@ def drive(
             write_json(out / "dataset.json", manifest | {"frames_done": 0})
         write_trajectory(out / "trajectory.csv", trajectory)
         counts = manifest["sensor_frames"]
-        write_sidecars(out, scene, rig, sensors, trajectory, start, counts, options.contents())
+        write_sidecars(
+            out,
+            scene,
+            rig=rig,
+            sensors=sensors,
+            trajectory=trajectory,
+            start=start,
+            frames=counts,
+            contents=options.contents(),
+        )
         watch = Stopwatch()
         recorder = Recorder(
             out,
             scene.frame,
-            trajectory,
-            start,
-            geo,
-            options.contents(),
-            watch,
+            trajectory=trajectory,
+            start=start,
+            geo=geo,
+            contents=options.contents(),
+            watch=watch,
             actors=actors,
             reach=max((s.reach for s in sensors), default=0.0),
             on=on,
@@ -191,9 +216,9 @@ def drive(
         written = record_all(
             scene,
             trajectory,
-            jobs,
-            sensors,
-            recorder,
+            jobs=jobs,
+            sensors=sensors,
+            recorder=recorder,
             actors=actors,
             workers=options.workers,
             progress=progress,
@@ -230,9 +255,9 @@ def _nothing_half_made(out: Path) -> Iterator[None]:
 def plan(
     scene: Scene,
     options: DriveOptions,
+    *,
     body: Vehicle,
     sensors: Sequence[Scanner | Camera],
-    *,
     progress: Progress = silent,
 ) -> Trajectory | RoadDrive | Flight:
     """Where the vehicle of a drive is over time; on streets with its path, in flight with when it scans.
@@ -255,25 +280,37 @@ def plan(
             )
         name = options.vehicle or load_rig(options.rig).vehicle
         travel = plan_travel(
-            scene, route, name, seed=options.seed, duration=options.duration, side=options.keeps(scene),
-            from_rest=options.from_rest, progress=progress,
-        )  # fmt: skip
+            scene,
+            route,
+            vehicle=name,
+            seed=options.seed,
+            duration=options.duration,
+            side=options.keeps(scene),
+            from_rest=options.from_rest,
+            progress=progress,
+        )
         trajectory = drive_obeying(
-            travel.path, body, road_graph(scene), seed=options.seed, side=options.keeps(scene),
-            bounds=scene.bounds, duration=travel.duration, under_way=travel.under_way,
-        )  # fmt: skip
+            travel.path,
+            body,
+            graph=road_graph(scene),
+            seed=options.seed,
+            side=options.keeps(scene),
+            bounds=scene.bounds,
+            duration=travel.duration,
+            under_way=travel.under_way,
+        )
         if travel.duration is not None:  # what cannot pull up within a short time is recorded until then
             trajectory = trajectory.until(round(travel.duration * 1e9))
         return RoadDrive(travel, trajectory)
-    progress("planning", 0, 0)
+    progress("planning", 0, total=0)
     seconds = options.duration
     if seconds is None and route == "random" and not options.survey:
         seconds = _RANDOM_SECONDS
     return plan_flight(
         scene,
         route,
-        body,
-        sensors,
+        vehicle=body,
+        sensors=sensors,
         survey=options.survey,
         altitude=options.altitude,
         overlap=options.overlap,
@@ -308,6 +345,7 @@ def schedule(sensors: Sequence[Scanner | Camera], duration_ns: int) -> list[Job]
 def _manifest(
     scene: Scene,
     rig: Rig,
+    *,
     options: DriveOptions,
     start: datetime,
     geo: Georeference,
@@ -343,19 +381,19 @@ def _manifest(
 def record_all(
     scene: Scene,
     trajectory: Trajectory,
+    *,
     jobs: Sequence[Job],
     sensors: Sequence[Scanner | Camera],
     recorder: Recorder,
-    *,
     actors: Actors | None = None,
     workers: int = 1,
     progress: Progress = silent,
 ) -> dict[str, int]:
     """Do all jobs that are not done yet, chunk by chunk of the route; the points written, by sensor."""
     pending = [job for job in jobs if not recorder.is_done(job.sensor, job.frame)]
-    progress("driving", len(jobs) - len(pending), len(jobs))
+    progress("driving", len(jobs) - len(pending), total=len(jobs))
     reach = max((s.reach for s in sensors), default=0.0)
-    worlds = Worlds(scene, reach, actors)
+    worlds = Worlds(scene, reach, actors=actors)
     points: dict[str, int] = {}
     done = len(jobs) - len(pending)
     workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
@@ -365,16 +403,16 @@ def record_all(
                 worlds.follow(region)
             running: dict[Future[int], str] = {}
             for job in chunk:
-                running[pool.submit(recorder.record, job.sensor, job.frame, worlds)] = job.sensor.name
+                running[pool.submit(recorder.record, job.sensor, job.frame, worlds=worlds)] = job.sensor.name
                 if len(running) >= 2 * workers:
-                    done += _take(running, points, wait(running, return_when=FIRST_COMPLETED).done)
-                    progress("driving", done, len(jobs))
-            done += _take(running, points, wait(running).done)
-            progress("driving", done, len(jobs))
+                    done += _take(running, points, finished=wait(running, return_when=FIRST_COMPLETED).done)
+                    progress("driving", done, total=len(jobs))
+            done += _take(running, points, finished=wait(running).done)
+            progress("driving", done, total=len(jobs))
     return points
 
 
-def _take(running: dict[Future[int], str], points: dict[str, int], finished: set[Future[int]]) -> int:
+def _take(running: dict[Future[int], str], points: dict[str, int], *, finished: set[Future[int]]) -> int:
     """Move finished frames from ``running`` to the sums of points; return how many there were."""
     for future in finished:
         name = running.pop(future)

@@ -52,9 +52,9 @@ def dials_of(level: str, given: Iterable[tuple[str, str]] = ()) -> tuple[Effects
     of_scanner, of_camera = ({f.name for f in fields(kind)} for kind in (Effects, CameraDials))
     for name, text in given:
         if name in of_scanner:
-            scanner = replace(scanner, **_one(name, text, scanner))
+            scanner = replace(scanner, **_one(name, text, of=scanner))
         elif name in of_camera:
-            camera = replace(camera, **_one(name, text, camera))
+            camera = replace(camera, **_one(name, text, of=camera))
         else:
             known = sorted(of_scanner | of_camera)
             near = get_close_matches(name, known, 3, 0.5)
@@ -100,13 +100,13 @@ def _shown(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _one(name: str, text: str, of: Effects | CameraDials) -> dict[str, Any]:
+def _one(name: str, text: str, *, of: Effects | CameraDials) -> dict[str, Any]:
     """A setting by its name, of the kind that the field has."""
     kind = type(getattr(of, name))
-    return {name: _value(name, text, kind)}
+    return {name: _value(name, text, kind=kind)}
 
 
-def _value(name: str, text: str, kind: type) -> object:
+def _value(name: str, text: str, *, kind: type) -> object:
     if kind is bool:
         if text.lower() not in _WORDS:
             raise InputError(f"--set {name}={text}: on or off is wanted")

@@ -41,7 +41,7 @@ def plain_cells(polygon: Any) -> Cells:
     return Cells(xy, np.zeros(xy.shape[:2]), np.zeros(len(xy), np.int64))
 
 
-def with_field(cells: Cells, direction: Float, offset: float) -> Cells:
+def with_field(cells: Cells, direction: Float, *, offset: float) -> Cells:
     """The cells with the field xy . direction - offset."""
     return replace(cells, field=cells.xy @ direction - offset)
 
@@ -72,9 +72,9 @@ def cut(cells: Cells, level: float) -> Cells:
     fa, fb, fc = (field[:, k] for k in range(3))
     at = np.full(len(xy), level)
 
-    p = _crossing(b, c, fb, fc, level)
-    q = _crossing(a, b, fa, fb, level)
-    r = _crossing(a, c, fa, fc, level)
+    p = _crossing(b, c, fa=fb, fb=fc, level=level)
+    q = _crossing(a, b, fa=fa, fb=fb, level=level)
+    r = _crossing(a, c, fa=fa, fb=fc, level=level)
     t, u = on_line, ~on_line
     tip = (np.take_along_axis(sign, turn[:, :1], axis=1)[:, 0] > 0).astype(np.int64)
     first = (np.take_along_axis(sign, turn[:, 1:2], axis=1)[:, 0] > 0).astype(np.int64)
@@ -146,10 +146,10 @@ def merged(cells: Cells) -> Cells:
     xy, owner = triangulate(polygons)
     if len(np.unique(owner)) < len(polygons):
         return cells
-    return Cells(xy, _values_at(xy, cells.xy.reshape(-1, 2), cells.field.ravel()), owner)
+    return Cells(xy, _values_at(xy, cells.xy.reshape(-1, 2), values=cells.field.ravel()), owner)
 
 
-def _values_at(xy: Float, known: Float, values: Float) -> Float:
+def _values_at(xy: Float, known: Float, *, values: Float) -> Float:
     """Values (m, 3) at corners (m, 3, 2) that all occur among known points (n, 2) of the grid."""
     # the product keeps cells apart within 100 km of zero
     key, wanted = (np.rint(p * 1e4).astype(np.int64) @ np.array([2**31, 1]) for p in (known, xy))
@@ -158,7 +158,7 @@ def _values_at(xy: Float, known: Float, values: Float) -> Float:
     return found
 
 
-def _crossing(a: Float, b: Float, fa: Float, fb: Float, level: float) -> Float:
+def _crossing(a: Float, b: Float, *, fa: Float, fb: Float, level: float) -> Float:
     """Points on the grid where the field passes a level between a and b, the same whichever way round."""
     swap = (a[:, 0] > b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] > b[:, 1]))
     first, last = np.where(swap[:, None], b, a), np.where(swap[:, None], a, b)
@@ -192,7 +192,7 @@ def skeleton_cells(skeleton: Skeleton) -> Cells:
         clipped = [_clip_ears(shapely.get_coordinates(p)[:-1]) for p in polygons[missing]]
         triangles = np.concatenate([triangles, *clipped])
         owner = np.concatenate([owner, np.repeat(missing, [len(c) for c in clipped])])
-    return Cells(triangles, _values_at(triangles, xy, time), owner)
+    return Cells(triangles, _values_at(triangles, xy, values=time), owner)
 
 
 def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:
@@ -267,7 +267,7 @@ def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
         if min(len(left), len(right)) < 4 or left[2] != peak or right[-1] != peak:
             continue
         beyond = left[3 % len(left)]
-        foot = _foot(xy, time, (a, b), peak, beyond) if right[-2] == beyond else None
+        foot = _foot(xy, time, edge=(a, b), peak=peak, beyond=beyond) if right[-2] == beyond else None
         if foot is None:
             continue
         x, y, height = foot
@@ -284,7 +284,7 @@ def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
 
 
 def _foot(
-    xy: list[tuple[float, ...]], time: list[float], edge: tuple[int, int], peak: int, beyond: int
+    xy: list[tuple[float, ...]], time: list[float], *, edge: tuple[int, int], peak: int, beyond: int
 ) -> tuple[float, float, float] | None:
     """Where the ridge from beyond over the peak meets an edge, x, y and the ridge's height there, or None."""
     (px, py), (qx, qy) = xy[peak], xy[beyond]

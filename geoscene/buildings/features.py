@@ -42,22 +42,24 @@ def read_buildings(
     """
     options = options or BuildingOptions()
     problems: list[Problem] = []
-    outlines = _take(osm.areas, frame, problems, parts=False, least=options.min_area)
+    outlines = _take(osm.areas, frame, problems=problems, parts=False, least=options.min_area)
     # masts and columns are parts too
-    parts = _take(osm.areas, frame, problems, parts=True, least=options.min_area / 100)
+    parts = _take(osm.areas, frame, problems=problems, parts=True, least=options.min_area / 100)
 
     known = np.array([len(r.tags) + 1000 * ("height" in r.tags) for r in outlines], float)
-    gone, found = duplicates([r.osm_id for r in outlines], gathered([r.footprint for r in outlines]), known)
+    gone, found = duplicates(
+        [r.osm_id for r in outlines], gathered([r.footprint for r in outlines]), known=known
+    )
     problems += found
     outlines = [r for r, g in zip(outlines, gone, strict=True) if not g]
 
-    rows = _settle_parts(outlines, parts, osm, options, problems)
-    table = _table(rows, osm.bounds, frame, options, problems)
+    rows = _settle_parts(outlines, parts, osm=osm, options=options, problems=problems)
+    table = _table(rows, osm.bounds, frame=frame, options=options, problems=problems)
     return _without_vanished(table), sorted(problems)
 
 
 def _take(
-    areas: Sequence[Area], frame: Frame, problems: list[Problem], *, parts: bool, least: float
+    areas: Sequence[Area], frame: Frame, *, problems: list[Problem], parts: bool, least: float
 ) -> list[Row]:
     """The buildings, or the parts, among areas, in order of id, with clean footprints in scene metres."""
     chosen = []
@@ -87,16 +89,16 @@ def _take(
 
 
 def _settle_parts(
-    outlines: list[Row], parts: list[Row], osm: OsmData, options: BuildingOptions, problems: list[Problem]
+    outlines: list[Row], parts: list[Row], *, osm: OsmData, options: BuildingOptions, problems: list[Problem]
 ) -> list[Row]:
     """Buildings, then parts, with their outlines' rows; what parts leave of an outline becomes a part."""
     shapes = gathered([p.footprint for p in parts])
     target = assign(
         [p.osm_id for p in parts],
         shapes,
-        [r.osm_id for r in outlines],
-        gathered([r.footprint for r in outlines]),
-        osm.relations,
+        outline_id=[r.osm_id for r in outlines],
+        outline=gathered([r.footprint for r in outlines]),
+        relations=osm.relations,
     )
     wholes = list(outlines)
     orphans = np.flatnonzero(target < 0)
@@ -128,6 +130,7 @@ def _settle_parts(
 def _table(
     rows: list[Row],
     bounds: tuple[float, float, float, float],
+    *,
     frame: Frame,
     options: BuildingOptions,
     problems: list[Problem],
@@ -143,13 +146,17 @@ def _table(
             detail = f"roof:shape={roof.unknown} made flat"
             problems.append(Problem(r.osm_id, "building", "repaired", "unknown-roof-shape", detail))
 
-    heights, found = settle_heights(rows, tagged, roofs, options=options)
+    heights, found = settle_heights(rows, tagged, roofs=roofs, options=options)
     problems += found
     ids = texts([r.osm_id for r in rows])
     drawn = np.ones(len(rows), np.bool_)
     drawn[outline[is_part]] = False
     footprint[drawn], found = cut_overlaps(
-        ids[drawn], footprint[drawn], outline[drawn].astype(np.int64), heights.low[drawn], heights.high[drawn]
+        ids[drawn],
+        footprint[drawn],
+        owner=outline[drawn].astype(np.int64),
+        low=heights.low[drawn],
+        high=heights.high[drawn],
     )
     problems += found
 
@@ -160,9 +167,9 @@ def _table(
 
     looks = [(read_walls(r.tags), read_roof(r.tags)) for r in rows]
     above = [looks[r.outline] if r.is_part else (None, None) for r in rows]
-    walls = [settle_look(look[0], up[0], "plaster") for look, up in zip(looks, above, strict=True)]
+    walls = [settle_look(look[0], up[0], default="plaster") for look, up in zip(looks, above, strict=True)]
     tops = [
-        settle_look(look[1], up[1], "roof_tile" if roof > 0 else "tar_roof")
+        settle_look(look[1], up[1], default="roof_tile" if roof > 0 else "tar_roof")
         for look, up, roof in zip(looks, above, heights.roof, strict=True)
     ]
     return Buildings(

@@ -81,7 +81,7 @@ class Tagged:
     levels: float
 
 
-def _value(value: float | None, low: float, high: float) -> float:
+def _value(value: float | None, low: float, *, high: float) -> float:
     return value if value is not None and low <= value <= high else np.nan
 
 
@@ -91,13 +91,13 @@ def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
     A height by storeys is storeys x level height, plus the roof's height or storeys (Simple 3D Buildings:
     building:levels leaves out the storeys of the roof). Values of 0 or less, or over 1,000 m, do not count.
     """
-    levels = _value(parse_number(tags.get("building:levels") or tags.get("levels")), 0, 300)
-    roof_levels = _value(parse_number(tags.get("roof:levels")), 0, 50)
-    roof = _value(parse_length(tags.get("roof:height") or tags.get("building:roof:height")), 0, HIGHEST)
+    levels = _value(parse_number(tags.get("building:levels") or tags.get("levels")), 0, high=300)
+    roof_levels = _value(parse_number(tags.get("roof:levels")), 0, high=50)
+    roof = _value(parse_length(tags.get("roof:height") or tags.get("building:roof:height")), 0, high=HIGHEST)
     roof_source = "tag" if np.isfinite(roof) else ""
     height, source, sigma = np.nan, "", np.nan
     for key in ("height", "building:height", "est_height"):
-        height = _value(parse_length(tags.get(key)), 0.01, HIGHEST)
+        height = _value(parse_length(tags.get(key)), 0.01, high=HIGHEST)
         if np.isfinite(height):
             source = "est_height" if key == "est_height" else "tag"
             sigma = SIGMA_EST * height if source == "est_height" else SIGMA_TAG
@@ -114,11 +114,11 @@ def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
         source, sigma = "levels", max(SIGMA_STOREYS * height, 1.0)
 
     minimum = _value(
-        parse_length(tags.get("min_height") or tags.get("building:min_height")), -HIGHEST, HIGHEST
+        parse_length(tags.get("min_height") or tags.get("building:min_height")), -HIGHEST, high=HIGHEST
     )
     minimum_source = "tag" if np.isfinite(minimum) else ""
     if not minimum_source:
-        skipped = _value(parse_number(tags.get("building:min_level") or tags.get("min_level")), 0, 300)
+        skipped = _value(parse_number(tags.get("building:min_level") or tags.get("min_level")), 0, high=300)
         if np.isfinite(skipped):
             minimum, minimum_source = skipped * step, "levels"
             if source == "levels" and levels <= skipped:  # levels counted from the part's own underside
@@ -134,7 +134,7 @@ def typical_height(use: NDArray[np.object_], area: Float) -> Float:
 
 
 def infer_heights(
-    xy: Float, use: NDArray[np.object_], area: Float, height: Float, *, reach: float = 400.0
+    xy: Float, use: NDArray[np.object_], *, area: Float, height: Float, reach: float = 400.0
 ) -> tuple[Float, Float, NDArray[np.object_]]:
     """Heights (n,), their standard deviations (n,) and the rule (n,), from the buildings with heights.
 

@@ -76,7 +76,7 @@ class Settled:
     source: str
 
 
-def settle_look(own: Look, outline: Look | None, default: str) -> Settled:
+def settle_look(own: Look, outline: Look | None, *, default: str) -> Settled:
     """The look of a wall or roof; a part without its own takes its outline's, else the default material."""
     for look, source in ((own, "tag"), (outline, "outline")):
         if look is not None and look.tagged:

@@ -30,7 +30,7 @@ def overlapping(a: Polygons, b: Polygons, *, least: float = 1e-4) -> tuple[Rows,
 
 
 def duplicates(
-    osm_id: Sequence[str] | Texts, footprint: Polygons, known: NDArray[np.float64]
+    osm_id: Sequence[str] | Texts, footprint: Polygons, *, known: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], list[Problem]]:
     """Which buildings (n,) repeat another, and the report.
 
@@ -55,6 +55,7 @@ def duplicates(
 def assign(
     part_id: Sequence[str],
     part: Polygons,
+    *,
     outline_id: Sequence[str],
     outline: Polygons,
     relations: Sequence[Relation],
@@ -108,6 +109,7 @@ def remainder(outline: Any, parts: Polygons, *, covered: float) -> tuple[Any, fl
 def cut_overlaps(
     osm_id: Sequence[str] | Texts,
     footprint: Polygons,
+    *,
     owner: Rows,
     low: NDArray[np.float64],
     high: NDArray[np.float64],

@@ -114,13 +114,9 @@ def roof_shell(polygon: Any, spec: RoofSpec) -> tuple[Triangles, str]:
         return _from_cells(_ridged(polygon, spec), spec), ""
     cells, raised = _inward(polygon, spec)
     if cells is None:
-        flat = (
-            np.array([polygon], dtype=object),
-            np.zeros(1, np.int64),
-            np.array([spec.low]),
-            np.array([spec.high]),
-        )
-        return prisms(*flat), f"{spec.shape} roof made flat"
+        low, high = np.array([spec.low]), np.array([spec.high])
+        flat = prisms(np.array([polygon], dtype=object), np.zeros(1, np.int64), low=low, high=high)
+        return flat, f"{spec.shape} roof made flat"
     stand_in = _STAND_IN.get(spec.shape, "")
     if spec.shape in GABLED and not raised:
         stand_in = "hipped"
@@ -171,14 +167,14 @@ def _slope(polygon: Any, spec: RoofSpec) -> Float:
     return nearest if nearest @ wanted > np.cos(np.radians(22.5)) else wanted
 
 
-def _profile(field: Float, span: float, profile: Profile) -> Float:
+def _profile(field: Float, span: float, *, profile: Profile) -> Float:
     share, height = np.array(profile, float).T
     return np.asarray(np.interp(field / span, share, height), float)
 
 
 def _skillion(polygon: Any, spec: RoofSpec) -> Cells:
     """One plane, with the height's share as field."""
-    cells = with_field(plain_cells(polygon), _slope(polygon, spec), 0.0)
+    cells = with_field(plain_cells(polygon), _slope(polygon, spec), offset=0.0)
     low, high = cells.field.min(), cells.field.max()
     return replace(cells, field=(cells.field - low) / (high - low))
 
@@ -187,18 +183,18 @@ def _ridged(polygon: Any, spec: RoofSpec) -> Cells:
     """A cross-section drawn along the ridge, with the height's share as field."""
     up = _slope(polygon, spec)
     profile = ACROSS[spec.shape]
-    cells = with_field(plain_cells(polygon), up, 0.0)
+    cells = with_field(plain_cells(polygon), up, offset=0.0)
     low = float(cells.field.min())
     span = float(cells.field.max()) - low
     cells = replace(cells, field=cells.field - low)
     for share, _ in profile[1:-1]:
         cells = cut(cells, share * span)
     if spec.shape == "half-hipped":
-        return merged(_hipped_ends(cells, up, low, span))
-    return merged(replace(cells, field=_profile(cells.field, span, profile)))
+        return merged(_hipped_ends(cells, up, low=low, span=span))
+    return merged(replace(cells, field=_profile(cells.field, span, profile=profile)))
 
 
-def _hipped_ends(cells: Cells, up: Float, low: float, span: float) -> Cells:
+def _hipped_ends(cells: Cells, up: Float, *, low: float, span: float) -> Cells:
     """A gabled cross-section whose ends are hipped from half way up, with the pitch of the sides."""
     ridge = np.array([-up[1], up[0]])
     hips = [(along, float((cells.xy @ along).min())) for along in (ridge, -ridge)]
@@ -206,7 +202,7 @@ def _hipped_ends(cells: Cells, up: Float, low: float, span: float) -> Cells:
     def height(xy: Float, count: int) -> Float:
         planes = [0.5 + 2 * (xy @ along - start) / span for along, start in hips[:count]]
         return np.asarray(
-            np.minimum.reduce([_profile(xy @ up - low, span, ACROSS["gabled"]), *planes]), float
+            np.minimum.reduce([_profile(xy @ up - low, span, profile=ACROSS["gabled"]), *planes]), float
         )
 
     for k, (along, start) in enumerate(hips):
@@ -233,7 +229,7 @@ def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
         cells = cut(cells, share * span)
     if len(profile) > 2:
         cells = merged(cells)
-    return replace(cells, field=_profile(cells.field, span, profile)), len(skeleton.xy) > corners
+    return replace(cells, field=_profile(cells.field, span, profile=profile)), len(skeleton.xy) > corners
 
 
 def _from_cells(cells: Cells, spec: RoofSpec) -> Triangles:
@@ -247,7 +243,7 @@ def _from_cells(cells: Cells, spec: RoofSpec) -> Triangles:
     low = to_grid(np.array([spec.low]))
     polygons = outlines(cells.xy, zeros)
     xy = cells.xy if polygons is None else triangulate(polygons)[0]
-    return close(top, _floor(xy, low), low)
+    return close(top, _floor(xy, low), underside=low)
 
 
 def _floor(xy: Float, low: Float) -> Triangles:
@@ -275,7 +271,7 @@ def _turned(polygon: Any, spec: RoofSpec) -> Triangles:
     zeros = np.zeros(len(corners), np.int64)
     top = Triangles(corners, zeros, np.full(len(corners), ROOF, np.uint8))
     low = to_grid(np.array([spec.low]))
-    return close(top, _floor(triangulate(np.array([polygon], dtype=object))[0], low), low)
+    return close(top, _floor(triangulate(np.array([polygon], dtype=object))[0], low), underside=low)
 
 
 def _three_corners(corners: Float) -> NDArray[np.bool_]:

@@ -62,7 +62,7 @@ def texts(values: Sequence[str]) -> Texts:
 
 
 def settle_heights(
-    rows: Sequence[Row], tagged: Sequence[Tagged], roofs: Sequence[RoofTags], *, options: BuildingOptions
+    rows: Sequence[Row], tagged: Sequence[Tagged], *, roofs: Sequence[RoofTags], options: BuildingOptions
 ) -> tuple[Heights, list[Problem]]:
     """Underside, top and roof of every row (buildings first, then parts), and what had to be put right."""
     problems: list[Problem] = []
@@ -79,11 +79,11 @@ def settle_heights(
     # The one storey of a hall is as high as the hall.
     hall = np.isin(use, _HALLS) & (h.source == "levels") & (np.array([t.levels for t in tagged]) <= 1)
     h.high[hall], h.sigma[hall], h.source[hall] = np.nan, np.nan, ""
-    _settle_roofs(rows, roofs, h)
+    _settle_roofs(rows, roofs, h=h)
     is_part = np.array([r.is_part for r in rows], np.bool_)
     outline = np.array([r.outline for r in rows], np.int64)
-    _settle_wholes(rows, is_part, outline, h, options=options)
-    _settle_rests(rows, is_part, outline, h)
+    _settle_wholes(rows, is_part, outline=outline, h=h, options=options)
+    _settle_rests(rows, is_part, outline=outline, h=h)
 
     lacking = is_part & ~np.isfinite(h.high)
     h.high[lacking], h.source[lacking] = h.high[outline[lacking]], "outline"
@@ -109,7 +109,7 @@ def settle_heights(
     return h, problems
 
 
-def _settle_roofs(rows: Sequence[Row], roofs: Sequence[RoofTags], h: Heights) -> None:
+def _settle_roofs(rows: Sequence[Row], roofs: Sequence[RoofTags], *, h: Heights) -> None:
     """Fill in the heights of roofs, in place."""
     for k, roof in enumerate(roofs):
         if roof.shape == "flat":
@@ -123,9 +123,9 @@ def _settle_roofs(rows: Sequence[Row], roofs: Sequence[RoofTags], h: Heights) ->
 def _settle_wholes(
     rows: Sequence[Row],
     is_part: NDArray[np.bool_],
+    *,
     outline: NDArray[np.int64],
     h: Heights,
-    *,
     options: BuildingOptions,
 ) -> None:
     """Fill in the heights of buildings, in place: at least as high as their highest part, else inferred."""
@@ -143,8 +143,8 @@ def _settle_wholes(
     inferred, sigma, rule = infer_heights(
         shapely.get_coordinates(shapely.point_on_surface(footprint)),
         texts([rows[k].use for k in whole.tolist()]),
-        np.asarray(shapely.area(footprint), float),
-        h.high[whole],
+        area=np.asarray(shapely.area(footprint), float),
+        height=h.high[whole],
         reach=options.reach,
     )
     lacking = ~np.isfinite(h.high[whole])
@@ -153,7 +153,7 @@ def _settle_wholes(
 
 
 def _settle_rests(
-    rows: Sequence[Row], is_part: NDArray[np.bool_], outline: NDArray[np.int64], h: Heights
+    rows: Sequence[Row], is_part: NDArray[np.bool_], *, outline: NDArray[np.int64], h: Heights
 ) -> None:
     """Settle, in place, what parts leave of an outline.
 

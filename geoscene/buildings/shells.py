@@ -99,7 +99,7 @@ def boundary(corners: Float, piece: Ids) -> tuple[Float, Ids]:
     return np.stack([corners[face, k], corners[face, (k + 1) % 3]], axis=1), piece[face]
 
 
-def close(top: Triangles, floor: Triangles, underside: Float) -> Triangles:
+def close(top: Triangles, floor: Triangles, *, underside: Float) -> Triangles:
     """Shells of the top surfaces, walls from their edges down to the undersides, and the floors.
 
     top       : seen from above, every vertex on the grid
@@ -122,12 +122,12 @@ def close(top: Triangles, floor: Triangles, underside: Float) -> Triangles:
     return shells.take(~equal)
 
 
-def prisms(polygons: Polygons, piece: Ids, low: Float, high: Float) -> Triangles:
+def prisms(polygons: Polygons, piece: Ids, *, low: Float, high: Float) -> Triangles:
     """Shells over polygons (n,) from low to high (n,) metres, flat; ``piece`` (n,) are their numbers."""
     xy, owner = triangulate(polygons)
     top = Triangles(lift(xy, to_grid(high)[owner]), owner, np.full(len(xy), ROOF, np.uint8))
     floor = Triangles(lift(xy, to_grid(low)[owner]), owner, np.full(len(xy), FLOOR, np.uint8))
-    shells = close(top, floor, to_grid(low))
+    shells = close(top, floor, underside=to_grid(low))
     return Triangles(shells.corners, piece[shells.piece], shells.surface)
 
 

@@ -100,7 +100,7 @@ class _Front:
         self.arcs[self._before(corner)].append((born, node))
         self.arcs[self.after[corner]].append((node, born))
 
-    def _new_corner(self, node: int, point: Float, after: int, previous: int, following: int) -> int:
+    def _new_corner(self, node: int, point: Float, *, after: int, previous: int, following: int) -> int:
         corner = len(self.next)
         self.next.append(following)
         self.previous.append(previous)
@@ -130,9 +130,11 @@ class _Front:
         self._trace(other, node)
         del self.alive[corner], self.alive[other]
         previous, following = self.previous[corner], self.next[other]
-        self._close(self._new_corner(node, point, self.after[other], previous, following))
+        self._close(
+            self._new_corner(node, point, after=self.after[other], previous=previous, following=following)
+        )
 
-    def _split(self, corner: int, edge_start: int, point: Float) -> None:
+    def _split(self, corner: int, edge_start: int, *, point: Float) -> None:
         """Split event: a reflex corner has met the edge after another corner."""
         edge_end = self.next[edge_start]
         previous, following = self.previous[corner], self.next[corner]
@@ -140,8 +142,8 @@ class _Front:
         node = self._new_node(point)
         self._trace(corner, node)
         del self.alive[corner]
-        first = self._new_corner(node, point, edge, previous, edge_end)
-        second = self._new_corner(node, point, after, edge_start, following)
+        first = self._new_corner(node, point, after=edge, previous=previous, following=edge_end)
+        second = self._new_corner(node, point, after=after, previous=edge_start, following=following)
         self._close(first)
         if second in self.alive:
             self._close(second)
@@ -205,7 +207,7 @@ class _Front:
         for k, corner in enumerate(alive):
             self.point[corner] = point[k] + speed[k] * wait
         if hit >= 0:
-            self._split(alive[best], alive[hit], self.point[alive[best]])
+            self._split(alive[best], alive[hit], point=self.point[alive[best]])
         else:
             self._join(alive[best], self.point[alive[best]])
 

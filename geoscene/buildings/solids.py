@@ -66,7 +66,7 @@ def build_solids(
     base = np.asarray(base, float)
     if len(base) not in (buildings.count, len(buildings)):
         raise InputError(f"{len(base)} bases for {buildings.count} buildings")
-    pieces = _pieces(buildings, base, lod)
+    pieces = _pieces(buildings, base, lod=lod)
     problems: list[Problem] = []
 
     done: list[Triangles] = []
@@ -86,17 +86,19 @@ def build_solids(
         rows.append(pieces.row[good.piece])
         if attempt:
             made = np.setdiff1d(pieces.building, failed)
-            problems += [_problem(buildings, b, "repaired", attempt) for b in made]
+            problems += [_problem(buildings, b, action="repaired", reason=attempt) for b in made]
         pieces = pieces.take(np.isin(pieces.building, failed))
-    problems += [_problem(buildings, b, "dropped", "no-solid") for b in np.unique(pieces.building)]
-    return _mesh(buildings, join(done), np.concatenate(rows) if rows else np.empty(0, np.int64)), problems
+    problems += [
+        _problem(buildings, b, action="dropped", reason="no-solid") for b in np.unique(pieces.building)
+    ]
+    return _mesh(buildings, join(done), row=np.concatenate(rows) if rows else np.empty(0, np.int64)), problems
 
 
-def _problem(buildings: Buildings, row: int, action: Any, reason: str, detail: str = "") -> Problem:
+def _problem(buildings: Buildings, row: int, *, action: Any, reason: str, detail: str = "") -> Problem:
     return Problem(str(buildings.osm_id[row]), "building", action, reason, detail)
 
 
-def _pieces(buildings: Buildings, base: Float, lod: int) -> _Pieces:
+def _pieces(buildings: Buildings, base: Float, *, lod: int) -> _Pieces:
     """What to build, polygon by polygon, sorted by building."""
     chosen = np.flatnonzero(~buildings.is_part if lod == 0 else buildings.drawn)
     polygon, index = shapely.get_parts(buildings.footprint[chosen], return_index=True)
@@ -135,7 +137,9 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ids, list
     n = len(pieces.row)
     notes: list[Problem] = []
     flat = np.flatnonzero(pieces.flat)
-    groups = [prisms(pieces.polygon[flat], flat.astype(np.int64), pieces.low[flat], pieces.high[flat])]
+    groups = [
+        prisms(pieces.polygon[flat], flat.astype(np.int64), low=pieces.low[flat], high=pieces.high[flat])
+    ]
     for k in np.flatnonzero(~pieces.flat):
         row = pieces.row[k]
         spec = RoofSpec(
@@ -148,7 +152,7 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ids, list
         )
         shell, fallback = roof_shell(pieces.polygon[k], spec)
         if fallback:
-            notes.append(_problem(buildings, row, "repaired", "roof-fallback", fallback))
+            notes.append(_problem(buildings, row, action="repaired", reason="roof-fallback", detail=fallback))
         groups.append(replace(shell, piece=np.full(len(shell), k, np.int64)))
     shells = join(groups)
     fine = sound(shells, n)
@@ -172,7 +176,9 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ids, list
         body, grooves = united
         out.append(body)
         if grooves:
-            notes.append(_problem(buildings, building, "repaired", "touching-bodies", grooves))
+            notes.append(
+                _problem(buildings, building, action="repaired", reason="touching-bodies", detail=grooves)
+            )
     result = join(out)
     united_fine = sound(replace(result, piece=pieces.building[result.piece]), len(buildings))
     failed |= {int(b) for b in np.unique(pieces.building) if not united_fine[b]}
@@ -180,7 +186,7 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ids, list
     return result, bad, [p for p in notes if p.osm_id not in {buildings.osm_id[b] for b in bad}]
 
 
-def _mesh(buildings: Buildings, triangles: Triangles, row: Ids) -> Mesh:
+def _mesh(buildings: Buildings, triangles: Triangles, *, row: Ids) -> Mesh:
     """The mesh of all triangles (with their table rows), welded within each building, sorted by building."""
     feature = buildings.outline[row].astype(np.int64)
     order = np.argsort(feature, kind="stable")

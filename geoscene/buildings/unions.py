@@ -27,7 +27,7 @@ def unite(shells: Triangles) -> tuple[Triangles, str] | None:
     first = m3.Manifold.reserve_ids(4 * len(pieces))
     # far from zero the booleans lose digits, so the body is united about its own corner
     origin = to_grid(shells.corners.reshape(-1, 3).min(axis=0))
-    bodies = [_manifold(shells, piece, first + 4 * k, origin) for k, piece in enumerate(pieces)]
+    bodies = [_manifold(shells, piece, first=first + 4 * k, origin=origin) for k, piece in enumerate(pieces)]
     if any(body is None for body in bodies):
         return None
     union = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
@@ -46,12 +46,12 @@ def unite(shells: Triangles) -> tuple[Triangles, str] | None:
             if reach is None:
                 break
             told = f"{len(seams)} edges where bodies only touched, {what} of {1e3 * reach:.0f} mm"
-            about = [_cutter(a, b, reach) for a, b in seams]
+            about = [_cutter(a, b, reach=reach) for a, b in seams]
             body = m3.Manifold.batch_boolean([body, *about], operation)
     return None
 
 
-def _manifold(shells: Triangles, piece: int, first: int, origin: Float) -> Any:
+def _manifold(shells: Triangles, piece: int, *, first: int, origin: Float) -> Any:
     """One piece as a manifold whose faces carry ``first`` plus their surface; None if it is none."""
     mine = shells.take(shells.piece == piece)
     order = np.argsort(mine.surface, kind="stable")
@@ -75,10 +75,10 @@ def _triangles(body: Any, first: int) -> tuple[Float, Ids]:
     run = np.repeat(np.asarray(mesh.run_original_id, np.int64), np.diff(mesh.run_index) // 3) - first
     points = to_grid(mesh.vert_properties[:, :3])
     ids, where = weld(points, np.zeros(len(points), np.int64))
-    return mend(points[where], ids[faces], run)
+    return mend(points[where], ids[faces], run=run)
 
 
-def mend(points: Float, faces: Ids, run: Ids) -> tuple[Float, Ids]:
+def mend(points: Float, faces: Ids, *, run: Ids) -> tuple[Float, Ids]:
     """Corners (m, 3, 3) and runs of triangles without the degenerate ones that the grid makes.
 
     Faces with two equal corners go; faces with three corners on a line are flipped into the neighbour across
@@ -90,7 +90,7 @@ def mend(points: Float, faces: Ids, run: Ids) -> tuple[Float, Ids]:
         flat = np.flatnonzero(degenerate_faces(points, faces))
         if not len(flat):
             break
-        faces, run = _cancel(*_flip(points, faces, run, int(flat[0])))
+        faces, run = _cancel(*_flip(points, faces, run=run, flat=int(flat[0])))
     return points[faces], run
 
 
@@ -104,7 +104,7 @@ def _cancel(faces: Ids, run: Ids) -> tuple[Ids, Ids]:
     return faces[keep], run[keep]
 
 
-def _flip(points: Float, faces: Ids, run: Ids, flat: int) -> tuple[Ids, Ids]:
+def _flip(points: Float, faces: Ids, *, run: Ids, flat: int) -> tuple[Ids, Ids]:
     """Faces with a face of three corners on a line replaced: its middle corner splits the face beyond."""
     corners = faces[flat]
     length = np.linalg.norm(points[np.roll(corners, -1)] - points[corners], axis=1)
@@ -137,7 +137,7 @@ def _crowded_edges(corners: Float) -> Float:
     return np.stack([points[faces[face, k]], points[faces[face, (k + 1) % 3]]], axis=1)
 
 
-def _cutter(a: Float, b: Float, reach: float) -> Any:
+def _cutter(a: Float, b: Float, *, reach: float) -> Any:
     """A convex body about an edge, reaching a little beyond it on all sides."""
     # turned off the axes, so that its faces lie in no plane of the building
     turn = np.array([[0.936, -0.275, 0.218], [0.290, 0.956, -0.036], [-0.199, 0.097, 0.975]])

@@ -121,7 +121,7 @@ class _Target:
         x, y = (
             self.frame.to_projected(points[:, 0], points[:, 1])
             if self.same
-            else self.frame.to_crs(self.crs, points[:, 0], points[:, 1])
+            else self.frame.to_crs(points[:, 0], points[:, 1], crs=self.crs)
         )
         moved = np.column_stack([x, y, points[:, 2]]) - self.zero
         return np.rint(moved * (1.0 / self.step)).astype(np.int64)
@@ -142,7 +142,7 @@ def _target(scene: Scene, crs: str | None) -> tuple[_Target, tuple[str, ...]]:
     if not parsed.is_projected or parsed.to_epsg() is None:
         raise InputError(f"--crs {crs}: CityJSON needs a projected CRS with an EPSG code")
     same = parsed == scene.frame.crs
-    x, y = scene.frame.to_crs(parsed, *middle)
+    x, y = scene.frame.to_crs(middle[0], middle[1], crs=parsed)
     zero = np.array([np.floor(x), np.floor(y), 0.0])
     return _Target(scene.frame, parsed, same, STEP if same else STEP_ELSEWHERE, zero), notes
 
@@ -176,8 +176,10 @@ def write_cityjson(
     with whole_file(path) as out, spool(path) as vertices:
         out.write(b'{"type":"CityJSON","version":"2.0","CityObjects":{')
         for done, part in enumerate(parts(scene, layers)):
-            progress("CityJSON", done, len(scene.tile_indices))
-            whole, entries, closed = _tile_objects(part, features, library, target, palette, lod, count)
+            progress("CityJSON", done, total=len(scene.tile_indices))
+            whole, entries, closed = _tile_objects(
+                part, features, library=library, target=target, palette=palette, lod=lod, first=count
+            )
             for name, entry in entries:
                 out.write(b",\n" if objects else b"\n")
                 out.write(_json(name) + b":" + _json(entry))
@@ -197,7 +199,9 @@ def write_cityjson(
         out.write(b'"appearance":' + _json(palette.to_json()) + b",\n")
         extent = np.concatenate([low, high]) * target.step + np.tile(target.zero, 2)
         out.write(b'"transform":' + _json({"scale": [target.step] * 3, "translate": target.zero.tolist()}))
-        out.write(b',\n"metadata":' + _json(_metadata(scene, target, extent if count else None)) + b"}\n")
+        out.write(
+            b',\n"metadata":' + _json(_metadata(scene, target, extent=extent if count else None)) + b"}\n"
+        )
     files, size = size_of(path)
     return Summary(
         path, "cityjson", files, size, objects, solids, faces, f"EPSG:{target.crs.to_epsg()}", notes
@@ -208,7 +212,7 @@ def _json(value: Any) -> bytes:
     return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _metadata(scene: Scene, target: _Target, extent: Float | None) -> dict[str, Any]:
+def _metadata(scene: Scene, target: _Target, *, extent: Float | None) -> dict[str, Any]:
     title = [str(scene.manifest.get("name", "")), attribution(scene)]
     out: dict[str, Any] = {"title": " - ".join(filter(None, title))}
     if "fingerprint" in scene.manifest:
@@ -222,6 +226,7 @@ def _metadata(scene: Scene, target: _Target, extent: Float | None) -> dict[str, 
 def _tile_objects(
     part: Part,
     features: Features,
+    *,
     library: Sequence[Mesh],
     target: _Target,
     palette: _Palette,
@@ -247,20 +252,33 @@ def _tile_objects(
     for piece in found:
         kind = _TYPES.get(piece.klass, "OtherConstruction" if piece.solid else "LandUse")
         look = palette.values(mesh, piece.rows)
-        name = _name(features, piece, part.index)
+        name = _name(features, piece, index=part.index)
         told = {"class": klass_name(piece.klass), **features.attributes(piece.feature)}
         if piece.solid:
-            made = _solids(mesh, piece, whole, corners[piece.rows], shell[piece.rows], look, first, kind)
-            entries += _solid_entries(name, kind, told, [{"lod": lod, **solid} for solid in made])
+            made = _solids(
+                mesh,
+                piece,
+                whole=whole,
+                triangles=corners[piece.rows],
+                shell=shell[piece.rows],
+                look=look,
+                first=first,
+                kind=kind,
+            )
+            entries += _solid_entries(
+                name, kind, attributes=told, solids=[{"lod": lod, **solid} for solid in made]
+            )
             solids += 1
         else:
-            made = [{"lod": "1", **_surface(piece, corners[piece.rows] + first, look, kind)}]
+            made = [{"lod": "1", **_surface(piece, corners[piece.rows] + first, look=look, kind=kind)}]
             entries.append((name, {"type": kind, "attributes": told, "geometry": made}))
-    entries += _copies(part.instances, features, library, part.index, ids[len(mesh.vertices) :] + first)
+    entries += _copies(
+        part.instances, features, library=library, index=part.index, anchors=ids[len(mesh.vertices) :] + first
+    )
     return whole, entries, solids
 
 
-def _name(features: Features, piece: Piece, index: tuple[int, int]) -> str:
+def _name(features: Features, piece: Piece, *, index: tuple[int, int]) -> str:
     name = features.name(piece.feature)
     if piece.solid and piece.feature >= 0:
         return name
@@ -268,7 +286,7 @@ def _name(features: Features, piece: Piece, index: tuple[int, int]) -> str:
 
 
 def _solid_entries(
-    name: str, kind: str, attributes: dict[str, Any], solids: list[dict[str, Any]]
+    name: str, kind: str, *, attributes: dict[str, Any], solids: list[dict[str, Any]]
 ) -> list[tuple[str, dict[str, Any]]]:
     """The city objects of one object of one or more bodies, in the geometries that the schema lets each have.
 
@@ -297,6 +315,7 @@ def _solid_entries(
 def _solids(
     mesh: Mesh,
     piece: Piece,
+    *,
     whole: NDArray[np.int64],
     triangles: NDArray[np.int64],
     shell: NDArray[np.int64],
@@ -305,10 +324,12 @@ def _solids(
     kind: str,
 ) -> list[dict[str, Any]]:
     """A Solid for each body."""
-    names, values = np.unique(_surface_kinds(mesh, piece, whole, triangles), return_inverse=True)
+    names, values = np.unique(
+        _surface_kinds(mesh, piece, whole=whole, triangles=triangles), return_inverse=True
+    )
     surfaces = [{"type": str(n)} for n in names]
     out = []
-    for body in bodies(whole.astype(float), triangles, shell):
+    for body in bodies(whole.astype(float), triangles, shell=shell):
         solid: dict[str, Any] = {
             "type": "Solid",
             "boundaries": [(triangles[rows][:, None] + first).tolist() for rows in body],
@@ -322,7 +343,7 @@ def _solids(
 
 
 def _surface_kinds(
-    mesh: Mesh, piece: Piece, whole: NDArray[np.int64], triangles: NDArray[np.int64]
+    mesh: Mesh, piece: Piece, *, whole: NDArray[np.int64], triangles: NDArray[np.int64]
 ) -> NDArray[np.str_]:
     """Semantic type (m,) of each face: a floor is the ground's where it lies lowest, else a ceiling's."""
     code = mesh.surface[piece.rows]
@@ -336,7 +357,7 @@ def _surface_kinds(
 
 
 def _surface(
-    piece: Piece, triangles: NDArray[np.int64], look: NDArray[np.int64], kind: str
+    piece: Piece, triangles: NDArray[np.int64], *, look: NDArray[np.int64], kind: str
 ) -> dict[str, Any]:
     out: dict[str, Any] = {
         "type": "CompositeSurface" if kind == "TINRelief" else "MultiSurface",
@@ -354,6 +375,7 @@ def _surface(
 def _copies(
     instances: Instances,
     features: Features,
+    *,
     library: Sequence[Mesh],
     index: tuple[int, int],
     anchors: NDArray[np.int64],

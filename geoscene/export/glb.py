@@ -45,16 +45,16 @@ def write_glb(
     library = scene.shapes()
     objects = solids = faces = 0
     with whole_file(path) as out, GlbWriter(path) as writer:
-        tables = _tables(writer, features, layers)
+        tables = _tables(writer, features, layers=layers)
         shapes: dict[int, int] = {}
         tiles = []
         for done, part in enumerate(parts(scene, layers)):
-            progress("GLB", done, len(scene.tile_indices))
+            progress("GLB", done, total=len(scene.tile_indices))
             first = writer.nodes
-            closed = _objects(writer, part, features, tables)
+            closed = _objects(writer, part, features=features, tables=tables)
             objects += writer.nodes - first
             solids += closed
-            objects += _copies(writer, part, features, tables, shapes, library)
+            objects += _copies(writer, part, features=features, tables=tables, shapes=shapes, library=library)
             faces += len(part.mesh)
             if writer.nodes > first:
                 name = f"tile {part.index[0]} {part.index[1]}"
@@ -74,19 +74,19 @@ def write_glb(
 
 
 def _tables(
-    writer: GlbWriter, features: Features, layers: Collection[str] | None
+    writer: GlbWriter, features: Features, *, layers: Collection[str] | None
 ) -> dict[str, tuple[int, int, int]]:
     """Number of each layer's property table, its first feature's number and how many it has."""
     tables = {}
     for name, columns, first in zip(features.layers, features.columns, features.starts, strict=True):
         if layers is None or name in layers:
             count = len(next(iter(columns.values())))
-            tables[name] = (writer.property_table(name, columns, count), int(first), count)
+            tables[name] = (writer.property_table(name, columns, count=count), int(first), count)
     return tables
 
 
 def _objects(
-    writer: GlbWriter, part: Part, features: Features, tables: dict[str, tuple[int, int, int]]
+    writer: GlbWriter, part: Part, *, features: Features, tables: dict[str, tuple[int, int, int]]
 ) -> int:
     """Add a node for every object of a tile; how many of them are solids."""
     solids = 0
@@ -118,6 +118,7 @@ def _objects(
 def _copies(
     writer: GlbWriter,
     part: Part,
+    *,
     features: Features,
     tables: dict[str, tuple[int, int, int]],
     shapes: dict[int, int],

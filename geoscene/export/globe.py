@@ -27,7 +27,7 @@ class Globe:
     matrix: Float
 
     @classmethod
-    def at(cls, frame: Frame, x: float, y: float, *, lift: float = 0.0) -> Globe:
+    def at(cls, frame: Frame, x: float, *, y: float, lift: float = 0.0) -> Globe:
         """The globe with its zero at a point of the scene."""
         lon, lat = (np.radians(float(v)) for v in frame.to_geographic(x, y))
         matrix = np.eye(4)

@@ -82,7 +82,7 @@ class GlbWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
+    def __exit__(  # noqa: PLR0917 - the protocol of context managers
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.close()
@@ -193,7 +193,7 @@ class GlbWriter:
         place = y_up(origin).tolist()
         return self.node(name=name, mesh=mesh, translation=place, extensions=extensions)
 
-    def property_table(self, name: str, columns: Mapping[str, NDArray[Any]], count: int) -> int:
+    def property_table(self, name: str, columns: Mapping[str, NDArray[Any]], *, count: int) -> int:
         """Add a table of attributes, one row a feature (EXT_structural_metadata); returns its number."""
         properties, described = {}, {}
         for column, values in columns.items():
@@ -225,7 +225,7 @@ class GlbWriter:
                 f"{starts[-1] / 2**30:.1f} GiB are more than one .glb holds; take 3D Tiles or fewer layers"
             )
         out.write(struct.pack("<4sIII4s", b"glTF", 2, 0, 0, b"JSON"))
-        self._json(out, starts, sizes, scene_nodes, asset)
+        self._json(out, starts, sizes=sizes, scene_nodes=scene_nodes, asset=asset)
         out.write(b" " * (-out.tell() % 4))
         length = out.tell() - 20
         out.write(struct.pack("<I4s", starts[-1], b"BIN\0"))
@@ -245,6 +245,7 @@ class GlbWriter:
         self,
         out: IO[bytes],
         starts: Sequence[int],
+        *,
         sizes: Sequence[int],
         scene_nodes: Sequence[int],
         asset: Mapping[str, Any],
@@ -265,7 +266,7 @@ class GlbWriter:
         if self._materials:
             head["materials"] = [_material(code, color) for code, *color in self._materials]
         head["buffers"] = [{"byteLength": starts[-1]}]
-        head["bufferViews"] = [_view(k, starts[k], sizes[k]) for k in range(len(sizes))]
+        head["bufferViews"] = [_view(k, starts[k], size=sizes[k]) for k in range(len(sizes))]
         text = dump({k: v for k, v in head.items() if v})
         out.write(text[:-1])
         for name, values in self._lists.items():
@@ -276,7 +277,7 @@ class GlbWriter:
         out.write(b"}")
 
 
-def _view(number: int, start: int, size: int) -> dict[str, Any]:
+def _view(number: int, start: int, *, size: int) -> dict[str, Any]:
     view: dict[str, Any] = {"buffer": 0, "byteOffset": start, "byteLength": size}
     if number < len(_VIEWS):
         _, target, stride = _VIEWS[number]

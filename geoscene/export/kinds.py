@@ -30,23 +30,29 @@ class Kind:
     options: frozenset[str]
 
 
-def _kind(title: str, writer: str, suffixes: str, options: str = "") -> Kind:
+def _kind(title: str, writer: str, *, suffixes: str, options: str = "") -> Kind:
     return Kind(title, writer, tuple(suffixes.split()), frozenset(options.split()))
 
 
 KINDS: dict[str, Kind] = {
-    "cityjson": _kind("CityJSON 2.0", "cityjson:write_cityjson", ".city.json .cityjson", "crs layers"),
-    "glb": _kind("binary glTF 2.0", "glb:write_glb", ".glb", "layers"),
-    "3dtiles": _kind("3D Tiles 1.1", "tiles3d:write_3dtiles", "", "layers height_offset"),
-    "obj": _kind("Wavefront OBJ and MTL", "triangles:write_obj", ".obj", "layers"),
-    "ply": _kind("PLY", "triangles:write_ply", ".ply", "layers"),
-    "stl": _kind("STL, solids only", "triangles:write_stl", ".stl", "layers"),
-    "gpkg": _kind("GeoPackage", "vector:write_gpkg", ".gpkg", "crs layers"),
-    "geojson": _kind("GeoJSON", "vector:write_geojson", ".geojson", "layers"),
-    "geoparquet": _kind("GeoParquet", "vector:write_geoparquet", ".parquet .geoparquet", "crs layers"),
-    "geotiff": _kind("GeoTIFF", "raster:write_geotiff", ".tif .tiff", "layers model resolution"),
-    "opendrive": _kind("OpenDRIVE 1.7", "opendrive:write_opendrive", ".xodr"),
-    "sumo": _kind("SUMO network", "sumo:write_sumo", ".net.xml"),
+    "cityjson": _kind(
+        "CityJSON 2.0", "cityjson:write_cityjson", suffixes=".city.json .cityjson", options="crs layers"
+    ),
+    "glb": _kind("binary glTF 2.0", "glb:write_glb", suffixes=".glb", options="layers"),
+    "3dtiles": _kind("3D Tiles 1.1", "tiles3d:write_3dtiles", suffixes="", options="layers height_offset"),
+    "obj": _kind("Wavefront OBJ and MTL", "triangles:write_obj", suffixes=".obj", options="layers"),
+    "ply": _kind("PLY", "triangles:write_ply", suffixes=".ply", options="layers"),
+    "stl": _kind("STL, solids only", "triangles:write_stl", suffixes=".stl", options="layers"),
+    "gpkg": _kind("GeoPackage", "vector:write_gpkg", suffixes=".gpkg", options="crs layers"),
+    "geojson": _kind("GeoJSON", "vector:write_geojson", suffixes=".geojson", options="layers"),
+    "geoparquet": _kind(
+        "GeoParquet", "vector:write_geoparquet", suffixes=".parquet .geoparquet", options="crs layers"
+    ),
+    "geotiff": _kind(
+        "GeoTIFF", "raster:write_geotiff", suffixes=".tif .tiff", options="layers model resolution"
+    ),
+    "opendrive": _kind("OpenDRIVE 1.7", "opendrive:write_opendrive", suffixes=".xodr"),
+    "sumo": _kind("SUMO network", "sumo:write_sumo", suffixes=".net.xml"),
 }
 """All formats by name."""
 
@@ -67,8 +73,8 @@ def kind_of(out: Path) -> str:
 def export_scene(
     scene: Scene,
     out: Path,
-    kind: str | None = None,
     *,
+    kind: str | None = None,
     crs: str | None = None,
     layers: Collection[str] | None = None,
     model: str | None = None,

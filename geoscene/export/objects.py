@@ -130,7 +130,7 @@ def check_layers(scene: Scene, layers: Collection[str] | None) -> None:
 
 
 def wanted_rows(
-    scene: Scene, feature: NDArray[np.int32], layers: Collection[str] | None
+    scene: Scene, feature: NDArray[np.int32], *, layers: Collection[str] | None
 ) -> NDArray[np.bool_]:
     """(m,) bool: the face or copy is of one of the layers; all of them for None."""
     if layers is None:
@@ -159,8 +159,8 @@ def parts(scene: Scene, layers: Collection[str] | None = None) -> Iterator[Part]
         tile = scene.tile(i, j)
         mesh, copies = tile.mesh, tile.instances
         if layers is not None:
-            mesh = mesh.take(wanted_rows(scene, mesh.feature, layers))
-            keep = wanted_rows(scene, copies.feature, layers)
+            mesh = mesh.take(wanted_rows(scene, mesh.feature, layers=layers))
+            keep = wanted_rows(scene, copies.feature, layers=layers)
             copies = Instances(copies.shape[keep], copies.transform[keep], copies.feature[keep])
         yield Part((i, j), tile.origin, mesh, copies)
 

@@ -77,15 +77,19 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
     with whole_file(path) as out:
         out.write(_header(scene).encode())
         for k in range(len(net.roads)):
-            progress("OpenDRIVE", k, len(net.roads))
-            told = "".join(_road(graph, net, k, junctions, controls, left_hand=left_hand))
+            progress("OpenDRIVE", k, total=len(net.roads))
+            told = "".join(
+                _road(graph, net, k=k, junctions=junctions, controls=controls, left_hand=left_hand)
+            )
             out.write(told.encode())
         for k, connection in enumerate(net.connections):
             told = "".join(
-                _connecting_road(graph, net, connection, first + k, junctions, left_hand=left_hand)
+                _connecting_road(
+                    graph, net, c=connection, number=first + k, junctions=junctions, left_hand=left_hand
+                )
             )
             out.write(told.encode())
-        out.write("".join(_junctions(net, junctions, first, left_hand=left_hand)).encode())
+        out.write("".join(_junctions(net, junctions, first=first, left_hand=left_hand)).encode())
         out.write(b"</OpenDRIVE>\n")
     files, size = size_of(path)
     chains = len(graph.chain_edges)
@@ -130,10 +134,10 @@ def _header(scene: Scene) -> str:
 def _road(
     graph: RoadGraph,
     net: RoadNet,
+    *,
     k: int,
     junctions: dict[int, int],
     controls: dict[int, list[tuple[float, str]]],
-    *,
     left_hand: bool,
 ) -> Iterator[str]:
     road = net.roads[k]
@@ -156,13 +160,13 @@ def _road(
         strict=True,
     ):
         shape = f'<arc curvature="{curvature:.12g}"/>' if curvature else "<line/>"
-        yield _geometry(s, x, y, heading, length, shape)
+        yield _geometry(s, x, y=y, heading=heading, length=length, shape=shape)
     yield "</planView>\n<elevationProfile>\n"
     yield from _elevations(plan.at, road.line[:, 2])
     yield "</elevationProfile>\n<lateralProfile/>\n<lanes>\n"
     shift = road.shift if not left_hand else -road.shift
     yield f'<laneOffset s="0" a="{_n(shift)}" b="0" c="0" d="0"/>\n<laneSection s="0">\n'
-    yield from _lanes(graph, net, k, left_hand=left_hand)
+    yield from _lanes(graph, net, k=k, left_hand=left_hand)
     yield "</laneSection>\n</lanes>\n<objects>"
     for kind, there, detail in (
         ("tunnel", graph.tunnel[edge], 'type="standard" lighting="1" daylight="0"'),
@@ -171,7 +175,7 @@ def _road(
         if there:
             yield f'<{kind} id="{kind}{k + 1}" s="0" length="{_n(plan.total)}" {detail}/>'
     yield "</objects>\n<signals>"
-    yield from _signals(road, k, controls, left_hand=left_hand)
+    yield from _signals(road, k, controls=controls, left_hand=left_hand)
     yield f'</signals>\n<userData code="osm" value={quoteattr(str(graph.osm_id[edge]))}/>\n</road>\n'
 
 
@@ -184,7 +188,7 @@ def _speed(speed: float) -> str:
     return f'<speed max="{_n(round(speed, 4))}" unit="m/s"/>'
 
 
-def _geometry(s: float, x: float, y: float, heading: float, length: float, shape: str) -> str:
+def _geometry(s: float, x: float, *, y: float, heading: float, length: float, shape: str) -> str:
     place = f's="{_n(s)}" x="{_n(x)}" y="{_n(y)}" hdg="{heading:.12g}" length="{_n(length)}"'
     return f"<geometry {place}>{shape}</geometry>\n"
 
@@ -197,7 +201,7 @@ def _elevations(at: Float, height: Float) -> Iterator[str]:
         yield f'<elevation s="{_n(s)}" a="{_n(z)}" b="{_n(b)}" c="0" d="0"/>\n'
 
 
-def _lanes(graph: RoadGraph, net: RoadNet, k: int, *, left_hand: bool) -> Iterator[str]:
+def _lanes(graph: RoadGraph, net: RoadNet, *, k: int, left_hand: bool) -> Iterator[str]:
     """The lanes of a road, from left to right; across a joint they go on in the lane of the same place."""
     road = net.roads[k]
     sign = 1 if left_hand else -1
@@ -208,19 +212,26 @@ def _lanes(graph: RoadGraph, net: RoadNet, k: int, *, left_hand: bool) -> Iterat
     if left:
         yield "<left>\n"
         for number, edge in reversed(left):
-            yield _lane(graph, road, number, edge, flip, sign, len(left))
+            yield _lane(graph, road, number=number, edge=edge, flip=flip, sign=sign, count=len(left))
         yield "</left>\n"
     middle = "solid" if road.twin >= 0 and not road.shared else "none"
     yield f'<center><lane id="0" type="none" level="false"><link/>{_mark(middle)}</lane></center>\n'
     if right:
         yield "<right>\n"
         for number, edge in right:
-            yield _lane(graph, road, number, edge, flip, sign, len(right))
+            yield _lane(graph, road, number=number, edge=edge, flip=flip, sign=sign, count=len(right))
         yield "</right>\n"
 
 
 def _lane(
-    graph: RoadGraph, road: Carriageway, number: int, edge: int, flip: dict[int, int], sign: int, count: int
+    graph: RoadGraph,
+    road: Carriageway,
+    *,
+    number: int,
+    edge: int,
+    flip: dict[int, int],
+    sign: int,
+    count: int,
 ) -> str:
     links = "".join(
         f'<{word} id="{flip[end] * number}"/>'
@@ -244,7 +255,7 @@ def _mark(kind: str) -> str:
 
 
 def _signals(
-    road: Carriageway, k: int, controls: dict[int, list[tuple[float, str]]], *, left_hand: bool
+    road: Carriageway, k: int, *, controls: dict[int, list[tuple[float, str]]], left_hand: bool
 ) -> Iterator[str]:
     """What drivers of each direction must heed, at the side of the road that they keep to."""
     count = 0
@@ -269,7 +280,7 @@ def _signals(
 
 
 def _connecting_road(
-    graph: RoadGraph, net: RoadNet, c: Connection, number: int, junctions: dict[int, int], *, left_hand: bool
+    graph: RoadGraph, net: RoadNet, *, c: Connection, number: int, junctions: dict[int, int], left_hand: bool
 ) -> Iterator[str]:
     curve = c.curve
     rule = "LHT" if left_hand else "RHT"
@@ -292,7 +303,7 @@ def _connecting_road(
         f'{letter}{axis}="{value:.12g}"' for axis, w in (("U", u), ("V", v)) for letter, value in w.items()
     )
     shape = f'<paramPoly3 {told} pRange="normalized"/>'
-    yield _geometry(0.0, curve.x, curve.y, curve.heading, curve.length, shape)
+    yield _geometry(0.0, curve.x, y=curve.y, heading=curve.heading, length=curve.length, shape=shape)
     a, b, cc, d = c.rise.tolist()
     yield (
         f'</planView>\n<elevationProfile><elevation s="0" a="{_n(a)}" b="{_n(b)}" c="{cc:.12g}" '
@@ -315,7 +326,7 @@ def _connecting_road(
     yield "</laneSection>\n</lanes>\n</road>\n"
 
 
-def _junctions(net: RoadNet, junctions: dict[int, int], first: int, *, left_hand: bool) -> Iterator[str]:
+def _junctions(net: RoadNet, junctions: dict[int, int], *, first: int, left_hand: bool) -> Iterator[str]:
     """Each junction with its connections, whose order is that of the connecting roads."""
     sign = 1 if left_hand else -1
     ways: dict[int, list[tuple[int, Connection]]] = defaultdict(list)

@@ -83,7 +83,7 @@ def plan_view(points: Float, *, reach: float = REACH) -> PlanView:
     return PlanView(np.cumsum(length) - length, x, y, angle, length, curvature, ends)
 
 
-def cut(points: Float, start: float, end: float) -> Float:
+def cut(points: Float, start: float, *, end: float) -> Float:
     """The polyline (n, 3) less ``start`` metres of plan at its beginning and ``end`` at its end."""
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points[:, :2], axis=0).T)))
     first, last = start, along[-1] - end
@@ -112,7 +112,7 @@ class Curve:
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(96)  # cubics that nearly turn on the spot need that many
 
 
-def connecting_curve(start: Float, heading: float, end: Float, end_heading: float) -> Curve:
+def connecting_curve(start: Float, heading: float, *, end: Float, end_heading: float) -> Curve:
     """The cubic from a point (2,) with a heading to another, close to an arc where an arc fits.
 
     For a turn by a with chord c the handles of an arc's cubic are c tan(a / 4) / (1.5 sin(a / 2)) long.

@@ -97,17 +97,17 @@ def write_geotiff(
         for top in range(0, grid.rows, _BLOCK):
             height[top : top + _BLOCK] = np.nan
         for done, part in enumerate(parts(scene, layers)):
-            progress("GeoTIFF", done, len(scene.tile_indices))
+            progress("GeoTIFF", done, total=len(scene.tile_indices))
             mesh = part.mesh
             if model == "terrain":
                 mesh = mesh.take(~mesh.closed & ~np.isin(mesh.klass, _STRUCTURES))
             elif len(part.instances):
                 mesh = concatenate([mesh, expand(part.instances, library)])
-            _draw(mesh, part.origin, scene, grid, height, labels)
+            _draw(mesh, part.origin, scene=scene, grid=grid, height=height, labels=labels)
             faces += len(mesh)
         draft = Path(folder) / "draft.tif"
-        _write_draft(draft, scene, grid, labels if model == "classes" else height, model)
-        _write_cog(draft, path, model)
+        _write_draft(draft, scene, grid=grid, cells=labels if model == "classes" else height, model=model)
+        _write_cog(draft, path, model=model)
     files, size = size_of(path)
     count = grid.columns * grid.rows
     return Summary(path, "geotiff", files, size, count, faces=faces, crs=scene.frame.name)
@@ -116,6 +116,7 @@ def write_geotiff(
 def _draw(
     mesh: Mesh,
     origin: Float,
+    *,
     scene: Scene,
     grid: _Grid,
     height: NDArray[np.float32],
@@ -131,7 +132,7 @@ def _draw(
     draw_triangles(corners, mesh.klass, height[window], labels[window])
 
 
-def _write_draft(path: Path, scene: Scene, grid: _Grid, cells: NDArray[Any], model: Model) -> None:
+def _write_draft(path: Path, scene: Scene, *, grid: _Grid, cells: NDArray[Any], model: Model) -> None:
     import rasterio  # noqa: PLC0415  (0.4 s)
     from rasterio.windows import Window  # noqa: PLC0415
 
@@ -161,7 +162,7 @@ def _write_draft(path: Path, scene: Scene, grid: _Grid, cells: NDArray[Any], mod
             out.set_band_unit(1, "metre")
 
 
-def _write_cog(draft: Path, path: Path, model: Model) -> None:
+def _write_cog(draft: Path, path: Path, *, model: Model) -> None:
     import rasterio.shutil  # noqa: PLC0415
 
     part = path.with_name(f"{path.stem}.{os.getpid()}.part.tif")

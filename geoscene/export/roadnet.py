@@ -108,19 +108,19 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
     for k, edge in enumerate(firsts):
         ends[int(graph.tail[edge])].append((k, START))
         ends[int(graph.head[edge])].append((k, END))
-    joints = _joints(graph, firsts, ends, before, after)
+    joints = _joints(graph, firsts, ends=ends, before=before, after=after)
     junctions = np.zeros(len(graph.node_id), np.bool_)
     junctions[graph.head[before]] = True
     for k, end in joints:
         edge = firsts[k]
         junctions[graph.head[edge] if end == END else graph.tail[edge]] = False
-    gaps = _gaps(graph, firsts, ends, junctions)
-    roads = [_carriageway(graph, edge, gaps[k]) for k, edge in enumerate(firsts)]
+    gaps = _gaps(graph, firsts, ends=ends, junctions=junctions)
+    roads = [_carriageway(graph, edge, gap=gaps[k]) for k, edge in enumerate(firsts)]
     connections = []
     for first, then in sorted(zip(before.tolist(), after.tolist(), strict=True)):
         node = int(graph.head[first])
         if junctions[node]:
-            made = _connection(graph, roads, road_of, first, then, left_hand=left_hand)
+            made = _connection(graph, roads, road_of=road_of, before=first, after=then, left_hand=left_hand)
             connections.append(made)
     connections.sort(key=lambda c: (c.node, c.before, c.after))
     return RoadNet(roads, road_of, junctions, connections, joints)
@@ -130,7 +130,7 @@ def _span(line: Float) -> float:
     return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
 
 
-def _direction(graph: RoadGraph, edge: int, end: int) -> float:
+def _direction(graph: RoadGraph, edge: int, *, end: int) -> float:
     """Heading (radians) in which a road leaves the node at one of its ends."""
     line = graph.geometry[edge][:, :2]
     if end == END:
@@ -147,6 +147,7 @@ def _angle(a: float, b: float) -> float:
 def _joints(
     graph: RoadGraph,
     firsts: list[int],
+    *,
     ends: dict[int, list[tuple[int, int]]],
     before: NDArray[np.int32],
     after: NDArray[np.int32],
@@ -158,7 +159,7 @@ def _joints(
             continue
         (a, end_a), (b, end_b) = met
         edge_a, edge_b = firsts[a], firsts[b]
-        away = _angle(_direction(graph, edge_a, end_a), _direction(graph, edge_b, end_b))
+        away = _angle(_direction(graph, edge_a, end=end_a), _direction(graph, edge_b, end=end_b))
         if np.pi - away > _STRAIGHT:
             continue
         turned = end_a == end_b  # one runs against the other
@@ -180,6 +181,7 @@ def _joints(
 def _gaps(
     graph: RoadGraph,
     firsts: list[int],
+    *,
     ends: dict[int, list[tuple[int, int]]],
     junctions: NDArray[np.bool_],
 ) -> Float:
@@ -191,7 +193,7 @@ def _gaps(
     for node, met in ends.items():
         if not junctions[node]:
             continue
-        heading = [_direction(graph, firsts[k], end) for k, end in met]
+        heading = [_direction(graph, firsts[k], end=end) for k, end in met]
         half = [graph.width[firsts[k]] / 2 for k, _ in met]
         for i, (k, end) in enumerate(met):
             need = _LEAST_GAP
@@ -204,10 +206,10 @@ def _gaps(
     return gaps
 
 
-def _carriageway(graph: RoadGraph, edge: int, gap: Float) -> Carriageway:
+def _carriageway(graph: RoadGraph, edge: int, *, gap: Float) -> Carriageway:
     full = graph.geometry[edge]
     fresh = np.append(True, np.hypot(*np.diff(full[:, :2], axis=0).T) > 1e-3)
-    line = cut(full[fresh], float(gap[START]), float(gap[END]))
+    line = cut(full[fresh], float(gap[START]), end=float(gap[END]))
     twin = int(graph.twin[edge])
     there, back = float(graph.lanes[edge]), float(graph.lanes[twin]) if twin >= 0 else 0.0
     shared = twin >= 0 and there % 1 > 0 and back % 1 > 0
@@ -245,10 +247,10 @@ def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[Lane]
 def _connection(
     graph: RoadGraph,
     roads: list[Carriageway],
+    *,
     road_of: NDArray[np.int64],
     before: int,
     after: int,
-    *,
     left_hand: bool,
 ) -> Connection:
     """The way from the end of one edge to the start of another."""
@@ -264,7 +266,7 @@ def _connection(
     here, there = (here[-count:], there[-count:]) if outer else (here[:count], there[:count])
     first = start[:2] + here[0][1] * np.array([-np.sin(heading), np.cos(heading)])
     last = end[:2] + there[0][1] * np.array([-np.sin(end_heading), np.cos(end_heading)])
-    curve = connecting_curve(first, heading, last, end_heading)
+    curve = connecting_curve(first, heading, end=last, end_heading=end_heading)
     length = max(curve.length, 1e-3)
     rise = end[2] - start[2]
     c = (3 * rise / length - 2 * slope - end_slope) / length

@@ -36,7 +36,7 @@ def shell_numbers(corners: Ids, owner: NDArray[np.integer]) -> Ids:
     return shells
 
 
-def bodies(points: Float, faces: NDArray[np.integer], shell: Ids) -> list[list[Ids]]:
+def bodies(points: Float, faces: NDArray[np.integer], *, shell: Ids) -> list[list[Ids]]:
     """The bodies of one object, each as rows of faces per shell: the outer shell first, then its cavities.
 
     A shell of negative volume is a cavity of the smallest outer shell whose box holds its box.

@@ -78,7 +78,7 @@ def kinds_of_columns(scene: Scene, layer: str) -> dict[str, np.dtype[Any]]:
     return dict(zip(told["fields"].tolist(), kinds, strict=True))
 
 
-def rows(scene: Scene, layer: str, crs: CRS) -> Iterator[Rows]:
+def rows(scene: Scene, layer: str, *, crs: CRS) -> Iterator[Rows]:
     """The features of a layer, some at a time, in their order (solids: tile by tile)."""
     if layer == SOLIDS:
         yield from _solids(scene, crs)
@@ -93,15 +93,15 @@ def rows(scene: Scene, layer: str, crs: CRS) -> Iterator[Rows]:
         )
         geometry = shapely.from_wkb(wkb)
         if not same:
-            geometry = _moved(scene, geometry, crs, projected=True)
+            geometry = _moved(scene, geometry, crs=crs, projected=True)
         yield Rows(layer, geometry, dict(zip(meta["fields"].tolist(), values, strict=True)))
 
 
-def _moved(scene: Scene, geometry: NDArray[np.object_], crs: CRS, *, projected: bool) -> NDArray[np.object_]:
+def _moved(scene: Scene, geometry: NDArray[np.object_], *, crs: CRS, projected: bool) -> NDArray[np.object_]:
     """Geometries in scene metres, or in the frame's projected coordinates, in those of a CRS."""
     flat = shapely.get_coordinates(geometry, include_z=True)
     east, north = scene.frame.origin if projected else (0.0, 0.0)
-    x, y = scene.frame.to_crs(crs, flat[:, 0] - east, flat[:, 1] - north)
+    x, y = scene.frame.to_crs(flat[:, 0] - east, flat[:, 1] - north, crs=crs)
     tall = bool(shapely.has_z(geometry).any())
     out: NDArray[np.object_] = shapely.set_coordinates(
         shapely.force_3d(geometry) if tall else geometry.copy(),
@@ -122,7 +122,7 @@ def _solids(scene: Scene, crs: CRS) -> Iterator[Rows]:
             continue
         feature, geometry = surfaces(chosen.shifted(tile.origin))
         own = {name: values[feature - first] for name, values in columns.items()}
-        yield Rows(SOLIDS, _moved(scene, geometry, crs, projected=False), {"feature": feature, **own})
+        yield Rows(SOLIDS, _moved(scene, geometry, crs=crs, projected=False), {"feature": feature, **own})
 
 
 def surfaces(mesh: Mesh) -> tuple[NDArray[np.int32], NDArray[np.object_]]:

@@ -59,7 +59,7 @@ def write_3dtiles(
     Raises InputError where the folder is something else, and for a scene without anything in it.
     """
     xmin, ymin, xmax, ymax = scene.bounds
-    globe = Globe.at(scene.frame, (xmin + xmax) / 2, (ymin + ymax) / 2, lift=height_offset)
+    globe = Globe.at(scene.frame, (xmin + xmax) / 2, y=(ymin + ymax) / 2, lift=height_offset)
     features = read_features(scene)
     library = list(scene.shapes().values())
     names = list(scene.shapes())
@@ -68,8 +68,10 @@ def write_3dtiles(
         (folder / "content").mkdir()
         nodes: dict[tuple[int, int], _Node] = {}
         for done, part in enumerate(parts(scene, layers)):
-            progress("3D Tiles", done, len(scene.tile_indices))
-            node = _tile(folder, scene, part, features, globe, names, library)
+            progress("3D Tiles", done, total=len(scene.tile_indices))
+            node = _tile(
+                folder, scene, part=part, features=features, globe=globe, names=names, library=library
+            )
             if node is not None:
                 nodes[part.index] = node
             found = pieces(part.mesh)
@@ -129,6 +131,7 @@ def _joined(children: list[_Node]) -> _Node:
 def _tile(
     folder: Path,
     scene: Scene,
+    *,
     part: Part,
     features: Features,
     globe: Globe,
@@ -140,11 +143,13 @@ def _tile(
     copies = None
     if len(part.instances):
         file = folder / "content" / f"{name}_copies.glb"
-        _write_copies(file, scene, part, features, globe, names)
-        copies = _copies_node(f"content/{file.name}", part, globe, library)
+        _write_copies(file, scene, part=part, features=features, globe=globe, names=names)
+        copies = _copies_node(f"content/{file.name}", part, globe=globe, library=library)
     if not len(part.mesh):
         return copies
-    low, high = _write_mesh(folder / "content" / f"{name}.glb", scene, part, features, globe)
+    low, high = _write_mesh(
+        folder / "content" / f"{name}.glb", scene, part=part, features=features, globe=globe
+    )
     document: dict[str, Any] = {
         "boundingVolume": _box(low, high),
         "geometricError": 0.0,
@@ -165,7 +170,7 @@ def _tallest(instances: Instances, library: list[Mesh]) -> float:
 
 
 def _write_mesh(
-    path: Path, scene: Scene, part: Part, features: Features, globe: Globe
+    path: Path, scene: Scene, *, part: Part, features: Features, globe: Globe
 ) -> tuple[Float, Float]:
     """Write the faces of a tile, a mesh a layer; the lowest and highest corner of the points as written."""
     mesh = part.mesh
@@ -186,7 +191,7 @@ def _write_mesh(
             high = np.maximum(high, points.max(axis=0) + middle)
             told: dict[str, Any] = {}
             if number:
-                table = _table(writer, features, number - 1, feature)
+                table = _table(writer, features, layer=number - 1, feature=feature)
                 told = {"table": table, "rows": own // len(mesh.vertices), "count": len(feature)}
             faces = Mesh.of(
                 np.empty((0, 3)),
@@ -204,16 +209,16 @@ def _write_mesh(
     return low, high
 
 
-def _table(writer: GlbWriter, features: Features, layer: int, feature: NDArray[np.integer]) -> int:
+def _table(writer: GlbWriter, features: Features, *, layer: int, feature: NDArray[np.integer]) -> int:
     """Add the attributes of some features of a layer, in their order; returns the table's number."""
     rows = feature - features.starts[layer]
     columns = {"feature": feature.astype(np.int32)}
     columns |= {name: values[rows] for name, values in features.columns[layer].items()}
-    return writer.property_table(features.layers[layer], columns, len(feature))
+    return writer.property_table(features.layers[layer], columns, count=len(feature))
 
 
 def _write_copies(
-    path: Path, scene: Scene, part: Part, features: Features, globe: Globe, names: list[str]
+    path: Path, scene: Scene, *, part: Part, features: Features, globe: Globe, names: list[str]
 ) -> None:
     """Write the copies of a tile, a node a shape and layer."""
     copies = part.instances
@@ -237,7 +242,10 @@ def _write_copies(
             if of_layer:
                 if of_layer not in tables:
                     feature = np.unique(copies.feature[layer == of_layer])
-                    tables[of_layer] = (_table(writer, features, of_layer - 1, feature), feature)
+                    tables[of_layer] = (
+                        _table(writer, features, layer=of_layer - 1, feature=feature),
+                        feature,
+                    )
                 table, feature = tables[of_layer]
                 rows = np.searchsorted(feature, copies.feature[chosen])
                 told = {"table": table, "rows": rows, "count": len(feature)}
@@ -248,7 +256,7 @@ def _write_copies(
         writer.finish(out, scene_nodes=nodes, asset={"copyright": attribution(scene)})
 
 
-def _copies_node(uri: str, part: Part, globe: Globe, library: list[Mesh]) -> _Node:
+def _copies_node(uri: str, part: Part, *, globe: Globe, library: list[Mesh]) -> _Node:
     points = globe.local(expand(part.instances, library).vertices + part.origin)
     low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
     box = _box(low, high)

@@ -21,12 +21,12 @@ Float = NDArray[np.float64]
 
 
 def _meshes(
-    scene: Scene, layers: Collection[str] | None, stage: str, progress: Progress
+    scene: Scene, layers: Collection[str] | None, *, stage: str, progress: Progress
 ) -> Iterator[tuple[tuple[int, int], Mesh]]:
     """Index and mesh of each tile in scene metres, its copies expanded."""
     library = list(scene.shapes().values())
     for done, part in enumerate(parts(scene, layers)):
-        progress(stage, done, len(scene.tile_indices))
+        progress(stage, done, total=len(scene.tile_indices))
         copies = [expand(part.instances, library)] if len(part.instances) else []
         yield part.index, concatenate([part.mesh, *copies]).shifted(part.origin)
 
@@ -58,7 +58,7 @@ def write_obj(
     with whole_file(library) as colors, whole_file(path) as out:
         out.write("".join(f"# {line}\n" for line in _head(scene)).encode())
         out.write(f"mtllib {library.name}\n".encode())
-        for index, mesh in _meshes(scene, layers, "OBJ", progress):
+        for index, mesh in _meshes(scene, layers, stage="OBJ", progress=progress):
             out.write(_lines("v %.4f %.4f %.4f\n", mesh.vertices))
             for piece in pieces(mesh):
                 name = features.name(piece.feature)
@@ -113,8 +113,8 @@ def write_ply(
     solids: set[int] = set()
     vertices = faces = objects = 0
     with whole_file(path) as out, spool(path) as rest:
-        out.write(_ply_head(scene, 0, 0))
-        for _, mesh in _meshes(scene, layers, "PLY", progress):
+        out.write(_ply_head(scene, 0, faces=0))
+        for _, mesh in _meshes(scene, layers, stage="PLY", progress=progress):
             out.write(mesh.vertices.astype("<f8").tobytes())
             rows = np.zeros(len(mesh), _FACE)
             rows["corners"] = 3
@@ -130,12 +130,12 @@ def write_ply(
             solids |= set(np.unique(mesh.feature[mesh.closed]).tolist())
         append(out, rest)
         out.seek(0)
-        out.write(_ply_head(scene, vertices, faces))
+        out.write(_ply_head(scene, vertices, faces=faces))
     files, size = size_of(path)
     return Summary(path, "ply", files, size, objects, len(solids), faces, scene.frame.name)
 
 
-def _ply_head(scene: Scene, vertices: int, faces: int) -> bytes:
+def _ply_head(scene: Scene, vertices: int, *, faces: int) -> bytes:
     """The header; its length does not depend on the counts, which are known only at the end."""
     kinds = {"i": "int", "u": "uchar"}
     columns = [f"property {kinds[_FACE[name].kind]} {name}" for name in _FACE.names[2:]]  # type: ignore[index]
@@ -169,7 +169,7 @@ def write_stl(
     head = f"geoscene; add {middle[0] + east:.0f} {middle[1] + north:.0f} 0; {scene.frame.name}"
     with whole_file(path) as out:
         out.write(head.encode("ascii", "replace")[:80].ljust(80, b" ") + bytes(4))
-        for _, mesh in _meshes(scene, layers, "STL", progress):
+        for _, mesh in _meshes(scene, layers, stage="STL", progress=progress):
             mesh, lost = _in_single_precision(mesh.take(mesh.closed).shifted(-middle))  # noqa: PLW2901
             rows = np.zeros(len(mesh), row)
             rows["normal"] = mesh.normals()

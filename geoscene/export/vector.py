@@ -31,14 +31,14 @@ _DATE = "2000-01-01T00:00:00Z"  # a constant, so that the same scene is the same
 
 
 def _reading(
-    scene: Scene, names: list[str], crs: CRS, stage: str, progress: Progress
+    scene: Scene, names: list[str], *, crs: CRS, stage: str, progress: Progress
 ) -> Iterator[tuple[int, Rows]]:
     """The rows of all layers, with a count of those before them."""
     total = sum(np.subtract(*scene.layers[name][::-1]) for name in names if name != SOLIDS)
     done = 0
     for name in names:
-        for chunk in rows(scene, name, crs):
-            progress(stage, min(done, int(total)), int(total))
+        for chunk in rows(scene, name, crs=crs):
+            progress(stage, min(done, int(total)), total=int(total))
             yield done, chunk
             done += len(chunk.geometry)
 
@@ -70,7 +70,7 @@ def write_gpkg(
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE})
     objects = solids = faces = 0
     try:
-        for _, chunk in _reading(scene, names, target, "GeoPackage", progress):
+        for _, chunk in _reading(scene, names, crs=target, stage="GeoPackage", progress=progress):
             write(
                 str(part),
                 geometry=shapely.to_wkb(chunk.geometry),
@@ -123,7 +123,7 @@ def write_geojson(
     with whole_file(path) as out:
         head: dict[str, Any] = {"type": "FeatureCollection", "attribution": attribution(scene)}
         out.write(_json(head)[:-1] + b',"features":[')
-        for _, chunk in _reading(scene, names, wgs84, "GeoJSON", progress):
+        for _, chunk in _reading(scene, names, crs=wgs84, stage="GeoJSON", progress=progress):
             geometry = _for_geojson(chunk.geometry)
             columns = {_told_as(chunk.layer, name): v.tolist() for name, v in chunk.columns.items()}
             for k, shape in enumerate(shapely.to_geojson(geometry).tolist()):
@@ -173,7 +173,7 @@ def write_geoparquet(
     parquet = need("pyarrow.parquet", "gis")
     target = target_crs(scene, crs)
     names = chosen_layers(scene, layers, solids=False)
-    kinds = _common_kinds(pa, scene, names)
+    kinds = _common_kinds(pa, scene, names=names)
     box = pa.struct([(edge, pa.float64()) for edge in ("xmin", "ymin", "xmax", "ymax")])
     fields = [("kind", pa.string()), *kinds.items(), ("bbox", box), ("geometry", pa.binary())]
     schema = pa.schema(fields, metadata={"attribution": attribution(scene)})
@@ -181,13 +181,13 @@ def write_geoparquet(
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
     count = 0
     with whole_file(path) as out, parquet.ParquetWriter(out, schema, compression="zstd") as writer:
-        for _, chunk in _reading(scene, names, target, "GeoParquet", progress):
+        for _, chunk in _reading(scene, names, crs=target, stage="GeoParquet", progress=progress):
             n = len(chunk.geometry)
             boxes = shapely.bounds(chunk.geometry)
             own = {_told_as(chunk.layer, name): values for name, values in chunk.columns.items()}
             columns = {
                 "kind": pa.array([chunk.layer] * n),
-                **{name: _arrow(pa, own.get(name), kind, n) for name, kind in kinds.items()},
+                **{name: _arrow(pa, own.get(name), kind=kind, n=n) for name, kind in kinds.items()},
                 "bbox": pa.StructArray.from_arrays([pa.array(c) for c in boxes.T], fields=list(box)),
                 "geometry": pa.array(shapely.to_wkb(chunk.geometry, flavor="iso").tolist()),
             }
@@ -197,7 +197,7 @@ def write_geoparquet(
                 [np.fmin(bounds[:2], boxes[:, :2].min(axis=0)), np.fmax(bounds[2:], boxes[:, 2:].max(axis=0))]
             )
             count += n
-        geo = _geoparquet_metadata(target, sorted(types), bounds if count else None)
+        geo = _geoparquet_metadata(target, sorted(types), bounds=bounds if count else None)
         writer.add_key_value_metadata({"geo": json.dumps(geo)})
     files, size = size_of(path)
     return Summary(path, "geoparquet", files, size, count, crs=_named(target))
@@ -208,7 +208,7 @@ def _told_as(layer: str, column: str) -> str:
     return f"{layer}_kind" if column == "kind" else column
 
 
-def _common_kinds(pa: Any, scene: Scene, names: list[str]) -> dict[str, Any]:
+def _common_kinds(pa: Any, scene: Scene, *, names: list[str]) -> dict[str, Any]:
     """Arrow type of each column of any layer: text where layers differ, a double for numbers of two kinds."""
     found: dict[str, list[np.dtype[Any]]] = {}
     for name in names:
@@ -221,7 +221,7 @@ def _common_kinds(pa: Any, scene: Scene, names: list[str]) -> dict[str, Any]:
     return out
 
 
-def _arrow(pa: Any, values: NDArray[Any] | None, kind: Any, n: int) -> Any:
+def _arrow(pa: Any, values: NDArray[Any] | None, *, kind: Any, n: int) -> Any:
     if values is None:
         return pa.nulls(n, kind)
     if kind == pa.string():
@@ -242,7 +242,7 @@ def _type_names(geometry: NDArray[np.object_]) -> set[str]:
     return {names[kind] + (" Z" if tall else "") for kind, tall in pairs.tolist()}
 
 
-def _geoparquet_metadata(crs: CRS, types: list[str], bounds: NDArray[np.float64] | None) -> dict[str, Any]:
+def _geoparquet_metadata(crs: CRS, types: list[str], *, bounds: NDArray[np.float64] | None) -> dict[str, Any]:
     column: dict[str, Any] = {
         "encoding": "WKB",
         "geometry_types": types,

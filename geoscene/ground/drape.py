@@ -63,7 +63,7 @@ class WaterLevels:
     reversed: tuple[str, ...]
 
 
-def water_levels(layers: Layers, ways: Sequence[Way], frame: Frame, *, height: Height) -> WaterLevels:
+def water_levels(layers: Layers, ways: Sequence[Way], *, frame: Frame, height: Height) -> WaterLevels:
     """The level of every water row of the layers.
 
     The sea has one level: the median of the terrain over it. Standing water, with all that touches it,
@@ -77,7 +77,7 @@ def water_levels(layers: Layers, ways: Sequence[Way], frame: Frame, *, height: H
     """
     level = np.full(len(layers), np.nan)
     lines = [way for way in ways if "waterway" in way.tags and len(way.lonlat) > 1]
-    stations, heights, turned = _profiles(lines, frame, height)
+    stations, heights, turned = _profiles(lines, frame, height=height)
     river = layers.body == "river"
     if river.any():
         tree = shapely.STRtree(layers.polygon[river])
@@ -85,7 +85,7 @@ def water_levels(layers: Layers, ways: Sequence[Way], frame: Frame, *, height: H
         river[np.flatnonzero(river)[~np.isin(np.arange(river.sum()), has_line)]] = False
     still = np.flatnonzero((layers.body != "") & ~river)
     if len(still):
-        level[still] = _still_levels(layers.polygon[still], layers.body[still] == "sea", height)
+        level[still] = _still_levels(layers.polygon[still], layers.body[still] == "sea", height=height)
     nearest = None
     if len(stations):
         from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
@@ -97,8 +97,8 @@ def water_levels(layers: Layers, ways: Sequence[Way], frame: Frame, *, height: H
 def drape(
     plan: GroundPlan,
     cells: Partition,
-    triangles: Triangles,
     *,
+    triangles: Triangles,
     height: Height | None = None,
     levels: WaterLevels | None = None,
 ) -> Mesh:
@@ -111,7 +111,7 @@ def drape(
     x, y = triangles.points.T
     z = np.zeros(len(x)) if height is None else np.asarray(height(x, y), float)
     if levels is not None:
-        z = _flooded(plan, cells, triangles, z, levels)
+        z = _flooded(plan, cells, triangles=triangles, z=z, levels=levels)
     color = np.zeros((256, 3), np.uint8)
     for material in materials().values():
         color[material.code] = material.color
@@ -126,11 +126,11 @@ def drape(
 
 
 def ground_tile(
-    plan: GroundPlan, i: int, j: int, *, height: Height | None = None, levels: WaterLevels | None = None
+    plan: GroundPlan, i: int, *, j: int, height: Height | None = None, levels: WaterLevels | None = None
 ) -> Mesh:
     """The ground of tile (i, j) in scene coordinates: partition, triangles and heights in one call."""
-    cells = partition_tile(plan, i, j)
-    return drape(plan, cells, triangulate(cells), height=height, levels=levels)
+    cells = partition_tile(plan, i, j=j)
+    return drape(plan, cells, triangles=triangulate(cells), height=height, levels=levels)
 
 
 def _inside(polygons: NDArray[np.object_]) -> tuple[Float, Float]:
@@ -145,7 +145,7 @@ def _inside(polygons: NDArray[np.object_]) -> tuple[Float, Float]:
     return every[:, 0], every[:, 1]
 
 
-def _still_levels(polygons: NDArray[np.object_], sea: NDArray[np.bool_], height: Height) -> Float:
+def _still_levels(polygons: NDArray[np.object_], sea: NDArray[np.bool_], *, height: Height) -> Float:
     """The level (n,) of waters that do not flow; those that touch stand equally high."""
     from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
@@ -169,7 +169,7 @@ def _still_levels(polygons: NDArray[np.object_], sea: NDArray[np.bool_], height:
     return levels
 
 
-def _profiles(ways: Sequence[Way], frame: Frame, height: Height) -> tuple[Float, Float, tuple[str, ...]]:
+def _profiles(ways: Sequence[Way], frame: Frame, *, height: Height) -> tuple[Float, Float, tuple[str, ...]]:
     """Stations (k, 2) on rivers, the water's height (k,) there, and which rivers were turned round."""
     stations, heights, turned = [np.empty((0, 2))], [np.empty(0)], []
     for way in ways:
@@ -190,17 +190,17 @@ def _profiles(ways: Sequence[Way], frame: Frame, height: Height) -> tuple[Float,
 
 
 def _flooded(
-    plan: GroundPlan, cells: Partition, triangles: Triangles, z: Float, levels: WaterLevels
+    plan: GroundPlan, cells: Partition, *, triangles: Triangles, z: Float, levels: WaterLevels
 ) -> Float:
     """Heights (n,) of the points, those on water at its level."""
     low, high = triangles.points.min(axis=0) - _AROUND, triangles.points.max(axis=0) + _AROUND
-    if not (plan.layers.body[rows_near(plan, *low, *high)] != "").any():
+    if not (plan.layers.body[rows_near(plan, low[0], ymin=low[1], xmax=high[0], ymax=high[1])] != "").any():
         return z
     vertex = triangles.faces.ravel()
     row = np.repeat(cells.row[triangles.cell], 3)
     edge = np.zeros(len(z), bool)
     for i, j in np.unique(cells.tile, axis=0):
-        xmin, ymin, xmax, ymax = tile_box(plan, i, j)
+        xmin, ymin, xmax, ymax = tile_box(plan, i, j=j)
         x, y = triangles.points.T
         within = (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)
         edge |= within & ((x == xmin) | (x == xmax) | (y == ymin) | (y == ymax))
@@ -209,10 +209,10 @@ def _flooded(
     around = triangles.points[edge][:, None] + _AROUND * np.stack(
         [np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)], axis=1
     )
-    beside = winners(plan, around[..., 0].ravel(), around[..., 1].ravel())
+    beside = winners(plan, around.reshape(-1, 2))
     vertex = np.concatenate([vertex, np.repeat(np.flatnonzero(edge), len(_DIRECTIONS))])
     row = np.concatenate([row, beside])
-    on_water = values_at(plan.layers.body, row, "") != ""
+    on_water = values_at(plan.layers.body, row, base="") != ""
     vertex, row = vertex[on_water], row[on_water]
     stand = levels.level[row]
     flows = levels.river[row]

@@ -34,7 +34,7 @@ def landcover(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[L
 
     extent : (xmin, ymin, xmax, ymax) scene metres; polygons are cut there
     """
-    areas, problems = _areas(osm, frame, extent)
+    areas, problems = _areas(osm, frame, extent=extent)
     lines, more = _lines(osm.ways, frame)
     coast = [way for way in osm.ways if way.tags.get("natural") == "coastline"]
     seas, still_more = sea(
@@ -70,7 +70,7 @@ def _priority(tier: NDArray[np.integer], polygons: NDArray[np.object_]) -> Float
     return priority
 
 
-def _areas(osm: OsmData, frame: Frame, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
+def _areas(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
     """Land cover drawn as areas that reach into the extent."""
     found = [(area, kind) for area in osm.areas if (kind := area_kind(area.tags)) is not None]
     polygons = np.empty(len(found), object)

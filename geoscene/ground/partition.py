@@ -161,28 +161,31 @@ def plan_ground(
     )
 
 
-def partition_tile(plan: GroundPlan, i: int, j: int) -> Partition:
+def partition_tile(plan: GroundPlan, i: int, *, j: int) -> Partition:
     """The cells of tile (i, j), which covers [i, i + 1) x [j, j + 1) times the tile size, within the extent.
 
     The same whatever other tiles are made. Raises InputError for a tile outside the extent.
     """
-    place = tile_place(plan, i, j)
+    place = tile_place(plan, i, j=j)
     if place is None:
         raise InputError(f"tile ({i}, {j}) is not one of the {len(plan.tiles)} tiles of the ground")
-    box = tile_box(plan, i, j)
+    box = tile_box(plan, i, j=j)
     mine = np.sort(plan.order[plan.offset[place] : plan.offset[place + 1]])
-    lines = [*_strings(plan.start[mine], plan.end[mine], plan.string[mine]), *_ruling(plan, i, j, box)]
+    lines = [
+        *_strings(plan.start[mine], plan.end[mine], string=plan.string[mine]),
+        *_ruling(plan, i, j=j, box=box),
+    ]
     cells = _faces(shapely.union_all(lines, grid_size=PRECISION), box)
     inside = shapely.get_coordinates(shapely.point_on_surface(cells))
-    row = winners(plan, inside[:, 0], inside[:, 1])
+    row = winners(plan, inside)
     edges = _Edges.of(cells)
-    row, slivers = _without_slivers(edges, cells, row)
-    level = np.isin(values_at(plan.layers.body, row, ""), ("sea", "standing"))
-    cells, row = _dissolve(edges, row, box, lines=_spacing(plan, i, j), level=level)
+    row, slivers = _without_slivers(edges, cells, row=row)
+    level = np.isin(values_at(plan.layers.body, row, base=""), ("sea", "standing"))
+    cells, row = _dissolve(edges, row, box=box, lines=_spacing(plan, i, j=j), level=level)
     cells = shapely.coverage_simplify(cells, BEND, simplify_boundary=False)
-    klass = values_at(plan.layers.klass, row, plan.base[0])
-    material = values_at(plan.layers.material, row, plan.base[1])
-    feature = values_at(plan.layers.feature, row, -1)
+    klass = values_at(plan.layers.klass, row, base=plan.base[0])
+    material = values_at(plan.layers.material, row, base=plan.base[1])
+    feature = values_at(plan.layers.feature, row, base=-1)
     tile = np.broadcast_to(np.array([i, j], np.int32), (len(cells), 2)).copy()
     return Partition(cells, row.astype(np.int32), klass, material, feature, tile, slivers)
 
@@ -199,39 +202,39 @@ def partition(
     """The cells of the whole extent, or of the chosen tiles, in one table; options as in `plan_ground`."""
     plan = plan_ground(extent, layers, tile_size=tile_size, lines=lines, base=base)
     chosen = [(int(i), int(j)) for i, j in plan.tiles] if tiles is None else list(tiles)
-    parts = [partition_tile(plan, i, j) for i, j in chosen]
+    parts = [partition_tile(plan, i, j=j) for i, j in chosen]
     names = [f.name for f in fields(Partition) if f.name != "slivers"]
     columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return Partition(**columns, slivers=sum(part.slivers for part in parts))
 
 
-def tile_box(plan: GroundPlan, i: int, j: int) -> tuple[float, float, float, float]:
+def tile_box(plan: GroundPlan, i: int, *, j: int) -> tuple[float, float, float, float]:
     """(xmin, ymin, xmax, ymax) of a tile's part of the extent, scene metres."""
     size, (xmin, ymin, xmax, ymax) = plan.tile_size, plan.extent
     return max(i * size, xmin), max(j * size, ymin), min((i + 1) * size, xmax), min((j + 1) * size, ymax)
 
 
-def tile_place(plan: GroundPlan, i: int, j: int) -> int | None:
+def tile_place(plan: GroundPlan, i: int, *, j: int) -> int | None:
     """The row of tile (i, j) in the plan's tiles, None where it is not among them."""
     (west, south), (east, north) = plan.tiles[0].tolist(), plan.tiles[-1].tolist()
     return (j - south) * (east - west + 1) + i - west if west <= i <= east and south <= j <= north else None
 
 
-def rows_near(plan: GroundPlan, xmin: float, ymin: float, xmax: float, ymax: float) -> NDArray[np.int64]:
+def rows_near(plan: GroundPlan, xmin: float, *, ymin: float, xmax: float, ymax: float) -> NDArray[np.int64]:
     """The rows of the layers whose boxes meet a box, in no particular order."""
     return np.asarray(plan.tree.query(shapely.box(xmin, ymin, xmax, ymax)), np.int64)
 
 
-def winners(plan: GroundPlan, x: Float, y: Float) -> NDArray[np.int64]:
-    """The row of the layers (n,) that holds each point (n,), -1 where none does."""
-    best = np.full(len(x), -1, np.int64)
-    point, row = plan.tree.query(shapely.points(x, y))
+def winners(plan: GroundPlan, xy: Float) -> NDArray[np.int64]:
+    """The row of the layers (n,) that holds each point (n, 2), -1 where none does."""
+    best = np.full(len(xy), -1, np.int64)
+    point, row = plan.tree.query(shapely.points(xy))
     polygons = plan.layers.polygon
     # Only what this call prepared is let go of, for what a preparation holds is larger than its polygon.
     fresh = np.unique(row)
     fresh = fresh[~shapely.is_prepared(polygons[fresh])]
     shapely.prepare(polygons[fresh])
-    hit = shapely.contains_xy(polygons[row], x[point], y[point])
+    hit = shapely.contains_xy(polygons[row], xy[point, 0], xy[point, 1])
     shapely.destroy_prepared(polygons[fresh])
     point, row = point[hit], row[hit]
     # The last of each point has the highest priority and, among equals, is the earliest row.
@@ -242,7 +245,7 @@ def winners(plan: GroundPlan, x: Float, y: Float) -> NDArray[np.int64]:
     return best
 
 
-def values_at(column: NDArray[Any], row: NDArray[np.integer[Any]], base: object) -> NDArray[Any]:
+def values_at(column: NDArray[Any], row: NDArray[np.integer[Any]], *, base: object) -> NDArray[Any]:
     """A column's values (n,) at rows (n,), and ``base`` where the row is -1."""
     values = np.full(len(row), base, column.dtype)
     there = row >= 0
@@ -297,7 +300,7 @@ def _by_tile(start: Float, end: Float, *, low: Int, count: Int, tile_size: float
     return segment[order], offset
 
 
-def _strings(start: Float, end: Float, string: Int) -> NDArray[np.object_]:
+def _strings(start: Float, end: Float, *, string: Int) -> NDArray[np.object_]:
     """Line strings of segments, joined where one outline runs on."""
     if len(start) == 0:
         return np.empty(0, object)
@@ -311,7 +314,7 @@ def _strings(start: Float, end: Float, string: Int) -> NDArray[np.object_]:
     return lines
 
 
-def _spacing(plan: GroundPlan, i: int, j: int) -> float:
+def _spacing(plan: GroundPlan, i: int, *, j: int) -> float:
     """Spacing of the terrain's lines in tile (i, j), 0 where it has none."""
     return plan.lines if plan.ruled is None or (i, j) in plan.ruled else plan.coarse
 
@@ -322,15 +325,15 @@ def _multiples(low: float, high: float, *spacings: float) -> Float:
     return np.unique(np.concatenate([np.empty(0), *steps]))
 
 
-def _ruling(plan: GroundPlan, i: int, j: int, box: tuple[float, float, float, float]) -> list[object]:
+def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float, float]) -> list[object]:
     """The tile's sides, and the terrain's lines across it.
 
     A side has a vertex at every line of the tiles on both its hands, so that the two agree.
     """
     xmin, ymin, xmax, ymax = box
-    own = _spacing(plan, i, j)
-    bottom, top = (_multiples(xmin, xmax, own, _spacing(plan, i, j + k)) for k in (-1, 1))
-    left, right = (_multiples(ymin, ymax, own, _spacing(plan, i + k, j)) for k in (-1, 1))
+    own = _spacing(plan, i, j=j)
+    bottom, top = (_multiples(xmin, xmax, own, _spacing(plan, i, j=j + k)) for k in (-1, 1))
+    left, right = (_multiples(ymin, ymax, own, _spacing(plan, i + k, j=j)) for k in (-1, 1))
     ring = [
         (xmin, ymin), *((x, ymin) for x in bottom),
         (xmax, ymin), *((xmax, y) for y in right),
@@ -386,7 +389,7 @@ class _Edges:
 
 
 def _without_slivers(
-    edges: _Edges, cells: NDArray[np.object_], row: NDArray[np.int64]
+    edges: _Edges, cells: NDArray[np.object_], *, row: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
     """Rows in which a sliver has the row of the wider cell it shares most border with; how many changed."""
     # The area is at most the radius of the greatest circle within times the outline (Bonnesen), so all
@@ -420,8 +423,8 @@ def _without_slivers(
 def _dissolve(
     edges: _Edges,
     row: NDArray[np.int64],
-    box: tuple[float, float, float, float],
     *,
+    box: tuple[float, float, float, float],
     lines: float,
     level: NDArray[np.bool_],
 ) -> tuple[NDArray[np.object_], NDArray[np.int64]]:

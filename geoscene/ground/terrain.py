@@ -98,7 +98,8 @@ class Terrain:
         open_ = np.full(x.shape, bool(self.grids))
         for k, transformer in enumerate(self._transformers):
             grid, last = self.grids[k], k == len(self.grids) - 1
-            value, covered = _bilinear(grid, *_posts(grid, transformer, self.frame, x[open_], y[open_]))
+            column, row = _posts(grid, transformer, frame=self.frame, x=x[open_], y=y[open_])
+            value, covered = _bilinear(grid, column, row=row)
             take = np.zeros(x.shape, bool)
             take[open_] = True if last else covered
             z[take] = value[take[open_]]
@@ -155,7 +156,7 @@ def open_terrain(
     covered = shapely.intersection(shapely.union_all([_outline(r, frame) for r in rasters]), box).area
     uncovered = max(1.0 - covered / box.area, 0.0)
     if uncovered > 1e-9 and (outside == "error" or covered == 0.0):
-        raise InputError(_not_covered(rasters, frame, bounds, uncovered))
+        raise InputError(_not_covered(rasters, frame, bounds=bounds, share=uncovered))
     groups: list[list[_Raster]] = []
     for raster in rasters:
         for group in groups:
@@ -164,7 +165,7 @@ def open_terrain(
                 break
         else:
             groups.append([raster])
-    read = [found for group in groups if (found := _read(group, frame, bounds)) is not None]
+    read = [found for group in groups if (found := _read(group, frame, bounds=bounds)) is not None]
     read.sort(key=lambda found: found[1])
     if not read:
         names = ", ".join(r.path.name for r in rasters)
@@ -291,12 +292,12 @@ def _outline(raster: _Raster, frame: Frame) -> Any:
     rows, columns = raster.shape
     edge = shapely.segmentize(shapely.box(-0.5, -0.5, columns - 0.5, rows - 0.5), max(rows, columns) / 32)
     xy = raster.origin + shapely.get_coordinates(edge) @ raster.step.T
-    outline = shapely.Polygon(np.column_stack(frame.from_crs(raster.crs, *xy.T)))
+    outline = shapely.Polygon(np.column_stack(frame.from_crs(xy[:, 0], xy[:, 1], crs=raster.crs)))
     # Neighbouring tiles' edges agree to the rounding of their headers and of the projection between vertices.
     return shapely.make_valid(outline).buffer(0.01, join_style="mitre")
 
 
-def _not_covered(rasters: Sequence[_Raster], frame: Frame, bounds: Sequence[float], share: float) -> str:
+def _not_covered(rasters: Sequence[_Raster], frame: Frame, *, bounds: Sequence[float], share: float) -> str:
     xmin, ymin, xmax, ymax = bounds
     lon, lat = frame.to_geographic([xmin, xmax, xmax, xmin], [ymin, ymin, ymax, ymax])
     return (
@@ -324,7 +325,7 @@ def _shares_lattice(one: _Raster, other: _Raster) -> bool:
 
 
 def _read(
-    group: Sequence[_Raster], frame: Frame, bounds: Sequence[float]
+    group: Sequence[_Raster], frame: Frame, *, bounds: Sequence[float]
 ) -> tuple[Grid, float, int, int] | None:
     """(grid, spacing in metres, posts, voids) of rasters on one lattice; None without a height in bounds."""
     import rasterio  # noqa: PLC0415 - slow to import
@@ -333,7 +334,7 @@ def _read(
     first = group[0]
     side = max(float(np.diff(bounds[::2])[0]), 1.0)
     edge = shapely.get_coordinates(shapely.segmentize(shapely.box(*bounds), side / 32))
-    place = np.column_stack(frame.to_crs(first.crs, *edge.T))
+    place = np.column_stack(frame.to_crs(edge[:, 0], edge[:, 1], crs=first.crs))
     post = np.linalg.solve(first.step, (place - first.origin).T)
     low = np.floor(post.min(axis=1)).astype(int) - _MARGIN
     high = np.ceil(post.max(axis=1)).astype(int) + _MARGIN + 1
@@ -365,9 +366,9 @@ def _read(
     origin = first.origin + first.step @ low
     grid = Grid(first.crs.to_wkt(), origin, first.step, _filled(values, known), known)
     middle = np.array([(bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2])
-    east, north = frame.to_crs(first.crs, *middle)
+    east, north = frame.to_crs(middle[0], middle[1], crs=first.crs)
     steps = np.column_stack([[0.0, 0.0], first.step]) + np.array([[east], [north]])
-    sx, sy = frame.from_crs(first.crs, *steps)
+    sx, sy = frame.from_crs(steps[0], steps[1], crs=first.crs)
     return grid, float(np.hypot(np.diff(sx[[0, 1]]), np.diff(sy[[0, 1]]))[0]), posts, voids
 
 
@@ -392,14 +393,14 @@ def _filled(values: Float, known: NDArray[np.bool_]) -> Float:
     return filled
 
 
-def _posts(grid: Grid, transformer: Transformer, frame: Frame, x: Float, y: Float) -> tuple[Float, Float]:
+def _posts(grid: Grid, transformer: Transformer, *, frame: Frame, x: Float, y: Float) -> tuple[Float, Float]:
     """Column and row (n,), fractional, of scene coordinates (n,)."""
     place = np.stack(transformer.transform(*frame.to_projected(x, y)))
     column, row = np.linalg.solve(grid.step, place - grid.origin[:, None])
     return column, row
 
 
-def _bilinear(grid: Grid, column: Float, row: Float) -> tuple[Float, NDArray[np.bool_]]:
+def _bilinear(grid: Grid, column: Float, *, row: Float) -> tuple[Float, NDArray[np.bool_]]:
     """Heights (n,) at fractional posts (n,), and whether a raster covers the place (its pixels do)."""
     rows, columns = grid.values.shape
     column, row = np.clip(column, 0.0, columns - 1.0), np.clip(row, 0.0, rows - 1.0)

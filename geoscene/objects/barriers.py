@@ -106,7 +106,7 @@ class Barriers:
         return Barriers(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
-def read_barriers(osm: OsmData, frame: Frame, plan: GroundPlan) -> tuple[Barriers, list[Problem]]:
+def read_barriers(osm: OsmData, frame: Frame, *, plan: GroundPlan) -> tuple[Barriers, list[Problem]]:
     """The barriers on the map within the ground's extent, and what was changed or left out.
 
     A line is as wide as its ``width`` or its kind's; it is open at gates on its nodes, where the ground has a
@@ -124,8 +124,12 @@ def read_barriers(osm: OsmData, frame: Frame, plan: GroundPlan) -> tuple[Barrier
         line = shapely.LineString(xy)
         if not line.intersects(box):
             continue
-        width, width_source = _size(way.tags, way.osm_id, "width", kind.width, _WIDEST, problems)
-        height, height_source = _size(way.tags, way.osm_id, "height", kind.height, _HIGHEST, problems)
+        width, width_source = _size(
+            way.tags, way.osm_id, key="width", usual=kind.width, most=_WIDEST, problems=problems
+        )
+        height, height_source = _size(
+            way.tags, way.osm_id, key="height", usual=kind.height, most=_HIGHEST, problems=problems
+        )
         open_at = [
             shapely.Point(p).buffer(gates[int(node)] / 2)
             for node, p in zip(way.nodes, xy, strict=True)
@@ -141,7 +145,9 @@ def read_barriers(osm: OsmData, frame: Frame, plan: GroundPlan) -> tuple[Barrier
             continue
         shape = shapely.transform(area.geometry, lambda c: np.column_stack(frame.from_geographic(*c.T)))
         if shape.intersects(box):
-            height, height_source = _size(area.tags, area.osm_id, "height", kind.height, _HIGHEST, problems)
+            height, height_source = _size(
+                area.tags, area.osm_id, key="height", usual=kind.height, most=_HIGHEST, problems=problems
+            )
             rows.append((shape, kind, _material(area.tags, kind), height, height_source, "area", area.osm_id))
     table = _table(rows)
     polygon, opened = _kept_open(table.polygon, plan)
@@ -159,10 +165,10 @@ def barrier_meshes(barriers: Barriers, *, height: Height | None = None) -> list[
     The bottom lies 0.3 m under the ground, the top the barrier's height above it, both following the
     terrain at places at most 5 m apart.
     """
-    return [_solid(barriers, row, height) for row in range(len(barriers))]
+    return [_solid(barriers, row, height=height) for row in range(len(barriers))]
 
 
-def _solid(barriers: Barriers, row: int, height: Height | None) -> Mesh:
+def _solid(barriers: Barriers, row: int, *, height: Height | None) -> Mesh:
     """The closed solids of one barrier."""
     material = next(m for m in materials().values() if m.code == barriers.material[row])
     parts = []
@@ -231,7 +237,7 @@ def _material(tags: Tags, kind: Kind) -> str:
 
 
 def _size(
-    tags: Tags, osm_id: str, key: str, usual: float, most: float, problems: list[Problem]
+    tags: Tags, osm_id: str, *, key: str, usual: float, most: float, problems: list[Problem]
 ) -> tuple[float, str]:
     """(metres, source) of a height or width."""
     if key not in tags:

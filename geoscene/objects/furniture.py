@@ -97,7 +97,7 @@ class Furniture:
 
 
 def read_furniture(
-    osm: OsmData, frame: Frame, plan: GroundPlan, *, left_hand: bool = False
+    osm: OsmData, frame: Frame, *, plan: GroundPlan, left_hand: bool = False
 ) -> tuple[Furniture, list[Problem]]:
     """The street furniture on the map within the ground's extent, and what could not be used.
 
@@ -123,15 +123,15 @@ def read_furniture(
     rows: list[_Row] = []
     for k in np.flatnonzero(inside):
         point, shape = chosen[k]
-        height, height_source = _height(point, shape, problems)
+        height, height_source = _height(point, shape, problems=problems)
         rows += [
             (*stand, shape, height, height_source, point.osm_id)
-            for stand in _stands(point, shape, xy[k], roads, frame, left_hand=left_hand)
+            for stand in _stands(point, shape, xy=xy[k], roads=roads, frame=frame, left_hand=left_hand)
         ]
     table = _table(rows)
     table, adrift = _put_beside(table, plan, left_hand=left_hand)
     problems += [Problem(str(osm_id), "furniture", "dropped", "no-roadside") for osm_id in np.unique(adrift)]
-    built = np.append(plan.layers.klass == Class.BUILDING_PAD, np.False_)[winners(plan, *table.xy.T)]
+    built = np.append(plan.layers.klass == Class.BUILDING_PAD, np.False_)[winners(plan, table.xy)]
     problems += [
         Problem(str(osm_id), "furniture", "dropped", "in-building")
         for osm_id in np.unique(table.osm_id[built])
@@ -193,7 +193,7 @@ def _usual_height(shape: str) -> float:
     return float(shapes()[shape].vertices[:, 2].max())
 
 
-def _height(point: Point, shape: str, problems: list[Problem]) -> tuple[float, str]:
+def _height(point: Point, shape: str, *, problems: list[Problem]) -> tuple[float, str]:
     """(metres, source) of a thing's height."""
     usual = _usual_height(shape)
     if "height" not in point.tags:
@@ -248,7 +248,7 @@ class _Roads:
 
 
 def _stands(
-    point: Point, shape: str, xy: Float, roads: _Roads, frame: Frame, *, left_hand: bool
+    point: Point, shape: str, *, xy: Float, roads: _Roads, frame: Frame, left_hand: bool
 ) -> list[_Stand]:
     """Where a thing stands and faces, once or twice; ``roadside`` ones are still on the centre line."""
     stated = parse_direction(point.tags.get("direction") or point.tags.get("light:direction"))
@@ -258,7 +258,7 @@ def _stands(
         heading = np.pi / 2 - (np.radians(stated) - float(frame.convergence(lon, lat)))
     on = roads.by_node.get(int(point.osm_id.removeprefix("node/")), [])
     if on and (shape == "traffic_signals" or shape.startswith("sign_")):
-        return _heeded(point, xy, roads, on)
+        return _heeded(point, xy, roads=roads, on=on)
     if heading is not None:
         return [(xy, heading, "node", "direction")]
     near = roads.tree.query_nearest(shapely.Point(xy), max_distance=_FARTHEST, all_matches=False)
@@ -282,7 +282,7 @@ def _stands(
     return [(xy, float(np.arctan2(toward[1], toward[0])), "node", "road")]
 
 
-def _heeded(point: Point, xy: Float, roads: _Roads, on: list[tuple[int, int]]) -> list[_Stand]:
+def _heeded(point: Point, xy: Float, *, roads: _Roads, on: list[tuple[int, int]]) -> list[_Stand]:
     """A thing on a road's centre line, once for each direction of traffic that heeds it, facing that."""
     # A node inside a way knows its course; one where ways meet takes that of the first that passes through.
     row, index = max(on, key=lambda at: 0 < at[1] < shapely.get_num_points(roads.lines[at[0]]) - 1)
@@ -308,9 +308,7 @@ def _put_beside(table: Furniture, plan: GroundPlan, *, left_hand: bool) -> tuple
     courses = np.stack([aside, (aside - ahead) / np.sqrt(2.0)], axis=1)
     reach = np.arange(0.0, _FARTHEST, 0.25)
     places = table.xy[moved][:, None, None] + reach[:, None] * courses[:, :, None]
-    klass = np.append(plan.layers.klass, np.uint8(plan.base[0]))[
-        winners(plan, places[..., 0].ravel(), places[..., 1].ravel())
-    ]
+    klass = np.append(plan.layers.klass, np.uint8(plan.base[0]))[winners(plan, places.reshape(-1, 2))]
     road = np.isin(klass, _ON_ROAD).reshape(places.shape[:3])
     ends = np.any(~road[:, :, reach <= _WIDEST], axis=2)
     no_surface = ~road[:, 0, 0]

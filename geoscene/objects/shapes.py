@@ -37,7 +37,7 @@ _CONE = ((0, 0), (1, 0.05), (0, 1))
 
 
 def prism(
-    outline: Float, bottom: float, top: float, *, taper: float = 1.0
+    outline: Float, bottom: float, *, top: float, taper: float = 1.0
 ) -> tuple[Float, NDArray[np.int32]]:
     """Vertices and faces of the closed solid over a convex outline (n, 2), counter-clockwise, metres.
 
@@ -92,8 +92,9 @@ def rectangle(width: float, depth: float, *, x: float = 0.0, y: float = 0.0) -> 
     return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width / 2, depth / 2) + (x, y)
 
 
-def solid(points: Float, faces: NDArray[np.integer], klass: Class, material: str) -> Mesh:
-    """A closed mesh of one class and material, in the material's colour."""
+def solid(body: tuple[Float, NDArray[np.int32]], *, klass: Class, material: str) -> Mesh:
+    """A closed mesh of (vertices, faces) of one class and material, in the material's colour."""
+    points, faces = body
     of = materials()[material]
     return Mesh.of(points, faces, klass=klass, material=of.code, color=of.color, closed=True)
 
@@ -107,10 +108,10 @@ def shapes() -> dict[str, Mesh]:
     solids.
     """
     return {
-        "trunk": solid(*prism(circle(1.0, 6), 0.0, 1.0, taper=0.7), Class.TRUNK, "bark"),
-        "crown_broadleaved": solid(*lathe(_BALL), Class.TREE_CROWN, "foliage"),
-        "crown_needleleaved": solid(*lathe(_CONE), Class.TREE_CROWN, "conifer"),
-        "crown_palm": solid(*lathe(_BALL), Class.TREE_CROWN, "foliage"),
+        "trunk": solid(prism(circle(1.0, 6), 0.0, top=1.0, taper=0.7), klass=Class.TRUNK, material="bark"),
+        "crown_broadleaved": solid(lathe(_BALL), klass=Class.TREE_CROWN, material="foliage"),
+        "crown_needleleaved": solid(lathe(_CONE), klass=Class.TREE_CROWN, material="conifer"),
+        "crown_palm": solid(lathe(_BALL), klass=Class.TREE_CROWN, material="foliage"),
         "street_lamp": _street_lamp(),
         "traffic_signals": _traffic_signals(),
         "sign_round": _sign(circle(0.6, 12), 2.5),
@@ -118,11 +119,13 @@ def shapes() -> dict[str, Mesh]:
         "sign_give_way": _sign(circle(0.9, 3) @ -_QUARTER, 2.5),
         "sign_stop": _sign(circle(0.75, 8) @ _eighth(), 2.5),
         "sign_rectangle": _sign(rectangle(0.6, 0.6), 2.5),
-        "bollard": solid(*prism(circle(0.12), -0.2, 0.9), Class.BOLLARD, "metal"),
+        "bollard": solid(prism(circle(0.12), -0.2, top=0.9), klass=Class.BOLLARD, material="metal"),
         "bench": _bench(),
-        "utility_pole": solid(*prism(circle(0.28), -0.3, 9.0, taper=0.7), Class.POLE, "wood"),
-        "flagpole": solid(*prism(circle(0.12), -0.2, 8.0, taper=0.6), Class.POLE, "metal"),
-        "hydrant": solid(*prism(circle(0.25), -0.2, 0.8), Class.BOLLARD, "metal"),
+        "utility_pole": solid(
+            prism(circle(0.28), -0.3, top=9.0, taper=0.7), klass=Class.POLE, material="wood"
+        ),
+        "flagpole": solid(prism(circle(0.12), -0.2, top=8.0, taper=0.6), klass=Class.POLE, material="metal"),
+        "hydrant": solid(prism(circle(0.25), -0.2, top=0.8), klass=Class.BOLLARD, material="metal"),
     }
 
 
@@ -143,27 +146,31 @@ def _eighth() -> Float:
 
 def _street_lamp() -> Mesh:
     """A mast of 8 m, an arm of 1.5 m the way it faces, a head at its end."""
-    pole = solid(*prism(circle(0.16), -0.3, 8.0, taper=0.6), Class.POLE, "metal")
-    arm = solid(*prism(rectangle(1.5, 0.06, x=0.75), 7.9, 7.98), Class.POLE, "metal")
-    head = solid(*prism(rectangle(0.7, 0.25, x=1.6), 7.82, 7.95), Class.POLE, "metal")
+    pole = solid(prism(circle(0.16), -0.3, top=8.0, taper=0.6), klass=Class.POLE, material="metal")
+    arm = solid(prism(rectangle(1.5, 0.06, x=0.75), 7.9, top=7.98), klass=Class.POLE, material="metal")
+    head = solid(prism(rectangle(0.7, 0.25, x=1.6), 7.82, top=7.95), klass=Class.POLE, material="metal")
     return concatenate([pole, arm, head])
 
 
 def _traffic_signals() -> Mesh:
     """A mast of 3.4 m and a head of three lamps that faces x."""
-    pole = solid(*prism(circle(0.11), -0.3, 3.4), Class.POLE, "metal")
-    head = solid(*prism(rectangle(0.2, 0.3, x=0.16), 2.4, 3.35), Class.TRAFFIC_LIGHT, "metal")
-    visor = solid(*prism(rectangle(0.12, 0.26, x=0.32), 2.45, 3.3), Class.TRAFFIC_LIGHT, "glass")
+    pole = solid(prism(circle(0.11), -0.3, top=3.4), klass=Class.POLE, material="metal")
+    head = solid(
+        prism(rectangle(0.2, 0.3, x=0.16), 2.4, top=3.35), klass=Class.TRAFFIC_LIGHT, material="metal"
+    )
+    visor = solid(
+        prism(rectangle(0.12, 0.26, x=0.32), 2.45, top=3.3), klass=Class.TRAFFIC_LIGHT, material="glass"
+    )
     return concatenate([pole, head, visor])
 
 
 def _sign(outline: Float, height: float) -> Mesh:
     """A plate of 4 mm whose centre is at a height, on a pole; the side towards x sends light back."""
-    pole = solid(*prism(circle(0.06), -0.3, height + 0.4), Class.POLE, "metal")
-    points, faces = prism(outline, 0.0, 0.004)
+    pole = solid(prism(circle(0.06), -0.3, top=height + 0.4), klass=Class.POLE, material="metal")
+    points, faces = prism(outline, 0.0, top=0.004)
     # The plate stands up: its plane's x becomes y, its y becomes z, what was above it is in front.
     points = np.column_stack([points[:, 2] + 0.035, points[:, 0], points[:, 1] + height])
-    plate = solid(points, faces, Class.TRAFFIC_SIGN, "metal")
+    plate = solid((points, faces), klass=Class.TRAFFIC_SIGN, material="metal")
     front = plate.normals()[:, 0] > 0.5
     sheet = materials()["retroreflector"]
     return concatenate(
@@ -188,7 +195,9 @@ def _bench() -> Mesh:
         (rectangle(0.04, 0.06, x=-0.31, y=-0.7), -0.1, 0.8, "metal"),
         (rectangle(0.04, 0.06, x=-0.31, y=0.7), -0.1, 0.8, "metal"),
     ]
-    return concatenate([solid(*prism(o, low, high), Class.BENCH, m) for o, low, high, m in boxes])
+    return concatenate(
+        [solid(prism(o, low, top=high), klass=Class.BENCH, material=m) for o, low, high, m in boxes]
+    )
 
 
 def place(

@@ -111,7 +111,7 @@ def read_trees(osm: OsmData, frame: Frame, *, spacing: float = 8.0) -> tuple[Tre
             places.append(row)
             tags += [way.tags] * len(row)
             ids += [way.osm_id] * len(row)
-    rows = [_sizes(tag, osm_id, problems) for tag, osm_id in zip(tags, ids, strict=True)]
+    rows = [_sizes(tag, osm_id, problems=problems) for tag, osm_id in zip(tags, ids, strict=True)]
     columns: list[Any] = list(zip(*rows, strict=True)) if rows else [[]] * 6
     height, crown, trunk = (np.array(columns[k], float) for k in range(3))
     height_source, form, form_source = (np.array(columns[k], np.str_) for k in range(3, 6))
@@ -141,7 +141,7 @@ def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
     x, y = trees.xy.T
     inside = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
     trees = trees.take(inside)
-    klass = values_at(plan.layers.klass, winners(plan, *trees.xy.T), plan.base[0])
+    klass = values_at(plan.layers.klass, winners(plan, trees.xy), base=plan.base[0])
     single = np.char.startswith(trees.osm_id, "node/")
     built = klass == Class.BUILDING_PAD
     blocked = built | (~single & np.isin(klass, [Class.ROAD, Class.LANE_MARKING, Class.RAIL, Class.WATER]))
@@ -166,8 +166,8 @@ def needle_shares(plan: GroundPlan, osm: OsmData) -> Float:
 def forest_trees(
     plan: GroundPlan,
     i: int,
-    j: int,
     *,
+    j: int,
     density: float = 0.02,
     seed: int = 0,
     needles: Float | None = None,
@@ -181,8 +181,10 @@ def forest_trees(
     needles : (rows of the plan's layers,) share of needle-leaved trees, from `needle_shares`; none by default
     """
     side = 1.0 / np.sqrt(density)
-    xmin, ymin, xmax, ymax = tile_box(plan, i, j)
-    if not (plan.layers.klass[rows_near(plan, xmin, ymin, xmax, ymax)] == Class.FOREST_FLOOR).any():
+    xmin, ymin, xmax, ymax = tile_box(plan, i, j=j)
+    if not (
+        plan.layers.klass[rows_near(plan, xmin, ymin=ymin, xmax=xmax, ymax=ymax)] == Class.FOREST_FLOOR
+    ).any():
         return _none()
     column, row = (
         grid.ravel()
@@ -191,16 +193,18 @@ def forest_trees(
             np.arange(np.floor(ymin / side), np.ceil(ymax / side)).astype(np.int64),
         )
     )
-    draw = _uniform(seed, column, row, 4)
+    draw = _uniform(seed, column, row=row, count=4)
     x, y = (column + 0.1 + 0.8 * draw[0]) * side, (row + 0.1 + 0.8 * draw[1]) * side
-    owner = winners(plan, x, y)
+    owner = winners(plan, np.column_stack([x, y]))
     stands = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
-    stands &= values_at(plan.layers.klass, owner, Class.UNLABELED) == Class.FOREST_FLOOR
+    stands &= values_at(plan.layers.klass, owner, base=Class.UNLABELED) == Class.FOREST_FLOOR
     x, y, draw, owner = x[stands], y[stands], draw[:, stands], owner[stands]
     # A trunk needs room: there must be forest half a metre away on all sides.
     dx, dy = np.array([(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)]).T[:, :, None]
     beside = values_at(
-        plan.layers.klass, winners(plan, (x + dx).ravel(), (y + dy).ravel()), Class.UNLABELED
+        plan.layers.klass,
+        winners(plan, np.column_stack([(x + dx).ravel(), (y + dy).ravel()])),
+        base=Class.UNLABELED,
     ).reshape(4, -1)
     roomy = (beside == Class.FOREST_FLOOR).all(axis=0)
     x, y, draw, owner = x[roomy], y[roomy], draw[:, roomy], owner[roomy]
@@ -248,7 +252,7 @@ def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
         feature=trees.feature,
     )
     column, row = np.floor(trees.xy.T * 100).astype(np.int64)
-    heading = 2 * np.pi * _uniform(0, column, row, 1)[0]
+    heading = 2 * np.pi * _uniform(0, column, row=row, count=1)[0]
     crowns = place(
         np.char.add("crown_", trees.form),
         np.column_stack([trees.xy, z + base]),
@@ -259,7 +263,7 @@ def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
     return concatenate_instances([trunks, crowns])
 
 
-def _uniform(seed: int, column: NDArray[np.int64], row: NDArray[np.int64], count: int) -> Float:
+def _uniform(seed: int, column: NDArray[np.int64], *, row: NDArray[np.int64], count: int) -> Float:
     """Numbers (count, n) in [0, 1) that depend on (seed, column, row) and nothing else.
 
     SplitMix64's finaliser (Steele, Lea and Flood 2014) over the three, which is what makes one draw for each
@@ -300,12 +304,12 @@ def _form(tags: Tags) -> tuple[str, str]:
     return "broadleaved", "genus" if genus else "default"
 
 
-def _sizes(tags: Tags, osm_id: str, problems: list[Problem]) -> tuple[float, float, float, str, str, str]:
+def _sizes(tags: Tags, osm_id: str, *, problems: list[Problem]) -> tuple[float, float, float, str, str, str]:
     """(height, crown or NaN, trunk or NaN, height source, form, form source) of one tree's tags."""
     form, form_source = _form(tags)
-    crown = _metres(tags, "diameter_crown", _WIDEST, osm_id, problems)
-    girth = _girth(tags, osm_id, problems)
-    height = _metres(tags, "height", _TALLEST, osm_id, problems)
+    crown = _metres(tags, "diameter_crown", most=_WIDEST, osm_id=osm_id, problems=problems)
+    girth = _girth(tags, osm_id, problems=problems)
+    height = _metres(tags, "height", most=_TALLEST, osm_id=osm_id, problems=problems)
     source = "height"
     if not np.isfinite(height):
         if np.isfinite(crown):
@@ -318,7 +322,7 @@ def _sizes(tags: Tags, osm_id: str, problems: list[Problem]) -> tuple[float, flo
     return height, crown, girth / np.pi, source, form, form_source
 
 
-def _metres(tags: Tags, key: str, most: float, osm_id: str, problems: list[Problem]) -> float:
+def _metres(tags: Tags, key: str, *, most: float, osm_id: str, problems: list[Problem]) -> float:
     """A length in metres, NaN where there is none that a tree can have."""
     if key not in tags:
         return np.nan
@@ -329,11 +333,11 @@ def _metres(tags: Tags, key: str, most: float, osm_id: str, problems: list[Probl
     return np.nan
 
 
-def _girth(tags: Tags, osm_id: str, problems: list[Problem]) -> float:
+def _girth(tags: Tags, osm_id: str, *, problems: list[Problem]) -> float:
     """A trunk's circumference in metres; a bare number beyond any trunk's metres is centimetres."""
     number = parse_number(tags.get("circumference"))
     if number is None or not _THICKEST < number <= 100 * _THICKEST:
-        return _metres(tags, "circumference", _THICKEST, osm_id, problems)
+        return _metres(tags, "circumference", most=_THICKEST, osm_id=osm_id, problems=problems)
     detail = f"circumference={tags['circumference']!r} read as centimetres"
     problems.append(Problem(osm_id, "tree", "repaired", "circumference-in-centimetres", detail))
     return number / 100.0

@@ -53,13 +53,13 @@ def build_road_graph(
         kinds = {street: number for number, street in enumerate(dict.fromkeys(streets))}
         kind = np.array([kinds[street] for street in streets], np.int64)
         symmetric = np.array([street.symmetric for street in streets], np.bool_)
-        cut = find_cuts(runs, kind, symmetric, len(node_id))
+        cut = find_cuts(runs, kind, symmetric=symmetric, nodes=len(node_id))
     else:
         cut = np.ones(len(node_id), np.bool_)
     chains = link_chains(runs, cut)
-    graph, sides = _edges(chains, ways, streets, (node_id, lonlat), frame)
-    graph = add_turns(graph, osm.relations, problems)
-    return add_controls(graph, osm.points, sides, (chains, ways, node_id)), problems
+    graph, sides = _edges(chains, ways, streets=streets, places=(node_id, lonlat), frame=frame)
+    graph = add_turns(graph, osm.relations, problems=problems)
+    return add_controls(graph, osm.points, sides=sides, lines=(chains, ways, node_id)), problems
 
 
 def _read_streets(ways: Sequence[Way], problems: list[Problem]) -> list[Street]:
@@ -110,6 +110,7 @@ def read_runs(ways: Sequence[Way], problems: list[Problem]) -> tuple[Runs, NDArr
 def _edges(
     chains: Sequence[Chain],
     ways: Sequence[Way],
+    *,
     streets: Sequence[Street],
     places: tuple[NDArray[np.int64], Float],
     frame: Frame,

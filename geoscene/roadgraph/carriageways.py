@@ -86,7 +86,10 @@ class Carriageways:
     @property
     def place(self) -> NDArray[np.int8]:
         """0 on the ground, 1 on a bridge (or an upper storey), 2 in a tunnel."""
-        return np.array([place_of(s.layer, s.layer_source, s.bridge, s.tunnel) for s in self.street], np.int8)
+        return np.array(
+            [place_of(s.layer, s.layer_source, bridge=s.bridge, tunnel=s.tunnel) for s in self.street],
+            np.int8,
+        )
 
     @property
     def layer(self) -> NDArray[np.int8]:
@@ -94,7 +97,7 @@ class Carriageways:
         return np.array([s.layer for s in self.street], np.int8)
 
 
-def place_of(layer: int, layer_source: str, bridge: bool, tunnel: bool) -> int:  # noqa: FBT001
+def place_of(layer: int, layer_source: str, *, bridge: bool, tunnel: bool) -> int:
     """0 on the ground, 1 on a bridge or an upper storey, 2 in a tunnel or a basement.
 
     ``layer`` alone lifts nothing: a road of layer -1 that is no tunnel runs in a cutting, which is ground.
@@ -137,8 +140,8 @@ def read_carriageways(
     cut = find_cuts(
         runs,
         np.array([number[kind] for kind in kinds], np.int64),
-        np.array([kind.symmetric for kind in kinds], np.bool_),
-        len(node_id),
+        symmetric=np.array([kind.symmetric for kind in kinds], np.bool_),
+        nodes=len(node_id),
     )
     chains = link_chains(runs, cut)
     x, y = frame.from_geographic(lonlat[:, 0], lonlat[:, 1])
@@ -163,7 +166,7 @@ def read_carriageways(
         marked=np.array([kind.marked for kind in of], np.bool_),
         osm_id=np.array([ways[chain.way[0]].osm_id for chain in chains], np.str_),
     )
-    return _guess_sidewalks(table, osm, frame, urban=sidewalks == "urban", left_hand=left_hand)
+    return _guess_sidewalks(table, osm, frame=frame, urban=sidewalks == "urban", left_hand=left_hand)
 
 
 def _read_kind(way: Way) -> _Kind:
@@ -192,7 +195,7 @@ def _sidewalk(tags: Tags, side: str) -> tuple[float, str]:
 
 
 def _guess_sidewalks(
-    table: Carriageways, osm: OsmData, frame: Frame, *, urban: bool, left_hand: bool
+    table: Carriageways, osm: OsmData, *, frame: Frame, urban: bool, left_hand: bool
 ) -> Carriageways:
     """The table with its unknown sidewalks decided."""
     unknown = table.walk_source == "?"
@@ -202,7 +205,7 @@ def _guess_sidewalks(
     )
     rows = np.flatnonzero(walked & unknown.any(axis=1) & np.isin(table.material, list(PAVED)))
     if urban and len(rows):
-        beside = _footway_beside(table, rows, osm, frame)
+        beside = _footway_beside(table, rows, osm=osm, frame=frame)
         # Of a divided road each half has its sidewalk on the outer side.
         divided = np.array([s.direction != 0 and s.highway in _WALKED[:2] for s in table.street], np.bool_)
         against = np.array([s.direction == -1 for s in table.street], np.bool_)
@@ -215,7 +218,7 @@ def _guess_sidewalks(
 
 
 def _footway_beside(
-    table: Carriageways, rows: NDArray[np.int64], osm: OsmData, frame: Frame
+    table: Carriageways, rows: NDArray[np.int64], *, osm: OsmData, frame: Frame
 ) -> NDArray[np.bool_]:
     """Whether a mapped footway runs along the left and the right of each stretch (len(rows), 2)."""
     found = np.zeros((len(rows), 2), np.bool_)

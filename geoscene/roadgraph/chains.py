@@ -37,7 +37,7 @@ class Chain:
 
 
 def find_cuts(
-    runs: Runs, kind: NDArray[np.int64], symmetric: NDArray[np.bool_], nodes: int
+    runs: Runs, kind: NDArray[np.int64], *, symmetric: NDArray[np.bool_], nodes: int
 ) -> NDArray[np.bool_]:
     """Whether a line must end at each node (nodes,): junctions, dead ends, changes.
 

@@ -22,6 +22,7 @@ _REACH = 30.0
 def add_controls(
     graph: RoadGraph,
     points: Iterable[Point],
+    *,
     sides: tuple[NDArray[np.int64], NDArray[np.bool_]],
     lines: tuple[Sequence[Chain], Sequence[Way], NDArray[np.int64]],
 ) -> RoadGraph:
@@ -47,7 +48,7 @@ def add_controls(
 
     flags = {name: np.zeros(len(graph.node_id), np.bool_) for name in ("traffic_signals", "stop", "give_way")}
     rows = []
-    for edge, vertex, with_way, tags in _met(graph, points, sides, lines):
+    for edge, vertex, with_way, tags in _met(graph, points, sides=sides, lines=lines):
         plan = np.linalg.norm(np.diff(graph.geometry[edge][:, :2], axis=0), axis=1)
         length = float(graph.length[edge])
         offset = length * float(plan[:vertex].sum() / max(plan.sum(), 1e-9))
@@ -85,6 +86,7 @@ def add_controls(
 def _met(
     graph: RoadGraph,
     points: Iterable[Point],
+    *,
     sides: tuple[NDArray[np.int64], NDArray[np.bool_]],
     lines: tuple[Sequence[Chain], Sequence[Way], NDArray[np.int64]],
 ) -> Iterator[tuple[int, int, bool, Tags]]:

@@ -49,7 +49,7 @@ class _Crossings:
     osm_id: NDArray[np.str_]
 
 
-def crossing_rows(osm: OsmData, roads: Carriageways, frame: Frame) -> SurfaceRows:
+def crossing_rows(osm: OsmData, roads: Carriageways, *, frame: Frame) -> SurfaceRows:
     """Crossings on the ground: the strip of road that people use, and its zebra stripes or border lines.
 
     They come from ways that are crossings and, where no such way passes, from nodes that are. A crossing
@@ -58,8 +58,8 @@ def crossing_rows(osm: OsmData, roads: Carriageways, frame: Frame) -> SurfaceRow
     ground = roads.take(roads.place == 0)
     ways = [way for way in osm.ways if _is_crossing(way.tags)]
     found = [
-        _from_ways([w for w in ways if _paint(w.tags)[0] != "none"], ground, frame),
-        _from_nodes(osm, ways, ground, frame),
+        _from_ways([w for w in ways if _paint(w.tags)[0] != "none"], ground, frame=frame),
+        _from_nodes(osm, ways, roads=ground, frame=frame),
     ]
     line, width, paint, source, osm_id = (
         np.concatenate([getattr(part, name) for part in found])
@@ -118,7 +118,7 @@ def _paint(tags: Tags) -> tuple[str, str]:
     return "stripes", "default"
 
 
-def _from_ways(ways: list[Way], roads: Carriageways, frame: Frame) -> _Crossings:
+def _from_ways(ways: list[Way], roads: Carriageways, *, frame: Frame) -> _Crossings:
     """Crossing ways, cut to the carriageways that they cross."""
     lines = way_lines(ways, frame)
     number = np.flatnonzero([line is not None for line in lines])
@@ -132,7 +132,7 @@ def _from_ways(ways: list[Way], roads: Carriageways, frame: Frame) -> _Crossings
     return _crossings(parts[long], of)
 
 
-def _from_nodes(osm: OsmData, ways: list[Way], roads: Carriageways, frame: Frame) -> _Crossings:
+def _from_nodes(osm: OsmData, ways: list[Way], *, roads: Carriageways, frame: Frame) -> _Crossings:
     """Crossing nodes that no crossing way passes, straight across their road."""
     passed = set(np.concatenate([way.nodes for way in ways]).tolist()) if ways else set()
     points = [

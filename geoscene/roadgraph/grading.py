@@ -37,7 +37,7 @@ def find_obstacles(osm: OsmData, frame: Frame) -> Obstacles:
 
 def _clear(tags: Tags) -> float | None:
     layer, source = read_layer(tags, [])
-    if place_of(layer, source, is_bridge(tags), is_tunnel(tags)) != 0:
+    if place_of(layer, source, bridge=is_bridge(tags), tunnel=is_tunnel(tags)) != 0:
         return None
     for key, heights in _CLEAR.items():
         if tags.get(key) in heights:

@@ -56,7 +56,7 @@ _FLAGS = {"signals": "traffic_signals", "stop": "stop", "give_way": "give_way"}
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 
 
-def write_graphml(graph: RoadGraph, frame: Frame, path: Path) -> None:
+def write_graphml(graph: RoadGraph, frame: Frame, *, path: Path) -> None:
     """Write the graph as GraphML, with longitude and latitude to 1e-10 degrees (0.01 mm).
 
     Keys and values are those of ``osmnx.save_graphml``: all text; ``x`` and ``y`` are degrees, ``length``
@@ -79,20 +79,20 @@ def _document(graph: RoadGraph, frame: Frame) -> Iterator[str]:
             yield f'<key id="{keys[domain, name]}" for="{domain}" attr.name="{name}" attr.type="string"/>'
     yield '<graph edgedefault="directed">'
     header = {"crs": "EPSG:4326", "simplified": "True", "created_with": "geoscene"}
-    yield _data("graph", header, keys)
+    yield _data("graph", header, keys=keys)
     tall = bool(np.any(graph.node_xyz[:, 2])) or any(bool(line[:, 2].any()) for line in graph.geometry)
     for node, row in zip(graph.node_id.tolist(), _node_rows(graph, frame, tall=tall), strict=True):
-        yield f'<node id="{node}">{_data("node", row, keys)}</node>'
+        yield f'<node id="{node}">{_data("node", row, keys=keys)}</node>'
     copies: Counter[tuple[int, int]] = Counter()
     ends = np.stack([graph.node_id[graph.tail], graph.node_id[graph.head]], axis=1)
     for (tail, head), row in zip(ends.tolist(), _edge_rows(graph, frame, tall=tall), strict=True):
         start = f'<edge source="{tail}" target="{head}" id="{copies[tail, head]}">'
-        yield f"{start}{_data('edge', row, keys)}</edge>"
+        yield f"{start}{_data('edge', row, keys=keys)}</edge>"
         copies[tail, head] += 1
     yield "</graph></graphml>\n"
 
 
-def _data(domain: str, row: Mapping[str, str], keys: Mapping[tuple[str, str], str]) -> str:
+def _data(domain: str, row: Mapping[str, str], *, keys: Mapping[tuple[str, str], str]) -> str:
     return "".join(
         f'<data key="{keys[domain, name]}">{escape(_UNPRINTABLE.sub("", value))}</data>'
         for name, value in row.items()
@@ -190,7 +190,7 @@ def read_graphml(path: Path, frame: Frame) -> RoadGraph:
     """
     try:
         nodes, edges = _parse(path)
-        return _graph(nodes, edges, frame)
+        return _graph(nodes, edges, frame=frame)
     except (OSError, ET.ParseError, KeyError, ValueError, shapely.errors.GEOSException) as error:
         raise SceneFormatError(
             f"{path}: not a readable road graph ({type(error).__name__}: {error}); build the scene again"
@@ -220,13 +220,13 @@ def _parse(path: Path) -> tuple[dict[int, _Row], list[tuple[int, int, _Row]]]:
     return nodes, edges
 
 
-def _graph(nodes: dict[int, _Row], edges: list[tuple[int, int, _Row]], frame: Frame) -> RoadGraph:
+def _graph(nodes: dict[int, _Row], edges: list[tuple[int, int, _Row]], *, frame: Frame) -> RoadGraph:
     node_id = np.array(list(nodes), np.int64)
     number = {osm: k for k, osm in enumerate(nodes)}
     row_of = {int(row["edge"]): k for k, (_, _, row) in enumerate(edges)}
     rows = [row for _, _, row in edges]
 
-    def column(name: str, kind: Callable[[str], Any], dtype: Any) -> NDArray[Any]:
+    def column(name: str, kind: Callable[[str], Any], *, dtype: Any) -> NDArray[Any]:
         return np.array([kind(row.get(name, "")) for row in rows], dtype)
 
     places = np.array([[float(n["x"]), float(n["y"])] for n in nodes.values()]).reshape(-1, 2)
@@ -253,23 +253,23 @@ def _graph(nodes: dict[int, _Row], edges: list[tuple[int, int, _Row]], frame: Fr
         tail=np.array([number[tail] for tail, _, _ in edges], np.int32),
         head=np.array([number[head] for _, head, _ in edges], np.int32),
         geometry=_lines(rows, frame),
-        length=column("length", float, float),
-        speed=column("speed_kph", float, float) / 3.6,
-        speed_source=column("speed_source", str, np.str_),
-        lanes=column("lanes_ahead", float, float),
-        lanes_source=column("lanes_source", str, np.str_),
-        width=column("width", float, float),
-        width_source=column("width_source", str, np.str_),
-        oneway=column("oneway", "True".__eq__, np.bool_),
-        layer=column("layer", int, np.int8),
-        layer_source=column("layer_source", str, np.str_),
-        bridge=column("bridge", "yes".__eq__, np.bool_),
-        tunnel=column("tunnel", "yes".__eq__, np.bool_),
-        highway=column("highway", str, np.str_),
-        name=column("name", str, np.str_),
-        ref=column("ref", str, np.str_),
-        osm_id=column("osmid", _way_ids, np.str_),
-        twin=column("twin", lambda text: row_of.get(int(text), -1) if text else -1, np.int32),
+        length=column("length", float, dtype=float),
+        speed=column("speed_kph", float, dtype=float) / 3.6,
+        speed_source=column("speed_source", str, dtype=np.str_),
+        lanes=column("lanes_ahead", float, dtype=float),
+        lanes_source=column("lanes_source", str, dtype=np.str_),
+        width=column("width", float, dtype=float),
+        width_source=column("width_source", str, dtype=np.str_),
+        oneway=column("oneway", "True".__eq__, dtype=np.bool_),
+        layer=column("layer", int, dtype=np.int8),
+        layer_source=column("layer_source", str, dtype=np.str_),
+        bridge=column("bridge", "yes".__eq__, dtype=np.bool_),
+        tunnel=column("tunnel", "yes".__eq__, dtype=np.bool_),
+        highway=column("highway", str, dtype=np.str_),
+        name=column("name", str, dtype=np.str_),
+        ref=column("ref", str, dtype=np.str_),
+        osm_id=column("osmid", _way_ids, dtype=np.str_),
+        twin=column("twin", lambda text: row_of.get(int(text), -1) if text else -1, dtype=np.int32),
         **flags,
         turn_from=np.array([turn[0] for turn in turns], np.int32),
         turn_via=np.array([turn[1] for turn in turns], np.int32),

@@ -80,17 +80,17 @@ def build_junctions(roads: Carriageways, importance: NDArray[np.int64]) -> Junct
 
     half = np.maximum(width, width[after]) / 2
     reach = np.maximum(tangent, tangent[np.argsort(after)])
-    stub = _stubs(roads, arms, np.maximum(reach + 0.5, half + 1.0))
+    stub = _stubs(roads, arms, length=np.maximum(reach + 0.5, half + 1.0))
     disc = shapely.buffer(shapely.points(arms.node_xy), np.minimum(width, width[after]) / 2, quad_segs=_QUAD)
     rounded = np.where(np.abs(between - np.pi) > _ROUNDED, radius, 0.0)
     slanted = (count == 2) & (np.abs(between - np.pi) < _BENT) & (width[after] > width + _STEP)
     taper = np.empty(len(stub), object)
-    taper[slanted] = _tapers(roads, arms, after)[slanted]
+    taper[slanted] = _tapers(roads, arms, after=after)[slanted]
     corner = _corner(np.stack([stub, stub[after], disc, taper], axis=1)[keep], rounded[keep])
 
     walk_width = np.minimum(arms.walk[:, 0], arms.walk[after][:, 1])[keep]
     walked = walk_width > 0
-    wedge = _wedges(arms, between, reach)[keep][walked]
+    wedge = _wedges(arms, between, reach=reach)[keep][walked]
     kerb, walk = (
         shapely.intersection(shapely.buffer(corner[walked], grow, quad_segs=_QUAD), wedge)
         for grow in (KERB, KERB + walk_width[walked])
@@ -183,12 +183,12 @@ def _neighbour(group: NDArray[np.int64]) -> NDArray[np.int64]:
     return after
 
 
-def _stubs(roads: Carriageways, arms: _Arms, length: Float) -> NDArray[np.object_]:
+def _stubs(roads: Carriageways, arms: _Arms, *, length: Float) -> NDArray[np.object_]:
     """The carriageways of the arms' first metres (a,)."""
     lines = []
     for road, end, far in zip(arms.road.tolist(), arms.end.tolist(), length.tolist(), strict=True):
         xy = shapely.get_coordinates(roads.line[road])
-        lines.append(cut_line(xy[::-1] if end else xy, 0.0, far))
+        lines.append(cut_line(xy[::-1] if end else xy, 0.0, end=far))
     sizes = [len(line) for line in lines]
     stubs = shapely.linestrings(np.concatenate(lines), indices=np.repeat(np.arange(len(lines)), sizes))
     return carriageway(stubs, roads.width[arms.road] / 2)
@@ -202,7 +202,7 @@ def carriageway(lines: NDArray[np.object_], half: Float) -> NDArray[np.object_]:
     return bands
 
 
-def cut_line(xy: Float, start: float, end: float) -> Float:
+def cut_line(xy: Float, start: float, *, end: float) -> Float:
     """The part (k, 2 or 3) of a line between two distances along it in plan; at least its two ends."""
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy[:, :2], axis=0).T))])
     start, end = max(start, 0.0), min(end, float(along[-1]))
@@ -211,7 +211,7 @@ def cut_line(xy: Float, start: float, end: float) -> Float:
     return np.stack([np.interp(at, along, column) for column in xy.T], axis=1)
 
 
-def _tapers(roads: Carriageways, arms: _Arms, after: NDArray[np.int64]) -> NDArray[np.object_]:
+def _tapers(roads: Carriageways, arms: _Arms, *, after: NDArray[np.int64]) -> NDArray[np.object_]:
     """Between each arm's end and the wider next arm's, the slant from one width to the other."""
     width = roads.width[arms.road]
     wide = np.maximum(width, width[after])
@@ -239,7 +239,7 @@ def _corner(shapes: NDArray[np.object_], radius: Float) -> NDArray[np.object_]:
     return closed
 
 
-def _wedges(arms: _Arms, between: Float, reach: Float) -> NDArray[np.object_]:
+def _wedges(arms: _Arms, between: Float, *, reach: Float) -> NDArray[np.object_]:
     """What lies between each arm and the next one, as seen from the node."""
     turn = np.linspace(0.0, 1.0, 9)
     angle = arms.angle[:, None] + between[:, None] * turn

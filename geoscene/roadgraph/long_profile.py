@@ -102,9 +102,9 @@ def profile(
         return graph
     stations = place_stations(graph, spacing=options.spacing)
     terrain = np.asarray(ground(stations.xy[:, 0], stations.xy[:, 1]), float)
-    bounds = _bounds(graph, stations, terrain, ground, obstacles, options)
-    z = _solve(graph, stations, terrain, bounds, options)
-    return _with_heights(graph, stations, z)
+    bounds = _bounds(graph, stations, terrain=terrain, ground=ground, obstacles=obstacles, options=options)
+    z = _solve(graph, stations, terrain=terrain, bounds=bounds, options=options)
+    return _with_heights(graph, stations, z=z)
 
 
 def _weights(graph: RoadGraph, stations: Stations) -> Float:
@@ -114,14 +114,14 @@ def _weights(graph: RoadGraph, stations: Stations) -> Float:
     count = len(stations.xy)
     ends = np.zeros(count, np.bool_)
     ends[a[structure]] = ends[b[structure]] = True
-    far = _distance(count, (a[~structure], b[~structure], metres[~structure]), ends, _RAMP_REACH)
+    far = _distance(count, (a[~structure], b[~structure], metres[~structure]), start=ends, limit=_RAMP_REACH)
     per_metre = _RAMP + (_FIRM - _RAMP) * np.clip(far / _RAMP_REACH, 0.0, 1.0) ** 2
     share = np.where(structure, 0.0, metres / 2)
     held = np.bincount(a, share, count) + np.bincount(b, share, count)
     return np.maximum(held * per_metre, _LOOSE)
 
 
-def _distance(count: int, links: tuple[Int, Int, Float], start: NDArray[np.bool_], limit: float) -> Float:
+def _distance(count: int, links: tuple[Int, Int, Float], *, start: NDArray[np.bool_], limit: float) -> Float:
     """Metres along links from the nearest start, at most ``limit``."""
     from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
     from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
@@ -146,6 +146,7 @@ def _distance(count: int, links: tuple[Int, Int, Float], start: NDArray[np.bool_
 def _bounds(
     graph: RoadGraph,
     stations: Stations,
+    *,
     terrain: Float,
     ground: Height,
     obstacles: Obstacles | None,
@@ -158,8 +159,8 @@ def _bounds(
 
     own = np.abs(terrain[b] - terrain[a])
     most = np.where(structure, options.slope * metres, np.maximum(options.slope * metres, own))
-    rows.add([(b, 1.0), (a, -1.0)], -most, _HARD)
-    rows.add([(a, 1.0), (b, -1.0)], -most, _HARD)
+    rows.add([(b, 1.0), (a, -1.0)], -most, weight=_HARD)
+    rows.add([(a, 1.0), (b, -1.0)], -most, weight=_HARD)
 
     p, q, r, before, after = stations.triples
     near = np.minimum(before, after)
@@ -170,8 +171,8 @@ def _bounds(
     turn = [(p, near / before), (q, -near / before - near / after), (r, near / after)]
     # A jolt is one of slope: between stations close together a few centimetres make it.
     firm = _STEADY * (options.spacing / np.clip(near, _CLOSE, options.spacing)) ** 2
-    rows.add(turn, -allowed, firm)
-    rows.add([(station, -factor) for station, factor in turn], -allowed, firm)
+    rows.add(turn, -allowed, weight=firm)
+    rows.add([(station, -factor) for station, factor in turn], -allowed, weight=firm)
 
     high = options.clearance + options.deck
     upper, on_upper, lower, on_lower, margin = find_crossings(graph, stations)
@@ -179,11 +180,11 @@ def _bounds(
     for shift in (-margin, 0.0 * margin, margin):
         k, m, s = stations.at(upper, np.clip(on_upper + shift, 0.0, length))
         place = stations.xy[k] * (1 - s)[:, None] + stations.xy[m] * s[:, None]
-        i, j, t = stations.at(lower, _nearest(graph, lower, place, on_lower))
-        rows.add([(k, 1 - s), (m, s), (i, t - 1), (j, -t)], np.full(len(upper), high), _HARDEST)
+        i, j, t = stations.at(lower, _nearest(graph, lower, xy=place, along=on_lower))
+        rows.add([(k, 1 - s), (m, s), (i, t - 1), (j, -t)], np.full(len(upper), high), weight=_HARDEST)
 
     room, parting = _parting(high, options)
-    beside = find_overlaps(graph, stations, (upper, lower), room)
+    beside = find_overlaps(graph, stations, crossing=(upper, lower), room=room)
     terms: list[tuple[Int, Float]] = [
         (beside.station, np.ones(len(beside.station))),
         (beside.before, beside.share - 1),
@@ -193,25 +194,31 @@ def _bounds(
     below = np.where(beside.side < 0, parting(beside.fork), -_CROSSFALL * beside.away)
     for sign, least, chosen in ((1.0, above, beside.side >= 0), (-1.0, below, beside.side <= 0)):
         factors = [(station[chosen], sign * share[chosen]) for station, share in terms]
-        rows.add(factors, least[chosen], _BESIDE)
+        rows.add(factors, least[chosen], weight=_BESIDE)
 
-    bridge, tunnel = (_mouth_distance(graph, stations, kind, options) for kind in ("bridge", "tunnel"))
+    bridge, tunnel = (
+        _mouth_distance(graph, stations, kind=kind, options=options) for kind in ("bridge", "tunnel")
+    )
     deck = np.flatnonzero(np.isfinite(bridge))
     rows.add(
-        [(deck, 1.0)], terrain[deck] + np.minimum(options.deck, options.slope / 2 * bridge[deck]), _HARDEST
+        [(deck, 1.0)],
+        terrain[deck] + np.minimum(options.deck, options.slope / 2 * bridge[deck]),
+        weight=_HARDEST,
     )
     bore = np.flatnonzero(np.isfinite(tunnel))
     deep = np.minimum(options.clearance + options.cover, options.slope / 2 * tunnel[bore])
-    rows.add([(bore, -1.0)], deep - terrain[bore], _HARDEST)
+    rows.add([(bore, -1.0)], deep - terrain[bore], weight=_HARDEST)
     # Where the ground does not rise over it, the road goes down into a cutting before its tunnel begins.
     bore = bore[tunnel[bore] >= _PORTAL]
     whole = np.full(len(bore), options.clearance + options.cover)
-    rows.add([(bore, -1.0)], whole - terrain[bore], _WISHED)
+    rows.add([(bore, -1.0)], whole - terrain[bore], weight=_WISHED)
 
     if obstacles is not None and len(obstacles.line):
-        over, along, x, y, clear = _over_obstacles(graph, stations, obstacles)
+        over, along, x, y, clear = _over_obstacles(graph, stations, obstacles=obstacles)
         i, j, t = stations.at(over, along)
-        rows.add([(i, 1 - t), (j, t)], np.asarray(ground(x, y), float) + clear + options.deck, _HARDEST)
+        rows.add(
+            [(i, 1 - t), (j, t)], np.asarray(ground(x, y), float) + clear + options.deck, weight=_HARDEST
+        )
     return rows.bounds()
 
 
@@ -231,7 +238,7 @@ def _parting(high: float, options: ProfileOptions) -> tuple[float, Callable[[Flo
     return bent + steep, apart
 
 
-def _nearest(graph: RoadGraph, edge: Int, xy: Float, along: Float) -> Float:
+def _nearest(graph: RoadGraph, edge: Int, *, xy: Float, along: Float) -> Float:
     """Metres along edges (k,) of the places nearest to points (k, 2), not far from ``along``."""
     lines = np.array([shapely.linestrings(graph.geometry[e][:, :2]) for e in edge.tolist()], object)
     found = shapely.line_locate_point(lines, shapely.points(xy)) if len(edge) else along
@@ -250,7 +257,7 @@ class _Rows:
         self._right: list[Float] = []
         self._weight: list[Float] = []
 
-    def add(self, terms: Sequence[tuple[Int, Float | float]], right: Float, weight: Float | float) -> None:
+    def add(self, terms: Sequence[tuple[Int, Float | float]], right: Float, *, weight: Float | float) -> None:
         """Add rows: the sum of factor times height over the terms is at least ``right``."""
         number = self._count + np.arange(len(right))
         for station, factor in terms:
@@ -268,7 +275,7 @@ class _Rows:
         return Bounds(matrix, np.concatenate(self._right), np.concatenate(self._weight))
 
 
-def _mouth_distance(graph: RoadGraph, stations: Stations, kind: str, options: ProfileOptions) -> Float:
+def _mouth_distance(graph: RoadGraph, stations: Stations, *, kind: str, options: ProfileOptions) -> Float:
     """Metres from each station of a bridge or a tunnel to its nearest end, NaN elsewhere."""
     flag = getattr(graph, kind)
     a, b, metres, edge = stations.segments
@@ -278,12 +285,12 @@ def _mouth_distance(graph: RoadGraph, stations: Stations, kind: str, options: Pr
     outside[a[~of_kind]] = outside[b[~of_kind]] = True
     limit = 4 * (options.clearance + options.deck + options.cover) / options.slope
     links = a[of_kind], b[of_kind], metres[of_kind]
-    far = _distance(len(stations.xy), links, inside & outside, limit)
+    far = _distance(len(stations.xy), links, start=inside & outside, limit=limit)
     return np.where(inside, far, np.nan)
 
 
 def _over_obstacles(
-    graph: RoadGraph, stations: Stations, obstacles: Obstacles
+    graph: RoadGraph, stations: Stations, *, obstacles: Obstacles
 ) -> tuple[Int, Float, Float, Float, Float]:
     """Where bridges cross obstacles: (edge, metres along it, x, y, free height needed)."""
     once = np.unique(stations.edge)
@@ -298,7 +305,7 @@ def _over_obstacles(
 
 
 def _solve(
-    graph: RoadGraph, stations: Stations, terrain: Float, bounds: Bounds, options: ProfileOptions
+    graph: RoadGraph, stations: Stations, *, terrain: Float, bounds: Bounds, options: ProfileOptions
 ) -> Float:
     """Heights (v,) of least cost within the bounds."""
     from scipy.sparse import csr_array, diags_array  # noqa: PLC0415  (slow to import)
@@ -331,9 +338,9 @@ def _solve(
     restless[bounds.a[short].indices] = True
     z, radius = terrain, _AROUND
     while restless.any():
-        far = _distance(len(terrain), (a, b, metres), restless, radius)
+        far = _distance(len(terrain), (a, b, metres), start=restless, limit=radius)
         free = far < radius
-        z = _solve_some(cost, pull, bounds, terrain, free)
+        z = _solve_some(cost, pull, bounds=bounds, terrain=terrain, free=free)
         rim = free & (far > radius / 2)
         if free.all() or np.abs(z - terrain)[rim].max(initial=0.0) < _MOVED:
             break
@@ -341,7 +348,7 @@ def _solve(
     return z
 
 
-def _solve_some(cost: Any, pull: Float, bounds: Bounds, terrain: Float, free: NDArray[np.bool_]) -> Float:
+def _solve_some(cost: Any, pull: Float, *, bounds: Bounds, terrain: Float, free: NDArray[np.bool_]) -> Float:
     """Heights (v,) of least cost within the bounds, those that are not free on the terrain."""
     held = np.where(free, 0.0, terrain)
     columns = np.flatnonzero(free)
@@ -350,12 +357,12 @@ def _solve_some(cost: Any, pull: Float, bounds: Bounds, terrain: Float, free: ND
     some = Bounds(a[rows], (bounds.b - bounds.a @ held)[rows], bounds.weight[rows])
     z = held
     z[columns] = interior_point(
-        cost[columns][:, columns].tocsc(), (pull - cost @ held)[columns], some, terrain[columns]
+        cost[columns][:, columns].tocsc(), (pull - cost @ held)[columns], bounds=some, start=terrain[columns]
     )
     return z
 
 
-def _with_heights(graph: RoadGraph, stations: Stations, z: Float) -> RoadGraph:
+def _with_heights(graph: RoadGraph, stations: Stations, *, z: Float) -> RoadGraph:
     """The graph at the stations' heights; a line that stays level keeps the vertices that it had."""
     geometry = np.empty(len(graph), object)
     begin = np.flatnonzero(np.diff(stations.edge, prepend=-1))

@@ -49,7 +49,7 @@ def marking_rows(roads: Carriageways, edge: NDArray[np.int32], *, left_hand: boo
     for k, row in enumerate(rows.tolist()):
         xy = shapely.get_coordinates(streets.line[row])
         length = float(shapely.length(streets.line[row]))
-        lines[k] = shapely.linestrings(cut_line(xy, reach[row, 0], length - reach[row, 1]))
+        lines[k] = shapely.linestrings(cut_line(xy, reach[row, 0], end=length - reach[row, 1]))
 
     which, aside, dashed = _offsets(streets, rows, left_hand=left_hand)
     parallel = lines[which]
@@ -114,7 +114,7 @@ def _dashes(lines: NDArray[np.object_]) -> tuple[NDArray[np.object_], NDArray[np
 
 
 def stop_rows(
-    graph: RoadGraph, roads: Carriageways, crossings: NDArray[np.object_], *, left_hand: bool
+    graph: RoadGraph, roads: Carriageways, *, crossings: NDArray[np.object_], left_hand: bool
 ) -> SurfaceRows:
     """Stop lines before signals and stop signs, and broken ones before give-way signs.
 
@@ -176,7 +176,7 @@ def _across(graph: RoadGraph, lines: list[tuple[int, float, str]], *, left_hand:
         xy = graph.geometry[edge][:, :2]
         plan = float(np.hypot(*np.diff(xy, axis=0).T).sum())
         at = place * plan / float(graph.length[edge])
-        bit = cut_line(xy, at - _STOP / 2, at + _STOP / 2)
+        bit = cut_line(xy, at - _STOP / 2, end=at + _STOP / 2)
         ahead = (bit[-1] - bit[0]) / np.hypot(*(bit[-1] - bit[0]))
         left = np.array([-ahead[1], ahead[0]])
         twin = int(graph.twin[edge])

@@ -45,7 +45,9 @@ class Overlaps:
     fork: Float
 
 
-def find_overlaps(graph: RoadGraph, stations: Stations, crossing: tuple[Int, Int], room: float) -> Overlaps:
+def find_overlaps(
+    graph: RoadGraph, stations: Stations, *, crossing: tuple[Int, Int], room: float
+) -> Overlaps:
     """All stations of bridges and tunnels within carriageways that run beside them.
 
     Roads of unequal layers are over one another if they cross somewhere, or if the middle of one runs within
@@ -74,7 +76,7 @@ def find_overlaps(graph: RoadGraph, stations: Stations, crossing: tuple[Int, Int
     keep = (edge != other) & (lap > _LAP) & (along > 0.01) & (along < length - 0.01)
     keep &= both | (graph.bridge[edge] & deep)
     way = _heading(stations, row)
-    theirs = _direction(lines[found], along, length)
+    theirs = _direction(lines[found], along, length=length)
     keep &= np.abs(way[:, 0] * theirs[:, 1] - way[:, 1] * theirs[:, 0]) < _PARALLEL
     row, edge, other, along, metres, length, both = (
         column[keep] for column in (row, edge, other, along, metres, length, both)
@@ -82,7 +84,7 @@ def find_overlaps(graph: RoadGraph, stations: Stations, crossing: tuple[Int, Int
     deep = metres < np.minimum(graph.width[edge], graph.width[other]) / 2
     rank = graph.layer * 2 + np.where(graph.tunnel, -1, graph.bridge.astype(np.int64))
     side = np.sign(rank[edge] - rank[other]).astype(np.int64)
-    fork = _from_fork(graph, stations, row, edge, other, along, length)
+    fork = _from_fork(graph, stations, row=row, edge=edge, other=other, along=along, length=length)
     roomy = fork >= room
     pair = np.minimum(edge, other) * len(graph) + np.maximum(edge, other)
     crosses = np.minimum(*crossing) * len(graph) + np.maximum(*crossing)
@@ -106,7 +108,7 @@ def _heading(stations: Stations, row: Int) -> Float:
     return way
 
 
-def _direction(lines: NDArray[np.object_], along: Float, length: Float) -> Float:
+def _direction(lines: NDArray[np.object_], along: Float, *, length: Float) -> Float:
     """Unit vectors (k, 2) along lines at places on them."""
     a, b = (
         shapely.get_coordinates(shapely.line_interpolate_point(lines, np.clip(along + s, 0.0, length)))
@@ -117,7 +119,7 @@ def _direction(lines: NDArray[np.object_], along: Float, length: Float) -> Float
 
 
 def _from_fork(
-    graph: RoadGraph, stations: Stations, row: Int, edge: Int, other: Int, along: Float, length: Float
+    graph: RoadGraph, stations: Stations, *, row: Int, edge: Int, other: Int, along: Float, length: Float
 ) -> Float:
     """Metres (k,) along roads from rows of stations to places on other edges; inf beyond the reach."""
     from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)

@@ -104,7 +104,7 @@ def _whereabouts(tags: Sequence[Tags]) -> dict[str, Any]:
     layers = [read_layer(t, []) for t in tags]
     return {
         "place": [
-            place_of(layer, source, is_bridge(t), is_tunnel(t))
+            place_of(layer, source, bridge=is_bridge(t), tunnel=is_tunnel(t))
             for t, (layer, source) in zip(tags, layers, strict=True)
         ],
         "level": [layer for layer, _ in layers],

@@ -29,7 +29,7 @@ class Bounds:
     weight: Float
 
 
-def interior_point(cost: Any, pull: Float, bounds: Bounds, start: Float) -> Float:
+def interior_point(cost: Any, pull: Float, *, bounds: Bounds, start: Float) -> Float:
     """The z (n,) that minimises ``z cost z / 2 - pull z`` and what falling short of the bounds costs.
 
     Mehrotra's predictor-corrector method (Nocedal and Wright, Numerical Optimization, 2nd edition, 16.6),

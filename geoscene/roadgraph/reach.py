@@ -22,7 +22,7 @@ from geoscene.roadgraph.routing import nearest_edge, path_line, shortest_path
 Float = NDArray[np.float64]
 
 
-def route_line(words: Sequence[str], graph: RoadGraph, frame: Frame) -> Any:
+def route_line(words: Sequence[str], graph: RoadGraph, *, frame: Frame) -> Any:
     """The route as a shapely line or points, scene metres.
 
     words : two or more waypoints ``LAT,LON`` (joined over the road graph), or one file: GPX, GeoJSON, or CSV
@@ -50,7 +50,7 @@ def route_line(words: Sequence[str], graph: RoadGraph, frame: Frame) -> Any:
     places = list(zip(edges.tolist(), offsets.tolist(), strict=True))
     lines = []
     for a, b in pairwise(places):
-        path = shortest_path(graph, a, b)
+        path = shortest_path(graph, a, goal=b)
         if path is None:
             raise InputError(f"--along {' '.join(given)}: no way to drive from one waypoint to the next")
         lines.append(path_line(graph, path)[:, :2])

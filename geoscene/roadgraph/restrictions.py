@@ -19,7 +19,7 @@ _KEYS = (*(f"restriction:{kind}" for kind in _CAR), "restriction")
 _HOURS = ("hour_on", "day_on")
 
 
-def add_turns(graph: RoadGraph, relations: Iterable[Relation], problems: list[Problem]) -> RoadGraph:
+def add_turns(graph: RoadGraph, relations: Iterable[Relation], *, problems: list[Problem]) -> RoadGraph:
     """The graph with the turns that relations forbid or command to cars.
 
     A restriction via a node is a pair of edges, one via ways a chain of three or more. One at a place where
@@ -41,11 +41,11 @@ def add_turns(graph: RoadGraph, relations: Iterable[Relation], problems: list[Pr
             members[role].append(f"{kind}/{member}")
         via = {name for name in members["via"] if name.startswith("way/")}
         if via:
-            trips = _trips(streets, members["from"], via, members["to"])
+            trips = _trips(streets, members["from"], via=via, targets=members["to"])
             if not trips and streets.have(members["from"], members["to"]) and via <= streets.of_way.keys():
                 problems.append(Problem(relation.osm_id, "turn", "dropped", "via-way", value))
         else:
-            trips = list(_turns(streets, members["from"], members["via"], members["to"]))
+            trips = list(_turns(streets, members["from"], via=members["via"], targets=members["to"]))
         for trip in trips:
             if len(trip) == 2:
                 pairs.add((trip[0], int(graph.head[trip[0]]), trip[1], value))
@@ -97,7 +97,7 @@ class _Streets:
 
 
 def _turns(
-    streets: _Streets, sources: Sequence[str], via: Sequence[str], targets: Sequence[str]
+    streets: _Streets, sources: Sequence[str], *, via: Sequence[str], targets: Sequence[str]
 ) -> Iterator[tuple[int, ...]]:
     """Pairs of edges that turn at a node from one of the ways into another."""
     graph, ways = streets.graph, streets.ways
@@ -111,7 +111,7 @@ def _turns(
 
 
 def _trips(
-    streets: _Streets, sources: Sequence[str], via: set[str], targets: Sequence[str]
+    streets: _Streets, sources: Sequence[str], *, via: set[str], targets: Sequence[str]
 ) -> list[tuple[int, ...]]:
     """Chains of edges from one of the ways over all those of ``via`` into another.
 

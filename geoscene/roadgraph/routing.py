@@ -89,8 +89,10 @@ def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.i
     commanded = np.concatenate(
         [np.column_stack([graph.turn_from[only], graph.turn_to[only]]), begun.reshape(-1, 2)]
     )
-    forbidden = _among(graph, before, after, graph.turn_from[~only], graph.turn_to[~only])
-    forbidden |= np.isin(before, commanded[:, 0]) & ~_among(graph, before, after, *commanded.T)
+    forbidden = _among(graph, before, after=after, first=graph.turn_from[~only], second=graph.turn_to[~only])
+    forbidden |= np.isin(before, commanded[:, 0]) & ~_among(
+        graph, before, after=after, first=commanded[:, 0], second=commanded[:, 1]
+    )
     if not u_turns:
         round_ = graph.twin[before] == after
         ways_out = np.bincount(before[~round_], minlength=len(graph))
@@ -106,6 +108,7 @@ def _commands(kind: NDArray[np.str_]) -> NDArray[np.bool_]:
 def _among(
     graph: RoadGraph,
     before: NDArray[np.int32],
+    *,
     after: NDArray[np.int32],
     first: NDArray[np.int32],
     second: NDArray[np.int32],
@@ -158,7 +161,8 @@ def turn_states(graph: RoadGraph, *, u_turns: bool = False) -> TurnStates:
 
     ordered = sorted(prefixes)
     number = {prefix: len(graph) + k for k, prefix in enumerate(ordered)}
-    watched = np.flatnonzero(_among(graph, before, after, *np.array([p[:2] for p in ordered], np.int32).T))
+    first, second = np.array([p[:2] for p in ordered], np.int32).T
+    watched = np.flatnonzero(_among(graph, before, after=after, first=first, second=second))
     onward: dict[int, list[int]] = {}
     for row in np.flatnonzero(np.isin(before, [prefix[-1] for prefix in ordered])).tolist():
         onward.setdefault(int(before[row]), []).append(int(after[row]))
@@ -186,8 +190,8 @@ def turn_states(graph: RoadGraph, *, u_turns: bool = False) -> TurnStates:
 def shortest_path(
     graph: RoadGraph,
     start: tuple[int, float],
-    goal: tuple[int, float],
     *,
+    goal: tuple[int, float],
     weight: Literal["time", "length"] = "time",
     either_side: bool = True,
     u_turns: bool = False,
@@ -212,7 +216,7 @@ def shortest_path(
     for edge, offset in starts:
         for target, end in goals:
             if edge == target and end >= offset:
-                spent = cost[edge] * _share(graph, edge, end - offset)
+                spent = cost[edge] * _share(graph, edge, offset=end - offset)
                 if best is None or spent < best[0]:
                     best = (spent, [edge], offset, end)
 
@@ -221,17 +225,20 @@ def shortest_path(
     turns = csr_array((cost[entered], (states.before, states.after)), shape=(len(states), len(states)))
     for edge, offset in starts:
         reach, came_from = dijkstra(turns, indices=edge, return_predecessors=True)
-        left = cost[edge] * (1 - _share(graph, edge, offset))
+        left = cost[edge] * (1 - _share(graph, edge, offset=offset))
         for target, end in goals:
             into = states.before[entered == target]
             if not len(into):
                 continue
             last = int(into[np.argmin(reach[into])])
-            spent = left + reach[last] + cost[target] * _share(graph, target, end)
+            spent = left + reach[last] + cost[target] * _share(graph, target, offset=end)
             if np.isfinite(spent) and (best is None or spent < best[0]):
-                driven = states.edge[_walk(came_from, edge, last)].tolist()
+                driven = states.edge[_walk(came_from, edge, last=last)].tolist()
                 best = (spent, [*driven, target], offset, end)
-    return None if best is None else _path(graph, *best[1:])
+    if best is None:
+        return None
+    _, edges, leave, arrive = best
+    return _path(graph, edges, start=leave, end=arrive)
 
 
 def path_line(graph: RoadGraph, path: RoadPath) -> Float:
@@ -240,8 +247,8 @@ def path_line(graph: RoadGraph, path: RoadPath) -> Float:
     first, last = path.edges[0], path.edges[-1]
     line = np.concatenate([parts[0], *(part[1:] for part in parts[1:])])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1))])
-    begin = _share(graph, first, path.start) * _plan(parts[0])
-    end = along[-1] - (1 - _share(graph, last, path.end)) * _plan(parts[-1])
+    begin = _share(graph, first, offset=path.start) * _plan(parts[0])
+    end = along[-1] - (1 - _share(graph, last, offset=path.end)) * _plan(parts[-1])
     inside = (along > begin) & (along < end)
     at = np.concatenate([[begin], along[inside], [end]])
     return np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
@@ -251,7 +258,7 @@ def _plan(line: Float) -> float:
     return float(np.linalg.norm(np.diff(line[:, :2], axis=0), axis=1).sum())
 
 
-def _share(graph: RoadGraph, edge: int, offset: float) -> float:
+def _share(graph: RoadGraph, edge: int, *, offset: float) -> float:
     length = float(graph.length[edge])
     return min(max(offset / length, 0.0), 1.0) if length > 0 else 0.0
 
@@ -265,7 +272,7 @@ def _sides(graph: RoadGraph, place: tuple[int, float], *, either_side: bool) -> 
     return [(edge, offset)]
 
 
-def _walk(came_from: NDArray[Any], first: int, last: int) -> list[int]:
+def _walk(came_from: NDArray[Any], first: int, *, last: int) -> list[int]:
     """States from ``first`` to ``last`` along Dijkstra's predecessors."""
     states = [last]
     while states[-1] != first:
@@ -273,7 +280,7 @@ def _walk(came_from: NDArray[Any], first: int, last: int) -> list[int]:
     return states[::-1]
 
 
-def _path(graph: RoadGraph, edges: list[int], start: float, end: float) -> RoadPath:
+def _path(graph: RoadGraph, edges: list[int], *, start: float, end: float) -> RoadPath:
     rows = np.array(edges, np.int32)
     driven = graph.length[rows].copy()
     driven[-1] = end

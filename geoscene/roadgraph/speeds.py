@@ -99,7 +99,9 @@ def _one_limit(text: str) -> tuple[float, str] | None:
     return None
 
 
-def read_speeds(tags: Tags, highway: str, unread: list[str]) -> tuple[tuple[float, float], tuple[str, str]]:
+def read_speeds(
+    tags: Tags, highway: str, *, unread: list[str]
+) -> tuple[tuple[float, float], tuple[str, str]]:
     """Limits in m/s along the way and against it, and their sources; unreadable tags join ``unread``."""
     default = _SPEED.get(highway, _SPEED["service"]) * _KMH, "default"
     both = default

@@ -53,7 +53,7 @@ class RoadSurfaces(SurfaceRows):
 
 
 def road_surfaces(
-    osm: OsmData, graph: RoadGraph, frame: Frame, *, options: SurfaceOptions | None = None
+    osm: OsmData, graph: RoadGraph, *, frame: Frame, options: SurfaceOptions | None = None
 ) -> tuple[RoadSurfaces, list[Problem]]:
     """The surfaces of roads, paths and rails in plan, and what could not be taken as it came.
 
@@ -63,7 +63,7 @@ def road_surfaces(
     options = options or SurfaceOptions()
     roads = read_carriageways(osm, frame, sidewalks=options.sidewalks, left_hand=options.left_hand)
     edge = _edges_below(roads, graph)
-    crossings = crossing_rows(osm, roads, frame)
+    crossings = crossing_rows(osm, roads, frame=frame)
     strips = crossings.polygon[crossings.priority == crossings.priority.min(initial=np.inf)]
     rows = concatenate_rows(
         [
@@ -72,7 +72,7 @@ def road_surfaces(
             *_carriageway_rows(roads, edge),
             crossings,
             marking_rows(roads, edge, left_hand=options.left_hand),
-            stop_rows(graph, roads, strips, left_hand=options.left_hand),
+            stop_rows(graph, roads, crossings=strips, left_hand=options.left_hand),
             rail_surfaces(osm, frame),
         ]
     )
@@ -134,7 +134,7 @@ def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[Surf
         (Class.SIDEWALK, _SIDEWALK, walk_material, "walk"),
     ):
         extra = np.where(roads.walk > 0, KERB + (roads.walk if shape == "walk" else 0.0), 0.0)
-        for rows, bands in _beside(roads, half, extra):
+        for rows, bands in _beside(roads, half, extra=extra):
             out.append(
                 SurfaceRows.of(
                     bands,
@@ -175,7 +175,7 @@ def _walk_source(roads: Carriageways) -> NDArray[np.str_]:
 
 
 def _beside(
-    roads: Carriageways, half: NDArray[np.float64], extra: NDArray[np.float64]
+    roads: Carriageways, half: NDArray[np.float64], *, extra: NDArray[np.float64]
 ) -> list[tuple[NDArray[np.integer], NDArray[np.object_]]]:
     """Bands that reach ``extra`` (k, 2) beyond the carriageway on the left and right, with their rows."""
     both = np.flatnonzero((extra[:, 0] == extra[:, 1]) & (extra[:, 0] > 0))

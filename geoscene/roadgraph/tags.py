@@ -125,9 +125,9 @@ def read_street(tags: Tags) -> tuple[Street, list[str]]:
     unread: list[str] = []
     highway = tags["highway"]
     direction = _direction(tags)
-    lanes, lanes_source = _lanes(tags, highway, direction, unread)
-    width, width_source = _width(tags, direction, (sum(lanes), lanes_source), unread)
-    speed, speed_source = read_speeds(tags, highway, unread)
+    lanes, lanes_source = _lanes(tags, highway, direction=direction, unread=unread)
+    width, width_source = _width(tags, direction, counted=(sum(lanes), lanes_source), unread=unread)
+    speed, speed_source = read_speeds(tags, highway, unread=unread)
     layer, layer_source = read_layer(tags, unread)
     street = Street(
         highway=highway,
@@ -193,7 +193,7 @@ def _direction(tags: Tags) -> int:
     return 1 if implied and value == "" else 0
 
 
-def _count(tags: Tags, key: str, unread: list[str]) -> float | None:
+def _count(tags: Tags, key: str, *, unread: list[str]) -> float | None:
     text = tags.get(key)
     if text is None:
         return None
@@ -207,17 +207,17 @@ def _count(tags: Tags, key: str, unread: list[str]) -> float | None:
     return None
 
 
-def _lanes(tags: Tags, highway: str, direction: int, unread: list[str]) -> tuple[tuple[float, float], str]:
-    total = _count(tags, "lanes", unread)
-    ahead = _count(tags, "lanes:forward", unread)
-    back = _count(tags, "lanes:backward", unread)
+def _lanes(tags: Tags, highway: str, *, direction: int, unread: list[str]) -> tuple[tuple[float, float], str]:
+    total = _count(tags, "lanes", unread=unread)
+    ahead = _count(tags, "lanes:forward", unread=unread)
+    back = _count(tags, "lanes:backward", unread=unread)
     if direction:
         side = ahead if direction == 1 else back
         given = total if total is not None else side
         count = _LANES.get(highway, 1.0) if given is None else given
         count = max(count, 1.0)
         return ((count, 0.0) if direction == 1 else (0.0, count)), ("default" if given is None else "lanes")
-    middle = _count(tags, "lanes:both_ways", unread) or 0.0
+    middle = _count(tags, "lanes:both_ways", unread=unread) or 0.0
     if ahead is not None and back is not None:
         return (ahead + middle / 2, back + middle / 2), "lanes"
     if total is None:
@@ -231,7 +231,7 @@ def _lanes(tags: Tags, highway: str, direction: int, unread: list[str]) -> tuple
     return (total / 2, total / 2), "lanes"
 
 
-def _width(tags: Tags, direction: int, counted: tuple[float, str], unread: list[str]) -> tuple[float, str]:
+def _width(tags: Tags, direction: int, *, counted: tuple[float, str], unread: list[str]) -> tuple[float, str]:
     highway, (lanes, lanes_source) = tags["highway"], counted
     for key in ("width:carriageway", "width", "est_width"):
         if (text := tags.get(key)) is None:

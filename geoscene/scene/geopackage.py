@@ -59,7 +59,7 @@ def _geometry_type(geometry: NDArray[np.object_]) -> str:
     return f"{name} Z" if name != "Unknown" and shapely.has_z(geometry).any() else name
 
 
-def write_geopackage(path: Path, layers: Sequence[Layer], frame: Frame) -> None:
+def write_geopackage(path: Path, layers: Sequence[Layer], *, frame: Frame) -> None:
     """Write layers in the frame's projected CRS; empty layers are left out."""
     import pyogrio  # noqa: PLC0415  (0.3 s)
     from pyogrio.errors import DataSourceError  # noqa: PLC0415
@@ -110,7 +110,7 @@ def write_geopackage(path: Path, layers: Sequence[Layer], frame: Frame) -> None:
         part.unlink(missing_ok=True)
 
 
-def read_layer(path: Path, name: str, frame: Frame) -> Layer:
+def read_layer(path: Path, name: str, *, frame: Frame) -> Layer:
     """A layer that `write_geopackage` wrote, geometry back in scene metres.
 
     Raises SceneFormatError if the file or the layer is not there.

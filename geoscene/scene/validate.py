@@ -32,6 +32,6 @@ def _osm_ids(scene: Scene, features: set[int]) -> dict[int, str]:
     out: dict[int, str] = {}
     for name, (start, stop) in scene.layers.items():
         if features & set(range(start, stop)):
-            layer = read_layer(scene.path / "features.gpkg", name, scene.frame)
+            layer = read_layer(scene.path / "features.gpkg", name, frame=scene.frame)
             out |= dict(zip(layer.columns["feature"].tolist(), layer.columns["osm_id"].tolist(), strict=True))
     return out

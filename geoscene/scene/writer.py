@@ -71,7 +71,7 @@ class SceneWriter:
             Layer(layer.name, layer.geometry, {"feature": np.arange(a, b, dtype=np.int32), **layer.columns})
             for layer, a, b in zip(layers, starts[:-1], starts[1:], strict=True)
         ]
-        write_geopackage(self.folder / "features.gpkg", numbered, frame)
+        write_geopackage(self.folder / "features.gpkg", numbered, frame=frame)
         write_shapes(self.folder / "shapes.npz", shapes)
         write_atomically(self.folder / "problems.csv", _problems_csv(problems))
         _write_json(self.folder / "tiles.json", tiles)
@@ -93,7 +93,7 @@ class SceneWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
+    def __exit__(  # noqa: PLR0917 - the protocol of context managers
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if kind is None or issubclass(kind, Exception):

@@ -88,7 +88,7 @@ def _says_area(tags: Tags) -> bool:
 
 
 def _boundary(
-    elements: Elements, row_of: dict[int, int], osm_id: int, tags: Tags, members: Members
+    elements: Elements, row_of: dict[int, int], *, osm_id: int, tags: Tags, members: Members
 ) -> tuple[_Boundary, set[int], bool]:
     """A relation with the tags that count, the ways whose area is the relation's, whether both are tagged.
 
@@ -121,7 +121,7 @@ def _boundary(
 
 
 def _relation_area(
-    elements: Elements, places: Places, boundary: _Boundary, extent: tuple[float, float, float, float]
+    elements: Elements, places: Places, *, boundary: _Boundary, extent: tuple[float, float, float, float]
 ) -> tuple[Any, Problem | None]:
     """The geometry of a multipolygon, or None, and what was wrong with it."""
     chains: list[Chain] = []
@@ -133,7 +133,7 @@ def _relation_area(
         nodes = places.merged(elements.chain(row))
         missing = int((nodes < 0).sum())
         if missing and elements.way_closed[row]:
-            ring = close_cut_ring(nodes, places.xy, extent)
+            ring = close_cut_ring(nodes, places.xy, extent=extent)
             if ring is not None:
                 cut += 1
                 chains.append(Chain(ring, inner))
@@ -168,6 +168,7 @@ def _relation_area(
 def multipolygon_areas(
     elements: Elements,
     places: Places,
+    *,
     extent: tuple[float, float, float, float],
     wanted: Callable[[Int], bool],
 ) -> tuple[list[Area], list[Problem], Claims]:
@@ -182,7 +183,7 @@ def multipolygon_areas(
     for osm_id, tags, members in elements.relations:
         if not is_multipolygon(tags):
             continue
-        boundary, taken, twice = _boundary(elements, row_of, osm_id, tags, members)
+        boundary, taken, twice = _boundary(elements, row_of, osm_id=osm_id, tags=tags, members=members)
         rows = np.array([row for row, _ in boundary.ways if row >= 0], np.int64)
         claims.members.update(rows.tolist())
         if not wanted(rows):
@@ -191,7 +192,7 @@ def multipolygon_areas(
         if not boundary.tags:
             problems.append(Problem(name, "area", "dropped", "no-tags", f"{len(boundary.ways)} member ways"))
             continue
-        geometry, problem = _relation_area(elements, places, boundary, extent)
+        geometry, problem = _relation_area(elements, places, boundary=boundary, extent=extent)
         if problem is not None:
             problems.append(problem)
         if geometry is None:
@@ -219,6 +220,7 @@ def multipolygon_areas(
 def way_areas(
     elements: Elements,
     places: Places,
+    *,
     extent: tuple[float, float, float, float],
     rows: Iterable[int],
     claims: Claims,
@@ -245,7 +247,7 @@ def way_areas(
         repair: tuple[str, str] | None = None
         if missing or not closed:
             reason = "missing-nodes" if missing else "open-ring"
-            cut = close_cut_ring(nodes, places.xy, extent)
+            cut = close_cut_ring(nodes, places.xy, extent=extent)
             if cut is None:
                 told = (
                     f"{missing} of {len(nodes)} nodes absent"

@@ -150,10 +150,10 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
         Problem(f"node/{i}", "node", "dropped", "bad-coordinates", "missing or out of range")
         for i in elements.misplaced.tolist()
     ]
-    areas, found, claims = multipolygon_areas(elements, places, extent, wanted)
+    areas, found, claims = multipolygon_areas(elements, places, extent=extent, wanted=wanted)
     problems += found
     rows = [row for row in np.flatnonzero(near).tolist() if has_meaning(elements.way_tags[row])]
-    more, found, meant = way_areas(elements, places, extent, rows, claims)
+    more, found, meant = way_areas(elements, places, extent=extent, rows=rows, claims=claims)
     problems += found
     lines = [
         row

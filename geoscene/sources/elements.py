@@ -93,7 +93,7 @@ class Collector:
         """Number of objects taken."""
         return len(self._node_id) + len(self._way_id) + len(self._relations)
 
-    def node(self, osm_id: int, x: int, y: int, tags: Tags | None) -> None:
+    def node(self, osm_id: int, x: int, *, y: int, tags: Tags | None) -> None:
         """Take a node at ``x``, ``y`` (longitude, latitude in 1e-7 degrees, `UNKNOWN` if not given)."""
         self._node_id.append(osm_id)
         self._node_x.append(x)
@@ -101,7 +101,7 @@ class Collector:
         if tags:
             self._node_tags[osm_id] = tags
 
-    def way(self, osm_id: int, refs: Iterable[int], tags: Tags) -> None:
+    def way(self, osm_id: int, refs: Iterable[int], *, tags: Tags) -> None:
         """Take a way by its node ids."""
         before = len(self._refs)
         self._refs.extend(refs)
@@ -109,7 +109,7 @@ class Collector:
         self._way_size.append(len(self._refs) - before)
         self._way_tags.append(tags)
 
-    def relation(self, osm_id: int, tags: Tags, members: Members) -> None:
+    def relation(self, osm_id: int, tags: Tags, *, members: Members) -> None:
         """Take a relation."""
         self._relations[osm_id] = (tags, members)
 

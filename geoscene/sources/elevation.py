@@ -133,13 +133,15 @@ def fetch_elevation(
     if path.exists():
         return path
     heights = np.empty(((y1 - y0 + 1) * _SIDE, (x1 - x0 + 1) * _SIDE))
-    for done, ((x, y), tile) in enumerate(zip(names, _tiles(names, z, cache_dir, server), strict=True), 1):
+    for done, ((x, y), tile) in enumerate(
+        zip(names, _tiles(names, z, cache_dir=cache_dir, server=server), strict=True), 1
+    ):
         row, column = (y - y0) * _SIDE, (x - x0) * _SIDE
         heights[row : row + _SIDE, column : column + _SIDE] = tile
-        progress("elevation tiles", done, len(names))
+        progress("elevation tiles", done, total=len(names))
     if len(shore):
         heights = _without_sea_floor(heights, _pixels(shore, z) - (x0 * _SIDE, y0 * _SIDE))
-    write_atomically(path, _geotiff(heights, z, x0 * _SIDE, y0 * _SIDE, server))
+    write_atomically(path, _geotiff(heights, z, column=x0 * _SIDE, row=y0 * _SIDE, server=server))
     return path
 
 
@@ -153,7 +155,7 @@ def _needed(osm: OsmData, crs: str) -> Box:
     east, north = np.nanmax(boxes[:, 2:], axis=0)
     if max(abs(south), abs(north)) > _LAST_LATITUDE:
         raise InputError(f"elevation tiles end at 85° of latitude; the map spans {south:.2f} to {north:.2f}")
-    frame = Frame.at((west + east) / 2, (south + north) / 2, crs)
+    frame = Frame.at((west + east) / 2, (south + north) / 2, crs=crs)
     rim = shapely.segmentize(shapely.box(west, south, east, north), max(east - west, north - south) / 8)
     xy = np.column_stack(frame.from_geographic(*shapely.get_coordinates(rim).T))
     (xmin, ymin), (xmax, ymax) = xy.min(axis=0), xy.max(axis=0)
@@ -171,7 +173,7 @@ def _pixels(lonlat: Float, z: int) -> Float:
     return pixels
 
 
-def _tiles(names: list[tuple[int, int]], z: int, cache_dir: Path, server: TileServer) -> Any:
+def _tiles(names: list[tuple[int, int]], z: int, *, cache_dir: Path, server: TileServer) -> Any:
     """Heights (256, 256) of each tile in turn, from the cache or the server."""
     import requests  # noqa: PLC0415 - heavy
 
@@ -184,7 +186,7 @@ def _tiles(names: list[tuple[int, int]], z: int, cache_dir: Path, server: TileSe
             kept = _heights(path.read_bytes()) if path.exists() else None
             if kept is None:
                 url = server.template.format(z=z, x=x, y=y)
-                content = _ask(session, url, server)
+                content = _ask(session, url, server=server)
                 kept = _heights(content)
                 if kept is None:
                     raise NetworkError(f"{url}: no elevation tile (a PNG of 256 x 256 pixels) but other data")
@@ -206,7 +208,7 @@ def _heights(content: bytes) -> Float | None:
     return np.where(rgb.any(axis=2), decode_terrarium(rgb), np.nan)
 
 
-def _ask(session: Any, url: str, server: TileServer) -> bytes:
+def _ask(session: Any, url: str, *, server: TileServer) -> bytes:
     """The bytes at an address, asked for again while the server fails or is busy."""
     import requests  # noqa: PLC0415 - heavy
 
@@ -257,7 +259,7 @@ def _without_sea_floor(heights: Float, shore: Float) -> Float:
     return np.where(low & np.isin(pieces, np.unique(pieces[near & low])), 0.0, heights)
 
 
-def _geotiff(heights: Float, z: int, column: int, row: int, server: TileServer) -> bytes:
+def _geotiff(heights: Float, z: int, *, column: int, row: int, server: TileServer) -> bytes:
     """The bytes of a GeoTIFF of heights (float32: the tiles' 1/256 m is exact) whose first pixel is given."""
     import rasterio  # noqa: PLC0415 - slow to import
     from rasterio.io import MemoryFile  # noqa: PLC0415

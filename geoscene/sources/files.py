@@ -45,7 +45,7 @@ def _format_of(path: Path) -> str:
     raise InputError(f"{path}: not an OpenStreetMap file; {_HELP}")
 
 
-def _stream(file: Any, taken: Collector, progress: Progress) -> None:
+def _stream(file: Any, taken: Collector, *, progress: Progress) -> None:
     """Put the objects that libosmium reads into ``taken``."""
     import osmium  # noqa: PLC0415 - heavy
 
@@ -57,14 +57,14 @@ def _stream(file: Any, taken: Collector, progress: Progress) -> None:
         if item.is_node():
             place = item.location
             tags = {tag.k: tag.v for tag in item.tags} if item.tags else None
-            taken.node(item.id, place.x, place.y, tags)
+            taken.node(item.id, place.x, y=place.y, tags=tags)
             if tags is None:
                 continue
         elif item.is_way() and not item.deleted:
-            taken.way(item.id, [node.ref for node in item.nodes], {tag.k: tag.v for tag in item.tags})
+            taken.way(item.id, [node.ref for node in item.nodes], tags={tag.k: tag.v for tag in item.tags})
         elif item.is_relation() and not item.deleted:
             members = tuple((kinds[m.type], m.ref, m.role) for m in item.members)
-            taken.relation(item.id, {tag.k: tag.v for tag in item.tags}, members)
+            taken.relation(item.id, {tag.k: tag.v for tag in item.tags}, members=members)
         else:
             continue
         if not stated:
@@ -87,10 +87,10 @@ def _collect(path: Path, progress: Progress) -> Collector:
         low, high = box.bottom_left, box.top_right
         taken.bounds = (low.lon, low.lat, high.lon, high.lat)
     try:
-        _stream(file, taken, progress)
+        _stream(file, taken, progress=progress)
     except osmium.InvalidLocationError:  # a node's position is no number: read on without libosmium
         taken = Collector(bounds=taken.bounds)
-        collect_xml(path, form, taken, progress=progress)
+        collect_xml(path, form, taken=taken, progress=progress)
     return taken
 
 

@@ -25,7 +25,7 @@ def whole_units(degrees: Any) -> int:
 
 
 def collect_xml(
-    path: Path, form: str, taken: Collector, *, progress: Callable[[Iterable[Any]], Iterable[Any]]
+    path: Path, form: str, *, taken: Collector, progress: Callable[[Iterable[Any]], Iterable[Any]]
 ) -> None:
     """Put the objects of an XML file into ``taken``, nodes without a position too; slower than libosmium.
 
@@ -42,15 +42,15 @@ def collect_xml(
                 osm_id = int(item.get("id", ""))
                 if item.tag == "node":
                     x, y = whole_units(item.get("lon")), whole_units(item.get("lat"))
-                    taken.node(osm_id, x, y, tags or None)
+                    taken.node(osm_id, x, y=y, tags=tags or None)
                 elif item.tag == "way":
-                    taken.way(osm_id, [int(nd.get("ref", "")) for nd in item.iter("nd")], tags)
+                    taken.way(osm_id, [int(nd.get("ref", "")) for nd in item.iter("nd")], tags=tags)
                 else:
                     members = tuple(
                         (m.get("type", ""), int(m.get("ref", "")), m.get("role", ""))
                         for m in item.iter("member")
                     )
-                    taken.relation(osm_id, tags, members)
+                    taken.relation(osm_id, tags, members=members)
                 if not taken.timestamp or item.get("timestamp", "") > taken.timestamp:
                     taken.timestamp = item.get("timestamp", "")
                 item.clear()

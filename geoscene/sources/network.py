@@ -67,7 +67,7 @@ class Servers:
 class _RefusedError(Exception):
     """A server's answer that is no data: its HTTP status, and after how many seconds to ask again."""
 
-    def __init__(self, status: int, reason: str, retry_after: float) -> None:
+    def __init__(self, status: int, reason: str, *, retry_after: float) -> None:
         super().__init__(f"HTTP {status}, {reason}" if reason else f"HTTP {status}")
         self.busy = status in {429, 502, 503, 504}
         self.retry_after = retry_after
@@ -78,7 +78,9 @@ def _refuse(response: Any, *_: Any, **__: Any) -> None:
     if response.status_code >= 400:
         stated = response.headers.get("Retry-After", "")
         raise _RefusedError(
-            response.status_code, response.reason or "", float(stated) if stated.isdigit() else math.inf
+            response.status_code,
+            response.reason or "",
+            retry_after=float(stated) if stated.isdigit() else math.inf,
         )
 
 
@@ -123,7 +125,7 @@ def _cause(error: BaseException) -> str:
     return text[:120] or type(error).__name__
 
 
-def _kept(cache_dir: Path | None, request: str, make: Callable[[], Any]) -> Any:
+def _kept(cache_dir: Path | None, request: str, *, make: Callable[[], Any]) -> Any:
     """The answer to ``request``: from the cache, else made and put there, whole or not at all."""
     if cache_dir is None:
         return make()
@@ -140,7 +142,7 @@ def _kept(cache_dir: Path | None, request: str, make: Callable[[], Any]) -> Any:
     return answer
 
 
-def _patiently(what: str, urls: Sequence[str], ask: Callable[[str], Any], servers: Servers) -> Any:
+def _patiently(what: str, urls: Sequence[str], *, ask: Callable[[str], Any], servers: Servers) -> Any:
     """The answer of the first server that gives one; those that are busy are asked again, for some rounds.
 
     Raises NetworkError, headed by ``what``, if none does.
@@ -177,17 +179,17 @@ def _ask_overpass(query: str, servers: Servers) -> Any:
             osmnx.settings.overpass_rate_limit = True
             pause = osmnx._overpass._get_overpass_pause(url, default_pause=0)  # noqa: SLF001
             if pause > servers.timeout:
-                raise _RefusedError(429, f"no free slot for {pause:.0f} s", pause)
+                raise _RefusedError(429, f"no free slot for {pause:.0f} s", retry_after=pause)
             time.sleep(pause)
             osmnx.settings.overpass_rate_limit = False
             osmnx.settings.requests_kwargs = guarded
             answer = osmnx._overpass._overpass_request(OrderedDict(data=query))  # noqa: SLF001
         remark = str(answer.get("remark", ""))
         if "error" in remark:  # the query ran out of time or memory: what came is not all there is
-            raise _RefusedError(200, remark.strip(), math.inf)
+            raise _RefusedError(200, remark.strip(), retry_after=math.inf)
         return answer
 
-    return _patiently("no map server delivered", servers.overpass, ask, servers)
+    return _patiently("no map server delivered", servers.overpass, ask=ask, servers=servers)
 
 
 def _parts(bounds: Bounds, largest_km2: float) -> list[Bounds]:
@@ -209,7 +211,7 @@ def _area_km2(bounds: Bounds) -> float:
 
 
 def _fetch(
-    bounds: Bounds, source: str, cache_dir: Path | None, servers: Servers, progress: Progress
+    bounds: Bounds, source: str, *, cache_dir: Path | None, servers: Servers, progress: Progress
 ) -> OsmData:
     area = _area_km2(bounds)
     if area > servers.max_area_km2:
@@ -220,7 +222,7 @@ def _fetch(
     taken = Collector(bounds=bounds)
     for part in progress(_parts(bounds, servers.max_query_km2)):
         query = query_for(part, timeout=servers.timeout)
-        answer = _kept(cache_dir, query, functools.partial(_ask_overpass, query, servers))
+        answer = _kept(cache_dir, query, make=functools.partial(_ask_overpass, query, servers))
         try:
             collect_answer(answer, taken)
         except InputError as error:
@@ -230,7 +232,7 @@ def _fetch(
     return features(taken.finish(), bounds=bounds, source=source)
 
 
-def _around(lon: float, lat: float, half_width: float, half_height: float) -> Bounds:
+def _around(lon: float, lat: float, *, half_width: float, half_height: float) -> Bounds:
     """The box of so many metres to each side of a point."""
     dy = half_height / _METRES_PER_DEGREE
     dx = half_width / (_METRES_PER_DEGREE * math.cos(math.radians(lat)))
@@ -238,17 +240,15 @@ def _around(lon: float, lat: float, half_width: float, half_height: float) -> Bo
 
 
 def fetch_bbox(
-    west: float,
-    south: float,
-    east: float,
-    north: float,
+    bbox: tuple[float, float, float, float],
     *,
     cache_dir: Path | None = None,
     servers: Servers | None = None,
     progress: Progress = iter,
 ) -> OsmData:
-    """The features that meet a box (degrees), from Overpass; the same as `read_osm` gives for an extract.
+    """The features that meet a box, from Overpass; the same as `read_osm` gives for an extract.
 
+    bbox      : west, south, east, north in degrees
     cache_dir : folder where answers are kept; the same request is then sent once. None keeps nothing
     servers   : which servers, and how patiently; the public ones if None
     progress  : wraps the parts in which a large area is asked for
@@ -256,16 +256,16 @@ def fetch_bbox(
     Raises InputError for a box that is none or too large, SourceNotFoundError if nothing is there,
     NetworkError if no server delivers.
     """
-    bounds = checked_bounds((west, south, east, north))
+    bounds = checked_bounds(bbox)
     source = f"OpenStreetMap, {','.join(f'{v:g}' for v in bounds)}"
-    return _fetch(bounds, source, cache_dir, servers or Servers(), progress)
+    return _fetch(bounds, source, cache_dir=cache_dir, servers=servers or Servers(), progress=progress)
 
 
 def fetch_point(
     lat: float,
     lon: float,
-    radius: float,
     *,
+    radius: float,
     cache_dir: Path | None = None,
     servers: Servers | None = None,
     progress: Progress = iter,
@@ -278,9 +278,9 @@ def fetch_point(
         raise InputError(f"point {lat:g},{lon:g}: give latitude, longitude in degrees, in this order")
     if not (math.isfinite(radius) and radius > 0):
         raise InputError(f"radius {radius:g}: give metres, more than 0")
-    bounds = checked_bounds(_around(lon, lat, radius, radius))
+    bounds = checked_bounds(_around(lon, lat, half_width=radius, half_height=radius))
     source = f"OpenStreetMap, {radius:g} m around {lat:g},{lon:g}"
-    return _fetch(bounds, source, cache_dir, servers or Servers(), progress)
+    return _fetch(bounds, source, cache_dir=cache_dir, servers=servers or Servers(), progress=progress)
 
 
 def locate(name: str, *, cache_dir: Path | None = None, servers: Servers | None = None) -> tuple[Bounds, str]:
@@ -301,7 +301,7 @@ def locate(name: str, *, cache_dir: Path | None = None, servers: Servers | None 
     results = _kept(
         cache_dir,
         f"{servers.nominatim} {name}",
-        lambda: _patiently(f"cannot look up {name!r}", [servers.nominatim], ask, servers),
+        make=lambda: _patiently(f"cannot look up {name!r}", [servers.nominatim], ask=ask, servers=servers),
     )
     if not results:
         raise SourceNotFoundError(
@@ -312,7 +312,7 @@ def locate(name: str, *, cache_dir: Path | None = None, servers: Servers | None 
     found = (outlined or results)[0]
     south, north, west, east = (float(v) for v in found["boundingbox"])
     lat, lon = (south + north) / 2, (west + east) / 2
-    least = _around(lon, lat, _SMALLEST / 2, _SMALLEST / 2)
+    least = _around(lon, lat, half_width=_SMALLEST / 2, half_height=_SMALLEST / 2)
     bounds = (min(west, least[0]), min(south, least[1]), max(east, least[2]), max(north, least[3]))
     return checked_bounds(bounds), str(found.get("display_name", name))
 
@@ -330,4 +330,6 @@ def fetch_place(
     """
     servers = servers or Servers()
     bounds, full_name = locate(name, cache_dir=cache_dir, servers=servers)
-    return _fetch(bounds, f"OpenStreetMap, {full_name}", cache_dir, servers, progress)
+    return _fetch(
+        bounds, f"OpenStreetMap, {full_name}", cache_dir=cache_dir, servers=servers, progress=progress
+    )

@@ -47,11 +47,13 @@ def collect_answer(answer: Any, taken: Collector) -> None:
             tags: Tags = item.get("tags") or {}
             kind, osm_id = item["type"], item["id"]
             if kind == "node":
-                taken.node(osm_id, whole_units(item.get("lon")), whole_units(item.get("lat")), tags or None)
+                taken.node(
+                    osm_id, whole_units(item.get("lon")), y=whole_units(item.get("lat")), tags=tags or None
+                )
             elif kind == "way":
-                taken.way(osm_id, item.get("nodes", ()), tags)
+                taken.way(osm_id, item.get("nodes", ()), tags=tags)
             elif kind == "relation":
                 members = tuple((m["type"], m["ref"], m["role"]) for m in item.get("members", ()))
-                taken.relation(osm_id, tags, members)
+                taken.relation(osm_id, tags, members=members)
     except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(f"JSON, but not as Overpass answers with [out:json]: {error!r}") from error

@@ -63,7 +63,7 @@ def _prune(segments: Int) -> Int:
     return segments
 
 
-def _inside(points: Float, a: Float, b: Float) -> NDArray[np.bool_]:
+def _inside(points: Float, a: Float, *, b: Float) -> NDArray[np.bool_]:
     """(p,) whether a ray eastwards from each point crosses an odd number of the segments a to b."""
     out = np.empty(len(points), bool)
     for i, (x, y) in enumerate(points):
@@ -88,7 +88,7 @@ def enclosed(segments: Int, xy: Float) -> tuple[Any, bool]:
     faces = shapely.get_parts(shapely.polygonize(lines))
     if len(faces) > 1 and len(_odd_ends(segments)) == 0:
         points = shapely.get_coordinates(shapely.point_on_surface(faces))
-        faces = faces[_inside(points, ends[:, 0], ends[:, 1])]
+        faces = faces[_inside(points, ends[:, 0], b=ends[:, 1])]
     if len(faces) == 0:
         return None, crossing
     return polygons_of(shapely.union_all(faces)), crossing
@@ -184,7 +184,7 @@ def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> As
     return Assembly(polygons_of(shapely.difference(outer, inner)), reason)
 
 
-def close_cut_ring(nodes: Int, xy: Float, extent: tuple[float, float, float, float]) -> Int | None:
+def close_cut_ring(nodes: Int, xy: Float, *, extent: tuple[float, float, float, float]) -> Int | None:
     """A ring that the edge of an extract cut, closed by straight edges; None if that is not sensible.
 
     It is sensible where both ends of every gap lie within 100 m of the extent's edge, the edges put in are

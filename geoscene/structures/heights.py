@@ -35,7 +35,7 @@ def foot(line: Float, xy: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
     return there[row, best, 2], metres[row, best], ~ends
 
 
-def surface_heights(table: Structures, piece: int, xy: Float) -> Float:
+def surface_heights(table: Structures, piece: int, *, xy: Float) -> Float:
     """Heights (n,) of a piece's carriageway at points (n, 2).
 
     Level across its centre line. Where carriageways join, they share the surface by the inverse fourth power

@@ -79,7 +79,7 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
     return Plan(grid * PRECISION, faces[twice != 0].astype(np.int64))
 
 
-def raise_shell(plan: Plan, levels: Float, solid: NDArray[np.bool_]) -> Shell:
+def raise_shell(plan: Plan, levels: Float, *, solid: NDArray[np.bool_]) -> Shell:
     """The closed surface around the solid layers of a plan's triangles.
 
     Where what is solid would touch itself along an upright edge alone, its smallest triangles there are left
@@ -90,7 +90,7 @@ def raise_shell(plan: Plan, levels: Float, solid: NDArray[np.bool_]) -> Shell:
     """
     n, count = levels.shape
     start, end, own, other = half_edges(plan)
-    solid = np.column_stack([_unpinched(plan, layer, start, own, other) for layer in solid.T])
+    solid = np.column_stack([_unpinched(plan, layer, start=start, own=own, other=other) for layer in solid.T])
     vertices = np.column_stack([np.tile(plan.xy, (count, 1)), levels.T.reshape(-1)])
     padded = np.pad(solid, ((0, 0), (1, 1)))
     faces, level, up, triangle = [], [], [], []
@@ -116,7 +116,9 @@ def raise_shell(plan: Plan, levels: Float, solid: NDArray[np.bool_]) -> Shell:
     )
 
 
-def _unpinched(plan: Plan, solid: NDArray[np.bool_], start: Int, own: Int, other: Int) -> NDArray[np.bool_]:
+def _unpinched(
+    plan: Plan, solid: NDArray[np.bool_], *, start: Int, own: Int, other: Int
+) -> NDArray[np.bool_]:
     """A layer (m,) in which the solid around each vertex hangs together."""
     (ux, uy), (vx, vy) = (plan.xy[plan.faces[:, k]].T - plan.xy[plan.faces[:, 0]].T for k in (1, 2))
     area = np.repeat(ux * vy - uy * vx, 3)

@@ -60,7 +60,7 @@ def ground_below(table: Structures, height: Height) -> Height:
         point, found = tree.query(points, predicate="intersects")
         for bridge in np.unique(found).tolist():
             rows, k = point[found == bridge], int(bridges[bridge])
-            deck = surface_heights(table, k, np.column_stack([x[rows], y[rows]]))
+            deck = surface_heights(table, k, xy=np.column_stack([x[rows], y[rows]]))
             away = shapely.distance(points[rows], table.approach[k])
             away = np.where(np.isnan(away), np.inf, away)
             below = np.minimum(_FALL * away, table.body[k] + _BELOW)
@@ -78,11 +78,11 @@ def find_low_decks(table: Structures, height: Height | None) -> Structures:
     low = table.low.copy()
     for k in np.flatnonzero(~table.tunnel).tolist():
         xy, _, ground = _ground_on(np.array([table.polygon[k]], object), height)
-        if (ground < surface_heights(table, k, xy) - table.body[k] - _HIGH).all():
+        if (ground < surface_heights(table, k, xy=xy) - table.body[k] - _HIGH).all():
             continue
         strips = _strips(table, k)
         xy, strip, ground = _ground_on(strips, height)
-        high = ground > surface_heights(table, k, xy) - table.body[k]
+        high = ground > surface_heights(table, k, xy=xy) - table.body[k]
         met = strips[np.bincount(strip[high], minlength=len(strips)) > 0]
         within = table.polygon[k].buffer(-_EDGE, join_style="mitre")
         low[k] = _areal(shapely.union_all(shapely.buffer(met, 1e-3)).intersection(within))
@@ -95,7 +95,7 @@ def _strips(table: Structures, k: int) -> NDArray[np.object_]:
     reach = float(table.half[k]) + 5.0
     cuts = np.linspace(0.0, flat.length, max(int(np.ceil(flat.length / _STEP)), 1) + 1)
     strips = [
-        shapely.LineString(cut_line(table.line[k], a, b)[:, :2]).buffer(reach, cap_style="flat")
+        shapely.LineString(cut_line(table.line[k], a, end=b)[:, :2]).buffer(reach, cap_style="flat")
         for a, b in pairwise(cuts)
     ]
     rest = table.polygon[k].difference(shapely.union_all(strips))  # beyond the line's ends, as at bends
@@ -125,7 +125,7 @@ def find_openings(table: Structures, height: Height | None) -> NDArray[np.object
     for k in np.flatnonzero(table.tunnel).tolist():
         strips = _strips(table, k)
         xy, strip, ground = _ground_on(strips, height)
-        covered = ground > surface_heights(table, k, xy) + table.rise[k] + THINNEST + 2 * LIP
+        covered = ground > surface_heights(table, k, xy=xy) + table.rise[k] + THINNEST + 2 * LIP
         open_ = np.bincount(strip[~covered], minlength=len(strips)) > 0
         if open_.any():
             within = table.inner[k].buffer(table.body[k] - _INTO, join_style="mitre")
@@ -166,6 +166,7 @@ def opening_layers(table: Structures, openings: NDArray[np.object_]) -> Layers:
 def tunnel_roof(
     xy: Float,
     ceiling: Float,
+    *,
     ground: Float,
     opening: shapely.Geometry | None,
     options: StructureOptions,

@@ -84,7 +84,7 @@ def road_members(graph: RoadGraph, raised: SurfaceRows) -> Members:
         landed[k] = [any(other == 0 for other, _, _ in found) for found in ends]
         bands = [
             _band(
-                np.concatenate([cut_line(inward[:, :2], 0.0, _SILL)[1:], first]),
+                np.concatenate([cut_line(inward[:, :2], 0.0, end=_SILL)[1:], first]),
                 max(width, graph.width[edge]),
             )
             for inward, found in zip((line[k], line[k][::-1]), ends, strict=True)
@@ -122,7 +122,7 @@ def _arms(graph: RoadGraph, members: NDArray[np.int64]) -> dict[int, list[tuple[
     arms: dict[int, list[tuple[int, Float, float]]] = {int(node): [] for node in ends}
     for node, step in ((graph.tail, 1), (graph.head, -1)):
         for edge in np.flatnonzero(np.isin(node, ends)).tolist():
-            line = cut_line(graph.geometry[edge][::step, :2], 0.0, _APPROACH)
+            line = cut_line(graph.geometry[edge][::step, :2], 0.0, end=_APPROACH)
             arms[int(node[edge])].append((_kind(graph, edge), line, float(graph.width[edge])))
     return arms
 

@@ -28,7 +28,7 @@ equally high do not leave a stair of micrometres, which the grid of solids would
 
 
 def buildings_over(
-    buildings: Buildings, base: Float, table: Structures, *, options: StructureOptions | None = None
+    buildings: Buildings, base: Float, *, table: Structures, options: StructureOptions | None = None
 ) -> tuple[Buildings, list[Problem]]:
     """The buildings with a passage where a tunnel or a road bridge would run into them, and which they are.
 
@@ -49,7 +49,7 @@ def buildings_over(
     free = np.where(tunnel, table.rise[road] + options.roof, options.headroom) + _OVER
     low, high = np.empty((2, len(row)))
     for k, piece in enumerate(road.tolist()):
-        z = surface_heights(table, piece, shapely.get_coordinates(common[k]).reshape(-1, 2))
+        z = surface_heights(table, piece, xy=shapely.get_coordinates(common[k]).reshape(-1, 2))
         low[k] = z.min(initial=np.inf) - table.body[piece]
         high[k] = z.max(initial=-np.inf) + free[k]
     stands = base[buildings.outline[row]]
@@ -61,15 +61,15 @@ def buildings_over(
         return buildings, []
     corridor = table.polygon[road[met]]
     clear = np.ceil((high - stands)[met] / _STEP - 1e-3) * _STEP
-    return _divided(buildings, row[met], corridor, clear, tunnel=tunnel[met])
+    return _divided(buildings, row[met], corridor=corridor, clear=clear, tunnel=tunnel[met])
 
 
 def _divided(
     buildings: Buildings,
     row: NDArray[np.int64],
+    *,
     corridor: NDArray[np.object_],
     clear: Float,
-    *,
     tunnel: NDArray[np.bool_],
 ) -> tuple[Buildings, list[Problem]]:
     """Rows (k,) divided along corridors (k,), what is in them standing ``clear`` (k,) over the base."""

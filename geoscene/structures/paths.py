@@ -78,9 +78,9 @@ class _Net:
 def path_members(
     raised: SurfaceRows,
     osm: OsmData,
+    *,
     frame: Frame,
     graph: RoadGraph,
-    *,
     height: Height | None,
     options: StructureOptions,
 ) -> tuple[Members, list[Problem]]:
@@ -110,15 +110,27 @@ def path_members(
     rows = [own[raised.osm_id[own] == name] for name in ids.tolist()]
     level = np.array([raised.level[r[0]] for r in rows], np.int8)
     track = np.array([(raised.klass[r] == Class.RAIL).all() for r in rows], np.bool_)
-    net = _network(lines, [way.nodes for way in ways], np.where(track, _TRACK_SLOPE, _SLOPE))
+    net = _network(lines, [way.nodes for way in ways], slope=np.where(track, _TRACK_SLOPE, _SLOPE))
     foot_only = ~track & np.array([(raised.klass[r] != Class.ROAD).all() for r in rows], np.bool_)
     sunk = tunnel & _sunk(osm, ways)
     joined = _joined(osm, ways)
-    ends = _ends(net, sunk, joined)
+    ends = _ends(net, sunk, joined=joined)
     free = np.where(foot_only, options.passage, options.headroom)
-    depth = _depths(net, sunk, joined, free + options.roof + _COVER)
+    depth = _depths(net, sunk, joined=joined, full=free + options.roof + _COVER)
     body = np.where(track, options.deck, options.slab)
-    z = _heights(net, tunnel, level, body, ends, depth, graph, osm, frame, height, options)
+    z = _heights(
+        net,
+        tunnel,
+        level=level,
+        body=body,
+        ends=ends,
+        depth=depth,
+        graph=graph,
+        osm=osm,
+        frame=frame,
+        height=height,
+        options=options,
+    )
 
     count = len(ways)
     line, approach, own_rows = (np.empty(count, object) for _ in range(3))
@@ -156,7 +168,7 @@ def _onward(xy: Float, width: float) -> shapely.Geometry:
     return band.union(shapely.Point(xy[0]).buffer(width / 2))
 
 
-def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]], slope: Float) -> _Net:
+def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]], *, slope: Float) -> _Net:
     """Stations at the ends and along lines, whose greatest slopes (n,) are given."""
     number: dict[int, int] = {}
     places: list[Float] = []
@@ -226,7 +238,7 @@ def _joined(osm: OsmData, ways: list[Way]) -> NDArray[np.int8]:
     return np.array(at, np.int8).reshape(-1, 2)
 
 
-def _ends(net: _Net, sunk: NDArray[np.bool_], joined: NDArray[np.int8]) -> NDArray[np.bool_]:
+def _ends(net: _Net, sunk: NDArray[np.bool_], *, joined: NDArray[np.int8]) -> NDArray[np.bool_]:
     """Whether a station (v,) is an end at which no other of the ways goes on, dead ends underground apart."""
     ends: NDArray[np.bool_] = np.bincount(np.concatenate([net.a, net.b]), minlength=len(net.xy)) == 1
     for k in np.flatnonzero(sunk).tolist():
@@ -235,7 +247,7 @@ def _ends(net: _Net, sunk: NDArray[np.bool_], joined: NDArray[np.int8]) -> NDArr
     return ends
 
 
-def _depths(net: _Net, sunk: NDArray[np.bool_], joined: NDArray[np.int8], full: Float) -> Float:
+def _depths(net: _Net, sunk: NDArray[np.bool_], *, joined: NDArray[np.int8], full: Float) -> Float:
     """Metres (v,) that stations are under the ground at least: ``full`` (n,) but for ramps; else NaN."""
     depth = np.full(len(net.xy), np.nan)
     mouth = np.zeros(len(net.xy), np.bool_)
@@ -254,6 +266,7 @@ def _depths(net: _Net, sunk: NDArray[np.bool_], joined: NDArray[np.int8], full: 
 def _heights(
     net: _Net,
     tunnel: NDArray[np.bool_],
+    *,
     level: NDArray[np.int8],
     body: Float,
     ends: NDArray[np.bool_],
@@ -269,10 +282,12 @@ def _heights(
         return np.empty(0)
     ground = _ground(net.xy, height)
     fixed = np.where(ends, ground, np.nan)
-    on_road = _on_road_bridges(net, tunnel, level, graph)
+    on_road = _on_road_bridges(net, tunnel, level=level, graph=graph)
     fixed = np.where(np.isnan(on_road), fixed, on_road)
-    z = _even(net, fixed, ground)
-    least, most = _needs(net, tunnel, level, body, graph, osm, frame, height, options)
+    z = _even(net, fixed, ground=ground)
+    least, most = _needs(
+        net, tunnel, level=level, body=body, graph=graph, osm=osm, frame=frame, height=height, options=options
+    )
     # What crosses comes after the cover: a path over a tunnel may have less of it, but does not come out.
     under = np.where(np.isnan(depth), np.inf, ground - np.maximum(depth - _SPARE, 0.0))
     least = np.minimum(least, under)
@@ -283,7 +298,7 @@ def _heights(
 
 
 def _on_road_bridges(
-    net: _Net, tunnel: NDArray[np.bool_], level: NDArray[np.int8], graph: RoadGraph
+    net: _Net, tunnel: NDArray[np.bool_], *, level: NDArray[np.int8], graph: RoadGraph
 ) -> Float:
     """Height (v,) of the nearest road bridge or tunnel of the same layer beside a station, NaN if none."""
     z, nearest = np.full(len(net.xy), np.nan), np.full(len(net.xy), np.inf)
@@ -305,7 +320,7 @@ def _on_road_bridges(
     return z
 
 
-def _even(net: _Net, fixed: Float, ground: Float) -> Float:
+def _even(net: _Net, fixed: Float, *, ground: Float) -> Float:
     """Heights (v,) that run evenly between the fixed ones; the ground's where none is fixed."""
     from scipy.sparse import csr_array, diags_array  # noqa: PLC0415  (slow to import)
     from scipy.sparse.linalg import spsolve  # noqa: PLC0415
@@ -323,6 +338,7 @@ def _even(net: _Net, fixed: Float, ground: Float) -> Float:
 def _needs(
     net: _Net,
     tunnel: NDArray[np.bool_],
+    *,
     level: NDArray[np.int8],
     body: Float,
     graph: RoadGraph,
@@ -334,14 +350,14 @@ def _needs(
     """How high stations (v,) must be at least and at most; NaN where anything goes."""
     obstacles = find_obstacles(osm, frame)
     roads = edge_lines(graph)
-    rank = _rank(graph.layer, graph.bridge, graph.tunnel)
+    rank = _rank(graph.layer, graph.bridge, tunnel=graph.tunnel)
     lines = np.concatenate([roads, obstacles.line])
     tree = shapely.STRtree(lines)
     least, most = np.full((2, len(net.xy)), np.nan)
     of_way = zip(net.rows, tunnel.tolist(), level.tolist(), body.tolist(), strict=True)
     for rows, below, layer, thick in of_way:
         way = shapely.LineString(net.xy[rows])
-        own = int(_rank(layer, not below, below))
+        own = int(_rank(layer, not below, tunnel=below))
         for other in tree.query(way, predicate="crosses").tolist():
             is_road = other < len(roads)
             over = own > rank[other] if is_road else not below
@@ -367,7 +383,7 @@ def _needs(
     return least, most
 
 
-def _rank(layer: Any, bridge: Any, tunnel: Any) -> Any:
+def _rank(layer: Any, bridge: Any, *, tunnel: Any) -> Any:
     """What is higher where ways cross: by layer, then a bridge over the ground over a tunnel."""
     return np.asarray(layer, np.int64) * 2 + np.where(tunnel, -1, np.asarray(bridge, np.int64))
 

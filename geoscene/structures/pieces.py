@@ -44,22 +44,24 @@ _CRUMB = 0.02
 """Square metres; smaller parts of a piece are left out."""
 
 
-def cut_pieces(members: Members, raised: SurfaceRows, options: StructureOptions) -> Structures:
+def cut_pieces(members: Members, raised: SurfaceRows, *, options: StructureOptions) -> Structures:
     """The pieces of all members, in order, without piers.
 
     Where outlines of one carriageway overlap, as they do at junctions, the smaller has the ground.
     """
-    member, polygon, line, around, half = _outlines(members, raised, options)
+    member, polygon, line, around, half = _outlines(members, raised, options=options)
     tunnel = members.tunnel[member]
     foot_only = members.foot[member]
     body = np.where(tunnel, options.wall, np.where(foot_only, options.slab, options.deck))
     free = np.where(foot_only, options.passage, options.headroom) + np.where(tunnel, THINNEST, 0.0)
-    polygon = part_outlines(polygon, around, half, tunnel, free=free, body=body)
-    sheets = find_sheets(polygon, around, tunnel)
+    polygon = part_outlines(polygon, around, half=half, tunnel=tunnel, free=free, body=body)
+    sheets = find_sheets(polygon, around, tunnel=tunnel)
     near = sheets.near
     rim = np.where(tunnel, options.wall, options.rim)
-    inner = _inner(polygon, line, around, half, sheets, members.approach[member], rim)
-    polygon = _territories(polygon, around, sheets)
+    inner = _inner(
+        polygon, line, around=around, half=half, sheets=sheets, approach=members.approach[member], rim=rim
+    )
+    polygon = _territories(polygon, around, sheets=sheets)
     rise = np.where(
         tunnel,
         np.where(foot_only, options.passage, options.headroom),
@@ -99,18 +101,18 @@ def cut_pieces(members: Members, raised: SurfaceRows, options: StructureOptions)
 
 
 def _outlines(
-    members: Members, raised: SurfaceRows, options: StructureOptions
+    members: Members, raised: SurfaceRows, *, options: StructureOptions
 ) -> tuple[Int, NDArray[np.object_], NDArray[np.object_], NDArray[np.object_], Float]:
     """Pieces before they are told apart: member, outline, line, line with its surroundings, half-width."""
     lines = [_without_crumbs(line) for line in members.line]
-    whole, half = _wholes(members, lines, raised, options)
+    whole, half = _wholes(members, lines, raised=raised, options=options)
     rows: list[tuple[int, object, Float, Float, float]] = []
     for m, line in enumerate(lines):
         length = _length(line)
         count = max(int(np.ceil(length / options.piece)), 1)
         cuts = np.linspace(0.0, length, count + 1)
         for k, (start, end) in enumerate(pairwise(cuts)):
-            part = _without_crumbs(cut_line(line, start, end))
+            part = _without_crumbs(cut_line(line, start, end=end))
             outline = whole[m]
             if count > 1:
                 reach = _flat(part).buffer(2 * half[m] + 5.0, cap_style="flat", join_style="mitre")
@@ -118,7 +120,7 @@ def _outlines(
                 discs = [shapely.Point(p[:2]).buffer(_SIDE / 2) for p in ends]
                 wedges = [shapely.Point(p[:2]).buffer(half[m] + 1.0) for p in (part[0], part[-1])]
                 outline = outline.intersection(shapely.union_all([reach, *discs, *wedges]))
-            rows.append((m, outline, part, cut_line(line, start - _AROUND, end + _AROUND), half[m]))
+            rows.append((m, outline, part, cut_line(line, start - _AROUND, end=end + _AROUND), half[m]))
     columns: NDArray[np.object_] = np.empty((3, len(rows)), object)
     for k, row in enumerate(rows):
         columns[0, k], columns[1, k], columns[2, k] = row[1:4]
@@ -132,7 +134,7 @@ def _outlines(
 
 
 def _wholes(
-    members: Members, lines: list[Float], raised: SurfaceRows, options: StructureOptions
+    members: Members, lines: list[Float], *, raised: SurfaceRows, options: StructureOptions
 ) -> tuple[list[shapely.Geometry], Float]:
     """Outlines of members with their rims, and metres from their lines to the outside.
 
@@ -195,6 +197,7 @@ def _half(outline: shapely.Geometry, line: shapely.LineString) -> float:
 def _inner(
     polygon: NDArray[np.object_],
     line: NDArray[np.object_],
+    *,
     around: NDArray[np.object_],
     half: Float,
     sheets: Sheets,
@@ -213,19 +216,19 @@ def _inner(
                 continue
             shape = polygon[q]
             if (min(k, q), max(k, q)) in sheets.parted:
-                shape = shape.intersection(where_same(around[k], around[q], PARTED))
+                shape = shape.intersection(where_same(around[k], around[q], within=PARTED))
             shapes.append(shape)
         whole = _union([*shapes, *approach[np.r_[k, others].astype(np.int64)]])
         closed = whole.buffer(0.05, join_style="mitre").buffer(-0.05 - rim[k], join_style="mitre")
         # Where two are squeezed together so that a wall would stand in the middle of the road, there is none.
         wide = min(_VEHICLE, float(half[k]) / 2)
-        middle = _flat(cut_line(line[k], wide, _length(line[k]) - wide)).buffer(wide, cap_style="flat")
+        middle = _flat(cut_line(line[k], wide, end=_length(line[k]) - wide)).buffer(wide, cap_style="flat")
         inner[k] = _union([closed, middle]).intersection(polygon[k].buffer(1.0))
     return inner
 
 
 def _territories(
-    polygon: NDArray[np.object_], around: NDArray[np.object_], sheets: Sheets
+    polygon: NDArray[np.object_], around: NDArray[np.object_], *, sheets: Sheets
 ) -> NDArray[np.object_]:
     """Outlines less those of smaller neighbours, so that none is covered altogether."""
     rank = np.empty(len(polygon), np.int64)
@@ -236,7 +239,7 @@ def _territories(
         for earlier in others[rank[others] < rank[k]].tolist():
             taken = polygon[earlier].buffer(-_OVERLAP, join_style="mitre")
             if (min(earlier, k), max(earlier, k)) in sheets.over:
-                taken = taken.intersection(where_same(around[k], around[earlier], SHEET))
+                taken = taken.intersection(where_same(around[k], around[earlier], within=SHEET))
             rest = rest.difference(taken)
         out[k] = _clean(rest)
     return out

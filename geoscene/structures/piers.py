@@ -58,16 +58,19 @@ def place_piers(
         spacing[k] = flat.length / count
         at = (np.arange(count) + 0.5) * spacing[k]
         tries = np.add.outer(at, [s for s in _SHIFTS if abs(s) < spacing[k] / 2])
-        shapes = _piers(table, k, flat, tries.ravel())
-        free = _stands_out(table, k, flat, tries.ravel(), height) & ~shapely.is_empty(shapes)
+        shapes = _piers(table, k, flat=flat, at=tries.ravel())
+        free = _stands_out(table, k, flat=flat, at=tries.ravel(), height=height) & ~shapely.is_empty(shapes)
         hit, found = below.query(shapes, predicate="dwithin", distance=_FREE)
         free[hit] = False
         hit, found = below.query(shapes, predicate="dwithin", distance=_RAIL_FREE)
         free[hit[rail[found]]] = False
-        free &= ~_on_pieces(table, k, pieces, shapes)
+        free &= ~_on_pieces(table, k, pieces=pieces, shapes=shapes)
         free = free.reshape(tries.shape)
         first = free.argmax(axis=1) + np.arange(count) * tries.shape[1]
-        stands = [*shapes[first[free.any(axis=1)]], *_abutments(table, k, flat, ends, solid, height)]
+        stands = [
+            *shapes[first[free.any(axis=1)]],
+            *_abutments(table, k, flat=flat, ends=ends, ways=solid, height=height),
+        ]
         pier[k] = shapely.MultiPolygon(shapely.get_parts(shapely.union_all(stands)).tolist())
     spacing[shapely.is_empty(pier)] = 0.0
     return replace(table, pier=pier, pier_spacing=spacing)
@@ -84,6 +87,7 @@ def _ends(table: Structures) -> NDArray[np.bool_]:
 def _abutments(
     table: Structures,
     k: int,
+    *,
     flat: shapely.LineString,
     ends: NDArray[np.bool_],
     ways: shapely.STRtree,
@@ -94,13 +98,13 @@ def _abutments(
     They keep free of roads and paths, not of the piece's own track, which ends before them.
     """
     at = np.array([_END, flat.length - _END])[ends[k]]
-    shapes = _piers(table, k, flat, at)
-    free = _stands_out(table, k, flat, at, height) & ~shapely.is_empty(shapes)
+    shapes = _piers(table, k, flat=flat, at=at)
+    free = _stands_out(table, k, flat=flat, at=at, height=height) & ~shapely.is_empty(shapes)
     free[np.unique(ways.query(shapes, predicate="dwithin", distance=_FREE)[0])] = False
     return list(shapes[free])
 
 
-def _piers(table: Structures, k: int, flat: shapely.LineString, at: Float) -> NDArray[np.object_]:
+def _piers(table: Structures, k: int, *, flat: shapely.LineString, at: Float) -> NDArray[np.object_]:
     """Piers' outlines (n,) at metres along a piece."""
     wide = min(_SHARE * 2 * table.half[k], 2 * table.half[k] - 0.6)
     here, there = (
@@ -121,7 +125,7 @@ def _piers(table: Structures, k: int, flat: shapely.LineString, at: Float) -> ND
 
 
 def _stands_out(
-    table: Structures, k: int, flat: shapely.LineString, at: Float, height: Height | None
+    table: Structures, k: int, *, flat: shapely.LineString, at: Float, height: Height | None
 ) -> NDArray[np.bool_]:
     """Whether the bridge is well above the ground at metres along it."""
     xy = shapely.get_coordinates(shapely.line_interpolate_point(flat, at))
@@ -131,7 +135,7 @@ def _stands_out(
 
 
 def _on_pieces(
-    table: Structures, k: int, pieces: shapely.STRtree, shapes: NDArray[np.object_]
+    table: Structures, k: int, *, pieces: shapely.STRtree, shapes: NDArray[np.object_]
 ) -> NDArray[np.bool_]:
     """Whether each pier would stand in the way of another bridge, or over an open tunnel."""
     blocked = np.zeros(len(shapes), np.bool_)

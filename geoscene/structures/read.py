@@ -26,9 +26,9 @@ Height = Callable[[Float, Float], Float]
 def read_structures(
     surfaces: RoadSurfaces,
     graph: RoadGraph,
+    *,
     osm: OsmData,
     frame: Frame,
-    *,
     height: Height | None = None,
     options: StructureOptions | None = None,
 ) -> tuple[Structures, list[Problem]]:
@@ -39,7 +39,7 @@ def read_structures(
     """
     options = options or StructureOptions()
     raised = surfaces.raised
-    paths, problems = path_members(raised, osm, frame, graph, height=height, options=options)
-    table = cut_pieces(concatenate_members([road_members(graph, raised), paths]), raised, options)
+    paths, problems = path_members(raised, osm, frame=frame, graph=graph, height=height, options=options)
+    table = cut_pieces(concatenate_members([road_members(graph, raised), paths]), raised, options=options)
     table = place_piers(table, surfaces, height=height, options=options)
     return find_low_decks(table, height), problems

@@ -64,7 +64,7 @@ def _pair(one: int, two: int) -> Pair:
 
 
 def find_sheets(
-    polygon: NDArray[np.object_], around: NDArray[np.object_], tunnel: NDArray[np.bool_]
+    polygon: NDArray[np.object_], around: NDArray[np.object_], *, tunnel: NDArray[np.bool_]
 ) -> Sheets:
     """Which pieces are one carriageway, by their heights where their outlines meet."""
     one, two = shapely.STRtree(polygon).query(polygon, predicate="dwithin", distance=_TOUCH)
@@ -93,22 +93,22 @@ def find_sheets(
     return Sheets(near, over, parted)
 
 
-def where_same(line: Float, other: Float, within: float) -> shapely.Geometry:
+def where_same(line: Float, other: Float, *, within: float) -> shapely.Geometry:
     """Where, beside a line, it is less than ``within`` metres higher or lower than another one, in strips."""
     cuts, middle = _strip_cuts(line)
     z, _, beside = foot(other, middle[:, :2])
     same = (np.abs(z - middle[:, 2]) < within) | ~beside
     return shapely.union_all(
-        [_flat_part(line, cuts, k).buffer(_SIDE, cap_style="flat") for k in np.flatnonzero(same).tolist()]
+        [_flat_part(line, cuts, k=k).buffer(_SIDE, cap_style="flat") for k in np.flatnonzero(same).tolist()]
     )
 
 
 def part_outlines(
     polygon: NDArray[np.object_],
     around: NDArray[np.object_],
+    *,
     half: Float,
     tunnel: NDArray[np.bool_],
-    *,
     free: Float,
     body: Float,
 ) -> NDArray[np.object_]:
@@ -132,16 +132,24 @@ def part_outlines(
         least = PARTED if tunnel[p] == tunnel[q] else 0.0
         strips = [
             *_in_conflict(
-                around[p], around[q], half[p] + half[q], (free[q] + body[p], free[p] + body[q]), least
+                around[p],
+                around[q],
+                reach=half[p] + half[q],
+                needs=(free[q] + body[p], free[p] + body[q]),
+                least=least,
             ),
             *_in_conflict(
-                around[q], around[p], half[p] + half[q], (free[p] + body[q], free[q] + body[p]), least
+                around[q],
+                around[p],
+                reach=half[p] + half[q],
+                needs=(free[p] + body[q], free[q] + body[p]),
+                least=least,
             ),
         ]
         where = _areal(shapely.union_all(strips).intersection(shared))
         if where.area < _SCANT:
             continue
-        theirs = _nearer(where, around[q], float(half[q]), around[p], float(half[p]))
+        theirs = _nearer(where, around[q], half=float(half[q]), other=around[p], other_half=float(half[p]))
         lost.setdefault(p, []).append(theirs)
         lost.setdefault(q, []).append(where.difference(theirs))
     out = polygon.copy()
@@ -157,7 +165,7 @@ def _areal(shape: shapely.Geometry) -> shapely.Geometry:
 
 
 def _in_conflict(
-    line: Float, other: Float, reach: float, needs: tuple[float, float], least: float
+    line: Float, other: Float, *, reach: float, needs: tuple[float, float], least: float
 ) -> list[shapely.Geometry]:
     """Strips along a line where another runs beside it at a height that lets neither pass the other.
 
@@ -169,7 +177,7 @@ def _in_conflict(
     short = (np.abs(up) >= least) & (np.abs(up) < np.where(up < 0, needs[1], needs[0]) - _TIGHT)
     strips, flat = [], shapely.LineString(other[:, :2])
     for k in np.flatnonzero(short & beside & (away <= reach)).tolist():
-        part = _flat_part(line, cuts, k)
+        part = _flat_part(line, cuts, k=k)
         start, end = shapely.line_locate_point(
             flat, [shapely.Point(part.coords[0]), shapely.Point(part.coords[-1])]
         )
@@ -186,13 +194,13 @@ def _strip_cuts(line: Float) -> tuple[Float, Float]:
     return cuts, np.stack([np.interp(at, along, column) for column in line.T], axis=1)
 
 
-def _flat_part(line: Float, cuts: Float, k: int) -> shapely.LineString:
+def _flat_part(line: Float, cuts: Float, *, k: int) -> shapely.LineString:
     """The line of a strip, which overlaps the next a little."""
-    return shapely.LineString(cut_line(line, cuts[k] - _LAP, cuts[k + 1] + _LAP)[:, :2])
+    return shapely.LineString(cut_line(line, cuts[k] - _LAP, end=cuts[k + 1] + _LAP)[:, :2])
 
 
 def _nearer(
-    where: shapely.Geometry, line: Float, half: float, other: Float, other_half: float
+    where: shapely.Geometry, line: Float, *, half: float, other: Float, other_half: float
 ) -> shapely.Geometry:
     """What of an area is further within the one carriageway than within the other.
 

@@ -39,35 +39,41 @@ def structure_meshes(
     openings : where the ground is open over tunnels, from `find_openings`
     """
     chosen = range(len(table)) if rows is None else [int(k) for k in rows]
-    return [_solid(table, k, height, openings, options or StructureOptions()) for k in chosen]
+    return [
+        _solid(table, k, height=height, openings=openings, options=options or StructureOptions())
+        for k in chosen
+    ]
 
 
 def _solid(
     table: Structures,
     k: int,
+    *,
     height: Height | None,
     openings: NDArray[np.object_] | None,
     options: StructureOptions,
 ) -> Mesh:
-    plan = cut_plan(table.polygon[k], _linework(table, k, openings))
+    plan = cut_plan(table.polygon[k], _linework(table, k, openings=openings))
     if not len(plan.faces):
         return Mesh.empty()
-    z = surface_heights(table, k, plan.xy)
+    z = surface_heights(table, k, xy=plan.xy)
     ground = np.zeros(len(z)) if height is None else np.asarray(height(*plan.xy.T), float)
     middle = plan.middle
     rim = ~shapely.contains_xy(table.inner[k], *middle.T)
     if table.tunnel[k]:
-        levels, solid = _tunnel(table, k, plan, z, ground, rim, openings, options)
+        levels, solid = _tunnel(
+            table, k, plan=plan, z=z, ground=ground, rim=rim, openings=openings, options=options
+        )
         floor = 1
     else:
-        levels, solid = _bridge(table, k, plan, z, ground, rim)
+        levels, solid = _bridge(table, k, plan=plan, z=z, ground=ground, rim=rim)
         floor = 2
-    shell = raise_shell(plan, levels, solid)
-    return _dressed(table, k, plan, shell, floor, rim)
+    shell = raise_shell(plan, levels, solid=solid)
+    return _dressed(table, k, plan=plan, shell=shell, floor=floor, rim=rim)
 
 
 def _bridge(
-    table: Structures, k: int, plan: Plan, z: Float, ground: Float, rim: NDArray[np.bool_]
+    table: Structures, k: int, *, plan: Plan, z: Float, ground: Float, rim: NDArray[np.bool_]
 ) -> tuple[Float, NDArray[np.bool_]]:
     """Levels under ground, soffit, deck, parapet; piers reach down, parapets up."""
     soffit = z - table.body[k]
@@ -79,6 +85,7 @@ def _bridge(
 def _tunnel(
     table: Structures,
     k: int,
+    *,
     plan: Plan,
     z: Float,
     ground: Float,
@@ -89,12 +96,12 @@ def _tunnel(
     """Levels under the floor, floor, ceiling, roof; walls between."""
     ceiling = z + table.rise[k]
     opening = None if openings is None else openings[k]
-    roof = tunnel_roof(plan.xy, ceiling, ground, opening, options)
+    roof = tunnel_roof(plan.xy, ceiling, ground=ground, opening=opening, options=options)
     full = np.ones(len(rim), np.bool_)
     return np.column_stack([z - table.body[k], z, ceiling, roof]), np.column_stack([full, rim, full])
 
 
-def _linework(table: Structures, k: int, openings: NDArray[np.object_] | None) -> NDArray[np.object_]:
+def _linework(table: Structures, k: int, *, openings: NDArray[np.object_] | None) -> NDArray[np.object_]:
     """Lines along which the piece is cut: what lies on it, its rim, and where its height bends."""
     lines = [
         *shapely.boundary(table.surfaces.polygon[table.tops[k]]),
@@ -129,14 +136,16 @@ def _ribs(line: Float, reach: float) -> NDArray[np.object_]:
     return np.atleast_1d(ribs)
 
 
-def _dressed(table: Structures, k: int, plan: Plan, shell: Shell, floor: int, rim: NDArray[np.bool_]) -> Mesh:
+def _dressed(
+    table: Structures, k: int, *, plan: Plan, shell: Shell, floor: int, rim: NDArray[np.bool_]
+) -> Mesh:
     """The shell as a mesh, its faces of the classes of what lies on them."""
     concrete = materials()["concrete"]
     body = Class.TUNNEL if table.tunnel[k] else Class.BRIDGE
     klass = np.full(len(shell.faces), body, np.uint8)
     material = np.full(len(shell.faces), concrete.code, np.uint8)
     on_top = shell.up & (shell.level == floor)
-    row = _top_rows(table, k, plan.middle)[shell.triangle]
+    row = _top_rows(table, k, xy=plan.middle)[shell.triangle]
     dressed = on_top & (row >= 0) & ~rim[shell.triangle]
     klass[dressed] = table.surfaces.klass[row[dressed]]
     material[dressed] = table.surfaces.material[row[dressed]]
@@ -157,7 +166,7 @@ def _dressed(table: Structures, k: int, plan: Plan, shell: Shell, floor: int, ri
     return mesh.take(np.ones(len(mesh), np.bool_))
 
 
-def _top_rows(table: Structures, k: int, xy: Float) -> NDArray[np.int64]:
+def _top_rows(table: Structures, k: int, *, xy: Float) -> NDArray[np.int64]:
     """The surface (n,) that lies on top at points (n, 2), -1 where none does."""
     tops = table.tops[k]
     tops = tops[np.lexsort([-tops, table.surfaces.priority[tops]])]

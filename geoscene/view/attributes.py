@@ -26,7 +26,9 @@ def tables(features: Features, present: NDArray[np.bool_]) -> list[dict[str, Any
     for number, (layer, start) in enumerate(zip(features.layers, features.starts.tolist(), strict=True)):
         columns = features.columns[number]
         length = len(next(iter(columns.values()), ()))
-        rows = _chosen(layer, columns, present[start : start + length], features, present)
+        rows = _chosen(
+            layer, columns, own=present[start : start + length], features=features, present=present
+        )
         if len(rows):
             told = {name: _column(values[rows]) for name, values in columns.items()}
             out.append({"layer": layer, "feature": (rows + start).tolist(), "columns": told})
@@ -36,6 +38,7 @@ def tables(features: Features, present: NDArray[np.bool_]) -> list[dict[str, Any
 def _chosen(
     layer: str,
     columns: dict[str, NDArray[Any]],
+    *,
     own: NDArray[np.bool_],
     features: Features,
     present: NDArray[np.bool_],

@@ -68,24 +68,24 @@ def view_scene(
     ends: list[int] = []
     faces = 0
     with whole_file(out) as file, spool(out) as blobs:
-        _blob(blobs, "shapes", shape_bytes)
+        _blob(blobs, "shapes", data=shape_bytes)
         for done, (i, j) in enumerate(indices.tolist()):
-            progress("page", done, len(indices))
-            tile = only(scene.tile(i, j), groups, kept)
+            progress("page", done, total=len(indices))
+            tile = only(scene.tile(i, j), groups, kept=kept)
             faces += len(tile.mesh)
             for column in (tile.mesh.feature, tile.instances.feature):
                 present[column[column >= 0]] = True
             entry, data = pack_tile(tile, groups)
             told.append({"index": [i, j], **entry})
-            _blob(blobs, f"tile-{done}", data)
+            _blob(blobs, f"tile-{done}", data=data)
             ends.append(blobs.tell())
             if blobs.tell() > max_mb * 1e6:
                 break
-        _blob(blobs, "attributes", gzip(_json(tables(read_features(scene), present))))
+        _blob(blobs, "attributes", data=gzip(_json(tables(read_features(scene), present))))
         if blobs.tell() > max_mb * 1e6:
-            raise InputError(_too_large(scene, indices, ends, blobs.tell(), max_mb))
-        head = _head(scene, told, groups, shapes)
-        _join(file, scene, head, blobs)
+            raise InputError(_too_large(scene, indices, sizes=ends, size=blobs.tell(), max_mb=max_mb))
+        head = _head(scene, told, groups=groups, shapes=shapes)
+        _join(file, scene, head=head, blobs=blobs)
     files, size = size_of(out)
     notes = []
     if len(told) < len(scene.tile_indices):
@@ -116,7 +116,7 @@ def _kept(groups: Groups, layers: Sequence[str]) -> NDArray[np.bool_]:
     return np.array([not layers or name in layers for name in groups.names])
 
 
-def _join(file: IO[bytes], scene: Scene, head: dict[str, Any], blobs: IO[bytes]) -> None:
+def _join(file: IO[bytes], scene: Scene, *, head: dict[str, Any], blobs: IO[bytes]) -> None:
     """Write the page: the template with its words filled in, and the bytes of the scene where it has them."""
     words = {
         "title": html.escape(str(head["name"])),
@@ -139,7 +139,7 @@ def _json(value: Any) -> bytes:
     return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _blob(file: IO[bytes], name: str, data: bytes) -> None:
+def _blob(file: IO[bytes], name: str, *, data: bytes) -> None:
     """Bytes as an element of the page that browsers neither run nor show."""
     file.write(f'<script type="text/plain" id="{name}">'.encode() + b64encode(data) + b"</script>\n")
 
@@ -185,7 +185,7 @@ def _outwards(indices: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _too_large(
-    scene: Scene, indices: NDArray[np.int64], sizes: Sequence[int], size: int, max_mb: float
+    scene: Scene, indices: NDArray[np.int64], *, sizes: Sequence[int], size: int, max_mb: float
 ) -> str:
     """How large the page would be, and which part of it would not be too large."""
     rings, share = _rings(indices), size / sizes[-1]
@@ -207,7 +207,7 @@ def _too_large(
 
 
 def _head(
-    scene: Scene, told: list[dict[str, Any]], groups: Groups, shapes: list[list[int]]
+    scene: Scene, told: list[dict[str, Any]], *, groups: Groups, shapes: list[list[int]]
 ) -> dict[str, Any]:
     """What the viewer must know before it reads the bytes."""
     low = np.min([entry["low"] for entry in told], axis=0).tolist()

@@ -64,7 +64,7 @@ def groups_of(scene: Scene) -> Groups:
     return Groups(tuple(names), of)
 
 
-def only(tile: Tile, groups: Groups, kept: NDArray[np.bool_]) -> Tile:
+def only(tile: Tile, groups: Groups, *, kept: NDArray[np.bool_]) -> Tile:
     """The faces and copies of a tile that are in the groups (n,) kept."""
     if kept.all():
         return tile
@@ -138,7 +138,7 @@ def _upright(transform: NDArray[np.float64], step: float) -> NDArray[np.int64] |
     """Columns (6, k) of whole steps for transforms (k, 3, 4), or None where they do not say all of them."""
     along, lift = np.hypot(transform[:, 0, 0], transform[:, 1, 0]), transform[:, 2, 2]
     turn = np.arctan2(transform[:, 1, 0], transform[:, 0, 0])
-    told = _turned(along, lift, turn)
+    told = _turned(along, lift, turn=turn)
     if not np.allclose(told, transform[:, :, :3], rtol=0, atol=1e-5) or (lift <= 0).any():
         return None
     steps = np.rint(transform[:, :, 3].T / step).astype(np.int64)
@@ -151,11 +151,11 @@ def _transforms(columns: NDArray[np.uint16], step: float) -> NDArray[np.float64]
     """Transforms (k, 3, 4) of the columns of upright copies."""
     x, y, z, turn, along, lift = columns.astype(np.int64)
     place = np.column_stack([np.cumsum(x) % 65_536, y, z]) * step
-    return np.dstack([_turned(along * SCALE, lift * SCALE, turn * TURN), place[:, :, None]])
+    return np.dstack([_turned(along * SCALE, lift * SCALE, turn=turn * TURN), place[:, :, None]])
 
 
 def _turned(
-    along: NDArray[np.float64], lift: NDArray[np.float64], turn: NDArray[np.float64]
+    along: NDArray[np.float64], lift: NDArray[np.float64], *, turn: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Matrices (k, 3, 3) that scale across and upwards and turn about the vertical."""
     matrix = np.zeros((len(turn), 3, 3))

@@ -39,7 +39,7 @@ class Facades:
     style: Float
 
 
-def facades(corners: Float, normal: Float, feature: NDArray[np.int32], wall: NDArray[np.bool_]) -> Facades:
+def facades(corners: Float, normal: Float, *, feature: NDArray[np.int32], wall: NDArray[np.bool_]) -> Facades:
     """The flat walls among m faces: upright ones of one feature in one plane are one wall.
 
     corners : (m, 3, 3) metres
@@ -58,7 +58,7 @@ def facades(corners: Float, normal: Float, feature: NDArray[np.int32], wall: NDA
     turn = np.arctan2(flat[:, 1], flat[:, 0])
     # Sorting and splitting at gaps gathers what differs by rounding alone; rounding keys would not.
     order = np.lexsort((turn, feature))
-    bearing = _runs(feature[order], turn[order], 0.005)
+    bearing = _runs(feature[order], turn[order], gap=0.005)
     tangent = np.empty((len(face), 2))
     first = np.flatnonzero(np.r_[True, np.diff(bearing) > 0])
     tangent[order] = np.stack([-flat[order[first], 1], flat[order[first], 0]], axis=1)[bearing]
@@ -66,7 +66,7 @@ def facades(corners: Float, normal: Float, feature: NDArray[np.int32], wall: NDA
     group = np.empty(len(face), np.int64)
     group[order] = bearing
     order = np.lexsort((away, group))
-    run = _runs(group[order], away[order], 0.05)
+    run = _runs(group[order], away[order], gap=0.05)
     plane = np.empty(len(face), np.int64)
     plane[order] = run
 
@@ -89,10 +89,10 @@ def facades(corners: Float, normal: Float, feature: NDArray[np.int32], wall: NDA
     of_face[face] = plane
     owner = np.empty(k, np.int32)
     owner[plane] = feature
-    return Facades(of_face, tangents, along, height, _styles(owner, along, height))
+    return Facades(of_face, tangents, along, height, _styles(owner, along, height=height))
 
 
-def _runs(key: NDArray[np.integer], value: Float, gap: float) -> NDArray[np.int64]:
+def _runs(key: NDArray[np.integer], value: Float, *, gap: float) -> NDArray[np.int64]:
     """Numbers (n,) of the runs in sorted rows: a new one where the key changes or the value jumps."""
     numbers = np.zeros(len(key), np.int64)
     np.cumsum((np.diff(key) != 0) | (np.diff(value) > gap), out=numbers[1:])
@@ -113,7 +113,7 @@ def _chances(feature: NDArray[np.int32], count: int) -> Float:
     return out
 
 
-def _styles(feature: NDArray[np.int32], along: Float, height: Float) -> Float:
+def _styles(feature: NDArray[np.int32], along: Float, *, height: Float) -> Float:
     """How windows look on each wall (k, 10), out of the building's number alone: no map says.
 
     Metres, but for FLOORS (a count; 0 for a wall without windows) and PAINT (albedo of the frames).
@@ -210,7 +210,7 @@ def _of_part(world: World, part: Geometry) -> Facades:
     surfaces = world.lookup(Hits(ones, _numbers(part), own, ones.astype(np.float32), np.empty((0, 3))))
     corners = part.vertices[part.faces] + world.caster.origin
     wall = (surfaces.klass == Class.BUILDING) & (surfaces.surface == WALL)
-    return facades(corners, part.planes[:, :3], surfaces.feature, wall)
+    return facades(corners, part.planes[:, :3], feature=surfaces.feature, wall=wall)
 
 
 def _joined(parts: list[Facades], numbers: list[NDArray[np.int32]]) -> Facades:

@@ -56,7 +56,7 @@ def _air_mass(sine: Float) -> Float:
     return mass
 
 
-def _sky_radiance(sine: Float, cosine: Float, sun_sine: float) -> Float:
+def _sky_radiance(sine: Float, cosine: Float, *, sun_sine: float) -> Float:
     """Radiance (..., 3) of a clear sky at elevations by sine, ``cosine`` being that of the angle to the sun.
 
     Single scattering in a plane-parallel atmosphere with the air masses of a round one.
@@ -116,7 +116,7 @@ def daylight(direction: ArrayLike, *, rows: int = 64, columns: int = 64) -> Ligh
     cosine = np.clip(sine * rise + flat * np.hypot(s[0], s[1]) * turn, -1, 1)
     # Twilight: each degree below the horizon takes the sky down by a factor of 2, to a floor.
     dusk = max(2.0 ** min(np.degrees(np.arcsin(rise)), 0.0), 1e-4)
-    sky = _sky_radiance(np.broadcast_to(sine, cosine.shape), cosine, rise) * dusk
+    sky = _sky_radiance(np.broadcast_to(sine, cosine.shape), cosine, sun_sine=rise) * dusk
     sun_mass = float(_air_mass(np.array(max(rise, 0.0))))
     clear = np.clip(np.degrees(np.arcsin(rise)) / 0.5 + 0.5, 0.0, 1.0)  # the disc is half a degree wide
     beam = clear * _SUN * np.exp(-(_RAYLEIGH + _AEROSOL + _OZONE) * sun_mass)
@@ -124,7 +124,7 @@ def daylight(direction: ArrayLike, *, rows: int = 64, columns: int = 64) -> Ligh
     normal, weight = _sphere(48, 96)
     bearing = np.hypot(normal[:, 0], normal[:, 1])
     cos_turn = (normal[:, 0] * s[0] + normal[:, 1] * s[1]) / np.maximum(bearing * np.hypot(s[0], s[1]), 1e-9)
-    radiance = sky_colour(sky, normal[:, 2], cos_turn)
+    radiance = sky_colour(sky, normal[:, 2], cos_turn=cos_turn)
     above = normal[:, 2] > 0
     down = (radiance * (weight * normal[:, 2])[:, None])[above].sum(axis=0) + beam * max(rise, 0.0)
     radiance[~above] = _GROUND / np.pi * down
@@ -146,7 +146,7 @@ def _sphere(rows: int, columns: int) -> tuple[Float, Float]:
     return np.stack([flat * np.cos(aa), flat * np.sin(aa), zz], axis=1), np.full(zz.size, 4 * np.pi / zz.size)
 
 
-def sky_colour(sky: Float, sine: Float, cos_turn: Float) -> Float:
+def sky_colour(sky: Float, sine: Float, *, cos_turn: Float) -> Float:
     """Radiance (n, 3) from the table `Light.sky` at sines of elevation and cosines of azimuth to the sun."""
     rows, columns = sky.shape[:2]
     elevation = np.arcsin(np.clip(sine, 0, 1)) / (np.pi / 2)

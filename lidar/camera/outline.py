@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Float = NDArray[np.float64]
 
 
-def outline(corners: Float, width: int, height: int) -> tuple[tuple[float, float, float, float], int]:
+def outline(corners: Float, width: int, *, height: int) -> tuple[tuple[float, float, float, float], int]:
     """Left, top, right and bottom of triangles (n, 3, 2) within an image, and the pixels they cover together.
 
     The image reaches from -0.5 to its size - 0.5; a pixel is covered if its centre is. Triangles with a

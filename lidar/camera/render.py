@@ -114,8 +114,8 @@ def exposure_times(camera: CameraSpec, start_ns: int, *, samples: int = 1) -> ND
 def render(
     camera: CameraSpec,
     poses: Poses,
-    world: World,
     *,
+    world: World,
     sun: ArrayLike,
     times: Float | None = None,
     random: np.random.Generator | None = None,
@@ -155,20 +155,31 @@ def render(
 
     def band(edges: tuple[int, int]) -> None:
         first, last = edges
-        view = _view(camera, poses, world, middle, first, last, times)
+        view = _view(camera, poses, world=world, sample=middle, first=first, last=last, times=times)
         surfaces, distance = view.surfaces, view.hits.range
         if coloured:
             total = np.zeros(((last - first) * w, 3), np.float32)
             for sample in range(samples):
                 if k > 1 or sample != middle:
-                    seen = _view(fine, poses, world, sample, first * k, last * k, times, rows=h)
+                    seen = _view(
+                        fine,
+                        poses,
+                        world=world,
+                        sample=sample,
+                        first=first * k,
+                        last=last * k,
+                        times=times,
+                        rows=h,
+                    )
                 else:
                     seen = view
-                part = radiance(world, seen, light, walls, blur=0.0, angle=1 / fine.fx, options=options)
-                total += part if k == 1 else _binned(part, k, w)
+                part = radiance(
+                    world, seen, light=light, walls=walls, blur=0.0, angle=1 / fine.fx, options=options
+                )
+                total += part if k == 1 else _binned(part, k, width=w)
             exposure = light.exposure * 2.0**options.exposure / samples
             if electrons is not None:
-                total = _noisy(total, exposure, electrons[first:last].reshape(-1, 3), options)
+                total = _noisy(total, exposure, normal=electrons[first:last].reshape(-1, 3), options=options)
             shade.develop(total, exposure, shade.transfer_table(), rgb[first:last].reshape(-1, 3))
         near = np.where(distance <= camera.far, distance, np.inf)
         depth[first:last] = near.reshape(-1, w)
@@ -205,7 +216,7 @@ def _finer(camera: CameraSpec, k: int) -> CameraSpec:
     )
 
 
-def _binned(fine: NDArray[np.float32], k: int, width: int) -> NDArray[np.float32]:
+def _binned(fine: NDArray[np.float32], k: int, *, width: int) -> NDArray[np.float32]:
     """Means (n, 3) over blocks of k by k pixels; ``width`` is that of the coarse image."""
     mean: NDArray[np.float32] = fine.reshape(-1, k, width, k, 3).mean(axis=(1, 3), dtype=np.float32)
     return mean.reshape(-1, 3)
@@ -214,12 +225,12 @@ def _binned(fine: NDArray[np.float32], k: int, width: int) -> NDArray[np.float32
 def _view(
     camera: CameraSpec,
     poses: Poses,
+    *,
     world: World,
     sample: int,
     first: int,
     last: int,
     times: Float | None,
-    *,
     rows: int | None = None,
 ) -> View:
     """What the rows first to last of a camera see in one sample of the exposure.
@@ -270,9 +281,9 @@ def _without(hits: Hits, gone: NDArray[np.bool_]) -> Hits:
 def radiance(
     world: World,
     view: View,
+    *,
     light: Light,
     walls: Facades,
-    *,
     blur: float,
     angle: float,
     options: RenderOptions,
@@ -325,7 +336,7 @@ def radiance(
 
 
 def _noisy(
-    light: NDArray[np.float32], exposure: float, normal: NDArray[np.float32], options: RenderOptions
+    light: NDArray[np.float32], exposure: float, *, normal: NDArray[np.float32], options: RenderOptions
 ) -> NDArray[np.float32]:
     """Light with the noise of a sensor: that of counting electrons, and that of reading them."""
     electrons = np.minimum(light * exposure, 1.0) * options.full_well
@@ -337,9 +348,9 @@ def _noisy(
 def optical_flow(
     camera: CameraSpec,
     poses: Poses,
+    *,
     later: Poses,
     world: World,
-    *,
     times: Float | None = None,
     later_times: Float | None = None,
 ) -> NDArray[np.float32]:
@@ -358,14 +369,14 @@ def optical_flow(
         raise InputError(f"camera {camera.name}: optical flow needs {rows} poses of each frame")
     start = np.zeros(rows) if times is None else np.asarray(times, float)
     end = np.ones(rows) if later_times is None else np.asarray(later_times, float)
-    view = _view(camera, poses, world, 0, 0, camera.height, start)
+    view = _view(camera, poses, world=world, sample=0, first=0, last=camera.height, times=start)
     hit = np.isfinite(view.hits.range)
     point = view.origin[view.row] + np.where(hit, view.hits.range, 1.0)[:, None] * view.direction
-    body = _on_bodies(point, view.hits, world, start[view.row])
+    body = _on_bodies(point, view.hits, world=world, time=start[view.row])
     row = view.row
     for _ in range(_ROLLS if rows > 1 else 1):
         there = later.take(row if rows > 1 else [0])
-        moved = _off_bodies(point, body, view.hits, world, end[row])
+        moved = _off_bodies(point, body, hits=view.hits, world=world, time=end[row])
         away = np.where(hit[:, None], moved - there.position, view.direction)
         seen = np.einsum("ni,nij->nj", away / there.scale, np.broadcast_to(there.rotation, (len(away), 3, 3)))
         pixel, _ = project(camera, np.where(view.seen[:, None], seen, np.nan))
@@ -375,25 +386,25 @@ def optical_flow(
     return flow.reshape(camera.height, camera.width, 2)
 
 
-def _on_bodies(point: Float, hits: Hits, world: World, time: Float) -> Float:
+def _on_bodies(point: Float, hits: Hits, *, world: World, time: Float) -> Float:
     """Points (k, 3) that are on instances, in the instances' own frames, at ray times (n,)."""
     on = np.flatnonzero(hits.instance >= 0)
-    place = _transforms(world, hits.instance[on], time[on])
+    place = _transforms(world, hits.instance[on], time=time[on])
     offset = (point[on] - place[:, :, 3])[..., None]
     body: Float = np.linalg.solve(place[:, :, :3], offset)[..., 0].astype(np.float64)
     return body
 
 
-def _off_bodies(point: Float, body: Float, hits: Hits, world: World, time: Float) -> Float:
+def _off_bodies(point: Float, body: Float, *, hits: Hits, world: World, time: Float) -> Float:
     """The points (n, 3), those on instances (k, 3) where these have carried them at ray times (n,)."""
     on = np.flatnonzero(hits.instance >= 0)
-    place = _transforms(world, hits.instance[on], time[on])
+    place = _transforms(world, hits.instance[on], time=time[on])
     moved = point.copy()
     moved[on] = np.einsum("nij,nj->ni", place[:, :, :3], body) + place[:, :, 3]
     return moved
 
 
-def _transforms(world: World, instance: NDArray[np.int32], time: Float) -> Float:
+def _transforms(world: World, instance: NDArray[np.int32], *, time: Float) -> Float:
     """Transforms (k, 3, 4) of instances at ray times (k,), linear between their moments."""
     out = np.empty((len(instance), 3, 4))
     start = 0

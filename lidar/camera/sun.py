@@ -13,7 +13,7 @@ from lidar.errors import InputError
 Float = NDArray[np.float64]
 
 
-def sun_position(when: datetime, lon_deg: ArrayLike, lat_deg: ArrayLike) -> tuple[Float, Float]:
+def sun_position(when: datetime, lon_deg: ArrayLike, *, lat_deg: ArrayLike) -> tuple[Float, Float]:
     """Azimuth (clockwise from true north) and apparent elevation of the sun's centre, radians, any shape.
 
     Good to 0.02° from 1950 to 2050. The low-accuracy solar coordinates of Meeus, Astronomical Algorithms
@@ -75,7 +75,7 @@ def sun_direction(frame: Frame, when: datetime, *, at: tuple[float, float] = (0.
     Raises InputError for a time without a zone.
     """
     lon, lat = frame.to_geographic(*at)
-    azimuth, elevation = sun_position(when, lon, lat)
+    azimuth, elevation = sun_position(when, lon, lat_deg=lat)
     bearing = azimuth - frame.convergence(lon, lat)
     flat = np.cos(elevation)
     return np.array([flat * np.sin(bearing), flat * np.cos(bearing), np.sin(elevation)])

@@ -24,7 +24,7 @@ def gather_boxes(out: Path) -> None:
     header, *rows = gathered[scanners[0]]
     step = 10**9 / calibration[scanners[0]]["rate_hz"]
     first = calibration[scanners[0]]["time_offset_ns"]
-    counts = [_points_by_step(gathered[name], first, step) for name in scanners]
+    counts = [_points_by_step(gathered[name], first, step_ns=step) for name in scanners]
     names = header.split(",")
     frame, number = names.index("frame"), names.index("id")
     lines = [",".join([header, *(f"points_{name}" for name in scanners)])]
@@ -46,7 +46,7 @@ def _gathered(folder: Path) -> list[str]:
     return lines
 
 
-def _points_by_step(lines: list[str], first_ns: int, step_ns: float) -> dict[tuple[int, int], int]:
+def _points_by_step(lines: list[str], first_ns: int, *, step_ns: float) -> dict[tuple[int, int], int]:
     """Points by (frame of a scanner that starts then and has such a step, id)."""
     if not lines:
         return {}

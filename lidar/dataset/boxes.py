@@ -19,16 +19,16 @@ Float = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-def actors_near(actors: Actors, ego: Trajectory, time_ns: int, *, reach: float) -> Ints:
+def actors_near(actors: Actors, ego: Trajectory, *, time_ns: int, reach: float) -> Ints:
     """Actors (k,) that are there at a time, within ``reach`` true metres of the ego vehicle."""
-    rows = alive(actors, time_ns, time_ns)
-    away = states(actors, rows, time_ns).position - ego.at([time_ns]).position
+    rows = alive(actors, time_ns, end_ns=time_ns)
+    away = states(actors, rows, time_ns=time_ns).position - ego.at([time_ns]).position
     near: Ints = rows[np.hypot(*away[:, :2].T) <= reach * actors.scale]
     return near
 
 
 def box_rows(
-    actors: Actors, ego: Trajectory, time_ns: int, frame: int, *, reach: float = np.inf
+    actors: Actors, ego: Trajectory, *, time_ns: int, frame: int, reach: float = np.inf
 ) -> dict[str, NDArray[Any]]:
     """Boxes at a time as columns, one row an actor within reach, by id.
 
@@ -45,10 +45,10 @@ def box_rows(
     """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
-    rows = actors_near(actors, ego, time_ns, reach=reach)
-    at = states(actors, rows, time_ns)
+    rows = actors_near(actors, ego, time_ns=time_ns, reach=reach)
+    at = states(actors, rows, time_ns=time_ns)
     turn = rotations(at.angles)
-    middle = _middles(actors, rows, at)
+    middle = _middles(actors, rows, at=at)
     quat = Rotation.from_matrix(turn).as_quat(canonical=True) if len(rows) else np.empty((0, 4))
     velocity = at.velocity / [actors.scale, actors.scale, 1.0]
     pose = ego.at([time_ns])
@@ -85,14 +85,14 @@ COLUMNS = (
 """Columns of `box_rows`, in order."""
 
 
-def _middles(actors: Actors, rows: Ints, at: States) -> Float:
+def _middles(actors: Actors, rows: Ints, *, at: States) -> Float:
     """Middles (k, 3) of boxes: half the height along the body's own z axis above where it stands."""
     up = rotations(at.angles)[:, :, 2] * [actors.scale, actors.scale, 1.0]
     middle: Float = at.position + up * actors.size[rows, 2:] / 2
     return middle
 
 
-def count_points(actors: Actors, rows: ArrayLike, feature: NDArray[np.integer]) -> Ints:
+def count_points(actors: Actors, rows: ArrayLike, *, feature: NDArray[np.integer]) -> Ints:
     """How many points (k,) lie on each of the actors ``rows`` in a cloud with that feature column."""
     low = int(actors.feature[0]) if len(actors) else 0
     mine = feature[(feature >= low) & (feature < low + len(actors))] - low
@@ -119,7 +119,7 @@ class ImageBoxes:
 
 
 def image_boxes(
-    actors: Actors, camera: CameraSpec, pose: Poses, time_ns: int, instance: NDArray[np.integer]
+    actors: Actors, camera: CameraSpec, *, pose: Poses, time_ns: int, instance: NDArray[np.integer]
 ) -> ImageBoxes:
     """Actors in an image.
 
@@ -129,22 +129,22 @@ def image_boxes(
     The pixels of an unhidden actor are those that its projected triangles cover. What reaches behind the
     camera is left out of them.
     """
-    rows = alive(actors, time_ns, time_ns)
-    at = states(actors, rows, time_ns)
+    rows = alive(actors, time_ns, end_ns=time_ns)
+    at = states(actors, rows, time_ns=time_ns)
     away = ((at.position - pose.position) / pose.scale) @ pose.rotation[0]
     size = np.linalg.norm(actors.size[rows], axis=1)
     ahead = (np.linalg.norm(away, axis=1) < camera.far + size) & (
         (away[:, 2] > -size) | np.full(len(rows), camera.model == "fisheye")
     )
     found: list[tuple[int, tuple[float, ...], tuple[float, ...], int, float]] = []
-    body = poses_of(actors, rows, at)
+    body = poses_of(actors, rows, at=at)
     for k in np.flatnonzero(ahead).tolist():
         row = int(rows[k])
         mesh = actors.shapes[body[k]].mesh
         turn = rotations(at.angles[k : k + 1])[0]
         points = at.position[k] + (mesh.vertices * actors.stretch[row]) @ turn.T * pose.scale[0]
         pixels, _ = project(camera, ((points - pose.position) / pose.scale) @ pose.rotation[0])
-        box, whole = outline(pixels[mesh.faces], camera.width, camera.height)
+        box, whole = outline(pixels[mesh.faces], camera.width, height=camera.height)
         if not np.isfinite(box[0]):
             continue
         u0, v0 = (max(int(side) - 1, 0) for side in box[:2])

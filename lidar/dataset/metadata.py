@@ -37,7 +37,7 @@ def iso_times(start: datetime, time_ns: NDArray[np.integer]) -> list[str]:
 
 
 def pose_columns(
-    trajectory: Trajectory, frame: Frame, start: datetime, time_ns: NDArray[np.integer]
+    trajectory: Trajectory, frame: Frame, *, start: datetime, time_ns: NDArray[np.integer]
 ) -> dict[str, Any]:
     """Columns of ``poses.csv``: the vehicle at given times.
 
@@ -135,6 +135,7 @@ def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]
 def write_sidecars(
     out: Path,
     scene: Scene,
+    *,
     rig: Rig,
     sensors: Sequence[Scanner | Camera],
     trajectory: Trajectory,
@@ -158,36 +159,45 @@ def write_sidecars(
         stamps: dict[str, Any] = {"frame": np.arange(len(times)), "time_ns": times}
         write_columns(folder / "timestamps.csv", stamps | {"timestamp": iso_times(start, times)})
         if k == 0:
-            write_columns(out / "poses.csv", pose_columns(trajectory, scene.frame, start, times))
+            write_columns(
+                out / "poses.csv", pose_columns(trajectory, scene.frame, start=start, time_ns=times)
+            )
         if sequences and isinstance(sensor, Scanner):
-            _write_sequence(folder, rig, sensor.spec.mount, trajectory, times)
+            _write_sequence(folder, rig, mount=sensor.spec.mount, trajectory=trajectory, times=times)
     for receiver in rig.gnss:
-        _write_fixes(out, scene, receiver, trajectory, start, seed)
+        _write_fixes(out, scene, spec=receiver, trajectory=trajectory, start=start, seed=seed)
     for unit in rig.imus:
-        rows = observe_imu(trajectory, scene.frame, unit, seed=seed)
+        rows = observe_imu(trajectory, scene.frame, spec=unit, seed=seed)
         stamped: dict[str, Any] = {"timestamp": iso_times(start, rows.time_ns), **imu_columns(rows)}
         write_columns(out / f"{unit.name}.csv", stamped)
 
 
 def _write_fixes(
-    out: Path, scene: Scene, spec: GnssSpec, trajectory: Trajectory, start: datetime, seed: int
+    out: Path, scene: Scene, *, spec: GnssSpec, trajectory: Trajectory, start: datetime, seed: int
 ) -> None:
     times = epochs(spec, trajectory.duration_ns)
-    antenna, _ = antenna_motion(trajectory, scene.frame, spec, times)
+    antenna, _ = antenna_motion(trajectory, scene.frame, spec=spec, time_ns=times)
 
     def world_at(region: tuple[float, float, float, float]) -> World:
         return World.load(scene, region=region)
 
-    sky = sky_view(scene.frame, antenna, start, times, world_at, mask_deg=spec.mask_deg,
-                   systems=spec.constellations)  # fmt: skip
-    fixes = observe_gnss(trajectory, scene.frame, spec, seed=seed, start=start, sky=sky)
+    sky = sky_view(
+        scene.frame,
+        antenna,
+        start=start,
+        time_ns=times,
+        world_at=world_at,
+        mask_deg=spec.mask_deg,
+        systems=spec.constellations,
+    )
+    fixes = observe_gnss(trajectory, scene.frame, spec=spec, seed=seed, start=start, sky=sky)
     stamped: dict[str, Any] = {"timestamp": iso_times(start, fixes.time_ns), **gnss_columns(fixes)}
     write_columns(out / f"{spec.name}.csv", stamped)
     write_atomically(out / f"{spec.name}.nmea", "".join(nmea(fixes, start)).encode("ascii"))
 
 
 def _write_sequence(
-    folder: Path, rig: Rig, mount: Mount, trajectory: Trajectory, times: NDArray[np.int64]
+    folder: Path, rig: Rig, *, mount: Mount, trajectory: Trajectory, times: NDArray[np.int64]
 ) -> None:
     """Write KITTI's calib.txt, times.txt and poses.txt.
 
@@ -205,7 +215,7 @@ def _write_sequence(
         projections = [np.eye(3, 4)]
         camera_from_lidar = np.eye(4)
         camera_from_lidar[:3, :3] = OPTICAL.T
-    kitti.write_calibration(folder / "calib.txt", projections, camera_from_lidar)
+    kitti.write_calibration(folder / "calib.txt", projections, camera_from_lidar=camera_from_lidar)
     if not len(times):
         return
     kitti.write_times(folder / "times.txt", times)
@@ -213,7 +223,7 @@ def _write_sequence(
     world_from_lidar = np.tile(np.eye(4), (len(times), 1, 1))
     world_from_lidar[:, :3, :3] = at.rotation
     world_from_lidar[:, :3, 3] = at.position / at.scale[0]  # true metres
-    kitti.write_poses(folder / "poses.txt", world_from_lidar, camera_from_lidar)
+    kitti.write_poses(folder / "poses.txt", world_from_lidar, camera_from_lidar=camera_from_lidar)
 
 
 def _matrix(mount: Mount) -> NDArray[np.float64]:

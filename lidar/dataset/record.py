@@ -120,12 +120,12 @@ class Recorder:
         self,
         out: Path,
         frame: Frame,
+        *,
         trajectory: Trajectory,
         start: datetime,
         geo: Georeference,
         contents: Contents,
         watch: _Watch,
-        *,
         actors: Actors | None = None,
         reach: float = 0.0,
         on: NDArray[np.int64] | None = None,
@@ -174,32 +174,34 @@ class Recorder:
         kind = self.contents.formats[0]
         return points_in(self.paths(sensor, frame)[kind], kind)
 
-    def record(self, sensor: Scanner | Camera, frame: int, worlds: Worlds) -> int:
+    def record(self, sensor: Scanner | Camera, frame: int, *, worlds: Worlds) -> int:
         """Sense one frame and write its files; return the number of points."""
         for path in self.paths(sensor, frame).values():
             path.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(sensor, Camera):
-            self._record_images(sensor, frame, worlds)
+            self._record_images(sensor, frame, worlds=worlds)
             return 0
         world = worlds.during(*sensor.sensor.window_ns(frame))
-        cloud = self._record_cloud(sensor, frame, world)
+        cloud = self._record_cloud(sensor, frame, world=world)
         if self.actors is not None:
             with self.watch.stage("boxes"):
-                self._record_boxes(self.actors, sensor, frame, cloud, world)
+                self._record_boxes(self.actors, sensor, frame=frame, cloud=cloud, world=world)
         return len(cloud)
 
-    def _record_boxes(self, actors: Actors, scanner: Scanner, frame: int, cloud: Cloud, world: World) -> None:
+    def _record_boxes(
+        self, actors: Actors, scanner: Scanner, *, frame: int, cloud: Cloud, world: World
+    ) -> None:
         """Write the 3D boxes of a frame, with the number of its points on each and how much of it is seen."""
         begin, mount = scanner.frame_start_ns(frame), scanner.spec.mount
-        columns = box_rows(actors, self.trajectory, begin, frame, reach=self.reach)
-        points = count_points(actors, columns["id"], cloud.feature)
+        columns = box_rows(actors, self.trajectory, time_ns=begin, frame=frame, reach=self.reach)
+        points = count_points(actors, columns["id"], feature=cloud.feature)
         eye = self.trajectory.at([begin]).mounted(mount.translation, mount.rotation).position[0]
         assert self._visibility is not None  # noqa: S101
-        share = self._visibility.seen_from(eye, world, columns["id"], begin)
+        share = self._visibility.seen_from(eye, world, rows=columns["id"], time_ns=begin)
         extra = {"points": points, "visibility": np.round(share, 4)}
         write_columns(self.paths(scanner, frame)["boxes"], {**columns, **extra})
 
-    def _scanned(self, scanner: Scanner, frame: int, world: World) -> Cloud:
+    def _scanned(self, scanner: Scanner, frame: int, *, world: World) -> Cloud:
         """What a scanner reports in a frame, while it works."""
         start, end = scanner.sensor.window_ns(frame)
         if self.on is not None and not ((self.on[:, 0] <= end) & (self.on[:, 1] >= start)).any():
@@ -209,9 +211,9 @@ class Recorder:
             cloud = scan(
                 scanner.sensor,
                 scanner.spec.mount,
-                self.trajectory,
-                world,
-                frame,
+                trajectory=self.trajectory,
+                world=world,
+                frame=frame,
                 seed=wanted.seed,
                 effects=wanted.effects,
             )
@@ -221,9 +223,9 @@ class Recorder:
         first = np.searchsorted(self.on[:, 0], time, side="right") - 1
         return cloud.where((first >= 0) & (time <= np.maximum.accumulate(self.on[:, 1])[first]))
 
-    def _record_cloud(self, scanner: Scanner, frame: int, world: World) -> Cloud:
+    def _record_cloud(self, scanner: Scanner, frame: int, *, world: World) -> Cloud:
         wanted = self.contents
-        cloud = self._scanned(scanner, frame, world)
+        cloud = self._scanned(scanner, frame, world=world)
         begin = scanner.frame_start_ns(frame)
         time_ns = cloud.start_ns + cloud.time_ns.astype(np.int64)
         paths = self.paths(scanner, frame)
@@ -239,10 +241,12 @@ class Recorder:
                 )
         if scanner.sensor.fmcw:
             with self.watch.stage("velocity"):
-                table["velocity"] = self._velocity(scanner, frame, cloud, placed, time_ns)
+                table["velocity"] = self._velocity(
+                    scanner, frame, cloud=cloud, placed=placed, time_ns=time_ns
+                )
         self._write_raw(paths, table)
         if wanted.deskew:
-            self._write_raw(paths, table | self._at_once(scanner, frame, placed), prefix="deskewed ")
+            self._write_raw(paths, table | self._at_once(scanner, frame, placed=placed), prefix="deskewed ")
         if world_kinds:
             with self.watch.stage("georeference"):
                 east, north, up = self.geo.points(placed).T
@@ -250,7 +254,7 @@ class Recorder:
                 moved = table | {"x": east, "y": north, "z": up, "gps_time": gps}
             for kind in world_kinds:
                 with self.watch.stage(f"write {kind}"):
-                    write_las(paths[kind], moved, self._las)
+                    write_las(paths[kind], moved, info=self._las)
         self._write_labels(paths, cloud)
         return cloud
 
@@ -260,16 +264,17 @@ class Recorder:
                 with self.watch.stage(f"write {kind}"):
                     write(paths[prefix + kind], table)
 
-    def _at_once(self, scanner: Scanner, frame: int, placed: NDArray[np.float64]) -> Table:
+    def _at_once(self, scanner: Scanner, frame: int, *, placed: NDArray[np.float64]) -> Table:
         """Coordinates of a frame's points at the moment that is asked for."""
         moment = scanner.frame_start_ns(frame) + int(MOMENTS[self.contents.deskew] * scanner.period_ns)
-        x, y, z = deskewed(placed, self.trajectory, scanner.spec.mount, moment).T
+        x, y, z = deskewed(placed, self.trajectory, mount=scanner.spec.mount, time_ns=moment).T
         return {"x": x, "y": y, "z": z}
 
     def _velocity(
         self,
         scanner: Scanner,
         frame: int,
+        *,
         cloud: Cloud,
         placed: NDArray[np.float64],
         time_ns: NDArray[np.int64],
@@ -277,8 +282,8 @@ class Recorder:
         """Radial velocities as measured: with noise where ranges have it."""
         moving = None
         if self.actors is not None:
-            moving = surface_velocity(self.actors, cloud.feature, placed, time_ns)
-        velocity = radial_velocity(cloud, scanner.spec.mount, self.trajectory, moving=moving)
+            moving = surface_velocity(self.actors, cloud.feature, placed=placed, time_ns=time_ns)
+        velocity = radial_velocity(cloud, scanner.spec.mount, trajectory=self.trajectory, moving=moving)
         sigma, wanted = scanner.sensor.velocity_sigma, self.contents
         if sigma and wanted.effects.range_noise != "none":
             rng = generator(wanted.seed, scanner.name, frame, "velocity noise")
@@ -293,11 +298,11 @@ class Recorder:
                 on = np.flatnonzero((row >= 0) & (row < len(self.actors)))
                 thing[on] = row[on] + 1
                 moving[on] = ~self.actors.parked[row[on]]
-            write_labels(path, semantic_kitti_labels(cloud.klass, thing, moving))
+            write_labels(path, semantic_kitti_labels(cloud.klass, thing, moving=moving))
         if (path := paths.get("labels nuscenes")) is not None:
             write_lidarseg(path, cloud.klass)
 
-    def _record_images(self, camera: Camera, frame: int, worlds: Worlds) -> None:
+    def _record_images(self, camera: Camera, frame: int, *, worlds: Worlds) -> None:
         spec, dials = camera.spec, self.contents.dials
         start = camera.frame_start_ns(frame)
         samples = dials.moments(spec)
@@ -309,7 +314,7 @@ class Recorder:
             image = render(
                 spec,
                 poses,
-                world,
+                world=world,
                 sun=self._sun(start),
                 times=None if self.actors is None else (times - start) / (end - start),
                 random=generator(self.contents.seed, camera.name, frame, "image"),
@@ -321,7 +326,9 @@ class Recorder:
         if self.actors is not None:
             with self.watch.stage("boxes"):
                 pose = poses.take([middle])
-                self._record_image_boxes(self.actors, camera, frame, pose, int(times[middle]), image)
+                self._record_image_boxes(
+                    self.actors, camera, frame=frame, pose=pose, time_ns=int(times[middle]), image=image
+                )
         for kind in spec.images:
             with self.watch.stage(f"write {kind}"):
                 if kind == "rgb" and image.rgb is not None:
@@ -334,14 +341,14 @@ class Recorder:
                     write_png(paths[kind], feature_to_image(image.feature))
                 elif kind == "flow":
                     first = (samples // 2) * rows
-                    flow = self._flow(camera, worlds, times[first : first + rows])
+                    flow = self._flow(camera, worlds, times=times[first : first + rows])
                     write_png(paths[kind], flow_to_image(flow))
 
     def _record_image_boxes(
-        self, actors: Actors, camera: Camera, frame: int, pose: Poses, time_ns: int, image: Image
+        self, actors: Actors, camera: Camera, *, frame: int, pose: Poses, time_ns: int, image: Image
     ) -> None:
         """Write the 2D boxes of an image."""
-        found = image_boxes(actors, camera.spec, pose, time_ns, image.feature)
+        found = image_boxes(actors, camera.spec, pose=pose, time_ns=time_ns, instance=image.feature)
         names = np.array([Class(int(k)).name.lower() for k in actors.klass[found.row]], np.str_)
         sides = ("left", "top", "right", "bottom")
         columns = {
@@ -362,7 +369,7 @@ class Recorder:
         mount = camera.spec.mount
         return self.trajectory.at(times).mounted(mount.translation, mount.rotation)
 
-    def _flow(self, camera: Camera, worlds: Worlds, times: NDArray[np.int64]) -> NDArray[np.float32]:
+    def _flow(self, camera: Camera, worlds: Worlds, *, times: NDArray[np.int64]) -> NDArray[np.float32]:
         """Optical flow to the next frame; the thread's world is laid anew for it.
 
         times : of the rows in this frame, one for all without a rolling shutter
@@ -372,13 +379,16 @@ class Recorder:
         world = worlds.during(start, end)
         moments = [(t - start) / (end - start) for t in (times, later)]
         here, there = (self._seen_from(camera, t) for t in (times, later))
-        return optical_flow(camera.spec, here, there, world, times=moments[0], later_times=moments[1])
+        return optical_flow(
+            camera.spec, here, later=there, world=world, times=moments[0], later_times=moments[1]
+        )
 
     def _sun(self, time_ns: int) -> NDArray[np.float64]:
         when = self.start + timedelta(seconds=(time_ns // _SUN_NS) * _SUN_NS // 10**9)
-        return _sun(self.frame, when, *self.trajectory.position[0, :2].tolist())
+        x, y = self.trajectory.position[0, :2].tolist()
+        return _sun(self.frame, when, x=x, y=y)
 
 
 @functools.lru_cache(maxsize=4)
-def _sun(frame: Frame, when: datetime, x: float, y: float) -> NDArray[np.float64]:
+def _sun(frame: Frame, when: datetime, *, x: float, y: float) -> NDArray[np.float64]:
     return sun_direction(frame, when, at=(x, y))

@@ -41,7 +41,7 @@ def euler_from_quat(quat_xyzw: ArrayLike) -> Float:
     return out
 
 
-def quat_from_euler(alpha: ArrayLike, beta: ArrayLike, gamma: ArrayLike) -> Float:
+def quat_from_euler(alpha: ArrayLike, beta: ArrayLike, *, gamma: ArrayLike) -> Float:
     """Quaternions (..., 4) x, y, z, w of R = Rz(gamma) Ry(beta) Rx(alpha), with w >= 0."""
     a, b, g = np.broadcast_arrays(*(np.asarray(v, float) / 2.0 for v in (alpha, beta, gamma)))
     ca, sa, cb, sb, cg, sg = np.cos(a), np.sin(a), np.cos(b), np.sin(b), np.cos(g), np.sin(g)
@@ -67,9 +67,11 @@ def euler_from_quat_intrinsic(quat_xyzw: ArrayLike) -> Float:
     return out
 
 
-def quat_from_euler_intrinsic(alpha: ArrayLike, beta: ArrayLike, gamma: ArrayLike) -> Float:
+def quat_from_euler_intrinsic(alpha: ArrayLike, beta: ArrayLike, *, gamma: ArrayLike) -> Float:
     """Quaternions (..., 4) x, y, z, w of R = Rx(alpha) Ry(beta) Rz(gamma), with w >= 0."""
-    inverse = quat_from_euler(-np.asarray(alpha, float), -np.asarray(beta, float), -np.asarray(gamma, float))
+    inverse = quat_from_euler(
+        -np.asarray(alpha, float), -np.asarray(beta, float), gamma=-np.asarray(gamma, float)
+    )
     conjugate: Float = inverse * np.array([-1.0, -1.0, -1.0, 1.0])
     return conjugate
 

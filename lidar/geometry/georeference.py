@@ -28,7 +28,7 @@ def export_crs(frame: Frame, crs: str = "utm") -> CRS:
     lon, lat = frame.to_geographic(0.0, 0.0)
     if crs == "utm":
         return CRS.from_user_input(utm_crs(float(lon), float(lat)))
-    return Frame.at(float(lon), float(lat), crs).crs
+    return Frame.at(float(lon), float(lat), crs=crs).crs
 
 
 @dataclass(frozen=True)

@@ -105,15 +105,15 @@ def aggregate(
         for k, (frame, table) in enumerate(source.tables()):
             read += rows(table)
             frames.add(frame)
-            progress("reading clouds", k + 1, len(source))
+            progress("reading clouds", k + 1, total=len(source))
             real = table["label"] != Class.NOISE
             if not noise and not real.all():
                 dropped += int(np.count_nonzero(~real))
                 table = {name: column[real] for name, column in table.items()}  # noqa: PLW2901
             yield table
 
-    stream = tables() if voxel is None else _voxels(tables(), voxel, out, source.geo.offset)
-    written = _write(out, (_colored(t, color, limits) for t in stream), source)
+    stream = tables() if voxel is None else _voxels(tables(), voxel, out=out, offset=source.geo.offset)
+    written = _write(out, (_colored(t, color, limits=limits) for t in stream), source=source)
     return MapSummary(read, written, dropped, len(frames), source.missing(), out)
 
 
@@ -157,15 +157,15 @@ class _Source:
                         | {"source": np.full(rows(table), index, np.uint16)},
                     )
             else:
-                yield frame, self._placed(CLOUD_READERS[kind](path), name, index, frame)
+                yield frame, self._placed(CLOUD_READERS[kind](path), name, index=index, frame=frame)
 
-    def _placed(self, table: Table, name: str, index: int, frame: int) -> Table:
+    def _placed(self, table: Table, name: str, *, index: int, frame: int) -> Table:
         if self._trajectory is None:
             self._trajectory = self.dataset.trajectory()
         sensor = self._lidars[name]
         start = int(sensor["time_offset_ns"]) + int(frame * frame_ns(sensor["rate_hz"]))
         mount = np.array(sensor["vehicle_from_sensor"])
-        placed, time_ns = placed_returns(table, self._trajectory, start, mount)
+        placed, time_ns = placed_returns(table, self._trajectory, start_ns=start, vehicle_from_sensor=mount)
         world = self.geo.points(placed)
         return {
             "x": world[:, 0],
@@ -187,13 +187,13 @@ class _Source:
         return float(low), float(high)
 
 
-def _colored(table: Table, color: str, limits: tuple[float, float]) -> Table:
+def _colored(table: Table, color: str, *, limits: tuple[float, float]) -> Table:
     if color == "class":
         rgb = class_codes().color[table["label"]]
     elif color == "height":
-        rgb = ramp(table["z"], *limits)
+        rgb = ramp(table["z"], limits[0], high=limits[1])
     elif color == "intensity":
-        rgb = ramp(table["intensity"], 0.0, 100.0)
+        rgb = ramp(table["intensity"], 0.0, high=100.0)
     else:
         rgb = distinct(table["source"])
     return table | {"red": rgb[:, 0], "green": rgb[:, 1], "blue": rgb[:, 2]}
@@ -212,7 +212,7 @@ def _nearest_to_centre(data: NDArray[np.void], voxel: float) -> NDArray[np.void]
 
 
 def _voxels(
-    tables: Iterator[Table], voxel: float, out: Path, offset: tuple[float, float, float]
+    tables: Iterator[Table], voxel: float, *, out: Path, offset: tuple[float, float, float]
 ) -> Iterator[Table]:
     """Thinned tables: points are gathered in squares on disk first, so that memory holds one square."""
     folder = out.with_name(f"{out.name}.{os.getpid()}.voxels")
@@ -247,26 +247,26 @@ def _voxels(
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _write(out: Path, tables: Iterator[Table], source: _Source) -> int:
+def _write(out: Path, tables: Iterator[Table], *, source: _Source) -> int:
     suffix = out.suffix.lower()
     out.parent.mkdir(parents=True, exist_ok=True)
     if suffix in (".las", ".laz"):
-        return _write_las(out, tables, source)
-    return _write_raw(out, tables, source, "ply" if suffix == ".ply" else "pcd")
+        return _write_las(out, tables, source=source)
+    return _write_raw(out, tables, source=source, kind="ply" if suffix == ".ply" else "pcd")
 
 
-def _write_las(out: Path, tables: Iterator[Table], source: _Source) -> int:
+def _write_las(out: Path, tables: Iterator[Table], *, source: _Source) -> int:
     dataset = source.dataset
     info = LasInfo(dataset.crs, source.geo.offset, dataset.start)
     count = 0
-    with LasWriter(out, info, (*_COLUMNS, "red", "green", "blue")) as writer:
+    with LasWriter(out, info, columns=(*_COLUMNS, "red", "green", "blue")) as writer:
         for table in tables:
             writer.write(table)
             count += rows(table)
     return count
 
 
-def _write_raw(out: Path, tables: Iterator[Table], source: _Source, kind: Literal["ply", "pcd"]) -> int:
+def _write_raw(out: Path, tables: Iterator[Table], *, source: _Source, kind: Literal["ply", "pcd"]) -> int:
     """Write PLY or PCD: points first to a temporary file, then header and points to the real one."""
     body = out.with_name(f"{out.name}.{os.getpid()}.body")
     whole = out.with_name(f"{out.name}.{os.getpid()}.part")
@@ -282,7 +282,7 @@ def _write_raw(out: Path, tables: Iterator[Table], source: _Source, kind: Litera
         empty = {name: column[:0] for name, column in (last or {}).items()}
         name = source.dataset.crs.name
         if kind == "ply":
-            header = ply_header(empty, count, (f"crs {name}",))
+            header = ply_header(empty, count, comments=(f"crs {name}",))
         else:
             note = f"add {offset[0]:.0f} {offset[1]:.0f} {offset[2]:.0f} for {name}"
             text = encode_pcd(empty, comment=note).decode("ascii")

@@ -24,7 +24,7 @@ _DISTINCT = np.array(
 )  # fmt: skip
 
 
-def ramp(values: ArrayLike, low: float, high: float) -> NDArray[np.uint8]:
+def ramp(values: ArrayLike, low: float, *, high: float) -> NDArray[np.uint8]:
     """Colours (..., 3) of values between ``low`` (violet) and ``high`` (yellow); clipped outside."""
     share = np.clip((np.asarray(values, float) - low) / max(high - low, 1e-12), 0.0, 1.0)
     at = share * (len(_VIRIDIS) - 1)

@@ -73,9 +73,9 @@ def scene_picture(
     area = bounds or world.region or world.scene.bounds
     low, high = _heights(world, area)
     corners = np.array([[x, y, z] for x in area[0::2] for y in area[1::2] for z in (low, high)])
-    camera, pose = _eye(corners, _view(view), size)
+    camera, pose = _eye(corners, _view(view), size=size)
     settings = options or RenderOptions(supersample=2, visibility=np.inf)
-    picture = render(camera, pose, world, sun=sun, options=settings).rgb
+    picture = render(camera, pose, world=world, sun=sun, options=settings).rgb
     if picture is None:
         raise InputError("the camera of a picture records colour")
     return picture
@@ -101,7 +101,7 @@ def _heights(world: World, area: tuple[float, float, float, float]) -> tuple[flo
     return float(z.min()), float(np.percentile(z, 98))
 
 
-def _eye(corners: Float, view: View, size: tuple[int, int]) -> tuple[CameraSpec, Poses]:
+def _eye(corners: Float, view: View, *, size: tuple[int, int]) -> tuple[CameraSpec, Poses]:
     """A camera that has all corners (n, 3) just in view."""
     width, height = size
     a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
@@ -148,7 +148,7 @@ def cloud_picture(
     box = np.percentile(xyz, [0.5, 99.5], axis=0) if bounds is None else np.asarray(bounds, float)
     box[1] = np.maximum(box[1], box[0] + 1e-3)
     corners = np.array([[x, y, z] for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]])
-    camera, pose = _eye(corners, _view(view), size)
+    camera, pose = _eye(corners, _view(view), size=size)
     pixels, z = project(camera, (xyz - pose.position) @ pose.rotation[0])
     width, height = size
     image = np.empty((height, width, 3), np.uint8)
@@ -206,7 +206,7 @@ def class_colors(klass: NDArray[np.uint8]) -> Pixels:
 def depth_picture(depth: NDArray[np.floating], *, near: float = 2.0, far: float = 120.0) -> Pixels:
     """Depths (h, w) in metres as colours (h, w, 3) by the logarithm: bright near, dark far, grey if none."""
     seen = np.isfinite(depth) & (depth > 0)
-    picture = ramp(-np.log(np.where(seen, depth, far)), -math.log(far), -math.log(near))
+    picture = ramp(-np.log(np.where(seen, depth, far)), -math.log(far), high=-math.log(near))
     picture[~seen] = (40, 40, 44)
     return picture
 
@@ -245,7 +245,7 @@ def with_key(image: Pixels, entries: Sequence[tuple[str, ArrayLike]]) -> Pixels:
     return np.asarray(picture).copy()
 
 
-def vehicle_outline(length: float, width: float, rear: float, *, step: float = 0.05) -> Float:
+def vehicle_outline(length: float, width: float, *, rear: float, step: float = 0.05) -> Float:
     """Points (n, 3) along a vehicle's outline on the ground and an arrow to its front, vehicle frame, metres.
 
     rear : metres from the rear axle, the frame's zero, to the back
@@ -299,7 +299,7 @@ def sweep_picture(
     low = float(np.percentile(xyz[near, 2], 2))
     marks = [range_rings(np.arange(step, reach, step).tolist(), height=low)]
     if vehicle is not None:
-        marks.append(vehicle_outline(vehicle.length, vehicle.width, vehicle.rear_overhang))
+        marks.append(vehicle_outline(vehicle.length, vehicle.width, rear=vehicle.rear_overhang))
     drawn = np.concatenate([xyz[near], *marks])
     kinds = [(110, 116, 130), (255, 255, 255)]
     marked = [np.tile(np.array(kind, np.uint8), (len(m), 1)) for kind, m in zip(kinds, marks, strict=False)]

@@ -49,9 +49,16 @@ class Constellation:
 
 
 def walker(
-    letter: str, tilt_deg: float, planes: Sequence[float], first_deg: Sequence[float], radius: float, *,
-    each: int, epoch: datetime, source: str,
-) -> Constellation:  # fmt: skip
+    letter: str,
+    tilt_deg: float,
+    *,
+    planes: Sequence[float],
+    first_deg: Sequence[float],
+    radius: float,
+    each: int,
+    epoch: datetime,
+    source: str,
+) -> Constellation:
     """A constellation of evenly filled planes.
 
     planes    : degrees, right ascensions of their ascending nodes
@@ -89,7 +96,14 @@ def _gps() -> Constellation:
 def _beidou() -> Constellation:
     epoch = datetime(2020, 8, 1, tzinfo=UTC)
     middle = walker(
-        "C", 55.0, (0.0, 120.0, 240.0), (0.0, 15.0, 30.0), 27906.1e3, each=8, epoch=epoch, source=""
+        "C",
+        55.0,
+        planes=(0.0, 120.0, 240.0),
+        first_deg=(0.0, 15.0, 30.0),
+        radius=27906.1e3,
+        each=8,
+        epoch=epoch,
+        source="",
     )
     # those above the equator stand over a longitude; the inclined ones cross it there at the epoch and after
     # a third and two thirds of a day
@@ -114,19 +128,29 @@ def constellations() -> dict[str, Constellation]:
     return {
         "gps": _gps(),
         "glonass": walker(
-            "R", 64.8, (0.0, 120.0, 240.0), (0.0, 15.0, 30.0), 25510.0e3, each=8,
+            "R",
+            64.8,
+            planes=(0.0, 120.0, 240.0),
+            first_deg=(0.0, 15.0, 30.0),
+            radius=25510.0e3,
+            each=8,
             epoch=datetime(2008, 1, 1, tzinfo=UTC),
             source="GLONASS Interface Control Document, edition 5.1: 24 in three planes 120 degrees apart,"
             " 64.8 degrees, 45 degrees along a plane and 15 between planes, 19,100 km; first node assumed",
         ),
         "galileo": walker(
-            "E", 56.0, (317.632, 77.632, 197.632), (225.153, 240.153, 255.153), 29599.801e3, each=8,
+            "E",
+            56.0,
+            planes=(317.632, 77.632, 197.632),
+            first_deg=(225.153, 240.153, 255.153),
+            radius=29599.801e3,
+            each=8,
             epoch=datetime(2016, 11, 21, tzinfo=UTC),
             source="Galileo Open Service Service Definition Document: Walker 24/3/1, 56 degrees,"
             " 29,599.801 km, reference slots; the drift of the nodes since their epoch left out",
         ),
         "beidou": _beidou(),
-    }  # fmt: skip
+    }
 
 
 def check_systems(systems: Sequence[str]) -> None:
@@ -152,7 +176,7 @@ def sidereal_angle(seconds: ArrayLike) -> Float:
     return angle
 
 
-def satellites(start: datetime, time_ns: NDArray[np.integer], systems: Sequence[str] = SYSTEMS) -> Float:
+def satellites(start: datetime, time_ns: NDArray[np.integer], *, systems: Sequence[str] = SYSTEMS) -> Float:
     """Earth-fixed positions (n, k, 3) in metres of the satellites at nanoseconds after a UTC start.
 
     Raises InputError for systems that there are not.

@@ -118,7 +118,7 @@ def epochs(spec: GnssSpec, duration_ns: int) -> NDArray[np.int64]:
 
 
 def antenna_motion(
-    trajectory: Trajectory, frame: Frame, spec: GnssSpec, time_ns: NDArray[np.int64]
+    trajectory: Trajectory, frame: Frame, *, spec: GnssSpec, time_ns: NDArray[np.int64]
 ) -> tuple[Float, Float]:
     """Position (n, 3) in scene metres and velocity (n, 3) in m/s true east, north, up of the antenna."""
     poses = trajectory.at(time_ns)
@@ -144,8 +144,8 @@ def _true_from_grid(vectors: Float, convergence: Float) -> Float:
 def observe_gnss(
     trajectory: Trajectory,
     frame: Frame,
-    spec: GnssSpec,
     *,
+    spec: GnssSpec,
     seed: int,
     start: datetime,
     sky: Sky | None = None,
@@ -161,12 +161,14 @@ def observe_gnss(
     if spec.mode not in _LADDER:
         raise InputError(f"receiver {spec.name}: no mode {spec.mode}; there are {', '.join(_LADDER)}")
     time_ns = epochs(spec, trajectory.duration_ns)
-    position, velocity = antenna_motion(trajectory, frame, spec, time_ns)
+    position, velocity = antenna_motion(trajectory, frame, spec=spec, time_ns=time_ns)
     if sky is None:
-        sky = open_sky(frame, position, start, time_ns, mask_deg=spec.mask_deg, systems=spec.constellations)
-    dop = dilution(sky.azimuth, sky.elevation, sky.visible, sky.names)
-    state = _states(spec, sky, dop[:, 2])
-    error = _errors(spec, sky, dop, state, seed)
+        sky = open_sky(
+            frame, position, start=start, time_ns=time_ns, mask_deg=spec.mask_deg, systems=spec.constellations
+        )
+    dop = dilution(sky.azimuth, sky.elevation, used=sky.visible, names=sky.names)
+    state = _states(spec, sky, pdop=dop[:, 2])
+    error = _errors(spec, sky, dop=dop, state=state, seed=seed)
     sizes = np.array([STATES[name].speed for name in NAMES])[state]
     shake = generator(seed, spec.name, "velocity").standard_normal((len(time_ns), 3))
     moving = velocity + sizes[:, None] * shake
@@ -179,9 +181,9 @@ def observe_gnss(
         quality=np.array([STATES[name].quality for name in NAMES], np.int8)[state],
         satellites=sky.count.astype(np.int8),
         dop=dop,
-        lonlath=_shifted(frame, position, error),
+        lonlath=_shifted(frame, position, error=error),
         speed=speed,
-        course=_course(moving, speed, 3.0 * np.nan_to_num(sizes) + 0.01),
+        course=_course(moving, speed, least=3.0 * np.nan_to_num(sizes) + 0.01),
         error=error,
         true_lonlath=true,
         true_velocity=velocity,
@@ -190,7 +192,7 @@ def observe_gnss(
     )
 
 
-def _states(spec: GnssSpec, sky: Sky, pdop: Float) -> NDArray[np.int64]:
+def _states(spec: GnssSpec, sky: Sky, *, pdop: Float) -> NDArray[np.int64]:
     """State (n,) at each epoch: worse at once, better after it has been possible for `SETTLE_S`."""
     ladder = _LADDER[spec.mode]
     rank = np.full(len(sky.count), len(ladder))
@@ -205,7 +207,7 @@ def _states(spec: GnssSpec, sky: Sky, pdop: Float) -> NDArray[np.int64]:
     return rows
 
 
-def _errors(spec: GnssSpec, sky: Sky, dop: Float, state: NDArray[np.int64], seed: int) -> Float:
+def _errors(spec: GnssSpec, sky: Sky, *, dop: Float, state: NDArray[np.int64], seed: int) -> Float:
     """Errors (n, 3) in metres east, north, up."""
     n = len(state)
     table = [STATES[name] for name in NAMES]
@@ -215,20 +217,22 @@ def _errors(spec: GnssSpec, sky: Sky, dop: Float, state: NDArray[np.int64], seed
         return np.column_stack([pairs[:, 0], pairs[:, 0], pairs[:, 1]])
 
     # what stands in the way also spoils the geometry: errors grow as the dilution does
-    whole = dilution(sky.azimuth, sky.elevation, sky.above, sky.names)
+    whole = dilution(sky.azimuth, sky.elevation, used=sky.above, names=sky.names)
     with np.errstate(invalid="ignore"):
         worse = np.where(np.isfinite(dop[:, :2]), dop[:, :2] / whole[:, :2], 1.0)
     worse = np.where(np.isfinite(worse), worse, 1.0)[:, [0, 0, 1]]
     white = generator(seed, spec.name, "white").standard_normal((n, 3))
     tau = np.array([row.tau for row in table])[state]
-    bias = gauss_markov(generator(seed, spec.name, "bias"), 1.0 / spec.rate_hz, tau)
-    path = gauss_markov(generator(seed, spec.name, "path"), 1.0 / spec.rate_hz, np.full(n, MULTIPATH_TAU_S))
+    bias = gauss_markov(generator(seed, spec.name, "bias"), 1.0 / spec.rate_hz, tau=tau)
+    path = gauss_markov(
+        generator(seed, spec.name, "path"), 1.0 / spec.rate_hz, tau=np.full(n, MULTIPATH_TAU_S)
+    )
     near = worse * (sizes("white") * white + sizes("bias") * bias)
     total: Float = near + sizes("blocked") * sky.blocked[:, None] * path
     return total
 
 
-def gauss_markov(rng: np.random.Generator, dt: float, tau: Float) -> Float:
+def gauss_markov(rng: np.random.Generator, dt: float, *, tau: Float) -> Float:
     """Three independent first-order Gauss-Markov processes (n, 3) of unit variance, from their steady state.
 
     u[k] = phi u[k-1] + sqrt(1 - phi^2) N(0, 1) with phi = exp(-dt / tau[k]), computed in order from the
@@ -245,7 +249,7 @@ def gauss_markov(rng: np.random.Generator, dt: float, tau: Float) -> Float:
     return out
 
 
-def _shifted(frame: Frame, position: Float, error: Float) -> Float:
+def _shifted(frame: Frame, position: Float, *, error: Float) -> Float:
     """Longitude, latitude and height (n, 3) of positions displaced by metres east, north and up."""
     lon, lat = frame.to_geographic(position[:, 0], position[:, 1])
     turn, scale = frame.convergence(lon, lat), frame.scale(lon, lat)
@@ -259,7 +263,7 @@ def _shifted(frame: Frame, position: Float, error: Float) -> Float:
     return out
 
 
-def _course(velocity: Float, speed: Float, least: Float) -> Float:
+def _course(velocity: Float, speed: Float, *, least: Float) -> Float:
     """Course (n,) clockwise from true north; below the least speed the last one known, 0 before any."""
     course = np.asarray(np.mod(np.arctan2(velocity[:, 0], velocity[:, 1]), 2 * np.pi))
     known: NDArray[np.int64] = np.where(speed > least, np.arange(len(speed)), -1)

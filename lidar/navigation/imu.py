@@ -57,7 +57,7 @@ def normal_gravity(lat_deg: ArrayLike, h: ArrayLike) -> Float:
 
 
 def true_inertial(
-    trajectory: Trajectory, frame: Frame, spec: ImuSpec, time_ns: NDArray[np.int64]
+    trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, time_ns: NDArray[np.int64]
 ) -> tuple[Float, Float]:
     """Angular rate (n, 3) and specific force (n, 3) that a unit feels, in its own axes.
 
@@ -70,7 +70,7 @@ def true_inertial(
     arm = np.asarray(spec.mount.translation, float)
     velocity = trajectory.velocity + np.einsum("nij,nj->ni", R, np.cross(turn, arm))
     acceleration = np.gradient(velocity, seconds, axis=0)
-    earth, travel, gravity = _planet(trajectory, frame, velocity)
+    earth, travel, gravity = _planet(trajectory, frame, velocity=velocity)
     felt = acceleration + np.cross(2 * earth + travel, velocity)
     felt[:, 2] += gravity
     rate = turn + np.einsum("nji,nj->ni", R, earth + travel)
@@ -81,7 +81,7 @@ def true_inertial(
     return out[0], out[1]
 
 
-def _planet(trajectory: Trajectory, frame: Frame, velocity: Float) -> tuple[Float, Float, Float]:
+def _planet(trajectory: Trajectory, frame: Frame, *, velocity: Float) -> tuple[Float, Float, Float]:
     """Turning (n, 3) of the Earth and of the vertical as one travels, scene axes; and gravity (n,)."""
     x, y, z = trajectory.position.T
     lon, lat = frame.to_geographic(x, y)
@@ -98,7 +98,7 @@ def _planet(trajectory: Trajectory, frame: Frame, velocity: Float) -> tuple[Floa
     return earth, travel, normal_gravity(lat, z)
 
 
-def observe_imu(trajectory: Trajectory, frame: Frame, spec: ImuSpec, *, seed: int) -> Inertial:
+def observe_imu(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, seed: int) -> Inertial:
     """What an inertial unit reports along a drive.
 
     Random numbers are keyed by seed and unit and drawn moment by moment from the start, so that a shorter
@@ -107,12 +107,12 @@ def observe_imu(trajectory: Trajectory, frame: Frame, spec: ImuSpec, *, seed: in
     step = 1e9 / spec.rate_hz
     count = int(np.floor((trajectory.duration_ns - spec.time_offset_ns) / step + 1e-9)) + 1
     time_ns = np.round(np.arange(max(count, 0)) * step).astype(np.int64) + spec.time_offset_ns
-    rate, force = true_inertial(trajectory, frame, spec, time_ns)
-    noise = inertial_noise(spec, len(time_ns), seed)
+    rate, force = true_inertial(trajectory, frame, spec=spec, time_ns=time_ns)
+    noise = inertial_noise(spec, len(time_ns), seed=seed)
     return Inertial(time_ns, rate + noise[:, :3], force + noise[:, 3:], rate, force)
 
 
-def inertial_noise(spec: ImuSpec, count: int, seed: int) -> Float:
+def inertial_noise(spec: ImuSpec, count: int, *, seed: int) -> Float:
     """Errors (n, 6) of gyros, rad/s, and accelerometers, m/s^2: white noise, a random walk, flicker."""
     draw = generator(seed, spec.name, "imu").standard_normal((count, 12))
     dt = 1.0 / spec.rate_hz
@@ -121,11 +121,13 @@ def inertial_noise(spec: ImuSpec, count: int, seed: int) -> Float:
     total: Float = draw[:, :6] * white + np.cumsum(draw[:, 6:] * walk, axis=0)
     for axes, instability in ((slice(0, 3), spec.gyro_instability), (slice(3, 6), spec.accel_instability)):
         if instability:
-            total[:, axes] += instability * _flicker(count, dt, seed, f"{spec.name}/imu/{axes.start}")
+            total[:, axes] += instability * _flicker(
+                count, dt, seed=seed, name=f"{spec.name}/imu/{axes.start}"
+            )
     return total
 
 
-def _flicker(count: int, dt: float, seed: int, name: str) -> Float:
+def _flicker(count: int, dt: float, *, seed: int, name: str) -> Float:
     """Three columns (n, 3) of noise whose spectrum is 1 / (2 pi f), with an Allan deviation of 0.664.
 
     The sum of stationary first-order Gauss-Markov processes, a factor of e apart in correlation time, each of
@@ -143,7 +145,7 @@ def _flicker(count: int, dt: float, seed: int, name: str) -> Float:
     return total
 
 
-def allan_deviation(rate: Float, rate_hz: float, windows: NDArray[np.integer]) -> Float:
+def allan_deviation(rate: Float, rate_hz: float, *, windows: NDArray[np.integer]) -> Float:
     """Overlapping Allan deviation (w, k) of readings (n, k) for averaging windows of so many readings."""
     total = np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(rate, axis=0)]) / rate_hz
     out = np.empty((len(windows), rate.shape[1]))

@@ -30,15 +30,15 @@ def sentence(body: str) -> str:
 
 def latitude(deg: float) -> str:
     """Latitude in degrees as ``ddmm.mmmmmm,N``; nothing but the comma where it is not known."""
-    return _angle(deg, 2, "NS")
+    return _angle(deg, 2, signs="NS")
 
 
 def longitude(deg: float) -> str:
     """Longitude in degrees as ``dddmm.mmmmmm,E``; nothing but the comma where it is not known."""
-    return _angle(deg, 3, "EW")
+    return _angle(deg, 3, signs="EW")
 
 
-def _angle(deg: float, digits: int, signs: str) -> str:
+def _angle(deg: float, digits: int, *, signs: str) -> str:
     if not math.isfinite(deg):
         return ","
     micro = round(abs(deg) * 60e6)  # whole millionths of a minute, so that 59.9999999 never prints as 60
@@ -66,11 +66,11 @@ def nmea(fixes: Fixes, start: datetime, *, geoid: float | None = None) -> list[s
     lines: list[str] = []
     for k in range(len(fixes)):
         when = start + timedelta(microseconds=round(int(fixes.time_ns[k]) / 1000))
-        lines += _epoch(fixes, k, when, geoid)
+        lines += _epoch(fixes, k, when=when, geoid=geoid)
     return lines
 
 
-def _epoch(fixes: Fixes, k: int, when: datetime, geoid: float | None) -> Sequence[str]:
+def _epoch(fixes: Fixes, k: int, *, when: datetime, geoid: float | None) -> Sequence[str]:
     lon, lat, h = fixes.lonlath[k].tolist()
     quality, fixed = int(fixes.quality[k]), math.isfinite(lon)
     hundredths = round(when.microsecond / 1e4)

@@ -75,7 +75,7 @@ def systems_of(names: NDArray[np.str_]) -> list[NDArray[np.int64]]:
     return [np.flatnonzero(np.array(letters) == letter) for letter in dict.fromkeys(letters)]
 
 
-def ecef(lon_deg: ArrayLike, lat_deg: ArrayLike, h: ArrayLike) -> Float:
+def ecef(lon_deg: ArrayLike, lat_deg: ArrayLike, *, h: ArrayLike) -> Float:
     """Earth-centred, earth-fixed coordinates (..., 3) in metres of WGS 84 degrees and ellipsoidal heights."""
     lon, lat = np.radians(np.asarray(lon_deg, float)), np.radians(np.asarray(lat_deg, float))
     n = A / np.sqrt(1 - E2 * np.sin(lat) ** 2)
@@ -103,19 +103,19 @@ def enu_axes(lon_deg: ArrayLike, lat_deg: ArrayLike) -> Float:
 def look_up(
     lon_deg: Float,
     lat_deg: Float,
+    *,
     h: Float,
     start: datetime,
     time_ns: NDArray[np.integer],
-    *,
     systems: Sequence[str] = SYSTEMS,
 ) -> tuple[Float, Float]:
     """True azimuth and elevation (n, k) in radians of the satellites from n places, one a time."""
-    d = satellites(start, time_ns, systems) - ecef(lon_deg, lat_deg, h)[:, None, :]
+    d = satellites(start, time_ns, systems=systems) - ecef(lon_deg, lat_deg, h=h)[:, None, :]
     e, n, u = np.moveaxis(np.einsum("nij,nkj->nki", enu_axes(lon_deg, lat_deg), d), -1, 0)
     return np.mod(np.arctan2(e, n), 2 * np.pi), np.arctan2(u, np.hypot(e, n))
 
 
-def grid_directions(azimuth: Float, elevation: Float, convergence: Float) -> Float:
+def grid_directions(azimuth: Float, elevation: Float, *, convergence: Float) -> Float:
     """Unit vectors (..., 3) in scene axes of true azimuths and elevations; convergence as of `Frame`."""
     grid, elevation = np.broadcast_arrays(azimuth - convergence, elevation)
     out: Float = np.stack(
@@ -127,9 +127,9 @@ def grid_directions(azimuth: Float, elevation: Float, convergence: Float) -> Flo
 def open_sky(
     frame: Frame,
     antenna: Float,
+    *,
     start: datetime,
     time_ns: NDArray[np.integer],
-    *,
     mask_deg: float,
     systems: Sequence[str] = SYSTEMS,
 ) -> Sky:
@@ -138,7 +138,7 @@ def open_sky(
     systems : of `SYSTEMS`; raises InputError for others
     """
     lon, lat = frame.to_geographic(antenna[:, 0], antenna[:, 1])
-    azimuth, elevation = look_up(lon, lat, antenna[:, 2], start, time_ns, systems=systems)
+    azimuth, elevation = look_up(lon, lat, h=antenna[:, 2], start=start, time_ns=time_ns, systems=systems)
     above = elevation > np.radians(mask_deg)
     return Sky(azimuth, elevation, above, above, np.zeros(len(antenna)), satellite_names(systems))
 
@@ -146,10 +146,10 @@ def open_sky(
 def sky_view(
     frame: Frame,
     antenna: Float,
+    *,
     start: datetime,
     time_ns: NDArray[np.integer],
     world_at: Callable[[tuple[float, float, float, float]], _World],
-    *,
     mask_deg: float,
     systems: Sequence[str] = SYSTEMS,
 ) -> Sky:
@@ -161,7 +161,7 @@ def sky_view(
     world_at : the world that covers a region (xmin, ymin, xmax, ymax), such as `World.follow`; asked once for
                every hundred metres or so of the drive, with `REACH` around them
     """
-    sky = open_sky(frame, antenna, start, time_ns, mask_deg=mask_deg, systems=systems)
+    sky = open_sky(frame, antenna, start=start, time_ns=time_ns, mask_deg=mask_deg, systems=systems)
     lon, lat = frame.to_geographic(antenna[:, 0], antenna[:, 1])
     turn = frame.convergence(lon, lat)
     ring = np.repeat((np.arange(_RINGS) + 0.5) / _RINGS, _SPOKES)  # equal steps of sine: equal areas
@@ -174,10 +174,10 @@ def sky_view(
         caster = world_at((x.min() - REACH, y.min() - REACH, x.max() + REACH, y.max() + REACH)).caster
         k, satellite = np.nonzero(sky.above[rows])
         way = grid_directions(
-            sky.azimuth[rows][k, satellite], sky.elevation[rows][k, satellite], turn[rows][k]
+            sky.azimuth[rows][k, satellite], sky.elevation[rows][k, satellite], convergence=turn[rows][k]
         )
         visible[rows[k], satellite] = ~caster.occluded(antenna[rows[k]], way)
-        dome = grid_directions(spoke[None, :], rise[None, :], turn[rows, None]).reshape(-1, 3)
+        dome = grid_directions(spoke[None, :], rise[None, :], convergence=turn[rows, None]).reshape(-1, 3)
         hit = caster.occluded(np.repeat(antenna[rows], len(ring), axis=0), dome)
         blocked[rows] = hit.reshape(len(rows), -1).mean(axis=1)
     return Sky(sky.azimuth, sky.elevation, visible, sky.above, blocked, sky.names)
@@ -190,7 +190,7 @@ def _blocks(antenna: Float) -> list[NDArray[np.int64]]:
     return np.split(np.arange(len(antenna)), np.flatnonzero(np.diff(block)) + 1)
 
 
-def dilution(azimuth: Float, elevation: Float, used: Bool, names: NDArray[np.str_]) -> Float:
+def dilution(azimuth: Float, elevation: Float, *, used: Bool, names: NDArray[np.str_]) -> Float:
     """Dilution of precision (n, 3): horizontal, vertical and in position; infinite where too few are used.
 
     Each system in use has a clock of its own that must be solved for: three coordinates and a clock need four

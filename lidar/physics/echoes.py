@@ -168,7 +168,7 @@ def numbered(echoes: Echoes) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 
 
 def reported(
-    echoes: Echoes, amplitude: Float, mode: str, *, most: int, second: bool = False
+    echoes: Echoes, amplitude: Float, *, mode: str, most: int, second: bool = False
 ) -> NDArray[np.int64]:
     """Rows that a sensor reports in a return mode; rows sorted by pulse and range.
 

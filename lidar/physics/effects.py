@@ -119,11 +119,11 @@ def effects_of(level: str = "standard", settings: Mapping[str, str] | None = Non
     for name, text in (settings or {}).items():
         if name not in known:
             raise InputError(f"setting {name!r} is not known: {', '.join(known)}")
-        values[name] = _value(name, text, known[name])
+        values[name] = _value(name, text, kind=known[name])
     return replace(LEVELS[level], **values)  # type: ignore[arg-type]
 
 
-def _value(name: str, text: str, kind: type) -> object:
+def _value(name: str, text: str, *, kind: type) -> object:
     if kind is bool:
         words = {"on": True, "yes": True, "true": True, "1": True}
         words |= {"off": False, "no": False, "false": False, "0": False}

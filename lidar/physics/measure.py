@@ -22,7 +22,7 @@ def signal_sigma(received: ArrayLike, resolution: float = RESOLUTION) -> Float:
     return sigma
 
 
-def stretch_sigma(distance: ArrayLike, cosine: ArrayLike, divergence: float) -> Float:
+def stretch_sigma(distance: ArrayLike, cosine: ArrayLike, *, divergence: float) -> Float:
     """Standard deviation in metres that a footprint's depth on a slanted surface adds.
 
     The 1/e^2 footprint is R B tan(theta) deep; a Gaussian has a quarter of its 1/e^2 width as deviation. Held

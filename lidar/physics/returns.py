@@ -24,7 +24,7 @@ _BLOOM_POWER = 0.01  # of the retro-reflector's power, assumed
 _OVERLAP = 5e-5  # probability that another scanner's pulse enters a shot, typical value (1e-5 to 1e-4)
 
 
-def received(sensor: Sensor, echoes: Echoes, effects: Effects) -> Float:
+def received(sensor: Sensor, echoes: Echoes, *, effects: Effects) -> Float:
     """Power over threshold of each echo."""
     return amplitude(
         echoes.apparent,
@@ -35,13 +35,13 @@ def received(sensor: Sensor, echoes: Echoes, effects: Effects) -> Float:
     )
 
 
-def detected(sensor: Sensor, echoes: Echoes, effects: Effects, rng: np.random.Generator) -> Echoes:
+def detected(sensor: Sensor, echoes: Echoes, *, effects: Effects, rng: np.random.Generator) -> Echoes:
     """The echoes that pass the threshold, with the apparent reflectance that the sensor measures.
 
     With ``detection``, noise is added to each echo's power before it meets the threshold, which gives the
     probability of `lidar.physics.link.detection_probability`, and is part of the measured reflectance.
     """
-    power = received(sensor, echoes, effects)
+    power = received(sensor, echoes, effects=effects)
     measured = power
     if effects.detection:
         measured = power + daylight_noise(sensor.noise_ratio, effects.daylight_lux) * rng.standard_normal(
@@ -53,18 +53,18 @@ def detected(sensor: Sensor, echoes: Echoes, effects: Effects, rng: np.random.Ge
 
 
 def false_echoes(
-    sensor: Sensor, pulses: Firings, echoes: Echoes, effects: Effects, seed: int, frame: int
+    sensor: Sensor, pulses: Firings, *, echoes: Echoes, effects: Effects, seed: int, frame: int
 ) -> list[Echoes]:
     """Echoes of nothing that is there: blooming, other scanners, noise over the threshold."""
     found = []
     if effects.blooming:
         rng = generator(seed, sensor.name, frame, "blooming")
-        found.append(_blooming(pulses, echoes, rng))
+        found.append(_blooming(pulses, echoes, rng=rng))
     if effects.interference:
         rng = generator(seed, sensor.name, frame, "interference")
         pulse = np.flatnonzero(rng.random(len(pulses)) < 1 - (1 - _OVERLAP) ** effects.interference)
         power = 100 ** rng.random(len(pulse))  # log-uniform over two decades, assumed
-        found.append(_anywhere(sensor, pulse, power, rng))
+        found.append(_anywhere(sensor, pulse, power=power, rng=rng))
     if effects.false_alarms:
         rng = generator(seed, sensor.name, frame, "false alarms")
         noise = daylight_noise(sensor.noise_ratio, effects.daylight_lux)
@@ -72,11 +72,11 @@ def false_echoes(
         pulse = np.flatnonzero(rng.random(len(pulses)) < chance)
         # Beyond a high threshold the tail of a Gaussian falls like an exponential.
         power = 1 + noise**2 * rng.standard_exponential(len(pulse))
-        found.append(_anywhere(sensor, pulse, power, rng))
+        found.append(_anywhere(sensor, pulse, power=power, rng=rng))
     return found
 
 
-def _nothing(pulse: NDArray[np.integer], distance: Float, apparent: Float) -> Echoes:
+def _nothing(pulse: NDArray[np.integer], distance: Float, *, apparent: Float) -> Echoes:
     """Echoes that belong to no surface; their true range is 0."""
     n = len(pulse)
     return Echoes(
@@ -91,7 +91,9 @@ def _nothing(pulse: NDArray[np.integer], distance: Float, apparent: Float) -> Ec
     )
 
 
-def _anywhere(sensor: Sensor, pulse: NDArray[np.integer], power: Float, rng: np.random.Generator) -> Echoes:
+def _anywhere(
+    sensor: Sensor, pulse: NDArray[np.integer], *, power: Float, rng: np.random.Generator
+) -> Echoes:
     """Echoes of given power over threshold at ranges the sensor accepts, each as likely as the other."""
     distance = rng.uniform(sensor.min_range, sensor.max_range, len(pulse))
     apparent = apparent_of(
@@ -100,16 +102,16 @@ def _anywhere(sensor: Sensor, pulse: NDArray[np.integer], power: Float, rng: np.
         reference_reflectance=sensor.reference_reflectance,
         reference_range=sensor.reference_range,
     )
-    return _nothing(pulse, distance - sensor.pattern.range_offset, apparent)
+    return _nothing(pulse, distance - sensor.pattern.range_offset, apparent=apparent)
 
 
-def _blooming(pulses: Firings, echoes: Echoes, rng: np.random.Generator) -> Echoes:
+def _blooming(pulses: Firings, echoes: Echoes, *, rng: np.random.Generator) -> Echoes:
     """Echoes at the range of retro-reflectors in pulses that pass close by one."""
     from scipy.spatial import cKDTree  # noqa: PLC0415
 
     bright = echoes.take(echoes.apparent > RETRO)
     if not len(bright):
-        return _nothing(np.empty(0, np.int32), np.empty(0), np.empty(0))
+        return _nothing(np.empty(0, np.int32), np.empty(0), apparent=np.empty(0))
     distance, nearest = cKDTree(pulses.direction[bright.pulse]).query(
         pulses.direction, distance_upper_bound=2 * np.sin(_BLOOM_ANGLE / 2)
     )
@@ -117,11 +119,11 @@ def _blooming(pulses: Firings, echoes: Echoes, rng: np.random.Generator) -> Echo
     beside[bright.pulse] = False
     pulse = np.flatnonzero(beside & (rng.random(len(pulses)) < _BLOOM_CHANCE))
     source = nearest[pulse]
-    return _nothing(pulse, bright.range[source], _BLOOM_POWER * bright.apparent[source])
+    return _nothing(pulse, bright.range[source], apparent=_BLOOM_POWER * bright.apparent[source])
 
 
 def measured_range(
-    sensor: Sensor, pulses: Firings, echoes: Echoes, effects: Effects, seed: int, frame: int
+    sensor: Sensor, pulses: Firings, *, echoes: Echoes, effects: Effects, seed: int, frame: int
 ) -> Float:
     """Ranges (m,) as the sensor reports them, metres."""
     distance = echoes.range + sensor.pattern.range_offset
@@ -130,7 +132,7 @@ def measured_range(
         error = generator(seed, sensor.name, "bias").normal(0, sensor.bias_sigma, lasers)
         distance = distance + error[pulses.channel[echoes.pulse]]
     if effects.walk or effects.range_noise == "signal":
-        power = np.maximum(received(sensor, echoes, effects), 1.0)
+        power = np.maximum(received(sensor, echoes, effects=effects), 1.0)
         if effects.walk:
             distance = distance + walk(power)
     if effects.range_noise != "none":
@@ -141,6 +143,6 @@ def measured_range(
         distance = distance + sigma * rng.standard_normal(len(echoes))
     if effects.stretch and effects.rays == 1:
         rng = generator(seed, sensor.name, frame, "stretch")
-        width = stretch_sigma(echoes.range, echoes.cosine, sensor.divergence[1])
+        width = stretch_sigma(echoes.range, echoes.cosine, divergence=sensor.divergence[1])
         distance = distance + width * rng.standard_normal(len(echoes))
     return quantised(distance, sensor.range_quantum) if effects.quantise else distance

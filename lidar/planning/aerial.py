@@ -45,9 +45,9 @@ _GROUND = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD]
 def plan_flight(
     scene: Scene,
     spec: Spec,
+    *,
     vehicle: Vehicle,
     sensors: Sequence[Scanner | Camera],
-    *,
     survey: str = "",
     altitude: float | None = None,
     overlap: float = 0.3,
@@ -74,14 +74,25 @@ def plan_flight(
     below = _Below(scene)
     if survey:
         height = usual if altitude is None else altitude
-        route, lines, spacing = _strips(scene, survey, vehicle, sensors, height, overlap, below)
+        route, lines, spacing = _strips(
+            scene, survey, vehicle=vehicle, sensors=sensors, height=height, overlap=overlap, below=below
+        )
     else:
-        route = _along(scene, spec, vehicle, altitude, usual, seed, duration, below)
+        route = _along(
+            scene,
+            spec,
+            vehicle=vehicle,
+            altitude=altitude,
+            usual=usual,
+            seed=seed,
+            duration=duration,
+            below=below,
+        )
     under_way = spec == "random" and not survey and not from_rest
-    trajectory = drive_path(plan_path(route, vehicle, scene.frame), vehicle, under_way=under_way)
+    trajectory = drive_path(plan_path(route, vehicle, frame=scene.frame), vehicle, under_way=under_way)
     if duration is not None:
         trajectory = trajectory.until(round(duration * 1e9))
-    _refuse_collisions(trajectory, below, scene)
+    _refuse_collisions(trajectory, below, scene=scene)
     if not survey or turns:
         return Flight(trajectory)
     on = times_on_lines(trajectory, lines, beside=spacing / 2)
@@ -145,6 +156,7 @@ class _Below:
 def _along(
     scene: Scene,
     spec: Spec,
+    *,
     vehicle: Vehicle,
     altitude: float | None,
     usual: float,
@@ -161,7 +173,7 @@ def _along(
             )
         length = vehicle.max_speed * ((60.0 if duration is None else duration) + AHEAD_S)
         graph = covered(road_graph(scene), scene)
-        line = plan_route(graph, scene.frame, "random", seed=seed, length=length).line
+        line = plan_route(graph, scene.frame, spec="random", seed=seed, length=length).line
         xyz, given = np.array(line), False
     elif isinstance(spec, str | Path):
         track = read_track(Path(spec), scene.frame)
@@ -187,6 +199,7 @@ def _dense(xy: Float) -> Float:
 def _strips(
     scene: Scene,
     survey: str,
+    *,
     vehicle: Vehicle,
     sensors: Sequence[Scanner | Camera],
     height: float,
@@ -284,7 +297,7 @@ def _swath(sensor: Scanner | Camera, height: float) -> float:
     return 2.0 * float(min(left, right, furthest))
 
 
-def _refuse_collisions(trajectory: Trajectory, below: _Below, scene: Scene) -> None:
+def _refuse_collisions(trajectory: Trajectory, below: _Below, *, scene: Scene) -> None:
     """Raise RouteError where the craft comes too close to what is below it, or meets it."""
     xyz = trajectory.position[::10]
     top = below.top(xyz[:, 0], xyz[:, 1])

@@ -66,7 +66,7 @@ class Line:
 
 
 def body_outlines(
-    xy: Float, heading: Float, vehicle: Vehicle, margin: float = 0.0, aside: float = 0.0
+    xy: Float, heading: Float, *, vehicle: Vehicle, margin: float = 0.0, aside: float = 0.0
 ) -> NDArray[np.object_]:
     """Outlines (n,) of the body in plan, longer by the margin at each end and wider by both on each side.
 
@@ -84,27 +84,31 @@ def body_outlines(
 
 
 def touching(
-    track: Track, line: Line, setting: Setting
+    track: Track, line: Line, *, setting: Setting
 ) -> tuple[NDArray[np.int64], NDArray[np.object_], NDArray[np.object_]]:
     """Rows of a track where the body touches an obstacle, its outlines there, and the obstacles."""
     every = max(round(_SWEEP / track.step), 1)
     rows = np.unique(np.append(np.arange(0, len(track.row), every), len(track.row) - 1))
     rows = rows[~line.free[track.row[rows]]]
-    bodies = body_outlines(track.xy[rows], track.heading[rows], setting.vehicle, setting.margin)
+    bodies = body_outlines(
+        track.xy[rows], track.heading[rows], vehicle=setting.vehicle, margin=setting.margin
+    )
     body, obstacle = setting.tree.query(bodies, predicate="intersects")
     return rows[body], bodies[body], setting.tree.geometries[obstacle]
 
 
-def pushes(track: Track, line: Line, setting: Setting) -> tuple[Float, NDArray[np.int64]]:
+def pushes(track: Track, line: Line, *, setting: Setting) -> tuple[Float, NDArray[np.int64]]:
     """How far the line must move, positive to the left, and at which of its rows, to free the body.
 
     Not a number where no place beside the line within `ASIDE` is free.
     """
-    rows = np.unique(touching(track, line, setting)[0])
+    rows = np.unique(touching(track, line, setting=setting)[0])
     if not len(rows):
         return np.empty(0), np.empty(0, np.int64)
     half = setting.vehicle.width / 2 + setting.margin
-    strips = body_outlines(track.xy[rows], track.heading[rows], setting.vehicle, setting.margin, aside=ASIDE)
+    strips = body_outlines(
+        track.xy[rows], track.heading[rows], vehicle=setting.vehicle, margin=setting.margin, aside=ASIDE
+    )
     strip, obstacle = setting.tree.query(strips, predicate="intersects")
     parts, of = shapely.get_parts(
         shapely.intersection(strips[strip], setting.tree.geometries[obstacle]), return_index=True
@@ -120,12 +124,14 @@ def pushes(track: Track, line: Line, setting: Setting) -> tuple[Float, NDArray[n
     near = np.full(len(rows), -np.inf)
     body = np.abs(across) <= half
     np.maximum.at(near, k[body], ahead[body])
-    push = np.array([_way_out(low[strip[of] == r], high[strip[of] == r], half) for r in range(len(rows))])
+    push = np.array(
+        [_way_out(low[strip[of] == r], high[strip[of] == r], half=half) for r in range(len(rows))]
+    )
     at = track.row[rows] + np.round(np.clip(near, 0.0, setting.vehicle.front) / line.gap).astype(np.int64)
     return push, np.minimum(at, len(line.edge) - 1)
 
 
-def _way_out(low: Float, high: Float, half: float) -> float:
+def _way_out(low: Float, high: Float, *, half: float) -> float:
     """The least shift sideways that takes a body of a half width clear of intervals; NaN if none does."""
     ways = np.concatenate([high + half, low - half])
     ways += np.copysign(0.05, ways)
@@ -147,7 +153,7 @@ def turns_at(line: Line, rows: NDArray[np.int64]) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def turn_round(pose: Pose, line: Line, setting: Setting) -> list[Track]:
+def turn_round(pose: Pose, line: Line, *, setting: Setting) -> list[Track]:
     """Arcs, forwards and backwards in turn, after which the vehicle points the other way: 3, 5, 7 or 9.
 
     Raises BlockedError if the body touches an obstacle whatever their number.
@@ -170,7 +176,7 @@ def turn_round(pose: Pose, line: Line, setting: Setting) -> list[Track]:
             span = math.pi / arcs * radius / (n - 1)
             tracks.append(Track(xy, heading, np.full(n, hand / radius), np.full(n, here), gear, span))
             x, y, th = tracks[-1].end
-        if not any(len(touching(t, line, setting)[0]) for t in tracks):
+        if not any(len(touching(t, line, setting=setting)[0]) for t in tracks):
             return tracks
     edge = int(line.edge[-1])
     raise BlockedError(

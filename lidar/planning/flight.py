@@ -71,7 +71,7 @@ def survey_flight(
     """
     if not (area.area > 0 and spacing > 0 and radius > 0):
         raise RouteError("a survey needs an area, a spacing of strips and a turning radius above zero")
-    west, east, middle, back = _strips(area, spacing, heading_deg)
+    west, east, middle, back = _strips(area, spacing, heading_deg=heading_deg)
     count = len(middle)
     ends = (west - run_out, east + run_out)
     parts: list[Float] = []
@@ -83,13 +83,13 @@ def survey_flight(
             parts.append(np.array([[ends[1 if forth else 0][k], y]]))
         else:  # a strip goes on to where the longer of it and the next one ends
             x = max(ends[1][k : k + 2]) if forth else min(ends[0][k : k + 2])
-            parts.append(_turn(float(x), y, spacing, radius, 1.0 if forth else -1.0))
+            parts.append(_turn(float(x), y, spacing=spacing, radius=radius, way=1.0 if forth else -1.0))
     xy = np.concatenate(parts) @ back
     top = float(ground(xy[:, 0], xy[:, 1]).max()) if ground is not None else 0.0
     return free_route(np.column_stack([xy, np.full(len(xy), top + height)]), limit=limit)
 
 
-def _strips(area: Any, spacing: float, heading_deg: float) -> tuple[Float, Float, Float, Float]:
+def _strips(area: Any, spacing: float, *, heading_deg: float) -> tuple[Float, Float, Float, Float]:
     """Both ends (k,) and place across (k,) of strips in the survey's axes; the turn (2, 2) back."""
     turn = math.radians(90.0 - heading_deg)
     c, s = math.cos(turn), math.sin(turn)
@@ -106,7 +106,7 @@ def _strips(area: Any, spacing: float, heading_deg: float) -> tuple[Float, Float
 
 def survey_lines(area: Any, *, spacing: float, heading_deg: float = 90.0) -> Float:
     """Where each strip of `survey_flight` enters and leaves the area, (k, 2, 2) scene metres, as flown."""
-    west, east, middle, back = _strips(area, spacing, heading_deg)
+    west, east, middle, back = _strips(area, spacing, heading_deg=heading_deg)
     ends = np.stack([np.column_stack([west, middle]), np.column_stack([east, middle])], axis=1)
     ends[1::2] = ends[1::2, ::-1]
     lines: Float = ends @ back
@@ -133,24 +133,24 @@ def times_on_lines(trajectory: Trajectory, lines: Float, *, beside: float) -> ND
     return np.column_stack([time[first] - _LEAD_NS, time[last] + _LEAD_NS])
 
 
-def _turn(x: float, y: float, spacing: float, radius: float, way: float) -> Float:
+def _turn(x: float, y: float, *, spacing: float, radius: float, way: float) -> Float:
     """Points (n, 2) from the end of a strip flown along ``way`` (1 or -1) of x to the next strip above it."""
     if spacing >= 2 * radius:
-        up = _arc(radius, -np.pi / 2, 0.0, [0.0, radius])
-        on = _arc(radius, 0.0, np.pi / 2, [0.0, spacing - radius])
+        up = _arc(radius, -np.pi / 2, last=0.0, centre=[0.0, radius])
+        on = _arc(radius, 0.0, last=np.pi / 2, centre=[0.0, spacing - radius])
         local = np.concatenate([up, on])
     else:
         # arcs of one radius: out by alpha, back by pi + 2 alpha, out by alpha; their centres lie 2 r apart
         alpha = math.acos((radius + spacing / 2) / (2 * radius))
         far = 2 * radius * math.sin(alpha)
-        out = _arc(radius, np.pi / 2, np.pi / 2 - alpha, [0.0, -radius])
-        main = _arc(radius, -np.pi / 2 - alpha, np.pi / 2 + alpha, [far, spacing / 2])
-        home = _arc(radius, -np.pi / 2 + alpha, -np.pi / 2, [0.0, spacing + radius])
+        out = _arc(radius, np.pi / 2, last=np.pi / 2 - alpha, centre=[0.0, -radius])
+        main = _arc(radius, -np.pi / 2 - alpha, last=np.pi / 2 + alpha, centre=[far, spacing / 2])
+        home = _arc(radius, -np.pi / 2 + alpha, last=-np.pi / 2, centre=[0.0, spacing + radius])
         local = np.concatenate([out, main, home])
     return np.column_stack([x + way * local[:, 0], y + local[:, 1]])
 
 
-def _arc(radius: float, first: float, last: float, centre: Sequence[float]) -> Float:
+def _arc(radius: float, first: float, *, last: float, centre: Sequence[float]) -> Float:
     angle = np.linspace(first, last, max(math.ceil(abs(last - first) / _ARC_STEP), 2) + 1)
     arc: Float = np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return arc

@@ -63,7 +63,7 @@ def drive_path(
     the body under acceleration. Raises InputError for a duration or rate that is not positive.
     """
     motion = motion_along(path, vehicle, rate_hz=rate_hz, duration=duration, under_way=under_way)
-    return poses_along(path, vehicle, motion)
+    return poses_along(path, vehicle, motion=motion)
 
 
 def motion_along(
@@ -80,13 +80,13 @@ def motion_along(
     limit = speed_limits(path, vehicle)
     fine = math.ceil(100.0 / rate_hz)
     dt = 1.0 / (rate_hz * fine)
-    s, v, leg = _all_legs(path, limit, vehicle, dt, under_way=under_way)
+    s, v, leg = _all_legs(path, limit, vehicle=vehicle, dt=dt, under_way=under_way)
     if duration is not None and len(s) * dt > duration:
         if under_way:
             count = max(round(duration / dt), fine) + 1
             s, v, leg = s[:count], v[:count], leg[:count]
         else:
-            s, v, leg = _within(path, limit, vehicle, dt, duration)
+            s, v, leg = _within(path, limit, vehicle=vehicle, dt=dt, duration=duration)
     s, v, leg = s[::fine], v[::fine], leg[::fine]
     n = len(s)
     time_ns = np.round(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
@@ -144,7 +144,7 @@ def legs_of(path: Path) -> list[tuple[int, int]]:
 
 
 def _all_legs(
-    path: Path, limit: Float, vehicle: Vehicle, dt: float, *, under_way: bool = False
+    path: Path, limit: Float, *, vehicle: Vehicle, dt: float, under_way: bool = False
 ) -> tuple[Float, Float, NDArray[np.int32]]:
     """Distance, speed and leg at every ``dt`` of the whole path, with a rest between legs.
 
@@ -156,7 +156,9 @@ def _all_legs(
     rest = round(DWELL_S / dt)
     for first, last in legs_of(path):
         at_rest = (not vehicle.cruise and not (under_way and not first), not vehicle.cruise)
-        ds, dv = _time_law(path.s[first:last] - path.s[first], limit[first:last], vehicle, dt, at_rest)
+        ds, dv = _time_law(
+            path.s[first:last] - path.s[first], limit[first:last], vehicle=vehicle, dt=dt, rest=at_rest
+        )
         if s:
             ds, dv = np.concatenate([np.zeros(rest), ds[1:]]), np.concatenate([np.zeros(rest), dv[1:]])
         s.append(path.s[first] + ds)
@@ -166,15 +168,15 @@ def _all_legs(
 
 
 def _within(
-    path: Path, limit: Float, vehicle: Vehicle, dt: float, duration: float
+    path: Path, limit: Float, *, vehicle: Vehicle, dt: float, duration: float
 ) -> tuple[Float, Float, NDArray[np.int32]]:
     """As `_all_legs`, of as much of the path as can be driven in ``duration``, and then at rest."""
 
     def until(row: int) -> tuple[Float, Float, NDArray[np.int32]]:
-        return _all_legs(path.take(slice(0, row + 1)), limit[: row + 1], vehicle, dt)
+        return _all_legs(path.take(slice(0, row + 1)), limit[: row + 1], vehicle=vehicle, dt=dt)
 
     # the whole drive passes here at that time; a part of it has to brake before, so it ends a little sooner
-    s, _, _ = _all_legs(path, limit, vehicle, dt)
+    s, _, _ = _all_legs(path, limit, vehicle=vehicle, dt=dt)
     low, high = 1, int(np.searchsorted(path.s, s[round(duration / dt)]))
     best, back = until(1), 64
     while low < high:
@@ -194,7 +196,7 @@ def _within(
 
 
 def _time_law(
-    s: Float, limit: Float, vehicle: Vehicle, dt: float, rest: tuple[bool, bool]
+    s: Float, limit: Float, *, vehicle: Vehicle, dt: float, rest: tuple[bool, bool]
 ) -> tuple[Float, Float]:
     """Distance and speed at every ``dt`` of a leg, from rest and to rest where ``rest`` says so.
 
@@ -214,11 +216,11 @@ def _time_law(
         s, limit = at, np.interp(at, s, limit)
     lowered = limit
     for _ in range(_FIT):
-        far, speed = _smooth_profile(s, lowered, (up, down), (window, brief), dt, rest=rest)
+        far, speed = _smooth_profile(s, lowered, bounds=(up, down), windows=(window, brief), dt=dt, rest=rest)
         excess = speed / np.interp(far, s, limit)
         if excess.max() <= 1.0:
             return far, speed
-        lowered = _lowered(lowered, s, far, excess, speed * (half * dt))
+        lowered = _lowered(lowered, s, far=far, excess=excess, reach=speed * (half * dt))
     # slower throughout by what is left over, everything is within bounds
     old = np.arange(len(far))
     moment = np.linspace(0.0, old[-1], math.ceil(old[-1] * excess.max()) + 1)
@@ -228,14 +230,14 @@ def _time_law(
 def _smooth_profile(
     s: Float,
     limit: Float,
+    *,
     bounds: tuple[float, float],
     windows: tuple[int, int],
     dt: float,
-    *,
     rest: tuple[bool, bool],
 ) -> tuple[Float, Float]:
     """Distance and speed at every ``dt``: the fastest profile, averaged over two windows in time."""
-    v = _fastest(s, limit, *bounds, rest=rest)
+    v = _fastest(s, limit, up=bounds[0], down=bounds[1], rest=rest)
     t = np.concatenate([[0.0], np.cumsum(np.diff(s) / np.maximum((v[1:] + v[:-1]) / 2, 1e-3))])
     raw = np.interp(dt * np.arange(math.ceil(t[-1] / dt) + 1), t, v)
     reach = sum(windows) // 2 - 1
@@ -266,7 +268,7 @@ def _averaged(values: Float, window: int) -> Float:
     return mean
 
 
-def _lowered(lowered: Float, s: Float, far: Float, excess: Float, reach: Float) -> Float:
+def _lowered(lowered: Float, s: Float, *, far: Float, excess: Float, reach: Float) -> Float:
     """Limits lowered where a profile exceeded them, within ``reach`` metres of each place."""
     over = np.flatnonzero(excess > 1.0)
     out = lowered.copy()
@@ -281,7 +283,7 @@ def _lowered(lowered: Float, s: Float, far: Float, excess: Float, reach: Float) 
     return out
 
 
-def _fastest(s: Float, limit: Float, up: float, down: float, *, rest: tuple[bool, bool]) -> Float:
+def _fastest(s: Float, limit: Float, *, up: float, down: float, rest: tuple[bool, bool]) -> Float:
     """The highest speeds (n,) at distances s under a limit and accelerations up and down."""
     square = limit**2
     for still, end in zip(rest, (0, -1), strict=True):
@@ -293,7 +295,7 @@ def _fastest(s: Float, limit: Float, up: float, down: float, *, rest: tuple[bool
     return speed
 
 
-def poses_along(path: Path, vehicle: Vehicle, motion: Motion) -> Trajectory:
+def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:
     """The trajectory of a motion along a path; cubic between the path's rows, so velocity has no steps."""
     n = len(motion.s)
     position, heading = np.empty((n, 3)), np.empty(n)
@@ -309,8 +311,10 @@ def poses_along(path: Path, vehicle: Vehicle, motion: Motion) -> Trajectory:
         tangent = np.column_stack(
             [run * np.cos(p.heading), run * np.sin(p.heading), np.sin(p.slope) * p.gear]
         )
-        position[here] = _hermite(p.s, p.position, tangent, s)
-        heading[here] = _hermite(p.s, p.heading[:, None], (p.curvature * np.cos(p.slope))[:, None], s)[:, 0]
+        position[here] = _hermite(p.s, p.position, slope=tangent, at=s)
+        heading[here] = _hermite(
+            p.s, p.heading[:, None], slope=(p.curvature * np.cos(p.slope))[:, None], at=s
+        )[:, 0]
         for name, column in columns.items():
             column[here] = np.interp(s, p.s, getattr(p, name))
     v = motion.speed * gear
@@ -324,16 +328,16 @@ def poses_along(path: Path, vehicle: Vehicle, motion: Motion) -> Trajectory:
     if vehicle.kind != "air" or vehicle.cruise:  # what hovers climbs level
         pitch = pitch - columns["pitch"]
     if any(vehicle.bob):
-        shift = _gait(motion, vehicle, heading)
+        shift = _gait(motion, vehicle, heading=heading)
         seconds = motion.time_ns * 1e-9
         velocity = velocity + np.gradient(shift, seconds, axis=0)
         position = position + shift * np.column_stack([columns["scale"], columns["scale"], np.ones(n)])
     return Trajectory(
-        motion.time_ns, position, quat_from_euler(roll, pitch, heading), velocity, columns["scale"]
+        motion.time_ns, position, quat_from_euler(roll, pitch, gamma=heading), velocity, columns["scale"]
     )
 
 
-def _hermite(knot: Float, value: Float, slope: Float, at: Float) -> Float:
+def _hermite(knot: Float, value: Float, *, slope: Float, at: Float) -> Float:
     """Values (k, c) at places (k,) of cubics between knots (n,) with values and slopes (n, c) there."""
     i = np.clip(np.searchsorted(knot, at, side="right") - 1, 0, len(knot) - 2)
     gap = (knot[i + 1] - knot[i])[:, None]
@@ -344,7 +348,7 @@ def _hermite(knot: Float, value: Float, slope: Float, at: Float) -> Float:
     return out
 
 
-def _gait(motion: Motion, vehicle: Vehicle, heading: Float) -> Float:
+def _gait(motion: Motion, vehicle: Vehicle, *, heading: Float) -> Float:
     """True metres (n, 3) along the scene's axes by which a walker's body is off its path, step by step.
 
     The body rises once a step and sways to one side and the other in two, in proportion to its speed.

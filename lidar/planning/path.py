@@ -96,8 +96,8 @@ class Path:
 def plan_path(
     route: Route,
     vehicle: Vehicle,
-    frame: Frame,
     *,
+    frame: Frame,
     obstacles: Sequence[Any] | NDArray[np.object_] | shapely.STRtree | None = None,
     ground: Surface | None = None,
     margin: float = MARGIN,
@@ -127,13 +127,13 @@ def plan_path(
         turns_back = last < len(line.edge)
         if turns_back:
             part = _shortened(part, vehicle)
-        tracks = [_clear_track(part, setting, pose)]
+        tracks = [_clear_track(part, setting, pose=pose)]
         if turns_back:
-            tracks += turn_round(tracks[-1].end, part, setting)
+            tracks += turn_round(tracks[-1].end, part, setting=setting)
         pose = tracks[-1].end
         legs += tracks
         lines += [part] * len(tracks)
-    return _joined(legs, lines, setting, ground)
+    return _joined(legs, lines, setting=setting, ground=ground)
 
 
 def _resampled(route: Route, spacing: float) -> Line:
@@ -162,7 +162,7 @@ def _shortened(line: Line, vehicle: Vehicle) -> Line:
     return line.take(slice(0, len(line.edge) - max(spare, 0)))
 
 
-def _clear_track(line: Line, setting: Setting, pose: Pose | None) -> Track:
+def _clear_track(line: Line, setting: Setting, *, pose: Pose | None) -> Track:
     """A leg along the line on which the body touches no obstacle, from a pose if one is given.
 
     Raises BlockedError if the line cannot be pushed clear, or bends too tightly.
@@ -180,9 +180,9 @@ def _clear_track(line: Line, setting: Setting, pose: Pose | None) -> Track:
     shift = np.zeros(len(base))
     for _ in range(_REPAIRS):
         pushed = base + shift[:, None] * left
-        xy = relaxed(pushed, cap / scale, reach)
-        track = follow(xy, vehicle, scale, pose=pose, step=setting.step)
-        lost = _lost(track, line, pushed, vehicle)
+        xy = relaxed(pushed, cap / scale, reach=reach)
+        track = follow(xy, vehicle, scale=scale, pose=pose, step=setting.step)
+        lost = _lost(track, line, xy=pushed, vehicle=vehicle)
         if len(lost):
             x, y = base[lost[0]]
             raise BlockedError(
@@ -191,7 +191,7 @@ def _clear_track(line: Line, setting: Setting, pose: Pose | None) -> Track:
                 f" {vehicle.turning_radius} m",
                 turns_at(line, lost),
             )
-        push, at = pushes(track, line, setting)
+        push, at = pushes(track, line, setting=setting)
         if not len(at):
             return track
         if np.isnan(push).any():
@@ -213,7 +213,7 @@ def _clear_track(line: Line, setting: Setting, pose: Pose | None) -> Track:
     )
 
 
-def _lost(track: Track, line: Line, xy: Float, vehicle: Vehicle) -> NDArray[np.int64]:
+def _lost(track: Track, line: Line, *, xy: Float, vehicle: Vehicle) -> NDArray[np.int64]:
     """The row of the line, pushed to ``xy`` (n, 2), where the track leaves it; none if it does not."""
     if track.row[-1] < len(line.edge) - 1:
         return track.row[-1:]
@@ -224,9 +224,9 @@ def _lost(track: Track, line: Line, xy: Float, vehicle: Vehicle) -> NDArray[np.i
     return track.row[worst : worst + 1] if len(rows) else rows
 
 
-def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Surface | None) -> Path:
+def _joined(legs: list[Track], lines: list[Line], *, setting: Setting, ground: Surface | None) -> Path:
     """One path of all legs, with the ground under it."""
-    heights = _heights(legs, lines, setting, ground)
+    heights = _heights(legs, lines, setting=setting, ground=ground)
     parts = []
     start = 0.0
     for number, (leg, line, (z, slope, pitch, bank)) in enumerate(zip(legs, lines, heights, strict=True)):
@@ -260,7 +260,7 @@ def _joined(legs: list[Track], lines: list[Line], setting: Setting, ground: Surf
 
 
 def _heights(
-    legs: list[Track], lines: list[Line], setting: Setting, ground: Surface | None
+    legs: list[Track], lines: list[Line], *, setting: Setting, ground: Surface | None
 ) -> list[tuple[Float, Float, Float, Float]]:
     """Height of the rear axle, slope of its path, pitch and bank of the body on its wheels, of each leg.
 
@@ -268,7 +268,9 @@ def _heights(
     """
     from scipy.ndimage import gaussian_filter1d, maximum_filter1d, median_filter  # noqa: PLC0415
 
-    raw = [_raw_heights(leg, line, setting, ground) for leg, line in zip(legs, lines, strict=True)]
+    raw = [
+        _raw_heights(leg, line, setting=setting, ground=ground) for leg, line in zip(legs, lines, strict=True)
+    ]
     sizes = np.array([len(leg.row) for leg in legs])
     starts = np.cumsum(sizes)[:-1]
     # where a leg begins the position stands twice: smooth the rows that differ, then say them twice again
@@ -305,7 +307,7 @@ def _heights(
 
 
 def _raw_heights(
-    leg: Track, line: Line, setting: Setting, ground: Surface | None
+    leg: Track, line: Line, *, setting: Setting, ground: Surface | None
 ) -> tuple[Float, Float, Float]:
     """Height, rise per metre ahead to the front axle and to the left, at the rows of a leg (n,).
 
@@ -321,18 +323,18 @@ def _raw_heights(
     if ground is None or not len(z):
         return z, rise, np.zeros(len(leg.row))
     base = max(setting.vehicle.wheelbase, _AXLES)
-    rear, across = _axle(leg, z, 0.0, setting, ground)
+    rear, across = _axle(leg, z, ahead=0.0, setting=setting, ground=ground)
     ahead = np.clip(rise, -_STEEP, _STEEP)
     for _ in range(2):  # on a slope the front axle is less than the wheelbase ahead, in plan
         reach = base / np.hypot(1.0, ahead)
-        front, twisted = _axle(leg, rear + reach * ahead, reach, setting, ground)
+        front, twisted = _axle(leg, rear + reach * ahead, ahead=reach, setting=setting, ground=ground)
         ahead = (front - rear) / reach
     # a rigid body on four wheels: the twist of the ground is left to the springs
     return rear, ahead, (across + twisted) / 2
 
 
 def _axle(
-    leg: Track, z: Float, ahead: Float | float, setting: Setting, ground: Surface
+    leg: Track, z: Float, *, ahead: Float | float, setting: Setting, ground: Surface
 ) -> tuple[Float, Float]:
     """Mean height of the ground under the wheels of an axle, and its rise to the left, near heights (n,).
 

@@ -45,13 +45,13 @@ def read_replay(path: Path, frame: Frame) -> Trajectory:
         recorded = Frame.from_json(json.loads(manifest.read_text("utf-8"))["frame"])
     if names[0] == "time_ns":
         found = read_trajectory(path)
-        return found if recorded == frame else _moved(found, recorded, frame)
+        return found if recorded == frame else _moved(found, recorded, frame=frame)
     if not {"timestamp", "lon", "lat", "h", *_QUAT} <= set(names):
         raise FormatError(f"{path}: neither a poses.csv nor a trajectory.csv of a dataset")
-    return _from_poses(path, recorded, frame)
+    return _from_poses(path, recorded, frame=frame)
 
 
-def _from_poses(path: Path, recorded: Frame, frame: Frame) -> Trajectory:
+def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
     from scipy.interpolate import CubicSpline  # noqa: PLC0415
     from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415
 
@@ -73,7 +73,7 @@ def _from_poses(path: Path, recorded: Frame, frame: Frame) -> Trajectory:
     spline = CubicSpline(
         seconds, np.column_stack([x, y, h]), bc_type="natural" if len(rows) > 2 else "not-a-knot"
     )
-    turn = _turn(recorded, frame, lon, lat) * Rotation.from_quat(quat)
+    turn = _turn(recorded, frame, lon=lon, lat=lat) * Rotation.from_quat(quat)
     position = spline(at * 1e-9)
     scale = np.asarray(frame.scale_at(*position[:, :2].T), float)
     velocity = spline(at * 1e-9, 1)
@@ -89,7 +89,7 @@ def _nanoseconds(stamps: list[str]) -> NDArray[np.int64]:
     return since
 
 
-def _turn(recorded: Frame, frame: Frame, lon: Float, lat: Float) -> Rotation:
+def _turn(recorded: Frame, frame: Frame, *, lon: Float, lat: Float) -> Rotation:
     """Turns (n,) about the vertical from the axes of one frame to those of another."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
@@ -99,13 +99,13 @@ def _turn(recorded: Frame, frame: Frame, lon: Float, lat: Float) -> Rotation:
     return Rotation.from_rotvec(angle)
 
 
-def _moved(old: Trajectory, recorded: Frame, frame: Frame) -> Trajectory:
+def _moved(old: Trajectory, recorded: Frame, *, frame: Frame) -> Trajectory:
     """A trajectory in another frame."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
     lon, lat = recorded.to_geographic(*old.position[:, :2].T)
     x, y = frame.from_geographic(lon, lat)
-    turn = _turn(recorded, frame, lon, lat)
+    turn = _turn(recorded, frame, lon=lon, lat=lat)
     return Trajectory(
         old.time_ns,
         np.column_stack([x, y, old.position[:, 2]]),

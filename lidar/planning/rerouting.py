@@ -23,9 +23,9 @@ DETOURS = 40
 def plan_drive(
     graph: RoadGraph,
     frame: Frame,
+    *,
     spec: Spec,
     vehicle: Vehicle,
-    *,
     seed: int = 0,
     duration: float | None = None,
     length: float | None = None,
@@ -52,7 +52,7 @@ def plan_drive(
             route = plan_route(
                 graph,
                 frame,
-                spec,
+                spec=spec,
                 seed=seed,
                 duration=duration,
                 length=length,
@@ -67,7 +67,9 @@ def plan_drive(
                 break
             raise
         try:
-            return route, plan_path(route, vehicle, frame, obstacles=obstacles, ground=ground, margin=margin)
+            return route, plan_path(
+                route, vehicle, frame=frame, obstacles=obstacles, ground=ground, margin=margin
+            )
         except BlockedError as error:
             blocked = error
             fresh = set(error.turns) - avoid

@@ -63,8 +63,8 @@ class Route:
 def plan_route(
     graph: RoadGraph,
     frame: Frame,
-    spec: Spec,
     *,
+    spec: Spec,
     seed: int = 0,
     duration: float | None = None,
     length: float | None = None,
@@ -98,7 +98,7 @@ def plan_route(
             seconds = 600.0
         edges = random_edges(graph, seed=seed, seconds=seconds, metres=target, avoid=avoid)
         ends = (_SET_OUT * float(graph.length[edges[0]]), 0.75 * float(graph.length[edges[-1]]))
-        return lane_route(graph, edges, ends, side=side, body_width=body_width)
+        return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
 
     from lidar.planning.waypoints import match_track, read_track, through  # noqa: PLC0415  (they import this module)
 
@@ -108,14 +108,14 @@ def plan_route(
             return free_route(track.xyz, side=side)
         _need_streets(graph)
         if track.dense:
-            edges, ends = match_track(graph, track, frame, tolerance=tolerance, avoid=avoid)
-            return lane_route(graph, edges, ends, side=side, body_width=body_width)
+            edges, ends = match_track(graph, track, frame=frame, tolerance=tolerance, avoid=avoid)
+            return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
         points = track.lat_lon
     else:
         points = [(float(lat), float(lon)) for lat, lon in spec]
     _need_streets(graph)
-    edges, ends = through(graph, frame, points, tolerance=tolerance, avoid=avoid)
-    return lane_route(graph, edges, ends, side=side, body_width=body_width)
+    edges, ends = through(graph, frame, points=points, tolerance=tolerance, avoid=avoid)
+    return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
 
 
 def _need_streets(graph: RoadGraph) -> None:
@@ -123,7 +123,7 @@ def _need_streets(graph: RoadGraph) -> None:
         raise RouteError("the scene has no drivable streets; build one of a place with roads")
 
 
-def turns_back(graph: RoadGraph, before: NDArray[Any], after: NDArray[Any]) -> NDArray[np.bool_]:
+def turns_back(graph: RoadGraph, before: NDArray[Any], *, after: NDArray[Any]) -> NDArray[np.bool_]:
     """Whether (k,) going from one edge to the next turns the vehicle round: by `U_TURN` or more."""
     leave, enter = _end_headings(graph)
     turn = np.abs((enter[after] - leave[before] + np.pi) % (2 * np.pi) - np.pi)
@@ -163,7 +163,7 @@ def permitted_turns(graph: RoadGraph, avoid: Collection[tuple[int, int]]) -> Tur
 
 
 def _components(
-    graph: RoadGraph, states: TurnStates, turns: NDArray[np.bool_]
+    graph: RoadGraph, states: TurnStates, *, turns: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], Float]:
     """Strongly connected component of each state (s,) by some of the turns (t,), and its metres of street."""
     from scipy.sparse import csr_array  # noqa: PLC0415
@@ -200,9 +200,9 @@ def random_edges(
     rng = generator(seed, "route")
     states = permitted_turns(graph, avoid)
     edges = states.edge
-    use = ~turns_back(graph, edges[states.before], edges[states.after])
-    label, size = _components(graph, states, use)
-    label_back, size_back = _components(graph, states, np.ones(len(use), bool))
+    use = ~turns_back(graph, edges[states.before], after=edges[states.after])
+    label, size = _components(graph, states, turns=use)
+    label_back, size_back = _components(graph, states, turns=np.ones(len(use), bool))
     if not (size.max(initial=0.0) >= 0.2 * size_back.max(initial=0.0) and size.max(initial=0.0) > 0):
         use[:], label, size = True, label_back, size_back
     # where there is none, one-way streets lead out of the map: drive until they do
@@ -282,7 +282,7 @@ def _beside(line: Float, offset: float) -> Float:
     return np.column_stack([xy, z])
 
 
-def _cut(line: Float, begin: float, end: float) -> Float:
+def _cut(line: Float, begin: float, *, end: float) -> Float:
     """The part of a line (k, 3) between two shares of its length in plan."""
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
     begin, end = begin * along[-1], end * along[-1]
@@ -291,7 +291,7 @@ def _cut(line: Float, begin: float, end: float) -> Float:
     return np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
 
 
-def _meet(a: Float, b: Float, reach: float, change: float) -> tuple[Float, Float]:
+def _meet(a: Float, b: Float, *, reach: float, change: float) -> tuple[Float, Float]:
     """Two lanes that follow each other, joined within ``reach``.
 
     Straight on, a lane that lies ``change`` metres further out than the other is left over five times that
@@ -302,7 +302,7 @@ def _meet(a: Float, b: Float, reach: float, change: float) -> tuple[Float, Float
     if abs(change) > _STEP and u @ v > _STRAIGHT:
         long_a, long_b = (float(np.hypot(*np.diff(x[:, :2], axis=0).T).sum()) for x in (a, b))
         taper = 2.5 * abs(change)
-        return _cut(a, 0.0, max(1 - taper / long_a, 0.6)), _cut(b, min(taper / long_b, 0.4), 1.0)
+        return _cut(a, 0.0, end=max(1 - taper / long_a, 0.6)), _cut(b, min(taper / long_b, 0.4), end=1.0)
     one, two = shapely.linestrings(a[:, :2]), shapely.linestrings(b[:, :2])
     cross = shapely.get_coordinates(shapely.intersection(one, two))
     if len(cross):
@@ -313,7 +313,7 @@ def _meet(a: Float, b: Float, reach: float, change: float) -> tuple[Float, Float
         if spent[k] <= 2 * reach:
             at_one = float(shapely.line_locate_point(one, points[k]) / one.length)
             at_two = float(shapely.line_locate_point(two, points[k]) / two.length)
-            return _cut(a, 0.0, max(at_one, 1e-6)), _cut(b, min(at_two, 1 - 1e-6), 1.0)
+            return _cut(a, 0.0, end=max(at_one, 1e-6)), _cut(b, min(at_two, 1 - 1e-6), end=1.0)
     sine = u[0] * v[1] - u[1] * v[0]
     if abs(sine) > 0.2:
         gap = b[0, :2] - a[-1, :2]
@@ -327,8 +327,8 @@ def _meet(a: Float, b: Float, reach: float, change: float) -> tuple[Float, Float
 def lane_route(
     graph: RoadGraph,
     edges: ArrayLike,
-    ends: tuple[float, float],
     *,
+    ends: tuple[float, float],
     side: Side = "right",
     body_width: float = 1.82,
 ) -> Route:
@@ -345,14 +345,14 @@ def lane_route(
         whole = max(float(graph.length[e]), 1e-9)
         begin = min(max(ends[0] / whole, 0.0), 1.0) if k == 0 else 0.0
         end = min(max(ends[1] / whole, 0.0), 1.0) if k == len(order) - 1 else 1.0
-        lanes.append(_cut(lane, begin, max(end, begin + 1e-6)))
+        lanes.append(_cut(lane, begin, end=max(end, begin + 1e-6)))
     turns: list[int] = []
-    rounds = np.append(turns_back(graph, order[:-1], order[1:]), False)
+    rounds = np.append(turns_back(graph, order[:-1], after=order[1:]), False)
     for k in range(len(order) - 1):
         if not rounds[k]:
             reach = 2.0 * max(abs(float(offset[order[k]])), abs(float(offset[order[k + 1]])), 1.0)
             change = float(offset[order[k + 1]] - offset[order[k]])
-            lanes[k], lanes[k + 1] = _meet(lanes[k], lanes[k + 1], reach, change)
+            lanes[k], lanes[k + 1] = _meet(lanes[k], lanes[k + 1], reach=reach, change=change)
     sizes = np.array([len(lane) for lane in lanes])
     last = np.cumsum(sizes) - 1
     turns = last[rounds].tolist()

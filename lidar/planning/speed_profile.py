@@ -46,9 +46,9 @@ class _Knots:
 def motion_behind(
     path: Path,
     vehicle: Vehicle,
+    *,
     time_s: Float,
     reach: Float,
-    *,
     rate_hz: float = 100.0,
     under_way: bool = False,
 ) -> Motion:
@@ -79,8 +79,10 @@ def motion_behind(
         late = STEP_S * np.minimum(t / _SETTLING_S, 1.0) if rolls else STEP_S
         bounds = np.interp(begin + t - late, time_s, allowed)
         still = (not rolls, not under_way or until < total - begin)
-        knots = _best(path.s[first:last] - origin, limit[first:last], vehicle, bounds, still)
-        s, v = _sampled(knots, end - origin, dt)
+        knots = _best(
+            path.s[first:last] - origin, limit[first:last], vehicle=vehicle, allowed=bounds, rest=still
+        )
+        s, v = _sampled(knots, end - origin, dt=dt)
         driven = s[-1] > end - origin - 2 * _NEAR
         if driven and last < len(path):
             rest = round(DWELL_S / dt)
@@ -104,11 +106,11 @@ def wished_speed(path: Path, vehicle: Vehicle) -> Float:
     for first, last in legs_of(path):
         wished = limit[first:last].copy()
         wished[-1] = 0.0
-        out[first:last] = _braked(path.s[first:last], wished, vehicle)
+        out[first:last] = _braked(path.s[first:last], wished, vehicle=vehicle)
     return out
 
 
-def _braked(s: Float, limit: Float, vehicle: Vehicle) -> Float:
+def _braked(s: Float, limit: Float, *, vehicle: Vehicle) -> Float:
     """Limits (n,) at distances (n,) from which there is braking in comfort for those that follow."""
     ramp = 2 * _COMFORT * vehicle.deceleration * s
     square = np.minimum.accumulate((limit**2 + ramp)[::-1])[::-1] - ramp
@@ -116,7 +118,7 @@ def _braked(s: Float, limit: Float, vehicle: Vehicle) -> Float:
     return braked
 
 
-def _best(s: Float, limit: Float, vehicle: Vehicle, allowed: Float, rest: tuple[bool, bool]) -> _Knots:
+def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tuple[bool, bool]) -> _Knots:
     """The knots of the best motion along a leg that stays behind ``allowed`` (k,) metres at its steps.
 
     rest : whether it is at rest at the first of them, and at the last
@@ -126,11 +128,13 @@ def _best(s: Float, limit: Float, vehicle: Vehicle, allowed: Float, rest: tuple[
     gap = 0.25
     place = np.arange(0.0, s[-1] + gap, gap)
     strict = np.interp(place, s, limit)
-    cautious = _braked(place, minimum_filter1d(strict, 2 * round(_AROUND / gap) + 1), vehicle)
-    allowed = _paced(allowed, place, cautious, vehicle, 0.0 if rest[0] else float(cautious[0]))
+    cautious = _braked(place, minimum_filter1d(strict, 2 * round(_AROUND / gap) + 1), vehicle=vehicle)
+    allowed = _paced(
+        allowed, place, limit=cautious, vehicle=vehicle, speed=0.0 if rest[0] else float(cautious[0])
+    )
     cap = np.interp(allowed, place, cautious)
     for _ in range(_AGAIN):
-        knots = _solved(vehicle, allowed, cap, rest)
+        knots = _solved(vehicle, allowed, cap=cap, rest=rest)
         excess = float((knots.v / np.interp(knots.s, place, strict)).max())
         if excess <= 1.0 + _SLACK:
             break
@@ -140,7 +144,7 @@ def _best(s: Float, limit: Float, vehicle: Vehicle, allowed: Float, rest: tuple[
     return _Knots(knots.s, knots.v / late, knots.a / late**2, knots.dt * late)
 
 
-def _paced(allowed: Float, place: Float, limit: Float, vehicle: Vehicle, speed: float) -> Float:
+def _paced(allowed: Float, place: Float, *, limit: Float, vehicle: Vehicle, speed: float) -> Float:
     """Distances (k,) behind those allowed that are reached under speed limits and the vehicle's acceleration.
 
     speed : m/s at the first of them
@@ -159,7 +163,7 @@ def _paced(allowed: Float, place: Float, limit: Float, vehicle: Vehicle, speed: 
     return out
 
 
-def _solved(vehicle: Vehicle, allowed: Float, cap: Float, rest: tuple[bool, bool]) -> _Knots:
+def _solved(vehicle: Vehicle, allowed: Float, *, cap: Float, rest: tuple[bool, bool]) -> _Knots:
     """The linear programme: greatest sum of distances under those allowed and caps (k,) on speed."""
     from scipy.optimize import linprog  # noqa: PLC0415
     from scipy.sparse import csr_array, diags_array, hstack, vstack  # noqa: PLC0415
@@ -196,7 +200,7 @@ def _solved(vehicle: Vehicle, allowed: Float, cap: Float, rest: tuple[bool, bool
     return _Knots(s, np.maximum(v, 0.0), a, dt)
 
 
-def _sampled(knots: _Knots, end: float, dt: float) -> tuple[Float, Float]:
+def _sampled(knots: _Knots, end: float, *, dt: float) -> tuple[Float, Float]:
     """Distance and speed at every ``dt`` until the knots end, or the vehicle rests at the end of its leg."""
     last = len(knots.s) - 1
     resting = np.flatnonzero((knots.s > end - _NEAR) & (knots.v < 1e-3))

@@ -40,7 +40,7 @@ class Track:
         return float(self.xy[-1, 0]), float(self.xy[-1, 1]), float(self.heading[-1])
 
 
-def relaxed(xy: Float, cap: float, reach: float) -> Float:
+def relaxed(xy: Float, cap: float, *, reach: float) -> Float:
     """Points (n, 2) near the given ones whose curvature stays below ``cap`` (1/m) where that is possible.
 
     Minimises the sum of w |p - xy|^2 + reach^4 |p''|^2; w starts at 1 and falls where the line still bends
@@ -86,7 +86,7 @@ def line_curvature(xy: Float) -> Float:
     return np.concatenate([inner[:1], inner, inner[-1:]])
 
 
-def follow(xy: Float, vehicle: Vehicle, scale: float, *, step: float, pose: Pose | None = None) -> Track:
+def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose | None = None) -> Track:
     """The way of a vehicle that follows a line (m, 2), from the line's start or a pose, to its end.
 
     Feed-forward of the line's curvature and feedback of lateral and heading error, both within what the wheel

@@ -94,7 +94,7 @@ def standing_footprints(scene: Scene) -> NDArray[np.object_]:
     """Footprints, scene metres, of buildings that reach down to the ground."""
     if "buildings" not in scene.layers or len(set(scene.layers["buildings"])) == 1:
         return np.empty(0, object)
-    layer = read_layer(scene.path / "features.gpkg", "buildings", scene.frame)
+    layer = read_layer(scene.path / "features.gpkg", "buildings", frame=scene.frame)
     low = np.asarray(layer.columns["min_height"], float)
     standing: NDArray[np.object_] = layer.geometry[low < 2.5]
     return standing
@@ -104,7 +104,7 @@ def road_surface(scene: Scene) -> Surface:
     """The surface of ground and bridges, as rays see it, near given heights; those where there is none."""
     world: World | None = None
 
-    def surface(x: Float, y: Float, z: Float) -> Float:
+    def surface(x: Float, y: Float, z: Float) -> Float:  # noqa: PLR0917 - a Surface
         nonlocal world
         region = (float(x.min()) - 1, float(y.min()) - 1, float(x.max()) + 1, float(y.max()) + 1)
         if world is None:
@@ -123,8 +123,8 @@ def road_surface(scene: Scene) -> Surface:
 def plan_travel(
     scene: Scene,
     spec: Spec,
-    vehicle: str,
     *,
+    vehicle: str,
     seed: int = 0,
     duration: float | None = None,
     side: str = "right",
@@ -144,14 +144,14 @@ def plan_travel(
     graph = whole if kept.all() else whole.take(kept)
     body = load_vehicle(vehicle)
     obstacles = standing_footprints(scene)
-    progress("planning", 0, 0)
+    progress("planning", 0, total=0)
     seconds = duration if duration is not None or spec != "random" else _RANDOM_SECONDS
     under_way = spec == "random" and not from_rest
     route, path = plan_drive(
         graph,
         scene.frame,
-        spec,
-        body,
+        spec=spec,
+        vehicle=body,
         seed=seed,
         duration=None if seconds is None else seconds + (AHEAD_S if under_way else 0.0),
         side=cast("Literal['left', 'right']", side),

@@ -125,8 +125,8 @@ def _geojson(path: Path, text: str) -> list[tuple[float, float, float]]:
 def through(
     graph: RoadGraph,
     frame: Frame,
-    points: Sequence[tuple[float, float]],
     *,
+    points: Sequence[tuple[float, float]],
     tolerance: float,
     avoid: Collection[tuple[int, int]] = (),
 ) -> tuple[NDArray[np.int32], tuple[float, float]]:
@@ -155,13 +155,13 @@ def through(
         ]
         rest = [f"and so are {len(far) - _NAMED} more"] if len(far) > _NAMED else []
         raise RouteError("; ".join(named + rest))
-    candidates = [_both_sides(graph, int(e), float(o)) for e, o in zip(edge, offset, strict=True)]
-    chain = _Search(graph, graph.travel_time, avoid, u_turn=U_TURN_S)
+    candidates = [_both_sides(graph, int(e), offset=float(o)) for e, o in zip(edge, offset, strict=True)]
+    chain = _Search(graph, graph.travel_time, avoid=avoid, u_turn=U_TURN_S)
 
     def score(_: int, cost: Float) -> Float:
         return cost
 
-    best = chain.best(candidates, [np.zeros(len(c)) for c in candidates], score)
+    best = chain.best(candidates, [np.zeros(len(c)) for c in candidates], score=score)
     if isinstance(best, int):
         raise RouteError(
             f"waypoint {best + 1} ({lat[best]:.6f}, {lon[best]:.6f}) cannot be reached from waypoint {best}"
@@ -170,7 +170,7 @@ def through(
     return best
 
 
-def _both_sides(graph: RoadGraph, edge: int, offset: float) -> list[Place]:
+def _both_sides(graph: RoadGraph, edge: int, *, offset: float) -> list[Place]:
     twin = int(graph.twin[edge])
     return [(edge, offset)] + ([(twin, float(graph.length[edge]) - offset)] if twin >= 0 else [])
 
@@ -178,8 +178,8 @@ def _both_sides(graph: RoadGraph, edge: int, offset: float) -> list[Place]:
 def match_track(
     graph: RoadGraph,
     track: Track,
-    frame: Frame,
     *,
+    frame: Frame,
     tolerance: float,
     avoid: Collection[tuple[int, int]] = (),
 ) -> tuple[NDArray[np.int32], tuple[float, float]]:
@@ -219,8 +219,8 @@ def match_track(
         excess: Float = np.abs(cost - straight[k]) / BETA_M
         return excess
 
-    search = _Search(graph, graph.length, avoid, u_turn=100.0, slack=2 * SIGMA_M)
-    best = search.best(candidates, costs, score, reach=4 * straight + 300.0)
+    search = _Search(graph, graph.length, avoid=avoid, u_turn=100.0, slack=2 * SIGMA_M)
+    best = search.best(candidates, costs, score=score, reach=4 * straight + 300.0)
     if isinstance(best, int):
         lon, lat = frame.to_geographic(*xy[best])
         raise RouteError(
@@ -252,8 +252,8 @@ class _Search:
         self,
         graph: RoadGraph,
         cost: Float,
-        avoid: Collection[tuple[int, int]],
         *,
+        avoid: Collection[tuple[int, int]],
         u_turn: float,
         slack: float = 0.0,
     ) -> None:
@@ -263,7 +263,7 @@ class _Search:
         self.edge, self.length, self.slack = states.edge, graph.length[states.edge], slack
         self.cost = np.maximum(cost, 1e-9)[states.edge]
         self.watched = set(states.edge[len(graph) :].tolist())
-        round_ = turns_back(graph, states.edge[states.before], states.edge[states.after])
+        round_ = turns_back(graph, states.edge[states.before], after=states.edge[states.after])
         # a step costs the edge it leaves behind, so that a target's own edge is not counted
         weight = self.cost[states.before] + np.where(round_, u_turn, 0.0)
         self.links = csr_array((weight, (states.before, states.after)), shape=(len(states), len(states)))
@@ -291,7 +291,7 @@ class _Search:
         edge, offset = place
         return float(self.cost[edge] * min(max(offset / max(self.length[edge], 1e-9), 0.0), 1.0))
 
-    def _costs(self, source: Place, targets: list[Place], reach: float) -> Float:
+    def _costs(self, source: Place, targets: list[Place], *, reach: float) -> Float:
         """Cost from one place to each of others; infinite beyond reach."""
         edge, offset = source
         far, _ = self._dijkstra(edge, reach)
@@ -318,6 +318,7 @@ class _Search:
         self,
         candidates: list[list[Place]],
         own: list[Float],
+        *,
         score: Callable[[int, Float], Float],
         reach: Float | None = None,
     ) -> tuple[NDArray[np.int32], tuple[float, float]] | int:
@@ -326,7 +327,7 @@ class _Search:
         candidates, own = self._states(candidates, own)
         for k in range(1, len(candidates)):
             limit = np.inf if reach is None else float(reach[k - 1])
-            step = np.array([self._costs(c, candidates[k], limit) for c in candidates[k - 1]])
+            step = np.array([self._costs(c, candidates[k], reach=limit) for c in candidates[k - 1]])
             sums = total[:, None] + np.where(np.isfinite(step), score(k - 1, step), np.inf)
             choice.append(np.argmin(sums, axis=0))
             total = sums.min(axis=0) + own[k]

@@ -79,7 +79,7 @@ class Caster:
         scene = EmbreeScene if _works(backend) else EmbreexScene
         self.scene = scene(self.origin, dynamic=dynamic)
         self.instances: tuple[Instances, ...] = ()
-        self.update(attach=dict(enumerate(split(v - self.origin, f, mask))), instances=instances)
+        self.update(attach=dict(enumerate(split(v - self.origin, f, mask=mask))), instances=instances)
 
     def update(
         self,
@@ -143,8 +143,8 @@ class Caster:
         self,
         poses: Poses,
         pose_index: NDArray[np.integer],
-        directions: Float,
         *,
+        directions: Float,
         offsets: Float | None = None,
         near: float = 0.0,
         far: float = np.inf,
@@ -163,7 +163,7 @@ class Caster:
 
         ``near`` and ``far`` count from the beam's start in true metres; the rest as for `cast`.
         """
-        rays = posed_rays(poses, pose_index, directions, offsets)
+        rays = posed_rays(poses, pose_index, directions=directions, offsets=offsets)
         rays = limited(rays, near=near, far=far, mask=mask, time=time, order=order)
         return self.scene.cast(rays, normals=normals, threads=threads)
 
@@ -171,8 +171,8 @@ class Caster:
         self,
         origins: ArrayLike,
         directions: ArrayLike,
-        far: float | NDArray[np.float64] = np.inf,
         *,
+        far: float | NDArray[np.float64] = np.inf,
         near: float = 0.0,
         mask: int = ALL,
         time: ArrayLike | None = None,

@@ -96,8 +96,8 @@ class EmbreeScene:
         if len(part) == 0:
             return
         geometry = self._lib.call("rtcNewGeometry", self._lib.device, TRIANGLE)
-        fill(self._lib, geometry, VERTEX, 0, FLOAT3, part.vertices.astype(np.float32))
-        fill(self._lib, geometry, INDEX, 0, UINT3, part.faces.astype(np.uint32))
+        fill(self._lib, geometry, kind=VERTEX, slot=0, form=FLOAT3, rows=part.vertices.astype(np.float32))
+        fill(self._lib, geometry, kind=INDEX, slot=0, form=UINT3, rows=part.faces.astype(np.uint32))
         self._lib.call("rtcSetGeometryMask", geometry, part.mask)
         self._lib.call("rtcSetGeometryBuildQuality", geometry, MEDIUM)
         self._attach(geometry, COPIES + number)
@@ -132,13 +132,16 @@ class EmbreeScene:
             for bits in masks:
                 rows = np.flatnonzero(mask == bits)
                 self._attach(
-                    self._copy(shapes, group.shape[rows], placed[rows], int(bits)), len(self._copies)
+                    self._copy(shapes, group.shape[rows], placed=placed[rows], mask=int(bits)),
+                    len(self._copies),
                 )
                 self._copies.append(rows + start)
             self._groups.append(_Group(group, shapes, placed, len(masks)))
             start += len(group)
 
-    def _copy(self, shapes: Sequence[EmbreeScene], shape: NDArray[np.int32], placed: Float, mask: int) -> int:
+    def _copy(
+        self, shapes: Sequence[EmbreeScene], shape: NDArray[np.int32], *, placed: Float, mask: int
+    ) -> int:
         """An Embree geometry of copies with one mask."""
         lib = self._lib
         if len(shape) == 1:  # of an array of one, Embree takes the first shape whatever its index
@@ -150,8 +153,8 @@ class EmbreeScene:
         lib.call("rtcSetGeometryTimeStepCount", copies, steps)
         for step in range(steps):
             matrices = np.ascontiguousarray(placed[:, step], np.float32)
-            fill(lib, copies, TRANSFORM, step, FLOAT3X4_ROW_MAJOR, matrices)
-        fill(lib, copies, INDEX, 0, UINT, shape.astype(np.uint32))
+            fill(lib, copies, kind=TRANSFORM, slot=step, form=FLOAT3X4_ROW_MAJOR, rows=matrices)
+        fill(lib, copies, kind=INDEX, slot=0, form=UINT, rows=shape.astype(np.uint32))
         lib.call("rtcSetGeometryMask", copies, mask)
         return copies
 
@@ -202,13 +205,13 @@ class EmbreeScene:
         def work(lo: int, hi: int) -> int:
             return int(kernels.cast(target, rays, lo, hi, *columns, hits.normal))
 
-        share(work, rays, threads)
+        share(work, rays, threads=threads)
         return hits
 
     def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:
         """Whether anything lies on each ray."""
         out, target = np.empty(len(rays.directions), np.bool_), self.target
-        share(lambda lo, hi: int(kernels.occluded(target, rays, lo, hi, out)), rays, threads)
+        share(lambda lo, hi: int(kernels.occluded(target, rays, lo, hi, out)), rays, threads=threads)
         return out
 
     def echoes(self, rays: Rays, k: int, *, threads: int) -> Echoes:
@@ -222,7 +225,7 @@ class EmbreeScene:
             np.empty((n, k), np.float32),
         )
         target = self.target
-        share(lambda lo, hi: int(echoes(target, rays, COLLECT, lo, hi, *columns)), rays, threads)
+        share(lambda lo, hi: int(echoes(target, rays, COLLECT, lo, hi, *columns)), rays, threads=threads)
         return Echoes(*columns)
 
 

@@ -88,7 +88,7 @@ class _Body:
             self._seen[mask] = _Body(self.soup.take(shown))
         return self._seen[mask]
 
-    def met(self, o: Float, d: Float, near: float, far: Float, turned: bool) -> NDArray[np.int64]:  # noqa: FBT001
+    def met(self, o: Float, d: Float, *, near: float, far: Float, turned: bool) -> NDArray[np.int64]:
         """Rows of the triangles that rays meet first, -1 for none."""
         if self._scene is None:
             return np.full(len(d), -1)
@@ -102,7 +102,7 @@ class _Body:
         found = self._scene.run(start, unit.astype(np.float32), dists=reach, query="INTERSECT", output=1)
         return np.asarray(found["primID"], np.int64)
 
-    def at(self, rows: NDArray[np.int64], o: Float, d: Float) -> tuple[Float, Float, Float]:
+    def at(self, rows: NDArray[np.int64], o: Float, *, d: Float) -> tuple[Float, Float, Float]:
         """Range, cosine and normal (not unit) of rays that meet triangles; inf, 0 and 0 for row -1."""
         t, cosine = np.full(len(d), np.inf), np.zeros(len(d))
         normal = np.zeros((len(d), 3))
@@ -124,7 +124,7 @@ class _Body:
         normal[hit] = n
         return t, cosine, normal
 
-    def all_met(self, o: Float, d: Float, k: int, near: float, far: Float) -> NDArray[np.int64]:
+    def all_met(self, o: Float, d: Float, *, k: int, near: float, far: Float) -> NDArray[np.int64]:
         """Rows (n, k) of the first k triangles along each ray, -1 from the last on."""
         if self._reference is None:
             self._reference = Reference(self.soup.corners)
@@ -198,7 +198,7 @@ class EmbreexScene:
             start += len(group)
         self._rest = _Body(_joined(soups))
 
-    def _views(self, rays: Rays, o: Float, d: Float) -> list[tuple[_Body, Float, Float, Float]]:
+    def _views(self, rays: Rays, o: Float, *, d: Float) -> list[tuple[_Body, Float, Float, Float]]:
         """Bodies that rays can see, with the rays' origins and directions and the axes of their normals."""
         views = [(self._rest.seen(rays.mask), o, d, np.broadcast_to(np.eye(3), (len(d), 3, 3)))]
         for mover in self._movers:
@@ -218,12 +218,12 @@ class EmbreexScene:
         far = np.broadcast_to(rays.far, (n,))
         best, cosine, normal = np.full(n, np.inf), np.zeros(n), np.zeros((n, 3))
         face, instance = np.full(n, -1, np.int32), np.full(n, -1, np.int32)
-        views = self._views(rays, o, d)
+        views = self._views(rays, o, d=d)
         for turned in (False, True):
             todo = np.flatnonzero((face < 0) | (cosine < 0)) if turned else np.arange(n)
             for body, local, way, axes in views:
-                rows = body.met(local[todo], way[todo], rays.near, far[todo], turned)
-                t, c, m = body.at(rows, local[todo], way[todo])
+                rows = body.met(local[todo], way[todo], near=rays.near, far=far[todo], turned=turned)
+                t, c, m = body.at(rows, local[todo], d=way[todo])
                 m = np.einsum("nij,nj->ni", axes[todo], m)
                 length = np.linalg.norm(m, axis=1) * np.linalg.norm(d[todo], axis=1)
                 c = -np.divide(
@@ -251,9 +251,9 @@ class EmbreexScene:
         n, o = len(d), start - self.origin
         far = np.broadcast_to(rays.far, (n,))
         columns: list[list[NDArray[Any]]] = [[], [], [], []]
-        for body, local, way, axes in self._views(rays, o, d):
-            for rows in body.all_met(local, way, k, rays.near, far).T:
-                t, _, m = body.at(rows, local, way)
+        for body, local, way, axes in self._views(rays, o, d=d):
+            for rows in body.all_met(local, way, k=k, near=rays.near, far=far).T:
+                t, _, m = body.at(rows, local, d=way)
                 m = np.einsum("nij,nj->ni", axes, m)
                 length = np.linalg.norm(m, axis=1) * np.linalg.norm(d, axis=1)
                 c = -np.divide(np.einsum("ij,ij->i", m, d), length, out=np.zeros(n), where=length > 0)

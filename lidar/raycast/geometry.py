@@ -75,7 +75,7 @@ def planes(vertices: Float, faces: NDArray[np.int32]) -> Float:
     return out
 
 
-def split(vertices: Float, faces: NDArray[np.int32], mask: ArrayLike | None = None) -> list[Geometry]:
+def split(vertices: Float, faces: NDArray[np.int32], *, mask: ArrayLike | None = None) -> list[Geometry]:
     """Geometries of checked vertices, relative to the origin, and faces: one for each mask that occurs.
 
     mask : (m,) bits, or one for all; all bits by default

@@ -62,7 +62,7 @@ class _Row:
 class _Rows:
     """Rows of numbers from an address on, end to end, in code that is being built."""
 
-    def __init__(self, builder: Any, lanes: Any, address: Any, kind: Any = _DOUBLE) -> None:
+    def __init__(self, builder: Any, lanes: Any, *, address: Any, kind: Any = _DOUBLE) -> None:
         self.builder, self.lanes, self.kind = builder, lanes.count, ir.VectorType(kind, lanes.count)
         self.size = 4 if kind in (_FLOAT, _INT) else 8
         self.base = builder.inttoptr(address, self.kind.as_pointer())
@@ -91,8 +91,10 @@ class _Rows:
 def _row(kind: Any, kept: Any) -> Any:
     @intrinsic
     def move(context: Any, lanes: Any, source: Any, target: Any) -> Any:  # noqa: ARG001
-        def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-            _Rows(builder, lanes, values[2], kept)[0] = _Rows(builder, lanes, values[1], kind)[0]
+        def build(made: Any, builder: Any, *, signature: Any, values: Any) -> Any:  # noqa: ARG001
+            _Rows(builder, lanes, address=values[2], kind=kept)[0] = _Rows(
+                builder, lanes, address=values[1], kind=kind
+            )[0]
             return made.get_dummy_value()
 
         return types.void(lanes, types.int64, types.int64), build
@@ -108,10 +110,12 @@ narrow = _row(_DOUBLE, _FLOAT)
 
 @intrinsic
 def _same(context: Any, lanes: Any, source: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        row = _Rows(builder, lanes, values[1], _INT)[0].value
+    def build(made: Any, builder: Any, *, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        row = _Rows(builder, lanes, address=values[1], kind=_INT)[0].value
         first = builder.extract_element(row, ir.Constant(_INT, 0))
-        differ = builder.icmp_unsigned("!=", row, _Rows(builder, lanes, values[1], _INT).same(first).value)
+        differ = builder.icmp_unsigned(
+            "!=", row, _Rows(builder, lanes, address=values[1], kind=_INT).same(first).value
+        )
         bits = ir.IntType(lanes.count)
         return builder.icmp_unsigned("==", builder.bitcast(differ, bits), ir.Constant(bits, 0))
 
@@ -124,8 +128,11 @@ same: Any = _same
 
 @intrinsic
 def _settle(context: Any, lanes: Any, work: Any, packet: Any, x: Any, y: Any, z: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        rows, rounded = _Rows(builder, lanes, values[1]), _Rows(builder, lanes, values[2], _FLOAT)
+    def build(made: Any, builder: Any, *, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        rows, rounded = (
+            _Rows(builder, lanes, address=values[1]),
+            _Rows(builder, lanes, address=values[2], kind=_FLOAT),
+        )
         place = [rows[r] - rows.same(value) for r, value in enumerate(values[3:])]
         way = [rows[3 + r] for r in range(3)]
         for r in range(3):
@@ -146,8 +153,8 @@ Embree's packet; whether all directions have length 1 and all origins are within
 
 @intrinsic
 def _cross(context: Any, lanes: Any, work: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        rows = _Rows(builder, lanes, values[1])
+    def build(made: Any, builder: Any, *, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        rows = _Rows(builder, lanes, address=values[1])
         ox, oy, oz, dx, dy, dz = (rows[r] for r in range(6))
         nx, ny, nz, d = (rows[r] for r in range(9, 13))
         along = nx * dx + ny * dy + nz * dz

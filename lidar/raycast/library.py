@@ -121,7 +121,7 @@ def _publish(embree: c.CDLL) -> None:
         llvm.add_symbol(name, c.cast(getattr(embree, name), _P).value)
 
 
-def fill(lib: Library, geometry: int, kind: int, slot: int, form: int, rows: np.ndarray[Any, Any]) -> None:
+def fill(lib: Library, geometry: int, *, kind: int, slot: int, form: int, rows: np.ndarray[Any, Any]) -> None:
     """Give a geometry a buffer of its own with the rows (n, ...) of a contiguous array."""
     size = rows.itemsize * (rows.size // len(rows))
     target = lib.call("rtcSetNewGeometryBuffer", geometry, kind, slot, form, size, len(rows))
@@ -133,14 +133,14 @@ def _check(lib: Library) -> None:
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     shape, top = (lib.call("rtcNewScene", lib.device) for _ in range(2))
     triangle = lib.call("rtcNewGeometry", lib.device, TRIANGLE)
-    fill(lib, triangle, VERTEX, 0, FLOAT3, corners)
-    fill(lib, triangle, INDEX, 0, UINT3, np.array([[0, 0, 0], [0, 1, 2]], np.uint32))
+    fill(lib, triangle, kind=VERTEX, slot=0, form=FLOAT3, rows=corners)
+    fill(lib, triangle, kind=INDEX, slot=0, form=UINT3, rows=np.array([[0, 0, 0], [0, 1, 2]], np.uint32))
     copies = lib.call("rtcNewGeometry", lib.device, INSTANCE_ARRAY)
     lib.call("rtcSetGeometryInstancedScenes", copies, c.byref(_P(shape)), 1)
     moved = np.tile(np.eye(3, 4, dtype=np.float32), (2, 1, 1))
     moved[:, 2, 3] = -9.0, 2.5
-    fill(lib, copies, TRANSFORM, 0, FLOAT3X4_ROW_MAJOR, moved)
-    fill(lib, copies, INDEX, 0, UINT, np.zeros(2, np.uint32))
+    fill(lib, copies, kind=TRANSFORM, slot=0, form=FLOAT3X4_ROW_MAJOR, rows=moved)
+    fill(lib, copies, kind=INDEX, slot=0, form=UINT, rows=np.zeros(2, np.uint32))
     for scene, geometry in ((shape, triangle), (top, copies)):
         lib.call("rtcCommitGeometry", geometry)
         lib.call("rtcAttachGeometryByID", scene, geometry, 0)

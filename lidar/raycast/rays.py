@@ -32,11 +32,11 @@ def free_rays(origins: ArrayLike, directions: ArrayLike) -> Rays:
     o = _rows(o[None] if o.ndim == 1 else o, "origins")
     if len(o) not in (1, len(d)):
         raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one a ray")
-    return _plain(d, o, np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    return _plain(d, o, pose=np.empty(0, np.int64), position=np.empty((0, 3)), matrix=np.empty((0, 3, 3)))
 
 
 def posed_rays(
-    poses: Poses, pose_index: NDArray[np.integer], directions: ArrayLike, offsets: ArrayLike | None
+    poses: Poses, pose_index: NDArray[np.integer], *, directions: ArrayLike, offsets: ArrayLike | None
 ) -> Rays:
     """Rays in the frames of poses; see `lidar.raycast.Caster.cast_posed`."""
     d = _rows(directions, "directions")
@@ -48,10 +48,16 @@ def posed_rays(
         raise InputError(f"a ray names a pose beyond the {len(poses)} there are")
     level = bool((poses.scale == 1.0).all())
     matrix = poses.rotation if level else poses.scale[:, :, None] * poses.rotation
-    return _plain(d, o, index, np.ascontiguousarray(poses.position, np.float64), np.ascontiguousarray(matrix))
+    return _plain(
+        d,
+        o,
+        pose=index,
+        position=np.ascontiguousarray(poses.position, np.float64),
+        matrix=np.ascontiguousarray(matrix),
+    )
 
 
-def _plain(d: Float, o: Float, pose: NDArray[np.int64], position: Float, matrix: Float) -> Rays:
+def _plain(d: Float, o: Float, *, pose: NDArray[np.int64], position: Float, matrix: Float) -> Rays:
     none, start = np.empty(0, np.int64), np.empty(0, np.float32)
     return Rays(d, o, pose, position, matrix, none, start, 0.0, np.array([np.inf]), ALL)
 
@@ -130,7 +136,7 @@ if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
-def share(work: Callable[[int, int], int], rays: Rays, threads: int) -> None:
+def share(work: Callable[[int, int], int], rays: Rays, *, threads: int) -> None:
     """Have threads do the rays in chunks of the order; ``work`` returns a ray that cannot be cast, or -1.
 
     Raises InputError for such a ray.

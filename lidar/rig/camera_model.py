@@ -29,12 +29,12 @@ def pixel_rays(camera: CameraSpec) -> Float:
     return _pixel_rays(
         camera.model,
         camera.width,
-        camera.height,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-        camera.distortion,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        distortion=camera.distortion,
     )
 
 
@@ -42,6 +42,7 @@ def pixel_rays(camera: CameraSpec) -> Float:
 def _pixel_rays(
     model: str,
     width: int,
+    *,
     height: int,
     fx: float,
     fy: float,
@@ -83,7 +84,7 @@ def project(camera: CameraSpec, points: ArrayLike) -> tuple[Float, Float]:
 # Pinhole with the distortion of Brown (Photogrammetric Engineering 32, 1966) as OpenCV writes it.
 
 
-def _distortion(x: Float, y: Float, k: tuple[float, ...]) -> tuple[Float, Float, Float, Float, Float]:
+def _distortion(x: Float, y: Float, *, k: tuple[float, ...]) -> tuple[Float, Float, Float, Float, Float]:
     """Distorted x and y and the Jacobian's xx, xy, yy at normalised coordinates."""
     k1, k2, p1, p2, k3 = k
     r2 = x * x + y * y
@@ -117,7 +118,7 @@ def _distort(points: Float, k: tuple[float, ...]) -> Float:
     if not any(k):
         return np.stack([x, y], axis=1)
     with np.errstate(invalid="ignore", over="ignore"):
-        xd, yd, xx, xy, yy = _distortion(x, y, k)
+        xd, yd, xx, xy, yy = _distortion(x, y, k=k)
         seen = (x * x + y * y < _reach(k)) & (xx * yy - xy * xy > 0) & (xx > 0)
     return np.where(seen[:, None], np.stack([xd, yd], axis=1), np.nan)
 
@@ -143,7 +144,7 @@ def _undistort(distorted: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
         x *= shrink
         y *= shrink
         for _ in range(_STEPS):
-            fx, fy, xx, xy, yy = _distortion(x, y, k)
+            fx, fy, xx, xy, yy = _distortion(x, y, k=k)
             ex, ey = fx - xd, fy - yd
             det = xx * yy - xy * xy
             dx, dy = (yy * ex - xy * ey) / det, (xx * ey - xy * ex) / det
@@ -151,7 +152,7 @@ def _undistort(distorted: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
             y -= dy
             if np.nanmax(np.abs(dx) + np.abs(dy), initial=0.0) < _TOLERANCE:
                 break
-        fx, fy, xx, xy, yy = _distortion(x, y, k)
+        fx, fy, xx, xy, yy = _distortion(x, y, k=k)
         found = (np.hypot(fx - xd, fy - yd) < 1e-9) & (x * x + y * y < limit)
         found &= (xx * yy - xy * xy > 0) & (xx > 0)
     return np.where(found, x, np.nan), np.where(found, y, np.nan)

@@ -111,7 +111,7 @@ class Sensor:
 
 def firings(sensor: Sensor, frame: int) -> Firings:
     """The pulses of frame ``frame`` of a drive, in the order they are fired."""
-    return sensor.pattern.fire(frame, sensor.rate_hz, sensor.start_ns)
+    return sensor.pattern.fire(frame, sensor.rate_hz, start_ns=sensor.start_ns)
 
 
 def sensor_names() -> list[str]:
@@ -149,10 +149,12 @@ def load_sensor(
             raise RigError(f"sensor {preset!r} is not known: {', '.join(sensor_names())}, or a .toml file")
         file = resources.files("lidar.rig") / "sensors" / f"{preset}.toml"
         table = read_table(file, name=f"presets/{preset}.toml")
-    return _read(table, name or Path(preset).stem, rate_hz, return_mode, start_ns)
+    return _read(
+        table, name or Path(preset).stem, rate_hz=rate_hz, return_mode=return_mode, start_ns=start_ns
+    )
 
 
-def _read(table: Table, name: str, rate_hz: float, return_mode: str, start_ns: int) -> Sensor:
+def _read(table: Table, name: str, *, rate_hz: float, return_mode: str, start_ns: int) -> Sensor:
     kind = table.text("kind", among=KINDS)
     rates = table.numbers("rates_hz")
     rate = rate_hz or rates[0]
@@ -210,5 +212,5 @@ _READERS: dict[str, Callable[[Table, float, tuple[float, ...]], Pattern]] = {
     "table": lambda table, _rate, _rates: read_listed(table),
     "flash": lambda table, rate, _rates: read_flash(table, rate),
     "line": lambda table, _rate, _rates: read_line(table),
-    "scan2d": read_scan2d,
+    "scan2d": lambda table, rate, rates: read_scan2d(table, rate, rates_hz=rates),
 }

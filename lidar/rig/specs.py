@@ -163,7 +163,8 @@ def _mount(table: Table, *, camera: bool = False) -> Mount:
             raise table.error("quat_wxyz", "not a unit quaternion")
         turn = np.array([x, y, z, w]) / np.sqrt(w * w + x * x + y * y + z * z)
     else:
-        turn = quat_from_euler(*np.radians(table.numbers("rpy_deg", (0.0, 0.0, 0.0), count=3)))
+        roll, pitch, yaw = np.radians(table.numbers("rpy_deg", (0.0, 0.0, 0.0), count=3))
+        turn = quat_from_euler(roll, pitch, gamma=yaw)
         if camera:
             turn = quat_product(turn, OPTICAL_QUAT)
     a, b, c = translation

@@ -71,7 +71,7 @@ class Vehicle:
         return self.length - self.rear_overhang
 
 
-def rear_axle_radius(turning_circle: float, wheelbase: float, track: float) -> float:
+def rear_axle_radius(turning_circle: float, wheelbase: float, *, track: float) -> float:
     """Least radius of the rear axle's centre of a car with a kerb-to-kerb turning circle, metres.
 
     turning_circle : a diameter. The outer front wheel runs on the circle; front wheels steer about a point on

@@ -16,7 +16,7 @@ _HALF_NS = 500_000  # half the span over which velocities are taken
 
 
 def radial_velocity(
-    cloud: Cloud, mount: Mount, trajectory: Trajectory, *, moving: Float | None = None
+    cloud: Cloud, mount: Mount, *, trajectory: Trajectory, moving: Float | None = None
 ) -> NDArray[np.float32]:
     """Radial velocity (n,) of each return against the sensor in m/s, positive away from it.
 
@@ -41,7 +41,7 @@ def radial_velocity(
 
 
 def surface_velocity(
-    actors: Actors, feature: NDArray[np.integer], placed: Float, time_ns: NDArray[np.int64]
+    actors: Actors, feature: NDArray[np.integer], *, placed: Float, time_ns: NDArray[np.int64]
 ) -> Float:
     """Velocity (n, 3) in true m/s along the scene's axes of what points lie on; 0 for what stands still.
 
@@ -59,11 +59,11 @@ def surface_velocity(
     on = on[~actors.parked[row[on]]]
     row, time = row[on], time_ns[on]
     across = np.array([actors.scale, actors.scale, 1.0])
-    now = states(actors, row, time)
+    now = states(actors, row, time_ns=time)
     local = np.einsum("nji,nj->ni", rotations(now.angles), (placed[on] - now.position) / across)
     ends = []
     for shift in (-_HALF_NS, _HALF_NS):
-        at = states(actors, row, time + shift)
+        at = states(actors, row, time_ns=time + shift)
         ends.append(at.position / across + np.einsum("nij,nj->ni", rotations(at.angles), local))
     out[on] = (ends[1] - ends[0]) / (2e-9 * _HALF_NS)
     return out

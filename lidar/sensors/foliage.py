@@ -36,7 +36,7 @@ class Leaves:
     seed: int
 
     def pierce(
-        self, hits: Hits, rays: Rays, first: int, time: NDArray[np.float32] | None
+        self, hits: Hits, rays: Rays, *, first: int, time: NDArray[np.float32] | None
     ) -> NDArray[np.int64]:
         """Move the hits of rays that meet foliage to the leaf or to what lies behind, in place; their rows.
 
@@ -54,12 +54,15 @@ class Leaves:
         poses = through.poses.take(through.index)
         start, way = poses.place(through.origin), poses.directions(through.direction)
         walk = _Walk(
-            hits, rows, -np.log(uniform_of(first + rows, self.seed)), uniform_of(first + rows, ~self.seed)
+            hits,
+            rows,
+            depth=-np.log(uniform_of(first + rows, self.seed)),
+            share=uniform_of(first + rows, ~self.seed),
         )
         met = Hits(hits.range[rows], hits.face[rows], hits.instance[rows], hits.cosine[rows], hits.normal)
         going = np.arange(len(rows))
         for _ in range(_CROSSINGS):
-            going, at = walk.on(going, met, self._kind(met), self.faces.leaves)
+            going, at = walk.on(going, met, kind=self._kind(met), leaves=self.faces.leaves)
             if not len(going):
                 break
             later = None if time is None else time[rows[going]]
@@ -85,14 +88,14 @@ class _Walk:
     share : (k,) of the leaves that a ray meets, those that it meets more squarely
     """
 
-    def __init__(self, hits: Hits, rows: NDArray[np.int64], depth: Float, share: Float) -> None:
+    def __init__(self, hits: Hits, rows: NDArray[np.int64], *, depth: Float, share: Float) -> None:
         self._hits, self._rows, self._left = hits, rows, depth
         self._cosine = np.sqrt(share).astype(np.float32)
         self._dense, self._at = np.zeros(len(rows)), np.zeros(len(rows))
         self._crown = np.full((2, len(rows)), -1, np.int32)
 
     def on(
-        self, going: NDArray[np.int64], met: Hits, kind: NDArray[np.int64], leaves: Float
+        self, going: NDArray[np.int64], met: Hits, *, kind: NDArray[np.int64], leaves: Float
     ) -> tuple[NDArray[np.int64], Float]:
         """Go on to the surfaces that were met; the rays that cross them, and where they do."""
         own = PROJECTION * leaves[kind]

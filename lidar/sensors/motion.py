@@ -104,7 +104,7 @@ class Carrier:
     """
 
     def __init__(
-        self, firings: Firings, mount: Mount, trajectory: Trajectory, beam: Beam, *, batch: int
+        self, firings: Firings, mount: Mount, *, trajectory: Trajectory, beam: Beam, batch: int
     ) -> None:
         first, last = (int(t) // KNOT_NS for t in (firings.time_ns.min(), firings.time_ns.max()))
         knots = trajectory.at(KNOT_NS * np.arange(first, last + 2, dtype=np.int64))

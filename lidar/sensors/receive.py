@@ -30,7 +30,7 @@ def shiny_codes() -> tuple[int, int]:
 
 
 @functools.lru_cache(maxsize=8)
-def _factors(low: int, high: int, spread: float, seed: int) -> Float:
+def _factors(low: int, high: int, *, spread: float, seed: int) -> Float:
     """Factors of the reflectance of features ``low`` to ``high``."""
     factors: Float = np.exp(spread * normal_of(np.arange(low, high + 1), seed))
     return factors
@@ -61,7 +61,7 @@ class Look:
     effects, seed : how surfaces differ and how they send light back
     """
 
-    def __init__(self, world: World, wavelength_nm: float, effects: Effects, seed: int) -> None:
+    def __init__(self, world: World, wavelength_nm: float, *, effects: Effects, seed: int) -> None:
         self.world, self.effects = world, effects
         self.faces: Faces = world.faces
         reflectance, specular = reflectance_table(wavelength_nm)
@@ -69,7 +69,7 @@ class Look:
         shiny[list(shiny_codes())] = effects.mirrors
         factor = np.empty(0)
         if effects.spread:
-            factor = _factors(self.faces.low, self.faces.high, effects.spread, seed)
+            factor = _factors(self.faces.low, self.faces.high, spread=effects.spread, seed=seed)
         law = INCIDENCE_LAWS.index(effects.law)
         self.optics = Optics(reflectance, specular, factor, self.faces.low, law, shiny)
 
@@ -100,7 +100,7 @@ class Receiver:
     pulses     : of which there are so many in all
     """
 
-    def __init__(self, look: Look, share: Float, separation: float, *, pulses: int) -> None:
+    def __init__(self, look: Look, share: Float, *, separation: float, pulses: int) -> None:
         self._look, self._share, self._separation = look, share, separation
         self._columns, self._open, self._count = _columns(pulses), np.empty(pulses, np.bool_), 0
 
@@ -127,7 +127,7 @@ class Receiver:
         self._count += count
         ray, row = shiny[:, :met]
         if met:
-            wet = self._look.faces.what[_place(self._look.faces, hits, ray)] & 255 == shiny_codes()[1]
+            wet = self._look.faces.what[_place(self._look.faces, hits, ray=ray)] & 255 == shiny_codes()[1]
             echoes.apparent[row[wet]] = (
                 glint(echoes.cosine[row[wet]]) * self._share[ray[wet] % len(self._share)]
             )
@@ -158,7 +158,7 @@ def _columns(n: int) -> Echoes:
     return Echoes(number, distance, apparent, feature, klass, cosine, true, axis)
 
 
-def _place(faces: Faces, hits: Hits, ray: NDArray[np.int32]) -> NDArray[np.int64]:
+def _place(faces: Faces, hits: Hits, *, ray: NDArray[np.int32]) -> NDArray[np.int64]:
     place: NDArray[np.int64] = hits.face[ray] + faces.start[hits.instance[ray]]
     return place
 

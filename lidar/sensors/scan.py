@@ -29,10 +29,10 @@ Float = NDArray[np.float64]
 def scan(
     sensor: Sensor,
     mount: Mount,
+    *,
     trajectory: Trajectory,
     world: World,
     frame: int,
-    *,
     seed: int = 0,
     effects: Effects = PLAIN,
     threads: int = 1,
@@ -50,17 +50,17 @@ def scan(
     offset = sensor.pattern.range_offset
     bent = pulses
     if effects.angle_noise:
-        bent = _unsteady(pulses, sensor, generator(seed, sensor.name, frame, "angle"))
+        bent = _unsteady(pulses, sensor, rng=generator(seed, sensor.name, frame, "angle"))
     echoes = met(
         bent,
         mount,
-        trajectory,
-        world,
+        trajectory=trajectory,
+        world=world,
         beam=beam_of(effects.rays, divergence=sensor.divergence, aperture=sensor.aperture),
         far=sensor.max_range - offset,
         wavelength_nm=sensor.wavelength_nm,
         separation=sensor.echo_separation,
-        time=_ray_time(sensor, frame, pulses) if _moving(world) else None,
+        time=_ray_time(sensor, frame, pulses=pulses) if _moving(world) else None,
         effects=effects,
         seed=seed,
         leaf_seed=int(generator(seed, sensor.name, frame, "foliage").integers(2**63)),
@@ -68,25 +68,30 @@ def scan(
     )
     echoes = echoes.where(echoes.range + offset >= sensor.min_range)
     if effects.link or effects.detection:
-        echoes = detected(sensor, echoes, effects, generator(seed, sensor.name, frame, "detection"))
-    false = false_echoes(sensor, pulses, echoes, effects, seed, frame)
+        echoes = detected(
+            sensor, echoes, effects=effects, rng=generator(seed, sensor.name, frame, "detection")
+        )
+    false = false_echoes(sensor, pulses, echoes=echoes, effects=effects, seed=seed, frame=frame)
     echoes = joined(echoes, *false)
     number, count = numbered(echoes)
     if effects.rays > 1 or effects.mirrors or false:
-        power = received(sensor, echoes, effects)
+        power = received(sensor, echoes, effects=effects)
         rows = reported(
-            echoes, power, sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
+            echoes, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
         )
         echoes, number, count = echoes.take(rows), number[rows], np.minimum(count[rows], sensor.max_echoes)
-    distance = measured_range(sensor, pulses, echoes, effects, seed, frame)
+    distance = measured_range(sensor, pulses, echoes=echoes, effects=effects, seed=seed, frame=frame)
     keep = (distance >= sensor.min_range) & (distance <= sensor.max_range)
     echoes, distance, number, count = echoes.where(keep), distance[keep], number[keep], count[keep]
-    return _cloud(sensor, pulses, echoes, distance, number, count, effects)
+    return _cloud(
+        sensor, pulses, echoes=echoes, distance=distance, number=number, count=count, effects=effects
+    )
 
 
 def _cloud(
     sensor: Sensor,
     pulses: Firings,
+    *,
     echoes: Echoes,
     distance: Float,
     number: NDArray[np.uint8],
@@ -127,7 +132,7 @@ def _place(pulse: Any, reach: Any, origin: Any, direction: Any, time_ns: Any, xy
         time[i] = time_ns[p] - time_ns[0]
 
 
-def _unsteady(pulses: Firings, sensor: Sensor, rng: np.random.Generator) -> Firings:
+def _unsteady(pulses: Firings, sensor: Sensor, *, rng: np.random.Generator) -> Firings:
     """The pulses where they really go, which is not quite where the sensor says."""
     bent = pulses.direction + sensor.angle_sigma * rng.standard_normal((len(pulses), 3))
     return replace(pulses, direction=bent / np.linalg.norm(bent, axis=1, keepdims=True))
@@ -138,7 +143,7 @@ def _moving(world: World) -> bool:
     return any(group.transform.ndim == 4 for group in world.caster.instances)
 
 
-def _ray_time(sensor: Sensor, frame: int, pulses: Firings) -> NDArray[np.float32]:
+def _ray_time(sensor: Sensor, frame: int, *, pulses: Firings) -> NDArray[np.float32]:
     """Ray times of the pulses, 0 to 1 over the frame's window."""
     start, stop = sensor.window_ns(frame)
     share: NDArray[np.float32] = ((pulses.time_ns - start) / (stop - start)).astype(np.float32)

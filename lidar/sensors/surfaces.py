@@ -30,9 +30,9 @@ _BATCH = 1 << 15  # rays worked on at a time, so that their columns stay in the 
 def met(
     pulses: Firings,
     mount: Mount,
+    *,
     trajectory: Trajectory,
     world: World,
-    *,
     beam: Beam,
     far: float,
     wavelength_nm: float,
@@ -52,9 +52,9 @@ def met(
     """
     rays = len(beam)
     batch = max(_BATCH // rays, 1)
-    look = Look(world, wavelength_nm, effects, seed)
-    carrier = Carrier(pulses, mount, trajectory, beam, batch=batch)
-    receiver = Receiver(look, beam.share, separation, pulses=len(pulses))
+    look = Look(world, wavelength_nm, effects=effects, seed=seed)
+    carrier = Carrier(pulses, mount, trajectory=trajectory, beam=beam, batch=batch)
+    receiver = Receiver(look, beam.share, separation=separation, pulses=len(pulses))
     leaves = Leaves(world.caster, world.faces, far, leaf_seed) if effects.foliage else None
     beyond: list[Echoes] = []
     for number, first in enumerate(range(0, len(pulses), batch)):
@@ -63,14 +63,14 @@ def met(
         hits = world.caster.cast_posed(
             cast.poses,
             cast.index,
-            cast.direction,
+            directions=cast.direction,
             offsets=cast.origin,
             far=far,
             time=moments,
             order=cast.order,
             threads=threads,
         )
-        pierced = None if leaves is None else leaves.pierce(hits, cast, first * rays, moments)
+        pierced = None if leaves is None else leaves.pierce(hits, cast, first=first * rays, time=moments)
         shiny = receiver.take(hits, first)
         if len(shiny):
             pulse, ray = np.divmod(shiny, np.int32(rays))
@@ -80,7 +80,13 @@ def met(
                 among = np.isin(shiny, pierced)
                 skip[among] = hits.range[shiny[among]] - _CLEAR
             beyond += _beyond(
-                cast.take(shiny), pulse + np.int32(first), beam.share[ray], look, far, later, skip
+                cast.take(shiny),
+                pulse + np.int32(first),
+                power=beam.share[ray],
+                look=look,
+                far=far,
+                time=later,
+                skip=skip,
             )
     echoes, surfaces = receiver.echoes()
     if not len(surfaces):
@@ -97,6 +103,7 @@ def _by_pulse(one: Echoes, other: Echoes) -> Echoes:
 def _beyond(
     rays: Rays,
     pulse: NDArray[np.int32],
+    *,
     power: Float,
     look: Look,
     far: float,
@@ -122,7 +129,7 @@ def _beyond(
         hits = caster.cast(start, way, far=far, time=time, normals=True)
         surface, material = look.at(hits)
         if layer:  # the first surface is there already
-            found.append(_along(surface, hits, pulse, power, travelled, klass=None))
+            found.append(_along(surface, hits, pulse=pulse, power=power, travelled=travelled, klass=None))
         shiny = (hits.face >= 0) & np.isin(material, (glass, water)) & (travelled + hits.range < far)
         if not shiny.any():
             break
@@ -137,7 +144,14 @@ def _beyond(
             back = mirrored(way, hits.normal)
             ghosts = caster.cast(place, back, near=_CLEAR, far=far, time=time)
             found.append(
-                _along(look.at(ghosts)[0], ghosts, pulse, power * mirror**2, travelled, klass=Class.NOISE)
+                _along(
+                    look.at(ghosts)[0],
+                    ghosts,
+                    pulse=pulse,
+                    power=power * mirror**2,
+                    travelled=travelled,
+                    klass=Class.NOISE,
+                )
             )
         through = material == glass
         start, way = (place + _CLEAR * way)[through], way[through]
@@ -152,10 +166,10 @@ def _beyond(
 def _along(
     surface: Echoes,
     hits: Hits,
+    *,
     pulse: NDArray[np.int32],
     power: Float,
     travelled: Float,
-    *,
     klass: Class | None,
 ) -> Echoes:
     """The rows that were hit, at the ranges and with the power in which the receiver sees them."""

@@ -31,8 +31,8 @@ _ON_S = 10.0  # seconds that a drive that is under way is planned beyond the rec
 def drive_obeying(
     path: Path,
     vehicle: Vehicle,
-    graph: RoadGraph,
     *,
+    graph: RoadGraph,
     seed: int,
     side: str = "right",
     bounds: tuple[float, float, float, float] | None = None,
@@ -48,18 +48,28 @@ def drive_obeying(
     """
     alone = drive_path(path, vehicle, duration=duration, under_way=under_way)
     plan = junction_plan(graph, lanes_of(graph, side=side, bounds=bounds), seed=seed)
-    if not meets_control(ego_trip(path, vehicle), graph, plan):
+    if not meets_control(ego_trip(path, vehicle), graph, plan=plan):
         return alone
-    return _driven(path, vehicle, graph, plan, [], alone, duration, reach=np.inf, under_way=under_way)
+    return _driven(
+        path,
+        vehicle,
+        graph=graph,
+        plan=plan,
+        trips=[],
+        alone=alone,
+        duration=duration,
+        reach=np.inf,
+        under_way=under_way,
+    )
 
 
 def drive_among(
     scene: Scene,
     graph: RoadGraph,
+    *,
     path: Path,
     vehicle: Vehicle,
     first: Trajectory,
-    *,
     seed: int,
     options: TrafficOptions | None = None,
     duration: float | None = None,
@@ -77,26 +87,35 @@ def drive_among(
     options = options or TrafficOptions()
     ego = first
     for _ in range(_ROUNDS):
-        company = company_of(scene, graph, ego, seed=seed, options=options)
+        company = company_of(scene, graph, ego=ego, seed=seed, options=options)
         before, reach = ego, options.reach * company.scale
         ego = _driven(
-            path, vehicle, graph, company.plan, company.trips, first, duration,
-            reach=reach, under_way=under_way,
-        )  # fmt: skip
+            path,
+            vehicle,
+            graph=graph,
+            plan=company.plan,
+            trips=company.trips,
+            alone=first,
+            duration=duration,
+            reach=reach,
+            under_way=under_way,
+        )
         if _apart(before, ego) < _SAME * company.scale:
             break
-    return ego, settled(scene, graph, ego, vehicle, company, seed=seed, options=options, obeys=True)
+    return ego, settled(
+        scene, graph, ego=ego, vehicle=vehicle, company=company, seed=seed, options=options, obeys=True
+    )
 
 
 def _driven(
     path: Path,
     vehicle: Vehicle,
+    *,
     graph: RoadGraph,
     plan: Plan,
     trips: list[Trip],
     alone: Trajectory,
     duration: float | None,
-    *,
     reach: float,
     under_way: bool,
 ) -> Trajectory:
@@ -106,10 +125,12 @@ def _driven(
     if duration is not None and under_way:
         seconds += _ON_S
     trip = ego_trip(path, vehicle, under_way=under_way)
-    gone = simulate_ego(trip, trips, graph, plan, seconds=seconds, reach=reach)
+    gone = simulate_ego(trip, trips, graph=graph, plan=plan, seconds=seconds, reach=reach)
     time_s: Float = DT * np.arange(len(gone), dtype=float)
-    motion = motion_behind(path, vehicle, time_s, gone.clip(max=path.length), under_way=under_way)
-    trajectory = poses_along(path, vehicle, motion)
+    motion = motion_behind(
+        path, vehicle, time_s=time_s, reach=gone.clip(max=path.length), under_way=under_way
+    )
+    trajectory = poses_along(path, vehicle, motion=motion)
     return trajectory if duration is None else trajectory.until(round(duration * 1e9))
 
 

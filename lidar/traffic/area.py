@@ -58,7 +58,7 @@ class Area:
         return float(self.time[np.argmax(left)] if left.any() else self.time[-1])
 
 
-def area_of(lanes: Lanes, ego: Trajectory, reach: float, scale: float) -> Area:
+def area_of(lanes: Lanes, ego: Trajectory, *, reach: float, scale: float) -> Area:
     """The surroundings of the ego along its way."""
     lines = edge_lines(lanes.graph)
     seconds = ego.duration_ns * 1e-9
@@ -73,7 +73,7 @@ def ego_line(ego: Trajectory) -> shapely.Geometry:
     return shapely.linestrings(xy).simplify(0.2) if np.ptp(xy, axis=0).max() > 0.5 else shapely.points(xy[0])
 
 
-def entrances(lanes: Lanes, area: Area, t: float) -> list[tuple[int, float]]:
+def entrances(lanes: Lanes, area: Area, *, t: float) -> list[tuple[int, float]]:
     """Where traffic comes into the surroundings of the ego at a time: edges, and shares of their lengths.
 
     That is where edges cross the rim inwards, and where they come into the map.

@@ -224,7 +224,7 @@ def _rows(path: Path) -> tuple[Float, list[str], list[str]]:
         if root.tag != "fcd-export":
             raise FormatError(f"{path}: <{root.tag}> is not floating car data; run sumo with --fcd-output")
         for step in steps:
-            time = _number(path, step, "time", "a time step")
+            time = _number(path, step, attribute="time", where="a time step")
             for mover in step:
                 if mover.tag not in ("vehicle", "person"):
                     continue
@@ -234,13 +234,17 @@ def _rows(path: Path) -> tuple[Float, list[str], list[str]]:
                 if key not in numbers:
                     numbers[key] = len(numbers)
                     kinds.append(mover.get("type", "") if mover.tag == "vehicle" else "pedestrian")
-                x, y, angle = (_number(path, mover, a, where) for a in ("x", "y", "angle"))
-                speed = _number(path, mover, "speed", where) if "speed" in mover.attrib else np.nan
+                x, y, angle = (_number(path, mover, attribute=a, where=where) for a in ("x", "y", "angle"))
+                speed = (
+                    _number(path, mover, attribute="speed", where=where)
+                    if "speed" in mover.attrib
+                    else np.nan
+                )
                 rows.append((numbers[key], time, x, y, angle, speed))
     return np.array(rows, float).reshape(-1, 6), [name for _, name in numbers], kinds
 
 
-def _number(path: Path, element: ET.Element, attribute: str, where: str) -> float:
+def _number(path: Path, element: ET.Element, *, attribute: str, where: str) -> float:
     text = element.get(attribute)
     try:
         value = float(text if text is not None else "")
@@ -308,6 +312,10 @@ def _types(path: Path, noted: dict[str, str]) -> dict[str, tuple[str, float | No
                 vclass = element.get("vClass", "passenger")
                 vclass = _OTHER.get(vclass, vclass)
                 where = f"vType {element.get('id')!r}"
-                length = _number(source, element, "length", where) if "length" in element.attrib else None
+                length = (
+                    _number(source, element, attribute="length", where=where)
+                    if "length" in element.attrib
+                    else None
+                )
                 out[element.get("id", "")] = vclass if vclass in _LENGTHS else "left out", length
     return out

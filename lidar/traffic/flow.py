@@ -52,10 +52,10 @@ class Flow:
 def simulate_trips(
     trips: Sequence[Trip],
     graph: RoadGraph,
+    *,
     plan: Plan,
     ego: Trajectory,
     ego_box: tuple[float, float, float],
-    *,
     reach: float,
     obeys: bool = False,
 ) -> Flow:
@@ -69,8 +69,8 @@ def simulate_trips(
     if not trips:
         none = np.empty(0, np.int64)
         return Flow(none, none, np.empty(0), np.empty(0))
-    movers = _movers(trips, graph, plan)
-    known = ego_on(ego, ego_box, graph)
+    movers = _movers(trips, graph, plan=plan)
+    known = ego_on(ego, ego_box, graph=graph)
     movers, known, squares = _numbered(movers, known)
     signals = plan.signals if obeys else plan.signals._replace(window=green_windows(plan, known))
     out = np.zeros(len(trips), bool)
@@ -85,13 +85,13 @@ def simulate_trips(
 
 
 def simulate_ego(
-    ego: EgoTrip, trips: Sequence[Trip], graph: RoadGraph, plan: Plan, *, seconds: float, reach: float
+    ego: EgoTrip, trips: Sequence[Trip], *, graph: RoadGraph, plan: Plan, seconds: float, reach: float
 ) -> Float:
     """Metres (t,) along its path that the ego gets by each step of `DT` as one of the traffic.
 
     It follows, gives way and stops at signals and signs as the others do, and they know it as one of them.
     """
-    movers = _movers([ego, *trips], graph, plan)
+    movers = _movers([ego, *trips], graph, plan=plan)
     steps = int(np.ceil(seconds / DT)) + 1
     x, y, heading, speed = np.zeros((4, steps))
     none = np.empty(0, np.int64)
@@ -105,13 +105,13 @@ def simulate_ego(
     return np.maximum.accumulate(gone)
 
 
-def meets_control(ego: EgoTrip, graph: RoadGraph, plan: Plan) -> bool:
+def meets_control(ego: EgoTrip, graph: RoadGraph, *, plan: Plan) -> bool:
     """Whether there are signals or stop signs on the ego's way."""
-    blocks = _blocks(ego, graph, plan, {})
+    blocks = _blocks(ego, graph, plan=plan, ways={})
     return bool((blocks[:, 4] >= 0).any() or (blocks[:, 7] > 0).any())
 
 
-def ego_on(ego: Trajectory, box: tuple[float, float, float], graph: RoadGraph) -> Ego:
+def ego_on(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadGraph) -> Ego:
     """What the others know of the ego vehicle; ``box`` as in `simulate_trips`."""
     length, width, ahead = box
     steps = int(ego.duration_ns * 1e-9 / DT) + 2
@@ -165,11 +165,11 @@ def green_windows(plan: Plan, ego: Ego) -> Float:
     for a, b in itertools.pairwise(cuts.tolist()):
         z = int(zone[a])
         if z >= 0 and plan.lit[z]:
-            rows.append((z, signal_group(plan, z, float(ego.heading[a])), a * DT - 8.0, b * DT))
+            rows.append((z, signal_group(plan, z, heading=float(ego.heading[a])), a * DT - 8.0, b * DT))
     return np.array(rows, float).reshape(-1, 4)
 
 
-def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, plan: Plan) -> Movers:
+def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: Plan) -> Movers:
     """The tables of the simulation."""
     station, square, blocks = [0], [0], [0]
     columns: dict[str, list[NDArray[Any]]] = {
@@ -181,8 +181,8 @@ def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, plan: Plan) -> Mo
         way = trip.way
         xy, heading = trip.body()
         level = np.where(way.edge >= 0, covered[way.edge], False).astype(np.int64)
-        swept = sweep(xy, heading, trip.length, trip.width, level, scale=way.scale)
-        found = _blocks(trip, graph, plan, ways)
+        swept = sweep(xy, heading, length=trip.length, width=trip.width, level=level, scale=way.scale)
+        found = _blocks(trip, graph, plan=plan, ways=ways)
         columns["wish"].append(trip.wish)
         columns["x"].append(xy[:, 0])
         columns["y"].append(xy[:, 1])
@@ -228,7 +228,7 @@ def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, plan: Plan) -> Mo
     )
 
 
-def _blocks(trip: Trip | EgoTrip, graph: RoadGraph, plan: Plan, ways: dict[tuple[int, ...], int]) -> Float:
+def _blocks(trip: Trip | EgoTrip, graph: RoadGraph, *, plan: Plan, ways: dict[tuple[int, ...], int]) -> Float:
     """Stretches through junctions (b, 8): from, to, stop, zone, group, way, rank, halt; see `Movers`."""
     way = trip.way
     zone = zone_at(plan.zones, way.xyz[:, :2])
@@ -237,7 +237,7 @@ def _blocks(trip: Trip | EgoTrip, graph: RoadGraph, plan: Plan, ways: dict[tuple
     for first, last, number in trip.crossing:
         if last >= trip.begin:
             z = int(zone[(first + last) // 2])
-            group = signal_group(plan, z, float(way.heading[(first + last) // 2])) if z >= 0 else -1
+            group = signal_group(plan, z, heading=float(way.heading[(first + last) // 2])) if z >= 0 else -1
             key = ways.setdefault((-1, number), len(ways))
             rows.append([first, last, first - 1, z, group, key, 99.0, 0.0])
     if trip.walks:
@@ -254,7 +254,7 @@ def _blocks(trip: Trip | EgoTrip, graph: RoadGraph, plan: Plan, ways: dict[tuple
         )
         heading, entry = float(way.heading[before]), int(way.edge[before])
         start, end = a - half, b - 1 + half
-        stop = min(start - 2, _stop_line(way, graph, entry, a) - half)
+        stop = min(start - 2, _stop_line(way, graph, edge=entry, station=a) - half)
         if stop < 4 and isinstance(trip, EgoTrip):  # it sets out from within
             continue
         if rows and stop - rows[-1][1] < 2:  # no room to stand between two junctions
@@ -265,7 +265,7 @@ def _blocks(trip: Trip | EgoTrip, graph: RoadGraph, plan: Plan, ways: dict[tuple
         rank = 2.0 * road_rank(str(graph.highway[entry]) if entry >= 0 else "") + 0.5 * (abs(bend) > 0.5)
         signs = graph.control_kind[graph.control_edge == entry]
         rank += 3.0 if np.isin(signs, ("stop", "give_way")).any() else 0.0
-        group = signal_group(plan, z, heading)
+        group = signal_group(plan, z, heading=heading)
         halt = group < 0 and _stops(graph, entry)
         rows.append([start, end, stop, z, group, ways.setdefault(through, len(ways)), rank, float(halt)])
     return np.array(rows, float).reshape(-1, 8)
@@ -278,7 +278,7 @@ def _stops(graph: RoadGraph, edge: int) -> bool:
     return edge >= 0 and bool(near.any() or graph.stop[graph.head[edge]])
 
 
-def _stop_line(way: Way, graph: RoadGraph, edge: int, station: int) -> int:
+def _stop_line(way: Way, graph: RoadGraph, *, edge: int, station: int) -> int:
     """Station of the first line to stop at, on the edge that leads up to a junction at a station."""
     here = graph.control_edge == edge
     offset = graph.control_offset[here]

@@ -121,7 +121,7 @@ def junction_plan(graph: RoadGraph, lanes: Lanes, *, seed: int, cycle: float = 6
     return Plan(zones, axis, lit, Signals(np.full(n, cycle), shift, np.empty((0, 4))))
 
 
-def signal_group(plan: Plan, zone: int, heading: float) -> int:
+def signal_group(plan: Plan, zone: int, *, heading: float) -> int:
     """Group of a junction's signals that speaks to traffic of a heading, -1 without signals."""
     if not plan.lit[zone]:
         return -1

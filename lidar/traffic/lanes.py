@@ -81,10 +81,10 @@ def lanes_of(
     for k, line in enumerate(graph.geometry):
         enter[k], leave[k] = _heading(line[:, :2], first=True), _heading(line[:, :2], first=False)
     liking = np.array([_QUIET.get(str(kind), 1.0) for kind in graph.highway])
-    leads_out = _at_edge(graph, bounds, graph.head, graph.tail)
-    leads_in = _at_edge(graph, bounds, graph.tail, graph.head)
+    leads_out = _at_edge(graph, bounds, end=graph.head, other=graph.tail)
+    leads_in = _at_edge(graph, bounds, end=graph.tail, other=graph.head)
     straight_on = graph.twin[state[before]] != state[after]
-    onward = _leading_on(before[straight_on], after[straight_on], leads_out[state])
+    onward = _leading_on(before[straight_on], after[straight_on], leads_out=leads_out[state])
     return Lanes(
         graph,
         np.maximum(np.floor(graph.lanes), 1.0).astype(np.int64),
@@ -105,6 +105,7 @@ def lanes_of(
 def _at_edge(
     graph: RoadGraph,
     bounds: tuple[float, float, float, float] | None,
+    *,
     end: NDArray[np.int32],
     other: NDArray[np.int32],
 ) -> NDArray[np.bool_]:
@@ -118,7 +119,7 @@ def _at_edge(
     return out
 
 
-def _leading_on(before: Ints, after: Ints, leads_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _leading_on(before: Ints, after: Ints, *, leads_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """States (s,) from which a drive can go on for ever, or to the map's edge."""
     leads_on = np.ones(len(leads_out), np.bool_)
     while True:
@@ -138,12 +139,12 @@ def _heading(xy: Float, *, first: bool) -> float:
     return float(np.arctan2(d[1], d[0]))
 
 
-def turn(lanes: Lanes, a: int, b: int) -> float:
+def turn(lanes: Lanes, a: int, *, b: int) -> float:
     """Change of heading in radians from edge a to edge b, positive to the left."""
     return float((lanes.enter[b] - lanes.leave[a] + np.pi) % (2 * np.pi) - np.pi)
 
 
-def lane_shift(lanes: Lanes, edge: int, lane: int, width: float, *, kerb: bool = False) -> float:
+def lane_shift(lanes: Lanes, edge: int, *, lane: int, width: float, kerb: bool = False) -> float:
     """Metres from an edge's centre line to a lane's middle, positive on the side that traffic keeps to.
 
     Lane 0 is the one at the kerb. A body of that width stays inside the carriageway where there is room; with
@@ -195,9 +196,9 @@ class Way:
 def wander(
     lanes: Lanes,
     rng: np.random.Generator,
+    *,
     edge: int,
     lane: int,
-    *,
     metres: float,
     inside: NDArray[np.bool_],
     width: float,
@@ -217,7 +218,7 @@ def wander(
         states, ways = states[fit], ways[fit]
         if not len(ways):
             break
-        turns = np.array([turn(lanes, edge, int(w)) for w in ways])
+        turns = np.array([turn(lanes, edge, b=int(w)) for w in ways])
         weight = lanes.liking[ways] * np.where(np.abs(turns) < _STRAIGHT, 3.0, 1.0)
         weight = weight * np.where(np.abs(turns) > np.radians(140), 0.02, 1.0)
         weight = weight * np.where(lanes.onward[states], 1.0, 1e-9)
@@ -248,8 +249,8 @@ def wander(
 def way_along(
     lanes: Lanes,
     edges: Sequence[int],
-    picked: Sequence[int],
     *,
+    picked: Sequence[int],
     width: float,
     radius: float,
     scale: float,
@@ -264,12 +265,12 @@ def way_along(
     parts, owner = [], []
     graph = lanes.graph
     lines = [
-        beside(graph.geometry[e], -lanes.side * scale * lane_shift(lanes, e, k, width, kerb=kerb))
+        beside(graph.geometry[e], -lanes.side * scale * lane_shift(lanes, e, lane=k, width=width, kerb=kerb))
         for e, k in zip(edges, picked, strict=True)
     ]
     for k, line in enumerate(lines):
         if k + 1 < len(lines):
-            line, following, joint = _joint(line, lines[k + 1], radius)  # noqa: PLW2901
+            line, following, joint = _joint(line, lines[k + 1], radius=radius)  # noqa: PLW2901
             lines[k + 1] = following
         else:
             joint = np.empty((0, 3))
@@ -284,17 +285,17 @@ def way_along(
     line = np.stack([np.interp(at, along, xyz[:, c]) for c in range(3)], axis=1)
     row = own[np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(own) - 1)]
     edge, lane = np.asarray(edges, np.int64)[row], np.asarray(picked, np.int64)[row]
-    return rounded(line, edge, lane, graph.speed[edge], radius=radius, scale=scale)
+    return rounded(line, edge, lane=lane, limit=graph.speed[edge], radius=radius, scale=scale)
 
 
-def rounded(line: Float, edge: Ints, lane: Ints, limit: Float, *, radius: float, scale: float) -> Way:
+def rounded(line: Float, edge: Ints, *, lane: Ints, limit: Float, radius: float, scale: float) -> Way:
     """The way along a line (n, 3) of evenly spaced points, rounded to bends of ``radius`` and more.
 
     radius            : true metres
     edge, lane, limit : columns of `Way` at the points
     """
     gap = STEP * scale
-    smooth = relaxed(line[:, :2], 0.95 / radius / scale, 0.45 * radius)
+    smooth = relaxed(line[:, :2], 0.95 / radius / scale, reach=0.45 * radius)
     # corners that were rounded are shorter: even spacing again
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(smooth, axis=0).T))])
     even = np.arange(0.0, length[-1], gap)
@@ -330,7 +331,7 @@ def beside(line: Float, offset: float) -> Float:
     return moved
 
 
-def _joint(a: Float, b: Float, radius: float) -> tuple[Float, Float, Float]:
+def _joint(a: Float, b: Float, *, radius: float) -> tuple[Float, Float, Float]:
     """Two lanes cut back where they meet, and the curve (c, 3) between them."""
     u, v = _unit(a[-1, :2] - a[-2, :2]), _unit(b[1, :2] - b[0, :2])
     gap = b[0, :2] - a[-1, :2]
@@ -345,8 +346,8 @@ def _joint(a: Float, b: Float, radius: float) -> tuple[Float, Float, Float]:
     else:
         aside = abs(float(u[0] * gap[1] - u[1] * gap[0]))
         cut_a = cut_b = 0.0 if aside < 0.05 else max(4.0 * aside, 2.0) + max(-float(gap @ u), 0.0)
-    a = _within(a, 0.0, max(long_a - max(cut_a, 0.0), 0.55 * long_a))
-    b = _within(b, min(max(cut_b, 0.0), 0.45 * long_b), long_b)
+    a = _within(a, 0.0, end=max(long_a - max(cut_a, 0.0), 0.55 * long_a))
+    b = _within(b, min(max(cut_b, 0.0), 0.45 * long_b), end=long_b)
     p, q = a[-1], b[0]
     u, v = _unit(a[-1, :2] - a[-2, :2]), _unit(b[1, :2] - b[0, :2])
     reach = float(np.hypot(*(q - p)[:2]))
@@ -368,7 +369,7 @@ def _length(line: Float) -> float:
     return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
 
 
-def _within(line: Float, begin: float, end: float) -> Float:
+def _within(line: Float, begin: float, *, end: float) -> Float:
     """The part of a line between two lengths along it."""
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
     inside = (along > begin + 1e-6) & (along < end - 1e-6)

@@ -60,7 +60,7 @@ def kerb_spots(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: float
         if not slow or g.length[e] < 15.0 or kind not in (*_QUIET, *_BUSY):
             continue
         rng = generator(seed, "parked", "kerb", e)
-        lane = lane_shift(lanes, e, 0, 1.82)
+        lane = lane_shift(lanes, e, lane=0, width=1.82)
         # the inner side of a one-way street of several lanes is a median as likely as not
         alone = g.twin[e] < 0 and lanes.count[e] == 1 and kind in _QUIET
         both = (lanes.side, -lanes.side) if alone else (lanes.side,)
@@ -113,7 +113,7 @@ def lot_spots(lots: NDArray[np.object_], *, seed: int, share: float) -> Spots:
             at = np.arange(0.4 + wide / 2, size[0] - wide / 2, wide)
             points = origin + at[:, None] * u + y * v
             angle = np.arctan2(v[1], v[0]) + (np.pi if flip else 0.0)
-            slot = rectangles(points, np.full(len(at), angle), deep, wide - 0.2)
+            slot = rectangles(points, np.full(len(at), angle), length=deep, width=wide - 0.2)
             fits = shapely.covered_by(slot, lot) & (rng.random(len(at)) < share)
             backwards = np.where(rng.random(len(at)) < 0.3, np.pi, 0.0)
             xy.append(points[fits])
@@ -127,9 +127,9 @@ def lot_spots(lots: NDArray[np.object_], *, seed: int, share: float) -> Spots:
 def parked_actors(
     spots: Spots,
     scene: Scene,
+    *,
     kinds: dict[str, float],
     trees: Sequence[shapely.STRtree],
-    *,
     seed: int,
     scale: float,
 ) -> Actors:
@@ -145,7 +145,7 @@ def parked_actors(
     grow = 1 + rng.uniform(-0.03, 0.03, (n, 3))
     size = np.array([[s.length, s.width, s.base] for s in shapes]).reshape(-1, 3)
     length, width, base = size[:, 0] * grow[:, 0], size[:, 1] * grow[:, 1], size[:, 2] * grow[:, 0]
-    boxes = rectangles(spots.xy, spots.heading, length * scale, width * scale)
+    boxes = rectangles(spots.xy, spots.heading, length=length * scale, width=width * scale)
     keep = np.ones(n, bool)
     for tree in trees:
         if len(tree):
@@ -157,8 +157,8 @@ def parked_actors(
     *pose, sound = standing(
         scene,
         spots.xy[rows],
-        spots.heading[rows],
-        spots.hint[rows],
+        yaw=spots.heading[rows],
+        hint=spots.hint[rows],
         axle=base[rows],
         track=0.8 * width[rows],
         scale=scale,
@@ -168,12 +168,12 @@ def parked_actors(
     return table(
         [shapes[k] for k in rows],
         grow[rows],
-        np.ones(len(rows), np.int64),
-        np.zeros(len(rows), np.int64),
-        np.column_stack([spots.xy[rows], height]),
-        np.column_stack([spots.heading[rows], pitch, roll]),
-        np.zeros((len(rows), 3)),
-        np.zeros(len(rows)),
+        knots=np.ones(len(rows), np.int64),
+        time_ns=np.zeros(len(rows), np.int64),
+        position=np.column_stack([spots.xy[rows], height]),
+        angles=np.column_stack([spots.heading[rows], pitch, roll]),
+        velocity=np.zeros((len(rows), 3)),
+        gone=np.zeros(len(rows)),
         parked=True,
         scale=scale,
     )

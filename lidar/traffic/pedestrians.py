@@ -52,7 +52,7 @@ class Walks:
 
 
 def walks_of(
-    lanes: Lanes, area: Area, pavement: shapely.Geometry | None, standing: NDArray[np.object_]
+    lanes: Lanes, area: Area, *, pavement: shapely.Geometry | None, standing: NDArray[np.object_]
 ) -> Walks:
     """Stretches of sidewalk around the ego's way, clear of what stands there.
 
@@ -75,7 +75,7 @@ def walks_of(
             for wide in _OUT:
                 aside = (float(g.width[e]) / 2 + wide) * area.scale
                 line = beside(g.geometry[e], side * aside)
-                pieces = _clear(line, pavement, tree)
+                pieces = _clear(line, pavement, tree=tree)
                 if sum(map(_plan, pieces)) > 1.3 * sum(map(_plan, best)):
                     best = pieces
             out.line.extend(best)
@@ -84,7 +84,7 @@ def walks_of(
     return out
 
 
-def _clear(line: Float, pavement: shapely.Geometry, tree: shapely.STRtree) -> list[Float]:
+def _clear(line: Float, pavement: shapely.Geometry, *, tree: shapely.STRtree) -> list[Float]:
     """Pieces of a line on the pavement, away from what stands there."""
     whole = shapely.linestrings(line)
     if len(tree):
@@ -100,7 +100,7 @@ def _plan(line: Float) -> float:
     return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
 
 
-def walker_trips(lanes: Lanes, area: Area, walks: Walks, *, seed: int, density: float) -> list[Trip]:
+def walker_trips(lanes: Lanes, area: Area, *, walks: Walks, seed: int, density: float) -> list[Trip]:
     """People at random places on the sidewalks; half of those who come to a crossing take it.
 
     density : people per kilometre of sidewalk
@@ -120,8 +120,16 @@ def walker_trips(lanes: Lanes, area: Area, walks: Walks, *, seed: int, density: 
         pace = _FREE[kind] * float(np.clip(rng.normal(1.0, 0.12), 0.7, 1.4))
         place = shapely.line_interpolate_point(shapely.linestrings(walks.line[walk][:, :2]), begin)
         for start, end in area.visits(shapely.get_coordinates(place)[0]):
-            line, over = _stroll(walks, crossings, walk, begin, pace * (end - start) + 20.0, lanes.side, rng)
-            way, crossed = _way(line, over, area.scale)
+            line, over = _stroll(
+                walks,
+                crossings,
+                walk=walk,
+                begin=begin,
+                metres=pace * (end - start) + 20.0,
+                side=lanes.side,
+                rng=rng,
+            )
+            way, crossed = _way(line, over, scale=area.scale)
             wish = np.full(len(way), pace)
             trips.append(
                 Trip(shape, grow, way, _WALK, wish, 0, start, leaves=False, walks=True, crossing=crossed)
@@ -132,6 +140,7 @@ def walker_trips(lanes: Lanes, area: Area, walks: Walks, *, seed: int, density: 
 def _stroll(
     walks: Walks,
     crossings: Mapping[int, list[tuple[int, float, float, int]]],
+    *,
     walk: int,
     begin: float,
     metres: float,
@@ -152,7 +161,7 @@ def _stroll(
         taken = ahead[int(rng.integers(len(ahead)))] if ahead and rng.random() < 0.5 else None
         stop = end if taken is None else taken[1]
         if abs(stop - begin) > 0.5:
-            parts.append(_lane(own, begin, stop, side))
+            parts.append(_lane(own, begin, end=stop, side=side))
             far += abs(stop - begin)
         if taken is None:
             begin, forwards = stop, not forwards
@@ -202,7 +211,7 @@ def _crossings(lanes: Lanes, walks: Walks) -> dict[int, list[tuple[int, float, f
 
 
 def _way(
-    parts: list[Float], over: list[tuple[int, int]], scale: float
+    parts: list[Float], over: list[tuple[int, int]], *, scale: float
 ) -> tuple[Way, tuple[tuple[int, int, int], ...]]:
     """The way along lines, and the stations between which it is on the crossings that follow some of them."""
     line = np.concatenate(parts)
@@ -213,23 +222,25 @@ def _way(
     keep = np.concatenate([[True], np.diff(along) > 1e-6])
     points = np.stack([np.interp(even, along[keep], line[keep, c]) for c in range(3)], axis=1)
     nowhere = np.full(len(even), -1, np.int64)
-    way = rounded(points, nowhere, nowhere, np.full(len(even), np.inf), radius=_WALK.radius, scale=scale)
+    way = rounded(
+        points, nowhere, lane=nowhere, limit=np.full(len(even), np.inf), radius=_WALK.radius, scale=scale
+    )
     crossed = []
     for part, number in over:
         # rounded corners shorten the way a little: the crossing is found by its ends
-        first, last = (_nearest(way, line[k, :2], along[k] / gap) for k in (ends[part] - 1, ends[part]))
+        first, last = (_nearest(way, line[k, :2], about=along[k] / gap) for k in (ends[part] - 1, ends[part]))
         crossed.append((first + 1, max(last - 1, first + 2), number))
     return way, tuple(crossed)
 
 
-def _nearest(way: Way, point: Float, about: float) -> int:
+def _nearest(way: Way, point: Float, *, about: float) -> int:
     """The station of a way nearest to a point, near a guess."""
     low = int(np.clip(about - 16, 0, len(way) - 1))
     part = way.xyz[low : int(about) + 17, :2]
     return low + int(np.argmin(np.hypot(*(part - point).T)))
 
 
-def _lane(line: Float, begin: float, end: float, side: int) -> Float:
+def _lane(line: Float, begin: float, *, end: float, side: int) -> Float:
     """A stretch of a sidewalk's line from one length along it to another, a little to one's own side."""
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
     low, high = min(begin, end), max(begin, end)

@@ -99,9 +99,9 @@ class Company:
 def populate(
     scene: Scene,
     graph: RoadGraph,
+    *,
     ego: Trajectory,
     vehicle: Vehicle,
-    *,
     seed: int,
     options: TrafficOptions | None = None,
 ) -> Actors:
@@ -114,42 +114,46 @@ def populate(
     Raises InputError for a scene whose features cannot be read.
     """
     options = options or TrafficOptions()
-    company = company_of(scene, graph, ego, seed=seed, options=options)
-    return settled(scene, graph, ego, vehicle, company, seed=seed, options=options, obeys=False)
+    company = company_of(scene, graph, ego=ego, seed=seed, options=options)
+    return settled(
+        scene, graph, ego=ego, vehicle=vehicle, company=company, seed=seed, options=options, obeys=False
+    )
 
 
 def company_of(
-    scene: Scene, graph: RoadGraph, ego: Trajectory, *, seed: int, options: TrafficOptions
+    scene: Scene, graph: RoadGraph, *, ego: Trajectory, seed: int, options: TrafficOptions
 ) -> Company:
     """Those who are about in the surroundings of an ego that moves so."""
     lanes = lanes_of(graph, side=options.side, bounds=scene.bounds)
     plan = junction_plan(graph, lanes, seed=seed)
     scale = float(np.mean(np.asarray(scene.frame.scale_at(*ego.position[0, :2]), float)))
-    area = area_of(lanes, ego, options.reach, scale)
+    area = area_of(lanes, ego, reach=options.reach, scale=scale)
     around = shapely.buffer(ego_line(ego), (options.reach + 30.0) * scale)
     shapely.prepare(around)
     surfaces = _layer(scene, "road_surfaces")
-    road = _union(surfaces, _ROAD, around, 0.3)
+    road = _union(surfaces, _ROAD, area=around, grow=0.3)
     standing = _standing(scene, around)
     if road is not None:
-        road = _passable(road, standing, lanes, area)
+        road = _passable(road, standing, lanes=lanes, area=area)
 
     trips = vehicle_trips(lanes, area, seed=seed, density=options.vehicles, ground=road)
     trips += vehicle_trips(
         lanes, area, seed=seed, density=options.cyclists, shares={"cyclist": 1.0}, ground=road
     )
-    walks = walks_of(lanes, area, _union(surfaces, ("sidewalk",), around, 0.0), standing)
-    trips += walker_trips(lanes, area, walks, seed=seed, density=options.walkers)
+    walks = walks_of(
+        lanes, area, pavement=_union(surfaces, ("sidewalk",), area=around, grow=0.0), standing=standing
+    )
+    trips += walker_trips(lanes, area, walks=walks, seed=seed, density=options.walkers)
     return Company(lanes, plan, area, trips, standing, surfaces, around, scale)
 
 
 def settled(
     scene: Scene,
     graph: RoadGraph,
+    *,
     ego: Trajectory,
     vehicle: Vehicle,
     company: Company,
-    *,
     seed: int,
     options: TrafficOptions,
     obeys: bool,
@@ -160,11 +164,21 @@ def settled(
     """
     trips, plan = company.trips, company.plan
     box = (vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang)
-    flow = simulate_trips(trips, graph, plan, ego, box, reach=options.reach * company.scale, obeys=obeys)
+    flow = simulate_trips(
+        trips, graph, plan=plan, ego=ego, ego_box=box, reach=options.reach * company.scale, obeys=obeys
+    )
     return joined(
         [
-            moving_actors(trips, flow, scene, scale=company.scale),
-            parked_about(scene, ego, vehicle, company, _swept(trips), seed=seed, share=options.parked),
+            moving_actors(trips, flow, scene=scene, scale=company.scale),
+            parked_about(
+                scene,
+                ego,
+                vehicle=vehicle,
+                company=company,
+                swept=_swept(trips),
+                seed=seed,
+                share=options.parked,
+            ),
         ],
         first_feature=first_feature(scene),
     )
@@ -178,10 +192,10 @@ def first_feature(scene: Scene) -> int:
 def parked_about(
     scene: Scene,
     ego: Trajectory,
+    *,
     vehicle: Vehicle,
     company: Company,
     swept: NDArray[np.object_],
-    *,
     seed: int,
     share: float,
 ) -> Actors:
@@ -191,11 +205,11 @@ def parked_about(
     share : of the places that are taken
     """
     surfaces, around, lanes = company.surfaces, company.around, company.lanes
-    lots = _polygons(_layer(scene, "landcover"), ("parking",), around)
+    lots = _polygons(_layer(scene, "landcover"), ("parking",), area=around)
     structures = _layer(scene, "structures")
-    crossings = shapely.buffer(_polygons(surfaces, ("crossing",), around), 2.0)
+    crossings = shapely.buffer(_polygons(surfaces, ("crossing",), area=around), 2.0)
     free = [
-        _ego_boxes(ego, vehicle, company.scale),
+        _ego_boxes(ego, vehicle, scale=company.scale),
         swept,
         _strips(lanes, company.area),
         shapely.buffer(company.plan.zones.polygon, 3.0),
@@ -209,11 +223,11 @@ def parked_about(
             lot_spots(lots, seed=seed, share=share),
         ]
     )
-    return parked_actors(spots, scene, CARS, trees, seed=seed, scale=company.scale)
+    return parked_actors(spots, scene, kinds=CARS, trees=trees, seed=seed, scale=company.scale)
 
 
 def _passable(
-    road: shapely.Geometry, standing: NDArray[np.object_], lanes: Lanes, area: Area
+    road: shapely.Geometry, standing: NDArray[np.object_], *, lanes: Lanes, area: Area
 ) -> shapely.Geometry:
     """Carriageways less the buildings that stand on them, but for bridges and what runs under buildings."""
     houses = standing[shapely.area(standing) > _HOUSE]
@@ -230,14 +244,16 @@ def _swept(trips: list[Trip]) -> NDArray[np.object_]:
     for trip in trips:
         xy, heading = body_poses(trip.way, trip.axle)
         every = slice(0, None, 2 if trip.walks else 4)
-        parts.append(rectangles(xy[every], heading[every], max(trip.length, 1.0) + 0.5, trip.width + 0.3))
+        parts.append(
+            rectangles(xy[every], heading[every], length=max(trip.length, 1.0) + 0.5, width=trip.width + 0.3)
+        )
     return np.concatenate(parts)
 
 
 def _strips(lanes: Lanes, area: Area) -> NDArray[np.object_]:
     """Lanes around the ego's way as wide as a car."""
     lines = [
-        beside(lanes.graph.geometry[e], -lanes.side * lane_shift(lanes, e, lane, 1.82))[:, :2]
+        beside(lanes.graph.geometry[e], -lanes.side * lane_shift(lanes, e, lane=lane, width=1.82))[:, :2]
         for e in np.flatnonzero(area.near & (lanes.liking > 0)).tolist()
         for lane in range(int(lanes.count[e]))
     ]
@@ -247,7 +263,7 @@ def _strips(lanes: Lanes, area: Area) -> NDArray[np.object_]:
     return strips
 
 
-def _ego_boxes(ego: Trajectory, vehicle: Vehicle, scale: float) -> NDArray[np.object_]:
+def _ego_boxes(ego: Trajectory, vehicle: Vehicle, *, scale: float) -> NDArray[np.object_]:
     """Boxes of the ego vehicle along its way, grown by what is kept from it."""
     moved = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ego.position[:, :2], axis=0).T))])
     rows = np.unique(np.searchsorted(moved, np.arange(0.0, moved[-1] + 1.0, 1.0)).clip(0, len(moved) - 1))
@@ -255,17 +271,19 @@ def _ego_boxes(ego: Trajectory, vehicle: Vehicle, scale: float) -> NDArray[np.ob
     forward = poses.rotation[:, :2, 0]
     middle = poses.position[:, :2] + scale * forward * (vehicle.length / 2 - vehicle.rear_overhang)
     heading = np.arctan2(forward[:, 1], forward[:, 0])
-    return rectangles(middle, heading, vehicle.length + 1.2, vehicle.width + 0.5)
+    return rectangles(middle, heading, length=vehicle.length + 1.2, width=vehicle.width + 0.5)
 
 
 def _layer(scene: Scene, name: str) -> Layer | None:
     try:
-        return read_layer(scene.path / "features.gpkg", name, scene.frame)
+        return read_layer(scene.path / "features.gpkg", name, frame=scene.frame)
     except SceneFormatError:
         return None  # a scene without such features has no such layer
 
 
-def _polygons(layer: Layer | None, classes: tuple[str, ...], area: shapely.Geometry) -> NDArray[np.object_]:
+def _polygons(
+    layer: Layer | None, classes: tuple[str, ...], *, area: shapely.Geometry
+) -> NDArray[np.object_]:
     """Polygons of some classes that touch an area."""
     if layer is None:
         return np.empty(0, object)
@@ -275,10 +293,10 @@ def _polygons(layer: Layer | None, classes: tuple[str, ...], area: shapely.Geome
 
 
 def _union(
-    layer: Layer | None, classes: tuple[str, ...], area: shapely.Geometry, grow: float
+    layer: Layer | None, classes: tuple[str, ...], *, area: shapely.Geometry, grow: float
 ) -> shapely.Geometry | None:
     """Surfaces of some classes around an area as one, grown; None where there are none."""
-    parts = _polygons(layer, classes, area)
+    parts = _polygons(layer, classes, area=area)
     if not len(parts):
         return None
     whole = shapely.buffer(shapely.union_all(parts), grow)

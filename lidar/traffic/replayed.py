@@ -58,9 +58,9 @@ _ROOM = (0.6, 0.3)  # metres that the ego's box is longer and wider than it is t
 def replay(
     scene: Scene,
     graph: RoadGraph,
+    *,
     ego: Trajectory,
     vehicle: Vehicle,
-    *,
     seed: int,
     options: TrafficFile,
 ) -> Actors:
@@ -76,22 +76,26 @@ def replay(
     others = TrafficOptions(
         vehicles=0.0, cyclists=0.0, walkers=0.0, parked=options.parked, reach=options.reach, side=options.side
     )
-    company = company_of(scene, graph, ego, seed=seed, options=others)
+    company = company_of(scene, graph, ego=ego, seed=seed, options=others)
     begin = float(fcd.time.min()) if options.begin is None else options.begin
-    moving = _moving(fcd, begin, scene, graph, ego, vehicle, company, seed=seed)
-    parked = parked_about(scene, ego, vehicle, company, _covered(moving), seed=seed, share=options.parked)
+    moving = _moving(
+        fcd, begin, scene=scene, graph=graph, ego=ego, vehicle=vehicle, company=company, seed=seed
+    )
+    parked = parked_about(
+        scene, ego, vehicle=vehicle, company=company, swept=_covered(moving), seed=seed, share=options.parked
+    )
     return joined([moving, parked], first_feature=first_feature(scene))
 
 
 def _moving(
     fcd: Fcd,
     begin: float,
+    *,
     scene: Scene,
     graph: RoadGraph,
     ego: Trajectory,
     vehicle: Vehicle,
     company: Company,
-    *,
     seed: int,
 ) -> Actors:
     """Those of a file who move in the ego's surroundings."""
@@ -102,15 +106,15 @@ def _moving(
     for k, name in enumerate(fcd.name):
         rows = slice(fcd.first[k], fcd.first[k + 1])
         rng = generator(seed, "traffic", "fcd", name)
-        shape, grow = _body(fcd.vclass[k], float(fcd.length[k]), rng)
+        shape, grow = _body(fcd.vclass[k], float(fcd.length[k]), rng=rng)
         back = shape.length * grow[0] / 2 * scale if fcd.vclass[k] != "pedestrian" else 0.0
         time = fcd.time[rows] - begin
-        for run in _runs(time, front[rows], fcd.speed[rows], scale):
+        for run in _runs(time, front[rows], speed=fcd.speed[rows], scale=scale):
             yaw = np.unwrap(heading[rows][run])
             middle = front[rows][run] - back * np.column_stack([np.cos(yaw), np.sin(yaw)])
-            track = _sampled(time[run], middle, yaw, ego.duration_ns * 1e-9)
+            track = _sampled(time[run], middle, yaw=yaw, until=ego.duration_ns * 1e-9)
             anybody |= len(track) > 0 and bool(_inside(track[:, 1:3], scene.bounds).any())
-            for part in _about(track, scene, ego, company.area.reach * scale):
+            for part in _about(track, scene, ego=ego, reach=company.area.reach * scale):
                 shapes.append(shape)
                 stretch.append(grow)
                 parts.append(part)
@@ -124,17 +128,17 @@ def _moving(
     actors = tracked(
         scene,
         shapes,
-        stretch,
-        knots,
-        np.round(step).astype(np.int64),
-        middle,
-        yaw,
-        _hints(graph, middle, yaw, foot),
+        stretch=stretch,
+        knots=knots,
+        step=np.round(step).astype(np.int64),
+        middle=middle,
+        yaw=yaw,
+        hint=_hints(graph, middle, yaw=yaw, foot=foot),
         speed=speed,
         gone=gone / scale,
         scale=scale,
     )
-    return _without(actors, _touched(actors, ego, vehicle))
+    return _without(actors, _touched(actors, ego, vehicle=vehicle))
 
 
 def _nobody(fcd: Fcd, begin: float, *, anybody: bool) -> str:
@@ -158,7 +162,9 @@ def _in_scene(fcd: Fcd, scene: Scene) -> tuple[Float, Float]:
     return front, np.arctan2(d[:, 1], d[:, 0])
 
 
-def _body(vclass: str, length: float, rng: np.random.Generator) -> tuple[Shape, tuple[float, float, float]]:
+def _body(
+    vclass: str, length: float, *, rng: np.random.Generator
+) -> tuple[Shape, tuple[float, float, float]]:
     """A body of a class, no longer than SUMO's as far as that goes, and its factors."""
     kinds = _KINDS[vclass]
     weight = np.cumsum([MOTOR_SHARES.get(kind, 1.0) for kind in kinds])
@@ -169,7 +175,7 @@ def _body(vclass: str, length: float, rng: np.random.Generator) -> tuple[Shape, 
     return shape, (x, y, z)
 
 
-def _runs(time: Float, front: Float, speed: Float, scale: float) -> list[slice]:
+def _runs(time: Float, front: Float, *, speed: Float, scale: float) -> list[slice]:
     """Rows of one mover between which it moves on its own: not away meanwhile, not put elsewhere."""
     if len(time) < 2:
         return []
@@ -182,9 +188,9 @@ def _runs(time: Float, front: Float, speed: Float, scale: float) -> list[slice]:
     return [slice(a, b) for a, b in itertools.pairwise(ends) if b - a > 1]
 
 
-def _sampled(time: Float, middle: Float, yaw: Float, until: float) -> Float:
+def _sampled(time: Float, middle: Float, *, yaw: Float, until: float) -> Float:
     """Rows (k, 5) of step, x, y, yaw and scene metres covered, every `DT` of the drive."""
-    spread, aside = _changes(time, middle, yaw)
+    spread, aside = _changes(time, middle, yaw=yaw)
     chord = np.hypot(*np.diff(spread, axis=0).T)
     slope = chord / np.diff(time)
     speed = _monotone(slope)
@@ -221,7 +227,7 @@ def _monotone(slope: Float) -> Float:
     return np.concatenate([slope[:1], middle, slope[-1:]])
 
 
-def _changes(time: Float, middle: Float, yaw: Float) -> tuple[Float, list[tuple[float, Float]]]:
+def _changes(time: Float, middle: Float, *, yaw: Float) -> tuple[Float, list[tuple[float, Float]]]:
     """The middles (n, 2) without changes of lane at one go, and those: second of its middle, and offset."""
     d, dt = np.diff(middle, axis=0), np.diff(time)
     mean = (yaw[:-1] + yaw[1:]) / 2
@@ -242,7 +248,7 @@ def _inside(xy: Float, bounds: tuple[float, float, float, float]) -> NDArray[np.
     return np.asarray(((xy >= bounds[:2]) & (xy <= bounds[2:])).all(axis=1), np.bool_)
 
 
-def _about(track: Float, scene: Scene, ego: Trajectory, reach: float) -> list[Float]:
+def _about(track: Float, scene: Scene, *, ego: Trajectory, reach: float) -> list[Float]:
     """Parts of a track on the map that come within reach of the ego, from there to where they leave it."""
     if not len(track):
         return []
@@ -257,7 +263,7 @@ def _about(track: Float, scene: Scene, ego: Trajectory, reach: float) -> list[Fl
     ]
 
 
-def _hints(graph: RoadGraph, xy: Float, yaw: Float, foot: NDArray[np.bool_]) -> Float:
+def _hints(graph: RoadGraph, xy: Float, *, yaw: Float, foot: NDArray[np.bool_]) -> Float:
     """Height (n,) of the road that each place is on, NaN where there is none: the nearest that runs that way.
 
     foot : who goes in any direction
@@ -285,7 +291,7 @@ def _hints(graph: RoadGraph, xy: Float, yaw: Float, foot: NDArray[np.bool_]) -> 
     return out
 
 
-def _touched(actors: Actors, ego: Trajectory, vehicle: Vehicle) -> Ints:
+def _touched(actors: Actors, ego: Trajectory, *, vehicle: Vehicle) -> Ints:
     """Actors whose box the ego's touches at some time."""
     hit: list[Ints] = []
     scale = actors.scale
@@ -293,8 +299,8 @@ def _touched(actors: Actors, ego: Trajectory, vehicle: Vehicle) -> Ints:
     for t in range(0, ego.duration_ns + 1, round(DT * 1e9)):
         pose = ego.at([t])
         forward = pose.rotation[0, :2, 0]
-        rows = alive(actors, t, t)
-        at = states(actors, rows, t)
+        rows = alive(actors, t, end_ns=t)
+        at = states(actors, rows, time_ns=t)
         near = (
             np.hypot(*(at.position[:, :2] - pose.position[0, :2]).T) < (actors.size[rows, 0] + 10.0) * scale
         )
@@ -302,9 +308,11 @@ def _touched(actors: Actors, ego: Trajectory, vehicle: Vehicle) -> Ints:
         if not near.any():
             continue
         middle = pose.position[0, :2] + scale * forward * (vehicle.length / 2 - vehicle.rear_overhang)
-        own = rectangles(middle[None], np.arctan2(forward[1:], forward[:1]), length * scale, width * scale)[0]
+        own = rectangles(
+            middle[None], np.arctan2(forward[1:], forward[:1]), length=length * scale, width=width * scale
+        )[0]
         size = actors.size[rows[near]] * scale
-        boxes = rectangles(at.position[near, :2], at.angles[near, 0], size[:, 0], size[:, 1])
+        boxes = rectangles(at.position[near, :2], at.angles[near, 0], length=size[:, 0], width=size[:, 1])
         hit.append(rows[near][shapely.intersects(boxes, own)])
     return np.unique(np.concatenate(hit)) if hit else np.empty(0, np.int64)
 
@@ -331,5 +339,8 @@ def _covered(actors: Actors) -> NDArray[np.object_]:
     size = actors.size[owner] * actors.scale
     room = np.hypot(*actors.velocity[::5, :2].T) * DT * 5
     return rectangles(
-        actors.position[::5, :2], actors.angles[::5, 0], size[:, 0] + room + 0.5, size[:, 1] + 0.3
+        actors.position[::5, :2],
+        actors.angles[::5, 0],
+        length=size[:, 0] + room + 0.5,
+        width=size[:, 1] + 0.3,
     )

@@ -39,7 +39,7 @@ class Sweep:
 
 
 def sweep(
-    xy: Float, heading: Float, length: float, width: float, level: NDArray[np.int64], *, scale: float
+    xy: Float, heading: Float, *, length: float, width: float, level: NDArray[np.int64], scale: float
 ) -> Sweep:
     """What a body of that size covers along a way, a station at a time.
 
@@ -72,7 +72,7 @@ def _extended(values: Float, rows: Float) -> Float:
     return out
 
 
-def rectangles(xy: Float, heading: Float, length: ArrayLike, width: ArrayLike) -> NDArray[np.object_]:
+def rectangles(xy: Float, heading: Float, *, length: ArrayLike, width: ArrayLike) -> NDArray[np.object_]:
     """Outlines (n,) in plan of boxes about points (n, 2); length and width one number or (n,)."""
     forward = np.column_stack([np.cos(heading), np.sin(heading)]) * np.reshape(length, (-1, 1)) / 2
     left = np.column_stack([-np.sin(heading), np.cos(heading)]) * np.reshape(width, (-1, 1)) / 2

@@ -33,13 +33,13 @@ _STEEP, _BANKED = 0.3, 0.15  # radians
 def table(
     shapes: Sequence[Shape],
     stretch: ArrayLike,
+    *,
     knots: NDArray[np.int64],
     time_ns: NDArray[np.int64],
     position: Float,
     angles: Float,
     velocity: Float,
     gone: Float,
-    *,
     parked: bool,
     scale: float,
 ) -> Actors:
@@ -78,7 +78,7 @@ def table(
     )
 
 
-def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: float) -> Actors:
+def moving_actors(trips: Sequence[Trip], flow: Flow, *, scene: Scene, scale: float) -> Actors:
     """Actors of the trips that took place."""
     present, counts = np.unique(flow.trip, return_counts=True)
     ends = np.concatenate([[0], np.cumsum(counts)])
@@ -95,12 +95,12 @@ def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: flo
     return tracked(
         scene,
         [trips[row].shape for row in present],
-        [trips[row].stretch for row in present],
-        counts,
-        flow.step,
-        middle,
-        yaw,
-        hint,
+        stretch=[trips[row].stretch for row in present],
+        knots=counts,
+        step=flow.step,
+        middle=middle,
+        yaw=yaw,
+        hint=hint,
         speed=flow.speed,
         gone=flow.gone,
         scale=scale,
@@ -110,13 +110,13 @@ def moving_actors(trips: Sequence[Trip], flow: Flow, scene: Scene, *, scale: flo
 def tracked(
     scene: Scene,
     shapes: Sequence[Shape],
+    *,
     stretch: Sequence[tuple[float, float, float]],
     knots: NDArray[np.int64],
     step: NDArray[np.int64],
     middle: Float,
     yaw: Float,
     hint: Float,
-    *,
     speed: Float,
     gone: Float,
     scale: float,
@@ -132,7 +132,7 @@ def tracked(
     ends = np.concatenate([[0], np.cumsum(knots)])
     axle = np.repeat([s.base * g[0] for s, g in zip(shapes, stretch, strict=True)], knots)
     track = np.repeat([_TRACK * s.width * g[1] for s, g in zip(shapes, stretch, strict=True)], knots)
-    z, pitch, roll, _ = standing(scene, middle, yaw, hint, axle=axle, track=track, scale=scale)
+    z, pitch, roll, _ = standing(scene, middle, yaw=yaw, hint=hint, axle=axle, track=track, scale=scale)
     course, climb = np.empty(len(z)), np.empty(len(z))
     for k, shape in enumerate(shapes):
         part = slice(ends[k], ends[k + 1])
@@ -146,19 +146,19 @@ def tracked(
     return table(
         shapes,
         stretch,
-        knots,
-        np.round(step * DT * 1e9).astype(np.int64),
-        np.column_stack([middle, z]),
-        np.column_stack([yaw, pitch, roll]),
-        np.column_stack([v * np.cos(course), v * np.sin(course), climb]),
-        gone,
+        knots=knots,
+        time_ns=np.round(step * DT * 1e9).astype(np.int64),
+        position=np.column_stack([middle, z]),
+        angles=np.column_stack([yaw, pitch, roll]),
+        velocity=np.column_stack([v * np.cos(course), v * np.sin(course), climb]),
+        gone=gone,
         parked=False,
         scale=scale,
     )
 
 
 def standing(
-    scene: Scene, middle: Float, yaw: Float, hint: Float, *, axle: Float, track: Float, scale: float
+    scene: Scene, middle: Float, *, yaw: Float, hint: Float, axle: Float, track: Float, scale: float
 ) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
     """Height (n,), pitch (nose down positive) and roll of bodies that stand on the ground on four wheels.
 

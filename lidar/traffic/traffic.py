@@ -144,23 +144,29 @@ def vehicle_trips(
         edge, at = int(rng.choice(len(metres), p=metres / metres.sum())), rng.random()
         where = shapely.line_interpolate_point(area.lines[edge], at, normalized=True)
         spans = area.visits(shapely.get_coordinates(where)[0])
-        trips += [_trip(lanes, area, rng, shares, (edge, at), span, ground) for span in spans]
+        trips += [
+            _trip(lanes, area, rng=rng, shares=shares, place=(edge, at), span=span, ground=ground)
+            for span in spans
+        ]
     for wave in range(int(area.time[-1] / _WAVE_S)):
         begin = wave * _WAVE_S
-        for edge, at in entrances(lanes, area, begin):
+        for edge, at in entrances(lanes, area, t=begin):
             rng = generator(seed, "traffic", name, "wave", wave, edge)
             rate = density / 1000 * lanes.count[edge] * max(liking[edge], 0.05) * _MEAN * graph.speed[edge]
             for _ in range(rng.poisson(rate * _WAVE_S)):
                 t = begin + rng.random() * _WAVE_S
                 where = shapely.line_interpolate_point(area.lines[edge], at, normalized=True)
                 span = (t, area.until(shapely.get_coordinates(where)[0], t))
-                trips.append(_trip(lanes, area, rng, shares, (edge, at), span, ground))
+                trips.append(
+                    _trip(lanes, area, rng=rng, shares=shares, place=(edge, at), span=span, ground=ground)
+                )
     return [trip for trip in trips if trip is not None]
 
 
 def _trip(
     lanes: Lanes,
     area: Area,
+    *,
     rng: np.random.Generator,
     shares: dict[str, float],
     place: tuple[int, float],
@@ -185,19 +191,19 @@ def _trip(
     top = min(float(lanes.graph.speed.max()) * 1.1, driver.top)
     metres = min(top * (span[1] - span[0]), _FAR) + 60.0
     for _ in range(_TRIES):
-        edges, picked = wander(lanes, rng, edge, lane, metres=metres, inside=area.near, width=width)
+        edges, picked = wander(lanes, rng, edge=edge, lane=lane, metres=metres, inside=area.near, width=width)
         whole = way_along(
-            lanes, edges, picked, width=width, radius=driver.radius, scale=area.scale, kerb=driver.kerb
+            lanes, edges, picked=picked, width=width, radius=driver.radius, scale=area.scale, kerb=driver.kerb
         )
         begin = int(at * float(lanes.graph.length[edge]) / STEP)
-        first, last = _on(whole, shape, grow, ground, begin)
+        first, last = _on(whole, shape, grow=grow, ground=ground, begin=begin)
         complete = len(whole) - last <= shape.length / STEP + 4
         if not complete or last - begin < _SHORT:
             continue
         way = whole.part(first, last)
         end = edges[-1]
         leaves = bool(lanes.exit[end] or not area.near[end])
-        wish = desired_speed(way, driver, pace)
+        wish = desired_speed(way, driver, pace=pace)
         return Trip(shape, grow, way, driver, wish, begin - first, span[0], leaves)
     return None
 
@@ -224,19 +230,21 @@ def varied(rng: np.random.Generator) -> tuple[float, float, float]:
 
 
 def _on(
-    way: Way, shape: Shape, grow: Sequence[float], ground: shapely.Geometry | None, begin: int
+    way: Way, shape: Shape, *, grow: Sequence[float], ground: shapely.Geometry | None, begin: int
 ) -> tuple[int, int]:
     """First and last station (exclusive) about ``begin`` between which the body keeps to the carriageway."""
     if ground is None:
         return 0, len(way)
     xy, heading = body_poses(way, shape.base * grow[0])
-    boxes = rectangles(xy, heading, shape.length * grow[0] * way.scale, shape.width * grow[1] * way.scale)
+    boxes = rectangles(
+        xy, heading, length=shape.length * grow[0] * way.scale, width=shape.width * grow[1] * way.scale
+    )
     off = np.flatnonzero(~shapely.covers(ground, boxes))
     before, behind = off[off <= begin], off[off > begin]
     return int(before[-1]) + 1 if len(before) else 0, int(behind[0]) if len(behind) else len(way)
 
 
-def desired_speed(way: Way, driver: Driver, pace: float) -> Float:
+def desired_speed(way: Way, driver: Driver, *, pace: float) -> Float:
     """Speed (n,) that a driver wants at each station, m/s: limit, bend, and braking for what is ahead."""
     bend = np.maximum(np.abs(way.curvature), 1e-6)
     v = np.minimum(np.minimum(way.limit * pace, driver.top), np.sqrt(_LATERAL / bend))

@@ -85,8 +85,9 @@ CLOTHES: dict[str, tuple[Rgb, Rgb]] = {
 """Jackets and trousers of people."""
 
 
-def _car(length: float, width: float, height: float, profile: str, paint: Rgb) -> list[Mesh]:
+def _car(size: tuple[float, float, float], *, profile: str, paint: Rgb) -> list[Mesh]:
     """A car: body, cabin, wheels, seats, lamps, plates and mirrors."""
+    length, width, height = size
     half, w = length / 2, width / 2 - 0.01
     belt = 0.63 * height
     # stations along the body: share of the length, share of the width, bottom and top
@@ -110,7 +111,7 @@ def _car(length: float, width: float, height: float, profile: str, paint: Rgb) -
         )  # fmt: skip
     shell = loft(rings, color=paint)
     corner = sides(len(stations) - 1, 8)[:, 1]
-    shell = repainted(shell, corner == 7, "tyre", DARK)
+    shell = repainted(shell, corner == 7, material="tyre", color=DARK)
     # the cabin: where its glass begins and ends, and its roof
     start, roof0, roof1, end = {
         "sedan": (0.40, 0.10, -0.42, -0.76),
@@ -129,44 +130,83 @@ def _car(length: float, width: float, height: float, profile: str, paint: Rgb) -
     glass = loft(cabin, color=paint)
     span, side = sides(3, 4).T
     pane = ((side == 0) | (side == 2) | ((side == 1) & (span != 1))) & (span >= 0)
-    glass = repainted(glass, pane, "glass", GLASS)
+    glass = repainted(glass, pane, material="glass", color=GLASS)
     radius = 0.36 if profile == "suv" else 0.315
     base = 0.29 * length
     parts = [shell, glass]
     for x in (-base, base):
-        parts += mirrored(wheel(x, w - 0.10, radius, 0.21))
-    parts += [box((-0.62 * half, -0.8 * w, 0.3), (-0.4 * half, 0.8 * w, height - 0.35), "clothing", DARK)]
+        parts += mirrored(wheel(x, w - 0.10, radius=radius, width=0.21))
+    parts += [
+        box(
+            (-0.62 * half, -0.8 * w, 0.3),
+            (-0.4 * half, 0.8 * w, height - 0.35),
+            material="clothing",
+            color=DARK,
+        )
+    ]
     parts += mirrored(
-        box((-0.12 * half, 0.12 * w, 0.3), (0.02 * half, 0.75 * w, height - 0.32), "clothing", DARK)
+        box(
+            (-0.12 * half, 0.12 * w, 0.3),
+            (0.02 * half, 0.75 * w, height - 0.32),
+            material="clothing",
+            color=DARK,
+        )
     )
     lamp = nose - 0.14
     parts += mirrored(
-        box((0.955 * half, 0.50 * w, lamp), (half + 0.002, 0.78 * w, lamp + 0.12), "glass", WHITE)
+        box(
+            (0.955 * half, 0.50 * w, lamp),
+            (half + 0.002, 0.78 * w, lamp + 0.12),
+            material="glass",
+            color=WHITE,
+        )
     )
     rear = tail - 0.22
     parts += mirrored(
-        box((-half - 0.002, 0.55 * w, rear), (-0.955 * half, 0.84 * w, rear + 0.12), "retroreflector", RED)
+        box(
+            (-half - 0.002, 0.55 * w, rear),
+            (-0.955 * half, 0.84 * w, rear + 0.12),
+            material="retroreflector",
+            color=RED,
+        )
     )
     parts += [_plate(half - 0.012, 0.36), _plate(-half + 0.012, 0.52)]
     parts += mirrored(box((0.26 * half, w - 0.06, belt), (0.31 * half, w + 0.01, belt + 0.13), color=paint))
     return parts
 
 
-def _plate(x: float, z: float, y: float = 0.0) -> Mesh:
+def _plate(x: float, z: float, *, y: float = 0.0) -> Mesh:
     """A number plate, 520 by 110 mm, that stands 12 mm out of the body on either side of x."""
-    return box((x - 0.024, y - 0.26, z), (x + 0.024, y + 0.26, z + 0.11), "retroreflector", WHITE)
+    return box(
+        (x - 0.024, y - 0.26, z), (x + 0.024, y + 0.26, z + 0.11), material="retroreflector", color=WHITE
+    )
 
 
-def _lamps(front: float, rear: float, w: float, z: float) -> list[Mesh]:
+def _lamps(front: float, rear: float, *, w: float, z: float) -> list[Mesh]:
     """Lamps in front, reflecting lamps behind."""
     return [
-        *mirrored(box((front - 0.05, 0.62 * w, z), (front + 0.012, 0.92 * w, z + 0.16), "glass", WHITE)),
-        *mirrored(box((rear - 0.012, 0.70 * w, z), (rear + 0.05, 0.93 * w, z + 0.16), "retroreflector", RED)),
+        *mirrored(
+            box(
+                (front - 0.05, 0.62 * w, z),
+                (front + 0.012, 0.92 * w, z + 0.16),
+                material="glass",
+                color=WHITE,
+            )
+        ),
+        *mirrored(
+            box(
+                (rear - 0.012, 0.70 * w, z),
+                (rear + 0.05, 0.93 * w, z + 0.16),
+                material="retroreflector",
+                color=RED,
+            )
+        ),
     ]
 
 
-def _van(length: float, width: float, height: float, paint: Rgb) -> list[Mesh]:
+def _van(size: tuple[float, float, float], paint: Rgb) -> list[Mesh]:
     """A delivery van: a box with a sloping front."""
+    length, width, height = size
     half, w = length / 2 - 0.012, width / 2
     rings = []
     stations = (
@@ -185,17 +225,21 @@ def _van(length: float, width: float, height: float, paint: Rgb) -> list[Mesh]:
         )
     shell = loft(rings, color=paint)
     span, side = sides(5, 8).T
-    shell = repainted(shell, (side == 3) & (span == 2), "glass", GLASS)
-    shell = repainted(shell, np.isin(side, (2, 4)) & np.isin(span, (1, 2)), "glass", GLASS)
-    shell = repainted(shell, side == 7, "tyre", DARK)
-    parts = [shell, box((0.12 * half, -0.8 * w, 0.5), (0.24 * half, 0.8 * w, 1.6), "clothing", DARK)]
+    shell = repainted(shell, (side == 3) & (span == 2), material="glass", color=GLASS)
+    shell = repainted(shell, np.isin(side, (2, 4)) & np.isin(span, (1, 2)), material="glass", color=GLASS)
+    shell = repainted(shell, side == 7, material="tyre", color=DARK)
+    parts = [
+        shell,
+        box((0.12 * half, -0.8 * w, 0.5), (0.24 * half, 0.8 * w, 1.6), material="clothing", color=DARK),
+    ]
     for x in (-0.29 * length, 0.31 * length):
-        parts += mirrored(wheel(x, w - 0.11, 0.34, 0.23))
-    return [*parts, *_lamps(half, -half, w, 0.72), _plate(half - 0.01, 0.40), _plate(-half, 0.55)]
+        parts += mirrored(wheel(x, w - 0.11, radius=0.34, width=0.23))
+    return [*parts, *_lamps(half, -half, w=w, z=0.72), _plate(half - 0.01, 0.40), _plate(-half, 0.55)]
 
 
-def _truck(length: float, width: float, height: float, paint: Rgb) -> list[Mesh]:
+def _truck(size: tuple[float, float, float], paint: Rgb) -> list[Mesh]:
     """A lorry: cab, chassis and a box."""
+    length, width, height = size
     half, w = length / 2 - 0.012, width / 2
     cab = half - 1.9
     windows = [
@@ -205,23 +249,31 @@ def _truck(length: float, width: float, height: float, paint: Rgb) -> list[Mesh]
     parts = [
         box((cab, -0.97 * w, 0.55), (half, 0.97 * w, 1.55), color=paint),
         loft(windows, color=paint),
-        box((-half, -0.42 * w, 0.6), (cab + 0.1, 0.42 * w, 0.98), "metal", DARK),
+        box((-half, -0.42 * w, 0.6), (cab + 0.1, 0.42 * w, 0.98), material="metal", color=DARK),
         box((-half, -w, 0.96), (cab - 0.1, w, height), color=WHITE),
-        box((-half, -0.95 * w, 0.45), (-half + 0.08, 0.95 * w, 0.6), "metal", DARK),
+        box((-half, -0.95 * w, 0.45), (-half + 0.08, 0.95 * w, 0.6), material="metal", color=DARK),
     ]  # fmt: skip
     span, side = sides(2, 4).T
     parts[1] = repainted(
-        parts[1], ((side == 1) & (span == 1)) | (np.isin(side, (0, 2)) & (span >= 0)), "glass", GLASS
+        parts[1],
+        ((side == 1) & (span == 1)) | (np.isin(side, (0, 2)) & (span >= 0)),
+        material="glass",
+        color=GLASS,
     )
     for x in (-0.26 * length, 0.36 * length):
-        parts += mirrored(wheel(x, w - 0.15, 0.48, 0.29))
-    parts += [box((-half - 0.004, -w * 0.9, 1.0), (-half + 0.02, w * 0.9, 1.1), "retroreflector", RED)]
-    parts += _lamps(half, -half, w, 0.75)
+        parts += mirrored(wheel(x, w - 0.15, radius=0.48, width=0.29))
+    parts += [
+        box(
+            (-half - 0.004, -w * 0.9, 1.0), (-half + 0.02, w * 0.9, 1.1), material="retroreflector", color=RED
+        )
+    ]
+    parts += _lamps(half, -half, w=w, z=0.75)
     return [*parts, _plate(half - 0.01, 0.58), _plate(-half, 0.62)]
 
 
-def _bus(length: float, width: float, height: float, paint: Rgb) -> list[Mesh]:
+def _bus(size: tuple[float, float, float], paint: Rgb) -> list[Mesh]:
     """A low-floor city bus."""
+    length, width, height = size
     half, w = length / 2 - 0.012, width / 2
     rings = []
     for at, wide in ((-1.0, 0.97), (-0.99, 1.0), (0.985, 1.0), (1.0, 0.96)):
@@ -232,18 +284,28 @@ def _bus(length: float, width: float, height: float, paint: Rgb) -> list[Mesh]:
         )
     shell = loft(rings, color=paint)
     span, side = sides(3, 8).T
-    shell = repainted(shell, np.isin(side, (1, 5)) & (span == 1), "glass", GLASS)
-    shell = repainted(shell, side == 7, "tyre", DARK)
+    shell = repainted(shell, np.isin(side, (1, 5)) & (span == 1), material="glass", color=GLASS)
+    shell = repainted(shell, side == 7, material="tyre", color=DARK)
     parts = [
         shell,
-        box((half - 0.02, -0.88 * w, 1.0), (half + 0.01, 0.88 * w, height - 0.45), "glass", GLASS),
-        box((-half - 0.01, -0.80 * w, 1.5), (-half + 0.02, 0.80 * w, height - 0.6), "glass", GLASS),
-        box((-0.8 * half, -0.85 * w, 0.5), (0.75 * half, -0.25 * w, 1.35), "clothing", DARK),
-        box((-0.8 * half, 0.25 * w, 0.5), (0.75 * half, 0.85 * w, 1.35), "clothing", DARK),
+        box(
+            (half - 0.02, -0.88 * w, 1.0),
+            (half + 0.01, 0.88 * w, height - 0.45),
+            material="glass",
+            color=GLASS,
+        ),
+        box(
+            (-half - 0.01, -0.80 * w, 1.5),
+            (-half + 0.02, 0.80 * w, height - 0.6),
+            material="glass",
+            color=GLASS,
+        ),
+        box((-0.8 * half, -0.85 * w, 0.5), (0.75 * half, -0.25 * w, 1.35), material="clothing", color=DARK),
+        box((-0.8 * half, 0.25 * w, 0.5), (0.75 * half, 0.85 * w, 1.35), material="clothing", color=DARK),
     ]
     for x in (-0.24 * length, 0.27 * length):
-        parts += mirrored(wheel(x, w - 0.14, 0.48, 0.28))
-    return [*parts, *_lamps(half, -half, w, 0.62), _plate(half - 0.01, 0.40), _plate(-half + 0.01, 0.72)]
+        parts += mirrored(wheel(x, w - 0.14, radius=0.48, width=0.28))
+    return [*parts, *_lamps(half, -half, w=w, z=0.62), _plate(half - 0.01, 0.40), _plate(-half + 0.01, 0.72)]
 
 
 def _bicycle(paint: Rgb) -> list[Mesh]:
@@ -254,14 +316,14 @@ def _bicycle(paint: Rgb) -> list[Mesh]:
         ((-0.12, 0, 0.28), (0.36, 0, 0.72), 0.04), ((-0.22, 0, 0.78), (0.34, 0, 0.80), 0.035),
         ((-x, 0, r), (-0.22, 0, 0.78), 0.025), ((x, 0, r), (0.33, 0, 0.98), 0.035),
     ]  # fmt: skip
-    parts = [hoop(-x, r, 0.04), hoop(x, r, 0.04)]
-    parts += [limb(a, b, (d, d), "car_paint", paint, corners=4) for a, b, d in tubes]
+    parts = [hoop(-x, r, width=0.04), hoop(x, r, width=0.04)]
+    parts += [limb(a, b, thick=(d, d), material="car_paint", color=paint, corners=4) for a, b, d in tubes]
     parts += [
-        limb((0.33, -0.29, 1.02), (0.33, 0.29, 1.02), (0.03, 0.03), "metal", corners=4),
-        box((-0.36, -0.08, 0.88), (-0.12, 0.08, 0.94), "tyre", DARK),
-        *mirrored(box((-0.17, 0.09, 0.24), (-0.07, 0.18, 0.27), "tyre", DARK)),
-        box((-0.62, -0.04, 0.66), (-0.60, 0.04, 0.72), "retroreflector", RED),
-        box((0.40, -0.03, 0.84), (0.42, 0.03, 0.90), "retroreflector", WHITE),
+        limb((0.33, -0.29, 1.02), (0.33, 0.29, 1.02), thick=(0.03, 0.03), material="metal", corners=4),
+        box((-0.36, -0.08, 0.88), (-0.12, 0.08, 0.94), material="tyre", color=DARK),
+        *mirrored(box((-0.17, 0.09, 0.24), (-0.07, 0.18, 0.27), material="tyre", color=DARK)),
+        box((-0.62, -0.04, 0.66), (-0.60, 0.04, 0.72), material="retroreflector", color=RED),
+        box((0.40, -0.03, 0.84), (0.42, 0.03, 0.90), material="retroreflector", color=WHITE),
     ]
     return parts
 
@@ -278,19 +340,30 @@ def _motorcycle(paint: Rgb) -> list[Mesh]:
     )
     across = ((0.8, 0.0), (1.0, 0.5), (0.6, 1.0), (-0.6, 1.0), (-1.0, 0.5), (-0.8, 0.0))
     tank = [[(at, a * w, low + b * (high - low)) for a, b in across] for at, w, low, high in stations]
-    parts = [wheel(-x, 0.0, r, 0.16), wheel(x, 0.0, r, 0.12), loft(tank, color=paint)]
+    parts = [
+        wheel(-x, 0.0, radius=r, width=0.16),
+        wheel(x, 0.0, radius=r, width=0.12),
+        loft(tank, color=paint),
+    ]
     parts += [
-        box((-0.25, -0.14, 0.22), (0.32, 0.14, 0.60), "metal", DARK),
-        *mirrored(limb((x, 0.09, r), (0.44, 0.09, 0.92), (0.05, 0.05), "metal", corners=4)),
-        limb((0.40, -0.36, 0.98), (0.40, 0.36, 0.98), (0.035, 0.035), "metal", corners=4),
-        limb((-x, 0.0, r), (-0.2, 0.0, 0.36), (0.08, 0.08), "metal", DARK, corners=4),
-        box((0.52, -0.09, 0.76), (0.58, 0.09, 0.92), "glass", WHITE),
-        box((-0.90, -0.07, 0.70), (-0.86, 0.07, 0.78), "retroreflector", RED),
-        box((-0.93, -0.09, 0.46), (-0.91, 0.09, 0.60), "retroreflector", WHITE),
+        box((-0.25, -0.14, 0.22), (0.32, 0.14, 0.60), material="metal", color=DARK),
+        *mirrored(limb((x, 0.09, r), (0.44, 0.09, 0.92), thick=(0.05, 0.05), material="metal", corners=4)),
+        limb((0.40, -0.36, 0.98), (0.40, 0.36, 0.98), thick=(0.035, 0.035), material="metal", corners=4),
+        limb((-x, 0.0, r), (-0.2, 0.0, 0.36), thick=(0.08, 0.08), material="metal", color=DARK, corners=4),
+        box((0.52, -0.09, 0.76), (0.58, 0.09, 0.92), material="glass", color=WHITE),
+        box((-0.90, -0.07, 0.70), (-0.86, 0.07, 0.78), material="retroreflector", color=RED),
+        box((-0.93, -0.09, 0.46), (-0.91, 0.09, 0.60), material="retroreflector", color=WHITE),
     ]
     return [
         *parts,
-        *rider((-0.22, 0.84), (0.38, 1.0), (0.05, 0.34), 1.78, ((40, 40, 46), (30, 30, 34)), helmet=paint),
+        *rider(
+            (-0.22, 0.84),
+            (0.38, 1.0),
+            foot=(0.05, 0.34),
+            stature=1.78,
+            clothes=((40, 40, 46), (30, 30, 34)),
+            helmet=paint,
+        ),
     ]
 
 
@@ -328,9 +401,9 @@ STATURE = {"adult": 1.78, "small_adult": 1.64, "child": 1.25}
 
 def _parts(kind: str, paint: Rgb) -> list[Mesh]:
     if kind in ("sedan", "hatchback", "suv"):
-        return _car(*_SIZES[kind][:3], kind, paint)
+        return _car(_SIZES[kind][:3], profile=kind, paint=paint)
     if kind in ("van", "truck", "bus"):
-        return {"van": _van, "truck": _truck, "bus": _bus}[kind](*_SIZES[kind][:3], paint)
+        return {"van": _van, "truck": _truck, "bus": _bus}[kind](_SIZES[kind][:3], paint)
     return _motorcycle(paint) if kind == "motorcycle" else _bicycle(paint)
 
 
@@ -348,7 +421,9 @@ def catalogue() -> dict[str, Shape]:
         pedals = [
             [
                 *_bicycle(clothes[0]),
-                *rider((-0.22, 0.95), (0.33, 1.03), (-0.12, 0.28), 1.76, clothes, crank=turn),
+                *rider(
+                    (-0.22, 0.95), (0.33, 1.03), foot=(-0.12, 0.28), stature=1.76, clothes=clothes, crank=turn
+                ),
             ]
             for turn in np.pi / 2 * np.arange(STRIDE)
         ]
@@ -356,7 +431,8 @@ def catalogue() -> dict[str, Shape]:
     for kind, tall in STATURE.items():
         for name, clothes in CLOTHES.items():
             poses = [
-                person(tall, clothes, phase) for phase in (*(2 * np.pi / STRIDE * np.arange(STRIDE)), None)
+                person(tall, clothes, phase=phase)
+                for phase in (*(2 * np.pi / STRIDE * np.arange(STRIDE)), None)
             ]
             made += [(f"{kind}/{name}/{k}", kind, 0.4, parts) for k, parts in enumerate(poses)]
     figures: dict[str, list[tuple[str, str, float, Mesh]]] = {}

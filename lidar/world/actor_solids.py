@@ -22,7 +22,7 @@ RED: Rgb = (170, 20, 20)
 WHITE: Rgb = (238, 238, 232)
 
 
-def painted(points: Float, faces: NDArray[np.integer], material: str, color: Rgb | None = None) -> Mesh:
+def painted(points: Float, faces: NDArray[np.integer], *, material: str, color: Rgb | None = None) -> Mesh:
     """A closed mesh of one material, without a class yet; in the material's colour by default.
 
     Faces may all face inwards: they are turned if they do.
@@ -32,7 +32,7 @@ def painted(points: Float, faces: NDArray[np.integer], material: str, color: Rgb
     return mesh if volume(mesh) > 0 else replace(mesh, faces=mesh.faces[:, ::-1].copy())
 
 
-def repainted(mesh: Mesh, faces: NDArray[np.bool_], material: str, color: Rgb | None = None) -> Mesh:
+def repainted(mesh: Mesh, faces: NDArray[np.bool_], *, material: str, color: Rgb | None = None) -> Mesh:
     """The mesh with another material on some of its faces."""
     of = materials()[material]
     return replace(
@@ -48,7 +48,7 @@ def body(parts: Sequence[Mesh], klass: Class) -> Mesh:
     return replace(whole, klass=np.full(len(whole), klass, np.uint8))
 
 
-def loft(rings: ArrayLike, material: str = "car_paint", color: Rgb | None = None) -> Mesh:
+def loft(rings: ArrayLike, material: str = "car_paint", *, color: Rgb | None = None) -> Mesh:
     """The closed solid through rings (k, n, 3) of corners, all the same way round.
 
     Faces are in the order: two for each side of each span between rings, then the lids at the first and the
@@ -67,7 +67,12 @@ def loft(rings: ArrayLike, material: str = "car_paint", color: Rgb | None = None
         axis=2,
     ).reshape(-1, 3)
     fan = np.column_stack([np.zeros(n - 2, int), ring[1:-1], ring[2:]])
-    return painted(points.reshape(-1, 3), np.vstack([side, fan, fan[:, ::-1] + n * (k - 1)]), material, color)
+    return painted(
+        points.reshape(-1, 3),
+        np.vstack([side, fan, fan[:, ::-1] + n * (k - 1)]),
+        material=material,
+        color=color,
+    )
 
 
 def sides(spans: int, corners: int) -> NDArray[np.int64]:
@@ -80,9 +85,9 @@ def sides(spans: int, corners: int) -> NDArray[np.int64]:
 def box(
     low: Sequence[float],
     high: Sequence[float],
+    *,
     material: str = "car_paint",
     color: Rgb | None = None,
-    *,
     taper: tuple[float, float] = (1.0, 1.0),
 ) -> Mesh:
     """A box between two corners; ``taper`` is the top's size along x and y against the bottom's."""
@@ -90,7 +95,7 @@ def box(
     floor = np.array([[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]])
     middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2, 0.0])
     lid = (floor - middle) * [*taper, 1.0] + middle + [0.0, 0.0, z1 - z0]
-    return loft(np.stack([floor, lid])[:, ::-1], material, color)
+    return loft(np.stack([floor, lid])[:, ::-1], material, color=color)
 
 
 def mirrored(mesh: Mesh) -> list[Mesh]:
@@ -99,7 +104,7 @@ def mirrored(mesh: Mesh) -> list[Mesh]:
     return [mesh, other]
 
 
-def wheel(x: float, y: float, radius: float, width: float, *, corners: int = 10) -> Mesh:
+def wheel(x: float, y: float, *, radius: float, width: float, corners: int = 10) -> Mesh:
     """A wheel about (x, y) that stands on the ground: a tyre with a disc of metal on both sides."""
     turn = 2 * np.pi * np.arange(corners) / corners
     rings = []
@@ -111,10 +116,10 @@ def wheel(x: float, y: float, radius: float, width: float, *, corners: int = 10)
             )
         )
     tyre = loft(np.array(rings), "tyre")
-    return repainted(tyre, sides(3, corners)[:, 0] < 0, "metal")
+    return repainted(tyre, sides(3, corners)[:, 0] < 0, material="metal")
 
 
-def hoop(x: float, radius: float, width: float, *, corners: int = 12) -> Mesh:
+def hoop(x: float, radius: float, *, width: float, corners: int = 12) -> Mesh:
     """A bicycle's wheel in the plane y = 0 that stands on the ground at x: a tyre, without spokes."""
     turn = 2 * np.pi * np.arange(corners) / corners
     ring = np.column_stack([np.cos(turn), np.zeros(corners), np.sin(turn)])
@@ -136,16 +141,16 @@ def hoop(x: float, radius: float, width: float, *, corners: int = 12) -> Mesh:
             np.column_stack([p + here, q + ahead, q + here]),
             np.column_stack([p + here, p + ahead, q + ahead]),
         ]
-    return painted(tubes.reshape(-1, 3) + np.array([x, 0.0, radius]), np.vstack(faces), "tyre")
+    return painted(tubes.reshape(-1, 3) + np.array([x, 0.0, radius]), np.vstack(faces), material="tyre")
 
 
 def limb(
     start: ArrayLike,
     end: ArrayLike,
+    *,
     thick: tuple[float, float],
     material: str = "clothing",
     color: Rgb | None = None,
-    *,
     flat: float = 1.0,
     corners: int = 6,
 ) -> Mesh:
@@ -158,13 +163,13 @@ def limb(
     v = np.cross(along, u)
     turn = -2 * np.pi * np.arange(corners) / corners
     ring = np.outer(np.cos(turn), u) * flat + np.outer(np.sin(turn), v)
-    return loft(np.stack([a + ring * thick[0] / 2, b + ring * thick[1] / 2]), material, color)
+    return loft(np.stack([a + ring * thick[0] / 2, b + ring * thick[1] / 2]), material, color=color)
 
 
-def ball(centre: ArrayLike, size: Sequence[float], material: str, color: Rgb | None = None) -> Mesh:
+def ball(centre: ArrayLike, size: Sequence[float], *, material: str, color: Rgb | None = None) -> Mesh:
     """An ellipsoid of 48 faces of the given sizes along x, y and z."""
     points, faces = lathe([(0, -0.5), (0.7, -0.35), (1.0, 0.0), (0.7, 0.35), (0, 0.5)], sides=8)
-    return painted(points * size + np.asarray(centre, float), faces, material, color)
+    return painted(points * size + np.asarray(centre, float), faces, material=material, color=color)
 
 
 def volume(mesh: Mesh) -> float:

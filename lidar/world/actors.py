@@ -85,14 +85,14 @@ class States:
     gone: Float
 
 
-def alive(actors: Actors, start_ns: int, end_ns: int) -> NDArray[np.int64]:
+def alive(actors: Actors, start_ns: int, *, end_ns: int) -> NDArray[np.int64]:
     """Actors (k,) that are there at some time of a span."""
     begin = actors.time_ns[actors.first[:-1]]
     end = actors.time_ns[actors.first[1:] - 1]
     return np.flatnonzero(actors.parked | ((begin <= end_ns) & (end >= start_ns)))
 
 
-def states(actors: Actors, rows: ArrayLike, time_ns: ArrayLike) -> States:
+def states(actors: Actors, rows: ArrayLike, *, time_ns: ArrayLike) -> States:
     """Where actors (k,) are at times (k,); held at the ends of their tracks.
 
     Cubic between knots in position (Hermite, with the knots' velocities), linear in angles.
@@ -127,7 +127,7 @@ def states(actors: Actors, rows: ArrayLike, time_ns: ArrayLike) -> States:
 
 def velocities(actors: Actors, time_ns: int) -> Float:
     """Velocities (n, 3) of all actors at a time, scene metres a second."""
-    return states(actors, np.arange(len(actors)), time_ns).velocity
+    return states(actors, np.arange(len(actors)), time_ns=time_ns).velocity
 
 
 def rotations(angles: Float) -> Float:
@@ -146,7 +146,7 @@ def actor_shapes(actors: Actors) -> list[Mesh]:
     return [shape.mesh for shape in actors.shapes]
 
 
-def poses_of(actors: Actors, rows: NDArray[np.int64], at: States) -> NDArray[np.int32]:
+def poses_of(actors: Actors, rows: NDArray[np.int64], *, at: States) -> NDArray[np.int32]:
     """Bodies (k,) of actors in their states: walkers and riders take the pose of their stride."""
     step = at.gone / actors.stride[rows] * actors.poses[rows]
     shape: NDArray[np.int32] = actors.shape[rows] + step.astype(np.int32) % actors.poses[rows]
@@ -156,8 +156,8 @@ def poses_of(actors: Actors, rows: NDArray[np.int64], at: States) -> NDArray[np.
 def actor_transforms(
     actors: Actors,
     start_ns: int,
-    end_ns: int,
     *,
+    end_ns: int,
     region: Region | None = None,
     moments: int = 3,
     which: Literal["all", "moving", "parked"] = "all",
@@ -169,16 +169,16 @@ def actor_transforms(
     which   : those that ever move, those that never do, or all
     moments : poses within the span; a car that turns at 0.5 rad/s is off by 0.1 mm between three in 0.1 s
     """
-    rows = alive(actors, start_ns, end_ns)
+    rows = alive(actors, start_ns, end_ns=end_ns)
     if which != "all":
         rows = rows[actors.parked[rows] == (which == "parked")]
     times = np.linspace(start_ns, end_ns, moments).astype(np.int64)
     k = len(rows)
-    at = states(actors, np.repeat(rows, moments), np.tile(times, k))
+    at = states(actors, np.repeat(rows, moments), time_ns=np.tile(times, k))
     turn = rotations(at.angles) * actors.stretch[np.repeat(rows, moments), None, :]
     turn[:, :2] *= actors.scale
     transform = np.concatenate([turn, at.position[:, :, None]], axis=2).reshape(k, moments, 3, 4)
-    shape = poses_of(actors, rows, States(*(getattr(at, f.name)[::moments] for f in fields(States))))
+    shape = poses_of(actors, rows, at=States(*(getattr(at, f.name)[::moments] for f in fields(States))))
     if region is not None:
         x, y = transform[:, 0, :2, 3].T
         reach = actors.size[rows, 0]

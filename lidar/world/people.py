@@ -19,13 +19,13 @@ _SKIN: Rgb = (198, 152, 122)
 _HAIR: Rgb = (62, 46, 36)
 
 
-def person(stature: float, clothes: Clothes, phase: float | None) -> list[Mesh]:
+def person(stature: float, clothes: Clothes, *, phase: float | None) -> list[Mesh]:
     """A person who walks along x; ``phase`` 0 to 2 pi of a stride of two steps, None for standing."""
     jacket, trousers = clothes
     h = stature
     swing = 0.0 if phase is None else _SWING * np.sin(phase)
     lift = 0.0 if phase is None else max(np.cos(phase), 0.0)
-    parts = _trunk((0.0, _HIP * h), (0.0, _SHOULDER * h), h, jacket)
+    parts = _trunk((0.0, _HIP * h), (0.0, _SHOULDER * h), h=h, jacket=jacket)
     parts += _head((0.0, _CHIN * h), h)
     for side, angle, bend in (
         (1, swing, lift),
@@ -36,27 +36,29 @@ def person(stature: float, clothes: Clothes, phase: float | None) -> list[Mesh]:
         shin = angle - 0.5 * bend
         ankle = knee + 0.24 * h * np.array([np.sin(shin), 0.0, -np.cos(shin)])
         parts += [
-            limb(hip, knee, (0.105 * h, 0.075 * h), color=trousers),
-            limb(knee, ankle, (0.075 * h, 0.05 * h), color=trousers),
+            limb(hip, knee, thick=(0.105 * h, 0.075 * h), color=trousers),
+            limb(knee, ankle, thick=(0.075 * h, 0.05 * h), color=trousers),
             limb(
                 ankle - np.array([0.03 * h, 0, 0.015 * h]),
                 ankle + np.array([0.10 * h, 0, -0.02 * h]),
-                (0.05 * h, 0.04 * h),
-                "tyre",
-                DARK,
+                thick=(0.05 * h, 0.04 * h),
+                material="tyre",
+                color=DARK,
             ),
         ]
-        parts += _arm(np.array([0.0, side * 0.125 * h, 0.80 * h]), -0.8 * angle, 0.25, h, jacket)
+        parts += _arm(
+            np.array([0.0, side * 0.125 * h, 0.80 * h]), -0.8 * angle, bend=0.25, h=h, jacket=jacket
+        )
     return _grounded(parts)
 
 
 def rider(
     seat: tuple[float, float],
     grip: tuple[float, float],
+    *,
     foot: tuple[float, float],
     stature: float,
     clothes: Clothes,
-    *,
     crank: float | None = None,
     helmet: Rgb | None = None,
 ) -> list[Mesh]:
@@ -69,36 +71,36 @@ def rider(
     h = stature
     lean = 0.42 if crank is not None else 0.3
     top = (seat[0] + 0.30 * h * np.sin(lean), seat[1] + 0.30 * h * np.cos(lean))
-    parts = _trunk(seat, top, h, jacket)
-    parts += _head((top[0] + 0.02 * h, top[1] + 0.05 * h), h, helmet)
+    parts = _trunk(seat, top, h=h, jacket=jacket)
+    parts += _head((top[0] + 0.02 * h, top[1] + 0.05 * h), h, helmet=helmet)
     for side in (1, -1):
         turn = 0.0 if crank is None else crank + (0.0 if side > 0 else np.pi)
         reach = 0.0 if crank is None else 0.17
         hip = np.array([seat[0], side * 0.05 * h, seat[1]])
         ankle = np.array([foot[0] + reach * np.cos(turn), side * 0.09, foot[1] + 0.08 + reach * np.sin(turn)])
-        knee = _joint(hip, ankle, 0.26 * h, 0.25 * h)
+        knee = _joint(hip, ankle, first=0.26 * h, second=0.25 * h)
         parts += [
-            limb(hip, knee, (0.10 * h, 0.075 * h), color=trousers),
-            limb(knee, ankle, (0.075 * h, 0.05 * h), color=trousers),
+            limb(hip, knee, thick=(0.10 * h, 0.075 * h), color=trousers),
+            limb(knee, ankle, thick=(0.075 * h, 0.05 * h), color=trousers),
             limb(
                 ankle - np.array([0.05, 0, 0.03]),
                 ankle + np.array([0.16, 0, -0.03]),
-                (0.08, 0.06),
-                "tyre",
-                DARK,
+                thick=(0.08, 0.06),
+                material="tyre",
+                color=DARK,
             ),
         ]
         shoulder = np.array([top[0], side * 0.115 * h, top[1] - 0.02 * h])
         hand = np.array([grip[0], side * 0.24, grip[1]])
         elbow = (shoulder + hand) / 2 + [-0.02, side * 0.05, -0.06]
         parts += [
-            limb(shoulder, elbow, (0.055 * h, 0.045 * h), color=jacket),
-            limb(elbow, hand, (0.045 * h, 0.035 * h), color=jacket),
+            limb(shoulder, elbow, thick=(0.055 * h, 0.045 * h), color=jacket),
+            limb(elbow, hand, thick=(0.045 * h, 0.035 * h), color=jacket),
         ]
     return parts
 
 
-def _trunk(low: tuple[float, float], high: tuple[float, float], h: float, jacket: Rgb) -> list[Mesh]:
+def _trunk(low: tuple[float, float], high: tuple[float, float], *, h: float, jacket: Rgb) -> list[Mesh]:
     turn = -2 * np.pi * np.arange(8) / 8
     rings = []
     for share, deep, wide in (
@@ -111,31 +113,43 @@ def _trunk(low: tuple[float, float], high: tuple[float, float], h: float, jacket
     ):
         x, z = (a + share * (b - a) for a, b in zip(low, high, strict=True))
         rings.append(np.column_stack([x + deep * h * np.cos(turn), wide * h * np.sin(turn), np.full(8, z)]))
-    return [loft(np.array(rings), "clothing", jacket)]
+    return [loft(np.array(rings), "clothing", color=jacket)]
 
 
-def _head(chin: tuple[float, float], h: float, helmet: Rgb | None = None) -> list[Mesh]:
+def _head(chin: tuple[float, float], h: float, *, helmet: Rgb | None = None) -> list[Mesh]:
     x, z = chin
-    face = ball((x + 0.005, 0.0, z + 0.062 * h), (0.115 * h, 0.09 * h, 0.125 * h), "skin", _SKIN)
+    face = ball(
+        (x + 0.005, 0.0, z + 0.062 * h), (0.115 * h, 0.09 * h, 0.125 * h), material="skin", color=_SKIN
+    )
     if helmet is not None:
-        return [face, ball((x, 0.0, z + 0.075 * h), (0.15 * h, 0.135 * h, 0.13 * h), "car_paint", helmet)]
+        return [
+            face,
+            ball(
+                (x, 0.0, z + 0.075 * h), (0.15 * h, 0.135 * h, 0.13 * h), material="car_paint", color=helmet
+            ),
+        ]
     return [
         face,
-        ball((x - 0.012 * h, 0.0, z + 0.078 * h), (0.112 * h, 0.098 * h, 0.104 * h), "clothing", _HAIR),
+        ball(
+            (x - 0.012 * h, 0.0, z + 0.078 * h),
+            (0.112 * h, 0.098 * h, 0.104 * h),
+            material="clothing",
+            color=_HAIR,
+        ),
     ]
 
 
-def _arm(shoulder: Float, angle: float, bend: float, h: float, jacket: Rgb) -> list[Mesh]:
+def _arm(shoulder: Float, angle: float, *, bend: float, h: float, jacket: Rgb) -> list[Mesh]:
     elbow = shoulder + 0.17 * h * np.array([np.sin(angle), 0.0, -np.cos(angle)])
     hand = elbow + 0.15 * h * np.array([np.sin(angle + bend), 0.0, -np.cos(angle + bend)])
     return [
-        limb(shoulder, elbow, (0.055 * h, 0.045 * h), color=jacket),
-        limb(elbow, hand, (0.045 * h, 0.035 * h), color=jacket),
-        ball(hand, (0.05 * h, 0.03 * h, 0.055 * h), "skin", _SKIN),
+        limb(shoulder, elbow, thick=(0.055 * h, 0.045 * h), color=jacket),
+        limb(elbow, hand, thick=(0.045 * h, 0.035 * h), color=jacket),
+        ball(hand, (0.05 * h, 0.03 * h, 0.055 * h), material="skin", color=_SKIN),
     ]
 
 
-def _joint(a: Float, b: Float, first: float, second: float) -> Float:
+def _joint(a: Float, b: Float, *, first: float, second: float) -> Float:
     """The knee between hip and ankle, bent forwards: where two bars of given lengths meet."""
     d = b - a
     far = min(float(np.linalg.norm(d)), 0.999 * (first + second))

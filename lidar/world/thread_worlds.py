@@ -17,7 +17,7 @@ class Worlds:
     actors : what moves; none by default
     """
 
-    def __init__(self, scene: Scene, margin: float, actors: Actors | None = None) -> None:
+    def __init__(self, scene: Scene, margin: float, *, actors: Actors | None = None) -> None:
         self.scene = scene
         self.margin = margin
         self.actors = actors if actors is not None and len(actors) else None
@@ -44,7 +44,8 @@ class Worlds:
         if self.actors is not None:
             m = self.margin
             around = (region[0] - m, region[1] - m, region[2] + m, region[3] + m)
-            world.place_actors(*actor_transforms(self.actors, start_ns, end_ns, region=around))
+            shape, transform, feature = actor_transforms(self.actors, start_ns, end_ns=end_ns, region=around)
+            world.place_actors(shape, transform, feature=feature)
         return world
 
     def _moved(self, world: World | None, region: Region) -> World:

@@ -29,7 +29,7 @@ class Visibility:
         self._place = np.stack([p for p, _ in places]) if places else np.empty((0, _SAMPLES, 3))
         self._normal = np.stack([n for _, n in places]) if places else np.empty((0, _SAMPLES, 3))
 
-    def seen_from(self, eye: ArrayLike, world: World, rows: NDArray[np.int64], time_ns: int) -> Float:
+    def seen_from(self, eye: ArrayLike, world: World, *, rows: NDArray[np.int64], time_ns: int) -> Float:
         """Share (k,) of each of the actors ``rows`` that is seen from ``eye``, 0 to 1.
 
         It is the share of the side that faces the eye, by solid angle, which no other thing hides. Actors are
@@ -41,8 +41,8 @@ class Visibility:
         k = len(rows)
         if not k:
             return np.empty(0)
-        at = states(actors, rows, time_ns)
-        body = poses_of(actors, rows, at)
+        at = states(actors, rows, time_ns=time_ns)
+        body = poses_of(actors, rows, at=at)
         turn, stretch = rotations(at.angles), actors.stretch[rows][:, None]
         across = np.array([actors.scale, actors.scale, 1.0])
         place = np.einsum("kij,knj->kni", turn, self._place[body] * stretch) * across + at.position[:, None]

@@ -162,7 +162,7 @@ class World:
 
         What rays hit depends on the region alone, not on the regions before.
         """
-        ranks = _touching(self.scene, region, self.margin + _OVERHANG)
+        ranks = _touching(self.scene, region, margin=self.margin + _OVERHANG)
         if not ranks:
             raise InputError(
                 f"no tile of {self.scene.path} lies in {tuple(round(float(v), 1) for v in region)};"
@@ -187,7 +187,7 @@ class World:
             instances=[self._still, self._moving[0]],
         )
 
-    def place_actors(self, shape: NDArray[np.int32], transform: Float, feature: NDArray[np.int32]) -> None:
+    def place_actors(self, shape: NDArray[np.int32], transform: Float, *, feature: NDArray[np.int32]) -> None:
         """Put actors into this world, in place of those there were; its static part is not built again.
 
         shape     : (k,) int32, index into the ``actors`` of the world
@@ -215,7 +215,9 @@ class World:
     def _read(self, rank: int) -> _Tile:
         tile = self.scene.tile(*self.scene.tile_indices[rank])
         mesh, copies = tile.mesh, tile.instances
-        parts = split(mesh.vertices + (tile.origin - self.caster.origin), mesh.faces, _bits(mesh.material))
+        parts = split(
+            mesh.vertices + (tile.origin - self.caster.origin), mesh.faces, mask=_bits(mesh.material)
+        )
         transform = copies.transform.copy()
         transform[:, :, 3] += tile.origin
         return _Tile(
@@ -278,7 +280,7 @@ def _nothing(shapes: tuple[Caster, ...]) -> tuple[Instances, NDArray[np.int32]]:
     return Instances(shapes, none, np.empty((0, 3, 4))), none
 
 
-def _touching(scene: Scene, region: Region, margin: float) -> list[int]:
+def _touching(scene: Scene, region: Region, *, margin: float) -> list[int]:
     """Ranks among the scene's tiles of those that touch a region grown by a margin."""
     ij = np.array(scene.tile_indices, float).reshape(-1, 2)
     low, high = ij * scene.tile_size, (ij + 1) * scene.tile_size

@@ -29,7 +29,7 @@ def osm():
 
 @pytest.fixture(scope="module")
 def scene(osm, tmp_path_factory):
-    return build(osm, tmp_path_factory.mktemp("scene") / "demo", BuildOptions(name="demo"))
+    return build(osm, tmp_path_factory.mktemp("scene") / "demo", options=BuildOptions(name="demo"))
 
 
 def test_every_solid_is_closed_oriented_and_of_positive_volume(scene):
@@ -132,7 +132,7 @@ def same_files(a, b):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_same_map_is_the_same_bytes_for_any_number_of_workers(osm, scene, tmp_path, workers):
-    again = build(osm, tmp_path / "again", BuildOptions(name="demo"), workers=workers)
+    again = build(osm, tmp_path / "again", options=BuildOptions(name="demo"), workers=workers)
     same_files(scene.path, again.path)
 
 
@@ -148,10 +148,10 @@ def test_a_killed_build_goes_on_and_ends_with_the_same_bytes(osm, scene, tmp_pat
 
     monkeypatch.setattr(geoscene.tiles, "build_tile", dying)
     with pytest.raises(KeyboardInterrupt):
-        build(osm, tmp_path / "scene", BuildOptions(name="demo"))
+        build(osm, tmp_path / "scene", options=BuildOptions(name="demo"))
     assert not (tmp_path / "scene").exists()
     monkeypatch.setattr(geoscene.tiles, "build_tile", lambda *a, **o: made.append(a) or whole(*a, **o))
-    again = build(osm, tmp_path / "scene", BuildOptions(name="demo"))
+    again = build(osm, tmp_path / "scene", options=BuildOptions(name="demo"))
     assert len(made) == len(scene.tile_indices)  # no tile twice
     same_files(scene.path, again.path)
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
@@ -168,16 +168,16 @@ def test_a_rebuild_makes_anew_only_what_the_options_change(
     whole = geoscene.tiles.ground_tile
     monkeypatch.setattr(geoscene.tiles, "ground_tile", lambda *a, **o: made.append(a) or whole(*a, **o))
     options = BuildOptions(**({"name": "demo"} | change))
-    again = build(osm, tmp_path / "scene", options, overwrite=True)
+    again = build(osm, tmp_path / "scene", options=options, overwrite=True)
     assert len(made) == grounds * len(again.tile_indices)
-    same_files(build(osm, tmp_path / "fresh", options).path, again.path)
+    same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
 
 
 def test_tiles_along_a_route_are_the_tiles_of_the_whole_scene(osm, tmp_path):
     along = ("60.1665,24.9420", "60.1668,24.9440")
     options = BuildOptions(name="demo", along=along, reach=20.0, tile_size=100.0)
-    part = build(osm, tmp_path / "part", options)
-    whole = build(osm, tmp_path / "whole", BuildOptions(name="demo", tile_size=100.0))
+    part = build(osm, tmp_path / "part", options=options)
+    whole = build(osm, tmp_path / "whole", options=BuildOptions(name="demo", tile_size=100.0))
     assert 0 < len(part.tile_indices) < len(whole.tile_indices)
     for i, j in part.tile_indices:
         name = f"tiles/{i}_{j}.npz"
@@ -185,7 +185,7 @@ def test_tiles_along_a_route_are_the_tiles_of_the_whole_scene(osm, tmp_path):
 
 
 def test_only_what_is_asked_for_is_built(osm, tmp_path):
-    scene = build(osm, tmp_path / "s", BuildOptions(only=("buildings",)))
+    scene = build(osm, tmp_path / "s", options=BuildOptions(only=("buildings",)))
     counts = scene.manifest["counts"]
     assert counts["solids"] > 20
     assert counts["trees"] == counts["furniture"] == counts["barriers"] == counts["road_edges"] == 0

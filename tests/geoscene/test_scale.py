@@ -43,7 +43,7 @@ def town(make_osm, tmp_path_factory):
 @pytest.fixture(scope="module")
 def scene(town, tmp_path_factory):
     options = BuildOptions(tile_size=100.0, lod=1)
-    return build(read_osm(town), tmp_path_factory.mktemp("whole") / "scene", options)
+    return build(read_osm(town), tmp_path_factory.mktemp("whole") / "scene", options=options)
 
 
 def files_of(folder):
@@ -76,7 +76,7 @@ def test_who_holds_a_place_is_found_without_looking_at_what_is_far(monkeypatch):
     x, y = np.mgrid[0:100, 0:100].reshape(2, -1) * 10.0
     layers = Layers.of(shapely.box(x, y, x + 9.0, y + 9.0), klass=1, material=1, priority=0.0)
     plan = plan_ground((0, 0, 1000, 1000), layers, tile_size=50.0)
-    cells = partition_tile(plan, 3, 4)
+    cells = partition_tile(plan, 3, j=4)
     assert len(cells) == 26  # five by five squares and what is between them
     assert 25 <= sum(prepared) <= 49
     assert not shapely.is_prepared(layers.polygon).any()  # nothing stays behind
@@ -135,7 +135,7 @@ def test_a_long_wall_is_seen_from_its_end(make_osm, town, tmp_path):
     osm = read_osm(town)
     wall = Way("way/999999", {"barrier": "wall"}, np.array([-1, -2]), lonlat[2:])
     without, walled = (
-        build(replace(osm, ways=ways), tmp_path / name, options)
+        build(replace(osm, ways=ways), tmp_path / name, options=options)
         for name, ways in (("without", osm.ways), ("walled", [*osm.ways, wall]))
     )
     (home,) = set(walled.tile_indices) - set(without.tile_indices)
@@ -176,14 +176,14 @@ def test_a_drive_is_the_same_bytes_on_the_tiles_along_its_route(make_osm, town, 
     route = tuple((lat, lon) for lon, lat in lonlat.tolist())
     along = tuple(f"{lat},{lon}" for lat, lon in route)
     options = BuildOptions(tile_size=100.0, lod=1, along=along, reach=100.0)
-    part = build(read_osm(town), tmp_path / "part", options)
+    part = build(read_osm(town), tmp_path / "part", options=options)
     assert len(part.tile_indices) < 0.7 * len(scene.tile_indices)
     assert part.layers == scene.layers
     for i, j in part.tile_indices:
         name = f"tiles/{i}_{j}.npz"
         assert (part.path / name).read_bytes() == (scene.path / name).read_bytes()
     words = DriveOptions(route=route, rig="vlp16", duration=2.0, formats=("pcd",))
-    drives = [drive(s, tmp_path / s.path.name / "drive", words).path for s in (scene, part)]
+    drives = [drive(s, tmp_path / s.path.name / "drive", options=words).path for s in (scene, part)]
     clouds = [{p.relative_to(d): p.read_bytes() for p in d.rglob("*.pcd")} for d in drives]
     assert len(clouds[0]) == 20
     assert clouds[0] == clouds[1]

@@ -39,20 +39,20 @@ def _solid(points, faces, feature, wall=16, roof=21):
 
 def buildings():
     """One mesh of four buildings; the last is turned, tapered and 100 m up a tower."""
-    box = _solid(*prism(rectangle(10, 20, x=12.5, y=-20.25), 0.0, 30.0), 0)
-    west = _solid(*prism(rectangle(8, 8, x=-80, y=60), 1.0, 11.0), 1)
-    east = _solid(*prism(rectangle(8, 8, x=-60, y=60), 1.0, 11.0), 1)
-    outer = _solid(*prism(rectangle(20, 20, x=60, y=60), 0.0, 20.0), 2)
-    points, faces = prism(rectangle(10, 10, x=60, y=60), 5.0, 15.0)
+    box = _solid(*prism(rectangle(10, 20, x=12.5, y=-20.25), 0.0, top=30.0), 0)
+    west = _solid(*prism(rectangle(8, 8, x=-80, y=60), 1.0, top=11.0), 1)
+    east = _solid(*prism(rectangle(8, 8, x=-60, y=60), 1.0, top=11.0), 1)
+    outer = _solid(*prism(rectangle(20, 20, x=60, y=60), 0.0, top=20.0), 2)
+    points, faces = prism(rectangle(10, 10, x=60, y=60), 5.0, top=15.0)
     cavity = _solid(points, faces[:, ::-1], 2)
     turn = np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
-    tower = _solid(*prism(rectangle(11.3, 7.7) @ turn, 2.0, 140.0, taper=0.4), 3)
+    tower = _solid(*prism(rectangle(11.3, 7.7) @ turn, 2.0, top=140.0, taper=0.4), 3)
     return concatenate([box, west, east, outer, cavity, tower.shifted([-30.5, -60.25, 0])])
 
 
 def hedge(feature):
     """A hedge of two bodies."""
-    made = [prism(rectangle(6, 1, x=x, y=-80), -1.0, 2.0) for x in (60, 70)]
+    made = [prism(rectangle(6, 1, x=x, y=-80), -1.0, top=2.0) for x in (60, 70)]
     return concatenate(
         [
             Mesh.of(*solid, feature=feature, klass=Class.HEDGE, material=12, color=(66, 112, 48), closed=True)
@@ -176,6 +176,6 @@ def write_world(path, crs="utm"):
             origin = np.array([i * size, j * size, np.floor(mesh.vertices[:, 2].min())])
             tile = Tile(origin, mesh.shifted(-origin), shifted_instances(some, -origin))
             write_tile(writer.folder / "tiles" / f"{i}_{j}.npz", tile)
-        write_graphml(graph, frame, writer.folder / "roads.graphml")
+        write_graphml(graph, frame, path=writer.folder / "roads.graphml")
         writer.finish(frame=frame, layers=layers, shapes=shapes(), problems=[], tiles={}, manifest=manifest)
     return open_scene(path)

@@ -33,4 +33,4 @@ def boxes_at(trips, poses):
     there = np.flatnonzero(np.isfinite(poses[:, 0]))
     length = np.array([trips[k].length for k in there])
     width = np.array([trips[k].width for k in there])
-    return rectangles(poses[there, :2], poses[there, 2], length, width)
+    return rectangles(poses[there, :2], poses[there, 2], length=length, width=width)

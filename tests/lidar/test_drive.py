@@ -40,13 +40,13 @@ BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "demo"
-    return build(read_osm(demo_path(), bounds=BOX), folder, BuildOptions())
+    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions())
 
 
 @pytest.fixture(scope="module")
 def scene_utm(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "utm"
-    return build(read_osm(demo_path(), bounds=BOX), folder, BuildOptions(crs="utm"))
+    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions(crs="utm"))
 
 
 OPTIONS = DriveOptions(rig="vlp16", duration=4.0, seed=3, formats=("pcd", "laz"))
@@ -55,7 +55,7 @@ OPTIONS = DriveOptions(rig="vlp16", duration=4.0, seed=3, formats=("pcd", "laz")
 @pytest.fixture(scope="module")
 def dataset(scene, tmp_path_factory):
     out = tmp_path_factory.mktemp("drive") / "a"
-    drive(scene, out, OPTIONS)
+    drive(scene, out, options=OPTIONS)
     return open_dataset(out)
 
 
@@ -100,7 +100,7 @@ def test_returns_from_buildings_lie_on_those_buildings_after_georeferencing_and_
     crs, scene, scene_utm, tmp_path
 ):
     where = scene if crs == "local" else scene_utm
-    drive(where, tmp_path / "d", replace(OPTIONS, duration=2.0, formats=("laz",)))
+    drive(where, tmp_path / "d", options=replace(OPTIONS, duration=2.0, formats=("laz",)))
     solids = solids_by_feature(where)
     frame = where.manifest["frame"]
     near, count = 0, 0
@@ -122,8 +122,8 @@ def test_returns_from_buildings_lie_on_those_buildings_after_georeferencing_and_
 
 
 def test_the_georeferencing_error_budget_is_half_a_millimetre(scene, tmp_path):
-    drive(scene, tmp_path / "d", replace(OPTIONS, duration=0.5))
-    drive(scene, tmp_path / "e", replace(OPTIONS, duration=0.5, exact=True))
+    drive(scene, tmp_path / "d", options=replace(OPTIONS, duration=0.5))
+    drive(scene, tmp_path / "e", options=replace(OPTIONS, duration=0.5, exact=True))
     for path in sorted((tmp_path / "d" / "lidar_top" / "laz").glob("*.laz")):
         quick, exact = laspy.read(path), laspy.read(tmp_path / "e" / "lidar_top" / "laz" / path.name)
         for axis in "xyz":
@@ -131,7 +131,7 @@ def test_the_georeferencing_error_budget_is_half_a_millimetre(scene, tmp_path):
 
 
 def test_any_number_of_workers_gives_the_same_bytes(scene, dataset, tmp_path):
-    drive(scene, tmp_path / "b", replace(OPTIONS, workers=1))
+    drive(scene, tmp_path / "b", options=replace(OPTIONS, workers=1))
     assert digest(tmp_path / "b") == digest(dataset.path)
 
 
@@ -155,7 +155,7 @@ def test_a_killed_drive_goes_on_and_ends_with_the_same_bytes(scene, dataset, tmp
 
 def test_another_drive_is_not_written_over(scene, dataset):
     with pytest.raises(DatasetError, match=r"other options: seed 3 \(now 4\);.*--overwrite"):
-        drive(scene, dataset.path, replace(OPTIONS, seed=4))
+        drive(scene, dataset.path, options=replace(OPTIONS, seed=4))
     assert digest(dataset.path)
 
 
@@ -173,7 +173,7 @@ def test_pose_rows_agree_with_each_other_and_with_the_earth(scene, dataset):
     lon, lat = scene.frame.to_geographic(columns["x"], columns["y"])
     np.testing.assert_allclose(lon, columns["lon"], atol=1e-12)
     np.testing.assert_allclose(lat, columns["lat"], atol=1e-12)
-    quat = quat_from_euler(columns["alpha"], columns["beta"], columns["gamma"])
+    quat = quat_from_euler(columns["alpha"], columns["beta"], gamma=columns["gamma"])
     given = np.column_stack([columns[k] for k in ("qx", "qy", "qz", "qw")])
     np.testing.assert_allclose(np.abs((quat * given).sum(axis=1)), 1.0, atol=1e-12)
 
@@ -210,7 +210,7 @@ def test_every_point_of_a_revolution_has_its_own_time_and_ring(dataset):
 )
 def test_what_cannot_be_driven_is_said_in_one_line(scene, tmp_path, change, words):
     with pytest.raises(InputError, match=words) as error:
-        drive(scene, tmp_path / "x", replace(OPTIONS, **change))
+        drive(scene, tmp_path / "x", options=replace(OPTIONS, **change))
     assert "\n" not in str(error.value)
     assert not (tmp_path / "x").exists()
 
@@ -221,7 +221,7 @@ def test_a_drive_that_fails_before_its_first_frame_leaves_nothing(scene, tmp_pat
     for tile in (broken / "tiles").iterdir():
         tile.write_bytes(tile.read_bytes()[:300])
     with pytest.raises((GeosceneError, LidarError)):
-        drive(open_scene(broken), tmp_path / "d", replace(OPTIONS, duration=1.0))
+        drive(open_scene(broken), tmp_path / "d", options=replace(OPTIONS, duration=1.0))
     assert not (tmp_path / "d").exists()
 
 
@@ -235,8 +235,8 @@ def test_traffic_is_labelled_boxed_and_the_same_for_any_number_of_workers(scene,
     options = replace(
         OPTIONS, duration=2.0, formats=("pcd",), traffic=TrafficOptions(vehicles=20.0, parked=0.8)
     )
-    drive(scene, tmp_path / "a", options)
-    drive(scene, tmp_path / "b", replace(options, workers=1))
+    drive(scene, tmp_path / "a", options=options)
+    drive(scene, tmp_path / "b", options=replace(options, workers=1))
     assert digest(tmp_path / "a") == digest(tmp_path / "b")
     with (tmp_path / "a" / "boxes.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -271,9 +271,9 @@ def test_a_random_drive_is_under_way_from_first_to_last_unless_it_is_to_be_from_
         options = replace(OPTIONS, duration=3.0, seed=seed)
         speeds = {}
         for from_rest in (False, True):
-            travel = plan_travel(scene, "random", "car", seed=seed, duration=3.0, from_rest=from_rest)
+            travel = plan_travel(scene, "random", vehicle="car", seed=seed, duration=3.0, from_rest=from_rest)
             trajectory = drive_obeying(
-                travel.path, load_vehicle("car"), road_graph(scene), seed=seed, bounds=scene.bounds,
+                travel.path, load_vehicle("car"), graph=road_graph(scene), seed=seed, bounds=scene.bounds,
                 duration=3.0, under_way=travel.under_way,
             )  # fmt: skip
             speeds[from_rest] = np.linalg.norm(trajectory.velocity, axis=1)
@@ -295,5 +295,5 @@ def test_no_more_threads_work_than_there_are_cores(scene, tmp_path, monkeypatch)
     monkeypatch.setattr("lidar.drive.ThreadPoolExecutor", Pool)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     for workers in (1, 64):
-        drive(scene, tmp_path / str(workers), replace(OPTIONS, duration=0.2, workers=workers))
+        drive(scene, tmp_path / str(workers), options=replace(OPTIONS, duration=0.2, workers=workers))
     assert sizes == [1, 2]

@@ -118,7 +118,7 @@ OPTIONS = DriveOptions(
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "demo"
-    return build(read_osm(demo_path(), bounds=BOX), folder, BuildOptions())
+    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions())
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def rig(tmp_path_factory):
 @pytest.fixture(scope="module")
 def recorded(scene, rig, tmp_path_factory):
     out = tmp_path_factory.mktemp("drive") / "a"
-    summary = drive(scene, out, replace(OPTIONS, rig=rig))
+    summary = drive(scene, out, options=replace(OPTIONS, rig=rig))
     return open_dataset(out), summary
 
 
@@ -225,7 +225,7 @@ def test_solid_boxes_say_how_much_is_seen_and_how_many_points_of_each_scanner_hi
 def test_a_static_wall_is_straight_after_deskewing_while_the_vehicle_turns():
     sensor, mount = load_sensor("vlp16"), Mount((1.0, 0.5, 1.8), (0.0, 0.0, 0.0998334, 0.9950042))
     trajectory = driven((6.0, 2.0, 0.0), yaw_rate=1.0, start=(0, 0, 0))
-    cloud = scan(sensor, mount, trajectory, world(plate(25.0, tilt=0.3)), 7)
+    cloud = scan(sensor, mount, trajectory=trajectory, world=world(plate(25.0, tilt=0.3)), frame=7)
     times = cloud.start_ns + cloud.time_ns.astype(np.int64)
     where = trajectory.place(cloud.xyz, times, translation=mount.translation, rotation=mount.rotation)
 
@@ -237,7 +237,7 @@ def test_a_static_wall_is_straight_after_deskewing_while_the_vehicle_turns():
     assert bend(cloud.xyz.astype(float)) > 0.3
     for share in MOMENTS.values():
         moment = sensor.frame_start_ns(7) + int(share * 1e8)
-        points = deskewed(where, trajectory, mount, moment)
+        points = deskewed(where, trajectory, mount=mount, time_ns=moment)
         assert bend(points.astype(float)) < 2e-5
         pose = trajectory.at([moment]).mounted(mount.translation, mount.rotation)
         np.testing.assert_allclose(pose.place(points.astype(float)), where, atol=1e-4)
@@ -336,7 +336,7 @@ def test_what_moves_has_numbers_of_its_own_in_semantic_kitti():
     )
     thing = np.array([7, 8, 9, 10, 11, 70_000, 0])
     moves = np.array([False, True, True, True, True, True, False])
-    labels = semantic_kitti_labels(klass, thing, moves)
+    labels = semantic_kitti_labels(klass, thing, moving=moves)
     assert (labels & 0xFFFF).tolist() == [10, 252, 254, 253, 257, 258, 40]
     assert (labels >> 16).tolist() == [7, 8, 9, 10, 11, 0, 0]
 
@@ -458,14 +458,14 @@ def test_a_drive_that_goes_on_counts_all_of_its_points(scene, rig, recorded, tmp
     assert summary.points["top"] == counted == dataset.manifest["points"]["top"]
     for kinds in (("ply",), ("csv",), ("laz",), ("kitti",)):
         options = replace(OPTIONS, rig=rig, duration=0.4, traffic=None, labels=(), deskew="", formats=kinds)
-        first = drive(scene, tmp_path / kinds[0], options)
-        again = drive(scene, tmp_path / kinds[0], options)
+        first = drive(scene, tmp_path / kinds[0], options=options)
+        again = drive(scene, tmp_path / kinds[0], options=options)
         assert again.points == first.points
         assert (first.resumed, again.written) == (0, 0)
         assert again.resumed == 4 + 8 + 4 + 2
         if kinds == ("ply",):
             with pytest.raises(DatasetError, match=r"formats ply \(now csv\), seed 11 \(now 12\)"):
-                drive(scene, tmp_path / "ply", replace(options, formats=("csv",), seed=12))
+                drive(scene, tmp_path / "ply", options=replace(options, formats=("csv",), seed=12))
 
 
 def test_dials_of_cameras_are_reached_and_leave_truth_as_it_is(scene, rig, tmp_path):
@@ -480,7 +480,7 @@ def test_dials_of_cameras_are_reached_and_leave_truth_as_it_is(scene, rig, tmp_p
     }
     images = {}
     for name, change in changes.items():
-        drive(scene, tmp_path / name, replace(options, **change))
+        drive(scene, tmp_path / name, options=replace(options, **change))
         rgb, depth = (
             np.array(Image.open(tmp_path / name / "front" / kind / "000001.png")) for kind in ("rgb", "depth")
         )
@@ -574,7 +574,7 @@ def test_what_cannot_be_a_nuscenes_dataset_is_said(dataset, scene, tmp_path):
     options = replace(
         OPTIONS, rig="vlp16", duration=0.3, traffic=None, formats=("laz",), labels=(), deskew=""
     )
-    drive(scene, tmp_path / "d", options)
+    drive(scene, tmp_path / "d", options=options)
     with pytest.raises(DatasetError, match="--format pcd"):
         export_nuscenes(open_dataset(tmp_path / "d"), tmp_path / "m")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "n"]
@@ -582,7 +582,7 @@ def test_what_cannot_be_a_nuscenes_dataset_is_said(dataset, scene, tmp_path):
 
 def test_a_map_says_which_frames_are_missing(scene, rig, tmp_path):
     options = replace(OPTIONS, rig=rig, duration=0.5, traffic=None, formats=("pcd",), labels=(), deskew="")
-    drive(scene, tmp_path / "d", options)
+    drive(scene, tmp_path / "d", options=options)
     assert aggregate(open_dataset(tmp_path / "d"), tmp_path / "m.ply").missing == {}
     (tmp_path / "d" / "top" / "pcd" / "000002.pcd").unlink()
     assert aggregate(open_dataset(tmp_path / "d"), tmp_path / "n.ply").missing == {"top": 1}

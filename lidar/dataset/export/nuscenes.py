@@ -110,7 +110,7 @@ def export_nuscenes(
     part = out.with_name(f"{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
     try:
-        counts = _Export(dataset, streams, part).write(progress)
+        counts = _Export(dataset, streams, out=part).write(progress)
         if out.exists():
             shutil.rmtree(out)
         part.replace(out)
@@ -180,7 +180,7 @@ def _chained(rows: Sequence[Row]) -> None:
 class _Export:
     """The tables of one drive, and where they lie."""
 
-    def __init__(self, dataset: Dataset, streams: Sequence[_Stream], out: Path) -> None:
+    def __init__(self, dataset: Dataset, streams: Sequence[_Stream], *, out: Path) -> None:
         self.dataset, self.streams, self.out = dataset, streams, out
         self.trajectory: Trajectory = dataset.trajectory()
         self.scale = np.array([self.trajectory.scale[0], self.trajectory.scale[0], 1.0])
@@ -206,12 +206,14 @@ class _Export:
             rows = []
             near = _nearest(stream.times, key_times)
             for k, frame in enumerate(stream.frames):
-                rows.append(self._sample_data(stream, k, frame, samples, key_times, near))
+                rows.append(
+                    self._sample_data(stream, k, frame=frame, samples=samples, key_times=key_times, near=near)
+                )
                 counts[stream.modality] += 1
-                progress("nuScenes", sum(counts.values()), total)
+                progress("nuScenes", sum(counts.values()), total=total)
             _chained(rows)
             self.tables["sample_data"] += rows
-        self._annotate(top, keys, samples)
+        self._annotate(top, keys, samples=samples)
         self._describe(samples)
         (self.out / VERSION).mkdir(parents=True, exist_ok=True)
         for name in (*_TABLES, *(("lidarseg",) if self.tables["lidarseg"] else ())):
@@ -246,6 +248,7 @@ class _Export:
         self,
         stream: _Stream,
         k: int,
+        *,
         frame: int,
         samples: Sequence[Row],
         key_times: NDArray[np.int64],
@@ -271,7 +274,7 @@ class _Export:
         path = self.out / name
         path.parent.mkdir(parents=True, exist_ok=True)
         if stream.modality == "lidar":
-            self._write_cloud(stream, source, time, path, token, labelled=key)
+            self._write_cloud(stream, source, time=time, path=path, token=token, labelled=key)
         else:
             shutil.copyfile(source, path)
         return {
@@ -288,12 +291,12 @@ class _Export:
         }
 
     def _write_cloud(
-        self, stream: _Stream, source: Path, time: int, path: Path, token: str, *, labelled: bool
+        self, stream: _Stream, source: Path, *, time: int, path: Path, token: str, labelled: bool
     ) -> None:
         """Write a cloud as from one moment, and of a key frame's points their classes."""
         table = dict(CLOUD_READERS[source.suffix[1:]](source))
         mount = np.array(stream.sensor["vehicle_from_sensor"])
-        placed, _ = placed_returns(table, self.trajectory, time, mount)
+        placed, _ = placed_returns(table, self.trajectory, start_ns=time, vehicle_from_sensor=mount)
         here: Poses = self.trajectory.at([time]).mounted(mount[:3, 3], mount[:3, :3])
         still = ((placed - here.position[0]) / here.scale[0]) @ here.rotation[0]
         write_nuscenes(path, table | {axis: still[:, k] for k, axis in enumerate("xyz")})
@@ -303,7 +306,7 @@ class _Export:
             write_lidarseg(self.out / name, table["label"].astype(np.int64))
             self.tables["lidarseg"].append({"token": token, "sample_data_token": token, "filename": name})
 
-    def _annotate(self, top: _Stream, keys: Sequence[int], samples: Sequence[Row]) -> None:
+    def _annotate(self, top: _Stream, keys: Sequence[int], *, samples: Sequence[Row]) -> None:
         """Boxes that the scanner sees in key frames, and the things they are of."""
         path = self.dataset.path / top.name / "boxes.csv"
         if not path.exists():

@@ -21,7 +21,7 @@ CLOUD_READERS: dict[str, Callable[[Path], Table]] = {"pcd": read_pcd, "ply": rea
 
 
 def placed_returns(
-    table: Table, trajectory: Trajectory, start_ns: int, vehicle_from_sensor: Float
+    table: Table, trajectory: Trajectory, *, start_ns: int, vehicle_from_sensor: Float
 ) -> tuple[Float, NDArray[np.int64]]:
     """Scene coordinates (n, 3) of a frame's returns, and their times (n,) in nanoseconds of the drive.
 

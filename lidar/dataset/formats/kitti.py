@@ -42,7 +42,7 @@ def read_velodyne(path: Path) -> NDArray[np.float32]:
 
 
 def semantic_kitti_labels(
-    klass: NDArray[np.integer], thing: NDArray[np.integer], moving: NDArray[np.bool_]
+    klass: NDArray[np.integer], thing: NDArray[np.integer], *, moving: NDArray[np.bool_]
 ) -> NDArray[np.uint32]:
     """SemanticKITTI's labels (n,): its class in the lower 16 bits, the instance in the upper.
 
@@ -65,7 +65,7 @@ def write_labels(path: Path, labels: NDArray[np.uint32]) -> None:
     write_atomically(path, labels.astype("<u4").tobytes())
 
 
-def write_calibration(path: Path, projections: Sequence[ArrayLike], camera_from_lidar: Float) -> None:
+def write_calibration(path: Path, projections: Sequence[ArrayLike], *, camera_from_lidar: Float) -> None:
     """Write ``calib.txt``: P0 to P3, and the way from scanner to the first camera as Tr.
 
     projections : (3, 4) each, from the first camera's frame to the pixels of each camera. Loaders want four:
@@ -86,7 +86,7 @@ def write_times(path: Path, time_ns: NDArray[np.integer]) -> None:
     write_atomically(path, "".join(lines).encode("ascii"))
 
 
-def write_poses(path: Path, world_from_lidar: Float, camera_from_lidar: Float) -> None:
+def write_poses(path: Path, world_from_lidar: Float, *, camera_from_lidar: Float) -> None:
     """Write ``poses.txt``: the camera of each frame in that of the first; its first row is the identity.
 
     world_from_lidar : (n, 4, 4)

@@ -83,7 +83,7 @@ class _Layout:
 
 
 @functools.lru_cache(maxsize=16)
-def _layout(info: LasInfo, extra: tuple[str, ...], colour: bool) -> _Layout:  # noqa: FBT001
+def _layout(info: LasInfo, extra: tuple[str, ...], *, colour: bool) -> _Layout:
     import laspy  # noqa: PLC0415  (0.4 s)
 
     header = laspy.LasHeader(version="1.4", point_format=7 if colour else 6)
@@ -183,12 +183,12 @@ class LasWriter:
     blue.
     """
 
-    def __init__(self, path: Path, info: LasInfo, columns: tuple[str, ...]) -> None:
+    def __init__(self, path: Path, info: LasInfo, *, columns: tuple[str, ...]) -> None:
         self.path = path
         self._info = info
         self._extra = tuple(n for n in _EXTRA if n in columns)
         self._colour = "red" in columns
-        self._layout = _layout(info, self._extra, self._colour)
+        self._layout = _layout(info, self._extra, colour=self._colour)
         self._part = path.with_name(f"{path.name}.{os.getpid()}.part")
         sink = _Compressed if path.suffix.lower() == ".laz" else _Uncompressed
         self._sink = sink(self._part, self._layout)
@@ -251,9 +251,9 @@ def _count(place: Any, offset: float, counts: Any) -> bool:
     return fits
 
 
-def write_las(path: Path, table: Table, info: LasInfo) -> None:
+def write_las(path: Path, table: Table, *, info: LasInfo) -> None:
     """Write one table as LAS or LAZ, by the suffix."""
-    with LasWriter(path, info, tuple(table)) as writer:
+    with LasWriter(path, info, columns=tuple(table)) as writer:
         writer.write(table)
 
 

@@ -36,7 +36,7 @@ def ply_table(table: Table) -> Table:
     return out
 
 
-def ply_header(table: Table, count: int, comments: tuple[str, ...] = ()) -> bytes:
+def ply_header(table: Table, count: int, *, comments: tuple[str, ...] = ()) -> bytes:
     """The header for ``count`` vertices of a PLY table; its length does not depend on the count."""
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
     lines += [f"element vertex {count:0{_COUNT_WIDTH}d}"]
@@ -47,7 +47,7 @@ def ply_header(table: Table, count: int, comments: tuple[str, ...] = ()) -> byte
 def write_ply(path: Path, table: Table, *, comments: tuple[str, ...] = ()) -> None:
     """Write a table as PLY."""
     out = ply_table(table)
-    write_atomically(path, ply_header(out, rows(out), comments) + records(out).tobytes())
+    write_atomically(path, ply_header(out, rows(out), comments=comments) + records(out).tobytes())
 
 
 def read_ply(path: Path) -> Table:

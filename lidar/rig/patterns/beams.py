@@ -50,7 +50,7 @@ class Pattern(Protocol):
     def tail_ns(self) -> int:
         """Nanoseconds after the end of its frame by which the last pulse may be late."""
 
-    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+    def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of frame ``frame``; ``start_ns`` is the time frame 0 starts."""
 
 
@@ -79,7 +79,7 @@ def frame_ns(rate_hz: float) -> Fraction:
     return 10**9 / Fraction(rate_hz).limit_denominator(10**6)
 
 
-def blocks(frame: int, rate_hz: float, block_ns: Fraction, start_ns: int) -> Blocks:
+def blocks(frame: int, rate_hz: float, *, block_ns: Fraction, start_ns: int) -> Blocks:
     """The blocks of a clock that ticks every ``block_ns``, whatever the frames do, within one frame.
 
     The clock is not reset by a frame: where the frame is no multiple of the block, one frame in a few has a

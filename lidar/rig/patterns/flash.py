@@ -64,10 +64,10 @@ class Flash:
             frozen(np.arange(n).astype(np.uint16)),
         )
 
-    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+    def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of frame ``frame``."""
         direction, origin, ring, column, channel = self._grid
-        start = blocks(frame, rate_hz, frame_ns(rate_hz), start_ns).time_ns[0]
+        start = blocks(frame, rate_hz, block_ns=frame_ns(rate_hz), start_ns=start_ns).time_ns[0]
         time = start + np.repeat(np.arange(self.rows, dtype=np.int64) * self.row_ns, self.columns)
         return Firings(time, direction, origin, ring, column, channel, np.arange(len(time), dtype=np.int32))
 

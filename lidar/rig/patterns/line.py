@@ -42,9 +42,9 @@ class Line:
     range_offset: float = 0.0
     tail_ns: int = 0
 
-    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+    def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of frame ``frame``; the mirror moves on from frame to frame."""
-        block = blocks(frame, rate_hz, 10**9 / self.pulse_hz, start_ns)
+        block = blocks(frame, rate_hz, block_ns=10**9 / self.pulse_hz, start_ns=start_ns)
         seconds = (block.first + np.arange(len(block))) / float(self.pulse_hz)
         swing = self.line_hz * seconds
         direction = self._directions(swing)

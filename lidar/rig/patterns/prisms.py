@@ -35,9 +35,9 @@ class Prisms:
     range_offset: float = 0.0
     tail_ns: int = 0
 
-    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+    def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of frame ``frame``; the prisms turn on from frame to frame."""
-        block = blocks(frame, rate_hz, 10**9 / self.pulse_hz, start_ns)
+        block = blocks(frame, rate_hz, block_ns=10**9 / self.pulse_hz, start_ns=start_ns)
         seconds = (block.first + np.arange(len(block))) / float(self.pulse_hz)
         beams = len(self.incident)
         phase = 2 * np.pi * np.mod(np.multiply.outer(seconds, self.turn_hz), 1.0)
@@ -108,7 +108,7 @@ def read_prisms(table: Table) -> Prisms:
     )
     if (pattern.index < 1).any():
         raise table.error("index", "indices of refraction are 1 or more")
-    if not np.isfinite(pattern.fire(0, 10.0, 0).direction).all():
+    if not np.isfinite(pattern.fire(0, 10.0, start_ns=0).direction).all():
         raise table.error("wedge_deg", "beams are totally reflected within these prisms")
     table.close()
     return pattern

@@ -41,14 +41,16 @@ class Scan2d:
             frozen(np.zeros(count, np.uint16)),
         )
 
-    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+    def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of turn ``frame``: the sector is swept first, the blind rest of the turn follows."""
         direction, origin, column, zero = self._beams
-        time = blocks(frame, rate_hz, frame_ns(rate_hz) / self.steps, start_ns).time_ns[: len(column)]
+        time = blocks(frame, rate_hz, block_ns=frame_ns(rate_hz) / self.steps, start_ns=start_ns).time_ns[
+            : len(column)
+        ]
         return Firings(time, direction, origin, zero, column, zero, column)
 
 
-def read_scan2d(table: Table, rate_hz: float, rates_hz: tuple[float, ...]) -> Scan2d:
+def read_scan2d(table: Table, rate_hz: float, *, rates_hz: tuple[float, ...]) -> Scan2d:
     """The pattern that a ``[scan2d]`` table describes at one of its rates.
 
     Raises RigError for keys that are missing, unknown or out of bounds.

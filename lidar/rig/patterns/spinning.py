@@ -57,29 +57,34 @@ class Spinning:
         """Whether all beams start on the axis."""
         return not (self.forward.any() or self.left.any())
 
-    def _starts(self, encoder: Any, late: Any, ahead: Any) -> Float:
+    def _starts(self, encoder: Any, late: Any, *, ahead: Any) -> Float:
         """Where the beams start, (blocks * lasers, 3)."""
         origin = np.empty((len(encoder), len(late), 3))
         x = self.forward * np.cos(late) - self.left * np.sin(ahead)
         y = self.forward * np.sin(late) + self.left * np.cos(ahead)
-        _turned(encoder, x, y, out=origin)
+        _turned(encoder, x, y=y, out=origin)
         origin[:, :, 2] = self.up
         return origin.reshape(-1, 3)
 
-    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+    def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of revolution ``frame``; no two have the same azimuths unless encoder-locked."""
         period = frame_ns(rate_hz)
-        block = blocks(frame, rate_hz, period / self.columns if self.columns else self.block_ns, start_ns)
+        block = blocks(
+            frame,
+            rate_hz,
+            block_ns=period / self.columns if self.columns else self.block_ns,
+            start_ns=start_ns,
+        )
         turned = block.phase + block.step * np.arange(len(block), dtype=np.float64)
         encoder = self.start + self.turn * 2 * np.pi * turned
         late = self.turn * (2 * np.pi / float(period)) * self.fire_ns.astype(np.float64)
         ahead = late + self.turn * self.azimuth
         level = np.cos(self.elevation)
         direction = np.empty((len(block), len(late), 3))
-        _turned(encoder, level * np.cos(ahead), level * np.sin(ahead), out=direction)
+        _turned(encoder, level * np.cos(ahead), y=level * np.sin(ahead), out=direction)
         direction[:, :, 2] = np.sin(self.elevation)
         ring, column, channel, order, up = _labels(self, len(block))
-        origin = up if self._central else self._starts(encoder, late, ahead)
+        origin = up if self._central else self._starts(encoder, late, ahead=ahead)
         time = (block.time_ns[:, None] + self.fire_ns).ravel()
         return Firings(time, direction.reshape(-1, 3), origin, ring, column, channel, order)
 
@@ -101,7 +106,7 @@ def _labels(
     )
 
 
-def _turned(angle: Any, x: Any, y: Any, *, out: Float) -> None:
+def _turned(angle: Any, x: Any, *, y: Any, out: Float) -> None:
     """Write (x, y) of each laser, turned by the angle of each block, into ``out[:, :, :2]``."""
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     out[:, :, 0] = c * x - s * y

@@ -34,9 +34,9 @@ class Sweep:
     range_offset: float = 0.0
     tail_ns: int = 0
 
-    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+    def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of frame ``frame``; the pattern goes on from frame to frame."""
-        block = blocks(frame, rate_hz, 10**9 / self.pulse_hz, start_ns)
+        block = blocks(frame, rate_hz, block_ns=10**9 / self.pulse_hz, start_ns=start_ns)
         number = block.first + np.arange(len(block))
         seconds = number / float(self.pulse_hz)
         line = (number % self.lines).astype(np.uint16)
@@ -45,7 +45,7 @@ class Sweep:
         elevation = (self.low + self.high) / 2 + (self.high - self.low) / 2 * triangle
         azimuth = 2 * np.pi * np.mod(self.azimuth_hz * seconds, 1.0)
         column, _ = numbers(len(block), 1)
-        return _pulses(block.time_ns, azimuth, elevation, column, line)
+        return _pulses(block.time_ns, azimuth, elevation=elevation, column=column, channel=line)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class Listed:
     range_offset: float = 0.0
     tail_ns: int = 0
 
-    def fire(self, frame: int, rate_hz: float, start_ns: int) -> Firings:
+    def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of frame ``frame``; the list goes on from frame to frame."""
         first, stop = (-(-k * frame_ns(rate_hz) // 1) for k in (frame, frame + 1))
         rounds = np.arange(first // self.period_ns, stop // self.period_ns + 1, dtype=np.int64)
@@ -72,12 +72,19 @@ class Listed:
         rows = np.flatnonzero((time >= first) & (time < stop))
         entry = rows % len(self.after_ns)
         column, channel = numbers(len(rows), 1)
-        return _pulses(start_ns + time[rows], self.azimuth[entry], self.elevation[entry], column, channel)
+        return _pulses(
+            start_ns + time[rows],
+            self.azimuth[entry],
+            elevation=self.elevation[entry],
+            column=column,
+            channel=channel,
+        )
 
 
 def _pulses(
     time: NDArray[np.int64],
     azimuth: Float,
+    *,
     elevation: Float,
     column: NDArray[np.int32],
     channel: NDArray[np.uint16],

@@ -402,11 +402,11 @@ def test_an_unknown_height_follows_its_neighbours():
     use, area_ = np.full(n, "house", dtype=object), np.full(n, 120.0)
     truth = np.where(xy[:, 0] < 200, 6.0, 18.0)
     known = np.where(rng.random(n) < 0.5, truth, np.nan)
-    height, sigma, rule = infer_heights(xy, use, area_, known)
+    height, sigma, rule = infer_heights(xy, use, area=area_, height=known)
     hidden = np.isnan(known) & (np.abs(xy[:, 0] - 200) > 60)
     assert np.abs(height - truth)[hidden].max() < 1.0
     assert set(rule) == {"inferred-neighbours"}
-    lone, lone_sigma, lone_rule = infer_heights(xy[:1], use[:1], area_[:1], np.array([np.nan]))
+    lone, lone_sigma, lone_rule = infer_heights(xy[:1], use[:1], area=area_[:1], height=np.array([np.nan]))
     assert lone_rule[0] == "inferred-type"
     assert lone_sigma[0] / lone[0] > 2 * np.median(sigma[hidden] / height[hidden])
     assert 4 < lone[0] < 10
@@ -415,10 +415,10 @@ def test_an_unknown_height_follows_its_neighbours():
 def test_a_television_tower_says_nothing_of_the_houses_below():
     xy = np.column_stack([np.arange(6) * 60.0, np.zeros(6)])
     use, area_ = np.full(6, "yes", dtype=object), np.array([2324.0, 2000.0, 900.0, 300.0, 700.0, 4400.0])
-    alone = infer_heights(xy, use, area_, np.full(6, np.nan))[0]
-    beside = infer_heights(xy, use, area_, np.array([540.0, *[np.nan] * 5]))[0]
+    alone = infer_heights(xy, use, area=area_, height=np.full(6, np.nan))[0]
+    beside = infer_heights(xy, use, area=area_, height=np.array([540.0, *[np.nan] * 5]))[0]
     np.testing.assert_array_equal(beside[1:], alone[1:])
-    block = infer_heights(xy, use, area_, np.array([48.0, *[np.nan] * 5]))[0]
+    block = infer_heights(xy, use, area=area_, height=np.array([48.0, *[np.nan] * 5]))[0]
     assert (block[1:3] > 1.2 * alone[1:3]).all()
 
 
@@ -426,7 +426,7 @@ def test_bodies_that_meet_in_an_edge_of_a_hairline_gap_are_joined():
     upper = shapely.Polygon([(0, 0), (10, 0.0005), (10, 10), (-10, 10), (-10, 0.0005)])
     lower = shapely.Polygon([(0, 0), (-10, -0.0005), (-10, -10), (10, -10), (10, -0.0005)])
     footprints = shapely.set_precision(np.array([upper, lower]), 1e-4)
-    shells = prisms(footprints, np.arange(2), np.zeros(2), np.full(2, 9.0))
+    shells = prisms(footprints, np.arange(2), low=np.zeros(2), high=np.full(2, 9.0))
     body, told = unite(shells)
     assert "joined by beads of" in told
     assert sound(replace(body, piece=np.zeros(len(body), np.int64)), 1).all()
@@ -436,8 +436,8 @@ def test_bodies_that_meet_in_an_edge_of_a_hairline_gap_are_joined():
 def test_a_building_does_not_inform_its_own_guess():
     xy = np.array([[0.0, 0.0], [10.0, 0.0]])
     use, area_ = np.array(["yes", "yes"], dtype=object), np.array([100.0, 100.0])
-    first, _, _ = infer_heights(xy, use, area_, np.array([30.0, np.nan]))
-    again, _, _ = infer_heights(xy, use, area_, np.array([60.0, np.nan]))
+    first, _, _ = infer_heights(xy, use, area=area_, height=np.array([30.0, np.nan]))
+    again, _, _ = infer_heights(xy, use, area=area_, height=np.array([60.0, np.nan]))
     assert first[0] == again[0]
     assert again[1] > 1.5 * first[1]
 

@@ -200,7 +200,7 @@ def test_what_stands_in_for_a_shape_is_said():
 
 
 def test_a_cut_splits_cells_at_the_level_and_keeps_their_area():
-    cells = with_field(plain_cells(turned(L_SHAPE, 12.0)), np.array([0.6, 0.8]), 1.0)
+    cells = with_field(plain_cells(turned(L_SHAPE, 12.0)), np.array([0.6, 0.8]), offset=1.0)
     level = float(cells.field.mean())
     parts = cut(cells, level)
     assert triangle_areas(parts.xy).sum() == pytest.approx(triangle_areas(cells.xy).sum(), rel=1e-5)

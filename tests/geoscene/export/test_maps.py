@@ -170,7 +170,7 @@ def test_what_cannot_be_meant_is_said_before_anything_is_written(scene, tmp_path
     with pytest.raises(InputError, match="does not say what to write"):
         export_scene(scene, tmp_path / "a.json")
     with pytest.raises(InputError, match="--to dwg"):
-        export_scene(scene, tmp_path / "a", "dwg")
+        export_scene(scene, tmp_path / "a", kind="dwg")
     with pytest.raises(InputError, match=r"--resolution does not go with PLY, which takes --layers"):
         export_scene(scene, tmp_path / "a.ply", resolution=1)
     with pytest.raises(InputError, match="EPSG:99999"):

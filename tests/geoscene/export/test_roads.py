@@ -98,7 +98,7 @@ def _write(graph, scene, folder, **options):
     path = folder / "scene"
     if not path.exists():
         write_world(path)
-    write_graphml(graph, scene.frame, path / "roads.graphml")
+    write_graphml(graph, scene.frame, path=path / "roads.graphml")
     return export_scene(replace(scene, path=path), folder / "a.xodr", overwrite=True, **options).path
 
 
@@ -147,7 +147,7 @@ def test_restrictions_that_junctions_cannot_say_are_counted(tmp_path):
     assert export_scene(scene, tmp_path / "plain.xodr").notes == ()
     chain = rows_of([np.array([0, 2, 3], np.int32)])
     graph = replace(roads(), chain_edges=chain, chain_kind=np.array(["no_u_turn"]))
-    write_graphml(graph, scene.frame, scene.path / "roads.graphml")
+    write_graphml(graph, scene.frame, path=scene.path / "roads.graphml")
     (note,) = export_scene(scene, tmp_path / "bound.xodr").notes
     assert note.startswith("1 turn restrictions via ways are not in it")
     assert (tmp_path / "bound.xodr").read_bytes() == (tmp_path / "plain.xodr").read_bytes()
@@ -266,7 +266,7 @@ def test_a_reference_line_is_smooth_and_near_its_polyline(steps):
 def test_a_connecting_curve_is_near_an_arc_and_as_long_as_it_says(heading, turn, chord):
     direction = heading + turn / 2
     end = chord * np.array([np.cos(direction), np.sin(direction)])
-    curve = connecting_curve(np.zeros(2), heading, end, heading + turn)
+    curve = connecting_curve(np.zeros(2), heading, end=end, end_heading=heading + turn)
     p = np.linspace(0, 1, 20001)
     u, v = (np.polynomial.polynomial.polyval(p, c) for c in (curve.u, curve.v))
     assert curve.length == pytest.approx(np.hypot(np.diff(u), np.diff(v)).sum(), rel=1e-5)
@@ -277,5 +277,5 @@ def test_a_connecting_curve_is_near_an_arc_and_as_long_as_it_says(heading, turn,
 
 
 def test_cutting_keeps_heights_in_place():
-    line = cut(np.array([[0, 0, 0], [10, 0, 1], [10, 30, 4.0]]), 5.0, 10.0)
+    line = cut(np.array([[0, 0, 0], [10, 0, 1], [10, 30, 4.0]]), 5.0, end=10.0)
     np.testing.assert_allclose(line, [[5, 0, 0.5], [10, 0, 1], [10, 20, 3]])

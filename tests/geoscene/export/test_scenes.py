@@ -27,7 +27,7 @@ def city(scene, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def tiles(scene, tmp_path_factory):
-    return export_scene(scene, tmp_path_factory.mktemp("out") / "tiles", "3dtiles").path
+    return export_scene(scene, tmp_path_factory.mktemp("out") / "tiles", kind="3dtiles").path
 
 
 def _glb(path):
@@ -325,13 +325,13 @@ def test_a_folder_that_is_not_ours_is_not_replaced(scene, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years")
     with pytest.raises(InputError, match=r"holds no tileset\.json"):
-        export_scene(scene, tmp_path / "mine", "3dtiles", overwrite=True)
+        export_scene(scene, tmp_path / "mine", kind="3dtiles", overwrite=True)
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
 
 
 def test_heights_are_lifted_to_the_ellipsoid_on_request(scene, tmp_path, tiles):
     low, high = (
         np.array(json.loads((path / "tileset.json").read_text())["root"]["transform"])[12:15]
-        for path in (tiles, export_scene(scene, tmp_path / "t", "3dtiles", height_offset=39.5).path)
+        for path in (tiles, export_scene(scene, tmp_path / "t", kind="3dtiles", height_offset=39.5).path)
     )
     assert np.linalg.norm(high - low) == pytest.approx(39.5)

@@ -45,7 +45,7 @@ def exported(scene, tmp_path_factory):
         if kind not in done:
             layers = ["building_solids"] if kind in ("gpkg", "geoparquet", "geojson") else None
             out = folder / f"world{SUFFIX.get(kind, '.' + kind)}"
-            done[kind] = export_scene(scene, out, kind, layers=layers)
+            done[kind] = export_scene(scene, out, kind=kind, layers=layers)
         return done[kind].path
 
     return path
@@ -216,7 +216,7 @@ def test_a_building_is_the_same_closed_solid(kind, exported, scene):
 def test_the_same_scene_is_the_same_bytes(kind, exported, scene, tmp_path):
     first = exported(kind)
     layers = ["building_solids"] if kind in ("gpkg", "geoparquet", "geojson") else None
-    again = export_scene(scene, tmp_path / first.name, kind, layers=layers).path
+    again = export_scene(scene, tmp_path / first.name, kind=kind, layers=layers).path
     files = sorted(p for p in first.rglob("*") if p.is_file()) if first.is_dir() else [first]
     assert files
     for file in files:
@@ -234,7 +234,7 @@ def test_cityjson_of_a_frame_without_a_code_is_in_utm_and_closed(tmp_path):
     assert document["metadata"]["referenceSystem"] == "https://www.opengis.net/def/crs/EPSG/0/32633"
     transform = document["transform"]
     points = np.array(document["vertices"]) * transform["scale"] + transform["translate"]
-    x, y = scene.frame.from_crs("EPSG:32633", points[:, 0], points[:, 1])
+    x, y = scene.frame.from_crs(points[:, 0], points[:, 1], crs="EPSG:32633")
     faces = np.array([face[0] for face in document["CityObjects"]["way/1"]["geometry"][0]["boundaries"][0]])
     mesh = Mesh.of(np.column_stack([x, y, points[:, 2]]), faces, feature=0, closed=True)
     verdict = validate_mesh(mesh)
@@ -244,7 +244,7 @@ def test_cityjson_of_a_frame_without_a_code_is_in_utm_and_closed(tmp_path):
 
 def test_every_solid_of_a_real_place_is_still_closed_after_ply(tmp_path):
     osm = read_osm(demo_path(), bounds=(24.9405, 60.1655, 24.9475, 60.1690))
-    scene = build(osm, tmp_path / "demo", BuildOptions(crs="utm"))
+    scene = build(osm, tmp_path / "demo", options=BuildOptions(crs="utm"))
     mesh = trimesh.load(export_scene(scene, tmp_path / "a.ply").path, process=False)
     rows = mesh.metadata["_ply_raw"]["face"]["data"]
     closed = np.asarray(rows["closed"]).ravel() == 1
@@ -256,7 +256,7 @@ def test_every_solid_of_a_real_place_is_still_closed_after_ply(tmp_path):
 
 def test_every_solid_of_a_real_place_is_still_closed_after_cityjson(tmp_path):
     osm = read_osm(demo_path(), bounds=(24.9405, 60.1655, 24.9475, 60.1690))
-    scene = build(osm, tmp_path / "demo", BuildOptions())
+    scene = build(osm, tmp_path / "demo", options=BuildOptions())
     document = json.loads(export_scene(scene, tmp_path / "a.city.json").path.read_text())
     points = np.array(document["vertices"]) * document["transform"]["scale"]
     solids = [

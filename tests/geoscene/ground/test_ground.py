@@ -86,7 +86,7 @@ def assert_one_surface(points, faces, extent):
 def test_the_ground_is_one_surface_across_tiles(seed, lines, size):
     rng = np.random.default_rng(seed)
     plan = plan_ground(EXTENT, layers_of(blobs(seed), rng), tile_size=size, lines=lines)
-    mesh = concatenate([ground_tile(plan, i, j) for i, j in plan.tiles])
+    mesh = concatenate([ground_tile(plan, i, j=j) for i, j in plan.tiles])
     assert_one_surface(*welded(mesh), EXTENT)
 
 
@@ -115,10 +115,10 @@ def test_a_tile_does_not_depend_on_which_others_are_made(seed):
     layers = layers_of(blobs(seed), rng)
     plan = plan_ground(EXTENT, layers, tile_size=16.0, lines=8.0)
     i, j = plan.tiles[rng.integers(len(plan.tiles))]
-    alone = ground_tile(plan, i, j)
-    xmin, ymin, xmax, ymax = tile_box(plan, i, j)
+    alone = ground_tile(plan, i, j=j)
+    xmin, ymin, xmax, ymax = tile_box(plan, i, j=j)
     near = shapely.intersects(layers.polygon, shapely.box(xmin - 1, ymin - 1, xmax + 1, ymax + 1))
-    without_the_far = ground_tile(plan_ground(EXTENT, layers.take(near), tile_size=16.0, lines=8.0), i, j)
+    without_the_far = ground_tile(plan_ground(EXTENT, layers.take(near), tile_size=16.0, lines=8.0), i, j=j)
     np.testing.assert_array_equal(alone.vertices, without_the_far.vertices)
     np.testing.assert_array_equal(alone.faces, without_the_far.faces)
     np.testing.assert_array_equal(alone.feature, without_the_far.feature)
@@ -137,14 +137,14 @@ def test_outlines_on_tile_borders_and_grid_ties_still_meet():
     ]
     layers = Layers.of(polygons, klass=Class.GRASS, material=GRASS, priority=np.arange(6))
     plan = plan_ground(EXTENT, layers, tile_size=16.0)
-    mesh = concatenate([ground_tile(plan, i, j) for i, j in plan.tiles])
+    mesh = concatenate([ground_tile(plan, i, j=j) for i, j in plan.tiles])
     assert_one_surface(*welded(mesh), EXTENT)
 
 
 def test_vertices_stay_where_they_are_when_moved_to_a_tile():
     """A power of two as the grid: whole metres off and on again give the same numbers."""
     plan = plan_ground(EXTENT, layers_of(blobs(3), np.random.default_rng(3)), tile_size=25.0)
-    mesh = ground_tile(plan, 0, 0)
+    mesh = ground_tile(plan, 0, j=0)
     assert (mesh.shifted((-5000, 4000, 0)).shifted((5000, -4000, 0)).vertices == mesh.vertices).all()
 
 
@@ -184,8 +184,8 @@ def test_rings_that_touch_in_a_point_and_courtyards_are_triangulated_wholly():
 def test_faces_keep_class_material_and_feature_of_their_cell():
     layers = Layers.of([shapely.box(0, 0, 5, 5)], klass=Class.SAND, material=10, priority=1, feature=42)
     plan = plan_ground((-5, -5, 10, 10), layers)
-    cells = partition_tile(plan, 0, 0)
-    mesh = drape(plan, cells, triangulate(cells))
+    cells = partition_tile(plan, 0, j=0)
+    mesh = drape(plan, cells, triangles=triangulate(cells))
     middle = mesh.vertices[mesh.faces].mean(axis=1)
     sandy = (middle[:, :2] > 0).all(axis=1) & (middle[:, :2] < 5).all(axis=1)
     assert sandy.any()
@@ -203,4 +203,4 @@ def test_an_extent_without_area_is_refused(extent):
 
 def test_a_tile_outside_the_extent_is_refused():
     with pytest.raises(InputError, match=r"\(9, 9\)"):
-        partition_tile(plan_ground(EXTENT, concatenate_layers([])), 9, 9)
+        partition_tile(plan_ground(EXTENT, concatenate_layers([])), 9, j=9)

@@ -188,8 +188,8 @@ def test_lakes_are_level_and_the_ground_closes_on_them_across_tiles(size):
     touching_the_side = shapely.box(60, 30, 90, 60)
     layers = wet_layers((lake, "standing"), (touching_the_side, "standing"))
     plan = plan_ground(EXTENT, layers, tile_size=size, lines=15.0)
-    levels = water_levels(layers, [], FRAME, height=rising)
-    mesh = concatenate([ground_tile(plan, i, j, height=rising, levels=levels) for i, j in plan.tiles])
+    levels = water_levels(layers, [], frame=FRAME, height=rising)
+    mesh = concatenate([ground_tile(plan, i, j=j, height=rising, levels=levels) for i, j in plan.tiles])
     water = mesh.klass == Class.WATER
     z = mesh.vertices[mesh.faces][water][..., 2]
     east = mesh.vertices[mesh.faces][water][..., 0].mean(axis=1) > 50
@@ -215,7 +215,7 @@ def test_waters_that_touch_stand_equally_high_and_at_the_seas_level_beside_it():
         (shapely.box(40, 0, 60, 20), "standing"),
         (shapely.box(80, -90, 90, 90), "sea"),
     )
-    level = water_levels(layers, [], FRAME, height=rising).level
+    level = water_levels(layers, [], frame=FRAME, height=rising).level
     assert level[0] == level[1] == level[2] == level[4]
     assert level[3] == pytest.approx(rising(40, 0), abs=0.01)  # the lowest of its corners
 
@@ -224,13 +224,13 @@ def test_a_river_never_flows_uphill_and_is_turned_if_drawn_so():
     """The map draws it eastward, up the slope; the water falls to the west."""
     stream = way(1, [(-90, 0), (0, 5), (90, 0)], waterway="river")
     layers, _ = cover(stream)
-    levels = water_levels(layers, [stream], FRAME, height=rising)
+    levels = water_levels(layers, [stream], frame=FRAME, height=rising)
     assert levels.reversed == ("way/1",)
     order = np.argsort(-levels.station[:, 0])
     assert (np.diff(levels.height[order]) <= 0).all()
     assert (levels.height <= rising(*levels.station.T) + 1e-9).all()
     plan = plan_ground(EXTENT, layers, tile_size=50.0, lines=10.0)
-    mesh = concatenate([ground_tile(plan, i, j, height=rising, levels=levels) for i, j in plan.tiles])
+    mesh = concatenate([ground_tile(plan, i, j=j, height=rising, levels=levels) for i, j in plan.tiles])
     corners = mesh.vertices[mesh.faces][mesh.klass == Class.WATER].reshape(-1, 3)
     assert np.abs(corners[:, 2] - (50 + 0.2 * corners[:, 0])).max() < 3.5
 
@@ -252,7 +252,7 @@ def test_the_ground_of_real_places_is_one_surface(shared_osm, name):
         np.array(houses, object), lambda c: np.column_stack(frame.from_geographic(*c.T))
     )
     plan = plan_ground(extent, concatenate_layers([layers, building_pads(houses)]))
-    mesh = concatenate([ground_tile(plan, i, j) for i, j in plan.tiles])
+    mesh = concatenate([ground_tile(plan, i, j=j) for i, j in plan.tiles])
     points, number = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = number.reshape(-1)[mesh.faces]
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
@@ -277,8 +277,10 @@ def test_monaco_lies_on_the_sea_and_rises_behind_it(shared_osm, shared_dem):
     terrain = open_terrain([shared_dem("N43E007.hgt.zip")], frame, bounds=extent)
     layers, _ = landcover(osm, frame, extent=extent)
     plan = plan_ground(extent, layers, lines=terrain.lines)
-    levels = water_levels(layers, osm.ways, frame, height=terrain.height)
-    mesh = concatenate([ground_tile(plan, i, j, height=terrain.height, levels=levels) for i, j in plan.tiles])
+    levels = water_levels(layers, osm.ways, frame=frame, height=terrain.height)
+    mesh = concatenate(
+        [ground_tile(plan, i, j=j, height=terrain.height, levels=levels) for i, j in plan.tiles]
+    )
     middle = mesh.vertices[mesh.faces].mean(axis=1)
     harbour = (np.abs(middle[:, 0] - 450) < 60) & (np.abs(middle[:, 1]) < 60)
     assert (mesh.klass[harbour] == Class.WATER).any()

@@ -38,7 +38,7 @@ def posts(corner, shape, step=25.0):
 
 def around(shape=(60, 60), step=25.0):
     """A corner such that a raster of that shape is centred on the frame's centre."""
-    east, north = FRAME.to_crs(UTM, 0.0, 0.0)
+    east, north = FRAME.to_crs(0.0, 0.0, crs=UTM)
     return float(east) - shape[1] * step / 2 + 3.7, float(north) + shape[0] * step / 2 - 8.1
 
 
@@ -55,7 +55,7 @@ def test_a_slope_comes_back_exactly_at_every_place(tmp_path):
     )
     terrain = open_terrain([path], FRAME, bounds=BOUNDS)
     x, y = sample()
-    e, n = FRAME.to_crs(UTM, x, y)
+    e, n = FRAME.to_crs(x, y, crs=UTM)
     np.testing.assert_allclose(
         terrain.height(x, y), 100 + 0.1 * (e - 500000) - 0.05 * (n - 5538000), atol=1e-4
     )
@@ -70,7 +70,7 @@ def test_between_four_posts_the_height_is_bilinear(tmp_path):
     path = write_dem(tmp_path / "a.tif", values, corner=corner)
     e, n = (grid[1, 1] for grid in posts(corner, (4, 4)))
     u, v = 0.25, 0.6
-    x, y = FRAME.from_crs(UTM, e + u * 25, n - v * 25)
+    x, y = FRAME.from_crs(e + u * 25, n - v * 25, crs=UTM)
     terrain = open_terrain([path], FRAME, bounds=(-20, -20, 20, 20))
     assert terrain.height(x, y) == pytest.approx(
         10 * 0.75 * 0.4 + 20 * 0.25 * 0.4 + 30 * 0.75 * 0.6 + 80 * 0.25 * 0.6
@@ -86,7 +86,7 @@ def test_tiles_of_one_model_are_as_one_raster_in_any_order(tmp_path):
     left = write_dem(tmp_path / "left.tif", values[:, :30], corner=corner)
     right = write_dem(tmp_path / "right.tif", values[:, 30:], corner=(middle, corner[1]))
     x, y = sample(3000)
-    assert (np.abs(FRAME.to_crs(UTM, x, y)[0] - middle) < 12).sum() > 50
+    assert (np.abs(FRAME.to_crs(x, y, crs=UTM)[0] - middle) < 12).sum() > 50
     expected = open_terrain([whole], FRAME, bounds=BOUNDS).height(x, y)
     for order in ([left, right], [right, left]):
         np.testing.assert_allclose(
@@ -115,7 +115,7 @@ def test_voids_are_filled_from_around_and_counted(tmp_path):
     terrain = open_terrain([path], FRAME, bounds=BOUNDS)
     assert terrain.voids == 18
     x, y = sample(2000)
-    expected = 0.1 * (FRAME.to_crs(UTM, x, y)[0] - 500000) + 300
+    expected = 0.1 * (FRAME.to_crs(x, y, crs=UTM)[0] - 500000) + 300
     assert np.abs(terrain.height(x, y) - expected).max() < 5.0
 
 
@@ -150,7 +150,7 @@ def test_a_model_that_does_not_cover_the_scene_is_an_error_or_a_counted_fallback
         open_terrain([path], FRAME, bounds=bounds)
     terrain = open_terrain([path], FRAME, bounds=bounds, outside="nearest")
     edge = corner[0] + 20 * 25
-    west = FRAME.to_crs(UTM, bounds[0], 0)[0]
+    west = FRAME.to_crs(bounds[0], 0, crs=UTM)[0]
     assert terrain.uncovered == pytest.approx(1 - (edge - west) / 400, abs=1e-3)
     assert terrain.height(40, 0) == pytest.approx(east.max() - 499000)
     with pytest.raises(InputError, match=r"all of the scene is not covered.*add files that cover it$"):
@@ -204,7 +204,7 @@ def test_a_building_stands_on_the_lowest_ground_along_its_outline(tmp_path):
     east, _ = posts(corner, (60, 60))
     path = write_dem(tmp_path / "a.tif", np.abs(east - east[0, 30]), corner=corner)
     terrain = open_terrain([path], FRAME, bounds=BOUNDS)
-    x0 = float(FRAME.from_crs(UTM, east[0, 30], FRAME.to_crs(UTM, 0, 0)[1])[0])
+    x0 = float(FRAME.from_crs(east[0, 30], FRAME.to_crs(0, 0, crs=UTM)[1], crs=UTM)[0])
     across = shapely.box(x0 - 30, -10, x0 + 50, 10)  # no corner lies in the valley, its sides cross it
     base = base_heights([across, None, shapely.box(x0 + 20, 0, x0 + 30, 5)], terrain.height)
     assert base[0] == pytest.approx(0.0, abs=1.1)

@@ -54,7 +54,7 @@ def street(**tags):
 
 
 def read(*features, roads=(STREET,), houses=(), **options):
-    return read_furniture(osm_of(*features), FRAME, plan_with(roads, houses), **options)
+    return read_furniture(osm_of(*features), FRAME, plan=plan_with(roads, houses), **options)
 
 
 def facing(table):
@@ -163,7 +163,7 @@ def volume(mesh):
 
 
 def solids(*features, roads=(), houses=(), height=None):
-    barriers, problems = read_barriers(osm_of(*features), FRAME, plan_with(roads, houses))
+    barriers, problems = read_barriers(osm_of(*features), FRAME, plan=plan_with(roads, houses))
     return barriers, barrier_meshes(barriers, height=height), problems
 
 
@@ -197,7 +197,9 @@ def test_a_barrier_is_open_where_a_road_passes_and_ends_at_houses():
 
 def test_a_barrier_over_a_tunnels_mouth_does_not_bar_it():
     wall = way(1, [(-20, 0), (20, 0)], barrier="wall", height="2.2", width="0.5")
-    barriers, problems = read_barriers(osm_of(wall), FRAME, plan_with(mouths=[shapely.box(-4, -10, 5, 10)]))
+    barriers, problems = read_barriers(
+        osm_of(wall), FRAME, plan=plan_with(mouths=[shapely.box(-4, -10, 5, 10)])
+    )
     assert barriers.polygon[0].area == pytest.approx((40 - 9) * 0.5)
     assert [p.reason for p in problems] == ["across-road"]
 
@@ -233,6 +235,6 @@ def test_every_barrier_of_a_real_place_is_closed(shared_osm, name):
     frame = Frame.at((west + east) / 2, (south + north) / 2)
     x, y = frame.from_geographic([west, east], [south, north])
     plan = plan_ground((x.min(), y.min(), x.max(), y.max()), concatenate_layers([]))
-    barriers, _ = read_barriers(osm, frame, plan)
+    barriers, _ = read_barriers(osm, frame, plan=plan)
     assert len(barriers) > 50
     assert all(volume(mesh) > 0 for mesh in barrier_meshes(barriers))

@@ -135,7 +135,7 @@ def test_a_mapped_tree_in_a_building_is_dropped_one_on_a_road_stays():
 
 def test_woods_are_filled_to_their_density_and_leave_roads_and_houses_free():
     plan = wood_plan(tile_size=400.0)
-    trees = np.vstack([forest_trees(plan, i, j, density=0.02).xy for i, j in plan.tiles])
+    trees = np.vstack([forest_trees(plan, i, j=j, density=0.02).xy for i, j in plan.tiles])
     x, y = trees.T
     assert (x < 120).all()
     assert (y < 80).all()
@@ -148,7 +148,7 @@ def test_woods_are_filled_to_their_density_and_leave_roads_and_houses_free():
 def test_a_wood_is_the_same_whatever_the_tiles_and_another_with_another_seed():
     def all_trees(size, seed=0):
         plan = wood_plan(tile_size=size)
-        found = [forest_trees(plan, i, j, seed=seed) for i, j in plan.tiles]
+        found = [forest_trees(plan, i, j=j, seed=seed) for i, j in plan.tiles]
         table = np.concatenate([np.column_stack([t.xy, t.height]) for t in found])
         return table[np.lexsort(table.T)]
 

@@ -55,7 +55,7 @@ def test_what_the_map_says_counts_for_more_than_the_place():
 
 @pytest.mark.parametrize("given", ["", "left", "right"])
 def test_the_scene_and_the_drive_keep_to_one_side(given, tmp_path):
-    scene = build(extract(street(1)), tmp_path / "scene", BuildOptions(driving_side=given))
+    scene = build(extract(street(1)), tmp_path / "scene", options=BuildOptions(driving_side=given))
     roads = json.loads((tmp_path / "scene" / "scene.json").read_text())["roads"]
     side = given or "left"
     assert roads == {"driving_side": side, "driving_side_source": "option" if given else "place"}

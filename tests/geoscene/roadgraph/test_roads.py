@@ -249,10 +249,10 @@ def test_a_forbidden_turn_is_driven_round():
     free = graph_of(places, ways)
     bound = graph_of(places, ways, (), [only("no_right_turn", 1, 100, 101)])
     start, goal = edge_between(free, 2, 1), edge_between(free, 1, 3)
-    short = shortest_path(free, (start, 50.0), (goal, 50.0), either_side=False)
+    short = shortest_path(free, (start, 50.0), goal=(goal, 50.0), either_side=False)
     assert short.edges.tolist() == [start, goal]
     assert short.length == pytest.approx(100, abs=1e-3)
-    long = shortest_path(bound, (start, 50.0), (goal, 50.0), either_side=False)
+    long = shortest_path(bound, (start, 50.0), goal=(goal, 50.0), either_side=False)
     assert long is None or long.edges.tolist() != [start, goal]
     assert bound.turn_kind.tolist() == ["no_right_turn"]
 
@@ -309,12 +309,12 @@ def test_a_turn_forbidden_via_a_way_binds_only_who_came_from_its_first_street():
     ]
     assert not len(bound.turn_from)
     home = (edge_between(bound, 7, 8), 50.0)
-    from_west = shortest_path(bound, (edge_between(bound, 1, 2), 50.0), home, either_side=False)
+    from_west = shortest_path(bound, (edge_between(bound, 1, 2), 50.0), goal=home, either_side=False)
     assert driven_nodes(bound, from_west) == [1, 2, 3, 6, 7, 8]
-    from_south = shortest_path(bound, (edge_between(bound, 9, 2), 20.0), home, either_side=False)
+    from_south = shortest_path(bound, (edge_between(bound, 9, 2), 20.0), goal=home, either_side=False)
     assert driven_nodes(bound, from_south) == [9, 2, 7, 8]
     ahead = (edge_between(bound, 7, 10), 50.0)
-    onward = shortest_path(bound, (edge_between(bound, 1, 2), 50.0), ahead, either_side=False)
+    onward = shortest_path(bound, (edge_between(bound, 1, 2), 50.0), goal=ahead, either_side=False)
     assert driven_nodes(bound, onward) == [1, 2, 7, 10]
 
 
@@ -325,10 +325,15 @@ def test_a_turn_commanded_via_a_way_leaves_no_other():
     assert after[before == start].tolist() == [edge_between(bound, 2, 7)]
     home = (edge_between(bound, 7, 8), 50.0)
     ahead = (edge_between(bound, 7, 10), 50.0)
-    assert driven_nodes(bound, shortest_path(bound, (start, 20.0), ahead, either_side=False)) == [9, 2, 7, 10]
-    around = shortest_path(bound, (start, 20.0), home, either_side=False)
+    assert driven_nodes(bound, shortest_path(bound, (start, 20.0), goal=ahead, either_side=False)) == [
+        9,
+        2,
+        7,
+        10,
+    ]
+    around = shortest_path(bound, (start, 20.0), goal=home, either_side=False)
     assert driven_nodes(bound, around) == [9, 2, 7, 10, 7, 8]
-    others = shortest_path(bound, (edge_between(bound, 1, 2), 50.0), home, either_side=False)
+    others = shortest_path(bound, (edge_between(bound, 1, 2), 50.0), goal=home, either_side=False)
     assert driven_nodes(bound, others) == [1, 2, 7, 8]
 
 
@@ -349,7 +354,7 @@ def test_a_restriction_runs_over_all_of_its_ways_also_where_the_graph_joined_or_
     expected = [edge_between(graph, *ends) for ends in ((0, 2), (2, 3), (3, 6), (6, 50))]
     assert [chain.tolist() for chain in graph.chain_edges] == [expected]
     goals = [(edge_between(graph, 6, n), 10.0) for n in (50, 60)]
-    left, right = (shortest_path(graph, (expected[0], 5.0), goal, either_side=False) for goal in goals)
+    left, right = (shortest_path(graph, (expected[0], 5.0), goal=goal, either_side=False) for goal in goals)
     assert driven_nodes(graph, right) == [0, 2, 3, 6, 60]
     assert driven_nodes(graph, left) != [0, 2, 3, 6, 50]
 
@@ -470,10 +475,10 @@ def test_nobody_turns_round_but_at_a_dead_end():
 def test_a_street_is_entered_on_either_side_and_a_one_way_street_never_driven_backwards():
     places = {1: (0, 0), 2: (100, 0), 3: (100, 100), 4: (0, 100)}
     graph = graph_of(places, [({"oneway": "yes"}, [1, 2, 3, 4, 1])])
-    back = shortest_path(graph, (0, 60.0), (0, 40.0))
+    back = shortest_path(graph, (0, 60.0), goal=(0, 40.0))
     assert back.length == pytest.approx(380, abs=0.01)
     two_way = graph_of({1: (0, 0), 2: (100, 0)}, [({}, [1, 2])])
-    path = shortest_path(two_way, (0, 60.0), (0, 40.0))
+    path = shortest_path(two_way, (0, 60.0), goal=(0, 40.0))
     assert path.length == pytest.approx(20, abs=1e-3)
     np.testing.assert_allclose(path_line(two_way, path)[:, 0], [60, 40], atol=1e-3)
 
@@ -484,8 +489,8 @@ def test_time_and_length_choose_different_ways():
     graph = graph_of(places, [(slow, [1, 2]), (fast, [1, 3, 2])])
     ends = [nearest_edge(graph, [[x, 0]]) for x in (-5, 105)]
     start, goal = ((int(e[0]), float(o[0])) for e, o, _ in ends)
-    by_time = shortest_path(graph, start, goal)
-    by_length = shortest_path(graph, start, goal, weight="length")
+    by_time = shortest_path(graph, start, goal=goal)
+    by_length = shortest_path(graph, start, goal=goal, weight="length")
     assert by_time.length > 150 > by_length.length
     assert by_time.time < by_length.time
 
@@ -535,7 +540,7 @@ def test_the_main_network_is_strongly_connected():
 
 def test_true_lengths_do_not_depend_on_the_projection():
     osm = town(CROSS, ARMS)
-    utm = Frame.at(10.0, 50.0, "utm")
+    utm = Frame.at(10.0, 50.0, crs="utm")
     local_length = build_road_graph(osm, FRAME)[0].length
     np.testing.assert_allclose(build_road_graph(osm, utm)[0].length, local_length, rtol=1e-7)
 
@@ -609,7 +614,7 @@ def test_graphml_round_trip(tmp_path_factory, osm, tall):
             | {"geometry": geometry, "node_xyz": graph.node_xyz + LIFT}
         )
     path = tmp_path_factory.mktemp("graphml") / "roads.graphml"
-    write_graphml(graph, FRAME, path)
+    write_graphml(graph, FRAME, path=path)
     first = path.read_bytes()
     back = read_graphml(path, FRAME)
     for name in graph.__dataclass_fields__:
@@ -621,14 +626,14 @@ def test_graphml_round_trip(tmp_path_factory, osm, tall):
             np.testing.assert_allclose(one, two, atol=1e-4)
         else:
             assert one.tolist() == two.tolist(), name
-    write_graphml(graph, FRAME, path)
+    write_graphml(graph, FRAME, path=path)
     assert path.read_bytes() == first
 
 
 def test_restrictions_via_ways_survive_graphml_and_a_cut(tmp_path):
     relations = [via_ways("no_u_turn", 100, [102], 101), via_ways("only_straight_on", 106, [102], 107)]
     graph = graph_of(DUAL, CARRIAGEWAYS, (), relations)
-    write_graphml(graph, FRAME, tmp_path / "roads.graphml")
+    write_graphml(graph, FRAME, path=tmp_path / "roads.graphml")
     back = read_graphml(tmp_path / "roads.graphml", FRAME)
     assert [c.tolist() for c in back.chain_edges] == [c.tolist() for c in graph.chain_edges]
     assert back.chain_kind.tolist() == ["no_u_turn", "only_straight_on"]
@@ -642,7 +647,7 @@ def test_osmnx_opens_what_we_write(tmp_path):
     import osmnx as ox  # noqa: PLC0415  (slow to import)
 
     graph = graph_of(CROSS | {6: (0, 200)}, [*ARMS, ({"name": "A & B"}, [3, 6])])
-    write_graphml(graph, FRAME, tmp_path / "roads.graphml")
+    write_graphml(graph, FRAME, path=tmp_path / "roads.graphml")
     theirs = ox.load_graphml(tmp_path / "roads.graphml")
     assert len(theirs.edges) == len(graph)
     assert sum(d["length"] for _, _, d in theirs.edges(data=True)) == pytest.approx(
@@ -688,7 +693,7 @@ def test_real_places_hang_together(shared_osm, name, share):
     assert distance.max() < 1e-6
     lines = edge_lines(main)
     for (e, o), (g, p) in pairwise(zip(edges.tolist(), offsets.tolist(), strict=True)):
-        path = shortest_path(main, (e, o), (g, p))
+        path = shortest_path(main, (e, o), goal=(g, p))
         if path is None:  # a turn restriction may shut in what one-way streets leave open
             continue
         assert (main.head[path.edges[:-1]] == main.tail[path.edges[1:]]).all()

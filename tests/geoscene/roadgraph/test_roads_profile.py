@@ -248,7 +248,7 @@ def test_interior_point_finds_the_constrained_minimum(seed, n, k):
     cost = csr_array(diags_array(rng.uniform(0.5, 5, n)))
     pull, a, b = rng.normal(size=n), rng.normal(size=(k, n)), rng.normal(size=k)
     weight = 10.0 ** rng.uniform(0, 4, k)
-    z = interior_point(cost, pull, Bounds(csr_array(a), b, weight), np.zeros(n))
+    z = interior_point(cost, pull, bounds=Bounds(csr_array(a), b, weight), start=np.zeros(n))
     # At the minimum the slope of cost and penalties together is 0.
     slope = cost @ z - pull + a.T @ (weight * np.minimum(a @ z - b, 0))
     scale = 1 + np.abs(pull).max() + np.abs(a.T * weight).max()

@@ -28,9 +28,9 @@ def layers():
 
 
 def test_geopandas_sees_the_features_where_they_are(tmp_path):
-    frame = Frame.at(-76.3059, 36.8853, "utm")
+    frame = Frame.at(-76.3059, 36.8853, crs="utm")
     path = tmp_path / "features.gpkg"
-    write_geopackage(path, layers(), frame)
+    write_geopackage(path, layers(), frame=frame)
     found = geopandas.read_file(path, layer="buildings")
     assert found.crs.to_epsg() == 32618
     assert found.osm_id.tolist() == ["way/1", "relation/-2"]
@@ -44,8 +44,8 @@ def test_geopandas_sees_the_features_where_they_are(tmp_path):
 
 def test_reading_back_gives_scene_coordinates(tmp_path):
     frame = Frame.at(13.4, 52.5)
-    write_geopackage(tmp_path / "a.gpkg", layers(), frame)
-    back = read_layer(tmp_path / "a.gpkg", "buildings", frame)
+    write_geopackage(tmp_path / "a.gpkg", layers(), frame=frame)
+    back = read_layer(tmp_path / "a.gpkg", "buildings", frame=frame)
     assert shapely.equals(back.geometry, layers()[0].geometry).all()
     assert back.columns["feature"].tolist() == [0, 1]
 
@@ -53,6 +53,6 @@ def test_reading_back_gives_scene_coordinates(tmp_path):
 def test_the_same_features_are_the_same_bytes(tmp_path):
     frame = Frame.at(13.4, 52.5)
     for name in ("a.gpkg", "b.gpkg"):
-        write_geopackage(tmp_path / name, layers(), frame)
+        write_geopackage(tmp_path / name, layers(), frame=frame)
     assert (tmp_path / "a.gpkg").read_bytes() == (tmp_path / "b.gpkg").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.gpkg", "b.gpkg"]

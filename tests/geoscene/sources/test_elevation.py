@@ -109,7 +109,7 @@ def patient(server, **changes):
 
 def heights_of(path, osm, places, crs="local"):
     west, south, east, north = osm.bounds
-    frame = Frame.at((west + east) / 2, (south + north) / 2, crs)
+    frame = Frame.at((west + east) / 2, (south + north) / 2, crs=crs)
     x, y = frame.from_geographic(*places.T)
     bounds = (x.min(), y.min(), x.max(), y.max())
     terrain = open_terrain([path], frame, bounds=bounds)
@@ -160,7 +160,7 @@ def test_hills_are_met_to_what_ten_metre_posts_can_say(serve, tmp_path):
 def test_tiles_cover_the_rectangle_of_a_scene_whose_grid_is_turned_against_the_map(serve, tmp_path):
     server = serve(hills)
     osm = replace(area(0.05), bounds=(11.90, 43.70, 12.00, 43.80))  # 3 degrees off the meridian of UTM 32
-    frame = Frame.at(11.95, 43.75, "EPSG:32632")
+    frame = Frame.at(11.95, 43.75, crs="EPSG:32632")
     west, south, east, north = osm.bounds
     x, y = frame.from_geographic([west, east, east, west], [south, south, north, north])
     path = fetch_elevation(osm, cache_dir=tmp_path, crs="EPSG:32632", server=patient(server))

@@ -261,13 +261,13 @@ def test_what_was_fetched_once_comes_from_the_cache(server, tmp_path):
 def test_a_large_area_is_asked_for_in_parts_and_is_the_same(server):
     parts = []
     servers = replace(servers_at(server), max_query_km2=0.05)
-    data = fetch_bbox(*BOX, servers=servers, progress=lambda items: [parts.append(i) or i for i in items])
+    data = fetch_bbox(BOX, servers=servers, progress=lambda items: [parts.append(i) or i for i in items])
     assert server.asked_for("/api/interpreter") == len(parts) >= 4
     assert_is_the_box(data)
 
 
 def test_a_point_is_fetched_with_its_surroundings(server):
-    data = fetch_point(60.1675, 24.9455, 100, servers=servers_at(server))
+    data = fetch_point(60.1675, 24.9455, radius=100, servers=servers_at(server))
     west, south, east, north = data.bounds
     assert (north - south) * 111_195 == pytest.approx(200)
     assert (east - west) * 111_195 * 0.4975 == pytest.approx(200, rel=1e-3)
@@ -283,7 +283,7 @@ def test_a_place_that_is_a_point_is_widened_to_a_scene(server):
 def test_a_busy_server_is_asked_again(server):
     server.refuse = [429, 504]
     with osmnx_untouched():
-        data = fetch_bbox(*BOX, servers=servers_at(server))
+        data = fetch_bbox(BOX, servers=servers_at(server))
     assert_is_the_box(data)
     assert server.asked_for("/api/interpreter") == 3
 
@@ -291,14 +291,14 @@ def test_a_busy_server_is_asked_again(server):
 def test_a_busy_server_is_not_asked_for_ever(server):
     server.refuse = [429] * 99
     with osmnx_untouched(), pytest.raises(NetworkError, match="HTTP 429"):
-        fetch_bbox(*BOX, servers=servers_at(server))
+        fetch_bbox(BOX, servers=servers_at(server))
     assert server.asked_for("/api/interpreter") == 3
 
 
 def test_a_server_that_fails_gives_way_to_the_next(start):
     first, second = start(), start()
     first.refuse = [500]
-    data = fetch_bbox(*BOX, servers=servers_at(first, second))
+    data = fetch_bbox(BOX, servers=servers_at(first, second))
     assert_is_the_box(data)
     assert (first.asked_for("/api/interpreter"), second.asked_for("/api/interpreter")) == (1, 1)
 
@@ -306,10 +306,10 @@ def test_a_server_that_fails_gives_way_to_the_next(start):
 def test_a_server_that_fails_is_named_and_nothing_is_kept(server, tmp_path):
     server.refuse = [500]
     with pytest.raises(NetworkError, match=r"127\.0\.0\.1:\d+: HTTP 500.*--osm FILE.*--demo"):
-        fetch_bbox(*BOX, cache_dir=tmp_path, servers=servers_at(server))
+        fetch_bbox(BOX, cache_dir=tmp_path, servers=servers_at(server))
     server.remark = "runtime error: Query run out of memory using about 2048 MB of RAM."
     with pytest.raises(NetworkError, match="out of memory"):
-        fetch_bbox(*BOX, cache_dir=tmp_path, servers=servers_at(server))
+        fetch_bbox(BOX, cache_dir=tmp_path, servers=servers_at(server))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -317,7 +317,7 @@ def test_without_a_network_one_line_says_what_to_do():
     servers = Servers(nominatim=nowhere(), overpass=(f"{nowhere()}/api", "http://map.invalid/api"), wait=0.0)
     for fetch in (
         lambda: fetch_place("Norfolk, VA", servers=servers),
-        lambda: fetch_bbox(*BOX, servers=servers),
+        lambda: fetch_bbox(BOX, servers=servers),
     ):
         with osmnx_untouched(), pytest.raises(NetworkError) as caught:
             fetch()
@@ -332,19 +332,19 @@ def test_a_place_nobody_knows_is_not_found(server):
     with pytest.raises(SourceNotFoundError, match="no place called 'Atlantis'"):
         fetch_place("Atlantis", servers=servers_at(server))
     with pytest.raises(SourceNotFoundError, match="nothing"):
-        fetch_bbox(0.0, 0.0, 0.01, 0.01, servers=servers_at(server))
+        fetch_bbox((0.0, 0.0, 0.01, 0.01), servers=servers_at(server))
 
 
 def test_what_cannot_be_asked_for_is_refused_before_asking(server):
     servers = servers_at(server)
     with pytest.raises(InputError, match="km²"):
-        fetch_bbox(20, 60, 25, 65, servers=servers)
+        fetch_bbox((20, 60, 25, 65), servers=servers)
     with pytest.raises(InputError, match="latitude"):
-        fetch_point(120, 24, 100, servers=servers)
+        fetch_point(120, 24, radius=100, servers=servers)
     with pytest.raises(InputError, match="radius"):
-        fetch_point(60, 24, -1, servers=servers)
+        fetch_point(60, 24, radius=-1, servers=servers)
     with pytest.raises(InputError, match="west is not less than east"):
-        fetch_bbox(25, 60, 24, 61, servers=servers)
+        fetch_bbox((25, 60, 24, 61), servers=servers)
     assert server.asked == []
 
 

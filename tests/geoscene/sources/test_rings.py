@@ -135,7 +135,7 @@ METRE = 9e-6
 def test_a_cut_ring_closes_the_same_wherever_it_starts(shift):
     corners = np.array([(5, 30), (5, 10), (30, 10), (30, 40), (5, 40)]) * METRE
     ring = np.roll([0, 1, 2, 3, 4, -1], shift)
-    closed = close_cut_ring(np.append(ring, ring[0]), corners, EDGE)
+    closed = close_cut_ring(np.append(ring, ring[0]), corners, extent=EDGE)
     assert closed is not None
     assert closed[0] == closed[-1]
     assert shapely.Polygon(corners[closed]).area / METRE**2 == pytest.approx(750)
@@ -143,10 +143,10 @@ def test_a_cut_ring_closes_the_same_wherever_it_starts(shift):
 
 def test_a_ring_is_not_closed_where_the_gap_makes_most_of_it_or_lies_inland():
     corners = np.array([(5, 40), (5, 5), (30, 5), (30, 40)]) * METRE
-    assert close_cut_ring(np.arange(4), corners, EDGE) is not None
-    assert close_cut_ring(np.arange(3), corners, EDGE) is None
+    assert close_cut_ring(np.arange(4), corners, extent=EDGE) is not None
+    assert close_cut_ring(np.arange(3), corners, extent=EDGE) is None
     inland = corners + 500 * METRE
-    assert close_cut_ring(np.arange(4), inland, EDGE) is None
-    assert close_cut_ring(np.array([0, -1, -1]), corners, EDGE) is None
+    assert close_cut_ring(np.arange(4), inland, extent=EDGE) is None
+    assert close_cut_ring(np.array([0, -1, -1]), corners, extent=EDGE) is None
     crossing = corners[[0, 2, 1, 3]]
-    assert close_cut_ring(np.arange(4), crossing, EDGE) is None
+    assert close_cut_ring(np.arange(4), crossing, extent=EDGE) is None

@@ -65,9 +65,9 @@ class Town:
         graph, _ = build_road_graph(osm, frame)
         self.graph = profile(graph, ground, obstacles=find_obstacles(osm, frame))
         graded = graded_ground(self.graph, ground)
-        surfaces, _ = road_surfaces(osm, self.graph, frame)
+        surfaces, _ = road_surfaces(osm, self.graph, frame=frame)
         self.ground_rows = surfaces
-        self.table, self.problems = read_structures(surfaces, self.graph, osm, frame, height=graded)
+        self.table, self.problems = read_structures(surfaces, self.graph, osm=osm, frame=frame, height=graded)
         self.height = ground_below(self.table, graded)
         self.openings = find_openings(self.table, self.height)
         self.meshes = structure_meshes(self.table, height=self.height, openings=self.openings)
@@ -180,7 +180,7 @@ def test_whatever_stands_on_a_slab_or_hangs_from_it_is_one_closed_solid(size, se
     slab = np.ones(len(plan.faces), bool)
     solid = np.column_stack([rng.random(len(slab)) < 0.4, slab, rng.random(len(slab)) < 0.4])
     levels = np.cumsum(rng.uniform(0.2, 1.0, (len(plan.xy), 4)), axis=1)
-    shell = raise_shell(plan, levels, solid)
+    shell = raise_shell(plan, levels, solid=solid)
     verdict = validate_mesh(Mesh.of(shell.vertices, shell.faces, feature=0, closed=True))
     assert verdict.ok.all(), verdict.fault(0)
 
@@ -188,7 +188,7 @@ def test_whatever_stands_on_a_slab_or_hangs_from_it_is_one_closed_solid(size, se
 def test_a_shell_holds_what_is_solid_and_no_more():
     plan = Plan(np.array([[0, 0], [2, 0], [2, 2], [0, 2.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
     levels = np.tile([0.0, 1.0, 3.0], (4, 1))
-    shell = raise_shell(plan, levels, np.array([[True, True], [True, False]]))
+    shell = raise_shell(plan, levels, solid=np.array([[True, True], [True, False]]))
     verdict = validate_mesh(Mesh.of(shell.vertices, shell.faces, feature=0, closed=True))
     assert verdict.ok.all()
     assert verdict.volume[0] == pytest.approx(4 * 1 + 2 * 2)
@@ -311,7 +311,7 @@ def test_a_building_stands_over_the_tunnel_that_would_run_into_it(tunnel):
     )
     buildings, _ = read_buildings(town(PLACES, UNDER, [house]), FRAME)
     base = np.full(buildings.count, -4.0)
-    over, problems = buildings_over(buildings, base, tunnel.table)
+    over, problems = buildings_over(buildings, base, table=tunnel.table)
     assert [p.reason for p in problems] == ["over-tunnel"]
     solid, _ = build_solids(over, base=base)
     assert validate_mesh(solid).ok.all()
@@ -344,7 +344,7 @@ def test_a_building_over_two_tunnels_that_cross_stands_over_the_upper_one():
     house = Area("way/900", {"building": "yes", "height": "40"}, shapely.Polygon(outline), np.empty(0, int))
     buildings, _ = read_buildings(town(places, ways, [house]), FRAME)
     base = np.full(1, near[:, 2].min() - 1)
-    solid, _ = build_solids(buildings_over(buildings, base, both.table)[0], base=base)
+    solid, _ = build_solids(buildings_over(buildings, base, table=both.table)[0], base=base)
     assert validate_mesh(solid).ok.all()
     for along in (near[np.abs(near[:, 0]) < 0.1], near[np.abs(near[:, 1]) < 0.1]):
         for up in (0.3, 4.5):
@@ -363,7 +363,7 @@ def test_a_building_over_a_road_bridge_lets_its_traffic_through_and_one_beside_i
             "way/900", {"building": "yes", "height": "20"}, shapely.Polygon(outline), np.empty(0, int)
         )
         buildings, _ = read_buildings(town(PLACES, OVER, [house]), FRAME)
-        over, problems = buildings_over(buildings, base, bridge.table)
+        over, problems = buildings_over(buildings, base, table=bridge.table)
         assert [p.reason for p in problems] == (["over-bridge"] if through else [])
         solid, _ = build_solids(over, base=base)
         assert validate_mesh(solid).ok.all()
@@ -544,7 +544,7 @@ def ground_mesh(town, extent):
     bare = Layers.of([shapely.box(*extent)], klass=Class.GRASS, material=7, priority=1.0)
     layers = concatenate_layers([bare, opening_layers(town.table, town.openings)])
     plan = plan_ground(extent, layers, lines=10.0)
-    return concatenate([ground_tile(plan, int(i), int(j), height=town.height) for i, j in plan.tiles])
+    return concatenate([ground_tile(plan, int(i), j=int(j), height=town.height) for i, j in plan.tiles])
 
 
 def test_ground_on_a_steep_slope_stays_below_a_low_deck():
@@ -654,7 +654,7 @@ def test_undersides_over_a_tunnel_in_pieces_come_in_whole_steps():
     line = Town(town(places, ways))
     buildings, _ = read_buildings(town(places, ways, station), FRAME)
     base = np.full(buildings.count, line.centre_lines("tunnel")[:, 2].min() - 1.0)
-    over, problems = buildings_over(buildings, base, line.table)
+    over, problems = buildings_over(buildings, base, table=line.table)
     assert [p.reason for p in problems] == ["over-tunnel"]
     steps = over.min_height[over.min_height_source == "tunnel"] / 0.05
     assert len(steps) >= 5

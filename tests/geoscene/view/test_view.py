@@ -67,7 +67,9 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     osm = read_osm(demo_path(), bounds=BOX)
-    return build(osm, tmp_path_factory.mktemp("view") / "demo", BuildOptions(name="demo", tile_size=200.0))
+    return build(
+        osm, tmp_path_factory.mktemp("view") / "demo", options=BuildOptions(name="demo", tile_size=200.0)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +179,7 @@ def test_every_attribute_is_in_the_page(scene, page):
     known = {table["layer"]: table for table in page.json("attributes")}
     assert {"buildings", "building_parts", "road_surfaces", "roads", "trees", "furniture"} <= set(known)
     for name in ("buildings", "building_parts", "trees"):
-        layer, table = read_layer(scene.path / "features.gpkg", name, scene.frame), known[name]
+        layer, table = read_layer(scene.path / "features.gpkg", name, frame=scene.frame), known[name]
         assert table["feature"] == layer.columns["feature"].tolist()
         assert set(table["columns"]) == set(layer.columns) - {"feature"}
         for column, told in table["columns"].items():
@@ -194,8 +196,8 @@ def test_every_attribute_is_in_the_page(scene, page):
 
 def test_road_edges_come_with_the_surfaces_of_their_ways(scene, page):
     tables = {table["layer"]: table for table in page.json("attributes")}
-    roads = read_layer(scene.path / "features.gpkg", "roads", scene.frame)
-    surfaces = read_layer(scene.path / "features.gpkg", "road_surfaces", scene.frame)
+    roads = read_layer(scene.path / "features.gpkg", "roads", frame=scene.frame)
+    surfaces = read_layer(scene.path / "features.gpkg", "road_surfaces", frame=scene.frame)
     seen = np.isin(surfaces.columns["feature"], np.concatenate([t.mesh.feature for t in scene.tiles()]))
     ways = {way for text in surfaces.columns["osm_id"][seen] for way in text.split(";")}
     belongs = [not ways.isdisjoint(text.split(";")) for text in roads.columns["osm_id"]]
@@ -352,7 +354,7 @@ def test_groups_are_ground_and_the_layers_that_are_seen(scene):
 )
 def test_longitude_and_latitude_are_within_the_error_that_is_told(place, size, seed):
     crs, lon, lat = place
-    frame = Frame.at(lon, lat, crs)
+    frame = Frame.at(lon, lat, crs=crs)
     grid = lonlat_grid(frame, (-size, -0.7 * size, size, 0.9 * size))
     assert grid.error <= ACCURACY
     points = np.random.default_rng(seed).uniform(-0.7 * size, 0.7 * size, (50, 2))
@@ -363,7 +365,7 @@ def test_longitude_and_latitude_are_within_the_error_that_is_told(place, size, s
 @pytest.mark.shared
 def test_lower_manhattan_is_a_small_page(shared_osm, tmp_path):
     osm = read_osm(shared_osm("nyc_lower_east_side.osm.pbf"))
-    scene = build(osm, tmp_path / "scene", BuildOptions(name="Lower East Side"))
+    scene = build(osm, tmp_path / "scene", options=BuildOptions(name="Lower East Side"))
     summary = view_scene(scene, tmp_path / "page.html")
     assert summary.faces == scene.manifest["counts"]["faces"] > 100_000
     assert summary.bytes == (tmp_path / "page.html").stat().st_size < 2.5e6

@@ -24,7 +24,9 @@ SLOW = "GPU stall due to ReadPixels"
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     osm = read_osm(demo_path(), bounds=BOX)
-    return build(osm, tmp_path_factory.mktemp("browser") / "demo", BuildOptions(name="demo", tile_size=200.0))
+    return build(
+        osm, tmp_path_factory.mktemp("browser") / "demo", options=BuildOptions(name="demo", tile_size=200.0)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +73,7 @@ def middle(window):
 
 def tall_house(scene, window):
     """(row, feature, columns) of the highest house in the page that is a way."""
-    buildings = read_layer(scene.path / "features.gpkg", "buildings", scene.frame).columns
+    buildings = read_layer(scene.path / "features.gpkg", "buildings", frame=scene.frame).columns
     for row in np.argsort(-buildings["height"]):
         feature = int(buildings["feature"][row])
         if buildings["osm_id"][row].startswith("way/") and window.js(
@@ -161,7 +163,7 @@ def test_search_by_id_goes_there(scene, opened):
 
 
 def test_search_by_name_finds_and_says_when_there_is_none(scene, opened):
-    names = read_layer(scene.path / "features.gpkg", "buildings", scene.frame).columns["name"]
+    names = read_layer(scene.path / "features.gpkg", "buildings", frame=scene.frame).columns["name"]
     name = next(name for name in names if name)
     assert opened.js("return geoscene.select(arguments[0])", name.upper())
     assert name in opened.text("panel")
@@ -175,7 +177,9 @@ def test_what_was_guessed_has_its_own_colours_and_a_legend(scene, opened):
     opened.js("const c = document.getElementById('color'); c.value = 'source'; c.onchange();")
     assert (np.abs(middle(opened) - before).max(axis=2) > 12).mean() > 0.1
     legend = opened.text("legend")
-    sources = read_layer(scene.path / "features.gpkg", "buildings", scene.frame).columns["height_source"]
+    sources = read_layer(scene.path / "features.gpkg", "buildings", frame=scene.frame).columns[
+        "height_source"
+    ]
     assert f"from its storeys ({(sources == 'levels').sum()})" in legend
     for mode in ("material", "class", "sigma", "look"):
         opened.js("const c = document.getElementById('color'); c.value = arguments[0]; c.onchange();", mode)

@@ -56,7 +56,7 @@ def test_a_scanners_points_lie_on_the_pixels_that_show_them(column):
     scene, world = column
     poses = _street_view(world, yaw=0.4)
     sun = sun_direction(scene.frame, datetime(2026, 6, 21, 9, tzinfo=UTC))
-    frame = render(CAMERA, poses, world, sun=sun)
+    frame = render(CAMERA, poses, world=world, sun=sun)
     # A scanner at the camera itself sees just what it sees, so that nothing is hidden.
     directions = np.random.default_rng(0).normal(size=(20000, 3)) * [1, 1, 0.3]
     hits = world.caster.cast(poses.position[0], directions)
@@ -79,7 +79,7 @@ def test_a_scanners_points_lie_on_the_pixels_that_show_them(column):
 
 def test_the_column_stands_in_the_middle_of_the_picture(column):
     _, world = column
-    frame = render(CAMERA, _street_view(world, yaw=0.4), world, sun=(0, -1, 1))
+    frame = render(CAMERA, _street_view(world, yaw=0.4), world=world, sun=(0, -1, 1))
     assert {Class.SKY, Class.ROAD, Class.BUILDING} <= set(np.unique(frame.klass).tolist())
     v, u = np.nonzero((frame.klass == Class.BUILDING) & (frame.depth < 90))
     assert abs(np.median(u) - 319.5) < 30
@@ -93,7 +93,11 @@ def test_frames_of_a_real_place_are_the_same_every_time(column):
     for threads in (1, 2):
         world = World.load(scene)
         frame = render(
-            CAMERA, _street_view(world, yaw=2.0), world, sun=(1, 0, 1), options=RenderOptions(threads=threads)
+            CAMERA,
+            _street_view(world, yaw=2.0),
+            world=world,
+            sun=(1, 0, 1),
+            options=RenderOptions(threads=threads),
         )
         shots.append((encode_png(frame.rgb), encode_png(depth_to_counts(frame.depth))))
     assert shots[0] == shots[1]
@@ -110,7 +114,7 @@ def test_walls_are_found_again_when_tiles_come_and_go(column):
     assert len(again.style) == len(whole.style) > 50
     assert (again.wall >= 0).sum() == (whole.wall >= 0).sum()
     pose, camera = _street_view(world, yaw=0.4), replace(CAMERA, width=160, height=90, cx=79.5, cy=44.5)
-    a, b = (render(camera, pose, w, sun=(0, -1, 1)).rgb for w in (world, moving))
+    a, b = (render(camera, pose, world=w, sun=(0, -1, 1)).rgb for w in (world, moving))
     np.testing.assert_array_equal(a, b)
 
 

@@ -60,14 +60,14 @@ def street():
 
 
 def test_depth_is_measured_along_the_optical_axis():
-    frame = render(CAMERA, looking(), world(plate(10.0)), sun=NOON)
+    frame = render(CAMERA, looking(), world=world(plate(10.0)), sun=NOON)
     # A plate square to the axis is everywhere equally deep, though its corners are farther away.
     np.testing.assert_allclose(frame.depth, 10.0, atol=1e-5)
 
 
 def test_depth_is_in_true_metres_where_the_grid_is_not():
     k = 0.9996
-    frame = render(CAMERA, looking(scale=k), world(plate(10.0 * k)), sun=NOON)
+    frame = render(CAMERA, looking(scale=k), world=world(plate(10.0 * k)), sun=NOON)
     np.testing.assert_allclose(frame.depth, 10.0, atol=1e-5)
 
 
@@ -82,7 +82,7 @@ def test_depth_is_in_true_metres_where_the_grid_is_not():
 def test_points_of_a_scanner_lie_in_the_depth_image(camera):
     town = street()
     poses = looking((0, 0, 1.5), yaw=0.3)
-    frame = render(camera, poses, town, sun=NOON)
+    frame = render(camera, poses, world=town, sun=NOON)
     scanner = np.array([0.5, 0.2, 1.9])
     directions = np.random.default_rng(1).normal(size=(4000, 3)) * [1, 1, 0.2] + [0.5, 0, 0]
     hits = town.caster.cast(scanner, directions)
@@ -109,7 +109,9 @@ def test_points_of_a_scanner_lie_in_the_depth_image(camera):
 
 def test_a_box_covers_the_pixels_its_size_demands():
     # 4 m wide and 2 m high, its face 20 m away, f = 100 px: 20 by 10 pixels.
-    frame = render(CAMERA, looking((0, 0, 1.0)), world(box((20, -2, 0), (22, 2, 2), feature=7)), sun=NOON)
+    frame = render(
+        CAMERA, looking((0, 0, 1.0)), world=world(box((20, -2, 0), (22, 2, 2), feature=7)), sun=NOON
+    )
     v, u = np.nonzero(frame.feature == 7)
     assert (np.ptp(u) + 1, np.ptp(v) + 1) == (20, 10)
     assert (u.min() + u.max()) / 2 == pytest.approx(79.5)
@@ -126,7 +128,7 @@ def test_a_balls_outline_is_that_of_its_tangent_cone():
     a = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     f = np.concatenate([np.stack([a, a + 1, a + n + 2], 1), np.stack([a, a + n + 2, a + n + 1], 1)])
     ball = Mesh.of(v * 2.0 + [10, 0, 1.5], f, feature=3)
-    frame = render(CAMERA, looking(), world(ball), sun=NOON)
+    frame = render(CAMERA, looking(), world=world(ball), sun=NOON)
     # sin(half angle) = 2 / 10, radius = f tan(half angle)
     radius = 100 * np.tan(np.arcsin(0.2))
     assert (frame.feature == 3).sum() == pytest.approx(np.pi * radius**2, rel=0.01)
@@ -134,7 +136,7 @@ def test_a_balls_outline_is_that_of_its_tangent_cone():
 
 
 def test_far_things_are_seen_but_not_measured():
-    frame = render(replace(CAMERA, far=9.0), looking(), world(plate(10.0, feature=5)), sun=NOON)
+    frame = render(replace(CAMERA, far=9.0), looking(), world=world(plate(10.0, feature=5)), sun=NOON)
     assert np.isinf(frame.depth).all()
     assert (frame.feature == 5).all()
 
@@ -142,8 +144,8 @@ def test_far_things_are_seen_but_not_measured():
 def test_nothing_nearer_than_near_is_seen():
     near = world(plate(0.5, half=0.2, feature=1), plate(10.0, feature=2))
     eye = looking((0, 0, 0.0))
-    assert (render(CAMERA, eye, near, sun=NOON).feature == 1).any()
-    assert (render(replace(CAMERA, near=1.0), eye, near, sun=NOON).feature == 2).all()
+    assert (render(CAMERA, eye, world=near, sun=NOON).feature == 1).any()
+    assert (render(replace(CAMERA, near=1.0), eye, world=near, sun=NOON).feature == 2).all()
 
 
 def _above():
@@ -158,7 +160,7 @@ def test_shadows_fall_away_from_the_sun_as_long_as_its_height_says(azimuth_deg):
     elevation, azimuth = np.radians(30), np.radians(azimuth_deg)
     flat = np.array([np.sin(azimuth), np.cos(azimuth)])
     sun = [*np.cos(elevation) * flat, np.sin(elevation)]
-    frame = render(CAMERA, _above(), town, sun=sun, options=FLAT)
+    frame = render(CAMERA, _above(), world=town, sun=sun, options=FLAT)
     bright = frame.rgb.astype(int).sum(axis=2)
 
     def at(xy):
@@ -172,16 +174,16 @@ def test_shadows_fall_away_from_the_sun_as_long_as_its_height_says(azimuth_deg):
     assert at(-flat * (length + 2.5)) == lit
     across = np.array([flat[1], -flat[0]])
     assert at(-flat * 5 + across * 4) == lit
-    unshaded = render(CAMERA, _above(), town, sun=sun, options=replace(FLAT, shadows=False))
+    unshaded = render(CAMERA, _above(), world=town, sun=sun, options=replace(FLAT, shadows=False))
     assert (unshaded.rgb[frame.feature == 0].astype(int).sum(axis=1) == lit).all()
 
 
 def test_a_mid_grey_floor_in_sun_and_sky_is_a_quarter_of_full_scale():
     # sRGB 118 is 18 % reflectance; a quarter of full scale is sRGB 137.
     for sun in ((0, -1, 1), (1, 0, 0.3), (0.0, 0.0, 1.0)):
-        frame = render(CAMERA, _above(), world(ground()), sun=sun, options=FLAT)
+        frame = render(CAMERA, _above(), world=world(ground()), sun=sun, options=FLAT)
         assert frame.rgb.mean() == pytest.approx(137, abs=4)
-    brighter = render(CAMERA, _above(), world(ground()), sun=NOON, options=replace(FLAT, exposure=1.0))
+    brighter = render(CAMERA, _above(), world=world(ground()), sun=NOON, options=replace(FLAT, exposure=1.0))
     # A stop doubles linear light: 0.5 of full scale is sRGB 188.
     assert brighter.rgb.mean() == pytest.approx(188, abs=5)
 
@@ -191,9 +193,9 @@ def test_a_wall_is_lit_by_the_cosine_of_the_suns_angle():
     for turn in np.radians([0, 30, 60]):
         sun = (-np.cos(turn), np.sin(turn), 1e-3)
         wall = world(plate(10.0))
-        shade = render(CAMERA, looking(), wall, sun=(1.0, 0, 1e-3), options=FLAT).rgb
+        shade = render(CAMERA, looking(), world=wall, sun=(1.0, 0, 1e-3), options=FLAT).rgb
         assert shade.max() < 255
-        raw = render(CAMERA, looking(), wall, sun=sun, options=replace(FLAT, exposure=-3.0)).rgb
+        raw = render(CAMERA, looking(), world=wall, sun=sun, options=replace(FLAT, exposure=-3.0)).rgb
         s = raw[60, 80] / 255
         light.append(np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)[0])
     assert light[0] > light[1] > light[2]
@@ -201,7 +203,7 @@ def test_a_wall_is_lit_by_the_cosine_of_the_suns_angle():
 
 def test_same_input_same_bytes_on_any_number_of_threads():
     town, poses = street(), looking(yaw=0.2)
-    a, b = (render(CAMERA, poses, town, sun=NOON, options=RenderOptions(threads=n)) for n in (1, 3))
+    a, b = (render(CAMERA, poses, world=town, sun=NOON, options=RenderOptions(threads=n)) for n in (1, 3))
     assert encode_png(a.rgb) == encode_png(b.rgb)
     for name in ("depth", "klass", "feature"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
@@ -212,7 +214,7 @@ def test_noise_follows_its_seed_and_the_light():
 
     def shot(key):
         random = np.random.Generator(np.random.Philox(key=key))
-        return render(CAMERA, _above(), world(ground()), sun=NOON, random=random, options=options).rgb
+        return render(CAMERA, _above(), world=world(ground()), sun=NOON, random=random, options=options).rgb
 
     np.testing.assert_array_equal(shot(5), shot(5))
     assert (shot(5) != shot(6)).mean() > 0.5
@@ -221,13 +223,13 @@ def test_noise_follows_its_seed_and_the_light():
     slope = 255 * 1.055 / 2.4 * 0.25 ** (1 / 2.4 - 1)
     assert spread == pytest.approx(slope * np.sqrt(500 + 16) / 2000, rel=0.1)
     with pytest.raises(InputError, match="random"):
-        render(CAMERA, _above(), world(ground()), sun=NOON, options=options)
+        render(CAMERA, _above(), world=world(ground()), sun=NOON, options=options)
 
 
 def test_supersampling_softens_edges_and_keeps_labels():
     town, poses = street(), looking(yaw=0.2)
-    plain = render(CAMERA, poses, town, sun=NOON, options=FLAT)
-    soft = render(CAMERA, poses, town, sun=NOON, options=replace(FLAT, supersample=2))
+    plain = render(CAMERA, poses, world=town, sun=NOON, options=FLAT)
+    soft = render(CAMERA, poses, world=town, sun=NOON, options=replace(FLAT, supersample=2))
     np.testing.assert_array_equal(plain.depth, soft.depth)
     np.testing.assert_array_equal(plain.feature, soft.feature)
     a, b = plain.rgb.astype(float), soft.rgb.astype(float)
@@ -243,12 +245,12 @@ def test_a_rolling_shutter_slants_an_upright_edge():
     # 20 m/s to the left, 10 m from an upright edge: 100 / 10 * 20 * 1e-4 = 0.02 pixels a row, right.
     poses = stacked([looking((0.0, 20.0 * 1e-4 * v, 1.5)) for v in range(120)])
     edge = world(box((10, -50, -50), (11, 0, 50), feature=1))
-    frame = render(camera, poses, edge, sun=NOON)
+    frame = render(camera, poses, world=edge, sun=NOON)
     first = np.argmax(frame.feature == 1, axis=1)
     slope = np.polyfit(np.arange(120), first, 1)[0]
     assert slope == pytest.approx(0.02, abs=0.002)
     with pytest.raises(InputError, match="exposure_times"):
-        render(camera, looking(), edge, sun=NOON)
+        render(camera, looking(), world=edge, sun=NOON)
 
 
 def test_an_open_shutter_blurs_what_moves():
@@ -258,8 +260,8 @@ def test_an_open_shutter_blurs_what_moves():
     # 20 m/s for 10 ms is 0.2 m, 2 pixels at 10 m: the edge takes steps instead of one jump.
     poses = stacked([looking((0.0, 20.0 * t * 1e-9, 1.5)) for t in times])
     edge = world(box((10, -50, -50), (11, 0, 50), feature=1, material="tyre"))
-    still = render(CAMERA, poses.take([2]), edge, sun=NOON, options=FLAT)
-    moved = render(camera, poses, edge, sun=NOON, options=FLAT)
+    still = render(CAMERA, poses.take([2]), world=edge, sun=NOON, options=FLAT)
+    moved = render(camera, poses, world=edge, sun=NOON, options=FLAT)
     row = moved.rgb[60].astype(int).sum(axis=1)
     sharp = still.rgb[60].astype(int).sum(axis=1)
     assert (np.diff(sharp) != 0).sum() <= 1 + (np.abs(np.diff(sharp)) < 10).sum()
@@ -270,7 +272,7 @@ def test_an_open_shutter_blurs_what_moves():
 
 def test_a_fisheye_measures_along_its_rays_and_is_black_outside_its_circle():
     camera = replace(CAMERA, model="fisheye", fx=15.0, fy=15.0, distortion=(0.0,) * 4)
-    frame = render(camera, looking((0, 0, 3.0)), world(ground()), sun=NOON)
+    frame = render(camera, looking((0, 0, 3.0)), world=world(ground()), sun=NOON)
     outside = np.isnan(pixel_rays(camera)[:, 0]).reshape(120, 160)
     assert outside.any()
     assert (frame.klass[outside] == Class.UNLABELED).all()
@@ -313,8 +315,8 @@ def test_detail_gives_odometry_something_to_hold_on_to():
     camera = replace(CAMERA, width=640, height=480, fx=400.0, fy=400.0, cx=319.5, cy=239.5)
     town, poses = street(), looking((-20, 0, 1.5), yaw=0.1)
     smooth = RenderOptions(supersample=3)
-    drawn = _corners(render(camera, poses, town, sun=NOON, options=smooth).rgb)
-    plain = _corners(render(camera, poses, town, sun=NOON, options=replace(smooth, detail=False)).rgb)
+    drawn = _corners(render(camera, poses, world=town, sun=NOON, options=smooth).rgb)
+    plain = _corners(render(camera, poses, world=town, sun=NOON, options=replace(smooth, detail=False)).rgb)
     assert drawn > 300
     assert drawn > 10 * plain
 
@@ -324,7 +326,7 @@ def test_detail_stays_in_its_place_when_the_camera_moves():
     camera = replace(CAMERA, width=320, fx=200.0, fy=200.0, cx=159.5)
     options = RenderOptions(supersample=3, visibility=np.inf)
     a, b = (
-        render(camera, looking((0, y, 0.0)), wall, sun=(-1, -0.5, 0.8), options=options)
+        render(camera, looking((0, y, 0.0)), world=wall, sun=(-1, -0.5, 0.8), options=options)
         .rgb[:, :, 1]
         .astype(float)
         for y in (0.0, 1.0)
@@ -343,7 +345,7 @@ def test_far_detail_fades_instead_of_flickering():
     for height in (20.0, 100.0, 800.0):
         poses = _above()
         poses = Poses(np.array([[0.0, 0.0, height]]), poses.rotation, poses.scale)
-        rgb = render(camera, poses, world(ground()), sun=NOON, options=replace(FLAT, detail=True)).rgb
+        rgb = render(camera, poses, world=world(ground()), sun=NOON, options=replace(FLAT, detail=True)).rgb
         contrast.append(np.abs(np.diff(rgb.astype(float), axis=1)).mean())
     assert all(near > far for near, far in pairwise(contrast))
 
@@ -356,7 +358,7 @@ def test_haze_takes_the_contrast_that_its_visibility_says():
             box((199.9, 0, -99), (200.5, 99, 99), feature=2),
         )
         middle = replace(CAMERA, width=20, height=20, cx=9.5, cy=9.5)
-        frame = render(middle, looking((0, 0, 0)), pair, sun=(-1, 0, 0.5), options=options)
+        frame = render(middle, looking((0, 0, 0)), world=pair, sun=(-1, 0, 0.5), options=options)
         s = frame.rgb / 255
         light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)[..., 1]
         return abs(light[frame.feature == 1].mean() - light[frame.feature == 2].mean())
@@ -367,7 +369,7 @@ def test_haze_takes_the_contrast_that_its_visibility_says():
 
 def test_flow_of_a_still_world_is_the_cameras_own_motion():
     first, second = looking((0, 0, 1.5)), looking((0, 0.5, 1.5))
-    flow = optical_flow(CAMERA, first, second, world(plate(10.0)))
+    flow = optical_flow(CAMERA, first, later=second, world=world(plate(10.0)))
     np.testing.assert_allclose(flow[..., 0], 100 * 0.5 / 10, atol=1e-4)
     np.testing.assert_allclose(flow[..., 1], 0, atol=1e-4)
 
@@ -380,7 +382,7 @@ def test_flow_of_a_rolling_shutter_ends_on_the_row_that_sees_the_point():
     def exposed(t):
         return stacked([looking((0.0, left * s, 1.5 + up * s)) for s in t])
 
-    flow = optical_flow(camera, exposed(rows), exposed(rows + period), world(plate(10.0)))
+    flow = optical_flow(camera, exposed(rows), later=exposed(rows + period), world=world(plate(10.0)))
     # A point sinks by k pixels a second and is met d rows on, d k times later: d = k (period + d row).
     k = 100 / 10 * up
     down = k * period / (1 - k * 1e-4)
@@ -389,21 +391,23 @@ def test_flow_of_a_rolling_shutter_ends_on_the_row_that_sees_the_point():
     np.testing.assert_allclose(flow[inside, :, 0], 100 / 10 * left * (period + down * 1e-4), atol=0.01)
     assert down - k * period > 0.05
     with pytest.raises(InputError, match="120 poses"):
-        optical_flow(camera, looking(), looking(), world(plate(10.0)))
+        optical_flow(camera, looking(), later=looking(), world=world(plate(10.0)))
 
 
 def test_the_sky_moves_with_turning_alone():
     sky = world(box((-5, -5, -100), (5, 5, -99)))
-    np.testing.assert_allclose(optical_flow(CAMERA, looking(), looking((5, 3, 2)), sky), 0, atol=1e-4)
-    turned = optical_flow(CAMERA, looking(), looking(yaw=0.1), sky)
+    np.testing.assert_allclose(
+        optical_flow(CAMERA, looking(), later=looking((5, 3, 2)), world=sky), 0, atol=1e-4
+    )
+    turned = optical_flow(CAMERA, looking(), later=looking(yaw=0.1), world=sky)
     assert turned[60, 79, 0] == pytest.approx(100 * np.tan(0.1), abs=0.1)
 
 
 def test_a_pixel_follows_its_flow_to_the_same_surface():
     town = street()
     first, second = looking((0, 0, 1.5), yaw=0.1), looking((0.6, 0.1, 1.5), yaw=0.13)
-    flow = optical_flow(CAMERA, first, second, town)
-    a, b = (render(CAMERA, p, town, sun=NOON) for p in (first, second))
+    flow = optical_flow(CAMERA, first, later=second, world=town)
+    a, b = (render(CAMERA, p, world=town, sun=NOON) for p in (first, second))
     v, u = np.mgrid[0:120, 0:160]
     to = np.rint(np.stack([u, v], -1) + flow).astype(int)
     inside = (to >= 0).all(-1) & (to[..., 0] < 160) & (to[..., 1] < 120)
@@ -437,8 +441,8 @@ class ActorWorld:
 def test_flow_of_an_actor_is_its_own_motion():
     still = looking((0, 0, 0))
     moving = ActorWorld((11, 0, 0), (0, -0.5, 0))
-    flow = optical_flow(CAMERA, still, still, moving)
-    actor = render(CAMERA, still, moving, sun=NOON).feature == 9
+    flow = optical_flow(CAMERA, still, later=still, world=moving)
+    actor = render(CAMERA, still, world=moving, sun=NOON).feature == 9
     assert actor.sum() == 20 * 20
     np.testing.assert_allclose(flow[actor], [[5.0, 0.0]] * actor.sum(), atol=1e-4)
     np.testing.assert_allclose(flow[~actor], 0, atol=1e-4)
@@ -446,18 +450,18 @@ def test_flow_of_an_actor_is_its_own_motion():
 
 def test_flow_between_ray_times_is_that_part_of_an_actors_motion():
     still, part = looking((0, 0, 0)), {"times": np.array([0.2]), "later_times": np.array([0.8])}
-    flow = optical_flow(CAMERA, still, still, ActorWorld((11, 0, 0), (0, -0.5, 0)), **part)
+    flow = optical_flow(CAMERA, still, later=still, world=ActorWorld((11, 0, 0), (0, -0.5, 0)), **part)
     assert np.nanmax(flow) == pytest.approx(3.0, abs=1e-4)
 
 
 def test_a_camera_that_does_not_record_colour_skips_it():
-    frame = render(replace(CAMERA, images=("depth",)), looking(), street(), sun=NOON)
+    frame = render(replace(CAMERA, images=("depth",)), looking(), world=street(), sun=NOON)
     assert frame.rgb is None
     assert np.isfinite(frame.depth).any()
 
 
 def test_night_is_dark_but_not_empty():
-    frame = render(CAMERA, looking(), street(), sun=(0.5, 0.0, -0.8), options=FLAT)
+    frame = render(CAMERA, looking(), world=street(), sun=(0.5, 0.0, -0.8), options=FLAT)
     assert 0 < frame.rgb.mean() < 255
     assert np.ptp(frame.rgb) > 10
 

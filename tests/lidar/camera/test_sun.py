@@ -28,7 +28,7 @@ ALMANAC = [
 
 @pytest.mark.parametrize(("place", "lon", "lat", "when", "azimuth", "elevation"), ALMANAC)
 def test_the_sun_stands_where_the_almanac_says(place, lon, lat, when, azimuth, elevation):
-    a, e = sun_position(datetime.fromisoformat(when), lon, lat)
+    a, e = sun_position(datetime.fromisoformat(when), lon, lat_deg=lat)
     true = e - refraction(np.radians(elevation))
     assert abs(np.degrees(a) - azimuth) < 0.02, place
     assert abs(np.degrees(true) - elevation) < 0.02, place
@@ -37,7 +37,7 @@ def test_the_sun_stands_where_the_almanac_says(place, lon, lat, when, azimuth, e
 def test_the_example_of_the_solar_position_algorithm():
     # Reda and Andreas, NREL/TP-560-34302 (2008), appendix A.5: zenith 50.11162, azimuth 194.34024.
     when = datetime.fromisoformat("2003-10-17T12:30:30-07:00")
-    azimuth, elevation = np.degrees(sun_position(when, -105.1786, 39.742476))
+    azimuth, elevation = np.degrees(sun_position(when, -105.1786, lat_deg=39.742476))
     assert abs(azimuth - 194.34024) < 0.01
     assert abs(90 - elevation - 50.11162) < 0.01
 
@@ -52,14 +52,14 @@ def test_refraction_lifts_the_setting_sun_by_its_own_width():
 
 def test_a_time_without_a_zone_is_refused():
     with pytest.raises(InputError, match="zone"):
-        sun_position(datetime(2024, 1, 1, 12), 0.0, 0.0)  # noqa: DTZ001
+        sun_position(datetime(2024, 1, 1, 12), 0.0, lat_deg=0.0)  # noqa: DTZ001
 
 
 def test_the_grids_north_is_not_the_suns():
     # Far from its central meridian a UTM grid is turned by over a degree; the sun does not care.
     when = datetime(2024, 6, 21, 10, tzinfo=UTC)
     local = sun_direction(Frame.at(24.9384, 60.1699), when)
-    utm = sun_direction(Frame.at(24.9384, 60.1699, "utm"), when)
+    utm = sun_direction(Frame.at(24.9384, 60.1699, crs="utm"), when)
     turn = np.arctan2(utm[0], utm[1]) - np.arctan2(local[0], local[1])
     lon_from_meridian = np.radians(24.9384 - 27)
     assert turn == pytest.approx(-lon_from_meridian * np.sin(np.radians(60.1699)), rel=0.01)
@@ -70,7 +70,7 @@ def test_the_grids_north_is_not_the_suns():
 @given(lon=st.floats(-180, 180), lat=st.floats(-89, 89), hours=st.integers(0, 24 * 365 * 30))
 def test_direction_and_position_agree(lon, lat, hours):
     when = datetime(2000, 1, 1, tzinfo=UTC) + timedelta(hours=hours)
-    azimuth, elevation = sun_position(when, lon, lat)
+    azimuth, elevation = sun_position(when, lon, lat_deg=lat)
     s = sun_direction(Frame.at(lon, lat), when)
     assert np.linalg.norm(s) == pytest.approx(1.0)
     assert np.arcsin(s[2]) == pytest.approx(elevation, abs=1e-4)

@@ -115,7 +115,7 @@ def test_laspy_reads_world_coordinates_crs_classes_and_time(tmp_path, suffix):
         "gps_time": gps_seconds(INFO.created, cloud["time_ns"]),
         "source": np.full(2000, 7, np.uint16),
     }
-    write_las(path, world, INFO)
+    write_las(path, world, info=INFO)
     las = laspy.read(path)
     assert las.header.version == "1.4"
     assert las.header.parse_crs().to_epsg() == 32618
@@ -139,7 +139,7 @@ def test_an_uncompressed_file_in_parts_is_what_laspy_writes_of_its_points(tmp_pa
     for axis, shift in zip("xyz", INFO.offset, strict=True):
         world[axis] = cloud[axis] + shift
     parts = [{name: column[rows] for name, column in world.items()} for rows in (slice(400), slice(400, 900))]
-    with LasWriter(tmp_path / "a.las", INFO, tuple(world)) as writer:
+    with LasWriter(tmp_path / "a.las", INFO, columns=tuple(world)) as writer:
         for part in parts:
             writer.write(part)
     copy = io.BytesIO()
@@ -150,7 +150,7 @@ def test_an_uncompressed_file_in_parts_is_what_laspy_writes_of_its_points(tmp_pa
 def test_a_point_beyond_what_las_can_count_is_refused(tmp_path):
     far = table(3) | {"x": np.array([0.0, 1.0, 3e6])}
     with pytest.raises(FormatError, match="too far"):
-        write_las(tmp_path / "a.las", far, replace(INFO, offset=(0.0, 0.0, 0.0)))
+        write_las(tmp_path / "a.las", far, info=replace(INFO, offset=(0.0, 0.0, 0.0)))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -163,7 +163,10 @@ def test_gps_time_of_a_known_moment():
 
 
 def test_a_failed_writer_leaves_nothing(tmp_path):
-    with pytest.raises(KeyError), LasWriter(tmp_path / "a.laz", INFO, ("x", "y", "z", "label")) as writer:
+    with (
+        pytest.raises(KeyError),
+        LasWriter(tmp_path / "a.laz", INFO, columns=("x", "y", "z", "label")) as writer,
+    ):
         writer.write({"x": np.zeros(1)})
     assert list(tmp_path.iterdir()) == []
 
@@ -178,7 +181,7 @@ def test_damaged_files_are_named(tmp_path, reader, name, content):
 
 
 def test_a_truncated_laz_is_named(tmp_path):
-    write_las(tmp_path / "a.laz", table(500), replace(INFO, offset=(0.0, 0.0, 0.0)))
+    write_las(tmp_path / "a.laz", table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
     whole = (tmp_path / "a.laz").read_bytes()
     (tmp_path / "a.laz").write_bytes(whole[: len(whole) // 3])
     with pytest.raises(FormatError, match=r"a\.laz"):

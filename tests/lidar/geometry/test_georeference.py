@@ -23,7 +23,7 @@ places = st.tuples(st.floats(-179.9, 179.9), st.floats(-79, 83))
 @pytest.mark.parametrize("place", ANCHORS)
 def test_utm_scale_and_convergence_of_known_places(place):
     lat, lon, east, north, scale, convergence = ANCHORS[place]
-    frame = Frame.at(lon, lat, "utm")
+    frame = Frame.at(lon, lat, crs="utm")
     found = frame.to_projected(*frame.from_geographic(lon, lat))
     np.testing.assert_allclose(found, (east, north), atol=1e-3)
     assert frame.scale(lon, lat) == pytest.approx(scale, abs=2e-8)
@@ -43,7 +43,7 @@ def test_a_metre_is_a_metre_in_the_local_frame(place, x, y):
 @settings(deadline=None, max_examples=15)
 @given(places, st.floats(-20000, 20000), st.floats(-20000, 20000), st.sampled_from(["local", "utm"]))
 def test_there_and_back_is_the_same_place(place, x, y, crs):
-    frame = Frame.at(*place, crs)
+    frame = Frame.at(place[0], place[1], crs=crs)
     np.testing.assert_allclose(frame.from_geographic(*frame.to_geographic(x, y)), (x, y), atol=1e-6)
     again = Frame.from_json(frame.to_json())
     np.testing.assert_allclose(again.from_geographic(*frame.to_geographic(x, y)), (x, y), atol=1e-6)
@@ -59,7 +59,7 @@ def test_the_affine_short_cut_is_within_its_limit(place, x, y, width):
     fast = Georeference(frame, crs).points(points)
     exact = Georeference(frame, crs, exact=True).points(points)
     assert np.abs(fast - exact).max() <= 1.05 * AFFINE_LIMIT
-    back = np.column_stack([*frame.from_crs(crs, exact[:, 0], exact[:, 1]), exact[:, 2]])
+    back = np.column_stack([*frame.from_crs(exact[:, 0], exact[:, 1], crs=crs), exact[:, 2]])
     assert np.abs(back - points).max() < 1e-5
 
 
@@ -69,14 +69,14 @@ def test_the_export_system_is_the_zone_of_the_scene_or_its_own():
     assert export_crs(Frame.at(10.7, 59.9)).to_epsg() == 32632
     assert export_crs(Frame.at(5.3, 60.4)).to_epsg() == 32632  # zone 32 is wide off south-west Norway
     assert export_crs(Frame.at(20.0, 78.0)).to_epsg() == 32633  # and 33 on Svalbard
-    assert export_crs(Frame.at(13.4, 52.5, "EPSG:25833")).to_epsg() == 25833
+    assert export_crs(Frame.at(13.4, 52.5, crs="EPSG:25833")).to_epsg() == 25833
     assert export_crs(Frame.at(13.4, 52.5), "EPSG:3035") == CRS.from_epsg(3035)
 
 
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:2263", "EPSG:3857", "nonsense"])
 def test_a_system_that_cannot_carry_a_scene_is_refused(crs):
     with pytest.raises(FrameError, match=crs):
-        Frame.at(-73.99, 60.72, crs)
+        Frame.at(-73.99, 60.72, crs=crs)
 
 
 def test_utm_ends_at_the_poles():

@@ -38,9 +38,11 @@ def rz(g):
 @given(angles, angles, angles)
 @settings(max_examples=200, deadline=None)
 def test_the_matrix_is_what_the_convention_says(a, b, g):
-    np.testing.assert_allclose(matrix_from_quat(quat_from_euler(a, b, g)), rz(g) @ ry(b) @ rx(a), atol=1e-12)
     np.testing.assert_allclose(
-        matrix_from_quat(quat_from_euler_intrinsic(a, b, g)), rx(a) @ ry(b) @ rz(g), atol=1e-12
+        matrix_from_quat(quat_from_euler(a, b, gamma=g)), rz(g) @ ry(b) @ rx(a), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        matrix_from_quat(quat_from_euler_intrinsic(a, b, gamma=g)), rx(a) @ ry(b) @ rz(g), atol=1e-12
     )
 
 
@@ -51,8 +53,9 @@ def test_angles_survive_the_round_trip_even_with_the_nose_straight_up(a, b, g):
         (quat_from_euler, euler_from_quat),
         (quat_from_euler_intrinsic, euler_from_quat_intrinsic),
     ):
-        quat = there(a, b, g)
-        again = there(*back(quat))
+        quat = there(a, b, gamma=g)
+        alpha, beta, gamma = back(quat)
+        again = there(alpha, beta, gamma=gamma)
         turned = np.linalg.norm((Rotation.from_quat(quat).inv() * Rotation.from_quat(again)).as_rotvec())
         assert turned < 1e-6
         assert np.linalg.norm(quat) == pytest.approx(1.0, abs=1e-12)
@@ -65,18 +68,18 @@ def test_both_conventions_agree_with_another_implementation_and_differ_at_large_
     np.testing.assert_allclose(
         euler_from_quat_intrinsic(quat), Rotation.from_quat(quat).as_euler("XYZ"), atol=1e-12
     )
-    one, two = quat_from_euler(0.5, 0.6, 0.7), quat_from_euler_intrinsic(0.5, 0.6, 0.7)
+    one, two = quat_from_euler(0.5, 0.6, gamma=0.7), quat_from_euler_intrinsic(0.5, 0.6, gamma=0.7)
     assert np.linalg.norm((Rotation.from_quat(one).inv() * Rotation.from_quat(two)).as_rotvec()) > 0.3
 
 
 def test_signs_are_those_of_a_car():
     forward = np.array([1.0, 0, 0])
     left = np.array([0, 1.0, 0])
-    nose_down = matrix_from_quat(quat_from_euler(0.0, 0.1, 0.0))
+    nose_down = matrix_from_quat(quat_from_euler(0.0, 0.1, gamma=0.0))
     assert (nose_down @ forward)[2] < 0
-    left_up = matrix_from_quat(quat_from_euler(0.1, 0.0, 0.0))
+    left_up = matrix_from_quat(quat_from_euler(0.1, 0.0, gamma=0.0))
     assert (left_up @ left)[2] > 0
-    north = matrix_from_quat(quat_from_euler(0.0, 0.0, np.pi / 2))
+    north = matrix_from_quat(quat_from_euler(0.0, 0.0, gamma=np.pi / 2))
     np.testing.assert_allclose(north @ forward, [0, 1, 0], atol=1e-12)
 
 
@@ -88,13 +91,13 @@ def test_body_rates_of_a_steady_spin_are_exact():
 
 
 def test_the_table_of_poses_puts_the_vehicle_where_it_is():
-    frame = Frame.at(-76.3059, 36.8853, "EPSG:32618")
+    frame = Frame.at(-76.3059, 36.8853, crs="EPSG:32618")
     n = 11
-    quat = quat_from_euler(np.full(n, 0.02), np.full(n, -0.05), np.linspace(0.0, 3.0, n))
+    quat = quat_from_euler(np.full(n, 0.02), np.full(n, -0.05), gamma=np.linspace(0.0, 3.0, n))
     position = np.column_stack([np.linspace(0, 50, n), np.linspace(0, 20, n), np.linspace(3, 4, n)])
     trajectory = Trajectory(np.arange(n) * 10**8, position, quat, np.zeros((n, 3)), np.full(n, 0.99976683))
     start = datetime(2026, 5, 1, 12, 0, 0, 250000, UTC)
-    table = pose_columns(trajectory, frame, start, np.array([0, 5 * 10**8, 10**9]))
+    table = pose_columns(trajectory, frame, start=start, time_ns=np.array([0, 5 * 10**8, 10**9]))
     assert list(table) == [
         *("timestamp", "frame", "x", "y", "z", "alpha", "beta", "gamma"),
         *("qx", "qy", "qz", "qw", "lon", "lat", "h"),

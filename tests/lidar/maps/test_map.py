@@ -81,7 +81,7 @@ def dataset(path, *, first=0, frames=6, n=400, kinds=("laz",)):
             gps = gps_seconds(START, time_ns + np.int64(k * 100_000_000))
             (path / "top" / "laz").mkdir(parents=True, exist_ok=True)
             table = {"x": east, "y": north, "z": up, "gps_time": gps} | base
-            write_las(path / "top" / "laz" / f"{k:06d}.laz", table, LasInfo(CRS_OUT, geo.offset, START))
+            write_las(path / "top" / "laz" / f"{k:06d}.laz", table, info=LasInfo(CRS_OUT, geo.offset, START))
         if "pcd" in kinds:
             poses = (
                 trajectory()

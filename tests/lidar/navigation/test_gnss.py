@@ -30,7 +30,7 @@ from lidar.random_streams import generator
 from lidar.rig.specs import SYSTEMS, GnssSpec
 
 START = datetime(2026, 5, 1, 9, 30, tzinfo=UTC)
-FRAME = Frame.at(-76.3059, 36.8853, "EPSG:32618")  # convergence -0.78 degrees, scale 0.99977
+FRAME = Frame.at(-76.3059, 36.8853, crs="EPSG:32618")  # convergence -0.78 degrees, scale 0.99977
 GEOD = Geod(ellps="WGS84")
 
 
@@ -58,7 +58,7 @@ def eastward(seconds=60.0, speed=10.0, heading=0.0):
     return Trajectory(
         np.round(t * 1e9).astype(np.int64),
         k * speed * t[:, None] * d,
-        quat_from_euler(np.zeros(len(t)), np.zeros(len(t)), np.full(len(t), heading)),
+        quat_from_euler(np.zeros(len(t)), np.zeros(len(t)), gamma=np.full(len(t), heading)),
         np.broadcast_to(speed * d, (len(t), 3)).copy(),
         np.full(len(t), k),
     )
@@ -69,12 +69,12 @@ def circle(radius=20.0, rate=0.2, seconds=40.0):
     yaw = rate * t
     position = radius * np.column_stack([np.sin(yaw), 1 - np.cos(yaw), np.zeros(len(t))])
     velocity = radius * rate * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))])
-    quat = quat_from_euler(0 * t, 0 * t, yaw)
+    quat = quat_from_euler(0 * t, 0 * t, gamma=yaw)
     return Trajectory(np.round(t * 1e9).astype(np.int64), position, quat, velocity, np.ones(len(t)))
 
 
 def test_an_ideal_receiver_reports_the_antenna():
-    fixes = observe_gnss(circle(), FRAME, spec(arm=(1.0, 0.5, 1.6)), seed=0, start=START)
+    fixes = observe_gnss(circle(), FRAME, spec=spec(arm=(1.0, 0.5, 1.6)), seed=0, start=START)
     np.testing.assert_array_equal(fixes.error, 0.0)
     x, y = FRAME.from_geographic(*fixes.lonlath[:, :2].T)
     yaw = 0.2 * fixes.time_ns * 1e-9
@@ -85,7 +85,7 @@ def test_an_ideal_receiver_reports_the_antenna():
 
 
 def test_an_antenna_ahead_of_the_axle_is_swung_sideways_in_a_turn():
-    _, velocity = antenna_motion(circle(), FRAME, spec(arm=(3.0, 0.0, 0.0)), np.array([0]))
+    _, velocity = antenna_motion(circle(), FRAME, spec=spec(arm=(3.0, 0.0, 0.0)), time_ns=np.array([0]))
     turn = float(FRAME.convergence(*FRAME.to_geographic(0.0, 0.0)))
     grid = np.array([4.0, 0.2 * 3.0, 0.0])  # v + omega x l, heading grid east
     east = grid[0] * np.cos(turn) + grid[1] * np.sin(turn)
@@ -95,7 +95,7 @@ def test_an_antenna_ahead_of_the_axle_is_swung_sideways_in_a_turn():
 
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, 200.0])
 def test_course_and_speed_are_those_of_the_geodesic(heading_deg):
-    fixes = observe_gnss(eastward(heading=np.radians(heading_deg)), FRAME, spec(), seed=0, start=START)
+    fixes = observe_gnss(eastward(heading=np.radians(heading_deg)), FRAME, spec=spec(), seed=0, start=START)
     (lon0, lat0), (lon1, lat1) = fixes.lonlath[0, :2], fixes.lonlath[-1, :2]
     azimuth, _, metres = GEOD.inv(lon0, lat0, lon1, lat1)
     middle = np.degrees(fixes.course[len(fixes) // 2])
@@ -108,7 +108,7 @@ def test_course_and_speed_are_those_of_the_geodesic(heading_deg):
 
 def test_a_gauss_markov_process_has_its_variance_and_its_memory():
     n, dt, tau = 100_000, 1.0, 30.0
-    u = gauss_markov(generator(1, "test"), dt, np.full(n, tau))
+    u = gauss_markov(generator(1, "test"), dt, tau=np.full(n, tau))
     assert u.std() == pytest.approx(1.0, rel=0.05)
     lag = round(tau / dt)
     assert (u[lag:] * u[:-lag]).mean() == pytest.approx(np.exp(-1), rel=0.1)
@@ -121,7 +121,9 @@ def test_errors_are_as_large_as_the_table_says(mode, state):
     table = STATES[state]
     rate = 0.1 / table.tau
     n = 4000
-    fixes = observe_gnss(standing((n - 1) / rate), FRAME, spec(mode, rate, mask_deg=5.0), seed=3, start=START)
+    fixes = observe_gnss(
+        standing((n - 1) / rate), FRAME, spec=spec(mode, rate, mask_deg=5.0), seed=3, start=START
+    )
     held = fixes.state == NAMES.index(state)
     assert held.mean() > 0.95
     across, up = fixes.error[held][:, :2].std(), fixes.error[held][:, 2].std()
@@ -129,21 +131,23 @@ def test_errors_are_as_large_as_the_table_says(mode, state):
     assert up == pytest.approx(np.hypot(table.white[1], table.bias[1]), rel=0.05)
     assert np.abs(fixes.error.mean(axis=0)).max() < 0.1 * up
     # white: from one fix to the next in a tenth of a second the bias stands still
-    quick = observe_gnss(standing(400.0), FRAME, spec(mode, 10.0), seed=3, start=START)
+    quick = observe_gnss(standing(400.0), FRAME, spec=spec(mode, 10.0), seed=3, start=START)
     step = np.diff(quick.error, axis=0)[:, :2].std()
     assert step == pytest.approx(np.sqrt(2) * table.white[0], rel=0.06)
 
 
 def test_a_fix_does_not_depend_on_what_comes_after_it():
-    short, long = (observe_gnss(standing(s), FRAME, spec("rtk"), seed=9, start=START) for s in (20.0, 60.0))
+    short, long = (
+        observe_gnss(standing(s), FRAME, spec=spec("rtk"), seed=9, start=START) for s in (20.0, 60.0)
+    )
     for name, column in gnss_columns(short).items():
         np.testing.assert_array_equal(column, gnss_columns(long)[name][: len(short)], err_msg=name)
-    other = observe_gnss(standing(20.0), FRAME, spec("rtk"), seed=10, start=START)
+    other = observe_gnss(standing(20.0), FRAME, spec=spec("rtk"), seed=10, start=START)
     assert (other.lonlath != short.lonlath).all()
 
 
 def test_what_is_reported_is_the_truth_plus_the_error():
-    fixes = observe_gnss(eastward(), FRAME, spec("single"), seed=2, start=START)
+    fixes = observe_gnss(eastward(), FRAME, spec=spec("single"), seed=2, start=START)
     azimuth, _, metres = GEOD.inv(*fixes.true_lonlath[:, :2].T, *fixes.lonlath[:, :2].T)
     a = np.radians(azimuth)
     np.testing.assert_allclose(metres * np.sin(a), fixes.error[:, 0], atol=1e-3)
@@ -160,7 +164,7 @@ def test_epochs_come_at_the_rate_from_the_offset_on():
 
 def test_an_unknown_mode_is_refused():
     with pytest.raises(InputError, match="no mode ppp; there are ideal, single, sbas, rtk"):
-        observe_gnss(standing(1.0), FRAME, spec("ppp"), seed=0, start=START)
+        observe_gnss(standing(1.0), FRAME, spec=spec("ppp"), seed=0, start=START)
 
 
 # ------------------------------------------------------------------------------------------------- the sky
@@ -168,28 +172,30 @@ def test_an_unknown_mode_is_refused():
 
 def test_coordinates_agree_with_known_values():
     np.testing.assert_allclose(
-        ecef(-76.3059, 36.8853, 0.0), [1209173.8058, -4962451.0372, 3807219.6582], atol=1e-3
+        ecef(-76.3059, 36.8853, h=0.0), [1209173.8058, -4962451.0372, 3807219.6582], atol=1e-3
     )
-    d = ecef(-76.2959, 36.8953, 25.0) - ecef(-76.3059, 36.8853, 10.0)
+    d = ecef(-76.2959, 36.8953, h=25.0) - ecef(-76.3059, 36.8853, h=10.0)
     np.testing.assert_allclose(enu_axes(-76.3059, 36.8853) @ d, [891.33917, 1109.80692, 14.84095], atol=1e-4)
 
 
 def test_the_constellation_repeats_every_sidereal_day_and_is_as_full_as_gps():
     day = round(86164.0905 * 1e9)
-    one, two = satellites(START, np.array([0, day]), ("gps",))
+    one, two = satellites(START, np.array([0, day]), systems=("gps",))
     # twice a period of 43077.3 s against the sidereal day: some hundred metres of 26 560 km
     assert np.linalg.norm(one - two, axis=1).max() < 100e3
     np.testing.assert_allclose(np.linalg.norm(one, axis=1), 26559.7e3)
     hours = np.arange(0, 24 * 3600, 600) * 10**9
     for lat in (0.0, 36.9, 60.2, -33.9, 85.0):
         full = np.full(len(hours), lat)
-        azimuth, elevation = look_up(np.zeros(len(hours)), full, 0 * full, START, hours, systems=("gps",))
+        azimuth, elevation = look_up(
+            np.zeros(len(hours)), full, h=0 * full, start=START, time_ns=hours, systems=("gps",)
+        )
         count = (elevation > np.radians(5)).sum(axis=1)
         assert count.min() >= 5  # the baseline constellation's promise is four in view
         assert 7 <= count.mean() <= 10
         assert elevation.max() > np.radians(45 if lat > 80 else 70)
         used = elevation > np.radians(5)
-        assert np.median(dilution(azimuth, elevation, used, satellite_names(("gps",)))[:, 2]) < 3.5
+        assert np.median(dilution(azimuth, elevation, used=used, names=satellite_names(("gps",)))[:, 2]) < 3.5
 
 
 def test_dilution_of_four_satellites_is_that_of_the_textbook():
@@ -197,12 +203,12 @@ def test_dilution_of_four_satellites_is_that_of_the_textbook():
     azimuth = np.array([[0.0, 0.0, 2 * np.pi / 3, 4 * np.pi / 3]])
     elevation = np.array([[np.pi / 2, 0.0, 0.0, 0.0]])
     one = np.array(["G01", "G02", "G03", "G04"])
-    dop = dilution(azimuth, elevation, np.ones((1, 4), bool), one)
+    dop = dilution(azimuth, elevation, used=np.ones((1, 4), bool), names=one)
     np.testing.assert_allclose(dop[0, :2], np.sqrt(4 / 3), atol=1e-12)
-    assert np.isinf(dilution(azimuth, elevation, np.array([[True, True, True, False]]), one)).all()
+    assert np.isinf(dilution(azimuth, elevation, used=np.array([[True, True, True, False]]), names=one)).all()
     # a clock of a second system takes the satellite that would solve for it
     two = np.array(["G01", "G02", "G03", "E01"])
-    assert np.isinf(dilution(azimuth, elevation, np.ones((1, 4), bool), two)).all()
+    assert np.isinf(dilution(azimuth, elevation, used=np.ones((1, 4), bool), names=two)).all()
 
 
 # days and nights per revolution, radius in km and inclination in degrees that the interface documents give
@@ -213,19 +219,19 @@ ORBITS = {"gps": (24, 43077.3, 55.0), "glonass": (24, 40544.0, 64.8), "galileo":
 def test_orbits_have_the_published_periods_and_inclinations(system):
     count, period, tilt = ORBITS[system]
     time_ns = np.arange(0, 86_400, 300) * 10**9
-    place = satellites(START, time_ns, (system,))
+    place = satellites(START, time_ns, systems=(system,))
     assert place.shape[1] == count
     # earth-fixed latitudes reach the inclination
     top = np.degrees(np.arcsin(place[..., 2] / np.linalg.norm(place, axis=-1))).max()
     assert top == pytest.approx(tilt, abs=0.1)
     # after a period each is at the same height over the equator, on its way up or down again
-    later = satellites(START, time_ns + round(period * 1e9), (system,))
+    later = satellites(START, time_ns + round(period * 1e9), systems=(system,))
     np.testing.assert_allclose(later[..., 2], place[..., 2], atol=150e3)
 
 
 def test_beidou_stands_over_asia_and_its_inclined_ones_draw_an_eight_there():
     time_ns = np.arange(0, 86_164, 600) * 10**9
-    place = satellites(START, time_ns, ("beidou",))
+    place = satellites(START, time_ns, systems=("beidou",))
     assert place.shape[1] == 30
     lon = np.degrees(np.arctan2(place[..., 1], place[..., 0]))
     still, eight = lon[:, 24:27], lon[:, 27:]
@@ -237,7 +243,7 @@ def test_beidou_stands_over_asia_and_its_inclined_ones_draw_an_eight_there():
 def test_satellites_of_a_walker_constellation_keep_apart():
     """No two are ever at one place, as a wrong phase between planes would have it."""
     for system in ("glonass", "galileo"):
-        place = satellites(START, np.arange(0, 43_200, 900) * 10**9, (system,))
+        place = satellites(START, np.arange(0, 43_200, 900) * 10**9, systems=(system,))
         for moment in place:
             gap = np.linalg.norm(moment[:, None] - moment[None], axis=-1)
             assert gap[~np.eye(len(moment), dtype=bool)].min() > 5e5
@@ -248,11 +254,11 @@ def test_four_systems_see_more_and_place_better_than_one():
     full = np.full(len(hours), 50.0)
     median = {}
     for systems in (("gps",), SYSTEMS):
-        azimuth, elevation = look_up(0 * full, full, 0 * full, START, hours, systems=systems)
+        azimuth, elevation = look_up(0 * full, full, h=0 * full, start=START, time_ns=hours, systems=systems)
         used = elevation > np.radians(10)
         median[len(systems)] = (
             np.median(used.sum(axis=1)),
-            np.median(dilution(azimuth, elevation, used, satellite_names(systems))[:, 2]),
+            np.median(dilution(azimuth, elevation, used=used, names=satellite_names(systems))[:, 2]),
         )
     assert median[4][0] > 3 * median[1][0]
     assert median[4][1] < 0.8 * median[1][1]
@@ -262,7 +268,7 @@ def test_four_systems_see_more_and_place_better_than_one():
 def test_systems_that_there_are_not_are_refused():
     for systems in (("gps", "loran"), (), ("gps", "gps")):
         with pytest.raises(InputError, match="give one or more of gps, glonass"):
-            satellites(START, np.array([0]), systems)
+            satellites(START, np.array([0]), systems=systems)
 
 
 @dataclass
@@ -286,7 +292,7 @@ class Street:
 
 def view(trajectory, s, height):
     time_ns = epochs(s, trajectory.duration_ns)
-    position, _ = antenna_motion(trajectory, FRAME, s, time_ns)
+    position, _ = antenna_motion(trajectory, FRAME, spec=s, time_ns=time_ns)
     asked = []
 
     def world_at(region):
@@ -294,7 +300,15 @@ def view(trajectory, s, height):
         return Street(Walls(10.0, height))
 
     return (
-        sky_view(FRAME, position, START, time_ns, world_at, mask_deg=s.mask_deg, systems=s.constellations),
+        sky_view(
+            FRAME,
+            position,
+            start=START,
+            time_ns=time_ns,
+            world_at=world_at,
+            mask_deg=s.mask_deg,
+            systems=s.constellations,
+        ),
         asked,
         position,
     )
@@ -318,10 +332,10 @@ def test_high_walls_hide_the_satellites_beside_the_street_and_not_those_along_it
 def test_in_the_open_the_sky_is_whole():
     s = spec("rtk", rate=1.0, arm=(0.0, 0.0, 1.6))
     sky, _, position = view(eastward(30.0), s, 1.0)
-    open_ = open_sky(FRAME, position, START, epochs(s, 30 * 10**9), mask_deg=10.0)
+    open_ = open_sky(FRAME, position, start=START, time_ns=epochs(s, 30 * 10**9), mask_deg=10.0)
     np.testing.assert_array_equal(sky.visible, open_.visible)
     np.testing.assert_array_equal(sky.blocked, 0.0)
-    fixes = [observe_gnss(eastward(30.0), FRAME, s, seed=1, start=START, sky=k) for k in (sky, None)]
+    fixes = [observe_gnss(eastward(30.0), FRAME, spec=s, seed=1, start=START, sky=k) for k in (sky, None)]
     np.testing.assert_array_equal(fixes[0].lonlath, fixes[1].lonlath)
 
 
@@ -329,7 +343,7 @@ def test_a_street_canyon_spoils_fixes():
     s = spec("single", rate=0.02, arm=(0.0, 0.0, 1.6), constellations=("gps",))
     trajectory = standing(200_000.0)
     low, high = (view(trajectory, s, h)[0] for h in (1.0, 15.0))
-    free, walled = (observe_gnss(trajectory, FRAME, s, seed=4, start=START, sky=k) for k in (low, high))
+    free, walled = (observe_gnss(trajectory, FRAME, spec=s, seed=4, start=START, sky=k) for k in (low, high))
     fixed = walled.quality > 0
     assert 0.1 < fixed.mean() < 1.0
     assert np.nanstd(walled.error[fixed, :2]) > 2 * np.std(free.error[:, :2])
@@ -343,7 +357,7 @@ def test_in_a_street_of_five_storeys_four_systems_nearly_always_have_a_fix():
     shares, errors = {}, {}
     for systems in (("gps",), SYSTEMS):
         s = spec("single", rate=0.02, arm=(0.0, 0.0, 1.6), constellations=systems)
-        fixes = observe_gnss(trajectory, FRAME, s, seed=4, start=START, sky=view(trajectory, s, 17.0)[0])
+        fixes = observe_gnss(trajectory, FRAME, spec=s, seed=4, start=START, sky=view(trajectory, s, 17.0)[0])
         shares[len(systems)] = (fixes.quality > 0).mean()
         errors[len(systems)] = np.nanstd(fixes.error[:, :2])
     assert shares[1] < 0.75
@@ -359,7 +373,7 @@ def test_rtk_falls_at_once_and_recovers_after_it_has_settled():
     elevation = np.tile(np.linspace(0.3, 1.4, 24), (n, 1))
     azimuth = np.tile(np.arange(24) * 2.4, (n, 1))
     sky = Sky(azimuth, elevation, visible, np.ones((n, 24), bool), np.zeros(n), satellite_names(("gps",)))
-    fixes = observe_gnss(standing(19.9), FRAME, s, seed=0, start=START, sky=sky)
+    fixes = observe_gnss(standing(19.9), FRAME, spec=s, seed=0, start=START, sky=sky)
     assert (fixes.quality[:50] == 4).all()
     assert (fixes.quality[50:89] == 0).all()  # ten epochs under the bridge, three seconds to settle less one
     assert (fixes.quality[90:] == 4).all()
@@ -382,7 +396,7 @@ def read(lines):
 
 @pytest.mark.parametrize("mode", ["single", "sbas", "rtk"])
 def test_another_reader_reads_the_fixes(mode):
-    fixes = observe_gnss(eastward(5.0), FRAME, spec(mode, constellations=("gps",)), seed=1, start=START)
+    fixes = observe_gnss(eastward(5.0), FRAME, spec=spec(mode, constellations=("gps",)), seed=1, start=START)
     lines = nmea(fixes, START)
     assert max(map(len, lines)) <= 82
     assert all(line.endswith("\r\n") for line in lines)
@@ -409,7 +423,7 @@ def test_another_reader_reads_the_fixes(mode):
 
 
 def test_a_receiver_of_four_systems_names_the_satellites_of_each():
-    fixes = observe_gnss(eastward(1.0), FRAME, spec("single"), seed=1, start=START)
+    fixes = observe_gnss(eastward(1.0), FRAME, spec=spec("single"), seed=1, start=START)
     lines = nmea(fixes, START)
     assert max(map(len, lines)) <= 82
     assert all(line.startswith("$GN") for line in lines)
@@ -426,7 +440,7 @@ def test_no_fix_leaves_fields_empty_and_says_so():
     sky = Sky(
         *(np.full((6, 24), 0.5),) * 2, *(np.zeros((6, 24), bool),) * 2, np.ones(6), satellite_names(("gps",))
     )
-    fixes = observe_gnss(standing(0.5), FRAME, spec("single"), seed=0, start=START, sky=sky)
+    fixes = observe_gnss(standing(0.5), FRAME, spec=spec("single"), seed=0, start=START, sky=sky)
     gga, rmc, _, gsa = read(nmea(fixes, START)[:4])
     assert gga.quality == 0
     assert gga.lat == ""
@@ -435,7 +449,7 @@ def test_no_fix_leaves_fields_empty_and_says_so():
 
 
 def test_the_separation_of_the_geoid_is_taken_off_the_height():
-    fixes = observe_gnss(standing(0.5, height=-30.0), FRAME, spec(), seed=0, start=START)
+    fixes = observe_gnss(standing(0.5, height=-30.0), FRAME, spec=spec(), seed=0, start=START)
     gga = read(nmea(fixes, START, geoid=-38.0)[:1])[0]
     assert gga.alt == pytest.approx(8.0)
     assert gga.sep == -38.0
@@ -443,7 +457,7 @@ def test_the_separation_of_the_geoid_is_taken_off_the_height():
 
 
 def test_columns_are_named_and_whole():
-    fixes = observe_gnss(eastward(2.0), FRAME, spec("rtk"), seed=1, start=START)
+    fixes = observe_gnss(eastward(2.0), FRAME, spec=spec("rtk"), seed=1, start=START)
     columns = gnss_columns(fixes)
     assert {len(c) for c in columns.values()} == {21}
     assert columns["course_deg"][0] == pytest.approx(90.0 - 0.78, abs=0.5)

@@ -43,8 +43,8 @@ def test_gravity_is_that_of_wgs84():
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3, 2.5])
 def test_at_rest_it_feels_gravity_upwards_and_the_turning_earth(tilt):
-    still = track(np.zeros(3), np.zeros(3), quat_from_euler(tilt, 0.0, np.pi / 2))  # heading north
-    rate, force = true_inertial(still, FRAME, ImuSpec("imu", Mount()), TIMES)
+    still = track(np.zeros(3), np.zeros(3), quat_from_euler(tilt, 0.0, gamma=np.pi / 2))  # heading north
+    rate, force = true_inertial(still, FRAME, spec=ImuSpec("imu", Mount()), time_ns=TIMES)
     g = float(normal_gravity(52.516275, 0.0))
     np.testing.assert_allclose(
         force, np.broadcast_to([0, g * np.sin(tilt), g * np.cos(tilt)], force.shape), atol=1e-9
@@ -59,11 +59,11 @@ def circling(radius=20.0, rate=0.3):
     yaw = rate * t
     position = radius * np.column_stack([np.sin(yaw), 1 - np.cos(yaw), 0 * t])
     velocity = radius * rate * np.column_stack([np.cos(yaw), np.sin(yaw), 0 * t])
-    return Trajectory(TIMES, position, quat_from_euler(0 * t, 0 * t, yaw), velocity, np.ones(len(t)))
+    return Trajectory(TIMES, position, quat_from_euler(0 * t, 0 * t, gamma=yaw), velocity, np.ones(len(t)))
 
 
 def test_in_a_circle_it_feels_the_turn_and_the_pull_to_the_centre():
-    rate, force = true_inertial(circling(), FRAME, ImuSpec("imu", Mount()), TIMES)
+    rate, force = true_inertial(circling(), FRAME, spec=ImuSpec("imu", Mount()), time_ns=TIMES)
     inner = slice(2, -2)
     np.testing.assert_allclose(rate[inner, 2], 0.3 + EARTH_RATE * np.sin(PHI), atol=1e-9)
     coriolis = 2 * EARTH_RATE * np.sin(PHI) * 6.0
@@ -74,8 +74,8 @@ def test_in_a_circle_it_feels_the_turn_and_the_pull_to_the_centre():
 def test_a_unit_off_the_axle_feels_the_lever_arm_and_its_own_axes():
     turned = Rotation.from_euler("z", 90, degrees=True).as_quat()
     off = ImuSpec("imu", Mount((2.0, 0.0, 0.0), tuple(turned)))
-    _, axle = true_inertial(circling(), FRAME, ImuSpec("imu", Mount()), TIMES)
-    _, force = true_inertial(circling(), FRAME, off, TIMES)
+    _, axle = true_inertial(circling(), FRAME, spec=ImuSpec("imu", Mount()), time_ns=TIMES)
+    _, force = true_inertial(circling(), FRAME, spec=off, time_ns=TIMES)
     inner = slice(2, -2)
     # 2 m ahead, -omega^2 l along the nose; the unit's x axis points left
     np.testing.assert_allclose(force[inner, 1], -axle[inner, 0] + 0.3**2 * 2.0, atol=1e-4)
@@ -84,7 +84,7 @@ def test_a_unit_off_the_axle_feels_the_lever_arm_and_its_own_axes():
 
 def test_dead_reckoning_of_the_true_signals_gives_the_drive_back():
     trajectory = circling()
-    rate, force = true_inertial(trajectory, FRAME, ImuSpec("imu", Mount()), TIMES)
+    rate, force = true_inertial(trajectory, FRAME, spec=ImuSpec("imu", Mount()), time_ns=TIMES)
     earth = EARTH_RATE * np.array([0.0, np.cos(PHI), np.sin(PHI)])
     turn, v, x = Rotation.from_quat(trajectory.quat_xyzw[0]), trajectory.velocity[0].copy(), np.zeros(3)
     for k in range(len(TIMES) - 1):
@@ -107,7 +107,7 @@ def test_allan_deviation_is_that_of_the_parameters(name):
     noise = inertial_noise(spec, 400_000, seed=2)
     windows = np.array([1, 4, 20, 100, 400, 2000])
     tau = windows / 20.0
-    measured = allan_deviation(noise, 20.0, windows)
+    measured = allan_deviation(noise, 20.0, windows=windows)
     for columns, n, k in (
         (slice(0, 3), p.gyro_noise, p.gyro_walk),
         (slice(3, 6), p.accel_noise, p.accel_walk),
@@ -123,7 +123,7 @@ def test_the_bias_wanders_as_its_instability_says():
         "imu", Mount(), rate_hz=10.0, **SILENT, gyro_instability=2.18e-6, accel_instability=7.35e-4
     )
     noise = np.concatenate([inertial_noise(spec, 100_000, seed=seed) for seed in range(8)], axis=1)
-    measured = allan_deviation(noise, 10.0, np.array([20, 100, 400, 1500]))
+    measured = allan_deviation(noise, 10.0, windows=np.array([20, 100, 400, 1500]))
     for columns, b in ((slice(0, 3), 2.18e-6), (slice(3, 6), 7.35e-4)):
         every = np.concatenate([measured[:, 6 * k :][:, columns] for k in range(8)], axis=1)
         np.testing.assert_allclose(np.sqrt((every**2).mean(axis=1)), 0.664 * b, rtol=0.08)
@@ -140,15 +140,15 @@ def test_a_reading_does_not_depend_on_what_comes_after_it():
         *(getattr(whole, f)[:500] for f in ("time_ns", "position", "quat_xyzw", "velocity", "scale"))
     )
     spec = ImuSpec("imu", Mount(), rate_hz=200.0)
-    one, two = observe_imu(half, FRAME, spec, seed=5), observe_imu(whole, FRAME, spec, seed=5)
+    one, two = observe_imu(half, FRAME, spec=spec, seed=5), observe_imu(whole, FRAME, spec=spec, seed=5)
     n = len(one.time_ns) - 4  # the last differences are one-sided
     np.testing.assert_array_equal(one.gyro[:n], two.gyro[:n])
     np.testing.assert_array_equal(one.accel[:n], two.accel[:n])
-    assert (observe_imu(whole, FRAME, spec, seed=6).gyro != two.gyro).all()
+    assert (observe_imu(whole, FRAME, spec=spec, seed=6).gyro != two.gyro).all()
 
 
 def test_without_noise_it_reports_the_truth():
-    rows = observe_imu(circling(), FRAME, ImuSpec("imu", Mount(), rate_hz=50.0, **SILENT), seed=0)
+    rows = observe_imu(circling(), FRAME, spec=ImuSpec("imu", Mount(), rate_hz=50.0, **SILENT), seed=0)
     np.testing.assert_array_equal(rows.gyro, rows.true_gyro)
     np.testing.assert_array_equal(rows.accel, rows.true_accel)
     np.testing.assert_array_equal(np.diff(rows.time_ns), 20_000_000)

@@ -113,10 +113,10 @@ def test_range_noise_falls_with_signal(snr, millimetres):
 
 def test_a_slanted_surface_stretches_the_pulse():
     """30 m, 3 mrad, 80 degrees: 0.51 m deep, 0.13 m of deviation."""
-    sigma = stretch_sigma(30.0, np.cos(np.radians(80)), 3e-3)
+    sigma = stretch_sigma(30.0, np.cos(np.radians(80)), divergence=3e-3)
     assert 4 * sigma == pytest.approx(0.51, abs=0.005)
     assert sigma == pytest.approx(0.13, abs=0.005)
-    assert stretch_sigma(30.0, 1.0, 3e-3) == 0
+    assert stretch_sigma(30.0, 1.0, divergence=3e-3) == 0
 
 
 @pytest.mark.parametrize("quantum", [0.001, 0.002, 0.0025, 0.004, 0.005, 0.007])
@@ -256,7 +256,7 @@ def test_return_modes_choose_the_echoes_they_name():
     power = np.array([0.1, 0.9, 0.2, 0.5, 0.5])
 
     def chosen(mode, **options):
-        return reported(echoes, power, mode, most=options.pop("most", 5), **options).tolist()
+        return reported(echoes, power, mode=mode, most=options.pop("most", 5), **options).tolist()
 
     assert chosen("strongest") == [1, 3]  # of equals the nearer
     assert chosen("first") == [0, 3]
@@ -269,8 +269,8 @@ def test_return_modes_choose_the_echoes_they_name():
 def test_dual_with_one_echo_both_strongest_and_last():
     echoes = surfaces([(0, 5, 0.1, True), (0, 10, 0.9, False)])
     power = np.array([0.1, 0.9])
-    assert reported(echoes, power, "dual", most=2).tolist() == [1]
-    assert reported(echoes, power, "dual", most=2, second=True).tolist() == [0, 1]
+    assert reported(echoes, power, mode="dual", most=2).tolist() == [1]
+    assert reported(echoes, power, mode="dual", most=2, second=True).tolist() == [0, 1]
 
 
 def test_no_echoes_are_no_trouble():
@@ -278,7 +278,7 @@ def test_no_echoes_are_no_trouble():
     assert len(merged(empty, 1.0)) == 0
     assert len(numbered(empty)[0]) == 0
     for mode in ("strongest", "first", "last", "dual", "all"):
-        assert len(reported(empty, np.empty(0), mode, most=3, second=True)) == 0
+        assert len(reported(empty, np.empty(0), mode=mode, most=3, second=True)) == 0
     assert len(joined(empty, empty)) == 0
 
 

@@ -22,7 +22,15 @@ def wall(distance=20.0, **options):
 
 
 def seen(name, scene, effects, *, frame=0, seed=1, **options):
-    return scan(load_sensor(name, **options), HERE, STILL, scene, frame, seed=seed, effects=effects)
+    return scan(
+        load_sensor(name, **options),
+        HERE,
+        trajectory=STILL,
+        world=scene,
+        frame=frame,
+        seed=seed,
+        effects=effects,
+    )
 
 
 def test_link_ends_where_the_root_of_reflectance_says():
@@ -44,7 +52,10 @@ def test_detection_follows_the_data_sheet_in_a_scan():
     for share, at in ((0.5, 1.0), (0.9, 0.9)):
         scene = world(plate(at * 50 * np.sqrt(reflectance / 0.8), half=1.5, material="brick"))
         plain, kept = (
-            sum(len(scan(sensor, HERE, STILL, scene, k, effects=Effects(detection=on))) for k in range(8))
+            sum(
+                len(scan(sensor, HERE, trajectory=STILL, world=scene, frame=k, effects=Effects(detection=on)))
+                for k in range(8)
+            )
             for on in (False, True)
         )
         assert plain > 500
@@ -88,7 +99,14 @@ def test_quantisation_gives_whole_steps_and_codes():
 def test_angle_noise_is_not_seen_in_the_angles_but_in_the_ranges():
     scene = wall(20.0, tilt=np.radians(60))
     plain, noisy = (
-        scan(load_sensor("mid40"), HERE, STILL, scene, 0, effects=Effects(angle_noise=on))
+        scan(
+            load_sensor("mid40"),
+            HERE,
+            trajectory=STILL,
+            world=scene,
+            frame=0,
+            effects=Effects(angle_noise=on),
+        )
         for on in (False, True)
     )
     both = np.intersect1d(plain.time_ns, noisy.time_ns)
@@ -197,13 +215,22 @@ def test_water_mirrors_the_far_bank_and_glints_below():
         box((20, -30, 0), (21, 30, 8), feature=2, material="plaster"),
     )
     mount = Mount((0.0, 0.0, 2.0))
-    cloud = scan(load_sensor("vlp16"), mount, STILL, pond, 0, effects=Effects(mirrors=True, link=True))
+    cloud = scan(
+        load_sensor("vlp16"),
+        mount,
+        trajectory=STILL,
+        world=pond,
+        frame=0,
+        effects=Effects(mirrors=True, link=True),
+    )
     ghosts = cloud.klass == Class.NOISE
     assert ghosts.any()
     assert (cloud.xyz[ghosts, 2] + 2 < 0).all()  # the bank's image lies below the water
     assert not (cloud.klass == Class.WATER).any()  # at 15 degrees and less nothing comes straight back
     down = Mount((0.0, 0.0, 30.0), (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)))
-    below = scan(load_sensor("mid40"), down, STILL, pond, 0, effects=Effects(mirrors=True))
+    below = scan(
+        load_sensor("mid40"), down, trajectory=STILL, world=pond, frame=0, effects=Effects(mirrors=True)
+    )
     water = below.klass == Class.WATER
     assert below.intensity[water & (below.incidence < 0.05)].min() > 5 * np.median(
         below.intensity[water & (below.incidence > 0.3)]

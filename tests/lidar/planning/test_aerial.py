@@ -32,13 +32,13 @@ BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "demo"
-    return build(read_osm(demo_path(), bounds=BOX), folder, BuildOptions())
+    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions())
 
 
 @pytest.fixture(scope="module")
 def scene_utm(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scene") / "utm"
-    return build(read_osm(demo_path(), bounds=BOX), folder, BuildOptions(crs="utm"))
+    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions(crs="utm"))
 
 
 def flight(scene, rig="drone", **change):
@@ -48,7 +48,7 @@ def flight(scene, rig="drone", **change):
 
 
 def planned(scene, options, kit):
-    return plan(scene, options, load_vehicle(kit.vehicle), [*scanners(kit), *cameras(kit)])
+    return plan(scene, options, body=load_vehicle(kit.vehicle), sensors=[*scanners(kit), *cameras(kit)])
 
 
 def test_between_the_lines_of_a_survey_scanners_are_off_unless_asked_for(scene, tmp_path):
@@ -71,7 +71,7 @@ def test_between_the_lines_of_a_survey_scanners_are_off_unless_asked_for(scene, 
         planned(scene, replace(options, duration=0.5), kit)
 
     first = int(whole.on[0, 0]) / 1e9
-    summary = drive(scene, tmp_path / "x", replace(options, duration=first + 1.35))
+    summary = drive(scene, tmp_path / "x", options=replace(options, duration=first + 1.35))
     files = sorted((tmp_path / "x").glob("*/pcd/*.pcd"))
     assert len(files) == summary.frames
     sizes = [len(read_pcd(file)["x"]) for file in files]
@@ -123,7 +123,7 @@ def test_waypoints_are_flown_over_above_the_ground(scene, tmp_path):
 
 
 def test_a_drone_without_more_words_flies_over_streets_and_sees_them(scene, tmp_path):
-    summary = drive(scene, tmp_path / "d", DriveOptions(rig="drone", duration=1.0, formats=("laz",)))
+    summary = drive(scene, tmp_path / "d", options=DriveOptions(rig="drone", duration=1.0, formats=("laz",)))
     assert summary.points["lidar_down"] > 50_000
     las = laspy.read(next((tmp_path / "d" / "lidar_down" / "laz").glob("*5.laz")))
     assert np.isin(11, las.classification)  # road surface
@@ -155,13 +155,13 @@ def test_flights_that_cannot_be_are_refused_in_one_line(scene, rig, change, says
 @pytest.fixture(scope="module")
 def driven(scene, tmp_path_factory):
     out = tmp_path_factory.mktemp("drive") / "a"
-    drive(scene, out, DriveOptions(rig="vlp16", duration=6.0, seed=3, formats=("pcd",)))
+    drive(scene, out, options=DriveOptions(rig="vlp16", duration=6.0, seed=3, formats=("pcd",)))
     return out
 
 
 def test_a_trajectory_is_driven_again_bit_for_bit(scene, driven, tmp_path):
     options = DriveOptions(rig="vlp16", route=driven / "trajectory.csv", formats=("pcd",), duration=2.0)
-    drive(scene, tmp_path / "b", options)
+    drive(scene, tmp_path / "b", options=options)
     again = read_trajectory(tmp_path / "b" / "trajectory.csv")
     first = read_trajectory(driven / "trajectory.csv").until(2_000_000_000)
     np.testing.assert_array_equal(again.position, first.position)

@@ -32,7 +32,7 @@ def test_strips_cover_the_area_and_can_be_flown(name, spacing, run_out, heading)
         heading_deg=heading,
         run_out=run_out,
     )
-    path = plan_path(route, craft, FRAME)
+    path = plan_path(route, craft, frame=FRAME)
     assert np.abs(path.curvature).max() <= 1 / craft.turning_radius + 1e-9
     flown = shapely.LineString(path.position[:, :2])
     inside = shapely.intersection(flown, shapely.buffer(area, spacing))
@@ -49,7 +49,7 @@ def test_strips_cover_the_area_and_can_be_flown(name, spacing, run_out, heading)
 def test_an_aircraft_keeps_its_speed_and_banks_into_turns():
     craft = load_vehicle("aircraft")
     route = survey_flight(AREA, spacing=400.0, height=500.0, radius=700.0, run_out=400.0)
-    trajectory = drive_path(plan_path(route, craft, FRAME), craft, rate_hz=20.0)
+    trajectory = drive_path(plan_path(route, craft, frame=FRAME), craft, rate_hz=20.0)
     speed = np.linalg.norm(trajectory.velocity, axis=1)
     assert speed.min() > 30.0  # slower only to limit the roll rate
     yaw = np.unwrap(euler_from_quat(trajectory.quat_xyzw)[:, 2])
@@ -64,7 +64,7 @@ def test_an_aircraft_keeps_its_speed_and_banks_into_turns():
 def test_a_drone_climbs_level_and_tips_forward_to_speed_up():
     craft = load_vehicle("drone")
     points = [(0, 0, 10), (100, 0, 40), (100, 80, 40), (200, 80, 5)]
-    path = plan_path(waypoint_flight(points), craft, FRAME)
+    path = plan_path(waypoint_flight(points), craft, frame=FRAME)
     trajectory = drive_path(path, craft)
     np.testing.assert_allclose(trajectory.position[[0, -1]], [points[0], points[-1]], atol=0.3)
     pitch = euler_from_quat(trajectory.quat_xyzw)[:, 1]
@@ -72,13 +72,13 @@ def test_a_drone_climbs_level_and_tips_forward_to_speed_up():
     change = np.gradient(speed, 0.01)
     np.testing.assert_allclose(pitch, 0.102 * change, atol=1e-3)
     assert trajectory.velocity[:, 2].max() > 1.5
-    high = plan_path(waypoint_flight(points, ground=lambda x, _y: 0.1 * x), craft, FRAME)
+    high = plan_path(waypoint_flight(points, ground=lambda x, _y: 0.1 * x), craft, frame=FRAME)
     assert high.position[-1, 2] == pytest.approx(25.0, abs=0.2)
 
 
 def test_a_walker_sways_and_rises_with_every_step():
     walker = load_vehicle("backpack")
-    trajectory = drive_path(plan_path(free_route([[0.0, 0, 0], [60.0, 0, 0]]), walker, FRAME), walker)
+    trajectory = drive_path(plan_path(free_route([[0.0, 0, 0], [60.0, 0, 0]]), walker, frame=FRAME), walker)
     middle = slice(1000, 3000)
     sway, rise = trajectory.position[middle, 1], trajectory.position[middle, 2]
     assert (sway.min(), sway.max()) == (pytest.approx(-0.02, abs=1e-3), pytest.approx(0.02, abs=1e-3))
@@ -95,7 +95,9 @@ def test_every_vehicle_is_whole_and_a_bad_one_is_refused_with_every_fault(tmp_pa
     for name in vehicle_names():
         assert load_vehicle(name).name == name
         assert len(load_vehicle(name).source) > 20
-    assert rear_axle_radius(11.4, 2.71, 1.55) == pytest.approx(load_vehicle("car").turning_radius, abs=0.01)
+    assert rear_axle_radius(11.4, 2.71, track=1.55) == pytest.approx(
+        load_vehicle("car").turning_radius, abs=0.01
+    )
     with pytest.raises(InputError, match="no vehicle tank; there are aircraft, backpack, car"):
         load_vehicle("tank")
     path = tmp_path / "mine.toml"

@@ -61,8 +61,8 @@ def assert_gentle(trajectory, vehicle, *, rests=True):
 @settings(max_examples=12, deadline=None)
 def test_a_drive_through_town_is_gentle(seed, name, duration):
     vehicle = load_vehicle(name)
-    route = plan_route(grid(4, 4), FRAME, "random", seed=seed, length=600.0)
-    path = plan_path(route, vehicle, FRAME)
+    route = plan_route(grid(4, 4), FRAME, spec="random", seed=seed, length=600.0)
+    path = plan_path(route, vehicle, frame=FRAME)
     trajectory = drive_path(path, vehicle, duration=duration)
     assert_gentle(trajectory, vehicle)
     if duration is None:
@@ -75,8 +75,8 @@ def test_a_drive_through_town_is_gentle(seed, name, duration):
 @settings(max_examples=12, deadline=None)
 def test_a_drive_that_is_under_way_is_gentle_too(seed, name, duration):
     vehicle = load_vehicle(name)
-    route = plan_route(grid(4, 4), FRAME, "random", seed=seed, length=600.0)
-    path = plan_path(route, vehicle, FRAME)
+    route = plan_route(grid(4, 4), FRAME, spec="random", seed=seed, length=600.0)
+    path = plan_path(route, vehicle, frame=FRAME)
     trajectory = drive_path(path, vehicle, duration=duration, under_way=True)
     assert_gentle(trajectory, vehicle, rests=False)
     motion = motion_along(path, vehicle, duration=duration, under_way=True)
@@ -85,7 +85,7 @@ def test_a_drive_that_is_under_way_is_gentle_too(seed, name, duration):
 
 
 def test_what_is_under_way_is_at_the_limit_from_first_to_last():
-    path = plan_path(straight(1000.0), CAR, FRAME)
+    path = plan_path(straight(1000.0), CAR, frame=FRAME)
     trajectory = drive_path(path, CAR, duration=30.0, under_way=True)
     speed = np.linalg.norm(trajectory.velocity, axis=1)
     np.testing.assert_allclose(speed, 13.9, rtol=3e-3)
@@ -97,7 +97,7 @@ def test_what_is_under_way_is_at_the_limit_from_first_to_last():
 
 def test_before_a_bend_what_is_under_way_starts_slowly_enough_for_it():
     corner = free_route([[0.0, 0, 0], [12.0, 0, 0], [12.0, 100.0, 0]], limit=13.9)
-    trajectory = drive_path(plan_path(corner, CAR, FRAME), CAR, under_way=True)
+    trajectory = drive_path(plan_path(corner, CAR, frame=FRAME), CAR, under_way=True)
     assert 2.0 < np.linalg.norm(trajectory.velocity[0]) < 8.0
     bent = slice(0, len(trajectory.time_ns) // 2)
     yaw = np.unwrap(euler_from_quat(trajectory.quat_xyzw)[:, 2])
@@ -121,7 +121,7 @@ def test_whatever_the_limits_the_speed_keeps_to_them(stretches, grade):
     )
     if ends[-1] < 2.0:
         return
-    path = plan_path(route, CAR, FRAME)
+    path = plan_path(route, CAR, frame=FRAME)
     motion = motion_along(path, CAR)
     trajectory = drive_path(path, CAR)
     assert_gentle(trajectory, CAR)
@@ -132,7 +132,7 @@ def test_whatever_the_limits_the_speed_keeps_to_them(stretches, grade):
 
 
 def test_on_an_open_road_the_limit_is_reached_and_held():
-    motion = motion_along(plan_path(straight(1000.0), CAR, FRAME), CAR)
+    motion = motion_along(plan_path(straight(1000.0), CAR, frame=FRAME), CAR)
     assert motion.speed.max() == pytest.approx(13.9, rel=3e-3)
     held = (motion.speed > 13.85).mean()
     # time at the limit if acceleration and braking were at their bounds throughout: the jerk costs little
@@ -144,7 +144,7 @@ def test_on_an_open_road_the_limit_is_reached_and_held():
 
 def test_the_steepest_curve_is_taken_slowly_and_the_body_leans_out_of_it():
     corner = free_route([[0.0, 0, 0], [100.0, 0, 0], [100.0, 100.0, 0]], limit=13.9)
-    path = plan_path(corner, CAR, FRAME)
+    path = plan_path(corner, CAR, frame=FRAME)
     trajectory = drive_path(path, CAR)
     speed = np.linalg.norm(trajectory.velocity, axis=1)
     rates = body_rates(trajectory.time_ns * 1e-9, trajectory.quat_xyzw)
@@ -156,13 +156,13 @@ def test_the_steepest_curve_is_taken_slowly_and_the_body_leans_out_of_it():
 
 
 def test_braking_dips_the_nose_and_a_hill_lifts_it():
-    trajectory = drive_path(plan_path(straight(300.0), CAR, FRAME), CAR)
+    trajectory = drive_path(plan_path(straight(300.0), CAR, frame=FRAME), CAR)
     pitch = euler_from_quat(trajectory.quat_xyzw)[:, 1]
     speed = np.linalg.norm(trajectory.velocity, axis=1)
     change = np.gradient(speed, 0.01)
     assert pitch[np.argmin(change)] == pytest.approx(CAR.pitch_gradient * 2.45, rel=0.02)
     assert pitch[np.argmax(change)] == pytest.approx(-CAR.pitch_gradient * 1.96, rel=0.02)
-    uphill = drive_path(plan_path(straight(300.0, grade=0.1), CAR, FRAME), CAR)
+    uphill = drive_path(plan_path(straight(300.0, grade=0.1), CAR, frame=FRAME), CAR)
     steady = np.abs(np.gradient(np.linalg.norm(uphill.velocity, axis=1))) < 1e-9
     steady &= np.abs(uphill.position[:, 0] - 150.0) < 50.0
     np.testing.assert_allclose(euler_from_quat(uphill.quat_xyzw)[steady, 1], -np.arctan(0.1), atol=1e-4)
@@ -171,7 +171,7 @@ def test_braking_dips_the_nose_and_a_hill_lifts_it():
 
 def test_at_a_dead_end_it_stops_five_times_and_drives_backwards_once():
     graph = road_graph([(0, 0), (60, 0)], [(0, 1)])
-    path = plan_path(lane_route(graph, [0, 1], (0.0, 60.0)), CAR, FRAME)
+    path = plan_path(lane_route(graph, [0, 1], ends=(0.0, 60.0)), CAR, frame=FRAME)
     trajectory = drive_path(path, CAR)
     assert_gentle(trajectory, CAR)
     R = matrix_from_quat(trajectory.quat_xyzw)
@@ -183,7 +183,7 @@ def test_at_a_dead_end_it_stops_five_times_and_drives_backwards_once():
 
 
 def test_a_recording_of_given_length_ends_at_rest_and_is_no_slower_than_it_must_be():
-    path = plan_path(straight(2000.0), CAR, FRAME)
+    path = plan_path(straight(2000.0), CAR, frame=FRAME)
     trajectory = drive_path(path, CAR, duration=30.0)
     assert trajectory.duration_ns == 30_000_000_000
     whole = drive_path(path, CAR)
@@ -194,7 +194,7 @@ def test_a_recording_of_given_length_ends_at_rest_and_is_no_slower_than_it_must_
 
 @pytest.mark.parametrize("rate", [7.0, 10.0, 100.0, 250.0])
 def test_poses_come_at_the_rate_and_on_the_same_way(rate):
-    path = plan_path(straight(150.0), CAR, FRAME)
+    path = plan_path(straight(150.0), CAR, frame=FRAME)
     one, fine = drive_path(path, CAR, rate_hz=rate), drive_path(path, CAR, rate_hz=100.0)
     np.testing.assert_allclose(np.diff(one.time_ns), 1e9 / rate, atol=1.0)
     at = np.interp(one.time_ns, fine.time_ns, fine.position[:, 0])
@@ -202,8 +202,8 @@ def test_poses_come_at_the_rate_and_on_the_same_way(rate):
 
 
 def test_true_speed_is_kept_where_the_projection_stretches():
-    frame = Frame.at(-78.467838, -0.180653, "EPSG:32717")  # scale 1.00058 at Quito
-    path = plan_path(straight(1000.0), CAR, frame)
+    frame = Frame.at(-78.467838, -0.180653, crs="EPSG:32717")  # scale 1.00058 at Quito
+    path = plan_path(straight(1000.0), CAR, frame=frame)
     trajectory = drive_path(path, CAR)
     assert trajectory.scale[0] == pytest.approx(1.000584, abs=1e-5)
     held = np.linalg.norm(trajectory.velocity, axis=1) > 13.899
@@ -212,7 +212,7 @@ def test_true_speed_is_kept_where_the_projection_stretches():
 
 
 def test_bad_options_are_refused():
-    path = plan_path(straight(50.0), CAR, FRAME)
+    path = plan_path(straight(50.0), CAR, frame=FRAME)
     for options in ({"rate_hz": 0.0}, {"duration": -1.0}):
         with pytest.raises(InputError, match="must be positive"):
             drive_path(path, CAR, **options)
@@ -223,7 +223,7 @@ def test_a_crest_is_taken_without_taking_off():
     hill = free_route(
         np.column_stack([x, np.zeros(len(x)), 20.0 * np.exp(-(((x - 200.0) / 25.0) ** 2))]), limit=25.0
     )
-    trajectory = drive_path(plan_path(hill, CAR, FRAME), CAR)
+    trajectory = drive_path(plan_path(hill, CAR, frame=FRAME), CAR)
     lift = np.gradient(trajectory.velocity[:, 2], 0.01)
     speed = np.linalg.norm(trajectory.velocity, axis=1)
     at_top = np.argmin(np.abs(trajectory.position[:, 0] - 200.0))

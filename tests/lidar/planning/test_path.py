@@ -23,12 +23,12 @@ CAR = load_vehicle("car")
 
 
 def outlines(path, vehicle=CAR):
-    return body_outlines(path.position[:, :2], path.heading, vehicle)
+    return body_outlines(path.position[:, :2], path.heading, vehicle=vehicle)
 
 
 def afloat(path, ground):
     """Metres (4, n) by which each wheel of the car stands above the ground, as its attitude has it."""
-    turn = matrix_from_quat(quat_from_euler(path.bank, -path.pitch, path.heading))
+    turn = matrix_from_quat(quat_from_euler(path.bank, -path.pitch, gamma=path.heading))
     out = []
     for ahead in (0.0, CAR.wheelbase):
         for left in (CAR.track / 2, -CAR.track / 2):
@@ -74,7 +74,7 @@ def crooked_lines(draw):
 def test_whatever_line_it_is_given_the_path_can_be_driven_or_is_refused(line, name):
     vehicle = load_vehicle(name)
     try:
-        path = plan_path(free_route(line), vehicle, FRAME)
+        path = plan_path(free_route(line), vehicle, frame=FRAME)
     except BlockedError:
         return
     assert_drivable(path, vehicle)
@@ -86,8 +86,8 @@ def test_whatever_line_it_is_given_the_path_can_be_driven_or_is_refused(line, na
 @settings(max_examples=10, deadline=None)
 def test_in_a_town_of_blocks_the_body_stays_on_the_street_and_in_its_lane(seed, side):
     graph = grid(4, 4, width=8.0)
-    route = plan_route(graph, FRAME, "random", seed=seed, length=1500.0, side=side)
-    path = plan_path(route, CAR, FRAME)
+    route = plan_route(graph, FRAME, spec="random", seed=seed, length=1500.0, side=side)
+    path = plan_path(route, CAR, frame=FRAME)
     assert_drivable(path, CAR)
     # a kerb with the usual rounding at corners
     streets = shapely.union_all(shapely.buffer(shapely.linestrings([g[:, :2] for g in graph.geometry]), 4.0))
@@ -102,15 +102,15 @@ def test_in_a_town_of_blocks_the_body_stays_on_the_street_and_in_its_lane(seed, 
 def test_a_corner_house_at_the_kerb_is_driven_round():
     # the inner corner of a right turn is a house; straight through the lanes' rounding the body would hit it
     graph = road_graph([(-60, 0), (0, 0), (0, -60)], [(0, 1), (1, 2)], width=6.0)
-    route = lane_route(graph, [0, 2], (0.0, 60.0))
+    route = lane_route(graph, [0, 2], ends=(0.0, 60.0))
     house = shapely.box(-40, -40, -3.2, -3.2)
-    free = plan_path(route, CAR, FRAME)
+    free = plan_path(route, CAR, frame=FRAME)
     assert shapely.intersects(outlines(free), house).any()
-    path = plan_path(route, CAR, FRAME, obstacles=[house])
+    path = plan_path(route, CAR, frame=FRAME, obstacles=[house])
     assert_drivable(path, CAR)
     assert shapely.distance(outlines(path), house).min() >= 0.2
     far_side = shapely.box(-60, 3.5, 10, 20)  # and it does not need the houses on the other side
-    both = plan_path(route, CAR, FRAME, obstacles=[house, far_side])
+    both = plan_path(route, CAR, frame=FRAME, obstacles=[house, far_side])
     assert shapely.distance(outlines(both), house).min() >= 0.2
     assert shapely.distance(outlines(both), far_side).min() >= 0.2
 
@@ -119,16 +119,18 @@ def test_a_gap_narrower_than_the_body_is_refused_and_named():
     graph = road_graph([(0, 0), (100, 0)], [(0, 1)])
     walls = [shapely.box(50, 0.8, 60, 20), shapely.box(50, -20, 60, -0.8)]
     with pytest.raises(BlockedError, match=r"does not pass between .* scene x [45]\d\.\d") as caught:
-        plan_path(lane_route(graph, [0], (0.0, 100.0)), CAR, FRAME, obstacles=walls)
+        plan_path(lane_route(graph, [0], ends=(0.0, 100.0)), CAR, frame=FRAME, obstacles=walls)
     assert caught.value.turns == [(0, 0)]
     robot = load_vehicle("robot")
-    assert_drivable(plan_path(lane_route(graph, [0], (0.0, 100.0)), robot, FRAME, obstacles=walls), robot)
+    assert_drivable(
+        plan_path(lane_route(graph, [0], ends=(0.0, 100.0)), robot, frame=FRAME, obstacles=walls), robot
+    )
 
 
 def test_buildings_do_not_matter_in_tunnels_and_on_bridges():
     graph = road_graph([(0, 0), (100, 0)], [(0, 1)], tunnel=[True, True])
     house = shapely.box(40, -20, 60, 20)
-    path = plan_path(lane_route(graph, [0], (0.0, 100.0)), CAR, FRAME, obstacles=[house])
+    path = plan_path(lane_route(graph, [0], ends=(0.0, 100.0)), CAR, frame=FRAME, obstacles=[house])
     assert shapely.intersects(outlines(path), house).any()
 
 
@@ -136,19 +138,21 @@ def test_where_it_does_not_fit_another_way_is_found():
     graph = grid(3, 2)
     across = shapely.box(120, -10, 180, 10)  # a market hall across the southern street
     lat_lon = [FRAME.to_geographic(x, y)[::-1] for x, y in [(50, 0), (200, 50)]]
-    direct, _ = plan_drive(graph, FRAME, lat_lon, CAR)
+    direct, _ = plan_drive(graph, FRAME, spec=lat_lon, vehicle=CAR)
     assert direct.line[:, 1].max() < 60.0
-    route, path = plan_drive(graph, FRAME, lat_lon, CAR, obstacles=[across])
+    route, path = plan_drive(graph, FRAME, spec=lat_lon, vehicle=CAR, obstacles=[across])
     assert route.line[:, 1].max() > 90.0
     assert not shapely.intersects(outlines(path), across).any()
     with pytest.raises(BlockedError, match="does not pass"):
-        plan_drive(graph, FRAME, lat_lon, CAR, obstacles=[across, shapely.box(120, 90, 180, 110)])
+        plan_drive(
+            graph, FRAME, spec=lat_lon, vehicle=CAR, obstacles=[across, shapely.box(120, 90, 180, 110)]
+        )
 
 
 def test_at_a_dead_end_the_vehicle_turns_round_in_three_moves():
     graph = road_graph([(0, 0), (100, 0)], [(0, 1)])
-    route = lane_route(graph, [0, 1], (0.0, 100.0))
-    path = plan_path(route, CAR, FRAME)
+    route = lane_route(graph, [0, 1], ends=(0.0, 100.0))
+    path = plan_path(route, CAR, frame=FRAME)
     assert_drivable(path, CAR)
     legs = [path.take(path.leg == k) for k in range(path.leg.max() + 1)]
     assert [leg.gear[0] for leg in legs] == [1, 1, -1, 1, 1]
@@ -156,17 +160,17 @@ def test_at_a_dead_end_the_vehicle_turns_round_in_three_moves():
     np.testing.assert_allclose(np.cos(path.heading[[0, -1]]), [1.0, -1.0], atol=1e-3)
     np.testing.assert_allclose(path.position[-1, :2], [0.0, 1.75], atol=0.3)
     tight = [shapely.box(85, 5.0, 110, 20), shapely.box(85, -20, 110, -5.0)]
-    more = plan_path(route, CAR, FRAME, obstacles=tight)
+    more = plan_path(route, CAR, frame=FRAME, obstacles=tight)
     assert more.leg.max() > path.leg.max()
     assert not shapely.intersects(shapely.union_all(outlines(more)), shapely.union_all(tight))
     closed = [shapely.box(80, 3.6, 110, 20), shapely.box(80, -20, 110, -3.6)]
     with pytest.raises(BlockedError, match="no room to turn round"):
-        plan_path(route, CAR, FRAME, obstacles=closed)
+        plan_path(route, CAR, frame=FRAME, obstacles=closed)
 
 
 def test_on_a_slope_the_vehicle_stands_on_the_ground():
     line = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 20.0]])
-    path = plan_path(free_route(line), CAR, FRAME)
+    path = plan_path(free_route(line), CAR, frame=FRAME)
     inner = slice(40, -40)
     np.testing.assert_allclose(path.position[inner, 2], 0.1 * path.position[inner, 0], atol=1e-5)
     np.testing.assert_allclose(path.slope[inner], np.arctan(0.1), atol=1e-6)
@@ -179,7 +183,7 @@ def test_a_ground_that_is_given_lifts_and_banks_the_vehicle():
     def ground(x, y, _near=None):
         return 5.0 + 0.05 * x + 0.02 * y
 
-    path = plan_path(free_route(line), CAR, FRAME, ground=ground)
+    path = plan_path(free_route(line), CAR, frame=FRAME, ground=ground)
     inner = slice(40, -40)
     np.testing.assert_allclose(path.position[inner, 2], ground(*path.position[inner, :2].T), atol=1e-6)
     # the body rolls about an axis that points uphill
@@ -196,7 +200,7 @@ def test_on_faceted_hairpins_each_wheel_keeps_to_the_ground():
     def ground(x, y, _near=None):
         return np.interp(x, [0, 20, 35, 50, 58, 66, 80], [0, 1, 3.8, 5, 6.4, 6.8, 9]) + 0.1 * np.abs(y - 9.0)
 
-    path = plan_path(free_route(line), CAR, FRAME, ground=ground)
+    path = plan_path(free_route(line), CAR, frame=FRAME, ground=ground)
     off = afloat(path, ground)
     assert np.percentile(np.abs(off), 95) < 0.03
     assert np.abs(off).max() < 0.12
@@ -212,7 +216,7 @@ def test_on_a_plane_however_steep_all_wheels_stand_on_it(ahead, aside, way):
         return ahead * (c * x + s * y) + aside * (c * y - s * x)
 
     line = np.array([[0.0, 0.0, 0.0], [60.0 * c, 60.0 * s, 60.0 * ahead]])
-    path = plan_path(free_route(line), CAR, FRAME, ground=ground)
+    path = plan_path(free_route(line), CAR, frame=FRAME, ground=ground)
     assert np.abs(afloat(path, ground)[:, 20:-20]).max() < 1e-3
 
 
@@ -226,7 +230,7 @@ def test_a_street_may_be_as_steep_as_stairs_and_is_no_step():
         def ground(at, _y, _near=None, x=x, z=z):
             return np.interp(at, x, z)
 
-        path = plan_path(free_route(np.column_stack([x, 0 * x, z])), CAR, FRAME, ground=ground)
+        path = plan_path(free_route(np.column_stack([x, 0 * x, z])), CAR, frame=FRAME, ground=ground)
         worst.append(np.abs(afloat(path, ground)[:, 20:-20]).max())
     assert max(worst) < 0.02
     assert worst[1] == pytest.approx(worst[0], rel=0.3)
@@ -236,15 +240,15 @@ def test_a_wall_beside_the_road_does_not_tip_the_vehicle():
     def ground(x, y, _near=None):
         return np.where(np.abs(y) > 0.6, 1.2, 0.0) + 0.0 * x
 
-    path = plan_path(free_route([[0.0, 0, 0], [60.0, 0, 0]]), CAR, FRAME, ground=ground)
+    path = plan_path(free_route([[0.0, 0, 0], [60.0, 0, 0]]), CAR, frame=FRAME, ground=ground)
     np.testing.assert_allclose(path.bank, 0.0, atol=1e-9)
     np.testing.assert_allclose(path.position[:, 2], 0.0, atol=1e-9)
 
 
 def test_lengths_are_true_metres_where_the_projection_shrinks_them():
-    frame = Frame.at(-75.0, 40.0, "EPSG:32618")  # on the zone's meridian: 0.9996
+    frame = Frame.at(-75.0, 40.0, crs="EPSG:32618")  # on the zone's meridian: 0.9996
     lon, lat = frame.to_geographic(np.array([0.0, 1000.0]), np.zeros(2))
-    path = plan_path(free_route([[0.0, 0, 0], [1000.0, 0, 0]]), CAR, frame)
+    path = plan_path(free_route([[0.0, 0, 0], [1000.0, 0, 0]]), CAR, frame=frame)
     from pyproj import Geod  # noqa: PLC0415
 
     true = Geod(ellps="WGS84").inv(lon[0], lat[0], lon[1], lat[1])[2]
@@ -255,7 +259,7 @@ def test_lengths_are_true_metres_where_the_projection_shrinks_them():
 
 def test_a_route_that_is_too_short_is_refused():
     with pytest.raises(RouteError, match="too short to drive"):
-        plan_path(free_route([[0.0, 0, 0], [0.1, 0, 0]]), CAR, FRAME)
+        plan_path(free_route([[0.0, 0, 0], [0.1, 0, 0]]), CAR, frame=FRAME)
 
 
 @pytest.mark.shared
@@ -272,7 +276,9 @@ def test_in_a_real_city_the_body_touches_no_building(shared_osm, name):
     shapes = [a.geometry for a in osm.areas if a.tags.get("building", "no") not in ("no", "roof")]
     houses = shapely.STRtree(shapely.transform(np.array(shapes, object), project))
     for seed in range(2):
-        route, path = plan_drive(graph, frame, "random", CAR, seed=seed, duration=240.0, obstacles=houses)
+        route, path = plan_drive(
+            graph, frame, spec="random", vehicle=CAR, seed=seed, duration=240.0, obstacles=houses
+        )
         assert_drivable(path, CAR)
         covered = (graph.bridge | graph.tunnel)[path.edge]
         body, _ = houses.query(outlines(path)[~covered], predicate="intersects")
@@ -293,14 +299,14 @@ def test_of_stacked_surfaces_the_one_near_the_road_is_driven_on():
         deck, ravine = np.full(len(x), 0.4), np.where((x > 101) & (x < 149), -8.0, 0.4)
         return np.where(np.abs(deck - near) < np.abs(ravine - near), deck, ravine)
 
-    path = plan_path(lane_route(graph, [0, 2, 4], (0.0, 100.0)), CAR, FRAME, ground=ground)
+    path = plan_path(lane_route(graph, [0, 2, 4], ends=(0.0, 100.0)), CAR, frame=FRAME, ground=ground)
     np.testing.assert_allclose(path.position[:, 2], 0.4, atol=1e-6)
 
 
 def test_velocity_along_a_hilly_path_is_its_derivative():
     x = np.arange(0.0, 401.0, 4.0)
     line = np.column_stack([x, np.zeros(len(x)), 6.0 * np.sin(x / 30.0)])
-    path = plan_path(free_route(line), CAR, FRAME)
+    path = plan_path(free_route(line), CAR, frame=FRAME)
     rise = np.diff(path.position[:, 2]) / np.diff(path.s)
     np.testing.assert_allclose(rise, np.sin(0.5 * (path.slope[1:] + path.slope[:-1])), atol=2e-3)
 
@@ -309,7 +315,7 @@ def test_every_row_of_the_path_knows_its_street():
     graph = road_graph(
         [(0, 0), (80, 0), (160, 0), (240, 0)], [(0, 1), (1, 2), (2, 3)], speed=[9.0, 9, 5, 5, 12, 12]
     )
-    path = plan_path(lane_route(graph, [0, 2, 4], (0.0, 80.0)), CAR, FRAME)
+    path = plan_path(lane_route(graph, [0, 2, 4], ends=(0.0, 80.0)), CAR, frame=FRAME)
     expected = np.array([0, 2, 4])[np.clip((path.position[:, 0] // 80).astype(int), 0, 2)]
     inner = np.abs(path.position[:, 0] % 80.0 - 40.0) < 39.0
     np.testing.assert_array_equal(path.edge[inner], expected[inner])

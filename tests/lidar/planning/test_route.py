@@ -38,7 +38,7 @@ def test_a_random_drive_follows_streets_and_never_turns_round_where_it_need_not(
     graph = grid(columns, rows)
     edges = random_edges(graph, seed=seed, seconds=300.0)
     assert follows(graph, edges)
-    assert not turns_back(graph, edges[:-1], edges[1:]).any()
+    assert not turns_back(graph, edges[:-1], after=edges[1:]).any()
     assert graph.travel_time[edges].sum() >= 300.0
     assert np.array_equal(edges, random_edges(graph, seed=seed, seconds=300.0))
 
@@ -61,7 +61,7 @@ def test_a_random_drive_prefers_streets_it_has_not_seen():
 
 def test_a_village_of_one_dead_end_street_is_driven_up_and_down():
     graph = road_graph([(0, 0), (150, 0), (300, 0)], [(0, 1), (1, 2)])
-    route = plan_route(graph, FRAME, "random", seed=3, length=1500.0)
+    route = plan_route(graph, FRAME, spec="random", seed=3, length=1500.0)
     assert len(route.turns) >= 3
     ends = route.line[route.turns][:, 0]
     assert np.all(np.minimum(abs(ends), abs(ends - 300)) < 1.0)  # it turns at the ends only
@@ -75,13 +75,13 @@ def test_one_way_streets_that_lead_out_of_the_map_are_driven_to_their_end():
 def test_a_map_without_streets_has_no_route():
     graph = grid().take(np.zeros(len(grid()), bool))
     with pytest.raises(RouteError, match="no drivable streets"):
-        plan_route(graph, FRAME, "random")
+        plan_route(graph, FRAME, spec="random")
 
 
 @pytest.mark.parametrize(("side", "sign"), [("right", -1.0), ("left", 1.0)])
 def test_the_vehicle_keeps_to_its_side(side, sign):
     graph = grid(2, 2, width=7.0)
-    route = lane_route(graph, [0], (10.0, 90.0), side=side)  # east along y = 0
+    route = lane_route(graph, [0], ends=(10.0, 90.0), side=side)  # east along y = 0
     np.testing.assert_allclose(route.line[:, 1], sign * 1.75, atol=1e-9)
     np.testing.assert_allclose(route.line[[0, -1], 0], [10.0, 90.0])
 
@@ -99,7 +99,7 @@ def test_the_vehicle_keeps_to_its_side(side, sign):
 )
 def test_the_lane_is_the_outer_one_inside_the_carriageway(width, lanes, twoway, offset):
     graph = road_graph([(0, 0), (100, 0)], [(0, 1)], width=width, lanes=lanes, twoway=twoway)
-    route = lane_route(graph, [0], (0.0, 100.0))
+    route = lane_route(graph, [0], ends=(0.0, 100.0))
     np.testing.assert_allclose(-route.line[:, 1], offset, atol=0.011)
 
 
@@ -107,14 +107,14 @@ def test_waypoints_are_joined_by_the_fastest_way():
     graph = grid(3, 2)
     south = np.array([line[:, 1].max() == 0 for line in graph.geometry])
     graph = dataclasses.replace(graph, speed=np.where(south, 2.0, graph.speed))
-    route = plan_route(graph, FRAME, [lat_lon(0, 50), lat_lon(200, 50)])
+    route = plan_route(graph, FRAME, spec=[lat_lon(0, 50), lat_lon(200, 50)])
     assert route.line[:, 1].max() > 90.0  # by the northern street
     assert route.line[:, 1].min() > 40.0
     np.testing.assert_allclose(route.line[[0, -1], 1], 50.0, atol=0.01)
 
 
 def test_waypoints_may_lie_on_one_street():
-    route = plan_route(grid(2, 2), FRAME, [lat_lon(80, 2), lat_lon(20, -1)])
+    route = plan_route(grid(2, 2), FRAME, spec=[lat_lon(80, 2), lat_lon(20, -1)])
     assert len(route.edges) == 1
     np.testing.assert_allclose(route.line[[0, -1], 0], [80.0, 20.0], atol=0.01)
     assert (route.line[:, 1] > 1.0).all()  # westward, on the northern side
@@ -125,9 +125,9 @@ def test_waypoints_respect_one_way_streets_and_forbidden_turns():
     graph = road_graph(
         [(0, 0), (100, 0), (100, 100), (0, 100)], [(0, 1), (1, 2), (2, 3), (3, 0)], twoway=False
     )
-    route = plan_route(graph, FRAME, [lat_lon(50, 0), lat_lon(0, 50)])
+    route = plan_route(graph, FRAME, spec=[lat_lon(50, 0), lat_lon(0, 50)])
     assert route.edges.tolist() == [0, 1, 2, 3]
-    back = plan_route(graph, FRAME, [lat_lon(50, 0), lat_lon(30, 0)])
+    back = plan_route(graph, FRAME, spec=[lat_lon(50, 0), lat_lon(30, 0)])
     assert back.edges.tolist() == [0, 1, 2, 3, 0]
     banned = dataclasses.replace(
         graph,
@@ -137,7 +137,7 @@ def test_waypoints_respect_one_way_streets_and_forbidden_turns():
         turn_kind=np.array(["no_left_turn"]),
     )
     with pytest.raises(RouteError, match=r"waypoint 2 .* cannot be reached from waypoint 1"):
-        plan_route(banned, FRAME, [lat_lon(50, 0), lat_lon(0, 50)])
+        plan_route(banned, FRAME, spec=[lat_lon(50, 0), lat_lon(0, 50)])
 
 
 def chained(graph, *chains):
@@ -167,10 +167,10 @@ def test_random_drives_take_no_turn_that_is_forbidden_via_a_way():
 def test_waypoints_take_no_turn_that_is_forbidden_via_a_way(between):
     graph = grid(3, 2)
     places = [lat_lon(*xy) for xy in [(50, 0), *between, (150, 100)]]
-    free = plan_route(graph, FRAME, [lat_lon(50, 0), lat_lon(100, 50), lat_lon(150, 100)])
+    free = plan_route(graph, FRAME, spec=[lat_lon(50, 0), lat_lon(100, 50), lat_lon(150, 100)])
     assert len(free.edges) == 3
     bound = chained(graph, free.edges)
-    route = plan_route(bound, FRAME, places)
+    route = plan_route(bound, FRAME, spec=places)
     assert not drives_along(route.edges, free.edges)
     passed = shapely.distance(
         shapely.LineString(route.line[:, :2]), shapely.points(np.reshape(between, (-1, 2)))
@@ -181,12 +181,12 @@ def test_waypoints_take_no_turn_that_is_forbidden_via_a_way(between):
 def test_of_many_waypoints_off_the_streets_three_are_named_and_the_rest_counted():
     said = r"^waypoint 1 .*; waypoint 2 .*; waypoint 3 .*; and so are 37 more$"
     with pytest.raises(RouteError, match=said):
-        plan_route(grid(2, 2), FRAME, [(36.5, -76.0)] * 40)
+        plan_route(grid(2, 2), FRAME, spec=[(36.5, -76.0)] * 40)
 
 
 def test_a_waypoint_off_the_streets_is_named_with_its_distance():
     with pytest.raises(RouteError, match=r"waypoint 2 \(36\.\d+, -76\.\d+\) is 200 m from the nearest"):
-        plan_route(grid(2, 2), FRAME, [lat_lon(50, 0), lat_lon(300, 50)])
+        plan_route(grid(2, 2), FRAME, spec=[lat_lon(50, 0), lat_lon(300, 50)])
 
 
 GPX = """<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1" version="1.1" creator="t">
@@ -209,12 +209,12 @@ def test_a_noisy_gpx_track_is_matched_to_the_streets_it_was_driven_on(tmp_path):
     points = "\n".join('<trkpt lat="{:.8f}" lon="{:.8f}"/>'.format(*lat_lon(*p)) for p in track)
     path = tmp_path / "drive.gpx"
     path.write_text(GPX.format(points))
-    route = plan_route(graph, FRAME, str(path))
+    route = plan_route(graph, FRAME, spec=str(path))
     nodes = [tuple(graph.node_xyz[n, :2].astype(int).tolist()) for n in graph.head[route.edges[:-1]]]
     assert nodes == [
         (100, 0), (200, 0), (200, 100), (200, 200), (100, 200), (100, 300), (200, 300)
     ]  # fmt: skip
-    as_is = plan_route(graph, FRAME, path, as_is=True)
+    as_is = plan_route(graph, FRAME, spec=path, as_is=True)
     assert (as_is.edge == -1).all()
     assert len(as_is.line) == points.count("trkpt")
 
@@ -227,7 +227,7 @@ def test_a_geojson_line_and_points_are_read(tmp_path):
     points = tmp_path / "points.geojson"
     feature = [{"type": "Feature", "geometry": {"type": "Point", "coordinates": p}} for p in lonlat]
     points.write_text(json.dumps({"type": "FeatureCollection", "features": feature}))
-    one, two = (plan_route(graph, FRAME, p) for p in (line, points))
+    one, two = (plan_route(graph, FRAME, spec=p) for p in (line, points))
     np.testing.assert_array_equal(one.line, two.line)
     assert len(one.edges) == 2
 
@@ -246,9 +246,9 @@ def test_a_bad_file_is_refused_with_a_reason(tmp_path, text, error, words):
     path = tmp_path / "route"
     path.write_text(text)
     with pytest.raises(error, match=words):
-        plan_route(grid(), FRAME, path)
+        plan_route(grid(), FRAME, spec=path)
     with pytest.raises(RouteError, match="does not exist"):
-        plan_route(grid(), FRAME, tmp_path / "none.gpx")
+        plan_route(grid(), FRAME, spec=tmp_path / "none.gpx")
 
 
 @pytest.mark.shared
@@ -261,4 +261,4 @@ def test_a_random_drive_through_a_real_city_is_lawful(shared_osm, name):
         edges = random_edges(graph, seed=seed, seconds=900.0)
         assert follows(graph, edges)
         assert graph.travel_time[edges].sum() >= 900.0
-        assert not turns_back(graph, edges[:-1], edges[1:]).any()
+        assert not turns_back(graph, edges[:-1], after=edges[1:]).any()

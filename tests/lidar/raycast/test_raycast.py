@@ -157,7 +157,7 @@ def test_the_number_of_threads_changes_nothing():
         for name in one.__slots__:
             np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
     np.testing.assert_array_equal(
-        cast.occluded([0, 0, 0], way, 9.0), cast.occluded([0, 0, 0], way, 9.0, threads=2)
+        cast.occluded([0, 0, 0], way, far=9.0), cast.occluded([0, 0, 0], way, far=9.0, threads=2)
     )
     shuffled = cast.cast([0, 0, 0], way, order=order, threads=2)
     np.testing.assert_allclose(shuffled.range, cast.cast([0, 0, 0], way).range, atol=1e-6)
@@ -282,7 +282,7 @@ def test_ranges_of_posed_rays_are_true_distances_on_a_stretched_map(k, seed):
     way = rng.normal(size=(600, 3))
     way /= np.linalg.norm(way, axis=1, keepdims=True)
     offsets = rng.uniform(-0.1, 0.1, (600, 3))
-    hits = Caster(drawn, room.faces).cast_posed(poses, index, way, offsets=offsets)
+    hits = Caster(drawn, room.faces).cast_posed(poses, index, directions=way, offsets=offsets)
     true_way = np.einsum("nij,nj->ni", poses.rotation[index], way)
     start = where[index] + np.einsum("nij,nj->ni", poses.rotation[index], offsets)
     with np.errstate(divide="ignore"):
@@ -294,9 +294,9 @@ def test_one_posed_ray_starts_at_its_offset():
     poses = Poses(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 3)))
     cast = Caster(*sheet([0, 0, 1], np.array([0, 0, -5.0])))
     way = np.array([[0.0, 0, -1]])
-    assert cast.cast_posed(poses, np.zeros(1, int), way).range == pytest.approx(5)
+    assert cast.cast_posed(poses, np.zeros(1, int), directions=way).range == pytest.approx(5)
     assert cast.cast_posed(
-        poses, np.zeros(1, int), way, offsets=np.array([[0, 0, -2.0]])
+        poses, np.zeros(1, int), directions=way, offsets=np.array([[0, 0, -2.0]])
     ).range == pytest.approx(3)
 
 
@@ -308,8 +308,8 @@ def test_bounds_hold(backend):
     assert np.isinf(cast.cast([0.3, 0.2, 10], down, far=4.999).range)
     assert np.isinf(cast.cast([0.3, 0.2, 10], down, near=5.001).range)
     assert cast.cast([0.3, 0.2, 10], down, near=4.9, far=5.0).range == pytest.approx(5)
-    assert cast.occluded([0.3, 0.2, 10], down, 5.1)
-    assert not cast.occluded([0.3, 0.2, 10], down, 4.9)
+    assert cast.occluded([0.3, 0.2, 10], down, far=5.1)
+    assert not cast.occluded([0.3, 0.2, 10], down, far=4.9)
 
 
 @BACKENDS

@@ -21,7 +21,14 @@ def hedge(low, high, feature=7):
 
 def seen(scene, effects=LEAFY, *, name="hdl64e_s3", frame=0, seed=1, start=(0, 0, 0), **options):
     return scan(
-        load_sensor(name), HERE, driven(start=start), scene, frame, seed=seed, effects=effects, **options
+        load_sensor(name),
+        HERE,
+        trajectory=driven(start=start),
+        world=scene,
+        frame=frame,
+        seed=seed,
+        effects=effects,
+        **options,
     )
 
 

@@ -36,7 +36,7 @@ def placed(cloud, mount, trajectory):
 def test_points_of_a_moving_turning_vehicle_lie_on_the_surfaces():
     drive = driven((20.0, 3.0, 0.0), yaw_rate=0.8, start=(-20, -10, 0))
     sensor = load_sensor("vlp16")
-    cloud = scan(sensor, ROOF, drive, ROOM, 3)
+    cloud = scan(sensor, ROOF, trajectory=drive, world=ROOM, frame=3)
     p = placed(cloud, ROOF, drive)
     assert len(cloud) > 5000
     on = {
@@ -52,7 +52,7 @@ def test_points_of_a_moving_turning_vehicle_lie_on_the_surfaces():
 
 def test_one_pose_a_frame_smears_the_same_drive():
     drive = driven((20.0, 0.0, 0.0), start=(-20, -10, 0))
-    cloud = scan(load_sensor("vlp16"), ROOF, drive, ROOM, 3, effects=LEVELS["draft"])
+    cloud = scan(load_sensor("vlp16"), ROOF, trajectory=drive, world=ROOM, frame=3, effects=LEVELS["draft"])
     assert not cloud.time_ns.any()
     late = replace(cloud, time_ns=np.full(len(cloud), 90_000_000, np.int32))
     moved = placed(late, ROOF, drive) - placed(cloud, ROOF, drive)
@@ -62,13 +62,25 @@ def test_one_pose_a_frame_smears_the_same_drive():
 def test_ranges_are_true_metres_where_the_projection_stretches():
     """A wall 10 true metres ahead of the sensor is 10.4 grid metres ahead in a grid of scale 1.04."""
     scale = 1.04
-    cloud = scan(load_sensor("utm30lx"), Mount(), driven(scale=scale), world(plate(10 * scale)), 0)
+    cloud = scan(
+        load_sensor("utm30lx"),
+        Mount(),
+        trajectory=driven(scale=scale),
+        world=world(plate(10 * scale)),
+        frame=0,
+    )
     ahead = np.argmin(np.abs(cloud.xyz[:, 1]))
     assert cloud.range[ahead] == pytest.approx(10.0, abs=1e-9)
 
 
 def test_intensity_is_reflectance_times_cosine():
-    cloud = scan(load_sensor("vlp16"), Mount((0, 0, 2.0)), driven(), world(plate(8.0, material="brick")), 0)
+    cloud = scan(
+        load_sensor("vlp16"),
+        Mount((0, 0, 2.0)),
+        trajectory=driven(),
+        world=world(plate(8.0, material="brick")),
+        frame=0,
+    )
     expected = 100 * materials()["brick"].reflectance[0] * np.cos(cloud.incidence)
     assert cloud.intensity == pytest.approx(expected, rel=1e-5)
     assert cloud.intensity.max() > 39
@@ -79,29 +91,42 @@ def test_intensity_is_reflectance_times_cosine():
 
 def test_the_range_has_hard_limits():
     vlp16 = load_sensor("vlp16")
-    near = scan(vlp16, Mount(), driven(), world(plate(0.49)), 0)
+    near = scan(vlp16, Mount(), trajectory=driven(), world=world(plate(0.49)), frame=0)
     assert near.range.min() >= 0.5
-    far = scan(vlp16, Mount(), driven(), world(plate(99.0)), 0)
+    far = scan(vlp16, Mount(), trajectory=driven(), world=world(plate(99.0)), frame=0)
     # No beam is level: the nearest points are at 1 degree.
     assert far.range.min() == pytest.approx(99.0 / np.cos(np.radians(1)), abs=1e-3)
     assert far.range.max() <= 100.0
-    assert len(scan(vlp16, Mount(), driven(), world(plate(100.01)), 0)) == 0
+    assert len(scan(vlp16, Mount(), trajectory=driven(), world=world(plate(100.01)), frame=0)) == 0
 
 
 def test_something_within_the_blind_zone_still_hides_what_is_behind():
     blocked = world(box((0.1, -5, -5), (0.2, 5, 5)), plate(10.0, feature=3))
-    cloud = scan(load_sensor("vlp16"), Mount(), driven(), blocked, 0)
+    cloud = scan(load_sensor("vlp16"), Mount(), trajectory=driven(), world=blocked, frame=0)
     assert np.abs(cloud.xyz[cloud.feature == 3, 1]).min(initial=99) > 5
 
 
 def test_a_frame_alone_is_the_frame_of_a_run():
     sensor = load_sensor("vlp16")
     drive = driven((10.0, 0.0, 0.0), start=(-20, -10, 0))
-    run = [scan(sensor, ROOF, drive, ROOM, k, seed=5, effects=LEVELS["survey"]) for k in range(3)]
-    alone = scan(load_sensor("vlp16"), ROOF, drive, ROOM, 2, seed=5, effects=LEVELS["survey"], threads=2)
+    run = [
+        scan(sensor, ROOF, trajectory=drive, world=ROOM, frame=k, seed=5, effects=LEVELS["survey"])
+        for k in range(3)
+    ]
+    alone = scan(
+        load_sensor("vlp16"),
+        ROOF,
+        trajectory=drive,
+        world=ROOM,
+        frame=2,
+        seed=5,
+        effects=LEVELS["survey"],
+        threads=2,
+    )
     assert same(run[2], alone)
     assert not np.array_equal(
-        run[2].range, scan(sensor, ROOF, drive, ROOM, 2, seed=6, effects=LEVELS["survey"]).range
+        run[2].range,
+        scan(sensor, ROOF, trajectory=drive, world=ROOM, frame=2, seed=6, effects=LEVELS["survey"]).range,
     )
 
 
@@ -130,11 +155,11 @@ def test_every_effect_changes_the_returns_and_none_is_on_by_default():
         "quantise": True,
     }
     drive = driven((10.0, 0.0, 0.0), start=(-20, -10, 0))
-    plain = scan(sensor, ROOF, drive, scene, 0, effects=PLAIN)
+    plain = scan(sensor, ROOF, trajectory=drive, world=scene, frame=0, effects=PLAIN)
     assert np.array_equal(plain.range, plain.true_range)
     for name, value in turned.items():
         assert getattr(Effects(), name) == type(value)() or name in ("motion", "law", "rays", "range_noise")
-        other = scan(sensor, ROOF, drive, scene, 0, effects=Effects(**{name: value}))
+        other = scan(sensor, ROOF, trajectory=drive, world=scene, frame=0, effects=Effects(**{name: value}))
         assert not same(plain, other), name
 
 
@@ -143,4 +168,4 @@ def test_the_seed_rig_scans():
     drive = driven((5.0, 0.0, 0.0), start=(-10, -5, 0))
     for spec in rig.lidars:
         sensor = load_sensor(spec.preset, name=spec.name, rate_hz=spec.rate_hz)
-        assert len(scan(sensor, spec.mount, drive, ROOM, 0)) > 500
+        assert len(scan(sensor, spec.mount, trajectory=drive, world=ROOM, frame=0)) > 500

@@ -288,17 +288,19 @@ def test_a_list_of_directions_is_gone_through_again_and_again(tmp_path):
 def test_radial_velocity_is_that_of_approach():
     """At 10 m/s towards a wall returns close in at 10 m/s times the cosine to the way."""
     sensor, mount, drive = load_sensor("fmcw"), Mount((2.0, 0.0, 0.0)), driven((10.0, 0.0, 0.0))
-    cloud = scan(sensor, mount, drive, world(plate(60.0, feature=5)), 0)
+    cloud = scan(sensor, mount, trajectory=drive, world=world(plate(60.0, feature=5)), frame=0)
     ahead = cloud.xyz[:, 0] / np.linalg.norm(cloud.xyz, axis=1)
-    assert radial_velocity(cloud, mount, drive) == pytest.approx(-10 * ahead, abs=1e-4)
+    assert radial_velocity(cloud, mount, trajectory=drive) == pytest.approx(-10 * ahead, abs=1e-4)
     fleeing = np.tile([12.0, 0.0, 0.0], (len(cloud), 1))
-    assert radial_velocity(cloud, mount, drive, moving=fleeing) == pytest.approx(2 * ahead, abs=1e-4)
+    assert radial_velocity(cloud, mount, trajectory=drive, moving=fleeing) == pytest.approx(
+        2 * ahead, abs=1e-4
+    )
 
 
 def test_radial_velocity_counts_the_lever_arm_of_a_turning_vehicle():
     mount, drive = Mount((0.0, 2.0, 0.0)), driven(yaw_rate=0.5, start=(0, 0, 0))
-    cloud = scan(load_sensor("fmcw"), mount, drive, world(plate(60.0)), 0)
+    cloud = scan(load_sensor("fmcw"), mount, trajectory=drive, world=world(plate(60.0)), frame=0)
     level = cloud.xyz[np.argmin(np.abs(cloud.xyz[:, 1]) + np.abs(cloud.xyz[:, 2]))]
-    found = radial_velocity(cloud, mount, drive)[np.argmin(np.abs(cloud.xyz - level).sum(axis=1))]
+    found = radial_velocity(cloud, mount, trajectory=drive)[np.argmin(np.abs(cloud.xyz - level).sum(axis=1))]
     # 2 m to the left of the axis of a left turn the sensor goes backwards at 1 m/s.
     assert found == pytest.approx(1.0, abs=0.01)

@@ -34,26 +34,30 @@ BUSY = TrafficOptions(vehicles=25.0, cyclists=4.0, walkers=40.0, parked=0.7, rea
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    return build(read_osm(demo_path(), bounds=BOX), tmp_path_factory.mktemp("scene") / "demo", BuildOptions())
+    return build(
+        read_osm(demo_path(), bounds=BOX), tmp_path_factory.mktemp("scene") / "demo", options=BuildOptions()
+    )
 
 
 @pytest.fixture(scope="module")
 def ego(scene):
-    travel = plan_travel(scene, "random", "car", seed=2, duration=15.0)
+    travel = plan_travel(scene, "random", vehicle="car", seed=2, duration=15.0)
     return drive_obeying(
-        travel.path, load_vehicle("car"), road_graph(scene), seed=2, bounds=scene.bounds, duration=15.0,
+        travel.path, load_vehicle("car"), graph=road_graph(scene), seed=2, bounds=scene.bounds, duration=15.0,
         under_way=travel.under_way,
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def actors(scene, ego):
-    return populate(scene, road_graph(scene), ego, CAR, seed=5, options=BUSY)
+    return populate(scene, road_graph(scene), ego=ego, vehicle=CAR, seed=5, options=BUSY)
 
 
 def outlines(actors, rows, t):
-    at = states(actors, rows, t)
-    return rectangles(at.position[:, :2], at.angles[:, 0], actors.size[rows, 0], actors.size[rows, 1])
+    at = states(actors, rows, time_ns=t)
+    return rectangles(
+        at.position[:, :2], at.angles[:, 0], length=actors.size[rows, 0], width=actors.size[rows, 1]
+    )
 
 
 def test_there_are_road_users_of_all_sorts(actors):
@@ -68,30 +72,32 @@ def test_there_are_road_users_of_all_sorts(actors):
 
 def test_nobody_touches_anybody_nor_the_ego(actors, ego):
     for t in range(0, ego.duration_ns, 300_000_000):
-        rows = alive(actors, t, t)
+        rows = alive(actors, t, end_ns=t)
         boxes = outlines(actors, rows, t)
         a, b = shapely.STRtree(boxes).query(boxes, predicate="intersects")
         assert not (a < b).any()
         pose = ego.at([t])
         forward = pose.rotation[:, :2, 0]
         middle = pose.position[:, :2] + (CAR.length / 2 - CAR.rear_overhang) * forward
-        own = rectangles(middle, np.arctan2(forward[:, 1], forward[:, 0]), CAR.length, CAR.width)[0]
+        own = rectangles(
+            middle, np.arctan2(forward[:, 1], forward[:, 0]), length=CAR.length, width=CAR.width
+        )[0]
         assert not shapely.intersects(own, boxes).any()
 
 
 def test_nobody_stands_in_a_building(actors, scene):
-    layer = read_layer(scene.path / "features.gpkg", "buildings", scene.frame)
+    layer = read_layer(scene.path / "features.gpkg", "buildings", frame=scene.frame)
     walls = shapely.STRtree(layer.geometry[np.asarray(layer.columns["min_height"], float) < 2.5])
     for t in (0, 7_000_000_000):
-        rows = alive(actors, t, t)
+        rows = alive(actors, t, end_ns=t)
         assert not len(walls.query(outlines(actors, rows, t), predicate="intersects")[0])
 
 
 def test_vehicles_stand_on_the_ground(actors, scene):
     """Rays cast up from below the tyres meet the road where the vehicle stands."""
     world = World.load(scene)
-    rows = alive(actors, 0, 0)
-    at = states(actors, rows, 0)
+    rows = alive(actors, 0, end_ns=0)
+    at = states(actors, rows, time_ns=0)
     start = at.position + np.array([0.0, 0.0, 1.0])
     hits = world.caster.cast(start, np.tile([0.0, 0.0, -1.0], (len(rows), 1)))
     off = at.position[:, 2] - (start[:, 2] - hits.range)
@@ -104,34 +110,34 @@ def test_features_follow_the_scenes_own(actors, scene):
 
 
 def test_the_same_seed_gives_the_same_actors_and_another_seed_others(actors, scene, ego):
-    again = populate(scene, road_graph(scene), ego, CAR, seed=5, options=BUSY)
+    again = populate(scene, road_graph(scene), ego=ego, vehicle=CAR, seed=5, options=BUSY)
     for name in ("shape", "size", "time_ns", "position", "angles", "velocity"):
         assert getattr(again, name).tobytes() == getattr(actors, name).tobytes()
-    other = populate(scene, road_graph(scene), ego, CAR, seed=6, options=BUSY)
+    other = populate(scene, road_graph(scene), ego=ego, vehicle=CAR, seed=6, options=BUSY)
     assert other.position.tobytes() != actors.position.tobytes()
 
 
 def test_an_empty_place_has_nobody(scene, ego):
     none = TrafficOptions(vehicles=0.0, cyclists=0.0, walkers=0.0, parked=0.0)
-    actors = populate(scene, road_graph(scene), ego, CAR, seed=1, options=none)
+    actors = populate(scene, road_graph(scene), ego=ego, vehicle=CAR, seed=1, options=none)
     assert len(actors) == 0
     assert actor_shapes(actors) == []
-    shape, transform, feature = actor_transforms(actors, 0, 10**8)
+    shape, transform, feature = actor_transforms(actors, 0, end_ns=10**8)
     assert transform.shape == (0, 3, 3, 4)
     assert len(shape) == len(feature) == 0
-    assert {len(column) for column in box_rows(actors, ego, 0, 0).values()} == {0}
-    assert count_points(actors, [], np.array([-1, 3, 10**6])).tolist() == []
+    assert {len(column) for column in box_rows(actors, ego, time_ns=0, frame=0).values()} == {0}
+    assert count_points(actors, [], feature=np.array([-1, 3, 10**6])).tolist() == []
 
 
 @settings(max_examples=20, deadline=None)
 @given(t=st.integers(100_000_000, 14_000_000_000), dt=st.integers(1_000_000, 50_000_000))
 def test_positions_change_as_velocities_say(actors, t, dt):
-    rows = alive(actors, t, t + dt)
+    rows = alive(actors, t, end_ns=t + dt)
     born = actors.time_ns[actors.first[rows]] <= t
     lasts = actors.time_ns[actors.first[rows + 1] - 1] >= t + dt
     rows = rows[(born & lasts) | actors.parked[rows]]
     times = np.linspace(t, t + dt, 9).astype(np.int64)
-    steps = [states(actors, rows, x) for x in times]
+    steps = [states(actors, rows, time_ns=x) for x in times]
     moved = steps[-1].position - steps[0].position
     mean = np.mean([(a.velocity + b.velocity) / 2 for a, b in itertools.pairwise(steps)], axis=0)
     np.testing.assert_allclose(moved, mean * (times[-1] - times[0]) * 1e-9, atol=2e-3)
@@ -139,20 +145,20 @@ def test_positions_change_as_velocities_say(actors, t, dt):
 
 def test_transforms_put_bodies_where_states_say(actors):
     start, end = 2_000_000_000, 2_100_000_000
-    shape, transform, feature = actor_transforms(actors, start, end, moments=3)
+    shape, transform, feature = actor_transforms(actors, start, end_ns=end, moments=3)
     rows = feature - actors.feature[0]
     for k, t in enumerate((start, (start + end) // 2, end)):
-        at = states(actors, rows, t)
+        at = states(actors, rows, time_ns=t)
         np.testing.assert_allclose(transform[:, k, :, 3], at.position)
         # the body's nose points the way it is turned
         nose = transform[:, k, :, 0] / np.linalg.norm(transform[:, k, :, 0], axis=1, keepdims=True)
         np.testing.assert_allclose(nose, rotations(at.angles)[:, :, 0], atol=1e-12)
     assert (shape < len(actor_shapes(actors))).all()
-    parts = [actor_transforms(actors, start, end, which=w)[2] for w in ("moving", "parked")]
+    parts = [actor_transforms(actors, start, end_ns=end, which=w)[2] for w in ("moving", "parked")]
     assert sorted(np.concatenate(parts)) == sorted(feature)
     x, y = transform[:, 0, :2, 3].T
     region = (float(np.median(x)), y.min() - 1, x.max() + 1, y.max() + 1)
-    some = actor_transforms(actors, start, end, region=region)[2]
+    some = actor_transforms(actors, start, end_ns=end, region=region)[2]
     assert 0 < len(some) < len(feature)
     assert set(feature[x > region[0]]) <= set(some)
 
@@ -161,7 +167,7 @@ def test_walkers_change_pose_as_they_go(actors):
     t = np.arange(0, 3_000_000_000, 100_000_000)
     seen = {}
     for k in t:
-        shape, _, feature = actor_transforms(actors, int(k), int(k) + 1000, moments=2, which="moving")
+        shape, _, feature = actor_transforms(actors, int(k), end_ns=int(k) + 1000, moments=2, which="moving")
         for f, s in zip(feature.tolist(), shape.tolist(), strict=True):
             seen.setdefault(f, set()).add(s)
     walkers = actors.feature[(actors.klass == Class.PEDESTRIAN) & ~actors.parked]
@@ -178,19 +184,21 @@ def test_points_on_actors_lie_in_their_boxes_and_are_counted(actors, scene, ego)
     )
     low, on_moving = int(actors.feature[0]), 0
     for frame in (10, 40, 80, 120):
-        world.place_actors(*actor_transforms(actors, *sensor.window_ns(frame)))
-        cloud = scan(sensor, mount, ego, world, frame)
+        start_ns, end_ns = sensor.window_ns(frame)
+        shape, transform, feature = actor_transforms(actors, start_ns, end_ns=end_ns)
+        world.place_actors(shape, transform, feature=feature)
+        cloud = scan(sensor, mount, trajectory=ego, world=world, frame=frame)
         time = cloud.start_ns + cloud.time_ns.astype(np.int64)
         xyz = ego.place(cloud.xyz, time, translation=mount.translation, rotation=mount.rotation)
         mine = cloud.feature >= low
         rows = cloud.feature[mine] - low
-        at = states(actors, rows, time[mine])
+        at = states(actors, rows, time_ns=time[mine])
         local = np.einsum("nji,nj->ni", rotations(at.angles), xyz[mine] - at.position)
         assert (np.abs(local[:, :2]) <= actors.size[rows, :2] / 2 + 0.002).all()
         assert (local[:, 2] <= actors.size[rows, 2] + 0.002).all()
         on_moving += int((~actors.parked[rows]).sum())
         everyone = np.arange(len(actors))
-        counts = count_points(actors, everyone, cloud.feature)
+        counts = count_points(actors, everyone, feature=cloud.feature)
         assert counts.sum() == mine.sum()
         assert counts.tolist() == [int((cloud.feature == actors.feature[k]).sum()) for k in everyone]
     assert on_moving > 30
@@ -198,7 +206,7 @@ def test_points_on_actors_lie_in_their_boxes_and_are_counted(actors, scene, ego)
 
 def test_boxes_are_the_same_in_the_scene_and_about_the_ego(actors, ego):
     t = 6_000_000_000
-    rows = box_rows(actors, ego, t, 60, reach=100.0)
+    rows = box_rows(actors, ego, time_ns=t, frame=60, reach=100.0)
     assert tuple(rows) == COLUMNS
     assert len(rows["id"]) > 3
     pose = ego.at([t])
@@ -220,7 +228,7 @@ def test_boxes_are_the_same_in_the_scene_and_about_the_ego(actors, ego):
 def test_an_image_shows_what_is_in_the_way(actors, scene, ego):
     """A parked car alone before the camera is all visible; behind another body it is partly so."""
     k = int(np.flatnonzero(actors.parked & (actors.klass == Class.CAR))[0])
-    at = states(actors, [k], 0)
+    at = states(actors, [k], time_ns=0)
     ahead = rotations(at.angles)[0, :, 0]
     camera = CameraSpec("c", Mount(), 400, 240, 300.0, 300.0, 199.5, 119.5, near=0.1, far=np.inf)
     # two metres behind the car, one up, looking where it points
@@ -233,7 +241,7 @@ def test_an_image_shows_what_is_in_the_way(actors, scene, ego):
     world = World.load(scene, region=region, margin=60.0, actors=actor_shapes(actors))
     shown = []
     for blocked in (False, True):
-        shape, transform, feature = actor_transforms(actors, 0, 1000, moments=2)
+        shape, transform, feature = actor_transforms(actors, 0, end_ns=1000, moments=2)
         mine = feature == actors.feature[k]
         # a small body of the same sort, half in the way or far above
         board = transform[mine].copy()
@@ -243,10 +251,10 @@ def test_an_image_shows_what_is_in_the_way(actors, scene, ego):
         world.place_actors(
             np.repeat(shape[mine], 2),
             np.concatenate([transform[mine], board]),
-            np.append(feature[mine], np.int32(10**6)),
+            feature=np.append(feature[mine], np.int32(10**6)),
         )
-        image = render(camera, pose, world, sun=(0.0, 0.0, 1.0), options=RenderOptions())
-        boxes = image_boxes(actors, camera, pose, 0, image.feature)
+        image = render(camera, pose, world=world, sun=(0.0, 0.0, 1.0), options=RenderOptions())
+        boxes = image_boxes(actors, camera, pose=pose, time_ns=0, instance=image.feature)
         row = int(np.flatnonzero(boxes.row == k)[0])
         shown.append(boxes.visibility[row])
         v, u = np.nonzero(image.feature == actors.feature[k])

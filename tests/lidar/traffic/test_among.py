@@ -30,7 +30,9 @@ def city(*, lit, **columns):
 
 
 def path_on(graph, seed, seconds):
-    return plan_path(plan_route(graph, Plane(), "random", seed=seed, duration=seconds), CAR, Plane())
+    return plan_path(
+        plan_route(graph, Plane(), spec="random", seed=seed, duration=seconds), CAR, frame=Plane()
+    )
 
 
 def middle_of(ego, times):
@@ -56,7 +58,7 @@ def check_gentle(ego):
 def test_the_ego_enters_no_junction_on_red(seed, under_way):
     graph = city(lit=True)
     path = path_on(graph, seed, 95.0)
-    ego = drive_obeying(path, CAR, graph, seed=seed, duration=80.0, under_way=under_way)
+    ego = drive_obeying(path, CAR, graph=graph, seed=seed, duration=80.0, under_way=under_way)
     assert (speed_of(ego)[0] > 1.0) == under_way
     plan = junction_plan(graph, lanes_of(graph), seed=seed)
     times = np.arange(0.0, 80.0, DT)
@@ -66,7 +68,7 @@ def test_the_ego_enters_no_junction_on_red(seed, under_way):
     entries = np.flatnonzero((np.diff(zone) != 0) & (zone[1:] >= 0)) + 1
     assert len(entries) >= 2
     for k in entries[times[entries] > 5.0]:
-        group = signal_group(plan, int(zone[k]), float(heading[k]))
+        group = signal_group(plan, int(zone[k]), heading=float(heading[k]))
         ago = np.arange(0.0, AMBER, 0.5)  # let in while it was green, or a little late by smoothness
         assert any(is_green(int(zone[k]), group, float(times[k] - a), plan.signals) for a in ago)
     check_gentle(ego)
@@ -83,7 +85,7 @@ def test_at_stop_signs_the_ego_stops_and_goes_on():
         control_kind=np.full(len(graph), "stop"),
     )
     path = path_on(graph, 4, 90.0)
-    ego = drive_obeying(path, CAR, signs, seed=1, duration=90.0)
+    ego = drive_obeying(path, CAR, graph=signs, seed=1, duration=90.0)
     plan = junction_plan(graph, lanes_of(graph), seed=1)
     times = np.arange(0.0, 90.0, DT)
     middle, _ = middle_of(ego, times)
@@ -94,7 +96,7 @@ def test_at_stop_signs_the_ego_stops_and_goes_on():
     for k in entries[times[entries] > 8.0]:
         assert speed[max(k - 60, 0) : k].min() < 0.15
     check_gentle(ego)
-    free = drive_obeying(path, CAR, graph, seed=1, duration=90.0)
+    free = drive_obeying(path, CAR, graph=graph, seed=1, duration=90.0)
     assert speed_of(free)[300:-500].min() > 1.0  # without signs it does not stop
 
 
@@ -103,13 +105,13 @@ def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 700.0, 30.0))
     path = path_on(graph, 1, 60.0)
     free = drive_path(path, CAR, duration=60.0)
-    trips = vehicle_trips(lanes, area_of(lanes, free, 400.0, 1.0), seed=1, density=10.0)
+    trips = vehicle_trips(lanes, area_of(lanes, free, reach=400.0, scale=1.0), seed=1, density=10.0)
     slow = [replace(t, wish=np.minimum(t.wish, 4.0)) for t in trips if t.appear_s == 0.0 and t.begin > 60]
     plan = junction_plan(graph, lanes, seed=1)
-    gone = simulate_ego(ego_trip(path, CAR), slow, graph, plan, seconds=60.0, reach=600.0)
-    motion = motion_behind(path, CAR, np.arange(len(gone)) * DT, np.minimum(gone, path.length))
-    ego = poses_along(path, CAR, motion)
-    flow = simulate_trips(slow, graph, plan, ego, BOX, reach=600.0, obeys=True)
+    gone = simulate_ego(ego_trip(path, CAR), slow, graph=graph, plan=plan, seconds=60.0, reach=600.0)
+    motion = motion_behind(path, CAR, time_s=np.arange(len(gone)) * DT, reach=np.minimum(gone, path.length))
+    ego = poses_along(path, CAR, motion=motion)
+    flow = simulate_trips(slow, graph, plan=plan, ego=ego, ego_box=BOX, reach=600.0, obeys=True)
     assert len(np.unique(flow.trip)) == len(slow)  # nobody had to be taken out of its way
     check_gentle(ego)
     ahead = min((k for k in range(len(slow))), key=lambda k: slow[k].begin)
@@ -129,15 +131,15 @@ def test_among_traffic_the_ego_touches_nobody_and_nobody_is_taken_out_for_it(see
     plan = junction_plan(graph, lanes, seed=seed)
     path = path_on(graph, seed, 60.0)
     alone = drive_path(path, CAR, duration=60.0)
-    trips = vehicle_trips(lanes, area_of(lanes, alone, 300.0, 1.0), seed=seed, density=20.0)
-    gone = simulate_ego(ego_trip(path, CAR), trips, graph, plan, seconds=60.0, reach=300.0)
-    motion = motion_behind(path, CAR, np.arange(len(gone)) * DT, np.minimum(gone, path.length))
-    ego = poses_along(path, CAR, motion)
+    trips = vehicle_trips(lanes, area_of(lanes, alone, reach=300.0, scale=1.0), seed=seed, density=20.0)
+    gone = simulate_ego(ego_trip(path, CAR), trips, graph=graph, plan=plan, seconds=60.0, reach=300.0)
+    motion = motion_behind(path, CAR, time_s=np.arange(len(gone)) * DT, reach=np.minimum(gone, path.length))
+    ego = poses_along(path, CAR, motion=motion)
     check_gentle(ego)
-    flow = simulate_trips(trips, graph, plan, ego, BOX, reach=300.0, obeys=True)
+    flow = simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, reach=300.0, obeys=True)
     poses = tracks(trips, flow)
     times = np.arange(len(poses)) * DT
-    own = rectangles(*middle_of(ego, times), BOX[0], BOX[1])
+    own = rectangles(*middle_of(ego, times), length=BOX[0], width=BOX[1])
     for mine, moment in zip(own[::2], poses[::2], strict=True):
         if np.isfinite(moment).any():
             assert not shapely.intersects(mine, boxes_at(trips, moment)).any()

@@ -31,7 +31,9 @@ TO_NET = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    return build(read_osm(demo_path(), bounds=BOX), tmp_path_factory.mktemp("scene") / "demo", BuildOptions())
+    return build(
+        read_osm(demo_path(), bounds=BOX), tmp_path_factory.mktemp("scene") / "demo", options=BuildOptions()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -113,11 +115,13 @@ def together(*tracks):
 
 
 def played(scene, graph, path, ego, **options):
-    return replay(scene, graph, ego, CAR, seed=1, options=TrafficFile(path, **{"parked": 0.0} | options))
+    return replay(
+        scene, graph, ego=ego, vehicle=CAR, seed=1, options=TrafficFile(path, **{"parked": 0.0} | options)
+    )
 
 
 def fronts(actors, k, t):
-    at = states(actors, np.full(len(t), k), (np.asarray(t) * 1e9).astype(np.int64))
+    at = states(actors, np.full(len(t), k), time_ns=(np.asarray(t) * 1e9).astype(np.int64))
     return at, at.position + rotations(at.angles)[:, :, 0] * actors.size[k, 0] / 2
 
 
@@ -154,7 +158,9 @@ def test_who_is_in_the_file_from_when_to_when_is_there_then_and_begin_moves_it(
     ego = standing(street[0] + 60.0)
 
     def there(t, **options):
-        return len(alive(played(scene, graph, path, ego, net=net, **options), int(t * 1e9), int(t * 1e9)))
+        return len(
+            alive(played(scene, graph, path, ego, net=net, **options), int(t * 1e9), end_ns=int(t * 1e9))
+        )
 
     assert [there(t) for t in (0.0, 4.9, 5.5, 6.1, 8.9, 9.2)] == [1, 1, 0, 1, 1, 0]
     assert [there(t, begin=54.0) for t in (0.5, 1.5, 2.5, 4.9, 5.2)] == [1, 0, 1, 1, 0]
@@ -246,8 +252,8 @@ def test_whom_the_ego_would_touch_is_left_out_and_parked_cars_keep_clear(scene, 
     assert (~met.parked).sum() == 1
     assert free.parked.sum() > 3
     for t in range(0, 8_000_000_000, 500_000_000):
-        rows = alive(free, t, t)
-        at = states(free, rows, t)
+        rows = alive(free, t, end_ns=t)
+        at = states(free, rows, time_ns=t)
         half = shapely.points(at.position[:, :2])
         for k in np.flatnonzero(~free.parked[rows]):
             near = shapely.distance(half[k], half[free.parked[rows]])

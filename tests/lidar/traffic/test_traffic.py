@@ -34,8 +34,8 @@ def standing(xy, seconds):
 
 
 def driving(graph, seed, seconds):
-    route = plan_route(graph, Plane(), "random", seed=seed, duration=seconds)
-    return drive_path(plan_path(route, CAR, Plane()), CAR).until(int(seconds * 1e9))
+    route = plan_route(graph, Plane(), spec="random", seed=seed, duration=seconds)
+    return drive_path(plan_path(route, CAR, frame=Plane()), CAR).until(int(seconds * 1e9))
 
 
 def city(*, lit, lanes=1.0, width=7.0):
@@ -46,9 +46,9 @@ def city(*, lit, lanes=1.0, width=7.0):
 def flow_on(graph, ego, *, seed, density=25.0, reach=400.0, shares=None):
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
     plan = junction_plan(graph, lanes, seed=seed)
-    area = area_of(lanes, ego, reach, 1.0)
+    area = area_of(lanes, ego, reach=reach, scale=1.0)
     trips = vehicle_trips(lanes, area, seed=seed, density=density, shares=shares)
-    return trips, simulate_trips(trips, graph, plan, ego, BOX, reach=reach), plan
+    return trips, simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, reach=reach), plan
 
 
 def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
@@ -57,7 +57,9 @@ def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
 
     def drive(lanes, seed):
         rng = np.random.default_rng(seed)
-        return wander(lanes, rng, seed % len(graph), 0, metres=2000.0, inside=everywhere, width=1.8)[0]
+        return wander(
+            lanes, rng, edge=seed % len(graph), lane=0, metres=2000.0, inside=everywhere, width=1.8
+        )[0]
 
     chains = {tuple(drive(lanes_of(graph), seed)[k : k + 3]) for seed in range(4) for k in (1, 6)}
     edges = rows_of(np.array(chain, np.int32) for chain in chains)
@@ -93,14 +95,16 @@ def test_not_even_reckless_drivers_touch():
     graph = city(lit=False)
     ego = standing((400.0, 400.0), 45.0)
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
-    trips = vehicle_trips(lanes, area_of(lanes, ego, 600.0, 1.0), seed=9, density=30.0)
+    trips = vehicle_trips(lanes, area_of(lanes, ego, reach=600.0, scale=1.0), seed=9, density=30.0)
     wild = [
         replace(
             t, driver=replace(t.driver, headway=0.0, gap=0.0, brake=50.0, pull=4.0), wish=0 * t.wish + 16.0
         )
         for t in trips
     ]
-    flow = simulate_trips(wild, graph, junction_plan(graph, lanes, seed=9), ego, BOX, reach=600.0)
+    flow = simulate_trips(
+        wild, graph, plan=junction_plan(graph, lanes, seed=9), ego=ego, ego_box=BOX, reach=600.0
+    )
     for moment in tracks(wild, flow)[::2]:
         assert overlaps(boxes_at(wild, moment)) == 0
     assert flow.speed.max() > 14.0
@@ -137,7 +141,10 @@ def test_the_ego_is_never_touched(seed, lit):
     at = ego.at(times)
     forward = at.rotation[:, :2, 0]
     own = rectangles(
-        at.position[:, :2] + BOX[2] * forward, np.arctan2(forward[:, 1], forward[:, 0]), BOX[0], BOX[1]
+        at.position[:, :2] + BOX[2] * forward,
+        np.arctan2(forward[:, 1], forward[:, 0]),
+        length=BOX[0],
+        width=BOX[1],
     )
     for mine, moment in zip(own, poses, strict=True):
         if np.isfinite(moment).any():
@@ -189,7 +196,7 @@ def test_nobody_enters_a_junction_on_red():
         here = zone[front]
         for i in np.flatnonzero((np.diff(here) != 0) & (here[1:] >= 0)):
             z = int(here[i + 1])
-            group = signal_group(plan, z, float(trips[k].way.heading[front[i]]))
+            group = signal_group(plan, z, heading=float(trips[k].way.heading[front[i]]))
             t = float(flow.step[rows][i + 1]) * DT
             # green now or, for who was let in while it was, within amber and clearing
             lately = [is_green(z, group, t - ago, plan.signals) for ago in np.arange(0.0, AMBER, 0.5)]
@@ -215,12 +222,12 @@ def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
     road = shapely.union_all([shapely.LineString(line[:, :2]).buffer(7.3) for line in graph.geometry])
     for side, sign in (("right", 1), ("left", -1)):
         lanes = lanes_of(graph, side=side, bounds=(-30.0, -30.0, 300.0, 300.0))
-        area = area_of(lanes, standing((400.0, 400.0), 30.0), 600.0, 1.0)
+        area = area_of(lanes, standing((400.0, 400.0), 30.0), reach=600.0, scale=1.0)
         trips = vehicle_trips(lanes, area, seed=1, density=10.0, ground=road)
         assert len(trips) > 10
         for trip in trips:
             xy, heading = body_poses(trip.way, trip.axle)
-            assert shapely.covers(road, rectangles(xy, heading, trip.length, trip.width)).all()
+            assert shapely.covers(road, rectangles(xy, heading, length=trip.length, width=trip.width)).all()
             line = shapely.LineString(graph.geometry[trip.way.edge[trip.begin]][:, :2])
             ring = shapely.LinearRing([*line.coords, trip.way.xyz[trip.begin, :2]])
             if abs(trip.way.curvature[trip.begin]) < 1e-3:
@@ -230,7 +237,7 @@ def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
 def test_lanes_lie_side_by_side():
     graph = road_graph([(0.0, 0.0), (100.0, 0.0)], [(0, 1)], lanes=2.0, width=14.0)
     lanes = lanes_of(graph)
-    assert [lane_shift(lanes, 0, k, 1.8) for k in (0, 1)] == pytest.approx([5.25, 1.75])
+    assert [lane_shift(lanes, 0, lane=k, width=1.8) for k in (0, 1)] == pytest.approx([5.25, 1.75])
 
 
 def test_the_same_seed_gives_the_same_traffic():
@@ -255,7 +262,7 @@ def test_signals_are_green_for_the_ego_when_it_comes():
     ego = driving(graph, 3, 40.0)
     lanes = lanes_of(graph)
     plan = junction_plan(graph, lanes, seed=11)
-    signals = plan.signals._replace(window=green_windows(plan, ego_on(ego, BOX, graph)))
+    signals = plan.signals._replace(window=green_windows(plan, ego_on(ego, BOX, graph=graph)))
     times = np.arange(0.0, 40.0, 0.1)
     at = ego.at((times * 1e9).astype(np.int64))
     zone = zone_at(plan.zones, at.position[:, :2])
@@ -263,6 +270,6 @@ def test_signals_are_green_for_the_ego_when_it_comes():
     assert len(entries) >= 2
     for k in entries:
         forward = at.rotation[k, :2, 0]
-        group = signal_group(plan, int(zone[k]), float(np.arctan2(forward[1], forward[0])))
+        group = signal_group(plan, int(zone[k]), heading=float(np.arctan2(forward[1], forward[0])))
         assert is_green(int(zone[k]), group, float(times[k]), signals)
         assert not is_green(int(zone[k]), 1 - group, float(times[k]), signals)

@@ -54,7 +54,7 @@ def seen(*others, eye=(0.0, 0.0, 0.75), yaw=0.0):
     body = type(mesh).of(
         turned, mesh.faces, feature=100, klass=Class.CAR, material=int(mesh.material[0]), closed=True
     )
-    return Visibility(car).seen_from(eye, world(body, *others), np.array([0]), 0)[0]
+    return Visibility(car).seen_from(eye, world(body, *others), rows=np.array([0]), time_ns=0)[0]
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, 1.2, 3.0])
@@ -77,7 +77,9 @@ def test_a_wall_that_covers_a_part_hides_that_part(share):
 
 def test_a_road_user_that_is_not_there_is_no_row():
     assert (
-        Visibility(one_car()).seen_from((0, 0, 0), world(box((0, 0, 0), (1, 1, 1))), np.empty(0, int), 0).size
+        Visibility(one_car())
+        .seen_from((0, 0, 0), world(box((0, 0, 0), (1, 1, 1))), rows=np.empty(0, int), time_ns=0)
+        .size
         == 0
     )
 
@@ -94,7 +96,7 @@ def test_outlines_are_the_union_of_triangles_within_the_image(seed, count, size)
     corners = middle + rng.uniform(-size, size, (count, 3, 2))
     frame = shapely.box(-0.5, -0.5, 99.5, 59.5)
     union = shapely.intersection(shapely.union_all(shapely.polygons(corners)), frame)
-    bounds, pixels = outline(corners, 100, 60)
+    bounds, pixels = outline(corners, 100, height=60)
     if union.area < 1e-9:
         assert pixels == 0
         return
@@ -108,8 +110,8 @@ def test_triangles_with_corners_nowhere_are_left_out():
     good = np.array([[[10.0, 10.0], [20.0, 10.0], [10.0, 20.0]]])
     bad = good.copy()
     bad[0, 0, 0] = np.nan
-    assert outline(np.concatenate([good, bad]), 100, 60) == outline(good, 100, 60)
-    bounds, pixels = outline(bad, 100, 60)
+    assert outline(np.concatenate([good, bad]), 100, height=60) == outline(good, 100, height=60)
+    bounds, pixels = outline(bad, 100, height=60)
     assert np.isnan(bounds).all()
     assert pixels == 0
 
@@ -117,17 +119,21 @@ def test_triangles_with_corners_nowhere_are_left_out():
 def test_points_on_a_car_go_with_it_and_points_on_a_wall_stay():
     car = one_car(velocity=(7.0, -3.0, 0.0))
     where = np.array([[21.0, 0.5, 1.0], [3.0, 3.0, 3.0]])
-    found = surface_velocity(car, np.array([100, 5]), where, np.array([500_000_000, 500_000_000]))
+    found = surface_velocity(
+        car, np.array([100, 5]), placed=where, time_ns=np.array([500_000_000, 500_000_000])
+    )
     np.testing.assert_allclose(found, [[7.0, -3.0, 0.0], [0, 0, 0]], atol=1e-6)
 
 
 def test_points_on_a_turning_body_go_round_its_middle():
     car = one_car(turning=0.8)
     where = np.array([[22.0, 0.0, 1.0], [20.0, 1.0, 0.2]])
-    found = surface_velocity(car, np.array([100, 100]), where, np.full(2, 1_000_000_000))
+    found = surface_velocity(car, np.array([100, 100]), placed=where, time_ns=np.full(2, 1_000_000_000))
     np.testing.assert_allclose(found, [[0.0, 1.6, 0.0], [-0.8, 0.0, 0.0]], atol=1e-5)
 
 
 def test_parked_cars_do_not_move():
-    found = surface_velocity(one_car(), np.array([100]), np.array([[20.0, 0.0, 1.0]]), np.array([10**9]))
+    found = surface_velocity(
+        one_car(), np.array([100]), placed=np.array([[20.0, 0.0, 1.0]]), time_ns=np.array([10**9])
+    )
     assert (found == 0).all()

@@ -167,17 +167,19 @@ def test_actors_are_met_where_they_are_at_each_rays_time(scene):
     drive = np.tile(np.eye(3, 4), (1, 11, 1, 1))
     drive[0, :, :, 3] = [120, 50, 0]
     drive[0, :, 0, 3] += np.linspace(0, 10, 11)
-    world.place_actors(np.zeros(1, np.int32), drive, np.array([5000], np.int32))
+    world.place_actors(np.zeros(1, np.int32), drive, feature=np.array([5000], np.int32))
     time = np.array([0, 0.25, 0.5, 0.75, 1])
     poses = Poses(np.array([[150.0, 50, 1]]), np.eye(3)[None], np.ones((1, 3)))
-    hits = world.caster.cast_posed(poses, np.zeros(5, int), np.tile([[-1.0, 0, 0]], (5, 1)), time=time)
+    hits = world.caster.cast_posed(
+        poses, np.zeros(5, int), directions=np.tile([[-1.0, 0, 0]], (5, 1)), time=time
+    )
     np.testing.assert_allclose(hits.range, 30 - 10 * time - 2)
     found = world.lookup(hits)
     assert set(found.feature.tolist()) == {5000}
     assert set(found.klass.tolist()) == {Class.CAR}
     tree = world.lookup(world.caster.cast([30, 30, 30], DOWN))
     assert tree.feature.tolist() == [1002]
-    world.place_actors(np.empty(0, np.int32), np.empty((0, 3, 4)), np.empty(0, np.int32))
+    world.place_actors(np.empty(0, np.int32), np.empty((0, 3, 4)), feature=np.empty(0, np.int32))
     np.testing.assert_array_equal(world.caster.cast([150.0, 50, 1], [[-1.0, 0, 0]] * 5).range, before.range)
 
 
@@ -186,7 +188,7 @@ def test_actors_stay_when_the_world_moves_on(scene):
     world = World.load(scene, region=(50, 50, 50, 50), margin=10, actors=[car])
     here = np.eye(3, 4)[None].copy()
     here[0, :, 3] = [150, 50, 0]
-    world.place_actors(np.zeros(1, np.int32), here, np.array([9], np.int32))
+    world.place_actors(np.zeros(1, np.int32), here, feature=np.array([9], np.int32))
     for x in (150.0, 250.0, 150.0):
         world.follow((x, 50, x, 50))
         hits = world.caster.cast([150, 50, 10], DOWN)
