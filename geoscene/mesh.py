@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 OTHER, WALL, ROOF, FLOOR = 0, 1, 2, 3
 """Codes of `Mesh.surface`."""

@@ -55,8 +55,8 @@ from geoscene.structures import (
     read_structures,
     within_extent,
 )
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Bounds = tuple[float, float, float, float]
 Height = Callable[[Float, Float], Float]
 

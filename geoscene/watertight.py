@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.mesh import Mesh
+from geoscene.typing import Float, Ints
 
 GRID = 1e-4
 """Step of the grid that solids' vertices lie on, metres; vertices in the same cell are one."""
-
-Float = NDArray[np.float64]
-Ids = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +29,12 @@ class Verdict:
     """
 
     feature: NDArray[np.int32]
-    faces: Ids
+    faces: Ints
     finite: NDArray[np.bool_]
     closed: NDArray[np.bool_]
     oriented: NDArray[np.bool_]
     positive: NDArray[np.bool_]
-    degenerate: Ids
+    degenerate: Ints
     volume: Float
 
     def __len__(self) -> int:
@@ -61,7 +59,7 @@ class Verdict:
         return next((slug for slug, fine in checks if not fine), "")
 
 
-def _pair_ids(a: Ids, b: Ids) -> tuple[Ids, Ids]:
+def _pair_ids(a: Ints, b: Ints) -> tuple[Ints, Ints]:
     """Numbers 0..k-1 of the distinct pairs (a, b), and the first index of each."""
     # both are dense counts or grid numbers here, so that the product stays below 2**63
     low = b.min(initial=0)
@@ -70,8 +68,8 @@ def _pair_ids(a: Ids, b: Ids) -> tuple[Ids, Ids]:
     return ids.astype(np.int64), first
 
 
-def weld(points: Float, owner: NDArray[np.integer], *, grid: float = GRID) -> tuple[Ids, Ids]:
-    """Ids (n,) of points that are one (same owner, same cell of the grid), and the first index of each id.
+def weld(points: Float, owner: NDArray[np.integer], *, grid: float = GRID) -> tuple[Ints, Ints]:
+    """Ints (n,) of points that are one (same owner, same cell of the grid), and the first index of each id.
 
     points : (n, 3) metres, finite, within 1e5 m of zero
     """
@@ -82,7 +80,7 @@ def weld(points: Float, owner: NDArray[np.integer], *, grid: float = GRID) -> tu
     return _pair_ids(owner.astype(np.int64), ids)
 
 
-def edge_uses(corners: Ids) -> tuple[Ids, Ids, Ids]:
+def edge_uses(corners: Ints) -> tuple[Ints, Ints, Ints]:
     """Edge number of every half-edge (3 m,), and per edge its number of uses and their balance.
 
     corners : (m, 3) welded vertex ids. Half-edge k of face i is number 3 i + k and goes from corner k to
@@ -142,7 +140,7 @@ def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
     )
 
 
-def _volumes(points: Float, triangles: Ids, *, owner: Ids, n: int) -> Float:
+def _volumes(points: Float, triangles: Ints, *, owner: Ints, n: int) -> Float:
     """Signed volume (n,) of each owner's triangles, summed about its own first vertex to keep digits."""
     if not len(triangles):
         return np.zeros(n)

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError
 from geoscene.files import write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.typing import Float
 from lidar import __version__
 from lidar.dataset.box_tables import gather_boxes
 from lidar.dataset.layout import prepare
@@ -42,8 +42,6 @@ from lidar.traffic.populate import populate
 from lidar.traffic.replayed import replay
 from lidar.world.actors import Actors
 from lidar.world.thread_worlds import Worlds
-
-Float = NDArray[np.float64]
 
 _RANDOM_SECONDS = 60.0
 _CHUNK = (

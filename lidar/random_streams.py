@@ -7,7 +7,7 @@ import hashlib
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 
 def generator(seed: int, *words: object) -> np.random.Generator:

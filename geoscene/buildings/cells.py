@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.shells import boundary, lift, triangulate
 from geoscene.buildings.skeleton import Skeleton, loops, polygons_of
+from geoscene.typing import Float
 from geoscene.watertight import weld
-
-Float = NDArray[np.float64]
 
 ON_LINE = 1e-3
 """Corners this near to a cutting line, metres of the field, count as on it, so that no slivers arise."""

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from geoscene.buildings.table import BuildingOptions
 from geoscene.sources.data import Tags
 from geoscene.tags import parse_length, parse_number
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 HIGHEST = 1000.0
 """Heights beyond this are taken for slips; the tallest building there is has 828 m."""

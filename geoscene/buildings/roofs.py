@@ -24,8 +24,8 @@ from geoscene.buildings.footprints import to_grid
 from geoscene.buildings.shells import Triangles, close, lift, prisms, triangulate
 from geoscene.buildings.skeleton import straight_skeleton
 from geoscene.mesh import FLOOR, ROOF
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Profile = tuple[tuple[float, float], ...]
 
 BOX_LIKE = 0.85

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from geoscene.buildings.footprints import gathered
 from geoscene.buildings.heights import HIGHEST, SIGMA_PRIOR, Tagged, infer_heights
 from geoscene.buildings.rooftags import RoofTags, default_roof_height
-from geoscene.buildings.table import BuildingOptions, Float, Texts
+from geoscene.buildings.table import BuildingOptions, Texts
 from geoscene.report import Problem
 from geoscene.sources.data import Tags
+from geoscene.typing import Float
 
 _HALLS = (
     "church", "cathedral", "chapel", "mosque", "synagogue", "temple", "stadium", "sports_hall", "hangar",

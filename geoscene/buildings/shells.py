@@ -12,10 +12,8 @@ from shapely.errors import GEOSException
 
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.mesh import FLOOR, ROOF, WALL
+from geoscene.typing import Float, Ints
 from geoscene.watertight import degenerate_faces, edge_uses, weld
-
-Float = NDArray[np.float64]
-Ids = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +26,7 @@ class Triangles:
     """
 
     corners: Float
-    piece: Ids
+    piece: Ints
     surface: NDArray[np.uint8]
 
     def __len__(self) -> int:
@@ -51,7 +49,7 @@ def join(groups: list[Triangles]) -> Triangles:
     )
 
 
-def triangulate(polygons: Polygons) -> tuple[Float, Ids]:
+def triangulate(polygons: Polygons) -> tuple[Float, Ints]:
     """Constrained Delaunay triangles (m, 3, 2) of polygons (n,), counter-clockwise, and the polygon of each.
 
     No vertex is added. A polygon that GEOS refuses, or whose triangles do not add up to its area, has none.
@@ -90,7 +88,7 @@ def lift(xy: Float, z: Float) -> Float:
     return np.concatenate([xy, height[..., None]], axis=2)
 
 
-def boundary(corners: Float, piece: Ids) -> tuple[Float, Ids]:
+def boundary(corners: Float, piece: Ints) -> tuple[Float, Ints]:
     """Edges (k, 2, 3) that one triangle of its piece uses, in that triangle's direction, and their pieces."""
     ids, _ = weld(corners.reshape(-1, 3), np.repeat(piece, 3))
     edge, uses, _ = edge_uses(ids.reshape(-1, 3))
@@ -122,7 +120,7 @@ def close(top: Triangles, floor: Triangles, *, underside: Float) -> Triangles:
     return shells.take(~equal)
 
 
-def prisms(polygons: Polygons, piece: Ids, *, low: Float, high: Float) -> Triangles:
+def prisms(polygons: Polygons, piece: Ints, *, low: Float, high: Float) -> Triangles:
     """Shells over polygons (n,) from low to high (n,) metres, flat; ``piece`` (n,) are their numbers."""
     xy, owner = triangulate(polygons)
     top = Triangles(lift(xy, to_grid(high)[owner]), owner, np.full(len(xy), ROOF, np.uint8))

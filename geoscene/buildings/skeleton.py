@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _PARALLEL = 1e-7
 _STILL = 1e-12

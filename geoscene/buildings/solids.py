@@ -18,10 +18,8 @@ from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.mesh import ROOF, Mesh
 from geoscene.report import Problem
+from geoscene.typing import Float, Ints
 from geoscene.watertight import weld
-
-Float = NDArray[np.float64]
-Ids = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +27,8 @@ class _Pieces:
     """Simple polygons to build on: a row of the table each, or one of several polygons of a row."""
 
     polygon: NDArray[Any]
-    row: Ids
-    building: Ids
+    row: Ints
+    building: Ints
     low: Float
     high: Float
     flat: NDArray[np.bool_]
@@ -70,7 +68,7 @@ def build_solids(
     problems: list[Problem] = []
 
     done: list[Triangles] = []
-    rows: list[Ids] = []
+    rows: list[Ints] = []
     for attempt in ("", "flat-roof", "cleaned-footprint"):
         if not len(pieces.row):
             break
@@ -132,7 +130,7 @@ def _simplified(pieces: _Pieces) -> _Pieces:
     return replace(pieces.take(index), polygon=polygon)
 
 
-def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ids, list[Problem]]:
+def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, list[Problem]]:
     """Triangles of all bodies, the buildings that failed, and notes on roofs that fell back to another."""
     n = len(pieces.row)
     notes: list[Problem] = []
@@ -186,7 +184,7 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ids, list
     return result, bad, [p for p in notes if p.osm_id not in {buildings.osm_id[b] for b in bad}]
 
 
-def _mesh(buildings: Buildings, triangles: Triangles, *, row: Ids) -> Mesh:
+def _mesh(buildings: Buildings, triangles: Triangles, *, row: Ints) -> Mesh:
     """The mesh of all triangles (with their table rows), welded within each building, sorted by building."""
     feature = buildings.outline[row].astype(np.int64)
     order = np.argsort(feature, kind="stable")

@@ -8,8 +8,9 @@ import manifold3d as m3
 import numpy as np
 
 from geoscene.buildings.footprints import to_grid
-from geoscene.buildings.shells import Float, Ids, Triangles
+from geoscene.buildings.shells import Triangles
 from geoscene.mesh import WALL
+from geoscene.typing import Float, Ints
 from geoscene.watertight import degenerate_faces, edge_uses, weld
 
 GROOVES = (2e-3, 2e-2, 1e-1)
@@ -68,7 +69,7 @@ def _manifold(shells: Triangles, piece: int, *, first: int, origin: Float) -> An
     return body if body.status() == m3.Error.NoError and not body.is_empty() else None
 
 
-def _triangles(body: Any, first: int) -> tuple[Float, Ids]:
+def _triangles(body: Any, first: int) -> tuple[Float, Ints]:
     """Corners (m, 3, 3) of a body's triangles on the grid, mended there, and their runs less ``first``."""
     mesh = body.to_mesh64()
     faces = mesh.tri_verts.astype(np.int64)
@@ -78,7 +79,7 @@ def _triangles(body: Any, first: int) -> tuple[Float, Ids]:
     return mend(points[where], ids[faces], run=run)
 
 
-def mend(points: Float, faces: Ids, *, run: Ids) -> tuple[Float, Ids]:
+def mend(points: Float, faces: Ints, *, run: Ints) -> tuple[Float, Ints]:
     """Corners (m, 3, 3) and runs of triangles without the degenerate ones that the grid makes.
 
     Faces with two equal corners go; faces with three corners on a line are flipped into the neighbour across
@@ -94,7 +95,7 @@ def mend(points: Float, faces: Ids, *, run: Ids) -> tuple[Float, Ids]:
     return points[faces], run
 
 
-def _cancel(faces: Ids, run: Ids) -> tuple[Ids, Ids]:
+def _cancel(faces: Ints, run: Ints) -> tuple[Ints, Ints]:
     """Faces without pairs of the same three vertices in opposite order: they bound nothing."""
     turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     key = {tuple(f): i for i, f in enumerate(turned.tolist())}
@@ -104,7 +105,7 @@ def _cancel(faces: Ids, run: Ids) -> tuple[Ids, Ids]:
     return faces[keep], run[keep]
 
 
-def _flip(points: Float, faces: Ids, *, run: Ids, flat: int) -> tuple[Ids, Ids]:
+def _flip(points: Float, faces: Ints, *, run: Ints, flat: int) -> tuple[Ints, Ints]:
     """Faces with a face of three corners on a line replaced: its middle corner splits the face beyond."""
     corners = faces[flat]
     length = np.linalg.norm(points[np.roll(corners, -1)] - points[corners], axis=1)

@@ -31,8 +31,7 @@ from geoscene.frames import Frame, utm_crs
 from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 STEP = 1e-4
 """Metres between whole numbers of the file: the grid that solids lie on, so that nothing moves."""

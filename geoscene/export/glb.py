@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.export.files import Summary, size_of, whole_file
 from geoscene.export.gltf import GlbWriter, y_up
@@ -23,8 +22,6 @@ from geoscene.export.objects import (
 from geoscene.mesh import Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
-
-Float = NDArray[np.float64]
 
 
 def write_glb(

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import Transformer
 
 from geoscene.frames import Frame
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from geoscene.classes import materials
 from geoscene.errors import InputError
 from geoscene.export.files import append, spool
 from geoscene.mesh import Mesh
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _COMPONENTS = {"u2": 5123, "u4": 5125, "f4": 5126}
 _SHAPES = {0: "SCALAR", 3: "VEC3", 4: "VEC4"}

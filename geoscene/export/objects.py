@@ -14,8 +14,7 @@ from geoscene.errors import InputError
 from geoscene.export.files import plain
 from geoscene.mesh import Instances, Mesh, concatenate
 from geoscene.scene import Scene
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 BARE = "terrain"
 """Name of the layer of faces that belong to no feature."""

@@ -9,7 +9,6 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.errors import InputError
 from geoscene.export.files import Summary, size_of, whole_file
@@ -19,8 +18,7 @@ from geoscene.progress import Progress, silent
 from geoscene.roadgraph import read_graphml
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _TYPES = {
     "motorway": "motorway",

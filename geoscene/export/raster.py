@@ -20,8 +20,8 @@ from geoscene.export.zbuffer import draw_triangles
 from geoscene.mesh import Mesh, concatenate
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Model = Literal["surface", "terrain", "classes"]
 
 MOST_CELLS = 4_000_000_000

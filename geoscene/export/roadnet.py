@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from geoscene.export.planview import Curve, PlanView, connecting_curve, cut, plan_view
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import turn_table
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Lane = tuple[int, float, float]
 """Number of a lane, where its inner edge is (metres left of the centre line, looking as it drives), width."""
 

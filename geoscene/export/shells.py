@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float, Ints
 from geoscene.watertight import edge_uses
 
-Ids = NDArray[np.int64]
-Float = NDArray[np.float64]
 
-
-def shell_numbers(corners: Ids, owner: NDArray[np.integer]) -> Ids:
+def shell_numbers(corners: Ints, owner: NDArray[np.integer]) -> Ints:
     """Number (m,) of the shell each face is of: faces of one owner that hang together by edges.
 
     corners : (m, 3) ids of welded vertices
@@ -32,11 +30,11 @@ def shell_numbers(corners: Ids, owner: NDArray[np.integer]) -> Ids:
     _, first, numbers = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
-    shells: Ids = rank[numbers]
+    shells: Ints = rank[numbers]
     return shells
 
 
-def bodies(points: Float, faces: NDArray[np.integer], *, shell: Ids) -> list[list[Ids]]:
+def bodies(points: Float, faces: NDArray[np.integer], *, shell: Ints) -> list[list[Ints]]:
     """The bodies of one object, each as rows of faces per shell: the outer shell first, then its cavities.
 
     A shell of negative volume is a cavity of the smallest outer shell whose box holds its box.

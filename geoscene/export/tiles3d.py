@@ -20,8 +20,7 @@ from geoscene.files import write_atomically
 from geoscene.mesh import Instances, Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _MARGIN = 1e-3
 """Metres that boxes are larger than their content, for what float32 rounds."""

@@ -17,8 +17,6 @@ from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.watertight import degenerate_faces, validate_mesh
 
-Float = NDArray[np.float64]
-
 
 def _meshes(
     scene: Scene, layers: Collection[str] | None, *, stage: str, progress: Progress

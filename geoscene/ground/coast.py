@@ -10,8 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.report import Problem
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _ASIDE = 0.01
 """How far beside a coastline its land and sea are looked for, metres."""

@@ -25,8 +25,8 @@ from geoscene.ground.partition import (
 from geoscene.ground.triangulate import Triangles, triangulate
 from geoscene.mesh import Mesh
 from geoscene.sources.data import Way
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
 """z (n,) in metres of the terrain at scene x (n,), y (n,)."""
 

@@ -17,8 +17,7 @@ from geoscene.ground.layers import Layers, concatenate_layers
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.tags import parse_length
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _WIDEST = 3000.0
 """A width beyond this, metres, is a slip of the pen."""

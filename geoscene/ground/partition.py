@@ -20,9 +20,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, materials
 from geoscene.errors import GeosceneError, InputError
 from geoscene.ground.layers import Layers
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+from geoscene.typing import Float, Ints
 
 PRECISION = 2.0**-13
 """Side of the grid that ground vertices lie on, 0.12 mm.
@@ -73,10 +71,10 @@ class GroundPlan:
     base: tuple[int, int]
     start: Float
     end: Float
-    string: Int
-    order: Int
-    offset: Int
-    tiles: Int
+    string: Ints
+    order: Ints
+    offset: Ints
+    tiles: Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,7 +251,7 @@ def values_at(column: NDArray[Any], row: NDArray[np.integer[Any]], *, base: obje
     return values
 
 
-def distinct(points: Float) -> tuple[Float, Int]:
+def distinct(points: Float) -> tuple[Float, Ints]:
     """Points (k, 2) on the grid, sorted by x, then y, each once, and the number (n,) of each given one."""
     grid = np.round(points / PRECISION).astype(np.int64)
     low = grid.min(axis=0, initial=np.iinfo(np.int64).max)
@@ -268,7 +266,7 @@ def _snap(values: Float) -> Float:
     return snapped
 
 
-def _outlines(polygons: NDArray[np.object_], box: Float) -> tuple[Float, Float, Int]:
+def _outlines(polygons: NDArray[np.object_], box: Float) -> tuple[Float, Float, Ints]:
     """Start and end (m, 2) of the outlines' segments near the box, on the grid, and their strings (m,)."""
     rings = shapely.get_rings(shapely.get_parts(polygons))
     coords, ring = shapely.get_coordinates(rings, return_index=True)
@@ -284,7 +282,7 @@ def _outlines(polygons: NDArray[np.object_], box: Float) -> tuple[Float, Float, 
     return start[keep], end[keep], ring[:-1][keep].astype(np.int64)
 
 
-def _by_tile(start: Float, end: Float, *, low: Int, count: Int, tile_size: float) -> tuple[Int, Int]:
+def _by_tile(start: Float, end: Float, *, low: Ints, count: Ints, tile_size: float) -> tuple[Ints, Ints]:
     """Segments by tile, in compressed rows: (order, offset)."""
     first = np.floor((np.minimum(start, end) - _REACH) / tile_size).astype(np.int64) - low
     last = np.floor((np.maximum(start, end) + _REACH) / tile_size).astype(np.int64) - low
@@ -300,7 +298,7 @@ def _by_tile(start: Float, end: Float, *, low: Int, count: Int, tile_size: float
     return segment[order], offset
 
 
-def _strings(start: Float, end: Float, *, string: Int) -> NDArray[np.object_]:
+def _strings(start: Float, end: Float, *, string: Ints) -> NDArray[np.object_]:
     """Line strings of segments, joined where one outline runs on."""
     if len(start) == 0:
         return np.empty(0, object)
@@ -367,10 +365,10 @@ class _Edges:
     points : (k, 2) float64, metres
     """
 
-    a: Int
-    b: Int
-    cell: Int
-    other: Int
+    a: Ints
+    b: Ints
+    cell: Ints
+    other: Ints
     points: Float
 
     @classmethod
@@ -451,12 +449,12 @@ def _dissolve(
     return cells, row[edges.cell[order[place]]]
 
 
-def _numbers(points: Float, wanted: Float) -> Int:
+def _numbers(points: Float, wanted: Float) -> Ints:
     """The number (...,) of each wanted point (..., 2) in points (k, 2), which are sorted by x, then y."""
     grid = np.round(points / PRECISION).astype(np.int64)
     low, high = grid.min(axis=0), grid.max(axis=0)
     width = high[1] - low[1] + 1
     key = (grid[:, 0] - low[0]) * width + grid[:, 1] - low[1]
     target = np.round(wanted / PRECISION).astype(np.int64) - low
-    number: Int = np.searchsorted(key, target[..., 0] * width + target[..., 1])
+    number: Ints = np.searchsorted(key, target[..., 0] * width + target[..., 1])
     return number

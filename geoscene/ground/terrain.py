@@ -16,8 +16,8 @@ from pyproj import CRS, Transformer
 
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.frames import Frame
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Vertical = Literal["flat", "orthometric", "ellipsoidal"]
 
 _UNITS = {

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError
 from geoscene.ground.partition import Partition, distinct
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 
 @dataclass(frozen=True, slots=True)

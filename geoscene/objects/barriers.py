@@ -18,9 +18,9 @@ from geoscene.mesh import Mesh, concatenate
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
 from geoscene.tags import parse_length
+from geoscene.typing import Float
 from geoscene.watertight import GRID
 
-Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
 
 _BELOW = 0.3

@@ -18,8 +18,8 @@ from geoscene.objects.shapes import place, shapes
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Point, Tags
 from geoscene.tags import parse_direction, parse_length
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
 _Stand = tuple[Float, float, str, str]
 """(place, heading, place source, heading source)."""

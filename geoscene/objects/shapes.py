@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.mesh import Instances, Mesh, concatenate
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 LEAF_AREA_DENSITY: dict[str, float] = {
     "crown_broadleaved": 1.1,

@@ -18,8 +18,8 @@ from geoscene.objects.shapes import concatenate_instances, place
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
 from geoscene.tags import parse_length, parse_number
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
 
 HEIGHT = {"broadleaved": 12.0, "needleleaved": 12.0, "palm": 8.0}

@@ -17,8 +17,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.restrictions import add_turns
 from geoscene.roadgraph.tags import Street, drivable, read_street
 from geoscene.sources.data import OsmData, Way
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 
 @dataclass(frozen=True, slots=True)

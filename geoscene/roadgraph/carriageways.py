@@ -17,8 +17,7 @@ from geoscene.roadgraph.chains import find_cuts, link_chains
 from geoscene.roadgraph.tags import Street, drivable, read_street
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.tags import parse_length
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 KERB = 0.15
 """Metres, plan width of a kerb stone (usual sizes are 0.12 to 0.15)."""

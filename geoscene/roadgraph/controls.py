@@ -13,8 +13,6 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.tags import CLASSES
 from geoscene.sources.data import Point, Tags, Way
 
-Float = NDArray[np.float64]
-
 # Metres before a node within which a signal or a sign is the node's own.
 _REACH = 30.0
 

@@ -17,8 +17,7 @@ from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows, concatenate_rows
 from geoscene.sources.data import OsmData, Point, Tags, Way
 from geoscene.tags import parse_length
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _AREA, _PAINT = 160.0, 165.0
 # Metres: width of a crossing where the map has none, of a zebra's stripes and the gaps between, and of the

@@ -20,8 +20,6 @@ from geoscene.files import write_atomically
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph, rows_of
 
-Float = NDArray[np.float64]
-
 _XMLNS = "http://graphml.graphdrawing.org/xmlns"
 _GRAPH_KEYS = ("crs", "simplified", "created_with")
 _NODE_KEYS = ("x", "y", "elevation", "street_count", "highway", "controls")

@@ -9,8 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.roadgraph.carriageways import KERB, Carriageways
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 # Metres, radius of the kerb at a corner by the lesser road of the two. Assumed within the usual ranges of
 # street design guides (NACTO: 3 to 4.5 on city streets; larger where lorries turn).

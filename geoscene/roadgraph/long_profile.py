@@ -14,9 +14,8 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.overlaps import find_overlaps
 from geoscene.roadgraph.quadratic import Bounds, interior_point
 from geoscene.roadgraph.stations import Stations, find_crossings, place_stations
+from geoscene.typing import Float, Ints
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Height = Callable[[Float, Float], Float]
 """z (n,) in metres of the ground at scene x (n,), y (n,)."""
 
@@ -121,7 +120,9 @@ def _weights(graph: RoadGraph, stations: Stations) -> Float:
     return np.maximum(held * per_metre, _LOOSE)
 
 
-def _distance(count: int, links: tuple[Int, Int, Float], *, start: NDArray[np.bool_], limit: float) -> Float:
+def _distance(
+    count: int, links: tuple[Ints, Ints, Float], *, start: NDArray[np.bool_], limit: float
+) -> Float:
     """Metres along links from the nearest start, at most ``limit``."""
     from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
     from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
@@ -185,7 +186,7 @@ def _bounds(
 
     room, parting = _parting(high, options)
     beside = find_overlaps(graph, stations, crossing=(upper, lower), room=room)
-    terms: list[tuple[Int, Float]] = [
+    terms: list[tuple[Ints, Float]] = [
         (beside.station, np.ones(len(beside.station))),
         (beside.before, beside.share - 1),
         (beside.after, -beside.share),
@@ -238,7 +239,7 @@ def _parting(high: float, options: ProfileOptions) -> tuple[float, Callable[[Flo
     return bent + steep, apart
 
 
-def _nearest(graph: RoadGraph, edge: Int, *, xy: Float, along: Float) -> Float:
+def _nearest(graph: RoadGraph, edge: Ints, *, xy: Float, along: Float) -> Float:
     """Metres along edges (k,) of the places nearest to points (k, 2), not far from ``along``."""
     lines = np.array([shapely.linestrings(graph.geometry[e][:, :2]) for e in edge.tolist()], object)
     found = shapely.line_locate_point(lines, shapely.points(xy)) if len(edge) else along
@@ -253,11 +254,13 @@ class _Rows:
     def __init__(self, stations: int) -> None:
         self._stations = stations
         self._count = 0
-        self._entries: list[tuple[Int, Int, Float]] = []
+        self._entries: list[tuple[Ints, Ints, Float]] = []
         self._right: list[Float] = []
         self._weight: list[Float] = []
 
-    def add(self, terms: Sequence[tuple[Int, Float | float]], right: Float, *, weight: Float | float) -> None:
+    def add(
+        self, terms: Sequence[tuple[Ints, Float | float]], right: Float, *, weight: float | Float
+    ) -> None:
         """Add rows: the sum of factor times height over the terms is at least ``right``."""
         number = self._count + np.arange(len(right))
         for station, factor in terms:
@@ -291,7 +294,7 @@ def _mouth_distance(graph: RoadGraph, stations: Stations, *, kind: str, options:
 
 def _over_obstacles(
     graph: RoadGraph, stations: Stations, *, obstacles: Obstacles
-) -> tuple[Int, Float, Float, Float, Float]:
+) -> tuple[Ints, Float, Float, Float, Float]:
     """Where bridges cross obstacles: (edge, metres along it, x, y, free height needed)."""
     once = np.unique(stations.edge)
     once = once[graph.bridge[once]]

@@ -12,8 +12,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import cut_line, junction_reach
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 PRIORITY = 170.0
 

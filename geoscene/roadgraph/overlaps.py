@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.stations import Stations
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+from geoscene.typing import Float, Ints
 
 _LAP = 1.0
 """Metres by which carriageways overlap at least; widths on maps are no better than that."""
@@ -36,17 +34,17 @@ class Overlaps:
     fork    : (k,) float64 metres along both roads from where they part; inf where they do not hang together
     """
 
-    station: Int
-    before: Int
-    after: Int
+    station: Ints
+    before: Ints
+    after: Ints
     share: Float
     away: Float
-    side: Int
+    side: Ints
     fork: Float
 
 
 def find_overlaps(
-    graph: RoadGraph, stations: Stations, *, crossing: tuple[Int, Int], room: float
+    graph: RoadGraph, stations: Stations, *, crossing: tuple[Ints, Ints], room: float
 ) -> Overlaps:
     """All stations of bridges and tunnels within carriageways that run beside them.
 
@@ -99,7 +97,7 @@ def find_overlaps(
     return Overlaps(stations.row[row], before, after, share, metres, side, fork)
 
 
-def _heading(stations: Stations, row: Int) -> Float:
+def _heading(stations: Stations, row: Ints) -> Float:
     """Unit vectors (k, 2) along the edges at rows of stations."""
     ends = np.append(stations.edge[1:] != stations.edge[:-1], True)[row]
     a, b = np.where(ends, row - 1, row), np.where(ends, row, row + 1)
@@ -119,7 +117,7 @@ def _direction(lines: NDArray[np.object_], along: Float, *, length: Float) -> Fl
 
 
 def _from_fork(
-    graph: RoadGraph, stations: Stations, *, row: Int, edge: Int, other: Int, along: Float, length: Float
+    graph: RoadGraph, stations: Stations, *, row: Ints, edge: Ints, other: Ints, along: Float, length: Float
 ) -> Float:
     """Metres (k,) along roads from rows of stations to places on other edges; inf beyond the reach."""
     from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)

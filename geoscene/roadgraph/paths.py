@@ -17,8 +17,6 @@ from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
 from geoscene.sources.data import Area, OsmData, Tags, Way
 from geoscene.tags import parse_length, parse_number
 
-Float = NDArray[np.float64]
-
 # Metres and material where the map names none. Assumed: what design guides ask of each kind at least.
 _PATHS = {
     "footway": (2.0, "paving"),

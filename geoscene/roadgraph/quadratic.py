@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _ROUNDS = 80
 _CLOSE = 1e-4

@@ -12,14 +12,12 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import nearest_edge, path_line, shortest_path
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 
 def route_line(words: Sequence[str], graph: RoadGraph, *, frame: Frame) -> Any:

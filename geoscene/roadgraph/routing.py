@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.errors import InputError
 from geoscene.roadgraph.graph import RoadGraph
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.roadgraph.graph import RoadGraph
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+from geoscene.typing import Float, Ints
 
 # Arms of a node whose directions differ by less than this (radians) are one road that goes on.
 _GOES_ON = np.radians(40.0)
@@ -29,20 +27,20 @@ class Stations:
     """
 
     xy: Float
-    row: Int
-    edge: Int
+    row: Ints
+    edge: Ints
     along: Float
     drawn: NDArray[np.bool_]
 
     @property
-    def segments(self) -> tuple[Int, Int, Float, Int]:
+    def segments(self) -> tuple[Ints, Ints, Float, Ints]:
         """Neighbours on an edge: (from (s,), to (s,), metres (s,), edge (s,))."""
         first = np.flatnonzero(self.edge[1:] == self.edge[:-1])
         metres = np.maximum(self.along[first + 1] - self.along[first], 1e-3)
         return self.row[first], self.row[first + 1], metres, self.edge[first]
 
     @property
-    def triples(self) -> tuple[Int, Int, Int, Float, Float]:
+    def triples(self) -> tuple[Ints, Ints, Ints, Float, Float]:
         """Stations before, at and after each bend: (a, b, c (t,), metres from a to b, and from b to c).
 
         Within edges, and across nodes where a road goes on.
@@ -64,7 +62,7 @@ class Stations:
         joined = [np.concatenate(columns) for columns in zip(inside, across, strict=True)]
         return joined[0], joined[1], joined[2], joined[3], joined[4]
 
-    def at(self, edge: Int, along: Float) -> tuple[Int, Int, Float]:
+    def at(self, edge: Ints, along: Float) -> tuple[Ints, Ints, Float]:
         """Stations before and after places on edges, and the share (0..1) of the latter."""
         # One rising number for all edges, so that one search serves them all.
         step = float(self.along.max(initial=0.0)) + 1.0
@@ -79,7 +77,7 @@ class Stations:
         return self.row[before], self.row[after], share
 
 
-def _pairs(group: Int) -> tuple[Int, Int]:
+def _pairs(group: Ints) -> tuple[Ints, Ints]:
     """All pairs i < j of rows of equal group."""
     order = np.argsort(group, kind="stable")
     size = np.bincount(group)[group[order]]
@@ -121,7 +119,7 @@ def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
     )
 
 
-def find_crossings(graph: RoadGraph, stations: Stations) -> tuple[Int, Float, Int, Float, Float]:
+def find_crossings(graph: RoadGraph, stations: Stations) -> tuple[Ints, Float, Ints, Float, Float]:
     """Where one road runs over another: (upper edge, metres along it, lower edge, metres along it, margin).
 
     Those are lines that cross in plan without a common node there and differ in layer, or in being bridge or

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from geoscene.errors import SceneFormatError
 from geoscene.files import write_atomically
 from geoscene.mesh import Instances, Mesh
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 
 @dataclass(frozen=True, slots=True)

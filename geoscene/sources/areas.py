@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from geoscene.report import Problem
 from geoscene.sources.data import Area, Tags
-from geoscene.sources.elements import Elements, Int, Members
+from geoscene.sources.elements import Elements, Members
 from geoscene.sources.rings import Chain, assemble, close_cut_ring, polygons_of
 from geoscene.sources.tags import NOISE, area_tags, is_area, is_building, is_open_area, kind_of
+from geoscene.typing import Ints
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
-_NO_NODES: Int = np.empty(0, np.int64)
+_NO_NODES: Ints = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,7 @@ class Places:
     """
 
     xy: NDArray[np.float64]
-    same: Int
+    same: Ints
 
     @classmethod
     def of(cls, elements: Elements) -> Places:
@@ -40,7 +41,7 @@ class Places:
         _, first, inverse = np.unique(packed, return_index=True, return_inverse=True)
         return cls(elements.lonlat(np.arange(len(packed))), first[inverse].astype(np.int64))
 
-    def merged(self, nodes: Int) -> Int:
+    def merged(self, nodes: Ints) -> Ints:
         """Node indices with the first node of each position in place of the others; -1 stays."""
         return np.where(nodes >= 0, self.same[nodes], -1) if len(self.same) else nodes
 
@@ -170,7 +171,7 @@ def multipolygon_areas(
     places: Places,
     *,
     extent: tuple[float, float, float, float],
-    wanted: Callable[[Int], bool],
+    wanted: Callable[[Ints], bool],
 ) -> tuple[list[Area], list[Problem], Claims]:
     """Areas of multipolygon relations, in order of id, with what was wrong and which ways they take.
 
@@ -229,7 +230,7 @@ def way_areas(
     areas: list[Area] = []
     problems: list[Problem] = []
     meant: set[int] = set()
-    rings: list[Int] = []
+    rings: list[Ints] = []
     of: list[int] = []
     for row in rows:
         tags = elements.way_tags[row]

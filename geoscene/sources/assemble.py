@@ -10,8 +10,9 @@ from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.report import Action, Problem
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
 from geoscene.sources.data import OsmData, Point, Relation, Way
-from geoscene.sources.elements import UNITS, Elements, Int
+from geoscene.sources.elements import UNITS, Elements
 from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
+from geoscene.typing import Ints
 
 Bounds = tuple[float, float, float, float]
 
@@ -143,7 +144,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
     places = Places.of(elements)
     near = _near(elements, bounds)
 
-    def wanted(rows: Int) -> bool:
+    def wanted(rows: Ints) -> bool:
         return bool(near[rows].any())
 
     problems = [

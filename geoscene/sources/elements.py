@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.sources.data import Tags
+from geoscene.typing import Ints
 
-Int = NDArray[np.int64]
 Members = tuple[tuple[str, int, str], ...]
 
 UNITS = 10_000_000
@@ -39,29 +39,29 @@ class Elements:
     misplaced : ids of nodes whose coordinates were missing or out of range
     """
 
-    node_id: Int
+    node_id: Ints
     node_xy: NDArray[np.int32]
     node_tags: dict[int, Tags]
-    way_id: Int
-    way_start: Int
+    way_id: Ints
+    way_start: Ints
     way_closed: NDArray[np.bool_]
     way_tags: list[Tags]
-    ref: Int
+    ref: Ints
     relations: list[tuple[int, Tags, Members]]
     bounds: tuple[float, float, float, float] | None
     timestamp: str
-    misplaced: Int
+    misplaced: Ints
 
-    def chain(self, way: int) -> Int:
+    def chain(self, way: int) -> Ints:
         """(k,) node indices of the way in row ``way``, -1 for nodes that are not here."""
         return self.ref[self.way_start[way] : self.way_start[way + 1]]
 
-    def lonlat(self, nodes: Int) -> NDArray[np.float64]:
+    def lonlat(self, nodes: Ints) -> NDArray[np.float64]:
         """(k, 2) degrees of nodes given by index."""
         return self.node_xy[nodes] / UNITS
 
 
-def _last_of_each(ids: Int) -> Int:
+def _last_of_each(ids: Ints) -> Ints:
     """Positions that sort ``ids``, the last one of equal ids only."""
     order = np.argsort(ids, kind="stable")
     ordered = ids[order]

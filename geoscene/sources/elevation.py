@@ -20,8 +20,8 @@ from geoscene.files import write_atomically
 from geoscene.frames import Frame
 from geoscene.progress import Progress, silent
 from geoscene.sources.data import OsmData
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Box = tuple[float, float, float, float]
 
 CREDIT = (

@@ -10,9 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.sources.elements import Int
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +21,7 @@ class Chain:
     inner : whether it is said to bound a hole
     """
 
-    nodes: Int
+    nodes: Ints
     inner: bool
 
 
@@ -38,21 +36,21 @@ def polygons_of(geometry: Any) -> Any:
     return shapely.orient_polygons(parts[0] if len(parts) == 1 else shapely.multipolygons(parts))
 
 
-def segments_of(nodes: Int) -> Int:
+def segments_of(nodes: Ints) -> Ints:
     """(s, 2) int64 node indices of a chain's segments, the lesser first; segments of no length left out."""
-    pairs: Int = np.sort(np.stack([nodes[:-1], nodes[1:]], axis=1), axis=1)
-    distinct: Int = pairs[pairs[:, 0] != pairs[:, 1]]
+    pairs: Ints = np.sort(np.stack([nodes[:-1], nodes[1:]], axis=1), axis=1)
+    distinct: Ints = pairs[pairs[:, 0] != pairs[:, 1]]
     return distinct
 
 
-def _odd_ends(segments: Int) -> Int:
+def _odd_ends(segments: Ints) -> Ints:
     """The nodes at which an odd number of segments end: where the boundary is open."""
     nodes, count = np.unique(segments, return_counts=True)
-    odd: Int = nodes[count % 2 == 1]
+    odd: Ints = nodes[count % 2 == 1]
     return odd
 
 
-def _prune(segments: Int) -> Int:
+def _prune(segments: Ints) -> Ints:
     """Segments less those that lead to a dead end."""
     while len(segments):
         _, inverse, count = np.unique(segments, return_inverse=True, return_counts=True)
@@ -73,7 +71,7 @@ def _inside(points: Float, a: Float, *, b: Float) -> NDArray[np.bool_]:
     return out
 
 
-def enclosed(segments: Int, xy: Float) -> tuple[Any, bool]:
+def enclosed(segments: Ints, xy: Float) -> tuple[Any, bool]:
     """The area that segments bound, by the even-odd rule, and whether any cross or overlap between nodes.
 
     Where the boundary is open, dead ends are left out and what is still enclosed counts as inside. The area
@@ -94,9 +92,9 @@ def enclosed(segments: Int, xy: Float) -> tuple[Any, bool]:
     return polygons_of(shapely.union_all(faces)), crossing
 
 
-def _joined(chains: Sequence[Int]) -> list[list[Int]]:
+def _joined(chains: Sequence[Ints]) -> list[list[Ints]]:
     """Chains grouped into rings: closed ones alone, open ones with those they meet end to end."""
-    groups: list[list[Int]] = []
+    groups: list[list[Ints]] = []
     owner: dict[int, int] = {}
     for chain in chains:
         ends = {int(chain[0]), int(chain[-1])}
@@ -116,7 +114,7 @@ def _joined(chains: Sequence[Int]) -> list[list[Int]]:
     return [group for group in groups if group]
 
 
-def _union_of_rings(chains: Sequence[Int], xy: Float) -> Any:
+def _union_of_rings(chains: Sequence[Ints], xy: Float) -> Any:
     """The union of what each ring encloses; empty if none does."""
     areas = []
     for group in _joined(chains):
@@ -152,7 +150,7 @@ def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> As
     """
     seen: set[bytes] = set()
     once: list[Chain] = []
-    parts: list[Int] = []
+    parts: list[Ints] = []
     spikes = False
     for chain in chains:
         segments = segments_of(chain.nodes)
@@ -184,7 +182,7 @@ def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> As
     return Assembly(polygons_of(shapely.difference(outer, inner)), reason)
 
 
-def close_cut_ring(nodes: Int, xy: Float, *, extent: tuple[float, float, float, float]) -> Int | None:
+def close_cut_ring(nodes: Ints, xy: Float, *, extent: tuple[float, float, float, float]) -> Ints | None:
     """A ring that the edge of an extract cut, closed by straight edges; None if that is not sensible.
 
     It is sensible where both ends of every gap lie within 100 m of the extent's edge, the edges put in are

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.structures.table import Structures
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _FADE = 1.5
 """Metres beyond its outside over which a carriageway's height ceases to count."""

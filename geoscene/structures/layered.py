@@ -8,8 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+from geoscene.typing import Float, Ints
 
 PRECISION = 1e-3
 """Metres: the grid that plans are cut on, ten times that on which solids are checked."""
@@ -27,7 +26,7 @@ class Plan:
     """
 
     xy: Float
-    faces: Int
+    faces: Ints
 
     @property
     def middle(self) -> Float:
@@ -48,10 +47,10 @@ class Shell:
     """
 
     vertices: Float
-    faces: Int
-    level: Int
+    faces: Ints
+    level: Ints
     up: NDArray[np.bool_]
-    triangle: Int
+    triangle: Ints
 
 
 def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
@@ -117,7 +116,7 @@ def raise_shell(plan: Plan, levels: Float, *, solid: NDArray[np.bool_]) -> Shell
 
 
 def _unpinched(
-    plan: Plan, solid: NDArray[np.bool_], *, start: Int, own: Int, other: Int
+    plan: Plan, solid: NDArray[np.bool_], *, start: Ints, own: Ints, other: Ints
 ) -> NDArray[np.bool_]:
     """A layer (m,) in which the solid around each vertex hangs together."""
     (ux, uy), (vx, vy) = (plan.xy[plan.faces[:, k]].T - plan.xy[plan.faces[:, 0]].T for k in (1, 2))
@@ -135,7 +134,7 @@ def _unpinched(
         solid[own[least]] = False
 
 
-def half_edges(plan: Plan) -> tuple[Int, Int, Int, Int]:
+def half_edges(plan: Plan) -> tuple[Ints, Ints, Ints, Ints]:
     """Edges of all triangles: (start, end, triangle, the triangle on the other side or -1), each (3 m,)."""
     start, end = plan.faces.ravel(), np.roll(plan.faces, -1, axis=1).ravel()
     own = np.repeat(np.arange(len(plan.faces)), 3)

@@ -15,8 +15,8 @@ from geoscene.ground.layers import PADS, Layers, concatenate_layers
 from geoscene.roadgraph.junctions import cut_line
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
 
 OPENING, LOW = PADS + 100.0, PADS + 50.0

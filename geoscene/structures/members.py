@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import cut_line
 from geoscene.roadgraph.surface_rows import SurfaceRows
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _APPROACH = 6.0
 """Metres of the road on the ground that tell which way a bridge or tunnel opens."""

@@ -13,8 +13,7 @@ from geoscene.buildings.table import GRID
 from geoscene.report import Problem
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.table import StructureOptions, Structures
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 _SCANT = 1.0
 """Square metres; a smaller overlap of building and road is left as it is."""

@@ -23,9 +23,8 @@ from geoscene.sources.data import OsmData, Way
 from geoscene.structures.heights import foot
 from geoscene.structures.members import Members
 from geoscene.structures.table import StructureOptions
+from geoscene.typing import Float, Ints
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Height = Callable[[Float, Float], Float]
 
 _STATION = 5.0
@@ -68,9 +67,9 @@ class _Net:
     """
 
     xy: Float
-    rows: list[Int]
-    a: Int
-    b: Int
+    rows: list[Ints]
+    a: Ints
+    b: Ints
     metres: Float
     slope: Float
 

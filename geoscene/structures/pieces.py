@@ -18,9 +18,7 @@ from geoscene.structures.layered import PRECISION
 from geoscene.structures.members import Members
 from geoscene.structures.sheets import Sheets, find_sheets, part_outlines, where_same
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+from geoscene.typing import Float, Ints
 
 _AROUND = 12.0
 """Metres by which a piece's centre line is known beyond its ends."""
@@ -102,7 +100,7 @@ def cut_pieces(members: Members, raised: SurfaceRows, *, options: StructureOptio
 
 def _outlines(
     members: Members, raised: SurfaceRows, *, options: StructureOptions
-) -> tuple[Int, NDArray[np.object_], NDArray[np.object_], NDArray[np.object_], Float]:
+) -> tuple[Ints, NDArray[np.object_], NDArray[np.object_], NDArray[np.object_], Float]:
     """Pieces before they are told apart: member, outline, line, line with its surroundings, half-width."""
     lines = [_without_crumbs(line) for line in members.line]
     whole, half = _wholes(members, lines, raised=raised, options=options)

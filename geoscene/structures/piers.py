@@ -13,8 +13,8 @@ from geoscene.classes import Class
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.structures.heights import foot
 from geoscene.structures.table import StructureOptions, Structures
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
 
 _KEPT_FREE = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.SIDEWALK, Class.KERB, Class.RAIL)

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
-
 from geoscene.frames import Frame
 from geoscene.report import Problem
 from geoscene.roadgraph.graph import RoadGraph
@@ -18,8 +15,8 @@ from geoscene.structures.paths import path_members
 from geoscene.structures.pieces import cut_pieces
 from geoscene.structures.piers import place_piers
 from geoscene.structures.table import StructureOptions, Structures
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
 
 

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from geoscene.roadgraph.junctions import cut_line
 from geoscene.structures.heights import PARTED, SHEET, foot
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 Pair = tuple[int, int]
 
 _STRIP = 4.0

@@ -14,8 +14,8 @@ from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.layered import SIDE, Plan, Shell, cut_plan, raise_shell
 from geoscene.structures.meeting import tunnel_roof
 from geoscene.structures.table import StructureOptions, Structures
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Height = Callable[[Float, Float], Float]
 
 _STANDING = 0.5

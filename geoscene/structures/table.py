@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.roadgraph.surface_rows import SurfaceRows
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 THINNEST = 0.15
 """Metres: least thickness of a tunnel's roof."""

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.frames import Frame
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 ACCURACY = 0.01
 """Metres that interpolation may be off."""

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.mesh import WALL
+from geoscene.typing import Float
 from lidar.camera.texture import covered, hashed, pulses, span
 from lidar.raycast import Caster, Geometry, Hits
 from lidar.world.world import World
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

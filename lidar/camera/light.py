@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 # A clear atmosphere in three bands (red, green, blue: 615, 535, 465 nm). Extraterrestrial light relative to
 # green from the sun at 5772 K. Rayleigh optical depths by Hansen and Travis (Space Science Reviews 16, 1974):

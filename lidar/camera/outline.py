@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 
 def outline(corners: Float, width: int, *, height: int) -> tuple[tuple[float, float, float, float], int]:

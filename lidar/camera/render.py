@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class
+from geoscene.typing import Float
 from lidar.camera import shade
 from lidar.camera.facades import Facades, facades_of
 from lidar.camera.light import Light, daylight
@@ -19,8 +20,6 @@ from lidar.raycast import Hits
 from lidar.rig.camera_model import pixel_rays, project
 from lidar.rig.specs import CameraSpec
 from lidar.world.world import Surfaces, World
-
-Float = NDArray[np.float64]
 
 _BAND = 1 << 16
 """Rays worked on at a time: their columns stay in the processor's cache."""

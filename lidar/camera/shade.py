@@ -11,11 +11,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
+from geoscene.typing import Float
 from lidar.camera import texture
 from lidar.camera.facades import PAINT, windows
 from lidar.camera.texture import detail, hashed, noise
 
-Float = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 _BUILDING = int(Class.BUILDING)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from geoscene.frames import Frame
+from geoscene.typing import Float
 from lidar.errors import InputError
-
-Float = NDArray[np.float64]
 
 
 def sun_position(when: datetime, lon_deg: ArrayLike, *, lat_deg: ArrayLike) -> tuple[Float, Float]:

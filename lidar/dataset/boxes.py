@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class
+from geoscene.typing import Float, Ints
 from lidar.camera.outline import outline
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.camera_model import project
 from lidar.rig.specs import CameraSpec
 from lidar.world.actors import Actors, States, alive, poses_of, rotations, states
-
-Float = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 def actors_near(actors: Actors, ego: Trajectory, *, time_ns: int, reach: float) -> Ints:

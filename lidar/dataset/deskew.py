@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
-
-Float = NDArray[np.float64]
 
 MOMENTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 """Moments of a frame that points can be brought to, as shares of its period."""

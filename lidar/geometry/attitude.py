@@ -14,9 +14,9 @@ functions end in ``_intrinsic``.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 LOCK = 1e-7
 """Radians from 90 degrees of the middle angle within which the outer angles cannot be told apart."""

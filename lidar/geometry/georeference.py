@@ -6,12 +6,10 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
 from geoscene.frames import Frame, utm_crs
-
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 AFFINE_LIMIT = 1e-4
 """Metres by which an affine map may differ from the projection: a fifth of a LAS coordinate's half step."""

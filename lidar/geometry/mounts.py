@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.geometry.attitude import matrix_from_quat
-
-Float = NDArray[np.float64]
 
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Axes of a body (x forward, y left, z up) from those of the camera in it (x right, y down, z forward)."""

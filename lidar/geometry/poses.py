@@ -9,9 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.typing import Float
 from lidar.errors import InputError
-
-Float = NDArray[np.float64]
 
 KNOT_NS = 200_000
 """Poses within a scan are taken this often, nanoseconds; between two of them a point moves along the chord.

@@ -27,7 +27,6 @@ from lidar.geometry.poses import Trajectory
 from lidar.maps.colors import distinct, ramp
 from lidar.rig.patterns.beams import frame_ns
 
-Float = NDArray[np.float64]
 COLORS = ("class", "height", "intensity", "sensor")
 """What the colours of a map may show."""
 

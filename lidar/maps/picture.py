@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from geoscene.classes import Class, class_codes
+from geoscene.typing import Float
 from lidar.camera.render import RenderOptions, render
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
@@ -24,7 +25,6 @@ from lidar.rig.specs import CameraSpec
 from lidar.rig.vehicle import Vehicle
 from lidar.world.world import World
 
-Float = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
 AFTERNOON = (-0.52, -0.37, 0.77)

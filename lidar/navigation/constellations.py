@@ -13,10 +13,9 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.rig.specs import SYSTEMS
-
-Float = NDArray[np.float64]
 
 _MU = 3.986004418e14  # m^3/s^2, WGS 84
 _STATIONARY = 42164.2e3  # metres, radius at which an orbit takes a sidereal day

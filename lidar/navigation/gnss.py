@@ -20,14 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.frames import Frame
+from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.attitude import body_rates
 from lidar.geometry.poses import Trajectory
 from lidar.navigation.satellite_visibility import Sky, dilution, open_sky
 from lidar.random_streams import generator
 from lidar.rig.specs import GnssSpec
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,13 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.frames import Frame
+from geoscene.typing import Float
 from lidar.geometry.attitude import body_rates, matrix_from_quat
 from lidar.geometry.poses import Trajectory
 from lidar.navigation.satellite_visibility import E2, A
 from lidar.random_streams import generator
 from lidar.rig.specs import ImuSpec
-
-Float = NDArray[np.float64]
 
 _FLICKER_TIMES = 0.1 * np.exp(np.arange(12))
 """Seconds, correlation times of the processes that add up to flicker: from 0.1 s to 100 minutes."""

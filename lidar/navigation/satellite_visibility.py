@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.frames import Frame
+from geoscene.typing import Bools, Float
 from lidar.navigation.constellations import satellite_names, satellites
 from lidar.rig.specs import SYSTEMS
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 A, F = 6378137.0, 1 / 298.257223563
 """WGS 84: semi-major axis in metres, flattening."""
@@ -29,7 +27,7 @@ REACH = 400.0
 
 
 class _Caster(Protocol):
-    def occluded(self, origins: ArrayLike, directions: ArrayLike) -> Bool: ...
+    def occluded(self, origins: ArrayLike, directions: ArrayLike) -> Bools: ...
 
 
 class _World(Protocol):
@@ -50,8 +48,8 @@ class Sky:
 
     azimuth: Float
     elevation: Float
-    visible: Bool
-    above: Bool
+    visible: Bools
+    above: Bools
     blocked: Float
     names: NDArray[np.str_]
 
@@ -190,7 +188,7 @@ def _blocks(antenna: Float) -> list[NDArray[np.int64]]:
     return np.split(np.arange(len(antenna)), np.flatnonzero(np.diff(block)) + 1)
 
 
-def dilution(azimuth: Float, elevation: Float, *, used: Bool, names: NDArray[np.str_]) -> Float:
+def dilution(azimuth: Float, elevation: Float, *, used: Bools, names: NDArray[np.str_]) -> Float:
     """Dilution of precision (n, 3): horizontal, vertical and in position; infinite where too few are used.
 
     Each system in use has a clock of its own that must be solved for: three coordinates and a clock need four

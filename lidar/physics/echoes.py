@@ -9,9 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.raycast.memory import inlined
-
-Float = NDArray[np.float64]
 
 _MODES = ("strongest", "first", "last", "dual", "all")
 _STRONGEST, _FIRST, _LAST, _DUAL, _ALL = range(5)

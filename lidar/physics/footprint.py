@@ -5,11 +5,9 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.errors import InputError
-
-Float = NDArray[np.float64]
 
 
 def ring_energy(rings: int, *, waist: float = 1.0) -> Float:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 AIR, WATER, GLASS = 1.0003, 1.33, 1.5
 """Refractive indices."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 BRIGHTEST = 1000.0
 """Apparent reflectance that has the code 255: high-intensity sheeting, typical value."""

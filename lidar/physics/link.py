@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 GATE = 0.3
 """Metres of range in which noise has one chance to pass the threshold."""

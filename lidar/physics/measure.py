@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 RESOLUTION = 0.09
 """Metres, range resolution in `signal_sigma`: the default of LISA (Kilic et al. 2021)."""

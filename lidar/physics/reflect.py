@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from geoscene.classes import materials
+from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast.memory import inlined
-
-Float = NDArray[np.float64]
 
 WAVELENGTHS_NM = (905.0, 1064.0, 1550.0)
 """Where materials have their reflectance."""

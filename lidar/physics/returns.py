@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from geoscene.typing import Float
 from lidar.physics.echoes import Echoes
 from lidar.physics.effects import Effects
 from lidar.physics.link import amplitude, apparent_of, daylight_noise, false_alarm_probability
@@ -16,8 +17,6 @@ from lidar.physics.reflect import RETRO
 from lidar.random_streams import generator
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
-
-Float = NDArray[np.float64]
 
 _BLOOM_ANGLE, _BLOOM_CHANCE = np.radians(0.3), 0.3  # typical values
 _BLOOM_POWER = 0.01  # of the retro-reflector's power, assumed

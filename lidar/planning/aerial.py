@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.scene import Scene
+from geoscene.typing import Float
 from lidar.errors import InputError, RouteError
 from lidar.geometry.poses import Trajectory
 from lidar.planning.flight import Flight, survey_flight, survey_lines, times_on_lines, waypoint_flight
@@ -27,8 +27,6 @@ from lidar.rig.devices import Camera, Scanner
 from lidar.rig.scanner import firings
 from lidar.rig.vehicle import Vehicle
 from lidar.world.world import World
-
-Float = NDArray[np.float64]
 
 ALTITUDES = {"slow": 60.0, "fast": 600.0}
 """Metres above the ground that a craft flies where nothing else is said: below and above 30 m/s."""

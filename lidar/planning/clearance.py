@@ -10,11 +10,10 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.frames import Frame
+from geoscene.typing import Float
 from lidar.errors import BlockedError
 from lidar.planning.steering import Pose, Track
 from lidar.rig.vehicle import Vehicle
-
-Float = NDArray[np.float64]
 
 ASIDE = 4.0
 """Metres that a line may be pushed aside to get past an obstacle."""

@@ -11,12 +11,11 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.typing import Float
 from lidar.errors import RouteError
 from lidar.geometry.poses import Trajectory
 from lidar.planning.path import Ground
 from lidar.planning.route import Route, free_route
-
-Float = NDArray[np.float64]
 
 _ARC_STEP = np.radians(2.0)
 _ALONG = np.cos(np.radians(15.0))  # least cosine between the course and a line that is flown

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.attitude import quat_from_euler
 from lidar.geometry.poses import Trajectory
 from lidar.planning.path import Path
 from lidar.rig.vehicle import Vehicle
-
-Float = NDArray[np.float64]
 
 DWELL_S = 1.0
 """Seconds at rest at every stop on the way, while the wheel is turned or the gear changed."""

@@ -20,13 +20,13 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.frames import Frame
+from geoscene.typing import Float
 from lidar.errors import BlockedError, RouteError
 from lidar.planning.clearance import ASIDE, Line, Setting, pushes, turn_round, turns_at
 from lidar.planning.route import Route
 from lidar.planning.steering import Pose, Track, follow, line_heading, relaxed
 from lidar.rig.vehicle import Vehicle
 
-Float = NDArray[np.float64]
 Ground = Callable[[Float, Float], Float]
 """z (n,) of the ground at scene x (n,), y (n,)."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.frames import Frame
+from geoscene.typing import Float
 from lidar.errors import FormatError, RouteError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import read_trajectory
@@ -19,7 +20,6 @@ from lidar.geometry.trajectory_csv import read_trajectory
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-Float = NDArray[np.float64]
 
 _STEP_NS = 10_000_000
 _QUAT = ("qx", "qy", "qz", "qw")

@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import TurnStates, edge_lines, turn_states
+from geoscene.typing import Float
 from lidar.errors import RouteError
 from lidar.random_streams import generator
 
-Float = NDArray[np.float64]
 Side = Literal["right", "left"]
 Spec = str | Path | Sequence[tuple[float, float]]
 

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.planning.motion import DWELL_S, Motion, legs_of, speed_limits
 from lidar.planning.path import Path
 from lidar.rig.vehicle import Vehicle
-
-Float = NDArray[np.float64]
 
 STEP_S = 0.2
 """Seconds between the knots of a motion."""

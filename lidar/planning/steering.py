@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.rig.vehicle import Vehicle
 
-Float = NDArray[np.float64]
 Pose = tuple[float, float, float]
 """Scene x and y of the rear axle, and heading in radians."""
 

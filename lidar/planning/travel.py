@@ -14,6 +14,7 @@ from geoscene.roadgraph import read_graphml
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import read_layer
+from geoscene.typing import Float
 from lidar.errors import RouteError
 from lidar.planning.path import Path, Surface
 from lidar.planning.rerouting import plan_drive
@@ -30,8 +31,6 @@ _ABOVE = (
     1.5  # metres over the graph's height from which the surface under the wheels is looked for, and below it
 )
 _DRIVEN = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD or c == Class.BRIDGE]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import nearest_edge
+from geoscene.typing import Float
 from lidar.errors import FormatError, RouteError
 from lidar.planning.route import U_TURN_S, permitted_turns, street_tree, turns_back
 
-Float = NDArray[np.float64]
 Place = tuple[int, float]
 """An edge and the true metres from its tail."""
 

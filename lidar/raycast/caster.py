@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.typing import Float
 from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast.embree import EmbreeScene
@@ -19,8 +20,6 @@ from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, sp
 from lidar.raycast.hits import Echoes, Hits
 from lidar.raycast.library import library
 from lidar.raycast.rays import free_rays, limited, posed_rays
-
-Float = NDArray[np.float64]
 
 log = logging.getLogger(__name__)
 

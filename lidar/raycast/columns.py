@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from geoscene.typing import Float
 
 COPIES = 256
 """Numbers of an Embree scene's geometries for copies; those of its mesh follow. A commit looks at all

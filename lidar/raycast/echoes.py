@@ -9,13 +9,12 @@ import numpy as np
 from numba import cfunc, njit, types
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.raycast.columns import Rays, Target
 from lidar.raycast.library import ARGUMENT_FILTER, INVALID
 from lidar.raycast.memory import aligned, inlined, intersect1, pointer
 from lidar.raycast.packets import first_bad, gather, nudge
 from lidar.raycast.planes import meet, numbered, placed
-
-Float = NDArray[np.float64]
 
 carray: Any = vars(numba)["carray"]  # numba does not declare it as its own
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast import kernels
 from lidar.raycast.columns import COPIES, Rays, Target
@@ -36,8 +37,6 @@ from lidar.raycast.library import (
     library,
 )
 from lidar.raycast.rays import share
-
-Float = NDArray[np.float64]
 
 
 def arguments(flags: int = 0, *, context: int = 0, collect: int = 0) -> NDArray[np.int64]:

@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.errors import BackendError
 from lidar.raycast.columns import Rays
 from lidar.raycast.geometry import ALL, Geometry, Instances
 from lidar.raycast.hits import Echoes, Hits
 from lidar.raycast.rays import in_scene
 from lidar.raycast.reference import Reference
-
-Float = NDArray[np.float64]
 
 _NUDGE = 3e-7
 _GRAZING = 1e-3

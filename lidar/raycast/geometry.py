@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.typing import Float
 from lidar.errors import InputError
 
 if TYPE_CHECKING:
     from lidar.raycast.caster import Caster
 
-Float = NDArray[np.float64]
 
 ALL = 0xFFFFFFFF
 """The mask that sees every face."""

@@ -16,13 +16,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.raycast.columns import CHUNK, Rays, Target
 from lidar.raycast.lanes import GRAZING, cross, move_float64, move_int32, narrow, same
 from lidar.raycast.memory import aligned, float64_at, inlined, int32_at, int64_at
 from lidar.raycast.packets import RAY, ROWS, alike, first_bad, gather, nudge, trace
 from lidar.raycast.planes import INVALID, meet, numbered, placed, plane_of
-
-Float = NDArray[np.float64]
 
 
 @inlined

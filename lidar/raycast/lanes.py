@@ -91,7 +91,7 @@ class _Rows:
 def _row(kind: Any, kept: Any) -> Any:
     @intrinsic
     def move(context: Any, lanes: Any, source: Any, target: Any) -> Any:  # noqa: ARG001
-        def build(made: Any, builder: Any, *, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
             _Rows(builder, lanes, address=values[2], kind=kept)[0] = _Rows(
                 builder, lanes, address=values[1], kind=kind
             )[0]
@@ -110,7 +110,7 @@ narrow = _row(_DOUBLE, _FLOAT)
 
 @intrinsic
 def _same(context: Any, lanes: Any, source: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, *, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         row = _Rows(builder, lanes, address=values[1], kind=_INT)[0].value
         first = builder.extract_element(row, ir.Constant(_INT, 0))
         differ = builder.icmp_unsigned(
@@ -128,7 +128,7 @@ same: Any = _same
 
 @intrinsic
 def _settle(context: Any, lanes: Any, work: Any, packet: Any, x: Any, y: Any, z: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, *, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         rows, rounded = (
             _Rows(builder, lanes, address=values[1]),
             _Rows(builder, lanes, address=values[2], kind=_FLOAT),
@@ -153,7 +153,7 @@ Embree's packet; whether all directions have length 1 and all origins are within
 
 @intrinsic
 def _cross(context: Any, lanes: Any, work: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, *, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         rows = _Rows(builder, lanes, address=values[1])
         ox, oy, oz, dx, dy, dz = (rows[r] for r in range(6))
         nx, ny, nz, d = (rows[r] for r in range(9, 13))

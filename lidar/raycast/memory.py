@@ -25,7 +25,7 @@ addresses."""
 def _loader(kind: Any, size: int) -> Any:
     @intrinsic
     def load(context: Any, address: Any, index: Any) -> Any:  # noqa: ARG001
-        def build(target: Any, builder: Any, *, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
             step = builder.mul(values[1], values[1].type(size))
             place = builder.inttoptr(builder.add(values[0], step), target.get_value_type(kind).as_pointer())
             return builder.load(place)
@@ -44,7 +44,7 @@ int32_at = _loader(types.int32, 4)
 
 @intrinsic
 def _pointer(context: Any, address: Any) -> Any:  # noqa: ARG001
-    def build(target: Any, builder: Any, *, signature: Any, values: Any) -> Any:  # noqa: ARG001
+    def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         return builder.inttoptr(values[0], cgutils.voidptr_t)
 
     return types.voidptr(types.int64), build

@@ -10,12 +10,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast.columns import CHUNK, Rays
 from lidar.raycast.geometry import ALL
-
-Float = NDArray[np.float64]
 
 
 def _rows(values: ArrayLike, name: str) -> Float:

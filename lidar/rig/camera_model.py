@@ -5,11 +5,10 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from geoscene.typing import Float
 from lidar.rig.specs import CameraSpec
-
-Float = NDArray[np.float64]
 
 _STEPS = 30
 _TOLERANCE = 1e-12

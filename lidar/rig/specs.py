@@ -9,15 +9,12 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lidar.errors import RigError
 from lidar.geometry.attitude import quat_from_euler, quat_product
 from lidar.geometry.mounts import OPTICAL_QUAT, Mount
 from lidar.rig.imu_grades import PRESETS
 from lidar.rig.toml_table import Table, read_table
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.cloud import Cloud
 from lidar.world.actors import Actors, rotations, states
-
-Float = NDArray[np.float64]
 
 _HALF_NS = 500_000  # half the span over which velocities are taken
 

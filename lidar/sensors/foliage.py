@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.random_streams import uniform_of
 from lidar.raycast import Caster, Hits
 from lidar.sensors.motion import Rays
 from lidar.world.world import Faces
-
-Float = NDArray[np.float64]
 
 PROJECTION = 0.5
 """Shadow of a unit of leaf area on a plane across the ray, where leaves face all ways alike (Ross 1981)."""

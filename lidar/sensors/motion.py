@@ -10,12 +10,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import KNOT_NS, Poses, Trajectory
 from lidar.physics.footprint import bundle
 from lidar.rig.patterns.beams import Firings
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.classes import materials
+from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, gather, insert
 from lidar.physics.effects import Effects
 from lidar.physics.fresnel import glint
@@ -18,8 +19,6 @@ from lidar.physics.reflect import INCIDENCE_LAWS, RETRO, apparent, reflectance_t
 from lidar.random_streams import normal_of
 from lidar.raycast import Hits
 from lidar.world.world import Faces, World
-
-Float = NDArray[np.float64]
 
 
 @functools.cache

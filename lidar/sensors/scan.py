@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.physics.echoes import Echoes, joined, numbered, reported
@@ -22,8 +23,6 @@ from lidar.sensors.cloud import Cloud
 from lidar.sensors.motion import beam_of
 from lidar.sensors.surfaces import met
 from lidar.world.world import World
-
-Float = NDArray[np.float64]
 
 
 def scan(

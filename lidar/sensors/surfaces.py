@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.physics.echoes import Echoes, joined, merged
@@ -19,8 +20,6 @@ from lidar.sensors.foliage import Leaves
 from lidar.sensors.motion import Beam, Carrier, Rays
 from lidar.sensors.receive import Look, Receiver, shiny_codes
 from lidar.world.world import World
-
-Float = NDArray[np.float64]
 
 _PANES = 4  # panes a ray may pass one after another
 _CLEAR = 1e-3  # metres, how far beyond a surface the next ray starts

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
+from geoscene.typing import Float
 from lidar.geometry.poses import Trajectory
 from lidar.planning.motion import drive_path, poses_along
 from lidar.planning.path import Path
@@ -19,8 +19,6 @@ from lidar.traffic.lanes import lanes_of
 from lidar.traffic.populate import TrafficOptions, company_of, settled
 from lidar.traffic.traffic import Trip
 from lidar.world.actors import Actors
-
-Float = NDArray[np.float64]
 
 _ROUNDS = 3  # times that the ego's drive is planned among those who are about during the last plan
 _SAME = 25.0  # metres between two plans that are about the same

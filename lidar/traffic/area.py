@@ -9,10 +9,9 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.roadgraph.routing import edge_lines
+from geoscene.typing import Float
 from lidar.geometry.poses import Trajectory
 from lidar.traffic.lanes import Lanes
-
-Float = NDArray[np.float64]
 
 LEFT = 100.0
 """Metres beyond its reach at which what was around the ego is forgotten."""

@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.planning.path import Path
 from lidar.planning.speed_profile import wished_speed
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.lanes import STEP, Way
 from lidar.traffic.traffic import Driver
-
-Float = NDArray[np.float64]
 
 _ROOM = (0.4, 0.2)
 """Metres by which the ego's box is longer and wider to the others, for what its driver does less exactly."""

@@ -17,9 +17,8 @@ from typing import IO, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.errors import FormatError, InputError
-
-Float = NDArray[np.float64]
 
 _HEAD = 1 << 16  # bytes at a file's start in which SUMO notes its options
 _OPTION = re.compile(

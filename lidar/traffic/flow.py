@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
+from geoscene.typing import Float, Ints
 from lidar.geometry.poses import Trajectory
 from lidar.traffic.area import LEFT
 from lidar.traffic.ego import EgoTrip
@@ -21,9 +22,6 @@ from lidar.traffic.lanes import STEP, Way
 from lidar.traffic.simulate import Ego, Movers, run
 from lidar.traffic.sweep import SQUARE, squares_under, sweep
 from lidar.traffic.traffic import Trip
-
-Float = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 DT = 0.1
 """Seconds of a step of the simulation."""

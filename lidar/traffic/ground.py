@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.scene import Scene
+from geoscene.typing import Float
 from lidar.raycast import Caster
-
-Float = NDArray[np.float64]
 
 _GROUND = (
     *(Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.SIDEWALK, Class.KERB, Class.PARKING, Class.RAIL),

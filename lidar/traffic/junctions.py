@@ -12,11 +12,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.typing import Float, Ints
 from lidar.random_streams import generator
 from lidar.traffic.lanes import Lanes
-
-Float = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _ROUND = 3.0  # metres by which a junction reaches beyond half the width of its widest street
 _TOGETHER = (

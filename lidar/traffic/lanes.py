@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import turn_states
+from geoscene.typing import Float, Ints
 from lidar.planning.steering import line_curvature, line_heading, relaxed
-
-Float = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 STEP = 0.5
 """True metres between the stations of a way."""

@@ -10,14 +10,13 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.scene import Scene
+from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.traffic.lanes import Lanes, beside, lane_shift
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import standing, table
 from lidar.traffic.traffic import pick
 from lidar.world.actors import Actors
-
-Float = NDArray[np.float64]
 
 CARS = {"hatchback": 0.38, "sedan": 0.30, "suv": 0.22, "van": 0.10}
 """Shares of what parks: assumed."""

@@ -10,12 +10,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.traffic.area import Area
 from lidar.traffic.lanes import STEP, Lanes, Way, beside, rounded
 from lidar.traffic.traffic import Driver, Trip, pick, varied
-
-Float = NDArray[np.float64]
 
 _KINDS = {"adult": 0.5, "small_adult": 0.38, "child": 0.12}
 _FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}

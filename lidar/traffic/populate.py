@@ -27,8 +27,6 @@ from lidar.traffic.tracks import moving_actors
 from lidar.traffic.traffic import Trip, vehicle_trips
 from lidar.world.actors import Actors, joined
 
-Float = NDArray[np.float64]
-
 _ROAD = ("road", "lane_marking", "crossing", "parking")
 _HEADROOM = 2.5  # metres under what stands out of a wall that one can stand below
 _HOUSE = 1.0  # square metres above which what stands there is a building

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.scene import Scene
+from geoscene.typing import Float, Ints
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.random_streams import generator
@@ -25,9 +26,6 @@ from lidar.traffic.tracks import tracked
 from lidar.traffic.traffic import MOTOR_SHARES, pick, varied
 from lidar.world.actor_shapes import Shape
 from lidar.world.actors import Actors, alive, joined, states
-
-Float = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _KINDS: dict[str, tuple[str, ...]] = {
     "passenger": ("sedan", "hatchback", "suv"),

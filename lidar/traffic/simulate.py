@@ -17,11 +17,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.typing import Float, Ints
 from lidar.traffic.junctions import is_green
 from lidar.traffic.lanes import STEP
 
-Float = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 HARD = 8.0

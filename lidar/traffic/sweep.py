@@ -11,9 +11,8 @@ import shapely
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.typing import Float
 from lidar.traffic.lanes import STEP, Way
-
-Float = NDArray[np.float64]
 
 SQUARE = 0.3
 """Metres of a square's side. Two bodies that share no square do not touch: squares are taken whose middle

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.scene import Scene
+from geoscene.typing import Float
 from lidar.traffic.flow import DT, Flow
 from lidar.traffic.ground import ground_heights
 from lidar.traffic.lanes import STEP
@@ -15,8 +16,6 @@ from lidar.traffic.sweep import body_poses
 from lidar.traffic.traffic import Trip
 from lidar.world.actor_shapes import STRIDE, Shape, catalogue
 from lidar.world.actors import Actors
-
-Float = NDArray[np.float64]
 
 _POSES = {"cyclist": STRIDE, "adult": STRIDE, "small_adult": STRIDE, "child": STRIDE}
 _STRIDE = {"cyclist": 5.6, "adult": 1.45, "small_adult": 1.35, "child": 1.05}

@@ -7,16 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.traffic.area import Area, entrances
 from lidar.traffic.lanes import STEP, Lanes, Way, wander, way_along
 from lidar.traffic.sweep import body_poses, rectangles
 from lidar.world.actor_shapes import PAINTS, Shape, catalogue
-
-Float = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _LATERAL = 2.0  # m/s^2 across the way that drivers put up with in bends
 _TRIES = 5  # ways that are tried for a vehicle until one keeps to the carriageway

@@ -9,7 +9,6 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.mesh import Mesh
@@ -30,8 +29,6 @@ from lidar.world.actor_solids import (
     wheel,
 )
 from lidar.world.people import person, rider
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

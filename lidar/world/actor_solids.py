@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.classes import Class, materials
 from geoscene.mesh import Mesh, concatenate
 from geoscene.objects.shapes import lathe
+from geoscene.typing import Float
 
-Float = NDArray[np.float64]
 Rgb = tuple[int, int, int]
 
 GLASS: Rgb = (52, 60, 68)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.mesh import Mesh
+from geoscene.typing import Float
 from lidar.world.actor_shapes import Shape
 
-Float = NDArray[np.float64]
 Region = tuple[float, float, float, float]
 
 _AGE = 1 << 50

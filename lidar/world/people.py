@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.mesh import Mesh
+from geoscene.typing import Float
 from lidar.world.actor_solids import DARK, Rgb, ball, limb, loft
 
-Float = NDArray[np.float64]
 Clothes = tuple[Rgb, Rgb]
 
 _LEG, _HIP, _SHOULDER, _CHIN = 0.48, 0.53, 0.82, 0.87

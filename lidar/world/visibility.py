@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.mesh import Mesh
+from geoscene.typing import Float
 from lidar.world.actors import Actors, poses_of, rotations, states
 from lidar.world.world import World
-
-Float = NDArray[np.float64]
 
 _SAMPLES = 192  # places on a body: a share is known to about 1 / sqrt(96), half of them facing away
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])

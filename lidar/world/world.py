@@ -13,11 +13,11 @@ from geoscene.classes import Class, materials
 from geoscene.mesh import Mesh
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.scene import Scene
+from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast import Caster, Geometry, Hits, Instances
 from lidar.raycast.geometry import split
 
-Float = NDArray[np.float64]
 Region = tuple[float, float, float, float]
 
 SOLID, GLASS, FOLIAGE, WATER = 1, 2, 4, 8

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, class_codes
 from geoscene.files import write_atomically
 from geoscene.progress import Progress, silent
+from geoscene.typing import Float
 from lidar.camera.png import write_png
 from lidar.dataset.formats.clouds import CLOUD_READERS, placed_returns
 from lidar.dataset.formats.nuscenes import write_lidarseg, write_nuscenes
@@ -29,7 +30,6 @@ from lidar.dataset.layout import Dataset
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Poses, Trajectory
 
-Float = NDArray[np.float64]
 Row = dict[str, Any]
 
 VERSION = "v1.0-mini"

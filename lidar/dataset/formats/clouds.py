@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.dataset.formats.pcd import read_pcd
 from lidar.dataset.formats.ply import read_ply
 from lidar.dataset.formats.table import Table
 from lidar.dataset.formats.text import read_csv
 from lidar.geometry.poses import Trajectory
-
-Float = NDArray[np.float64]
 
 CLOUD_READERS: dict[str, Callable[[Path], Table]] = {"pcd": read_pcd, "ply": read_ply, "csv": read_csv}
 """By format, which is the suffix too."""

@@ -14,10 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import class_codes
 from geoscene.files import write_atomically
+from geoscene.typing import Float
 from lidar.dataset.formats.table import Table
 from lidar.errors import FormatError
-
-Float = NDArray[np.float64]
 
 # What moves has a number of its own: car, bicyclist, person, motorcyclist, bus, truck, other vehicle. A
 # bicycle or motorcycle that moves has a rider.

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.rig.patterns.beams import Firings, blocks, frame_ns, frozen
 from lidar.rig.toml_table import Table
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.rig.patterns.beams import Firings, blocks
 from lidar.rig.toml_table import Table
-
-Float = NDArray[np.float64]
 
 LAWS = ("polygon", "zigzag", "sine", "conical")
 """How the mirror moves."""

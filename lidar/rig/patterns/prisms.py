@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.rig.patterns.beams import Firings, blocks, numbers
 from lidar.rig.toml_table import Table
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

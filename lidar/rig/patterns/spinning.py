@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.rig.patterns.beams import Firings, blocks, frame_ns, frozen, ranks
 from lidar.rig.toml_table import Table
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
