@@ -36,10 +36,10 @@ from lidar.planning.travel import Travel, plan_travel, road_graph
 from lidar.rig.devices import Camera, Scanner, cameras, scanners
 from lidar.rig.specs import Rig, load_rig
 from lidar.rig.vehicle import Vehicle, load_vehicle
-from lidar.traffic.among import drive_among, drive_obeying
+from lidar.traffic.ego_drive import drive_in_traffic, drive_with_signals
 from lidar.traffic.fcd import TrafficFile
+from lidar.traffic.fcd_replay import replay
 from lidar.traffic.populate import populate
-from lidar.traffic.replayed import replay
 from lidar.world.actors import Actors
 from lidar.world.thread_worlds import Worlds
 
@@ -143,7 +143,7 @@ def drive(
         if isinstance(traffic, TrafficFile):
             actors = replay(scene, graph, ego=trajectory, vehicle=body, seed=options.seed, options=traffic)
         elif isinstance(planned, RoadDrive):
-            trajectory, actors = drive_among(
+            trajectory, actors = drive_in_traffic(
                 scene,
                 graph,
                 path=planned.travel.path,
@@ -287,7 +287,7 @@ def plan(
             from_rest=options.from_rest,
             progress=progress,
         )
-        trajectory = drive_obeying(
+        trajectory = drive_with_signals(
             travel.path,
             body,
             graph=road_graph(scene),

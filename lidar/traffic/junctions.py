@@ -91,7 +91,7 @@ def road_rank(highway: str) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class JunctionPlan:
     """Junctions and their signals.
 
     zones  : the junctions
@@ -105,7 +105,7 @@ class Plan:
     signals: Signals
 
 
-def junction_plan(graph: RoadGraph, lanes: Lanes, *, seed: int, cycle: float = 60.0) -> Plan:
+def junction_plan(graph: RoadGraph, lanes: Lanes, *, seed: int, cycle: float = 60.0) -> JunctionPlan:
     """Junctions with fixed-time signals of two groups where the map has signals."""
     zones = zones_of(graph)
     n = len(zones.polygon)
@@ -116,10 +116,10 @@ def junction_plan(graph: RoadGraph, lanes: Lanes, *, seed: int, cycle: float = 6
         axis[z] = np.angle(np.exp(4j * lanes.leave[into]).sum()) / 4
         lit[z] = bool(graph.signals[nodes].any())
     shift = generator(seed, "traffic", "signals").uniform(0, cycle, n)
-    return Plan(zones, axis, lit, Signals(np.full(n, cycle), shift, np.empty((0, 4))))
+    return JunctionPlan(zones, axis, lit, Signals(np.full(n, cycle), shift, np.empty((0, 4))))
 
 
-def signal_group(plan: Plan, zone: int, *, heading: float) -> int:
+def signal_group(plan: JunctionPlan, zone: int, *, heading: float) -> int:
     """Group of a junction's signals that speaks to traffic of a heading, -1 without signals."""
     if not plan.lit[zone]:
         return -1

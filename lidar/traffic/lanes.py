@@ -161,7 +161,7 @@ def lane_shift(lanes: Lanes, edge: int, *, lane: int, width: float, kerb: bool =
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class ActorPath:
     """Where a mover's middle goes, a row every `STEP` true metres.
 
     xyz       : (n, 3) scene metres
@@ -185,13 +185,13 @@ class Way:
         """Number of stations."""
         return len(self.xyz)
 
-    def part(self, first: int, last: int) -> Way:
+    def part(self, first: int, last: int) -> ActorPath:
         """The stations from the first up to, not including, the last."""
         columns = {f.name: getattr(self, f.name)[first:last] for f in fields(self) if f.name != "scale"}
         return replace(self, **columns)
 
 
-def wander(
+def random_lanes(
     lanes: Lanes,
     rng: np.random.Generator,
     *,
@@ -244,7 +244,7 @@ def wander(
     return edges, picked
 
 
-def way_along(
+def path_along_lanes(
     lanes: Lanes,
     edges: Sequence[int],
     *,
@@ -253,7 +253,7 @@ def way_along(
     radius: float,
     scale: float,
     kerb: bool = False,
-) -> Way:
+) -> ActorPath:
     """The way along lanes of edges that follow each other, rounded to bends of ``radius`` and more.
 
     width  : metres of the body
@@ -286,11 +286,11 @@ def way_along(
     return rounded(line, edge, lane=lane, limit=graph.speed[edge], radius=radius, scale=scale)
 
 
-def rounded(line: Float, edge: Ints, *, lane: Ints, limit: Float, radius: float, scale: float) -> Way:
+def rounded(line: Float, edge: Ints, *, lane: Ints, limit: Float, radius: float, scale: float) -> ActorPath:
     """The way along a line (n, 3) of evenly spaced points, rounded to bends of ``radius`` and more.
 
     radius            : true metres
-    edge, lane, limit : columns of `Way` at the points
+    edge, lane, limit : columns of `ActorPath` at the points
     """
     gap = STEP * scale
     smooth = relaxed(line[:, :2], 0.95 / radius / scale, reach=0.45 * radius)
@@ -301,7 +301,7 @@ def rounded(line: Float, edge: Ints, *, lane: Ints, limit: Float, radius: float,
     out = np.column_stack(
         [*(np.interp(even, length, smooth[:, c]) for c in (0, 1)), np.interp(even, length, line[:, 2])]
     )
-    return Way(
+    return ActorPath(
         out,
         line_heading(out[:, :2]),
         line_curvature(out[:, :2]) * scale,

@@ -15,7 +15,7 @@ from lidar.random_streams import generator
 from lidar.traffic.lanes import Lanes, beside, lane_shift
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import standing, table
-from lidar.traffic.traffic import pick
+from lidar.traffic.trips import pick
 from lidar.world.actors import Actors
 
 CARS = {"hatchback": 0.38, "sedan": 0.30, "suv": 0.22, "van": 0.10}
@@ -31,7 +31,7 @@ _AISLE = 6.0
 
 
 @dataclass(frozen=True, slots=True)
-class Spots:
+class ParkingSpaces:
     """Where bodies may stand.
 
     xy      : (n, 2) scene metres, the middle of the box
@@ -44,12 +44,14 @@ class Spots:
     hint: Float
 
 
-def concatenated(parts: Sequence[Spots]) -> Spots:
+def concatenated(parts: Sequence[ParkingSpaces]) -> ParkingSpaces:
     """All spots, in order."""
-    return Spots(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Spots)))
+    return ParkingSpaces(
+        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ParkingSpaces))
+    )
 
 
-def kerb_spots(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: float) -> Spots:
+def kerb_spaces(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: float) -> ParkingSpaces:
     """Places along kerbs on the edges ``near``, a share of them, at random."""
     g = lanes.graph
     xy, heading, hint = [], [], []
@@ -82,11 +84,11 @@ def kerb_spots(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: float
             heading.append(np.arctan2(d[1], d[0]) + turned + rng.normal(0.0, 0.012, len(at)))
             hint.append(np.interp(at, along, line[:, 2]))
     if not xy:
-        return Spots(np.empty((0, 2)), np.empty(0), np.empty(0))
-    return Spots(np.concatenate(xy), np.concatenate(heading), np.concatenate(hint))
+        return ParkingSpaces(np.empty((0, 2)), np.empty(0), np.empty(0))
+    return ParkingSpaces(np.concatenate(xy), np.concatenate(heading), np.concatenate(hint))
 
 
-def lot_spots(lots: NDArray[np.object_], *, seed: int, share: float) -> Spots:
+def lot_spaces(lots: NDArray[np.object_], *, seed: int, share: float) -> ParkingSpaces:
     """Places in parking lots: rows across the lot's longer side, with aisles between pairs of rows."""
     xy, heading = [], []
     wide, deep = _SLOT
@@ -118,13 +120,13 @@ def lot_spots(lots: NDArray[np.object_], *, seed: int, share: float) -> Spots:
             xy.append(points[fits])
             heading.append((angle + backwards + rng.normal(0.0, 0.02, len(at)))[fits])
     if not xy:
-        return Spots(np.empty((0, 2)), np.empty(0), np.empty(0))
+        return ParkingSpaces(np.empty((0, 2)), np.empty(0), np.empty(0))
     whole = np.concatenate(xy)
-    return Spots(whole, np.concatenate(heading), np.full(len(whole), np.nan))
+    return ParkingSpaces(whole, np.concatenate(heading), np.full(len(whole), np.nan))
 
 
 def parked_actors(
-    spots: Spots,
+    spots: ParkingSpaces,
     scene: Scene,
     *,
     kinds: dict[str, float],

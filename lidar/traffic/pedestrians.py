@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.random_streams import generator
-from lidar.traffic.area import Area
-from lidar.traffic.lanes import STEP, Lanes, Way, beside, rounded
-from lidar.traffic.traffic import Driver, Trip, pick, varied
+from lidar.traffic.lanes import STEP, ActorPath, Lanes, beside, rounded
+from lidar.traffic.surroundings import Surroundings
+from lidar.traffic.trips import Driver, Trip, pick, varied
 
 _KINDS = {"adult": 0.5, "small_adult": 0.38, "child": 0.12}
 _FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}
@@ -37,7 +37,7 @@ _PIECE = 12.0  # metres of a stretch of sidewalk that is worth walking
 
 
 @dataclass(frozen=True, slots=True)
-class Walks:
+class Sidewalks:
     """Stretches of sidewalk along streets.
 
     line  : (w,) object, each (k, 3) float64 scene metres, in the direction of its edge
@@ -50,15 +50,15 @@ class Walks:
     side: list[int]
 
 
-def walks_of(
-    lanes: Lanes, area: Area, *, pavement: shapely.Geometry | None, standing: NDArray[np.object_]
-) -> Walks:
+def sidewalks_around(
+    lanes: Lanes, area: Surroundings, *, pavement: shapely.Geometry | None, standing: NDArray[np.object_]
+) -> Sidewalks:
     """Stretches of sidewalk around the ego's way, clear of what stands there.
 
     pavement : the sidewalks, None for none
     standing : polygons of buildings, poles and trunks
     """
-    out = Walks([], [], [])
+    out = Sidewalks([], [], [])
     if pavement is None:
         return out
     g = lanes.graph
@@ -99,7 +99,9 @@ def _plan(line: Float) -> float:
     return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
 
 
-def walker_trips(lanes: Lanes, area: Area, *, walks: Walks, seed: int, density: float) -> list[Trip]:
+def pedestrian_trips(
+    lanes: Lanes, area: Surroundings, *, walks: Sidewalks, seed: int, density: float
+) -> list[Trip]:
     """People at random places on the sidewalks; half of those who come to a crossing take it.
 
     density : people per kilometre of sidewalk
@@ -137,7 +139,7 @@ def walker_trips(lanes: Lanes, area: Area, *, walks: Walks, seed: int, density: 
 
 
 def _stroll(
-    walks: Walks,
+    walks: Sidewalks,
     crossings: Mapping[int, list[tuple[int, float, float, int]]],
     *,
     walk: int,
@@ -173,7 +175,7 @@ def _stroll(
     return parts, over
 
 
-def _crossings(lanes: Lanes, walks: Walks) -> dict[int, list[tuple[int, float, float, int]]]:
+def _crossings(lanes: Lanes, walks: Sidewalks) -> dict[int, list[tuple[int, float, float, int]]]:
     """Crossings by the stretch of sidewalk from which they start.
 
     Each is the stretch opposite, metres along the one and the other, and the crossing's number.
@@ -211,7 +213,7 @@ def _crossings(lanes: Lanes, walks: Walks) -> dict[int, list[tuple[int, float, f
 
 def _way(
     parts: list[Float], over: list[tuple[int, int]], *, scale: float
-) -> tuple[Way, tuple[tuple[int, int, int], ...]]:
+) -> tuple[ActorPath, tuple[tuple[int, int, int], ...]]:
     """The way along lines, and the stations between which it is on the crossings that follow some of them."""
     line = np.concatenate(parts)
     ends = np.cumsum([len(p) for p in parts])
@@ -232,7 +234,7 @@ def _way(
     return way, tuple(crossed)
 
 
-def _nearest(way: Way, point: Float, *, about: float) -> int:
+def _nearest(way: ActorPath, point: Float, *, about: float) -> int:
     """The station of a way nearest to a point, near a guess."""
     low = int(np.clip(about - 16, 0, len(way) - 1))
     part = way.xyz[low : int(about) + 17, :2]

@@ -16,15 +16,15 @@ from geoscene.scene.geopackage import Layer, read_layer
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.rig.vehicle import Vehicle
-from lidar.traffic.area import Area, area_of, ego_line
-from lidar.traffic.flow import simulate_trips
-from lidar.traffic.junctions import Plan, junction_plan
+from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import Lanes, beside, lane_shift, lanes_of
-from lidar.traffic.parked import CARS, concatenated, kerb_spots, lot_spots, parked_actors
-from lidar.traffic.pedestrians import walker_trips, walks_of
+from lidar.traffic.parked import CARS, concatenated, kerb_spaces, lot_spaces, parked_actors
+from lidar.traffic.pedestrians import pedestrian_trips, sidewalks_around
+from lidar.traffic.simulation import simulate_trips
+from lidar.traffic.surroundings import Surroundings, ego_line, surroundings_of
 from lidar.traffic.sweep import body_poses, rectangles
 from lidar.traffic.tracks import moving_actors
-from lidar.traffic.traffic import Trip, vehicle_trips
+from lidar.traffic.trips import Trip, vehicle_trips
 from lidar.world.actors import Actors, joined
 
 _ROAD = ("road", "lane_marking", "crossing", "parking")
@@ -73,7 +73,7 @@ class TrafficOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Company:
+class TrafficSetup:
     """Who is about during a drive, before anybody moves.
 
     plan, area : junctions, and the surroundings of the ego
@@ -85,8 +85,8 @@ class Company:
     """
 
     lanes: Lanes
-    plan: Plan
-    area: Area
+    plan: JunctionPlan
+    area: Surroundings
     trips: list[Trip]
     standing: NDArray[np.object_]
     surfaces: Layer | None
@@ -106,26 +106,26 @@ def populate(
     """The road users around the ego vehicle for its whole drive; the same for the same seed and options.
 
     ego     : the ego vehicle's trajectory, which is given: the others keep clear of it, signals are green
-              for it; see `drive_among` for an ego that is one of the traffic
+              for it; see `drive_in_traffic` for an ego that is one of the traffic
     vehicle : its size
 
     Raises InputError for a scene whose features cannot be read.
     """
     options = options or TrafficOptions()
-    company = company_of(scene, graph, ego=ego, seed=seed, options=options)
-    return settled(
-        scene, graph, ego=ego, vehicle=vehicle, company=company, seed=seed, options=options, obeys=False
+    setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
+    return simulated_actors(
+        scene, graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed, options=options, obeys=False
     )
 
 
-def company_of(
+def traffic_setup(
     scene: Scene, graph: RoadGraph, *, ego: Trajectory, seed: int, options: TrafficOptions
-) -> Company:
+) -> TrafficSetup:
     """Those who are about in the surroundings of an ego that moves so."""
     lanes = lanes_of(graph, side=options.side, bounds=scene.bounds)
     plan = junction_plan(graph, lanes, seed=seed)
     scale = float(np.mean(np.asarray(scene.frame.scale_at(*ego.position[0, :2]), float)))
-    area = area_of(lanes, ego, reach=options.reach, scale=scale)
+    area = surroundings_of(lanes, ego, reach=options.reach, scale=scale)
     around = shapely.buffer(ego_line(ego), (options.reach + 30.0) * scale)
     shapely.prepare(around)
     surfaces = _layer(scene, "road_surfaces")
@@ -138,41 +138,41 @@ def company_of(
     trips += vehicle_trips(
         lanes, area, seed=seed, density=options.cyclists, shares={"cyclist": 1.0}, ground=road
     )
-    walks = walks_of(
+    walks = sidewalks_around(
         lanes, area, pavement=_union(surfaces, ("sidewalk",), area=around, grow=0.0), standing=standing
     )
-    trips += walker_trips(lanes, area, walks=walks, seed=seed, density=options.walkers)
-    return Company(lanes, plan, area, trips, standing, surfaces, around, scale)
+    trips += pedestrian_trips(lanes, area, walks=walks, seed=seed, density=options.walkers)
+    return TrafficSetup(lanes, plan, area, trips, standing, surfaces, around, scale)
 
 
-def settled(
+def simulated_actors(
     scene: Scene,
     graph: RoadGraph,
     *,
     ego: Trajectory,
     vehicle: Vehicle,
-    company: Company,
+    setup: TrafficSetup,
     seed: int,
     options: TrafficOptions,
     obeys: bool,
 ) -> Actors:
-    """The actors of a company: where they go and stand about an ego whose motion is given.
+    """The actors of a setup: where they go and stand about an ego whose motion is given.
 
     obeys : whether that motion keeps to the signals; otherwise they are green when it comes
     """
-    trips, plan = company.trips, company.plan
+    trips, plan = setup.trips, setup.plan
     box = (vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang)
     flow = simulate_trips(
-        trips, graph, plan=plan, ego=ego, ego_box=box, reach=options.reach * company.scale, obeys=obeys
+        trips, graph, plan=plan, ego=ego, ego_box=box, reach=options.reach * setup.scale, obeys=obeys
     )
     return joined(
         [
-            moving_actors(trips, flow, scene=scene, scale=company.scale),
-            parked_about(
+            moving_actors(trips, flow, scene=scene, scale=setup.scale),
+            parked_vehicles(
                 scene,
                 ego,
                 vehicle=vehicle,
-                company=company,
+                setup=setup,
                 swept=_swept(trips),
                 seed=seed,
                 share=options.parked,
@@ -187,12 +187,12 @@ def first_feature(scene: Scene) -> int:
     return max((stop for _, stop in scene.layers.values()), default=0)
 
 
-def parked_about(
+def parked_vehicles(
     scene: Scene,
     ego: Trajectory,
     *,
     vehicle: Vehicle,
-    company: Company,
+    setup: TrafficSetup,
     swept: NDArray[np.object_],
     seed: int,
     share: float,
@@ -202,30 +202,30 @@ def parked_about(
     swept : what those who move cover, as polygons in plan
     share : of the places that are taken
     """
-    surfaces, around, lanes = company.surfaces, company.around, company.lanes
+    surfaces, around, lanes = setup.surfaces, setup.around, setup.lanes
     lots = _polygons(_layer(scene, "landcover"), ("parking",), area=around)
     structures = _layer(scene, "structures")
     crossings = shapely.buffer(_polygons(surfaces, ("crossing",), area=around), 2.0)
     free = [
-        _ego_boxes(ego, vehicle, scale=company.scale),
+        _ego_boxes(ego, vehicle, scale=setup.scale),
         swept,
-        _strips(lanes, company.area),
-        shapely.buffer(company.plan.zones.polygon, 3.0),
+        _strips(lanes, setup.area),
+        shapely.buffer(setup.plan.zones.polygon, 3.0),
         crossings,
         np.empty(0, object) if structures is None else shapely.buffer(structures.geometry, 0.5),
     ]
-    trees = [shapely.STRtree(part) for part in (company.standing, np.concatenate(free))]
+    trees = [shapely.STRtree(part) for part in (setup.standing, np.concatenate(free))]
     spots = concatenated(
         [
-            kerb_spots(lanes, company.area.near, seed=seed, share=share),
-            lot_spots(lots, seed=seed, share=share),
+            kerb_spaces(lanes, setup.area.near, seed=seed, share=share),
+            lot_spaces(lots, seed=seed, share=share),
         ]
     )
-    return parked_actors(spots, scene, kinds=CARS, trees=trees, seed=seed, scale=company.scale)
+    return parked_actors(spots, scene, kinds=CARS, trees=trees, seed=seed, scale=setup.scale)
 
 
 def _passable(
-    road: shapely.Geometry, standing: NDArray[np.object_], *, lanes: Lanes, area: Area
+    road: shapely.Geometry, standing: NDArray[np.object_], *, lanes: Lanes, area: Surroundings
 ) -> shapely.Geometry:
     """Carriageways less the buildings that stand on them, but for bridges and what runs under buildings."""
     houses = standing[shapely.area(standing) > _HOUSE]
@@ -248,7 +248,7 @@ def _swept(trips: list[Trip]) -> NDArray[np.object_]:
     return np.concatenate(parts)
 
 
-def _strips(lanes: Lanes, area: Area) -> NDArray[np.object_]:
+def _strips(lanes: Lanes, area: Surroundings) -> NDArray[np.object_]:
     """Lanes around the ego's way as wide as a car."""
     lines = [
         beside(lanes.graph.geometry[e], -lanes.side * lane_shift(lanes, e, lane=lane, width=1.82))[:, :2]

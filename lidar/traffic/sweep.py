@@ -12,13 +12,13 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.typing import Float
-from lidar.traffic.lanes import STEP, Way
+from lidar.traffic.lanes import STEP, ActorPath
 
-SQUARE = 0.3
+CELL = 0.3
 """Metres of a square's side. Two bodies that share no square do not touch: squares are taken whose middle
 lies within half a diagonal of the body."""
 _MANY = 1 << 30  # squares along a side of the grid: 322,000 km
-_SPARE = 0.05 + SQUARE * math.sqrt(0.5)
+_SPARE = 0.05 + CELL * math.sqrt(0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +48,13 @@ def sweep(
     """
     # a body between two stations lies within both, grown by half a step
     half = np.array([length / 2 + STEP / 2, width / 2]) * scale + _SPARE
-    most = int(math.ceil(2 * half[0] / SQUARE) + 2) * int(math.ceil(2 * half[1] / SQUARE) + 2)
+    most = int(math.ceil(2 * half[0] / CELL) + 2) * int(math.ceil(2 * half[1] / CELL) + 2)
     square, first, last, count = _cover(xy, heading, half, level, most)
     square, first, last = square[:count], first[:count], last[:count]
     return Sweep(square, first, last, np.argsort(last, kind="stable").astype(np.int32))
 
 
-def body_poses(way: Way, axle: float) -> tuple[Float, Float]:
+def body_poses(way: ActorPath, axle: float) -> tuple[Float, Float]:
     """Middle (n, 2) and heading (n,) of a body at each station, whose axles stay on the way."""
     reach = axle / 2 / STEP
     rows = np.arange(len(way), dtype=float)
@@ -81,14 +81,14 @@ def rectangles(xy: Float, heading: Float, *, length: ArrayLike, width: ArrayLike
 
 
 @njit(cache=True, nogil=True)
-def squares_under(x: float, y: float, heading: float, half: Any, level: int, out: Any) -> int:
+def cells_under(x: float, y: float, heading: float, half: Any, level: int, out: Any) -> int:
     """Fill ``out`` with the squares whose middle lies in a rectangle; return their number."""
     c, s, hl, hw = math.cos(heading), math.sin(heading), half[0], half[1]
     ex, ey = abs(c) * hl + abs(s) * hw, abs(s) * hl + abs(c) * hw
     n = 0
-    for j in range(math.ceil((y - ey) / SQUARE - 0.5), math.floor((y + ey) / SQUARE - 0.5) + 1):
-        for i in range(math.ceil((x - ex) / SQUARE - 0.5), math.floor((x + ex) / SQUARE - 0.5) + 1):
-            dx, dy = (i + 0.5) * SQUARE - x, (j + 0.5) * SQUARE - y
+    for j in range(math.ceil((y - ey) / CELL - 0.5), math.floor((y + ey) / CELL - 0.5) + 1):
+        for i in range(math.ceil((x - ex) / CELL - 0.5), math.floor((x + ex) / CELL - 0.5) + 1):
+            dx, dy = (i + 0.5) * CELL - x, (j + 0.5) * CELL - y
             if abs(dx * c + dy * s) <= hl and abs(dy * c - dx * s) <= hw:
                 out[n] = (level * _MANY + j + _MANY // 2) * _MANY + i + _MANY // 2
                 n += 1
@@ -105,7 +105,7 @@ def _cover(xy: Any, heading: Any, half: Any, level: Any, most: int) -> Any:
     seen = {np.int64(-1): 0}  # row of each square last seen
     count = 0
     for k in range(n):
-        found = squares_under(xy[k, 0], xy[k, 1], heading[k], half, level[k], under)
+        found = cells_under(xy[k, 0], xy[k, 1], heading[k], half, level[k], under)
         if count + found > len(square):
             square = np.concatenate((square, np.empty_like(square)))
             first, last = np.concatenate((first, first)), np.concatenate((last, last))

@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.scene import Scene
 from geoscene.typing import Float
-from lidar.traffic.flow import DT, Flow
 from lidar.traffic.ground import ground_heights
 from lidar.traffic.lanes import STEP
+from lidar.traffic.simulation import DT, SimulatedTrips
 from lidar.traffic.sweep import body_poses
-from lidar.traffic.traffic import Trip
+from lidar.traffic.trips import Trip
 from lidar.world.actor_shapes import STRIDE, Shape, catalogue
 from lidar.world.actors import Actors
 
@@ -77,7 +77,7 @@ def table(
     )
 
 
-def moving_actors(trips: Sequence[Trip], flow: Flow, *, scene: Scene, scale: float) -> Actors:
+def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, scale: float) -> Actors:
     """Actors of the trips that took place."""
     present, counts = np.unique(flow.trip, return_counts=True)
     ends = np.concatenate([[0], np.cumsum(counts)])

@@ -31,7 +31,7 @@ from lidar.errors import DatasetError, InputError, LidarError
 from lidar.geometry.attitude import quat_from_euler
 from lidar.planning.travel import plan_travel, road_graph
 from lidar.rig.vehicle import load_vehicle
-from lidar.traffic.among import drive_obeying
+from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.populate import TrafficOptions
 
 BOX = (24.9405, 60.1655, 24.9475, 60.1690)
@@ -272,7 +272,7 @@ def test_a_random_drive_is_under_way_from_first_to_last_unless_it_is_to_be_from_
         speeds = {}
         for from_rest in (False, True):
             travel = plan_travel(scene, "random", vehicle="car", seed=seed, duration=3.0, from_rest=from_rest)
-            trajectory = drive_obeying(
+            trajectory = drive_with_signals(
                 travel.path, load_vehicle("car"), graph=road_graph(scene), seed=seed, bounds=scene.bounds,
                 duration=3.0, under_way=travel.under_way,
             )  # fmt: skip

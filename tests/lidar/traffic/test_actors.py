@@ -21,7 +21,7 @@ from lidar.rig.scanner import load_sensor
 from lidar.rig.specs import CameraSpec
 from lidar.rig.vehicle import load_vehicle
 from lidar.sensors.scan import scan
-from lidar.traffic.among import drive_obeying
+from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.populate import TrafficOptions, populate
 from lidar.traffic.sweep import rectangles
 from lidar.world.actors import actor_shapes, actor_transforms, alive, rotations, states, velocities
@@ -42,7 +42,7 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def ego(scene):
     travel = plan_travel(scene, "random", vehicle="car", seed=2, duration=15.0)
-    return drive_obeying(
+    return drive_with_signals(
         travel.path, load_vehicle("car"), graph=road_graph(scene), seed=2, bounds=scene.bounds, duration=15.0,
         under_way=travel.under_way,
     )  # fmt: skip

@@ -17,9 +17,9 @@ from lidar.geometry.poses import Trajectory
 from lidar.planning.travel import road_graph
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.fcd import TrafficFile, read_fcd
+from lidar.traffic.fcd_replay import replay
 from lidar.traffic.ground import ground_heights
 from lidar.traffic.lanes import beside
-from lidar.traffic.replayed import replay
 from lidar.world.actors import alive, rotations, states
 
 BOX = (24.9405, 60.1655, 24.9475, 60.1690)

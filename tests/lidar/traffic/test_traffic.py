@@ -16,13 +16,13 @@ from lidar.geometry.poses import Trajectory
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
 from lidar.planning.route import plan_route
-from lidar.traffic.area import area_of
-from lidar.traffic.flow import DT, ego_on, green_windows, simulate_trips
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
-from lidar.traffic.lanes import STEP, lane_shift, lanes_of, wander
-from lidar.traffic.simulate import HARD
+from lidar.traffic.lanes import STEP, lane_shift, lanes_of, random_lanes
+from lidar.traffic.simulation import DT, ego_motion, green_windows, simulate_trips
+from lidar.traffic.simulation_kernel import HARD
+from lidar.traffic.surroundings import surroundings_of
 from lidar.traffic.sweep import body_poses, rectangles
-from lidar.traffic.traffic import vehicle_trips
+from lidar.traffic.trips import vehicle_trips
 
 
 def standing(xy, seconds):
@@ -46,7 +46,7 @@ def city(*, lit, lanes=1.0, width=7.0):
 def flow_on(graph, ego, *, seed, density=25.0, reach=400.0, shares=None):
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
     plan = junction_plan(graph, lanes, seed=seed)
-    area = area_of(lanes, ego, reach=reach, scale=1.0)
+    area = surroundings_of(lanes, ego, reach=reach, scale=1.0)
     trips = vehicle_trips(lanes, area, seed=seed, density=density, shares=shares)
     return trips, simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, reach=reach), plan
 
@@ -57,7 +57,7 @@ def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
 
     def drive(lanes, seed):
         rng = np.random.default_rng(seed)
-        return wander(
+        return random_lanes(
             lanes, rng, edge=seed % len(graph), lane=0, metres=2000.0, inside=everywhere, width=1.8
         )[0]
 
@@ -95,7 +95,7 @@ def test_not_even_reckless_drivers_touch():
     graph = city(lit=False)
     ego = standing((400.0, 400.0), 45.0)
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
-    trips = vehicle_trips(lanes, area_of(lanes, ego, reach=600.0, scale=1.0), seed=9, density=30.0)
+    trips = vehicle_trips(lanes, surroundings_of(lanes, ego, reach=600.0, scale=1.0), seed=9, density=30.0)
     wild = [
         replace(
             t, driver=replace(t.driver, headway=0.0, gap=0.0, brake=50.0, pull=4.0), wish=0 * t.wish + 16.0
@@ -222,7 +222,7 @@ def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
     road = shapely.union_all([shapely.LineString(line[:, :2]).buffer(7.3) for line in graph.geometry])
     for side, sign in (("right", 1), ("left", -1)):
         lanes = lanes_of(graph, side=side, bounds=(-30.0, -30.0, 300.0, 300.0))
-        area = area_of(lanes, standing((400.0, 400.0), 30.0), reach=600.0, scale=1.0)
+        area = surroundings_of(lanes, standing((400.0, 400.0), 30.0), reach=600.0, scale=1.0)
         trips = vehicle_trips(lanes, area, seed=1, density=10.0, ground=road)
         assert len(trips) > 10
         for trip in trips:
@@ -262,7 +262,7 @@ def test_signals_are_green_for_the_ego_when_it_comes():
     ego = driving(graph, 3, 40.0)
     lanes = lanes_of(graph)
     plan = junction_plan(graph, lanes, seed=11)
-    signals = plan.signals._replace(window=green_windows(plan, ego_on(ego, BOX, graph=graph)))
+    signals = plan.signals._replace(window=green_windows(plan, ego_motion(ego, BOX, graph=graph)))
     times = np.arange(0.0, 40.0, 0.1)
     at = ego.at((times * 1e9).astype(np.int64))
     zone = zone_at(plan.zones, at.position[:, :2])

@@ -10,8 +10,8 @@ import shapely
 
 from geoscene.typing import Float
 from lidar.random_streams import generator
-from lidar.traffic.area import Area, entrances
-from lidar.traffic.lanes import STEP, Lanes, Way, wander, way_along
+from lidar.traffic.lanes import STEP, ActorPath, Lanes, path_along_lanes, random_lanes
+from lidar.traffic.surroundings import Surroundings, entrances
 from lidar.traffic.sweep import body_poses, rectangles
 from lidar.world.actor_shapes import PAINTS, Shape, catalogue
 
@@ -58,7 +58,7 @@ DRIVERS: dict[str, Driver] = {
 lorries and buses slower. Radii: of the middle, from kerb-to-kerb turning circles of such vehicles, nominal.
 Cyclists: assumed."""
 
-MOTOR_SHARES = {
+VEHICLE_SHARES = {
     "sedan": 0.30,
     "hatchback": 0.30,
     "suv": 0.20,
@@ -87,7 +87,7 @@ class Trip:
 
     shape: Shape
     stretch: tuple[float, float, float]
-    way: Way
+    way: ActorPath
     driver: Driver
     wish: Float
     begin: int
@@ -118,7 +118,7 @@ class Trip:
 
 def vehicle_trips(
     lanes: Lanes,
-    area: Area,
+    area: Surroundings,
     *,
     seed: int,
     density: float,
@@ -128,10 +128,10 @@ def vehicle_trips(
     """Vehicles at random places on the lanes around the ego, and others that come in from the rim in time.
 
     density : vehicles per kilometre of lane
-    shares  : of kinds of `DRIVERS`; `MOTOR_SHARES` by default
+    shares  : of kinds of `DRIVERS`; `VEHICLE_SHARES` by default
     ground  : the carriageways; ways that leave them are not driven
     """
-    shares = shares or MOTOR_SHARES
+    shares = shares or VEHICLE_SHARES
     graph, liking = lanes.graph, lanes.liking
     metres = graph.length * lanes.count * area.near * (liking > 0) * np.maximum(liking, 0.05) * lanes.open
     name = "+".join(shares)
@@ -162,7 +162,7 @@ def vehicle_trips(
 
 def _trip(
     lanes: Lanes,
-    area: Area,
+    area: Surroundings,
     *,
     rng: np.random.Generator,
     shares: dict[str, float],
@@ -188,8 +188,10 @@ def _trip(
     top = min(float(lanes.graph.speed.max()) * 1.1, driver.top)
     metres = min(top * (span[1] - span[0]), _FAR) + 60.0
     for _ in range(_TRIES):
-        edges, picked = wander(lanes, rng, edge=edge, lane=lane, metres=metres, inside=area.near, width=width)
-        whole = way_along(
+        edges, picked = random_lanes(
+            lanes, rng, edge=edge, lane=lane, metres=metres, inside=area.near, width=width
+        )
+        whole = path_along_lanes(
             lanes, edges, picked=picked, width=width, radius=driver.radius, scale=area.scale, kerb=driver.kerb
         )
         begin = int(at * float(lanes.graph.length[edge]) / STEP)
@@ -227,7 +229,7 @@ def varied(rng: np.random.Generator) -> tuple[float, float, float]:
 
 
 def _on(
-    way: Way, shape: Shape, *, grow: Sequence[float], ground: shapely.Geometry | None, begin: int
+    way: ActorPath, shape: Shape, *, grow: Sequence[float], ground: shapely.Geometry | None, begin: int
 ) -> tuple[int, int]:
     """First and last station (exclusive) about ``begin`` between which the body keeps to the carriageway."""
     if ground is None:
@@ -241,7 +243,7 @@ def _on(
     return int(before[-1]) + 1 if len(before) else 0, int(behind[0]) if len(behind) else len(way)
 
 
-def desired_speed(way: Way, driver: Driver, *, pace: float) -> Float:
+def desired_speed(way: ActorPath, driver: Driver, *, pace: float) -> Float:
     """Speed (n,) that a driver wants at each station, m/s: limit, bend, and braking for what is ahead."""
     bend = np.maximum(np.abs(way.curvature), 1e-6)
     v = np.minimum(np.minimum(way.limit * pace, driver.top), np.sqrt(_LATERAL / bend))

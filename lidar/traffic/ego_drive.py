@@ -12,12 +12,12 @@ from lidar.planning.motion import drive_path, poses_along
 from lidar.planning.path import Path
 from lidar.planning.speed_profile import motion_behind
 from lidar.rig.vehicle import Vehicle
-from lidar.traffic.ego import ego_trip
-from lidar.traffic.flow import DT, meets_control, simulate_ego
-from lidar.traffic.junctions import Plan, junction_plan
+from lidar.traffic.ego_trip import ego_trip
+from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import lanes_of
-from lidar.traffic.populate import TrafficOptions, company_of, settled
-from lidar.traffic.traffic import Trip
+from lidar.traffic.populate import TrafficOptions, simulated_actors, traffic_setup
+from lidar.traffic.simulation import DT, has_traffic_control, simulate_ego
+from lidar.traffic.trips import Trip
 from lidar.world.actors import Actors
 
 _ROUNDS = 3  # times that the ego's drive is planned among those who are about during the last plan
@@ -26,7 +26,7 @@ _LONGER = (2.0, 90.0)  # a drive to an end takes at most so many times as long a
 _ON_S = 10.0  # seconds that a drive that is under way is planned beyond the record's end
 
 
-def drive_obeying(
+def drive_with_signals(
     path: Path,
     vehicle: Vehicle,
     *,
@@ -46,7 +46,7 @@ def drive_obeying(
     """
     alone = drive_path(path, vehicle, duration=duration, under_way=under_way)
     plan = junction_plan(graph, lanes_of(graph, side=side, bounds=bounds), seed=seed)
-    if not meets_control(ego_trip(path, vehicle), graph, plan=plan):
+    if not has_traffic_control(ego_trip(path, vehicle), graph, plan=plan):
         return alone
     return _driven(
         path,
@@ -61,7 +61,7 @@ def drive_obeying(
     )
 
 
-def drive_among(
+def drive_in_traffic(
     scene: Scene,
     graph: RoadGraph,
     *,
@@ -75,7 +75,7 @@ def drive_among(
 ) -> tuple[Trajectory, Actors]:
     """The trajectory of a vehicle along a path as one of the traffic, and the others.
 
-    first    : its trajectory without the others, such as `drive_obeying` gives
+    first    : its trajectory without the others, such as `drive_with_signals` gives
     duration, under_way : as for `drive_path`
 
     The ego is simulated together with the others and keeps its distance as they do; its motion is then
@@ -85,23 +85,23 @@ def drive_among(
     options = options or TrafficOptions()
     ego = first
     for _ in range(_ROUNDS):
-        company = company_of(scene, graph, ego=ego, seed=seed, options=options)
-        before, reach = ego, options.reach * company.scale
+        setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
+        before, reach = ego, options.reach * setup.scale
         ego = _driven(
             path,
             vehicle,
             graph=graph,
-            plan=company.plan,
-            trips=company.trips,
+            plan=setup.plan,
+            trips=setup.trips,
             alone=first,
             duration=duration,
             reach=reach,
             under_way=under_way,
         )
-        if _apart(before, ego) < _SAME * company.scale:
+        if _apart(before, ego) < _SAME * setup.scale:
             break
-    return ego, settled(
-        scene, graph, ego=ego, vehicle=vehicle, company=company, seed=seed, options=options, obeys=True
+    return ego, simulated_actors(
+        scene, graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed, options=options, obeys=True
     )
 
 
@@ -110,7 +110,7 @@ def _driven(
     vehicle: Vehicle,
     *,
     graph: RoadGraph,
-    plan: Plan,
+    plan: JunctionPlan,
     trips: list[Trip],
     alone: Trajectory,
     duration: float | None,

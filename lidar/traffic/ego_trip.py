@@ -11,8 +11,8 @@ from geoscene.typing import Float
 from lidar.planning.path import Path
 from lidar.planning.speed_profile import wished_speed
 from lidar.rig.vehicle import Vehicle
-from lidar.traffic.lanes import STEP, Way
-from lidar.traffic.traffic import Driver
+from lidar.traffic.lanes import STEP, ActorPath
+from lidar.traffic.trips import Driver
 
 _ROOM = (0.4, 0.2)
 """Metres by which the ego's box is longer and wider to the others, for what its driver does less exactly."""
@@ -23,12 +23,12 @@ _HEADWAY_S, _GAP = 1.4, 2.0
 
 @dataclass(frozen=True, slots=True)
 class EgoTrip:
-    """The ego's way, in the columns of `lidar.traffic.traffic.Trip`.
+    """The ego's way, in the columns of `lidar.traffic.trips.Trip`.
 
     xy, heading : (n, 2) and (n,) of the box's middle at each station
     """
 
-    way: Way
+    way: ActorPath
     driver: Driver
     wish: Float
     length: float
@@ -57,7 +57,7 @@ def ego_trip(path: Path, vehicle: Vehicle, *, under_way: bool = False) -> EgoTri
     axle = np.stack([np.interp(at, s, path.position[:, c]) for c in range(3)], axis=1)
     xy = axle[:, :2] + ahead * np.column_stack([np.cos(heading), np.sin(heading)])
     row = np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(path) - 1)
-    way = Way(
+    way = ActorPath(
         np.column_stack([xy, axle[:, 2]]),
         heading,
         path.curvature[row],

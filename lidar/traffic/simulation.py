@@ -15,13 +15,13 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import Trajectory
-from lidar.traffic.area import LEFT
-from lidar.traffic.ego import EgoTrip
-from lidar.traffic.junctions import Plan, road_rank, signal_group, zone_at
-from lidar.traffic.lanes import STEP, Way
-from lidar.traffic.simulate import Ego, Movers, run
-from lidar.traffic.sweep import SQUARE, squares_under, sweep
-from lidar.traffic.traffic import Trip
+from lidar.traffic.ego_trip import EgoTrip
+from lidar.traffic.junctions import JunctionPlan, road_rank, signal_group, zone_at
+from lidar.traffic.lanes import STEP, ActorPath
+from lidar.traffic.simulation_kernel import Ego, Movers, run
+from lidar.traffic.surroundings import LEFT
+from lidar.traffic.sweep import CELL, cells_under, sweep
+from lidar.traffic.trips import Trip
 
 DT = 0.1
 """Seconds of a step of the simulation."""
@@ -34,7 +34,7 @@ _LINE_ROOM = 4.0  # metres before the middle of a crossing, or a signal, at whic
 
 
 @dataclass(frozen=True, slots=True)
-class Flow:
+class SimulatedTrips:
     """What became of trips: the knots of those that came to be, by trip and in time.
 
     trip, step : (k,) int64
@@ -51,12 +51,12 @@ def simulate_trips(
     trips: Sequence[Trip],
     graph: RoadGraph,
     *,
-    plan: Plan,
+    plan: JunctionPlan,
     ego: Trajectory,
     ego_box: tuple[float, float, float],
     reach: float,
     obeys: bool = False,
-) -> Flow:
+) -> SimulatedTrips:
     """Trips in time, from the drive's start to its end.
 
     ego_box : length, width and metres from the rear axle to the middle of the ego's box
@@ -66,10 +66,10 @@ def simulate_trips(
     """
     if not trips:
         none = np.empty(0, np.int64)
-        return Flow(none, none, np.empty(0), np.empty(0))
+        return SimulatedTrips(none, none, np.empty(0), np.empty(0))
     movers = _movers(trips, graph, plan=plan)
-    known = ego_on(ego, ego_box, graph=graph)
-    movers, known, squares = _numbered(movers, known)
+    known = ego_motion(ego, ego_box, graph=graph)
+    movers, known, squares = _number_cells(movers, known)
     signals = plan.signals if obeys else plan.signals._replace(window=green_windows(plan, known))
     out = np.zeros(len(trips), bool)
     for _ in range(_ROUNDS):
@@ -79,11 +79,11 @@ def simulate_trips(
         out |= met
     order = np.lexsort((log[:, 1], log[:, 0]))
     log = log[order]
-    return Flow(log[:, 0].astype(np.int64), log[:, 1].astype(np.int64), log[:, 2], log[:, 3])
+    return SimulatedTrips(log[:, 0].astype(np.int64), log[:, 1].astype(np.int64), log[:, 2], log[:, 3])
 
 
 def simulate_ego(
-    ego: EgoTrip, trips: Sequence[Trip], *, graph: RoadGraph, plan: Plan, seconds: float, reach: float
+    ego: EgoTrip, trips: Sequence[Trip], *, graph: RoadGraph, plan: JunctionPlan, seconds: float, reach: float
 ) -> Float:
     """Metres (t,) along its path that the ego gets by each step of `DT` as one of the traffic.
 
@@ -94,7 +94,7 @@ def simulate_ego(
     x, y, heading, speed = np.zeros((4, steps))
     none = np.empty(0, np.int64)
     known = Ego(x, y, heading, speed, np.full(2, -np.inf), np.zeros(steps + 1, np.int64), none)
-    movers, known, squares = _numbered(movers, known)
+    movers, known, squares = _number_cells(movers, known)
     out = np.zeros(len(trips) + 1, bool)
     log, _ = run(movers, known, plan.signals, out, squares, DT, steps, _HORIZON, reach + LEFT, 0)
     mine = log[:, 0] == 0
@@ -103,13 +103,13 @@ def simulate_ego(
     return np.maximum.accumulate(gone)
 
 
-def meets_control(ego: EgoTrip, graph: RoadGraph, *, plan: Plan) -> bool:
+def has_traffic_control(ego: EgoTrip, graph: RoadGraph, *, plan: JunctionPlan) -> bool:
     """Whether there are signals or stop signs on the ego's way."""
     blocks = _blocks(ego, graph, plan=plan, ways={})
     return bool((blocks[:, 4] >= 0).any() or (blocks[:, 7] > 0).any())
 
 
-def ego_on(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadGraph) -> Ego:
+def ego_motion(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadGraph) -> Ego:
     """What the others know of the ego vehicle; ``box`` as in `simulate_trips`."""
     length, width, ahead = box
     steps = int(ego.duration_ns * 1e-9 / DT) + 2
@@ -121,10 +121,10 @@ def ego_on(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadGraph
     speed = np.interp(time, ego.time_ns, np.hypot(*ego.velocity[:, :2].T))
     level = _levels(middle, graph)
     grown = np.column_stack([length / 2 + _KEEP[0] + speed * DT / 2, np.full(steps, width / 2 + _KEEP[1])])
-    under = np.empty(int(4 * np.prod(grown.max(axis=0) / SQUARE + 2)), np.int64)
+    under = np.empty(int(4 * np.prod(grown.max(axis=0) / CELL + 2)), np.int64)
     events = []
     for k in range(steps):
-        n = squares_under(middle[k, 0], middle[k, 1], heading[k], grown[k], level[k], under)
+        n = cells_under(middle[k, 0], middle[k, 1], heading[k], grown[k], level[k], under)
         events.append(under[:n].copy())
     start = np.concatenate([[0], np.cumsum([len(e) for e in events])])
     half = np.array([length / 2 + 0.2, width / 2 + 0.1])
@@ -148,14 +148,14 @@ def _levels(xyz: Float, graph: RoadGraph) -> Ints:
     return out
 
 
-def _numbered(movers: Movers, ego: Ego) -> tuple[Movers, Ego, int]:
+def _number_cells(movers: Movers, ego: Ego) -> tuple[Movers, Ego, int]:
     """The tables with squares numbered from 0, and how many there are."""
     used, number = np.unique(np.concatenate([movers.square, ego.event_square]), return_inverse=True)
     mine, its = np.split(number.astype(np.int32), [len(movers.square)])
     return movers._replace(square=mine), ego._replace(event_square=its), len(used)
 
 
-def green_windows(plan: Plan, ego: Ego) -> Float:
+def green_windows(plan: JunctionPlan, ego: Ego) -> Float:
     """Windows (w, 4) in which signals are green for the ego: from 8 s before it reaches a junction."""
     zone = zone_at(plan.zones, np.column_stack([ego.x, ego.y]))
     rows = []
@@ -167,7 +167,7 @@ def green_windows(plan: Plan, ego: Ego) -> Float:
     return np.array(rows, float).reshape(-1, 4)
 
 
-def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: Plan) -> Movers:
+def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: JunctionPlan) -> Movers:
     """The tables of the simulation."""
     station, square, blocks = [0], [0], [0]
     columns: dict[str, list[NDArray[Any]]] = {
@@ -226,7 +226,9 @@ def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: Plan) ->
     )
 
 
-def _blocks(trip: Trip | EgoTrip, graph: RoadGraph, *, plan: Plan, ways: dict[tuple[int, ...], int]) -> Float:
+def _blocks(
+    trip: Trip | EgoTrip, graph: RoadGraph, *, plan: JunctionPlan, ways: dict[tuple[int, ...], int]
+) -> Float:
     """Stretches through junctions (b, 8): from, to, stop, zone, group, way, rank, halt; see `Movers`."""
     way = trip.way
     zone = zone_at(plan.zones, way.xyz[:, :2])
@@ -276,7 +278,7 @@ def _stops(graph: RoadGraph, edge: int) -> bool:
     return edge >= 0 and bool(near.any() or graph.stop[graph.head[edge]])
 
 
-def _stop_line(way: Way, graph: RoadGraph, *, edge: int, station: int) -> int:
+def _stop_line(way: ActorPath, graph: RoadGraph, *, edge: int, station: int) -> int:
     """Station of the first line to stop at, on the edge that leads up to a junction at a station."""
     here = graph.control_edge == edge
     offset = graph.control_offset[here]

@@ -18,7 +18,7 @@ LEFT = 100.0
 
 
 @dataclass(frozen=True, slots=True)
-class Area:
+class Surroundings:
     """Where there are road users: within ``reach`` of the ego.
 
     lines  : (m,) the graph's edges in plan
@@ -57,13 +57,13 @@ class Area:
         return float(self.time[np.argmax(left)] if left.any() else self.time[-1])
 
 
-def area_of(lanes: Lanes, ego: Trajectory, *, reach: float, scale: float) -> Area:
+def surroundings_of(lanes: Lanes, ego: Trajectory, *, reach: float, scale: float) -> Surroundings:
     """The surroundings of the ego along its way."""
     lines = edge_lines(lanes.graph)
     seconds = ego.duration_ns * 1e-9
     time = np.linspace(0.0, seconds, max(int(np.ceil(seconds)), 1) + 1)
     xy = ego.at(np.round(time * 1e9).astype(np.int64)).position[:, :2]
-    return Area(lines, shapely.dwithin(lines, ego_line(ego), reach * scale), time, xy, reach, scale)
+    return Surroundings(lines, shapely.dwithin(lines, ego_line(ego), reach * scale), time, xy, reach, scale)
 
 
 def ego_line(ego: Trajectory) -> shapely.Geometry:
@@ -72,7 +72,7 @@ def ego_line(ego: Trajectory) -> shapely.Geometry:
     return shapely.linestrings(xy).simplify(0.2) if np.ptp(xy, axis=0).max() > 0.5 else shapely.points(xy[0])
 
 
-def entrances(lanes: Lanes, area: Area, *, t: float) -> list[tuple[int, float]]:
+def entrances(lanes: Lanes, area: Surroundings, *, t: float) -> list[tuple[int, float]]:
     """Where traffic comes into the surroundings of the ego at a time: edges, and shares of their lengths.
 
     That is where edges cross the rim inwards, and where they come into the map.

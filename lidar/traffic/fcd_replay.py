@@ -17,13 +17,13 @@ from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.random_streams import generator
 from lidar.rig.vehicle import Vehicle
-from lidar.traffic.area import LEFT
 from lidar.traffic.fcd import Fcd, TrafficFile, read_fcd
-from lidar.traffic.flow import DT
-from lidar.traffic.populate import Company, TrafficOptions, company_of, first_feature, parked_about
+from lidar.traffic.populate import TrafficOptions, TrafficSetup, first_feature, parked_vehicles, traffic_setup
+from lidar.traffic.simulation import DT
+from lidar.traffic.surroundings import LEFT
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import tracked
-from lidar.traffic.traffic import MOTOR_SHARES, pick, varied
+from lidar.traffic.trips import VEHICLE_SHARES, pick, varied
 from lidar.world.actor_shapes import Shape
 from lidar.world.actors import Actors, alive, joined, states
 
@@ -74,13 +74,11 @@ def replay(
     others = TrafficOptions(
         vehicles=0.0, cyclists=0.0, walkers=0.0, parked=options.parked, reach=options.reach, side=options.side
     )
-    company = company_of(scene, graph, ego=ego, seed=seed, options=others)
+    setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=others)
     begin = float(fcd.time.min()) if options.begin is None else options.begin
-    moving = _moving(
-        fcd, begin, scene=scene, graph=graph, ego=ego, vehicle=vehicle, company=company, seed=seed
-    )
-    parked = parked_about(
-        scene, ego, vehicle=vehicle, company=company, swept=_covered(moving), seed=seed, share=options.parked
+    moving = _moving(fcd, begin, scene=scene, graph=graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed)
+    parked = parked_vehicles(
+        scene, ego, vehicle=vehicle, setup=setup, swept=_covered(moving), seed=seed, share=options.parked
     )
     return joined([moving, parked], first_feature=first_feature(scene))
 
@@ -93,11 +91,11 @@ def _moving(
     graph: RoadGraph,
     ego: Trajectory,
     vehicle: Vehicle,
-    company: Company,
+    setup: TrafficSetup,
     seed: int,
 ) -> Actors:
     """Those of a file who move in the ego's surroundings."""
-    scale = company.scale
+    scale = setup.scale
     front, heading = _in_scene(fcd, scene)
     shapes, stretch, parts = [], [], []
     anybody = False
@@ -112,7 +110,7 @@ def _moving(
             middle = front[rows][run] - back * np.column_stack([np.cos(yaw), np.sin(yaw)])
             track = _sampled(time[run], middle, yaw=yaw, until=ego.duration_ns * 1e-9)
             anybody |= len(track) > 0 and bool(_inside(track[:, 1:3], scene.bounds).any())
-            for part in _about(track, scene, ego=ego, reach=company.area.reach * scale):
+            for part in _about(track, scene, ego=ego, reach=setup.area.reach * scale):
                 shapes.append(shape)
                 stretch.append(grow)
                 parts.append(part)
@@ -165,7 +163,7 @@ def _body(
 ) -> tuple[Shape, tuple[float, float, float]]:
     """A body of a class, no longer than SUMO's as far as that goes, and its factors."""
     kinds = _KINDS[vclass]
-    weight = np.cumsum([MOTOR_SHARES.get(kind, 1.0) for kind in kinds])
+    weight = np.cumsum([VEHICLE_SHARES.get(kind, 1.0) for kind in kinds])
     shape = pick(kinds[int(np.searchsorted(weight, rng.random() * weight[-1], side="right"))], rng)
     x, y, z = varied(rng)
     if vclass != "pedestrian":

@@ -12,14 +12,14 @@ from lidar.planning.motion import drive_path, poses_along
 from lidar.planning.path import plan_path
 from lidar.planning.route import plan_route
 from lidar.planning.speed_profile import motion_behind
-from lidar.traffic.among import drive_obeying
-from lidar.traffic.area import area_of
-from lidar.traffic.ego import ego_trip
-from lidar.traffic.flow import DT, simulate_ego, simulate_trips
+from lidar.traffic.ego_drive import drive_with_signals
+from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.traffic.lanes import STEP, lanes_of
+from lidar.traffic.simulation import DT, simulate_ego, simulate_trips
+from lidar.traffic.surroundings import surroundings_of
 from lidar.traffic.sweep import rectangles
-from lidar.traffic.traffic import vehicle_trips
+from lidar.traffic.trips import vehicle_trips
 
 BOUNDS = (-30.0, -30.0, 300.0, 300.0)
 
@@ -58,7 +58,7 @@ def check_gentle(ego):
 def test_the_ego_enters_no_junction_on_red(seed, under_way):
     graph = city(lit=True)
     path = path_on(graph, seed, 95.0)
-    ego = drive_obeying(path, CAR, graph=graph, seed=seed, duration=80.0, under_way=under_way)
+    ego = drive_with_signals(path, CAR, graph=graph, seed=seed, duration=80.0, under_way=under_way)
     assert (speed_of(ego)[0] > 1.0) == under_way
     plan = junction_plan(graph, lanes_of(graph), seed=seed)
     times = np.arange(0.0, 80.0, DT)
@@ -85,7 +85,7 @@ def test_at_stop_signs_the_ego_stops_and_goes_on():
         control_kind=np.full(len(graph), "stop"),
     )
     path = path_on(graph, 4, 90.0)
-    ego = drive_obeying(path, CAR, graph=signs, seed=1, duration=90.0)
+    ego = drive_with_signals(path, CAR, graph=signs, seed=1, duration=90.0)
     plan = junction_plan(graph, lanes_of(graph), seed=1)
     times = np.arange(0.0, 90.0, DT)
     middle, _ = middle_of(ego, times)
@@ -96,7 +96,7 @@ def test_at_stop_signs_the_ego_stops_and_goes_on():
     for k in entries[times[entries] > 8.0]:
         assert speed[max(k - 60, 0) : k].min() < 0.15
     check_gentle(ego)
-    free = drive_obeying(path, CAR, graph=graph, seed=1, duration=90.0)
+    free = drive_with_signals(path, CAR, graph=graph, seed=1, duration=90.0)
     assert speed_of(free)[300:-500].min() > 1.0  # without signs it does not stop
 
 
@@ -105,7 +105,7 @@ def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 700.0, 30.0))
     path = path_on(graph, 1, 60.0)
     free = drive_path(path, CAR, duration=60.0)
-    trips = vehicle_trips(lanes, area_of(lanes, free, reach=400.0, scale=1.0), seed=1, density=10.0)
+    trips = vehicle_trips(lanes, surroundings_of(lanes, free, reach=400.0, scale=1.0), seed=1, density=10.0)
     slow = [replace(t, wish=np.minimum(t.wish, 4.0)) for t in trips if t.appear_s == 0.0 and t.begin > 60]
     plan = junction_plan(graph, lanes, seed=1)
     gone = simulate_ego(ego_trip(path, CAR), slow, graph=graph, plan=plan, seconds=60.0, reach=600.0)
@@ -131,7 +131,9 @@ def test_among_traffic_the_ego_touches_nobody_and_nobody_is_taken_out_for_it(see
     plan = junction_plan(graph, lanes, seed=seed)
     path = path_on(graph, seed, 60.0)
     alone = drive_path(path, CAR, duration=60.0)
-    trips = vehicle_trips(lanes, area_of(lanes, alone, reach=300.0, scale=1.0), seed=seed, density=20.0)
+    trips = vehicle_trips(
+        lanes, surroundings_of(lanes, alone, reach=300.0, scale=1.0), seed=seed, density=20.0
+    )
     gone = simulate_ego(ego_trip(path, CAR), trips, graph=graph, plan=plan, seconds=60.0, reach=300.0)
     motion = motion_behind(path, CAR, time_s=np.arange(len(gone)) * DT, reach=np.minimum(gone, path.length))
     ego = poses_along(path, CAR, motion=motion)
