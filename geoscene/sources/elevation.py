@@ -20,6 +20,7 @@ from geoscene.files import write_atomically
 from geoscene.frames import Frame
 from geoscene.progress import Progress, silent
 from geoscene.sources.data import OsmData
+from geoscene.sources.http import BUSY, RefusedError, cause, open_session
 from geoscene.typing import Float
 
 Box = tuple[float, float, float, float]
@@ -44,6 +45,7 @@ _COARSEST = 10.0  # metres between posts that the chosen zoom does not exceed; i
 _LAST_LATITUDE = 85.0  # degrees; web Mercator's square ends at 85.05
 _AROUND = 8  # posts fetched beyond the box on each side
 _SHORE = 2  # posts from a coastline within which the sea's floor begins
+_LONGEST_PAUSE = 30.0  # seconds between two attempts, whatever the server asks for
 _CACHE_VERSION = 1
 
 
@@ -175,18 +177,15 @@ def _pixels(lonlat: Float, z: int) -> Float:
 
 def _tiles(names: list[tuple[int, int]], z: int, *, cache_dir: Path, server: TileServer) -> Any:
     """Heights (256, 256) of each tile in turn, from the cache or the server."""
-    import requests  # noqa: PLC0415 - heavy
-
     folder = cache_dir / "tiles" / hashlib.sha256(server.template.encode()).hexdigest()[:16] / str(z)
     folder.mkdir(parents=True, exist_ok=True)
-    with requests.Session() as session:
-        session.headers["User-Agent"] = server.user_agent
+    with open_session(server.user_agent) as session:
         for x, y in names:
             path = folder / f"{x}_{y}.png"
             kept = _heights(path.read_bytes()) if path.exists() else None
             if kept is None:
                 url = server.template.format(z=z, x=x, y=y)
-                content = _ask(session, url, server=server)
+                content = _download(session, url, server=server)
                 kept = _heights(content)
                 if kept is None:
                     raise NetworkError(f"{url}: no elevation tile (a PNG of 256 x 256 pixels) but other data")
@@ -208,38 +207,27 @@ def _heights(content: bytes) -> Float | None:
     return np.where(rgb.any(axis=2), decode_terrarium(rgb), np.nan)
 
 
-def _ask(session: Any, url: str, *, server: TileServer) -> bytes:
+def _download(session: Any, url: str, *, server: TileServer) -> bytes:
     """The bytes at an address, asked for again while the server fails or is busy."""
-    import requests  # noqa: PLC0415 - heavy
-
-    told, pause = "", server.wait
+    pause = server.wait
     for attempt in range(server.attempts):
         if attempt:
             time.sleep(pause)
             pause *= 2
         try:
-            answer = session.get(url, timeout=server.timeout)
-        except requests.exceptions.RequestException as error:
-            told = _cause(error)
-            continue
-        if answer.status_code == 200:
-            return bytes(answer.content)
-        told = f"HTTP {answer.status_code}, {answer.reason}"
-        if answer.status_code not in {429, 500, 502, 503, 504}:
-            break
-        stated = answer.headers.get("Retry-After", "")
-        pause = min(float(stated), 30.0) if stated.isdigit() else pause
+            return bytes(session.get(url, timeout=server.timeout).content)
+        except RefusedError as error:
+            failure = str(error)
+            if error.status not in {500, *BUSY}:
+                break
+            if math.isfinite(error.retry_after):
+                pause = min(error.retry_after, _LONGEST_PAUSE)
+        except OSError as error:
+            failure = cause(error)
     raise NetworkError(
-        f"no elevation tile from {urlsplit(url).netloc} ({url}: {told});"
+        f"no elevation tile from {urlsplit(url).netloc} ({url}: {failure});"
         " without a network, give an elevation file (--dem FILE) or build on level ground (no --dem)"
     )
-
-
-def _cause(error: BaseException) -> str:
-    """The innermost reason of a failed request, in few words."""
-    while (inner := error.__cause__ or error.__context__) is not None:
-        error = inner
-    return " ".join(str(getattr(error, "strerror", None) or error).split())[:120] or type(error).__name__
 
 
 def _without_sea_floor(heights: Float, shore: Float) -> Float:

@@ -1,4 +1,4 @@
-"""OpenStreetMap over the network: Nominatim finds a place, Overpass delivers it, osmnx speaks to both."""
+"""OpenStreetMap over the network: Nominatim finds a place by its name, Overpass delivers the map of a box."""
 
 from __future__ import annotations
 
@@ -7,12 +7,9 @@ import gzip
 import hashlib
 import json
 import math
-import socket
-import threading
+import re
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,13 +23,14 @@ from geoscene.files import write_atomically
 from geoscene.sources.assemble import Bounds, checked_bounds, features
 from geoscene.sources.data import OsmData
 from geoscene.sources.elements import Collector
+from geoscene.sources.http import BUSY, RefusedError, cause, open_session
 from geoscene.sources.overpass import collect_answer, query_for
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 _METRES_PER_DEGREE = 111_195.0  # on a sphere of 6371 km, the mean radius of the Earth (IUGG)
 _SMALLEST = 400.0  # metres: a place that is a point or one house is fetched with its surroundings
-_ONE_AT_A_TIME = threading.Lock()  # osmnx's settings are global
+_NOMINATIM_PAUSE = 1.0  # seconds before each request; the public server allows one a second
 _CACHE_VERSION = 1
 
 
@@ -64,68 +62,11 @@ class Servers:
     max_area_km2: float = 2500.0
 
 
-class _RefusedError(Exception):
-    """A server's answer that is no data: its HTTP status, and after how many seconds to ask again."""
-
-    def __init__(self, status: int, reason: str, *, retry_after: float) -> None:
-        super().__init__(f"HTTP {status}, {reason}" if reason else f"HTTP {status}")
-        self.busy = status in {429, 502, 503, 504}
-        self.retry_after = retry_after
-
-
-def _refuse(response: Any, *_: Any, **__: Any) -> None:
-    """Raise for an HTTP error, before osmnx sleeps or parses; handed to requests as a hook."""
-    if response.status_code >= 400:
-        stated = response.headers.get("Retry-After", "")
-        raise _RefusedError(
-            response.status_code,
-            response.reason or "",
-            retry_after=float(stated) if stated.isdigit() else math.inf,
-        )
-
-
-@contextmanager
-def _osmnx(servers: Servers, overpass: str) -> Iterator[Any]:
-    """The osmnx package with these servers set; whatever it changes is put back afterwards."""
-    import osmnx  # noqa: PLC0415 - heavy
-
-    wanted = {
-        "doh_url_template": None,
-        "http_referer": servers.user_agent,
-        "http_user_agent": servers.user_agent,
-        "nominatim_url": servers.nominatim,
-        "overpass_rate_limit": False,  # `_ask_overpass` waits for its turn, and gives up in time
-        "overpass_url": overpass,
-        "requests_kwargs": {**osmnx.settings.requests_kwargs, "hooks": {"response": _refuse}},
-        "requests_timeout": servers.timeout,
-        "use_cache": False,  # answers are kept by `_kept`, whole or not at all
-    }
-    with _ONE_AT_A_TIME:
-        before = {name: getattr(osmnx.settings, name) for name in wanted}
-        resolver = socket.getaddrinfo  # osmnx pins the server's address by replacing it
-        try:
-            for name, value in wanted.items():
-                setattr(osmnx.settings, name, value)
-            yield osmnx
-        finally:
-            for name, value in before.items():
-                setattr(osmnx.settings, name, value)
-            socket.getaddrinfo = resolver
-
-
 def _host(url: str) -> str:
     return urlsplit(url).netloc or url
 
 
-def _cause(error: BaseException) -> str:
-    """The innermost reason of a failed request, in few words."""
-    while (inner := error.__cause__ or error.__context__) is not None:
-        error = inner
-    text = " ".join(str(getattr(error, "strerror", None) or error).split())
-    return text[:120] or type(error).__name__
-
-
-def _kept(cache_dir: Path | None, request: str, *, make: Callable[[], Any]) -> Any:
+def _cached(cache_dir: Path | None, request: str, *, make: Callable[[], Any]) -> Any:
     """The answer to ``request``: from the cache, else made and put there, whole or not at all."""
     if cache_dir is None:
         return make()
@@ -142,54 +83,78 @@ def _kept(cache_dir: Path | None, request: str, *, make: Callable[[], Any]) -> A
     return answer
 
 
-def _patiently(what: str, urls: Sequence[str], *, ask: Callable[[str], Any], servers: Servers) -> Any:
-    """The answer of the first server that gives one; those that are busy are asked again, for some rounds.
+def _first_answer(what: str, urls: Sequence[str], *, ask: Callable[[Any, str], Any], servers: Servers) -> Any:
+    """The answer of the first server that gives one; busy servers are asked `Servers.rounds` times.
 
-    Raises NetworkError, headed by ``what``, if none does.
+    what : head of the error message
+    ask  : returns the answer of one server, given a session and the server's address
+
+    Raises NetworkError if no server answers.
     """
-    import requests  # noqa: PLC0415 - heavy
-
     for round_ in range(servers.rounds):
-        told: list[str] = []
+        failures: list[str] = []
         waits: list[float] = []
         for url in urls:
             try:
-                return ask(url)
-            except _RefusedError as error:
-                told.append(f"{_host(url)}: {error}")
-                if error.busy:
+                with open_session(servers.user_agent) as session:
+                    return ask(session, url)
+            except RefusedError as error:
+                failures.append(f"{_host(url)}: {error}")
+                if error.status in BUSY:
                     waits.append(min(error.retry_after, servers.wait))
-            except (requests.exceptions.RequestException, OSError, ValueError) as error:
-                told.append(f"{_host(url)}: {_cause(error)}")  # ValueError: an answer that osmnx cannot read
+            except (OSError, ValueError) as error:  # no connection; an answer that is not JSON
+                failures.append(f"{_host(url)}: {cause(error)}")
         if not waits or round_ == servers.rounds - 1:
             break
         time.sleep(min(waits))
     raise NetworkError(
-        f"{what} ({'; '.join(told)}); without a network, build from an extract (--osm FILE)"
-        " or from the one that comes along (--demo)"
+        f"{what} ({'; '.join(failures)}); without a network, build from an extract (--osm FILE)"
+        " or from the bundled one (--demo)"
     )
 
 
-def _ask_overpass(query: str, servers: Servers) -> Any:
-    """Overpass' answer to a query, sent when the server has a slot free."""
+def _search(name: str, servers: Servers) -> Any:
+    """Nominatim's results for a name."""
+    query = {"q": name, "format": "json", "polygon_geojson": 1, "dedupe": 0, "limit": 10}
 
-    def ask(url: str) -> Any:
-        with _osmnx(servers, url) as osmnx:
-            guarded, osmnx.settings.requests_kwargs = osmnx.settings.requests_kwargs, {}
-            osmnx.settings.overpass_rate_limit = True
-            pause = osmnx._overpass._get_overpass_pause(url, default_pause=0)  # noqa: SLF001
-            if pause > servers.timeout:
-                raise _RefusedError(429, f"no free slot for {pause:.0f} s", retry_after=pause)
-            time.sleep(pause)
-            osmnx.settings.overpass_rate_limit = False
-            osmnx.settings.requests_kwargs = guarded
-            answer = osmnx._overpass._overpass_request(OrderedDict(data=query))  # noqa: SLF001
+    def ask(session: Any, url: str) -> Any:
+        time.sleep(_NOMINATIM_PAUSE)
+        found = session.get(f"{url.rstrip('/')}/search", params=query, timeout=servers.timeout).json()
+        if not isinstance(found, list):
+            raise RefusedError(200, "but no list of places")
+        return found
+
+    return _first_answer(f"cannot look up {name!r}", [servers.nominatim], ask=ask, servers=servers)
+
+
+def _ask_overpass(query: str, servers: Servers) -> Any:
+    """Overpass' answer to a query, sent when the server has a free slot."""
+
+    def ask(session: Any, url: str) -> Any:
+        base = url.rstrip("/")
+        wait = _seconds_to_free_slot(session, f"{base}/status", timeout=servers.timeout)
+        if wait > servers.timeout:
+            raise RefusedError(429, f"no free slot for {wait:.0f} s", retry_after=wait)
+        time.sleep(wait)
+        answer = session.post(f"{base}/interpreter", data={"data": query}, timeout=servers.timeout).json()
+        if not isinstance(answer, dict):
+            raise RefusedError(200, "but no map objects")
         remark = str(answer.get("remark", ""))
-        if "error" in remark:  # the query ran out of time or memory: what came is not all there is
-            raise _RefusedError(200, remark.strip(), retry_after=math.inf)
+        if "error" in remark:  # the query ran out of time or memory: the answer is incomplete
+            raise RefusedError(200, remark.strip())
         return answer
 
-    return _patiently("no map server delivered", servers.overpass, ask=ask, servers=servers)
+    return _first_answer("no map server delivered", servers.overpass, ask=ask, servers=servers)
+
+
+def _seconds_to_free_slot(session: Any, url: str, *, timeout: float) -> float:
+    """Seconds until an Overpass server takes a query, by its status page; 0 if the page does not say."""
+    try:
+        page = session.get(url, timeout=timeout).text
+    except (RefusedError, OSError):
+        return 0.0
+    waits = [float(seconds) for seconds in re.findall(r"Slot available after: .* in (\d+) seconds", page)]
+    return 0.0 if re.search(r"\d+ slots? available now", page) else min(waits, default=0.0)
 
 
 def _parts(bounds: Bounds, largest_km2: float) -> list[Bounds]:
@@ -222,7 +187,7 @@ def _fetch(
     taken = Collector(bounds=bounds)
     for part in progress(_parts(bounds, servers.max_query_km2)):
         query = query_for(part, timeout=servers.timeout)
-        answer = _kept(cache_dir, query, make=functools.partial(_ask_overpass, query, servers))
+        answer = _cached(cache_dir, query, make=functools.partial(_ask_overpass, query, servers))
         try:
             collect_answer(answer, taken)
         except InputError as error:
@@ -294,15 +259,7 @@ def locate(name: str, *, cache_dir: Path | None = None, servers: Servers | None 
     if not name.strip():
         raise InputError("the place has no name")
 
-    def ask(_: str) -> Any:
-        with _osmnx(servers, servers.overpass[0]) as osmnx:
-            return osmnx._nominatim._download_nominatim_element(name, limit=10)  # noqa: SLF001
-
-    results = _kept(
-        cache_dir,
-        f"{servers.nominatim} {name}",
-        make=lambda: _patiently(f"cannot look up {name!r}", [servers.nominatim], ask=ask, servers=servers),
-    )
+    results = _cached(cache_dir, f"{servers.nominatim} {name}", make=lambda: _search(name, servers))
     if not results:
         raise SourceNotFoundError(
             f"no place called {name!r} in OpenStreetMap; try another spelling,"

@@ -6,14 +6,13 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import urllib.parse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import osmium
-import osmnx
 import pytest
 from helpers.extracts import same
 
@@ -105,6 +104,7 @@ PLACES = {
             "geojson": {"type": "Polygon", "coordinates": []},
         },
     ],
+    "nonsense": {"error": "unable to geocode"},
     "a bench": [{"boundingbox": ["60.167", "60.167", "24.945", "24.945"], "importance": 0.1}],
 }
 
@@ -114,6 +114,7 @@ class MapServer(ThreadingHTTPServer):
 
     asked   : the requests, as (path, user agent)
     refuse  : statuses to refuse the next requests for data with, in order
+    status  : the page that says when a query may be sent
     """
 
     def __init__(self, extract: Extract) -> None:
@@ -122,6 +123,7 @@ class MapServer(ThreadingHTTPServer):
         self.asked: list[tuple[str, str]] = []
         self.refuse: list[int] = []
         self.remark = ""
+        self.status = "Connected as: 1\nCurrent time: x\nRate limit: 2\n2 slots available now.\n"
 
     @property
     def url(self) -> str:
@@ -153,11 +155,7 @@ class Handler(BaseHTTPRequestHandler):
         self.server.asked.append((self.path, self.headers["User-Agent"]))
         url = urllib.parse.urlsplit(self.path)
         if url.path == "/api/status":
-            self._send(
-                200,
-                b"Connected as: 1\nCurrent time: x\nRate limit: 2\n\n2 slots available now.\n",
-                "text/plain",
-            )
+            self._send(200, self.server.status.encode(), "text/plain")
         elif not self._refused():
             name = urllib.parse.parse_qs(url.query)["q"][0]
             self._send(200, json.dumps(PLACES.get(name, [])).encode())
@@ -218,16 +216,6 @@ def nowhere() -> str:
         return f"http://127.0.0.1:{probe.getsockname()[1]}"
 
 
-@contextmanager
-def osmnx_untouched() -> Iterator[None]:
-    """Assert that osmnx and the resolver of names are left as they were."""
-    before = {k: v for k, v in vars(osmnx.settings).items() if not k.startswith("_")}
-    resolver = socket.getaddrinfo
-    yield
-    assert {k: v for k, v in vars(osmnx.settings).items() if not k.startswith("_")} == before
-    assert socket.getaddrinfo is resolver
-
-
 def assert_is_the_box(data) -> None:
     expected = read_osm(demo_path(), bounds=BOX)
     same(expected, data)
@@ -238,8 +226,7 @@ def assert_is_the_box(data) -> None:
 
 
 def test_a_place_is_found_fetched_and_the_same_as_from_a_file(server, tmp_path):
-    with osmnx_untouched():
-        data = fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers_at(server))
+    data = fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers_at(server))
     assert_is_the_box(data)
     assert data.source == "OpenStreetMap, Esplanadi, Helsinki, Finland"
     assert all(agent.startswith("geoscene/") for _, agent in server.asked)
@@ -282,15 +269,14 @@ def test_a_place_that_is_a_point_is_widened_to_a_scene(server):
 
 def test_a_busy_server_is_asked_again(server):
     server.refuse = [429, 504]
-    with osmnx_untouched():
-        data = fetch_bbox(BOX, servers=servers_at(server))
+    data = fetch_bbox(BOX, servers=servers_at(server))
     assert_is_the_box(data)
     assert server.asked_for("/api/interpreter") == 3
 
 
 def test_a_busy_server_is_not_asked_for_ever(server):
     server.refuse = [429] * 99
-    with osmnx_untouched(), pytest.raises(NetworkError, match="HTTP 429"):
+    with pytest.raises(NetworkError, match="HTTP 429"):
         fetch_bbox(BOX, servers=servers_at(server))
     assert server.asked_for("/api/interpreter") == 3
 
@@ -313,13 +299,29 @@ def test_a_server_that_fails_is_named_and_nothing_is_kept(server, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_query_waits_for_a_free_slot(server):
+    server.status = "Rate limit: 2\nSlot available after: 2024-05-01T12:00:09Z, in 1 seconds.\n"
+    start = time.monotonic()
+    fetch_bbox(BOX, servers=servers_at(server))
+    assert time.monotonic() - start >= 1
+    server.status = "Rate limit: 2\n" + 2 * "Slot available after: 2024-05-01T12:00:09Z, in 99 seconds.\n"
+    with pytest.raises(NetworkError, match="no free slot for 99 s"):
+        fetch_bbox(BOX, servers=servers_at(server))
+    assert server.asked_for("/api/interpreter") == 1
+
+
+def test_an_answer_of_another_kind_is_refused(server):
+    with pytest.raises(NetworkError, match="no list of places"):
+        locate("nonsense", servers=servers_at(server))
+
+
 def test_without_a_network_one_line_says_what_to_do():
     servers = Servers(nominatim=nowhere(), overpass=(f"{nowhere()}/api", "http://map.invalid/api"), wait=0.0)
     for fetch in (
         lambda: fetch_place("Norfolk, VA", servers=servers),
         lambda: fetch_bbox(BOX, servers=servers),
     ):
-        with osmnx_untouched(), pytest.raises(NetworkError) as caught:
+        with pytest.raises(NetworkError) as caught:
             fetch()
         message = str(caught.value)
         assert "\n" not in message
