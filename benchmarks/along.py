@@ -19,6 +19,8 @@ from typing import Any
 
 from scale import build_command, run, show
 
+from geoscene.scene import SceneFiles
+
 
 def along(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     """Cost of the whole build and of the one along a route, and whether what is there is the same."""
@@ -40,7 +42,7 @@ def along(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
         ]
         driven = run([*command, "--overwrite", "--quiet"])
         clouds.append(_bytes(drive, "*.pcd"))
-        tiles.append(_bytes(out / "tiles", "*.npz"))
+        tiles.append(_bytes(SceneFiles(out).tiles, "*.npz"))
         rows.append(
             {"build": name, "tiles": len(tiles[-1]), "scene_mib": _mib(_bytes(out, "*")), **asdict(cost)}
             | {f"drive_{key}": value for key, value in asdict(driven).items() if key != "largest_mib"}

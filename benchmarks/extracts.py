@@ -22,6 +22,8 @@ from typing import Any
 
 from scale import build_command, run
 
+from geoscene.scene import open_scene
+
 COLUMNS = (
     "extract", "km2", "buildings", "solids", "repaired", "dropped", "watertight", "broken", "roofs", "ground",
     "wall_s", "cpu_s", "peak_mib",
@@ -38,7 +40,7 @@ def row_of(extract: Path, folder: Path, *, lod: int, workers: int) -> dict[str, 
         except subprocess.CalledProcessError:
             said.seek(0)
             return {"extract": extract.name, "error": said.read().decode().strip()}
-    scene = json.loads((out / "scene.json").read_text("utf-8"))
+    scene = open_scene(out).manifest
     judge = [sys.executable, "-m", "geoscene.cli", "validate", str(out), "--json"]
     verdict = json.loads(subprocess.run(judge, stdout=subprocess.PIPE, check=False).stdout)
     counts, ground, problems = scene["counts"], scene["ground"], scene["problems"]

@@ -28,10 +28,9 @@ STEP = 100.0
 
 def _route(scene_path: Path, km: float, queue: multiprocessing.Queue[NDArray[np.float64]]) -> None:
     from lidar.planning.route import plan_route  # noqa: PLC0415
-    from lidar.planning.travel import road_graph  # noqa: PLC0415
 
     scene = open_scene(scene_path)
-    queue.put(plan_route(road_graph(scene), scene.frame, spec="random", seed=1, length=1000 * km).line)
+    queue.put(plan_route(scene.road_graph(), scene.frame, spec="random", seed=1, length=1000 * km).line)
 
 
 def resident() -> float:

@@ -48,7 +48,7 @@ def convert(city: Path, out: Path) -> None:
     from geoscene.files import write_json  # noqa: PLC0415
     from geoscene.frames import Frame  # noqa: PLC0415
     from geoscene.mesh import Mesh  # noqa: PLC0415
-    from geoscene.scene.layout import SCHEMA  # noqa: PLC0415
+    from geoscene.scene.layout import SCHEMA, SceneFiles  # noqa: PLC0415
     from geoscene.scene.tile_files import Tile, write_shapes, write_tile  # noqa: PLC0415
     from lidar.geometry.poses import Trajectory  # noqa: PLC0415
     from lidar.geometry.trajectory_csv import write_trajectory  # noqa: PLC0415
@@ -72,13 +72,14 @@ def convert(city: Path, out: Path) -> None:
     place = np.stack([np.bincount(owner, middle[:, k]) / count for k in (0, 1)], axis=1)[owner]
     square = np.floor(place / _TILE).astype(int)
     folder = out / "scene"
-    (folder / "tiles").mkdir(parents=True)
+    files = SceneFiles(folder)
+    files.tiles.mkdir(parents=True)
     indices = np.unique(square, axis=0)
     for i, j in indices.tolist():
         origin = np.array([i * _TILE, j * _TILE, 0.0])
         part = whole.take((square == (i, j)).all(axis=1))
-        write_tile(folder / "tiles" / f"{i}_{j}.npz", Tile(origin, part.shifted(-origin)))
-    write_shapes(folder / "shapes.npz", {})
+        write_tile(files.tile(i, j), Tile(origin, part.shifted(-origin)))
+    write_shapes(files.shapes, {})
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     frame = Frame.at(2.0, 48.0, crs="utm")
     document = {
@@ -90,7 +91,7 @@ def convert(city: Path, out: Path) -> None:
         "tiles": indices.tolist(),
         "layers": {"buildings": [0, int(building.max()) + 1]},
     }
-    write_json(folder / "scene.json", document)
+    write_json(files.manifest, document)
 
     t, x, y, z, yaw_deg = np.loadtxt(city / "route.csv", delimiter=",", skiprows=1).T
     time_ns = np.round(t * 1e9).astype(np.int64)

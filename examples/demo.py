@@ -12,6 +12,7 @@ import numpy as np
 from geoscene.build import BuildOptions, build
 from geoscene.classes import class_codes
 from geoscene.console import progress_bar
+from geoscene.scene import SceneFiles
 from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
 from geoscene.view import view_scene
@@ -99,7 +100,7 @@ say("done; open these:")
 for path, what in {
     out / "scene.html": "the scene, to turn and click (any browser, no network)",
     pictures: "pictures of all of it",
-    out / "scene" / "features.gpkg": "buildings, land cover, roads (QGIS)",
+    SceneFiles(out / "scene").features: "buildings, land cover, roads (QGIS)",
     out / "map.laz": "the map, in UTM (CloudCompare, QGIS)",
     out / "drive" / "lidar_top": "sweeps as PCD, PLY, CSV and LAZ",
     out / "drive" / "camera_front": "RGB and depth images",

@@ -20,7 +20,6 @@ from geoscene.objects.shapes import shapes
 from geoscene.plan import KINDS, Plan, make_plan
 from geoscene.progress import Progress, silent
 from geoscene.report import Problem
-from geoscene.roadgraph import write_graphml
 from geoscene.roadgraph.reach import route_line
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.writer import SceneWriter
@@ -124,11 +123,10 @@ def build(
             reports.append(report)
             progress("tiles", len(reports), total=len(tiles))
         problems += _tile_problems(reports)
-        if len(plan.graph):
-            write_graphml(plan.graph, plan.frame, path=writer.folder / "roads.graphml")
         writer.finish(
             frame=plan.frame,
             layers=plan.layers,
+            graph=plan.graph,
             shapes=shapes(),
             problems=problems,
             tiles=tiles_document(keys, reports),

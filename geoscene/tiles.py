@@ -26,6 +26,7 @@ from geoscene.objects.shapes import concatenate_instances
 from geoscene.objects.vegetation import forest_trees, tree_instances
 from geoscene.plan import Plan, take_buildings
 from geoscene.report import Problem
+from geoscene.scene import SceneFiles
 from geoscene.scene.tile_files import Tile, read_tile, write_tile
 from geoscene.structures import structure_meshes
 from geoscene.watertight import validate_mesh
@@ -98,12 +99,6 @@ def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances]:
     return concatenate(meshes), concatenate_instances(copies)
 
 
-def tile_path(folder: Path, tile: tuple[int, int]) -> Path:
-    """Path of tile (i, j) within a scene directory."""
-    i, j = tile
-    return folder / "tiles" / f"{i}_{j}.npz"
-
-
 def build_tile(
     plan: Plan, folder: Path, *, tile: tuple[int, int], lod: int, former: Path | None
 ) -> TileReport:
@@ -126,7 +121,9 @@ def build_tile(
     origin = np.array([tile[0] * size, tile[1] * size, low])
     moved = copies.transform.copy()
     moved[:, :, 3] -= origin
-    write_tile(tile_path(folder, tile), Tile(origin, mesh.shifted(-origin), replace(copies, transform=moved)))
+    write_tile(
+        SceneFiles(folder).tile(*tile), Tile(origin, mesh.shifted(-origin), replace(copies, transform=moved))
+    )
     verdict = validate_mesh(mesh)
     built = verdict.feature < plan.buildings.count
     return TileReport(
@@ -167,11 +164,12 @@ def build_tiles(
     lie in ``folder`` as soon as they are made, so that a build that was killed goes on from there. Tiles of a
     ``former`` scene whose keys are the same are copied, or give their ground.
     """
-    (folder / "tiles").mkdir(parents=True, exist_ok=True)
+    files = SceneFiles(folder)
+    files.tiles.mkdir(parents=True, exist_ok=True)
     wanted = set(tiles)
     known = {tile: report for tile, report in _known(folder, keys).items() if tile in wanted}
-    kept = {tile_path(folder, tile) for tile in known}
-    for path in (folder / "tiles").iterdir():
+    kept = {files.tile(*tile) for tile in known}
+    for path in files.tiles.iterdir():
         if path not in kept:  # of another build, or half written
             path.unlink()
     yield from known.values()
@@ -203,7 +201,7 @@ class _Former:
 
     @classmethod
     def of(cls, folder: Path | None, keys: Keys) -> _Former:
-        path = None if folder is None else folder / "tiles.json"
+        path = None if folder is None else SceneFiles(folder).tile_reports
         if folder is None or path is None or not path.exists():
             return cls(None, frozenset(), ground=False, all=False, reports={})
         document = json.loads(path.read_text("utf-8"))
@@ -215,9 +213,9 @@ class _Former:
     def build(self, plan: Plan, folder: Path, *, tile: tuple[int, int], lod: int) -> TileReport:
         old = None
         if self.folder is not None and self.ground and tile in self.tiles:
-            old = tile_path(self.folder, tile)
+            old = SceneFiles(self.folder).tile(*tile)
             if self.all and old.exists():
-                write_atomically(tile_path(folder, tile), old.read_bytes())
+                write_atomically(SceneFiles(folder).tile(*tile), old.read_bytes())
                 return self.reports[tile]
         return build_tile(
             plan, folder, tile=tile, lod=lod, former=old if old is not None and old.exists() else None
@@ -251,28 +249,26 @@ def _report(document: dict[str, Any]) -> TileReport:
 
 def _noted(folder: Path, keys: Keys, *, report: TileReport) -> TileReport:
     """Append a report to the folder's journal."""
-    with (folder / "tiles.jsonl").open("a", encoding="utf-8") as journal:
+    with SceneFiles(folder).tile_journal.open("a", encoding="utf-8") as journal:
         journal.write(json.dumps({"keys": asdict(keys), **asdict(report)}) + "\n")
     return report
 
 
 def _known(folder: Path, keys: Keys) -> dict[tuple[int, int], TileReport]:
     """Reports of the tiles that a build with the same keys has left in the folder."""
-    path = folder / "tiles.jsonl"
+    files = SceneFiles(folder)
+    path = files.tile_journal
     known: dict[tuple[int, int], TileReport] = {}
     for line in path.read_text("utf-8").splitlines() if path.exists() else ():
         try:
             document = json.loads(line)
         except ValueError:  # the last line of a build that was killed
             continue
-        if (
-            document.pop("keys") == asdict(keys)
-            and tile_path(folder, (document["i"], document["j"])).exists()
-        ):
+        if document.pop("keys") == asdict(keys) and files.tile(document["i"], document["j"]).exists():
             known[document["i"], document["j"]] = _report(document)
     return known
 
 
 def tiles_document(keys: Keys, reports: Sequence[TileReport]) -> dict[str, Any]:
-    """What ``tiles.json`` of a finished scene says."""
+    """The document of tile reports of a finished scene."""
     return {"keys": asdict(keys), "tiles": [asdict(r) for r in sorted(reports, key=lambda r: (r.i, r.j))]}

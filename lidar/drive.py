@@ -32,7 +32,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import write_trajectory
 from lidar.options import DriveOptions
 from lidar.planning.flight import Flight
-from lidar.planning.travel import Travel, plan_travel, road_graph
+from lidar.planning.travel import Travel, plan_travel
 from lidar.rig.devices import Camera, Scanner, cameras, scanners
 from lidar.rig.specs import Rig, load_rig
 from lidar.rig.vehicle import Vehicle, load_vehicle
@@ -139,7 +139,7 @@ def drive(
     if options.traffic is not None:
         progress("traffic", 0, total=0)
         traffic = replace(options.traffic, side=options.keeps(scene))
-        graph = road_graph(scene)
+        graph = scene.road_graph()
         if isinstance(traffic, TrafficFile):
             actors = replay(scene, graph, ego=trajectory, vehicle=body, seed=options.seed, options=traffic)
         elif isinstance(planned, RoadDrive):
@@ -290,7 +290,7 @@ def plan(
         trajectory = drive_with_signals(
             travel.path,
             body,
-            graph=road_graph(scene),
+            graph=scene.road_graph(),
             seed=options.seed,
             side=options.keeps(scene),
             bounds=scene.bounds,

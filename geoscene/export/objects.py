@@ -64,30 +64,17 @@ class Features:
 def read_features(scene: Scene) -> Features:
     """The attributes of all features, without their geometry.
 
-    Raises SceneFormatError if ``features.gpkg`` lacks a layer.
+    Raises SceneFormatError if the scene lacks a layer that its manifest names.
     """
-    from pyogrio.errors import DataLayerError, DataSourceError  # noqa: PLC0415
-    from pyogrio.raw import read  # noqa: PLC0415
-
-    from geoscene.errors import SceneFormatError  # noqa: PLC0415
-
-    names, starts, columns = [], [], []
-    path = scene.path / "features.gpkg"
-    for name, (start, stop) in sorted(scene.layers.items(), key=lambda item: item[1]):
-        if start == stop:
-            continue
-        try:
-            meta, _, _, values = read(path, layer=name, read_geometry=False)
-        except (DataSourceError, DataLayerError) as error:
-            raise SceneFormatError(f"{path}: no readable layer {name} ({error})") from error
-        names.append(name)
-        starts.append(start)
-        columns.append({str(k): v for k, v in zip(meta["fields"], values, strict=True) if k != "feature"})
+    layers = [name for name, (a, b) in sorted(scene.layers.items(), key=lambda item: item[1]) if b > a]
+    tables = [scene.features(name, geometry="none").columns for name in layers]
+    columns = tuple({name: v for name, v in table.items() if name != "feature"} for table in tables)
+    starts = np.array([scene.layers[name][0] for name in layers], np.int64)
     unique = [np.empty(0, np.bool_)]
     for layer in columns:
         _, owner, count = np.unique(layer["osm_id"].astype(str), return_inverse=True, return_counts=True)
         unique.append(count[owner] == 1)
-    return Features(np.array(starts, np.int64), tuple(names), tuple(columns), np.concatenate(unique))
+    return Features(starts, tuple(layers), columns, np.concatenate(unique))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,12 +10,10 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from geoscene.errors import InputError
 from geoscene.export.files import Summary, size_of, whole_file
 from geoscene.export.objects import attribution
 from geoscene.export.roadnet import END, START, Carriageway, Connection, RoadNet, road_net
 from geoscene.progress import Progress, silent
-from geoscene.roadgraph import read_graphml
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.typing import Float
@@ -56,11 +54,9 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
     ``userData`` names the OpenStreetMap way. A lane that both directions share has the type
     ``bidirectional``. Restrictions via ways are counted in the summary: junctions know pairs of roads alone.
 
-    Raises InputError for a scene without roads.
+    Raises SceneFormatError for a scene without drivable roads.
     """
-    if not (scene.path / "roads.graphml").exists():
-        raise InputError(f"{scene.path}: no drivable roads in it, so no OpenDRIVE")
-    graph = read_graphml(scene.path / "roads.graphml", scene.frame)
+    graph = scene.road_graph()
     left_hand = scene.left_hand
     net = road_net(graph, left_hand=left_hand)
     controls: dict[int, list[tuple[float, str]]] = defaultdict(list)

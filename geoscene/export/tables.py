@@ -13,7 +13,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from geoscene.classes import Class
-from geoscene.errors import InputError, SceneFormatError
+from geoscene.errors import InputError
 from geoscene.export.objects import read_features
 from geoscene.mesh import Mesh
 from geoscene.scene import Scene
@@ -66,16 +66,7 @@ def chosen_layers(scene: Scene, layers: Collection[str] | None, *, solids: bool)
 
 def kinds_of_columns(scene: Scene, layer: str) -> dict[str, np.dtype[Any]]:
     """Type of each column of a layer; object for text."""
-    from pyogrio import read_info  # noqa: PLC0415  (0.3 s)
-    from pyogrio.errors import DataLayerError, DataSourceError  # noqa: PLC0415
-
-    path = scene.path / "features.gpkg"
-    try:
-        told = read_info(path, layer="buildings" if layer == SOLIDS else layer)
-    except (DataSourceError, DataLayerError) as error:
-        raise SceneFormatError(f"{path}: no readable layer {layer} ({error})") from error
-    kinds = [np.dtype(kind) for kind in told["dtypes"]]
-    return dict(zip(told["fields"].tolist(), kinds, strict=True))
+    return dict(scene.schema("buildings" if layer == SOLIDS else layer).columns)
 
 
 def rows(scene: Scene, layer: str, *, crs: CRS) -> Iterator[Rows]:
@@ -83,18 +74,12 @@ def rows(scene: Scene, layer: str, *, crs: CRS) -> Iterator[Rows]:
     if layer == SOLIDS:
         yield from _solids(scene, crs)
         return
-    from pyogrio.raw import read  # noqa: PLC0415
-
     start, stop = scene.layers[layer]
     same = crs == scene.frame.crs
-    for skip in range(0, stop - start, ROWS):
-        meta, _, wkb, values = read(
-            scene.path / "features.gpkg", layer=layer, skip_features=skip, max_features=ROWS
-        )
-        geometry = shapely.from_wkb(wkb)
-        if not same:
-            geometry = _moved(scene, geometry, crs=crs, projected=True)
-        yield Rows(layer, geometry, dict(zip(meta["fields"].tolist(), values, strict=True)))
+    for first in range(0, stop - start, ROWS):
+        some = scene.features(layer, geometry="projected", rows=range(first, first + ROWS))
+        geometry = some.geometry if same else _moved(scene, some.geometry, crs=crs, projected=True)
+        yield Rows(layer, geometry, dict(some.columns))
 
 
 def _moved(scene: Scene, geometry: NDArray[np.object_], *, crs: CRS, projected: bool) -> NDArray[np.object_]:

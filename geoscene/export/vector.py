@@ -98,9 +98,7 @@ def write_gpkg(
 def _geometry_type(scene: Scene, chunk: Rows) -> str:
     if chunk.layer == SOLIDS:
         return "MultiPolygon Z"
-    from pyogrio import read_info  # noqa: PLC0415
-
-    return str(read_info(scene.path / "features.gpkg", layer=chunk.layer)["geometry_type"])
+    return scene.schema(chunk.layer).geometry_type
 
 
 def _named(crs: CRS) -> str:

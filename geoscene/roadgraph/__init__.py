@@ -7,6 +7,7 @@ from geoscene.roadgraph.components import find_components as find_components
 from geoscene.roadgraph.components import main_network as main_network
 from geoscene.roadgraph.grading import find_obstacles as find_obstacles
 from geoscene.roadgraph.grading import graded_ground as graded_ground
+from geoscene.roadgraph.graph import RoadGraph as RoadGraph
 from geoscene.roadgraph.graphml import read_graphml as read_graphml
 from geoscene.roadgraph.graphml import write_graphml as write_graphml
 from geoscene.roadgraph.long_profile import Obstacles as Obstacles

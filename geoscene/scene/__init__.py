@@ -1,4 +1,5 @@
-"""The scene on disk."""
+"""Scenes on disk: layout, reading, writing and validation."""
 
 from geoscene.scene.layout import Scene as Scene
+from geoscene.scene.layout import SceneFiles as SceneFiles
 from geoscene.scene.layout import open_scene as open_scene

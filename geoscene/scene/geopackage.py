@@ -1,12 +1,13 @@
-"""Features as a GeoPackage: one layer a kind, with provenance, for QGIS and everything else."""
+"""Features as a GeoPackage: one layer for each kind, with the source of every value."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import shapely
@@ -110,22 +111,67 @@ def write_geopackage(path: Path, layers: Sequence[Layer], *, frame: Frame) -> No
         part.unlink(missing_ok=True)
 
 
-def read_layer(path: Path, name: str, *, frame: Frame) -> Layer:
-    """A layer that `write_geopackage` wrote, geometry back in scene metres.
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """What a layer of a GeoPackage holds.
 
-    Raises SceneFormatError if the file or the layer is not there.
+    geometry_type : as GDAL names it: ``Polygon``, ``MultiPolygon Z`` ...
+    columns       : column name to type; object for text
     """
-    from pyogrio.errors import DataLayerError, DataSourceError  # noqa: PLC0415
+
+    geometry_type: str
+    columns: Mapping[str, np.dtype[Any]]
+
+
+def read_schema(path: Path, name: str) -> Schema:
+    """The geometry type and the columns of a layer; raises SceneFormatError if there is no such layer."""
+    from pyogrio import read_info  # noqa: PLC0415  (0.3 s)
+
+    with _readable(path, name):
+        info = read_info(path, layer=name)
+    types = [np.dtype(kind) for kind in info["dtypes"]]
+    return Schema(str(info["geometry_type"]), dict(zip(info["fields"].tolist(), types, strict=True)))
+
+
+def read_layer(
+    path: Path,
+    name: str,
+    *,
+    frame: Frame,
+    geometry: Literal["scene", "projected", "none"] = "scene",
+    rows: range | None = None,
+) -> Layer:
+    """A layer that `write_geopackage` wrote.
+
+    geometry : coordinates in scene metres or as stored, in the frame's projected CRS; ``none`` reads the
+               columns only and gives None for each feature
+    rows     : consecutive rows to read; all by default
+
+    Raises SceneFormatError if the file or the layer is missing or damaged.
+    """
     from pyogrio.raw import read  # noqa: PLC0415
 
+    part = {} if rows is None else {"skip_features": rows.start, "max_features": len(rows)}
+    with _readable(path, name):
+        meta, _, wkb, values = read(path, layer=name, read_geometry=geometry != "none", **part)
+    columns = dict(zip(meta["fields"].tolist(), values, strict=True))
+    if geometry == "none":
+        return Layer(name, np.full(len(values[0]) if values else 0, None, object), columns)
+    shapes = shapely.from_wkb(wkb)
+    if geometry == "scene":
+        shift = np.array(frame.origin)
+        has_z = bool(shapely.has_z(shapes).any())
+        shift = np.append(shift, 0.0) if has_z else shift
+        shapes = shapely.transform(shapes, lambda c: c - shift, include_z=has_z)
+    return Layer(name, shapes, columns)
+
+
+@contextmanager
+def _readable(path: Path, name: str) -> Iterator[None]:
+    """Raise GDAL's errors as SceneFormatError."""
+    from pyogrio.errors import DataLayerError, DataSourceError  # noqa: PLC0415
+
     try:
-        meta, _, wkb, fields = read(path, layer=name)
+        yield
     except (DataSourceError, DataLayerError) as error:
         raise SceneFormatError(f"{path}: no readable layer {name} ({error})") from error
-    geometry = shapely.from_wkb(wkb)
-    shift = np.array(frame.origin)
-    has_z = bool(shapely.has_z(geometry).any())
-    moved = shapely.transform(
-        geometry, (lambda c: c - np.append(shift, 0.0)) if has_z else (lambda c: c - shift), include_z=has_z
-    )
-    return Layer(name, moved, dict(zip(meta["fields"], fields, strict=True)))

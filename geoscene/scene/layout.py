@@ -6,29 +6,87 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from geoscene.errors import SceneFormatError
 from geoscene.frames import Frame
 from geoscene.mesh import Mesh
+from geoscene.roadgraph import RoadGraph, read_graphml
+from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile
 
 SCHEMA = 1
 """Version of the scene directory; a reader refuses others."""
 
 
+@dataclass(frozen=True, slots=True)
+class SceneFiles:
+    """Paths of the files in a scene directory."""
+
+    folder: Path
+
+    @property
+    def manifest(self) -> Path:
+        """Manifest: frame, bounds, sources, options and counts. It is written last."""
+        return self.folder / "scene.json"
+
+    @property
+    def features(self) -> Path:
+        """GeoPackage of the features."""
+        return self.folder / "features.gpkg"
+
+    @property
+    def road_graph(self) -> Path:
+        """GraphML of the drivable road graph; missing in a scene without drivable roads."""
+        return self.folder / "roads.graphml"
+
+    @property
+    def problems(self) -> Path:
+        """Table of what was repaired or dropped."""
+        return self.folder / "problems.csv"
+
+    @property
+    def shapes(self) -> Path:
+        """Meshes that the tiles' instances copy."""
+        return self.folder / "shapes.npz"
+
+    @property
+    def tiles(self) -> Path:
+        """Folder of the tiles."""
+        return self.folder / "tiles"
+
+    @property
+    def tile_reports(self) -> Path:
+        """What each tile holds, with digests of what the tiles depend on."""
+        return self.folder / "tiles.json"
+
+    @property
+    def tile_journal(self) -> Path:
+        """The same while the build runs, one line per finished tile."""
+        return self.folder / "tiles.jsonl"
+
+    def tile(self, i: int, j: int) -> Path:
+        """Tile (i, j)."""
+        return self.tiles / f"{i}_{j}.npz"
+
+
 @dataclass(frozen=True)
 class Scene:
-    """A scene directory, opened. Tiles are read when asked for.
+    """A scene directory, opened. Its files are read on request; no other module needs their names.
 
     path     : the directory
-    manifest : what ``scene.json`` holds
+    manifest : the document that the build wrote
     frame    : the scene frame
     """
 
     path: Path
     manifest: dict[str, Any]
     frame: Frame
+
+    @property
+    def files(self) -> SceneFiles:
+        """Paths of the files."""
+        return SceneFiles(self.path)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -43,22 +101,22 @@ class Scene:
 
     @property
     def tile_indices(self) -> list[tuple[int, int]]:
-        """(i, j) of the tiles there are; tile (i, j) covers [i, i + 1) x [j, j + 1) times `tile_size`."""
+        """(i, j) of all tiles; tile (i, j) covers [i, i + 1) x [j, j + 1) times `tile_size`."""
         return [(int(i), int(j)) for i, j in self.manifest["tiles"]]
 
     @property
     def layers(self) -> dict[str, tuple[int, int]]:
-        """Layer name to its range [start, stop) of feature numbers."""
+        """Layer name to its range [start, stop) of feature numbers, in the order of the numbers."""
         return {name: (int(a), int(b)) for name, (a, b) in self.manifest["layers"].items()}
 
     @property
     def left_hand(self) -> bool:
-        """Traffic keeps left."""
+        """Whether traffic keeps left."""
         return bool(self.manifest["roads"]["driving_side"] == "left")
 
     def tile(self, i: int, j: int) -> Tile:
-        """Tile (i, j), read from disk."""
-        return read_tile(self.path / "tiles" / f"{i}_{j}.npz")
+        """Tile (i, j); raises SceneFormatError if it is missing or damaged."""
+        return read_tile(self.files.tile(i, j))
 
     def tiles(self) -> Iterator[Tile]:
         """All tiles, one at a time."""
@@ -66,28 +124,53 @@ class Scene:
             yield self.tile(i, j)
 
     def shapes(self) -> dict[str, Mesh]:
-        """The shapes that tiles' instances copy."""
-        return read_shapes(self.path / "shapes.npz")
+        """The meshes that the tiles' instances copy, by name."""
+        return read_shapes(self.files.shapes)
+
+    def features(
+        self,
+        layer: str,
+        *,
+        geometry: Literal["scene", "projected", "none"] = "scene",
+        rows: range | None = None,
+    ) -> Layer:
+        """The features of a layer with their columns; see `geoscene.scene.geopackage.read_layer`.
+
+        Raises SceneFormatError if the scene has no such feature.
+        """
+        return read_layer(self.files.features, layer, frame=self.frame, geometry=geometry, rows=rows)
+
+    def schema(self, layer: str) -> Schema:
+        """The geometry type and the columns of a layer; raises SceneFormatError as `features` does."""
+        return read_schema(self.files.features, layer)
+
+    def road_graph(self) -> RoadGraph:
+        """The drivable road graph; raises SceneFormatError if the scene has no drivable roads."""
+        if not self.files.road_graph.exists():
+            raise SceneFormatError(f"{self.path}: this scene has no drivable roads")
+        return read_graphml(self.files.road_graph, self.frame)
 
 
 def open_scene(path: str | Path) -> Scene:
     """Open a scene directory.
 
-    Raises SceneFormatError if it is none, is unfinished, or has another schema version.
+    Raises SceneFormatError if it is not a scene, is unfinished, or has another schema version.
     """
     folder = Path(path)
-    manifest_path = folder / "scene.json"
+    manifest_file = SceneFiles(folder).manifest
     if not folder.is_dir():
         raise SceneFormatError(
             f"{folder}: no such scene directory; make one with: geoscene build --demo -o {folder}"
         )
-    if not manifest_path.exists():
-        raise SceneFormatError(f"{folder}: no scene.json in it: not a scene, or its build did not finish")
+    if not manifest_file.exists():
+        raise SceneFormatError(
+            f"{folder}: no {manifest_file.name} in it: not a scene, or its build did not finish"
+        )
     try:
-        manifest = json.loads(manifest_path.read_text("utf-8"))
+        manifest = json.loads(manifest_file.read_text("utf-8"))
         schema = manifest["schema"]
     except (ValueError, KeyError, TypeError) as error:
-        raise SceneFormatError(f"{manifest_path}: damaged ({error}); build the scene again") from error
+        raise SceneFormatError(f"{manifest_file}: damaged ({error}); build the scene again") from error
     if schema != SCHEMA:
         raise SceneFormatError(
             f"{folder}: schema version {schema}, this program reads {SCHEMA}; build the scene again"

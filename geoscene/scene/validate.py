@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from geoscene.scene.geopackage import read_layer
 from geoscene.scene.layout import Scene
 from geoscene.watertight import validate_mesh
 
@@ -32,6 +31,6 @@ def _osm_ids(scene: Scene, features: set[int]) -> dict[int, str]:
     out: dict[int, str] = {}
     for name, (start, stop) in scene.layers.items():
         if features & set(range(start, stop)):
-            layer = read_layer(scene.path / "features.gpkg", name, frame=scene.frame)
+            layer = scene.features(name, geometry="none")
             out |= dict(zip(layer.columns["feature"].tolist(), layer.columns["osm_id"].tolist(), strict=True))
     return out

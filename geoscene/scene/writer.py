@@ -20,8 +20,9 @@ from geoscene.files import write_atomically
 from geoscene.frames import Frame
 from geoscene.mesh import Mesh
 from geoscene.report import Problem
+from geoscene.roadgraph import RoadGraph, write_graphml
 from geoscene.scene.geopackage import Layer, write_geopackage
-from geoscene.scene.layout import SCHEMA
+from geoscene.scene.layout import SCHEMA, SceneFiles
 from geoscene.scene.tile_files import write_shapes
 
 
@@ -37,7 +38,7 @@ class SceneWriter:
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self.former: Path | None = None
         if path.exists():
-            ours = (path / "scene.json").exists()
+            ours = SceneFiles(path).manifest.exists()
             if not path.is_dir() or (any(path.iterdir()) and not ours):
                 raise SceneFormatError(f"{path}: exists and is not a scene; give another directory")
             if ours and not overwrite:
@@ -46,8 +47,9 @@ class SceneWriter:
         self.path = path
         self.folder = path.with_name(f"{path.name}.part")
         self.folder.mkdir(parents=True, exist_ok=True)
+        self.files = SceneFiles(self.folder)
         for left in self.folder.iterdir():
-            if left.name not in ("tiles", "tiles.jsonl"):  # a killed build's tiles serve, nothing else
+            if left not in (self.files.tiles, self.files.tile_journal):  # of a killed build only tiles serve
                 left.unlink()
 
     def finish(
@@ -55,6 +57,7 @@ class SceneWriter:
         *,
         frame: Frame,
         layers: Sequence[Layer],
+        graph: RoadGraph,
         shapes: Mapping[str, Mesh],
         problems: Iterable[Problem],
         tiles: Mapping[str, Any],
@@ -63,19 +66,22 @@ class SceneWriter:
         """Write everything but the tiles and move the directory to its name.
 
         layers   : features; the number of a feature is its row, counted through all layers in order
-        tiles    : what ``tiles.json`` says
-        manifest : what ``scene.json`` says besides frame, layers and codes
+        graph    : the drivable road graph; not written if it has no edges
+        tiles    : the document of tile reports
+        manifest : the manifest without frame, layers and codes
         """
         starts = np.cumsum([0, *(len(layer) for layer in layers)]).tolist()
         numbered = [
             Layer(layer.name, layer.geometry, {"feature": np.arange(a, b, dtype=np.int32), **layer.columns})
             for layer, a, b in zip(layers, starts[:-1], starts[1:], strict=True)
         ]
-        write_geopackage(self.folder / "features.gpkg", numbered, frame=frame)
-        write_shapes(self.folder / "shapes.npz", shapes)
-        write_atomically(self.folder / "problems.csv", _problems_csv(problems))
-        _write_json(self.folder / "tiles.json", tiles)
-        (self.folder / "tiles.jsonl").unlink(missing_ok=True)
+        write_geopackage(self.files.features, numbered, frame=frame)
+        if len(graph):
+            write_graphml(graph, frame, path=self.files.road_graph)
+        write_shapes(self.files.shapes, shapes)
+        write_atomically(self.files.problems, _problems_csv(problems))
+        _write_json(self.files.tile_reports, tiles)
+        self.files.tile_journal.unlink(missing_ok=True)
         ranges = {layer.name: [a, b] for layer, a, b in zip(layers, starts[:-1], starts[1:], strict=True)}
         document = {
             "schema": SCHEMA,
@@ -85,7 +91,7 @@ class SceneWriter:
             "classes": {c.name.lower(): int(c) for c in Class},
             "materials": {name: m.code for name, m in materials().items()},
         }
-        _write_json(self.folder / "scene.json", document)
+        _write_json(self.files.manifest, document)
         if self.path.exists():
             shutil.rmtree(self.path)
         self.folder.rename(self.path)

@@ -20,7 +20,7 @@ from lidar.planning.flight import Flight, survey_flight, survey_lines, times_on_
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
 from lidar.planning.route import Route, Spec, plan_route
-from lidar.planning.travel import AHEAD_S, covered, road_graph
+from lidar.planning.travel import AHEAD_S, covered
 from lidar.planning.waypoints import read_track
 from lidar.rig.camera_model import unproject
 from lidar.rig.devices import Camera, Scanner
@@ -170,7 +170,7 @@ def _along(
                 " --survey all, --survey FILE or waypoints"
             )
         length = vehicle.max_speed * ((60.0 if duration is None else duration) + AHEAD_S)
-        graph = covered(road_graph(scene), scene)
+        graph = covered(scene.road_graph(), scene)
         line = plan_route(graph, scene.frame, spec="random", seed=seed, length=length).line
         xyz, given = np.array(line), False
     elif isinstance(spec, str | Path):

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.progress import Progress, silent
-from geoscene.roadgraph import read_graphml
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
-from geoscene.scene.geopackage import read_layer
 from geoscene.typing import Float
 from lidar.errors import RouteError
 from lidar.planning.path import Path, Surface
@@ -46,17 +44,6 @@ class Travel:
     path: Path
     duration: float | None
     under_way: bool = False
-
-
-def road_graph(scene: Scene) -> RoadGraph:
-    """The scene's road graph.
-
-    Raises RouteError if the scene has none.
-    """
-    path = scene.path / "roads.graphml"
-    if not path.exists():
-        raise RouteError(f"{scene.path}: this scene has no roads to drive on")
-    return read_graphml(path, scene.frame)
 
 
 def covered(graph: RoadGraph, scene: Scene) -> RoadGraph:
@@ -93,7 +80,7 @@ def standing_footprints(scene: Scene) -> NDArray[np.object_]:
     """Footprints, scene metres, of buildings that reach down to the ground."""
     if "buildings" not in scene.layers or len(set(scene.layers["buildings"])) == 1:
         return np.empty(0, object)
-    layer = read_layer(scene.path / "features.gpkg", "buildings", frame=scene.frame)
+    layer = scene.features("buildings")
     low = np.asarray(layer.columns["min_height"], float)
     standing: NDArray[np.object_] = layer.geometry[low < 2.5]
     return standing
@@ -138,7 +125,7 @@ def plan_travel(
     Where a street is too narrow for the vehicle between its buildings, it is left out and the route planned
     again. Raises RouteError if no way is left.
     """
-    whole = road_graph(scene)
+    whole = scene.road_graph()
     kept = edges_on_tiles(whole, scene)
     graph = whole if kept.all() else whole.take(kept)
     body = load_vehicle(vehicle)

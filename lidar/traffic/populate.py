@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geoscene.errors import SceneFormatError
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
-from geoscene.scene.geopackage import Layer, read_layer
+from geoscene.scene.geopackage import Layer
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.rig.vehicle import Vehicle
@@ -274,7 +274,7 @@ def _ego_boxes(ego: Trajectory, vehicle: Vehicle, *, scale: float) -> NDArray[np
 
 def _layer(scene: Scene, name: str) -> Layer | None:
     try:
-        return read_layer(scene.path / "features.gpkg", name, frame=scene.frame)
+        return scene.features(name)
     except SceneFormatError:
         return None  # a scene without such features has no such layer
 

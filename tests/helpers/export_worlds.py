@@ -10,7 +10,6 @@ from geoscene.classes import Class
 from geoscene.frames import Frame
 from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh, concatenate
 from geoscene.objects.shapes import concatenate_instances, place, prism, rectangle, shapes, shifted_instances
-from geoscene.roadgraph import write_graphml
 from geoscene.scene import open_scene
 from geoscene.scene.geopackage import Layer
 from geoscene.scene.tile_files import Tile, write_tile
@@ -165,7 +164,7 @@ def write_world(path, crs="utm"):
         "bounds": [-100, -100, 100, 100], "tile_size": size, "tiles": [[-1, -1], [-1, 0], [0, -1], [0, 0]],
     }  # fmt: skip
     with SceneWriter(path) as writer:
-        (writer.folder / "tiles").mkdir()
+        writer.files.tiles.mkdir()
         for i, j in manifest["tiles"]:
             own = [k for k in range(4) if tuple(np.floor(middle[k, :2] / size)) == (i, j)]
             standing = [solids.take(np.isin(solids.feature, own))]
@@ -175,7 +174,8 @@ def write_world(path, crs="utm"):
             some = Instances(copies.shape[here], copies.transform[here], copies.feature[here])
             origin = np.array([i * size, j * size, np.floor(mesh.vertices[:, 2].min())])
             tile = Tile(origin, mesh.shifted(-origin), shifted_instances(some, -origin))
-            write_tile(writer.folder / "tiles" / f"{i}_{j}.npz", tile)
-        write_graphml(graph, frame, path=writer.folder / "roads.graphml")
-        writer.finish(frame=frame, layers=layers, shapes=shapes(), problems=[], tiles={}, manifest=manifest)
+            write_tile(writer.files.tile(i, j), tile)
+        writer.finish(
+            frame=frame, layers=layers, graph=graph, shapes=shapes(), problems=[], tiles={}, manifest=manifest
+        )
     return open_scene(path)

@@ -29,7 +29,7 @@ from lidar.dataset.layout import open_dataset
 from lidar.drive import DriveOptions, drive
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.geometry.attitude import quat_from_euler
-from lidar.planning.travel import plan_travel, road_graph
+from lidar.planning.travel import plan_travel
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.populate import TrafficOptions
@@ -273,7 +273,7 @@ def test_a_random_drive_is_under_way_from_first_to_last_unless_it_is_to_be_from_
         for from_rest in (False, True):
             travel = plan_travel(scene, "random", vehicle="car", seed=seed, duration=3.0, from_rest=from_rest)
             trajectory = drive_with_signals(
-                travel.path, load_vehicle("car"), graph=road_graph(scene), seed=seed, bounds=scene.bounds,
+                travel.path, load_vehicle("car"), graph=scene.road_graph(), seed=seed, bounds=scene.bounds,
                 duration=3.0, under_way=travel.under_way,
             )  # fmt: skip
             speeds[from_rest] = np.linalg.norm(trajectory.velocity, axis=1)

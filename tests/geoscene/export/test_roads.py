@@ -16,6 +16,7 @@ from geoscene.export.planview import connecting_curve, cut, plan_view
 from geoscene.roadgraph import write_graphml
 from geoscene.roadgraph.graph import rows_of
 from geoscene.roadgraph.routing import turn_table
+from geoscene.scene import SceneFiles
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +99,7 @@ def _write(graph, scene, folder, **options):
     path = folder / "scene"
     if not path.exists():
         write_world(path)
-    write_graphml(graph, scene.frame, path=path / "roads.graphml")
+    write_graphml(graph, scene.frame, path=SceneFiles(path).road_graph)
     return export_scene(replace(scene, path=path), folder / "a.xodr", overwrite=True, **options).path
 
 
@@ -147,7 +148,7 @@ def test_restrictions_that_junctions_cannot_say_are_counted(tmp_path):
     assert export_scene(scene, tmp_path / "plain.xodr").notes == ()
     chain = rows_of([np.array([0, 2, 3], np.int32)])
     graph = replace(roads(), chain_edges=chain, chain_kind=np.array(["no_u_turn"]))
-    write_graphml(graph, scene.frame, path=scene.path / "roads.graphml")
+    write_graphml(graph, scene.frame, path=scene.files.road_graph)
     (note,) = export_scene(scene, tmp_path / "bound.xodr").notes
     assert note.startswith("1 turn restrictions via ways are not in it")
     assert (tmp_path / "bound.xodr").read_bytes() == (tmp_path / "plain.xodr").read_bytes()

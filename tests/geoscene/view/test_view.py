@@ -17,7 +17,6 @@ from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.frames import Frame
 from geoscene.mesh import Instances, Mesh
-from geoscene.scene.geopackage import read_layer
 from geoscene.scene.tile_files import Tile
 from geoscene.sources import demo_path, read_osm
 from geoscene.view import view_scene
@@ -179,7 +178,7 @@ def test_every_attribute_is_in_the_page(scene, page):
     known = {table["layer"]: table for table in page.json("attributes")}
     assert {"buildings", "building_parts", "road_surfaces", "roads", "trees", "furniture"} <= set(known)
     for name in ("buildings", "building_parts", "trees"):
-        layer, table = read_layer(scene.path / "features.gpkg", name, frame=scene.frame), known[name]
+        layer, table = scene.features(name), known[name]
         assert table["feature"] == layer.columns["feature"].tolist()
         assert set(table["columns"]) == set(layer.columns) - {"feature"}
         for column, told in table["columns"].items():
@@ -196,8 +195,8 @@ def test_every_attribute_is_in_the_page(scene, page):
 
 def test_road_edges_come_with_the_surfaces_of_their_ways(scene, page):
     tables = {table["layer"]: table for table in page.json("attributes")}
-    roads = read_layer(scene.path / "features.gpkg", "roads", frame=scene.frame)
-    surfaces = read_layer(scene.path / "features.gpkg", "road_surfaces", frame=scene.frame)
+    roads = scene.features("roads")
+    surfaces = scene.features("road_surfaces")
     seen = np.isin(surfaces.columns["feature"], np.concatenate([t.mesh.feature for t in scene.tiles()]))
     ways = {way for text in surfaces.columns["osm_id"][seen] for way in text.split(";")}
     belongs = [not ways.isdisjoint(text.split(";")) for text in roads.columns["osm_id"]]

@@ -11,7 +11,6 @@ from PIL import Image
 from geoscene.build import BuildOptions, build
 from geoscene.classes import Class
 from geoscene.cli import app
-from geoscene.scene.geopackage import read_layer
 from geoscene.sources import demo_path, read_osm
 
 BOX = (24.9405, 60.1655, 24.9450, 60.1680)
@@ -73,7 +72,7 @@ def middle(window):
 
 def tall_house(scene, window):
     """(row, feature, columns) of the highest house in the page that is a way."""
-    buildings = read_layer(scene.path / "features.gpkg", "buildings", frame=scene.frame).columns
+    buildings = scene.features("buildings").columns
     for row in np.argsort(-buildings["height"]):
         feature = int(buildings["feature"][row])
         if buildings["osm_id"][row].startswith("way/") and window.js(
@@ -163,7 +162,7 @@ def test_search_by_id_goes_there(scene, opened):
 
 
 def test_search_by_name_finds_and_says_when_there_is_none(scene, opened):
-    names = read_layer(scene.path / "features.gpkg", "buildings", frame=scene.frame).columns["name"]
+    names = scene.features("buildings").columns["name"]
     name = next(name for name in names if name)
     assert opened.js("return geoscene.select(arguments[0])", name.upper())
     assert name in opened.text("panel")
@@ -177,9 +176,7 @@ def test_what_was_guessed_has_its_own_colours_and_a_legend(scene, opened):
     opened.js("const c = document.getElementById('color'); c.value = 'source'; c.onchange();")
     assert (np.abs(middle(opened) - before).max(axis=2) > 12).mean() > 0.1
     legend = opened.text("legend")
-    sources = read_layer(scene.path / "features.gpkg", "buildings", frame=scene.frame).columns[
-        "height_source"
-    ]
+    sources = scene.features("buildings").columns["height_source"]
     assert f"from its storeys ({(sources == 'levels').sum()})" in legend
     for mode in ("material", "class", "sigma", "look"):
         opened.js("const c = document.getElementById('color'); c.value = arguments[0]; c.onchange();", mode)

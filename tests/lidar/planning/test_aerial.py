@@ -13,6 +13,7 @@ import pytest
 import shapely
 
 from geoscene.build import BuildOptions, build
+from geoscene.scene import SceneFiles
 from geoscene.sources import demo_path, read_osm
 from lidar.dataset.formats.pcd import read_pcd
 from lidar.dataset.layout import open_dataset
@@ -242,10 +243,10 @@ def test_words_that_cannot_be_are_one_line_and_exit_code_two(scene, tmp_path, wo
 
 def test_a_scene_without_roads_can_be_flown_over_but_not_driven_through(scene, tmp_path):
     shutil.copytree(scene.path, tmp_path / "bare")
-    (tmp_path / "bare" / "roads.graphml").unlink()
+    SceneFiles(tmp_path / "bare").road_graph.unlink()
     done = program("drive", "bare", "--route", "random", "-o", "x", cwd=tmp_path)
     assert done.returncode == 2
-    assert "no roads" in done.stderr
+    assert "no drivable roads" in done.stderr
     words = [
         "--rig",
         "drone",

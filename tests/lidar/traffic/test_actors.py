@@ -10,13 +10,12 @@ from hypothesis import strategies as st
 
 from geoscene.build import BuildOptions, build
 from geoscene.classes import Class
-from geoscene.scene.geopackage import read_layer
 from geoscene.sources import demo_path, read_osm
 from lidar.camera.render import RenderOptions, render
 from lidar.dataset.boxes import COLUMNS, box_rows, count_points, image_boxes
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
-from lidar.planning.travel import plan_travel, road_graph
+from lidar.planning.travel import plan_travel
 from lidar.rig.scanner import load_sensor
 from lidar.rig.specs import CameraSpec
 from lidar.rig.vehicle import load_vehicle
@@ -43,14 +42,14 @@ def scene(tmp_path_factory):
 def ego(scene):
     travel = plan_travel(scene, "random", vehicle="car", seed=2, duration=15.0)
     return drive_with_signals(
-        travel.path, load_vehicle("car"), graph=road_graph(scene), seed=2, bounds=scene.bounds, duration=15.0,
-        under_way=travel.under_way,
+        travel.path, load_vehicle("car"), graph=scene.road_graph(), seed=2, bounds=scene.bounds,
+        duration=15.0, under_way=travel.under_way,
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def actors(scene, ego):
-    return populate(scene, road_graph(scene), ego=ego, vehicle=CAR, seed=5, options=BUSY)
+    return populate(scene, scene.road_graph(), ego=ego, vehicle=CAR, seed=5, options=BUSY)
 
 
 def outlines(actors, rows, t):
@@ -86,7 +85,7 @@ def test_nobody_touches_anybody_nor_the_ego(actors, ego):
 
 
 def test_nobody_stands_in_a_building(actors, scene):
-    layer = read_layer(scene.path / "features.gpkg", "buildings", frame=scene.frame)
+    layer = scene.features("buildings")
     walls = shapely.STRtree(layer.geometry[np.asarray(layer.columns["min_height"], float) < 2.5])
     for t in (0, 7_000_000_000):
         rows = alive(actors, t, end_ns=t)
@@ -110,16 +109,16 @@ def test_features_follow_the_scenes_own(actors, scene):
 
 
 def test_the_same_seed_gives_the_same_actors_and_another_seed_others(actors, scene, ego):
-    again = populate(scene, road_graph(scene), ego=ego, vehicle=CAR, seed=5, options=BUSY)
+    again = populate(scene, scene.road_graph(), ego=ego, vehicle=CAR, seed=5, options=BUSY)
     for name in ("shape", "size", "time_ns", "position", "angles", "velocity"):
         assert getattr(again, name).tobytes() == getattr(actors, name).tobytes()
-    other = populate(scene, road_graph(scene), ego=ego, vehicle=CAR, seed=6, options=BUSY)
+    other = populate(scene, scene.road_graph(), ego=ego, vehicle=CAR, seed=6, options=BUSY)
     assert other.position.tobytes() != actors.position.tobytes()
 
 
 def test_an_empty_place_has_nobody(scene, ego):
     none = TrafficOptions(vehicles=0.0, cyclists=0.0, walkers=0.0, parked=0.0)
-    actors = populate(scene, road_graph(scene), ego=ego, vehicle=CAR, seed=1, options=none)
+    actors = populate(scene, scene.road_graph(), ego=ego, vehicle=CAR, seed=1, options=none)
     assert len(actors) == 0
     assert actor_shapes(actors) == []
     shape, transform, feature = actor_transforms(actors, 0, end_ns=10**8)

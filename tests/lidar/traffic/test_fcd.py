@@ -14,7 +14,6 @@ from geoscene.sources import demo_path, read_osm
 from lidar.cli import app
 from lidar.errors import FormatError, InputError
 from lidar.geometry.poses import Trajectory
-from lidar.planning.travel import road_graph
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.fcd import TrafficFile, read_fcd
 from lidar.traffic.fcd_replay import replay
@@ -38,7 +37,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def graph(scene):
-    return road_graph(scene)
+    return scene.road_graph()
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import trimesh
 from geoscene.classes import Class, materials
 from geoscene.frames import Frame
 from geoscene.mesh import WALL, Instances, Mesh
-from geoscene.scene import open_scene
+from geoscene.scene import SceneFiles, open_scene
 from geoscene.scene.tile_files import Tile, write_shapes, write_tile
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
@@ -58,12 +58,13 @@ def tile(i, j, rank):
 def scene(tmp_path_factory):
     """Six tiles in a row and one above, from x = -200 to 400."""
     folder = tmp_path_factory.mktemp("scene")
-    (folder / "tiles").mkdir()
+    files = SceneFiles(folder)
+    files.tiles.mkdir()
     indices = [(i, 0) for i in range(-2, 4)] + [(0, 1)]
     for rank, (i, j) in enumerate(indices):
-        write_tile(folder / "tiles" / f"{i}_{j}.npz", tile(i, j, rank))
+        write_tile(files.tile(i, j), tile(i, j, rank))
     crown = box([4, 4, 4], [0, 0, 4.0], klass=Class.TREE_CROWN, material=materials()["foliage"].code)
-    write_shapes(folder / "shapes.npz", {"tree": crown})
+    write_shapes(files.shapes, {"tree": crown})
     manifest = {
         "schema": 1,
         "frame": Frame.at(2.0, 48.0).to_json(),
@@ -72,7 +73,7 @@ def scene(tmp_path_factory):
         "tiles": indices,
         "layers": {},
     }
-    (folder / "scene.json").write_text(json.dumps(manifest))
+    files.manifest.write_text(json.dumps(manifest))
     return open_scene(folder)
 
 
@@ -136,12 +137,13 @@ def test_following_keeps_only_the_tiles_around(scene):
 
 
 def test_the_float32_origin_follows_over_long_ways_and_ranges_stay_exact(tmp_path):
-    (tmp_path / "tiles").mkdir()
+    files = SceneFiles(tmp_path)
+    files.tiles.mkdir()
     indices = [(0, 0), (400, 7)]
     for rank, (i, j) in enumerate(indices):
-        write_tile(tmp_path / "tiles" / f"{i}_{j}.npz", tile(i, j, rank))
-    write_shapes(tmp_path / "shapes.npz", {"tree": box([4, 4, 4], [0, 0, 4.0])})
-    (tmp_path / "scene.json").write_text(
+        write_tile(files.tile(i, j), tile(i, j, rank))
+    write_shapes(files.shapes, {"tree": box([4, 4, 4], [0, 0, 4.0])})
+    files.manifest.write_text(
         json.dumps(
             {
                 "schema": 1,
