@@ -96,6 +96,8 @@ def tree_layer(trees: Trees, z: NDArray[np.float64]) -> Layer:
             "trunk": trees.trunk,
             "form": trees.form,
             "form_source": trees.form_source,
+            "place_source": trees.place_source,
+            "moved": trees.moved,
         },
     )
 
@@ -113,6 +115,7 @@ def furniture_layer(furniture: Furniture, z: NDArray[np.float64]) -> Layer:
             "heading": furniture.heading,
             "heading_source": furniture.heading_source,
             "place_source": furniture.place_source,
+            "moved": furniture.moved,
         },
     )
 

@@ -12,36 +12,31 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.frames import Frame
 from geoscene.ground.kinds import is_underground
-from geoscene.ground.partition import GroundPlan, winners
+from geoscene.ground.partition import GroundPlan
 from geoscene.mesh import Instances
 from geoscene.objects.shapes import place, shapes
+from geoscene.objects.siting import Sites
 from geoscene.report import Problem
+from geoscene.roadgraph.tags import is_bridge, is_tunnel
 from geoscene.sources.data import OsmData, Point, Tags
 from geoscene.tags import parse_direction, parse_length
 from geoscene.typing import Float
 
 Height = Callable[[Float, Float], Float]
-_Stand = tuple[Float, float, str, str]
-"""(place, heading, place source, heading source)."""
-_Row = tuple[Float, float, str, str, str, float, str, str]
-"""A stand with (shape, height, height source, id)."""
+_Stand = tuple[Float, float, str]
+"""(place, heading, heading source)."""
+_Row = tuple[Float, float, str, str, float, str, str, str, Float]
+"""A stand with (shape, height, height source, place source, id, where it is mapped)."""
 
 _TALLEST = 60.0
 """Metres: a taller pole is a mast or a slip of the pen."""
 
-_ASIDE = 0.5
-"""Metres between the edge of the carriageway and what stands beside it: the clearance of traffic signs."""
-
 _FARTHEST = 30.0
-"""Metres within which the road that a thing belongs to, or that road's edge, is looked for."""
-
-_WIDEST = 15.0
-"""Metres from a centre line beyond which no carriageway of one road reaches."""
+"""Metres within which the road that a thing belongs to is looked for."""
 
 _WITHOUT_SURFACE = 4.0
-"""Metres from the centre line where no road surface is known: half a street of two lanes, and `_ASIDE`."""
+"""Metres from the centre line where no road surface is known: half a street of two lanes, and a clearance."""
 
-_ON_ROAD = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.KERB, Class.PARKING, Class.RAIL)
 _TRAVELLED = frozenset(
     {"motorway", "trunk", "primary", "secondary", "tertiary", "unclassified", "residential", "living_street",
      "service", "motorway_link", "trunk_link", "primary_link", "secondary_link", "tertiary_link", "busway",
@@ -71,7 +66,9 @@ class Furniture:
     height   : (n,) float64 metres above the ground
     heading  : (n,) float64, radians counter-clockwise from east: where it faces
     height_source : (n,) str: ``height`` or ``default`` (the shape's own)
-    place_source : (n,) str: ``node`` (where the map has it) or ``roadside`` (beside the road of its node)
+    place_source : (n,) str: ``node`` (where it is mapped), ``moved`` (mapped on a carriageway, moved to the
+                nearest clear place) or ``roadside`` (mapped on a road's own node, moved beside that road)
+    moved    : (n,) float64 metres from where it is mapped
     heading_source : (n,) str: ``direction``, ``road`` (against its traffic, or towards it) or ``default``
     osm_id   : (n,) str
     feature  : (n,) int32, -1 for none
@@ -83,6 +80,7 @@ class Furniture:
     heading: Float
     height_source: NDArray[np.str_]
     place_source: NDArray[np.str_]
+    moved: Float
     heading_source: NDArray[np.str_]
     osm_id: NDArray[np.str_]
     feature: NDArray[np.int32]
@@ -99,13 +97,19 @@ class Furniture:
 def read_furniture(
     osm: OsmData, frame: Frame, *, plan: GroundPlan, left_hand: bool = False
 ) -> tuple[Furniture, list[Problem]]:
-    """The street furniture on the map within the ground's extent, and what could not be used.
+    """The street furniture on the map within the ground's extent, and what was moved or left out.
 
-    Signals and signs that the map has on a road's own node are put beside the road, facing the traffic
-    that heeds them (``direction`` or ``traffic_signals:direction``, else, on a two-way road, traffic of
-    both directions, each with its own): on the side that traffic keeps to, half a metre off the road's
-    surface, as the ground has it. Lamps face the nearest road. What is in tunnels, on bridges or inside
-    buildings is left out.
+    No post stands on a carriageway, a crossing, a track or in the mouth of a tunnel:
+
+    - Signals and signs on a road's own node stand beside the road, half a metre off its surface, on the
+      side that their traffic keeps to, and face that traffic: the one that ``traffic_signals:direction``,
+      ``traffic_sign:direction`` or ``direction`` names, else that of a one-way road, else (``stop`` and
+      ``give_way``) the one that comes to the nearer junction, else both, each with a post of its own.
+    - What else is mapped on a carriageway is taken for imprecise and stands at the nearest clear place,
+      bollards too: vehicles pass where they are mapped, for the road graph does not close roads there.
+
+    Lamps face the nearest road. Signals and signs of bridges and tunnels, things inside buildings and things
+    without a clear place within `geoscene.objects.siting.FARTHEST` are left out and listed as problems.
 
     left_hand : traffic keeps left
     """
@@ -115,23 +119,34 @@ def read_furniture(
         if (shape := shape_of(point.tags)) is not None and not _elsewhere(point.tags)
     ]
     x, y = frame.from_geographic(*np.array([(p.lon, p.lat) for p, _ in chosen]).reshape(-1, 2).T)
-    xy = np.column_stack([x, y])
     xmin, ymin, xmax, ymax = plan.extent
-    inside = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
-    roads = _Roads.of(osm, frame)
-    problems: list[Problem] = []
+    inside = np.flatnonzero((x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax))
+    chosen, mapped = [chosen[k] for k in inside.tolist()], np.column_stack([x, y])[inside]
+    roads, sites = _Roads.of(osm, frame), Sites.of(plan)
+    addressing = np.array([_addresses(shape) and bool(roads.at(p)) for p, shape in chosen], np.bool_)
+    amid = ~addressing & sites.driven(mapped)
+    xy, found = mapped.copy(), np.ones(len(mapped), np.bool_)
+    xy[amid], found[amid] = sites.nearest_clear(mapped[amid])
+    problems = [
+        Problem(chosen[k][0].osm_id, "furniture", "dropped", "on-carriageway")
+        for k in np.flatnonzero(~found).tolist()
+    ]
     rows: list[_Row] = []
-    for k in np.flatnonzero(inside):
+    for k in np.flatnonzero(found).tolist():
         point, shape = chosen[k]
         height, height_source = _height(point, shape, problems=problems)
-        rows += [
-            (*stand, shape, height, height_source, point.osm_id)
-            for stand in _stands(point, shape, xy=xy[k], roads=roads, frame=frame, left_hand=left_hand)
-        ]
-    table = _table(rows)
-    table, adrift = _put_beside(table, plan, left_hand=left_hand)
-    problems += [Problem(str(osm_id), "furniture", "dropped", "no-roadside") for osm_id in np.unique(adrift)]
-    built = np.append(plan.layers.klass == Class.BUILDING_PAD, np.False_)[winners(plan, table.xy)]
+        stands = (
+            _roadside_stands(point, shape, xy=xy[k], roads=roads, frame=frame)
+            if addressing[k]
+            else [_stand(point, shape, xy=xy[k], roads=roads, frame=frame, left_hand=left_hand)]
+        )
+        if not stands:
+            problems.append(Problem(point.osm_id, "furniture", "dropped", "on-bridge-or-in-tunnel"))
+        source = "roadside" if addressing[k] else "moved" if amid[k] else "node"
+        rows += [(*stand, shape, height, height_source, source, point.osm_id, mapped[k]) for stand in stands]
+    table, lost = _beside_roads(_table(rows), sites, left_hand=left_hand)
+    problems += [Problem(str(osm_id), "furniture", "dropped", "no-roadside") for osm_id in np.unique(lost)]
+    built = sites.classes(table.xy) == Class.BUILDING_PAD
     problems += [
         Problem(str(osm_id), "furniture", "dropped", "in-building")
         for osm_id in np.unique(table.osm_id[built])
@@ -185,6 +200,7 @@ def _elsewhere(tags: Tags) -> bool:
         is_underground(tags)
         or layer not in {"0", ""}
         or tags.get("location") in {"indoor", "wall", "wall_mounted"}
+        or tags.get("fire_hydrant:type") in {"underground", "wall", "pond", "pipe"}
     )
 
 
@@ -212,18 +228,23 @@ class _Roads:
 
     lines : (n,) object, scene metres
     oneway : (n,) int8: 1, -1 or 0
+    raised : (n,) bool, on a bridge or in a tunnel
     by_node : rows and places in them of each node
+    nodes : ids of the nodes of each line
     tree : of the lines
     """
 
     lines: NDArray[np.object_]
     oneway: NDArray[np.int8]
+    raised: NDArray[np.bool_]
     by_node: dict[int, list[tuple[int, int]]]
+    nodes: list[NDArray[np.int64]]
     tree: shapely.STRtree
 
     @classmethod
     def of(cls, osm: OsmData, frame: Frame) -> _Roads:
         ways = [w for w in osm.ways if w.tags.get("highway") in _TRAVELLED and len(w.lonlat) > 1]
+        nodes = [way.nodes for way in ways]
         lines = np.empty(len(ways), object)
         by_node: dict[int, list[tuple[int, int]]] = {}
         oneway = []
@@ -233,7 +254,31 @@ class _Roads:
             oneway.append({"yes": 1, "1": 1, "true": 1, "-1": -1, "reverse": -1}.get(value, 0))
             for index, node in enumerate(way.nodes):
                 by_node.setdefault(int(node), []).append((row, index))
-        return cls(lines, np.array(oneway, np.int8), by_node, shapely.STRtree(lines))
+        raised = np.array([is_bridge(way.tags) or is_tunnel(way.tags) for way in ways], np.bool_)
+        return cls(lines, np.array(oneway, np.int8), raised, by_node, nodes, shapely.STRtree(lines))
+
+    def at(self, point: Point) -> list[tuple[int, int]]:
+        """Rows, and places in them, of a node that lies on roads."""
+        return self.by_node.get(int(point.osm_id.removeprefix("node/")), [])
+
+    def nearer_junction(self, row: int, index: int) -> int:
+        """1 if a vertex's nearer junction lies ahead along its line, -1 if behind, 0 if it is a junction.
+
+        Where no junction lies between, the end of the line counts.
+        """
+        nodes, last = self.nodes[row], len(self.nodes[row]) - 1
+        crossing = [k for k in range(last + 1) if k in (0, last) or self._arms(int(nodes[k])) > 2]
+        if index in crossing:
+            return 0 if self._arms(int(nodes[index])) > 2 else 1 if index else -1
+        xy = shapely.get_coordinates(self.lines[row])
+        metres = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+        ahead = min(metres[k] for k in crossing if k > index) - metres[index]
+        behind = metres[index] - max(metres[k] for k in crossing if k < index)
+        return 1 if ahead <= behind else -1
+
+    def _arms(self, node: int) -> int:
+        """Number of road arms that leave a node."""
+        return sum(1 if k in (0, len(self.nodes[row]) - 1) else 2 for row, k in self.by_node[node])
 
     def course(self, row: int, index: int) -> Float:
         """Unit vector (2,) along a line at one of its vertices, of the segment that leads to it."""
@@ -247,91 +292,102 @@ class _Roads:
         return unit
 
 
-def _stands(
-    point: Point, shape: str, *, xy: Float, roads: _Roads, frame: Frame, left_hand: bool
-) -> list[_Stand]:
-    """Where a thing stands and faces, once or twice; ``roadside`` ones are still on the centre line."""
+def _addresses(shape: str) -> bool:
+    """Whether a shape speaks to the traffic of one direction."""
+    return shape == "traffic_signals" or shape.startswith("sign_")
+
+
+def _facing(point: Point, xy: Float, *, frame: Frame) -> float | None:
+    """Heading that the tags give in degrees or as a compass point, None if they do not."""
     stated = parse_direction(point.tags.get("direction") or point.tags.get("light:direction"))
-    heading = None
-    if stated is not None:
-        lon, lat = frame.to_geographic(*xy)
-        heading = np.pi / 2 - (np.radians(stated) - float(frame.convergence(lon, lat)))
-    on = roads.by_node.get(int(point.osm_id.removeprefix("node/")), [])
-    if on and (shape == "traffic_signals" or shape.startswith("sign_")):
-        return _heeded(point, xy, roads=roads, on=on)
+    if stated is None:
+        return None
+    lon, lat = frame.to_geographic(*xy)
+    return float(np.pi / 2 - (np.radians(stated) - float(frame.convergence(lon, lat))))
+
+
+def _stand(point: Point, shape: str, *, xy: Float, roads: _Roads, frame: Frame, left_hand: bool) -> _Stand:
+    """Where a thing that stands beside the road, or away from roads, faces."""
+    heading = _facing(point, xy, frame=frame)
     if heading is not None:
-        return [(xy, heading, "node", "direction")]
+        return xy, heading, "direction"
     near = roads.tree.query_nearest(shapely.Point(xy), max_distance=_FARTHEST, all_matches=False)
     if len(near) == 0:
-        return [(xy, 0.0, "node", "default")]
+        return xy, 0.0, "default"
     line = roads.lines[near[0]]
-    foot = shapely.get_coordinates(line.interpolate(line.project(shapely.Point(xy))))[0]
-    toward = foot - xy
+    along = line.project(shapely.Point(xy))
+    toward = shapely.get_coordinates(line.interpolate(along))[0] - xy
     if np.hypot(*toward) < 1e-6:
-        return [(xy, 0.0, "node", "default")]
-    if shape.startswith("sign_") or shape == "traffic_signals":
-        # Beside the road: it faces the traffic that keeps to its side, against that traffic's course.
-        along = line.project(shapely.Point(xy))
-        ahead = shapely.get_coordinates(line.interpolate([max(along - 1, 0), along + 1]))
-        course = ahead[1] - ahead[0]
-        right = course[0] * -toward[1] - course[1] * -toward[0] < 0
-        against = -course if right != left_hand else course
-        if roads.oneway[near[0]]:
-            against = -course * float(roads.oneway[near[0]])
-        return [(xy, float(np.arctan2(against[1], against[0])), "node", "road")]
-    return [(xy, float(np.arctan2(toward[1], toward[0])), "node", "road")]
+        return xy, 0.0, "default"
+    if not _addresses(shape):
+        return xy, float(np.arctan2(toward[1], toward[0])), "road"
+    # It faces the traffic that keeps to its side of the road.
+    before, after = shapely.get_coordinates(line.interpolate([max(along - 1, 0), along + 1]))
+    course = after - before
+    right = course[0] * -toward[1] - course[1] * -toward[0] < 0
+    against = -course if right != left_hand else course
+    if roads.oneway[near[0]]:
+        against = -course * float(roads.oneway[near[0]])
+    return xy, float(np.arctan2(against[1], against[0])), "road"
 
 
-def _heeded(point: Point, xy: Float, *, roads: _Roads, on: list[tuple[int, int]]) -> list[_Stand]:
-    """A thing on a road's centre line, once for each direction of traffic that heeds it, facing that."""
-    # A node inside a way knows its course; one where ways meet takes that of the first that passes through.
+def _roadside_stands(point: Point, shape: str, *, xy: Float, roads: _Roads, frame: Frame) -> list[_Stand]:
+    """A post, still at the node, for each direction of traffic that a road's node addresses."""
+    on = [(row, index) for row, index in roads.at(point) if not roads.raised[row]]
+    if not on:
+        return []
+    # A node inside a way has one course; one where ways meet takes that of the first that passes through.
     row, index = max(on, key=lambda at: 0 < at[1] < shapely.get_num_points(roads.lines[at[0]]) - 1)
     course = roads.course(row, index)
-    stated = point.tags.get("traffic_signals:direction") or point.tags.get("direction", "")
+    keys = ("traffic_signals:direction", "traffic_sign:direction", "direction")
+    stated = next((point.tags[key] for key in keys if key in point.tags), "")
     signs = {"forward": (1,), "backward": (-1,), "both": (1, -1)}.get(stated)
-    source = "direction" if signs is not None else "road"
-    if signs is None:
-        signs = (int(roads.oneway[row]),) if roads.oneway[row] else (1, -1)
+    facing = _facing(point, xy, frame=frame)
+    if signs is None and facing is not None:
+        return [(xy, facing, "direction")]
+    source = "road" if signs is None else "direction"
+    if signs is None and roads.oneway[row]:
+        signs = (int(roads.oneway[row]),)
+    elif signs is None:
+        nearer = roads.nearer_junction(row, index) if shape in {"sign_stop", "sign_give_way"} else 0
+        signs = (nearer,) if nearer else (1, -1)
     against = [-course * sign for sign in signs]
-    return [(xy, float(np.arctan2(y, x)), "roadside", source) for x, y in against]
+    return [(xy, float(np.arctan2(y, x)), source) for x, y in against]
 
 
-def _put_beside(table: Furniture, plan: GroundPlan, *, left_hand: bool) -> tuple[Furniture, NDArray[np.str_]]:
-    """The table with its roadside things half a metre off the road, and the ids that found no place.
+def _beside_roads(table: Furniture, sites: Sites, *, left_hand: bool) -> tuple[Furniture, NDArray[np.str_]]:
+    """The table with its roadside posts moved off the road, and the ids that found no place.
 
-    Straight to the side of the traffic that the thing faces; amid a junction, where that leads along another
-    road, back to the near corner.
+    A post goes to the nearest clear place between straight aside, on the side that the traffic it faces keeps
+    to, and straight back: amid a junction that is the near corner.
     """
     moved = np.flatnonzero(table.place_source == "roadside")
-    ahead = -np.column_stack([np.cos(table.heading[moved]), np.sin(table.heading[moved])])
-    aside = np.column_stack([ahead[:, 1], -ahead[:, 0]]) * (-1.0 if left_hand else 1.0)
-    courses = np.stack([aside, (aside - ahead) / np.sqrt(2.0)], axis=1)
-    reach = np.arange(0.0, _FARTHEST, 0.25)
-    places = table.xy[moved][:, None, None] + reach[:, None] * courses[:, :, None]
-    klass = np.append(plan.layers.klass, np.uint8(plan.base[0]))[winners(plan, places.reshape(-1, 2))]
-    road = np.isin(klass, _ON_ROAD).reshape(places.shape[:3])
-    ends = np.any(~road[:, :, reach <= _WIDEST], axis=2)
-    no_surface = ~road[:, 0, 0]
-    which = np.where(ends[:, 0], 0, 1)
-    nth = np.arange(len(moved))
-    off = np.where(no_surface, _WITHOUT_SURFACE, reach[np.argmin(road[nth, which], axis=1)] + _ASIDE)
-    xy = table.xy.copy()
-    xy[moved] += off[:, None] * courses[nth, which]
-    keep = np.ones(len(table), bool)
-    keep[moved] = no_surface | ends.any(axis=1)
-    return replace(table, xy=xy).take(keep), table.osm_id[~keep]
+    side = 1.0 if left_hand else -1.0
+    aside = table.heading[moved] + np.pi + side * np.pi / 2
+    paved = sites.driven(table.xy[moved])
+    off = np.where(paved, 0.0, _WITHOUT_SURFACE)[:, None] * np.column_stack([np.cos(aside), np.sin(aside)])
+    xy, found = sites.nearest_clear(
+        table.xy[moved] + off, angles=aside[:, None] + side * np.radians(np.arange(0, 91, 15))
+    )
+    xy[~found], found[~found] = sites.nearest_clear(table.xy[moved[~found]])
+    places, keep = table.xy.copy(), np.ones(len(table), np.bool_)
+    places[moved], keep[moved] = xy, found
+    placed = replace(table, xy=places, moved=table.moved + np.hypot(*(places - table.xy).T))
+    return placed.take(keep), table.osm_id[~keep]
 
 
 def _table(rows: list[_Row]) -> Furniture:
-    columns: list[list[object]] = [list(column) for column in zip(*rows, strict=True)] if rows else [[]] * 8
-    where, heading, place_source, heading_source, shape, height, height_source, osm_id = columns
+    columns: list[list[object]] = [list(column) for column in zip(*rows, strict=True)] if rows else [[]] * 9
+    where, heading, heading_source, shape, height, height_source, place_source, osm_id, mapped = columns
+    xy = np.array(where, float).reshape(-1, 2)
     return Furniture(
-        np.array(where, float).reshape(-1, 2),
+        xy,
         np.array(shape, np.str_),
         np.array(height, float),
         np.array(heading, float),
         np.array(height_source, np.str_),
         np.array(place_source, np.str_),
+        np.hypot(*(xy - np.array(mapped, float).reshape(-1, 2)).T),
         np.array(heading_source, np.str_),
         np.array(osm_id, np.str_),
         np.full(len(rows), -1, np.int32),

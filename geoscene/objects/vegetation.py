@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from geoscene.frames import Frame
 from geoscene.ground.partition import GroundPlan, rows_near, tile_box, values_at, winners
 from geoscene.mesh import Instances
 from geoscene.objects.shapes import concatenate_instances, place
+from geoscene.objects.siting import Sites
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
 from geoscene.tags import parse_length, parse_number
@@ -61,6 +62,9 @@ class Trees:
     height_source : (n,) str: ``height``, ``diameter_crown``, ``circumference``, ``default`` or ``sampled``
     crown_source : (n,) str: ``diameter_crown`` or ``height`` (by its ratio to the height)
     form_source : (n,) str: ``leaf_type``, ``genus`` or ``default``
+    place_source : (n,) str: ``node`` (where it is mapped), ``moved`` (mapped on a carriageway, moved to the
+              nearest clear place), ``row`` (spaced along a tree row) or ``sampled``
+    moved   : (n,) float64 metres from where it is mapped
     osm_id  : (n,) str: the tree's node, or its row's or wood's way or relation
     feature : (n,) int32, -1 for none
     """
@@ -73,6 +77,8 @@ class Trees:
     height_source: NDArray[np.str_]
     crown_source: NDArray[np.str_]
     form_source: NDArray[np.str_]
+    place_source: NDArray[np.str_]
+    moved: Float
     osm_id: NDArray[np.str_]
     feature: NDArray[np.int32]
 
@@ -126,30 +132,39 @@ def read_trees(osm: OsmData, frame: Frame, *, spacing: float = 8.0) -> tuple[Tre
         height_source,
         np.where(mapped, "diameter_crown", "height"),
         form_source,
+        np.array(["node" if osm_id.startswith("node/") else "row" for osm_id in ids], np.str_),
+        np.zeros(len(ids)),
         np.array(ids, np.str_),
         np.full(len(ids), -1, np.int32),
     ), _each_once(problems)
 
 
 def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
-    """The trees that can stand where they are, and the others by id.
+    """The trees within the ground's extent that find a place, and what was left out, by id.
 
-    A mapped tree within a building, and a tree that a row would put on a road, a track, water or a
-    building, are dropped; trees outside the ground's extent go without a word.
+    A tree that is mapped on a carriageway, a crossing or a track is taken for imprecise and moves to the
+    nearest clear place. Dropped are mapped trees in buildings or without such a place, and the trees that a
+    row would put on a road, a track, water or a building.
     """
     xmin, ymin, xmax, ymax = plan.extent
     x, y = trees.xy.T
-    inside = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
-    trees = trees.take(inside)
-    klass = values_at(plan.layers.klass, winners(plan, trees.xy), base=plan.base[0])
-    single = np.char.startswith(trees.osm_id, "node/")
+    trees = trees.take((x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax))
+    sites = Sites.of(plan)
+    klass, driven = sites.classes(trees.xy), sites.driven(trees.xy)
+    single = trees.place_source == "node"
+    amid = single & driven
+    xy, source, lost = trees.xy.copy(), trees.place_source.astype("U7"), np.zeros(len(trees), np.bool_)
+    xy[amid], found = sites.nearest_clear(trees.xy[amid])
+    lost[amid] = ~found
+    source[amid] = "moved"
     built = klass == Class.BUILDING_PAD
-    blocked = built | (~single & np.isin(klass, [Class.ROAD, Class.LANE_MARKING, Class.RAIL, Class.WATER]))
+    blocked = built | lost | (~single & (driven | (klass == Class.WATER)))
     problems = [
         Problem(str(osm_id), "tree", "dropped", "in-building" if b else "on-road")
         for osm_id, b in zip(trees.osm_id[blocked], built[blocked], strict=True)
     ]
-    return trees.take(~blocked), _each_once(problems)
+    placed = replace(trees, xy=xy, place_source=source, moved=np.hypot(*(xy - trees.xy).T))
+    return placed.take(~blocked), _each_once(problems)
 
 
 def needle_shares(plan: GroundPlan, osm: OsmData) -> Float:
@@ -223,6 +238,8 @@ def forest_trees(
         np.full(n, "sampled"),
         np.full(n, "height"),
         np.where(share[owner] > 0, "leaf_type", "default"),
+        np.full(n, "sampled"),
+        np.zeros(n),
         plan.layers.osm_id[owner],
         plan.layers.feature[owner],
     )
@@ -232,7 +249,18 @@ def _none() -> Trees:
     """No trees."""
     text, number = np.empty(0, np.str_), np.empty(0)
     return Trees(
-        np.empty((0, 2)), number, number, number, text, text, text, text, text, np.empty(0, np.int32)
+        np.empty((0, 2)),
+        number,
+        number,
+        number,
+        text,
+        text,
+        text,
+        text,
+        text,
+        number,
+        text,
+        np.empty(0, np.int32),
     )
 
 

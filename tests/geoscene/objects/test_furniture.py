@@ -89,6 +89,95 @@ def test_direction_oneway_and_side_decide_where_a_signal_stands(tags, way_tags, 
     assert np.cos(table.heading[0] - heading) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(
+    ("tags", "left_hand", "place", "heading"),
+    [
+        ({"traffic_sign:direction": "forward"}, False, (20, -3.5), WEST),
+        ({"traffic_sign:direction": "backward"}, True, (20, -3.5), EAST),
+        ({"direction": "90"}, False, (20, 3.5), EAST),  # seen by traffic that comes from the east
+        ({"direction": "E"}, True, (20, -3.5), EAST),
+    ],
+)
+def test_a_sign_on_a_node_of_the_road_stands_beside_the_traffic_it_faces(tags, left_hand, place, heading):
+    table, _ = read(street(), node(2, (20, 0), traffic_sign="maxspeed", **tags), left_hand=left_hand)
+    np.testing.assert_allclose(table.xy, [place], atol=0.26)
+    np.testing.assert_allclose(np.cos(table.heading - heading), 1.0, atol=1e-6)
+    assert (table.place_source[0], table.heading_source[0]) == ("roadside", "direction")
+    np.testing.assert_allclose(table.moved, 3.5, atol=0.26)
+
+
+@pytest.mark.parametrize(("left_hand", "headings"), [(False, (EAST, WEST)), (True, (WEST, EAST))])
+def test_a_sign_mapped_on_the_carriageway_moves_to_the_kerb_and_faces_its_traffic(left_hand, headings):
+    signs = [node(7, (0, 1), traffic_sign="maxspeed"), node(8, (9, -2), traffic_sign="hazard")]
+    table, problems = read(street(), *signs, left_hand=left_hand)
+    np.testing.assert_allclose(table.xy, [(0, 3.5), (9, -3.5)], atol=0.26)
+    np.testing.assert_allclose(np.cos(table.heading - headings), 1.0, atol=1e-6)
+    assert table.place_source.tolist() == ["moved", "moved"]
+    np.testing.assert_allclose(table.moved, [2.5, 1.5], atol=0.26)
+    assert problems == []
+
+
+@pytest.mark.parametrize("kind", ["stop", "give_way"])
+def test_a_stop_sign_without_direction_addresses_the_traffic_towards_the_nearer_junction(kind):
+    cross = way(2, [(30, -100), (30, 0), (30, 100)], nodes=[8, 9, 10], highway="residential")
+    main = way(1, [(-100, 0), (20, 0), (30, 0), (100, 0)], nodes=[1, 2, 9, 3], highway="residential")
+    table, _ = read(main, cross, node(2, (20, 0), highway=kind))
+    np.testing.assert_allclose(table.xy, [(20, -3.5)], atol=0.26)
+    np.testing.assert_allclose(facing(table), [(-1, 0)], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [{"highway": "street_lamp"}, {"power": "pole"}, {"man_made": "flagpole"}, {"barrier": "bollard"}],
+)
+def test_poles_and_bollards_mapped_on_the_carriageway_move_beside_it(tags):
+    table, problems = read(
+        street(), node(7, (0, 2), **tags), node(2, (20, 0), **tags), node(9, (0, 9), **tags)
+    )
+    assert (np.abs(table.xy[:2, 1]) > 3.2).all()
+    assert (table.moved[:2] < 4.0).all()
+    assert table.place_source.tolist() == ["moved", "moved", "node"]
+    assert table.moved[2] == 0
+    assert problems == []
+
+
+def test_a_bollard_on_a_footway_stays_in_it():
+    path = way(3, [(0, 5), (0, 50)], nodes=[20, 21], highway="footway")
+    table, _ = read(street(), path, node(21, (0, 50), barrier="bollard"))
+    np.testing.assert_allclose(table.xy, [(0, 50)], atol=1e-6)
+
+
+def test_nothing_stands_between_the_rails_of_a_track():
+    rails = Layers.of(
+        [shapely.box(-100, y - 0.036, 100, y + 0.036) for y in (9.2, 10.8)],
+        klass=Class.RAIL,
+        material=1,
+        priority=175.0,
+    )
+    plan = plan_ground(EXTENT, rails)
+    table, _ = read_furniture(osm_of(node(7, (0, 10), highway="street_lamp")), FRAME, plan=plan)
+    assert 1.5 < abs(table.xy[0, 1] - 10) < 3.0
+
+
+def test_what_finds_no_place_is_listed():
+    everywhere = shapely.box(*EXTENT)
+    bridge = way(4, [(-100, 50), (0, 50), (100, 50)], nodes=[30, 31, 32], highway="primary", bridge="yes")
+    signals = [node(k, xy, highway="traffic_signals") for k, xy in ((2, (20, 0)), (31, (0, 50)))]
+    table, problems = read(street(), bridge, node(7, (0, 1), power="pole"), *signals, roads=[everywhere])
+    assert len(table) == 0
+    assert {(p.osm_id, p.action, p.reason) for p in problems} == {
+        ("node/7", "dropped", "on-carriageway"),
+        ("node/2", "dropped", "no-roadside"),
+        ("node/31", "dropped", "on-bridge-or-in-tunnel"),
+    }
+
+
+def test_a_hydrant_below_the_ground_is_no_pillar():
+    hydrant = {"emergency": "fire_hydrant", "fire_hydrant:type": "underground"}
+    table, problems = read(node(7, (0, 9), **hydrant))
+    assert (len(table), problems) == (0, [])
+
+
 def test_at_a_crossing_of_streets_signals_stand_at_corners_off_both():
     cross = shapely.box(17, -100, 23, 100)
     table, _ = read(street(), node(2, (20, 0), highway="traffic_signals"), roads=[STREET, cross])

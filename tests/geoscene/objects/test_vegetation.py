@@ -125,11 +125,14 @@ def test_a_row_has_a_tree_at_both_ends_and_none_on_the_road_that_crosses_it():
     assert [(p.osm_id, p.reason) for p in problems] == [("way/5", "on-road")]
 
 
-def test_a_mapped_tree_in_a_building_is_dropped_one_on_a_road_stays():
-    places = lonlat_of((45, 45), (10, 0), (10, 50))
+def test_a_mapped_tree_in_a_building_is_dropped_and_one_on_a_road_moves_beside_it():
+    places = lonlat_of((45, 45), (10, 1), (10, 50))
     trees, _ = read_trees(osm_of([(tuple(p), {}) for p in places]), FRAME)
     left, problems = clear_of(wood_plan(), trees)
     assert left.osm_id.tolist() == ["node/1", "node/2"]
+    np.testing.assert_allclose(left.xy, [(10, 3.5), (10, 50)], atol=0.26)
+    assert left.place_source.tolist() == ["moved", "node"]
+    np.testing.assert_allclose(left.moved, [2.5, 0.0], atol=0.26)
     assert [(p.osm_id, p.action, p.reason) for p in problems] == [("node/0", "dropped", "in-building")]
 
 
