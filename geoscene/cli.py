@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -56,6 +57,7 @@ def build(
     point: Numbers = None,
     radius: Annotated[float, Parameter(group=_SOURCE)] = 500.0,
     demo: Annotated[bool, Parameter(group=_SOURCE, negative=())] = False,
+    source: Annotated[list[str] | None, Parameter(group=_SOURCE, negative=())] = None,
     cache: Annotated[Path | None, Parameter(group=_SOURCE)] = None,
     nominatim: Annotated[str | None, Parameter(group=_SOURCE)] = None,
     overpass: Annotated[str | None, Parameter(group=_SOURCE)] = None,
@@ -88,6 +90,8 @@ def build(
 
     geoscene build --point 36.8853,-76.3059 --radius 800 -o odu
 
+    geoscene build --osm city.osm.pbf --source overture=buildings.parquet -o scene
+
     Parameters
     ----------
     osm
@@ -95,13 +99,16 @@ def build(
     place
         Name of a place, asked of Nominatim and fetched from Overpass (needs a network; answers are cached).
     bbox
-        W,S,E,N in degrees, fetched from Overpass, or cut out of --osm or --demo.
+        W,S,E,N in degrees, fetched from Overpass, or cut out of --osm, --demo or --source.
     point
         LAT,LON in degrees, with --radius, fetched from Overpass.
     radius
         Metres around --point.
     demo
-        The extract of central Helsinki that comes along; needs no network.
+        The bundled extract of central Helsinki; needs no network.
+    source
+        NAME=FILE of another source, whose features replace those of the map: overture=FILE, buildings of
+        Overture Maps in GeoParquet. Alone, the scene has only these. May be given several times.
     cache
         Directory for answers of map servers and elevation tiles; ~/.cache/geoscene by default.
     nominatim
@@ -170,7 +177,9 @@ def build(
     with progress_bar(quiet=quiet) as progress:
         progress("reading the map", 0, total=0)
         asked = {"cache_dir": kept} | _servers(nominatim, overpass)
-        data = _read(osm, place, bbox=bbox, point=point, radius=radius, asked=asked, demo=demo)
+        data = _read(
+            osm, place, bbox=bbox, point=point, radius=radius, asked=asked, demo=demo, files=source or ()
+        )
         if fetched:
             options = replace(
                 options, dem=(_elevation(data, kept, crs=crs, template=dem_server, progress=progress),)
@@ -226,32 +235,44 @@ def _read(
     radius: float,
     asked: dict[str, Any],
     demo: bool,
+    files: Sequence[str],
 ) -> Any:
+    """The map that the options name, with the features of other sources merged in."""
     from geoscene import sources  # noqa: PLC0415
 
     given = [n for n, v in (("--osm", osm), ("--place", place), ("--point", point), ("--demo", demo)) if v]
-    if bbox and not (osm or demo):
+    if bbox and not (osm or demo or files):
         given.append("--bbox")
-    if len(given) != 1:
+    if len(given) > 1 or not (given or files):
         what = f"not {' and '.join(given)} together" if given else "none was given"
-        raise InputError(f"give one of --osm FILE, --place NAME, --bbox, --point or --demo; {what}")
+        raise InputError(
+            f"give one of --osm FILE, --place NAME, --bbox, --point, --demo or --source NAME=FILE; {what}"
+        )
     box = None
     if bbox:
         west, south, east, north = _numbers(bbox, "--bbox", names="W,S,E,N")
         if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
             raise InputError(f"--bbox {bbox.strip()}: W,S,E,N must rise from west to east and south to north")
         box = (west, south, east, north)
+    data = None
     if osm or demo:
-        return sources.read_osm(osm or sources.demo_path(), bounds=box)
-    if place:
-        return sources.fetch_place(place, **asked)
-    if point:
+        data = sources.read_source("osm", osm or sources.demo_path(), bounds=box)
+    elif place:
+        data = sources.fetch_place(place, **asked)
+    elif point:
         lat, lon = _numbers(point, "--point", names="LAT,LON")
         if not (abs(lat) <= 90 and abs(lon) <= 180):
             raise InputError(f"--point {point.strip()}: not a latitude and longitude in degrees")
-        return sources.fetch_point(lat, lon, radius=radius, **asked)
-    assert box is not None  # noqa: S101  (the only source left)
-    return sources.fetch_bbox(box, **asked)
+        data = sources.fetch_point(lat, lon, radius=radius, **asked)
+    elif given and box:
+        data = sources.fetch_bbox(box, **asked)
+    for text in files:
+        name, equals, path = text.partition("=")
+        if not (equals and path):
+            raise InputError(f"--source {text}: give NAME=FILE")
+        found = sources.read_source(name, path, bounds=data.bounds if data else box)
+        data = sources.merged(data, found) if data else found
+    return data
 
 
 @app.command

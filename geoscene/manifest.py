@@ -15,7 +15,7 @@ from geoscene.plan import Plan
 from geoscene.report import Problem, summarise
 from geoscene.roadgraph import find_components
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.sources import ATTRIBUTION, OsmData
+from geoscene.sources import SOURCES, OsmData, credits_of
 from geoscene.tiles import TileReport
 
 STEEP = 0.2
@@ -34,24 +34,13 @@ def scene_manifest(
     """Sources, options, counts, where heights come from, repairs and drops."""
     xmin, ymin, xmax, ymax = plan.extent
     terrain = plan.terrain
+    sources = _sources(osm, plan)
     return {
         "generator": f"geoscene {__version__}",
         "name": options["name"],
-        "attribution": ATTRIBUTION,
+        "attribution": "; ".join(dict.fromkeys(s["attribution"] for s in sources if "attribution" in s)),
         "fingerprint": fingerprint,
-        "sources": [
-            {
-                "kind": "osm",
-                "from": osm.source,
-                "timestamp": osm.timestamp,
-                "licence": "ODbL-1.0",
-                "attribution": ATTRIBUTION,
-            },
-            *(
-                {"kind": "terrain", "from": name} | ({"attribution": credit} if credit else {})
-                for name, credit in zip(terrain.sources, terrain.credits, strict=True)
-            ),
-        ],
+        "sources": sources,
         "geographic_bounds": list(osm.bounds),
         "bounds": [xmin, ymin, xmax, ymax],
         "tile_size": options["tile_size"],
@@ -78,6 +67,28 @@ def scene_manifest(
         "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),
         "problems": summarise(problems),
     }
+
+
+def _sources(osm: OsmData, plan: Plan) -> list[dict[str, str]]:
+    """Every source of the scene, with licence and attribution where they are known."""
+    licences = {source.attribution: source.licence for source in SOURCES.values()}
+    maps = [
+        {
+            "kind": credit.kind,
+            "from": credit.origin,
+            "timestamp": credit.timestamp,
+            "licence": credit.licence,
+            "attribution": credit.attribution,
+        }
+        for credit in credits_of(osm)
+    ]
+    terrain = [
+        {"kind": "terrain", "from": name}
+        | ({"licence": licences[credit]} if credit in licences else {})
+        | ({"attribution": credit} if credit else {})
+        for name, credit in zip(plan.terrain.sources, plan.terrain.credits, strict=True)
+    ]
+    return maps + terrain
 
 
 def _open_area(plan: Plan) -> float:

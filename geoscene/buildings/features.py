@@ -70,7 +70,7 @@ def _take(
             problems.append(Problem(area.osm_id, "building", "dropped", "underground"))
         else:
             chosen.append(area)
-    chosen.sort(key=lambda a: (a.osm_id.split("/")[0], int(a.osm_id.split("/")[1])))
+    chosen.sort(key=_id_order)
     raw = project(gathered([a.geometry for a in chosen]), frame)
     polygons, repaired = clean(raw)
     before, after = shapely.area(raw), shapely.area(polygons)
@@ -86,6 +86,12 @@ def _take(
         use = area.tags["building:part" if parts else "building"].split(";")[0].strip().lower()
         rows.append(Row(area.osm_id, area.tags, polygons[k], use, is_part=parts))
     return rows
+
+
+def _id_order(area: Area) -> tuple[str, int]:
+    """Sort key of an area: ``way/9`` before ``way/10``; ids without a number by their text."""
+    kind, _, number = area.osm_id.partition("/")
+    return kind, int(number or 0)
 
 
 def _settle_parts(

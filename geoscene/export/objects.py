@@ -178,5 +178,5 @@ def geoscene_lod(scene: Scene) -> int:
 
 
 def attribution(scene: Scene) -> str:
-    """Whom to credit for the data."""
+    """Attribution of all sources of the scene."""
     return str(scene.manifest.get("attribution", ""))

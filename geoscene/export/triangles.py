@@ -33,9 +33,10 @@ def _head(scene: Scene) -> list[str]:
     """Where the coordinates are, as lines of comment."""
     east, north = scene.frame.origin
     wkt = " ".join(scene.frame.wkt.split())
+    ascii_only = attribution(scene).replace("©", "(c)").encode("ascii", "replace").decode()
     return [
         "made by geoscene; x east, y north, z up, metres",
-        attribution(scene),
+        ascii_only,
         f"add {east:.0f} to x and {north:.0f} to y for coordinates in {scene.frame.name}",
         f"heights: {scene.frame.vertical}",
         f"crs {wkt}",

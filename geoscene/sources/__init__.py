@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from geoscene.sources.data import ATTRIBUTION as ATTRIBUTION
 from geoscene.sources.data import Area as Area
 from geoscene.sources.data import OsmData as OsmData
 from geoscene.sources.data import Point as Point
 from geoscene.sources.data import Relation as Relation
 from geoscene.sources.data import Tags as Tags
 from geoscene.sources.data import Way as Way
+from geoscene.sources.registry import SOURCES as SOURCES
+from geoscene.sources.registry import credits_of as credits_of
+from geoscene.sources.registry import merged as merged
+from geoscene.sources.registry import read_source as read_source
 
 if TYPE_CHECKING:
     from geoscene.sources.demo import demo_path as demo_path

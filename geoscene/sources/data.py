@@ -67,6 +67,24 @@ class Relation:
 
 
 @dataclass(frozen=True, slots=True)
+class Credit:
+    """A source whose features are in a map.
+
+    kind        : its name in the registry
+    origin      : file or place it was read from
+    timestamp   : newest edit, ISO 8601, or "" if unknown
+    licence     : SPDX identifier, or in words
+    attribution : text to show with the data
+    """
+
+    kind: str
+    origin: str
+    timestamp: str
+    licence: str
+    attribution: str
+
+
+@dataclass(frozen=True, slots=True)
 class OsmData:
     """One map extract.
 
@@ -76,8 +94,11 @@ class OsmData:
     points      : nodes with tags
     relations   : other relations
     problems    : what was repaired or dropped while reading
-    source      : what it was read from, for people
+    source      : file or place it was read from, for messages
     timestamp   : newest edit or replication time, ISO 8601, or "" if unknown
+    kind        : name of the source in `geoscene.sources.registry.SOURCES`
+    attribution : of these data, where it says more than the registry's
+    added       : credits of other sources from which features were merged in
     """
 
     bounds: tuple[float, float, float, float]
@@ -88,6 +109,9 @@ class OsmData:
     problems: list[Problem] = field(default_factory=list)
     source: str = ""
     timestamp: str = ""
+    kind: str = "osm"
+    attribution: str = ""
+    added: tuple[Credit, ...] = ()
 
     @property
     def digest(self) -> str:
@@ -106,6 +130,3 @@ class OsmData:
         for relation in self.relations:
             found.update(repr((relation.osm_id, sorted(relation.tags.items()), relation.members)).encode())
         return found.hexdigest()[:20]
-
-
-ATTRIBUTION = "(c) OpenStreetMap contributors, ODbL 1.0, https://www.openstreetmap.org/copyright"

@@ -21,21 +21,10 @@ from geoscene.frames import Frame
 from geoscene.progress import Progress, silent
 from geoscene.sources.data import OsmData
 from geoscene.sources.http import BUSY, RefusedError, cause, open_session
+from geoscene.sources.registry import SOURCES
 from geoscene.typing import Float
 
 Box = tuple[float, float, float, float]
-
-CREDIT = (
-    "Terrain Tiles (Mapzen, AWS open data): ArcticDEM, DigitalGlobe, Inc., imagery funded by National Science"
-    " Foundation awards 1043681, 1559691 and 1542736; © offene Daten Österreichs - Digitales Geländemodell"
-    " (DGM) Österreich; contains information licensed under the Open Government Licence - Canada; produced"
-    " using Copernicus data and information funded by the European Union - EU-DEM layers; ETOPO1, U.S."
-    " National Oceanic and Atmospheric Administration; source: INEGI, Continental relief, 2016; © 2011 Crown"
-    " copyright Land Information New Zealand and the New Zealand Government; © Kartverket; © Environment"
-    " Agency copyright and/or database right 2015; 3DEP, SRTM and GMTED2010 courtesy of the U.S. Geological"
-    " Survey"
-)
-"""What the data set's page on attribution asks to be said."""
 
 DATUM = "the geoids of the tiles' sources, mixed (EGM96, EGM2008, NAVD88, national)"
 
@@ -65,7 +54,7 @@ class TileServer:
     """
 
     template: str = "https://s3.amazonaws.com/elevation-tiles-prod/terrarium/{z}/{x}/{y}.png"
-    credit: str = CREDIT
+    credit: str = SOURCES["terrain-tiles"].attribution
     datum: str = DATUM
     user_agent: str = f"geoscene/{__version__} (builds 3D scenes from OpenStreetMap)"
     timeout: float = 30.0

@@ -10,7 +10,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -194,7 +194,7 @@ def _fetch(
             raise NetworkError(f"{source}: the map server's answer cannot be read ({error})") from error
     if len(taken) == 0:
         raise SourceNotFoundError(f"{source}: OpenStreetMap has nothing there; are the coordinates in order?")
-    return features(taken.finish(), bounds=bounds, source=source)
+    return replace(features(taken.finish(), bounds=bounds, source=source), kind="overpass")
 
 
 def _around(lon: float, lat: float, *, half_width: float, half_height: float) -> Bounds:

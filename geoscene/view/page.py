@@ -120,7 +120,7 @@ def _join(file: IO[bytes], scene: Scene, *, head: dict[str, Any], blobs: IO[byte
     """Write the page: the template with its words filled in, and the bytes of the scene where it has them."""
     words = {
         "title": html.escape(str(head["name"])),
-        "credit": _linked(" · ".join(_credits(scene))),
+        "credit": _linked(attribution(scene)),
         "style": _part("page.css"),
         "scene": _json(head).decode().replace("<", "\\u003c"),
         "script": "\n".join(_part(name) for name in SCRIPTS),
@@ -239,12 +239,6 @@ def _head(
         "shapes": shapes,
         "tiles": told,
     }
-
-
-def _credits(scene: Scene) -> list[str]:
-    """Whom to credit, once each, in the order of the sources."""
-    named = [attribution(scene), *(str(s.get("attribution", "")) for s in scene.manifest.get("sources", ()))]
-    return list(dict.fromkeys(filter(None, named)))
 
 
 def _linked(text: str) -> str:
