@@ -64,17 +64,17 @@ class BuildOptions:
     def __post_init__(self) -> None:
         """Refuse options that cannot be meant."""
         if self.lod not in (0, 1, 2):
-            raise InputError(f"--lod {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
+            raise InputError(f"`lod` {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
         if self.dem_gaps not in ("error", "nearest"):
-            raise InputError(f"--dem-gaps {self.dem_gaps}: error or nearest")
+            raise InputError(f"`dem_gaps` {self.dem_gaps}: error or nearest")
         if unknown := sorted(set(self.only) - set(KINDS)):
-            raise InputError(f"--only {','.join(unknown)}: of {','.join(KINDS)}")
+            raise InputError(f"`only` {','.join(unknown)}: of {','.join(KINDS)}")
         if self.driving_side not in ("", "left", "right"):
-            raise InputError(f"--driving-side {self.driving_side}: left or right")
+            raise InputError(f"`driving_side` {self.driving_side}: left or right")
         if not 0 < self.reach < 1e6:
-            raise InputError(f"--reach {self.reach:g}: give metres, more than 0 and less than a million")
+            raise InputError(f"`reach` {self.reach:g}: give metres, more than 0 and less than a million")
         if not 50 <= self.tile_size <= 2000 or self.tile_size != int(self.tile_size):
-            raise InputError(f"--tile-size {self.tile_size}: give whole metres from 50 to 2000")
+            raise InputError(f"`tile_size` {self.tile_size}: give whole metres from 50 to 2000")
 
 
 def build(

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from cyclopts import App, Group, Parameter, validators
 
 from geoscene import __version__
-from geoscene.console import FAILURE, print_json, progress_bar, whole
+from geoscene.console import FAILURE, print_json, progress_bar, whole, with_flags
 from geoscene.console import main as run
 from geoscene.errors import GeosceneError, InputError
 from geoscene.progress import Progress
@@ -333,7 +333,7 @@ def export(
     /,
     *,
     out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
-    to: str | None = None,
+    kind: Annotated[str | None, Parameter(name="--to")] = None,
     crs: str | None = None,
     layers: str | None = None,
     model: str | None = None,
@@ -363,7 +363,7 @@ def export(
         Directory of the scene.
     out
         File to write; for 3D Tiles a directory.
-    to
+    kind
         cityjson, glb, 3dtiles, obj, ply, stl, gpkg, geojson, geoparquet, geotiff, opendrive or sumo; by the
         name of the file where that says it.
     crs
@@ -391,7 +391,7 @@ def export(
         summary = export_scene(
             open_scene(scene),
             out,
-            kind=to,
+            kind=kind,
             crs=crs,
             layers=tuple(layers.split(",")) if layers else None,
             model=model,
@@ -407,7 +407,7 @@ def export(
         what = "cells" if summary.kind == "geotiff" else "objects"
         print(f"{summary.path}: {summary.kind}, {summary.objects} {what}, {size}, {summary.crs}")
         for note in summary.notes:
-            print(f"  {note}")
+            print(f"  {with_flags(app, note)}")
     return 0
 
 
@@ -417,9 +417,9 @@ def view(
     /,
     *,
     out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
-    bbox: str | None = None,
+    bounds_deg: Annotated[str | None, Parameter(name="--bbox")] = None,
     layers: str = "",
-    max_size: float | None = None,
+    max_mb: Annotated[float | None, Parameter(name="--max-size")] = None,
     overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
@@ -438,11 +438,11 @@ def view(
         Directory of the scene.
     out
         File to write.
-    bbox
+    bounds_deg
         W,S,E,N in degrees: only the tiles that meet it.
     layers
         Only these, with commas, such as ground,buildings,trees; all by default.
-    max_size
+    max_mb
         Megabytes that the page may have, 40 by default. A larger one is refused, with the bounds of a part
         that fits.
     overwrite
@@ -455,14 +455,14 @@ def view(
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from geoscene.view import MAX_MB, view_scene  # noqa: PLC0415
 
-    west, south, east, north = _numbers(bbox, "--bbox", names="W,S,E,N") if bbox else (0.0,) * 4
+    west, south, east, north = _numbers(bounds_deg, "--bbox", names="W,S,E,N") if bounds_deg else (0.0,) * 4
     with progress_bar(quiet=quiet) as progress:
         summary = view_scene(
             open_scene(scene),
             out,
-            bounds_deg=(west, south, east, north) if bbox else None,
+            bounds_deg=(west, south, east, north) if bounds_deg else None,
             layers=tuple(name for name in layers.split(",") if name),
-            max_mb=MAX_MB if max_size is None else max_size,
+            max_mb=MAX_MB if max_mb is None else max_mb,
             overwrite=overwrite,
             progress=progress,
         )
@@ -473,7 +473,7 @@ def view(
             f"{summary.path}: {summary.faces} faces, {summary.objects} objects, {summary.bytes / 1e6:.1f} MB"
         )
         for note in summary.notes:
-            print(f"  {note}")
+            print(f"  {with_flags(app, note)}")
     return 0
 
 

@@ -83,8 +83,18 @@ def _command(app: App) -> str:
     return f"{asked} " if asked in app else ""
 
 
+def with_flags(app: App, text: str) -> str:
+    """A message of the library with its parameters, `` `tile_size` ``, as flags of this command, --tile-size.
+
+    A parameter that the command does not have keeps its plain name.
+    """
+    command = app[sys.argv[1]] if len(sys.argv) > 1 and sys.argv[1] in app else app
+    flags = {argument.field_info.name: argument.name for argument in command.assemble_argument_collection()}
+    return re.sub(r"`(\w+)`", lambda found: flags.get(found[1], found[1]), text)
+
+
 def _complain(app: App, what: object) -> None:
-    text = " ".join(str(what).split())
+    text = " ".join(with_flags(app, str(what)).split())
     print(f"{app.name[0]}: {text}", file=sys.stderr)
 
 

@@ -1,4 +1,8 @@
-"""Everything geoscene raises on purpose."""
+"""Everything geoscene raises on purpose.
+
+Messages name parameters in backquotes (`tile_size`); the command line shows them as flags (--tile-size), see
+`geoscene.console.with_flags`.
+"""
 
 from __future__ import annotations
 

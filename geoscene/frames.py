@@ -37,7 +37,7 @@ def utm_crs(lon_deg: float, lat_deg: float) -> str:
     Raises FrameError outside 80° S to 84° N, where UTM is not defined.
     """
     if not -80.0 <= lat_deg <= 84.0:
-        raise FrameError(f"no UTM zone at {lat_deg:.4f}, {lon_deg:.4f}; use the local frame (--crs local)")
+        raise FrameError(f"no UTM zone at {lat_deg:.4f}, {lon_deg:.4f}; use the local frame (`crs` local)")
     lon = (lon_deg + 180.0) % 360.0 - 180.0
     zone = int((lon + 180.0) // 6.0) + 1
     if 56.0 <= lat_deg < 64.0 and 3.0 <= lon < 12.0:
@@ -77,19 +77,19 @@ class Frame:
         try:
             parsed = CRS.from_user_input(utm_crs(lon_deg, lat_deg) if crs == "utm" else crs)
         except CRSError as error:
-            raise FrameError(f"--crs {crs}: pyproj does not know it; give utm or EPSG:<number>") from error
+            raise FrameError(f"`crs` {crs}: pyproj does not know it; give utm or EPSG:<number>") from error
         if not parsed.is_projected:
-            raise FrameError(f"--crs {crs} ({parsed.name}) is not projected; give utm or EPSG:<number>")
+            raise FrameError(f"`crs` {crs} ({parsed.name}) is not projected; give utm or EPSG:<number>")
         if any(axis.unit_conversion_factor != 1.0 for axis in parsed.axis_info[:2]):
-            raise FrameError(f"--crs {crs} ({parsed.name}) is not in metres")
+            raise FrameError(f"`crs` {crs} ({parsed.name}) is not in metres")
         frame = cls(str(parsed.to_wkt()), (0.0, 0.0), vertical)
         easting, northing = frame.to_projected(*frame.from_geographic(lon_deg, lat_deg))
         if not (np.isfinite(easting) and np.isfinite(northing)):
-            raise FrameError(f"--crs {crs} ({parsed.name}) cannot project {lat_deg:.4f}, {lon_deg:.4f}")
+            raise FrameError(f"`crs` {crs} ({parsed.name}) cannot project {lat_deg:.4f}, {lon_deg:.4f}")
         frame = cls(str(parsed.to_wkt()), (float(np.round(easting)), float(np.round(northing))), vertical)
         if not 0.9 < float(frame.scale(lon_deg, lat_deg)) < 1.1:
             raise FrameError(
-                f"--crs {crs} ({parsed.name}) distorts lengths by over 10 % at {lat_deg:.4f}, {lon_deg:.4f}"
+                f"`crs` {crs} ({parsed.name}) distorts lengths by over 10 % at {lat_deg:.4f}, {lon_deg:.4f}"
             )
         return frame
 

@@ -148,7 +148,7 @@ def make_plan(
     if area > LARGEST_KM2:
         raise InputError(
             f"{osm.source}: {area:,.0f} km2, more than the {LARGEST_KM2:,.0f} of one scene;"
-            " cut a part out (--bbox)"
+            " cut a part out (`bbox`)"
         )
     frame = Frame.at((west + east) / 2, (south + north) / 2, crs=crs)
     problems: list[Problem] = list(osm.problems)

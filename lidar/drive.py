@@ -271,10 +271,10 @@ def plan(
         return replayed if options.duration is None else replayed.until(round(options.duration * 1e9))
     if body.kind != "air":
         if options.survey or options.altitude is not None:
-            option = "--survey" if options.survey else "--altitude"
+            option = "survey" if options.survey else "altitude"
             raise InputError(
-                f"{option} is for what flies, and a {body.name} does not; add --vehicle drone or aircraft,"
-                " or a rig of such a craft"
+                f"`{option}` is for aircraft, and a {body.name} does not fly; set `vehicle` to drone or"
+                " aircraft, or take the rig of one"
             )
         name = options.vehicle or load_rig(options.rig).vehicle
         travel = plan_travel(

@@ -1,4 +1,4 @@
-"""Everything lidar raises on purpose."""
+"""Everything lidar raises on purpose; messages name parameters as in `geoscene.errors`."""
 
 from __future__ import annotations
 

@@ -73,17 +73,17 @@ class DriveOptions:
     def __post_init__(self) -> None:
         """Refuse options that cannot be meant."""
         if self.duration is not None and not 0.1 <= self.duration <= 86400:
-            raise InputError(f"--duration {self.duration}: give 0.1 to 86400 seconds")
+            raise InputError(f"`duration` {self.duration}: give 0.1 to 86400 seconds")
         if self.side not in ("", "left", "right"):
-            raise InputError(f"--side {self.side}: left or right")
+            raise InputError(f"`side` {self.side}: left or right")
         if not 1 <= self.workers <= 256:
-            raise InputError(f"--workers {self.workers}: give 1 to 256")
+            raise InputError(f"`workers` {self.workers}: give 1 to 256")
         if not 0 <= self.seed < 1 << 63:
-            raise InputError(f"--seed {self.seed}: give a whole number from 0 on")
+            raise InputError(f"`seed` {self.seed}: give a whole number from 0 on")
         if self.altitude is not None and not 0 < self.altitude <= 20_000:
-            raise InputError(f"--altitude {self.altitude:g}: give metres above the ground, up to 20000")
+            raise InputError(f"`altitude` {self.altitude:g}: give metres above the ground, up to 20000")
         if not 0 <= self.overlap < 1:
-            raise InputError(f"--overlap {self.overlap:g}: give a share from 0 to less than 1")
+            raise InputError(f"`overlap` {self.overlap:g}: give a share from 0 to less than 1")
         self.contents()
 
     def keeps(self, scene: Scene) -> Side:

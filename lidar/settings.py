@@ -47,7 +47,7 @@ def dials_of(level: str, given: Iterable[tuple[str, str]] = ()) -> tuple[Effects
     value that is not known.
     """
     if level not in effects.LEVELS:
-        raise InputError(f"--fidelity {level}: one of {', '.join(levels())}")
+        raise InputError(f"`fidelity` {level}: one of {', '.join(levels())}")
     scanner, camera = effects.LEVELS[level], dials.LEVELS[level]
     of_scanner, of_camera = ({f.name for f in fields(kind)} for kind in (Effects, CameraDials))
     for name, text in given:
@@ -59,7 +59,7 @@ def dials_of(level: str, given: Iterable[tuple[str, str]] = ()) -> tuple[Effects
             known = sorted(of_scanner | of_camera)
             near = get_close_matches(name, known, 3, 0.5)
             hint = f"; is {' or '.join(near)} meant?" if near else ";"
-            raise InputError(f"--set {name}: no such setting{hint} lidar settings lists all {len(known)}")
+            raise InputError(f"`settings` {name}: unknown{hint} lidar settings lists all {len(known)}")
     return scanner, camera
 
 
@@ -109,10 +109,10 @@ def _one(name: str, text: str, *, of: Effects | CameraDials) -> dict[str, Any]:
 def _value(name: str, text: str, *, kind: type) -> object:
     if kind is bool:
         if text.lower() not in _WORDS:
-            raise InputError(f"--set {name}={text}: on or off is wanted")
+            raise InputError(f"`settings` {name}={text}: on or off is wanted")
         return _WORDS[text.lower()]
     try:
         return kind(text)
     except ValueError:
         wanted = "a whole number" if kind is int else "a number"
-        raise InputError(f"--set {name}={text}: {wanted} is wanted") from None
+        raise InputError(f"`settings` {name}={text}: {wanted} is wanted") from None

@@ -137,9 +137,9 @@ def _target(scene: Scene, crs: str | None) -> tuple[_Target, tuple[str, ...]]:
     try:
         parsed = CRS.from_user_input(crs or scene.frame.name)
     except Exception as error:
-        raise InputError(f"--crs {crs}: pyproj does not know it; give EPSG:<number>") from error
+        raise InputError(f"`crs` {crs}: pyproj does not know it; give EPSG:<number>") from error
     if not parsed.is_projected or parsed.to_epsg() is None:
-        raise InputError(f"--crs {crs}: CityJSON needs a projected CRS with an EPSG code")
+        raise InputError(f"`crs` {crs}: CityJSON needs a projected CRS with an EPSG code")
     same = parsed == scene.frame.crs
     x, y = scene.frame.to_crs(middle[0], middle[1], crs=parsed)
     zero = np.array([np.floor(x), np.floor(y), 0.0])

@@ -67,7 +67,7 @@ def kind_of(out: Path) -> str:
         if name.endswith(told.suffixes) and told.suffixes:
             return kind
     known = " ".join(told.suffixes[0] for told in KINDS.values() if told.suffixes)
-    raise InputError(f"{out}: its name does not say what to write; give --to ({', '.join(KINDS)}) or {known}")
+    raise InputError(f"{out}: unknown suffix; give `kind` ({', '.join(KINDS)}) or {known}")
 
 
 def export_scene(
@@ -101,7 +101,7 @@ def export_scene(
     """
     name = kind_of(out) if kind is None else kind
     if name not in KINDS:
-        raise InputError(f"--to {name}: there are {', '.join(KINDS)}")
+        raise InputError(f"`kind` {name}: there are {', '.join(KINDS)}")
     told = KINDS[name]
     given: dict[str, Any] = {
         key: value
@@ -116,11 +116,11 @@ def export_scene(
     }
     foreign = sorted(set(given) - told.options)
     if foreign:
-        names = ", ".join(f"--{key.replace('_', '-')}" for key in foreign)
-        takes = ", ".join(f"--{key.replace('_', '-')}" for key in sorted(told.options)) or "none"
+        names = ", ".join(f"`{key}`" for key in foreign)
+        takes = ", ".join(f"`{key}`" for key in sorted(told.options)) or "none"
         raise InputError(f"{names} does not go with {told.title}, which takes {takes}")
     if out.exists() and not overwrite:
-        raise InputError(f"{out}: is there already; add --overwrite to replace it")
+        raise InputError(f"{out}: is there already; set `overwrite` to replace it")
     if out.is_dir() and told.suffixes:
         raise InputError(f"{out}: is a folder; {told.title} is a file, name one")
     module, function = told.writer.split(":")

@@ -52,7 +52,7 @@ class _Grid:
 def _grid(scene: Scene, resolution: float) -> _Grid:
     """The scene's extent on whole multiples of the resolution, so that rasters of a CRS match."""
     if not (np.isfinite(resolution) and resolution > 0):
-        raise InputError(f"--resolution {resolution}: give metres over 0")
+        raise InputError(f"`resolution` {resolution}: give metres over 0")
     xmin, ymin, xmax, ymax = scene.bounds
     east, north = scene.frame.origin
     left, right = np.floor((xmin + east) / resolution), np.ceil((xmax + east) / resolution)
@@ -60,7 +60,7 @@ def _grid(scene: Scene, resolution: float) -> _Grid:
     columns, rows = int(right - left), int(high - low)
     if columns * rows > MOST_CELLS:
         raise InputError(
-            f"--resolution {resolution}: {columns} x {rows} cells are too many; take a larger one"
+            f"`resolution` {resolution}: {columns} x {rows} cells are too many; take a larger one"
         )
     return _Grid(float(left * resolution), float(high * resolution), resolution, columns, rows)
 
@@ -85,7 +85,7 @@ def write_geotiff(
     Raises InputError for a model or a resolution that cannot be.
     """
     if model not in ("surface", "terrain", "classes"):
-        raise InputError(f"--model {model}: surface, terrain or classes")
+        raise InputError(f"`model` {model}: surface, terrain or classes")
     grid = _grid(scene, resolution)
     library = list(scene.shapes().values())
     faces = 0

@@ -90,7 +90,7 @@ def write_3dtiles(
         write_atomically(folder / "tileset.json", text.encode())
     notes: tuple[str, ...] = ()
     if scene.frame.vertical != "ellipsoidal" and not height_offset:
-        notes = (f"{scene.frame.vertical} heights stand as ellipsoidal ones; --height-offset raises them",)
+        notes = (f"{scene.frame.vertical} heights stand as ellipsoidal ones; `height_offset` raises them",)
     files, size = size_of(path)
     return Summary(path, "3dtiles", files, size, objects, solids, faces, "EPSG:4978", notes)
 

@@ -303,7 +303,7 @@ def _not_covered(rasters: Sequence[_Raster], frame: Frame, *, bounds: Sequence[f
     return (
         f"{', '.join(r.path.name for r in rasters)}: {_percent(share)} of the scene is not covered; it spans "
         f"W {lon.min():.5f} S {lat.min():.5f} E {lon.max():.5f} N {lat.max():.5f}; add files that cover it"
-        + (", or let the rest take the nearest height (--dem-gaps nearest)" if share < 1.0 else "")
+        + (", or let the rest take the nearest height (`dem_gaps` nearest)" if share < 1.0 else "")
     )
 
 

@@ -37,27 +37,27 @@ def route_line(words: Sequence[str], graph: RoadGraph, *, frame: Frame) -> Any:
         latlon = np.array([[float(v) for v in word.split(",")] for word in given])
         lat, lon = latlon.T
     except ValueError:
-        raise InputError(f"--along {' '.join(given)}: a file, or two or more LAT,LON") from None
+        raise InputError(f"`along` {' '.join(given)}: a file, or two or more LAT,LON") from None
     if len(lat) < 2:
-        raise InputError(f"--along {given[0]}: one waypoint is no route; give two or more, or a file")
+        raise InputError(f"`along` {given[0]}: one waypoint is no route; give two or more, or a file")
     xy = np.column_stack(frame.from_geographic(lon, lat))
     edges, offsets, distances = nearest_edge(graph, xy)
     if distances.max() > 100.0:
         far = int(distances.argmax())
-        raise InputError(f"--along {given[far]}: {distances[far]:.0f} m from the nearest road; at most 100")
+        raise InputError(f"`along` {given[far]}: {distances[far]:.0f} m from the nearest road; at most 100")
     places = list(zip(edges.tolist(), offsets.tolist(), strict=True))
     lines = []
     for a, b in pairwise(places):
         path = shortest_path(graph, a, goal=b)
         if path is None:
-            raise InputError(f"--along {' '.join(given)}: no way to drive from one waypoint to the next")
+            raise InputError(f"`along` {' '.join(given)}: no way to drive from one waypoint to the next")
         lines.append(path_line(graph, path)[:, :2])
     return shapely.LineString(np.concatenate(lines))
 
 
 def _read_lonlat(path: Path) -> Float:
     if not path.exists():
-        raise SourceNotFoundError(f"{path}: no such file; --along takes GPX, GeoJSON, CSV, or LAT,LON")
+        raise SourceNotFoundError(f"{path}: no such file; `along` takes GPX, GeoJSON, CSV, or LAT,LON")
     text = path.read_text("utf-8", errors="replace")
     try:
         if path.suffix.lower() == ".csv":

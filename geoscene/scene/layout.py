@@ -159,9 +159,7 @@ def open_scene(path: str | Path) -> Scene:
     folder = Path(path)
     manifest_file = SceneFiles(folder).manifest
     if not folder.is_dir():
-        raise SceneFormatError(
-            f"{folder}: no such scene directory; make one with: geoscene build --demo -o {folder}"
-        )
+        raise SceneFormatError(f"{folder}: no such scene directory; geoscene build makes one")
     if not manifest_file.exists():
         raise SceneFormatError(
             f"{folder}: no {manifest_file.name} in it: not a scene, or its build did not finish"

@@ -42,7 +42,7 @@ class SceneWriter:
             if not path.is_dir() or (any(path.iterdir()) and not ours):
                 raise SceneFormatError(f"{path}: exists and is not a scene; give another directory")
             if ours and not overwrite:
-                raise SceneFormatError(f"{path}: holds a scene; add --overwrite to replace it")
+                raise SceneFormatError(f"{path}: holds a scene; set `overwrite` to replace it")
             self.former = path if ours else None
         self.path = path
         self.folder = path.with_name(f"{path.name}.part")

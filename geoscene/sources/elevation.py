@@ -114,7 +114,7 @@ def fetch_elevation(
     if len(names) > server.most:
         raise InputError(
             f"{len(names):,} elevation tiles of zoom {z}, more than the {server.most:,} that may be asked"
-            " for; take a part of the map, or an elevation file (--dem FILE)"
+            " for; take a part of the map, or an elevation file (`dem` FILE)"
         )
     coast = [way.lonlat for way in osm.ways if way.tags.get("natural") == "coastline"]
     shore = np.concatenate(coast) if coast else np.empty((0, 2))
@@ -215,7 +215,7 @@ def _download(session: Any, url: str, *, server: TileServer) -> bytes:
             failure = cause(error)
     raise NetworkError(
         f"no elevation tile from {urlsplit(url).netloc} ({url}: {failure});"
-        " without a network, give an elevation file (--dem FILE) or build on level ground (no --dem)"
+        " without a network, give an elevation file (`dem` FILE) or build on level ground (no `dem`)"
     )
 
 

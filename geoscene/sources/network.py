@@ -108,8 +108,8 @@ def _first_answer(what: str, urls: Sequence[str], *, ask: Callable[[Any, str], A
             break
         time.sleep(min(waits))
     raise NetworkError(
-        f"{what} ({'; '.join(failures)}); without a network, build from an extract (--osm FILE)"
-        " or from the bundled one (--demo)"
+        f"{what} ({'; '.join(failures)}); without a network, build from an extract (`osm` FILE)"
+        " or from the bundled one (`demo`)"
     )
 
 
@@ -182,7 +182,7 @@ def _fetch(
     if area > servers.max_area_km2:
         raise InputError(
             f"{source}: {area:,.0f} km², more than the {servers.max_area_km2:,.0f} km² that map servers"
-            " may be asked for; take a part of it, or an extract of the region (--osm FILE)"
+            " may be asked for; take a part of it, or an extract of the region (`osm` FILE)"
         )
     taken = Collector(bounds=bounds)
     for part in progress(_parts(bounds, servers.max_query_km2)):
@@ -263,7 +263,7 @@ def locate(name: str, *, cache_dir: Path | None = None, servers: Servers | None 
     if not results:
         raise SourceNotFoundError(
             f"no place called {name!r} in OpenStreetMap; try another spelling,"
-            " or --point LAT,LON, or --bbox W,S,E,N"
+            " or `point` LAT,LON, or `bbox` W,S,E,N"
         )
     outlined = [r for r in results if r.get("geojson", {}).get("type") in {"Polygon", "MultiPolygon"}]
     found = (outlined or results)[0]

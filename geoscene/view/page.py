@@ -104,15 +104,15 @@ def _check(out: Path, max_mb: float, *, overwrite: bool) -> None:
     if out.is_dir():
         raise InputError(f"{out}: is a folder; name a file such as page.html")
     if out.exists() and not overwrite:
-        raise InputError(f"{out}: is there already; add --overwrite to replace it")
+        raise InputError(f"{out}: is there already; set `overwrite` to replace it")
     if not max_mb > 0:
-        raise InputError(f"--max-size {max_mb:g}: must be more than 0")
+        raise InputError(f"`max_mb` {max_mb:g}: must be more than 0")
 
 
 def _kept(groups: Groups, layers: Sequence[str]) -> NDArray[np.bool_]:
     """Which groups (n,) are in the page."""
     if unknown := sorted(set(layers) - set(groups.names)):
-        raise InputError(f"--layers: no {', '.join(unknown)} in the scene; it has {', '.join(groups.names)}")
+        raise InputError(f"`layers`: no {', '.join(unknown)} in the scene; it has {', '.join(groups.names)}")
     return np.array([not layers or name in layers for name in groups.names])
 
 
@@ -190,11 +190,11 @@ def _too_large(
     """How large the page would be, and which part of it would not be too large."""
     rings, share = _rings(indices), size / sizes[-1]
     whole = size / len(sizes) * len(indices) / 1e6
-    message = f"the page would have about {max(whole, 1.01 * max_mb):.3g} MB and --max-size is {max_mb:g}"
+    message = f"the page would have about {max(whole, 1.01 * max_mb):.3g} MB and `max_mb` is {max_mb:g}"
     ends = [int(np.flatnonzero(rings == ring)[-1]) for ring in range(int(rings[len(sizes) - 1]) + 1)]
     fits = [ring for ring, end in enumerate(ends) if end < len(sizes) and sizes[end] * share < max_mb * 1e6]
     if not fits:
-        return f"{message}; give more, leave out --layers, or build with smaller tiles (--tile-size)"
+        return f"{message}; give more, leave out `layers`, or build the scene with smaller tiles"
     middle, size_m = _middle(indices), scene.tile_size
     low = (middle - fits[-1]) * size_m + 1.0
     high = (middle + fits[-1] + 1) * size_m - 1.0
@@ -203,7 +203,7 @@ def _too_large(
     )
     inner = (max(lon[:2]), max(lat[0], lat[2]), min(lon[2:]), min(lat[1], lat[3]))
     box = ",".join(f"{v:.5f}" for v in inner)
-    return f"{message}; the middle of it fits: --bbox={box} (or name fewer --layers)"
+    return f"{message}; the middle of it fits: `bounds_deg`={box} (or name fewer `layers`)"
 
 
 def _head(

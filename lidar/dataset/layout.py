@@ -87,9 +87,7 @@ def open_dataset(path: str | Path) -> Dataset:
     folder = Path(path)
     manifest_path = folder / "dataset.json"
     if not manifest_path.exists():
-        raise DatasetError(
-            f"{folder}: no dataset.json in it; make one with: lidar drive SCENE --route random -o {folder}"
-        )
+        raise DatasetError(f"{folder}: no dataset.json in it; lidar drive records a dataset")
     try:
         manifest = json.loads(manifest_path.read_text("utf-8"))
         schema = manifest["schema"]
@@ -127,7 +125,7 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
         what = ", ".join(f"{k} {_said(old.get(k))} (now {_said(new[k])})" for k in changed)
         raise DatasetError(
             f"{path}: holds a drive made with other options: {what};"
-            " add --overwrite to replace it, or give another directory"
+            " set `overwrite` to replace it, or give another directory"
         )
     for left in path.rglob("*.part"):  # of a drive that was killed
         left.unlink()

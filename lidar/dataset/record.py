@@ -99,16 +99,16 @@ class Contents:
     def __post_init__(self) -> None:
         """Refuse what cannot be written."""
         if not self.formats:
-            raise InputError(f"--format: give one or more of {','.join(FORMATS)}")
+            raise InputError(f"`formats`: give one or more of {','.join(FORMATS)}")
         if unknown := sorted(set(self.formats) - set(FORMATS)):
-            raise InputError(f"--format {','.join(unknown)}: one or more of {','.join(FORMATS)}")
+            raise InputError(f"`formats` {','.join(unknown)}: one or more of {','.join(FORMATS)}")
         if unknown := sorted(set(self.labels) - set(LABELS)):
-            raise InputError(f"--labels {','.join(unknown)}: one or more of {','.join(LABELS)}")
+            raise InputError(f"`labels` {','.join(unknown)}: one or more of {','.join(LABELS)}")
         if self.deskew and self.deskew not in MOMENTS:
-            raise InputError(f"--deskew {self.deskew}: one of {', '.join(MOMENTS)}")
+            raise InputError(f"`deskew` {self.deskew}: one of {', '.join(MOMENTS)}")
         if self.deskew and not set(self.formats) - set(_WORLD):
             raise InputError(
-                f"--deskew: {','.join(self.formats)} files hold points as they are in the world; add"
+                f"`deskew`: {','.join(self.formats)} files hold points as they are in the world; add"
                 " a format of the sensor frame (pcd, ply, csv, kitti or nuscenes)"
             )
 

@@ -84,11 +84,11 @@ def aggregate(
     if out.suffix.lower() not in _SUFFIXES:
         raise InputError(f"{out}: maps are written as {', '.join(_SUFFIXES)}")
     if color not in COLORS:
-        raise InputError(f"--color {color}: one of {', '.join(COLORS)}")
+        raise InputError(f"`color` {color}: one of {', '.join(COLORS)}")
     if voxel is not None and not (np.isfinite(voxel) and voxel > 0):
-        raise InputError(f"--voxel {voxel}: give a positive number of metres")
+        raise InputError(f"`voxel` {voxel}: give a positive number of metres")
     if out.exists() and not overwrite:
-        raise InputError(f"{out}: is there already; add --overwrite to replace it")
+        raise InputError(f"{out}: is there already; set `overwrite` to replace it")
     lidars = dataset.lidars
     if unknown := sorted(set(sensors) - set(lidars)):
         raise InputError(f"no scanner {', '.join(unknown)} in {dataset.path}; there are {', '.join(lidars)}")

@@ -97,7 +97,7 @@ def plan_flight(
     if not len(on):
         raise RouteError(
             f"the record of {trajectory.duration_ns / 1e9:.1f} s ends before the first line of the survey;"
-            " record longer, or scan on the way there too (--turns)"
+            " record longer, or scan on the way there too (`turns`)"
         )
     return Flight(trajectory, on)
 
@@ -167,7 +167,7 @@ def _along(
         if vehicle.turning_radius > _STREET_RADIUS:
             raise RouteError(
                 f"a craft that turns within {vehicle.turning_radius:.0f} m cannot follow streets; give"
-                " --survey all, --survey FILE or waypoints"
+                " `survey` all, `survey` FILE or waypoints"
             )
         length = vehicle.max_speed * ((60.0 if duration is None else duration) + AHEAD_S)
         graph = covered(scene.road_graph(), scene)
@@ -207,7 +207,7 @@ def _strips(
     """The route to and fro over an area, strips along its longer side; these (k, 2, 2), and their spacing."""
     area = survey_area(scene, survey)
     if not 0.0 <= overlap < 1.0:
-        raise InputError(f"--overlap {overlap:g}: a share from 0 to less than 1")
+        raise InputError(f"`overlap` {overlap:g}: a share from 0 to less than 1")
     scale = float(np.asarray(scene.frame.scale_at(area.centroid.x, area.centroid.y)))
     spacing = swath(sensors, height) * (1.0 - overlap) * scale
     corner = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))
@@ -246,22 +246,22 @@ def survey_area(scene: Scene, text: str) -> Any:
     )  # degrees: sides stay straight on the map where they are in the file
     area = shapely.transform(area, lambda p: np.column_stack(scene.frame.from_geographic(*p.T)))
     if not shapely.intersects(area, whole):
-        raise RouteError(f"--survey {text}: the area does not touch the scene")
+        raise RouteError(f"`survey` {text}: the area does not touch the scene")
     return area
 
 
 def _polygon(path: Path) -> Any:
     if not path.is_file():
-        raise RouteError(f"--survey {path}: neither all, W,S,E,N in degrees, nor a GeoJSON file")
+        raise RouteError(f"`survey` {path}: neither all, W,S,E,N in degrees, nor a GeoJSON file")
     try:
         document = json.loads(path.read_text("utf-8-sig"))
         parts = [f.get("geometry") or f for f in document.get("features", [document])]
         shapes = [shapely.from_geojson(json.dumps(part)) for part in parts]
     except (ValueError, AttributeError, shapely.errors.GEOSException) as error:
-        raise RouteError(f"--survey {path}: not readable as GeoJSON ({error})") from error
+        raise RouteError(f"`survey` {path}: not readable as GeoJSON ({error})") from error
     areas = shapely.union_all([s for s in shapes if s.geom_type in ("Polygon", "MultiPolygon")])
     if areas.is_empty:
-        raise RouteError(f"--survey {path}: no polygon in it")
+        raise RouteError(f"`survey` {path}: no polygon in it")
     return areas if areas.geom_type == "Polygon" else areas.convex_hull
 
 
@@ -285,7 +285,7 @@ def _swath(sensor: Scanner | Camera, height: float) -> float:
     down = way[-way[:, 2] > _STEEPEST]
     if height >= sensor.reach:
         raise RouteError(
-            f"--altitude {height:g}: {sensor.name} sees {sensor.reach:g} m; fly lower, or take another sensor"
+            f"`altitude` {height:g}: {sensor.name} sees {sensor.reach:g} m; fly lower, or take another sensor"
         )
     if not len(down):
         raise RouteError(f"{sensor.name} does not look down; a survey needs a rig such as drone or aircraft")
@@ -305,5 +305,5 @@ def _refuse_collisions(trajectory: Trajectory, below: _Below, *, scene: Scene) -
         lon, lat = scene.frame.to_geographic(*xyz[worst, :2])
         raise RouteError(
             f"the flight would meet what reaches up to z = {top[worst]:.0f} m at {float(lat):.6f},"
-            f" {float(lon):.6f}; fly {math.ceil(short[worst])} m higher (--altitude)"
+            f" {float(lon):.6f}; fly {math.ceil(short[worst])} m higher (`altitude`)"
         )

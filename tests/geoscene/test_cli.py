@@ -95,6 +95,8 @@ def test_a_drive_and_its_map(scene, tmp_path):
         ("geoscene", ["build", "--point", "1,2", "--radius", "nan", "-o", "x"], "radius nan"),
         ("geoscene", ["info", "nowhere"], "nowhere"),
         ("geoscene", ["validate", "nowhere"], "nowhere"),
+        ("lidar", ["drive", "nowhere", "--route", "random", "--format", "doc", "-o", "x"], "--format doc"),
+        ("lidar", ["drive", "nowhere", "--route", "random", "--set", "ray=7", "-o", "x"], "--set ray"),
         ("lidar", ["drive", "nowhere", "--route", "random", "-o", "x"], "nowhere"),
         ("lidar", ["drive", "nowhere", "--seed", "1.5", "-o", "x"], "--seed"),
         ("lidar", ["map", "nowhere", "-o", "x.laz"], "nowhere"),

@@ -154,7 +154,7 @@ def test_a_killed_drive_goes_on_and_ends_with_the_same_bytes(scene, dataset, tmp
 
 
 def test_another_drive_is_not_written_over(scene, dataset):
-    with pytest.raises(DatasetError, match=r"other options: seed 3 \(now 4\);.*--overwrite"):
+    with pytest.raises(DatasetError, match=r"other options: seed 3 \(now 4\);.*`overwrite`"):
         drive(scene, dataset.path, options=replace(OPTIONS, seed=4))
     assert digest(dataset.path)
 

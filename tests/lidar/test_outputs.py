@@ -569,13 +569,13 @@ def test_nuscenes_tables_lead_from_a_sample_to_points_boxes_and_pixels(dataset, 
 
 def test_what_cannot_be_a_nuscenes_dataset_is_said(dataset, scene, tmp_path):
     (tmp_path / "n").mkdir()
-    with pytest.raises(InputError, match="--overwrite"):
+    with pytest.raises(InputError, match="`overwrite`"):
         export_nuscenes(dataset, tmp_path / "n")
     options = replace(
         OPTIONS, rig="vlp16", duration=0.3, traffic=None, formats=("laz",), labels=(), deskew=""
     )
     drive(scene, tmp_path / "d", options=options)
-    with pytest.raises(DatasetError, match="--format pcd"):
+    with pytest.raises(DatasetError, match="`formats` pcd"):
         export_nuscenes(open_dataset(tmp_path / "d"), tmp_path / "m")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "n"]
 

@@ -105,7 +105,7 @@ def export_nuscenes(
     frame (pcd, ply or csv).
     """
     if out.exists() and not overwrite:
-        raise InputError(f"{out}: is there already; add --overwrite to replace it")
+        raise InputError(f"{out}: is there already; set `overwrite` to replace it")
     streams = _streams(dataset)
     part = out.with_name(f"{out.name}.part")
     shutil.rmtree(part, ignore_errors=True)
@@ -152,7 +152,7 @@ def _streams(dataset: Dataset) -> list[_Stream]:
         )
     if not any(s.modality == "lidar" for s in streams):
         raise DatasetError(
-            f"{dataset.path}: no clouds in the sensor frame; drive with --format pcd, ply or csv too"
+            f"{dataset.path}: no clouds in the sensor frame; drive with `formats` pcd, ply or csv too"
         )
     return streams
 

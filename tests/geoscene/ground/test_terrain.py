@@ -145,7 +145,7 @@ def test_a_model_that_does_not_cover_the_scene_is_an_error_or_a_counted_fallback
     path = write_dem(tmp_path / "a.tif", east - 499000, corner=corner)
     bounds = (-350.0, -200.0, 50.0, 200.0)
     with pytest.raises(
-        InputError, match=r"a\.tif: 7\d\.\d % of the scene is not covered.*W 8\.99.*--dem-gaps nearest"
+        InputError, match=r"a\.tif: 7\d\.\d % of the scene is not covered.*W 8\.99.*`dem_gaps` nearest"
     ):
         open_terrain([path], FRAME, bounds=bounds)
     terrain = open_terrain([path], FRAME, bounds=bounds, outside="nearest")

@@ -65,5 +65,5 @@ def test_the_scene_and_the_drive_keep_to_one_side(given, tmp_path):
 
 
 def test_a_third_side_is_refused():
-    with pytest.raises(InputError, match="--driving-side middle: left or right"):
+    with pytest.raises(InputError, match="`driving_side` middle: left or right"):
         BuildOptions(driving_side="middle")

@@ -225,7 +225,7 @@ def test_a_busy_server_is_asked_again_and_not_for_ever(serve, tmp_path):
     server.refuse = [503, 429, 500]
     fetch_elevation(area(0.001), cache_dir=tmp_path / "a", server=patient(server))
     server.refuse = [503] * 99
-    with pytest.raises(NetworkError, match=r"HTTP 503.*--dem FILE"):
+    with pytest.raises(NetworkError, match=r"HTTP 503.*`dem` FILE"):
         fetch_elevation(area(0.001), cache_dir=tmp_path / "b", server=patient(server))
     assert len(server.refuse) == 99 - 4
     assert list((tmp_path / "b").rglob("*.*")) == []

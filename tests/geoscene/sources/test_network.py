@@ -291,7 +291,7 @@ def test_a_server_that_fails_gives_way_to_the_next(start):
 
 def test_a_server_that_fails_is_named_and_nothing_is_kept(server, tmp_path):
     server.refuse = [500]
-    with pytest.raises(NetworkError, match=r"127\.0\.0\.1:\d+: HTTP 500.*--osm FILE.*--demo"):
+    with pytest.raises(NetworkError, match=r"127\.0\.0\.1:\d+: HTTP 500.*`osm` FILE.*`demo`"):
         fetch_bbox(BOX, cache_dir=tmp_path, servers=servers_at(server))
     server.remark = "runtime error: Query run out of memory using about 2048 MB of RAM."
     with pytest.raises(NetworkError, match="out of memory"):
@@ -326,8 +326,8 @@ def test_without_a_network_one_line_says_what_to_do():
         message = str(caught.value)
         assert "\n" not in message
         assert "Connection refused" in message
-        assert "--osm FILE" in message
-        assert "--demo" in message
+        assert "`osm` FILE" in message
+        assert "`demo`" in message
 
 
 def test_a_place_nobody_knows_is_not_found(server):

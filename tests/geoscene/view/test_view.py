@@ -228,10 +228,10 @@ def test_bounds_take_the_tiles_that_they_meet(scene, tmp_path):
 def test_a_page_that_is_too_large_is_refused_with_a_part_that_is_not(scene, path, tmp_path):
     whole = path.stat().st_size / 1e6
     out = tmp_path / "page.html"
-    with pytest.raises(InputError, match="--max-size") as caught:
+    with pytest.raises(InputError, match="`max_mb`") as caught:
         view_scene(scene, out, max_mb=0.7 * whole)
     assert not list(tmp_path.iterdir())
-    told = re.search(r"--bbox=(\S+)", str(caught.value))
+    told = re.search(r"`bounds_deg`=(\S+)", str(caught.value))
     west, south, east, north = map(float, told[1].split(","))
     summary = view_scene(scene, out, bounds_deg=(west, south, east, north), max_mb=0.7 * whole)
     assert 0 < summary.faces < scene.manifest["counts"]["faces"]

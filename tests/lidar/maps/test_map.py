@@ -206,7 +206,7 @@ def test_noise_is_left_out_and_counted_unless_it_is_asked_for(tmp_path):
 def test_a_map_that_is_there_is_replaced_only_when_asked(tmp_path):
     data = dataset(tmp_path / "d", frames=1)
     (tmp_path / "m.ply").write_text("mine")
-    with pytest.raises(InputError, match="--overwrite"):
+    with pytest.raises(InputError, match="`overwrite`"):
         aggregate(data, tmp_path / "m.ply")
     assert (tmp_path / "m.ply").read_text() == "mine"
     assert aggregate(data, tmp_path / "m.ply", overwrite=True).points == 400

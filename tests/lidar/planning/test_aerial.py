@@ -137,7 +137,7 @@ def test_a_drone_without_more_words_flies_over_streets_and_sees_them(scene, tmp_
     [
         ("drone", {"survey": "all", "altitude": 12.0}, "would meet what reaches up"),
         ("vlp16", {"survey": "all"}, "a car does not"),
-        ("vlp16", {"altitude": 50.0}, "--altitude is for what flies"),
+        ("vlp16", {"altitude": 50.0}, "`altitude` is for aircraft"),
         ("aircraft", {"route": "random"}, "cannot follow streets"),
         ("drone", {"survey": "nowhere.geojson"}, "neither all"),
         ("drone", {"survey": "3,4,5,6"}, "does not touch"),
