@@ -20,5 +20,5 @@ def demo_path() -> Path:
             return folder / _NAME
     raise SourceNotFoundError(
         f"the demo extract {_NAME} is in neither {package / 'demo'} nor {package.parent / 'data'};"
-        " install the package again, make it with data/cut_demo.py, or read an extract of yours (--osm FILE)"
+        " install the package again, make it with data/cut_demo.py, or read an extract of yours (`osm` FILE)"
     )
