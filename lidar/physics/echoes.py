@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from enum import IntEnum
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numba import njit
@@ -43,25 +44,59 @@ class Echoes:
         """Number of rows."""
         return len(self.pulse)
 
-    def take(self, rows: NDArray[Any] | slice) -> Echoes:
+    def take(self, rows: NDArray[Any] | slice) -> Self:
         """Chosen rows; those of a slice are not copied."""
-        return Echoes(*(getattr(self, f.name)[rows] for f in fields(self)))
+        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
 
-    def where(self, keep: NDArray[np.bool_]) -> Echoes:
+    def where(self, keep: NDArray[np.bool_]) -> Self:
         """The rows of a mask, without a copy if that is all."""
         return self if keep.all() else self.take(keep)
 
 
-def joined(first: Echoes, *others: Echoes) -> Echoes:
+class Origin(IntEnum):
+    """Cause of an echo or a return."""
+
+    SURFACE = 0
+    WEATHER = 1
+    INTERFERENCE = 2
+    INJECTED = 3
+    REPLAYED = 4
+    MOVED = 5
+    RECEIVER = 6  # false alarms and blooming
+
+
+@dataclass(frozen=True, slots=True)
+class TracedEchoes(Echoes):
+    """Echoes with their ground truth, as stages change them.
+
+    origin : (m,) uint8, `Origin`
+    source : (m,) int32, row of the unaltered echo that this one is, or was moved from; -1 for an added echo
+    """
+
+    origin: NDArray[np.uint8]
+    source: NDArray[np.int32]
+
+
+def traced(echoes: Echoes, origin: Origin, *, source: NDArray[np.integer]) -> TracedEchoes:
+    """Echoes with an origin and their sources (m,)."""
+    columns: list[Any] = [getattr(echoes, f.name) for f in fields(Echoes)]
+    columns += [np.full(len(echoes), origin, np.uint8), source.astype(np.int32)]
+    return TracedEchoes(*columns)
+
+
+EchoesT = TypeVar("EchoesT", bound=Echoes)
+
+
+def joined(first: EchoesT, *others: EchoesT) -> EchoesT:
     """All rows, sorted by pulse and range."""
     together = (first, *(other for other in others if len(other)))
     if len(together) == 1:
         return first
-    both = Echoes(*(np.concatenate([getattr(e, f.name) for e in together]) for f in fields(Echoes)))
+    both = type(first)(*(np.concatenate([getattr(e, f.name) for e in together]) for f in fields(first)))
     return both.take(np.lexsort((both.range, both.pulse)))
 
 
-def merged(surfaces: Echoes, separation: float) -> Echoes:
+def merged(surfaces: EchoesT, separation: float) -> EchoesT:
     """The echoes of pulses that meet these surfaces.
 
     Surfaces of a pulse that follow each other within ``separation`` metres are one echo: it lies at their

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.typing import Float
-from lidar.physics.echoes import Echoes
+from lidar.physics.echoes import Echoes, EchoesT, Origin
 from lidar.physics.effects import Effects
 from lidar.physics.link import amplitude, apparent_of, daylight_noise, false_alarm_probability
 from lidar.physics.measure import quantised, signal_sigma, stretch_sigma, walk
@@ -17,6 +18,9 @@ from lidar.physics.reflect import RETRO
 from lidar.random_streams import generator
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
+
+Deviates = Callable[[str, Echoes], Float]
+"""Standard normal deviates (m,) of echoes for a purpose such as ``range noise``."""
 
 _BLOOM_ANGLE, _BLOOM_CHANCE = np.radians(0.3), 0.3  # typical values
 _BLOOM_POWER = 0.01  # of the retro-reflector's power, assumed
@@ -34,7 +38,7 @@ def received(sensor: Sensor, echoes: Echoes, *, effects: Effects) -> Float:
     )
 
 
-def detected(sensor: Sensor, echoes: Echoes, *, effects: Effects, rng: np.random.Generator) -> Echoes:
+def detected(sensor: Sensor, echoes: EchoesT, *, effects: Effects, deviates: Deviates) -> EchoesT:
     """The echoes that pass the threshold, with the apparent reflectance that the sensor measures.
 
     With ``detection``, noise is added to each echo's power before it meets the threshold, which gives the
@@ -43,9 +47,8 @@ def detected(sensor: Sensor, echoes: Echoes, *, effects: Effects, rng: np.random
     power = received(sensor, echoes, effects=effects)
     measured = power
     if effects.detection:
-        measured = power + daylight_noise(sensor.noise_ratio, effects.daylight_lux) * rng.standard_normal(
-            len(echoes)
-        )
+        noise = daylight_noise(sensor.noise_ratio, effects.daylight_lux)
+        measured = power + noise * deviates("detection", echoes)
     seen = measured > 1
     apparent = echoes.apparent * measured / np.maximum(power, 1e-300)
     return replace(echoes, apparent=apparent).take(seen)
@@ -53,17 +56,20 @@ def detected(sensor: Sensor, echoes: Echoes, *, effects: Effects, rng: np.random
 
 def false_echoes(
     sensor: Sensor, pulses: Firings, *, echoes: Echoes, effects: Effects, seed: int, frame: int
-) -> list[Echoes]:
-    """Echoes of nothing that is there: blooming, other scanners, noise over the threshold."""
-    found = []
+) -> list[tuple[Origin, Echoes]]:
+    """Echoes of no surface, by origin: blooming, pulses of other scanners, noise over the threshold.
+
+    Each entry has at most one echo a pulse.
+    """
+    found: list[tuple[Origin, Echoes]] = []
     if effects.blooming:
         rng = generator(seed, sensor.name, frame, "blooming")
-        found.append(_blooming(pulses, echoes, rng=rng))
+        found.append((Origin.RECEIVER, _blooming(pulses, echoes, rng=rng)))
     if effects.interference:
         rng = generator(seed, sensor.name, frame, "interference")
         pulse = np.flatnonzero(rng.random(len(pulses)) < 1 - (1 - _OVERLAP) ** effects.interference)
         power = 100 ** rng.random(len(pulse))  # log-uniform over two decades, assumed
-        found.append(_anywhere(sensor, pulse, power=power, rng=rng))
+        found.append((Origin.INTERFERENCE, _anywhere(sensor, pulse, power=power, rng=rng)))
     if effects.false_alarms:
         rng = generator(seed, sensor.name, frame, "false alarms")
         noise = daylight_noise(sensor.noise_ratio, effects.daylight_lux)
@@ -71,7 +77,7 @@ def false_echoes(
         pulse = np.flatnonzero(rng.random(len(pulses)) < chance)
         # Beyond a high threshold the tail of a Gaussian falls like an exponential.
         power = 1 + noise**2 * rng.standard_exponential(len(pulse))
-        found.append(_anywhere(sensor, pulse, power=power, rng=rng))
+        found.append((Origin.RECEIVER, _anywhere(sensor, pulse, power=power, rng=rng)))
     return found
 
 
@@ -122,7 +128,7 @@ def _blooming(pulses: Firings, echoes: Echoes, *, rng: np.random.Generator) -> E
 
 
 def measured_range(
-    sensor: Sensor, pulses: Firings, *, echoes: Echoes, effects: Effects, seed: int, frame: int
+    sensor: Sensor, pulses: Firings, *, echoes: Echoes, effects: Effects, seed: int, deviates: Deviates
 ) -> Float:
     """Ranges (m,) as the sensor reports them, metres."""
     distance = echoes.range + sensor.pattern.range_offset
@@ -138,10 +144,8 @@ def measured_range(
         sigma: Float = np.full(len(echoes), sensor.range_sigma)
         if effects.range_noise == "signal":
             sigma = np.hypot(sigma, signal_sigma(power))
-        rng = generator(seed, sensor.name, frame, "range noise")
-        distance = distance + sigma * rng.standard_normal(len(echoes))
+        distance = distance + sigma * deviates("range noise", echoes)
     if effects.stretch and effects.rays == 1:
-        rng = generator(seed, sensor.name, frame, "stretch")
         width = stretch_sigma(echoes.range, echoes.cosine, divergence=sensor.divergence[1])
-        distance = distance + width * rng.standard_normal(len(echoes))
+        distance = distance + width * deviates("stretch", echoes)
     return quantised(distance, sensor.range_quantum) if effects.quantise else distance

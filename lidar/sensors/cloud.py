@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,9 +56,25 @@ class Cloud:
         """Number of returns."""
         return len(self.xyz)
 
-    def where(self, keep: NDArray[np.bool_]) -> Cloud:
+    def where(self, keep: NDArray[np.bool_]) -> Self:
         """The returns (n,) to keep."""
-        return Cloud(self.start_ns, *(getattr(self, f.name)[keep] for f in fields(self)[1:]))
+        return type(self)(self.start_ns, *(getattr(self, f.name)[keep] for f in fields(self)[1:]))
+
+
+@dataclass(frozen=True, slots=True)
+class TracedCloud(Cloud):
+    """A cloud with the ground truth of its returns, as stages change them.
+
+    The original cloud is what the scanner reports without stages.
+
+    origin : (n,) uint8, `lidar.physics.echoes.Origin`
+    source : (n,) int32, row of the original return that this one is, or was moved from; -1 for an added one
+    hidden : (n,) int32, row of the original return that this one hides or replaces; -1 for none
+    """
+
+    origin: NDArray[np.uint8]
+    source: NDArray[np.int32]
+    hidden: NDArray[np.int32]
 
 
 def no_returns(start_ns: int) -> Cloud:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,17 +12,52 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
-from lidar.physics.echoes import Echoes, joined, numbered, reported
+from lidar.physics.echoes import Echoes, TracedEchoes, joined, numbered, reported, traced
 from lidar.physics.effects import PLAIN, Effects
 from lidar.physics.intensity import reflectivity_code
-from lidar.physics.returns import detected, false_echoes, measured_range, received
+from lidar.physics.returns import Deviates, detected, false_echoes, measured_range, received
 from lidar.random_streams import generator
 from lidar.rig.patterns.beams import Firings
-from lidar.rig.scanner import Sensor, firings
+from lidar.rig.scanner import Sensor
+from lidar.rig.scanner import firings as fire
 from lidar.sensors.cloud import Cloud
 from lidar.sensors.motion import beam_of
 from lidar.sensors.surfaces import met
 from lidar.world.world import World
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One frame before the detector: the pulses, and the echoes that reach the receiver.
+
+    seed, effects : of the detector
+    firings : the pulses as the sensor reports them
+    sent    : the pulses as they were sent: with noise of their direction
+    echoes  : sorted by pulse and range
+    """
+
+    sensor: Sensor
+    frame: int
+    seed: int
+    effects: Effects
+    firings: Firings
+    sent: Firings
+    echoes: Echoes
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """The echoes of a sweep that the sensor reports.
+
+    range  : (n,) metres as the sensor reports it
+    number : (n,) of the echo in its pulse, from 1
+    count  : (n,) echoes of its pulse
+    """
+
+    echoes: Echoes
+    range: Float
+    number: NDArray[np.uint8]
+    count: NDArray[np.uint8]
 
 
 def scan(
@@ -36,72 +71,112 @@ def scan(
     effects: Effects = PLAIN,
     threads: int = 1,
 ) -> Cloud:
-    """What the sensor reports in frame ``frame`` of the drive, in the order it was fired.
+    """The returns of frame ``frame`` of the drive, in the order they were fired.
 
-    Actors of the world are where their ray times say, which run from 0 to 1 over `Sensor.window_ns`. The same
-    seed, sensor name and frame give the same cloud, whatever was scanned before.
+    Actors of the world move with the ray time, which runs from 0 to 1 over `Sensor.window_ns`. The same seed,
+    sensor name and frame give the same cloud, whatever was scanned before.
 
     Raises BackendError if the ray engine does not work here.
     """
-    pulses = firings(sensor, frame)
+    sweep = cast(
+        sensor,
+        mount,
+        trajectory=trajectory,
+        world=world,
+        frame=frame,
+        seed=seed,
+        effects=effects,
+        threads=threads,
+    )
+    return report(sweep, detect(sweep, sweep.echoes, deviates=deviates_of(sweep)))
+
+
+def cast(
+    sensor: Sensor,
+    mount: Mount,
+    *,
+    trajectory: Trajectory,
+    world: World,
+    frame: int,
+    seed: int = 0,
+    effects: Effects = PLAIN,
+    threads: int = 1,
+) -> Sweep:
+    """The pulses of a frame and their echoes, before the detector; parameters as of `scan`."""
+    firings = fire(sensor, frame)
     if not effects.motion:
-        pulses = replace(pulses, time_ns=np.full_like(pulses.time_ns, pulses.time_ns[0]))
-    offset = sensor.pattern.range_offset
-    bent = pulses
+        firings = replace(firings, time_ns=np.full_like(firings.time_ns, firings.time_ns[0]))
+    sent = firings
     if effects.angle_noise:
-        bent = _unsteady(pulses, sensor, rng=generator(seed, sensor.name, frame, "angle"))
+        sent = _unsteady(firings, sensor, rng=generator(seed, sensor.name, frame, "angle"))
     echoes = met(
-        bent,
+        sent,
         mount,
         trajectory=trajectory,
         world=world,
         beam=beam_of(effects.rays, divergence=sensor.divergence, aperture=sensor.aperture),
-        far=sensor.max_range - offset,
+        far=sensor.max_range - sensor.pattern.range_offset,
         wavelength_nm=sensor.wavelength_nm,
         separation=sensor.echo_separation,
-        time=_ray_time(sensor, frame, pulses=pulses) if _moving(world) else None,
+        time=_ray_time(sensor, frame, pulses=firings) if _moving(world) else None,
         effects=effects,
         seed=seed,
         leaf_seed=int(generator(seed, sensor.name, frame, "foliage").integers(2**63)),
         threads=threads,
     )
+    return Sweep(sensor, frame, seed, effects, firings, sent, echoes)
+
+
+def deviates_of(sweep: Sweep) -> Deviates:
+    """The noise of a sweep's detector: streams of their own for each purpose, one deviate an echo."""
+
+    def deviates(purpose: str, echoes: Echoes) -> Float:
+        rng = generator(sweep.seed, sweep.sensor.name, sweep.frame, purpose)
+        return rng.standard_normal(len(echoes))
+
+    return deviates
+
+
+def detect(sweep: Sweep, echoes: Echoes, *, deviates: Deviates) -> Detection:
+    """Detection, return mode and measured range of echoes that reach the receiver in a sweep.
+
+    echoes : sorted by pulse and range: the sweep's own, or traced ones that stages have changed. Of traced
+             ones, the k-th kind of false echo of pulse p gets the source m + k n + p, where the sweep has m
+             echoes and n pulses
+    """
+    sensor, effects, offset = sweep.sensor, sweep.effects, sweep.sensor.pattern.range_offset
     echoes = echoes.where(echoes.range + offset >= sensor.min_range)
     if effects.link or effects.detection:
-        echoes = detected(
-            sensor, echoes, effects=effects, rng=generator(seed, sensor.name, frame, "detection")
-        )
-    false = false_echoes(sensor, pulses, echoes=echoes, effects=effects, seed=seed, frame=frame)
-    echoes = joined(echoes, *false)
+        echoes = detected(sensor, echoes, effects=effects, deviates=deviates)
+    false = false_echoes(
+        sensor, sweep.firings, echoes=echoes, effects=effects, seed=sweep.seed, frame=sweep.frame
+    )
+    is_traced = isinstance(echoes, TracedEchoes)
+    for k, (origin, found) in enumerate(false):
+        first = len(sweep.echoes) + k * len(sweep.firings)
+        echoes = joined(echoes, traced(found, origin, source=first + found.pulse) if is_traced else found)
     number, count = numbered(echoes)
-    if effects.rays > 1 or effects.mirrors or false:
+    if effects.rays > 1 or effects.mirrors or false or is_traced:
         power = received(sensor, echoes, effects=effects)
         rows = reported(
             echoes, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
         )
         echoes, number, count = echoes.take(rows), number[rows], np.minimum(count[rows], sensor.max_echoes)
-    distance = measured_range(sensor, pulses, echoes=echoes, effects=effects, seed=seed, frame=frame)
-    keep = (distance >= sensor.min_range) & (distance <= sensor.max_range)
-    echoes, distance, number, count = echoes.where(keep), distance[keep], number[keep], count[keep]
-    return _cloud(
-        sensor, pulses, echoes=echoes, distance=distance, number=number, count=count, effects=effects
+    distance = measured_range(
+        sensor, sweep.firings, echoes=echoes, effects=effects, seed=sweep.seed, deviates=deviates
     )
+    keep = (distance >= sensor.min_range) & (distance <= sensor.max_range)
+    return Detection(echoes.where(keep), distance[keep], number[keep], count[keep])
 
 
-def _cloud(
-    sensor: Sensor,
-    pulses: Firings,
-    *,
-    echoes: Echoes,
-    distance: Float,
-    number: NDArray[np.uint8],
-    count: NDArray[np.uint8],
-    effects: Effects,
-) -> Cloud:
+def report(sweep: Sweep, detection: Detection) -> Cloud:
+    """The point cloud of what a sweep's sensor reports."""
+    sensor, pulses, echoes = sweep.sensor, sweep.firings, detection.echoes
     pulse, offset, start = echoes.pulse, sensor.pattern.range_offset, int(pulses.time_ns[0])
     n = len(pulse)
     xyz, time = np.empty((n, 3), np.float32), np.empty(n, np.int32)
-    _place(pulse, distance - offset, pulses.origin, pulses.direction, pulses.time_ns, xyz, time)
-    code = reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code, whole=effects.quantise)
+    _place(pulse, detection.range - offset, pulses.origin, pulses.direction, pulses.time_ns, xyz, time)
+    code = reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code, whole=sweep.effects.quantise)
     real = echoes.true_range > 0
     return Cloud(
         start_ns=start,
@@ -109,14 +184,14 @@ def _cloud(
         time_ns=time,
         ring=pulses.ring[pulse],
         column=pulses.column[pulse],
-        range=distance,
+        range=detection.range,
         intensity=code,
         klass=echoes.klass,
         feature=echoes.feature,
         incidence=np.arccos(echoes.cosine).astype(np.float32),
         true_range=np.where(real, echoes.true_range + offset, 0.0),
-        echo=number,
-        echoes=count,
+        echo=detection.number,
+        echoes=detection.count,
     )
 
 

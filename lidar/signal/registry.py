@@ -1,0 +1,201 @@
+"""The stages that there are, and reading them from text, TOML files and recipes."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from difflib import get_close_matches
+from importlib import import_module
+from math import isfinite
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from lidar.errors import InputError
+from lidar.random_streams import generator
+from lidar.signal.stage import Stage
+
+_STAGES = {
+    "cover_glass": "cover_glass.CoverGlass",
+    "dropped_packets": "dropped_packets.DroppedPackets",
+    "lost_rows": "lost_rows.LostRows",
+}
+"""Module within this folder and class, by name."""
+
+SEAMS = {"echoes": "lidar", "cloud": "lidar", "image": "camera"}
+"""Kind of sensor of each seam; a stage has a method of that name for each seam that it acts on."""
+
+
+@dataclass(frozen=True, slots=True)
+class NamedStage:
+    """A stage that is switched on.
+
+    seed   : of its random numbers; the drive's if None
+    sensor : name of the only sensor that it acts on; all if empty
+    number : of earlier stages with the same name
+    """
+
+    name: str
+    stage: Stage
+    seed: int | None = None
+    sensor: str = ""
+    number: int = 0
+
+    def rng(self, seed: int, sensor: str, *, frame: int | str) -> np.random.Generator:
+        """The random numbers for a frame of a sensor; ``seed`` is the drive's."""
+        own = seed if self.seed is None else self.seed
+        return generator(own, "stage", self.name, self.number, sensor, frame)
+
+    def to_json(self) -> dict[str, Any]:
+        """What `read_stage` reads."""
+        extra = {"seed": self.seed, "sensor": self.sensor}
+        return {
+            "name": self.name,
+            **asdict(self.stage),
+            **{k: v for k, v in extra.items() if v not in (None, "")},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """Stages in the order in which they act; ``seed`` is the drive's."""
+
+    stages: tuple[NamedStage, ...] = ()
+    seed: int = 0
+
+    def at(self, seam: str, sensor: str) -> list[NamedStage]:
+        """The stages that act on a seam of a sensor."""
+        return [s for s in self.stages if s.sensor in ("", sensor) and hasattr(s.stage, seam)]
+
+    def act_on(self, sensor: str, *, kind: str) -> bool:
+        """Whether any stage acts on a sensor of a kind, ``lidar`` or ``camera``."""
+        return any(self.at(seam, sensor) for seam, of in SEAMS.items() if of == kind)
+
+    def check(self, sensors: Mapping[str, str]) -> None:
+        """Raise InputError for a stage that acts on none of the sensors, whose kinds are given by name."""
+        for named in self.stages:
+            if named.sensor and named.sensor not in sensors:
+                raise InputError(
+                    f"stage {named.name}: no sensor {named.sensor!r}; there are {', '.join(sensors)}"
+                )
+            kinds = {of for seam, of in SEAMS.items() if hasattr(named.stage, seam)}
+            if not any(kinds & {kind} for name, kind in sensors.items() if named.sensor in ("", name)):
+                raise InputError(
+                    f"stage {named.name} acts on a {' or '.join(sorted(kinds))}, and there is none"
+                )
+
+
+def stage_class(name: str) -> type[Stage]:
+    """The class of a stage; raises InputError if the name is unknown."""
+    if name not in _STAGES:
+        near = get_close_matches(name, _STAGES, 1)
+        hint = f"; is {near[0]} meant?" if near else ""
+        raise InputError(f"stage {name!r} is unknown{hint} (known are {', '.join(_STAGES)})")
+    module, kind = _STAGES[name].split(".")
+    return cast("type[Stage]", getattr(import_module(f"lidar.signal.{module}"), kind))
+
+
+def read_stage(table: Mapping[str, Any]) -> NamedStage:
+    """A stage from its name, its parameters and optionally ``seed`` and ``sensor``.
+
+    Raises InputError for a stage or parameter that is unknown, or a value out of its bounds.
+    """
+    name = table.get("name")
+    if not isinstance(name, str):
+        raise InputError("a stage has no name")
+    kind = stage_class(name)
+    values = {key: value for key, value in table.items() if key not in ("name", "seed", "sensor")}
+    known = [f.name for f in fields(kind)]
+    if unknown := [key for key in values if key not in known]:
+        raise InputError(
+            f"stage {name}: no parameter {unknown[0]!r} (known are {', '.join([*known, 'seed', 'sensor'])})"
+        )
+    seed, sensor = table.get("seed"), table.get("sensor", "")
+    if seed is not None and (type(seed) is not int or not 0 <= seed < 1 << 63):
+        raise InputError(f"stage {name}: seed = {seed!r} is not a whole number of 0 or more")
+    if not isinstance(sensor, str):
+        raise InputError(f"stage {name}: sensor = {sensor!r} is not a name")
+    try:
+        return NamedStage(name, kind(**values), seed, sensor)
+    except InputError as error:
+        raise InputError(f"stage {name}: {error}") from None
+
+
+def read_stages(texts: Iterable[str], *, seed: int = 0) -> Stages:
+    """Stages from texts ``NAME``, ``NAME:KEY=VALUE,KEY=VALUE`` or ``FILE.toml`` with tables ``[[stage]]``.
+
+    Raises InputError as `read_stage` does, and for a file that cannot be read.
+    """
+    tables: list[Mapping[str, Any]] = []
+    for text in texts:
+        tables += _file_tables(Path(text)) if text.endswith(".toml") else [_text_table(text)]
+    return stages_of(tables, seed=seed)
+
+
+def stages_of(tables: Iterable[Mapping[str, Any]], *, seed: int = 0) -> Stages:
+    """Stages from tables as `read_stage` reads them."""
+    found: list[NamedStage] = []
+    for table in tables:
+        named = read_stage(table)
+        number = sum(other.name == named.name for other in found)
+        found.append(NamedStage(named.name, named.stage, named.seed, named.sensor, number))
+    return Stages(tuple(found), seed)
+
+
+def _file_tables(path: Path) -> list[Mapping[str, Any]]:
+    try:
+        document = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as TOML ({error})") from None
+    tables = document.pop("stage", None)
+    if document or not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise InputError(f"{path}: give tables [[stage]] with a name and parameters, and nothing else")
+    return tables
+
+
+def _text_table(text: str) -> Mapping[str, Any]:
+    name, _, rest = text.partition(":")
+    kinds = {f.name: type(f.default) for f in fields(stage_class(name.strip()))} | {
+        "seed": int,
+        "sensor": str,
+    }
+    table: dict[str, Any] = {"name": name.strip()}
+    for pair in filter(None, rest.split(",")):
+        key, equals, value = (part.strip() for part in pair.partition("="))
+        if not equals:
+            raise InputError(f"stage {text}: give NAME:KEY=VALUE,KEY=VALUE")
+        table[key] = _value(value, kinds.get(key, str))
+    return table
+
+
+def _value(text: str, kind: type) -> Any:
+    """A value of a kind; the text itself, which `Stage` refuses, if it is none."""
+    if kind is bool:
+        return {"true": True, "on": True, "false": False, "off": False}.get(text.lower(), text)
+    try:
+        return kind(text)
+    except ValueError:
+        return text
+
+
+def stage_rows() -> list[dict[str, Any]]:
+    """Name, seams, meaning and parameters of every stage."""
+    rows = []
+    for name in _STAGES:
+        kind = stage_class(name)
+        parameters = [
+            {
+                "name": f.name,
+                "default": f.default,
+                **{end: f.metadata[end] for end in ("low", "high") if isfinite(f.metadata[end])},
+                **({"among": f.metadata["among"]} if f.metadata["among"] else {}),
+                "meaning": f.metadata["meaning"],
+            }
+            for f in fields(kind)
+        ]
+        seams = [seam for seam in SEAMS if hasattr(kind, seam)]
+        meaning = (kind.__doc__ or "").partition("\n")[0]
+        rows.append({"name": name, "acts_on": seams, "meaning": meaning, "parameters": parameters})
+    return rows

@@ -1,0 +1,178 @@
+"""Runs stages on a frame, and keeps the ground truth of what they did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.files import write_atomically
+from geoscene.typing import Float
+from lidar.camera.render import Frame
+from lidar.errors import LidarError
+from lidar.physics.echoes import Echoes, Origin, TracedEchoes, merged, traced
+from lidar.random_streams import generator
+from lidar.sensors.cloud import Cloud, TracedCloud
+from lidar.sensors.scan import Sweep, detect, deviates_of, report
+from lidar.signal.registry import Stages
+from lidar.signal.stage import CloudStage, EchoStage, ImageStage, Pulses, pulses_of
+
+_FALSE_KINDS = 3  # kinds of false echoes, each at most one a pulse
+
+
+@dataclass(frozen=True, slots=True)
+class Altered:
+    """A frame after its stages.
+
+    cloud    : what is recorded
+    original : what would be recorded without stages
+    """
+
+    cloud: TracedCloud
+    original: Cloud
+
+    def where(self, keep: Callable[[Cloud], NDArray[np.bool_]]) -> Altered:
+        """The returns that a rule keeps, of both clouds."""
+        kept = keep(self.original)
+        row = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1).astype(np.int32)
+        cloud = self.cloud.where(keep(self.cloud))
+        cloud = replace(cloud, source=row[cloud.source], hidden=row[cloud.hidden])
+        return Altered(cloud, self.original.where(kept))
+
+
+def altered_sweep(sweep: Sweep, stages: Stages) -> Altered:
+    """The point cloud of a sweep after the stages on its echoes and on the cloud."""
+    sensor, m = sweep.sensor, len(sweep.echoes)
+    noise = _RepeatedNoise(sweep)
+    echoes = traced(sweep.echoes, Origin.SURFACE, source=np.arange(m))
+    first = last = detect(sweep, echoes, deviates=noise.first)
+    original = report(sweep, first)
+    before = stages.at("echoes", sensor.name)
+    if before:
+        pulses = pulses_of(sensor, sweep.sent, extinction=sweep.effects.extinction)
+        echoes = altered_echoes(pulses, echoes, stages=stages, frame=sweep.frame)
+        last = detect(sweep, echoes, deviates=noise.again)
+    reported, unaltered = cast("TracedEchoes", last.echoes), cast("TracedEchoes", first.echoes)
+    cloud = linked(report(sweep, last) if before else original, reported, first=unaltered)
+    return Altered(altered_cloud(cloud, stages, sensor=sensor.name, frame=sweep.frame), original)
+
+
+def altered_echoes(pulses: Pulses, echoes: TracedEchoes, *, stages: Stages, frame: int | str) -> TracedEchoes:
+    """Echoes after the stages on them, sorted by pulse and range; what a receiver cannot tell apart is one."""
+    name = pulses.sensor.name
+    for named in stages.at("echoes", name):
+        stage = cast("EchoStage", named.stage)
+        echoes = stage.echoes(pulses, echoes, rng=named.rng(stages.seed, name, frame=frame))
+        if len(echoes) and not 0 <= echoes.pulse.min() <= echoes.pulse.max() < len(pulses):
+            raise LidarError(f"stage {named.name} returned echoes of pulses that were not fired")
+    echoes = echoes.take(np.lexsort((echoes.range, echoes.pulse)))
+    # Off the axis, so that an echo of several is described by the one that sends back most.
+    return merged(replace(echoes, axis=np.zeros(len(echoes), bool)), pulses.sensor.echo_separation)
+
+
+def linked(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> TracedCloud:
+    """A cloud with the truth of its returns against those of the original cloud.
+
+    echoes : of the returns of ``cloud``
+    first  : of the returns of the original cloud
+    """
+    row = np.full(max(first.source.max(initial=-1), echoes.source.max(initial=-1)) + 2, -1, np.int32)
+    row[first.source] = np.arange(len(first))
+    source = row[echoes.source]
+    lost = np.setdiff1d(np.arange(len(first)), source)
+    hidden = np.full(len(cloud), -1, np.int32)
+    if len(lost):
+        at = np.minimum(np.searchsorted(first.pulse[lost], echoes.pulse), len(lost) - 1)
+        hides = (source < 0) & (first.pulse[lost[at]] == echoes.pulse)
+        hidden[hides] = lost[at[hides]]
+    columns: list[Any] = [getattr(cloud, f.name) for f in fields(Cloud)]
+    columns += [echoes.origin, source, hidden]
+    return TracedCloud(*columns)
+
+
+def altered_cloud(cloud: TracedCloud, stages: Stages, *, sensor: str, frame: int | str) -> TracedCloud:
+    """A cloud after the stages on it."""
+    for named in stages.at("cloud", sensor):
+        rng = named.rng(stages.seed, sensor, frame=frame)
+        cloud = cast("CloudStage", named.stage).cloud(cloud, rng=rng)
+    moved = (cloud.origin == Origin.MOVED) & (cloud.hidden < 0)
+    return replace(cloud, hidden=np.where(moved, cloud.source, cloud.hidden))
+
+
+def altered_image(image: Frame, stages: Stages, *, sensor: str, frame: int | str) -> Frame:
+    """An image after the stages on it; unchanged without colour."""
+    if image.rgb is None:
+        return image
+    for named in stages.at("image", sensor):
+        rng = named.rng(stages.seed, sensor, frame=frame)
+        image = cast("ImageStage", named.stage).image(image, rng=rng)
+    return image
+
+
+class _RepeatedNoise:
+    """Noise of a detector that stays the same for an echo when stages add or remove others."""
+
+    def __init__(self, sweep: Sweep) -> None:
+        self._sweep, self._draw = sweep, deviates_of(sweep)
+        self._known: dict[str, Float] = {}
+
+    def first(self, purpose: str, echoes: Echoes) -> Float:
+        """Draw for the unaltered echoes."""
+        sweep, drawn = self._sweep, self._draw(purpose, echoes)
+        known = np.full(len(sweep.echoes) + _FALSE_KINDS * len(sweep.firings) + 1, np.nan)
+        known[cast("TracedEchoes", echoes).source] = drawn
+        self._known[purpose] = known
+        return drawn
+
+    def again(self, purpose: str, echoes: Echoes) -> Float:
+        """What was drawn for the same echoes, and other numbers for added ones."""
+        sweep = self._sweep
+        rng = generator(sweep.seed, sweep.sensor.name, sweep.frame, purpose, "altered")
+        known = self._known[purpose][cast("TracedEchoes", echoes).source]
+        drawn: Float = np.where(np.isnan(known), rng.standard_normal(len(echoes)), known)
+        return drawn
+
+
+def cloud_truth(altered: Altered, *, start_ns: int) -> dict[str, NDArray[Any]]:
+    """Columns of a truth file; ``removed_time_ns`` counts from ``start_ns``.
+
+    origin, source, hidden : (n,) of the recorded returns, as in `TracedCloud`
+    removed                : (k,) int32, rows of the original returns that are not among them, or were moved
+    removed_*              : (k,) or (k, 3), the columns of those, as in `Cloud`
+    """
+    cloud, original = altered.cloud, altered.original
+    kept = cloud.source[(cloud.source >= 0) & (cloud.origin != Origin.MOVED)]
+    removed = np.setdiff1d(np.arange(len(original), dtype=np.int32), kept)
+    gone = {f.name: getattr(original, f.name)[removed] for f in fields(Cloud)[1:]}
+    gone["time_ns"] = (original.start_ns - start_ns + gone["time_ns"].astype(np.int64)).astype(np.int64)
+    return {
+        "origin": cloud.origin,
+        "source": cloud.source,
+        "hidden": cloud.hidden,
+        "removed": removed,
+        **{f"removed_{name}": column for name, column in gone.items()},
+    }
+
+
+def image_truth(image: Frame, original: Frame) -> dict[str, NDArray[Any]]:
+    """What stages did to the colours of an image.
+
+    changed : (h, w) bool
+    removed : (k, 3) uint8, the colours of the changed pixels without stages, row by row
+    """
+    assert image.rgb is not None  # noqa: S101
+    assert original.rgb is not None  # noqa: S101
+    changed = (image.rgb != original.rgb).any(axis=2)
+    return {"changed": changed, "removed": original.rgb[changed]}
+
+
+def write_truth(path: Path, columns: dict[str, NDArray[Any]]) -> None:
+    """Write a truth file (NPZ)."""
+    data = BytesIO()
+    np.savez_compressed(data, **columns)  # type: ignore[arg-type]
+    write_atomically(path, data.getvalue())

@@ -1,0 +1,175 @@
+"""What a stage is: parameters with bounds, and one method for each seam that it acts on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from math import inf, isfinite
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.typing import Float
+from lidar.camera.render import Frame
+from lidar.errors import InputError
+from lidar.physics.echoes import Echoes, Origin, TracedEchoes, traced
+from lidar.physics.link import amplitude, apparent_of
+from lidar.rig.patterns.beams import Firings
+from lidar.rig.scanner import Sensor
+from lidar.sensors.cloud import TracedCloud
+
+T = TypeVar("T", bool, int, float, str)
+
+
+def parameter(
+    default: T, meaning: str, *, low: float = -inf, high: float = inf, among: tuple[str, ...] = ()
+) -> T:
+    """A field of a stage.
+
+    meaning   : one line with the unit, for ``lidar stages``
+    low, high : bounds of a number, both allowed
+    among     : allowed words of a text; any if empty
+    """
+    bounds = {"meaning": meaning, "low": low, "high": high, "among": among}
+    declared: T = field(default=default, metadata=bounds)
+    return declared
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Base of all stages; its fields are made by `parameter`.
+
+    Raises InputError for a parameter that is not of its default's type or not within its bounds.
+    """
+
+    def __post_init__(self) -> None:
+        """Validate the parameters, all faults in one message."""
+        if faults := [fault for f in fields(self) if (fault := _fault(f, getattr(self, f.name)))]:
+            raise InputError("; ".join(faults))
+
+
+def _fault(declared: Any, value: Any) -> str:
+    """What is wrong with the value of a parameter; empty if nothing is."""
+    name, kind, bounds = declared.name, type(declared.default), declared.metadata
+    if kind in (bool, str):
+        if type(value) is not kind:
+            return f"{name} = {value!r} is not {'true or false' if kind is bool else 'a text'}"
+        if bounds["among"] and value not in bounds["among"]:
+            return f"{name} = {value!r} is none of {', '.join(bounds['among'])}"
+        return ""
+    if isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
+        return f"{name} = {value!r} is not {'a whole number' if kind is int else 'a number'}"
+    if not (isfinite(value) and bounds["low"] <= value <= bounds["high"]):
+        return f"{name} = {value:g} is not within {bounds['low']:g} to {bounds['high']:g}"
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Pulses:
+    """The pulses of one frame in the order they are fired.
+
+    sensor     : the scanner
+    time_ns    : (n,) int64, nanoseconds since the drive's start
+    direction  : (n, 3) unit vectors as sent, in the sensor frame (x forward, y left, z up) of the pulse's time
+    origin     : (n, 3) metres, where the beam starts, same frame
+    ring       : (n,) uint16, rank of the beam's elevation, 0 lowest
+    column     : (n,) int32, firing block within the frame
+    channel    : (n,) uint16, number of the laser
+    power      : (n,) transmitted power over that of the sensor's nominal pulse
+    extinction : 1/m, one way, of the air, which `received` includes
+    """
+
+    sensor: Sensor
+    time_ns: NDArray[np.int64]
+    direction: Float
+    origin: Float
+    ring: NDArray[np.uint16]
+    column: NDArray[np.int32]
+    channel: NDArray[np.uint16]
+    power: Float
+    extinction: float = 0.0
+
+    def __len__(self) -> int:
+        """Number of pulses."""
+        return len(self.time_ns)
+
+    def received(self, echoes: Echoes) -> Float:
+        """Power (m,) of echoes over the detection threshold."""
+        return amplitude(
+            echoes.apparent,
+            echoes.range + self.sensor.pattern.range_offset,
+            reference_reflectance=self.sensor.reference_reflectance,
+            reference_range=self.sensor.reference_range,
+            extinction=self.extinction,
+        )
+
+    def apparent(self, power: Float, distance: Float) -> Float:
+        """Apparent reflectance (m,) of echoes that arrive with a power over the detection threshold.
+
+        distance : (m,) metres from the beam's start
+        """
+        away = distance + self.sensor.pattern.range_offset
+        clear = power * np.exp(2 * self.extinction * away)
+        return apparent_of(
+            clear,
+            away,
+            reference_reflectance=self.sensor.reference_reflectance,
+            reference_range=self.sensor.reference_range,
+        )
+
+
+def pulses_of(sensor: Sensor, sent: Firings, *, extinction: float = 0.0) -> Pulses:
+    """The pulses that a sensor sends, all with its nominal power."""
+    columns = (sent.time_ns, sent.direction, sent.origin, sent.ring, sent.column, sent.channel)
+    return Pulses(sensor, *columns, np.ones(len(sent)), extinction)
+
+
+def added_echoes(
+    pulse: NDArray[np.integer],
+    distance: Float,
+    *,
+    apparent: Float,
+    origin: Origin,
+    klass: Class = Class.NOISE,
+    feature: int = -1,
+) -> TracedEchoes:
+    """Echoes that a stage adds; join them to others with `lidar.physics.echoes.joined`.
+
+    pulse    : (k,) row of the pulse
+    distance : (k,) metres from the beam's start
+    apparent : (k,) apparent reflectance, such as from `Pulses.apparent`
+    """
+    n = len(pulse)
+    echoes = Echoes(
+        pulse.astype(np.int32),
+        distance,
+        apparent,
+        np.full(n, feature, np.int32),
+        np.full(n, klass, np.uint8),
+        np.ones(n),
+        np.zeros(n),
+        np.zeros(n, bool),
+    )
+    return traced(echoes, origin, source=np.full(n, -1))
+
+
+class EchoStage(Protocol):
+    """A stage before the detector."""
+
+    def echoes(self, pulses: Pulses, echoes: TracedEchoes, *, rng: np.random.Generator) -> TracedEchoes:
+        """The echoes that reach the detector, in any order."""
+
+
+class CloudStage(Protocol):
+    """A stage after the sensor."""
+
+    def cloud(self, cloud: TracedCloud, *, rng: np.random.Generator) -> TracedCloud:
+        """The cloud that is recorded. Moved returns get the origin MOVED and keep their source."""
+
+
+class ImageStage(Protocol):
+    """A stage on camera images."""
+
+    def image(self, frame: Frame, *, rng: np.random.Generator) -> Frame:
+        """The frame that is recorded; ``frame.rgb`` is there."""
