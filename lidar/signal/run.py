@@ -63,7 +63,7 @@ def altered_sweep(sweep: Sweep, stages: Stages) -> Altered:
 
 
 def altered_echoes(pulses: Pulses, echoes: TracedEchoes, *, stages: Stages, frame: int | str) -> TracedEchoes:
-    """Echoes after the stages on them, sorted by pulse and range; what a receiver cannot tell apart is one."""
+    """Echoes after the stages on them, by pulse and range; those within the echo separation are merged."""
     name = pulses.sensor.name
     for named in stages.at("echoes", name):
         stage = cast("EchoStage", named.stage)

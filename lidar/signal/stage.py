@@ -71,7 +71,7 @@ class Pulses:
 
     sensor     : the scanner
     time_ns    : (n,) int64, nanoseconds since the drive's start
-    direction  : (n, 3) unit vectors as sent, in the sensor frame (x forward, y left, z up) of the pulse's time
+    direction  : (n, 3) unit vectors as sent, sensor frame (x forward, y left, z up) at the pulse's time
     origin     : (n, 3) metres, where the beam starts, same frame
     ring       : (n,) uint16, rank of the beam's elevation, 0 lowest
     column     : (n,) int32, firing block within the frame
