@@ -122,8 +122,8 @@ def drive(
     settings
         One dial set apart from the level, NAME=VALUE; again for more. lidar settings lists them all.
     traffic
-        Other road users: on, or densities such as vehicles=20,parked=0.5,walkers=5,cyclists=2 (vehicles and
-        cyclists per km of lane, walkers per km of sidewalk, parked as a share of the places); or a file that
+        Other road users: on, or densities such as vehicles=20,parked=0.5,pedestrians=5,cyclists=2 (vehicles and
+        cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places); or a file that
         sumo --fcd-output wrote, with net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed.
     formats
         Formats of clouds, with commas: pcd, ply, csv, kitti, nuscenes (sensor frame), laz, las
@@ -245,7 +245,7 @@ def _traffic(text: str | None) -> Any:
     file, *words = text.split(",")
     if file.lower().endswith((".xml", ".xml.gz")):
         return TrafficFile(Path(file), **_words_of_file(text, words))
-    known = ("vehicles", "cyclists", "walkers", "parked", "reach")
+    known = ("vehicles", "cyclists", "pedestrians", "parked", "radius")
     pairs = [_setting(word) for word in text.split(",")] if "=" in text else [(text, "")]
     if unknown := [name for name, _ in pairs if name not in known]:
         raise InputError(f"--traffic {text}: {', '.join(unknown)} is none of on, off, {', '.join(known)}")
@@ -257,7 +257,7 @@ def _traffic(text: str | None) -> Any:
 
 
 def _words_of_file(text: str, words: list[str]) -> dict[str, Any]:
-    known = {"net": Path, "begin": float, "parked": float, "reach": float}
+    known = {"net": Path, "begin": float, "parked": float, "radius": float}
     given = dict(_setting(word) for word in words)
     if unknown := given.keys() - known.keys():
         raise InputError(f"--traffic {text}: {', '.join(sorted(unknown))} is none of {', '.join(known)}")

@@ -56,7 +56,7 @@ def drive_with_signals(
         trips=[],
         alone=alone,
         duration=duration,
-        reach=np.inf,
+        radius=np.inf,
         under_way=under_way,
     )
 
@@ -86,7 +86,7 @@ def drive_in_traffic(
     ego = first
     for _ in range(_ROUNDS):
         setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
-        before, reach = ego, options.reach * setup.scale
+        before, radius = ego, options.radius * setup.scale
         ego = _driven(
             path,
             vehicle,
@@ -95,7 +95,7 @@ def drive_in_traffic(
             trips=setup.trips,
             alone=first,
             duration=duration,
-            reach=reach,
+            radius=radius,
             under_way=under_way,
         )
         if _apart(before, ego) < _SAME * setup.scale:
@@ -114,7 +114,7 @@ def _driven(
     trips: list[Trip],
     alone: Trajectory,
     duration: float | None,
-    reach: float,
+    radius: float,
     under_way: bool,
 ) -> Trajectory:
     """The trajectory of the ego among trips; ``alone`` says how long it takes without them."""
@@ -123,7 +123,7 @@ def _driven(
     if duration is not None and under_way:
         seconds += _ON_S
     trip = ego_trip(path, vehicle, under_way=under_way)
-    gone = simulate_ego(trip, trips, graph=graph, plan=plan, seconds=seconds, reach=reach)
+    gone = simulate_ego(trip, trips, graph=graph, plan=plan, seconds=seconds, radius=radius)
     time_s: Float = DT * np.arange(len(gone), dtype=float)
     motion = motion_behind(
         path, vehicle, time_s=time_s, reach=gone.clip(max=path.length), under_way=under_way

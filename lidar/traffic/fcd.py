@@ -64,7 +64,7 @@ class TrafficFile:
              needed for longitudes and latitudes (``--fcd-output.geo``)
     begin  : SUMO's time in seconds at which the drive starts; the first in the file by default
     parked : share of the places along kerbs and in parking lots that are taken
-    reach  : true metres from the ego vehicle within which there are road users
+    radius  : true metres from the ego vehicle within which there are road users
     side   : side of the road that traffic keeps to
     """
 
@@ -72,15 +72,15 @@ class TrafficFile:
     net: Path | None = None
     begin: float | None = None
     parked: float = 0.6
-    reach: float = 200.0
+    radius: float = 200.0
     side: Literal["right", "left"] = "right"
 
     def __post_init__(self) -> None:
         """Refuse what cannot be meant."""
         if not 0 <= self.parked <= 1:
             raise InputError(f"traffic: parked = {self.parked} is not within 0 to 1")
-        if not 50 <= self.reach <= 1000:
-            raise InputError(f"traffic: reach = {self.reach} is not within 50 to 1000")
+        if not 50 <= self.radius <= 1000:
+            raise InputError(f"traffic: radius = {self.radius} is not within 50 to 1000")
 
 
 @dataclass(frozen=True, slots=True)

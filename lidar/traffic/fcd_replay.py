@@ -72,7 +72,12 @@ def replay(
     """
     fcd = read_fcd(options.path, net=options.net)
     others = TrafficOptions(
-        vehicles=0.0, cyclists=0.0, walkers=0.0, parked=options.parked, reach=options.reach, side=options.side
+        vehicles=0.0,
+        cyclists=0.0,
+        pedestrians=0.0,
+        parked=options.parked,
+        radius=options.radius,
+        side=options.side,
     )
     setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=others)
     begin = float(fcd.time.min()) if options.begin is None else options.begin
@@ -110,7 +115,7 @@ def _moving(
             middle = front[rows][run] - back * np.column_stack([np.cos(yaw), np.sin(yaw)])
             track = _sampled(time[run], middle, yaw=yaw, until=ego.duration_ns * 1e-9)
             anybody |= len(track) > 0 and bool(_inside(track[:, 1:3], scene.bounds).any())
-            for part in _about(track, scene, ego=ego, reach=setup.area.reach * scale):
+            for part in _about(track, scene, ego=ego, radius=setup.area.radius * scale):
                 shapes.append(shape)
                 stretch.append(grow)
                 parts.append(part)
@@ -140,7 +145,7 @@ def _moving(
 def _nobody(fcd: Fcd, begin: float, *, anybody: bool) -> str:
     """Why a file gave nobody."""
     if anybody:
-        return "traffic: nobody of the file comes near the ego vehicle; raise reach or choose another route"
+        return "traffic: nobody of the file comes near the ego vehicle; raise radius or choose another route"
     first, last = float(fcd.time.min()), float(fcd.time.max())
     if begin >= last or begin < first - 86_400:
         return f"traffic: begin={begin:g}: the file has seconds {first:g} to {last:g}"
@@ -244,18 +249,18 @@ def _inside(xy: Float, bounds: tuple[float, float, float, float]) -> NDArray[np.
     return np.asarray(((xy >= bounds[:2]) & (xy <= bounds[2:])).all(axis=1), np.bool_)
 
 
-def _about(track: Float, scene: Scene, *, ego: Trajectory, reach: float) -> list[Float]:
-    """Parts of a track on the map that come within reach of the ego, from there to where they leave it."""
+def _about(track: Float, scene: Scene, *, ego: Trajectory, radius: float) -> list[Float]:
+    """Parts of a track on the map that come within radius of the ego, from there to where they leave it."""
     if not len(track):
         return []
     at = ego.at(np.round(track[:, 0] * DT * 1e9).astype(np.int64).clip(max=ego.duration_ns)).position[:, :2]
     away = np.hypot(*(track[:, 1:3] - at).T)
-    here = _inside(track[:, 1:3], scene.bounds) & (away <= reach + LEFT)
+    here = _inside(track[:, 1:3], scene.bounds) & (away <= radius + LEFT)
     cuts = np.flatnonzero(np.diff(np.concatenate([[False], here, [False]]).astype(int)))
     return [
         track[a:b]
         for a, b in zip(cuts[::2].tolist(), cuts[1::2].tolist(), strict=True)
-        if b - a > 1 and away[a:b].min() <= reach
+        if b - a > 1 and away[a:b].min() <= radius
     ]
 
 

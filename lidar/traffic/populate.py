@@ -34,9 +34,9 @@ _POST = 0.2  # metres, half the thickness of posts and trunks
 _BOUNDS = {
     "vehicles": (0, 60),
     "cyclists": (0, 30),
-    "walkers": (0, 400),
+    "pedestrians": (0, 400),
     "parked": (0, 1),
-    "reach": (50, 1000),
+    "radius": (50, 1000),
 }
 
 
@@ -46,17 +46,17 @@ class TrafficOptions:
 
     vehicles : moving vehicles per kilometre of lane
     cyclists : per kilometre of lane
-    walkers  : people per kilometre of sidewalk
+    pedestrians  : people per kilometre of sidewalk
     parked   : share of the places along kerbs and in parking lots that are taken
-    reach    : true metres from the ego vehicle within which there are road users
+    radius    : true metres from the ego vehicle within which there are road users
     side     : side of the road that traffic keeps to
     """
 
     vehicles: float = 12.0
     cyclists: float = 1.0
-    walkers: float = 15.0
+    pedestrians: float = 15.0
     parked: float = 0.6
-    reach: float = 200.0
+    radius: float = 200.0
     side: Literal["right", "left"] = "right"
 
     def __post_init__(self) -> None:
@@ -125,8 +125,8 @@ def traffic_setup(
     lanes = lanes_of(graph, side=options.side, bounds=scene.bounds)
     plan = junction_plan(graph, lanes, seed=seed)
     scale = float(np.mean(np.asarray(scene.frame.scale_at(*ego.position[0, :2]), float)))
-    area = surroundings_of(lanes, ego, reach=options.reach, scale=scale)
-    around = shapely.buffer(ego_line(ego), (options.reach + 30.0) * scale)
+    area = surroundings_of(lanes, ego, radius=options.radius, scale=scale)
+    around = shapely.buffer(ego_line(ego), (options.radius + 30.0) * scale)
     shapely.prepare(around)
     surfaces = _layer(scene, "road_surfaces")
     road = _union(surfaces, _ROAD, area=around, grow=0.3)
@@ -141,7 +141,7 @@ def traffic_setup(
     walks = sidewalks_around(
         lanes, area, pavement=_union(surfaces, ("sidewalk",), area=around, grow=0.0), standing=standing
     )
-    trips += pedestrian_trips(lanes, area, walks=walks, seed=seed, density=options.walkers)
+    trips += pedestrian_trips(lanes, area, walks=walks, seed=seed, density=options.pedestrians)
     return TrafficSetup(lanes, plan, area, trips, standing, surfaces, around, scale)
 
 
@@ -163,7 +163,7 @@ def simulated_actors(
     trips, plan = setup.trips, setup.plan
     box = (vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang)
     flow = simulate_trips(
-        trips, graph, plan=plan, ego=ego, ego_box=box, reach=options.reach * setup.scale, obeys=obeys
+        trips, graph, plan=plan, ego=ego, ego_box=box, radius=options.radius * setup.scale, obeys=obeys
     )
     return joined(
         [

@@ -54,7 +54,7 @@ def simulate_trips(
     plan: JunctionPlan,
     ego: Trajectory,
     ego_box: tuple[float, float, float],
-    reach: float,
+    radius: float,
     obeys: bool = False,
 ) -> SimulatedTrips:
     """Trips in time, from the drive's start to its end.
@@ -73,7 +73,7 @@ def simulate_trips(
     signals = plan.signals if obeys else plan.signals._replace(window=green_windows(plan, known))
     out = np.zeros(len(trips), bool)
     for _ in range(_ROUNDS):
-        log, met = run(movers, known, signals, out, squares, DT, len(known.x), _HORIZON, reach + LEFT, -1)
+        log, met = run(movers, known, signals, out, squares, DT, len(known.x), _HORIZON, radius + LEFT, -1)
         if not met.any():
             break
         out |= met
@@ -83,7 +83,13 @@ def simulate_trips(
 
 
 def simulate_ego(
-    ego: EgoTrip, trips: Sequence[Trip], *, graph: RoadGraph, plan: JunctionPlan, seconds: float, reach: float
+    ego: EgoTrip,
+    trips: Sequence[Trip],
+    *,
+    graph: RoadGraph,
+    plan: JunctionPlan,
+    seconds: float,
+    radius: float,
 ) -> Float:
     """Metres (t,) along its path that the ego gets by each step of `DT` as one of the traffic.
 
@@ -96,7 +102,7 @@ def simulate_ego(
     known = Ego(x, y, heading, speed, np.full(2, -np.inf), np.zeros(steps + 1, np.int64), none)
     movers, known, squares = _number_cells(movers, known)
     out = np.zeros(len(trips) + 1, bool)
-    log, _ = run(movers, known, plan.signals, out, squares, DT, steps, _HORIZON, reach + LEFT, 0)
+    log, _ = run(movers, known, plan.signals, out, squares, DT, steps, _HORIZON, radius + LEFT, 0)
     mine = log[:, 0] == 0
     gone = np.zeros(steps)
     gone[log[mine, 1].astype(int)] = log[mine, 2]

@@ -14,18 +14,18 @@ from lidar.geometry.poses import Trajectory
 from lidar.traffic.lanes import Lanes
 
 LEFT = 100.0
-"""Metres beyond its reach at which what was around the ego is forgotten."""
+"""Metres beyond its radius at which what was around the ego is forgotten."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """Where there are road users: within ``reach`` of the ego.
+    """Where there are road users: within ``radius`` of the ego.
 
     lines  : (m,) the graph's edges in plan
-    near   : (m,) bool, edges that ever come within reach
+    near   : (m,) bool, edges that ever come within radius
     time   : (t,) seconds, about one apart
     ego    : (t, 2) scene metres, the ego vehicle then
-    reach  : true metres
+    radius  : true metres
     scale  : scene metres per true metre
     """
 
@@ -33,7 +33,7 @@ class Surroundings:
     near: NDArray[np.bool_]
     time: Float
     ego: Float
-    reach: float
+    radius: float
     scale: float
 
     def visits(self, xy: Float) -> list[tuple[float, float]]:
@@ -42,10 +42,10 @@ class Surroundings:
         out: list[tuple[float, float]] = []
         inside = False
         for t, d in zip(self.time.tolist(), away.tolist(), strict=True):
-            if not inside and d <= self.reach:
+            if not inside and d <= self.radius:
                 out.append((t, float(self.time[-1])))
                 inside = True
-            elif inside and d > self.reach + LEFT:
+            elif inside and d > self.radius + LEFT:
                 out[-1] = (out[-1][0], t)
                 inside = False
         return out
@@ -53,17 +53,17 @@ class Surroundings:
     def until(self, xy: Float, start: float) -> float:
         """Seconds until which a place (2,) that is in the surroundings at ``start`` stays in them."""
         away = np.hypot(*(self.ego - xy).T) / self.scale
-        left = (self.time > start) & (away > self.reach + LEFT)
+        left = (self.time > start) & (away > self.radius + LEFT)
         return float(self.time[np.argmax(left)] if left.any() else self.time[-1])
 
 
-def surroundings_of(lanes: Lanes, ego: Trajectory, *, reach: float, scale: float) -> Surroundings:
+def surroundings_of(lanes: Lanes, ego: Trajectory, *, radius: float, scale: float) -> Surroundings:
     """The surroundings of the ego along its way."""
     lines = edge_lines(lanes.graph)
     seconds = ego.duration_ns * 1e-9
     time = np.linspace(0.0, seconds, max(int(np.ceil(seconds)), 1) + 1)
     xy = ego.at(np.round(time * 1e9).astype(np.int64)).position[:, :2]
-    return Surroundings(lines, shapely.dwithin(lines, ego_line(ego), reach * scale), time, xy, reach, scale)
+    return Surroundings(lines, shapely.dwithin(lines, ego_line(ego), radius * scale), time, xy, radius, scale)
 
 
 def ego_line(ego: Trajectory) -> shapely.Geometry:
@@ -78,7 +78,7 @@ def entrances(lanes: Lanes, area: Surroundings, *, t: float) -> list[tuple[int, 
     That is where edges cross the rim inwards, and where they come into the map.
     """
     here = np.array([np.interp(t, area.time, area.ego[:, c]) for c in (0, 1)])
-    rim = shapely.Point(here).buffer(area.reach * area.scale, quad_segs=16).exterior
+    rim = shapely.Point(here).buffer(area.radius * area.scale, quad_segs=16).exterior
     rows = np.flatnonzero(area.near & (lanes.liking > 0) & lanes.open)
     found: list[tuple[int, float]] = []
     cut = shapely.intersection(area.lines[rows], rim)
@@ -89,8 +89,8 @@ def entrances(lanes: Lanes, area: Surroundings, *, t: float) -> list[tuple[int, 
         share = float(shapely.line_locate_point(area.lines[k], point, normalized=True))
         length = max(area.lines[k].length, 1e-9)
         ahead = shapely.line_interpolate_point(area.lines[k], min(share + 2.0 / length, 1.0), normalized=True)
-        if np.hypot(ahead.x - here[0], ahead.y - here[1]) < area.reach * area.scale:
+        if np.hypot(ahead.x - here[0], ahead.y - here[1]) < area.radius * area.scale:
             found.append((k, share))
     begins = np.array([line.coords[0] for line in area.lines[rows]]).reshape(-1, 2)
-    within = np.hypot(*(begins - here).T) < area.reach * area.scale
+    within = np.hypot(*(begins - here).T) < area.radius * area.scale
     return found + [(k, 0.0) for k in rows[within & lanes.entry[rows]].tolist()]

@@ -111,7 +111,7 @@ OPTIONS = DriveOptions(
     formats=("pcd", "ply", "csv", "laz", "kitti", "nuscenes"),
     labels=("semantickitti", "nuscenes"),
     deskew="end",
-    traffic=TrafficOptions(vehicles=25.0, parked=0.8, walkers=40.0),
+    traffic=TrafficOptions(vehicles=25.0, parked=0.8, pedestrians=40.0),
 )
 
 

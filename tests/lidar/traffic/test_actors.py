@@ -28,7 +28,7 @@ from lidar.world.world import World
 
 BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 CAR = load_vehicle("car")
-BUSY = TrafficOptions(vehicles=25.0, cyclists=4.0, walkers=40.0, parked=0.7, reach=150.0)
+BUSY = TrafficOptions(vehicles=25.0, cyclists=4.0, pedestrians=40.0, parked=0.7, radius=150.0)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_the_same_seed_gives_the_same_actors_and_another_seed_others(actors, sce
 
 
 def test_an_empty_place_has_nobody(scene, ego):
-    none = TrafficOptions(vehicles=0.0, cyclists=0.0, walkers=0.0, parked=0.0)
+    none = TrafficOptions(vehicles=0.0, cyclists=0.0, pedestrians=0.0, parked=0.0)
     actors = populate(scene, scene.road_graph(), ego=ego, vehicle=CAR, seed=1, options=none)
     assert len(actors) == 0
     assert actor_shapes(actors) == []
@@ -267,7 +267,7 @@ def test_an_image_shows_what_is_in_the_way(actors, scene, ego):
 
 @pytest.mark.parametrize(
     "change",
-    [{"vehicles": -1.0}, {"parked": 1.2}, {"reach": 5.0}, {"side": "middle"}, {"walkers": float("nan")}],
+    [{"vehicles": -1.0}, {"parked": 1.2}, {"radius": 5.0}, {"side": "middle"}, {"pedestrians": float("nan")}],
 )
 def test_densities_that_cannot_be_meant_are_refused(change):
     with pytest.raises(InputError, match=next(iter(change))):

@@ -105,13 +105,13 @@ def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 700.0, 30.0))
     path = path_on(graph, 1, 60.0)
     free = drive_path(path, CAR, duration=60.0)
-    trips = vehicle_trips(lanes, surroundings_of(lanes, free, reach=400.0, scale=1.0), seed=1, density=10.0)
+    trips = vehicle_trips(lanes, surroundings_of(lanes, free, radius=400.0, scale=1.0), seed=1, density=10.0)
     slow = [replace(t, wish=np.minimum(t.wish, 4.0)) for t in trips if t.appear_s == 0.0 and t.begin > 60]
     plan = junction_plan(graph, lanes, seed=1)
-    gone = simulate_ego(ego_trip(path, CAR), slow, graph=graph, plan=plan, seconds=60.0, reach=600.0)
+    gone = simulate_ego(ego_trip(path, CAR), slow, graph=graph, plan=plan, seconds=60.0, radius=600.0)
     motion = motion_behind(path, CAR, time_s=np.arange(len(gone)) * DT, reach=np.minimum(gone, path.length))
     ego = poses_along(path, CAR, motion=motion)
-    flow = simulate_trips(slow, graph, plan=plan, ego=ego, ego_box=BOX, reach=600.0, obeys=True)
+    flow = simulate_trips(slow, graph, plan=plan, ego=ego, ego_box=BOX, radius=600.0, obeys=True)
     assert len(np.unique(flow.trip)) == len(slow)  # nobody had to be taken out of its way
     check_gentle(ego)
     ahead = min((k for k in range(len(slow))), key=lambda k: slow[k].begin)
@@ -132,13 +132,13 @@ def test_among_traffic_the_ego_touches_nobody_and_nobody_is_taken_out_for_it(see
     path = path_on(graph, seed, 60.0)
     alone = drive_path(path, CAR, duration=60.0)
     trips = vehicle_trips(
-        lanes, surroundings_of(lanes, alone, reach=300.0, scale=1.0), seed=seed, density=20.0
+        lanes, surroundings_of(lanes, alone, radius=300.0, scale=1.0), seed=seed, density=20.0
     )
-    gone = simulate_ego(ego_trip(path, CAR), trips, graph=graph, plan=plan, seconds=60.0, reach=300.0)
+    gone = simulate_ego(ego_trip(path, CAR), trips, graph=graph, plan=plan, seconds=60.0, radius=300.0)
     motion = motion_behind(path, CAR, time_s=np.arange(len(gone)) * DT, reach=np.minimum(gone, path.length))
     ego = poses_along(path, CAR, motion=motion)
     check_gentle(ego)
-    flow = simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, reach=300.0, obeys=True)
+    flow = simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, radius=300.0, obeys=True)
     poses = tracks(trips, flow)
     times = np.arange(len(poses)) * DT
     own = rectangles(*middle_of(ego, times), length=BOX[0], width=BOX[1])

@@ -360,7 +360,7 @@ def test_traffic_of_another_place_is_told(scene, graph, street, tmp_path):
     ("words", "said"),
     [
         ("none.xml", "none.xml does not exist"),
-        ("none.xml,speed=2", "speed is none of net, begin, parked, reach"),
+        ("none.xml,speed=2", "speed is none of net, begin, parked, radius"),
         ("none.xml,begin=soon", "soon"),
         ("none.xml,parked=2", "parked = 2.0"),
     ],

@@ -43,12 +43,12 @@ def city(*, lit, lanes=1.0, width=7.0):
     return replace(graph, signals=np.full(len(graph.node_id), lit))
 
 
-def flow_on(graph, ego, *, seed, density=25.0, reach=400.0, shares=None):
+def flow_on(graph, ego, *, seed, density=25.0, radius=400.0, shares=None):
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
     plan = junction_plan(graph, lanes, seed=seed)
-    area = surroundings_of(lanes, ego, reach=reach, scale=1.0)
+    area = surroundings_of(lanes, ego, radius=radius, scale=1.0)
     trips = vehicle_trips(lanes, area, seed=seed, density=density, shares=shares)
-    return trips, simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, reach=reach), plan
+    return trips, simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, radius=radius), plan
 
 
 def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
@@ -80,7 +80,7 @@ def overlaps(boxes):
 @given(seed=st.integers(0, 10_000), lit=st.booleans(), lanes=st.sampled_from([1.0, 2.0]))
 def test_no_two_vehicles_ever_touch_and_none_jumps(seed, lit, lanes):
     graph = city(lit=lit, lanes=lanes, width=7.0 * lanes)
-    trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 65.0), seed=seed, reach=600.0)
+    trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 65.0), seed=seed, radius=600.0)
     assert len(np.unique(flow.trip)) > 15
     assert flow.step.max() * DT > 60
     poses = tracks(trips, flow)
@@ -95,7 +95,7 @@ def test_not_even_reckless_drivers_touch():
     graph = city(lit=False)
     ego = standing((400.0, 400.0), 45.0)
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
-    trips = vehicle_trips(lanes, surroundings_of(lanes, ego, reach=600.0, scale=1.0), seed=9, density=30.0)
+    trips = vehicle_trips(lanes, surroundings_of(lanes, ego, radius=600.0, scale=1.0), seed=9, density=30.0)
     wild = [
         replace(
             t, driver=replace(t.driver, headway=0.0, gap=0.0, brake=50.0, pull=4.0), wish=0 * t.wish + 16.0
@@ -103,7 +103,7 @@ def test_not_even_reckless_drivers_touch():
         for t in trips
     ]
     flow = simulate_trips(
-        wild, graph, plan=junction_plan(graph, lanes, seed=9), ego=ego, ego_box=BOX, reach=600.0
+        wild, graph, plan=junction_plan(graph, lanes, seed=9), ego=ego, ego_box=BOX, radius=600.0
     )
     for moment in tracks(wild, flow)[::2]:
         assert overlaps(boxes_at(wild, moment)) == 0
@@ -111,7 +111,7 @@ def test_not_even_reckless_drivers_touch():
 
 
 def test_speed_changes_as_a_vehicle_can():
-    trips, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=3, reach=600.0)
+    trips, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=3, radius=600.0)
     for k in np.unique(flow.trip):
         speed = flow.speed[flow.trip == k]
         change = np.diff(speed) / DT
@@ -123,7 +123,7 @@ def test_speed_changes_as_a_vehicle_can():
 
 
 def test_braking_is_mild_almost_always():
-    _, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=5, reach=600.0)
+    _, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=5, radius=600.0)
     same = np.diff(flow.trip) == 0
     change = np.diff(flow.speed)[same] / DT
     assert (change < -4.0).mean() < 0.01
@@ -135,7 +135,7 @@ def test_braking_is_mild_almost_always():
 def test_the_ego_is_never_touched(seed, lit):
     graph = city(lit=lit)
     ego = driving(graph, seed, 30.0)
-    trips, flow, _ = flow_on(graph, ego, seed=seed, reach=300.0)
+    trips, flow, _ = flow_on(graph, ego, seed=seed, radius=300.0)
     poses = tracks(trips, flow)
     times = (np.arange(len(poses)) * DT * 1e9).astype(np.int64)
     at = ego.at(times)
@@ -153,7 +153,7 @@ def test_the_ego_is_never_touched(seed, lit):
 
 def test_vehicles_queue_behind_an_ego_that_stands_in_their_lane():
     graph = road_graph([(0.0, 0.0), (400.0, 0.0)], [(0, 1)], speed=13.9)
-    trips, flow, _ = flow_on(graph, standing((300.0, -1.75), 60.0), seed=2, density=15.0, reach=400.0)
+    trips, flow, _ = flow_on(graph, standing((300.0, -1.75), 60.0), seed=2, density=15.0, radius=400.0)
     poses = tracks(trips, flow)
     last = poses[-1]
     behind = np.isfinite(last[:, 0]) & (last[:, 1] < 0) & (last[:, 0] < 300.0)
@@ -166,7 +166,7 @@ def test_vehicles_queue_behind_an_ego_that_stands_in_their_lane():
 def test_the_gap_to_a_leader_grows_with_speed():
     """At rest bodies are some 2 m apart; on a free road followers keep a second and more."""
     graph = road_graph([(0.0, 0.0), (2000.0, 0.0)], [(0, 1)], twoway=False, width=4.0, speed=13.9)
-    trips, flow, _ = flow_on(graph, standing((400.0, 500.0), 40.0), seed=1, density=20.0, reach=1500.0)
+    trips, flow, _ = flow_on(graph, standing((400.0, 500.0), 40.0), seed=1, density=20.0, radius=1500.0)
     poses = tracks(trips, flow)
     speed = np.full(poses.shape[:2], np.nan)
     speed[flow.step, flow.trip] = flow.speed
@@ -186,7 +186,7 @@ def test_the_gap_to_a_leader_grows_with_speed():
 
 def test_nobody_enters_a_junction_on_red():
     graph = city(lit=True)
-    trips, flow, plan = flow_on(graph, standing((400.0, 400.0), 70.0), seed=4, reach=600.0)
+    trips, flow, plan = flow_on(graph, standing((400.0, 400.0), 70.0), seed=4, radius=600.0)
     poses = tracks(trips, flow)
     entered = 0
     for k in np.unique(flow.trip):
@@ -222,7 +222,7 @@ def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
     road = shapely.union_all([shapely.LineString(line[:, :2]).buffer(7.3) for line in graph.geometry])
     for side, sign in (("right", 1), ("left", -1)):
         lanes = lanes_of(graph, side=side, bounds=(-30.0, -30.0, 300.0, 300.0))
-        area = surroundings_of(lanes, standing((400.0, 400.0), 30.0), reach=600.0, scale=1.0)
+        area = surroundings_of(lanes, standing((400.0, 400.0), 30.0), radius=600.0, scale=1.0)
         trips = vehicle_trips(lanes, area, seed=1, density=10.0, ground=road)
         assert len(trips) > 10
         for trip in trips:
@@ -243,7 +243,7 @@ def test_lanes_lie_side_by_side():
 def test_the_same_seed_gives_the_same_traffic():
     graph = city(lit=True)
     ego = driving(graph, 1, 20.0)
-    first, second, other = (flow_on(graph, ego, seed=s, reach=200.0)[1] for s in (7, 7, 8))
+    first, second, other = (flow_on(graph, ego, seed=s, radius=200.0)[1] for s in (7, 7, 8))
     for name in ("trip", "step", "gone", "speed"):
         assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
     assert first.gone.tobytes() != other.gone.tobytes()
