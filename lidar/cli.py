@@ -122,9 +122,9 @@ def drive(
     settings
         One dial set apart from the level, NAME=VALUE; again for more. lidar settings lists them all.
     traffic
-        Other road users: on, or densities such as vehicles=20,parked=0.5,pedestrians=5,cyclists=2 (vehicles and
-        cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places); or a file that
-        sumo --fcd-output wrote, with net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed.
+        Other road users: on, or densities such as vehicles=20,parked=0.5,pedestrians=5,cyclists=2 (vehicles
+        and cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places); or a
+        file that sumo --fcd-output wrote, with net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed.
     formats
         Formats of clouds, with commas: pcd, ply, csv, kitti, nuscenes (sensor frame), laz, las
         (georeferenced).

@@ -16,7 +16,7 @@ from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import lanes_of
 from lidar.traffic.populate import TrafficOptions, simulated_actors, traffic_setup
-from lidar.traffic.simulation import DT, has_traffic_control, simulate_ego
+from lidar.traffic.simulation import STEP_S, has_traffic_control, simulate_ego
 from lidar.traffic.trips import Trip
 from lidar.world.actors import Actors
 
@@ -101,7 +101,7 @@ def drive_in_traffic(
         if _apart(before, ego) < _SAME * setup.scale:
             break
     return ego, simulated_actors(
-        scene, graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed, options=options, obeys=True
+        scene, graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed, options=options, obeys_signals=True
     )
 
 
@@ -124,7 +124,7 @@ def _driven(
         seconds += _ON_S
     trip = ego_trip(path, vehicle, under_way=under_way)
     gone = simulate_ego(trip, trips, graph=graph, plan=plan, seconds=seconds, radius=radius)
-    time_s: Float = DT * np.arange(len(gone), dtype=float)
+    time_s: Float = STEP_S * np.arange(len(gone), dtype=float)
     motion = motion_behind(
         path, vehicle, time_s=time_s, reach=gone.clip(max=path.length), under_way=under_way
     )

@@ -30,7 +30,7 @@ class EgoTrip:
 
     way: ActorPath
     driver: Driver
-    wish: Float
+    desired_speed: Float
     length: float
     width: float
     xy: Float
@@ -38,7 +38,7 @@ class EgoTrip:
     begin: int = 0
     appear_s: float = 0.0
     leaves: bool = False
-    walks: bool = False
+    on_foot: bool = False
     crossing: Sequence[tuple[int, int, int]] = ()
 
     def body(self) -> tuple[Float, Float]:
@@ -66,9 +66,11 @@ def ego_trip(path: Path, vehicle: Vehicle, *, under_way: bool = False) -> EgoTri
         path.limit[row],
         scale,
     )
-    brake, pull = _BRAKE * vehicle.deceleration, _PULL * vehicle.acceleration
-    driver = Driver(vehicle.turning_radius, vehicle.max_speed, _HEADWAY_S, pull, brake, _GAP)
-    wish = np.interp(at, s, wished_speed(path, vehicle))
+    deceleration, acceleration = _BRAKE * vehicle.deceleration, _PULL * vehicle.acceleration
+    driver = Driver(vehicle.turning_radius, vehicle.max_speed, _HEADWAY_S, acceleration, deceleration, _GAP)
+    desired_speed = np.interp(at, s, wished_speed(path, vehicle))
     if not under_way:
-        wish = np.minimum(wish, np.sqrt(2 * pull * (at + 0.2)))
-    return EgoTrip(way, driver, wish, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading)
+        desired_speed = np.minimum(desired_speed, np.sqrt(2 * acceleration * (at + 0.2)))
+    return EgoTrip(
+        way, driver, desired_speed, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading
+    )

@@ -19,11 +19,11 @@ from lidar.random_streams import generator
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.fcd import Fcd, TrafficFile, read_fcd
 from lidar.traffic.populate import TrafficOptions, TrafficSetup, first_feature, parked_vehicles, traffic_setup
-from lidar.traffic.simulation import DT
+from lidar.traffic.simulation import STEP_S
 from lidar.traffic.surroundings import LEFT
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import tracked
-from lidar.traffic.trips import VEHICLE_SHARES, pick, varied
+from lidar.traffic.trips import VEHICLE_SHARES, random_shape, random_stretch
 from lidar.world.actor_shapes import Shape
 from lidar.world.actors import Actors, alive, joined, states
 
@@ -123,7 +123,7 @@ def _moving(
         raise InputError(_nobody(fcd, begin, anybody=anybody))
     knots = np.array([len(part) for part in parts], np.int64)
     step, x, y, yaw, gone = np.concatenate(parts).T
-    speed = np.concatenate([_monotone(np.diff(part[:, 4]) / DT) for part in parts]) / scale
+    speed = np.concatenate([_monotone(np.diff(part[:, 4]) / STEP_S) for part in parts]) / scale
     middle = np.column_stack([x, y])
     foot = np.repeat([shape.kind in _KINDS["pedestrian"] for shape in shapes], knots)
     actors = tracked(
@@ -169,8 +169,8 @@ def _body(
     """A body of a class, no longer than SUMO's as far as that goes, and its factors."""
     kinds = _KINDS[vclass]
     weight = np.cumsum([VEHICLE_SHARES.get(kind, 1.0) for kind in kinds])
-    shape = pick(kinds[int(np.searchsorted(weight, rng.random() * weight[-1], side="right"))], rng)
-    x, y, z = varied(rng)
+    shape = random_shape(kinds[int(np.searchsorted(weight, rng.random() * weight[-1], side="right"))], rng)
+    x, y, z = random_stretch(rng)
     if vclass != "pedestrian":
         x = max(min(x, length / shape.length), _SHORTER)
     return shape, (x, y, z)
@@ -190,17 +190,20 @@ def _runs(time: Float, front: Float, *, speed: Float, scale: float) -> list[slic
 
 
 def _sampled(time: Float, middle: Float, *, yaw: Float, until: float) -> Float:
-    """Rows (k, 5) of step, x, y, yaw and scene metres covered, every `DT` of the drive."""
+    """Rows (k, 5) of step, x, y, yaw and scene metres covered, every `STEP_S` of the drive."""
     spread, aside = _changes(time, middle, yaw=yaw)
     chord = np.hypot(*np.diff(spread, axis=0).T)
     slope = chord / np.diff(time)
     speed = _monotone(slope)
     velocity = speed[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)])
-    first, last = max(int(np.ceil(time[0] / DT - 1e-6)), 0), int(np.floor(min(time[-1], until) / DT + 1e-6))
+    first, last = (
+        max(int(np.ceil(time[0] / STEP_S - 1e-6)), 0),
+        int(np.floor(min(time[-1], until) / STEP_S + 1e-6)),
+    )
     step = np.arange(first, last + 1)
     if len(step) < 2:
         return np.empty((0, 5))
-    t = step * DT
+    t = step * STEP_S
     low = np.clip(np.searchsorted(time, t, side="right") - 1, 0, len(time) - 2)
     h = (time[low + 1] - time[low])[:, None]
     w = np.clip((t - time[low])[:, None] / h, 0.0, 1.0)
@@ -253,7 +256,9 @@ def _about(track: Float, scene: Scene, *, ego: Trajectory, radius: float) -> lis
     """Parts of a track on the map that come within radius of the ego, from there to where they leave it."""
     if not len(track):
         return []
-    at = ego.at(np.round(track[:, 0] * DT * 1e9).astype(np.int64).clip(max=ego.duration_ns)).position[:, :2]
+    at = ego.at(np.round(track[:, 0] * STEP_S * 1e9).astype(np.int64).clip(max=ego.duration_ns)).position[
+        :, :2
+    ]
     away = np.hypot(*(track[:, 1:3] - at).T)
     here = _inside(track[:, 1:3], scene.bounds) & (away <= radius + LEFT)
     cuts = np.flatnonzero(np.diff(np.concatenate([[False], here, [False]]).astype(int)))
@@ -297,7 +302,7 @@ def _touched(actors: Actors, ego: Trajectory, *, vehicle: Vehicle) -> Ints:
     hit: list[Ints] = []
     scale = actors.scale
     length, width = (size + room for size, room in zip((vehicle.length, vehicle.width), _ROOM, strict=True))
-    for t in range(0, ego.duration_ns + 1, round(DT * 1e9)):
+    for t in range(0, ego.duration_ns + 1, round(STEP_S * 1e9)):
         pose = ego.at([t])
         forward = pose.rotation[0, :2, 0]
         rows = alive(actors, t, end_ns=t)
@@ -338,7 +343,7 @@ def _covered(actors: Actors) -> NDArray[np.object_]:
     """What actors cover as they go, with some room: a box every fifth knot."""
     owner = np.repeat(np.arange(len(actors)), np.diff(actors.first))[::5]
     size = actors.size[owner] * actors.scale
-    room = np.hypot(*actors.velocity[::5, :2].T) * DT * 5
+    room = np.hypot(*actors.velocity[::5, :2].T) * STEP_S * 5
     return rectangles(
         actors.position[::5, :2],
         actors.angles[::5, 0],

@@ -36,21 +36,21 @@ class Lanes:
     after  : for each state the states that may follow it
     onward : (s,) bool, the state leads on, or out of the map: whoever is in it does not end in a dead end
     leave, enter : (m,) headings in which an edge is left and entered, radians
-    liking : (m,) how much traffic there is on an edge, relative
+    traffic_weight : (m,) how much traffic there is on an edge, relative
     open   : (m,) bool, `onward` of who begins on the edge
     exit, entry : (m,) bool, the edge ends, or begins, at the map's edge
     """
 
     graph: RoadGraph
     count: Ints
-    wide: Float
+    max_width: Float
     side: int
     state: Ints
     after: Sequence[Ints]
     onward: NDArray[np.bool_]
     leave: Float
     enter: Float
-    liking: Float
+    traffic_weight: Float
     open: NDArray[np.bool_]
     exit: NDArray[np.bool_]
     entry: NDArray[np.bool_]
@@ -69,7 +69,7 @@ def lanes_of(
     shared = two_way & (total < 2)
     each = np.where(shared, graph.width / 2, graph.width / total)
     alone = ~two_way & (graph.lanes < 2)
-    wide = np.where(alone, graph.width - 2 * _KERB, each - _SIDE)
+    max_width = np.where(alone, graph.width - 2 * _KERB, each - _SIDE)
     states = turn_states(graph)
     before, after, state = states.before, states.after, states.edge.astype(np.int64)
     order = np.argsort(before, kind="stable")
@@ -78,7 +78,7 @@ def lanes_of(
     leave, enter = np.empty(len(graph)), np.empty(len(graph))
     for k, line in enumerate(graph.geometry):
         enter[k], leave[k] = _heading(line[:, :2], first=True), _heading(line[:, :2], first=False)
-    liking = np.array([_QUIET.get(str(kind), 1.0) for kind in graph.highway])
+    traffic_weight = np.array([_QUIET.get(str(kind), 1.0) for kind in graph.highway])
     leads_out = _at_edge(graph, bounds, end=graph.head, other=graph.tail)
     leads_in = _at_edge(graph, bounds, end=graph.tail, other=graph.head)
     straight_on = graph.twin[state[before]] != state[after]
@@ -86,14 +86,14 @@ def lanes_of(
     return Lanes(
         graph,
         np.maximum(np.floor(graph.lanes), 1.0).astype(np.int64),
-        wide,
+        max_width,
         1 if side == "right" else -1,
         state,
         follow,
         onward,
         leave,
         enter,
-        liking,
+        traffic_weight,
         onward[: len(graph)],
         leads_out,
         leads_in,
@@ -212,12 +212,16 @@ def random_lanes(
     while far < metres:
         states = lanes.after[state]
         ways = lanes.state[states]
-        fit = (lanes.wide[ways] >= width) & (lanes.liking[ways] > 0) & (lanes.graph.twin[edge] != ways)
+        fit = (
+            (lanes.max_width[ways] >= width)
+            & (lanes.traffic_weight[ways] > 0)
+            & (lanes.graph.twin[edge] != ways)
+        )
         states, ways = states[fit], ways[fit]
         if not len(ways):
             break
         turns = np.array([turn(lanes, edge, b=int(w)) for w in ways])
-        weight = lanes.liking[ways] * np.where(np.abs(turns) < _STRAIGHT, 3.0, 1.0)
+        weight = lanes.traffic_weight[ways] * np.where(np.abs(turns) < _STRAIGHT, 3.0, 1.0)
         weight = weight * np.where(np.abs(turns) > np.radians(140), 0.02, 1.0)
         weight = weight * np.where(lanes.onward[states], 1.0, 1e-9)
         if lanes.count[edge] > 1:
@@ -252,18 +256,21 @@ def path_along_lanes(
     width: float,
     radius: float,
     scale: float,
-    kerb: bool = False,
+    keeps_kerb: bool = False,
 ) -> ActorPath:
     """The way along lanes of edges that follow each other, rounded to bends of ``radius`` and more.
 
     width  : metres of the body
     radius : true metres
-    kerb   : keep to the kerb within the lane
+    keeps_kerb : keep to the kerb within the lane
     """
     parts, owner = [], []
     graph = lanes.graph
     lines = [
-        beside(graph.geometry[e], -lanes.side * scale * lane_shift(lanes, e, lane=k, width=width, kerb=kerb))
+        beside(
+            graph.geometry[e],
+            -lanes.side * scale * lane_shift(lanes, e, lane=k, width=width, kerb=keeps_kerb),
+        )
         for e, k in zip(edges, picked, strict=True)
     ]
     for k, line in enumerate(lines):
@@ -352,8 +359,8 @@ def _joint(a: Float, b: Float, *, radius: float) -> tuple[Float, Float, Float]:
     if reach < 0.2:
         return a, b, np.empty((0, 3))
     t = np.linspace(0.0, 1.0, max(int(reach / 0.5), 2) + 1)[1:-1, None]
-    pull = 0.4 * reach
-    p1, q1 = p[:2] + pull * u, q[:2] - pull * v
+    handle = 0.4 * reach
+    p1, q1 = p[:2] + handle * u, q[:2] - handle * v
     xy = (1 - t) ** 3 * p[:2] + 3 * t * (1 - t) ** 2 * p1 + 3 * t**2 * (1 - t) * q1 + t**3 * q[:2]
     return a, b, np.column_stack([xy, p[2] + t * (q[2] - p[2])])
 

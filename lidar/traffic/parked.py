@@ -15,7 +15,7 @@ from lidar.random_streams import generator
 from lidar.traffic.lanes import Lanes, beside, lane_shift
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import standing, table
-from lidar.traffic.trips import pick
+from lidar.traffic.trips import random_shape
 from lidar.world.actors import Actors
 
 CARS = {"hatchback": 0.38, "sedan": 0.30, "suv": 0.22, "van": 0.10}
@@ -142,7 +142,7 @@ def parked_actors(
     n = len(spots.xy)
     rng = generator(seed, "parked", *kinds)
     names, chance = list(kinds), np.array(list(kinds.values()))
-    shapes = [pick(names[k], rng) for k in rng.choice(len(names), size=n, p=chance / chance.sum())]
+    shapes = [random_shape(names[k], rng) for k in rng.choice(len(names), size=n, p=chance / chance.sum())]
     grow = 1 + rng.uniform(-0.03, 0.03, (n, 3))
     size = np.array([[s.length, s.width, s.base] for s in shapes]).reshape(-1, 3)
     length, width, base = size[:, 0] * grow[:, 0], size[:, 1] * grow[:, 1], size[:, 2] * grow[:, 0]

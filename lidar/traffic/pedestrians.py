@@ -14,12 +14,12 @@ from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, beside, rounded
 from lidar.traffic.surroundings import Surroundings
-from lidar.traffic.trips import Driver, Trip, pick, varied
+from lidar.traffic.trips import Driver, Trip, random_shape, random_stretch
 
 _KINDS = {"adult": 0.5, "small_adult": 0.38, "child": 0.12}
 _FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}
 """m/s, free walking: adults after Weidmann, "Transporttechnik der Fussgänger" (1993), 1.34 on average."""
-_WALK = Driver(radius=0.4, top=2.5, headway=0.5, pull=0.8, brake=1.2, gap=0.3)
+_WALK = Driver(min_radius=0.4, max_speed=2.5, headway=0.5, acceleration=0.8, deceleration=1.2, gap=0.3)
 _LANE = 0.6  # metres beside a sidewalk's line on which people keep, on the side of traffic
 _EDGE = 0.15  # metres from the edge of the sidewalk to the middle of who walks nearest to it
 _OUT = (
@@ -51,18 +51,18 @@ class Sidewalks:
 
 
 def sidewalks_around(
-    lanes: Lanes, area: Surroundings, *, pavement: shapely.Geometry | None, standing: NDArray[np.object_]
+    lanes: Lanes, area: Surroundings, *, pavement: shapely.Geometry | None, obstacles: NDArray[np.object_]
 ) -> Sidewalks:
     """Stretches of sidewalk around the ego's way, clear of what stands there.
 
     pavement : the sidewalks, None for none
-    standing : polygons of buildings, poles and trunks
+    obstacles : polygons of buildings, poles and trunks
     """
     out = Sidewalks([], [], [])
     if pavement is None:
         return out
     g = lanes.graph
-    tree = shapely.STRtree(standing)
+    tree = shapely.STRtree(obstacles)
     # people walk beside the line, and are to be on the sidewalk there
     pavement = shapely.buffer(pavement, -(_LANE + _EDGE) * area.scale)
     shapely.prepare(pavement)
@@ -117,7 +117,7 @@ def pedestrian_trips(
         walk = int(rng.choice(len(metres), p=metres / metres.sum()))
         begin = rng.uniform(1.0, metres[walk] - 1.0)
         kind = names[int(rng.choice(len(names), p=chance / chance.sum()))]
-        shape, grow = pick(kind, rng), varied(rng)
+        shape, grow = random_shape(kind, rng), random_stretch(rng)
         pace = _FREE[kind] * float(np.clip(rng.normal(1.0, 0.12), 0.7, 1.4))
         place = shapely.line_interpolate_point(shapely.linestrings(walks.line[walk][:, :2]), begin)
         for start, end in area.visits(shapely.get_coordinates(place)[0]):
@@ -131,9 +131,20 @@ def pedestrian_trips(
                 rng=rng,
             )
             way, crossed = _way(line, over, scale=area.scale)
-            wish = np.full(len(way), pace)
+            desired_speed = np.full(len(way), pace)
             trips.append(
-                Trip(shape, grow, way, _WALK, wish, 0, start, leaves=False, walks=True, crossing=crossed)
+                Trip(
+                    shape,
+                    grow,
+                    way,
+                    _WALK,
+                    desired_speed,
+                    0,
+                    start,
+                    leaves=False,
+                    on_foot=True,
+                    crossing=crossed,
+                )
             )
     return trips
 
@@ -224,7 +235,7 @@ def _way(
     points = np.stack([np.interp(even, along[keep], line[keep, c]) for c in range(3)], axis=1)
     nowhere = np.full(len(even), -1, np.int64)
     way = rounded(
-        points, nowhere, lane=nowhere, limit=np.full(len(even), np.inf), radius=_WALK.radius, scale=scale
+        points, nowhere, lane=nowhere, limit=np.full(len(even), np.inf), radius=_WALK.min_radius, scale=scale
     )
     crossed = []
     for part, number in over:

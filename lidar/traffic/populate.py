@@ -1,4 +1,4 @@
-"""A scene's road users for a drive: traffic, parked vehicles, people."""
+"""The road users around an ego vehicle for a whole drive: traffic, parked vehicles, pedestrians."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from lidar.traffic.trips import Trip, vehicle_trips
 from lidar.world.actors import Actors, joined
 
 _ROAD = ("road", "lane_marking", "crossing", "parking")
-_HEADROOM = 2.5  # metres under what stands out of a wall that one can stand below
-_HOUSE = 1.0  # square metres above which what stands there is a building
-_POST = 0.2  # metres, half the thickness of posts and trunks
+_HEADROOM = 2.5  # metres, minimum height of a building part above a passage
+_BUILDING_AREA = 1.0  # square metres from which an obstacle is a building
+_POST_RADIUS = 0.2  # metres, of posts and trunks
 _BOUNDS = {
     "vehicles": (0, 60),
     "cyclists": (0, 30),
@@ -42,14 +42,14 @@ _BOUNDS = {
 
 @dataclass(frozen=True, slots=True)
 class TrafficOptions:
-    """How busy a place is.
+    """Densities of simulated road users.
 
-    vehicles : moving vehicles per kilometre of lane
-    cyclists : per kilometre of lane
-    pedestrians  : people per kilometre of sidewalk
-    parked   : share of the places along kerbs and in parking lots that are taken
-    radius    : true metres from the ego vehicle within which there are road users
-    side     : side of the road that traffic keeps to
+    vehicles    : moving vehicles per kilometre of lane
+    cyclists    : per kilometre of lane
+    pedestrians : per kilometre of sidewalk
+    parked      : share of the spaces along kerbs and in parking lots that are occupied
+    radius      : true metres around the ego vehicle within which road users are simulated
+    side        : side of the road that traffic drives on
     """
 
     vehicles: float = 12.0
@@ -60,7 +60,7 @@ class TrafficOptions:
     side: Literal["right", "left"] = "right"
 
     def __post_init__(self) -> None:
-        """Refuse densities that cannot be meant."""
+        """Raise InputError for values out of range."""
         faults = [
             f"{name} = {getattr(self, name)} is not within {low} to {high}"
             for name, (low, high) in _BOUNDS.items()
@@ -74,21 +74,22 @@ class TrafficOptions:
 
 @dataclass(frozen=True, slots=True)
 class TrafficSetup:
-    """Who is about during a drive, before anybody moves.
+    """Input of a traffic simulation around one ego trajectory.
 
-    plan, area : junctions, and the surroundings of the ego
-    trips      : those who move
-    standing   : footprints of what nobody goes or stands through
-    surfaces   : the scene's layer of roads and sidewalks
-    around     : the whole of the surroundings
-    scale      : scene metres per true metre
+    plan      : junctions and their signals
+    area      : surroundings of the ego over time
+    trips     : moving road users
+    obstacles : footprints of buildings, posts and trunks
+    surfaces  : the scene's layer of roads and sidewalks
+    around    : polygon of everything within the radius of the ego's trajectory
+    scale     : scene metres per true metre
     """
 
     lanes: Lanes
     plan: JunctionPlan
     area: Surroundings
     trips: list[Trip]
-    standing: NDArray[np.object_]
+    obstacles: NDArray[np.object_]
     surfaces: Layer | None
     around: shapely.Geometry
     scale: float
@@ -103,25 +104,22 @@ def populate(
     seed: int,
     options: TrafficOptions | None = None,
 ) -> Actors:
-    """The road users around the ego vehicle for its whole drive; the same for the same seed and options.
+    """The road users around an ego vehicle whose trajectory is fixed; deterministic for a seed and options.
 
-    ego     : the ego vehicle's trajectory, which is given: the others keep clear of it, signals are green
-              for it; see `drive_in_traffic` for an ego that is one of the traffic
-    vehicle : its size
-
-    Raises InputError for a scene whose features cannot be read.
+    Road users avoid the ego and signals are green when it arrives; see `drive_in_traffic` for an ego vehicle
+    that reacts to traffic. Raises InputError for a scene whose features cannot be read.
     """
     options = options or TrafficOptions()
     setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
     return simulated_actors(
-        scene, graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed, options=options, obeys=False
+        scene, graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed, options=options, obeys_signals=False
     )
 
 
 def traffic_setup(
     scene: Scene, graph: RoadGraph, *, ego: Trajectory, seed: int, options: TrafficOptions
 ) -> TrafficSetup:
-    """Those who are about in the surroundings of an ego that moves so."""
+    """Trips, junctions and obstacles around an ego trajectory."""
     lanes = lanes_of(graph, side=options.side, bounds=scene.bounds)
     plan = junction_plan(graph, lanes, seed=seed)
     scale = float(np.mean(np.asarray(scene.frame.scale_at(*ego.position[0, :2]), float)))
@@ -130,19 +128,19 @@ def traffic_setup(
     shapely.prepare(around)
     surfaces = _layer(scene, "road_surfaces")
     road = _union(surfaces, _ROAD, area=around, grow=0.3)
-    standing = _standing(scene, around)
+    obstacles = _obstacles(scene, around)
     if road is not None:
-        road = _passable(road, standing, lanes=lanes, area=area)
+        road = _passable(road, obstacles, lanes=lanes, area=area)
 
     trips = vehicle_trips(lanes, area, seed=seed, density=options.vehicles, ground=road)
     trips += vehicle_trips(
         lanes, area, seed=seed, density=options.cyclists, shares={"cyclist": 1.0}, ground=road
     )
     walks = sidewalks_around(
-        lanes, area, pavement=_union(surfaces, ("sidewalk",), area=around, grow=0.0), standing=standing
+        lanes, area, pavement=_union(surfaces, ("sidewalk",), area=around, grow=0.0), obstacles=obstacles
     )
     trips += pedestrian_trips(lanes, area, walks=walks, seed=seed, density=options.pedestrians)
-    return TrafficSetup(lanes, plan, area, trips, standing, surfaces, around, scale)
+    return TrafficSetup(lanes, plan, area, trips, obstacles, surfaces, around, scale)
 
 
 def simulated_actors(
@@ -154,16 +152,22 @@ def simulated_actors(
     setup: TrafficSetup,
     seed: int,
     options: TrafficOptions,
-    obeys: bool,
+    obeys_signals: bool,
 ) -> Actors:
-    """The actors of a setup: where they go and stand about an ego whose motion is given.
+    """Moving and parked road users of a simulation around an ego trajectory.
 
-    obeys : whether that motion keeps to the signals; otherwise they are green when it comes
+    obeys_signals : whether the trajectory stops at red signals; otherwise they are green when the ego arrives
     """
     trips, plan = setup.trips, setup.plan
     box = (vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang)
     flow = simulate_trips(
-        trips, graph, plan=plan, ego=ego, ego_box=box, radius=options.radius * setup.scale, obeys=obeys
+        trips,
+        graph,
+        plan=plan,
+        ego=ego,
+        ego_box=box,
+        radius=options.radius * setup.scale,
+        obeys_signals=obeys_signals,
     )
     return joined(
         [
@@ -183,7 +187,7 @@ def simulated_actors(
 
 
 def first_feature(scene: Scene) -> int:
-    """The first number that no feature of a scene bears."""
+    """The first unused feature number of a scene."""
     return max((stop for _, stop in scene.layers.values()), default=0)
 
 
@@ -197,10 +201,10 @@ def parked_vehicles(
     seed: int,
     share: float,
 ) -> Actors:
-    """Vehicles that stand along kerbs and in parking lots.
+    """Parked vehicles along kerbs and in parking lots.
 
-    swept : what those who move cover, as polygons in plan
-    share : of the places that are taken
+    swept : areas swept by moving road users, polygons in plan
+    share : share of the spaces that are occupied
     """
     surfaces, around, lanes = setup.surfaces, setup.around, setup.lanes
     lots = _polygons(_layer(scene, "landcover"), ("parking",), area=around)
@@ -214,7 +218,7 @@ def parked_vehicles(
         crossings,
         np.empty(0, object) if structures is None else shapely.buffer(structures.geometry, 0.5),
     ]
-    trees = [shapely.STRtree(part) for part in (setup.standing, np.concatenate(free))]
+    trees = [shapely.STRtree(part) for part in (setup.obstacles, np.concatenate(free))]
     spots = concatenated(
         [
             kerb_spaces(lanes, setup.area.near, seed=seed, share=share),
@@ -225,23 +229,23 @@ def parked_vehicles(
 
 
 def _passable(
-    road: shapely.Geometry, standing: NDArray[np.object_], *, lanes: Lanes, area: Surroundings
+    road: shapely.Geometry, obstacles: NDArray[np.object_], *, lanes: Lanes, area: Surroundings
 ) -> shapely.Geometry:
-    """Carriageways less the buildings that stand on them, but for bridges and what runs under buildings."""
-    houses = standing[shapely.area(standing) > _HOUSE]
+    """The carriageways without buildings that stand on them; bridges and tunnels are kept."""
+    buildings = obstacles[shapely.area(obstacles) > _BUILDING_AREA]
     over = np.flatnonzero(area.near & (lanes.graph.bridge | lanes.graph.tunnel))
     free = shapely.buffer(area.lines[over], lanes.graph.width[over] / 2 * area.scale)
-    whole = shapely.union(shapely.difference(road, shapely.union_all(houses)), shapely.union_all(free))
+    whole = shapely.union(shapely.difference(road, shapely.union_all(buildings)), shapely.union_all(free))
     shapely.prepare(whole)
     return whole
 
 
 def _swept(trips: list[Trip]) -> NDArray[np.object_]:
-    """Boxes of movers along their ways, with some room."""
+    """Bounding boxes (k,) of moving road users along their paths, with a margin."""
     parts = [np.empty(0, object)]
     for trip in trips:
         xy, heading = body_poses(trip.way, trip.axle)
-        every = slice(0, None, 2 if trip.walks else 4)
+        every = slice(0, None, 2 if trip.on_foot else 4)
         parts.append(
             rectangles(xy[every], heading[every], length=max(trip.length, 1.0) + 0.5, width=trip.width + 0.3)
         )
@@ -249,10 +253,10 @@ def _swept(trips: list[Trip]) -> NDArray[np.object_]:
 
 
 def _strips(lanes: Lanes, area: Surroundings) -> NDArray[np.object_]:
-    """Lanes around the ego's way as wide as a car."""
+    """Strips (k,) along the lanes around the ego, as wide as a car."""
     lines = [
         beside(lanes.graph.geometry[e], -lanes.side * lane_shift(lanes, e, lane=lane, width=1.82))[:, :2]
-        for e in np.flatnonzero(area.near & (lanes.liking > 0)).tolist()
+        for e in np.flatnonzero(area.near & (lanes.traffic_weight > 0)).tolist()
         for lane in range(int(lanes.count[e]))
     ]
     strips: NDArray[np.object_] = shapely.buffer(
@@ -262,7 +266,7 @@ def _strips(lanes: Lanes, area: Surroundings) -> NDArray[np.object_]:
 
 
 def _ego_boxes(ego: Trajectory, vehicle: Vehicle, *, scale: float) -> NDArray[np.object_]:
-    """Boxes of the ego vehicle along its way, grown by what is kept from it."""
+    """Bounding boxes (k,) of the ego vehicle every metre of its trajectory, with a margin."""
     moved = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ego.position[:, :2], axis=0).T))])
     rows = np.unique(np.searchsorted(moved, np.arange(0.0, moved[-1] + 1.0, 1.0)).clip(0, len(moved) - 1))
     poses = ego.at(ego.time_ns[rows])
@@ -282,7 +286,7 @@ def _layer(scene: Scene, name: str) -> Layer | None:
 def _polygons(
     layer: Layer | None, classes: tuple[str, ...], *, area: shapely.Geometry
 ) -> NDArray[np.object_]:
-    """Polygons of some classes that touch an area."""
+    """Polygons (k,) of some classes that intersect an area."""
     if layer is None:
         return np.empty(0, object)
     kept = layer.geometry[np.isin(layer.columns["class"].astype(str), classes)]
@@ -293,7 +297,7 @@ def _polygons(
 def _union(
     layer: Layer | None, classes: tuple[str, ...], *, area: shapely.Geometry, grow: float
 ) -> shapely.Geometry | None:
-    """Surfaces of some classes around an area as one, grown; None where there are none."""
+    """Union of the surfaces of some classes, buffered by ``grow`` metres; None where there are none."""
     parts = _polygons(layer, classes, area=area)
     if not len(parts):
         return None
@@ -302,8 +306,8 @@ def _union(
     return whole
 
 
-def _standing(scene: Scene, area: shapely.Geometry) -> NDArray[np.object_]:
-    """Footprints in an area of buildings that reach down to the ground, of posts, trunks and the like."""
+def _obstacles(scene: Scene, area: shapely.Geometry) -> NDArray[np.object_]:
+    """Footprints (k,) in an area of posts, trunks and buildings without a passage below."""
     parts: list[NDArray[np.object_]] = [np.empty(0, object)]
     buildings = _layer(scene, "buildings")
     if buildings is not None:
@@ -314,7 +318,7 @@ def _standing(scene: Scene, area: shapely.Geometry) -> NDArray[np.object_]:
         if shapely.intersects(area, shapely.box(*corner, *(corner + scene.tile_size))):
             tile = scene.tile(i, j)
             posts = tile.instances.transform[:, :2, 3] + tile.origin[:2]
-            parts.append(shapely.buffer(shapely.points(posts), _POST))
+            parts.append(shapely.buffer(shapely.points(posts), _POST_RADIUS))
     whole = np.concatenate(parts)
     kept: NDArray[np.object_] = whole[shapely.intersects(area, whole)]
     return kept

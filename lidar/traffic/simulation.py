@@ -18,12 +18,12 @@ from lidar.geometry.poses import Trajectory
 from lidar.traffic.ego_trip import EgoTrip
 from lidar.traffic.junctions import JunctionPlan, road_rank, signal_group, zone_at
 from lidar.traffic.lanes import STEP, ActorPath
-from lidar.traffic.simulation_kernel import Ego, Movers, run
+from lidar.traffic.simulation_kernel import EgoMotion, Movers, run
 from lidar.traffic.surroundings import LEFT
 from lidar.traffic.sweep import CELL, cells_under, sweep
 from lidar.traffic.trips import Trip
 
-DT = 0.1
+STEP_S = 0.1
 """Seconds of a step of the simulation."""
 _HORIZON = 60  # steps that the ego's way is known ahead: 6 s
 _KEEP = (0.8, 0.3)  # metres that others keep from the ego's box before and beside it
@@ -55,12 +55,12 @@ def simulate_trips(
     ego: Trajectory,
     ego_box: tuple[float, float, float],
     radius: float,
-    obeys: bool = False,
+    obeys_signals: bool = False,
 ) -> SimulatedTrips:
     """Trips in time, from the drive's start to its end.
 
     ego_box : length, width and metres from the rear axle to the middle of the ego's box
-    obeys   : whether the ego's motion keeps to the signals; otherwise they are green when it comes
+    obeys_signals   : whether the ego's motion keeps to the signals; otherwise they are green when it comes
 
     Those whom the ego, whose motion is given, would run into do not take place.
     """
@@ -69,14 +69,16 @@ def simulate_trips(
         return SimulatedTrips(none, none, np.empty(0), np.empty(0))
     movers = _movers(trips, graph, plan=plan)
     known = ego_motion(ego, ego_box, graph=graph)
-    movers, known, squares = _number_cells(movers, known)
-    signals = plan.signals if obeys else plan.signals._replace(window=green_windows(plan, known))
-    out = np.zeros(len(trips), bool)
+    movers, known, cells = _number_cells(movers, known)
+    signals = plan.signals if obeys_signals else plan.signals._replace(window=green_windows(plan, known))
+    excluded = np.zeros(len(trips), bool)
     for _ in range(_ROUNDS):
-        log, met = run(movers, known, signals, out, squares, DT, len(known.x), _HORIZON, radius + LEFT, -1)
-        if not met.any():
+        log, hit_ego = run(
+            movers, known, signals, excluded, cells, STEP_S, len(known.x), _HORIZON, radius + LEFT, -1
+        )
+        if not hit_ego.any():
             break
-        out |= met
+        excluded |= hit_ego
     order = np.lexsort((log[:, 1], log[:, 0]))
     log = log[order]
     return SimulatedTrips(log[:, 0].astype(np.int64), log[:, 1].astype(np.int64), log[:, 2], log[:, 3])
@@ -91,18 +93,18 @@ def simulate_ego(
     seconds: float,
     radius: float,
 ) -> Float:
-    """Metres (t,) along its path that the ego gets by each step of `DT` as one of the traffic.
+    """Metres (t,) along its path that the ego gets by each step of `STEP_S` as one of the traffic.
 
     It follows, gives way and stops at signals and signs as the others do, and they know it as one of them.
     """
     movers = _movers([ego, *trips], graph, plan=plan)
-    steps = int(np.ceil(seconds / DT)) + 1
+    steps = int(np.ceil(seconds / STEP_S)) + 1
     x, y, heading, speed = np.zeros((4, steps))
     none = np.empty(0, np.int64)
-    known = Ego(x, y, heading, speed, np.full(2, -np.inf), np.zeros(steps + 1, np.int64), none)
-    movers, known, squares = _number_cells(movers, known)
-    out = np.zeros(len(trips) + 1, bool)
-    log, _ = run(movers, known, plan.signals, out, squares, DT, steps, _HORIZON, radius + LEFT, 0)
+    known = EgoMotion(x, y, heading, speed, np.full(2, -np.inf), np.zeros(steps + 1, np.int64), none)
+    movers, known, cells = _number_cells(movers, known)
+    excluded = np.zeros(len(trips) + 1, bool)
+    log, _ = run(movers, known, plan.signals, excluded, cells, STEP_S, steps, _HORIZON, radius + LEFT, 0)
     mine = log[:, 0] == 0
     gone = np.zeros(steps)
     gone[log[mine, 1].astype(int)] = log[mine, 2]
@@ -115,18 +117,20 @@ def has_traffic_control(ego: EgoTrip, graph: RoadGraph, *, plan: JunctionPlan) -
     return bool((blocks[:, 4] >= 0).any() or (blocks[:, 7] > 0).any())
 
 
-def ego_motion(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadGraph) -> Ego:
+def ego_motion(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadGraph) -> EgoMotion:
     """What the others know of the ego vehicle; ``box`` as in `simulate_trips`."""
     length, width, ahead = box
-    steps = int(ego.duration_ns * 1e-9 / DT) + 2
-    time = np.round(np.arange(steps) * DT * 1e9).astype(np.int64)
+    steps = int(ego.duration_ns * 1e-9 / STEP_S) + 2
+    time = np.round(np.arange(steps) * STEP_S * 1e9).astype(np.int64)
     poses = ego.at(time)
     forward = poses.rotation[:, :, 0]
     middle = poses.position + poses.scale * forward * ahead
     heading = np.arctan2(forward[:, 1], forward[:, 0])
     speed = np.interp(time, ego.time_ns, np.hypot(*ego.velocity[:, :2].T))
     level = _levels(middle, graph)
-    grown = np.column_stack([length / 2 + _KEEP[0] + speed * DT / 2, np.full(steps, width / 2 + _KEEP[1])])
+    grown = np.column_stack(
+        [length / 2 + _KEEP[0] + speed * STEP_S / 2, np.full(steps, width / 2 + _KEEP[1])]
+    )
     under = np.empty(int(4 * np.prod(grown.max(axis=0) / CELL + 2)), np.int64)
     events = []
     for k in range(steps):
@@ -134,7 +138,7 @@ def ego_motion(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadG
         events.append(under[:n].copy())
     start = np.concatenate([[0], np.cumsum([len(e) for e in events])])
     half = np.array([length / 2 + 0.2, width / 2 + 0.1])
-    return Ego(middle[:, 0], middle[:, 1], heading, speed, half, start, np.concatenate(events))
+    return EgoMotion(middle[:, 0], middle[:, 1], heading, speed, half, start, np.concatenate(events))
 
 
 def _levels(xyz: Float, graph: RoadGraph) -> Ints:
@@ -154,14 +158,14 @@ def _levels(xyz: Float, graph: RoadGraph) -> Ints:
     return out
 
 
-def _number_cells(movers: Movers, ego: Ego) -> tuple[Movers, Ego, int]:
-    """The tables with squares numbered from 0, and how many there are."""
-    used, number = np.unique(np.concatenate([movers.square, ego.event_square]), return_inverse=True)
-    mine, its = np.split(number.astype(np.int32), [len(movers.square)])
-    return movers._replace(square=mine), ego._replace(event_square=its), len(used)
+def _number_cells(movers: Movers, ego: EgoMotion) -> tuple[Movers, EgoMotion, int]:
+    """The tables with cells numbered from 0, and how many there are."""
+    used, number = np.unique(np.concatenate([movers.cell, ego.event_cell]), return_inverse=True)
+    mine, its = np.split(number.astype(np.int32), [len(movers.cell)])
+    return movers._replace(cell=mine), ego._replace(event_cell=its), len(used)
 
 
-def green_windows(plan: JunctionPlan, ego: Ego) -> Float:
+def green_windows(plan: JunctionPlan, ego: EgoMotion) -> Float:
     """Windows (w, 4) in which signals are green for the ego: from 8 s before it reaches a junction."""
     zone = zone_at(plan.zones, np.column_stack([ego.x, ego.y]))
     rows = []
@@ -169,15 +173,17 @@ def green_windows(plan: JunctionPlan, ego: Ego) -> Float:
     for a, b in itertools.pairwise(cuts.tolist()):
         z = int(zone[a])
         if z >= 0 and plan.lit[z]:
-            rows.append((z, signal_group(plan, z, heading=float(ego.heading[a])), a * DT - 8.0, b * DT))
+            rows.append(
+                (z, signal_group(plan, z, heading=float(ego.heading[a])), a * STEP_S - 8.0, b * STEP_S)
+            )
     return np.array(rows, float).reshape(-1, 4)
 
 
 def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: JunctionPlan) -> Movers:
     """The tables of the simulation."""
-    station, square, blocks = [0], [0], [0]
+    station, cell, blocks = [0], [0], [0]
     columns: dict[str, list[NDArray[Any]]] = {
-        name: [] for name in ("wish", "x", "y", "heading", "square", "first", "last", "leave", "block")
+        name: [] for name in ("desired_speed", "x", "y", "heading", "cell", "first", "last", "leave", "block")
     }
     ways: dict[tuple[int, ...], int] = {}
     covered = graph.bridge | graph.tunnel
@@ -187,15 +193,15 @@ def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: Junction
         level = np.where(way.edge >= 0, covered[way.edge], False).astype(np.int64)
         swept = sweep(xy, heading, length=trip.length, width=trip.width, level=level, scale=way.scale)
         found = _blocks(trip, graph, plan=plan, ways=ways)
-        columns["wish"].append(trip.wish)
+        columns["desired_speed"].append(trip.desired_speed)
         columns["x"].append(xy[:, 0])
         columns["y"].append(xy[:, 1])
         columns["heading"].append(heading)
-        for name in ("square", "first", "last", "leave"):
+        for name in ("cell", "first", "last", "leave"):
             columns[name].append(getattr(swept, name))
         columns["block"].append(found)
         station.append(station[-1] + len(way))
-        square.append(square[-1] + len(swept.square))
+        cell.append(cell[-1] + len(swept.cell))
         blocks.append(blocks[-1] + len(found))
     whole = {name: np.concatenate(parts) for name, parts in columns.items()}
     b = whole["block"]
@@ -203,32 +209,32 @@ def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: Junction
     def of(name: str) -> Float:
         return np.array([getattr(t.driver, name) for t in trips])
 
-    names = ("block_from", "block_to", "block_stop", "block_zone", "block_group", "block_way")
+    names = ("block_from", "block_to", "block_stop", "block_zone", "block_group", "block_route")
     return Movers(
         station_start=np.array(station),
-        wish=whole["wish"],
+        desired_speed=whole["desired_speed"],
         x=whole["x"],
         y=whole["y"],
         heading=whole["heading"],
-        square_start=np.array(square),
-        square=whole["square"],
+        cell_start=np.array(cell),
+        cell=whole["cell"],
         first=whole["first"],
         last=whole["last"],
         leave=whole["leave"],
         block_start=np.array(blocks),
         **{name: b[:, c].astype(np.int64) for c, name in enumerate(names)},
         block_rank=b[:, 6].copy(),
-        block_halt=b[:, 7] > 0,
+        block_stop_sign=b[:, 7] > 0,
         headway=of("headway"),
-        pull=of("pull"),
-        brake=of("brake"),
+        acceleration=of("acceleration"),
+        deceleration=of("deceleration"),
         gap=of("gap"),
         length=np.array([t.length for t in trips]),
         width=np.array([t.width for t in trips]),
-        appear=np.array([int(t.appear_s / DT) for t in trips]),
+        appear=np.array([int(t.appear_s / STEP_S) for t in trips]),
         begin=np.array([t.begin for t in trips]),
         leaves=np.array([t.leaves for t in trips]),
-        whole=np.array([t.walks for t in trips]),
+        whole_block=np.array([t.on_foot for t in trips]),
     )
 
 
@@ -246,7 +252,7 @@ def _blocks(
             group = signal_group(plan, z, heading=float(way.heading[(first + last) // 2])) if z >= 0 else -1
             key = ways.setdefault((-1, number), len(ways))
             rows.append([first, last, first - 1, z, group, key, 99.0, 0.0])
-    if trip.walks:
+    if trip.on_foot:
         return np.array(rows, float).reshape(-1, 8)
     cuts = np.flatnonzero(np.diff(np.concatenate([[-2], zone, [-2]])))
     for a, b in itertools.pairwise(cuts.tolist()):

@@ -79,7 +79,7 @@ def entrances(lanes: Lanes, area: Surroundings, *, t: float) -> list[tuple[int, 
     """
     here = np.array([np.interp(t, area.time, area.ego[:, c]) for c in (0, 1)])
     rim = shapely.Point(here).buffer(area.radius * area.scale, quad_segs=16).exterior
-    rows = np.flatnonzero(area.near & (lanes.liking > 0) & lanes.open)
+    rows = np.flatnonzero(area.near & (lanes.traffic_weight > 0) & lanes.open)
     found: list[tuple[int, float]] = []
     cut = shapely.intersection(area.lines[rows], rim)
     points, owner = shapely.get_parts(cut, return_index=True)

@@ -1,4 +1,4 @@
-"""The ground that a moving body covers, as squares of a grid with the stations at which it covers them."""
+"""The ground that a moving body covers, as cells of a grid with the stations at which it covers them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from geoscene.typing import Float
 from lidar.traffic.lanes import STEP, ActorPath
 
 CELL = 0.3
-"""Metres of a square's side. Two bodies that share no square do not touch: squares are taken whose middle
+"""Metres of a cell's side. Two bodies that share no cell do not touch: cells are taken whose middle
 lies within half a diagonal of the body."""
-_MANY = 1 << 30  # squares along a side of the grid: 322,000 km
+_MANY = 1 << 30  # cells along a side of the grid: 322,000 km
 _SPARE = 0.05 + CELL * math.sqrt(0.5)
 
 
@@ -25,13 +25,13 @@ _SPARE = 0.05 + CELL * math.sqrt(0.5)
 class Sweep:
     """Squares that a body covers along its way, in the order of ``first``.
 
-    square : (q,) int64, the square's row, column and level as one number
+    cell : (q,) int64, the cell's row, column and level as one number
     first  : (q,) int32, station at which the body begins to cover it
     last   : (q,) int32, station until which it covers it
     leave  : (q,) int32, rows of the above in the order of ``last``
     """
 
-    square: NDArray[np.int64]
+    cell: NDArray[np.int64]
     first: NDArray[np.int32]
     last: NDArray[np.int32]
     leave: NDArray[np.int32]
@@ -43,15 +43,15 @@ def sweep(
     """What a body of that size covers along a way, a station at a time.
 
     xy, heading : (n, 2) and (n,) of its middle
-    level : (n,) 0 or 1: bridges and tunnels have squares of their own
+    level : (n,) 0 or 1: bridges and tunnels have cells of their own
     scale : scene metres per true metre
     """
     # a body between two stations lies within both, grown by half a step
     half = np.array([length / 2 + STEP / 2, width / 2]) * scale + _SPARE
     most = int(math.ceil(2 * half[0] / CELL) + 2) * int(math.ceil(2 * half[1] / CELL) + 2)
-    square, first, last, count = _cover(xy, heading, half, level, most)
-    square, first, last = square[:count], first[:count], last[:count]
-    return Sweep(square, first, last, np.argsort(last, kind="stable").astype(np.int32))
+    cell, first, last, count = _cover(xy, heading, half, level, most)
+    cell, first, last = cell[:count], first[:count], last[:count]
+    return Sweep(cell, first, last, np.argsort(last, kind="stable").astype(np.int32))
 
 
 def body_poses(way: ActorPath, axle: float) -> tuple[Float, Float]:
@@ -82,7 +82,7 @@ def rectangles(xy: Float, heading: Float, *, length: ArrayLike, width: ArrayLike
 
 @njit(cache=True, nogil=True)
 def cells_under(x: float, y: float, heading: float, half: Any, level: int, out: Any) -> int:
-    """Fill ``out`` with the squares whose middle lies in a rectangle; return their number."""
+    """Fill ``out`` with the cells whose middle lies in a rectangle; return their number."""
     c, s, hl, hw = math.cos(heading), math.sin(heading), half[0], half[1]
     ex, ey = abs(c) * hl + abs(s) * hw, abs(s) * hl + abs(c) * hw
     n = 0
@@ -99,15 +99,15 @@ def cells_under(x: float, y: float, heading: float, half: Any, level: int, out: 
 def _cover(xy: Any, heading: Any, half: Any, level: Any, most: int) -> Any:
     """Squares with their first and last stations, by first station."""
     n = len(xy)
-    square = np.empty(most + 64 * n, np.int64)
-    first, last = np.empty(len(square), np.int32), np.empty(len(square), np.int32)
+    cell = np.empty(most + 64 * n, np.int64)
+    first, last = np.empty(len(cell), np.int32), np.empty(len(cell), np.int32)
     under = np.empty(most, np.int64)
-    seen = {np.int64(-1): 0}  # row of each square last seen
+    seen = {np.int64(-1): 0}  # row of each cell last seen
     count = 0
     for k in range(n):
         found = cells_under(xy[k, 0], xy[k, 1], heading[k], half, level[k], under)
-        if count + found > len(square):
-            square = np.concatenate((square, np.empty_like(square)))
+        if count + found > len(cell):
+            cell = np.concatenate((cell, np.empty_like(cell)))
             first, last = np.concatenate((first, first)), np.concatenate((last, last))
         for m in range(found):
             p = under[m]
@@ -115,7 +115,7 @@ def _cover(xy: Any, heading: Any, half: Any, level: Any, most: int) -> Any:
             if row >= 0 and last[row] == k - 1:
                 last[row] = k
             else:
-                square[count], first[count], last[count] = p, k, k
+                cell[count], first[count], last[count] = p, k, k
                 seen[p] = count
                 count += 1
-    return square, first, last, count
+    return cell, first, last, count

@@ -11,7 +11,7 @@ from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.traffic.ground import ground_heights
 from lidar.traffic.lanes import STEP
-from lidar.traffic.simulation import DT, SimulatedTrips
+from lidar.traffic.simulation import STEP_S, SimulatedTrips
 from lidar.traffic.sweep import body_poses
 from lidar.traffic.trips import Trip
 from lidar.world.actor_shapes import STRIDE, Shape, catalogue
@@ -122,8 +122,8 @@ def tracked(
 ) -> Actors:
     """Actors (n) that go along tracks in plan, put on the scene's ground.
 
-    knots        : (n,) how many each has of the following (k) rows, which are `DT` apart
-    step         : (k,) `DT` since the drive's start
+    knots        : (n,) how many each has of the following (k) rows, which are `STEP_S` apart
+    step         : (k,) `STEP_S` since the drive's start
     middle, yaw  : (k, 2) scene metres and (k,) radians, unwrapped
     hint         : (k,) height near which the ground is; NaN to take the topmost
     speed, gone  : (k,) m/s and metres covered
@@ -146,7 +146,7 @@ def tracked(
         shapes,
         stretch,
         knots=knots,
-        time_ns=np.round(step * DT * 1e9).astype(np.int64),
+        time_ns=np.round(step * STEP_S * 1e9).astype(np.int64),
         position=np.column_stack([middle, z]),
         angles=np.column_stack([yaw, pitch, roll]),
         velocity=np.column_stack([v * np.cos(course), v * np.sin(course), climb]),
@@ -195,8 +195,8 @@ def standing(
 
 
 def _rate(values: Float) -> Float:
-    """Change of values at knots `DT` apart, per second."""
-    rate: Float = np.gradient(values, DT) if len(values) > 1 else np.zeros(len(values))
+    """Change of values at knots `STEP_S` apart, per second."""
+    rate: Float = np.gradient(values, STEP_S) if len(values) > 1 else np.zeros(len(values))
     return rate
 
 

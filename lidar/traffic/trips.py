@@ -1,4 +1,4 @@
-"""Traffic: who is on the road around the ego vehicle, and where each of them goes."""
+"""Trips of vehicles and cyclists around the ego vehicle: body, driver model, path and speed profile."""
 
 from __future__ import annotations
 
@@ -15,32 +15,34 @@ from lidar.traffic.surroundings import Surroundings, entrances
 from lidar.traffic.sweep import body_poses, rectangles
 from lidar.world.actor_shapes import PAINTS, Shape, catalogue
 
-_LATERAL = 2.0  # m/s^2 across the way that drivers put up with in bends
-_TRIES = 5  # ways that are tried for a vehicle until one keeps to the carriageway
-_SHORT = 40  # stations that a way has at least
-_FAR = 3000.0  # metres that a way has at most
-_WAVE_S = 5.0  # seconds between looks at where traffic comes in
-_MEAN = 0.45  # mean speed of traffic against the limit, with its stops: what it comes to in the simulation
+_LATERAL = 2.0  # m/s^2, comfortable lateral acceleration in bends
+_TRIES = 5  # paths tried for a vehicle until one stays on the carriageway
+_MIN_STATIONS = 40  # of a path
+_MAX_LENGTH = 3000.0  # metres of a path
+_WAVE_S = 5.0  # seconds between spawns at the entrances of the surroundings
+_MEAN_SPEED = 0.45  # mean speed of simulated traffic, with its stops, over the speed limit
 
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """How a kind of road user goes.
+    """Parameters of the Intelligent Driver Model and of the paths of one kind of road user.
 
-    radius  : least radius of its way in metres
-    top     : m/s
-    headway, pull, brake, gap : time gap in s, largest acceleration and comfortable braking in m/s^2, standing
-              gap in metres of the Intelligent Driver Model
-    kerb    : whether it keeps to the kerb within its lane
+    min_radius   : metres, smallest turning radius
+    max_speed    : m/s
+    headway      : seconds, desired time gap
+    acceleration : m/s^2, maximum
+    deceleration : m/s^2, comfortable
+    gap          : metres to the road user ahead at standstill
+    keeps_kerb   : whether it rides at the kerb within its lane
     """
 
-    radius: float
-    top: float
+    min_radius: float
+    max_speed: float
     headway: float
-    pull: float
-    brake: float
+    acceleration: float
+    deceleration: float
     gap: float
-    kerb: bool = False
+    keeps_kerb: bool = False
 
 
 DRIVERS: dict[str, Driver] = {
@@ -51,12 +53,12 @@ DRIVERS: dict[str, Driver] = {
     "truck": Driver(8.0, 25.0, 1.6, 0.8, 1.8, 2.5),
     "bus": Driver(9.5, 22.0, 1.6, 0.9, 1.6, 2.5),
     "motorcycle": Driver(4.0, 60.0, 1.1, 2.0, 2.5, 2.0),
-    "cyclist": Driver(2.5, 6.0, 1.0, 0.8, 1.5, 1.0, kerb=True),
+    "cyclist": Driver(2.5, 6.0, 1.0, 0.8, 1.5, 1.0, keeps_kerb=True),
 }
-"""Headway, acceleration and braking: about the values that Treiber and Kesting, "Traffic Flow Dynamics"
-(2013), give for city traffic (1 s, 1 m/s^2, 1.5 m/s^2, 2 m), livelier in acceleration as cars are at lights;
-lorries and buses slower. Radii: of the middle, from kerb-to-kerb turning circles of such vehicles, nominal.
-Cyclists: assumed."""
+"""Headway, acceleration, deceleration and gap: close to the values of Treiber and Kesting, "Traffic Flow
+Dynamics" (2013), for city traffic (1 s, 1 m/s^2, 1.5 m/s^2, 2 m), with higher acceleration as observed at
+traffic lights; lorries and buses accelerate less. Radii: of the body's centre, from nominal kerb-to-kerb
+turning circles. Cyclists: assumed."""
 
 VEHICLE_SHARES = {
     "sedan": 0.30,
@@ -67,52 +69,53 @@ VEHICLE_SHARES = {
     "bus": 0.02,
     "motorcycle": 0.04,
 }
-"""Shares of the traffic: assumed."""
+"""Shares of the vehicle kinds in traffic: assumed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trip:
-    """A mover before it moves.
+    """One simulated road user and its path.
 
-    shape    : its body, ``stretch`` the factors along x, y and z
-    way      : where it goes
-    driver   : how
-    wish     : (n,) m/s, the speed that it wants at each station
-    begin    : station at which it appears
-    appear_s : when, in seconds
-    leaves   : whether the way's end is out of sight; otherwise it stops there
-    walks    : whether it goes on foot, off the carriageway
-    crossing : stretches of a walk across carriageways: first and last station, and the crossing's number
+    shape         : body
+    stretch       : scale factors of the body along x, y and z
+    way           : path, n stations
+    driver        : driver model
+    desired_speed : (n,) m/s at each station
+    begin         : station of the start
+    appear_s      : seconds after the drive's start at which it appears
+    leaves        : whether it disappears at the end of the path; otherwise it stops there
+    on_foot       : whether it is a pedestrian
+    crossing      : of pedestrians: first station, last station and number of each crossing on the path
     """
 
     shape: Shape
     stretch: tuple[float, float, float]
     way: ActorPath
     driver: Driver
-    wish: Float
+    desired_speed: Float
     begin: int
     appear_s: float
     leaves: bool
-    walks: bool = False
+    on_foot: bool = False
     crossing: tuple[tuple[int, int, int], ...] = ()
 
     @property
     def length(self) -> float:
-        """Metres."""
+        """Metres, of the body."""
         return self.shape.length * self.stretch[0]
 
     @property
     def width(self) -> float:
-        """Metres."""
+        """Metres, of the body."""
         return self.shape.width * self.stretch[1]
 
     @property
     def axle(self) -> float:
-        """Metres between the points of the body that stay on the way."""
+        """Wheelbase in metres: both axles stay on the path."""
         return self.shape.base * self.stretch[0]
 
     def body(self) -> tuple[Float, Float]:
-        """Middle (n, 2) and heading (n,) of the body at each station."""
+        """Centre (n, 2) in scene metres and heading (n,) in radians of the body at each station."""
         return body_poses(self.way, self.axle)
 
 
@@ -125,15 +128,15 @@ def vehicle_trips(
     shares: dict[str, float] | None = None,
     ground: shapely.Geometry | None = None,
 ) -> list[Trip]:
-    """Vehicles at random places on the lanes around the ego, and others that come in from the rim in time.
+    """Trips that start at random places on the lanes around the ego, and later ones that enter at the rim.
 
     density : vehicles per kilometre of lane
-    shares  : of kinds of `DRIVERS`; `VEHICLE_SHARES` by default
-    ground  : the carriageways; ways that leave them are not driven
+    shares  : shares of the kinds of `DRIVERS`; `VEHICLE_SHARES` by default
+    ground  : the carriageways; a path ends where the body would leave them
     """
     shares = shares or VEHICLE_SHARES
-    graph, liking = lanes.graph, lanes.liking
-    metres = graph.length * lanes.count * area.near * (liking > 0) * np.maximum(liking, 0.05) * lanes.open
+    graph, weight = lanes.graph, lanes.traffic_weight
+    metres = graph.length * lanes.count * area.near * (weight > 0) * np.maximum(weight, 0.05) * lanes.open
     name = "+".join(shares)
     trips: list[Trip | None] = []
     for number in range(round(density * float(metres.sum()) / 1000)):
@@ -149,7 +152,9 @@ def vehicle_trips(
         begin = wave * _WAVE_S
         for edge, at in entrances(lanes, area, t=begin):
             rng = generator(seed, "traffic", name, "wave", wave, edge)
-            rate = density / 1000 * lanes.count[edge] * max(liking[edge], 0.05) * _MEAN * graph.speed[edge]
+            rate = (
+                density / 1000 * lanes.count[edge] * max(weight[edge], 0.05) * _MEAN_SPEED * graph.speed[edge]
+            )
             for _ in range(rng.poisson(rate * _WAVE_S)):
                 t = begin + rng.random() * _WAVE_S
                 where = shapely.line_interpolate_point(area.lines[edge], at, normalized=True)
@@ -170,45 +175,52 @@ def _trip(
     span: tuple[float, float],
     ground: shapely.Geometry | None,
 ) -> Trip | None:
-    """A vehicle's trip from a share of an edge's length on; None if it finds no way.
+    """A trip of a random vehicle; None if no path is long enough.
 
-    span : seconds in which the place is in the surroundings of the ego
+    place : edge and share of its length at which the trip starts
+    span  : seconds from and until which that place is in the surroundings of the ego
     """
     edge, at = place
     kind = list(shares)[
         int(rng.choice(len(shares), p=np.array(list(shares.values())) / sum(shares.values())))
     ]
     driver = DRIVERS[kind]
-    lane = 0 if driver.kerb else int(rng.integers(lanes.count[edge]))
-    shape, grow = pick(kind, rng), varied(rng)
+    lane = 0 if driver.keeps_kerb else int(rng.integers(lanes.count[edge]))
+    shape, grow = random_shape(kind, rng), random_stretch(rng)
     pace = float(np.clip(rng.normal(1.0, 0.06), 0.85, 1.1))
     width = shape.width * grow[1]
-    if width > lanes.wide[edge]:
+    if width > lanes.max_width[edge]:
         return None
-    top = min(float(lanes.graph.speed.max()) * 1.1, driver.top)
-    metres = min(top * (span[1] - span[0]), _FAR) + 60.0
+    top = min(float(lanes.graph.speed.max()) * 1.1, driver.max_speed)
+    metres = min(top * (span[1] - span[0]), _MAX_LENGTH) + 60.0
     for _ in range(_TRIES):
         edges, picked = random_lanes(
             lanes, rng, edge=edge, lane=lane, metres=metres, inside=area.near, width=width
         )
         whole = path_along_lanes(
-            lanes, edges, picked=picked, width=width, radius=driver.radius, scale=area.scale, kerb=driver.kerb
+            lanes,
+            edges,
+            picked=picked,
+            width=width,
+            radius=driver.min_radius,
+            scale=area.scale,
+            keeps_kerb=driver.keeps_kerb,
         )
         begin = int(at * float(lanes.graph.length[edge]) / STEP)
-        first, last = _on(whole, shape, grow=grow, ground=ground, begin=begin)
+        first, last = _stations_on_carriageway(whole, shape, grow=grow, ground=ground, begin=begin)
         complete = len(whole) - last <= shape.length / STEP + 4
-        if not complete or last - begin < _SHORT:
+        if not complete or last - begin < _MIN_STATIONS:
             continue
         way = whole.part(first, last)
         end = edges[-1]
         leaves = bool(lanes.exit[end] or not area.near[end])
-        wish = desired_speed(way, driver, pace=pace)
-        return Trip(shape, grow, way, driver, wish, begin - first, span[0], leaves)
+        desired = speed_profile(way, driver, pace=pace)
+        return Trip(shape, grow, way, driver, desired, begin - first, span[0], leaves)
     return None
 
 
-def pick(kind: str, rng: np.random.Generator) -> Shape:
-    """A body of a kind in a random colour; people and riders in the first of their poses."""
+def random_shape(kind: str, rng: np.random.Generator) -> Shape:
+    """A body of a kind in a random colour; pedestrians and riders in the first of their poses."""
     bodies = [
         s
         for s in catalogue().values()
@@ -222,16 +234,16 @@ def pick(kind: str, rng: np.random.Generator) -> Shape:
     return bodies[int(rng.choice(len(bodies), p=weight / weight.sum()))]
 
 
-def varied(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Factors from a body's size to an individual's."""
+def random_stretch(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Random scale factors of a body along x, y and z."""
     x, y, z = (1 + rng.uniform(-0.03, 0.03, 3)).tolist()
     return x, y, z
 
 
-def _on(
+def _stations_on_carriageway(
     way: ActorPath, shape: Shape, *, grow: Sequence[float], ground: shapely.Geometry | None, begin: int
 ) -> tuple[int, int]:
-    """First and last station (exclusive) about ``begin`` between which the body keeps to the carriageway."""
+    """First and last station (exclusive) around ``begin`` between which the body stays on the carriageway."""
     if ground is None:
         return 0, len(way)
     xy, heading = body_poses(way, shape.base * grow[0])
@@ -243,12 +255,12 @@ def _on(
     return int(before[-1]) + 1 if len(before) else 0, int(behind[0]) if len(behind) else len(way)
 
 
-def desired_speed(way: ActorPath, driver: Driver, *, pace: float) -> Float:
-    """Speed (n,) that a driver wants at each station, m/s: limit, bend, and braking for what is ahead."""
+def speed_profile(way: ActorPath, driver: Driver, *, pace: float) -> Float:
+    """Desired speed (n,) in m/s: speed limit times ``pace``, slower in bends and in time before them."""
     bend = np.maximum(np.abs(way.curvature), 1e-6)
-    v = np.minimum(np.minimum(way.limit * pace, driver.top), np.sqrt(_LATERAL / bend))
+    v = np.minimum(np.minimum(way.limit * pace, driver.max_speed), np.sqrt(_LATERAL / bend))
     v = np.maximum(v, 1.0)
-    ramp = 2 * driver.brake * 0.8 * STEP * np.arange(len(v))
+    ramp = 2 * driver.deceleration * 0.8 * STEP * np.arange(len(v))
     back = np.minimum.accumulate((v**2 + ramp)[::-1])[::-1] - ramp
     speed: Float = np.sqrt(np.maximum(back, 1.0))
     return speed

@@ -16,7 +16,7 @@ from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.traffic.lanes import STEP, lanes_of
-from lidar.traffic.simulation import DT, simulate_ego, simulate_trips
+from lidar.traffic.simulation import STEP_S, simulate_ego, simulate_trips
 from lidar.traffic.surroundings import surroundings_of
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.trips import vehicle_trips
@@ -61,7 +61,7 @@ def test_the_ego_enters_no_junction_on_red(seed, under_way):
     ego = drive_with_signals(path, CAR, graph=graph, seed=seed, duration=80.0, under_way=under_way)
     assert (speed_of(ego)[0] > 1.0) == under_way
     plan = junction_plan(graph, lanes_of(graph), seed=seed)
-    times = np.arange(0.0, 80.0, DT)
+    times = np.arange(0.0, 80.0, STEP_S)
     middle, heading = middle_of(ego, times)
     front = middle + CAR.length / 2 * np.column_stack([np.cos(heading), np.sin(heading)])
     zone = zone_at(plan.zones, front)
@@ -87,7 +87,7 @@ def test_at_stop_signs_the_ego_stops_and_goes_on():
     path = path_on(graph, 4, 90.0)
     ego = drive_with_signals(path, CAR, graph=signs, seed=1, duration=90.0)
     plan = junction_plan(graph, lanes_of(graph), seed=1)
-    times = np.arange(0.0, 90.0, DT)
+    times = np.arange(0.0, 90.0, STEP_S)
     middle, _ = middle_of(ego, times)
     zone = zone_at(plan.zones, middle)
     speed = np.interp(times, ego.time_ns * 1e-9, speed_of(ego))
@@ -106,18 +106,24 @@ def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
     path = path_on(graph, 1, 60.0)
     free = drive_path(path, CAR, duration=60.0)
     trips = vehicle_trips(lanes, surroundings_of(lanes, free, radius=400.0, scale=1.0), seed=1, density=10.0)
-    slow = [replace(t, wish=np.minimum(t.wish, 4.0)) for t in trips if t.appear_s == 0.0 and t.begin > 60]
+    slow = [
+        replace(t, desired_speed=np.minimum(t.desired_speed, 4.0))
+        for t in trips
+        if t.appear_s == 0.0 and t.begin > 60
+    ]
     plan = junction_plan(graph, lanes, seed=1)
     gone = simulate_ego(ego_trip(path, CAR), slow, graph=graph, plan=plan, seconds=60.0, radius=600.0)
-    motion = motion_behind(path, CAR, time_s=np.arange(len(gone)) * DT, reach=np.minimum(gone, path.length))
+    motion = motion_behind(
+        path, CAR, time_s=np.arange(len(gone)) * STEP_S, reach=np.minimum(gone, path.length)
+    )
     ego = poses_along(path, CAR, motion=motion)
-    flow = simulate_trips(slow, graph, plan=plan, ego=ego, ego_box=BOX, radius=600.0, obeys=True)
+    flow = simulate_trips(slow, graph, plan=plan, ego=ego, ego_box=BOX, radius=600.0, obeys_signals=True)
     assert len(np.unique(flow.trip)) == len(slow)  # nobody had to be taken out of its way
     check_gentle(ego)
     ahead = min((k for k in range(len(slow))), key=lambda k: slow[k].begin)
     rows = flow.trip == ahead
     tail = slow[ahead].way.xyz[0, 0] + flow.gone[rows] - slow[ahead].length / 2
-    middle, _ = middle_of(ego, flow.step[rows] * DT)
+    middle, _ = middle_of(ego, flow.step[rows] * STEP_S)
     gap = tail - middle[:, 0] - CAR.length / 2
     assert gap.min() > 1.5
     assert gap[300:].max() < 25.0  # it has caught up and follows
@@ -135,12 +141,14 @@ def test_among_traffic_the_ego_touches_nobody_and_nobody_is_taken_out_for_it(see
         lanes, surroundings_of(lanes, alone, radius=300.0, scale=1.0), seed=seed, density=20.0
     )
     gone = simulate_ego(ego_trip(path, CAR), trips, graph=graph, plan=plan, seconds=60.0, radius=300.0)
-    motion = motion_behind(path, CAR, time_s=np.arange(len(gone)) * DT, reach=np.minimum(gone, path.length))
+    motion = motion_behind(
+        path, CAR, time_s=np.arange(len(gone)) * STEP_S, reach=np.minimum(gone, path.length)
+    )
     ego = poses_along(path, CAR, motion=motion)
     check_gentle(ego)
-    flow = simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, radius=300.0, obeys=True)
+    flow = simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, radius=300.0, obeys_signals=True)
     poses = tracks(trips, flow)
-    times = np.arange(len(poses)) * DT
+    times = np.arange(len(poses)) * STEP_S
     own = rectangles(*middle_of(ego, times), length=BOX[0], width=BOX[1])
     for mine, moment in zip(own[::2], poses[::2], strict=True):
         if np.isfinite(moment).any():

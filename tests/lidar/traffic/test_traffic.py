@@ -18,7 +18,7 @@ from lidar.planning.path import plan_path
 from lidar.planning.route import plan_route
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.traffic.lanes import STEP, lane_shift, lanes_of, random_lanes
-from lidar.traffic.simulation import DT, ego_motion, green_windows, simulate_trips
+from lidar.traffic.simulation import STEP_S, ego_motion, green_windows, simulate_trips
 from lidar.traffic.simulation_kernel import HARD
 from lidar.traffic.surroundings import surroundings_of
 from lidar.traffic.sweep import body_poses, rectangles
@@ -82,12 +82,12 @@ def test_no_two_vehicles_ever_touch_and_none_jumps(seed, lit, lanes):
     graph = city(lit=lit, lanes=lanes, width=7.0 * lanes)
     trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 65.0), seed=seed, radius=600.0)
     assert len(np.unique(flow.trip)) > 15
-    assert flow.step.max() * DT > 60
+    assert flow.step.max() * STEP_S > 60
     poses = tracks(trips, flow)
     for moment in poses[::3]:
         assert overlaps(boxes_at(trips, moment)) == 0
     moved = np.hypot(*np.diff(poses[:, :, :2], axis=0).transpose(2, 0, 1))
-    assert np.nanmax(moved) < 13.9 * 1.1 * DT + 0.1
+    assert np.nanmax(moved) < 13.9 * 1.1 * STEP_S + 0.1
 
 
 def test_not_even_reckless_drivers_touch():
@@ -98,7 +98,9 @@ def test_not_even_reckless_drivers_touch():
     trips = vehicle_trips(lanes, surroundings_of(lanes, ego, radius=600.0, scale=1.0), seed=9, density=30.0)
     wild = [
         replace(
-            t, driver=replace(t.driver, headway=0.0, gap=0.0, brake=50.0, pull=4.0), wish=0 * t.wish + 16.0
+            t,
+            driver=replace(t.driver, headway=0.0, gap=0.0, deceleration=50.0, acceleration=4.0),
+            desired_speed=0 * t.desired_speed + 16.0,
         )
         for t in trips
     ]
@@ -114,18 +116,18 @@ def test_speed_changes_as_a_vehicle_can():
     trips, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=3, radius=600.0)
     for k in np.unique(flow.trip):
         speed = flow.speed[flow.trip == k]
-        change = np.diff(speed) / DT
-        assert change.max(initial=0.0) <= trips[k].driver.pull + 1e-6
+        change = np.diff(speed) / STEP_S
+        assert change.max(initial=0.0) <= trips[k].driver.acceleration + 1e-6
         assert change.min(initial=0.0) >= -HARD - 1e-6
         gone = np.diff(flow.gone[flow.trip == k])
-        np.testing.assert_allclose(gone, (speed[1:] + speed[:-1]) / 2 * DT, atol=0.02)
+        np.testing.assert_allclose(gone, (speed[1:] + speed[:-1]) / 2 * STEP_S, atol=0.02)
         assert (gone >= -1e-9).all()
 
 
 def test_braking_is_mild_almost_always():
     _, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=5, radius=600.0)
     same = np.diff(flow.trip) == 0
-    change = np.diff(flow.speed)[same] / DT
+    change = np.diff(flow.speed)[same] / STEP_S
     assert (change < -4.0).mean() < 0.01
     assert flow.speed.mean() > 2.0  # and yet they get on
 
@@ -137,7 +139,7 @@ def test_the_ego_is_never_touched(seed, lit):
     ego = driving(graph, seed, 30.0)
     trips, flow, _ = flow_on(graph, ego, seed=seed, radius=300.0)
     poses = tracks(trips, flow)
-    times = (np.arange(len(poses)) * DT * 1e9).astype(np.int64)
+    times = (np.arange(len(poses)) * STEP_S * 1e9).astype(np.int64)
     at = ego.at(times)
     forward = at.rotation[:, :2, 0]
     own = rectangles(
@@ -197,7 +199,7 @@ def test_nobody_enters_a_junction_on_red():
         for i in np.flatnonzero((np.diff(here) != 0) & (here[1:] >= 0)):
             z = int(here[i + 1])
             group = signal_group(plan, z, heading=float(trips[k].way.heading[front[i]]))
-            t = float(flow.step[rows][i + 1]) * DT
+            t = float(flow.step[rows][i + 1]) * STEP_S
             # green now or, for who was let in while it was, within amber and clearing
             lately = [is_green(z, group, t - ago, plan.signals) for ago in np.arange(0.0, AMBER, 0.5)]
             if i > 20:
