@@ -45,9 +45,13 @@ _POINTS = {"north": "n", "east": "e", "south": "s", "west": "w"}
 
 
 def _first(text: str) -> str:
+    """The first of a list of values, in lower case."""
+    return text.split(";", 1)[0].translate(_QUOTES).replace("''", '"').strip().lower()
+
+
+def _first_quantity(text: str) -> str:
     """The first of a list of values, in lower case, without "about"."""
-    value = text.split(";", 1)[0].translate(_QUOTES).replace("''", '"').strip().lower()
-    return _ABOUT.sub("", value)
+    return _ABOUT.sub("", _first(text))
 
 
 def _float(digits: str) -> float | None:
@@ -69,7 +73,7 @@ def parse_number(text: str | None) -> float | None:
     """A plain number ("3", "2.5", "2,5", the first of "3;4"), or None."""
     if text is None:
         return None
-    match = _PLAIN.match(_first(text))
+    match = _PLAIN.match(_first_quantity(text))
     return _float(match[1]) if match else None
 
 
@@ -82,7 +86,7 @@ def parse_length(text: str | None) -> float | None:
     """
     if text is None:
         return None
-    value = _first(text)
+    value = _first_quantity(text)
     if match := _FEET_INCHES.match(value):
         feet, inches = _float(match[1]), _float(match[2])
         if feet is None or inches is None or inches < 0:
@@ -99,7 +103,7 @@ def parse_direction(text: str | None) -> float | None:
     """Degrees clockwise from true north in [0, 360) of "135", "135°", "SE", "NNE", "north-west", or None."""
     if text is None:
         return None
-    value = _first(text).removesuffix("°").strip()
+    value = _first_quantity(text).removesuffix("°").strip()
     if match := _PLAIN.match(value):
         degrees = _float(match[1])
         return None if degrees is None else degrees % 360.0 % 360.0  # -1e-20 % 360 is 360

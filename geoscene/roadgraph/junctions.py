@@ -33,6 +33,8 @@ _BEND, _STEP = np.radians(1.0), 0.05
 _BENT, _SLANT = np.radians(30.0), 3.0
 # Neighbours closer to a straight line than this (radians) have no inner corner to round.
 _ROUNDED = np.radians(8.0)
+# Arms whose directions differ by less than this (radians) have the same direction.
+_ONE_DIRECTION = 1e-6
 
 _QUAD = 6
 """Segments of a quarter circle: 1.7 cm off a circle of 2 m, 5 cm off one of 6 m."""
@@ -232,9 +234,11 @@ def _tapers(roads: Carriageways, arms: _Arms, *, after: NDArray[np.int64]) -> ND
 def _corner(shapes: NDArray[np.object_], radius: Float) -> NDArray[np.object_]:
     """Shapes (c, s), some None, as one each, with inner corners rounded where the radius is not 0."""
     corner, nth = np.nonzero(~shapely.is_missing(shapes))
-    together = shapely.multipolygons(shapes[corner, nth], indices=corner)
-    grown = shapely.buffer(together, radius, quad_segs=_QUAD, join_style="mitre", mitre_limit=2.0)
-    closed: NDArray[np.object_] = shapely.buffer(grown, -radius, quad_segs=_QUAD)
+    parts, of = _parts(shapes[corner, nth], corner)
+    together = shapely.multipolygons(parts, indices=of)
+    with np.errstate(divide="ignore", invalid="ignore"):  # GEOS divides by tiny edges; its result is finite
+        grown = shapely.buffer(together, radius, quad_segs=_QUAD, join_style="mitre", mitre_limit=2.0)
+        closed: NDArray[np.object_] = shapely.buffer(grown, -radius, quad_segs=_QUAD)
     return closed
 
 
@@ -244,8 +248,12 @@ def _wedges(arms: _Arms, between: Float, *, reach: Float) -> NDArray[np.object_]
     angle = arms.angle[:, None] + between[:, None] * turn
     radius = (2.0 * reach + 60.0)[:, None]
     rim = arms.node_xy[:, None] + np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=2)
+    # Arms of one direction have no room between them, and all of it on their other sides.
     ring = np.concatenate([arms.node_xy[:, None], rim], axis=1)
+    around = between > 2 * np.pi - _ONE_DIRECTION
+    ring[around, 0] = rim[around, 0]
     wedges: NDArray[np.object_] = shapely.polygons(ring)
+    wedges[between < _ONE_DIRECTION] = shapely.Polygon()
     return wedges
 
 

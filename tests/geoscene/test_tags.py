@@ -99,7 +99,7 @@ def test_a_hex_colour_is_its_bytes(rgb):
     ("text", "expected"),
     [
         ("red", (255, 0, 0)), ("light grey", (211, 211, 211)), ("Dark_Red", (139, 0, 0)),
-        ("#fa0", (255, 170, 0)),
+        ("#fa0", (255, 170, 0)), ("ca0000", (202, 0, 0)), ("CA5", (204, 170, 85)), ("ca. 7 m", None),
         ("white;red", (255, 255, 255)), ("multicolour", None), ("#12", None), (None, None), ("", None),
     ],
 )  # fmt: skip

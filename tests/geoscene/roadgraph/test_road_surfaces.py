@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
@@ -220,6 +220,29 @@ def networks(draw):
     return places, ways, [(n, {"highway": draw(kinds)}) for n in range(4)]
 
 
+_ROAD_AND_BACK = {0: (33, 38), 3: (53, 6), 5: (20, -31)}
+_LOOP = {0: (0, 0), 2: (1, 0), 3: (1, 0), 5: (0, -1)}
+_TWO_NODES_AT_ONE_PLACE = {0: (1, 1), 3: (1, 0), 5: (1, 1), 6: (-1, 0)}
+_SHARP_LOOP = {0: (0, 1), 1: (1, 0), 3: (2, 0), 4: (2, 0), 5: (-2, 2)}
+
+
+@example((_ROAD_AND_BACK, [({"highway": "primary", "lanes": "3"}, [0, 3, 0, 5])], []))
+@example(({0: (0, 9), 3: (-6, 10), 5: (12, -16)}, [({"highway": "primary"}, [0, 3, 5, 3])], []))
+@example(
+    (
+        _LOOP,
+        [({"highway": "residential", "lanes": "5"}, [0, 3, 5, 0, 3]), ({"highway": "primary"}, [2, 0])],
+        [],
+    )
+)
+@example(
+    (
+        _TWO_NODES_AT_ONE_PLACE,
+        [({"highway": "residential", "lanes": "1"}, [5, 0, 3, 0]), ({"highway": "residential"}, [5, 6])],
+        [],
+    )
+)
+@example((_SHARP_LOOP, [({"highway": "track"}, [0, 3, 5, 0, 3]), ({"highway": "primary"}, [4, 1, 0])], []))
 @settings(max_examples=50, deadline=None)
 @given(networks())
 def test_whatever_the_network_polygons_are_valid_and_cover_their_lines(network):
@@ -232,7 +255,8 @@ def test_whatever_the_network_polygons_are_valid_and_cover_their_lines(network):
         for tags, nodes in ways
         if tags["highway"] != "footway" and "bridge" not in tags
     ]
-    covered = shapely.buffer(shapely.union_all(rows.polygon[rows.klass == Class.ROAD]), 0.01)
+    # Grown one by one: GEOS may return an invalid polygon for the buffer of a union with slivers at its rim.
+    covered = shapely.union_all(shapely.buffer(rows.polygon[rows.klass == Class.ROAD], 0.01))
     assert shapely.length(shapely.difference(shapely.union_all(roads), covered)) < 0.05
 
 
