@@ -82,15 +82,6 @@ def plan_view(points: Float, *, reach: float = REACH) -> PlanView:
     return PlanView(np.cumsum(length) - length, x, y, angle, length, curvature, ends)
 
 
-def cut(points: Float, start: float, *, end: float) -> Float:
-    """The polyline (n, 3) less ``start`` metres of plan at its beginning and ``end`` at its end."""
-    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(points[:, :2], axis=0).T)))
-    first, last = start, along[-1] - end
-    inside = (along > first + 1e-3) & (along < last - 1e-3)
-    marks = np.concatenate([[first], along[inside], [last]])
-    return np.column_stack([np.interp(marks, along, points[:, k]) for k in range(3)])
-
-
 @dataclass(frozen=True, slots=True)
 class Curve:
     """A cubic from one pose to another (OpenDRIVE paramPoly3, pRange normalized).

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.export.planview import Curve, PlanView, connecting_curve, cut, plan_view
+from geoscene import polylines
+from geoscene.export.planview import Curve, PlanView, connecting_curve, plan_view
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import turn_table
 from geoscene.typing import Float
@@ -96,7 +97,11 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
     A node where two roads of the same lanes meet within 0.05 degrees is a joint; any other where roads meet
     is a junction, with a way through for every turn that the graph permits (`routing.turn_table`).
     """
-    firsts = [k for k in range(len(graph)) if not 0 <= graph.twin[k] < k and _span(graph.geometry[k]) > 0.05]
+    firsts = [
+        k
+        for k in range(len(graph))
+        if not 0 <= graph.twin[k] < k and polylines.length(graph.geometry[k]) > 0.05
+    ]
     number = {edge: k for k, edge in enumerate(firsts)}
     road_of = np.array(
         [number.get(k, number.get(int(graph.twin[k]), -1)) for k in range(len(graph))], np.int64
@@ -126,18 +131,10 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
     return RoadNet(roads, road_of, junctions, connections, joints)
 
 
-def _span(line: Float) -> float:
-    return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
-
-
-def _direction(graph: RoadGraph, edge: int, *, end: int) -> float:
+def _leaving(graph: RoadGraph, edge: int, *, end: int) -> float:
     """Heading (radians) in which a road leaves the node at one of its ends."""
-    line = graph.geometry[edge][:, :2]
-    if end == END:
-        line = line[::-1]
-    far = np.flatnonzero(np.hypot(*(line - line[0]).T) > 1e-3)
-    dx, dy = line[far[0]] - line[0]
-    return float(np.arctan2(dy, dx))
+    line = graph.geometry[edge]
+    return polylines.end_headings(line if end == START else line[::-1], reach=1e-3)[0]
 
 
 def _angle(a: float, b: float) -> float:
@@ -159,7 +156,7 @@ def _joints(
             continue
         (a, end_a), (b, end_b) = met
         edge_a, edge_b = firsts[a], firsts[b]
-        away = _angle(_direction(graph, edge_a, end=end_a), _direction(graph, edge_b, end=end_b))
+        away = _angle(_leaving(graph, edge_a, end=end_a), _leaving(graph, edge_b, end=end_b))
         if np.pi - away > _STRAIGHT:
             continue
         turned = end_a == end_b  # one runs against the other
@@ -193,7 +190,7 @@ def _gaps(
     for node, met in ends.items():
         if not junctions[node]:
             continue
-        heading = [_direction(graph, firsts[k], end=end) for k, end in met]
+        heading = [_leaving(graph, firsts[k], end=end) for k, end in met]
         half = [graph.width[firsts[k]] / 2 for k, _ in met]
         for i, (k, end) in enumerate(met):
             need = _LEAST_GAP
@@ -201,7 +198,7 @@ def _gaps(
                 t = _angle(heading[i], heading[j])
                 if j != i and np.radians(5) < t < np.radians(170):
                     need = max(need, (half[j] + half[i] * np.cos(t)) / np.sin(t) + 1.0)
-            most = min(_MOST_GAP, _MOST_SHARE * _span(graph.geometry[firsts[k]]))
+            most = min(_MOST_GAP, _MOST_SHARE * polylines.length(graph.geometry[firsts[k]]))
             gaps[k, end] = min(need, most)
     return gaps
 
@@ -209,7 +206,9 @@ def _gaps(
 def _carriageway(graph: RoadGraph, edge: int, *, gap: Float) -> Carriageway:
     full = graph.geometry[edge]
     fresh = np.append(True, np.hypot(*np.diff(full[:, :2], axis=0).T) > 1e-3)
-    line = cut(full[fresh], float(gap[START]), end=float(gap[END]))
+    distinct = full[fresh]
+    end = polylines.stations(distinct)[-1] - float(gap[END])
+    line = polylines.cut(distinct, float(gap[START]), end=end, gap=1e-3)
     twin = int(graph.twin[edge])
     there, back = float(graph.lanes[edge]), float(graph.lanes[twin]) if twin >= 0 else 0.0
     shared = twin >= 0 and there % 1 > 0 and back % 1 > 0
@@ -219,7 +218,8 @@ def _carriageway(graph: RoadGraph, edge: int, *, gap: Float) -> Carriageway:
     count = ahead + behind + shared
     width = float(graph.width[edge]) / count
     return Carriageway(
-        edge, twin, line, plan_view(line[:, :2]), float(gap[START]), _span(full), width, ahead, behind,
+        edge, twin, line, plan_view(line[:, :2]), float(gap[START]), polylines.length(full), width,
+        ahead, behind,
         shared, width * (ahead + shared - behind) / 2,
     )  # fmt: skip
 

@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.classes import materials
 from geoscene.frames import Frame
 from geoscene.ground.layers import Layers
@@ -182,9 +183,9 @@ def _profiles(ways: Sequence[Way], frame: Frame, *, height: Height) -> tuple[Flo
             turned.append(way.osm_id)
         level = np.maximum(np.minimum.accumulate(ground), ground - _CUT)
         # Between stations the water falls evenly.
-        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(xy, axis=0).T)))
+        along = polylines.stations(xy)
         fine = np.linspace(0.0, along[-1], max(int(along[-1] / _FINE), 1) + 1)
-        stations.append(np.column_stack([np.interp(fine, along, column) for column in xy.T]))
+        stations.append(polylines.points_at(xy, fine, along=along))
         heights.append(np.interp(fine, along, level))
     return np.concatenate(stations), np.concatenate(heights), tuple(turned)
 

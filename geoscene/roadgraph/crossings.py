@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.frames import Frame
+from geoscene.polylines import directions
 from geoscene.roadgraph.carriageways import Carriageways
 from geoscene.roadgraph.junctions import carriageway
 from geoscene.roadgraph.paths import way_lines
@@ -146,13 +147,7 @@ def _from_nodes(osm: OsmData, ways: list[Way], *, roads: Carriageways, frame: Fr
     which, road = shapely.STRtree(roads.line).query_nearest(at, max_distance=0.5, all_matches=False)
     line = roads.line[road]
     along = shapely.line_locate_point(line, at[which])
-    a, b = (
-        shapely.get_coordinates(
-            shapely.line_interpolate_point(line, np.clip(along + step, 0.0, shapely.length(line)))
-        )
-        for step in (-1.0, 1.0)
-    )
-    ahead = (b - a) / np.maximum(np.hypot(*(b - a).T), 1e-9)[:, None]
+    ahead = directions(line, along, reach=1.0)
     across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) * (roads.width[road] / 2)[:, None]
     centre = shapely.get_coordinates(shapely.line_interpolate_point(line, along))
     ends = np.stack([centre - across, centre + across], axis=1)

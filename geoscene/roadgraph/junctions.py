@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.roadgraph.carriageways import KERB, Carriageways
 from geoscene.typing import Float
 
@@ -189,7 +190,7 @@ def _stubs(roads: Carriageways, arms: _Arms, *, length: Float) -> NDArray[np.obj
     lines = []
     for road, end, far in zip(arms.road.tolist(), arms.end.tolist(), length.tolist(), strict=True):
         xy = shapely.get_coordinates(roads.line[road])
-        lines.append(cut_line(xy[::-1] if end else xy, 0.0, end=far))
+        lines.append(polylines.cut(xy[::-1] if end else xy, 0.0, end=far))
     sizes = [len(line) for line in lines]
     stubs = shapely.linestrings(np.concatenate(lines), indices=np.repeat(np.arange(len(lines)), sizes))
     return carriageway(stubs, roads.width[arms.road] / 2)
@@ -201,15 +202,6 @@ def carriageway(lines: NDArray[np.object_], half: Float) -> NDArray[np.object_]:
         lines, half, cap_style="flat", join_style="mitre", mitre_limit=1.1
     )
     return bands
-
-
-def cut_line(xy: Float, start: float, *, end: float) -> Float:
-    """The part (k, 2 or 3) of a line between two distances along it in plan; at least its two ends."""
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy[:, :2], axis=0).T))])
-    start, end = max(start, 0.0), min(end, float(along[-1]))
-    inside = (along > start) & (along < end)
-    at = np.concatenate([[start], along[inside], [end]])
-    return np.stack([np.interp(at, along, column) for column in xy.T], axis=1)
 
 
 def _tapers(roads: Carriageways, arms: _Arms, *, after: NDArray[np.int64]) -> NDArray[np.object_]:

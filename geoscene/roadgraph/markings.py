@@ -6,10 +6,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.classes import Class
 from geoscene.roadgraph.carriageways import PAVED, Carriageways
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.junctions import cut_line, junction_reach
+from geoscene.roadgraph.junctions import junction_reach
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.typing import Float
@@ -48,7 +49,7 @@ def marking_rows(roads: Carriageways, edge: NDArray[np.int32], *, left_hand: boo
     for k, row in enumerate(rows.tolist()):
         xy = shapely.get_coordinates(streets.line[row])
         length = float(shapely.length(streets.line[row]))
-        lines[k] = shapely.linestrings(cut_line(xy, reach[row, 0], end=length - reach[row, 1]))
+        lines[k] = shapely.linestrings(polylines.cut(xy, reach[row, 0], end=length - reach[row, 1]))
 
     which, aside, dashed = _offsets(streets, rows, left_hand=left_hand)
     parallel = lines[which]
@@ -173,10 +174,10 @@ def _across(graph: RoadGraph, lines: list[tuple[int, float, str]], *, left_hand:
     shapes, edges = [], []
     for edge, place, kind in lines:
         xy = graph.geometry[edge][:, :2]
-        plan = float(np.hypot(*np.diff(xy, axis=0).T).sum())
+        plan = polylines.length(xy)
         at = place * plan / float(graph.length[edge])
-        bit = cut_line(xy, at - _STOP / 2, end=at + _STOP / 2)
-        ahead = (bit[-1] - bit[0]) / np.hypot(*(bit[-1] - bit[0]))
+        bit = polylines.cut(xy, at - _STOP / 2, end=at + _STOP / 2)
+        ahead = polylines.unit(bit[-1] - bit[0])
         left = np.array([-ahead[1], ahead[0]])
         twin = int(graph.twin[edge])
         share = graph.lanes[edge] / (graph.lanes[edge] + (graph.lanes[twin] if twin >= 0 else 0.0))

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from geoscene.polylines import directions, unit
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.stations import Stations
 from geoscene.typing import Float, Ints
@@ -74,7 +74,7 @@ def find_overlaps(
     keep = (edge != other) & (lap > _LAP) & (along > 0.01) & (along < length - 0.01)
     keep &= both | (graph.bridge[edge] & deep)
     way = _heading(stations, row)
-    theirs = _direction(lines[found], along, length=length)
+    theirs = directions(lines[found], along, reach=0.5)
     keep &= np.abs(way[:, 0] * theirs[:, 1] - way[:, 1] * theirs[:, 0]) < _PARALLEL
     row, edge, other, along, metres, length, both = (
         column[keep] for column in (row, edge, other, along, metres, length, both)
@@ -102,18 +102,7 @@ def _heading(stations: Stations, row: Ints) -> Float:
     ends = np.append(stations.edge[1:] != stations.edge[:-1], True)[row]
     a, b = np.where(ends, row - 1, row), np.where(ends, row, row + 1)
     step = stations.xy[stations.row[b]] - stations.xy[stations.row[a]]
-    way: Float = step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
-    return way
-
-
-def _direction(lines: NDArray[np.object_], along: Float, *, length: Float) -> Float:
-    """Unit vectors (k, 2) along lines at places on them."""
-    a, b = (
-        shapely.get_coordinates(shapely.line_interpolate_point(lines, np.clip(along + s, 0.0, length)))
-        for s in (-0.5, 0.5)
-    )
-    way: Float = (b - a) / np.maximum(np.hypot(*(b - a).T), 1e-9)[:, None]
-    return way
+    return unit(step)
 
 
 def _from_fork(

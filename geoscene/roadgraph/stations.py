@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Float, Ints
 
@@ -95,14 +96,14 @@ def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
     count = len(graph.node_id)
     for edge in once.tolist():
         xy = graph.geometry[edge][:, :2]
-        corner = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+        corner = polylines.stations(xy)
         pieces = np.maximum(np.ceil(np.diff(corner) / spacing), 1).astype(np.int64)
         first = np.repeat(np.arange(len(pieces)), pieces)
         part = np.arange(len(first)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         along = np.append(corner[first] + part * (np.diff(corner) / pieces)[first], corner[-1])
         inner = len(along) - 2
         rows.append(np.r_[graph.tail[edge], np.arange(count, count + inner), graph.head[edge]])
-        places.append(np.stack([np.interp(along[1:-1], corner, column) for column in xy.T], axis=1))
+        places.append(polylines.points_at(xy, along[1:-1], along=corner))
         edges.append(np.full(len(along), edge))
         alongs.append(along)
         drawns.append(np.append(part == 0, True))
@@ -150,9 +151,7 @@ def find_crossings(graph: RoadGraph, stations: Stations) -> tuple[Ints, Float, I
 def _heading(lines: NDArray[np.object_], along: Float) -> Float:
     step = np.minimum(1.0, shapely.length(lines) / 4)
     at = np.clip(along, step, shapely.length(lines) - step)
-    a, b = (shapely.get_coordinates(shapely.line_interpolate_point(lines, at + s)) for s in (-step, step))
-    way: Float = (b - a) / np.maximum(np.hypot(*(b - a).T), 1e-9)[:, None]
-    return way
+    return polylines.directions(lines, at, reach=step)
 
 
 def _cross(a: Float, b: Float) -> Float:

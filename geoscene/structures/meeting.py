@@ -10,9 +10,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.classes import Class, materials
 from geoscene.ground.layers import PADS, Layers, concatenate_layers
-from geoscene.roadgraph.junctions import cut_line
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
 from geoscene.typing import Float
@@ -95,7 +95,7 @@ def _strips(table: Structures, k: int) -> NDArray[np.object_]:
     reach = float(table.half[k]) + 5.0
     cuts = np.linspace(0.0, flat.length, max(int(np.ceil(flat.length / _STEP)), 1) + 1)
     strips = [
-        shapely.LineString(cut_line(table.line[k], a, end=b)[:, :2]).buffer(reach, cap_style="flat")
+        shapely.LineString(polylines.cut(table.line[k], a, end=b)[:, :2]).buffer(reach, cap_style="flat")
         for a, b in pairwise(cuts)
     ]
     rest = table.polygon[k].difference(shapely.union_all(strips))  # beyond the line's ends, as at bends

@@ -8,8 +8,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.junctions import cut_line
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.typing import Float
 
@@ -83,7 +83,7 @@ def road_members(graph: RoadGraph, raised: SurfaceRows) -> Members:
         landed[k] = [any(other == 0 for other, _, _ in found) for found in ends]
         bands = [
             _band(
-                np.concatenate([cut_line(inward[:, :2], 0.0, end=_SILL)[1:], first]),
+                np.concatenate([polylines.cut(inward[:, :2], 0.0, end=_SILL)[1:], first]),
                 max(width, graph.width[edge]),
             )
             for inward, found in zip((line[k], line[k][::-1]), ends, strict=True)
@@ -121,7 +121,7 @@ def _arms(graph: RoadGraph, members: NDArray[np.int64]) -> dict[int, list[tuple[
     arms: dict[int, list[tuple[int, Float, float]]] = {int(node): [] for node in ends}
     for node, step in ((graph.tail, 1), (graph.head, -1)):
         for edge in np.flatnonzero(np.isin(node, ends)).tolist():
-            line = cut_line(graph.geometry[edge][::step, :2], 0.0, end=_APPROACH)
+            line = polylines.cut(graph.geometry[edge][::step, :2], 0.0, end=_APPROACH)
             arms[int(node[edge])].append((_kind(graph, edge), line, float(graph.width[edge])))
     return arms
 

@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.classes import Class
-from geoscene.roadgraph.junctions import cut_line
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.structures.heights import PARTED, SHEET, foot
 from geoscene.structures.layered import PRECISION
@@ -106,11 +106,11 @@ def _outlines(
     whole, half = _wholes(members, lines, raised=raised, options=options)
     rows: list[tuple[int, object, Float, Float, float]] = []
     for m, line in enumerate(lines):
-        length = _length(line)
+        length = polylines.length(line)
         count = max(int(np.ceil(length / options.piece)), 1)
         cuts = np.linspace(0.0, length, count + 1)
         for k, (start, end) in enumerate(pairwise(cuts)):
-            part = _without_crumbs(cut_line(line, start, end=end))
+            part = _without_crumbs(polylines.cut(line, start, end=end))
             outline = whole[m]
             if count > 1:
                 reach = _flat(part).buffer(2 * half[m] + 5.0, cap_style="flat", join_style="mitre")
@@ -118,7 +118,7 @@ def _outlines(
                 discs = [shapely.Point(p[:2]).buffer(_SIDE / 2) for p in ends]
                 wedges = [shapely.Point(p[:2]).buffer(half[m] + 1.0) for p in (part[0], part[-1])]
                 outline = outline.intersection(shapely.union_all([reach, *discs, *wedges]))
-            rows.append((m, outline, part, cut_line(line, start - _AROUND, end=end + _AROUND), half[m]))
+            rows.append((m, outline, part, polylines.cut(line, start - _AROUND, end=end + _AROUND), half[m]))
     columns: NDArray[np.object_] = np.empty((3, len(rows)), object)
     for k, row in enumerate(rows):
         columns[0, k], columns[1, k], columns[2, k] = row[1:4]
@@ -170,10 +170,6 @@ def _flat(line: Float) -> shapely.LineString:
     return shapely.LineString(line[:, :2])
 
 
-def _length(line: Float) -> float:
-    return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
-
-
 def _without_crumbs(line: Float) -> Float:
     """A line (k, 3) less the vertices right beside its ends: caps of buffers would stand askew on them."""
     inner = line[1:-1]
@@ -220,7 +216,9 @@ def _inner(
         closed = whole.buffer(0.05, join_style="mitre").buffer(-0.05 - rim[k], join_style="mitre")
         # Where two are squeezed together so that a wall would stand in the middle of the road, there is none.
         wide = min(_VEHICLE, float(half[k]) / 2)
-        middle = _flat(cut_line(line[k], wide, end=_length(line[k]) - wide)).buffer(wide, cap_style="flat")
+        middle = _flat(polylines.cut(line[k], wide, end=polylines.length(line[k]) - wide)).buffer(
+            wide, cap_style="flat"
+        )
         inner[k] = _union([closed, middle]).intersection(polygon[k].buffer(1.0))
     return inner
 

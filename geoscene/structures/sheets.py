@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.roadgraph.junctions import cut_line
+from geoscene import polylines
 from geoscene.structures.heights import PARTED, SHEET, foot
 from geoscene.typing import Float
 
@@ -187,15 +187,15 @@ def _in_conflict(
 
 def _strip_cuts(line: Float) -> tuple[Float, Float]:
     """Metres along a line at which strips begin and end, and the middle (n, 3) of each strip."""
-    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T)))
+    along = polylines.stations(line)
     cuts = np.linspace(0.0, along[-1], max(int(np.ceil(along[-1] / _STRIP)), 1) + 1)
     at = (cuts[:-1] + cuts[1:]) / 2
-    return cuts, np.stack([np.interp(at, along, column) for column in line.T], axis=1)
+    return cuts, polylines.points_at(line, at, along=along)
 
 
 def _flat_part(line: Float, cuts: Float, *, k: int) -> shapely.LineString:
     """The line of a strip, which overlaps the next a little."""
-    return shapely.LineString(cut_line(line, cuts[k] - _LAP, end=cuts[k + 1] + _LAP)[:, :2])
+    return shapely.LineString(polylines.cut(line, cuts[k] - _LAP, end=cuts[k + 1] + _LAP)[:, :2])
 
 
 def _nearer(

@@ -19,12 +19,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import BlockedError, RouteError
 from lidar.planning.clearance import ASIDE, Line, Setting, pushes, turn_round, turns_at
 from lidar.planning.route import Route
-from lidar.planning.steering import Pose, Track, follow, line_heading, relaxed
+from lidar.planning.steering import Pose, Track, follow, relaxed
 from lidar.rig.vehicle import Vehicle
 
 Ground = Callable[[Float, Float], Float]
@@ -142,7 +143,7 @@ def _resampled(route: Route, spacing: float) -> Line:
     ends = [0, *(np.asarray(route.turns, int) + 1).tolist(), len(route.line)]
     for first, last in itertools.pairwise(ends):
         xyz = route.line[first:last]
-        s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))])
+        s = polylines.stations(xyz)
         keep = np.append(np.diff(s) > 1e-9, True)  # of points that coincide the last says what comes
         xyz, s = xyz[keep], s[keep]
         if len(s) < 2 or s[-1] < 2 * spacing:
@@ -151,7 +152,7 @@ def _resampled(route: Route, spacing: float) -> Line:
         index = np.arange(first, last)[keep][np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(s) - 1)]
         turn = np.zeros(len(at), bool)
         turn[-1] = last < len(route.line)
-        new = np.stack([np.interp(at, s, xyz[:, k]) for k in range(3)], axis=1)
+        new = polylines.points_at(xyz, at, along=s)
         parts.append(Line(new, route.edge[index], route.limit[index], route.free[index], turn))
     return Line(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Line)))
 
@@ -175,7 +176,7 @@ def _clear_track(line: Line, setting: Setting, *, pose: Pose | None) -> Track:
     middle = line.xyz[len(line.xyz) // 2]
     scale = float(setting.frame.scale_at(middle[0], middle[1]))
     base, gap = line.xyz[:, :2], line.gap
-    heading = gaussian_filter1d(line_heading(base), 2.0 / gap, mode="nearest")
+    heading = gaussian_filter1d(polylines.headings(base), 2.0 / gap, mode="nearest")
     left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
     shift = np.zeros(len(base))
     for _ in range(_REPAIRS):
@@ -234,7 +235,7 @@ def _joined(legs: list[Track], lines: list[Line], *, setting: Setting, ground: S
         s = start + np.concatenate([[0.0], np.cumsum(np.hypot(over, np.diff(z)))])
         start = float(s[-1])
         scale = np.asarray(setting.frame.scale_at(leg.xy[:, 0], leg.xy[:, 1]), float)
-        heading = line_heading(line.xyz[:, :2])[leg.row]
+        heading = polylines.headings(line.xyz[:, :2])[leg.row]
         d = leg.xy - line.xyz[leg.row, :2]
         parts.append(
             Path(
@@ -313,7 +314,7 @@ def _raw_heights(
 
     As the ground has them, or, without one, the line.
     """
-    heading = line_heading(line.xyz[:, :2])[leg.row]
+    heading = polylines.headings(line.xyz[:, :2])[leg.row]
     d = leg.xy - line.xyz[leg.row, :2]
     place = leg.row + (d[:, 0] * np.cos(heading) + d[:, 1] * np.sin(heading)) / line.gap
     # the last row may lie a little beyond the end of the line

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene import polylines
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import TurnStates, edge_lines, turn_states
@@ -23,6 +24,8 @@ Spec = str | Path | Sequence[tuple[float, float]]
 
 TOLERANCE = 50.0
 """Metres within which a waypoint must lie of a drivable street."""
+HEADING_REACH = 5.0
+"""Scene metres over which the heading of a street at a junction is taken."""
 U_TURN_S = 30.0
 """Seconds that turning round at a dead end costs in the search for the fastest way."""
 U_TURN = np.radians(150.0)
@@ -57,7 +60,7 @@ class Route:
     @property
     def length(self) -> float:
         """Scene metres of the line in plan."""
-        return float(np.hypot(*np.diff(self.line[:, :2], axis=0).T).sum())
+        return polylines.length(self.line)
 
 
 def plan_route(
@@ -125,23 +128,11 @@ def _need_streets(graph: RoadGraph) -> None:
 
 def turns_back(graph: RoadGraph, before: NDArray[Any], *, after: NDArray[Any]) -> NDArray[np.bool_]:
     """Whether (k,) going from one edge to the next turns the vehicle round: by `U_TURN` or more."""
-    leave, enter = _end_headings(graph)
+    ends = np.array([polylines.end_headings(line, reach=HEADING_REACH) for line in graph.geometry])
+    enter, leave = ends.reshape(-1, 2).T
     turn = np.abs((enter[after] - leave[before] + np.pi) % (2 * np.pi) - np.pi)
     back: NDArray[np.bool_] = (graph.twin[before] == after) | (turn > U_TURN)
     return back
-
-
-def _end_headings(graph: RoadGraph) -> tuple[Float, Float]:
-    """Headings (m,) in which each edge is left and entered, over its last and first five metres."""
-    out = np.empty((2, len(graph)))
-    for k, line in enumerate(graph.geometry):
-        xy = line[:, :2]
-        for row, part in enumerate((xy[::-1], xy)):
-            far = np.flatnonzero(np.hypot(*(part - part[0]).T) >= 5.0)
-            d = part[far[0] if len(far) else -1] - part[0]
-            d = -d if row == 0 else d
-            out[row, k] = np.arctan2(d[1], d[0])
-    return out[0], out[1]
 
 
 def permitted_turns(graph: RoadGraph, avoid: Collection[tuple[int, int]]) -> TurnStates:
@@ -264,31 +255,10 @@ def lane_offset(graph: RoadGraph, body_width: float) -> Float:
     return offset
 
 
-def _beside(line: Float, offset: float) -> Float:
-    """A line (k, 3) beside another, ``offset`` scene metres to its left, negative to its right."""
-    centre = shapely.linestrings(line[:, :2])
-    if offset == 0.0 or centre.length < 1e-6:
-        return line
-    moved = shapely.offset_curve(centre, offset, join_style="mitre", mitre_limit=2.0)
-    if moved.geom_type != "LineString" or moved.is_empty or moved.length < 0.5 * centre.length:
-        d = np.gradient(line[:, :2], axis=0)
-        unit = d / np.maximum(np.hypot(*d.T), 1e-9)[:, None]
-        return np.column_stack(
-            [line[:, :2] + offset * np.stack([-unit[:, 1], unit[:, 0]], axis=1), line[:, 2]]
-        )
-    xy = shapely.get_coordinates(moved)
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
-    z = np.interp(shapely.line_locate_point(centre, shapely.points(xy)), along, line[:, 2])
-    return np.column_stack([xy, z])
-
-
 def _cut(line: Float, begin: float, *, end: float) -> Float:
     """The part of a line (k, 3) between two shares of its length in plan."""
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
-    begin, end = begin * along[-1], end * along[-1]
-    inside = (along > begin) & (along < end)
-    at = np.concatenate([[begin], along[inside], [end]])
-    return np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
+    total = float(polylines.stations(line)[-1])
+    return polylines.cut(line, begin * total, end=end * total)
 
 
 def _meet(a: Float, b: Float, *, reach: float, change: float) -> tuple[Float, Float]:
@@ -297,10 +267,9 @@ def _meet(a: Float, b: Float, *, reach: float, change: float) -> tuple[Float, Fl
     Straight on, a lane that lies ``change`` metres further out than the other is left over five times that
     length. In a turn the lanes are cut where they cross, or extended to where they meet.
     """
-    u, v = a[-1, :2] - a[-2, :2], b[1, :2] - b[0, :2]
-    u, v = u / max(float(np.hypot(*u)), 1e-9), v / max(float(np.hypot(*v)), 1e-9)
+    u, v = polylines.unit(a[-1, :2] - a[-2, :2]), polylines.unit(b[1, :2] - b[0, :2])
     if abs(change) > _STEP and u @ v > _STRAIGHT:
-        long_a, long_b = (float(np.hypot(*np.diff(x[:, :2], axis=0).T).sum()) for x in (a, b))
+        long_a, long_b = polylines.length(a), polylines.length(b)
         taper = 2.5 * abs(change)
         return _cut(a, 0.0, end=max(1 - taper / long_a, 0.6)), _cut(b, min(taper / long_b, 0.4), end=1.0)
     one, two = shapely.linestrings(a[:, :2]), shapely.linestrings(b[:, :2])
@@ -341,7 +310,7 @@ def lane_route(
     offset = lane_offset(graph, body_width) * (-1.0 if side == "right" else 1.0)
     lanes: list[Float] = []
     for k, e in enumerate(order):
-        lane = _beside(graph.geometry[e], float(offset[e]))
+        lane = polylines.offset_curve(graph.geometry[e], float(offset[e]))
         whole = max(float(graph.length[e]), 1e-9)
         begin = min(max(ends[0] / whole, 0.0), 1.0) if k == 0 else 0.0
         end = min(max(ends[1] / whole, 0.0), 1.0) if k == len(order) - 1 else 1.0

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.typing import Float
 from lidar.rig.vehicle import Vehicle
 
@@ -61,29 +62,13 @@ def relaxed(xy: Float, cap: float, *, reach: float) -> Float:
     out = xy
     for _ in range(25):
         out = np.asarray(spsolve((bend + diags_array([weight], offsets=[0])).tocsc(), weight[:, None] * xy))
-        bad = np.abs(line_curvature(out)) > cap
+        bad = np.abs(polylines.curvatures(out)) > cap
         loose = np.hypot(*(out - xy).T) > 1.5 / cap
         if not (bad & ~loose).any():
             break
         near = maximum_filter1d((bad & ~loose).astype(np.uint8), 2 * math.ceil(1.0 / (cap * gap)) + 1) > 0
         weight = np.where(near, weight * 0.6, weight)
     return out
-
-
-def line_heading(xy: Float) -> Float:
-    """Unwrapped heading of a line at its points (n, 2)."""
-    d = np.gradient(xy, axis=0)
-    heading: Float = np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
-    return heading
-
-
-def line_curvature(xy: Float) -> Float:
-    """Curvature of a line at its points (n, 2), positive to the left."""
-    a, b = xy[1:-1] - xy[:-2], xy[2:] - xy[1:-1]
-    cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    dot = (a * b).sum(axis=1)
-    inner = 2.0 * np.arctan2(cross, dot) / np.maximum(np.hypot(*a.T) + np.hypot(*b.T), 1e-9)
-    return np.concatenate([inner[:1], inner, inner[-1:]])
 
 
 def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose | None = None) -> Track:
@@ -102,7 +87,7 @@ def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose
 
     most, rate = 1.0 / vehicle.turning_radius, vehicle.steering
     gap = float(np.mean(np.hypot(*np.diff(xy, axis=0).T)))
-    heading, bend = line_heading(xy), line_curvature(xy) * scale
+    heading, bend = polylines.headings(xy), polylines.curvatures(xy) * scale
     # the wheel starts to turn half its turning time ahead of the bend
     bend = gaussian_filter1d(bend, max(0.5 * most / rate / gap, 0.5), mode="nearest")
     length = 1.2 * most / rate

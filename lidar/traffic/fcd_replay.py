@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.scene import Scene
@@ -216,7 +217,7 @@ def _sampled(time: Float, middle: Float, *, yaw: Float, until: float) -> Float:
     for moment, offset in aside:
         u = np.clip((t - moment) / _CHANGE_S + 0.5, 0.0, 1.0)
         xy += (u**3 * (10 - 15 * u + 6 * u**2))[:, None] * offset
-    gone = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xy, axis=0).T))])
+    gone = polylines.stations(xy)
     return np.column_stack([step, xy, np.interp(t, time, yaw), gone])
 
 
@@ -282,11 +283,7 @@ def _hints(graph: RoadGraph, xy: Float, *, yaw: Float, foot: NDArray[np.bool_]) 
         return out
     along = shapely.line_locate_point(lines[edge], points[row])
     length = shapely.length(lines[edge])
-    a, b = (
-        shapely.get_coordinates(shapely.line_interpolate_point(lines[edge], np.clip(along + d, 0, length)))
-        for d in (-0.5, 0.5)
-    )
-    course = np.arctan2(*(b - a).T[::-1])
+    course = np.arctan2(*polylines.directions(lines[edge], along, reach=0.5).T[::-1])
     cost = shapely.distance(lines[edge], points[row])
     cost += np.where(foot[row], 0.0, _AGAINST / 2 * (1 - np.cos(yaw[row] - course)))
     solid = np.array([shapely.linestrings(line) for line in graph.geometry], object)

@@ -9,10 +9,12 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import turn_states
 from geoscene.typing import Float, Ints
-from lidar.planning.steering import line_curvature, line_heading, relaxed
+from lidar.planning.route import HEADING_REACH
+from lidar.planning.steering import relaxed
 
 STEP = 0.5
 """True metres between the stations of a way."""
@@ -75,9 +77,8 @@ def lanes_of(
     order = np.argsort(before, kind="stable")
     starts = np.searchsorted(before[order], np.arange(len(states) + 1))
     follow = [after[order[a:b]].astype(np.int64) for a, b in itertools.pairwise(starts)]
-    leave, enter = np.empty(len(graph)), np.empty(len(graph))
-    for k, line in enumerate(graph.geometry):
-        enter[k], leave[k] = _heading(line[:, :2], first=True), _heading(line[:, :2], first=False)
+    ends = [polylines.end_headings(line, reach=HEADING_REACH) for line in graph.geometry]
+    enter, leave = np.array(ends).reshape(-1, 2).T
     traffic_weight = np.array([_QUIET.get(str(kind), 1.0) for kind in graph.highway])
     leads_out = _at_edge(graph, bounds, end=graph.head, other=graph.tail)
     leads_in = _at_edge(graph, bounds, end=graph.tail, other=graph.head)
@@ -126,15 +127,6 @@ def _leading_on(before: Ints, after: Ints, *, leads_out: NDArray[np.bool_]) -> N
         if np.array_equal(further, leads_on):
             return leads_on
         leads_on = further
-
-
-def _heading(xy: Float, *, first: bool) -> float:
-    """Heading of a line over its first or last five metres."""
-    line = xy if first else xy[::-1]
-    far = np.flatnonzero(np.hypot(*(line - line[0]).T) >= 5.0)
-    d = line[far[0] if len(far) else -1] - line[0]
-    d = d if first else -d
-    return float(np.arctan2(d[1], d[0]))
 
 
 def turn(lanes: Lanes, a: int, *, b: int) -> float:
@@ -267,7 +259,7 @@ def path_along_lanes(
     parts, owner = [], []
     graph = lanes.graph
     lines = [
-        beside(
+        polylines.parallel(
             graph.geometry[e],
             -lanes.side * scale * lane_shift(lanes, e, lane=k, width=width, kerb=keeps_kerb),
         )
@@ -282,12 +274,12 @@ def path_along_lanes(
         parts += [line, joint]
         owner += [np.full(len(line), k), np.full(len(joint), k)]
     xyz, own = np.concatenate(parts), np.concatenate(owner)
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(xyz[:, :2], axis=0).T))])
+    along = polylines.stations(xyz)
     keep = np.concatenate([[True], np.diff(along) > 1e-6])
     xyz, own, along = xyz[keep], own[keep], along[keep]
     gap = STEP * scale
     at = np.arange(0.0, max(along[-1], 6 * gap), gap)
-    line = np.stack([np.interp(at, along, xyz[:, c]) for c in range(3)], axis=1)
+    line = polylines.points_at(xyz, at, along=along)
     row = own[np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(own) - 1)]
     edge, lane = np.asarray(edges, np.int64)[row], np.asarray(picked, np.int64)[row]
     return rounded(line, edge, lane=lane, limit=graph.speed[edge], radius=radius, scale=scale)
@@ -302,16 +294,14 @@ def rounded(line: Float, edge: Ints, *, lane: Ints, limit: Float, radius: float,
     gap = STEP * scale
     smooth = relaxed(line[:, :2], 0.95 / radius / scale, reach=0.45 * radius)
     # corners that were rounded are shorter: even spacing again
-    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(smooth, axis=0).T))])
+    length = polylines.stations(smooth)
     even = np.arange(0.0, length[-1], gap)
     near = np.clip(np.searchsorted(length, even), 0, len(line) - 1)
-    out = np.column_stack(
-        [*(np.interp(even, length, smooth[:, c]) for c in (0, 1)), np.interp(even, length, line[:, 2])]
-    )
+    out = polylines.points_at(np.column_stack([smooth, line[:, 2]]), even, along=length)
     return ActorPath(
         out,
-        line_heading(out[:, :2]),
-        line_curvature(out[:, :2]) * scale,
+        polylines.headings(out),
+        polylines.curvatures(out) * scale,
         edge[near],
         lane[near],
         limit[near],
@@ -319,29 +309,12 @@ def rounded(line: Float, edge: Ints, *, lane: Ints, limit: Float, radius: float,
     )
 
 
-def beside(line: Float, offset: float) -> Float:
-    """A line (k, 3) beside another, ``offset`` scene metres to its left, with mitred corners."""
-    d = np.diff(line[:, :2], axis=0)
-    size = np.hypot(*d.T)
-    d = d[size > 1e-9] / size[size > 1e-9, None]
-    keep = np.concatenate([[True], size > 1e-9])
-    if offset == 0.0 or not len(d):
-        kept: Float = line[keep]
-        return kept
-    normal = np.column_stack([-d[:, 1], d[:, 0]])
-    before, after = np.vstack([normal[:1], normal]), np.vstack([normal, normal[-1:]])
-    mitre = (before + after) / np.maximum(1 + (before * after).sum(axis=1), 0.5)[:, None]
-    moved: Float = line[keep].copy()
-    moved[:, :2] += offset * mitre
-    return moved
-
-
 def _joint(a: Float, b: Float, *, radius: float) -> tuple[Float, Float, Float]:
     """Two lanes cut back where they meet, and the curve (c, 3) between them."""
-    u, v = _unit(a[-1, :2] - a[-2, :2]), _unit(b[1, :2] - b[0, :2])
+    u, v = polylines.unit(a[-1, :2] - a[-2, :2]), polylines.unit(b[1, :2] - b[0, :2])
     gap = b[0, :2] - a[-1, :2]
     sine, cosine = float(u[0] * v[1] - u[1] * v[0]), float(u @ v)
-    long_a, long_b = _length(a), _length(b)
+    long_a, long_b = polylines.length(a), polylines.length(b)
     if abs(sine) > 0.25:
         on_a = (gap[0] * v[1] - gap[1] * v[0]) / sine  # metres beyond a's end to where the lanes cross
         on_b = (gap[0] * u[1] - gap[1] * u[0]) / sine  # metres after b's start
@@ -351,10 +324,10 @@ def _joint(a: Float, b: Float, *, radius: float) -> tuple[Float, Float, Float]:
     else:
         aside = abs(float(u[0] * gap[1] - u[1] * gap[0]))
         cut_a = cut_b = 0.0 if aside < 0.05 else max(4.0 * aside, 2.0) + max(-float(gap @ u), 0.0)
-    a = _within(a, 0.0, end=max(long_a - max(cut_a, 0.0), 0.55 * long_a))
-    b = _within(b, min(max(cut_b, 0.0), 0.45 * long_b), end=long_b)
+    a = polylines.cut(a, 0.0, end=max(long_a - max(cut_a, 0.0), 0.55 * long_a), gap=1e-6, least=1e-3)
+    b = polylines.cut(b, min(max(cut_b, 0.0), 0.45 * long_b), end=long_b, gap=1e-6, least=1e-3)
     p, q = a[-1], b[0]
-    u, v = _unit(a[-1, :2] - a[-2, :2]), _unit(b[1, :2] - b[0, :2])
+    u, v = polylines.unit(a[-1, :2] - a[-2, :2]), polylines.unit(b[1, :2] - b[0, :2])
     reach = float(np.hypot(*(q - p)[:2]))
     if reach < 0.2:
         return a, b, np.empty((0, 3))
@@ -363,21 +336,3 @@ def _joint(a: Float, b: Float, *, radius: float) -> tuple[Float, Float, Float]:
     p1, q1 = p[:2] + handle * u, q[:2] - handle * v
     xy = (1 - t) ** 3 * p[:2] + 3 * t * (1 - t) ** 2 * p1 + 3 * t**2 * (1 - t) * q1 + t**3 * q[:2]
     return a, b, np.column_stack([xy, p[2] + t * (q[2] - p[2])])
-
-
-def _unit(d: Float) -> Float:
-    unit: Float = d / max(float(np.hypot(*d)), 1e-9)
-    return unit
-
-
-def _length(line: Float) -> float:
-    return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
-
-
-def _within(line: Float, begin: float, *, end: float) -> Float:
-    """The part of a line between two lengths along it."""
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
-    inside = (along > begin + 1e-6) & (along < end - 1e-6)
-    at = np.concatenate([[begin], along[inside], [max(end, begin + 1e-3)]])
-    part: Float = np.stack([np.interp(at, along, line[:, k]) for k in range(3)], axis=1)
-    return part

@@ -9,10 +9,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.random_streams import generator
-from lidar.traffic.lanes import Lanes, beside, lane_shift
+from lidar.traffic.lanes import Lanes, lane_shift
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import standing, table
 from lidar.traffic.trips import random_shape
@@ -70,19 +71,19 @@ def kerb_spaces(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: floa
             out = max(float(g.width[e]) / 2 - 0.92 - 0.15, inner + _FREE + 0.92)
             if out > float(g.width[e]) / 2 + (_OVER if kind in _QUIET else -0.9):
                 continue
-            line = beside(g.geometry[e], -side * out)
-            along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+            line = polylines.parallel(g.geometry[e], -side * out)
+            along = polylines.stations(line)
             at = np.arange(4.0 + rng.uniform(0, 2.0), along[-1] - 4.0, 5.9)
             at = at + rng.uniform(-0.25, 0.25, len(at))
             at = at[rng.random(len(at)) < share]
-            d = [
-                np.interp(at + 0.5, along, line[:, c]) - np.interp(at - 0.5, along, line[:, c])
-                for c in (0, 1)
-            ]
+            d = polylines.points_at(line, at + 0.5, along=along) - polylines.points_at(
+                line, at - 0.5, along=along
+            )
             turned = np.pi if side != lanes.side else 0.0
-            xy.append(np.stack([np.interp(at, along, line[:, c]) for c in (0, 1)], axis=1))
-            heading.append(np.arctan2(d[1], d[0]) + turned + rng.normal(0.0, 0.012, len(at)))
-            hint.append(np.interp(at, along, line[:, 2]))
+            spots = polylines.points_at(line, at, along=along)
+            xy.append(spots[:, :2])
+            heading.append(np.arctan2(d[:, 1], d[:, 0]) + turned + rng.normal(0.0, 0.012, len(at)))
+            hint.append(spots[:, 2])
     if not xy:
         return ParkingSpaces(np.empty((0, 2)), np.empty(0), np.empty(0))
     return ParkingSpaces(np.concatenate(xy), np.concatenate(heading), np.concatenate(hint))

@@ -10,9 +10,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.typing import Float
 from lidar.random_streams import generator
-from lidar.traffic.lanes import STEP, ActorPath, Lanes, beside, rounded
+from lidar.traffic.lanes import STEP, ActorPath, Lanes, rounded
 from lidar.traffic.surroundings import Surroundings
 from lidar.traffic.trips import Driver, Trip, random_shape, random_stretch
 
@@ -73,9 +74,9 @@ def sidewalks_around(
             best: list[Float] = []
             for wide in _OUT:
                 aside = (float(g.width[e]) / 2 + wide) * area.scale
-                line = beside(g.geometry[e], side * aside)
+                line = polylines.parallel(g.geometry[e], side * aside)
                 pieces = _clear(line, pavement, tree=tree)
-                if sum(map(_plan, pieces)) > 1.3 * sum(map(_plan, best)):
+                if sum(map(polylines.length, pieces)) > 1.3 * sum(map(polylines.length, best)):
                     best = pieces
             out.line.extend(best)
             out.edge.extend([e] * len(best))
@@ -92,11 +93,7 @@ def _clear(line: Float, pavement: shapely.Geometry, *, tree: shapely.STRtree) ->
             whole = shapely.difference(whole, shapely.union_all(shapely.buffer(near, _ROOM)))
     parts = shapely.get_parts(shapely.intersection(whole, pavement))
     pieces = [shapely.get_coordinates(p, include_z=True) for p in parts if p.geom_type == "LineString"]
-    return [p for p in pieces if _plan(p) >= _PIECE]
-
-
-def _plan(line: Float) -> float:
-    return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
+    return [p for p in pieces if polylines.length(p) >= _PIECE]
 
 
 def pedestrian_trips(
@@ -108,7 +105,7 @@ def pedestrian_trips(
     """
     if not walks.line:
         return []
-    metres = np.array([_plan(line) for line in walks.line])
+    metres = np.array([polylines.length(line) for line in walks.line])
     crossings = _crossings(lanes, walks)
     names, chance = list(_KINDS), np.array(list(_KINDS.values()))
     trips = []
@@ -168,7 +165,7 @@ def _stroll(
     forwards, far = bool(rng.random() < 0.5), 0.0
     while far < metres or (over and over[-1][0] == len(parts) - 1):
         own = walks.line[walk]
-        end = _plan(own) - 0.7 if forwards else 0.7
+        end = polylines.length(own) - 0.7 if forwards else 0.7
         ahead = [c for c in crossings.get(walk, []) if min(begin, end) + 3.0 < c[1] < max(begin, end) - 1.0]
         taken = ahead[int(rng.integers(len(ahead)))] if ahead and rng.random() < 0.5 else None
         stop = end if taken is None else taken[1]
@@ -228,11 +225,11 @@ def _way(
     """The way along lines, and the stations between which it is on the crossings that follow some of them."""
     line = np.concatenate(parts)
     ends = np.cumsum([len(p) for p in parts])
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+    along = polylines.stations(line)
     gap = STEP * scale
     even = np.arange(0.0, along[-1], gap)
     keep = np.concatenate([[True], np.diff(along) > 1e-6])
-    points = np.stack([np.interp(even, along[keep], line[keep, c]) for c in range(3)], axis=1)
+    points = polylines.points_at(line[keep], even, along=along[keep])
     nowhere = np.full(len(even), -1, np.int64)
     way = rounded(
         points, nowhere, lane=nowhere, limit=np.full(len(even), np.inf), radius=_WALK.min_radius, scale=scale
@@ -254,8 +251,5 @@ def _nearest(way: ActorPath, point: Float, *, about: float) -> int:
 
 def _lane(line: Float, begin: float, *, end: float, side: int) -> Float:
     """A stretch of a sidewalk's line from one length along it to another, a little to one's own side."""
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
-    low, high = min(begin, end), max(begin, end)
-    at = np.concatenate([[low], along[(along > low) & (along < high)], [max(high, low + 0.1)]])
-    part = np.stack([np.interp(at, along, line[:, c]) for c in range(3)], axis=1)
-    return beside(part if end >= begin else part[::-1], -side * _LANE)
+    part = polylines.cut(line, min(begin, end), end=max(begin, end), least=0.1)
+    return polylines.parallel(part if end >= begin else part[::-1], -side * _LANE)

@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.errors import SceneFormatError
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
@@ -17,7 +18,7 @@ from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.junctions import JunctionPlan, junction_plan
-from lidar.traffic.lanes import Lanes, beside, lane_shift, lanes_of
+from lidar.traffic.lanes import Lanes, lane_shift, lanes_of
 from lidar.traffic.parked import CARS, concatenated, kerb_spaces, lot_spaces, parked_actors
 from lidar.traffic.pedestrians import pedestrian_trips, sidewalks_around
 from lidar.traffic.simulation import simulate_trips
@@ -255,7 +256,9 @@ def _swept(trips: list[Trip]) -> NDArray[np.object_]:
 def _strips(lanes: Lanes, area: Surroundings) -> NDArray[np.object_]:
     """Strips (k,) along the lanes around the ego, as wide as a car."""
     lines = [
-        beside(lanes.graph.geometry[e], -lanes.side * lane_shift(lanes, e, lane=lane, width=1.82))[:, :2]
+        polylines.parallel(
+            lanes.graph.geometry[e], -lanes.side * lane_shift(lanes, e, lane=lane, width=1.82)
+        )[:, :2]
         for e in np.flatnonzero(area.near & (lanes.traffic_weight > 0)).tolist()
         for lane in range(int(lanes.count[e]))
     ]
@@ -267,7 +270,7 @@ def _strips(lanes: Lanes, area: Surroundings) -> NDArray[np.object_]:
 
 def _ego_boxes(ego: Trajectory, vehicle: Vehicle, *, scale: float) -> NDArray[np.object_]:
     """Bounding boxes (k,) of the ego vehicle every metre of its trajectory, with a margin."""
-    moved = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ego.position[:, :2], axis=0).T))])
+    moved = polylines.stations(ego.position)
     rows = np.unique(np.searchsorted(moved, np.arange(0.0, moved[-1] + 1.0, 1.0)).clip(0, len(moved) - 1))
     poses = ego.at(ego.time_ns[rows])
     forward = poses.rotation[:, :2, 0]

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.typing import Float, Ints
@@ -298,9 +299,9 @@ def _stop_line(way: ActorPath, graph: RoadGraph, *, edge: int, station: int) -> 
     if not len(offset):
         return station
     line = graph.geometry[edge][:, :2]
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    along = polylines.stations(line)
     at = float(offset.min()) / max(float(graph.length[edge]), 1e-9) * along[-1]
-    point = np.array([np.interp(at, along, line[:, c]) for c in (0, 1)])
+    point = polylines.points_at(line, [at], along=along)[0]
     first = max(station - int(2 * _LINE_REACH / STEP), 0)
     distance = np.hypot(*(way.xyz[first : station + 1, :2] - point).T)
     return first + int(np.argmin(distance)) - int(_LINE_ROOM / STEP)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from geoscene.errors import InputError
 from geoscene.export import export_scene
-from geoscene.export.planview import connecting_curve, cut, plan_view
+from geoscene.export.planview import connecting_curve, plan_view
 from geoscene.roadgraph import write_graphml
 from geoscene.roadgraph.graph import rows_of
 from geoscene.roadgraph.routing import turn_table
@@ -275,8 +275,3 @@ def test_a_connecting_curve_is_near_an_arc_and_as_long_as_it_says(heading, turn,
     assert curve.length == pytest.approx(arc, rel=0.06)
     c, s = np.cos(heading), np.sin(heading)
     np.testing.assert_allclose([c * u[-1] - s * v[-1], s * u[-1] + c * v[-1]], end, atol=1e-9)
-
-
-def test_cutting_keeps_heights_in_place():
-    line = cut(np.array([[0, 0, 0], [10, 0, 1], [10, 30, 4.0]]), 5.0, end=10.0)
-    np.testing.assert_allclose(line, [[5, 0, 0.5], [10, 0, 1], [10, 20, 3]])

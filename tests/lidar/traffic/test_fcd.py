@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from pyproj import Transformer
 
 from geoscene.build import BuildOptions, build
+from geoscene.polylines import parallel
 from geoscene.sources import demo_path, read_osm
 from lidar.cli import app
 from lidar.errors import FormatError, InputError
@@ -18,7 +19,6 @@ from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.fcd import TrafficFile, read_fcd
 from lidar.traffic.fcd_replay import replay
 from lidar.traffic.ground import ground_heights
-from lidar.traffic.lanes import beside
 from lidar.world.actors import alive, rotations, states
 
 BOX = (24.9405, 60.1655, 24.9475, 60.1690)
@@ -44,7 +44,7 @@ def graph(scene):
 def street(scene, graph):
     """The middle of the right half of the longest level street, (n, 2) every metre."""
     for edge in np.argsort(-graph.length * (graph.twin >= 0)).tolist():
-        line = shapely.linestrings(beside(graph.geometry[edge], -graph.width[edge] / 4)[:, :2])
+        line = shapely.linestrings(parallel(graph.geometry[edge], -graph.width[edge] / 4)[:, :2])
         xy = shapely.get_coordinates(shapely.line_interpolate_point(line, np.arange(0.0, line.length - 1.0)))
         z = ground_heights(scene, np.column_stack([xy, np.zeros(len(xy))]))
         if np.abs(z).max() < 0.02 and (graph.geometry[edge][:, 2] == 0).all():

@@ -1,0 +1,127 @@
+"""Polylines as arrays of points (n, 2) or (n, 3): length, cutting, resampling, parallels, headings.
+
+Lengths, stations and offsets are measured in plan (x, y); heights are interpolated with the other columns.
+A station is the distance along the line from its first point.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from geoscene.typing import Float
+
+
+def length(line: Float) -> float:
+    """Length in plan."""
+    return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())
+
+
+def stations(line: Float) -> Float:
+    """Station (n,) of each point."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
+
+
+def points_at(line: Float, at: Float | list[float], *, along: Float | None = None) -> Float:
+    """Points (k, 2 or 3) of the line at stations (k,); beyond an end, that end.
+
+    along : stations of the line's points, where they are known already
+    """
+    known = stations(line) if along is None else along
+    return np.stack([np.interp(at, known, column) for column in line.T], axis=1)
+
+
+def cut(line: Float, start: float, *, end: float, gap: float = 0.0, least: float = 0.0) -> Float:
+    """The part (k, 2 or 3) of the line between two stations; at least its two ends.
+
+    An end before the start gives the two points alone.
+
+    gap   : vertices within this distance of the new ends are left out
+    least : smallest length of the part: its end moves on where it would be shorter
+    """
+    along = stations(line)
+    start, end = max(start, 0.0), min(max(end, start + least) if least else end, float(along[-1]))
+    inside = (along > start + gap) & (along < end - gap)
+    return points_at(line, np.concatenate([[start], along[inside], [end]]), along=along)
+
+
+def parallel(line: Float, offset: float) -> Float:
+    """The line (k, 3) moved by ``offset`` to its left vertex by vertex, with mitred corners.
+
+    Repeated points are left out. Loops that form inside tight bends stay; see `offset_curve`.
+    """
+    step = np.diff(line[:, :2], axis=0)
+    size = np.hypot(*step.T)
+    unit = step[size > 1e-9] / size[size > 1e-9, None]
+    keep = np.concatenate([[True], size > 1e-9])
+    moved: Float = line[keep].copy()
+    if offset == 0.0 or not len(unit):
+        return moved
+    normal = np.column_stack([-unit[:, 1], unit[:, 0]])
+    before, after = np.vstack([normal[:1], normal]), np.vstack([normal, normal[-1:]])
+    mitre = (before + after) / np.maximum(1 + (before * after).sum(axis=1), 0.5)[:, None]
+    moved[:, :2] += offset * mitre
+    return moved
+
+
+def offset_curve(line: Float, offset: float) -> Float:
+    """The line (k, 3) ``offset`` to the left without the loops inside bends; heights of the nearest place.
+
+    Where bends leave less than half of the line, its points are moved one by one instead.
+    """
+    centre = shapely.linestrings(line[:, :2])
+    if offset == 0.0 or centre.length < 1e-6:
+        return line
+    moved = shapely.offset_curve(centre, offset, join_style="mitre", mitre_limit=2.0)
+    if moved.geom_type != "LineString" or moved.is_empty or moved.length < 0.5 * centre.length:
+        d = np.gradient(line[:, :2], axis=0)
+        unit = d / np.maximum(np.hypot(*d.T), 1e-9)[:, None]
+        left = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
+        return np.column_stack([line[:, :2] + offset * left, line[:, 2]])
+    xy = shapely.get_coordinates(moved)
+    z = np.interp(shapely.line_locate_point(centre, shapely.points(xy)), stations(line), line[:, 2])
+    return np.column_stack([xy, z])
+
+
+def unit(vector: Float) -> Float:
+    """Unit vectors along vectors (..., 2); zero for zero."""
+    size: Float = np.maximum(np.hypot(vector[..., 0], vector[..., 1]), 1e-9)
+    return vector / size[..., None]
+
+
+def end_headings(line: Float, *, reach: float) -> tuple[float, float]:
+    """Headings, radians, in which the line begins and ends, over ``reach`` or up to its other end."""
+    found = []
+    for xy, sign in ((line[:, :2], 1.0), (line[::-1, :2], -1.0)):
+        far = np.flatnonzero(np.hypot(*(xy - xy[0]).T) >= reach)
+        dx, dy = sign * (xy[far[0] if len(far) else -1] - xy[0])
+        found.append(float(np.arctan2(dy, dx)))
+    return found[0], found[1]
+
+
+def headings(line: Float) -> Float:
+    """Unwrapped heading (n,) at each point, radians."""
+    d = np.gradient(line[:, :2], axis=0)
+    heading: Float = np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
+    return heading
+
+
+def curvatures(line: Float) -> Float:
+    """Curvature (n,) at each point, 1 / unit of length, positive to the left."""
+    xy = line[:, :2]
+    a, b = xy[1:-1] - xy[:-2], xy[2:] - xy[1:-1]
+    cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    dot = (a * b).sum(axis=1)
+    inner = 2.0 * np.arctan2(cross, dot) / np.maximum(np.hypot(*a.T) + np.hypot(*b.T), 1e-9)
+    return np.concatenate([inner[:1], inner, inner[-1:]])
+
+
+def directions(lines: NDArray[np.object_], at: Float, *, reach: ArrayLike) -> Float:
+    """Unit vectors (k, 2) along shapely lines (k,) at stations (k,), over ``reach`` before and behind."""
+    total = shapely.length(lines)
+    back, ahead = (
+        shapely.get_coordinates(shapely.line_interpolate_point(lines, np.clip(at + step, 0.0, total)))
+        for step in (-np.asarray(reach), np.asarray(reach))
+    )
+    return unit(ahead - back)

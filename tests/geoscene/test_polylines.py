@@ -1,0 +1,55 @@
+"""Polylines: what holds for every line, and the corner cases of cuts and parallels."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from geoscene import polylines
+
+
+@st.composite
+def lines(draw):
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    steps = rng.normal(size=(draw(st.integers(1, 8)), 3)) * draw(st.sampled_from([0.1, 1.0, 1e3]))
+    return np.cumsum(np.concatenate([[[0.0, 0.0, 0.0]], steps]), axis=0)
+
+
+@given(lines(), st.floats(0, 1), st.floats(0, 1))
+def test_a_cut_is_as_long_as_asked_and_lies_on_the_line(line, a, b):
+    total = polylines.length(line)
+    start, end = sorted((a * total, b * total))
+    part = polylines.cut(line, start, end=end)
+    assert polylines.length(part) == pytest.approx(end - start, abs=1e-9 * max(total, 1))
+    np.testing.assert_allclose(part[[0, -1]], polylines.points_at(line, [start, end]), atol=1e-9)
+
+
+@given(lines())
+def test_stations_of_a_lines_points_give_its_points(line):
+    np.testing.assert_allclose(polylines.points_at(line, polylines.stations(line)), line, atol=1e-9)
+    assert polylines.stations(line)[-1] == pytest.approx(polylines.length(line))
+
+
+def test_cutting_keeps_heights_in_place():
+    line = np.array([[0, 0, 0], [10, 0, 1], [10, 30, 4.0]])
+    np.testing.assert_allclose(polylines.cut(line, 5.0, end=30.0), [[5, 0, 0.5], [10, 0, 1], [10, 20, 3]])
+
+
+def test_a_cut_ends_within_the_line_has_a_least_length_and_leaves_out_vertices_near_its_ends():
+    line = np.array([[0.0, 0], [10, 0], [20, 0]])
+    np.testing.assert_allclose(polylines.cut(line, -5.0, end=99.0), line)
+    np.testing.assert_allclose(polylines.cut(line, 3.0, end=1.0, least=0.5), [[3, 0], [3.5, 0]])
+    np.testing.assert_allclose(polylines.cut(line, 9.99, end=15.0, gap=0.1), [[9.99, 0], [15, 0]])
+
+
+@pytest.mark.parametrize("moved", [polylines.parallel, polylines.offset_curve])
+def test_parallels_run_on_the_left_with_mitred_corners(moved):
+    line = np.array([[0, 0, 1], [10, 0, 2], [10, 10, 3.0]])
+    np.testing.assert_allclose(moved(line, 2.0), [[0, 2, 1], [8, 2, 1.8], [8, 10, 3]], atol=0.21)
+    np.testing.assert_allclose(moved(line, 2.0)[:, :2], [[0, 2], [8, 2], [8, 10]], atol=1e-9)
+
+
+def test_headings_of_ends_reach_over_short_segments():
+    line = np.array([[0, 0], [0, 0.1], [10, 0], [20, 0], [20, 10.0]])
+    first, last = polylines.end_headings(line, reach=5.0)
+    assert (first, last) == (0.0, np.pi / 2)
