@@ -18,8 +18,8 @@ from geoscene.scene import Scene
 from geoscene.watertight import degenerate_faces, validate_mesh
 
 
-def _meshes(
-    scene: Scene, layers: Collection[str] | None, *, stage: str, progress: Progress
+def meshes_of(
+    scene: Scene, layers: Collection[str] | None, *, stage: str = "", progress: Progress = silent
 ) -> Iterator[tuple[tuple[int, int], Mesh]]:
     """Index and mesh of each tile in scene metres, its copies expanded."""
     library = list(scene.shapes().values())
@@ -57,7 +57,7 @@ def write_obj(
     with whole_file(library) as colors, whole_file(path) as out:
         out.write("".join(f"# {line}\n" for line in _head(scene)).encode())
         out.write(f"mtllib {library.name}\n".encode())
-        for index, mesh in _meshes(scene, layers, stage="OBJ", progress=progress):
+        for index, mesh in meshes_of(scene, layers, stage="OBJ", progress=progress):
             out.write(_lines("v %.4f %.4f %.4f\n", mesh.vertices))
             for piece in pieces(mesh):
                 name = features.name(piece.feature)
@@ -113,7 +113,7 @@ def write_ply(
     vertices = faces = objects = 0
     with whole_file(path) as out, spool(path) as rest:
         out.write(_ply_head(scene, 0, faces=0))
-        for _, mesh in _meshes(scene, layers, stage="PLY", progress=progress):
+        for _, mesh in meshes_of(scene, layers, stage="PLY", progress=progress):
             out.write(mesh.vertices.astype("<f8").tobytes())
             rows = np.zeros(len(mesh), _FACE)
             rows["corners"] = 3
@@ -168,7 +168,7 @@ def write_stl(
     head = f"geoscene; add {middle[0] + east:.0f} {middle[1] + north:.0f} 0; {scene.frame.name}"
     with whole_file(path) as out:
         out.write(head.encode("ascii", "replace")[:80].ljust(80, b" ") + bytes(4))
-        for _, mesh in _meshes(scene, layers, stage="STL", progress=progress):
+        for _, mesh in meshes_of(scene, layers, stage="STL", progress=progress):
             mesh, lost = _in_single_precision(mesh.take(mesh.closed).shifted(-middle))  # noqa: PLW2901
             rows = np.zeros(len(mesh), row)
             rows["normal"] = mesh.normals()

@@ -107,7 +107,7 @@ def read_source(
     """
     known = sorted(source.name for source in SOURCES.values() if source.suffixes)
     if name not in known:
-        raise InputError(f"source {name}: of {', '.join(known)}")
+        raise InputError(f"`source` {name}: give one of {', '.join(known)}")
     found: OsmData = reader_of(name)(path, bounds=bounds, progress=progress)
     return found
 
