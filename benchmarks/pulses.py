@@ -111,16 +111,16 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
     from lidar.drive import Stopwatch, record_all, schedule  # noqa: PLC0415
     from lidar.geometry.georeference import Georeference, export_crs  # noqa: PLC0415
     from lidar.geometry.trajectory_csv import read_trajectory  # noqa: PLC0415
-    from lidar.physics.effects import effects_of  # noqa: PLC0415
     from lidar.rig.devices import scanners  # noqa: PLC0415
     from lidar.rig.specs import load_rig  # noqa: PLC0415
+    from lidar.settings import settings_of  # noqa: PLC0415
 
     imported, imported_cpu = time.perf_counter(), time.process_time()
     scene = open_scene(work / "scene")
     trajectory = read_trajectory(work / "trajectory.csv").until(round(seconds * 1e9))
     sensors = scanners(load_rig("vlp16"))
     geo = Georeference(scene.frame, export_crs(scene.frame))
-    effects = effects_of("standard", {"rays": str(rays)})
+    settings, _ = settings_of("standard", [("rays", str(rays))])
     watch = Stopwatch()
     recorder = Recorder(
         out,
@@ -128,7 +128,7 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
         trajectory=trajectory,
         start=_START,
         geo=geo,
-        contents=Contents(("las",), effects=effects),
+        contents=Contents(("las",), scanner=settings),
         watch=watch,
     )
     points = record_all(

@@ -120,7 +120,7 @@ def drive(
         draft (one pose a frame, exact ranges, no shadows), standard (a pose a pulse, exact ranges) or survey
         (beams with a size, several echoes, noise, lost and false returns; image noise).
     settings
-        One dial set apart from the level, NAME=VALUE; again for more. lidar settings lists them all.
+        One setting that differs from the level, NAME=VALUE; repeat for more. lidar settings lists them.
     traffic
         Other road users: on, or densities such as vehicles=20,parked=0.5,pedestrians=5,cyclists=2 (vehicles
         and cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places); or a
@@ -463,7 +463,7 @@ def sensors(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = Fa
 
 @app.command
 def settings(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False) -> int:
-    """List the dials of fidelity: their values at each level, and what they do.
+    """List the fidelity settings: their values at each level, and what they do.
 
     Parameters
     ----------
@@ -471,23 +471,20 @@ def settings(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = F
         Print them as JSON.
     """
     from lidar.rig.catalog import columns  # noqa: PLC0415
-    from lidar.settings import levels, list_dials  # noqa: PLC0415
+    from lidar.settings import levels, list_settings  # noqa: PLC0415
 
-    dials = list_dials()
+    rows = list_settings()
     if json:
-        rows = [
-            {"name": d.name, "of": d.of, **dict(zip(levels(), d.values, strict=True)), "meaning": d.meaning}
-            for d in dials
+        told = [
+            {"name": s.name, "of": s.of, **dict(zip(levels(), s.values, strict=True)), "meaning": s.meaning}
+            for s in rows
         ]
-        print_json({"settings": rows})
+        print_json({"settings": told})
         return 0
+    cells = [[s.name, s.of, *s.values, s.meaning] for s in rows]
+    print(columns([["name", "of", *levels(), "meaning"], *cells]))
     print(
-        columns(
-            [["name", "of", *levels(), "meaning"], *([d.name, d.of, *d.values, d.meaning] for d in dials)]
-        )
-    )
-    print(
-        "\nA level is chosen with --fidelity, one dial with --set NAME=VALUE. Options of their own: --exact"
+        "\n--fidelity takes a level, --set NAME=VALUE changes one setting. Separate options: --exact"
         "\n(the full projection for every point), --deskew, --crs; of scenes: geoscene build --lod, --dem,"
         "\n--along."
     )

@@ -13,7 +13,7 @@ from lidar.dataset.record import Contents
 from lidar.errors import InputError
 from lidar.planning.route import Side, Spec
 from lidar.rig.specs import load_rig, rig_digest
-from lidar.settings import dials_of
+from lidar.settings import settings_of
 from lidar.traffic.fcd import TrafficFile
 from lidar.traffic.populate import TrafficOptions
 
@@ -44,7 +44,7 @@ class DriveOptions:
     side       : side of the road, left or right; the scene's by default
     fidelity   : level of `lidar.settings.levels`: draft, standard or survey
     traffic    : other road users and parked cars, as densities or a file of SUMO; none by default
-    settings   : single dials set apart from the level, as (name, text)
+    settings   : single settings that differ from the level, as (name, text)
     workers    : threads
     """
 
@@ -92,8 +92,8 @@ class DriveOptions:
 
     def contents(self) -> Contents:
         """What is written of every frame; raises InputError for what cannot be."""
-        effects, dials = dials_of(self.fidelity, self.settings)
-        return Contents(self.formats, self.labels, self.deskew, self.seed, effects, dials)
+        scanner, camera = settings_of(self.fidelity, self.settings)
+        return Contents(self.formats, self.labels, self.deskew, self.seed, scanner, camera)
 
     def recipe(self, scene: Scene) -> dict[str, Any]:
         """What the dataset's bytes depend on, as JSON; of files their contents too."""

@@ -1,4 +1,4 @@
-"""The dials of fidelity: three levels set them together, names one by one."""
+"""Fidelity of a drive: a level sets all settings at once, a name and a value one of them."""
 
 from __future__ import annotations
 
@@ -8,24 +8,30 @@ from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from typing import Any
 
-from lidar.camera import dials
-from lidar.camera.dials import CameraDials
+from lidar.camera import settings as camera_settings
+from lidar.camera.settings import CameraSettings
 from lidar.errors import InputError
-from lidar.physics import effects
-from lidar.physics.effects import Effects
+from lidar.physics import settings as scanner_settings
 from lidar.physics.reflect import INCIDENCE_LAWS
+from lidar.physics.settings import ScannerSettings
 
-_WORDS = {"on": True, "yes": True, "true": True, "1": True}
-_WORDS |= {"off": False, "no": False, "false": False, "0": False}
+_SWITCH = {"on": True, "yes": True, "true": True, "1": True}
+_SWITCH |= {"off": False, "no": False, "false": False, "0": False}
+
+_CHOICES: dict[str, Iterable[object]] = {
+    "law": INCIDENCE_LAWS,
+    "rays": scanner_settings.FOOTPRINTS,
+    "range_noise": scanner_settings.NOISES,
+}
 
 
 @dataclass(frozen=True, slots=True)
-class Dial:
-    """One setting.
+class Setting:
+    """One setting as `list_settings` describes it.
 
-    name    : as in ``--set NAME=VALUE``
+    name    : field of `ScannerSettings` or `CameraSettings`
     of      : lidar or camera
-    values  : at each of `levels`
+    values  : as text, at each of `levels`
     meaning : one line
     """
 
@@ -36,25 +42,27 @@ class Dial:
 
 
 def levels() -> tuple[str, ...]:
-    """Names of the levels of fidelity, the cheapest first."""
-    return tuple(effects.LEVELS)
+    """Names of the fidelity levels, the cheapest first."""
+    return tuple(scanner_settings.LEVELS)
 
 
-def dials_of(level: str, given: Iterable[tuple[str, str]] = ()) -> tuple[Effects, CameraDials]:
-    """The dials of scanners and of cameras at a level, with some set apart by name and text.
+def settings_of(
+    level: str, changes: Iterable[tuple[str, str]] = ()
+) -> tuple[ScannerSettings, CameraSettings]:
+    """Settings of scanners and of cameras at a level, with single ones changed by name and text.
 
-    Values are numbers, words, or on/off, yes/no, true/false, 1/0. Raises InputError for a level, a name or a
-    value that is not known.
+    Values are numbers, words, or on/off, yes/no, true/false, 1/0. Raises InputError if a level, a name or a
+    value is unknown.
     """
-    if level not in effects.LEVELS:
+    if level not in scanner_settings.LEVELS:
         raise InputError(f"`fidelity` {level}: one of {', '.join(levels())}")
-    scanner, camera = effects.LEVELS[level], dials.LEVELS[level]
-    of_scanner, of_camera = ({f.name for f in fields(kind)} for kind in (Effects, CameraDials))
-    for name, text in given:
+    scanner, camera = scanner_settings.LEVELS[level], camera_settings.LEVELS[level]
+    of_scanner, of_camera = ({f.name for f in fields(kind)} for kind in (ScannerSettings, CameraSettings))
+    for name, text in changes:
         if name in of_scanner:
-            scanner = replace(scanner, **_one(name, text, of=scanner))
+            scanner = replace(scanner, **_parsed(name, text, former=getattr(scanner, name)))
         elif name in of_camera:
-            camera = replace(camera, **_one(name, text, of=camera))
+            camera = replace(camera, **_parsed(name, text, former=getattr(camera, name)))
         else:
             known = sorted(of_scanner | of_camera)
             near = get_close_matches(name, known, 3, 0.5)
@@ -63,56 +71,46 @@ def dials_of(level: str, given: Iterable[tuple[str, str]] = ()) -> tuple[Effects
     return scanner, camera
 
 
-def list_dials() -> list[Dial]:
+def list_settings() -> list[Setting]:
     """All settings, those of scanners first, with their values at each level."""
     found = []
-    for of, kind, table in (
-        ("lidar", Effects, effects.LEVELS),
-        ("camera", CameraDials, dials.LEVELS),
+    for of, kind, by_level in (
+        ("lidar", ScannerSettings, scanner_settings.LEVELS),
+        ("camera", CameraSettings, camera_settings.LEVELS),
     ):
-        said = _meanings(kind.__doc__ or "")
+        meanings = _meanings(kind.__doc__ or "")
         for f in fields(kind):
-            values = tuple(_shown(getattr(table[level], f.name)) for level in levels())
-            found.append(Dial(f.name, of, values, said.get(f.name, "")))
+            values = tuple(_text(getattr(by_level[level], f.name)) for level in levels())
+            found.append(Setting(f.name, of, values, meanings.get(f.name, "")))
     return found
 
 
-def _meanings(text: str) -> dict[str, str]:
-    """What a docstring says of each field: ``name : text``, which may go on in further, indented lines."""
-    entries = re.findall(r"^ {4}(\w+) *: (.+(?:\n {8,}\S.*)*)", text, re.MULTILINE)
-    known = {
-        "law": INCIDENCE_LAWS,
-        "rays": effects.FOOTPRINTS,
-        "range_noise": effects.NOISES,
-    }
-    out = {}
-    for name, said in entries:
-        text = re.sub(r",? of `[\w.]+`", "", said)
-        out[name] = re.sub(r"\s+", " ", text.replace("`", "")).strip()
-        if name in known:
-            out[name] += f" ({', '.join(map(str, known[name]))})"
-    return out
+def _meanings(docstring: str) -> dict[str, str]:
+    """Meaning of each field by its name: ``name : text``, which may continue in further, indented lines."""
+    meanings = {}
+    for name, entry in re.findall(r"^ {4}(\w+) *: (.+(?:\n {8,}\S.*)*)", docstring, re.MULTILINE):
+        text = re.sub(r",? of `[\w.]+`", "", entry)
+        meanings[name] = re.sub(r"\s+", " ", text.replace("`", "")).strip()
+        if name in _CHOICES:
+            meanings[name] += f" ({', '.join(map(str, _CHOICES[name]))})"
+    return meanings
 
 
-def _shown(value: object) -> str:
+def _text(value: object) -> str:
     if isinstance(value, bool):
         return "on" if value else "off"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _one(name: str, text: str, *, of: Effects | CameraDials) -> dict[str, Any]:
-    """A setting by its name, of the kind that the field has."""
-    kind = type(getattr(of, name))
-    return {name: _value(name, text, kind=kind)}
-
-
-def _value(name: str, text: str, *, kind: type) -> object:
+def _parsed(name: str, text: str, *, former: object) -> dict[str, Any]:
+    """A setting by its name, its text read as the type of its former value."""
+    kind: type = type(former)
     if kind is bool:
-        if text.lower() not in _WORDS:
-            raise InputError(f"`settings` {name}={text}: on or off is wanted")
-        return _WORDS[text.lower()]
+        if text.lower() not in _SWITCH:
+            raise InputError(f"`settings` {name}={text}: give on or off")
+        return {name: _SWITCH[text.lower()]}
     try:
-        return kind(text)
+        return {name: kind(text)}
     except ValueError:
         wanted = "a whole number" if kind is int else "a number"
-        raise InputError(f"`settings` {name}={text}: {wanted} is wanted") from None
+        raise InputError(f"`settings` {name}={text}: give {wanted}") from None

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.files import write_columns
 from geoscene.frames import Frame
-from lidar.camera.dials import PLAIN as SHARP
-from lidar.camera.dials import CameraDials
 from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
 from lidar.camera.render import Frame as Image
 from lidar.camera.render import exposure_times, optical_flow, render
+from lidar.camera.settings import PLAIN as PLAIN_CAMERA
+from lidar.camera.settings import CameraSettings
 from lidar.camera.sun import sun_direction
 from lidar.dataset.boxes import box_rows, count_points, image_boxes
 from lidar.dataset.deskew import MOMENTS, deskewed
@@ -35,7 +35,8 @@ from lidar.dataset.formats.text import write_csv
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Poses, Trajectory
-from lidar.physics.effects import PLAIN, Effects
+from lidar.physics.settings import PLAIN as PLAIN_SCANNER
+from lidar.physics.settings import ScannerSettings
 from lidar.random_streams import generator
 from lidar.rig.devices import Camera, Scanner
 from lidar.sensors.cloud import Cloud, no_returns
@@ -85,16 +86,16 @@ class Contents:
     labels  : of `LABELS`
     deskew  : moment, of `deskew.MOMENTS`, to which clouds are brought in files beside the raw ones
     seed    : of everything random
-    effects : of scanners
-    dials   : of cameras
+    scanner : settings of scanners
+    camera  : settings of cameras
     """
 
     formats: tuple[str, ...] = ("pcd",)
     labels: tuple[str, ...] = ()
     deskew: str = ""
     seed: int = 0
-    effects: Effects = PLAIN
-    dials: CameraDials = SHARP
+    scanner: ScannerSettings = PLAIN_SCANNER
+    camera: CameraSettings = PLAIN_CAMERA
 
     def __post_init__(self) -> None:
         """Refuse what cannot be written."""
@@ -215,7 +216,7 @@ class Recorder:
                 world=world,
                 frame=frame,
                 seed=wanted.seed,
-                effects=wanted.effects,
+                settings=wanted.scanner,
             )
         if self.on is None:
             return cloud
@@ -285,7 +286,7 @@ class Recorder:
             moving = surface_velocity(self.actors, cloud.feature, placed=placed, time_ns=time_ns)
         velocity = radial_velocity(cloud, scanner.spec.mount, trajectory=self.trajectory, moving=moving)
         sigma, wanted = scanner.sensor.velocity_sigma, self.contents
-        if sigma and wanted.effects.range_noise != "none":
+        if sigma and wanted.scanner.range_noise != "none":
             rng = generator(wanted.seed, scanner.name, frame, "velocity noise")
             velocity = velocity + np.float32(sigma) * rng.standard_normal(len(velocity), np.float32)
         return velocity
@@ -303,9 +304,9 @@ class Recorder:
             write_lidarseg(path, cloud.klass)
 
     def _record_images(self, camera: Camera, frame: int, *, worlds: Worlds) -> None:
-        spec, dials = camera.spec, self.contents.dials
+        spec, settings = camera.spec, self.contents.camera
         start = camera.frame_start_ns(frame)
-        samples = dials.moments(spec)
+        samples = settings.moments(spec)
         times = exposure_times(spec, start, samples=samples)
         end = max(int(times[-1]), start + 1)
         world = worlds.during(start, end)
@@ -318,7 +319,7 @@ class Recorder:
                 sun=self._sun(start),
                 times=None if self.actors is None else (times - start) / (end - start),
                 random=generator(self.contents.seed, camera.name, frame, "image"),
-                options=dials.options(spec),
+                options=settings.options(spec),
             )
         rows = len(times) // samples
         middle = (samples // 2) * rows + rows // 2

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, EchoesT, Origin
-from lidar.physics.effects import Effects
 from lidar.physics.link import amplitude, apparent_of, daylight_noise, false_alarm_probability
 from lidar.physics.measure import quantised, signal_sigma, stretch_sigma, walk
 from lidar.physics.reflect import RETRO
+from lidar.physics.settings import ScannerSettings
 from lidar.random_streams import generator
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
@@ -27,27 +27,27 @@ _BLOOM_POWER = 0.01  # of the retro-reflector's power, assumed
 _OVERLAP = 5e-5  # probability that another scanner's pulse enters a shot, typical value (1e-5 to 1e-4)
 
 
-def received(sensor: Sensor, echoes: Echoes, *, effects: Effects) -> Float:
+def received(sensor: Sensor, echoes: Echoes, *, settings: ScannerSettings) -> Float:
     """Power over threshold of each echo."""
     return amplitude(
         echoes.apparent,
         echoes.range + sensor.pattern.range_offset,
         reference_reflectance=sensor.reference_reflectance,
         reference_range=sensor.reference_range,
-        extinction=effects.extinction,
+        extinction=settings.extinction,
     )
 
 
-def detected(sensor: Sensor, echoes: EchoesT, *, effects: Effects, deviates: Deviates) -> EchoesT:
+def detected(sensor: Sensor, echoes: EchoesT, *, settings: ScannerSettings, deviates: Deviates) -> EchoesT:
     """The echoes that pass the threshold, with the apparent reflectance that the sensor measures.
 
     With ``detection``, noise is added to each echo's power before it meets the threshold, which gives the
     probability of `lidar.physics.link.detection_probability`, and is part of the measured reflectance.
     """
-    power = received(sensor, echoes, effects=effects)
+    power = received(sensor, echoes, settings=settings)
     measured = power
-    if effects.detection:
-        noise = daylight_noise(sensor.noise_ratio, effects.daylight_lux)
+    if settings.detection:
+        noise = daylight_noise(sensor.noise_ratio, settings.daylight_lux)
         measured = power + noise * deviates("detection", echoes)
     seen = measured > 1
     apparent = echoes.apparent * measured / np.maximum(power, 1e-300)
@@ -55,24 +55,24 @@ def detected(sensor: Sensor, echoes: EchoesT, *, effects: Effects, deviates: Dev
 
 
 def false_echoes(
-    sensor: Sensor, pulses: Firings, *, echoes: Echoes, effects: Effects, seed: int, frame: int
+    sensor: Sensor, pulses: Firings, *, echoes: Echoes, settings: ScannerSettings, seed: int, frame: int
 ) -> list[tuple[Origin, Echoes]]:
     """Echoes of no surface, by origin: blooming, pulses of other scanners, noise over the threshold.
 
     Each entry has at most one echo a pulse.
     """
     found: list[tuple[Origin, Echoes]] = []
-    if effects.blooming:
+    if settings.blooming:
         rng = generator(seed, sensor.name, frame, "blooming")
         found.append((Origin.RECEIVER, _blooming(pulses, echoes, rng=rng)))
-    if effects.interference:
+    if settings.interference:
         rng = generator(seed, sensor.name, frame, "interference")
-        pulse = np.flatnonzero(rng.random(len(pulses)) < 1 - (1 - _OVERLAP) ** effects.interference)
+        pulse = np.flatnonzero(rng.random(len(pulses)) < 1 - (1 - _OVERLAP) ** settings.interference)
         power = 100 ** rng.random(len(pulse))  # log-uniform over two decades, assumed
         found.append((Origin.INTERFERENCE, _anywhere(sensor, pulse, power=power, rng=rng)))
-    if effects.false_alarms:
+    if settings.false_alarms:
         rng = generator(seed, sensor.name, frame, "false alarms")
-        noise = daylight_noise(sensor.noise_ratio, effects.daylight_lux)
+        noise = daylight_noise(sensor.noise_ratio, settings.daylight_lux)
         chance = false_alarm_probability(noise, sensor.max_range - sensor.min_range)
         pulse = np.flatnonzero(rng.random(len(pulses)) < chance)
         # Beyond a high threshold the tail of a Gaussian falls like an exponential.
@@ -128,24 +128,30 @@ def _blooming(pulses: Firings, echoes: Echoes, *, rng: np.random.Generator) -> E
 
 
 def measured_range(
-    sensor: Sensor, pulses: Firings, *, echoes: Echoes, effects: Effects, seed: int, deviates: Deviates
+    sensor: Sensor,
+    pulses: Firings,
+    *,
+    echoes: Echoes,
+    settings: ScannerSettings,
+    seed: int,
+    deviates: Deviates,
 ) -> Float:
     """Ranges (m,) as the sensor reports them, metres."""
     distance = echoes.range + sensor.pattern.range_offset
-    if effects.bias:
+    if settings.bias:
         lasers = int(pulses.channel.max()) + 1
         error = generator(seed, sensor.name, "bias").normal(0, sensor.bias_sigma, lasers)
         distance = distance + error[pulses.channel[echoes.pulse]]
-    if effects.walk or effects.range_noise == "signal":
-        power = np.maximum(received(sensor, echoes, effects=effects), 1.0)
-        if effects.walk:
+    if settings.walk or settings.range_noise == "signal":
+        power = np.maximum(received(sensor, echoes, settings=settings), 1.0)
+        if settings.walk:
             distance = distance + walk(power)
-    if effects.range_noise != "none":
+    if settings.range_noise != "none":
         sigma: Float = np.full(len(echoes), sensor.range_sigma)
-        if effects.range_noise == "signal":
+        if settings.range_noise == "signal":
             sigma = np.hypot(sigma, signal_sigma(power))
         distance = distance + sigma * deviates("range noise", echoes)
-    if effects.stretch and effects.rays == 1:
+    if settings.stretch and settings.rays == 1:
         width = stretch_sigma(echoes.range, echoes.cosine, divergence=sensor.divergence[1])
         distance = distance + width * deviates("stretch", echoes)
-    return quantised(distance, sensor.range_quantum) if effects.quantise else distance
+    return quantised(distance, sensor.range_quantum) if settings.quantise else distance

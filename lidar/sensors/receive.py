@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from geoscene.classes import materials
 from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, gather, insert
-from lidar.physics.effects import Effects
 from lidar.physics.fresnel import glint
 from lidar.physics.reflect import INCIDENCE_LAWS, RETRO, apparent, reflectance_table, sent_back
+from lidar.physics.settings import ScannerSettings
 from lidar.random_streams import normal_of
 from lidar.raycast import Hits
 from lidar.world.world import Faces, World
@@ -57,19 +57,19 @@ class Look:
 
     world         : what is seen
     wavelength_nm : of the light
-    effects, seed : how surfaces differ and how they send light back
+    settings, seed : how surfaces differ and how they send light back
     """
 
-    def __init__(self, world: World, wavelength_nm: float, *, effects: Effects, seed: int) -> None:
-        self.world, self.effects = world, effects
+    def __init__(self, world: World, wavelength_nm: float, *, settings: ScannerSettings, seed: int) -> None:
+        self.world, self.settings = world, settings
         self.faces: Faces = world.faces
         reflectance, specular = reflectance_table(wavelength_nm)
         shiny = np.zeros(256, np.bool_)
-        shiny[list(shiny_codes())] = effects.mirrors
+        shiny[list(shiny_codes())] = settings.mirrors
         factor = np.empty(0)
-        if effects.spread:
-            factor = _factors(self.faces.low, self.faces.high, spread=effects.spread, seed=seed)
-        law = INCIDENCE_LAWS.index(effects.law)
+        if settings.spread:
+            factor = _factors(self.faces.low, self.faces.high, spread=settings.spread, seed=seed)
+        law = INCIDENCE_LAWS.index(settings.law)
         self.optics = Optics(reflectance, specular, factor, self.faces.low, law, shiny)
 
     def at(self, hits: Hits) -> tuple[Echoes, NDArray[np.uint8]]:
@@ -80,8 +80,8 @@ class Look:
         if len(optics.factor):
             one_off = rho * optics.factor[np.maximum(found.feature - optics.low, 0)]
             rho = np.where(rho > RETRO, one_off, np.minimum(one_off, RETRO))
-        back = apparent(rho, cosine, specular=optics.specular[found.material], law=self.effects.law)
-        if self.effects.mirrors:
+        back = apparent(rho, cosine, specular=optics.specular[found.material], law=self.settings.law)
+        if self.settings.mirrors:
             water = np.flatnonzero(found.material == shiny_codes()[1])
             back[water] = glint(cosine[water])
         n = len(hits.range)
@@ -110,7 +110,7 @@ class Receiver:
         """
         n = len(hits.range)
         self._make_room(n)
-        start, shiny = self._count, np.empty((2, n if self._look.effects.mirrors else 0), np.int32)
+        start, shiny = self._count, np.empty((2, n if self._look.settings.mirrors else 0), np.int32)
         echoes = self._columns.take(slice(start, start + n))
         count, met = _receive(
             (hits.range, hits.face, hits.instance, hits.cosine),

@@ -13,9 +13,9 @@ from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.physics.echoes import Echoes, TracedEchoes, joined, numbered, reported, traced
-from lidar.physics.effects import PLAIN, Effects
 from lidar.physics.intensity import reflectivity_code
 from lidar.physics.returns import Deviates, detected, false_echoes, measured_range, received
+from lidar.physics.settings import PLAIN, ScannerSettings
 from lidar.random_streams import generator
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
@@ -30,7 +30,7 @@ from lidar.world.world import World
 class Sweep:
     """One frame before the detector: the pulses, and the echoes that reach the receiver.
 
-    seed, effects : of the detector
+    seed, settings : of the detector
     firings : the pulses as the sensor reports them
     sent    : the pulses as they were sent: with noise of their direction
     echoes  : sorted by pulse and range
@@ -39,7 +39,7 @@ class Sweep:
     sensor: Sensor
     frame: int
     seed: int
-    effects: Effects
+    settings: ScannerSettings
     firings: Firings
     sent: Firings
     echoes: Echoes
@@ -68,7 +68,7 @@ def scan(
     world: World,
     frame: int,
     seed: int = 0,
-    effects: Effects = PLAIN,
+    settings: ScannerSettings = PLAIN,
     threads: int = 1,
 ) -> Cloud:
     """The returns of frame ``frame`` of the drive, in the order they were fired.
@@ -85,7 +85,7 @@ def scan(
         world=world,
         frame=frame,
         seed=seed,
-        effects=effects,
+        settings=settings,
         threads=threads,
     )
     return report(sweep, detect(sweep, sweep.echoes, deviates=deviates_of(sweep)))
@@ -99,32 +99,32 @@ def cast(
     world: World,
     frame: int,
     seed: int = 0,
-    effects: Effects = PLAIN,
+    settings: ScannerSettings = PLAIN,
     threads: int = 1,
 ) -> Sweep:
     """The pulses of a frame and their echoes, before the detector; parameters as of `scan`."""
     firings = fire(sensor, frame)
-    if not effects.motion:
+    if not settings.motion:
         firings = replace(firings, time_ns=np.full_like(firings.time_ns, firings.time_ns[0]))
     sent = firings
-    if effects.angle_noise:
+    if settings.angle_noise:
         sent = _unsteady(firings, sensor, rng=generator(seed, sensor.name, frame, "angle"))
     echoes = met(
         sent,
         mount,
         trajectory=trajectory,
         world=world,
-        beam=beam_of(effects.rays, divergence=sensor.divergence, aperture=sensor.aperture),
+        beam=beam_of(settings.rays, divergence=sensor.divergence, aperture=sensor.aperture),
         far=sensor.max_range - sensor.pattern.range_offset,
         wavelength_nm=sensor.wavelength_nm,
         separation=sensor.echo_separation,
         time=_ray_time(sensor, frame, pulses=firings) if _moving(world) else None,
-        effects=effects,
+        settings=settings,
         seed=seed,
         leaf_seed=int(generator(seed, sensor.name, frame, "foliage").integers(2**63)),
         threads=threads,
     )
-    return Sweep(sensor, frame, seed, effects, firings, sent, echoes)
+    return Sweep(sensor, frame, seed, settings, firings, sent, echoes)
 
 
 def deviates_of(sweep: Sweep) -> Deviates:
@@ -144,26 +144,26 @@ def detect(sweep: Sweep, echoes: Echoes, *, deviates: Deviates) -> Detection:
              ones, the k-th kind of false echo of pulse p gets the source m + k n + p, where the sweep has m
              echoes and n pulses
     """
-    sensor, effects, offset = sweep.sensor, sweep.effects, sweep.sensor.pattern.range_offset
+    sensor, settings, offset = sweep.sensor, sweep.settings, sweep.sensor.pattern.range_offset
     echoes = echoes.where(echoes.range + offset >= sensor.min_range)
-    if effects.link or effects.detection:
-        echoes = detected(sensor, echoes, effects=effects, deviates=deviates)
+    if settings.link or settings.detection:
+        echoes = detected(sensor, echoes, settings=settings, deviates=deviates)
     false = false_echoes(
-        sensor, sweep.firings, echoes=echoes, effects=effects, seed=sweep.seed, frame=sweep.frame
+        sensor, sweep.firings, echoes=echoes, settings=settings, seed=sweep.seed, frame=sweep.frame
     )
     is_traced = isinstance(echoes, TracedEchoes)
     for k, (origin, found) in enumerate(false):
         first = len(sweep.echoes) + k * len(sweep.firings)
         echoes = joined(echoes, traced(found, origin, source=first + found.pulse) if is_traced else found)
     number, count = numbered(echoes)
-    if effects.rays > 1 or effects.mirrors or false or is_traced:
-        power = received(sensor, echoes, effects=effects)
+    if settings.rays > 1 or settings.mirrors or false or is_traced:
+        power = received(sensor, echoes, settings=settings)
         rows = reported(
             echoes, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
         )
         echoes, number, count = echoes.take(rows), number[rows], np.minimum(count[rows], sensor.max_echoes)
     distance = measured_range(
-        sensor, sweep.firings, echoes=echoes, effects=effects, seed=sweep.seed, deviates=deviates
+        sensor, sweep.firings, echoes=echoes, settings=settings, seed=sweep.seed, deviates=deviates
     )
     keep = (distance >= sensor.min_range) & (distance <= sensor.max_range)
     return Detection(echoes.where(keep), distance[keep], number[keep], count[keep])
@@ -176,7 +176,7 @@ def report(sweep: Sweep, detection: Detection) -> Cloud:
     n = len(pulse)
     xyz, time = np.empty((n, 3), np.float32), np.empty(n, np.int32)
     _place(pulse, detection.range - offset, pulses.origin, pulses.direction, pulses.time_ns, xyz, time)
-    code = reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code, whole=sweep.effects.quantise)
+    code = reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code, whole=sweep.settings.quantise)
     real = echoes.true_range > 0
     return Cloud(
         start_ns=start,

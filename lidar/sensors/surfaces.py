@@ -12,8 +12,8 @@ from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.physics.echoes import Echoes, joined, merged
-from lidar.physics.effects import Effects
 from lidar.physics.fresnel import mirrored, pane_reflection, surface_reflection
+from lidar.physics.settings import ScannerSettings
 from lidar.raycast import Hits
 from lidar.rig.patterns.beams import Firings
 from lidar.sensors.foliage import Leaves
@@ -37,7 +37,7 @@ def met(
     wavelength_nm: float,
     separation: float,
     time: NDArray[np.float32] | None,
-    effects: Effects,
+    settings: ScannerSettings,
     seed: int,
     leaf_seed: int = 0,
     threads: int = 1,
@@ -51,10 +51,10 @@ def met(
     """
     rays = len(beam)
     batch = max(_BATCH // rays, 1)
-    look = Look(world, wavelength_nm, effects=effects, seed=seed)
+    look = Look(world, wavelength_nm, settings=settings, seed=seed)
     carrier = Carrier(pulses, mount, trajectory=trajectory, beam=beam, batch=batch)
     receiver = Receiver(look, beam.share, separation=separation, pulses=len(pulses))
-    leaves = Leaves(world.caster, world.faces, far, leaf_seed) if effects.foliage else None
+    leaves = Leaves(world.caster, world.faces, far, leaf_seed) if settings.foliage else None
     beyond: list[Echoes] = []
     for number, first in enumerate(range(0, len(pulses), batch)):
         cast = carrier.rays(number)

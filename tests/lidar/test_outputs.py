@@ -468,7 +468,7 @@ def test_a_drive_that_goes_on_counts_all_of_its_points(scene, rig, recorded, tmp
                 drive(scene, tmp_path / "ply", options=replace(options, formats=("csv",), seed=12))
 
 
-def test_dials_of_cameras_are_reached_and_leave_truth_as_it_is(scene, rig, tmp_path):
+def test_settings_of_cameras_are_reached_and_leave_truth_as_it_is(scene, rig, tmp_path):
     options = replace(OPTIONS, rig=rig, duration=0.3, traffic=None, formats=("pcd",), labels=(), deskew="")
     changes = {
         "plain": {},

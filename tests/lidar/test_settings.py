@@ -1,4 +1,4 @@
-"""Dials of fidelity, and what is listed of them."""
+"""Fidelity levels and settings, and what is listed of them."""
 
 import json
 import re
@@ -8,13 +8,13 @@ from dataclasses import fields
 
 import pytest
 
-from lidar.camera.dials import CameraDials
+from lidar.camera.settings import CameraSettings
 from lidar.errors import InputError
-from lidar.physics.effects import Effects
+from lidar.physics.settings import ScannerSettings
 from lidar.rig.catalog import rig_rows, sensor_rows
 from lidar.rig.scanner import load_sensor, sensor_names
 from lidar.rig.specs import load_rig, rig_names
-from lidar.settings import dials_of, levels, list_dials
+from lidar.settings import levels, list_settings, settings_of
 
 
 def program(*words, cwd=None):
@@ -23,14 +23,16 @@ def program(*words, cwd=None):
     )
 
 
-def test_every_dial_is_listed_with_its_value_at_each_level_and_a_meaning():
-    dials = list_dials()
-    assert [d.name for d in dials] == [f.name for kind in (Effects, CameraDials) for f in fields(kind)]
-    for dial in dials:
-        assert len(dial.values) == len(levels()) == 3
-        assert len(dial.meaning) > 10
-        assert "\n" not in dial.meaning
-    by_name = {d.name: d for d in dials}
+def test_every_setting_is_listed_with_its_value_at_each_level_and_a_meaning():
+    found = list_settings()
+    assert [s.name for s in found] == [
+        f.name for kind in (ScannerSettings, CameraSettings) for f in fields(kind)
+    ]
+    for setting in found:
+        assert len(setting.values) == len(levels()) == 3
+        assert len(setting.meaning) > 10
+        assert "\n" not in setting.meaning
+    by_name = {s.name: s for s in found}
     assert by_name["rays"].values == ("1", "1", "19")
     assert by_name["camera_noise"].values == ("off", "off", "on")
     assert "oren-nayar" in by_name["law"].meaning
@@ -38,8 +40,8 @@ def test_every_dial_is_listed_with_its_value_at_each_level_and_a_meaning():
 
 def test_each_listed_value_can_be_set_and_comes_back():
     for k, level in enumerate(levels()):
-        pairs = [(d.name, d.values[k]) for d in list_dials()]
-        assert dials_of("standard", pairs) == dials_of(level)
+        pairs = [(s.name, s.values[k]) for s in list_settings()]
+        assert settings_of("standard", pairs) == settings_of(level)
 
 
 @pytest.mark.parametrize(
@@ -54,9 +56,9 @@ def test_each_listed_value_can_be_set_and_comes_back():
         ("best", [], "draft, standard, survey"),
     ],
 )
-def test_dials_that_cannot_be_are_named_with_what_is_near(level, given, says):
+def test_unknown_settings_are_named_with_similar_ones(level, given, says):
     with pytest.raises(InputError, match=re.escape(says)) as error:
-        dials_of(level, given)
+        settings_of(level, given)
     assert "\n" not in str(error.value)
 
 

@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from geoscene.classes import materials
 from lidar.errors import InputError
 from lidar.physics.echoes import Echoes, joined, merged, numbered, reported
-from lidar.physics.effects import LEVELS, PLAIN, Effects, effects_of
 from lidar.physics.footprint import bundle, ring_energy
 from lidar.physics.fresnel import WATER, fresnel, glint, mirrored, pane_reflection, surface_reflection
 from lidar.physics.intensity import reflectivity_code
@@ -21,7 +20,9 @@ from lidar.physics.link import (
 )
 from lidar.physics.measure import quantised, signal_sigma, stretch_sigma, walk
 from lidar.physics.reflect import apparent, reflectance_table
+from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.random_streams import generator, normal_of
+from lidar.settings import settings_of
 
 OS0 = {"reference_reflectance": 0.8, "reference_range": 50.0}
 
@@ -299,9 +300,9 @@ def test_normals_of_numbers_are_normal_and_independent():
 
 
 def test_levels_and_settings():
-    assert effects_of() == PLAIN == Effects()
-    assert effects_of("survey") == LEVELS["survey"]
-    chosen = effects_of("survey", {"rays": "7", "mirrors": "off", "spread": "0.1"})
+    assert settings_of("standard")[0] == PLAIN == ScannerSettings()
+    assert settings_of("survey")[0] == LEVELS["survey"]
+    chosen = settings_of("survey", [("rays", "7"), ("mirrors", "off"), ("spread", "0.1")])[0]
     assert (chosen.rays, chosen.mirrors, chosen.spread, chosen.bias) == (7, False, 0.1, True)
     for level, values, word in [
         ("best", {}, "draft, standard, survey"),
@@ -313,4 +314,4 @@ def test_levels_and_settings():
         ("standard", {"law": "cosine"}, "lambert"),
     ]:
         with pytest.raises(InputError, match=word):
-            effects_of(level, values)
+            settings_of(level, values.items())

@@ -8,8 +8,8 @@ from helpers.sensor_worlds import box, driven, plate, world
 
 from geoscene.classes import Class, materials
 from lidar.geometry.mounts import Mount
-from lidar.physics.effects import Effects
 from lidar.physics.fresnel import pane_reflection
+from lidar.physics.settings import ScannerSettings
 from lidar.rig.scanner import firings, load_sensor
 from lidar.sensors.scan import scan
 
@@ -21,7 +21,7 @@ def wall(distance=20.0, **options):
     return world(plate(distance, **options))
 
 
-def seen(name, scene, effects, *, frame=0, seed=1, **options):
+def seen(name, scene, settings, *, frame=0, seed=1, **options):
     return scan(
         load_sensor(name, **options),
         HERE,
@@ -29,17 +29,17 @@ def seen(name, scene, effects, *, frame=0, seed=1, **options):
         world=scene,
         frame=frame,
         seed=seed,
-        effects=effects,
+        settings=settings,
     )
 
 
 def test_link_ends_where_the_root_of_reflectance_says():
     """VLP-16: 10 % at 50 m; a brick wall of 40 % is seen to 100 m * sqrt(cos), grazing parts not."""
-    cloud = seen("vlp16", wall(40.0, material="brick"), Effects(link=True))
+    cloud = seen("vlp16", wall(40.0, material="brick"), ScannerSettings(link=True))
     rho = materials()["brick"].reflectance[0]
     longest = 50 * np.sqrt(rho * np.cos(cloud.incidence) / 0.1)
     assert (cloud.range <= longest * (1 + 1e-4)).all()
-    plain = seen("vlp16", wall(40.0, material="brick"), Effects())
+    plain = seen("vlp16", wall(40.0, material="brick"), ScannerSettings())
     beyond = plain.range > 50 * np.sqrt(rho * np.cos(plain.incidence) / 0.1)
     assert len(plain) - len(cloud) == pytest.approx(np.count_nonzero(beyond), abs=2)
     assert beyond.any()
@@ -53,7 +53,16 @@ def test_detection_follows_the_data_sheet_in_a_scan():
         scene = world(plate(at * 50 * np.sqrt(reflectance / 0.8), half=1.5, material="brick"))
         plain, kept = (
             sum(
-                len(scan(sensor, HERE, trajectory=STILL, world=scene, frame=k, effects=Effects(detection=on)))
+                len(
+                    scan(
+                        sensor,
+                        HERE,
+                        trajectory=STILL,
+                        world=scene,
+                        frame=k,
+                        settings=ScannerSettings(detection=on),
+                    )
+                )
                 for k in range(8)
             )
             for on in (False, True)
@@ -63,23 +72,23 @@ def test_detection_follows_the_data_sheet_in_a_scan():
 
 
 def test_constant_noise_has_the_presets_deviation():
-    cloud = seen("vlp16", wall(), Effects(range_noise="constant"))
+    cloud = seen("vlp16", wall(), ScannerSettings(range_noise="constant"))
     error = cloud.range - cloud.true_range
     assert error.mean() == pytest.approx(0, abs=5e-4)
     assert error.std() == pytest.approx(0.01, rel=0.05)
-    assert np.array_equal(cloud.true_range, seen("vlp16", wall(), Effects()).range)
+    assert np.array_equal(cloud.true_range, seen("vlp16", wall(), ScannerSettings()).range)
 
 
 def test_noise_of_dim_targets_is_larger():
     for material, rho in (("plaster", 0.75), ("tyre", 0.04)):
-        cloud = seen("vlp16", wall(30.0, half=8.0, material=material), Effects(range_noise="signal"))
+        cloud = seen("vlp16", wall(30.0, half=8.0, material=material), ScannerSettings(range_noise="signal"))
         power = rho / 0.1 * (50 / 30) ** 2
         expected = np.hypot(0.01, 0.09 / np.sqrt(2 * power))
         assert np.std(cloud.range - cloud.true_range) == pytest.approx(expected, rel=0.1)
 
 
 def test_bias_belongs_to_the_laser_and_stays():
-    first, later = (seen("vlp16", wall(), Effects(bias=True), frame=k) for k in (0, 4))
+    first, later = (seen("vlp16", wall(), ScannerSettings(bias=True), frame=k) for k in (0, 4))
     errors = []
     for cloud in (first, later):
         error = cloud.range - cloud.true_range
@@ -90,7 +99,7 @@ def test_bias_belongs_to_the_laser_and_stays():
 
 
 def test_quantisation_gives_whole_steps_and_codes():
-    cloud = seen("vlp16", wall(), Effects(quantise=True))
+    cloud = seen("vlp16", wall(), ScannerSettings(quantise=True))
     assert np.abs(cloud.range / 0.002 - np.round(cloud.range / 0.002)).max() < 1e-6
     assert np.abs(cloud.range - cloud.true_range).max() <= 0.001 + 1e-12
     assert (cloud.intensity == np.round(cloud.intensity)).all()
@@ -105,7 +114,7 @@ def test_angle_noise_is_not_seen_in_the_angles_but_in_the_ranges():
             trajectory=STILL,
             world=scene,
             frame=0,
-            effects=Effects(angle_noise=on),
+            settings=ScannerSettings(angle_noise=on),
         )
         for on in (False, True)
     )
@@ -123,7 +132,7 @@ def test_false_alarms_come_at_the_computed_rate():
     """In bright daylight noise passes the threshold often enough to be counted."""
     lux = 30_000.0
     nothing = world(box((500, 500, 500), (501, 501, 501)))
-    cloud = seen("vlp16", nothing, Effects(false_alarms=True, daylight_lux=lux))
+    cloud = seen("vlp16", nothing, ScannerSettings(false_alarms=True, daylight_lux=lux))
     noise = 0.18 * np.sqrt(1 + lux / 20_000)
     gates = (100.0 - 0.5) / 0.3
     expected = len(firings(load_sensor("vlp16"), 0)) * gates * 0.5 * erfc(1 / (np.sqrt(2) * noise))
@@ -135,7 +144,7 @@ def test_false_alarms_come_at_the_computed_rate():
 
 def test_interference_grows_with_the_number_of_others():
     nothing = world(box((500, 500, 500), (501, 501, 501)))
-    few, many = (len(seen("vlp16", nothing, Effects(interference=m))) for m in (100, 1000))
+    few, many = (len(seen("vlp16", nothing, ScannerSettings(interference=m))) for m in (100, 1000))
     pulses = len(firings(load_sensor("vlp16"), 0))
     assert few == pytest.approx(pulses * 100 * 5e-5, rel=0.4)
     assert many == pytest.approx(pulses * (1 - (1 - 5e-5) ** 1000), rel=0.15)
@@ -150,7 +159,7 @@ def edge(depth):
 
 
 def test_a_beam_across_a_low_step_gives_one_point_between():
-    cloud = seen("vlp16", edge(0.4), Effects(rays=61))
+    cloud = seen("vlp16", edge(0.4), ScannerSettings(rays=61))
     x = cloud.xyz[:, 0]
     mixed = (x > 10.02) & (x < 10.38)
     assert mixed.any()
@@ -158,11 +167,11 @@ def test_a_beam_across_a_low_step_gives_one_point_between():
     # Its label and true range are those of the surface on the beam's axis.
     on_axis = np.where(cloud.xyz[mixed, 1] > 0, 1, 2)
     assert np.mean(cloud.feature[mixed] == on_axis) > 0.95
-    assert not ((seen("vlp16", edge(0.4), Effects()).xyz[:, 0] - 10.2) ** 2 < 0.18**2).any()
+    assert not ((seen("vlp16", edge(0.4), ScannerSettings()).xyz[:, 0] - 10.2) ** 2 < 0.18**2).any()
 
 
 def test_a_beam_across_a_high_step_gives_two_echoes():
-    cloud = seen("vlp16", edge(3.0), Effects(rays=61), return_mode="dual")
+    cloud = seen("vlp16", edge(3.0), ScannerSettings(rays=61), return_mode="dual")
     pair = cloud.echoes == 2
     assert pair.any()
     assert set(cloud.echo[pair]) == {1, 2}
@@ -173,7 +182,7 @@ def test_a_beam_across_a_high_step_gives_two_echoes():
 
 
 def test_a_footprint_on_a_flat_wall_changes_little():
-    clouds = [seen("vlp16", wall(20.0), Effects(rays=rays)) for rays in (1, 19)]
+    clouds = [seen("vlp16", wall(20.0), ScannerSettings(rays=rays)) for rays in (1, 19)]
     near = [c.true_range < 80 for c in clouds]
     off = [(c.range - c.true_range)[n] for c, n in zip(clouds, near, strict=True)]
     code = [c.intensity[n] for c, n in zip(clouds, near, strict=True)]
@@ -191,7 +200,7 @@ def test_glass_lets_through_and_mirrors():
         plate(15.0, feature=2),
         plate(-10.0, feature=3),
     )
-    cloud = seen("lms511", scene, Effects(mirrors=True), return_mode="all")
+    cloud = seen("lms511", scene, ScannerSettings(mirrors=True), return_mode="all")
     ahead = np.abs(np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])) < np.radians(5)
     x, feature = cloud.xyz[ahead, 0], cloud.feature[ahead]
     for number, place in ((1, 5.0), (2, 15.0), (3, 20.0)):
@@ -205,7 +214,7 @@ def test_glass_lets_through_and_mirrors():
     share = pane_reflection(1.0)
     assert cloud.intensity[middle & (cloud.feature == 2)] == pytest.approx(rho * (1 - share) ** 2, rel=1e-3)
     assert cloud.intensity[middle & (cloud.feature == 3)] == pytest.approx(rho * share**2, rel=1e-3)
-    blocked = seen("lms511", scene, Effects(), return_mode="all")
+    blocked = seen("lms511", scene, ScannerSettings(), return_mode="all")
     assert 3 not in blocked.feature
 
 
@@ -221,7 +230,7 @@ def test_water_mirrors_the_far_bank_and_glints_below():
         trajectory=STILL,
         world=pond,
         frame=0,
-        effects=Effects(mirrors=True, link=True),
+        settings=ScannerSettings(mirrors=True, link=True),
     )
     ghosts = cloud.klass == Class.NOISE
     assert ghosts.any()
@@ -229,7 +238,12 @@ def test_water_mirrors_the_far_bank_and_glints_below():
     assert not (cloud.klass == Class.WATER).any()  # at 15 degrees and less nothing comes straight back
     down = Mount((0.0, 0.0, 30.0), (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)))
     below = scan(
-        load_sensor("mid40"), down, trajectory=STILL, world=pond, frame=0, effects=Effects(mirrors=True)
+        load_sensor("mid40"),
+        down,
+        trajectory=STILL,
+        world=pond,
+        frame=0,
+        settings=ScannerSettings(mirrors=True),
     )
     water = below.klass == Class.WATER
     assert below.intensity[water & (below.incidence < 0.05)].min() > 5 * np.median(
@@ -239,9 +253,9 @@ def test_water_mirrors_the_far_bank_and_glints_below():
 
 def test_a_retro_reflector_saturates_and_blooms():
     sign = world(box((20, -0.5, -0.5), (20.1, 0.5, 0.5), feature=4, material="retroreflector"))
-    plain = seen("vlp16", sign, Effects())
+    plain = seen("vlp16", sign, ScannerSettings())
     assert plain.intensity.min() > 200
-    bloomed = seen("vlp16", sign, Effects(blooming=True))
+    bloomed = seen("vlp16", sign, ScannerSettings(blooming=True))
     false = bloomed.klass == Class.NOISE
     assert false.any()
     assert np.abs(bloomed.xyz[false, 0] - 20).max() < 0.2
@@ -251,8 +265,8 @@ def test_a_retro_reflector_saturates_and_blooms():
 
 def test_spread_belongs_to_the_object():
     scene = world(*(box((10, y, -5), (10.1, y + 1, 5), feature=y + 20) for y in range(-20, 20)))
-    cloud = seen("vlp16", scene, Effects(spread=0.2))
-    plain = seen("vlp16", scene, Effects())
+    cloud = seen("vlp16", scene, ScannerSettings(spread=0.2))
+    plain = seen("vlp16", scene, ScannerSettings())
     ratio = cloud.intensity / plain.intensity
     each = [ratio[plain.feature == f] for f in np.unique(plain.feature)]
     assert all(np.ptp(r) < 1e-4 for r in each)
@@ -260,6 +274,6 @@ def test_spread_belongs_to_the_object():
 
 
 def test_fog_dims_far_things_more():
-    clear, foggy = (seen("vlp16", wall(40.0), Effects(link=True, extinction=a)) for a in (0.0, 0.02))
+    clear, foggy = (seen("vlp16", wall(40.0), ScannerSettings(link=True, extinction=a)) for a in (0.0, 0.02))
     assert len(foggy) < len(clear)
     assert foggy.range.max() < clear.range.max()

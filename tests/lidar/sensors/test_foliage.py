@@ -6,20 +6,20 @@ from helpers.sensor_worlds import LEAVES, box, driven, plate, world
 
 from geoscene.classes import Class
 from lidar.geometry.mounts import Mount
-from lidar.physics.effects import Effects
+from lidar.physics.settings import ScannerSettings
 from lidar.rig.scanner import load_sensor
 from lidar.sensors.foliage import PROJECTION
 from lidar.sensors.scan import scan
 
 HERE = Mount((0.0, 0.0, 0.0))
-BARE, LEAFY = Effects(), Effects(foliage=True)
+BARE, LEAFY = ScannerSettings(), ScannerSettings(foliage=True)
 
 
 def hedge(low, high, feature=7):
     return box(low, high, feature=feature, klass=Class.HEDGE, material="foliage")
 
 
-def seen(scene, effects=LEAFY, *, name="hdl64e_s3", frame=0, seed=1, start=(0, 0, 0), **options):
+def seen(scene, settings=LEAFY, *, name="hdl64e_s3", frame=0, seed=1, start=(0, 0, 0), **options):
     return scan(
         load_sensor(name),
         HERE,
@@ -27,7 +27,7 @@ def seen(scene, effects=LEAFY, *, name="hdl64e_s3", frame=0, seed=1, start=(0, 0
         world=scene,
         frame=frame,
         seed=seed,
-        effects=effects,
+        settings=settings,
         **options,
     )
 

@@ -8,7 +8,7 @@ from helpers.sensor_worlds import box, driven, plate, world
 
 from geoscene.classes import Class, materials
 from lidar.geometry.mounts import Mount
-from lidar.physics.effects import LEVELS, PLAIN, Effects
+from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.rig.scanner import firings, load_sensor
 from lidar.rig.specs import load_rig
 from lidar.sensors.scan import scan
@@ -52,7 +52,7 @@ def test_points_of_a_moving_turning_vehicle_lie_on_the_surfaces():
 
 def test_one_pose_a_frame_smears_the_same_drive():
     drive = driven((20.0, 0.0, 0.0), start=(-20, -10, 0))
-    cloud = scan(load_sensor("vlp16"), ROOF, trajectory=drive, world=ROOM, frame=3, effects=LEVELS["draft"])
+    cloud = scan(load_sensor("vlp16"), ROOF, trajectory=drive, world=ROOM, frame=3, settings=LEVELS["draft"])
     assert not cloud.time_ns.any()
     late = replace(cloud, time_ns=np.full(len(cloud), 90_000_000, np.int32))
     moved = placed(late, ROOF, drive) - placed(cloud, ROOF, drive)
@@ -110,7 +110,7 @@ def test_a_frame_alone_is_the_frame_of_a_run():
     sensor = load_sensor("vlp16")
     drive = driven((10.0, 0.0, 0.0), start=(-20, -10, 0))
     run = [
-        scan(sensor, ROOF, trajectory=drive, world=ROOM, frame=k, seed=5, effects=LEVELS["survey"])
+        scan(sensor, ROOF, trajectory=drive, world=ROOM, frame=k, seed=5, settings=LEVELS["survey"])
         for k in range(3)
     ]
     alone = scan(
@@ -120,18 +120,18 @@ def test_a_frame_alone_is_the_frame_of_a_run():
         world=ROOM,
         frame=2,
         seed=5,
-        effects=LEVELS["survey"],
+        settings=LEVELS["survey"],
         threads=2,
     )
     assert same(run[2], alone)
     assert not np.array_equal(
         run[2].range,
-        scan(sensor, ROOF, trajectory=drive, world=ROOM, frame=2, seed=6, effects=LEVELS["survey"]).range,
+        scan(sensor, ROOF, trajectory=drive, world=ROOM, frame=2, seed=6, settings=LEVELS["survey"]).range,
     )
 
 
 def test_every_effect_changes_the_returns_and_none_is_on_by_default():
-    """Each dial turned alone does something, in a world where it can."""
+    """Each setting changes something on its own, in a world where it can."""
     sensor = load_sensor("vlp16", return_mode="dual")
     scene = world(
         ROOM.mesh,
@@ -155,11 +155,18 @@ def test_every_effect_changes_the_returns_and_none_is_on_by_default():
         "quantise": True,
     }
     drive = driven((10.0, 0.0, 0.0), start=(-20, -10, 0))
-    plain = scan(sensor, ROOF, trajectory=drive, world=scene, frame=0, effects=PLAIN)
+    plain = scan(sensor, ROOF, trajectory=drive, world=scene, frame=0, settings=PLAIN)
     assert np.array_equal(plain.range, plain.true_range)
     for name, value in turned.items():
-        assert getattr(Effects(), name) == type(value)() or name in ("motion", "law", "rays", "range_noise")
-        other = scan(sensor, ROOF, trajectory=drive, world=scene, frame=0, effects=Effects(**{name: value}))
+        assert getattr(ScannerSettings(), name) == type(value)() or name in (
+            "motion",
+            "law",
+            "rays",
+            "range_noise",
+        )
+        other = scan(
+            sensor, ROOF, trajectory=drive, world=scene, frame=0, settings=ScannerSettings(**{name: value})
+        )
         assert not same(plain, other), name
 
 

@@ -13,7 +13,7 @@ from lidar.camera.render import Frame
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.physics.echoes import Origin, joined
-from lidar.physics.effects import LEVELS, PLAIN, Effects
+from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.rig.scanner import load_sensor
 from lidar.sensors.cloud import Cloud
 from lidar.sensors.scan import cast, scan
@@ -58,12 +58,12 @@ class Shifted(Stage):
         return replace(cloud, xyz=cloud.xyz + np.float32([0, 1, 0]), origin=moved)
 
 
-def swept(effects=PLAIN, *, sensor="vlp16", frame=2, **options):
-    return cast(load_sensor(sensor, **options), ROOF, frame=frame, seed=5, effects=effects, **HERE)
+def swept(settings=PLAIN, *, sensor="vlp16", frame=2, **options):
+    return cast(load_sensor(sensor, **options), ROOF, frame=frame, seed=5, settings=settings, **HERE)
 
 
-def plain(effects=PLAIN, **options):
-    return scan(load_sensor("vlp16", **options), ROOF, frame=2, seed=5, effects=effects, **HERE)
+def plain(settings=PLAIN, **options):
+    return scan(load_sensor("vlp16", **options), ROOF, frame=2, seed=5, settings=settings, **HERE)
 
 
 def chain(*stages, seed=5):
@@ -75,19 +75,19 @@ def assert_same(cloud, other):
         assert np.array_equal(getattr(cloud, f.name), getattr(other, f.name)), f.name
 
 
-@pytest.mark.parametrize("effects", [PLAIN, NOISY])
+@pytest.mark.parametrize("settings", [PLAIN, NOISY])
 @pytest.mark.parametrize("mode", ["strongest", "dual"])
-def test_stages_with_nothing_to_do_leave_the_returns(effects, mode):
+def test_stages_with_nothing_to_do_leave_the_returns(settings, mode):
     idle = read_stages(["cover_glass:transmission=1", "dropped_packets:loss=0"], seed=5)
-    found = altered_sweep(swept(effects, return_mode=mode), idle)
-    expected = plain(effects, return_mode=mode)
+    found = altered_sweep(swept(settings, return_mode=mode), idle)
+    expected = plain(settings, return_mode=mode)
     assert_same(found.cloud, expected)
     assert_same(found.original, expected)
     assert np.array_equal(found.cloud.source, np.arange(len(expected)))
     assert (found.cloud.hidden == -1).all()
     noise = expected.klass == Class.NOISE
     assert (found.cloud.origin[~noise] == Origin.SURFACE).all()
-    if effects is NOISY:
+    if settings is NOISY:
         assert {Origin.RECEIVER, Origin.INTERFERENCE} <= set(found.cloud.origin[noise].tolist())
 
 
@@ -152,12 +152,12 @@ def test_an_injected_echo_hides_the_surface_in_strongest_mode_and_joins_it_in_du
 
 
 def test_an_injected_echo_obeys_threshold_separation_and_range_limits():
-    effects = Effects(link=True)
-    faint = altered_sweep(swept(effects), chain(Injected(3.0, power=0.9)))
-    assert_same(faint.cloud, plain(effects))
-    bright = altered_sweep(swept(effects), chain(Injected(3.0, power=1.1)))
+    settings = ScannerSettings(link=True)
+    faint = altered_sweep(swept(settings), chain(Injected(3.0, power=0.9)))
+    assert_same(faint.cloud, plain(settings))
+    bright = altered_sweep(swept(settings), chain(Injected(3.0, power=1.1)))
     assert (bright.cloud.origin == Origin.INJECTED).sum() > 5000
-    far = altered_sweep(swept(effects), chain(Injected(200.0)))
+    far = altered_sweep(swept(settings), chain(Injected(200.0)))
     assert (far.cloud.origin == Origin.SURFACE).all()
     wall = world(plate(20.0))
     sweep = cast(load_sensor("utm30lx"), Mount(), trajectory=driven(), world=wall, frame=0)
@@ -185,8 +185,8 @@ def test_returns_that_a_stage_leaves_alone_keep_their_noise():
 
 
 def test_cover_glass_attenuates_by_the_square_of_its_transmission():
-    effects = Effects(link=True)
-    found = altered_sweep(swept(effects), read_stages(["cover_glass:transmission=0.5"]))
+    settings = ScannerSettings(link=True)
+    found = altered_sweep(swept(settings), read_stages(["cover_glass:transmission=0.5"]))
     diffuse = found.cloud.feature != 11  # codes of retro-reflectors are logarithmic
     before = found.original.intensity[found.cloud.source]
     assert found.cloud.intensity[diffuse] == pytest.approx(before[diffuse] / 4, rel=1e-5)

@@ -1,4 +1,4 @@
-"""How faithfully cameras render: the dials of a level of fidelity."""
+"""Settings of cameras: how their images are rendered."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from lidar.rig.specs import CameraSpec
 
 
 @dataclass(frozen=True, slots=True)
-class CameraDials:
-    """The dials of images. The defaults are a camera without noise, a ray a pixel.
+class CameraSettings:
+    """Settings of images. The defaults are a camera without noise and one ray per pixel.
 
     shadows      : the sun casts shadows
     detail       : windows, joints and grain are drawn where the map has flat colour
     supersample  : rays along each side of a pixel, for colour: 1 to 16
     blur         : moments of an exposure (the camera's ``exposure_ns``) that are averaged: motion blur
-    haze         : metres at which haze has taken 98 % of a contrast; inf for clear air
+    haze         : distance in metres at which haze removes 98 % of contrast; inf for clear air
     camera_noise : noise of counting and of reading electrons (the camera's ``full_well``, ``read_noise``)
     """
 
@@ -31,7 +31,7 @@ class CameraDials:
     camera_noise: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse settings that mean nothing, all faults in one message."""
+        """Validate the settings; one InputError names all faults."""
         faults = []
         if not 1 <= self.supersample <= 16:
             faults.append(f"supersample={self.supersample}: give 1 to 16")
@@ -59,12 +59,12 @@ class CameraDials:
         )
 
 
-PLAIN = CameraDials()
+PLAIN = CameraSettings()
 """A sharp, clean image."""
 
-LEVELS: dict[str, CameraDials] = {
-    "draft": CameraDials(shadows=False, detail=False, blur=1),
+LEVELS: dict[str, CameraSettings] = {
+    "draft": CameraSettings(shadows=False, detail=False, blur=1),
     "standard": PLAIN,
-    "survey": CameraDials(supersample=2, blur=9, camera_noise=True),
+    "survey": CameraSettings(supersample=2, blur=9, camera_noise=True),
 }
-"""Dials by level of fidelity."""
+"""Settings by fidelity level."""
