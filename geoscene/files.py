@@ -1,34 +1,105 @@
-"""Files that appear whole or not at all."""
+"""Files and folders written atomically: they appear complete under their name, or not at all."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
-from collections.abc import Mapping, Sequence
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import InputError
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write ``data`` beside ``path`` and move it there whole."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+
+@contextmanager
+def atomic_path(path: Path, *, keep_suffix: bool = False) -> Iterator[Path]:
+    """Yield a temporary path in the same folder, and rename what was written there to ``path``.
+
+    If the block raises, what was written is deleted and ``path`` stays as it was. If the block writes
+    nothing, there is no file at ``path`` afterwards.
+
+    keep_suffix : the temporary name ends like ``path``, for libraries that choose a format by it; by default
+                  it ends in ``.part``
+    """
+    middle = f".{os.getpid()}.part"
+    part = path.with_name(f"{path.stem}{middle}{path.suffix}" if keep_suffix else f"{path.name}{middle}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part.unlink(missing_ok=True)
     try:
-        part.write_bytes(data)
-        part.replace(path)
+        yield part
+        if part.exists():
+            part.replace(path)
+        else:
+            path.unlink(missing_ok=True)
     finally:
         part.unlink(missing_ok=True)
 
 
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
+@contextmanager
+def atomic_file(path: Path) -> Iterator[IO[bytes]]:
+    """Yield a binary file to write (and read) that gets the name ``path`` unless the block raises."""
+    with atomic_path(path) as part, part.open("w+b") as file:
+        yield file
+
+
+@contextmanager
+def atomic_folder(path: Path, *, mark: str) -> Iterator[Path]:
+    """Yield a folder to write into that replaces ``path`` unless the block raises.
+
+    mark : file by which a folder of this kind is recognised; only such a folder, or an empty one, is replaced
+
+    Raises InputError if ``path`` is anything else.
+    """
+    if path.exists() and not (path / mark).is_file() and not (path.is_dir() and not any(path.iterdir())):
+        raise InputError(f"{path}: exists and holds no {mark}; give another folder")
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    try:
+        yield part
+        if path.exists():
+            shutil.rmtree(path)
+        part.rename(path)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write ``data`` as a file, atomically."""
+    with atomic_path(path) as part:
+        part.write_bytes(data)
+
+
+def write_json(path: Path, document: Mapping[str, Any], *, indent: int = 2) -> None:
     """Write a document as indented UTF-8 JSON."""
-    write_atomically(path, (json.dumps(document, indent=2, ensure_ascii=False) + "\n").encode("utf-8"))
+    write_atomically(path, (json.dumps(document, indent=indent, ensure_ascii=False) + "\n").encode("utf-8"))
 
 
 def write_columns(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> None:
     """Write columns as CSV with a header; floats in the shortest text that reads back the same."""
-    lists = [np.asarray(c).tolist() for c in columns.values()]
-    lines = [",".join(columns), *(",".join(map(str, row)) for row in zip(*lists, strict=True))]
-    write_atomically(path, ("\n".join(lines) + "\n").encode("utf-8"))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True))
+    write_atomically(path, text.getvalue().encode("utf-8"))
+
+
+@contextmanager
+def spool(near: Path) -> Iterator[IO[bytes]]:
+    """Yield a nameless temporary file on the disk of ``near``, for what a format stores after its header."""
+    with tempfile.TemporaryFile(dir=near.parent) as file:
+        yield file
+
+
+def append(target: IO[bytes], source: IO[bytes]) -> None:
+    """Copy all of a spool to the end of a file."""
+    source.seek(0)
+    shutil.copyfileobj(source, target, 1 << 20)

@@ -14,7 +14,7 @@ from pyproj import CRS
 
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
-from geoscene.export.files import Summary, append, size_of, spool, whole_file
+from geoscene.export.files import Summary, size_of
 from geoscene.export.objects import (
     Features,
     Part,
@@ -27,6 +27,7 @@ from geoscene.export.objects import (
     read_features,
 )
 from geoscene.export.shells import bodies, shell_numbers
+from geoscene.files import append, atomic_file, spool
 from geoscene.frames import Frame, utm_crs
 from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh
 from geoscene.progress import Progress, silent
@@ -172,7 +173,7 @@ def write_cityjson(
     lod = LOD[geoscene_lod(scene)]
     objects = solids = faces = count = 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    with whole_file(path) as out, spool(path) as vertices:
+    with atomic_file(path) as out, spool(path) as vertices:
         out.write(b'{"type":"CityJSON","version":"2.0","CityObjects":{')
         for done, part in enumerate(parts(scene, layers)):
             progress("CityJSON", done, total=len(scene.tile_indices))

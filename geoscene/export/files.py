@@ -1,19 +1,12 @@
-"""Files and folders that appear whole or not at all."""
+"""What all exports share: the summary they return, and small conversions."""
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
-
-from geoscene.errors import InputError
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,54 +33,6 @@ class Summary:
     faces: int = 0
     crs: str = ""
     notes: tuple[str, ...] = ()
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[IO[bytes]]:
-    """A binary file to write to, which takes its name when the block ends well."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with part.open("w+b") as file:
-            yield file
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
-@contextmanager
-def whole_folder(path: Path, *, mark: str) -> Iterator[Path]:
-    """A folder to write to, which takes its name when the block ends well.
-
-    mark : name of the file by which a folder of this kind is known, so that only such a one is replaced
-
-    Raises InputError where the name is taken by anything else.
-    """
-    if path.exists() and not (path / mark).is_file() and not (path.is_dir() and not any(path.iterdir())):
-        raise InputError(f"{path}: exists and holds no {mark}; give another folder")
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    try:
-        yield part
-        if path.exists():
-            shutil.rmtree(path)
-        part.rename(path)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-
-
-@contextmanager
-def spool(near: Path) -> Iterator[IO[bytes]]:
-    """A nameless temporary file on the disk of ``near``, for what a format wants at its end."""
-    with tempfile.TemporaryFile(dir=near.parent) as file:
-        yield file
-
-
-def append(target: IO[bytes], source: IO[bytes]) -> None:
-    """Copy all of a spool to the end of a file."""
-    source.seek(0)
-    shutil.copyfileobj(source, target, 1 << 20)
 
 
 def size_of(path: Path) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.export.files import Summary, size_of, whole_file
+from geoscene.export.files import Summary, size_of
 from geoscene.export.gltf import GlbWriter, y_up
 from geoscene.export.objects import (
     Features,
@@ -19,6 +19,7 @@ from geoscene.export.objects import (
     pieces,
     read_features,
 )
+from geoscene.files import atomic_file
 from geoscene.mesh import Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -41,7 +42,7 @@ def write_glb(
     features = read_features(scene)
     library = scene.shapes()
     objects = solids = faces = 0
-    with whole_file(path) as out, GlbWriter(path) as writer:
+    with atomic_file(path) as out, GlbWriter(path) as writer:
         tables = _tables(writer, features, layers=layers)
         shapes: dict[int, int] = {}
         tiles = []

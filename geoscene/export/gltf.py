@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import materials
 from geoscene.errors import InputError
-from geoscene.export.files import append, spool
+from geoscene.files import append, spool
 from geoscene.mesh import Mesh
 from geoscene.typing import Float
 

@@ -10,9 +10,10 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from geoscene.export.files import Summary, size_of, whole_file
+from geoscene.export.files import Summary, size_of
 from geoscene.export.objects import attribution
 from geoscene.export.roadnet import END, START, Carriageway, Connection, RoadNet, road_net
+from geoscene.files import atomic_file
 from geoscene.progress import Progress, silent
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
@@ -68,7 +69,7 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
     junctions = {
         int(node): first + len(net.connections) + k for k, node in enumerate(np.flatnonzero(net.junctions))
     }
-    with whole_file(path) as out:
+    with atomic_file(path) as out:
         out.write(_header(scene).encode())
         for k in range(len(net.roads)):
             progress("OpenDRIVE", k, total=len(net.roads))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from geoscene.errors import InputError
 from geoscene.export.files import Summary, size_of
 from geoscene.export.objects import attribution, expand, parts
 from geoscene.export.zbuffer import draw_triangles
+from geoscene.files import atomic_path
 from geoscene.mesh import Mesh, concatenate
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -165,8 +165,7 @@ def _write_draft(path: Path, scene: Scene, *, grid: _Grid, cells: NDArray[Any], 
 def _write_cog(draft: Path, path: Path, *, model: Model) -> None:
     import rasterio.shutil  # noqa: PLC0415
 
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.tif")
-    try:
+    with atomic_path(path, keep_suffix=True) as part:
         rasterio.shutil.copy(
             draft,
             part,
@@ -177,6 +176,3 @@ def _write_cog(draft: Path, path: Path, *, model: Model) -> None:
             BIGTIFF="IF_SAFER",
             NUM_THREADS="1",
         )
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -8,8 +8,9 @@ import tempfile
 from pathlib import Path
 
 from geoscene.errors import GeosceneError, need
-from geoscene.export.files import Summary, size_of, whole_file
+from geoscene.export.files import Summary, size_of
 from geoscene.export.opendrive import write_opendrive
+from geoscene.files import atomic_file
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 
@@ -42,7 +43,7 @@ def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summ
         if run.returncode or not net.exists():
             lines = [line for line in run.stderr.splitlines() if line.strip()] or ["it said nothing"]
             raise GeosceneError(f"netconvert failed: {lines[-1]}")
-        with whole_file(path) as out:
+        with atomic_file(path) as out:
             out.write(_STAMP.sub(b"", net.read_bytes()))
     warned = run.stderr.count("Warning")
     files, size = size_of(path)

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.errors import InputError
-from geoscene.export.files import Summary, size_of, whole_file, whole_folder
+from geoscene.export.files import Summary, size_of
 from geoscene.export.globe import Globe
 from geoscene.export.gltf import GlbWriter, y_up
 from geoscene.export.objects import Features, Part, attribution, expand, parts, pieces, read_features
-from geoscene.files import write_atomically
+from geoscene.files import atomic_file, atomic_folder, write_atomically
 from geoscene.mesh import Instances, Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -63,7 +63,7 @@ def write_3dtiles(
     library = list(scene.shapes().values())
     names = list(scene.shapes())
     objects = solids = faces = 0
-    with whole_folder(path, mark="tileset.json") as folder:
+    with atomic_folder(path, mark="tileset.json") as folder:
         (folder / "content").mkdir()
         nodes: dict[tuple[int, int], _Node] = {}
         for done, part in enumerate(parts(scene, layers)):
@@ -177,7 +177,7 @@ def _write_mesh(
     middle = np.round((local.min(axis=0) + local.max(axis=0)) / 2)
     layer = np.searchsorted(features.starts, mesh.feature, side="right")
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    with whole_file(path) as out, GlbWriter(path) as writer:
+    with atomic_file(path) as out, GlbWriter(path) as writer:
         children = []
         for number in np.unique(layer).tolist():
             rows = np.flatnonzero(layer == number)
@@ -228,7 +228,7 @@ def _write_copies(
     shapes = scene.shapes()
     layer = np.searchsorted(features.starts, copies.feature, side="right")
     keys = np.column_stack([copies.shape, layer])
-    with whole_file(path) as out, GlbWriter(path) as writer:
+    with atomic_file(path) as out, GlbWriter(path) as writer:
         tables: dict[int, tuple[int, NDArray[np.integer]]] = {}
         meshes: dict[int, int] = {}
         nodes = []

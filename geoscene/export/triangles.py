@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import materials
-from geoscene.export.files import Summary, append, size_of, spool, whole_file
+from geoscene.export.files import Summary, size_of
 from geoscene.export.objects import attribution, expand, klass_name, parts, pieces, read_features
+from geoscene.files import append, atomic_file, spool
 from geoscene.mesh import Mesh, concatenate
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -54,7 +55,7 @@ def write_obj(
     objects = solids = faces = first = 0
     looks: dict[tuple[int, ...], str] = {}
     library = path.with_suffix(".mtl")
-    with whole_file(library) as colors, whole_file(path) as out:
+    with atomic_file(library) as colors, atomic_file(path) as out:
         out.write("".join(f"# {line}\n" for line in _head(scene)).encode())
         out.write(f"mtllib {library.name}\n".encode())
         for index, mesh in meshes_of(scene, layers, stage="OBJ", progress=progress):
@@ -111,7 +112,7 @@ def write_ply(
     """
     solids: set[int] = set()
     vertices = faces = objects = 0
-    with whole_file(path) as out, spool(path) as rest:
+    with atomic_file(path) as out, spool(path) as rest:
         out.write(_ply_head(scene, 0, faces=0))
         for _, mesh in meshes_of(scene, layers, stage="PLY", progress=progress):
             out.write(mesh.vertices.astype("<f8").tobytes())
@@ -166,7 +167,7 @@ def write_stl(
     facets = solids = broken = 0
     row = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
     head = f"geoscene; add {middle[0] + east:.0f} {middle[1] + north:.0f} 0; {scene.frame.name}"
-    with whole_file(path) as out:
+    with atomic_file(path) as out:
         out.write(head.encode("ascii", "replace")[:80].ljust(80, b" ") + bytes(4))
         for _, mesh in meshes_of(scene, layers, stage="STL", progress=progress):
             mesh, lost = _in_single_precision(mesh.take(mesh.closed).shifted(-middle))  # noqa: PLW2901

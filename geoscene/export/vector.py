@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from geoscene.errors import need
-from geoscene.export.files import Summary, plain, size_of, whole_file
+from geoscene.export.files import Summary, plain, size_of
 from geoscene.export.objects import attribution
 from geoscene.export.tables import (
     SOLIDS,
@@ -24,6 +23,7 @@ from geoscene.export.tables import (
     rows,
     target_crs,
 )
+from geoscene.files import atomic_file, atomic_path
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 
@@ -64,33 +64,30 @@ def write_gpkg(
 
     target = target_crs(scene, crs)
     names = chosen_layers(scene, layers, solids=True)
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part.gpkg")
-    path.parent.mkdir(parents=True, exist_ok=True)
     before = {"OGR_CURRENT_DATE": pyogrio.get_gdal_config_option("OGR_CURRENT_DATE")}
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE})
     objects = solids = faces = 0
     try:
-        for _, chunk in _reading(scene, names, crs=target, stage="GeoPackage", progress=progress):
-            write(
-                str(part),
-                geometry=shapely.to_wkb(chunk.geometry),
-                field_data=list(chunk.columns.values()),
-                fields=list(chunk.columns),
-                geometry_type=_geometry_type(scene, chunk),
-                crs=target.to_wkt(),
-                layer=chunk.layer,
-                driver="GPKG",
-                append=part.exists(),
-                layer_options={"FID": "fid", "SPATIAL_INDEX": "YES"},
-            )
-            objects += len(chunk.geometry)
-            if chunk.layer == SOLIDS:
-                solids += len(chunk.geometry)
-                faces += int(shapely.get_num_geometries(chunk.geometry).sum())
-        part.replace(path)
+        with atomic_path(path, keep_suffix=True) as part:
+            for _, chunk in _reading(scene, names, crs=target, stage="GeoPackage", progress=progress):
+                write(
+                    str(part),
+                    geometry=shapely.to_wkb(chunk.geometry),
+                    field_data=list(chunk.columns.values()),
+                    fields=list(chunk.columns),
+                    geometry_type=_geometry_type(scene, chunk),
+                    crs=target.to_wkt(),
+                    layer=chunk.layer,
+                    driver="GPKG",
+                    append=part.exists(),
+                    layer_options={"FID": "fid", "SPATIAL_INDEX": "YES"},
+                )
+                objects += len(chunk.geometry)
+                if chunk.layer == SOLIDS:
+                    solids += len(chunk.geometry)
+                    faces += int(shapely.get_num_geometries(chunk.geometry).sum())
     finally:
         pyogrio.set_gdal_config_options(before)
-        part.unlink(missing_ok=True)
     files, size = size_of(path)
     return Summary(path, "gpkg", files, size, objects, solids, faces, _named(target))
 
@@ -118,7 +115,7 @@ def write_geojson(
     names = chosen_layers(scene, layers, solids=False)
     wgs84 = CRS.from_user_input("OGC:CRS84")
     count = 0
-    with whole_file(path) as out:
+    with atomic_file(path) as out:
         head: dict[str, Any] = {"type": "FeatureCollection", "attribution": attribution(scene)}
         out.write(_json(head)[:-1] + b',"features":[')
         for _, chunk in _reading(scene, names, crs=wgs84, stage="GeoJSON", progress=progress):
@@ -178,7 +175,7 @@ def write_geoparquet(
     types: set[str] = set()
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
     count = 0
-    with whole_file(path) as out, parquet.ParquetWriter(out, schema, compression="zstd") as writer:
+    with atomic_file(path) as out, parquet.ParquetWriter(out, schema, compression="zstd") as writer:
         for _, chunk in _reading(scene, names, crs=target, stage="GeoParquet", progress=progress):
             n = len(chunk.geometry)
             boxes = shapely.bounds(chunk.geometry)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError, SceneFormatError
+from geoscene.files import atomic_path
 from geoscene.frames import Frame
 
 _DATE = "2000-01-01T00:00:00Z"  # a constant, so that the same scene is the same bytes
@@ -66,49 +66,42 @@ def write_geopackage(path: Path, layers: Sequence[Layer], *, frame: Frame) -> No
     from pyogrio.errors import DataSourceError  # noqa: PLC0415
     from pyogrio.raw import write  # noqa: PLC0415
 
-    part = path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
-    part.unlink(missing_ok=True)
     before = {"OGR_CURRENT_DATE": pyogrio.get_gdal_config_option("OGR_CURRENT_DATE")}
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE})
     shift = np.array(frame.origin)
     try:
-        for layer in layers:
-            if not len(layer):
-                continue
-            kind = _geometry_type(layer.geometry)
-            geometry = layer.geometry
-            if kind.startswith("Multi"):
-                parts, owner = shapely.get_parts(geometry, return_index=True)
-                gather = shapely.multipolygons if "Polygon" in kind else shapely.multilinestrings
-                geometry = gather(parts, indices=owner)
-            has_z = kind.endswith(" Z")
-            moved = shapely.transform(
-                geometry,
-                (lambda c: c + np.append(shift, 0.0)) if has_z else (lambda c: c + shift),
-                include_z=has_z,
-            )
-            write(
-                str(part),
-                geometry=shapely.to_wkb(moved),
-                field_data=[_column(np.asarray(v)) for v in layer.columns.values()],
-                fields=list(layer.columns),
-                geometry_type=kind,
-                crs=frame.wkt,
-                layer=layer.name,
-                driver="GPKG",
-                append=part.exists(),
-                layer_options={"FID": "fid", "SPATIAL_INDEX": "YES"},
-            )
+        with atomic_path(path, keep_suffix=True) as part:
+            for layer in layers:
+                if not len(layer):
+                    continue
+                kind = _geometry_type(layer.geometry)
+                geometry = layer.geometry
+                if kind.startswith("Multi"):
+                    parts, owner = shapely.get_parts(geometry, return_index=True)
+                    gather = shapely.multipolygons if "Polygon" in kind else shapely.multilinestrings
+                    geometry = gather(parts, indices=owner)
+                has_z = kind.endswith(" Z")
+                moved = shapely.transform(
+                    geometry,
+                    (lambda c: c + np.append(shift, 0.0)) if has_z else (lambda c: c + shift),
+                    include_z=has_z,
+                )
+                write(
+                    str(part),
+                    geometry=shapely.to_wkb(moved),
+                    field_data=[_column(np.asarray(v)) for v in layer.columns.values()],
+                    fields=list(layer.columns),
+                    geometry_type=kind,
+                    crs=frame.wkt,
+                    layer=layer.name,
+                    driver="GPKG",
+                    append=part.exists(),
+                    layer_options={"FID": "fid", "SPATIAL_INDEX": "YES"},
+                )
     except DataSourceError as error:
         raise GeosceneError(f"{path}: cannot be written ({error}); is the disk full?") from error
-    else:
-        if part.exists():
-            part.replace(path)
-        else:
-            path.unlink(missing_ok=True)
     finally:
         pyogrio.set_gdal_config_options(before)
-        part.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -16,7 +13,7 @@ import numpy as np
 
 from geoscene.classes import Class, materials
 from geoscene.errors import SceneFormatError
-from geoscene.files import write_atomically
+from geoscene.files import write_columns, write_json
 from geoscene.frames import Frame
 from geoscene.mesh import Mesh
 from geoscene.report import Problem
@@ -79,8 +76,10 @@ class SceneWriter:
         if len(graph):
             write_graphml(graph, frame, path=self.files.road_graph)
         write_shapes(self.files.shapes, shapes)
-        write_atomically(self.files.problems, _problems_csv(problems))
-        _write_json(self.files.tile_reports, tiles)
+        rows = sorted(problems)
+        columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(Problem)}
+        write_columns(self.files.problems, columns)
+        write_json(self.files.tile_reports, tiles, indent=1)
         self.files.tile_journal.unlink(missing_ok=True)
         ranges = {layer.name: [a, b] for layer, a, b in zip(layers, starts[:-1], starts[1:], strict=True)}
         document = {
@@ -91,7 +90,7 @@ class SceneWriter:
             "classes": {c.name.lower(): int(c) for c in Class},
             "materials": {name: m.code for name, m in materials().items()},
         }
-        _write_json(self.files.manifest, document)
+        write_json(self.files.manifest, document, indent=1)
         if self.path.exists():
             shutil.rmtree(self.path)
         self.folder.rename(self.path)
@@ -104,15 +103,3 @@ class SceneWriter:
     ) -> None:
         if kind is None or issubclass(kind, Exception):
             shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def _write_json(path: Path, document: Mapping[str, Any]) -> None:
-    write_atomically(path, (json.dumps(document, indent=1, ensure_ascii=False) + "\n").encode("utf-8"))
-
-
-def _problems_csv(problems: Iterable[Problem]) -> bytes:
-    out = io.StringIO()
-    writer = csv.DictWriter(out, ["osm_id", "kind", "action", "reason", "detail"], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(p) for p in sorted(problems))
-    return out.getvalue().encode("utf-8")

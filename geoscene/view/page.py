@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes, materials
 from geoscene.errors import InputError
-from geoscene.export.files import Summary, append, size_of, spool, whole_file
+from geoscene.export.files import Summary, size_of
 from geoscene.export.objects import attribution, read_features
+from geoscene.files import append, atomic_file, spool
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.view.attributes import tables
@@ -67,7 +68,7 @@ def view_scene(
     told: list[dict[str, Any]] = []
     ends: list[int] = []
     faces = 0
-    with whole_file(out) as file, spool(out) as blobs:
+    with atomic_file(out) as file, spool(out) as blobs:
         _blob(blobs, "shapes", data=shape_bytes)
         for done, (i, j) in enumerate(indices.tolist()):
             progress("page", done, total=len(indices))

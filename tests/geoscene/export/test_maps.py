@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
 
+from geoscene import files
 from geoscene.classes import Class
 from geoscene.errors import InputError, MissingExtraError
-from geoscene.export import KINDS, export_scene, files, kind_of
+from geoscene.export import KINDS, export_scene, kind_of
 from geoscene.export.zbuffer import draw_triangles
 
 
@@ -193,7 +194,7 @@ def test_without_sumo_the_extra_is_named(scene, tmp_path, monkeypatch):
 
 def test_a_file_that_failed_leaves_the_old_one(tmp_path):
     (tmp_path / "a").write_bytes(b"old")
-    with pytest.raises(ZeroDivisionError), files.whole_file(tmp_path / "a") as out:
+    with pytest.raises(ZeroDivisionError), files.atomic_file(tmp_path / "a") as out:
         out.write(bytes(1 // 0))
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
     assert (tmp_path / "a").read_bytes() == b"old"
