@@ -107,7 +107,7 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
     """Record the drive; seconds of the stages and the number of points."""
     began = time.perf_counter()
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
-    from lidar.dataset.record import Contents, Recorder  # noqa: PLC0415
+    from lidar.dataset.recording import Contents, Recording  # noqa: PLC0415
     from lidar.drive import Stopwatch, record_all, schedule  # noqa: PLC0415
     from lidar.geometry.georeference import Georeference, export_crs  # noqa: PLC0415
     from lidar.geometry.trajectory_csv import read_trajectory  # noqa: PLC0415
@@ -122,7 +122,7 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
     geo = Georeference(scene.frame, export_crs(scene.frame))
     settings, _ = settings_of("standard", [("rays", str(rays))])
     watch = Stopwatch()
-    recorder = Recorder(
+    recording = Recording(
         out,
         scene.frame,
         trajectory=trajectory,
@@ -136,7 +136,7 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
         trajectory,
         jobs=schedule(sensors, trajectory.duration_ns),
         sensors=sensors,
-        recorder=recorder,
+        recording=recording,
         workers=workers,
     )
     ended = time.perf_counter()

@@ -17,8 +17,7 @@ from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
 from geoscene.view import view_scene
 from lidar.camera.png import counts_to_depth, read_png, write_png
-from lidar.dataset.formats.las import read_las
-from lidar.dataset.formats.pcd import read_pcd
+from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
 from lidar.drive import DriveOptions, drive
 from lidar.maps.aggregate import aggregate
@@ -73,7 +72,7 @@ with progress_bar() as progress:
 
     # 4. One sweep by class, one camera frame.
     middle = f"{summary.frames // 2:06d}"
-    sweep = read_pcd(out / "drive" / "lidar_top" / "pcd" / f"{middle}.pcd")
+    sweep = read_table(out / "drive" / "lidar_top" / "pcd" / f"{middle}.pcd")
     mount = load_rig("seed").lidars[0].mount
     xyz = np.column_stack([sweep[axis] for axis in "xyz"]) @ mount.rotation.T + mount.translation
     label = sweep["label"].astype(np.uint8)
@@ -88,7 +87,7 @@ with progress_bar() as progress:
     say("putting all sweeps together")
     dataset = open_dataset(out / "drive")
     aggregate(dataset, out / "map.laz", voxel=0.1, sensors=("lidar_top",), progress=progress)
-    points = next(read_las(out / "map.laz", chunk=20_000_000))
+    points = read_table(out / "map.laz")
     world_xyz = np.column_stack([points[axis] for axis in "xyz"])
     colors = class_codes().color[points["label"]]
     write_png(

@@ -22,10 +22,11 @@ from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar import __version__
-from lidar.dataset.box_tables import gather_boxes
-from lidar.dataset.layout import prepare
-from lidar.dataset.metadata import write_sidecars
-from lidar.dataset.record import Recorder
+from lidar.dataset.boxes import merge_box_files
+from lidar.dataset.layout import Paths, prepare
+from lidar.dataset.metadata import write_metadata
+from lidar.dataset.record import record_frame
+from lidar.dataset.recording import Recording
 from lidar.errors import InputError, LidarError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.geometry.poses import Trajectory
@@ -179,11 +180,11 @@ def drive(
         manifest["scanners_on_ns"] = np.clip(on, 0, trajectory.duration_ns).tolist()
     manifest["recipe"] = recipe
     with _nothing_half_made(out):
-        if not (out / "dataset.json").exists():
-            write_json(out / "dataset.json", manifest | {"frames_done": 0})
-        write_trajectory(out / "trajectory.csv", trajectory)
+        if not Paths(out).manifest.exists():
+            write_json(Paths(out).manifest, manifest | {"frames_done": 0})
+        write_trajectory(Paths(out).trajectory, trajectory)
         counts = manifest["sensor_frames"]
-        write_sidecars(
+        write_metadata(
             out,
             scene,
             rig=rig,
@@ -194,7 +195,7 @@ def drive(
             contents=options.contents(),
         )
         watch = Stopwatch()
-        recorder = Recorder(
+        recording = Recording(
             out,
             scene.frame,
             trajectory=trajectory,
@@ -203,28 +204,28 @@ def drive(
             contents=options.contents(),
             watch=watch,
             actors=actors,
-            reach=max((s.reach for s in sensors), default=0.0),
-            on=on,
+            max_range=max((s.reach for s in sensors), default=0.0),
+            scanning_ns=on,
         )
-        there = [job for job in jobs if recorder.is_done(job.sensor, job.frame)]
+        there = [job for job in jobs if recording.is_done(job.sensor, job.frame)]
         points = dict.fromkeys((s.name for s in sensors if isinstance(s, Scanner)), 0)
         for job in there:
             if job.sensor.name in points:
-                points[job.sensor.name] += recorder.count(job.sensor, job.frame)
+                points[job.sensor.name] += recording.count(job.sensor, job.frame)
         written = record_all(
             scene,
             trajectory,
             jobs=jobs,
             sensors=sensors,
-            recorder=recorder,
+            recording=recording,
             actors=actors,
             workers=options.workers,
             progress=progress,
         )
         points = {name: n + written.get(name, 0) for name, n in points.items()}
         if actors is not None:
-            gather_boxes(out)
-        write_json(out / "dataset.json", manifest | {"points": points, "frames_done": manifest["frames"]})
+            merge_box_files(out)
+        write_json(Paths(out).manifest, manifest | {"points": points, "frames_done": manifest["frames"]})
     return DriveSummary(
         out,
         int(manifest["frames"]),
@@ -241,7 +242,7 @@ def drive(
 @contextmanager
 def _nothing_half_made(out: Path) -> Iterator[None]:
     """Remove a dataset that was begun here if an error ends the drive before any frame is recorded."""
-    begun = not (out / "dataset.json").exists()
+    begun = not Paths(out).manifest.exists()
     try:
         yield
     except (GeosceneError, LidarError):
@@ -382,13 +383,13 @@ def record_all(
     *,
     jobs: Sequence[Job],
     sensors: Sequence[Scanner | Camera],
-    recorder: Recorder,
+    recording: Recording,
     actors: Actors | None = None,
     workers: int = 1,
     progress: Progress = silent,
 ) -> dict[str, int]:
     """Do all jobs that are not done yet, chunk by chunk of the route; the points written, by sensor."""
-    pending = [job for job in jobs if not recorder.is_done(job.sensor, job.frame)]
+    pending = [job for job in jobs if not recording.is_done(job.sensor, job.frame)]
     progress("driving", len(jobs) - len(pending), total=len(jobs))
     reach = max((s.reach for s in sensors), default=0.0)
     worlds = Worlds(scene, reach, actors=actors)
@@ -397,11 +398,12 @@ def record_all(
     workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
     with ThreadPoolExecutor(workers) as pool:
         for chunk, region in _chunks(pending, trajectory):
-            with recorder.watch.stage("load"):
+            with recording.watch.stage("load"):
                 worlds.follow(region)
             running: dict[Future[int], str] = {}
             for job in chunk:
-                running[pool.submit(recorder.record, job.sensor, job.frame, worlds=worlds)] = job.sensor.name
+                future = pool.submit(record_frame, recording, job.sensor, frame=job.frame, worlds=worlds)
+                running[future] = job.sensor.name
                 if len(running) >= 2 * workers:
                     done += _take(running, points, finished=wait(running, return_when=FIRST_COMPLETED).done)
                     progress("driving", done, total=len(jobs))

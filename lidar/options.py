@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from geoscene.scene import Scene
-from lidar.dataset.record import Contents
+from lidar.dataset.recording import Contents
 from lidar.errors import InputError
 from lidar.planning.route import Side, Spec
 from lidar.rig.specs import load_rig, rig_digest
@@ -34,8 +34,8 @@ class DriveOptions:
     turns      : scanners work in the turns between a survey's strips too, and on the way there
     rig        : name of a rig, or a TOML file
     vehicle    : name of a vehicle, or a TOML file; the rig's by default
-    formats    : of clouds, of `lidar.dataset.record.FORMATS`
-    labels     : files of labels in others' codes, of `lidar.dataset.record.LABELS`
+    formats    : of clouds, of `lidar.dataset.formats.FORMATS`
+    labels     : files of labels in others' codes, of `lidar.dataset.formats.LABELS`
     deskew     : moment (start, middle, end) to which clouds are brought in further files; none by default
     seed       : of everything random, 0 or more
     start      : UTC time of the drive's start; 10:00 local solar time on 21 June 2026 by default

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class
+from geoscene.files import write_atomically
 from geoscene.typing import Float, Ints
 from lidar.camera.outline import outline
+from lidar.dataset.layout import Paths
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.camera_model import project
 from lidar.rig.specs import CameraSpec
@@ -158,3 +162,57 @@ def image_boxes(
         np.array([f[3] for f in found], np.int64),
         np.array([f[4] for f in found], float),
     )
+
+
+def merge_box_files(out: Path) -> None:
+    """Write the boxes of all frames of each sensor as one file, and ``boxes.csv`` of the dataset.
+
+    The dataset's file holds the boxes of the first scanner, with a column ``points_<scanner>`` for each
+    scanner: its points on the box in frames that start between the row's time and the next row's.
+    """
+    paths = Paths(out)
+    calibration = json.loads(paths.calibration.read_text("utf-8"))["sensors"]
+    lines = {
+        name: _merged(paths, name) for name, s in calibration.items() if s["kind"] in ("lidar", "camera")
+    }
+    scanners = [name for name in lines if calibration[name]["kind"] == "lidar"]
+    if not scanners or not lines[scanners[0]]:
+        return
+    header, *rows = lines[scanners[0]]
+    step_ns = 10**9 / calibration[scanners[0]]["rate_hz"]
+    first_ns = calibration[scanners[0]]["time_offset_ns"]
+    counts = [_points_by_step(lines[name], first_ns, step_ns=step_ns) for name in scanners]
+    names = header.split(",")
+    frame, number = names.index("frame"), names.index("id")
+    merged = [",".join([header, *(f"points_{name}" for name in scanners)])]
+    for row in rows:
+        cells = row.split(",")
+        key = int(cells[frame]), int(cells[number])
+        merged.append(",".join([row, *(str(count.get(key, 0)) for count in counts)]))
+    write_atomically(paths.boxes, ("\n".join(merged) + "\n").encode("utf-8"))
+
+
+def _merged(paths: Paths, name: str) -> list[str]:
+    """Header and rows of all box files of a sensor, written to its ``boxes.csv`` too; empty without files."""
+    lines: list[str] = []
+    for part in sorted(paths.frame_boxes(name, 0).parent.glob("*.csv")):
+        header, *rows = part.read_text("utf-8").splitlines()
+        lines += rows if lines else [header, *rows]
+    if lines:
+        write_atomically(paths.sensor_boxes(name), ("\n".join(lines) + "\n").encode("utf-8"))
+    return lines
+
+
+def _points_by_step(lines: list[str], first_ns: int, *, step_ns: float) -> dict[tuple[int, int], int]:
+    """Sums of points by (step, road user's id); step k starts ``k * step_ns`` after ``first_ns``."""
+    if not lines:
+        return {}
+    names = lines[0].split(",")
+    time, number, points = (names.index(name) for name in ("time_ns", "id", "points"))
+    total: dict[tuple[int, int], int] = {}
+    for line in lines[1:]:
+        cells = line.split(",")
+        # 1 ns is added because frame starts are rounded down
+        key = int((int(cells[time]) - first_ns + 1) // step_ns), int(cells[number])
+        total[key] = total.get(key, 0) + int(cells[points])
+    return total

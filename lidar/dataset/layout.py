@@ -12,6 +12,7 @@ DATASET/
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from collections.abc import Iterator, Mapping
@@ -23,12 +24,73 @@ from typing import Any
 from pyproj import CRS
 
 from geoscene.frames import Frame
+from lidar.dataset.formats import Format
 from lidar.errors import DatasetError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import read_trajectory
 
 SCHEMA = 1
 """Version of the dataset directory; a reader refuses others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Paths:
+    """Files of the dataset directory ``root``."""
+
+    root: Path
+
+    @property
+    def manifest(self) -> Path:
+        """Schema, scene, rig, options, seed, frames and licence; updated last."""
+        return self.root / "dataset.json"
+
+    @property
+    def calibration(self) -> Path:
+        """Mounts and intrinsics of all sensors."""
+        return self.root / "calibration.json"
+
+    @property
+    def trajectory(self) -> Path:
+        """The ego vehicle at 100 Hz."""
+        return self.root / "trajectory.csv"
+
+    @property
+    def poses(self) -> Path:
+        """The ego vehicle at the start of each frame of the first sensor."""
+        return self.root / "poses.csv"
+
+    @property
+    def boxes(self) -> Path:
+        """3D boxes at the frames of the first scanner."""
+        return self.root / "boxes.csv"
+
+    def measurements(self, name: str, suffix: str = ".csv") -> Path:
+        """Measurements of a GNSS receiver (also ``.nmea``) or an inertial unit."""
+        return self.root / f"{name}{suffix}"
+
+    def sensor(self, name: str) -> Path:
+        """Folder of a scanner or camera."""
+        return self.root / name
+
+    def timestamps(self, name: str) -> Path:
+        """Start times of a sensor's frames."""
+        return self.root / name / "timestamps.csv"
+
+    def sensor_boxes(self, name: str) -> Path:
+        """Boxes of all frames of a sensor."""
+        return self.root / name / "boxes.csv"
+
+    def frame_boxes(self, name: str, frame: int) -> Path:
+        """Boxes of one frame of a sensor."""
+        return self.root / name / "boxes" / f"{frame:06d}.csv"
+
+    def image(self, name: str, frame: int, *, kind: str) -> Path:
+        """An image of a camera: ``rgb``, ``depth``, ``semantic``, ``instance`` or ``flow``."""
+        return self.root / name / kind / f"{frame:06d}.png"
+
+    def deskewed(self, name: str, frame: int, *, suffix: str) -> Path:
+        """A de-skewed cloud of a scanner."""
+        return self.root / name / "deskewed" / f"{frame:06d}{suffix}"
 
 
 @dataclass(frozen=True)
@@ -63,20 +125,31 @@ class Dataset:
         return int(self.manifest["frames"])
 
     @property
-    def lidars(self) -> dict[str, dict[str, Any]]:
-        """Laser scanners by name, as ``calibration.json`` describes them."""
-        calibration = json.loads((self.path / "calibration.json").read_text("utf-8"))
-        return {name: sensor for name, sensor in calibration["sensors"].items() if sensor["kind"] == "lidar"}
+    def paths(self) -> Paths:
+        """The dataset's files."""
+        return Paths(self.path)
+
+    def sensors(self, *kinds: str) -> dict[str, dict[str, Any]]:
+        """Entries of ``calibration.json`` by name, of sensors of some kinds (lidar, camera, gnss, imu)."""
+        sensors = json.loads(self.paths.calibration.read_text("utf-8"))["sensors"]
+        return {name: sensor for name, sensor in sensors.items() if not kinds or sensor["kind"] in kinds}
+
+    def frame_times(self, name: str) -> dict[int, int]:
+        """Start times of a sensor's frames, nanoseconds since the drive's start, by frame number.
+
+        Raises DatasetError if the drive has not written them.
+        """
+        return {int(row["frame"]): int(row["time_ns"]) for row in read_rows(self.paths.timestamps(name))}
 
     def trajectory(self) -> Trajectory:
-        """The vehicle's poses."""
-        return read_trajectory(self.path / "trajectory.csv")
+        """The ego vehicle's poses."""
+        return read_trajectory(self.paths.trajectory)
 
-    def files(self, sensor: str, kind: str) -> Iterator[tuple[int, Path]]:
-        """(frame number, path) of a sensor's files of one format, in order."""
-        for path in sorted((self.path / sensor / kind).glob(f"*.{kind}")):
-            if path.stem.isdigit():
-                yield int(path.stem), path
+    def files(self, sensor: str, form: Format) -> Iterator[tuple[int, Path]]:
+        """(frame number, path) of a sensor's clouds of one format, in order."""
+        for path in sorted(form.path(self.paths.sensor(sensor), 0).parent.glob(f"*{form.suffix}")):
+            if (number := path.name.removesuffix(form.suffix)).isdigit():
+                yield int(number), path
 
 
 def open_dataset(path: str | Path) -> Dataset:
@@ -85,7 +158,7 @@ def open_dataset(path: str | Path) -> Dataset:
     Raises DatasetError if it is none or has another schema version.
     """
     folder = Path(path)
-    manifest_path = folder / "dataset.json"
+    manifest_path = Paths(folder).manifest
     if not manifest_path.exists():
         raise DatasetError(f"{folder}: no dataset.json in it; lidar drive records a dataset")
     try:
@@ -98,6 +171,18 @@ def open_dataset(path: str | Path) -> Dataset:
     return Dataset(folder, manifest)
 
 
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a dataset's CSV file.
+
+    Raises DatasetError if it cannot be read.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except OSError as error:
+        raise DatasetError(f"{path}: {error.strerror}; was the drive finished?") from error
+
+
 def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
     """Make a directory ready for a drive made by ``recipe``; return how many frames it already holds.
 
@@ -106,7 +191,7 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
 
     Raises DatasetError if the directory may not be used.
     """
-    manifest_path = path / "dataset.json"
+    manifest_path = Paths(path).manifest
     if path.exists() and not path.is_dir():
         raise DatasetError(f"{path}: is a file; give a directory")
     if not path.exists() or not any(path.iterdir()):

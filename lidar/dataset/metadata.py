@@ -1,4 +1,4 @@
-"""What a dataset holds beside clouds and images: poses, calibration, fixes, time stamps."""
+"""Metadata files of a dataset: poses, calibration, time stamps, GNSS and IMU measurements."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from geoscene.files import write_atomically, write_columns, write_json
 from geoscene.frames import Frame
 from geoscene.scene import Scene
-from lidar.dataset.formats import kitti
-from lidar.dataset.record import Contents
+from lidar.dataset.kitti_sequence import write_sequence
+from lidar.dataset.layout import Paths
+from lidar.dataset.recording import Contents
 from lidar.geometry.attitude import euler_from_quat
-from lidar.geometry.mounts import OPTICAL, Mount
+from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.navigation.gnss import antenna_motion, epochs, gnss_columns, observe_gnss
 from lidar.navigation.imu import imu_columns, observe_imu
@@ -77,14 +78,14 @@ def _quaternions(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _mounted(mount: Mount) -> dict[str, Any]:
     return {
-        "vehicle_from_sensor": _matrix(mount).tolist(),
+        "vehicle_from_sensor": mount.matrix.tolist(),
         "translation": list(mount.translation),
         "quat_xyzw": list(mount.quat_xyzw),
     }
 
 
 def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]:
-    """What ``calibration.json`` says: mounts, rates and intrinsics."""
+    """The document ``calibration.json``: mounts, rates and intrinsics."""
     out: dict[str, Any] = {}
     for kind, specs in (("gnss", rig.gnss), ("imu", rig.imus)):
         for spec in specs:
@@ -132,7 +133,7 @@ def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]
     }
 
 
-def write_sidecars(
+def write_metadata(
     out: Path,
     scene: Scene,
     *,
@@ -143,37 +144,35 @@ def write_sidecars(
     frames: Mapping[str, int],
     contents: Contents,
 ) -> None:
-    """Write all but clouds and images.
+    """Write all files of a dataset but clouds, images and boxes.
 
-    ``poses.csv`` (a row a frame of the first sensor), ``calibration.json``, time stamps by sensor, and
-    ``<name>.csv`` of every receiver (also as NMEA sentences) and inertial unit of the rig; with KITTI's
-    clouds or labels what makes a sequence of each scanner's folder.
+    ``poses.csv`` (a row for each frame of the first sensor), ``calibration.json``, time stamps of each
+    sensor, and ``<name>.csv`` of every receiver (also as NMEA sentences) and inertial unit of the rig; with
+    KITTI's clouds or labels the files that make each scanner's folder a sequence.
+
+    frames : number of frames, by sensor
     """
-    seed = contents.seed
-    sequences = "kitti" in contents.formats or "semantickitti" in contents.labels
-    write_json(out / "calibration.json", calibration(rig, sensors))
+    seed, paths = contents.seed, Paths(out)
+    write_json(paths.calibration, calibration(rig, sensors))
     for k, sensor in enumerate(sensors):
         times = np.array([sensor.frame_start_ns(f) for f in range(frames[sensor.name])], np.int64)
-        folder = out / sensor.name
-        folder.mkdir(parents=True, exist_ok=True)
         stamps: dict[str, Any] = {"frame": np.arange(len(times)), "time_ns": times}
-        write_columns(folder / "timestamps.csv", stamps | {"timestamp": iso_times(start, times)})
+        write_columns(paths.timestamps(sensor.name), stamps | {"timestamp": iso_times(start, times)})
         if k == 0:
-            write_columns(
-                out / "poses.csv", pose_columns(trajectory, scene.frame, start=start, time_ns=times)
-            )
-        if sequences and isinstance(sensor, Scanner):
-            _write_sequence(folder, rig, mount=sensor.spec.mount, trajectory=trajectory, times=times)
+            write_columns(paths.poses, pose_columns(trajectory, scene.frame, start=start, time_ns=times))
+        if contents.kitti and isinstance(sensor, Scanner):
+            folder, mount = paths.sensor(sensor.name), sensor.spec.mount
+            write_sequence(folder, rig, mount=mount, trajectory=trajectory, time_ns=times)
     for receiver in rig.gnss:
-        _write_fixes(out, scene, spec=receiver, trajectory=trajectory, start=start, seed=seed)
+        _write_fixes(paths, scene, spec=receiver, trajectory=trajectory, start=start, seed=seed)
     for unit in rig.imus:
         rows = observe_imu(trajectory, scene.frame, spec=unit, seed=seed)
         stamped: dict[str, Any] = {"timestamp": iso_times(start, rows.time_ns), **imu_columns(rows)}
-        write_columns(out / f"{unit.name}.csv", stamped)
+        write_columns(paths.measurements(unit.name), stamped)
 
 
 def _write_fixes(
-    out: Path, scene: Scene, *, spec: GnssSpec, trajectory: Trajectory, start: datetime, seed: int
+    paths: Paths, scene: Scene, *, spec: GnssSpec, trajectory: Trajectory, start: datetime, seed: int
 ) -> None:
     times = epochs(spec, trajectory.duration_ns)
     antenna, _ = antenna_motion(trajectory, scene.frame, spec=spec, time_ns=times)
@@ -192,42 +191,5 @@ def _write_fixes(
     )
     fixes = observe_gnss(trajectory, scene.frame, spec=spec, seed=seed, start=start, sky=sky)
     stamped: dict[str, Any] = {"timestamp": iso_times(start, fixes.time_ns), **gnss_columns(fixes)}
-    write_columns(out / f"{spec.name}.csv", stamped)
-    write_atomically(out / f"{spec.name}.nmea", "".join(nmea(fixes, start)).encode("ascii"))
-
-
-def _write_sequence(
-    folder: Path, rig: Rig, *, mount: Mount, trajectory: Trajectory, times: NDArray[np.int64]
-) -> None:
-    """Write KITTI's calib.txt, times.txt and poses.txt.
-
-    The cameras are the rig's first four; without one, a camera at the scanner that looks along its x axis.
-    """
-    vehicle_from_lidar = _matrix(mount)
-    if rig.cameras:
-        first = _matrix(rig.cameras[0].mount)
-        projections = [
-            intrinsic_matrix(camera) @ (np.linalg.inv(_matrix(camera.mount)) @ first)[:3]
-            for camera in rig.cameras
-        ]
-        camera_from_lidar = np.linalg.inv(first) @ vehicle_from_lidar
-    else:
-        projections = [np.eye(3, 4)]
-        camera_from_lidar = np.eye(4)
-        camera_from_lidar[:3, :3] = OPTICAL.T
-    kitti.write_calibration(folder / "calib.txt", projections, camera_from_lidar=camera_from_lidar)
-    if not len(times):
-        return
-    kitti.write_times(folder / "times.txt", times)
-    at = trajectory.at(times).mounted(mount.translation, mount.rotation)
-    world_from_lidar = np.tile(np.eye(4), (len(times), 1, 1))
-    world_from_lidar[:, :3, :3] = at.rotation
-    world_from_lidar[:, :3, 3] = at.position / at.scale[0]  # true metres
-    kitti.write_poses(folder / "poses.txt", world_from_lidar, camera_from_lidar=camera_from_lidar)
-
-
-def _matrix(mount: Mount) -> NDArray[np.float64]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = mount.rotation
-    matrix[:3, 3] = mount.translation
-    return matrix
+    write_columns(paths.measurements(spec.name), stamped)
+    write_atomically(paths.measurements(spec.name, ".nmea"), "".join(nmea(fixes, start)).encode("ascii"))

@@ -29,3 +29,11 @@ class Mount:
     def rotation(self) -> Float:
         """Vehicle axes from sensor axes, (3, 3)."""
         return matrix_from_quat(self.quat_xyzw)
+
+    @property
+    def matrix(self) -> Float:
+        """Vehicle frame from sensor frame, (4, 4) homogeneous."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = self.translation
+        return matrix

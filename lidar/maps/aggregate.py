@@ -8,18 +8,15 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes
 from geoscene.progress import Progress, silent
-from lidar.dataset.formats.clouds import CLOUD_READERS, placed_returns
-from lidar.dataset.formats.las import LasInfo, LasWriter, gps_seconds, read_las
-from lidar.dataset.formats.pcd import encode_pcd
-from lidar.dataset.formats.ply import ply_header, ply_table
-from lidar.dataset.formats.table import Table, records, rows
+from lidar.dataset.formats import FORMATS, Format, format_of, read_table
+from lidar.dataset.formats.las import LasInfo, gps_seconds, read_chunks
+from lidar.dataset.formats.table import Table, placed_returns, records, rows
 from lidar.dataset.layout import Dataset
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
@@ -31,10 +28,21 @@ COLORS = ("class", "height", "intensity", "sensor")
 """What the colours of a map may show."""
 
 _COLUMNS = ("x", "y", "z", "intensity", "gps_time", "ring", "label", "instance", "source")
-_SUFFIXES = (".las", ".laz", ".ply", ".pcd")
 _BUCKET = 64.0  # metres: side of the squares that voxels are gathered in
 _SHRINK_AT = 64 * 2**20  # bytes of a square's points beyond which they are thinned
 _SAMPLE = 12  # frames that the colour ramp of heights is taken from
+
+
+def map_suffixes() -> list[str]:
+    """Suffixes of files that maps are written to."""
+    return [form.suffix for form in FORMATS.values() if form.maps]
+
+
+def _readable() -> list[Format]:
+    """Formats that keep what maps need; those in the world frame first, which need not be placed."""
+    needed = {"intensity", "ring", "label", "instance"}
+    found = [form for form in FORMATS.values() if needed <= set(form.columns)]
+    return sorted(found, key=lambda form: form.frame != "world")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,15 +89,15 @@ def aggregate(
 
     Raises InputError for options that cannot be and DatasetError where there are no clouds.
     """
-    if out.suffix.lower() not in _SUFFIXES:
-        raise InputError(f"{out}: maps are written as {', '.join(_SUFFIXES)}")
+    if out.suffix.lower() not in map_suffixes():
+        raise InputError(f"{out}: maps are written as {', '.join(map_suffixes())}")
     if color not in COLORS:
         raise InputError(f"`color` {color}: one of {', '.join(COLORS)}")
     if voxel is not None and not (np.isfinite(voxel) and voxel > 0):
         raise InputError(f"`voxel` {voxel}: give a positive number of metres")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: is there already; set `overwrite` to replace it")
-    lidars = dataset.lidars
+    lidars = dataset.sensors("lidar")
     if unknown := sorted(set(sensors) - set(lidars)):
         raise InputError(f"no scanner {', '.join(unknown)} in {dataset.path}; there are {', '.join(lidars)}")
     chosen = [name for name in lidars if not sensors or name in sensors]
@@ -123,15 +131,15 @@ class _Source:
         self.dataset = dataset
         self.geo = Georeference(dataset.frame, dataset.crs)
         self._trajectory: Trajectory | None = None
-        self._lidars = dataset.lidars
+        self._lidars = dataset.sensors("lidar")
         self._names = list(names)
         order = list(self._lidars)
-        self._files: list[tuple[int, str, int, str, Path]] = []
+        self._files: list[tuple[int, str, int, Path]] = []
         for name in names:
-            kinds = [k for k in ("laz", "las", "pcd", "ply", "csv") if any(dataset.files(name, k))]
-            if kinds:
-                files = dataset.files(name, kinds[0])
-                self._files += [(frame, name, order.index(name), kinds[0], path) for frame, path in files]
+            form = next((f for f in _readable() if any(dataset.files(name, f))), None)
+            if form:
+                files = dataset.files(name, form)
+                self._files += [(frame, name, order.index(name), path) for frame, path in files]
         if not self._files:
             raise DatasetError(f"{dataset.path}: no clouds of {', '.join(names) or 'any scanner'} in it")
         self._files.sort()
@@ -147,16 +155,16 @@ class _Source:
         return {name: count for name, count in short.items() if count > 0}
 
     def tables(self, every: int = 1) -> Iterator[tuple[int, Table]]:
-        for frame, name, index, kind, path in self._files[::every]:
-            if kind in ("laz", "las"):
-                for table in read_las(path):
+        for frame, name, index, path in self._files[::every]:
+            if format_of(path).frame == "world":
+                for table in read_chunks(path):
                     yield (
                         frame,
                         {k: table[k] for k in _COLUMNS if k in table and k != "source"}
                         | {"source": np.full(rows(table), index, np.uint16)},
                     )
             else:
-                yield frame, self._placed(CLOUD_READERS[kind](path), name, index=index, frame=frame)
+                yield frame, self._placed(read_table(path), name, index=index, frame=frame)
 
     def _placed(self, table: Table, name: str, *, index: int, frame: int) -> Table:
         if self._trajectory is None:
@@ -247,61 +255,12 @@ def _voxels(
 
 
 def _write(out: Path, tables: Iterator[Table], *, source: _Source) -> int:
-    suffix = out.suffix.lower()
+    """Write tables as a map; return the number of points."""
+    info = LasInfo(source.dataset.crs, source.geo.offset, source.dataset.start)
     out.parent.mkdir(parents=True, exist_ok=True)
-    if suffix in (".las", ".laz"):
-        return _write_las(out, tables, source=source)
-    return _write_raw(out, tables, source=source, kind="ply" if suffix == ".ply" else "pcd")
-
-
-def _write_las(out: Path, tables: Iterator[Table], *, source: _Source) -> int:
-    dataset = source.dataset
-    info = LasInfo(dataset.crs, source.geo.offset, dataset.start)
     count = 0
-    with LasWriter(out, info, columns=(*_COLUMNS, "red", "green", "blue")) as writer:
+    with format_of(out).open_map(out, info=info, columns=(*_COLUMNS, "red", "green", "blue")) as append:
         for table in tables:
-            writer.write(table)
+            append(table)
             count += rows(table)
     return count
-
-
-def _write_raw(out: Path, tables: Iterator[Table], *, source: _Source, kind: Literal["ply", "pcd"]) -> int:
-    """Write PLY or PCD: points first to a temporary file, then header and points to the real one."""
-    body = out.with_name(f"{out.name}.{os.getpid()}.body")
-    whole = out.with_name(f"{out.name}.{os.getpid()}.part")
-    offset = source.geo.offset
-    count = 0
-    last: Table | None = None
-    try:
-        with body.open("wb") as file:
-            for table in tables:
-                last = ply_table(table) if kind == "ply" else _pcd_table(table, offset)
-                file.write(records(last).tobytes())
-                count += rows(table)
-        empty = {name: column[:0] for name, column in (last or {}).items()}
-        name = source.dataset.crs.name
-        if kind == "ply":
-            header = ply_header(empty, count, comments=(f"crs {name}",))
-        else:
-            note = f"add {offset[0]:.0f} {offset[1]:.0f} {offset[2]:.0f} for {name}"
-            text = encode_pcd(empty, comment=note).decode("ascii")
-            header = text.replace("WIDTH 0", f"WIDTH {count}").replace("POINTS 0", f"POINTS {count}").encode()
-        with whole.open("wb") as file, body.open("rb") as points:
-            file.write(header)
-            shutil.copyfileobj(points, file)
-        whole.replace(out)
-    finally:
-        body.unlink(missing_ok=True)
-        whole.unlink(missing_ok=True)
-    return count
-
-
-def _pcd_table(table: Table, offset: tuple[float, float, float]) -> Table:
-    shifted = {k: (table[k] - s).astype(np.float32) for k, s in zip("xyz", offset, strict=True)}
-    rgb = (
-        table["red"].astype(np.uint32) << 16
-        | table["green"].astype(np.uint32) << 8
-        | table["blue"].astype(np.uint32)
-    )
-    rest = {k: v for k, v in table.items() if k not in ("x", "y", "z", "red", "green", "blue")}
-    return shifted | {"rgb": rgb.view(np.float32)} | rest

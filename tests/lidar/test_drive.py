@@ -24,7 +24,7 @@ from geoscene.classes import Class
 from geoscene.errors import GeosceneError
 from geoscene.scene import open_scene
 from geoscene.sources import demo_path, read_osm
-from lidar.dataset.formats.pcd import read_pcd
+from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
 from lidar.drive import DriveOptions, drive
 from lidar.errors import DatasetError, InputError, LidarError
@@ -179,7 +179,7 @@ def test_pose_rows_agree_with_each_other_and_with_the_earth(scene, dataset):
 
 
 def test_intensity_tells_materials_and_angles_apart(dataset):
-    cloud = read_pcd(dataset.path / "lidar_top" / "pcd" / "000010.pcd")
+    cloud = read_table(dataset.path / "lidar_top" / "pcd" / "000010.pcd")
     wall = cloud["label"] == Class.BUILDING
     steep = wall & (cloud["incidence"] < 0.5)
     grazing = wall & (cloud["incidence"] > 1.2)
@@ -188,12 +188,12 @@ def test_intensity_tells_materials_and_angles_apart(dataset):
 
 
 def test_every_point_of_a_revolution_has_its_own_time_and_ring(dataset):
-    cloud = read_pcd(dataset.path / "lidar_top" / "pcd" / "000020.pcd")
+    cloud = read_table(dataset.path / "lidar_top" / "pcd" / "000020.pcd")
     assert (np.diff(cloud["time_ns"].astype(np.int64)) > 0).all()
     assert cloud["time_ns"].max() < 100_000_000 + 55_296  # its last block may end after it
     assert set(np.unique(cloud["ring"])) == set(range(16))
     azimuths = [
-        read_pcd(dataset.path / "lidar_top" / "pcd" / f"{k:06d}.pcd")["time_ns"][:1] for k in (20, 21, 22)
+        read_table(dataset.path / "lidar_top" / "pcd" / f"{k:06d}.pcd")["time_ns"][:1] for k in (20, 21, 22)
     ]
     assert len({int(a[0]) for a in azimuths}) > 1
 
@@ -248,7 +248,7 @@ def test_traffic_is_labelled_boxed_and_the_same_for_any_number_of_workers(scene,
     mount = np.array(calibration["sensors"]["lidar_top"]["vehicle_from_sensor"])
     for row in hit[:: max(1, len(hit) // 20)]:
         frame = int(row["frame"])
-        cloud = read_pcd(tmp_path / "a" / "lidar_top" / "pcd" / f"{frame:06d}.pcd")
+        cloud = read_table(tmp_path / "a" / "lidar_top" / "pcd" / f"{frame:06d}.pcd")
         on_it = cloud["instance"] == int(row["instance"])
         assert on_it.sum() == int(row["points"])
         assert int(row["instance"]) >= first

@@ -24,12 +24,11 @@ from geoscene.classes import Class, class_codes
 from geoscene.sources import demo_path, read_osm
 from lidar.dataset.deskew import MOMENTS, deskewed
 from lidar.dataset.export.nuscenes import CATEGORIES, VERSION, export_nuscenes
-from lidar.dataset.formats.kitti import read_velodyne, semantic_kitti_labels
-from lidar.dataset.formats.pcd import read_pcd
-from lidar.dataset.formats.ply import read_ply
-from lidar.dataset.formats.text import read_csv
+from lidar.dataset.formats import read_table
+from lidar.dataset.formats.kitti import semantic_kitti_labels
+from lidar.dataset.formats.table import PointLabels
 from lidar.dataset.layout import open_dataset
-from lidar.dataset.record import Contents
+from lidar.dataset.recording import Contents
 from lidar.drive import drive
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
@@ -210,7 +209,7 @@ def test_solid_boxes_say_how_much_is_seen_and_how_many_points_of_each_scanner_hi
     for row in rich[:: max(1, len(rich) // 25)]:
         frame = int(row["frame"])
         for sensor, frames in (("top", [frame]), ("ahead", [2 * frame, 2 * frame + 1])):
-            clouds = [read_pcd(dataset.path / sensor / "pcd" / f"{k:06d}.pcd") for k in frames]
+            clouds = [read_table(dataset.path / sensor / "pcd" / f"{k:06d}.pcd") for k in frames]
             count = sum(int((c["instance"] == int(row["instance"])).sum()) for c in clouds)
             assert count == int(row[f"points_{sensor}"])
         assert int(row["points"]) == int(row["points_top"])
@@ -246,8 +245,8 @@ def test_a_static_wall_is_straight_after_deskewing_while_the_vehicle_turns():
 def test_deskewed_files_hold_the_points_where_the_sensor_is_when_the_frame_ends(dataset):
     for sensor, period in (("top", 100_000_000), ("ahead", 50_000_000)):
         frame = 30
-        raw = read_pcd(dataset.path / sensor / "pcd" / f"{frame:06d}.pcd")
-        moved = read_pcd(dataset.path / sensor / "deskewed" / f"{frame:06d}.pcd")
+        raw = read_table(dataset.path / sensor / "pcd" / f"{frame:06d}.pcd")
+        moved = read_table(dataset.path / sensor / "deskewed" / f"{frame:06d}.pcd")
         where, _ = placed(dataset, sensor, frame, raw)
         mount = mounts(dataset)[1][sensor]
         pose = dataset.trajectory().at([(frame + 1) * period]).mounted(mount[:3, 3], mount[:3, :3])
@@ -255,7 +254,7 @@ def test_deskewed_files_hold_the_points_where_the_sensor_is_when_the_frame_ends(
             pose.place(np.column_stack([moved[k] for k in "xyz"]).astype(float)), where, atol=1e-4
         )
         np.testing.assert_array_equal(raw["time_ns"], moved["time_ns"])
-        assert len(read_velodyne(dataset.path / sensor / "deskewed" / f"{frame:06d}.bin")) == len(where)
+        assert len(read_table(dataset.path / sensor / "deskewed" / f"{frame:06d}.bin")["x"]) == len(where)
 
 
 def test_radial_velocities_are_those_of_the_ego_and_of_what_is_hit(dataset):
@@ -264,7 +263,7 @@ def test_radial_velocities_are_those_of_the_ego_and_of_what_is_hit(dataset):
     boxes = table(dataset.path / "ahead" / "boxes.csv")
     still = moving = 0
     for frame in range(40, 80, 3):
-        cloud = read_pcd(dataset.path / "ahead" / "pcd" / f"{frame:06d}.pcd")
+        cloud = read_table(dataset.path / "ahead" / "pcd" / f"{frame:06d}.pcd")
         where, times = placed(dataset, "ahead", frame, cloud)
         ends = [trajectory.at(times + s).mounted(mount[:3, 3], mount[:3, :3]) for s in (-(10**6), 10**6)]
         own = (ends[1].position - ends[0].position) / 2e-3
@@ -287,14 +286,14 @@ def test_radial_velocities_are_those_of_the_ego_and_of_what_is_hit(dataset):
 
 def test_all_formats_hold_the_same_velocities_and_true_ranges(dataset):
     folder = dataset.path / "ahead"
-    pcd, ply = read_pcd(folder / "pcd" / "000050.pcd"), read_ply(folder / "ply" / "000050.ply")
-    text, las = read_csv(folder / "csv" / "000050.csv"), laspy.read(folder / "laz" / "000050.laz")
+    pcd, ply = read_table(folder / "pcd" / "000050.pcd"), read_table(folder / "ply" / "000050.ply")
+    text, las = read_table(folder / "csv" / "000050.csv"), laspy.read(folder / "laz" / "000050.laz")
     assert np.ptp(pcd["velocity"]) > 0.5
     for name in ("velocity", "true_range"):
         np.testing.assert_array_equal(ply[name], pcd[name])
         np.testing.assert_array_equal(np.asarray(las[name]), pcd[name])
         np.testing.assert_allclose(text[name], pcd[name], atol=1e-4)
-    plain = read_pcd(dataset.path / "top" / "pcd" / "000010.pcd")
+    plain = read_table(dataset.path / "top" / "pcd" / "000010.pcd")
     assert "velocity" not in plain
     np.testing.assert_allclose(plain["true_range"], plain["range"], atol=1e-5)
 
@@ -306,7 +305,7 @@ def test_labels_are_those_of_semantic_kitti_nuscenes_and_asprs(dataset):
     seen_moving = 0
     moving = {int(r["instance"]) for r in table(dataset.path / "boxes.csv") if r["moving"] == "True"}
     for path in sorted((folder / "pcd").glob("*.pcd"))[::4]:
-        cloud = read_pcd(path)
+        cloud = read_table(path)
         labels = np.fromfile(folder / "labels" / f"{path.stem}.label", np.uint32)
         rows = np.fromfile(folder / "velodyne" / f"{path.stem}.bin", np.float32).reshape(-1, 4)
         np.testing.assert_array_equal(rows[:, :3], np.column_stack([cloud[k] for k in "xyz"]))
@@ -336,7 +335,7 @@ def test_what_moves_has_numbers_of_its_own_in_semantic_kitti():
     )
     thing = np.array([7, 8, 9, 10, 11, 70_000, 0])
     moves = np.array([False, True, True, True, True, True, False])
-    labels = semantic_kitti_labels(klass, thing, moving=moves)
+    labels = semantic_kitti_labels(PointLabels(klass, thing, moves))
     assert (labels & 0xFFFF).tolist() == [10, 252, 254, 253, 257, 258, 40]
     assert (labels >> 16).tolist() == [7, 8, 9, 10, 11, 0, 0]
 
@@ -389,7 +388,7 @@ def test_a_scanners_points_lie_at_the_depth_of_their_pixels_on_a_real_drive(data
         start = frame * 100_000_000
         counts = np.array(Image.open(dataset.path / "front" / "depth" / f"{frame:06d}.png")).astype(float)
         depth = np.where(counts > 0, counts / 256, np.inf)
-        cloud = read_pcd(dataset.path / "top" / "pcd" / f"{frame:06d}.pcd")
+        cloud = read_table(dataset.path / "top" / "pcd" / f"{frame:06d}.pcd")
         still = ~np.isin(cloud["label"], ROADS)
         where, _ = placed(dataset, "top", frame, cloud)
         eye = trajectory.at([start]).mounted(mount["front"][:3, 3], mount["front"][:3, :3])
@@ -454,7 +453,7 @@ def _sixteen_bit_colour(path):
 def test_a_drive_that_goes_on_counts_all_of_its_points(scene, rig, recorded, tmp_path):
     dataset, summary = recorded
     assert set(summary.points) == {"top", "ahead"}
-    counted = sum(len(read_pcd(p)["x"]) for p in (dataset.path / "top" / "pcd").glob("*.pcd"))
+    counted = sum(len(read_table(p)["x"]) for p in (dataset.path / "top" / "pcd").glob("*.pcd"))
     assert summary.points["top"] == counted == dataset.manifest["points"]["top"]
     for kinds in (("ply",), ("csv",), ("laz",), ("kitti",)):
         options = replace(OPTIONS, rig=rig, duration=0.4, traffic=None, labels=(), deskew="", formats=kinds)
@@ -594,7 +593,7 @@ def test_a_map_says_which_frames_are_missing(scene, rig, tmp_path):
         ({"formats": ("laz",), "deskew": "end"}, "sensor frame"),
         ({"formats": ("pcd",), "deskew": "noon"}, "start, middle, end"),
         ({"formats": ("pcd",), "labels": ("cityscapes",)}, "semantickitti"),
-        ({"formats": ()}, "pcd,ply"),
+        ({"formats": ()}, "pcd, ply"),
     ],
 )
 def test_contents_that_cannot_be_written_are_refused(change, says):

@@ -6,7 +6,6 @@ as measured at one moment, the start of their frame, and boxes are those of that
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import shutil
@@ -20,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes
-from geoscene.files import write_atomically
+from geoscene.files import atomic_folder, write_atomically
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.camera.png import write_png
-from lidar.dataset.formats.clouds import CLOUD_READERS, placed_returns
-from lidar.dataset.formats.nuscenes import write_lidarseg, write_nuscenes
-from lidar.dataset.layout import Dataset
+from lidar.dataset.formats import FORMATS, Format, nuscenes, read_table
+from lidar.dataset.formats.table import PointLabels, placed_returns
+from lidar.dataset.layout import Dataset, read_rows
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Poses, Trajectory
 
@@ -107,37 +106,26 @@ def export_nuscenes(
     if out.exists() and not overwrite:
         raise InputError(f"{out}: is there already; set `overwrite` to replace it")
     streams = _streams(dataset)
-    part = out.with_name(f"{out.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        counts = _Export(dataset, streams, out=part).write(progress)
-        if out.exists():
-            shutil.rmtree(out)
-        part.replace(out)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    with atomic_folder(out, mark=f"{VERSION}/sample.json") as folder:
+        counts = _Export(dataset, streams, out=folder).write(progress)
     return NuscenesSummary(*counts, out)
 
 
 def _streams(dataset: Dataset) -> list[_Stream]:
     """Scanners, the first as LIDAR_TOP, and cameras with colour images."""
-    calibration = json.loads((dataset.path / "calibration.json").read_text("utf-8"))
     streams: list[_Stream] = []
-    for name, sensor in calibration["sensors"].items():
-        if sensor["kind"] not in ("lidar", "camera"):
-            continue
+    for name, sensor in dataset.sensors("lidar", "camera").items():
         if sensor["kind"] == "lidar":
-            kind = next((k for k in CLOUD_READERS if any(dataset.files(name, k))), None)
-            found = list(dataset.files(name, kind)) if kind else []
+            form = next((f for f in _formats() if any(dataset.files(name, f))), None)
+            found = list(dataset.files(name, form)) if form else []
         else:
-            images = sorted((dataset.path / name / "rgb").glob("*.png"))
+            images = sorted(dataset.paths.image(name, 0, kind="rgb").parent.glob("*.png"))
             found = [(int(path.stem), path) for path in images]
         if not found:
             continue
         lidar = sensor["kind"] == "lidar"
         first = lidar and not any(s.modality == "lidar" for s in streams)
-        stamps = _rows(dataset.path / name / "timestamps.csv")
-        at = {int(row["frame"]): int(row["time_ns"]) for row in stamps}
+        at = dataset.frame_times(name)
         frames = [frame for frame, _ in found]
         streams.append(
             _Stream(
@@ -151,18 +139,17 @@ def _streams(dataset: Dataset) -> list[_Stream]:
             )
         )
     if not any(s.modality == "lidar" for s in streams):
+        names = ", ".join(form.name for form in _formats())
         raise DatasetError(
-            f"{dataset.path}: no clouds in the sensor frame; drive with `formats` pcd, ply or csv too"
+            f"{dataset.path}: holds no labelled clouds in the sensor frame; drive with `formats` {names}"
         )
     return streams
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
-    except OSError as error:
-        raise DatasetError(f"{path}: {error.strerror}; was the drive finished?") from error
+def _formats() -> list[Format]:
+    """Formats that keep what samples need: points in the sensor frame with times and labels."""
+    needed = {"time_ns", "label", "ring"}
+    return [form for form in FORMATS.values() if form.frame == "sensor" and needed <= set(form.columns)]
 
 
 def _token(*what: object) -> str:
@@ -294,27 +281,29 @@ class _Export:
         self, stream: _Stream, source: Path, *, time: int, path: Path, token: str, labelled: bool
     ) -> None:
         """Write a cloud as from one moment, and of a key frame's points their classes."""
-        table = dict(CLOUD_READERS[source.suffix[1:]](source))
+        table = read_table(source)
         mount = np.array(stream.sensor["vehicle_from_sensor"])
         placed, _ = placed_returns(table, self.trajectory, start_ns=time, vehicle_from_sensor=mount)
         here: Poses = self.trajectory.at([time]).mounted(mount[:3, 3], mount[:3, :3])
         still = ((placed - here.position[0]) / here.scale[0]) @ here.rotation[0]
-        write_nuscenes(path, table | {axis: still[:, k] for k, axis in enumerate("xyz")})
+        nuscenes.write(path, table | {axis: still[:, k] for k, axis in enumerate("xyz")})
         if labelled:
             name = f"lidarseg/{VERSION}/{token}_lidarseg.bin"
             (self.out / name).parent.mkdir(parents=True, exist_ok=True)
-            write_lidarseg(self.out / name, table["label"].astype(np.int64))
+            n = len(placed)
+            labels = PointLabels(table["label"].astype(np.int64), np.zeros(n, np.int64), np.zeros(n, bool))
+            nuscenes.write_labels(self.out / name, labels)
             self.tables["lidarseg"].append({"token": token, "sample_data_token": token, "filename": name})
 
     def _annotate(self, top: _Stream, keys: Sequence[int], *, samples: Sequence[Row]) -> None:
         """Boxes that the scanner sees in key frames, and the things they are of."""
-        path = self.dataset.path / top.name / "boxes.csv"
+        path = self.dataset.paths.sensor_boxes(top.name)
         if not path.exists():
             return
         sample_of = {top.frames[k]: sample for k, sample in zip(keys, samples, strict=True)}
         things: dict[str, list[Row]] = defaultdict(list)
         category: dict[str, str] = {}
-        for box in _rows(path):
+        for box in read_rows(path):
             sample = sample_of.get(int(box["frame"]))
             if sample is None or (int(box["points"]) == 0 and float(box["visibility"]) == 0.0):
                 continue

@@ -1,1 +1,174 @@
-"""Point-cloud formats."""
+"""Point-cloud formats and label formats: one module each, and one row each in the registries below.
+
+Modules are imported when a file is read or written, so that a list of the formats costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from lidar.errors import FormatError, InputError
+
+if TYPE_CHECKING:
+    from lidar.dataset.formats.table import PointLabels, Table
+    from lidar.sensors.cloud import Cloud
+
+ALL = (
+    *("x", "y", "z", "intensity", "time_ns", "ring", "column", "range", "label", "instance", "incidence"),
+    *("true_range", "echo", "echoes", "velocity"),
+)
+"""Columns of a recorded cloud, see `lidar.dataset.formats.table`; velocity of Doppler scanners only."""
+
+_LAS = (*(name for name in ALL if name not in ("time_ns", "column")), "gps_time")
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A point-cloud format: a row of `FORMATS` and a module with ``read``, ``write`` and ``count``.
+
+    name    : by which users choose it
+    module  : in this folder
+    suffix  : end of its files' names
+    frame   : of the points: the sensor's, at each point's own firing time, or the world's (export CRS)
+    columns : columns that its files keep
+    folder  : of its files, in a sensor's folder; by default its name
+    header  : files start with a header, so that a file without points is not empty
+    kitti   : a sensor's folder becomes a KITTI sequence: calib.txt, times.txt and poses.txt are added
+    maps    : its module has ``open_map``, which writes aggregated maps
+    """
+
+    name: str
+    module: str
+    suffix: str
+    frame: Literal["sensor", "world"] = "sensor"
+    columns: tuple[str, ...] = ALL
+    folder: str = ""
+    header: bool = True
+    kitti: bool = False
+    maps: bool = False
+
+    def path(self, folder: Path, frame: int) -> Path:
+        """File of a frame in a sensor's folder."""
+        return folder / (self.folder or self.name) / f"{frame:06d}{self.suffix}"
+
+    def read(self, path: Path) -> Table:
+        """The point table of a file.
+
+        Raises FormatError for a file that is not of this format or is damaged.
+        """
+        table: Table = self._functions().read(path)
+        return table
+
+    def write(self, path: Path, table: Table, **info: Any) -> None:
+        """Write a point table; formats of the world frame need ``info``, a `las.LasInfo`."""
+        self._functions().write(path, table, **info)
+
+    def count(self, path: Path) -> int:
+        """Number of points of a file, from its header or its size.
+
+        Raises FormatError for a file without a readable header.
+        """
+        try:
+            return int(self._functions().count(path))
+        except (OSError, ValueError, IndexError, StopIteration) as error:
+            raise FormatError(f"{path}: its number of points cannot be read ({error})") from error
+
+    def open_map(self, path: Path, *, info: Any, columns: tuple[str, ...]) -> Any:
+        """A context manager that yields a function which appends tables in the world frame to a map."""
+        return self._functions().open_map(path, info, columns=columns)
+
+    def _functions(self) -> Any:
+        return importlib.import_module(f"{__name__}.{self.module}")
+
+
+@dataclass(frozen=True, slots=True)
+class LabelFormat:
+    """A format of label files, a row per point: a row of `LABELS` and a module with ``write_labels``.
+
+    name, module, suffix, folder, kitti : as of `Format`
+    """
+
+    name: str
+    module: str
+    suffix: str
+    folder: str
+    kitti: bool = False
+
+    def path(self, folder: Path, frame: int) -> Path:
+        """File of a frame in a sensor's folder."""
+        return folder / self.folder / f"{frame:06d}{self.suffix}"
+
+    def write(self, path: Path, labels: PointLabels) -> None:
+        """Write the labels of a cloud's points, in their order."""
+        importlib.import_module(f"{__name__}.{self.module}").write_labels(path, labels)
+
+
+FORMATS = {
+    row.name: row
+    for row in (
+        Format("pcd", "pcd", ".pcd", maps=True),
+        Format("ply", "ply", ".ply", maps=True),
+        Format("csv", "text", ".csv"),
+        Format("laz", "las", ".laz", frame="world", columns=_LAS, maps=True),
+        Format("las", "las", ".las", frame="world", columns=_LAS, maps=True),
+        Format("kitti", "kitti", ".bin", columns=ALL[:4], folder="velodyne", header=False, kitti=True),
+        Format("nuscenes", "nuscenes", ".pcd.bin", columns=(*ALL[:4], "ring"), header=False),
+    )
+}
+"""Point-cloud formats by name."""
+
+LABELS = {
+    row.name: row
+    for row in (
+        LabelFormat("semantickitti", "kitti", ".label", "labels", kitti=True),
+        LabelFormat("nuscenes", "nuscenes", "_lidarseg.bin", "lidarseg"),
+    )
+}
+"""Label formats by name."""
+
+
+def format_of(path: Path, name: str = "") -> Format:
+    """The format of a file: by name, or else the one with the longest suffix that the file's name ends in.
+
+    Raises InputError for an unknown name or suffix.
+    """
+    if name:
+        if name not in FORMATS:
+            raise InputError(f"format {name}: one of {', '.join(FORMATS)}")
+        return FORMATS[name]
+    found = [row for row in FORMATS.values() if path.name.lower().endswith(row.suffix)]
+    if not found:
+        suffixes = ", ".join(row.suffix for row in FORMATS.values())
+        raise InputError(f"{path}: no point-cloud format has this suffix; there are {suffixes}")
+    return max(found, key=lambda row: len(row.suffix))
+
+
+def read_table(path: Path, format: str = "") -> Table:  # noqa: A002 - the word that users know
+    """The points of a file as a table, in the frame and with the columns of its format.
+
+    format : name in `FORMATS`; by default from the file's suffix
+
+    Raises InputError for an unknown format and FormatError for a damaged file.
+    """
+    return format_of(path, format).read(path)
+
+
+def read_cloud(path: Path, format: str = "", *, start_ns: int = 0) -> Cloud:  # noqa: A002
+    """The cloud of one frame, from a file in the sensor frame, to the precision of its format.
+
+    format   : name in `FORMATS`; by default from the file's suffix
+    start_ns : the frame's start; not stored in files
+
+    Columns that the format does not keep are filled in, see `lidar.dataset.formats.table.table_cloud`.
+
+    Raises InputError for a format of the world frame and FormatError for a damaged file.
+    """
+    from lidar.dataset.formats.table import table_cloud  # noqa: PLC0415
+
+    row = format_of(path, format)
+    if row.frame == "world":
+        raise InputError(f"{path}: {row.name} files hold points in the world frame; use read_table")
+    return table_cloud(row.read(path), start_ns=start_ns)

@@ -7,13 +7,12 @@ import functools
 import io
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from geoscene.classes import class_codes
+from geoscene.files import atomic_path
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
 
@@ -175,37 +175,29 @@ class _Compressed:
             self._writer.close()
 
 
-class LasWriter:
-    """A LAS or LAZ file that takes tables one after the other and appears under its name when closed whole.
-
-    Tables need x, y, z (projected, float64) and label; they may have gps_time, intensity, ring, instance,
-    range, incidence, true_range, velocity, echo, echoes (up to 15), source (point source id), red, green,
-    blue.
-    """
+class _Encoder:
+    """Tables as LAS point records; see `open_las` for their columns."""
 
     def __init__(self, path: Path, info: LasInfo, *, columns: tuple[str, ...]) -> None:
         self.path = path
         self._info = info
         self._extra = tuple(n for n in _EXTRA if n in columns)
         self._colour = "red" in columns
-        self._layout = _layout(info, self._extra, colour=self._colour)
-        self._part = path.with_name(f"{path.name}.{os.getpid()}.part")
-        sink = _Compressed if path.suffix.lower() == ".laz" else _Uncompressed
-        self._sink = sink(self._part, self._layout)
+        self.layout = _layout(info, self._extra, colour=self._colour)
 
-    def write(self, table: Table) -> None:
-        """Append a table.
+    def records(self, table: Table) -> NDArray[np.void]:
+        """The point records of a table.
 
         Raises FormatError for coordinates too far from the offset to be counted in millimetres.
         """
-        points = np.zeros(rows(table), self._layout.kinds)
+        points = np.zeros(rows(table), self.layout.kinds)
         for k, axis in enumerate("xyz"):
             if not _count(np.asarray(table[axis], np.float64), self._info.offset[k], points[axis.upper()]):
                 raise FormatError(f"{self.path}: a point lies too far from {self._info.offset} for LAS")
         points["classification"] = class_codes().asprs[table["label"]]
         one = np.ones(1, np.uint8)
-        number, count = (np.minimum(table.get(name, one), 15) for name in ("echo", "echoes"))
-        points["bit_fields"] = number | count << 4
+        number, echoes = (np.minimum(table.get(name, one), 15) for name in ("echo", "echoes"))
+        points["bit_fields"] = number | echoes << 4
         if "intensity" in table:
             points["intensity"] = np.clip(np.rint(table["intensity"] * INTENSITY_UNIT), 0, 65535)
         if "gps_time" in table:
@@ -217,27 +209,26 @@ class LasWriter:
         if self._colour:
             for name in ("red", "green", "blue"):
                 points[name] = table[name].astype(np.uint16) * 257
-        self._sink.write_points(points)
+        return points
 
-    def close(self) -> None:
-        """Finish the file and move it to its name."""
-        self._sink.close()
-        self._part.replace(self.path)
 
-    def __enter__(self) -> Self:
-        return self
+@contextmanager
+def open_las(path: Path, info: LasInfo, *, columns: tuple[str, ...]) -> Iterator[Callable[[Table], None]]:
+    """Yield a function that appends tables to a LAS or LAZ file, by the suffix.
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    columns : of the tables. They need x, y, z (projected, float64) and label; they may have gps_time,
+              intensity, ring, instance, range, incidence, true_range, velocity, echo, echoes (up to 15),
+              source (point source id), red, green and blue
+    """
+    encoder = _Encoder(path, info, columns=columns)
+    with atomic_path(path) as part:
+        sink = (_Compressed if path.suffix.lower() == ".laz" else _Uncompressed)(part, encoder.layout)
         try:
-            if kind is None:
-                self.close()
+            yield lambda table: sink.write_points(encoder.records(table))
+            sink.close()
         finally:
-            if self._part.exists():
-                with suppress(OSError):
-                    self._sink.dest.close()
-                self._part.unlink()
+            with suppress(OSError):
+                sink.dest.close()
 
 
 @njit(cache=True, nogil=True)
@@ -251,10 +242,20 @@ def _count(place: Any, offset: float, counts: Any) -> bool:
     return fits
 
 
-def write_las(path: Path, table: Table, *, info: LasInfo) -> None:
+open_map = open_las
+
+
+def write(path: Path, table: Table, *, info: LasInfo) -> None:
     """Write one table as LAS or LAZ, by the suffix."""
-    with LasWriter(path, info, columns=tuple(table)) as writer:
-        writer.write(table)
+    with open_las(path, info, columns=tuple(table)) as append:
+        append(table)
+
+
+def count(path: Path) -> int:
+    """Number of points of a file: the entry at byte 247 of the header of LAS 1.4 (R15, table 3)."""
+    with path.open("rb") as file:
+        file.seek(247)
+        return int.from_bytes(file.read(8), "little")
 
 
 @contextmanager
@@ -269,24 +270,34 @@ def _opened(path: Path) -> Iterator[Any]:
         raise FormatError(f"{path}: not a readable LAS or LAZ file ({error})") from error
 
 
-def read_las(path: Path, *, chunk: int = 1_000_000) -> Iterator[Table]:
-    """The tables of a LAS or LAZ file, ``chunk`` points at a time, coordinates in its CRS.
+def read(path: Path) -> Table:
+    """The table of a LAS or LAZ file, coordinates in its CRS.
 
     Raises FormatError for a file that laspy cannot read.
     """
     with _opened(path) as reader:
+        return _table(reader.read_points(reader.header.point_count))
+
+
+def read_chunks(path: Path, *, chunk: int = 1_000_000) -> Iterator[Table]:
+    """The tables of a LAS or LAZ file, ``chunk`` points at a time; see `read`."""
+    with _opened(path) as reader:
         for points in reader.chunk_iterator(chunk):
-            table: Table = {axis: np.asarray(points[axis], np.float64) for axis in ("x", "y", "z")}
-            table["intensity"] = (np.asarray(points.intensity) / INTENSITY_UNIT).astype(np.float32)
-            table["gps_time"] = np.asarray(points.gps_time)
-            table["classification"] = np.asarray(points.classification)
-            table["echo"] = np.asarray(points.return_number)
-            table["echoes"] = np.asarray(points.number_of_returns)
-            table["source"] = np.asarray(points.point_source_id)
-            for name in (*_EXTRA, "red", "green", "blue"):
-                if name in points.array.dtype.names:
-                    table[name] = np.asarray(points[name])
-            yield table
+            yield _table(points)
+
+
+def _table(points: Any) -> Table:
+    table: Table = {axis: np.asarray(points[axis], np.float64) for axis in ("x", "y", "z")}
+    table["intensity"] = (np.asarray(points.intensity) / INTENSITY_UNIT).astype(np.float32)
+    table["gps_time"] = np.asarray(points.gps_time)
+    table["classification"] = np.asarray(points.classification)
+    table["echo"] = np.asarray(points.return_number)
+    table["echoes"] = np.asarray(points.number_of_returns)
+    table["source"] = np.asarray(points.point_source_id)
+    for name in (*_EXTRA, "red", "green", "blue"):
+        if name in points.array.dtype.names:
+            table[name] = np.asarray(points[name])
+    return table
 
 
 def read_crs(path: Path) -> CRS | None:

@@ -1,23 +1,38 @@
-"""nuScenes' clouds and its point labels (lidarseg), as its development kit reads them."""
+"""Point clouds of nuScenes and its point labels (lidarseg), as its development kit reads them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.classes import class_codes
 from geoscene.files import write_atomically
-from lidar.dataset.formats.table import Table
+from lidar.dataset.formats.table import PointLabels, Table, read_rows
+
+_COLUMNS = ("x", "y", "z", "intensity", "ring")
 
 
-def write_nuscenes(path: Path, table: Table) -> None:
+def write(path: Path, table: Table) -> None:
     """Write x, y, z (metres, sensor frame), intensity (0 to 255) and ring as little-endian float32."""
-    columns = [table[name].astype("<f4") for name in ("x", "y", "z", "intensity", "ring")]
+    columns = [table[name].astype("<f4") for name in _COLUMNS]
     write_atomically(path, np.stack(columns, axis=1).tobytes())
 
 
-def write_lidarseg(path: Path, klass: NDArray[np.integer]) -> None:
-    """Write a lidarseg class a point as uint8; ``klass`` (n,) is `geoscene.classes.Class`."""
-    write_atomically(path, class_codes().nuscenes[klass].astype(np.uint8).tobytes())
+def read(path: Path) -> Table:
+    """The table x, y, z, intensity (float32) and ring (uint16) of a file.
+
+    Raises FormatError for a file whose length is not a multiple of 20 bytes.
+    """
+    table = dict(zip(_COLUMNS, read_rows(path, len(_COLUMNS)).T, strict=True))
+    return table | {"ring": table["ring"].astype(np.uint16)}
+
+
+def count(path: Path) -> int:
+    """Number of points of a file."""
+    return path.stat().st_size // (4 * len(_COLUMNS))
+
+
+def write_labels(path: Path, labels: PointLabels) -> None:
+    """Write the lidarseg class of each point as uint8."""
+    write_atomically(path, class_codes().nuscenes[labels.klass].astype(np.uint8).tobytes())

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 
 from geoscene.files import write_atomically
-from lidar.dataset.formats.table import Table, records, rows
+from lidar.dataset.formats.las import LasInfo
+from lidar.dataset.formats.table import Table, counted_file, number_in_header, records, rows
 from lidar.errors import FormatError
 
 _TYPES = {
@@ -44,13 +47,13 @@ def ply_header(table: Table, count: int, *, comments: tuple[str, ...] = ()) -> b
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
 
-def write_ply(path: Path, table: Table, *, comments: tuple[str, ...] = ()) -> None:
+def write(path: Path, table: Table, *, comments: tuple[str, ...] = ()) -> None:
     """Write a table as PLY."""
     out = ply_table(table)
     write_atomically(path, ply_header(out, rows(out), comments=comments) + records(out).tobytes())
 
 
-def read_ply(path: Path) -> Table:
+def read(path: Path) -> Table:
     """The table of a PLY file of vertices; ``t`` comes back as ``time_ns``.
 
     Raises FormatError for anything that is not binary little-endian with scalar vertex properties.
@@ -76,3 +79,19 @@ def read_ply(path: Path) -> Table:
         if name in table:
             table[name] = table[name].astype(np.uint16)
     return table
+
+
+def count(path: Path) -> int:
+    """Number of points of a file."""
+    return number_in_header(path, b"element vertex")
+
+
+def open_map(
+    path: Path,
+    info: LasInfo,
+    *,
+    columns: tuple[str, ...],  # noqa: ARG001 - any columns will do
+) -> AbstractContextManager[Callable[[Table], None]]:
+    """Yield a function that appends tables to a map in double precision; a comment names its CRS."""
+    comments = (f"crs {info.crs.name}",)
+    return counted_file(path, ply_table, header=lambda t, n: ply_header(t, n, comments=comments))

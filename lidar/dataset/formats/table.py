@@ -19,13 +19,21 @@ red, green, blue  uint8
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar.errors import LidarError
+from geoscene.files import append, atomic_file, spool
+from geoscene.typing import Float
+from lidar.errors import FormatError, LidarError
+from lidar.geometry.poses import Trajectory
 from lidar.sensors.cloud import Cloud
+from lidar.world.actors import Actors
 
 Table = dict[str, NDArray[Any]]
 
@@ -50,6 +58,36 @@ def cloud_table(cloud: Cloud) -> Table:
     }
 
 
+def table_cloud(table: Table, *, start_ns: int = 0) -> Cloud:
+    """The cloud of a table in the sensor frame.
+
+    Of columns that the table lacks, ``range`` is the distance from the sensor's origin, ``true_range`` is the
+    range, ``instance`` is -1, ``echo`` and ``echoes`` are 1, and all others are 0.
+    """
+    xyz = np.column_stack([table[axis] for axis in "xyz"]).astype(np.float32)
+    n = len(xyz)
+
+    def column(name: str, kind: type[np.generic], *, default: float = 0.0) -> NDArray[Any]:
+        return table[name].astype(kind) if name in table else np.full(n, default, kind)
+
+    distance = table["range"] if "range" in table else np.linalg.norm(xyz.astype(np.float64), axis=1)
+    return Cloud(
+        start_ns=start_ns,
+        xyz=xyz,
+        time_ns=column("time_ns", np.int32),
+        ring=column("ring", np.uint16),
+        column=column("column", np.int32),
+        range=distance.astype(np.float64),
+        intensity=column("intensity", np.float32),
+        klass=column("label", np.uint8),
+        feature=column("instance", np.int32, default=-1),
+        incidence=column("incidence", np.float32),
+        true_range=table.get("true_range", distance).astype(np.float64),
+        echo=column("echo", np.uint8, default=1),
+        echoes=column("echoes", np.uint8, default=1),
+    )
+
+
 def rows(table: Table) -> int:
     """Number of points; raises LidarError if columns disagree."""
     lengths = {name: len(column) for name, column in table.items()}
@@ -65,3 +103,84 @@ def records(table: Table) -> NDArray[np.void]:
     for name, column in table.items():
         out[name] = column
     return out
+
+
+def placed_returns(
+    table: Table, trajectory: Trajectory, *, start_ns: int, vehicle_from_sensor: Float
+) -> tuple[Float, NDArray[np.int64]]:
+    """Scene coordinates (n, 3) of a frame's returns, and their times (n,) in nanoseconds of the drive.
+
+    start_ns            : the frame's start
+    vehicle_from_sensor : (4, 4) the mount
+    """
+    time_ns = start_ns + table["time_ns"].astype(np.int64)
+    points = np.column_stack([table[axis] for axis in "xyz"])
+    mount = vehicle_from_sensor
+    world = trajectory.place(points, time_ns, translation=mount[:3, 3], rotation=mount[:3, :3])
+    return world, time_ns
+
+
+@dataclass(frozen=True, slots=True)
+class PointLabels:
+    """Labels of a cloud's points.
+
+    klass     : (n,) `geoscene.classes.Class`
+    road_user : (n,) int64, number of the road user hit, from 1; 0 for everything else
+    moving    : (n,) whether that road user moves at some time of the drive
+    """
+
+    klass: NDArray[np.integer]
+    road_user: NDArray[np.integer]
+    moving: NDArray[np.bool_]
+
+
+def point_labels(cloud: Cloud, actors: Actors | None) -> PointLabels:
+    """The labels of a cloud's points."""
+    road_user, moving = np.zeros(len(cloud), np.int64), np.zeros(len(cloud), bool)
+    if actors is not None and len(actors):
+        row = cloud.feature.astype(np.int64) - int(actors.feature[0])
+        on = np.flatnonzero((row >= 0) & (row < len(actors)))
+        road_user[on] = row[on] + 1
+        moving[on] = ~actors.parked[row[on]]
+    return PointLabels(cloud.klass, road_user, moving)
+
+
+def read_rows(path: Path, columns: int) -> NDArray[np.float32]:
+    """The rows (n, columns) of a file of little-endian float32 without a header.
+
+    Raises FormatError for a file whose length does not fit.
+    """
+    data = path.read_bytes()
+    if len(data) % (4 * columns):
+        raise FormatError(f"{path}: {len(data)} bytes are not rows of {columns} float32")
+    return np.frombuffer(data, "<f4").reshape(-1, columns).astype(np.float32)
+
+
+def number_in_header(path: Path, start: bytes) -> int:
+    """The last word, a number, of the line of a text header that begins with ``start``."""
+    with path.open("rb") as file:
+        head = file.read(4096)
+    return int(next(line for line in head.splitlines() if line.startswith(start)).split()[-1])
+
+
+@contextmanager
+def counted_file(
+    path: Path, convert: Callable[[Table], Table], *, header: Callable[[Table, int], bytes]
+) -> Iterator[Callable[[Table], None]]:
+    """Yield a function that appends tables to a file whose header states the number of points.
+
+    convert : the table as it is stored
+    header  : the header for a stored table and the number of points
+    """
+    count, last = 0, dict[str, NDArray[Any]]()
+    with atomic_file(path) as out, spool(path) as body:
+
+        def write(table: Table) -> None:
+            nonlocal count, last
+            last = convert(table)
+            body.write(records(last).tobytes())
+            count += rows(table)
+
+        yield write
+        out.write(header(last, count))
+        append(out, body)

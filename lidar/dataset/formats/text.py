@@ -67,7 +67,7 @@ def _format(values: NDArray[np.int64], decimals: NDArray[np.int64], out: NDArray
     return at
 
 
-def write_csv(path: Path, table: Table) -> None:
+def write(path: Path, table: Table) -> None:
     """Write a table as CSV: metres with 4 decimals, integers as they are."""
     decimals = np.array([_DECIMALS.get(name, 0) for name in table], np.int64)
     values = np.empty((rows(table), len(table)), np.int64)
@@ -78,7 +78,7 @@ def write_csv(path: Path, table: Table) -> None:
     write_atomically(path, (",".join(table) + "\n").encode("ascii") + text)
 
 
-def read_csv(path: Path) -> Table:
+def read(path: Path) -> Table:
     """The table of a CSV file with a header line.
 
     Raises FormatError if the columns cannot be read as numbers.
@@ -94,3 +94,8 @@ def read_csv(path: Path) -> Table:
     if values.shape[1] != len(names):
         raise FormatError(f"{path}: {values.shape[1]} numbers a line under {len(names)} names")
     return {name: values[:, j].astype(_TYPES.get(name, np.float64)) for j, name in enumerate(names)}
+
+
+def count(path: Path) -> int:
+    """Number of points of a file."""
+    return path.read_bytes().count(b"\n") - 1

@@ -14,10 +14,8 @@ from pypcd4 import PointCloud
 from pyproj import CRS
 
 from geoscene.classes import Class
-from lidar.dataset.formats.las import LasInfo, LasWriter, gps_seconds, read_crs, read_las, write_las
-from lidar.dataset.formats.pcd import read_pcd, write_pcd
-from lidar.dataset.formats.ply import read_ply, write_ply
-from lidar.dataset.formats.text import read_csv, write_csv
+from lidar.dataset.formats import las, pcd, ply, read_table, text
+from lidar.dataset.formats.las import LasInfo, gps_seconds, open_las, read_chunks, read_crs
 from lidar.errors import FormatError
 
 INFO = LasInfo(CRS.from_epsg(32618), (383_000.0, 4_082_000.0, 0.0), datetime(2026, 6, 1, 10, tzinfo=UTC))
@@ -44,9 +42,13 @@ def table(n, seed=0):
 
 
 FORMATS = {
-    ".pcd": (write_pcd, read_pcd, {}),
-    ".ply": (write_ply, read_ply, {}),
-    ".csv": (write_csv, read_csv, {"x": 5.1e-5, "range": 5.1e-5, "intensity": 5.1e-3, "incidence": 5.1e-6}),
+    ".pcd": (pcd.write, read_table, {}),
+    ".ply": (ply.write, read_table, {}),
+    ".csv": (
+        text.write,
+        read_table,
+        {"x": 5.1e-5, "range": 5.1e-5, "intensity": 5.1e-3, "incidence": 5.1e-6},
+    ),
 }
 
 
@@ -80,7 +82,7 @@ def test_the_same_cloud_is_the_same_bytes(tmp_path, suffix):
 def test_csv_writes_numbers_as_python_does(tmp_path_factory, metres, integers):
     path = tmp_path_factory.mktemp("csv") / "a.csv"
     n = min(len(metres), len(integers))
-    write_csv(path, {"x": np.array(metres[:n]), "instance": np.array(integers[:n], np.int64)})
+    text.write(path, {"x": np.array(metres[:n]), "instance": np.array(integers[:n], np.int64)})
     for line, x, k in zip(path.read_text().splitlines()[1:], metres, integers, strict=False):
         ten_thousandths = int(np.rint(np.float64(x) * 1e4))
         sign = "-" if ten_thousandths < 0 else ""
@@ -90,7 +92,7 @@ def test_csv_writes_numbers_as_python_does(tmp_path_factory, metres, integers):
 
 def test_pypcd4_reads_our_pcd(tmp_path):
     cloud = table(500)
-    write_pcd(tmp_path / "a.pcd", cloud, comment="x")
+    pcd.write(tmp_path / "a.pcd", cloud, comment="x")
     other = PointCloud.from_path(tmp_path / "a.pcd")
     assert other.fields == tuple("t" if name == "time_ns" else name for name in cloud)
     for name, column in cloud.items():
@@ -99,7 +101,7 @@ def test_pypcd4_reads_our_pcd(tmp_path):
 
 def test_trimesh_reads_our_ply(tmp_path):
     cloud = table(500)
-    write_ply(tmp_path / "a.ply", cloud, comments=("EPSG:32618",))
+    ply.write(tmp_path / "a.ply", cloud, comments=("EPSG:32618",))
     other = trimesh.load(tmp_path / "a.ply")
     np.testing.assert_array_equal(other.vertices, np.column_stack([cloud[k] for k in "xyz"]).astype(float))
 
@@ -115,18 +117,18 @@ def test_laspy_reads_world_coordinates_crs_classes_and_time(tmp_path, suffix):
         "gps_time": gps_seconds(INFO.created, cloud["time_ns"]),
         "source": np.full(2000, 7, np.uint16),
     }
-    write_las(path, world, info=INFO)
-    las = laspy.read(path)
-    assert las.header.version == "1.4"
-    assert las.header.parse_crs().to_epsg() == 32618
-    assert las.header.global_encoding.wkt
+    las.write(path, world, info=INFO)
+    file = laspy.read(path)
+    assert file.header.version == "1.4"
+    assert file.header.parse_crs().to_epsg() == 32618
+    assert file.header.global_encoding.wkt
     for axis in "xyz":
-        assert np.abs(las[axis] - world[axis]).max() <= 0.0005 + 1e-9
-    np.testing.assert_array_equal(las.ring, cloud["ring"])
-    np.testing.assert_array_equal(las.instance, cloud["instance"])
-    assert (np.asarray(las.classification)[cloud["label"] == Class.BUILDING] == 6).all()
-    np.testing.assert_allclose(las.gps_time, world["gps_time"])
-    back = list(read_las(path, chunk=700))
+        assert np.abs(file[axis] - world[axis]).max() <= 0.0005 + 1e-9
+    np.testing.assert_array_equal(file.ring, cloud["ring"])
+    np.testing.assert_array_equal(file.instance, cloud["instance"])
+    assert (np.asarray(file.classification)[cloud["label"] == Class.BUILDING] == 6).all()
+    np.testing.assert_allclose(file.gps_time, world["gps_time"])
+    back = list(read_chunks(path, chunk=700))
     assert [len(t["x"]) for t in back] == [700, 700, 600]
     np.testing.assert_array_equal(np.concatenate([t["label"] for t in back]), cloud["label"])
     assert np.abs(np.concatenate([t["intensity"] for t in back]) - cloud["intensity"]).max() < 0.002
@@ -139,9 +141,9 @@ def test_an_uncompressed_file_in_parts_is_what_laspy_writes_of_its_points(tmp_pa
     for axis, shift in zip("xyz", INFO.offset, strict=True):
         world[axis] = cloud[axis] + shift
     parts = [{name: column[rows] for name, column in world.items()} for rows in (slice(400), slice(400, 900))]
-    with LasWriter(tmp_path / "a.las", INFO, columns=tuple(world)) as writer:
+    with open_las(tmp_path / "a.las", INFO, columns=tuple(world)) as append:
         for part in parts:
-            writer.write(part)
+            append(part)
     copy = io.BytesIO()
     laspy.read(tmp_path / "a.las").write(copy)
     assert (tmp_path / "a.las").read_bytes() == copy.getvalue()
@@ -150,7 +152,7 @@ def test_an_uncompressed_file_in_parts_is_what_laspy_writes_of_its_points(tmp_pa
 def test_a_point_beyond_what_las_can_count_is_refused(tmp_path):
     far = table(3) | {"x": np.array([0.0, 1.0, 3e6])}
     with pytest.raises(FormatError, match="too far"):
-        write_las(tmp_path / "a.las", far, info=replace(INFO, offset=(0.0, 0.0, 0.0)))
+        las.write(tmp_path / "a.las", far, info=replace(INFO, offset=(0.0, 0.0, 0.0)))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -165,24 +167,24 @@ def test_gps_time_of_a_known_moment():
 def test_a_failed_writer_leaves_nothing(tmp_path):
     with (
         pytest.raises(KeyError),
-        LasWriter(tmp_path / "a.laz", INFO, columns=("x", "y", "z", "label")) as writer,
+        open_las(tmp_path / "a.laz", INFO, columns=("x", "y", "z", "label")) as append,
     ):
-        writer.write({"x": np.zeros(1)})
+        append({"x": np.zeros(1)})
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("reader", "name"), [(read_pcd, "pcd"), (read_ply, "ply"), (read_csv, "csv")])
+@pytest.mark.parametrize("name", ["pcd", "ply", "csv"])
 @pytest.mark.parametrize("content", [b"", b"hello\nworld\n", b"\x00\xff" * 50])
-def test_damaged_files_are_named(tmp_path, reader, name, content):
+def test_damaged_files_are_named(tmp_path, name, content):
     path = tmp_path / f"bad.{name}"
     path.write_bytes(content)
     with pytest.raises(FormatError, match=f"bad.{name}"):
-        reader(path)
+        read_table(path)
 
 
 def test_a_truncated_laz_is_named(tmp_path):
-    write_las(tmp_path / "a.laz", table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
+    las.write(tmp_path / "a.laz", table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
     whole = (tmp_path / "a.laz").read_bytes()
     (tmp_path / "a.laz").write_bytes(whole[: len(whole) // 3])
     with pytest.raises(FormatError, match=r"a\.laz"):
-        list(read_las(tmp_path / "a.laz"))
+        read_table(tmp_path / "a.laz")

@@ -16,8 +16,8 @@ from pyproj import CRS
 from geoscene.classes import Class, class_codes
 from geoscene.files import write_json
 from geoscene.frames import Frame
-from lidar.dataset.formats.las import LasInfo, gps_seconds, write_las
-from lidar.dataset.formats.pcd import read_pcd, write_pcd
+from lidar.dataset.formats import las, pcd
+from lidar.dataset.formats.las import LasInfo, gps_seconds
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
@@ -81,7 +81,7 @@ def dataset(path, *, first=0, frames=6, n=400, kinds=("laz",)):
             gps = gps_seconds(START, time_ns + np.int64(k * 100_000_000))
             (path / "top" / "laz").mkdir(parents=True, exist_ok=True)
             table = {"x": east, "y": north, "z": up, "gps_time": gps} | base
-            write_las(path / "top" / "laz" / f"{k:06d}.laz", table, info=LasInfo(CRS_OUT, geo.offset, START))
+            las.write(path / "top" / "laz" / f"{k:06d}.laz", table, info=LasInfo(CRS_OUT, geo.offset, START))
         if "pcd" in kinds:
             poses = (
                 trajectory()
@@ -91,7 +91,7 @@ def dataset(path, *, first=0, frames=6, n=400, kinds=("laz",)):
             local = np.einsum("nji,nj->ni", poses.rotation, xyz - poses.position).astype(np.float32)
             (path / "top" / "pcd").mkdir(parents=True, exist_ok=True)
             table = {"x": local[:, 0], "y": local[:, 1], "z": local[:, 2]} | base
-            write_pcd(path / "top" / "pcd" / f"{k:06d}.pcd", table)
+            pcd.write(path / "top" / "pcd" / f"{k:06d}.pcd", table)
     return open_dataset(path)
 
 
@@ -181,9 +181,9 @@ def test_the_same_dataset_gives_the_same_bytes(tmp_path):
     ("out", "change", "words"),
     [
         ("m.xyz", {}, "m.xyz"),
-        ("m.laz", {"voxel": 0.0}, "--voxel"),
-        ("m.laz", {"voxel": float("nan")}, "--voxel"),
-        ("m.laz", {"color": "mood"}, "--color mood"),
+        ("m.laz", {"voxel": 0.0}, "`voxel`"),
+        ("m.laz", {"voxel": float("nan")}, "`voxel`"),
+        ("m.laz", {"color": "mood"}, "`color` mood"),
         ("m.laz", {"sensors": ("bottom",)}, "no scanner bottom"),
     ],
 )
@@ -195,8 +195,8 @@ def test_bad_options_are_named(tmp_path, out, change, words):
 def test_noise_is_left_out_and_counted_unless_it_is_asked_for(tmp_path):
     data = dataset(tmp_path / "d", frames=2, kinds=("pcd",))
     path = tmp_path / "d" / "top" / "pcd" / "000001.pcd"
-    table = dict(read_pcd(path))
-    write_pcd(path, table | {"label": np.where(np.arange(400) < 7, Class.NOISE, table["label"])})
+    table = dict(pcd.read(path))
+    pcd.write(path, table | {"label": np.where(np.arange(400) < 7, Class.NOISE, table["label"])})
     summary = aggregate(data, tmp_path / "m.laz")
     assert (summary.points, summary.noise, summary.points_in) == (793, 7, 800)
     kept = aggregate(data, tmp_path / "n.laz", noise=True)

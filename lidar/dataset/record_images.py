@@ -1,0 +1,139 @@
+"""A frame of a camera: its images as PNG, with the 2D bounding boxes of road users."""
+
+from __future__ import annotations
+
+import functools
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.files import write_columns
+from geoscene.frames import Frame
+from geoscene.typing import Float
+from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
+from lidar.camera.render import Frame as Image
+from lidar.camera.render import exposure_times, optical_flow, render
+from lidar.camera.sun import sun_direction
+from lidar.dataset.boxes import image_boxes
+from lidar.dataset.recording import Recording
+from lidar.geometry.poses import Poses
+from lidar.random_streams import generator
+from lidar.rig.devices import Camera
+from lidar.world.actors import Actors
+from lidar.world.thread_worlds import Worlds
+
+_SUN_NS = 10_000_000_000
+"""Nanoseconds between updates of the sun's direction, which changes by 0.04 degrees meanwhile."""
+
+
+def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> None:
+    """Render one frame and write its images and boxes."""
+    paths, watch = recording.paths(camera, frame), recording.watch
+    samples = recording.contents.camera.moments(camera.spec)
+    times = exposure_times(camera.spec, camera.frame_start_ns(frame), samples=samples)
+    rows = len(times) // samples
+    first = (samples // 2) * rows  # of the exposure's middle sample, whose depth and labels are kept
+    image = _rendered(recording, camera, frame=frame, times=times, worlds=worlds)
+    if recording.actors is not None:
+        with watch.stage("boxes"):
+            middle = int(times[first + rows // 2])
+            pose = _poses(recording, camera, times=times[[first + rows // 2]])
+            columns = _box_columns(
+                recording.actors, camera, frame=frame, pose=pose, time_ns=middle, image=image
+            )
+            write_columns(paths["boxes"], columns)
+    for kind in camera.spec.images:
+        with watch.stage(f"write {kind}"):
+            if kind == "flow":
+                flow = _flow(recording, camera, times=times[first : first + rows], worlds=worlds)
+                write_png(paths[kind], flow_to_image(flow))
+            else:
+                _write_image(paths[kind], image, kind=kind)
+
+
+def _rendered(
+    recording: Recording, camera: Camera, *, frame: int, times: NDArray[np.int64], worlds: Worlds
+) -> Image:
+    """A frame of a camera; ``times`` are its exposure times."""
+    contents = recording.contents
+    start = camera.frame_start_ns(frame)
+    end = max(int(times[-1]), start + 1)
+    world = worlds.during(start, end)
+    with recording.watch.stage("render"):
+        return render(
+            camera.spec,
+            _poses(recording, camera, times=times),
+            world=world,
+            sun=_sun(recording, start),
+            times=None if recording.actors is None else (times - start) / (end - start),
+            random=generator(contents.seed, camera.name, frame, "image"),
+            options=contents.camera.options(camera.spec),
+        )
+
+
+def _write_image(path: Path, image: Image, *, kind: str) -> None:
+    if kind == "rgb" and image.rgb is not None:
+        write_png(path, image.rgb)
+    elif kind == "depth":
+        write_png(path, depth_to_counts(image.depth))
+    elif kind == "semantic":
+        write_png(path, image.klass)
+    elif kind == "instance":
+        write_png(path, feature_to_image(image.feature))
+
+
+def _box_columns(
+    actors: Actors, camera: Camera, *, frame: int, pose: Poses, time_ns: int, image: Image
+) -> dict[str, Any]:
+    """Columns of the 2D boxes of an image."""
+    found = image_boxes(actors, camera.spec, pose=pose, time_ns=time_ns, instance=image.feature)
+    sides = ("left", "top", "right", "bottom")
+    return {
+        "frame": np.full(len(found.row), frame),
+        "time_ns": np.full(len(found.row), time_ns),
+        "id": found.row,
+        "instance": actors.feature[found.row],
+        "class": np.array([Class(int(k)).name.lower() for k in actors.klass[found.row]], np.str_),
+        "kind": actors.kind[found.row],
+        **{side: np.round(found.box[:, k], 2) for k, side in enumerate(sides)},
+        **{f"seen_{side}": found.seen[:, k] for k, side in enumerate(sides)},
+        "pixels": found.pixels,
+        "visibility": np.round(found.visibility, 4),
+    }
+
+
+def _poses(recording: Recording, camera: Camera, *, times: NDArray[np.int64]) -> Poses:
+    """Poses of a camera at times (k,)."""
+    mount = camera.spec.mount
+    return recording.trajectory.at(times).mounted(mount.translation, mount.rotation)
+
+
+def _flow(
+    recording: Recording, camera: Camera, *, times: NDArray[np.int64], worlds: Worlds
+) -> NDArray[np.float32]:
+    """Optical flow to the next frame. It replaces this thread's world by one that spans both frames.
+
+    times : of the rows in this frame, one for all without a rolling shutter
+    """
+    later = times + camera.period_ns
+    start, end = int(times[0]), int(later[-1])
+    world = worlds.during(start, end)
+    shares = [(t - start) / (end - start) for t in (times, later)]
+    here, there = (_poses(recording, camera, times=t) for t in (times, later))
+    return optical_flow(camera.spec, here, later=there, world=world, times=shares[0], later_times=shares[1])
+
+
+def _sun(recording: Recording, time_ns: int) -> Float:
+    """Direction (3,) towards the sun."""
+    when = recording.start + timedelta(seconds=(time_ns // _SUN_NS) * _SUN_NS // 10**9)
+    x, y = recording.trajectory.position[0, :2].tolist()
+    return _sun_direction(recording.frame, when, x=x, y=y)
+
+
+@functools.lru_cache(maxsize=4)
+def _sun_direction(frame: Frame, when: datetime, *, x: float, y: float) -> Float:
+    return sun_direction(frame, when, at=(x, y))

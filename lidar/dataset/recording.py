@@ -1,0 +1,158 @@
+"""What a drive records: the options of its files, and what every frame is recorded from."""
+
+from __future__ import annotations
+
+import functools
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from lidar.camera.settings import PLAIN as PLAIN_CAMERA
+from lidar.camera.settings import CameraSettings
+from lidar.dataset.deskew import MOMENTS
+from lidar.dataset.formats import FORMATS, LABELS, Format, LabelFormat
+from lidar.dataset.formats.las import LasInfo
+from lidar.dataset.layout import Paths
+from lidar.errors import InputError
+from lidar.geometry.georeference import Georeference
+from lidar.geometry.poses import Trajectory
+from lidar.physics.settings import PLAIN as PLAIN_SCANNER
+from lidar.physics.settings import ScannerSettings
+from lidar.rig.devices import Camera, Scanner
+from lidar.world.actors import Actors
+from lidar.world.visibility import Visibility
+
+
+class StageTimer(Protocol):
+    """Measures the time that each stage of a recording takes."""
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        """Add the time until the block ends to a stage."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """Which files are written of every frame, and how its measurements are simulated.
+
+    formats : of clouds, names in `lidar.dataset.formats.FORMATS`
+    labels  : of label files, names in `lidar.dataset.formats.LABELS`
+    deskew  : moment of `deskew.MOMENTS` to which clouds in the sensor frame are de-skewed in further files
+    seed    : of the random number generators
+    scanner : settings of scanners
+    camera  : settings of cameras
+    """
+
+    formats: tuple[str, ...] = ("pcd",)
+    labels: tuple[str, ...] = ()
+    deskew: str = ""
+    seed: int = 0
+    scanner: ScannerSettings = PLAIN_SCANNER
+    camera: CameraSettings = PLAIN_CAMERA
+
+    def __post_init__(self) -> None:
+        """Validate the names."""
+        if not self.formats:
+            raise InputError(f"`formats`: give one or more of {', '.join(FORMATS)}")
+        if unknown := sorted(set(self.formats) - set(FORMATS)):
+            raise InputError(f"`formats` {','.join(unknown)}: unknown; there are {', '.join(FORMATS)}")
+        if unknown := sorted(set(self.labels) - set(LABELS)):
+            raise InputError(f"`labels` {','.join(unknown)}: unknown; there are {', '.join(LABELS)}")
+        if self.deskew and self.deskew not in MOMENTS:
+            raise InputError(f"`deskew` {self.deskew}: one of {', '.join(MOMENTS)}")
+        if self.deskew and all(form.frame == "world" for form in self.cloud_formats):
+            sensor = ", ".join(form.name for form in FORMATS.values() if form.frame == "sensor")
+            raise InputError(
+                f"`deskew`: {','.join(self.formats)} files hold points in the world frame; add a format of"
+                f" the sensor frame to `formats` ({sensor})"
+            )
+
+    @property
+    def cloud_formats(self) -> list[Format]:
+        """The formats of clouds."""
+        return [FORMATS[name] for name in self.formats]
+
+    @property
+    def label_formats(self) -> list[LabelFormat]:
+        """The formats of label files."""
+        return [LABELS[name] for name in self.labels]
+
+    @property
+    def kitti(self) -> bool:
+        """Whether scanners' folders are KITTI sequences."""
+        return any(f.kitti for f in self.cloud_formats) or any(f.kitti for f in self.label_formats)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What frames are recorded from; shared by the threads of a drive.
+
+    out         : dataset directory
+    frame       : scene frame
+    trajectory  : of the ego vehicle
+    start       : UTC time of the drive's start
+    geo         : from the scene frame to the export CRS
+    contents    : which files are written
+    watch       : measures the time of each stage
+    actors      : other road users; None without traffic, and then without boxes
+    max_range   : metres from the ego vehicle within which road users get 3D boxes
+    scanning_ns : (k, 2) times from and until which scanners work; None for always
+    """
+
+    out: Path
+    frame: Frame
+    trajectory: Trajectory
+    start: datetime
+    geo: Georeference
+    contents: Contents
+    watch: StageTimer
+    actors: Actors | None = None
+    max_range: float = 0.0
+    scanning_ns: NDArray[np.int64] | None = None
+
+    @functools.cached_property
+    def visibility(self) -> Visibility | None:
+        """How much of each road user can be seen; None without traffic."""
+        return None if self.actors is None else Visibility(self.actors)
+
+    @functools.cached_property
+    def las_info(self) -> LasInfo:
+        """What all LAS and LAZ files of the dataset share."""
+        return LasInfo(self.geo.crs, self.geo.offset, self.start)
+
+    def paths(self, sensor: Scanner | Camera, frame: int) -> dict[str, Path]:
+        """Files of one frame, by ``boxes``, image, format, ``deskewed <format>`` or ``labels <format>``."""
+        return {kind: path for kind, path, _ in self._files(sensor, frame)}
+
+    def is_done(self, sensor: Scanner | Camera, frame: int) -> bool:
+        """Whether all files of a frame are there, and none is empty that has a header."""
+        return all(
+            path.exists() and (not header or path.stat().st_size > 0)
+            for _, path, header in self._files(sensor, frame)
+        )
+
+    def count(self, sensor: Scanner | Camera, frame: int) -> int:
+        """Number of points of a frame that is done; 0 for an image."""
+        if isinstance(sensor, Camera):
+            return 0
+        form = self.contents.cloud_formats[0]
+        return form.count(self.paths(sensor, frame)[form.name])
+
+    def _files(self, sensor: Scanner | Camera, frame: int) -> list[tuple[str, Path, bool]]:
+        """(kind, path, whether it has a header) of each file of a frame."""
+        name, paths = sensor.name, Paths(self.out)
+        files = [] if self.actors is None else [("boxes", paths.frame_boxes(name, frame), True)]
+        if isinstance(sensor, Camera):
+            return files + [(kind, paths.image(name, frame, kind=kind), True) for kind in sensor.spec.images]
+        for form in self.contents.cloud_formats:
+            files.append((form.name, form.path(paths.sensor(name), frame), form.header))
+            if self.contents.deskew and form.frame == "sensor":
+                path = paths.deskewed(name, frame, suffix=form.suffix)
+                files.append((f"deskewed {form.name}", path, form.header))
+        labels = self.contents.label_formats
+        return files + [(f"labels {row.name}", row.path(paths.sensor(name), frame), False) for row in labels]
