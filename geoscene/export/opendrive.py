@@ -197,48 +197,42 @@ def _elevations(at: Float, height: Float) -> Iterator[str]:
 
 
 def _lanes(graph: RoadGraph, net: RoadNet, *, k: int, left_hand: bool) -> Iterator[str]:
-    """The lanes of a road, from left to right; across a joint they go on in the lane of the same place."""
+    """The lanes of a road, from left to right; at a joint each continues as the lane in the same place."""
     road = net.roads[k]
-    sign = 1 if left_hand else -1
-    along = [(sign * (i + 1), road.edge) for i in range(road.ahead + road.shared)]
-    against = [(-sign * (i + 1), road.twin) for i in range(road.back)]
-    left, right = (along, against) if left_hand else (against, along)
+    sign = 1 if left_hand else -1  # of the lanes along the reference line
     flip = {end: -1 if net.joints[k, end][1] == end else 1 for end in (START, END) if (k, end) in net.joints}
-    if left:
-        yield "<left>\n"
-        for number, edge in reversed(left):
-            yield _lane(graph, road, number=number, edge=edge, flip=flip, sign=sign, count=len(left))
-        yield "</left>\n"
+    sides: dict[int, list[str]] = {}
+    for side, edge, count in ((sign, road.edge, road.ahead + road.shared), (-sign, road.twin, road.back)):
+        lanes = []
+        for number in range(1, count + 1):
+            kind = "bidirectional" if road.shared and side == sign and number == 1 else "driving"
+            mark = "broken" if number < count else "none"
+            speed = float(graph.speed[edge])
+            lanes.append(_lane(side * number, kind, width=road.width, mark=mark, flip=flip, speed=speed))
+        if road.shoulder > 0:
+            lanes.append(_lane(side * (count + 1), "shoulder", width=road.shoulder, mark="none", flip=flip))
+        sides[side] = lanes
     middle = "solid" if road.twin >= 0 and not road.shared else "none"
+    if sides[1]:
+        yield from ("<left>\n", *reversed(sides[1]), "</left>\n")
     yield f'<center><lane id="0" type="none" level="false"><link/>{_mark(middle)}</lane></center>\n'
-    if right:
-        yield "<right>\n"
-        for number, edge in right:
-            yield _lane(graph, road, number=number, edge=edge, flip=flip, sign=sign, count=len(right))
-        yield "</right>\n"
+    if sides[-1]:
+        yield from ("<right>\n", *sides[-1], "</right>\n")
 
 
 def _lane(
-    graph: RoadGraph,
-    road: Carriageway,
-    *,
-    number: int,
-    edge: int,
-    flip: dict[int, int],
-    sign: int,
-    count: int,
+    number: int, kind: str, *, width: float, mark: str, flip: dict[int, int], speed: float | None = None
 ) -> str:
+    """A lane of constant width; ``flip`` gives the sign of the lane that it joins at each joint."""
     links = "".join(
         f'<{word} id="{flip[end] * number}"/>'
         for end, word in ((START, "predecessor"), (END, "successor"))
         if end in flip
     )
-    shared = road.shared and number == sign
+    limit = "" if speed is None else f'<speed sOffset="0" max="{_n(round(speed, 4))}" unit="m/s"/>'
     return (
-        f'<lane id="{number}" type="{"bidirectional" if shared else "driving"}" level="false">'
-        f'<link>{links}</link><width sOffset="0" a="{_n(road.width)}" b="0" c="0" d="0"/>'
-        f"{_mark('broken' if abs(number) < count else 'none')}"
-        f'<speed sOffset="0" max="{_n(round(float(graph.speed[edge]), 4))}" unit="m/s"/></lane>\n'
+        f'<lane id="{number}" type="{kind}" level="false"><link>{links}</link>'
+        f'<width sOffset="0" a="{_n(width)}" b="0" c="0" d="0"/>{_mark(mark)}{limit}</lane>\n'
     )
 
 
@@ -265,7 +259,7 @@ def _signals(
             place = (share if along else 1 - share) * road.whole - road.begins
             s = min(max(place, 0.0), total)
             lanes = road.ahead + road.back + road.shared
-            t = (lanes * road.width / 2 + 0.5) * (1 if along == left_hand else -1)
+            t = (lanes * road.width / 2 + road.shoulder + 0.5) * (1 if along == left_hand else -1)
             high = "3" if dynamic == "yes" else "2.2"
             yield (
                 f'<signal s="{_n(s)}" t="{_n(t)}" id="{k + 1}{count:03d}" name="{kind}" dynamic="{dynamic}" '

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from geoscene import polylines
 from geoscene.export.planview import Curve, PlanView, connecting_curve, plan_view
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
 from geoscene.roadgraph.routing import turn_table
 from geoscene.typing import Float
 
@@ -37,6 +38,7 @@ class Carriageway:
     ahead, back : number of lanes along the edge and along its twin
     shared   : one more lane, used in both directions, between them
     shift    : metres that the lanes' middle line lies left of the reference line
+    shoulder : metres of the carriageway on each side of the lanes
     """
 
     edge: int
@@ -50,6 +52,7 @@ class Carriageway:
     back: int
     shared: bool
     shift: float
+    shoulder: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +123,8 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
         edge = firsts[k]
         junctions[graph.head[edge] if end == END else graph.tail[edge]] = False
     gaps = _gaps(graph, firsts, ends=ends, junctions=junctions)
-    roads = [_carriageway(graph, edge, gap=gaps[k]) for k, edge in enumerate(firsts)]
+    lanes = graph_lanes(graph)
+    roads = [_carriageway(graph, lanes, edge=edge, gap=gaps[k]) for k, edge in enumerate(firsts)]
     connections = []
     for first, then in sorted(zip(before.tolist(), after.tolist(), strict=True)):
         node = int(graph.head[first])
@@ -203,25 +207,28 @@ def _gaps(
     return gaps
 
 
-def _carriageway(graph: RoadGraph, edge: int, *, gap: Float) -> Carriageway:
+def _carriageway(graph: RoadGraph, lanes: LaneLayout, *, edge: int, gap: Float) -> Carriageway:
     full = graph.geometry[edge]
     fresh = np.append(True, np.hypot(*np.diff(full[:, :2], axis=0).T) > 1e-3)
     distinct = full[fresh]
     end = polylines.stations(distinct)[-1] - float(gap[END])
     line = polylines.cut(distinct, float(gap[START]), end=end, gap=1e-3)
-    twin = int(graph.twin[edge])
-    there, back = float(graph.lanes[edge]), float(graph.lanes[twin]) if twin >= 0 else 0.0
-    shared = twin >= 0 and there % 1 > 0 and back % 1 > 0
-    ahead, behind = int(there), int(back)
-    if not shared:
-        ahead, behind = max(ahead, 1), max(behind, 1) if twin >= 0 else 0
-    count = ahead + behind + shared
-    width = float(graph.width[edge]) / count
+    ahead, behind = int(lanes.own[edge]), int(lanes.other[edge])
+    shared, width = bool(lanes.shared[edge]), float(lanes.width[edge])
     return Carriageway(
-        edge, twin, line, plan_view(line[:, :2]), float(gap[START]), polylines.length(full), width,
-        ahead, behind,
-        shared, width * (ahead + shared - behind) / 2,
-    )  # fmt: skip
+        edge=edge,
+        twin=int(graph.twin[edge]),
+        line=line,
+        plan=plan_view(line[:, :2]),
+        begins=float(gap[START]),
+        whole=polylines.length(full),
+        width=width,
+        ahead=ahead,
+        back=behind,
+        shared=shared,
+        shift=width * (ahead + shared - behind) / 2,
+        shoulder=float(graph.width[edge] - lanes.span[edge]) / 2,
+    )
 
 
 def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[Lane]:

@@ -11,6 +11,7 @@ from geoscene.classes import Class
 from geoscene.roadgraph.carriageways import PAVED, Carriageways
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import junction_reach
+from geoscene.roadgraph.lanes import graph_lanes, lane_layout
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.typing import Float
@@ -27,8 +28,6 @@ _EDGE_IN = 0.25
 _CLEAR = 1.0
 # A crossing that begins up to this far before a signal or sign belongs to it, metres.
 _STRIP_BEFORE = 12.0
-# Metres: a lane is not wider than this; what is left over on both sides is for parking and bicycles.
-_LANE_MOST = 4.5
 _MINOR = frozenset({"service", "track", "busway", "bus_guideway", "raceway", "escape"})
 _EDGED = frozenset({"motorway", "trunk", "primary", "secondary"})
 
@@ -78,14 +77,20 @@ def _offsets(
 ) -> tuple[NDArray[np.int64], Float, NDArray[np.bool_]]:
     """Painted lines as (position in ``rows``, metres to the left of the carriageway's middle, broken)."""
     found: list[tuple[int, float, bool]] = []
-    for k, row in enumerate(rows.tolist()):
-        street, width = roads.street[row], float(roads.width[row])
-        count = round(sum(street.lanes))
-        lane = min(width / max(count, 1), _LANE_MOST)
-        # Lanes along the line lie on its right, or on its left where traffic keeps left.
-        along = street.lanes[1] if left_hand else street.lanes[0]
+    streets = [roads.street[row] for row in rows.tolist()]
+    # Lanes along the line lie on its right, or on its left where traffic keeps left.
+    lanes = np.array([s.lanes[::-1] if left_hand else s.lanes for s in streets], float).reshape(-1, 2)
+    two_way = np.array([s.direction == 0 for s in streets], np.bool_)
+    one = ~two_way[:, None]
+    lanes = np.where(one, lanes.sum(axis=1, keepdims=True), lanes)
+    layout = lane_layout(lanes[:, 0], lanes[:, 1], two_way=two_way, width=roads.width[rows])
+    for k, (street, count, lane) in enumerate(
+        zip(streets, layout.count.tolist(), layout.width.tolist(), strict=True)
+    ):
+        row, width = rows[k], float(layout.carriageway[k])
+        middle = float(layout.own[k] + 0.5 * layout.shared[k])
         for i in range(1, count):
-            between = 0 < along < count and abs(i - along) < 0.75
+            between = bool(two_way[k]) and abs(i - middle) < 0.75
             found.append((k, (i - count / 2) * lane, not between))
         if street.highway.removesuffix("_link") in _EDGED:
             for side, sign in ((0, 1.0), (1, -1.0)):
@@ -172,6 +177,7 @@ def _strips(graph: RoadGraph, crossings: NDArray[np.object_]) -> dict[int, list[
 def _across(graph: RoadGraph, lines: list[tuple[int, float, str]], *, left_hand: bool) -> SurfaceRows:
     """Painted bands across the lanes of edges: (edge, metres from its tail, kind of control)."""
     shapes, edges = [], []
+    divider = graph_lanes(graph).divider
     for edge, place, kind in lines:
         xy = graph.geometry[edge][:, :2]
         plan = polylines.length(xy)
@@ -179,10 +185,8 @@ def _across(graph: RoadGraph, lines: list[tuple[int, float, str]], *, left_hand:
         bit = polylines.cut(xy, at - _STOP / 2, end=at + _STOP / 2)
         ahead = polylines.unit(bit[-1] - bit[0])
         left = np.array([-ahead[1], ahead[0]])
-        twin = int(graph.twin[edge])
-        share = graph.lanes[edge] / (graph.lanes[edge] + (graph.lanes[twin] if twin >= 0 else 0.0))
         far = float(graph.width[edge]) / 2 - _EDGE_IN
-        near = far - share * 2 * far + (_LINE if twin >= 0 else 0.0)
+        near = float(divider[edge]) + _LINE if graph.twin[edge] >= 0 else -far
         sign = 1.0 if left_hand else -1.0
         count = 1 if kind != "give_way" else max(int((far - near) / 0.8), 1)
         stops = np.linspace(near, far, count + 1)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene import polylines
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.lanes import graph_lanes
 from geoscene.roadgraph.routing import TurnStates, edge_lines, turn_states
 from geoscene.typing import Float
 from lidar.errors import RouteError
@@ -239,22 +240,6 @@ def random_edges(
 # ------------------------------------------------------------------------------------------------ lanes
 
 
-def lane_offset(graph: RoadGraph, body_width: float) -> Float:
-    """Metres (m,) from each carriageway's centre line to the middle of the outer lane of its direction.
-
-    The outermost lane is the one at the kerb. Where the carriageway is narrow the body stays inside it, and
-    where it is narrower than the body it takes the middle.
-    """
-    two_way = graph.twin >= 0
-    other = np.where(two_way, graph.lanes[graph.twin], 0.0)
-    lanes = np.maximum(graph.lanes + other, 1.0)
-    middle = graph.width / 2 - graph.width / lanes / 2
-    shared = two_way & (lanes < 2)  # one lane for both directions: keep aside where there is room
-    middle = np.where(shared, graph.width / 4, middle)
-    offset: Float = np.clip(np.minimum(middle, graph.width / 2 - body_width / 2 - _KEEP), 0.0, None)
-    return offset
-
-
 def _cut(line: Float, begin: float, *, end: float) -> Float:
     """The part of a line (k, 3) between two shares of its length in plan."""
     total = float(polylines.stations(line)[-1])
@@ -307,7 +292,8 @@ def lane_route(
     ends  : true metres from the first edge's tail to the start, and from the last one's tail to the end
     """
     order = np.asarray(edges, np.int32)
-    offset = lane_offset(graph, body_width) * (-1.0 if side == "right" else 1.0)
+    offset = graph_lanes(graph).offsets(body_width=body_width, clearance=_KEEP)
+    offset = offset * (-1.0 if side == "right" else 1.0)
     lanes: list[Float] = []
     for k, e in enumerate(order):
         lane = polylines.offset_curve(graph.geometry[e], float(offset[e]))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
 from geoscene.roadgraph.routing import turn_states
 from geoscene.typing import Float, Ints
 from lidar.planning.route import HEADING_REACH
@@ -31,8 +32,9 @@ class Lanes:
     """Lanes of a road graph.
 
     graph  : the road graph
+    layout : lanes of each edge and where they lie
     count  : (m,) int64, lanes in the direction of each edge
-    wide   : (m,) metres that a body may be wide on each edge
+    max_width : (m,) metres that a body may be wide on each edge
     side   : 1 where traffic keeps right, -1 where it keeps left
     state  : (s,) the edge of each state of `geoscene.roadgraph.routing.turn_states`
     after  : for each state the states that may follow it
@@ -44,6 +46,7 @@ class Lanes:
     """
 
     graph: RoadGraph
+    layout: LaneLayout
     count: Ints
     max_width: Float
     side: int
@@ -65,13 +68,10 @@ def lanes_of(
 
     bounds : (xmin, ymin, xmax, ymax) of the map in scene metres: streets that end near them go on beyond
     """
-    two_way = graph.twin >= 0
-    other = np.where(two_way, graph.lanes[graph.twin], 0.0)
-    total = np.maximum(graph.lanes + other, 1.0)
-    shared = two_way & (total < 2)
-    each = np.where(shared, graph.width / 2, graph.width / total)
-    alone = ~two_way & (graph.lanes < 2)
-    max_width = np.where(alone, graph.width - 2 * _KERB, each - _SIDE)
+    layout = graph_lanes(graph)
+    single = layout.count == 1
+    lane_width = np.where(single & layout.shared, graph.width / 2, layout.width) - _SIDE
+    max_width = np.where(single & ~layout.shared, graph.width - 2 * _KERB, lane_width)
     states = turn_states(graph)
     before, after, state = states.before, states.after, states.edge.astype(np.int64)
     order = np.argsort(before, kind="stable")
@@ -86,7 +86,8 @@ def lanes_of(
     onward = _leading_on(before[straight_on], after[straight_on], leads_out=leads_out[state])
     return Lanes(
         graph,
-        np.maximum(np.floor(graph.lanes), 1.0).astype(np.int64),
+        layout,
+        np.maximum(layout.own, 1),
         max_width,
         1 if side == "right" else -1,
         state,
@@ -135,21 +136,16 @@ def turn(lanes: Lanes, a: int, *, b: int) -> float:
 
 
 def lane_shift(lanes: Lanes, edge: int, *, lane: int, width: float, kerb: bool = False) -> float:
-    """Metres from an edge's centre line to a lane's middle, positive on the side that traffic keeps to.
+    """Metres from an edge's centre line to a body's path in a lane, positive on the side that is driven on.
 
     Lane 0 is the one at the kerb. A body of that width stays inside the carriageway where there is room; with
-    ``kerb`` it keeps to the kerb within its lane.
+    ``kerb`` it keeps to the kerb.
     """
-    g = lanes.graph
-    other = float(g.lanes[g.twin[edge]]) if g.twin[edge] >= 0 else 0.0
-    total = max(float(g.lanes[edge]) + other, 1.0)
-    whole = float(g.width[edge])
-    shared = other > 0 and total < 2
-    middle = whole / 4 if shared else whole / 2 - (lane + 0.5) * whole / total
     if kerb and lane == 0:
-        middle = whole / 2 - width / 2 - 2 * _KERB
-    room = max(whole / 2 - width / 2 - _KERB, 0.0)
-    return float(np.clip(middle, -room, room))
+        half = (float(lanes.graph.width[edge]) - width) / 2
+        room = max(half - _KERB, 0.0)
+        return float(np.clip(half - 2 * _KERB, -room, room))
+    return float(lanes.layout.take(edge).offsets(lane, body_width=width, clearance=_KERB))
 
 
 @dataclass(frozen=True, slots=True)

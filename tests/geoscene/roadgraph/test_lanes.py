@@ -1,0 +1,109 @@
+"""Lanes have one place, whoever asks for it: routes, traffic, paint and OpenDRIVE."""
+
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from helpers.export_worlds import write_world
+from helpers.roadgrids import road_graph
+
+from geoscene.export import export_scene
+from geoscene.frames import Frame
+from geoscene.roadgraph import build_road_graph, write_graphml
+from geoscene.roadgraph.carriageways import read_carriageways
+from geoscene.roadgraph.driving_side import Side
+from geoscene.roadgraph.lanes import WIDEST_LANE, graph_lanes, lane_layout
+from geoscene.roadgraph.markings import _offsets
+from geoscene.sources.data import OsmData, Way
+from lidar.planning.route import lane_route
+from lidar.traffic.lanes import lane_shift, lanes_of
+
+
+def layout(along, against=0.0, *, width=7.0):
+    two_way = np.array([against > 0])
+    return lane_layout(np.array([along]), np.array([against]), two_way=two_way, width=np.array([width]))
+
+
+@pytest.mark.parametrize(
+    ("along", "against", "found"),
+    [
+        (1.0, 1.0, (1, 1, False)),
+        (2.0, 1.0, (2, 1, False)),
+        (1.5, 1.5, (1, 1, True)),  # lanes=3: the middle one is for both
+        (0.5, 0.5, (0, 0, True)),  # lanes=1
+        (0.75, 0.75, (0, 0, True)),  # lanes=1.5: still one lane
+        (2.0, 0.5, (2, 1, False)),  # a half that the other direction does not share is a lane
+        (1.5, 0.0, (1, 0, False)),  # one-way: a wide lane
+        (3.5, 0.0, (3, 0, False)),
+    ],
+)
+def test_mapped_lanes_are_whole_lanes_and_a_shared_one(along, against, found):
+    lanes = layout(along, against)
+    assert (lanes.own[0], lanes.other[0], lanes.shared[0]) == found
+    assert lanes.width[0] * lanes.count[0] == pytest.approx(7.0)
+
+
+def test_wide_carriageways_leave_room_beside_their_lanes():
+    lanes = layout(2.0, 2.0, width=24.0)
+    assert lanes.width == WIDEST_LANE
+    places = [lanes.offsets(k, body_width=1.8, clearance=0.2)[0] for k in (0, 1)]
+    assert places == pytest.approx([6.75, 2.25])
+    assert layout(1.0, width=8.0).width == 8.0  # a single lane takes all of it
+
+
+def test_bodies_stay_inside_the_carriageway():
+    assert layout(1.0, 1.0, width=4.0).offsets(body_width=2.0, clearance=0.25) == pytest.approx(0.75)
+    assert layout(1.0, 1.0, width=2.0).offsets(body_width=2.0, clearance=0.25) == 0.0
+
+
+def test_the_divider_parts_the_directions():
+    assert layout(1.0, 1.0).divider == 0.0
+    assert layout(1.5, 1.5).divider == pytest.approx(0.0)
+    assert layout(2.0, 1.0, width=9.0).divider == pytest.approx(-1.5)
+    assert layout(2.0, width=7.0).divider == pytest.approx(-3.5)
+
+
+@pytest.mark.parametrize("lanes", [[1, 1], [2, 1], [1.5, 1.5], [2, 2], [2, 0.5], [1.25, 1.25]])
+@pytest.mark.parametrize("width", [9.0, 24.0])
+def test_routes_traffic_and_opendrive_agree(tmp_path, lanes, width):
+    graph = road_graph([(0, 0), (200, 0)], [(0, 1)], lanes=lanes, width=width)
+    scene = write_world(tmp_path / "scene")
+    write_graphml(graph, scene.frame, path=scene.files.road_graph)
+    root = ET.parse(export_scene(scene, tmp_path / "a.xodr").path).getroot()  # noqa: S314  (our own file)
+    road = root.find("road")
+    zero = float(road.find("lanes/laneOffset").get("a"))
+    traffic = lanes_of(graph)
+    for edge, side in ((0, -1), (1, 1)):
+        found = road.findall(f"lanes/laneSection/{'left' if side > 0 else 'right'}/lane")
+        found = sorted(found, key=lambda lane: abs(int(lane.get("id"))))
+        widths = [float(lane.find("width").get("a")) for lane in found]
+        middles = side * zero + np.cumsum(widths) - np.array(widths) / 2
+        outer = max(k for k, lane in enumerate(found) if lane.get("type") == "driving")
+        for lane in range(int(traffic.layout.own[edge])):
+            assert lane_shift(traffic, edge, lane=lane, width=1.6) == pytest.approx(middles[outer - lane])
+        line = lane_route(graph, [edge], ends=(0.0, 200.0), body_width=1.6).line
+        np.testing.assert_allclose(abs(line[:, 1]), middles[outer], atol=0.01)
+        assert middles[-1] + widths[-1] / 2 == pytest.approx(width / 2)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("tags", [{"lanes": "3"}, {"lanes": "3", "lanes:forward": "2"}, {"lanes": "4"}])
+def test_paint_lies_between_the_lanes_that_are_driven(side: Side, tags):
+    way = {"highway": "primary", "width": "24", "sidewalk": "both", **tags}
+    street = Way("way/1", way, np.array([1, 2]), np.array([[0.0, 0.0], [0.002, 0.0]]))
+    osm = OsmData((0.0, -0.001, 0.002, 0.001), [street], [], [], [])
+    frame = Frame.at(0.001, 0.0)
+    left_hand = side == "left"
+    roads = read_carriageways(osm, frame, sidewalks="mapped", left_hand=left_hand)
+    _, painted, _ = _offsets(roads, np.array([0]), left_hand=left_hand)
+    graph, _ = build_road_graph(osm, frame)
+    lanes = graph_lanes(graph)
+    ahead = graph.geometry[0][-1, 0] > graph.geometry[0][0, 0]
+    driven = []
+    for edge in range(2):
+        sign = (1 if (edge == 0) == ahead else -1) * (1 if left_hand else -1)
+        places = range(int(lanes.own[edge]))
+        row = lanes.take([edge])
+        driven += [sign * float(row.offsets(k, body_width=1.8, clearance=0.2)[0]) for k in places]
+    gaps = np.abs(np.subtract.outer(sorted(driven), sorted(painted))).min()
+    assert gaps == pytest.approx(lanes.width[0] / 2)
