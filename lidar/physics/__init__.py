@@ -1,1 +1,1 @@
-"""What a laser pulse gives back: power, detection, noise, echoes and codes."""
+"""Physics of laser returns: reflectance, received power, echoes, detection, noise and intensity codes."""

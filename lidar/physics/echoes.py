@@ -96,6 +96,12 @@ def joined(first: EchoesT, *others: EchoesT) -> EchoesT:
     return both.take(np.lexsort((both.range, both.pulse)))
 
 
+def by_pulse(first: EchoesT, other: EchoesT) -> EchoesT:
+    """All rows, sorted by pulse; no pulse may be in both."""
+    both = type(first)(*(np.concatenate([getattr(e, f.name) for e in (first, other)]) for f in fields(first)))
+    return both.take(np.argsort(both.pulse, kind="stable"))
+
+
 def merged(surfaces: EchoesT, separation: float) -> EchoesT:
     """The echoes of pulses that meet these surfaces.
 

@@ -24,3 +24,11 @@ def reflectivity_code(
     code = diffuse_code * np.clip(apparent, 0, 1) + (255.0 - diffuse_code) * np.minimum(bright, 1.0)
     coded: NDArray[np.float32] = (np.round(code) if whole else code).astype(np.float32)
     return coded
+
+
+def apparent_of_code(code: NDArray[np.floating], *, diffuse_code: float = 100.0) -> Float:
+    """Apparent reflectances of codes: the inverse of `reflectivity_code`."""
+    above = (np.asarray(code, np.float64) - diffuse_code) / (255.0 - diffuse_code)
+    bright = BRIGHTEST ** np.clip(above, 0.0, 1.0)
+    apparent: Float = np.where(above > 0, bright, np.clip(code, 0, diffuse_code) / diffuse_code)
+    return apparent

@@ -1,1 +1,1 @@
-"""Laser scanners: presets as data, when and where they fire, and what comes back."""
+"""Laser scanners: rays of a moving sensor, echoes of surfaces, detection and point clouds."""

@@ -1,4 +1,4 @@
-"""One frame of a laser scanner as columns, one row a return."""
+"""Point cloud of one frame, as columns with one row per return."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lidar.errors import LidarError
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """The returns of one frame, in the order they were fired.
+    """The returns of one frame, in the order of their pulses.
 
     start_ns : time of the frame's first firing, nanoseconds since the drive's start
     xyz       : (n, 3) float32, metres, sensor frame (x forward, y left, z up) at each point's own firing time
@@ -45,19 +45,17 @@ class Cloud:
     echoes: NDArray[np.uint8]
 
     def __post_init__(self) -> None:
-        """Refuse columns that disagree in length."""
+        """Check that all columns have the same length."""
         for f in fields(self)[1:]:
-            if len(getattr(self, f.name)) != len(self.xyz):
-                raise LidarError(
-                    f"cloud column {f.name} has {len(getattr(self, f.name))} rows for {len(self.xyz)}"
-                )
+            if (rows := len(getattr(self, f.name))) != len(self.xyz):
+                raise LidarError(f"cloud column {f.name} has {rows} rows for {len(self.xyz)}")
 
     def __len__(self) -> int:
         """Number of returns."""
         return len(self.xyz)
 
     def where(self, keep: NDArray[np.bool_]) -> Self:
-        """The returns (n,) to keep."""
+        """The returns at which a mask (n,) is true."""
         return type(self)(self.start_ns, *(getattr(self, f.name)[keep] for f in fields(self)[1:]))
 
 
@@ -78,17 +76,7 @@ class TracedCloud(Cloud):
 
 
 def no_returns(start_ns: int) -> Cloud:
-    """The cloud of a scanner that is off."""
-    kinds = (
-        np.int32,
-        np.uint16,
-        np.int32,
-        np.float64,
-        np.float32,
-        np.uint8,
-        np.int32,
-        np.float32,
-        np.float64,
-    )
-    rest: list[Any] = [np.empty(0, kind) for kind in (*kinds, np.uint8, np.uint8)]
+    """An empty cloud, as of a scanner that is off."""
+    kinds = (np.int32, np.uint16, np.int32, np.float64, np.float32, np.uint8, np.int32, np.float32)
+    rest: list[Any] = [np.empty(0, kind) for kind in (*kinds, np.float64, np.uint8, np.uint8)]
     return Cloud(start_ns, np.empty((0, 3), np.float32), *rest)

@@ -1,4 +1,4 @@
-"""One frame of a scanner in the world."""
+"""One frame of a scanner: cast rays, detect echoes, report a point cloud."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
+from lidar.physics.detector import Deviates, detected, false_echoes, measured_range, received
 from lidar.physics.echoes import Echoes, TracedEchoes, joined, numbered, reported, traced
 from lidar.physics.intensity import reflectivity_code
-from lidar.physics.returns import Deviates, detected, false_echoes, measured_range, received
 from lidar.physics.settings import PLAIN, ScannerSettings
 from lidar.random_streams import generator
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
 from lidar.rig.scanner import firings as fire
 from lidar.sensors.cloud import Cloud
-from lidar.sensors.motion import beam_of
-from lidar.sensors.surfaces import met
+from lidar.sensors.rays import beam_of
+from lidar.sensors.surface_echoes import surface_echoes
 from lidar.world.world import World
 
 
@@ -108,8 +108,8 @@ def cast(
         firings = replace(firings, time_ns=np.full_like(firings.time_ns, firings.time_ns[0]))
     sent = firings
     if settings.angle_noise:
-        sent = _unsteady(firings, sensor, rng=generator(seed, sensor.name, frame, "angle"))
-    echoes = met(
+        sent = _with_angle_noise(firings, sensor, rng=generator(seed, sensor.name, frame, "angle"))
+    echoes = surface_echoes(
         sent,
         mount,
         trajectory=trajectory,
@@ -196,29 +196,29 @@ def report(sweep: Sweep, detection: Detection) -> Cloud:
 
 
 @njit(cache=True, nogil=True)
-def _place(pulse: Any, reach: Any, origin: Any, direction: Any, time_ns: Any, xyz: Any, time: Any) -> None:
+def _place(pulse: Any, distance: Any, origin: Any, direction: Any, time_ns: Any, xyz: Any, time: Any) -> None:
     """Fill ``xyz`` and ``time`` of returns."""
     for i in range(len(pulse)):
         p = pulse[i]
-        xyz[i, 0] = origin[p, 0] + reach[i] * direction[p, 0]
-        xyz[i, 1] = origin[p, 1] + reach[i] * direction[p, 1]
-        xyz[i, 2] = origin[p, 2] + reach[i] * direction[p, 2]
+        xyz[i, 0] = origin[p, 0] + distance[i] * direction[p, 0]
+        xyz[i, 1] = origin[p, 1] + distance[i] * direction[p, 1]
+        xyz[i, 2] = origin[p, 2] + distance[i] * direction[p, 2]
         time[i] = time_ns[p] - time_ns[0]
 
 
-def _unsteady(pulses: Firings, sensor: Sensor, *, rng: np.random.Generator) -> Firings:
-    """The pulses where they really go, which is not quite where the sensor says."""
+def _with_angle_noise(pulses: Firings, sensor: Sensor, *, rng: np.random.Generator) -> Firings:
+    """The pulses as sent, whose directions differ from the reported ones by noise."""
     bent = pulses.direction + sensor.angle_sigma * rng.standard_normal((len(pulses), 3))
     return replace(pulses, direction=bent / np.linalg.norm(bent, axis=1, keepdims=True))
 
 
 def _moving(world: World) -> bool:
-    """Whether anything in the world moves during a frame."""
+    """Whether any instance in the world moves during a frame."""
     return any(group.transform.ndim == 4 for group in world.caster.instances)
 
 
 def _ray_time(sensor: Sensor, frame: int, *, pulses: Firings) -> NDArray[np.float32]:
-    """Ray times of the pulses, 0 to 1 over the frame's window."""
+    """Ray times (n,) of the pulses, 0 to 1 over `Sensor.window_ns`."""
     start, stop = sensor.window_ns(frame)
     share: NDArray[np.float32] = ((pulses.time_ns - start) / (stop - start)).astype(np.float32)
     return share

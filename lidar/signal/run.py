@@ -15,7 +15,7 @@ from geoscene.files import write_atomically
 from geoscene.typing import Float
 from lidar.camera.render import Frame
 from lidar.errors import LidarError
-from lidar.physics.echoes import Echoes, Origin, TracedEchoes, merged, traced
+from lidar.physics.echoes import Echoes, Origin, TracedEchoes, by_pulse, merged, traced
 from lidar.random_streams import generator
 from lidar.sensors.cloud import Cloud, TracedCloud
 from lidar.sensors.scan import Sweep, detect, deviates_of, report
@@ -63,16 +63,26 @@ def altered_sweep(sweep: Sweep, stages: Stages) -> Altered:
 
 
 def altered_echoes(pulses: Pulses, echoes: TracedEchoes, *, stages: Stages, frame: int | str) -> TracedEchoes:
-    """Echoes after the stages on them, by pulse and range; those within the echo separation are merged."""
+    """Echoes after the stages on them, sorted by pulse and range.
+
+    Echoes within the sensor's echo separation are merged in pulses that have added or moved ones.
+    """
     name = pulses.sensor.name
     for named in stages.at("echoes", name):
         stage = cast("EchoStage", named.stage)
         echoes = stage.echoes(pulses, echoes, rng=named.rng(stages.seed, name, frame=frame))
         if len(echoes) and not 0 <= echoes.pulse.min() <= echoes.pulse.max() < len(pulses):
             raise LidarError(f"stage {named.name} returned echoes of pulses that were not fired")
-    echoes = echoes.take(np.lexsort((echoes.range, echoes.pulse)))
+    is_new = (echoes.source < 0) | (echoes.origin == Origin.MOVED)
+    is_mixed = np.isin(echoes.pulse, echoes.pulse[is_new])
+    order = np.lexsort((np.where(is_mixed, echoes.range, 0.0), echoes.pulse))
+    echoes, is_mixed = echoes.take(order), is_mixed[order]
+    if not is_mixed.any():
+        return echoes
     # Off the axis, so that an echo of several is described by the one that sends back most.
-    return merged(replace(echoes, axis=np.zeros(len(echoes), bool)), pulses.sensor.echo_separation)
+    mixed = echoes.take(is_mixed)
+    mixed = merged(replace(mixed, axis=np.zeros(len(mixed), bool)), pulses.sensor.echo_separation)
+    return by_pulse(echoes.take(~is_mixed), mixed)
 
 
 def linked(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> TracedCloud:

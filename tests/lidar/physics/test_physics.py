@@ -18,7 +18,7 @@ from lidar.physics.link import (
     detection_probability,
     false_alarm_probability,
 )
-from lidar.physics.measure import quantised, signal_sigma, stretch_sigma, walk
+from lidar.physics.range_error import quantised, signal_sigma, stretch_sigma, walk
 from lidar.physics.reflect import apparent, reflectance_table
 from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.random_streams import generator, normal_of

@@ -18,6 +18,7 @@ from lidar.rig.scanner import load_sensor
 from lidar.sensors.cloud import Cloud
 from lidar.sensors.scan import cast, scan
 from lidar.signal.dropped_packets import DroppedPackets
+from lidar.signal.recorded import altered_recording
 from lidar.signal.registry import NamedStage, Stages, read_stage, read_stages, stage_rows, stages_of
 from lidar.signal.run import altered_image, altered_sweep, cloud_truth, image_truth
 from lidar.signal.stage import Stage, added_echoes, parameter
@@ -75,19 +76,19 @@ def assert_same(cloud, other):
         assert np.array_equal(getattr(cloud, f.name), getattr(other, f.name)), f.name
 
 
-@pytest.mark.parametrize("settings", [PLAIN, NOISY])
+@pytest.mark.parametrize("effects", [PLAIN, NOISY])
 @pytest.mark.parametrize("mode", ["strongest", "dual"])
-def test_stages_with_nothing_to_do_leave_the_returns(settings, mode):
+def test_stages_with_nothing_to_do_leave_the_returns(effects, mode):
     idle = read_stages(["cover_glass:transmission=1", "dropped_packets:loss=0"], seed=5)
-    found = altered_sweep(swept(settings, return_mode=mode), idle)
-    expected = plain(settings, return_mode=mode)
+    found = altered_sweep(swept(effects, return_mode=mode), idle)
+    expected = plain(effects, return_mode=mode)
     assert_same(found.cloud, expected)
     assert_same(found.original, expected)
     assert np.array_equal(found.cloud.source, np.arange(len(expected)))
     assert (found.cloud.hidden == -1).all()
     noise = expected.klass == Class.NOISE
     assert (found.cloud.origin[~noise] == Origin.SURFACE).all()
-    if settings is NOISY:
+    if effects is NOISY:
         assert {Origin.RECEIVER, Origin.INTERFERENCE} <= set(found.cloud.origin[noise].tolist())
 
 
@@ -152,12 +153,12 @@ def test_an_injected_echo_hides_the_surface_in_strongest_mode_and_joins_it_in_du
 
 
 def test_an_injected_echo_obeys_threshold_separation_and_range_limits():
-    settings = ScannerSettings(link=True)
-    faint = altered_sweep(swept(settings), chain(Injected(3.0, power=0.9)))
-    assert_same(faint.cloud, plain(settings))
-    bright = altered_sweep(swept(settings), chain(Injected(3.0, power=1.1)))
+    effects = ScannerSettings(link=True)
+    faint = altered_sweep(swept(effects), chain(Injected(3.0, power=0.9)))
+    assert_same(faint.cloud, plain(effects))
+    bright = altered_sweep(swept(effects), chain(Injected(3.0, power=1.1)))
     assert (bright.cloud.origin == Origin.INJECTED).sum() > 5000
-    far = altered_sweep(swept(settings), chain(Injected(200.0)))
+    far = altered_sweep(swept(effects), chain(Injected(200.0)))
     assert (far.cloud.origin == Origin.SURFACE).all()
     wall = world(plate(20.0))
     sweep = cast(load_sensor("utm30lx"), Mount(), trajectory=driven(), world=wall, frame=0)
@@ -185,8 +186,8 @@ def test_returns_that_a_stage_leaves_alone_keep_their_noise():
 
 
 def test_cover_glass_attenuates_by_the_square_of_its_transmission():
-    settings = ScannerSettings(link=True)
-    found = altered_sweep(swept(settings), read_stages(["cover_glass:transmission=0.5"]))
+    effects = ScannerSettings(link=True)
+    found = altered_sweep(swept(effects), read_stages(["cover_glass:transmission=0.5"]))
     diffuse = found.cloud.feature != 11  # codes of retro-reflectors are logarithmic
     before = found.original.intensity[found.cloud.source]
     assert found.cloud.intensity[diffuse] == pytest.approx(before[diffuse] / 4, rel=1e-5)
@@ -294,3 +295,37 @@ def test_every_listed_stage_is_documented():
         assert row["meaning"].endswith("."), row["name"]
         assert all(p["meaning"] for p in row["parameters"])
         assert read_stages([row["name"]])
+
+
+@pytest.mark.parametrize("effects", [PLAIN, NOISY])
+@pytest.mark.parametrize("mode", ["strongest", "dual"])
+def test_recorded_clouds_stay_the_same_without_an_effect(effects, mode):
+    recorded = plain(effects, return_mode=mode)
+    sensor = load_sensor("vlp16", return_mode=mode)
+    idle = read_stages(["cover_glass:transmission=1", "dropped_packets:loss=0"])
+    found = altered_recording(recorded, idle, sensor=sensor, frame=2)
+    assert_same(found.cloud, recorded)
+    assert np.array_equal(found.cloud.source, np.arange(len(recorded)))
+
+
+def test_dropped_packets_of_a_recorded_cloud_are_those_of_the_drive():
+    stages = read_stages(["dropped_packets:loss=0.3,burst=4"], seed=5)
+    driven_cloud = altered_sweep(SWEPT, stages).cloud
+    recorded = altered_recording(PLAIN_CLOUD, stages, sensor=load_sensor("vlp16"), frame=2).cloud
+    assert_same(recorded, driven_cloud)
+    assert np.array_equal(recorded.source, driven_cloud.source)
+
+
+def test_echo_stages_treat_recorded_returns_as_echoes():
+    effects = ScannerSettings(link=True)
+    glass = read_stages(["cover_glass:transmission=0.5"])
+    simulated = altered_sweep(swept(effects), glass)
+    recorded = altered_recording(plain(effects), glass, sensor=load_sensor("vlp16"), frame=2)
+    assert np.array_equal(recorded.cloud.source, simulated.cloud.source)
+    assert recorded.cloud.intensity == pytest.approx(simulated.cloud.intensity, rel=1e-4)
+    assert np.array_equal(recorded.cloud.xyz, simulated.cloud.xyz)
+    near = altered_recording(PLAIN_CLOUD, chain(Injected(3.0)), sensor=load_sensor("vlp16"), frame=2)
+    injected = near.cloud.origin == Origin.INJECTED
+    assert injected.sum() > 5000
+    assert np.linalg.norm(near.cloud.xyz[injected], axis=1) == pytest.approx(3.0, abs=0.1)
+    assert (near.cloud.hidden[injected] >= 0).all()

@@ -1,4 +1,4 @@
-"""What comes back from what rays hit: reflectance, and the echoes of each pulse."""
+"""Reflectance of the surfaces that rays hit, and the echoes of each pulse."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lidar.world.world import Faces, World
 
 
 @functools.cache
-def shiny_codes() -> tuple[int, int]:
+def glossy_codes() -> tuple[int, int]:
     """Material codes of glass and water."""
     known = materials()
     return known["glass"].code, known["water"].code
@@ -30,18 +30,18 @@ def shiny_codes() -> tuple[int, int]:
 
 @functools.lru_cache(maxsize=8)
 def _factors(low: int, high: int, *, spread: float, seed: int) -> Float:
-    """Factors of the reflectance of features ``low`` to ``high``."""
+    """Log-normal factors of the reflectance of features ``low`` to ``high``."""
     factors: Float = np.exp(spread * normal_of(np.arange(low, high + 1), seed))
     return factors
 
 
-class Optics(NamedTuple):
-    """How surfaces send light back, for compiled code.
+class ReflectionTables(NamedTuple):
+    """Reflection properties by material and feature, for compiled code.
 
     reflectance, specular : (256,) by material code
-    factor : (k,) of the reflectance, by feature number less ``low``; empty for none
-    law    : row of `INCIDENCE_LAWS`
-    shiny  : (256,) bool, by material code: rays go on where they meet it
+    factor : (k,) of the reflectance, by feature number minus ``low``; empty if there is no spread
+    law    : index in `INCIDENCE_LAWS`
+    glossy : (256,) bool, by material code: rays are mirrored or pass through
     """
 
     reflectance: Float
@@ -49,40 +49,39 @@ class Optics(NamedTuple):
     factor: Float
     low: int
     law: int
-    shiny: NDArray[np.bool_]
+    glossy: NDArray[np.bool_]
 
 
-class Look:
-    """Surfaces of a world as a receiver sees them.
+class SurfaceOptics:
+    """Reflection of a scanner's light by the surfaces of a world.
 
-    world         : what is seen
-    wavelength_nm : of the light
-    settings, seed : how surfaces differ and how they send light back
+    settings : incidence law, spread of the reflectance, and whether glass and water mirror
+    seed    : of the spread
     """
 
     def __init__(self, world: World, wavelength_nm: float, *, settings: ScannerSettings, seed: int) -> None:
         self.world, self.settings = world, settings
         self.faces: Faces = world.faces
         reflectance, specular = reflectance_table(wavelength_nm)
-        shiny = np.zeros(256, np.bool_)
-        shiny[list(shiny_codes())] = settings.mirrors
+        glossy = np.zeros(256, np.bool_)
+        glossy[list(glossy_codes())] = settings.mirrors
         factor = np.empty(0)
         if settings.spread:
             factor = _factors(self.faces.low, self.faces.high, spread=settings.spread, seed=seed)
         law = INCIDENCE_LAWS.index(settings.law)
-        self.optics = Optics(reflectance, specular, factor, self.faces.low, law, shiny)
+        self.tables = ReflectionTables(reflectance, specular, factor, self.faces.low, law, glossy)
 
     def at(self, hits: Hits) -> tuple[Echoes, NDArray[np.uint8]]:
-        """Rows for hits, numbered from 0 and all on the axis, and their materials."""
-        found, optics = self.world.lookup(hits), self.optics
+        """Surfaces (n,) of hits, with the hit's row as pulse and all on the axis; and their materials."""
+        found, tables = self.world.lookup(hits), self.tables
         cosine = np.minimum(np.abs(hits.cosine).astype(np.float64), 1.0)
-        rho = optics.reflectance[found.material]
-        if len(optics.factor):
-            one_off = rho * optics.factor[np.maximum(found.feature - optics.low, 0)]
+        rho = tables.reflectance[found.material]
+        if len(tables.factor):
+            one_off = rho * tables.factor[np.maximum(found.feature - tables.low, 0)]
             rho = np.where(rho > RETRO, one_off, np.minimum(one_off, RETRO))
-        back = apparent(rho, cosine, specular=optics.specular[found.material], law=self.settings.law)
+        back = apparent(rho, cosine, specular=tables.specular[found.material], law=self.settings.law)
         if self.settings.mirrors:
-            water = np.flatnonzero(found.material == shiny_codes()[1])
+            water = np.flatnonzero(found.material == glossy_codes()[1])
             back[water] = glint(cosine[water])
         n = len(hits.range)
         number, axis = np.arange(n, dtype=np.int32), np.ones(n, bool)
@@ -90,76 +89,79 @@ class Look:
         return rows, found.material
 
 
-class Receiver:
-    """Collects the echoes of pulses, some pulses at a time, in order.
+class EchoCollector:
+    """Collects the echoes of consecutive pulses, batch after batch.
 
-    look       : the surfaces
-    share      : (rays,) of a pulse's power, by ray
-    separation : metres, surfaces closer than this are one echo
-    pulses     : of which there are so many in all
+    share      : (rays,) share of a pulse's power in each ray
+    separation : metres; surfaces closer than this give one echo
+    pulses     : number of pulses in all
     """
 
-    def __init__(self, look: Look, share: Float, *, separation: float, pulses: int) -> None:
-        self._look, self._share, self._separation = look, share, separation
-        self._columns, self._open, self._count = _columns(pulses), np.empty(pulses, np.bool_), 0
+    def __init__(self, optics: SurfaceOptics, share: Float, *, separation: float, pulses: int) -> None:
+        self._optics, self._share, self._separation = optics, share, separation
+        self._columns, self._glossy, self._count = _columns(pulses), np.empty(pulses, np.bool_), 0
 
     def take(self, hits: Hits, first: int) -> NDArray[np.int32]:
-        """Take the hits of the rays of pulses from number ``first`` on; the rays that met glass or water.
+        """Add the hits of the pulses from number ``first`` on; return the rays that hit glass or water.
 
-        Pulses with such rays are kept apart, with their surfaces as they are.
+        The surfaces of pulses with such rays are collected apart and not yet merged into echoes.
         """
         n = len(hits.range)
         self._make_room(n)
-        start, shiny = self._count, np.empty((2, n if self._look.settings.mirrors else 0), np.int32)
+        start, glossy = self._count, np.empty((2, n if self._optics.settings.mirrors else 0), np.int32)
         echoes = self._columns.take(slice(start, start + n))
-        count, met = _receive(
+        count, found = _receive(
             (hits.range, hits.face, hits.instance, hits.cosine),
             first,
             self._share,
-            self._look.faces,
-            self._look.optics,
+            self._optics.faces,
+            self._optics.tables,
             self._separation,
             tuple(getattr(echoes, f.name) for f in fields(Echoes)),
-            self._open[start : start + n],
-            shiny,
+            self._glossy[start : start + n],
+            glossy,
         )
         self._count += count
-        ray, row = shiny[:, :met]
-        if met:
-            wet = self._look.faces.what[_place(self._look.faces, hits, ray=ray)] & 255 == shiny_codes()[1]
+        ray, row = glossy[:, :found]
+        if found:
+            wet = (
+                self._optics.faces.what[_face_row(self._optics.faces, hits, ray=ray)] & 255
+                == glossy_codes()[1]
+            )
             echoes.apparent[row[wet]] = (
                 glint(echoes.cosine[row[wet]]) * self._share[ray[wet] % len(self._share)]
             )
-        shining: NDArray[np.int32] = ray
-        return shining
+        rays: NDArray[np.int32] = ray
+        return rays
 
     def echoes(self) -> tuple[Echoes, Echoes]:
-        """The echoes of the pulses that met neither glass nor water, and the surfaces of those that did."""
-        together, kept = self._columns.take(slice(self._count)), self._open[: self._count]
+        """Echoes of pulses that hit neither glass nor water, and surfaces of the others."""
+        together, kept = self._columns.take(slice(self._count)), self._glossy[: self._count]
         return together.where(~kept), together.take(kept)
 
     def _make_room(self, rows: int) -> None:
-        """See that there are columns for so many more echoes."""
-        if self._count + rows <= len(self._open):
+        """Grow the columns so that ``rows`` more echoes fit."""
+        if self._count + rows <= len(self._glossy):
             return
-        old, flags, size = self._columns, self._open, 2 * len(self._open) + rows
-        self._columns, self._open = _columns(size), np.empty(size, np.bool_)
+        old, flags, size = self._columns, self._glossy, 2 * len(self._glossy) + rows
+        self._columns, self._glossy = _columns(size), np.empty(size, np.bool_)
         for name in (f.name for f in fields(Echoes)):
             getattr(self._columns, name)[: self._count] = getattr(old, name)[: self._count]
-        self._open[: self._count] = flags[: self._count]
+        self._glossy[: self._count] = flags[: self._count]
 
 
 def _columns(n: int) -> Echoes:
-    """Columns yet to be filled."""
+    """Uninitialised columns."""
     distance, apparent, cosine, true = (np.empty(n) for _ in range(4))
     number, feature = np.empty(n, np.int32), np.empty(n, np.int32)
     klass, axis = np.empty(n, np.uint8), np.empty(n, np.bool_)
     return Echoes(number, distance, apparent, feature, klass, cosine, true, axis)
 
 
-def _place(faces: Faces, hits: Hits, *, ray: NDArray[np.int32]) -> NDArray[np.int64]:
-    place: NDArray[np.int64] = hits.face[ray] + faces.start[hits.instance[ray]]
-    return place
+def _face_row(faces: Faces, hits: Hits, *, ray: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Row of ``faces.what`` of each ray's hit."""
+    row: NDArray[np.int64] = hits.face[ray] + faces.start[hits.instance[ray]]
+    return row
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -168,19 +170,19 @@ def _receive(
     pulse: Any,
     share: Any,
     faces: Any,
-    optics: Any,
+    tables: Any,
     separation: Any,
     out: Any,
-    opened: Any,
-    shiny: Any,
+    apart: Any,
+    glossy: Any,
 ) -> Any:
-    """Fill ``out`` with echoes; the number of them and of rays that met something shiny."""
+    """Fill ``out`` with echoes; return their number and that of rays that hit glass or water."""
     distance, face, instance, cosine = hits
     rays = len(share)
     # Fields of a tuple that are read in a loop cost a reference count each time.
     starts, named, whats, own = faces.start, faces.named, faces.what, len(faces.start) - 1
-    reflectance, specular, factor, glossy = optics.reflectance, optics.specular, optics.factor, optics.shiny
-    low, law, spread = optics.low, optics.law, len(optics.factor) > 0
+    reflectance, specular, factor, mirrors = tables.reflectance, tables.specular, tables.factor, tables.glossy
+    low, law, spread = tables.low, tables.law, len(tables.factor) > 0
     numbers, ranges, apparents, features, classes, cosines, trues, axes = out
     back, away, slant = np.empty(rays), np.empty(rays), np.empty(rays)
     axis = np.zeros(rays, np.bool_)
@@ -188,9 +190,9 @@ def _receive(
     what = np.empty(rays, np.int64)
     row, bearer = np.empty(rays, np.int64), np.empty(rays, np.int64)
     place, power = np.empty(rays), np.empty(rays)
-    count = met = 0
+    count = found = 0
     for first in range(0, len(distance), rays):
-        size, whole, number = 0, True, pulse + first // rays
+        size, plain, number = 0, True, pulse + first // rays
         for k in range(rays):
             i = first + k
             if face[i] < 0:
@@ -209,24 +211,24 @@ def _receive(
             back[k] = sent_back(rho, c, specular[material], law) * share[k]
             insert(row, size, k, away)
             size += 1
-            whole &= not glossy[material]
+            plain &= not mirrors[material]
         if size == 0:
             continue
-        if whole:
+        if plain:
             echoes = gather(row, size, away, back, axis, separation, 0, bearer, place, power)
         else:
             echoes = size
             for j in range(size):
                 k = row[j]
                 bearer[j], place[j], power[j] = k, away[k], back[k]
-                if glossy[what[k] & 255]:
-                    shiny[0, met], shiny[1, met] = first + k, count + j
-                    met += 1
+                if mirrors[what[k] & 255]:
+                    glossy[0, found], glossy[1, found] = first + k, count + j
+                    found += 1
         for j in range(echoes):
             k = bearer[j]
             numbers[count], ranges[count], apparents[count] = number, place[j], power[j]
             features[count], classes[count] = what[k] >> 32, (what[k] >> 8) & 255
             cosines[count], trues[count], axes[count] = slant[k], away[k], axis[k]
-            opened[count] = not whole
+            apart[count] = not plain
             count += 1
-    return count, met
+    return count, found

@@ -19,7 +19,7 @@ from lidar.rig.patterns.beams import Firings
 
 @dataclass(frozen=True, slots=True)
 class Beam:
-    """How a pulse is spread over rays.
+    """Rays that sample the cross-section of a pulse.
 
     spread : (rays, 2) radians, to the left and up, off the beam's axis, which comes first
     size   : (rays, 2) metres, to the left and up, where the rays start
@@ -40,23 +40,23 @@ def beam_of(
 ) -> Beam:
     """The beam of a scanner.
 
-    rays       : rays a pulse, see `lidar.physics.footprint.bundle`
-    divergence : (2,) radians, full 1/e^2 angles, level and upright
-    aperture   : (2,) metres, the beam's size at its start
+    rays       : rays per pulse, see `lidar.physics.footprint.bundle`
+    divergence : (2,) radians, full 1/e^2 angles, horizontal and vertical
+    aperture   : (2,) metres, size of the beam at its start
     """
-    place, share = bundle(rays)
-    return Beam(place * np.divide(divergence, 2), place * np.divide(aperture, 2), share)
+    position, share = bundle(rays)
+    return Beam(position * np.divide(divergence, 2), position * np.divide(aperture, 2), share)
 
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Rays of consecutive pulses: those of the first, of the second, ...; the beam's axis leads each bundle.
+    """Rays of consecutive pulses, pulse by pulse; the first ray of each pulse is the axis of its beam.
 
     poses     : of the sensor
     index     : (n,) int64, each ray's row of ``poses``
     direction : (n, 3) float64, unit vectors in the sensor frame of that pose
     origin    : (n, 3) float64, metres, in the same frame
-    order     : (n,) int64, permutation in which neighbours go almost the same way
+    order     : (n,) int64, permutation in which neighbouring rays have similar directions
     """
 
     poses: Poses
@@ -66,13 +66,13 @@ class Rays:
     order: NDArray[np.int64]
 
     def take(self, rows: NDArray[np.integer]) -> Rays:
-        """Chosen rays, in no order."""
+        """Selected rays, without an ``order``."""
         none = np.empty(0, np.int64)
         return Rays(self.poses, self.index[rows], self.direction[rows], self.origin[rows], none)
 
 
 class _Scratch(threading.local):
-    """Columns that a thread fills again and again: fresh memory takes longer to come by than to fill."""
+    """Columns that a thread reuses: allocating memory takes longer than filling it."""
 
     def __init__(self) -> None:
         self._grow(0)
@@ -81,7 +81,7 @@ class _Scratch(threading.local):
         self._columns = np.empty(n, np.int64), np.empty((n, 3)), np.empty((n, 3)), np.empty(n, np.int64)
 
     def columns(self, n: int) -> tuple[NDArray[np.int64], Float, Float, NDArray[np.int64]]:
-        """Index, direction, origin and order of n rays, to be filled."""
+        """Uninitialised columns of n rays: index, direction, origin and order."""
         if len(self._columns[0]) < n:
             self._grow(n)
         index, direction, origin, order = self._columns
@@ -91,15 +91,14 @@ class _Scratch(threading.local):
 _scratch = _Scratch()
 
 
-class Carrier:
-    """A moving sensor that fires pulses, some of them at a time.
+class MovingSensor:
+    """A sensor that moves while it fires; its rays come in batches of pulses.
 
-    Direction and start of a ray carry the motion from its pose to the pulse's own time, so that casting them
-    from the pose is casting each pulse from where the sensor is when it fires. Poses are taken every
-    `KNOT_NS` and beams moved linearly between them, as in `Trajectory.place`.
+    Poses are sampled every `KNOT_NS`. The direction and origin of a ray include the motion from its pose to
+    the pulse's own time, interpolated linearly as in `Trajectory.place`.
 
     firings : the pulses
-    batch   : pulses at a time, at most
+    batch   : maximum number of pulses per batch
     """
 
     def __init__(
@@ -118,7 +117,7 @@ class Carrier:
         _batches(firings.order, batch, self._order)
 
     def rays(self, batch: int) -> Rays:
-        """The rays of a batch, by its number; good until this thread asks for others."""
+        """The rays of a batch, by its number; valid until this thread requests another batch."""
         part = slice(batch * self._batch, (batch + 1) * self._batch)
         fired, beam = self._firings, self._beam
         work = self._order[part]
@@ -139,7 +138,7 @@ class Carrier:
 
 @njit(cache=True, nogil=True)
 def _batches(order: Any, size: int, out: Any) -> None:
-    """Fill ``out`` with the order, one batch of rows after the other."""
+    """Fill ``out`` with the order of the pulses, batch after batch."""
     batches = -(-len(order) // size)
     place = size * np.arange(batches)
     for i in range(len(order)):
@@ -166,11 +165,11 @@ def _fill(
         sx, sy, sz = shift[k, 0], shift[k, 1], shift[k, 2]
         x, y, z = directions[pulse, 0], directions[pulse, 1], directions[pulse, 2]
         ox, oy, oz = origins[pulse, 0], origins[pulse, 1], origins[pulse, 2]
-        # Across the beam: level to the left (lx, ly), and upright (ux, uy, uz).
+        # Axes across the beam: horizontal, to the left (lx, ly), and upwards (ux, uy, uz).
         lx, ly, ux, uy, uz = 0.0, 1.0, 0.0, 0.0, 0.0
         if len(angle) > 1:
             level = np.sqrt(x * x + y * y)
-            if level > 1e-9:  # else along the spin axis, where left is as good as any
+            if level > 1e-9:  # else the beam is along the spin axis, and any horizontal axis will do
                 lx, ly = -y / level, x / level
             ux, uy, uz = -z * ly, z * lx, x * ly - y * lx
         for ray in range(len(angle)):

@@ -12,7 +12,7 @@ from geoscene.classes import Class
 from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, EchoesT, Origin
 from lidar.physics.link import amplitude, apparent_of, daylight_noise, false_alarm_probability
-from lidar.physics.measure import quantised, signal_sigma, stretch_sigma, walk
+from lidar.physics.range_error import quantised, signal_sigma, stretch_sigma, walk
 from lidar.physics.reflect import RETRO
 from lidar.physics.settings import ScannerSettings
 from lidar.random_streams import generator

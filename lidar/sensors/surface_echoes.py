@@ -1,0 +1,182 @@
+"""Echoes of the surfaces that the pulses of a frame hit, also behind glass and in mirrors."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.typing import Float
+from lidar.geometry.mounts import Mount
+from lidar.geometry.poses import Trajectory
+from lidar.physics.echoes import Echoes, by_pulse, joined, merged
+from lidar.physics.fresnel import mirrored, pane_reflection, surface_reflection
+from lidar.physics.settings import ScannerSettings
+from lidar.raycast import Hits
+from lidar.rig.patterns.beams import Firings
+from lidar.sensors.foliage import Foliage
+from lidar.sensors.rays import Beam, MovingSensor, Rays
+from lidar.sensors.reflection import EchoCollector, SurfaceOptics, glossy_codes
+from lidar.world.world import World
+
+_MAX_PANES = 4  # panes that a ray may pass
+_CLEAR = 1e-3  # metres beyond a surface at which the next ray starts
+_BATCH = 1 << 15  # rays per batch, so that their columns stay in the processor's cache
+
+
+def surface_echoes(
+    pulses: Firings,
+    mount: Mount,
+    *,
+    trajectory: Trajectory,
+    world: World,
+    beam: Beam,
+    far: float,
+    wavelength_nm: float,
+    separation: float,
+    time: NDArray[np.float32] | None,
+    settings: ScannerSettings,
+    seed: int,
+    leaf_seed: int = 0,
+    threads: int = 1,
+) -> Echoes:
+    """The echoes of pulses that a moving sensor fires, within ``far`` metres, sorted by pulse and range.
+
+    separation : metres; surfaces closer than this give one echo
+    time       : (n,) ray times of the pulses; None in a static world
+    leaf_seed  : of the leaves that rays hit, if settings include foliage
+    """
+    rays = len(beam)
+    batch = max(_BATCH // rays, 1)
+    optics = SurfaceOptics(world, wavelength_nm, settings=settings, seed=seed)
+    moving = MovingSensor(pulses, mount, trajectory=trajectory, beam=beam, batch=batch)
+    collector = EchoCollector(optics, beam.share, separation=separation, pulses=len(pulses))
+    foliage = Foliage(world.caster, world.faces, far, leaf_seed) if settings.foliage else None
+    beyond: list[Echoes] = []
+    for number, first in enumerate(range(0, len(pulses), batch)):
+        cast = moving.rays(number)
+        moments = None if time is None else np.repeat(time[first : first + batch], rays)
+        hits = world.caster.cast_posed(
+            cast.poses,
+            cast.index,
+            directions=cast.direction,
+            offsets=cast.origin,
+            far=far,
+            time=moments,
+            order=cast.order,
+            threads=threads,
+        )
+        pierced = None if foliage is None else foliage.pierce(hits, cast, first=first * rays, time=moments)
+        glossy = collector.take(hits, first)
+        if len(glossy):
+            pulse, ray = np.divmod(glossy, np.int32(rays))
+            skip = np.zeros(len(glossy))
+            if pierced is not None:
+                through = np.isin(glossy, pierced)
+                skip[through] = hits.range[glossy[through]] - _CLEAR
+            beyond += _beyond(
+                cast.take(glossy),
+                pulse + np.int32(first),
+                power=beam.share[ray],
+                optics=optics,
+                far=far,
+                time=None if moments is None else moments[glossy],
+                skip=skip,
+            )
+    echoes, surfaces = collector.echoes()
+    if not len(surfaces):
+        return echoes
+    return by_pulse(echoes, merged(joined(surfaces, *beyond), separation))
+
+
+def _beyond(
+    rays: Rays,
+    pulse: NDArray[np.int32],
+    *,
+    power: Float,
+    optics: SurfaceOptics,
+    far: float,
+    time: NDArray[np.float32] | None,
+    skip: Float,
+) -> list[Echoes]:
+    """Surfaces that rays hit after glass or water: behind the pane, and in the mirror.
+
+    pulse, power : (n,) of each ray; time as in `surface_echoes`
+    skip         : (n,) metres from each ray's start that it has passed through foliage
+
+    Light takes the mirrored path twice, so that its power is proportional to the square of the reflected
+    share. The echo appears on the ray's own direction, as far behind the mirror as the surface is in front,
+    and is labelled noise.
+    """
+    caster = optics.world.caster
+    pose = rays.poses.take(rays.index)
+    start, direction = pose.place(rays.origin), pose.directions(rays.direction)
+    start, travelled = start + skip[:, None] * direction, skip
+    glass, water = glossy_codes()
+    found = []
+    for layer in range(_MAX_PANES):
+        hits = caster.cast(start, direction, far=far, time=time, normals=True)
+        surface, material = optics.at(hits)
+        if layer:  # the collector has the first surface
+            found.append(_along(surface, hits, pulse=pulse, power=power, travelled=travelled, klass=None))
+        is_glossy = (hits.face >= 0) & np.isin(material, (glass, water)) & (travelled + hits.range < far)
+        if not is_glossy.any():
+            break
+        hits, pulse, power = _rows(hits, is_glossy), pulse[is_glossy], power[is_glossy]
+        start, direction, material = start[is_glossy], direction[is_glossy], material[is_glossy]
+        travelled, time = travelled[is_glossy], None if time is None else time[is_glossy]
+        cosine = np.minimum(np.abs(hits.cosine).astype(np.float64), 1.0)
+        mirror = np.where(material == glass, pane_reflection(cosine), surface_reflection(cosine))
+        travelled = travelled + hits.range
+        place = start + hits.range[:, None] * direction
+        if not layer:
+            ghosts = caster.cast(place, mirrored(direction, hits.normal), near=_CLEAR, far=far, time=time)
+            found.append(
+                _along(
+                    optics.at(ghosts)[0],
+                    ghosts,
+                    pulse=pulse,
+                    power=power * mirror**2,
+                    travelled=travelled,
+                    klass=Class.NOISE,
+                )
+            )
+        through = material == glass
+        start, direction = (place + _CLEAR * direction)[through], direction[through]
+        power = (power * (1 - mirror) ** 2)[through]
+        pulse, travelled = pulse[through], travelled[through] + _CLEAR
+        time = None if time is None else time[through]
+        if not through.any():
+            break
+    return [part.take(part.range <= far) for part in found]
+
+
+def _along(
+    surface: Echoes,
+    hits: Hits,
+    *,
+    pulse: NDArray[np.int32],
+    power: Float,
+    travelled: Float,
+    klass: Class | None,
+) -> Echoes:
+    """The surfaces that were hit, with range and power along the whole path."""
+    hit = np.flatnonzero(hits.face >= 0)
+    distance = (travelled + hits.range)[hit]
+    labels = surface.klass[hit] if klass is None else np.full(len(hit), klass, np.uint8)
+    return Echoes(
+        pulse[hit],
+        distance,
+        (surface.apparent * power)[hit],
+        surface.feature[hit],
+        labels,
+        surface.cosine[hit],
+        distance,
+        np.zeros(len(hit), bool),
+    )
+
+
+def _rows(hits: Hits, rows: NDArray[np.bool_]) -> Hits:
+    """The hits at which a mask is true."""
+    normal = hits.normal[rows] if len(hits.normal) else hits.normal
+    return Hits(hits.range[rows], hits.face[rows], hits.instance[rows], hits.cosine[rows], normal)
