@@ -123,8 +123,9 @@ def drive(
         One setting that differs from the level, NAME=VALUE; repeat for more. lidar settings lists them.
     traffic
         Other road users: on, or densities such as vehicles=20,parked=0.5,pedestrians=5,cyclists=2 (vehicles
-        and cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places); or a
-        file that sumo --fcd-output wrote, with net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed.
+        and cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places);
+        sumo or sumo,vehicles=20,...: the same densities, simulated by SUMO; or a file that sumo --fcd-output
+        wrote, with net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed.
     formats
         Formats of clouds, with commas: pcd, ply, csv, kitti, nuscenes (sensor frame), laz, las
         (georeferenced).
@@ -239,6 +240,7 @@ def _traffic(text: str | None) -> Any:
         return None
     from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415
     from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415
+    from lidar.traffic.sumo import SumoOptions  # noqa: PLC0415
 
     if text == "on":
         return TrafficOptions()
@@ -246,12 +248,16 @@ def _traffic(text: str | None) -> Any:
     if file.lower().endswith((".xml", ".xml.gz")):
         return TrafficFile(Path(file), **_words_of_file(text, words))
     known = ("vehicles", "cyclists", "pedestrians", "parked", "radius")
-    pairs = [_setting(word) for word in text.split(",")] if "=" in text else [(text, "")]
+    kind = SumoOptions if file == "sumo" else TrafficOptions
+    given_words = words if file == "sumo" else text.split(",")
+    pairs = [_setting(word) if "=" in word else (word, "") for word in given_words]
     if unknown := [name for name, _ in pairs if name not in known]:
-        raise InputError(f"--traffic {text}: {', '.join(unknown)} is none of on, off, {', '.join(known)}")
+        raise InputError(
+            f"--traffic {text}: {', '.join(unknown)} is none of on, off, sumo, {', '.join(known)}"
+        )
     try:
         given: dict[str, Any] = {name: float(value) for name, value in pairs}
-        return TrafficOptions(**given)
+        return kind(**given)
     except ValueError as error:
         raise InputError(f"--traffic {text}: {error}") from None
 

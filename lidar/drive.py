@@ -41,6 +41,7 @@ from lidar.traffic.ego_drive import drive_in_traffic, drive_with_signals
 from lidar.traffic.fcd import TrafficFile
 from lidar.traffic.fcd_replay import replay
 from lidar.traffic.populate import populate
+from lidar.traffic.sumo import SumoOptions, drive_in_sumo
 from lidar.world.actors import Actors
 from lidar.world.thread_worlds import Worlds
 
@@ -144,7 +145,8 @@ def drive(
         if isinstance(traffic, TrafficFile):
             actors = replay(scene, graph, ego=trajectory, vehicle=body, seed=options.seed, options=traffic)
         elif isinstance(planned, RoadDrive):
-            trajectory, actors = drive_in_traffic(
+            simulate = drive_in_sumo if isinstance(traffic, SumoOptions) else drive_in_traffic
+            trajectory, actors = simulate(
                 scene,
                 graph,
                 path=planned.travel.path,
@@ -155,6 +157,8 @@ def drive(
                 duration=planned.travel.duration,
                 under_way=planned.travel.under_way,
             )
+        elif isinstance(traffic, SumoOptions):
+            raise InputError("traffic: SUMO needs a drive along a route on roads")
         else:
             actors = populate(scene, graph, ego=trajectory, vehicle=body, seed=options.seed, options=traffic)
     geo = Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact)

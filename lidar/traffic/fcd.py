@@ -10,15 +10,18 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Literal, cast
+from typing import IO, TYPE_CHECKING, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.errors import FormatError, InputError
+
+if TYPE_CHECKING:
+    from pyproj import Transformer
 
 _HEAD = 1 << 16  # bytes at a file's start in which SUMO notes its options
 _OPTION = re.compile(
@@ -106,6 +109,18 @@ class Fcd:
     ahead: Float
     speed: Float
 
+    def without(self, name: str) -> Fcd:
+        """All vehicles and persons but one."""
+        kept = np.array([other != name for other in self.name], bool)
+        rows = np.repeat(kept, np.diff(self.first))
+        return Fcd(
+            tuple(np.array(self.name, object)[kept]),
+            np.concatenate([[0], np.cumsum(np.diff(self.first)[kept])]).astype(np.int64),
+            tuple(np.array(self.vclass, object)[kept]),
+            self.length[kept],
+            *(column[rows] for column in (self.time, self.lon, self.lat, self.ahead, self.speed)),
+        )
+
 
 def read_fcd(path: Path, *, net: Path | None = None) -> Fcd:
     """The vehicles and persons of a file; what runs on rails or swims is left out.
@@ -133,12 +148,12 @@ def read_fcd(path: Path, *, net: Path | None = None) -> Fcd:
             " --fcd-output.geo"
         )
     else:
-        shift, unproject = _placed(net)
+        projection = network_projection(net)
         if noted.get("fcd-output.utm") == "true":
-            shift = np.zeros(2)
-        at = np.column_stack([x, y]) - shift
-        lon, lat = unproject(at)
-        ahead = np.column_stack(unproject(at + np.column_stack([c, s])))
+            projection = replace(projection, offset=np.zeros(2))
+        at = np.column_stack([x, y])
+        lon, lat = projection.to_geographic(at)
+        ahead = np.column_stack(projection.to_geographic(at + np.column_stack([c, s])))
     known = _types(path, noted)
     classes = [known.get(kind, ("", None)) for kind in kinds]
     vclass = [given or _class_of(kind) for (given, _), kind in zip(classes, kinds, strict=True)]
@@ -255,8 +270,24 @@ def _number(path: Path, element: ET.Element, *, attribute: str, where: str) -> f
     return value
 
 
-def _placed(net: Path) -> tuple[Float, _Unproject]:
-    """Where a network lies: its offset (2,), and what makes longitudes and latitudes of the rest."""
+@dataclass(frozen=True, slots=True)
+class NetworkProjection:
+    """Coordinates of a SUMO network: projected coordinates plus an offset (2,), in metres."""
+
+    offset: Float
+    transformer: Transformer
+
+    def to_geographic(self, xy: Float) -> tuple[Float, Float]:
+        """Longitudes (n,) and latitudes (n,) in degrees, WGS 84, of points (n, 2)."""
+        lon, lat = self.transformer.transform(*(xy - self.offset).T)
+        return np.asarray(lon, float), np.asarray(lat, float)
+
+
+def network_projection(net: Path) -> NetworkProjection:
+    """The projection of a network file; raises FormatError for one without a usable projection."""
+    from pyproj import CRS, Transformer  # noqa: PLC0415
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
     with _opened(net) as file:
         places = _elements(file, "location")
         root = next(places)
@@ -275,25 +306,10 @@ def _placed(net: Path) -> tuple[Float, _Unproject]:
             f"{net}: has no projection that can be undone ({proj!r}); run sumo with a network that"
             " geoscene export --to sumo or netconvert --proj made"
         )
-    return shift, _Unproject(net, proj)
-
-
-class _Unproject:
-    """Longitudes and latitudes of points in a projection given in PROJ's words."""
-
-    def __init__(self, net: Path, proj: str) -> None:
-        from pyproj import CRS, Transformer  # noqa: PLC0415
-        from pyproj.exceptions import CRSError  # noqa: PLC0415
-
-        try:
-            self._transformer = Transformer.from_crs(CRS(proj), "EPSG:4326", always_xy=True)
-        except CRSError as error:
-            raise FormatError(f"{net}: projParameter = {proj!r}: {error}") from None
-
-    def __call__(self, xy: Float) -> tuple[Float, Float]:
-        """Degrees (n,) and (n,) of points (n, 2)."""
-        lon, lat = self._transformer.transform(*xy.T)
-        return np.asarray(lon, float), np.asarray(lat, float)
+    try:
+        return NetworkProjection(shift, Transformer.from_crs(CRS(proj), "EPSG:4326", always_xy=True))
+    except CRSError as error:
+        raise FormatError(f"{net}: projParameter = {proj!r}: {error}") from None
 
 
 def _types(path: Path, noted: dict[str, str]) -> dict[str, tuple[str, float | None]]:

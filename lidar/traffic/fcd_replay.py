@@ -72,16 +72,30 @@ def replay(
     Raises FormatError for a file that is none, InputError if nobody of it comes into the scene or near.
     """
     fcd = read_fcd(options.path, net=options.net)
-    others = TrafficOptions(
-        vehicles=0.0,
-        cyclists=0.0,
-        pedestrians=0.0,
-        parked=options.parked,
-        radius=options.radius,
-        side=options.side,
-    )
-    setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=others)
     begin = float(fcd.time.min()) if options.begin is None else options.begin
+    others = TrafficOptions(parked=options.parked, radius=options.radius, side=options.side)
+    return replay_fcd(
+        fcd, scene, graph=graph, ego=ego, vehicle=vehicle, seed=seed, begin=begin, options=others
+    )
+
+
+def replay_fcd(
+    fcd: Fcd,
+    scene: Scene,
+    *,
+    graph: RoadGraph,
+    ego: Trajectory,
+    vehicle: Vehicle,
+    seed: int,
+    begin: float,
+    options: TrafficOptions,
+) -> Actors:
+    """As `replay`, of floating car data that have been read; densities of moving road users do not count.
+
+    begin : SUMO's time in seconds at which the drive starts
+    """
+    options = replace(options, vehicles=0.0, cyclists=0.0, pedestrians=0.0)
+    setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
     moving = _moving(fcd, begin, scene=scene, graph=graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed)
     parked = parked_vehicles(
         scene, ego, vehicle=vehicle, setup=setup, swept=_covered(moving), seed=seed, share=options.parked
@@ -102,7 +116,7 @@ def _moving(
 ) -> Actors:
     """Those of a file who move in the ego's surroundings."""
     scale = setup.scale
-    front, heading = _in_scene(fcd, scene)
+    front, heading = scene_positions(fcd, scene)
     shapes, stretch, parts = [], [], []
     anybody = False
     for k, name in enumerate(fcd.name):
@@ -157,7 +171,7 @@ def _nobody(fcd: Fcd, begin: float, *, anybody: bool) -> str:
     )
 
 
-def _in_scene(fcd: Fcd, scene: Scene) -> tuple[Float, Float]:
+def scene_positions(fcd: Fcd, scene: Scene) -> tuple[Float, Float]:
     """Middles of front bumpers (k, 2) in scene metres, and headings (k,) in radians from the x axis."""
     front = np.column_stack(scene.frame.from_geographic(fcd.lon, fcd.lat))
     d = np.column_stack(scene.frame.from_geographic(*fcd.ahead.T)) - front
