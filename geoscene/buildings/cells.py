@@ -1,4 +1,4 @@
-"""Roof surfaces as plane triangles with a field: made from skeletons, cut along lines of equal height."""
+"""Roof surfaces as triangles in plan with a height field: from skeletons, cut along contour lines."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import Polygons, to_grid
-from geoscene.buildings.shells import boundary, lift, triangulate
+from geoscene.buildings.shells import boundary, distinct_corners, lift, triangulate
 from geoscene.buildings.skeleton import Skeleton, loops, polygons_of
 from geoscene.typing import Float
 from geoscene.watertight import weld
 
 ON_LINE = 1e-3
-"""Corners this near to a cutting line, metres of the field, count as on it, so that no slivers arise."""
+"""Corners closer to a contour line than this count as on it, which avoids slivers; metres of the field."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cells:
-    """Triangles of a footprint and a field that is linear on each and agrees where they meet.
+    """Triangles of a footprint in plan and a continuous field, linear on each triangle.
 
     xy    : (m, 3, 2) metres on the grid, counter-clockwise
     field : (m, 3) metres
-    face  : (m,) int64, triangles of one number lie in one plane
+    face  : (m,) int64, triangles with the same number lie in one plane
     """
 
     xy: Float
@@ -46,10 +46,7 @@ def with_field(cells: Cells, direction: Float, *, offset: float) -> Cells:
 
 
 def cut(cells: Cells, level: float) -> Cells:
-    """The cells, split where the field crosses a level, so that it is crossed only along their edges.
-
-    Faces on the two sides of the level get numbers of their own.
-    """
+    """The cells, split along the contour line of a level; faces on its two sides get different numbers."""
     side = cells.field - level
     side = np.where(np.abs(side) < ON_LINE, 0.0, side)
     sign = np.sign(side)
@@ -59,7 +56,7 @@ def cut(cells: Cells, level: float) -> Cells:
         return replace(cells, face=2 * cells.face + above)
     whole = Cells(cells.xy[~crossed], cells.field[~crossed], (2 * cells.face + above)[~crossed])
     xy, field, sign, face = cells.xy[crossed], cells.field[crossed], sign[crossed], 2 * cells.face[crossed]
-    # turn each triangle until its lone corner comes first: alone on its side, or on the line
+    # rotate the corners of each triangle: first comes the one alone on its side, or the one on the line
     on_line = (sign == 0).any(axis=1)
     alone = np.where(
         on_line, np.argmax(sign == 0, axis=1), np.argmax(sign * -np.sign(sign.sum(axis=1))[:, None], axis=1)
@@ -85,7 +82,7 @@ def cut(cells: Cells, level: float) -> Cells:
         (q[u], c[u], r[u], at[u], fc[u], at[u], face[u] + 1 - tip[u]),
     ]
     pieces = [Cells(np.stack(x[:3], axis=1), np.stack(x[3:6], axis=1), x[6]) for x in parts]
-    return _sound(joined([whole, *pieces]))
+    return _without_degenerate(joined([whole, *pieces]))
 
 
 def joined(cells: list[Cells]) -> Cells:
@@ -98,9 +95,9 @@ def joined(cells: list[Cells]) -> Cells:
 
 
 def outlines(xy: Float, face: NDArray[np.int64]) -> Polygons | None:
-    """The polygons that triangles (m, 3, 2) of one number make together, with all vertices on their edges.
+    """Unions of the triangles (m, 3, 2) with the same number, as polygons with all vertices on their edges.
 
-    None where the edges do not join to valid polygons, as among triangles that the grid has turned over.
+    None if the edges do not form valid polygons, as when rounding to the grid has inverted a triangle.
     """
     corners = lift(xy, np.zeros(len(xy)))
     edge, owner = boundary(corners, face)
@@ -138,7 +135,7 @@ def outlines(xy: Float, face: NDArray[np.int64]) -> Polygons | None:
 
 
 def merged(cells: Cells) -> Cells:
-    """The cells with each face triangulated afresh, because many cuts leave many slivers."""
+    """The cells with each face triangulated again, which removes the slivers that many cuts leave."""
     polygons = outlines(cells.xy, cells.face)
     if polygons is None:
         return cells
@@ -149,8 +146,8 @@ def merged(cells: Cells) -> Cells:
 
 
 def _values_at(xy: Float, known: Float, *, values: Float) -> Float:
-    """Values (m, 3) at corners (m, 3, 2) that all occur among known points (n, 2) of the grid."""
-    # the product keeps cells apart within 100 km of zero
+    """Values (m, 3) at corners (m, 3, 2), each of which is one of the known grid points (n, 2)."""
+    # distinct for grid points within 100 km of the origin
     key, wanted = (np.rint(p * 1e4).astype(np.int64) @ np.array([2**31, 1]) for p in (known, xy))
     order = np.argsort(key, kind="stable")
     found: Float = values[order][np.searchsorted(key[order], wanted)]
@@ -158,7 +155,7 @@ def _values_at(xy: Float, known: Float, *, values: Float) -> Float:
 
 
 def _crossing(a: Float, b: Float, *, fa: Float, fb: Float, level: float) -> Float:
-    """Points on the grid where the field passes a level between a and b, the same whichever way round."""
+    """Grid points where the field equals a level between a and b; swapping a and b gives the same points."""
     swap = (a[:, 0] > b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] > b[:, 1]))
     first, last = np.where(swap[:, None], b, a), np.where(swap[:, None], a, b)
     f0, f1 = np.where(swap, fb, fa), np.where(swap, fa, fb)
@@ -167,18 +164,17 @@ def _crossing(a: Float, b: Float, *, fa: Float, fb: Float, level: float) -> Floa
     return to_grid(first + part[:, None] * (last - first))
 
 
-def _sound(cells: Cells) -> Cells:
-    """The cells without those that two equal corners make."""
-    c = np.rint(cells.xy * 1e4)
-    equal = (c == np.roll(c, -1, axis=1)).all(axis=2).any(axis=1)
-    return Cells(cells.xy[~equal], cells.field[~equal], cells.face[~equal])
+def _without_degenerate(cells: Cells) -> Cells:
+    """The cells whose three corners differ."""
+    keep = distinct_corners(cells.xy)
+    return Cells(cells.xy[keep], cells.field[keep], cells.face[keep])
 
 
 def skeleton_cells(skeleton: Skeleton) -> Cells:
     """The faces of a skeleton as cells whose field is the distance from their edges."""
     xy = to_grid(skeleton.xy)
     key = np.rint(xy * 1e4).astype(np.int64)
-    # nodes that the grid makes one take one height
+    # nodes at the same grid point take the same height
     _, first, same = np.unique(key, axis=0, return_index=True, return_inverse=True)
     time = skeleton.time[first][same.ravel()]
     rings = _unpinched(xy, [_distinct(face, same.ravel()) for face in skeleton.faces])
@@ -187,7 +183,7 @@ def skeleton_cells(skeleton: Skeleton) -> Cells:
     triangles, owner = triangulate(polygons)
     missing = np.setdiff1d(np.arange(len(polygons)), owner)
     if len(missing):
-        # ear clipping takes any ring; whether the shell is sound is checked later
+        # ear clipping accepts any ring; whether the shell is closed is checked later
         clipped = [_clip_ears(shapely.get_coordinates(p)[:-1]) for p in polygons[missing]]
         triangles = np.concatenate([triangles, *clipped])
         owner = np.concatenate([owner, np.repeat(missing, [len(c) for c in clipped])])
@@ -195,10 +191,10 @@ def skeleton_cells(skeleton: Skeleton) -> Cells:
 
 
 def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:
-    """Rings (node numbers) without needles that cross themselves or turn over on the grid.
+    """Rings (node numbers) without narrow parts that cross themselves or invert when rounded to the grid.
 
-    Where a node of a ring lies within two millimetres of another arc of the ring, the arc is led through it,
-    in the ring beyond too, and the ring falls into two.
+    If a node of a ring lies within 2 mm of another arc of the same ring, the node is inserted into that arc,
+    in the neighbouring ring too, and the ring is split in two.
     """
     for _ in range(8 * len(rings)):
         rings = [r for r in rings if len(r) > 2]
@@ -220,7 +216,7 @@ def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:
 
 
 def _pinch(xy: Float, ring: list[int]) -> tuple[int, int, int] | None:
-    """The node of a ring nearest to an arc of it that is not its own, and the arc's ends, if within 2 mm."""
+    """The node of a ring that is nearest to an arc not ending in it, and the arc's ends, if within 2 mm."""
     start, stop = np.array(ring), np.array([*ring[1:], *ring[:1]])
     line = shapely.linestrings(np.stack([xy[start], xy[stop]], axis=1))
     distance = shapely.distance(shapely.points(xy[start])[:, None], line)
@@ -239,17 +235,17 @@ def _clip_ears(ring: Float) -> Float:
 
 
 def _distinct(face: list[int], same: NDArray[np.integer]) -> list[int]:
-    """The nodes of a ring without those that repeat the one before."""
+    """The nodes of a ring without repetitions of the preceding node."""
     ids = same[face]
     return [node for node, a, b in zip(face, ids, np.roll(ids, 1), strict=True) if a != b]
 
 
 def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
-    """The skeleton with its triangular faces pushed out, into gables (share 1) or less (half-hipped).
+    """The skeleton with its hip ends turned into gables (share 1) or half-hips (share below 1).
 
-    A triangular face stands on an edge between two faces that lean towards each other over a ridge. Its peak
-    moves along that ridge towards the edge, and the edge rises as far between its ends: all faces stay plane.
-    Faces whose ridge would miss the edge, or which meet over no ridge, stay as they are.
+    A hip end is a triangular face between two faces that share a ridge. Its peak is moved along the ridge
+    towards the eave, and the eave is raised by the same share, so that all faces stay plane. Hip ends whose
+    ridge would miss the eave, or that have no ridge, are left unchanged.
     """
     xy, time = [tuple(p) for p in skeleton.xy.tolist()], skeleton.time.tolist()
     faces = [list(f) for f in skeleton.faces]
@@ -266,10 +262,12 @@ def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
         if min(len(left), len(right)) < 4 or left[2] != peak or right[-1] != peak:
             continue
         beyond = left[3 % len(left)]
-        foot = _foot(xy, time, edge=(a, b), peak=peak, beyond=beyond) if right[-2] == beyond else None
-        if foot is None:
+        ridge_end = (
+            _ridge_end(xy, time, edge=(a, b), peak=peak, beyond=beyond) if right[-2] == beyond else None
+        )
+        if ridge_end is None:
             continue
-        x, y, height = foot
+        x, y, height = ridge_end
         new = len(xy)
         for start in (a, b, peak):
             (x0, y0), t0 = xy[start], time[start]
@@ -282,10 +280,10 @@ def raise_gables(skeleton: Skeleton, share: float) -> Skeleton:
     return Skeleton(np.array(xy), np.array(time), [f for f in faces if f], skeleton.corners)
 
 
-def _foot(
+def _ridge_end(
     xy: list[tuple[float, ...]], time: list[float], *, edge: tuple[int, int], peak: int, beyond: int
 ) -> tuple[float, float, float] | None:
-    """Where the ridge from beyond over the peak meets an edge, x, y and the ridge's height there, or None."""
+    """x, y and height where the ridge from ``beyond`` over ``peak`` intersects an edge, or None."""
     (px, py), (qx, qy) = xy[peak], xy[beyond]
     (ax, ay), (bx, by) = xy[edge[0]], xy[edge[1]]
     dx, dy, ex, ey = px - qx, py - qy, bx - ax, by - ay
@@ -297,7 +295,7 @@ def _foot(
     part = ((x - ax) * ex + (y - ay) * ey) / (ex * ex + ey * ey)
     rise = time[peak] - time[beyond]
     height = time[peak] + rise * steps
-    # a ridge that climbs or falls by more than 0.3 is none
+    # an arc steeper than 0.3 is not a ridge
     if steps <= 0 or not 0.05 < part < 0.95 or abs(rise) > 0.3 * length or height <= 0:
         return None
     return x, y, height

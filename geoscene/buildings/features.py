@@ -1,4 +1,4 @@
-"""From map areas to the table of buildings."""
+"""Reads the table of buildings from map areas."""
 
 from __future__ import annotations
 
@@ -8,60 +8,60 @@ from dataclasses import fields, replace
 import numpy as np
 import shapely
 
-from geoscene.buildings.footprints import clean, gathered, groups, project
+from geoscene.buildings.appearance import choose_appearance, read_roof, read_walls
+from geoscene.buildings.footprints import clean, groups, object_array, project
 from geoscene.buildings.heights import read_heights
-from geoscene.buildings.looks import read_roof, read_walls, settle_look
 from geoscene.buildings.parts import assign, clusters, cut_overlaps, duplicates, remainder
-from geoscene.buildings.rooftags import read_roof_tags
-from geoscene.buildings.settle import Row, settle_heights, texts
+from geoscene.buildings.resolve import Row, resolve_heights, texts
+from geoscene.buildings.roof_tags import read_roof_tags
 from geoscene.buildings.table import BuildingOptions, Buildings
 from geoscene.frames import Frame
 from geoscene.report import Problem
 from geoscene.sources.data import Area, OsmData, Tags
 
-_NOT = ("no", "none", "false", "")
+_NEGATIVE = ("no", "none", "false", "")
 
 
 def is_building(tags: Tags) -> bool:
-    """The area is a building's outline."""
-    return tags.get("building", "no") not in _NOT
+    """Whether an area is the outline of a building."""
+    return tags.get("building", "no") not in _NEGATIVE
 
 
 def is_building_part(tags: Tags) -> bool:
-    """The area is a part of a building and not an outline."""
-    return tags.get("building:part", "no") not in _NOT and not is_building(tags)
+    """Whether an area is a part of a building and not an outline."""
+    return tags.get("building:part", "no") not in _NEGATIVE and not is_building(tags)
 
 
 def read_buildings(
     osm: OsmData, frame: Frame, *, options: BuildingOptions | None = None
 ) -> tuple[Buildings, list[Problem]]:
-    """The table of all buildings and parts of a map, and what was repaired or dropped, sorted.
+    """The table of all buildings and parts of a map, and the sorted problems.
 
-    Duplicates are dropped, parts given to outlines, missing heights inferred, and overlaps between buildings
-    taken from the larger one. The order of the map's areas does not matter.
+    Duplicates are dropped, parts assigned to outlines, missing heights inferred, and overlaps between
+    buildings cut from the larger one. The result does not depend on the order of the map's areas.
     """
     options = options or BuildingOptions()
     problems: list[Problem] = []
-    outlines = _take(osm.areas, frame, problems=problems, parts=False, least=options.min_area)
-    # masts and columns are parts too
-    parts = _take(osm.areas, frame, problems=problems, parts=True, least=options.min_area / 100)
+    outlines = _read_rows(osm.areas, frame, problems=problems, parts=False, min_area=options.min_area)
+    # parts may be as small as masts and columns
+    parts = _read_rows(osm.areas, frame, problems=problems, parts=True, min_area=options.min_area / 100)
 
-    known = np.array([len(r.tags) + 1000 * ("height" in r.tags) for r in outlines], float)
-    gone, found = duplicates(
-        [r.osm_id for r in outlines], gathered([r.footprint for r in outlines]), known=known
+    score = np.array([len(r.tags) + 1000 * ("height" in r.tags) for r in outlines], float)
+    repeated, found = duplicates(
+        [r.osm_id for r in outlines], object_array([r.footprint for r in outlines]), score=score
     )
     problems += found
-    outlines = [r for r, g in zip(outlines, gone, strict=True) if not g]
+    outlines = [r for r, repeats in zip(outlines, repeated, strict=True) if not repeats]
 
-    rows = _settle_parts(outlines, parts, osm=osm, options=options, problems=problems)
+    rows = _assign_parts(outlines, parts, osm=osm, options=options, problems=problems)
     table = _table(rows, osm.bounds, frame=frame, options=options, problems=problems)
     return _without_vanished(table), sorted(problems)
 
 
-def _take(
-    areas: Sequence[Area], frame: Frame, *, problems: list[Problem], parts: bool, least: float
+def _read_rows(
+    areas: Sequence[Area], frame: Frame, *, problems: list[Problem], parts: bool, min_area: float
 ) -> list[Row]:
-    """The buildings, or the parts, among areas, in order of id, with clean footprints in scene metres."""
+    """Rows of the buildings, or of the parts, in order of id, with clean footprints in scene metres."""
     chosen = []
     for area in areas:
         if not (is_building_part if parts else is_building)(area.tags):
@@ -71,13 +71,13 @@ def _take(
         else:
             chosen.append(area)
     chosen.sort(key=_id_order)
-    raw = project(gathered([a.geometry for a in chosen]), frame)
+    raw = project(object_array([a.geometry for a in chosen]), frame)
     polygons, repaired = clean(raw)
     before, after = shapely.area(raw), shapely.area(polygons)
     rows = []
     for k, area in enumerate(chosen):
-        if not after[k] >= least:
-            detail = f"{after[k]:.3f} m2, least is {least:g} m2"
+        if not after[k] >= min_area:
+            detail = f"{after[k]:.3f} m2, least is {min_area:g} m2"
             problems.append(Problem(area.osm_id, "building", "dropped", "too-small", detail))
             continue
         if repaired[k]:
@@ -94,42 +94,42 @@ def _id_order(area: Area) -> tuple[str, int]:
     return kind, int(number or 0)
 
 
-def _settle_parts(
+def _assign_parts(
     outlines: list[Row], parts: list[Row], *, osm: OsmData, options: BuildingOptions, problems: list[Problem]
 ) -> list[Row]:
-    """Buildings, then parts, with their outlines' rows; what parts leave of an outline becomes a part."""
-    shapes = gathered([p.footprint for p in parts])
+    """Buildings, then parts with the rows of their outlines; the rest of an outline is a part too."""
+    shapes = object_array([p.footprint for p in parts])
     target = assign(
         [p.osm_id for p in parts],
         shapes,
         outline_id=[r.osm_id for r in outlines],
-        outline=gathered([r.footprint for r in outlines]),
+        outline=object_array([r.footprint for r in outlines]),
         relations=osm.relations,
     )
-    wholes = list(outlines)
+    buildings = list(outlines)
     orphans = np.flatnonzero(target < 0)
     for group in groups(clusters(shapes[orphans])):
         members = orphans[group]
         first = parts[members[np.argmax(shapely.area(shapes[members]))]].osm_id
-        shape = clean(gathered([shapely.union_all(shapes[members])]))[0][0]
-        target[members] = len(wholes)
-        wholes.append(Row(first, {}, shape, "yes"))
+        shape = clean(object_array([shapely.union_all(shapes[members])]))[0][0]
+        target[members] = len(buildings)
+        buildings.append(Row(first, {}, shape, "yes"))
         detail = f"{len(members)} parts outside any outline, {shapely.area(shape):.1f} m2, made one building"
         problems.append(Problem(first, "building", "repaired", "parts-without-outline", detail))
 
-    rests = []
+    remainders = []
     for members in groups(target):
         row = int(target[members[0]])
-        whole = wholes[row]
+        whole = buildings[row]
         rest, share = remainder(whole.footprint, shapes[members], covered=options.covered)
         if shapely.area(rest) >= options.min_area:
-            rests.append(replace(whole, footprint=rest, outline=row, is_part=True, is_rest=True))
+            remainders.append(replace(whole, footprint=rest, outline=row, is_part=True, is_remainder=True))
             detail = f"parts cover {share:.0%}; {shapely.area(rest):.1f} m2 of the outline stay as a part"
             problems.append(Problem(whole.osm_id, "building", "repaired", "partly-covered", detail))
     return [
-        *(replace(r, outline=i) for i, r in enumerate(wholes)),
+        *(replace(r, outline=i) for i, r in enumerate(buildings)),
         *(replace(p, outline=int(target[i])) for i, p in enumerate(parts)),
-        *rests,
+        *remainders,
     ]
 
 
@@ -141,8 +141,8 @@ def _table(
     options: BuildingOptions,
     problems: list[Problem],
 ) -> Buildings:
-    """All columns; bounds are those of the map in degrees."""
-    footprint = gathered([r.footprint for r in rows])
+    """The table's columns; ``bounds`` are those of the map in degrees."""
+    footprint = object_array([r.footprint for r in rows])
     is_part = np.array([r.is_part for r in rows], np.bool_)
     outline = np.array([r.outline for r in rows], np.int32)
     tagged = [read_heights(r.tags, options=options) for r in rows]
@@ -152,7 +152,7 @@ def _table(
             detail = f"roof:shape={roof.unknown} made flat"
             problems.append(Problem(r.osm_id, "building", "repaired", "unknown-roof-shape", detail))
 
-    heights, found = settle_heights(rows, tagged, roofs=roofs, options=options)
+    heights, found = resolve_heights(rows, tagged, roofs=roofs, options=options)
     problems += found
     ids = texts([r.osm_id for r in rows])
     drawn = np.ones(len(rows), np.bool_)
@@ -166,17 +166,20 @@ def _table(
     )
     problems += found
 
-    # directions from true north become those of the grid; one turn serves the whole of a scene
+    # convert from true to grid north; one convergence is precise enough for the whole scene
     west, south, east, north = bounds
     turn = float(frame.convergence((west + east) / 2, (south + north) / 2)) if rows else 0.0
     azimuth = np.radians(np.array([r.direction_deg for r in roofs], float)) - turn
 
-    looks = [(read_walls(r.tags), read_roof(r.tags)) for r in rows]
-    above = [looks[r.outline] if r.is_part else (None, None) for r in rows]
-    walls = [settle_look(look[0], up[0], default="plaster") for look, up in zip(looks, above, strict=True)]
+    appearances = [(read_walls(r.tags), read_roof(r.tags)) for r in rows]
+    of_outline = [appearances[r.outline] if r.is_part else (None, None) for r in rows]
+    walls = [
+        choose_appearance(own[0], up[0], default="plaster")
+        for own, up in zip(appearances, of_outline, strict=True)
+    ]
     tops = [
-        settle_look(look[1], up[1], default="roof_tile" if roof > 0 else "tar_roof")
-        for look, up, roof in zip(looks, above, heights.roof, strict=True)
+        choose_appearance(own[1], up[1], default="roof_tile" if roof > 0 else "tar_roof")
+        for own, up, roof in zip(appearances, of_outline, heights.roof, strict=True)
     ]
     return Buildings(
         osm_id=ids,
@@ -206,7 +209,7 @@ def _table(
 
 
 def _without_vanished(table: Buildings) -> Buildings:
-    """The table less rows that overlaps have left nothing of, with the outlines' rows renumbered."""
+    """The table without rows whose footprint has become empty; outlines are renumbered."""
     keep = ~shapely.is_empty(table.footprint)
     alive = np.zeros(len(table), np.bool_)
     alive[table.outline[table.is_part & keep]] = True

@@ -1,4 +1,4 @@
-"""Footprints: map polygons as clean polygons on the grid, in scene metres."""
+"""Footprints: valid polygons on the 0.1 mm grid, in scene metres, from polygons of the map."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from geoscene.frames import Frame
 Polygons = NDArray[Any]
 
 NOTCH = 2e-3
-"""Half the diagonal of the notch that parts two rings which touch in a point, metres."""
+"""Half the diagonal of the notch that separates two rings touching in a point, metres."""
 
 
 def to_grid(xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coordinates moved to the nearest point of the 0.1 mm grid, by at most 0.07 mm."""
-    # dividing by 1e4, as GEOS does, gives the float nearest to the decimal; multiplying by 1e-4 does not
+    """Coordinates rounded to the 0.1 mm grid."""
+    # like GEOS: division by 1e4 gives the float nearest to the decimal, multiplication by 1e-4 does not
     rounded: NDArray[np.float64] = np.rint(xy * 1e4) / 1e4
     return rounded
 
 
-def gathered(shapes: Sequence[Any]) -> Polygons:
-    """A column of shapes."""
+def object_array(shapes: Sequence[Any]) -> Polygons:
+    """Shapes as an array of objects (n,)."""
     out = np.empty(len(shapes), dtype=object)
     out[:] = shapes
     return out
 
 
 def groups(number: NDArray[np.integer]) -> list[NDArray[np.int64]]:
-    """The places (rising) of each number that occurs, in order of number."""
+    """Ascending positions of each distinct number, in order of the numbers."""
     order = np.argsort(number, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(order) else []
 
@@ -49,9 +49,9 @@ def project(geometry: Polygons, frame: Frame) -> Polygons:
 def clean(polygons: Polygons) -> tuple[Polygons, NDArray[np.bool_]]:
     """Valid polygons on the grid (n,), and which of them had to be repaired.
 
-    What remains of a polygon may be a MultiPolygon, or empty. Rings of the result do not touch: where they
-    met in a point, a notch of 2 mm parts them (up to 100 mm in thin wedges), because a wall edge there would
-    carry four faces.
+    A repaired polygon may be a MultiPolygon, or empty. Rings of the result do not touch: a notch of 2 mm (up
+    to 100 mm in thin wedges) separates rings that touched in a point, where a wall edge would have four
+    faces.
     """
     out = np.array(polygons, dtype=object)
     finite = np.isfinite(shapely.bounds(out)).all(axis=1) & ~shapely.is_empty(out)
@@ -63,12 +63,12 @@ def clean(polygons: Polygons) -> tuple[Polygons, NDArray[np.bool_]]:
         snapped[bad] = _polygonal(shapely.set_precision(valid, GRID))
     pinched = _pinched(snapped)
     for row in np.flatnonzero(pinched):
-        snapped[row] = _part_rings(snapped[row])
+        snapped[row] = _separate_rings(snapped[row])
     return shapely.orient_polygons(snapped), bad | pinched
 
 
 def _polygonal(geometry: Polygons) -> Polygons:
-    """The polygons of geometries (n,); lines and points fall away."""
+    """The polygonal parts of geometries (n,); lines and points are dropped."""
     parts, row = shapely.get_parts(geometry, return_index=True)
     parts, row = _flatten(parts, row)
     out = np.full(len(geometry), shapely.Polygon(), dtype=object)
@@ -79,7 +79,7 @@ def _polygonal(geometry: Polygons) -> Polygons:
 
 
 def _flatten(parts: Polygons, row: NDArray[np.integer]) -> tuple[Polygons, NDArray[np.integer]]:
-    """Polygons with their rows out of parts that may hold MultiPolygons."""
+    """Single polygons of parts that may be MultiPolygons, with their rows."""
     inner, index = shapely.get_parts(parts, return_index=True)
     row = row[index]
     area = shapely.get_type_id(inner) == shapely.GeometryType.POLYGON
@@ -88,14 +88,14 @@ def _flatten(parts: Polygons, row: NDArray[np.integer]) -> tuple[Polygons, NDArr
 
 
 def _pinched(polygons: Polygons) -> NDArray[np.bool_]:
-    """(n,) bool: rings of the polygon touch."""
+    """(n,) bool, whether rings of the polygon touch."""
     return np.asarray(~shapely.is_simple(shapely.boundary(polygons)), np.bool_)
 
 
-def _part_rings(polygon: Any) -> Any:
-    """The polygon less a notch wherever a corner of a ring lies on another ring."""
+def _separate_rings(polygon: Any) -> Any:
+    """The polygon with a notch cut wherever a corner of a ring lies on another ring."""
     points, cut = _touching(polygon), polygon
-    # the notch opens the point only if the rings leave it by more than the grid: thin wedges need larger ones
+    # a notch separates the rings only if they diverge by more than the grid: thin wedges need larger ones
     for reach in (NOTCH, 10 * NOTCH, 50 * NOTCH):
         notches = shapely.union_all(shapely.buffer(points, reach, quad_segs=1))
         cut = _polygonal(np.array([shapely.difference(polygon, notches, grid_size=GRID)], dtype=object))[0]
@@ -116,7 +116,7 @@ def _touching(polygon: Any) -> Polygons:
 
 
 def subtract(polygon: Any, others: Any, *, sliver: float = 0.02) -> Any:
-    """The polygon less others, on the grid, without slivers narrower than twice ``sliver`` metres."""
+    """The polygon minus others, on the grid, without slivers narrower than twice ``sliver`` metres."""
     rest = shapely.difference(polygon, others, grid_size=GRID)
     opened = shapely.buffer(
         shapely.buffer(rest, -sliver, join_style="mitre"), sliver * 1.5, join_style="mitre"

@@ -1,4 +1,4 @@
-"""Heights of buildings and parts: what the tags say, and a stated rule where they say nothing."""
+"""Heights of buildings and parts: from tags, or inferred by a stated rule."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from geoscene.tags import parse_length, parse_number
 from geoscene.typing import Float
 
 HIGHEST = 1000.0
-"""Heights beyond this are taken for slips; the tallest building there is has 828 m."""
+"""Greater heights are treated as typing errors, metres; the tallest building has 828 m."""
 
 _TYPICAL: dict[str, tuple[float, float]] = {
     # height in metres of a building of 200 m2, and how it grows: the exponent of area / 200 m2
@@ -33,17 +33,17 @@ _TYPICAL: dict[str, tuple[float, float]] = {
     "church": (13.0, 0.2), "cathedral": (22.0, 0.2), "chapel": (7.0, 0.2), "mosque": (11.0, 0.15),
     "synagogue": (11.0, 0.15), "temple": (10.0, 0.15), "stadium": (18.0, 0.1), "sports_hall": (9.0, 0.05),
 }  # fmt: skip
-"""Assumed, from common storeys by use; the known heights of neighbours correct them in place."""
+"""Assumed from usual storeys by use; known heights of neighbours correct them (`infer_heights`)."""
 
 _TYPICAL_OTHER = (9.5, 0.33)
 """Fitted by least squares of logarithms to building=yes with heights in Heidelberg, Monaco, Moscow, Berlin,
-Baltimore, New York and Helsinki, each city with the same weight; the residual's deviation is 0.62."""
+Baltimore, New York and Helsinki, each city with the same weight; standard deviation of the residuals 0.62."""
 
 SIGMA_TAG, SIGMA_EST, SIGMA_STOREYS = 0.5, 0.2, 0.15
 """Assumed standard deviations: metres for a tagged height, shares of it for est_height and storeys."""
 
 SIGMA_PRIOR = 0.6
-"""Standard deviation of the natural logarithm of height about the typical one, without neighbours."""
+"""Standard deviation of ln(height / typical height) without neighbours."""
 
 _PSEUDO = 0.05
 """Weight of the pseudo-neighbour of `infer_heights`."""
@@ -52,13 +52,13 @@ _FAR = 0.005
 """Weight of a far neighbour of equal size in `infer_heights`."""
 
 _SLENDER = 8.0
-"""Height over the root of the footprint's area from which a building is a tower, a mast or a chimney and says
-nothing of its neighbours: Moscow's television tower has 11, blocks of flats and offices up to 6."""
+"""Height over the root of the footprint's area from which a building is a tower, a mast or a chimney and does
+not inform its neighbours' heights: Moscow's television tower has 11, blocks of flats and offices up to 6."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tagged:
-    """What the tags of one building or part say of its heights, metres; NaN where they say nothing.
+    """Tagged heights of one building or part, metres; NaN if not tagged.
 
     height   : top above base, roof included
     source   : tag, est_height, levels or ""
@@ -85,10 +85,10 @@ def _value(value: float | None, low: float, *, high: float) -> float:
 
 
 def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
-    """What tags say of heights: ``height``, else ``building:height``, ``est_height`` or ``building:levels``.
+    """Tagged heights: ``height``, else ``building:height``, ``est_height`` or ``building:levels``.
 
     A height by storeys is storeys x level height, plus the roof's height or storeys (Simple 3D Buildings:
-    building:levels leaves out the storeys of the roof). Values of 0 or less, or over 1,000 m, do not count.
+    building:levels leaves out the storeys of the roof). Values of 0 or less, or over 1,000 m, are ignored.
     """
     levels = _value(parse_number(tags.get("building:levels") or tags.get("levels")), 0, high=300)
     roof_levels = _value(parse_number(tags.get("roof:levels")), 0, high=50)
@@ -105,7 +105,7 @@ def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
     step = options.level_height
     storeys = levels + (roof_levels if np.isfinite(roof_levels) else 0.0)
     if np.isfinite(height) and storeys > 0:
-        step = float(np.clip(height / storeys, 2.0, 6.0))  # this building's own storeys
+        step = float(np.clip(height / storeys, 2.0, 6.0))  # storey height of this building
     if not np.isfinite(roof) and roof_levels > 0:
         roof, roof_source = roof_levels * step, "levels"
     if not np.isfinite(height) and (levels > 0 or roof_levels > 0):
@@ -120,7 +120,7 @@ def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
         skipped = _value(parse_number(tags.get("building:min_level") or tags.get("min_level")), 0, high=300)
         if np.isfinite(skipped):
             minimum, minimum_source = skipped * step, "levels"
-            if source == "levels" and levels <= skipped:  # levels counted from the part's own underside
+            if source == "levels" and levels <= skipped:  # levels are counted from the part's underside
                 height += minimum
     return Tagged(height, source, sigma, minimum, minimum_source, roof, roof_source, levels)
 
@@ -137,14 +137,14 @@ def infer_heights(
 ) -> tuple[Float, Float, NDArray[np.object_]]:
     """Heights (n,), their standard deviations (n,) and the rule (n,), from the buildings with heights.
 
-    The rule: a building's height is what is typical of its use and footprint area, times a factor. The factor
-    is the weighted median of the factors of the 24 nearest buildings with known heights within reach (not
-    itself) and of one pseudo-neighbour of factor 1 and weight 0.05. A neighbour weighs
-    (exp(-distance / 40 m) + 0.005) exp(-|ln(ratio of areas)|), four times that for the same use. Towers,
-    eight times as high as the root of their footprint's area or more, are nobody's neighbours. The standard
-    deviation is that of the neighbours' logarithms about the median, the pseudo-neighbour's being 0.6. The
-    constants were chosen by trial on eight cities, each building guessed from others.
-    Rule names: ``inferred-neighbours`` where a neighbour counts, else ``inferred-type``.
+    The rule: a building's height is the typical height of its use and footprint area, times a factor. The
+    factor is the weighted median of the factors of the 24 nearest buildings with known heights within reach
+    (not itself) and of one pseudo-neighbour of factor 1 and weight 0.05. A neighbour weighs (exp(-distance /
+    40 m) + 0.005) exp(-|ln(ratio of areas)|), four times that for the same use. Towers, at least eight times
+    as high as the square root of their footprint's area, do not count as neighbours. The standard deviation
+    is that of the neighbours' logarithms about the median, the pseudo-neighbour's being 0.6. The constants
+    were chosen by trial on eight cities, each building guessed from others. Rule names:
+    ``inferred-neighbours`` where a neighbour counts, else ``inferred-type``.
 
     xy     : (n, 2) scene metres, any point of each building
     area   : (n,) square metres
@@ -181,7 +181,7 @@ def infer_heights(
 
 
 def _weighted_median(values: Float, weight: Float) -> Float:
-    """Per row the value at half the weight, linear between the middles of neighbouring values' weights."""
+    """Weighted median of each row, interpolated between the midpoints of the sorted values' weights."""
     values = np.where(weight > 0, values, np.inf)  # sorted to the end
     order = np.argsort(values, axis=1, kind="stable")
     values, weight = (np.take_along_axis(a, order, axis=1) for a in (values, weight))

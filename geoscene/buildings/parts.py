@@ -1,4 +1,4 @@
-"""Which building a part belongs to, what parts leave of an outline, and buildings that lie on one another."""
+"""Assigns parts to buildings, finds what parts leave of an outline, and resolves overlaps of buildings."""
 
 from __future__ import annotations
 
@@ -18,38 +18,40 @@ Rows = NDArray[np.int64]
 
 
 def overlapping(a: Polygons, b: Polygons, *, least: float = 1e-4) -> tuple[Rows, Rows, NDArray[np.float64]]:
-    """Rows of a and of b whose interiors share over ``least`` square metres, and the shared areas."""
+    """Pairs of rows of a and b that share more than ``least`` square metres, and the shared areas."""
     j, i = shapely.STRtree(a).query(b, predicate="intersects")  # first row: index into b
     j, i = i.astype(np.int64), j.astype(np.int64)
-    # polygons that merely touch are the many; the exact test is cheaper than their intersection
-    meets = ~shapely.touches(a[j], b[i])
-    j, i = j[meets], i[meets]
+    # most pairs only touch; this test is cheaper than their intersection
+    overlap = ~shapely.touches(a[j], b[i])
+    j, i = j[overlap], i[overlap]
     area = shapely.area(shapely.intersection(a[j], b[i]))
     keep = area > least
     return j[keep], i[keep], area[keep]
 
 
 def duplicates(
-    osm_id: Sequence[str] | Texts, footprint: Polygons, *, known: NDArray[np.float64]
+    osm_id: Sequence[str] | Texts, footprint: Polygons, *, score: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], list[Problem]]:
-    """Which buildings (n,) repeat another, and the report.
+    """Which buildings (n,) repeat another one, and the problems.
 
-    Two are the same if they share over 90 % of both areas. The one about whose height and tags more is known
-    (``known``, any scale) stays; among equals the first.
+    Two buildings are the same if they share over 90 % of both areas. The one with the higher score is kept,
+    of equal ones the first.
+
+    score : (n,) how much is known of each building, in any unit
     """
     area = shapely.area(footprint)
     a, b, shared = overlapping(footprint, footprint)
     same = (a < b) & (shared > 0.9 * np.maximum(area[a], area[b]))
-    gone = np.zeros(len(footprint), np.bool_)
+    repeated = np.zeros(len(footprint), np.bool_)
     problems = []
     for i, j, s in zip(a[same], b[same], shared[same], strict=True):
-        if gone[i] or gone[j]:
+        if repeated[i] or repeated[j]:
             continue
-        loser, winner = (j, i) if known[i] >= known[j] else (i, j)
-        gone[loser] = True
+        loser, winner = (j, i) if score[i] >= score[j] else (i, j)
+        repeated[loser] = True
         detail = f"shares {s:.1f} of {area[loser]:.1f} m2 with {osm_id[winner]}"
         problems.append(Problem(osm_id[loser], "building", "dropped", "duplicate", detail))
-    return gone, problems
+    return repeated, problems
 
 
 def assign(
@@ -60,10 +62,10 @@ def assign(
     outline: Polygons,
     relations: Sequence[Relation],
 ) -> Rows:
-    """The outline's row for every part (n,), -1 for parts that no outline holds.
+    """The row of the outline of every part (n,), -1 for parts outside any outline.
 
-    Relations of type building decide; else the outline that covers most of the part, if it covers half, and
-    of several that cover over 90 % the smallest.
+    Relations of type building take precedence. Otherwise it is the outline that covers most of the part, at
+    least half of it; of several that cover over 90 %, the smallest.
     """
     found = np.full(len(part), -1, np.int64)
     p, o, shared = overlapping(part, outline)
@@ -88,7 +90,7 @@ def assign(
 
 
 def clusters(polygons: Polygons) -> Rows:
-    """Cluster number (n,) of polygons that touch or overlap, directly or through others."""
+    """Cluster number (n,) of polygons; those that touch or overlap, directly or through others, share one."""
     from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
@@ -98,7 +100,7 @@ def clusters(polygons: Polygons) -> Rows:
 
 
 def remainder(outline: Any, parts: Polygons, *, covered: float) -> tuple[Any, float]:
-    """What parts leave of an outline, and the covered share; empty where they cover it but for a tenth."""
+    """The uncovered rest of an outline (empty from a share of ``covered`` on), and the covered share."""
     union = shapely.union_all(parts, grid_size=GRID)
     share = shapely.area(shapely.intersection(outline, union)) / shapely.area(outline)
     if share >= covered:
@@ -114,29 +116,29 @@ def cut_overlaps(
     low: NDArray[np.float64],
     high: NDArray[np.float64],
 ) -> tuple[Polygons, list[Problem]]:
-    """Footprints (n,) less what smaller pieces of other buildings take at the same height, and the report.
+    """Footprints (n,) without the overlaps between buildings, and the problems.
 
-    Of two pieces of different buildings that share ground and heights the smaller keeps its shape. A piece
-    that keeps under a tenth of its area is dropped (its footprint is empty), as lying inside another.
+    Of two pieces of different buildings that overlap in plan and in height, the smaller keeps its shape. A
+    piece that keeps less than a tenth of its area is dropped (its footprint becomes empty).
 
-    low, high : metres above the base; pieces above one another do not meet
+    low, high : metres above the base; pieces above one another do not overlap
     """
     area = shapely.area(footprint)
     a, b, shared = overlapping(footprint, footprint)
-    meets = (a < b) & (owner[a] != owner[b]) & (np.minimum(high[a], high[b]) > np.maximum(low[a], low[b]))
-    a, b, shared = a[meets], b[meets], shared[meets]
+    overlap = (a < b) & (owner[a] != owner[b]) & (np.minimum(high[a], high[b]) > np.maximum(low[a], low[b]))
+    a, b, shared = a[overlap], b[overlap], shared[overlap]
     b_larger = (area[b] > area[a]) | ((area[b] == area[a]) & (b > a))
     loser, winner = np.where(b_larger, b, a), np.where(b_larger, a, b)
     out = footprint.copy()
     problems = []
-    # from the smallest on, so that a piece is final before it cuts others
+    # in ascending order of area, so that a piece has its final shape before it cuts others
     for mine in sorted(groups(loser), key=lambda g: area[loser[g[0]]]):
         row = loser[mine[0]]
         cutters = out[winner[mine]]
         out[row] = subtract(out[row], shapely.union_all(cutters, grid_size=GRID))
-        with_whom = ", ".join(sorted({osm_id[w] for w in winner[mine]}))
+        winners = ", ".join(sorted({osm_id[w] for w in winner[mine]}))
         lost = area[row] - shapely.area(out[row])
-        detail = f"lost {lost:.2f} of {area[row]:.1f} m2 to {with_whom}"
+        detail = f"lost {lost:.2f} of {area[row]:.1f} m2 to {winners}"
         if shapely.area(out[row]) < 0.1 * area[row]:
             out[row] = shapely.Polygon()
             problems.append(Problem(osm_id[row], "building", "dropped", "inside-another", detail))

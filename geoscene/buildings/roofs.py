@@ -1,4 +1,4 @@
-"""Roofs on any footprint: each shape as a closed shell from the floor to the ridge."""
+"""Roof shapes on any footprint, as closed shells from the floor to the ridge."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene.buildings.cells import (
     Cells,
@@ -21,21 +20,21 @@ from geoscene.buildings.cells import (
     with_field,
 )
 from geoscene.buildings.footprints import to_grid
-from geoscene.buildings.shells import Triangles, close, lift, prisms, triangulate
+from geoscene.buildings.shells import Triangles, close, distinct_corners, lift, prisms, triangulate
 from geoscene.buildings.skeleton import straight_skeleton
 from geoscene.mesh import FLOOR, ROOF
 from geoscene.typing import Float
 
 Profile = tuple[tuple[float, float], ...]
 
-BOX_LIKE = 0.85
-"""A footprint that fills this share of the smallest rectangle about it takes its ridge from the rectangle."""
+RECTANGULAR = 0.85
+"""Share of the smallest enclosing rectangle from which a footprint takes its ridge from the rectangle."""
 
 _ARC = tuple(
     (float(1 - np.cos(a)), float(np.sin(a))) for a in np.linspace(0, np.pi / 2, 7)
 )  # a quarter circle, by (distance, height)
 
-ACROSS: dict[str, Profile] = {
+SECTIONS: dict[str, Profile] = {
     # (share of the way from the low eave to the other, share of the roof's height), along the cross-section
     "gabled": ((0, 0), (0.5, 1), (1, 0)),
     "half-hipped": ((0, 0), (0.5, 1), (1, 0)),
@@ -59,15 +58,15 @@ INWARD: dict[str, Profile] = {
     "cone": ((0, 0), (1, 1)),
 }
 
-GABLED = {"gabled": 1.0, "gambrel": 1.0, "round": 1.0, "saltbox": 1.0, "half-hipped": 0.5}
-"""How far the ends of a skeleton's ridges are raised into gables."""
+GABLE_SHARE = {"gabled": 1.0, "gambrel": 1.0, "round": 1.0, "saltbox": 1.0, "half-hipped": 0.5}
+"""Share by which the hip ends of a skeleton are raised to gables."""
 
-_STAND_IN = {"onion": "a dome", "saltbox": "gabled", "pyramidal": "hipped", "cone": "hipped"}
-"""What a shape becomes on the skeleton, if not itself."""
+_FALLBACK = {"onion": "a dome", "saltbox": "gabled", "pyramidal": "hipped", "cone": "hipped"}
+"""Shape that replaces another one on the skeleton."""
 
-TURNED: dict[str, Profile] = {
-    # (share of the height, share of the footprint's size) of the rings about the middle; never wider than the
-    # footprint, so that an onion does not reach into its neighbour
+RADIAL: dict[str, Profile] = {
+    # (share of the height, scale of the footprint) of the rings about the centroid; the scale never exceeds
+    # 1, so that an onion does not reach into its neighbour
     "dome": tuple((h, 1 - d) for d, h in _ARC),
     "onion": (
         (0, 1), (0, 0.82), (0.08, 0.95), (0.18, 1), (0.3, 0.95), (0.42, 0.79), (0.55, 0.54), (0.68, 0.32),
@@ -80,12 +79,12 @@ TURNED: dict[str, Profile] = {
 
 @dataclass(frozen=True, slots=True)
 class RoofSpec:
-    """A roof to be made.
+    """Parameters of a roof.
 
     shape     : one of `geoscene.buildings.table.SHAPES`
     low, high : z of the underside of the body and of the top of the roof, metres
     height    : of the roof alone, metres, at most high - low
-    direction : radians counter-clockwise from x, where the roof's (low) face looks to, NaN if not known
+    direction : radians counter-clockwise from x, downslope direction of the (low) face, NaN if not known
     across    : the ridge runs across the longer side
     """
 
@@ -98,41 +97,43 @@ class RoofSpec:
 
 
 def roof_shell(polygon: Any, spec: RoofSpec) -> tuple[Triangles, str]:
-    """The closed shell of a body with its roof (pieces numbered 0), and what stands in for the shape, or "".
+    """The closed shell of a body with its roof (piece 0), and a note if the shape had to be replaced.
+
+    Pyramids, cones, domes and onions are built of rings about the centroid if all corners are visible from
+    it. Ridged shapes take their ridge from the smallest enclosing rectangle if the footprint nearly fills it
+    or a direction is tagged. All others are built on the straight skeleton.
 
     polygon : valid, on the grid, exterior counter-clockwise
-
-    Pyramids, cones, domes and onions turn about the centroid where it sees every corner. Ridged shapes take
-    their ridge from the rectangle about the footprint where it nearly fills it, or where the map gives a
-    direction. Everything else stands on the straight skeleton.
     """
-    if spec.shape in TURNED and _sees_all(polygon):
-        return _turned(polygon, spec), ""
+    if spec.shape in RADIAL and _is_star_shaped(polygon):
+        return _radial(polygon, spec), ""
     if spec.shape == "skillion":
         return _from_cells(_skillion(polygon, spec), spec), ""
-    if spec.shape in ACROSS and (_box_like(polygon) or np.isfinite(spec.direction) or spec.across):
+    if spec.shape in SECTIONS and (
+        _nearly_rectangular(polygon) or np.isfinite(spec.direction) or spec.across
+    ):
         return _from_cells(_ridged(polygon, spec), spec), ""
     cells, raised = _inward(polygon, spec)
     if cells is None:
         low, high = np.array([spec.low]), np.array([spec.high])
         flat = prisms(np.array([polygon], dtype=object), np.zeros(1, np.int64), low=low, high=high)
         return flat, f"{spec.shape} roof made flat"
-    stand_in = _STAND_IN.get(spec.shape, "")
-    if spec.shape in GABLED and not raised:
-        stand_in = "hipped"
-    return _from_cells(cells, spec), f"{spec.shape} roof made {stand_in}" if stand_in else ""
+    fallback = _FALLBACK.get(spec.shape, "")
+    if spec.shape in GABLE_SHARE and not raised:
+        fallback = "hipped"
+    return _from_cells(cells, spec), f"{spec.shape} roof made {fallback}" if fallback else ""
 
 
-def _sees_all(polygon: Any) -> bool:
-    """The centroid sees every corner: the footprint has no holes and is star-shaped about it."""
+def _is_star_shaped(polygon: Any) -> bool:
+    """Whether the footprint has no holes and all its corners are visible from the centroid (star-shaped)."""
     if shapely.get_num_interior_rings(polygon):
         return False
     ring = shapely.get_coordinates(polygon)
-    a, b = ring[:-1] - _middle(polygon), ring[1:] - _middle(polygon)
+    a, b = ring[:-1] - _centroid(polygon), ring[1:] - _centroid(polygon)
     return bool((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 1e-3).all())
 
 
-def _middle(polygon: Any) -> Float:
+def _centroid(polygon: Any) -> Float:
     return to_grid(shapely.get_coordinates(shapely.centroid(polygon))[0])
 
 
@@ -145,18 +146,18 @@ def _axes(polygon: Any) -> tuple[Float, Float, float]:
     return along, np.array([-along[1], along[0]]), lengths[0] * lengths[1]
 
 
-def _box_like(polygon: Any) -> bool:
+def _nearly_rectangular(polygon: Any) -> bool:
     if shapely.get_num_interior_rings(polygon):
         return False  # a ridge would run across the courtyard
-    return bool(shapely.area(polygon) > BOX_LIKE * _axes(polygon)[2])
+    return bool(shapely.area(polygon) > RECTANGULAR * _axes(polygon)[2])
 
 
 def _slope(polygon: Any, spec: RoofSpec) -> Float:
-    """Unit vector up the slope, from the face that looks to the tagged direction.
+    """Unit vector up the slope, opposite to the tagged direction.
 
     A direction within 22.5 degrees (half a step of the eight-point compass that mappers use) of a side of the
-    rectangle means that side. Without a direction the slope is across the longer side, or along it where the
-    ridge runs across.
+    smallest rectangle is taken to mean that side. Without a direction the slope is perpendicular to the
+    longer side, or parallel to it if the ridge runs across.
     """
     along, aside, _ = _axes(polygon)
     if not np.isfinite(spec.direction):
@@ -173,16 +174,16 @@ def _profile(field: Float, span: float, *, profile: Profile) -> Float:
 
 
 def _skillion(polygon: Any, spec: RoofSpec) -> Cells:
-    """One plane, with the height's share as field."""
+    """One plane; the field is the share of the roof's height."""
     cells = with_field(plain_cells(polygon), _slope(polygon, spec), offset=0.0)
     low, high = cells.field.min(), cells.field.max()
     return replace(cells, field=(cells.field - low) / (high - low))
 
 
 def _ridged(polygon: Any, spec: RoofSpec) -> Cells:
-    """A cross-section drawn along the ridge, with the height's share as field."""
+    """A cross-section extruded along the ridge; the field is the share of the roof's height."""
     up = _slope(polygon, spec)
-    profile = ACROSS[spec.shape]
+    profile = SECTIONS[spec.shape]
     cells = with_field(plain_cells(polygon), up, offset=0.0)
     low = float(cells.field.min())
     span = float(cells.field.max()) - low
@@ -195,14 +196,15 @@ def _ridged(polygon: Any, spec: RoofSpec) -> Cells:
 
 
 def _hipped_ends(cells: Cells, up: Float, *, low: float, span: float) -> Cells:
-    """A gabled cross-section whose ends are hipped from half way up, with the pitch of the sides."""
+    """A gabled cross-section whose ends are hipped above half the height, with the pitch of the sides."""
     ridge = np.array([-up[1], up[0]])
     hips = [(along, float((cells.xy @ along).min())) for along in (ridge, -ridge)]
 
     def height(xy: Float, count: int) -> Float:
         planes = [0.5 + 2 * (xy @ along - start) / span for along, start in hips[:count]]
         return np.asarray(
-            np.minimum.reduce([_profile(xy @ up - low, span, profile=ACROSS["gabled"]), *planes]), float
+            np.minimum.reduce([_profile(xy @ up - low, span, profile=SECTIONS["gabled"]), *planes]),
+            float,
         )
 
     for k, (along, start) in enumerate(hips):
@@ -212,16 +214,16 @@ def _hipped_ends(cells: Cells, up: Float, *, low: float, span: float) -> Cells:
 
 
 def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
-    """A profile drawn from the eaves inwards over the straight skeleton, with the height's share as field.
+    """A profile from the eaves inwards on the straight skeleton; the field is the share of the roof's height.
 
-    None if there is no skeleton. The flag says whether some end was raised into a gable.
+    None if there is no skeleton. The flag tells whether a hip end was raised to a gable.
     """
     skeleton = straight_skeleton(polygon)
     if skeleton is None:
         return None, False
     corners = len(skeleton.xy)
-    if spec.shape in GABLED:
-        skeleton = raise_gables(skeleton, GABLED[spec.shape])
+    if spec.shape in GABLE_SHARE:
+        skeleton = raise_gables(skeleton, GABLE_SHARE[spec.shape])
     cells = skeleton_cells(skeleton)
     span = float(cells.field.max())
     profile = INWARD[spec.shape]
@@ -233,9 +235,9 @@ def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
 
 
 def _from_cells(cells: Cells, spec: RoofSpec) -> Triangles:
-    """The shell under cells whose field is the share of the roof's height."""
+    """The shell below cells whose field is the share of the roof's height."""
     eaves = spec.high - spec.height
-    # the tagged height is the top's, also where the footprint leaves out the ridge
+    # the highest point has the tagged height even if the footprint excludes the ridge
     share = cells.field / cells.field.max()
     corners = np.concatenate([cells.xy, to_grid(eaves + share * spec.height)[..., None]], axis=2)
     zeros = np.zeros(len(corners), np.int64)
@@ -247,19 +249,21 @@ def _from_cells(cells: Cells, spec: RoofSpec) -> Triangles:
 
 
 def _floor(xy: Float, low: Float) -> Triangles:
-    """The floor of plane triangles (m, 3, 2)."""
+    """Floor triangles at height ``low`` (1,) from triangles in plan (m, 3, 2)."""
     zeros = np.zeros(len(xy), np.int64)
     return Triangles(lift(xy, low[zeros]), zeros, np.full(len(xy), FLOOR, np.uint8))
 
 
-def _turned(polygon: Any, spec: RoofSpec) -> Triangles:
-    """The shell under rings that shrink about the footprint's middle."""
+def _radial(polygon: Any, spec: RoofSpec) -> Triangles:
+    """The shell of rings: the footprint scaled about its centroid, at rising heights."""
     ring = shapely.get_coordinates(polygon)[:-1]
-    middle = _middle(polygon)
+    centroid = _centroid(polygon)
     eaves = spec.high - spec.height
     rings = [
-        np.column_stack((middle + (ring - middle) * size, np.full(len(ring), eaves + share * spec.height)))
-        for share, size in TURNED[spec.shape]
+        np.column_stack(
+            (centroid + (ring - centroid) * size, np.full(len(ring), eaves + share * spec.height))
+        )
+        for share, size in RADIAL[spec.shape]
     ]
     rings = [to_grid(r) for r in rings]
     triangles = []
@@ -267,14 +271,8 @@ def _turned(polygon: Any, spec: RoofSpec) -> Triangles:
         a, b, c, d = lower, np.roll(lower, -1, axis=0), np.roll(upper, -1, axis=0), upper
         triangles += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
     corners = np.concatenate(triangles)
-    corners = corners[_three_corners(corners)]
+    corners = corners[distinct_corners(corners)]
     zeros = np.zeros(len(corners), np.int64)
     top = Triangles(corners, zeros, np.full(len(corners), ROOF, np.uint8))
     low = to_grid(np.array([spec.low]))
     return close(top, _floor(triangulate(np.array([polygon], dtype=object))[0], low), underside=low)
-
-
-def _three_corners(corners: Float) -> NDArray[np.bool_]:
-    cell = np.rint(corners * 1e4)
-    distinct: NDArray[np.bool_] = ~(cell == np.roll(cell, -1, axis=1)).all(axis=2).any(axis=1)
-    return distinct

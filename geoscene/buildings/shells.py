@@ -1,4 +1,4 @@
-"""Closed shells over footprints: a floor, walls, and a roof surface on top, many at once."""
+"""Closed shells of many buildings at once: floor, walls and roof surface over their footprints."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from geoscene.watertight import degenerate_faces, edge_uses, weld
 
 @dataclass(frozen=True, slots=True)
 class Triangles:
-    """Triangles by their corners, each of one piece.
+    """Triangles given by their corners, each belonging to one piece.
 
     corners : (m, 3, 3) metres, counter-clockwise seen from outside
     piece   : (m,) int64
@@ -52,7 +52,8 @@ def join(groups: list[Triangles]) -> Triangles:
 def triangulate(polygons: Polygons) -> tuple[Float, Ints]:
     """Constrained Delaunay triangles (m, 3, 2) of polygons (n,), counter-clockwise, and the polygon of each.
 
-    No vertex is added. A polygon that GEOS refuses, or whose triangles do not add up to its area, has none.
+    No vertex is added. A polygon that GEOS cannot triangulate, or whose triangles do not cover it, yields
+    none.
     """
     try:
         collections = shapely.constrained_delaunay_triangles(polygons)
@@ -83,13 +84,13 @@ def _double_area(xy: Float) -> Float:
 
 
 def lift(xy: Float, z: Float) -> Float:
-    """Corners (m, 3, 3) of plane triangles (m, 3, 2) at heights (m,) or (m, 3)."""
+    """Corners (m, 3, 3) of triangles in plan (m, 3, 2) at heights (m,) or (m, 3)."""
     height = np.broadcast_to(z[:, None] if z.ndim == 1 else z, (len(xy), 3))
     return np.concatenate([xy, height[..., None]], axis=2)
 
 
 def boundary(corners: Float, piece: Ints) -> tuple[Float, Ints]:
-    """Edges (k, 2, 3) that one triangle of its piece uses, in that triangle's direction, and their pieces."""
+    """Boundary edges (k, 2, 3), each in the direction of its only triangle, and their pieces."""
     ids, _ = weld(corners.reshape(-1, 3), np.repeat(piece, 3))
     edge, uses, _ = edge_uses(ids.reshape(-1, 3))
     open_ = np.flatnonzero(uses[edge] == 1)
@@ -98,13 +99,13 @@ def boundary(corners: Float, piece: Ints) -> tuple[Float, Ints]:
 
 
 def close(top: Triangles, floor: Triangles, *, underside: Float) -> Triangles:
-    """Shells of the top surfaces, walls from their edges down to the undersides, and the floors.
+    """Closed shells: top surfaces, walls from their boundaries down to the undersides, and floors.
 
-    top       : seen from above, every vertex on the grid
-    floor     : seen from above too; its edge is the top's edge in plan
+    Walls of no height are left out, so that a roof may reach down to the floor.
+
+    top       : counter-clockwise from above, every vertex on the grid
+    floor     : counter-clockwise from above; its boundary in plan is that of the top
     underside : (n,) z of each piece's floor
-
-    Walls without height fall away, so that a roof may come down to the floor.
     """
     edge, piece = boundary(top.corners, top.piece)
     a, b = edge[:, 0], edge[:, 1]
@@ -114,14 +115,19 @@ def close(top: Triangles, floor: Triangles, *, underside: Float) -> Triangles:
     wall = Triangles(walls, np.tile(piece, 2), np.full(len(walls), WALL, np.uint8))
     bottom = Triangles(floor.corners[:, ::-1], floor.piece, np.full(len(floor), FLOOR, np.uint8))
     shells = join([top, wall, bottom])
-    # a wall of no height is two triangles with two equal corners; real slivers must stay, or the shell opens
-    c = np.rint(shells.corners * 1e4)
-    equal = (c == np.roll(c, -1, axis=1)).all(axis=2).any(axis=1)
-    return shells.take(~equal)
+    # a wall of no height has triangles with two equal corners; real slivers must stay, or the shell opens
+    return shells.take(distinct_corners(shells.corners))
+
+
+def distinct_corners(triangles: Float) -> NDArray[np.bool_]:
+    """(m,) bool, whether the three corners of triangles (m, 3, 2 or 3) are different grid points."""
+    c = np.rint(triangles * 1e4)
+    distinct: NDArray[np.bool_] = ~(c == np.roll(c, -1, axis=1)).all(axis=2).any(axis=1)
+    return distinct
 
 
 def prisms(polygons: Polygons, piece: Ints, *, low: Float, high: Float) -> Triangles:
-    """Shells over polygons (n,) from low to high (n,) metres, flat; ``piece`` (n,) are their numbers."""
+    """Prisms over polygons (n,) from z low to z high (n,), metres; ``piece`` (n,) are their numbers."""
     xy, owner = triangulate(polygons)
     top = Triangles(lift(xy, to_grid(high)[owner]), owner, np.full(len(xy), ROOF, np.uint8))
     floor = Triangles(lift(xy, to_grid(low)[owner]), owner, np.full(len(xy), FLOOR, np.uint8))
@@ -130,7 +136,7 @@ def prisms(polygons: Polygons, piece: Ints, *, low: Float, high: Float) -> Trian
 
 
 def sound(shells: Triangles, n: int) -> NDArray[np.bool_]:
-    """(n,) bool: the piece's triangles are a closed, oriented, non-degenerate surface of positive volume."""
+    """(n,) bool, whether each piece is a closed, oriented, non-degenerate surface of positive volume."""
     ids, first = weld(shells.corners.reshape(-1, 3), np.repeat(shells.piece, 3))
     faces = ids.reshape(-1, 3)
     edge, uses, balance = edge_uses(faces)

@@ -1,12 +1,11 @@
-"""Straight skeletons of polygons with holes, by moving the edges inwards from event to event.
+"""Straight skeletons of polygons with holes, by simulating the shrinking wavefront.
 
 The wavefront of Aichholzer, Aurenhammer, Alberts and Gärtner, "A novel type of skeleton for polygons" (1995):
-all edges move inwards at unit speed; an edge that shrinks to nothing joins its neighbours, a reflex corner
-that meets an edge splits the front (or joins a hole's front to it). Every step looks for the next event among
-all edges and corners anew, so no event can be missed or come twice; events at the same moment come one after
-the other with no time between. Where that fails on a symmetric polygon, its corners are moved by micrometres
-until no two events coincide, and the result is checked: each edge has one face, and the faces fill the
-polygon.
+all edges move inwards at unit speed. An edge event removes an edge that has shrunk to a point; a split event
+happens where a reflex corner hits an edge, and splits the front or joins it to that of a hole. Every step
+searches the next event among all edges and corners, so that no event is missed or handled twice; simultaneous
+events are handled one after another. If that fails on a symmetric polygon, its corners are jittered by
+micrometres. The result is checked: each edge has one face, and the faces fill the polygon.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 
 _PARALLEL = 1e-7
-_STILL = 1e-12
+_STATIONARY = 1e-12
 _NEAR = 1e-9
-_SAME = 1e-3
-_SHAKES = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
+_MERGE_DISTANCE = 1e-3
+_JITTERS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +32,8 @@ class Skeleton:
 
     xy      : (n, 2) nodes, metres; the polygon's own corners first, ring by ring, exterior first
     time    : (n,) distance of each node from the edges it belongs to, metres; 0 at the polygon's corners
-    faces   : per edge the nodes around its face, counter-clockwise, beginning with the edge's two corners;
-              after those of all edges, what joining near nodes has split off from them
+    faces   : nodes around the face of each edge, counter-clockwise, beginning with the edge's two corners;
+              then the faces that merging close nodes has split off
     corners : number of the polygon's corners, and of its edges
     """
 
@@ -45,7 +44,7 @@ class Skeleton:
 
 
 class _Front:
-    """The moving front: corners in loops, each between the edge before it and the edge after it."""
+    """The moving wavefront: closed loops of corners, each between two edges."""
 
     def __init__(self, rings: list[Float]) -> None:
         self.xy = np.concatenate(rings)
@@ -60,7 +59,7 @@ class _Front:
         self.nodes = [tuple(p) for p in self.xy.tolist()]
         self.times = [0.0] * n
         self.arcs: list[list[tuple[int, int]]] = [[] for _ in range(n)]
-        # columns over corners; those of dead corners stay
+        # by corner; corners that events have ended keep their entries
         self.next = following.tolist()
         self.previous = [0] * n
         for i, j in enumerate(self.next):
@@ -73,7 +72,7 @@ class _Front:
         self.ends = following
 
     def _speed(self, before: int, after: int) -> Float | None:
-        """Velocity of a corner between two edges; None between opposite edges, whose corner has no speed."""
+        """Velocity of the corner between two edges; None for antiparallel edges, where it is undefined."""
         a, b = self.inward[before], self.inward[after]
         turn = a[0] * b[1] - a[1] * b[0]
         if abs(turn) < _PARALLEL:
@@ -95,7 +94,7 @@ class _Front:
         return len(self.nodes) - 1
 
     def _trace(self, corner: int, node: int) -> None:
-        """Record the way of a corner from its birth to a node in the faces on both sides."""
+        """Add the arc that a corner has moved along, up to a node, to the faces on both sides."""
         born = self.node[corner]
         self.arcs[self._before(corner)].append((born, node))
         self.arcs[self.after[corner]].append((node, born))
@@ -113,7 +112,7 @@ class _Front:
         return corner
 
     def _close(self, corner: int) -> None:
-        """End a loop of two corners: the ridge between them belongs to both edges."""
+        """End a loop of two corners; the ridge between them is an arc of both faces."""
         other = self.next[corner]
         if self.next[other] != corner:
             return
@@ -135,7 +134,7 @@ class _Front:
         )
 
     def _split(self, corner: int, edge_start: int, *, point: Float) -> None:
-        """Split event: a reflex corner has met the edge after another corner."""
+        """Split event: a reflex corner has hit the edge after another corner."""
         edge_end = self.next[edge_start]
         previous, following = self.previous[corner], self.next[corner]
         after, edge = self.after[corner], self.after[edge_start]
@@ -148,8 +147,8 @@ class _Front:
         if second in self.alive:
             self._close(second)
 
-    def _stuck(self) -> bool:
-        """Move on from a corner between opposite edges: the ridge runs to its nearer neighbour at once."""
+    def _collapse_antiparallel(self) -> bool:
+        """Collapse a corner between antiparallel edges to its nearer neighbour; whether there was one."""
         for corner in self.alive:
             if self.speed[corner] is None:
                 here = self.point[corner]
@@ -163,8 +162,8 @@ class _Front:
         return False
 
     def step(self) -> None:
-        """Go on to the next event."""
-        if self._stuck():
+        """Advance to the next event and handle it."""
+        if self._collapse_antiparallel():
             return
         alive = list(self.alive)
         slot = {corner: k for k, corner in enumerate(alive)}
@@ -177,7 +176,7 @@ class _Front:
         gap = ((point[following] - point) * along).sum(axis=1)
         rate = ((speed[following] - speed) * along).sum(axis=1)
         shrink = np.full(len(alive), np.inf)
-        np.divide(gap, -rate, out=shrink, where=rate < -_STILL)
+        np.divide(gap, -rate, out=shrink, where=rate < -_STATIONARY)
         shrink = np.maximum(shrink, 0.0)
         best, hit = int(np.argmin(shrink)), -1
         wait = float(shrink[best])
@@ -187,7 +186,7 @@ class _Front:
             distance = point[reflex] @ inward.T - (point * inward).sum(axis=1)
             closing = 1.0 - speed[reflex] @ inward.T
             meet = np.full(closing.shape, np.inf)
-            np.divide(distance, closing, out=meet, where=(closing > _STILL) & (distance > -_NEAR))
+            np.divide(distance, closing, out=meet, where=(closing > _STATIONARY) & (distance > -_NEAR))
             meet = np.maximum(meet, 0.0)
             own = np.arange(len(reflex))
             meet[own, reflex] = meet[own, [slot[self.previous[alive[k]]] for k in reflex]] = np.inf
@@ -212,7 +211,7 @@ class _Front:
             self._join(alive[best], self.point[alive[best]])
 
     def run(self) -> Skeleton | None:
-        """Move until nothing moves, and gather the faces; None if they do not fit together."""
+        """Simulate until the front has vanished, and return the faces; None if they are not closed rings."""
         try:
             for _ in range(8 * len(self.xy) + 16):
                 if not self.alive:
@@ -231,7 +230,7 @@ class _Front:
         return Skeleton(np.array(self.nodes), np.array(self.times), faces, len(faces))
 
     def _ring(self, edge: int) -> list[int] | None:
-        """The nodes around the face of an edge, or None if its arcs make no ring."""
+        """The nodes around the face of an edge, or None if its arcs do not form a ring."""
         start, stop = edge, int(self.ends[edge])
         onward: dict[int, int] = {}
         for a, b in self.arcs[edge]:
@@ -250,33 +249,34 @@ class _Front:
 def straight_skeleton(polygon: Any) -> Skeleton | None:
     """The straight skeleton of a valid polygon (exterior counter-clockwise, holes clockwise), or None.
 
-    None only if no attempt passes the check that the faces fill the polygon. Corners on a straight line are
-    allowed. Time grows with the square of the number of corners: about 1 ms for a rectangle.
+    None if no attempt yields faces that fill the polygon. Collinear corners are allowed. Time grows with the
+    square of the number of corners: about 1 ms for a rectangle.
     """
     rings = [np.array(shapely.get_coordinates(r)[:-1]) for r in shapely.get_rings(polygon)]
     centre = rings[0].mean(axis=0)
     rings = [r - centre for r in rings]
     corners = np.concatenate(rings)
-    for shake in _SHAKES:
-        # a fixed pattern, so that the same polygon always gives the same skeleton
-        noise = np.random.Generator(np.random.Philox(key=len(corners))).uniform(-shake, shake, corners.shape)
-        shaken = np.split(corners + noise, np.cumsum([len(r) for r in rings])[:-1])
-        found = _Front(shaken).run()
+    for jitter in _JITTERS:
+        # seeded by the number of corners: the same polygon always gives the same skeleton
+        noise = np.random.Generator(np.random.Philox(key=len(corners))).uniform(
+            -jitter, jitter, corners.shape
+        )
+        jittered = np.split(corners + noise, np.cumsum([len(r) for r in rings])[:-1])
+        found = _Front(jittered).run()
         if found is None:
             continue
         xy = found.xy.copy()
         xy[: len(corners)] = corners
         found = replace(found, xy=xy + centre)
         if _fills(found, polygon):
-            return _joined(found)
+            return _merged(found)
     return None
 
 
-def _joined(skeleton: Skeleton) -> Skeleton:
-    """The skeleton with nodes joined that an arc shorter than a millimetre connects.
+def _merged(skeleton: Skeleton) -> Skeleton:
+    """The skeleton with nodes merged that are connected by an arc shorter than a millimetre.
 
-    On a grid the many nodes near one point, as in the middle of a regular polygon, would fall over each
-    other.
+    Rounding to the grid would make clusters of nodes, as in the centre of a regular polygon, invert faces.
     """
     parent = list(range(len(skeleton.xy)))
 
@@ -288,9 +288,9 @@ def _joined(skeleton: Skeleton) -> Skeleton:
     for face in skeleton.faces:
         ring = np.array(face)
         step = skeleton.xy[np.roll(ring, -1)] - skeleton.xy[ring]
-        for k in np.flatnonzero((step**2).sum(axis=1) < _SAME**2).tolist():
+        for k in np.flatnonzero((step**2).sum(axis=1) < _MERGE_DISTANCE**2).tolist():
             low, high = sorted((root(face[k]), root(face[(k + 1) % len(face)])))
-            if high >= skeleton.corners:  # two corners stay two
+            if high >= skeleton.corners:  # corners of the polygon are never merged with each other
                 parent[high] = low
     faces, extra = [], []
     for face in skeleton.faces:
@@ -301,7 +301,7 @@ def _joined(skeleton: Skeleton) -> Skeleton:
 
 
 def loops(ring: list[int]) -> list[list[int]]:
-    """A ring that may pass a node twice as rings that do not, the one that holds its first edge first."""
+    """A ring that may visit nodes twice, split into simple rings; the first one contains its first edge."""
     loops: list[list[int]] = []
     path: list[int] = []
     for node in ring:
@@ -316,7 +316,7 @@ def loops(ring: list[int]) -> list[list[int]]:
 
 
 def polygons_of(xy: Float, rings: list[list[int]]) -> NDArray[Any]:
-    """Polygons of rings of node numbers, three or more each."""
+    """Polygons of rings of at least three node numbers."""
     if not rings:
         return np.empty(0, dtype=object)
     sizes = [len(r) for r in rings]
@@ -327,13 +327,13 @@ def polygons_of(xy: Float, rings: list[list[int]]) -> NDArray[Any]:
 
 
 def _fills(skeleton: Skeleton, polygon: Any) -> bool:
-    """The faces are simple, counter-clockwise, and as large together as the polygon.
+    """Whether the faces are simple, counter-clockwise, and have the polygon's area in total.
 
-    As their arcs pair up, they then cover each point of it once.
+    As each arc belongs to two faces, they then cover each point of the polygon once.
     """
     shapes = polygons_of(skeleton.xy, skeleton.faces)
     area = shapely.area(shapes)
-    # rounding may turn slivers or let them cross themselves: a thousandth of a square metre is let pass
-    sound = (shapely.is_valid(shapes) & shapely.is_ccw(shapely.get_exterior_ring(shapes))) | (area < 1e-3)
+    # rounding may invert slivers or make them self-intersecting: areas below 1e-3 m2 are tolerated
+    valid = (shapely.is_valid(shapes) & shapely.is_ccw(shapely.get_exterior_ring(shapes))) | (area < 1e-3)
     size = shapely.area(polygon)
-    return bool(sound.all() and abs(area.sum() - size) < 1e-5 * max(size, 1.0))
+    return bool(valid.all() and abs(area.sum() - size) < 1e-5 * max(size, 1.0))

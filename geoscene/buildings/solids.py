@@ -1,4 +1,4 @@
-"""From the table of buildings to watertight solids."""
+"""Builds watertight solids from the table of buildings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from geoscene.watertight import weld
 
 @dataclass(frozen=True, slots=True)
 class _Pieces:
-    """Simple polygons to build on: a row of the table each, or one of several polygons of a row."""
+    """Single polygons to extrude: one or several per row of the table."""
 
     polygon: NDArray[Any]
     row: Ints
@@ -47,12 +47,12 @@ class _Pieces:
 def build_solids(
     buildings: Buildings, *, base: NDArray[np.float64], lod: int = 2
 ) -> tuple[Mesh, list[Problem]]:
-    """One closed, oriented body of positive volume per building, and what had to be simplified or dropped.
+    """One closed, oriented body of positive volume per building, and what was simplified or dropped.
 
-    The bodies stand on the 0.1 mm grid. Faces carry the building's row as feature, class BUILDING, the
-    surface, material and colour. LoD 0 is the outline as one block from the ground up, as high as its parts
-    on the average; LoD 1 has parts with their undersides and flat tops at full height; LoD 2 has roofs. What
-    fails is tried again with flat roofs, then with cleaned footprints, then dropped.
+    Vertices lie on the 0.1 mm grid. Faces have the building's row as feature, class BUILDING, and surface,
+    material and colour. LoD 0 extrudes the outline from the ground to the mean height of its parts; LoD 1 has
+    parts with their undersides and flat tops at full height; LoD 2 has roofs. A building whose body is not a
+    solid is built again with flat roofs, then with cleaned footprints, and is dropped if that fails too.
 
     base : (count,) or (n,) z in metres of each building's base, in the order of the table; a part stands on
            its building's base
@@ -97,7 +97,7 @@ def _problem(buildings: Buildings, row: int, *, action: Any, reason: str, detail
 
 
 def _pieces(buildings: Buildings, base: Float, *, lod: int) -> _Pieces:
-    """What to build, polygon by polygon, sorted by building."""
+    """The polygons to extrude, sorted by building."""
     chosen = np.flatnonzero(~buildings.is_part if lod == 0 else buildings.drawn)
     polygon, index = shapely.get_parts(buildings.footprint[chosen], return_index=True)
     row = chosen[index]
@@ -114,7 +114,7 @@ def _pieces(buildings: Buildings, base: Float, *, lod: int) -> _Pieces:
 
 
 def _mean_heights(buildings: Buildings) -> Float:
-    """Heights (n,) of the table's rows, for buildings with parts the mean of the parts' by area."""
+    """Heights (n,) of the table's rows; of buildings with parts, the mean of the parts weighted by area."""
     area = np.where(buildings.drawn, shapely.area(buildings.footprint), 0.0)
     total = np.bincount(buildings.outline, weights=area, minlength=len(buildings))
     sums = np.bincount(buildings.outline, weights=area * buildings.height, minlength=len(buildings))
@@ -123,7 +123,7 @@ def _mean_heights(buildings: Buildings) -> Float:
 
 
 def _simplified(pieces: _Pieces) -> _Pieces:
-    """The pieces with footprints opened by 5 mm and on a grid of 1 cm: thin necks and spikes go."""
+    """The pieces with footprints opened by 5 mm and rounded to 1 cm, which removes thin necks and spikes."""
     opened = shapely.buffer(pieces.polygon, -0.005, join_style="mitre")
     rounded = shapely.set_precision(shapely.buffer(opened, 0.005, join_style="mitre"), 0.01)
     polygon, index = shapely.get_parts(clean(rounded)[0], return_index=True)
@@ -131,7 +131,7 @@ def _simplified(pieces: _Pieces) -> _Pieces:
 
 
 def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, list[Problem]]:
-    """Triangles of all bodies, the buildings that failed, and notes on roofs that fell back to another."""
+    """Triangles of all bodies, the buildings that failed, and the replaced roofs and separated bodies."""
     n = len(pieces.row)
     notes: list[Problem] = []
     flat = np.flatnonzero(pieces.flat)
@@ -171,11 +171,11 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
         if united is None:
             failed.add(building)
             continue
-        body, grooves = united
+        body, note = united
         out.append(body)
-        if grooves:
+        if note:
             notes.append(
-                _problem(buildings, building, action="repaired", reason="touching-bodies", detail=grooves)
+                _problem(buildings, building, action="repaired", reason="touching-bodies", detail=note)
             )
     result = join(out)
     united_fine = sound(replace(result, piece=pieces.building[result.piece]), len(buildings))
@@ -185,7 +185,7 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
 
 
 def _mesh(buildings: Buildings, triangles: Triangles, *, row: Ints) -> Mesh:
-    """The mesh of all triangles (with their table rows), welded within each building, sorted by building."""
+    """The mesh of all triangles, sorted by building and welded within each; ``row`` are their table rows."""
     feature = buildings.outline[row].astype(np.int64)
     order = np.argsort(feature, kind="stable")
     triangles, row, feature = triangles.take(order), row[order], feature[order]

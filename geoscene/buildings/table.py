@@ -1,4 +1,4 @@
-"""Buildings and their parts as columns."""
+"""The table of buildings and their parts."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from geoscene.typing import Float
 Texts = NDArray[np.object_]
 
 GRID = 1e-4
-"""Step of the grid of all vertices, metres: file formats that round to 0.1 mm keep solids closed."""
+"""Grid of all vertices, metres; solids stay closed in file formats that round to 0.1 mm."""
 
 SHAPES = (
     "flat", "gabled", "hipped", "half-hipped", "pyramidal", "skillion", "gambrel", "mansard", "round", "dome",
     "onion", "saltbox", "cone",
 )  # fmt: skip
-"""Roof shapes that solids are made of; what a map says otherwise becomes flat, and is counted."""
+"""Supported roof shapes; others become flat and are reported."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BuildingOptions:
     """How tags become buildings.
 
-    level_height  : metres per storey where the map gives storeys alone
+    level_height  : metres per storey where only storeys are tagged
     min_area      : square metres; smaller buildings are dropped (parts: a hundredth of it)
     covered       : share of an outline that its parts must cover to replace it whole
-    reach         : metres within which neighbours' known heights inform a missing one
-    canopy        : metres, thickness of roofs that stand on nothing (``building=roof``)
+    reach         : metres within which known heights are used to infer a missing one
+    canopy        : metres, thickness of roofs without walls (``building=roof``)
     """
 
     level_height: float = 3.0
@@ -42,24 +42,24 @@ class BuildingOptions:
 
 @dataclass(frozen=True, slots=True)
 class Buildings:
-    """Buildings first, then their parts, one row each; a building's row is its feature number in the layer.
+    """One row per building, then one per part; a building's row is its feature number in the layer.
 
     osm_id           : (n,) str
     footprint        : (n,) valid shapely Polygon or MultiPolygon on the 0.1 mm grid, scene metres, exteriors
-                       counter-clockwise; where buildings overlapped, what is left of this one
+                       counter-clockwise, overlaps with other buildings removed
     is_part          : (n,) bool
-    outline          : (n,) int32, the building's row that a part belongs to; a building's own row
+    outline          : (n,) int32, row of the building that a part belongs to; a building's own row
     min_height       : (n,) metres from the building's base to the underside
     height           : (n,) metres from the building's base to the top of the roof
     roof_height      : (n,) metres, the part of height that is roof; 0 if flat
     roof_shape       : (n,) str, one of SHAPES
-    roof_direction   : (n,) radians counter-clockwise from x, where the roof's face slopes down to, NaN if not
-                       given
-    roof_across      : (n,) bool, the ridge runs across the longer side
+    roof_direction   : (n,) downslope direction of the roof's face, radians counter-clockwise from x, NaN if
+                       not tagged
+    roof_across      : (n,) bool, whether the ridge runs across the longer side
     height_source    : (n,) str: tag, est_height, levels, parts, outline, or inferred-<rule>
     height_sigma     : (n,) metres, one standard deviation of height
     min_height_source: (n,) str: tag, levels, canopy, or default (0)
-    roof_source      : (n,) str, where roof_height came from: tag, levels, angle, default, or none (flat)
+    roof_source      : (n,) str, source of roof_height: tag, levels, angle, default, or none (flat)
     levels           : (n,) storeys above ground as tagged, NaN if not
     use              : (n,) str, the value of building or building:part
     name             : (n,) str
@@ -106,7 +106,7 @@ class Buildings:
 
     @property
     def drawn(self) -> NDArray[np.bool_]:
-        """(n,) bool: the row is a solid of its own; false for an outline that its parts replace."""
+        """(n,) bool, whether the row is built as a solid; false for an outline that its parts replace."""
         replaced = np.zeros(len(self), np.bool_)
         replaced[self.outline[self.is_part]] = True
         return ~replaced

@@ -1,4 +1,4 @@
-"""One body per building: the union of its pieces, on the grid, without edges that carry four faces."""
+"""Unions of the pieces of a building, on the grid, without edges of four faces."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from geoscene.typing import Float, Ints
 from geoscene.watertight import degenerate_faces, edge_uses, weld
 
 GROOVES = (2e-3, 2e-2, 1e-1)
-"""Reach of the groove that parts two bodies of one building which meet in an edge only, metres; the next
-where the bodies leave the edge in so thin a wedge that the grid closes it again. Where none serves, beads of
-these sizes along the edges join the bodies instead."""
+"""Sizes of the groove that separates two bodies of a building which share only an edge, metres. The next size
+is tried where the grid closes the groove again (thin wedges); if none works, beads of these sizes join the
+bodies."""
 
 
 def unite(shells: Triangles) -> tuple[Triangles, str] | None:
-    """The union of the closed shells of one building, and what became of its seams; None if there is none.
+    """The union of the closed shells of one building, and a note on grooves or beads; None if it fails.
 
-    Faces keep the piece and surface they come from.
+    Faces keep their piece and surface.
     """
     pieces = np.unique(shells.piece)
     first = m3.Manifold.reserve_ids(4 * len(pieces))
-    # far from zero the booleans lose digits, so the body is united about its own corner
+    # boolean operations lose digits far from the origin, so coordinates are relative to a corner
     origin = to_grid(shells.corners.reshape(-1, 3).min(axis=0))
     bodies = [_manifold(shells, piece, first=first + 4 * k, origin=origin) for k, piece in enumerate(pieces)]
     if any(body is None for body in bodies):
         return None
     union = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
     for operation, what in ((m3.OpType.Subtract, "parted by grooves"), (m3.OpType.Add, "joined by beads")):
-        body, told = union, ""
+        body, note = union, ""
         for reach in (*GROOVES, None):
             if body.status() != m3.Error.NoError or body.is_empty():
                 return None
@@ -43,17 +43,17 @@ def unite(shells: Triangles) -> tuple[Triangles, str] | None:
                 known = (run >= 0) & (run < 4 * len(pieces))
                 piece = pieces[np.where(known, run // 4, 0)]
                 surface = np.where(known, run % 4, WALL).astype(np.uint8)
-                return Triangles(to_grid(corners + origin), piece, surface), told
+                return Triangles(to_grid(corners + origin), piece, surface), note
             if reach is None:
                 break
-            told = f"{len(seams)} edges where bodies only touched, {what} of {1e3 * reach:.0f} mm"
+            note = f"{len(seams)} edges where bodies only touched, {what} of {1e3 * reach:.0f} mm"
             about = [_cutter(a, b, reach=reach) for a, b in seams]
             body = m3.Manifold.batch_boolean([body, *about], operation)
     return None
 
 
 def _manifold(shells: Triangles, piece: int, *, first: int, origin: Float) -> Any:
-    """One piece as a manifold whose faces carry ``first`` plus their surface; None if it is none."""
+    """One piece as a manifold whose faces have the id ``first`` plus surface; None if it is not a solid."""
     mine = shells.take(shells.piece == piece)
     order = np.argsort(mine.surface, kind="stable")
     corners, surface = mine.corners[order].reshape(-1, 3) - origin, mine.surface[order]
@@ -70,20 +70,20 @@ def _manifold(shells: Triangles, piece: int, *, first: int, origin: Float) -> An
 
 
 def _triangles(body: Any, first: int) -> tuple[Float, Ints]:
-    """Corners (m, 3, 3) of a body's triangles on the grid, mended there, and their runs less ``first``."""
+    """Corners (m, 3, 3) of a body's triangles, repaired on the grid, and their ids minus ``first``."""
     mesh = body.to_mesh64()
     faces = mesh.tri_verts.astype(np.int64)
     run = np.repeat(np.asarray(mesh.run_original_id, np.int64), np.diff(mesh.run_index) // 3) - first
     points = to_grid(mesh.vert_properties[:, :3])
     ids, where = weld(points, np.zeros(len(points), np.int64))
-    return mend(points[where], ids[faces], run=run)
+    return repair(points[where], ids[faces], run=run)
 
 
-def mend(points: Float, faces: Ints, *, run: Ints) -> tuple[Float, Ints]:
-    """Corners (m, 3, 3) and runs of triangles without the degenerate ones that the grid makes.
+def repair(points: Float, faces: Ints, *, run: Ints) -> tuple[Float, Ints]:
+    """Corners (m, 3, 3) and ids of triangles, without those that rounding has made degenerate.
 
-    Faces with two equal corners go; faces with three corners on a line are flipped into the neighbour across
-    their longest edge. Both keep a closed surface closed.
+    Faces with two equal corners are removed; faces with three collinear corners are merged into the neighbour
+    at their longest edge. A closed surface stays closed.
     """
     distinct = (faces != np.roll(faces, -1, axis=1)).all(axis=1)
     faces, run = _cancel(faces[distinct], run[distinct])
@@ -96,7 +96,7 @@ def mend(points: Float, faces: Ints, *, run: Ints) -> tuple[Float, Ints]:
 
 
 def _cancel(faces: Ints, run: Ints) -> tuple[Ints, Ints]:
-    """Faces without pairs of the same three vertices in opposite order: they bound nothing."""
+    """Faces without pairs that have the same three vertices in opposite order and so enclose no volume."""
     turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     key = {tuple(f): i for i, f in enumerate(turned.tolist())}
     gone = [i for (a, b, c), i in key.items() if (a, c, b) in key]
@@ -106,7 +106,7 @@ def _cancel(faces: Ints, run: Ints) -> tuple[Ints, Ints]:
 
 
 def _flip(points: Float, faces: Ints, *, run: Ints, flat: int) -> tuple[Ints, Ints]:
-    """Faces with a face of three corners on a line replaced: its middle corner splits the face beyond."""
+    """Faces without the collinear face ``flat``: its middle corner splits the face at its longest edge."""
     corners = faces[flat]
     length = np.linalg.norm(points[np.roll(corners, -1)] - points[corners], axis=1)
     k = int(np.argmax(length))
@@ -124,7 +124,7 @@ def _flip(points: Float, faces: Ints, *, run: Ints, flat: int) -> tuple[Ints, In
 
 
 def _crowded_edges(corners: Float) -> Float:
-    """Edges (k, 2, 3) that more than two triangles share."""
+    """Edges (k, 2, 3) shared by more than two triangles."""
     flat = corners.reshape(-1, 3)
     ids, where = weld(flat, np.zeros(len(flat), np.int64))
     faces = ids.reshape(-1, 3)
@@ -139,8 +139,8 @@ def _crowded_edges(corners: Float) -> Float:
 
 
 def _cutter(a: Float, b: Float, *, reach: float) -> Any:
-    """A convex body about an edge, reaching a little beyond it on all sides."""
-    # turned off the axes, so that its faces lie in no plane of the building
+    """A convex body around an edge, ``reach`` metres larger on all sides."""
+    # rotated, so that none of its faces is coplanar with one of the building
     turn = np.array([[0.936, -0.275, 0.218], [0.290, 0.956, -0.036], [-0.199, 0.097, 0.975]])
     star = np.vstack([turn, -turn]) * reach
     return m3.Manifold.hull_points(np.vstack([a + star, b + star]))

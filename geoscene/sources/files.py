@@ -12,8 +12,8 @@ from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.sources.assemble import Bounds, checked_bounds, features
 from geoscene.sources.data import OsmData
 from geoscene.sources.elements import Collector
-from geoscene.sources.lenient import collect_xml
 from geoscene.sources.overpass import collect_answer
+from geoscene.sources.plain_xml import collect_xml
 
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
 

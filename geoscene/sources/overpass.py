@@ -7,7 +7,7 @@ from typing import Any
 from geoscene.errors import InputError
 from geoscene.sources.data import Tags
 from geoscene.sources.elements import Collector
-from geoscene.sources.lenient import whole_units
+from geoscene.sources.plain_xml import whole_units
 
 Box = tuple[float, float, float, float]
 

@@ -130,7 +130,7 @@ def test_shells_are_closed_over_all_but_the_oddest_footprints(shape):
     made = [footprint(seed) for seed in range(120)]
     shells = [roof_shell(p, RoofSpec(shape, 0.0, 10.0, 3.0)) for p in made if p is not None]
     assert len(shells) > 80
-    assert sum(not sound(shell, 1)[0] or "flat" in stand_in for shell, stand_in in shells) <= 1
+    assert sum(not sound(shell, 1)[0] or "flat" in fallback for shell, fallback in shells) <= 1
 
 
 @pytest.mark.parametrize(
@@ -146,8 +146,8 @@ def test_shells_are_closed_over_all_but_the_oddest_footprints(shape):
 @pytest.mark.parametrize("degrees", [0.0, 27.0])
 def test_the_roof_of_a_rectangle_has_the_volume_of_the_textbook(shape, share, degrees):
     polygon = turned(RECTANGLE, degrees)
-    shell, stand_in = roof_shell(polygon, RoofSpec(shape, low=0.0, high=9.0, height=3.0))
-    assert stand_in == ""
+    shell, fallback = roof_shell(polygon, RoofSpec(shape, low=0.0, high=9.0, height=3.0))
+    assert fallback == ""
     assert volume(shell) == pytest.approx(polygon.area * (6.0 + 3.0 * share), rel=1e-3)
 
 
@@ -161,8 +161,8 @@ def test_turned_roofs_over_a_circle_have_the_volume_of_the_textbook(shape, share
 
 def test_a_gabled_l_has_two_gables_and_a_valley():
     polygon = turned(L_SHAPE, 31.0)
-    shell, stand_in = roof_shell(polygon, RoofSpec("gabled", low=0.0, high=8.0, height=3.5))
-    assert stand_in == ""
+    shell, fallback = roof_shell(polygon, RoofSpec("gabled", low=0.0, high=8.0, height=3.5))
+    assert fallback == ""
     ridge = shell.corners[shell.surface == ROOF].reshape(-1, 3)
     ends = np.unique(ridge[ridge[:, 2] > 7.99][:, :2], axis=0)
     at_edge = shapely.distance(polygon.exterior, shapely.points(ends)) < 1e-3
@@ -194,9 +194,9 @@ def test_the_ridge_runs_along_the_longer_side_unless_it_is_said_to_run_across():
 def test_what_stands_in_for_a_shape_is_said():
     courtyard = turned([(0, 0), (20, 0), (20, 20), (0, 20)], holes=[[(6, 6), (6, 14), (14, 14), (14, 6)]])
     for shape, word in (("pyramidal", "hipped"), ("onion", "dome"), ("gabled", "hipped"), ("hipped", "")):
-        shell, stand_in = roof_shell(courtyard, RoofSpec(shape, 0.0, 9.0, 3.0))
+        shell, fallback = roof_shell(courtyard, RoofSpec(shape, 0.0, 9.0, 3.0))
         assert sound(shell, 1)[0]
-        assert (word in stand_in) if word else stand_in == ""
+        assert (word in fallback) if word else fallback == ""
 
 
 def test_a_cut_splits_cells_at_the_level_and_keeps_their_area():

@@ -1,4 +1,4 @@
-"""Every building's and part's heights: from its tags, its building, its parts, or by inference."""
+"""Resolves the heights of every building and part: from its tags, its building, its parts, or inferred."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.buildings.footprints import gathered
+from geoscene.buildings.footprints import object_array
 from geoscene.buildings.heights import HIGHEST, SIGMA_PRIOR, Tagged, infer_heights
-from geoscene.buildings.rooftags import RoofTags, default_roof_height
+from geoscene.buildings.roof_tags import RoofTags, default_roof_height
 from geoscene.buildings.table import BuildingOptions, Texts
 from geoscene.report import Problem
 from geoscene.sources.data import Tags
@@ -22,17 +22,17 @@ _HALLS = (
     "church", "cathedral", "chapel", "mosque", "synagogue", "temple", "stadium", "sports_hall", "hangar",
     "train_station",
 )  # fmt: skip
-"""Uses of buildings whose single storey says nothing of their height."""
+"""Uses of buildings whose single storey may have any height."""
 
 _OPEN_BELOW = ("roof", "carport", "canopy")
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A building or a part on its way into the table.
+    """A building or a part before it enters the table.
 
-    outline : row of its building; its own row if it is none's part
-    is_rest : it is what parts leave of an outline
+    outline      : row of its building; its own row for a building
+    is_remainder : whether it is what parts leave of an outline
     """
 
     osm_id: str
@@ -41,12 +41,12 @@ class Row:
     use: str
     outline: int = -1
     is_part: bool = False
-    is_rest: bool = False
+    is_remainder: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Heights:
-    """Columns (n,) of `geoscene.buildings.table.Buildings`, by shorter names."""
+    """Columns (n,) of heights for `geoscene.buildings.table.Buildings`."""
 
     low: Float
     high: Float
@@ -58,14 +58,14 @@ class Heights:
 
 
 def texts(values: Sequence[str]) -> Texts:
-    """A column of text."""
+    """Strings as an array of objects (n,)."""
     return np.array(values, dtype=object)
 
 
-def settle_heights(
+def resolve_heights(
     rows: Sequence[Row], tagged: Sequence[Tagged], *, roofs: Sequence[RoofTags], options: BuildingOptions
 ) -> tuple[Heights, list[Problem]]:
-    """Underside, top and roof of every row (buildings first, then parts), and what had to be put right."""
+    """Underside, top and roof height of every row (buildings first, then parts), and what was repaired."""
     problems: list[Problem] = []
     h = Heights(
         np.nan_to_num([t.minimum for t in tagged]),
@@ -77,18 +77,18 @@ def settle_heights(
         texts([t.roof_source for t in tagged]),
     )
     use = texts([r.use for r in rows])
-    # The one storey of a hall is as high as the hall.
+    # a single storey of a hall is as high as the hall, not 3 m
     hall = np.isin(use, _HALLS) & (h.source == "levels") & (np.array([t.levels for t in tagged]) <= 1)
     h.high[hall], h.sigma[hall], h.source[hall] = np.nan, np.nan, ""
-    _settle_roofs(rows, roofs, h=h)
+    _resolve_roofs(rows, roofs, h=h)
     is_part = np.array([r.is_part for r in rows], np.bool_)
     outline = np.array([r.outline for r in rows], np.int64)
-    _settle_wholes(rows, is_part, outline=outline, h=h, options=options)
-    _settle_rests(rows, is_part, outline=outline, h=h)
+    _resolve_buildings(rows, is_part, outline=outline, h=h, options=options)
+    _resolve_remainders(rows, is_part, outline=outline, h=h)
 
     lacking = is_part & ~np.isfinite(h.high)
     h.high[lacking], h.source[lacking] = h.high[outline[lacking]], "outline"
-    # the building's top says little about one part's
+    # the building's height is a poor estimate of one part's
     h.sigma[lacking] = np.maximum(h.sigma[outline[lacking]], SIGMA_PRIOR * h.high[lacking] / 2)
     np.minimum(h.high, HIGHEST, out=h.high)
 
@@ -110,18 +110,18 @@ def settle_heights(
     return h, problems
 
 
-def _settle_roofs(rows: Sequence[Row], roofs: Sequence[RoofTags], *, h: Heights) -> None:
-    """Fill in the heights of roofs, in place."""
+def _resolve_roofs(rows: Sequence[Row], roofs: Sequence[RoofTags], *, h: Heights) -> None:
+    """Set missing roof heights, in place."""
     for k, roof in enumerate(roofs):
         if roof.shape == "flat":
             h.roof[k], h.roof_source[k] = 0.0, "none"
         elif not np.isfinite(h.roof[k]):
             h.roof[k], h.roof_source[k] = default_roof_height(roof, rows[k].footprint)
-            if h.source[k] == "levels":  # storeys do not count the roof
+            if h.source[k] == "levels":  # building:levels excludes the roof
                 h.high[k] += h.roof[k]
 
 
-def _settle_wholes(
+def _resolve_buildings(
     rows: Sequence[Row],
     is_part: NDArray[np.bool_],
     *,
@@ -129,18 +129,18 @@ def _settle_wholes(
     h: Heights,
     options: BuildingOptions,
 ) -> None:
-    """Fill in the heights of buildings, in place: at least as high as their highest part, else inferred."""
-    own = np.flatnonzero(is_part & np.isfinite(h.high) & ~np.array([r.is_rest for r in rows], np.bool_))
+    """Set missing heights of buildings, in place: at least that of their highest part, else inferred."""
+    own = np.flatnonzero(is_part & np.isfinite(h.high) & ~np.array([r.is_remainder for r in rows], np.bool_))
     own = own[np.argsort(h.high[own], kind="stable")]
     top = np.full(len(rows), -1)
-    top[outline[own]] = own  # the last, and highest, stays
+    top[outline[own]] = own  # the last assignment is the highest part
     higher = np.flatnonzero(~is_part & (top >= 0))
     higher = higher[~(h.high[higher] >= h.high[top[higher]])]
     h.high[higher], h.source[higher] = h.high[top[higher]], "parts"
     h.sigma[higher] = h.sigma[top[higher]]
 
     whole = np.flatnonzero(~is_part)
-    footprint = gathered([rows[k].footprint for k in whole.tolist()])
+    footprint = object_array([rows[k].footprint for k in whole.tolist()])
     inferred, sigma, rule = infer_heights(
         shapely.get_coordinates(shapely.point_on_surface(footprint)),
         texts([rows[k].use for k in whole.tolist()]),
@@ -153,17 +153,17 @@ def _settle_wholes(
     h.high[gaps], h.sigma[gaps], h.source[gaps] = inferred[lacking], sigma[lacking], rule[lacking]
 
 
-def _settle_rests(
+def _resolve_remainders(
     rows: Sequence[Row], is_part: NDArray[np.bool_], *, outline: NDArray[np.int64], h: Heights
 ) -> None:
-    """Settle, in place, what parts leave of an outline.
+    """Set the heights of the remainders of outlines, in place.
 
-    Its own tags hold unless a part that stands on the ground reaches as high, for then the tags speak of that
-    part: the rest is as high as the lowest part on the ground.
+    The outline's tags apply, unless a part on the ground is as high: the tags then describe that part, and
+    the remainder is as high as the lowest part on the ground.
     """
     of = np.argsort(outline, kind="stable")
     begin, end = (np.searchsorted(outline[of], outline, side=side) for side in ("left", "right"))
-    for k in np.flatnonzero([r.is_rest for r in rows]):
+    for k in np.flatnonzero([r.is_remainder for r in rows]):
         family = of[begin[k] : end[k]]
         parts = family[is_part[family] & np.isfinite(h.high[family])]
         grounded = [p for p in parts if p != k and h.low[p] < 0.01]

@@ -1,4 +1,4 @@
-"""What tags say of a roof's shape, direction and pitch."""
+"""Shape, direction and pitch of a roof from its tags."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _OTHER_NAMES = {
 }  # fmt: skip
 
 PITCH_DEG = 30.0
-"""Assumed pitch of a roof whose height the map does not give."""
+"""Assumed pitch of a roof without a tagged height."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,10 +29,10 @@ class RoofTags:
     """A roof as tagged.
 
     shape         : one of SHAPES
-    unknown       : the value of roof:shape if it is none of them, else ""
-    direction_deg : clockwise from true north, where the face slopes down to; NaN if not given
+    unknown       : the value of roof:shape if it is not one of them, else ""
+    direction_deg : downslope azimuth of the face, clockwise from true north; NaN if not tagged
     across        : roof:orientation=across
-    angle_deg     : pitch, NaN if not given
+    angle_deg     : pitch, NaN if not tagged
     """
 
     shape: str
@@ -43,7 +43,7 @@ class RoofTags:
 
 
 def read_roof_tags(tags: Tags) -> RoofTags:
-    """The roof as tagged; flat where nothing is."""
+    """The tagged roof; flat if nothing is tagged."""
     value = (
         (tags.get("roof:shape") or tags.get("building:roof:shape") or "flat").split(";")[0].strip().lower()
     )
@@ -61,13 +61,13 @@ def read_roof_tags(tags: Tags) -> RoofTags:
 
 
 def default_roof_height(roof: RoofTags, footprint: Any) -> tuple[float, str]:
-    """Height of a roof in metres by its angle, else the usual pitch, and which of the two: angle, default.
+    """Height of a roof in metres from its angle, else a usual pitch; its source, ``angle`` or ``default``.
 
     The run is the radius of the largest circle in the footprint (its diameter for a skillion roof). A dome or
-    onion without height is as high as the run (onion: 1.5 runs), the curved and broken shapes take 45
+    onion without height is as high as the run (onion: 1.5 runs), curved and broken shapes have 45
     degrees.
     """
-    # GEOS gives the circle as the line from its centre to its rim
+    # GEOS returns the circle as a line from its centre to its rim
     run = float(shapely.length(shapely.maximum_inscribed_circle(footprint, tolerance=0.05)))
     if roof.shape == "skillion":
         run *= 2.0

@@ -1,4 +1,4 @@
-"""Colours and materials of walls and roofs."""
+"""Colours and materials of walls and roofs, from tags or by default."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ _MATERIALS: dict[str, str] = {
     "rubber": "tar_roof", "membrane": "tar_roof", "plants": "grass", "grass": "grass", "green": "grass",
     "thatch": "dry_grass", "straw": "dry_grass", "sand": "sand",
 }  # fmt: skip
-"""Values of building:material and roof:material, to names of `geoscene.classes.materials`."""
+"""Name in `geoscene.classes.materials` of each value of building:material and roof:material."""
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """Colour and material of a wall or a roof as tagged, None where the map does not say."""
+class Appearance:
+    """Colour and material of walls or a roof as tagged; None if not tagged."""
 
     color: tuple[int, int, int] | None
     material: Material | None
 
     @property
     def tagged(self) -> bool:
-        """The map gives either."""
+        """Whether the colour or the material is tagged."""
         return self.color is not None or self.material is not None
 
 
@@ -51,35 +51,35 @@ def _material(value: str | None) -> Material | None:
     return materials()[name] if name else None
 
 
-def read_walls(tags: Tags) -> Look:
-    """What tags say of the walls."""
-    return Look(
+def read_walls(tags: Tags) -> Appearance:
+    """The tagged colour and material of the walls."""
+    return Appearance(
         parse_color(_first(tags, "building:colour", "building:color", "colour", "color")),
         _material(_first(tags, "building:material", "building:facade:material", "material")),
     )
 
 
-def read_roof(tags: Tags) -> Look:
-    """What tags say of the roof."""
-    return Look(
+def read_roof(tags: Tags) -> Appearance:
+    """The tagged colour and material of the roof."""
+    return Appearance(
         parse_color(_first(tags, "roof:colour", "roof:color", "building:roof:colour")),
         _material(_first(tags, "roof:material", "building:roof:material")),
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Settled:
-    """Colour, material code and where they come from: tag, outline or default."""
+class ChosenAppearance:
+    """Colour, material code and their source: tag, outline or default."""
 
     color: tuple[int, int, int]
     material: int
     source: str
 
 
-def settle_look(own: Look, outline: Look | None, *, default: str) -> Settled:
-    """The look of a wall or roof; a part without its own takes its outline's, else the default material."""
-    for look, source in ((own, "tag"), (outline, "outline")):
-        if look is not None and look.tagged:
-            material = look.material or materials()[default]
-            return Settled(look.color or material.color, material.code, source)
-    return Settled(materials()[default].color, materials()[default].code, "default")
+def choose_appearance(own: Appearance, outline: Appearance | None, *, default: str) -> ChosenAppearance:
+    """The appearance of walls or a roof: its own tags, else its outline's, else the default material."""
+    for appearance, source in ((own, "tag"), (outline, "outline")):
+        if appearance is not None and appearance.tagged:
+            material = appearance.material or materials()[default]
+            return ChosenAppearance(appearance.color or material.color, material.code, source)
+    return ChosenAppearance(materials()[default].color, materials()[default].code, "default")
