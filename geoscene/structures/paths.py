@@ -74,6 +74,34 @@ class _Net:
     slope: Float
 
 
+@dataclass(frozen=True, slots=True)
+class _Crossed:
+    """What paths may cross, and the rules for it.
+
+    height : height of the terrain at x, y; None for level ground at 0
+    """
+
+    osm: OsmData
+    frame: Frame
+    graph: RoadGraph
+    height: Height | None
+    options: StructureOptions
+
+
+@dataclass(frozen=True, slots=True)
+class _Paths:
+    """Paths on bridges and in tunnels, one row each.
+
+    tunnel : (n,) bool, else on a bridge
+    level  : (n,) int8, OSM layer
+    body   : (n,) metres from the surface to the underside of the deck
+    """
+
+    tunnel: NDArray[np.bool_]
+    level: NDArray[np.int8]
+    body: Float
+
+
 def path_members(
     raised: SurfaceRows,
     osm: OsmData,
@@ -116,20 +144,9 @@ def path_members(
     ends = _ends(net, sunk, joined=joined)
     free = np.where(foot_only, options.passage, options.headroom)
     depth = _depths(net, sunk, joined=joined, full=free + options.roof + _COVER)
-    body = np.where(track, options.deck, options.slab)
-    z = _heights(
-        net,
-        tunnel,
-        level=level,
-        body=body,
-        ends=ends,
-        depth=depth,
-        graph=graph,
-        osm=osm,
-        frame=frame,
-        height=height,
-        options=options,
-    )
+    paths = _Paths(tunnel, level, np.where(track, options.deck, options.slab))
+    crossed = _Crossed(osm, frame, graph, height, options)
+    z = _heights(net, paths, ends=ends, depth=depth, crossed=crossed)
 
     count = len(ways)
     line, approach, own_rows = (np.empty(count, object) for _ in range(3))
@@ -262,31 +279,16 @@ def _depths(net: _Net, sunk: NDArray[np.bool_], *, joined: NDArray[np.int8], ful
     return ramped
 
 
-def _heights(
-    net: _Net,
-    tunnel: NDArray[np.bool_],
-    *,
-    level: NDArray[np.int8],
-    body: Float,
-    ends: NDArray[np.bool_],
-    depth: Float,
-    graph: RoadGraph,
-    osm: OsmData,
-    frame: Frame,
-    height: Height | None,
-    options: StructureOptions,
-) -> Float:
-    """Heights (v,) of stations."""
+def _heights(net: _Net, paths: _Paths, *, ends: NDArray[np.bool_], depth: Float, crossed: _Crossed) -> Float:
+    """Heights (v,) of stations; ``ends`` (v,) lie on the ground, tunnels at least ``depth`` (v,) under it."""
     if not len(net.xy):
         return np.empty(0)
-    ground = _ground(net.xy, height)
+    ground = _ground(net.xy, crossed.height)
     fixed = np.where(ends, ground, np.nan)
-    on_road = _on_road_bridges(net, tunnel, level=level, graph=graph)
+    on_road = _on_road_bridges(net, paths, graph=crossed.graph)
     fixed = np.where(np.isnan(on_road), fixed, on_road)
     z = _even(net, fixed, ground=ground)
-    least, most = _needs(
-        net, tunnel, level=level, body=body, graph=graph, osm=osm, frame=frame, height=height, options=options
-    )
+    least, most = _needs(net, paths, crossed=crossed)
     # What crosses comes after the cover: a path over a tunnel may have less of it, but does not come out.
     under = np.where(np.isnan(depth), np.inf, ground - np.maximum(depth - _SPARE, 0.0))
     least = np.minimum(least, under)
@@ -296,16 +298,14 @@ def _heights(
     return np.where(np.isnan(on_road), z, on_road)
 
 
-def _on_road_bridges(
-    net: _Net, tunnel: NDArray[np.bool_], *, level: NDArray[np.int8], graph: RoadGraph
-) -> Float:
+def _on_road_bridges(net: _Net, paths: _Paths, *, graph: RoadGraph) -> Float:
     """Height (v,) of the nearest road bridge or tunnel of the same layer beside a station, NaN if none."""
     z, nearest = np.full(len(net.xy), np.nan), np.full(len(net.xy), np.inf)
     edges = np.flatnonzero(graph.bridge | graph.tunnel)
     if not len(edges):
         return z
     tree = shapely.STRtree(edge_lines(graph)[edges])
-    for rows, below, layer in zip(net.rows, tunnel.tolist(), level.tolist(), strict=True):
+    for rows, below, layer in zip(net.rows, paths.tunnel.tolist(), paths.level.tolist(), strict=True):
         point, found = tree.query(shapely.points(net.xy[rows]), predicate="dwithin", distance=20.0)
         edge = edges[found]
         alike = graph.tunnel[edge] == below
@@ -334,27 +334,17 @@ def _even(net: _Net, fixed: Float, *, ground: Float) -> Float:
     return z
 
 
-def _needs(
-    net: _Net,
-    tunnel: NDArray[np.bool_],
-    *,
-    level: NDArray[np.int8],
-    body: Float,
-    graph: RoadGraph,
-    osm: OsmData,
-    frame: Frame,
-    height: Height | None,
-    options: StructureOptions,
-) -> tuple[Float, Float]:
-    """How high stations (v,) must be at least and at most; NaN where anything goes."""
-    obstacles = find_obstacles(osm, frame)
+def _needs(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Float, Float]:
+    """Least and greatest height (v,) of stations at crossings; NaN where there is no limit."""
+    graph, options = crossed.graph, crossed.options
+    obstacles = find_obstacles(crossed.osm, crossed.frame)
     roads = edge_lines(graph)
     rank = _rank(graph.layer, graph.bridge, tunnel=graph.tunnel)
     lines = np.concatenate([roads, obstacles.line])
     tree = shapely.STRtree(lines)
     least, most = np.full((2, len(net.xy)), np.nan)
-    of_way = zip(net.rows, tunnel.tolist(), level.tolist(), body.tolist(), strict=True)
-    for rows, below, layer, thick in of_way:
+    columns = (paths.tunnel.tolist(), paths.level.tolist(), paths.body.tolist())
+    for rows, below, layer, thick in zip(net.rows, *columns, strict=True):
         way = shapely.LineString(net.xy[rows])
         own = int(_rank(layer, not below, tunnel=below))
         for other in tree.query(way, predicate="crosses").tolist():
@@ -365,9 +355,8 @@ def _needs(
                 if is_road and own == rank[other]:
                     continue  # they meet
                 at = rows[near < _STATION]
-                z = float(
-                    foot(graph.geometry[other], xy[None])[0][0] if is_road else _ground(xy[None], height)[0]
-                )
+                on_road = foot(graph.geometry[other], xy[None])[0] if is_road else None
+                z = float((_ground(xy[None], crossed.height) if on_road is None else on_road)[0])
                 if over and is_road:
                     need = z + options.headroom + thick + (options.roof if graph.tunnel[other] else 0.0)
                 elif over:
