@@ -296,6 +296,8 @@ def _fastest(s: Float, limit: Float, *, up: float, down: float, rest: tuple[bool
 
 def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:
     """The trajectory of a motion along a path; cubic between the path's rows, so velocity has no steps."""
+    from scipy.interpolate import CubicHermiteSpline  # noqa: PLC0415  (slow to import)
+
     n = len(motion.s)
     position, heading = np.empty((n, 3)), np.empty(n)
     columns = {name: np.empty(n) for name in ("slope", "pitch", "bank", "scale", "curvature")}
@@ -310,10 +312,8 @@ def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:
         tangent = np.column_stack(
             [run * np.cos(p.heading), run * np.sin(p.heading), np.sin(p.slope) * p.gear]
         )
-        position[here] = _hermite(p.s, p.position, slope=tangent, at=s)
-        heading[here] = _hermite(
-            p.s, p.heading[:, None], slope=(p.curvature * np.cos(p.slope))[:, None], at=s
-        )[:, 0]
+        position[here] = CubicHermiteSpline(p.s, p.position, tangent)(s)
+        heading[here] = CubicHermiteSpline(p.s, p.heading, p.curvature * np.cos(p.slope))(s)
         for name, column in columns.items():
             column[here] = np.interp(s, p.s, getattr(p, name))
     v = motion.speed * gear
@@ -334,17 +334,6 @@ def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:
     return Trajectory(
         motion.time_ns, position, quat_from_euler(roll, pitch, gamma=heading), velocity, columns["scale"]
     )
-
-
-def _hermite(knot: Float, value: Float, *, slope: Float, at: Float) -> Float:
-    """Values (k, c) at places (k,) of cubics between knots (n,) with values and slopes (n, c) there."""
-    i = np.clip(np.searchsorted(knot, at, side="right") - 1, 0, len(knot) - 2)
-    gap = (knot[i + 1] - knot[i])[:, None]
-    u = (at - knot[i])[:, None] / gap
-    rise = value[i + 1] - value[i]
-    first, last = gap * slope[i] - rise, rise - gap * slope[i + 1]
-    out: Float = value[i] + u * rise + u * (1 - u) * (first * (1 - u) + last * u)
-    return out
 
 
 def _gait(motion: Motion, vehicle: Vehicle, *, heading: Float) -> Float:

@@ -218,16 +218,10 @@ def _sampled(time: Float, middle: Float, *, yaw: Float, until: float) -> Float:
     step = np.arange(first, last + 1)
     if len(step) < 2:
         return np.empty((0, 5))
+    from scipy.interpolate import CubicHermiteSpline  # noqa: PLC0415  (slow to import)
+
     t = step * STEP_S
-    low = np.clip(np.searchsorted(time, t, side="right") - 1, 0, len(time) - 2)
-    h = (time[low + 1] - time[low])[:, None]
-    w = np.clip((t - time[low])[:, None] / h, 0.0, 1.0)
-    xy = (
-        (1 + 2 * w) * (1 - w) ** 2 * spread[low]
-        + w * (1 - w) ** 2 * h * velocity[low]
-        + w**2 * (3 - 2 * w) * spread[low + 1]
-        - w**2 * (1 - w) * h * velocity[low + 1]
-    )
+    xy = CubicHermiteSpline(time, spread, velocity)(np.clip(t, time[0], time[-1]))
     for moment, offset in aside:
         u = np.clip((t - moment) / _CHANGE_S + 0.5, 0.0, 1.0)
         xy += (u**3 * (10 - 15 * u + 6 * u**2))[:, None] * offset
