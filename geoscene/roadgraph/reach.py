@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
-import re
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -17,6 +15,7 @@ from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import nearest_edge, path_line, shortest_path
+from geoscene.sources.tracks import read_track
 from geoscene.typing import Float
 
 
@@ -56,28 +55,17 @@ def route_line(words: Sequence[str], graph: RoadGraph, *, frame: Frame) -> Any:
 
 
 def _read_lonlat(path: Path) -> Float:
+    """Longitudes and latitudes (n, 2) of the points in a file."""
     if not path.exists():
-        raise SourceNotFoundError(f"{path}: no such file; `along` takes GPX, GeoJSON, CSV, or LAT,LON")
-    text = path.read_text("utf-8", errors="replace")
-    try:
-        if path.suffix.lower() == ".csv":
-            rows = list(csv.DictReader(text.splitlines()))
-            pairs = [(float(row["lon"]), float(row["lat"])) for row in rows]
-        elif path.suffix.lower() == ".gpx":
-            points = re.findall(r"<(?:trkpt|rtept|wpt)\b([^>]*)>", text)
-            pairs = [(_attribute(p, "lon"), _attribute(p, "lat")) for p in points]
-        else:
-            geometry = shapely.from_geojson(json.dumps(json.loads(text)))
-            pairs = [(float(x), float(y)) for x, y in shapely.get_coordinates(geometry)]
-    except (ValueError, KeyError, TypeError, shapely.errors.GEOSException) as error:
-        raise InputError(f"{path}: not a readable route ({error})") from error
-    if not pairs:
+        raise SourceNotFoundError(f"{path}: no such file; a route is GPX, GeoJSON, CSV, or LAT,LON")
+    if path.suffix.lower() != ".csv":
+        points = read_track(path)[:, :2]
+    else:
+        try:
+            rows = list(csv.DictReader(path.read_text("utf-8", errors="replace").splitlines()))
+            points = np.array([(float(row["lon"]), float(row["lat"])) for row in rows])
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path}: not a readable route ({error})") from error
+    if not len(points):
         raise InputError(f"{path}: holds no points")
-    return np.array(pairs)
-
-
-def _attribute(text: str, name: str) -> float:
-    found = re.search(rf"\b{name}\s*=\s*[\"']([^\"']+)[\"']", text)
-    if found is None:
-        raise ValueError(f"a point without {name}")
-    return float(found.group(1))
+    return points

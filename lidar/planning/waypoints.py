@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
-import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +15,9 @@ from numpy.typing import NDArray
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import nearest_edge
+from geoscene.sources.tracks import read_track as read_points
 from geoscene.typing import Float
-from lidar.errors import FormatError, RouteError
+from lidar.errors import RouteError
 from lidar.planning.route import U_TURN_S, permitted_turns, street_tree, turns_back
 
 Place = tuple[int, float]
@@ -51,72 +50,23 @@ class Track:
 
 
 def read_track(path: Path, frame: Frame) -> Track:
-    """The points of a GPX file (tracks, else routes, else waypoints) or of a GeoJSON file (lines or points).
+    """The points of a GPX or GeoJSON file; see `geoscene.sources.tracks.read_track`, whose errors it raises.
 
-    Raises FormatError for a file that is neither, and RouteError for one with fewer than two points.
+    Raises RouteError for a missing file and for one with fewer than two points.
     """
     if not path.exists():
         raise RouteError(
             f"{path} does not exist; a route is random, a GPX or GeoJSON file, or LAT,LON LAT,LON ..."
         )
-    text = path.read_text("utf-8-sig")
-    points = _gpx(path, text) if text.lstrip().startswith("<") else _geojson(path, text)
+    points = read_points(path)
     if len(points) < 2:
         raise RouteError(f"{path} holds {len(points)} points; a route needs two or more")
-    lon, lat, h = np.array(points, float).T
-    if not (np.isfinite(lon).all() and (np.abs(lat) <= 90).all() and (np.abs(lon) <= 180).all()):
-        raise FormatError(f"{path}: coordinates are not longitudes and latitudes in degrees")
+    lon, lat, h = points.T
     x, y = frame.from_geographic(lon, lat)
     xyz = np.column_stack([x, y, h])
     gaps = np.hypot(*np.diff(xyz[:, :2], axis=0).T)
     dense = len(points) > 2 and float(np.median(gaps)) <= DENSE_M
     return Track(list(zip(lat.tolist(), lon.tolist(), strict=True)), xyz, dense)
-
-
-def _gpx(path: Path, text: str) -> list[tuple[float, float, float]]:
-    try:
-        root = ET.fromstring(text)  # noqa: S314  (expat bounds the growth of entities)
-    except ET.ParseError as error:
-        raise FormatError(f"{path}: not readable as GPX: {error}") from error
-    for tag in ("trkpt", "rtept", "wpt"):
-        found = [e for e in root.iter() if e.tag.rsplit("}", 1)[-1] == tag]
-        if found:
-            try:
-                return [(float(e.attrib["lon"]), float(e.attrib["lat"]), _elevation(e)) for e in found]
-            except (KeyError, ValueError) as error:
-                raise FormatError(f"{path}: a {tag} without a readable lat and lon") from error
-    return []
-
-
-def _elevation(element: ET.Element) -> float:
-    for child in element:
-        if child.tag.rsplit("}", 1)[-1] == "ele" and child.text:
-            return float(child.text)
-    return 0.0
-
-
-def _geojson(path: Path, text: str) -> list[tuple[float, float, float]]:
-    try:
-        document = json.loads(text)
-    except ValueError as error:
-        raise FormatError(f"{path}: neither GPX (XML) nor GeoJSON (JSON)") from error
-    features = document.get("features", [document]) if isinstance(document, dict) else []
-    shapes = [f.get("geometry") or f for f in features if isinstance(f, dict)]
-    lines: list[Any] = []
-    for shape in shapes:
-        kind, at = shape.get("type"), shape.get("coordinates") or []
-        if kind in {"LineString", "MultiPoint"}:
-            lines.append(at)
-        elif kind == "MultiLineString":
-            lines.extend(at)
-        elif kind == "Point":
-            lines.append([at])
-    try:
-        return [
-            (float(p[0]), float(p[1]), float(p[2]) if len(p) > 2 else 0.0) for line in lines for p in line
-        ]
-    except (TypeError, ValueError, IndexError) as error:
-        raise FormatError(f"{path}: coordinates that are not numbers") from error
 
 
 # ----------------------------------------------------------------------------------------- through places

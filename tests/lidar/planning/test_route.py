@@ -10,12 +10,13 @@ from helpers.roadgrids import grid, road_graph
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from geoscene.errors import InputError
 from geoscene.frames import Frame
 from geoscene.roadgraph import build_road_graph
 from geoscene.roadgraph.graph import rows_of
 from geoscene.roadgraph.routing import turn_table
 from geoscene.sources import read_osm
-from lidar.errors import FormatError, RouteError
+from lidar.errors import RouteError
 from lidar.planning.route import lane_route, plan_route, random_edges, turns_back
 
 FRAME = Frame.at(-76.3, 36.88)
@@ -235,11 +236,11 @@ def test_a_geojson_line_and_points_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("text", "error", "words"),
     [
-        ("<gpx><wpt lat='x' lon='1'/></gpx>", FormatError, "readable lat and lon"),
-        ("<gpx>", FormatError, "not readable as GPX"),
-        ("hello", FormatError, "neither GPX"),
+        ("<gpx><wpt lat='x' lon='1'/></gpx>", InputError, "readable lat and lon"),
+        ("<gpx>", InputError, "not readable as GPX"),
+        ("hello", InputError, "neither GPX"),
         ('{"type": "Point", "coordinates": [1, 2]}', RouteError, "1 points"),
-        ('{"type": "LineString", "coordinates": [[1, 200], [1, 2]]}', FormatError, "not longitudes"),
+        ('{"type": "LineString", "coordinates": [[1, 200], [1, 2]]}', InputError, "not longitudes"),
     ],
 )
 def test_a_bad_file_is_refused_with_a_reason(tmp_path, text, error, words):
