@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.scene import Scene, open_scene
-from lidar.drive import DriveOptions, drive
+from lidar.drive import drive
+from lidar.options import DriveOptions
 
 RIGS = {"VLP-16": "vlp16", "HDL-64E": "hdl64e_s3", "OS1-128": "os1_128", "nuScenes": ""}
 """Sensor preset of each rig of one scanner; the nuScenes rig has a scanner and six cameras."""

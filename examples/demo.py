@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.build import BuildOptions, build
+from geoscene.build import build
 from geoscene.classes import class_codes
 from geoscene.console import progress_bar
+from geoscene.options import BuildOptions
 from geoscene.scene import SceneFiles
 from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
@@ -19,7 +20,7 @@ from geoscene.view import view_scene
 from lidar.camera.png import counts_to_depth, read_png, write_png
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
-from lidar.drive import DriveOptions, drive
+from lidar.drive import drive
 from lidar.maps.aggregate import aggregate
 from lidar.maps.picture import (
     class_colors,
@@ -29,6 +30,7 @@ from lidar.maps.picture import (
     sweep_picture,
     with_legend,
 )
+from lidar.options import DriveOptions
 from lidar.rig.specs import load_rig
 from lidar.rig.vehicle import load_vehicle
 from lidar.world.world import World

@@ -6,18 +6,18 @@ import hashlib
 import itertools
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Literal, cast
 
 import numpy as np
 import shapely
 
 from geoscene import __version__
-from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.errors import SourceNotFoundError
 from geoscene.manifest import scene_manifest
 from geoscene.objects.shapes import shapes
-from geoscene.plan import KINDS, Plan, make_plan
+from geoscene.options import BuildOptions
+from geoscene.plan import Plan, make_plan
 from geoscene.progress import Progress, silent
 from geoscene.report import Problem
 from geoscene.roadgraph.reach import route_line
@@ -33,55 +33,11 @@ _CROWN, _ARM = 5.0, 10.0
 """Metres by which the crown of a forest's tree and the arm of a lamp or a signal reach beyond their feet."""
 
 
-@dataclass(frozen=True, slots=True)
-class BuildOptions:
-    """How a scene is built.
-
-    crs       : ``local``, ``utm`` or a CRS that pyproj knows
-    lod       : of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs
-    dem       : elevation files; level ground without
-    dem_gaps  : what to do where they do not cover the scene: ``error``, or ``nearest`` height and say so
-    only      : what is built besides the ground, of `geoscene.plan.KINDS`; all by default
-    along     : waypoints (LAT,LON words) or one file (GPX, GeoJSON, or CSV with lon and lat): only tiles are
-                built that a sensor of that reach can see from there
-    reach     : metres, with ``along``
-    driving_side : ``left`` or ``right``; by default the map's ``driving_side`` tags, else the country's
-    tile_size : metres, side of a tile
-    name      : of the scene, for people
-    """
-
-    crs: str = "local"
-    lod: int = 2
-    dem: tuple[str, ...] = ()
-    dem_gaps: str = "error"
-    only: tuple[str, ...] = KINDS
-    along: tuple[str, ...] = ()
-    reach: float = 120.0
-    driving_side: str = ""
-    tile_size: float = 250.0
-    name: str = ""
-
-    def __post_init__(self) -> None:
-        """Refuse options that cannot be meant."""
-        if self.lod not in (0, 1, 2):
-            raise InputError(f"`lod` {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
-        if self.dem_gaps not in ("error", "nearest"):
-            raise InputError(f"`dem_gaps` {self.dem_gaps}: error or nearest")
-        if unknown := sorted(set(self.only) - set(KINDS)):
-            raise InputError(f"`only` {','.join(unknown)}: of {','.join(KINDS)}")
-        if self.driving_side not in ("", "left", "right"):
-            raise InputError(f"`driving_side` {self.driving_side}: left or right")
-        if not 0 < self.reach < 1e6:
-            raise InputError(f"`reach` {self.reach:g}: give metres, more than 0 and less than a million")
-        if not 50 <= self.tile_size <= 2000 or self.tile_size != int(self.tile_size):
-            raise InputError(f"`tile_size` {self.tile_size}: give whole metres from 50 to 2000")
-
-
 def build(
     osm: OsmData,
     out: Path,
     *,
-    options: BuildOptions | None = None,
+    options: BuildOptions = BuildOptions(),
     overwrite: bool = False,
     workers: int = 1,
     progress: Progress = silent,
@@ -94,20 +50,10 @@ def build(
     Raises SourceNotFoundError for an extract without anything to build, FrameError for a CRS that cannot
     serve and SceneFormatError for a directory that may not be used.
     """
-    options = options or BuildOptions()
     if not (osm.areas or osm.ways):
         raise SourceNotFoundError(f"{osm.source or 'the extract'}: nothing in it to build from")
     with SceneWriter(out, overwrite=overwrite) as writer:
-        plan, problems = make_plan(
-            osm,
-            options.crs,
-            dem=options.dem,
-            dem_gaps=cast("Literal['error', 'nearest']", options.dem_gaps),
-            tile_size=options.tile_size,
-            only=options.only,
-            driving_side=options.driving_side,
-            progress=progress,
-        )
+        plan, problems = make_plan(osm, options, progress=progress)
         keys = _keys(osm, options)
         tiles = _tiles_along(plan, options)
         reports: list[TileReport] = []

@@ -1,25 +1,35 @@
-"""The `geoscene` program: build, look into and check scenes."""
+"""The `geoscene` program: build, inspect, check, export and show scenes."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import App, Group, Parameter, validators
 
 from geoscene import __version__
-from geoscene.console import FAILURE, print_json, progress_bar, whole, with_flags
+from geoscene.console import (
+    DEFAULTS,
+    FAILURE,
+    Report,
+    degrees,
+    print_json,
+    progress_bar,
+    whole,
+    with_flags,
+)
 from geoscene.console import main as run
 from geoscene.errors import GeosceneError, InputError
+from geoscene.options import BuildOptions, Degrees, ExportOptions, ViewOptions
 from geoscene.progress import Progress
 
 app = App(
     name="geoscene",
     version=__version__,
+    default_parameter=DEFAULTS,
     suppress_keyboard_interrupt=False,
     help="""Turn a real place from OpenStreetMap into a watertight 3D scene.
 
@@ -34,49 +44,59 @@ app.register_install_completion_command()
 _SOURCE = Group("Where the map comes from (one of)", sort_key=1)
 _OUTPUT = Group("Output", sort_key=3)
 
-Numbers = Annotated[str | None, Parameter(group=_SOURCE)]
+Out = Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)]
+Reporting = Annotated[Report, Parameter(group=_OUTPUT)]
 
 
-def _numbers(text: str, option: str, *, names: str) -> list[float]:
-    count = names.count(",") + 1
-    try:
-        values = [float(v) for v in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != count:
-        raise InputError(f"{option} {text.strip()}: give {count} numbers in degrees as {names}")
-    return values
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class MapSource:
+    """Where the map and its elevation come from."""
+
+    osm: Path | None = None
+    """OpenStreetMap file: .osm, .osm.gz, .osm.bz2 or .osm.pbf. With --bbox, the part of it inside."""
+
+    place: str | None = None
+    """Name of a place, looked up in Nominatim and fetched from Overpass (needs a network; answers
+    are cached)."""
+
+    bbox: Annotated[Degrees | None, degrees("W,S,E,N")] = None
+    """W,S,E,N in degrees, fetched from Overpass, or cut out of --osm, --demo or --source."""
+
+    point: Annotated[tuple[float, float] | None, degrees("LAT,LON")] = None
+    """LAT,LON in degrees, with --radius, fetched from Overpass."""
+
+    radius: float = 500.0
+    """Metres around --point."""
+
+    demo: bool = False
+    """The bundled extract of central Helsinki; needs no network."""
+
+    source: tuple[str, ...] = ()
+    """NAME=FILE of another source, whose features replace those of the map: overture=FILE, buildings of
+    Overture Maps in GeoParquet. Alone, the scene has only these. May be given several times."""
+
+    cache: Path | None = None
+    """Directory for answers of map servers and elevation tiles; ~/.cache/geoscene by default."""
+
+    nominatim: str | None = None
+    """Address of another Nominatim server."""
+
+    overpass: str | None = None
+    """Address of another Overpass server, or several separated by commas, tried in turn."""
+
+    dem_server: str | None = None
+    """Address of other tiles for --dem tiles, with {z}, {x} and {y} in it: terrarium PNGs of 256 pixels."""
 
 
 @app.command
 def build(
     *,
-    osm: Annotated[Path | None, Parameter(group=_SOURCE)] = None,
-    place: Annotated[str | None, Parameter(group=_SOURCE)] = None,
-    bbox: Numbers = None,
-    point: Numbers = None,
-    radius: Annotated[float, Parameter(group=_SOURCE)] = 500.0,
-    demo: Annotated[bool, Parameter(group=_SOURCE, negative=())] = False,
-    source: Annotated[list[str] | None, Parameter(group=_SOURCE, negative=())] = None,
-    cache: Annotated[Path | None, Parameter(group=_SOURCE)] = None,
-    nominatim: Annotated[str | None, Parameter(group=_SOURCE)] = None,
-    overpass: Annotated[str | None, Parameter(group=_SOURCE)] = None,
-    dem_server: str | None = None,
-    crs: str = "local",
-    lod: Annotated[int, Parameter(converter=whole)] = 2,
-    dem: Annotated[list[Path] | None, Parameter(consume_multiple=True, negative=())] = None,
-    dem_gaps: str = "error",
-    driving_side: str = "",
-    only: str = "",
-    along: Annotated[list[str] | None, Parameter(consume_multiple=True, negative=())] = None,
-    reach: float = 120.0,
-    tile_size: float = 250.0,
-    name: str = "",
-    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
-    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    source: Annotated[MapSource, Parameter(group=_SOURCE)] = MapSource(),
+    options: BuildOptions = BuildOptions(),
+    out: Out,
     workers: Annotated[int | None, Parameter(group=_OUTPUT, converter=whole)] = None,
-    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+    report: Reporting = Report(),
 ) -> int:
     """Build a scene: solids of all buildings, one ground surface, the drivable road graph.
 
@@ -86,191 +106,98 @@ def build(
 
     geoscene build --osm city.osm.pbf -o scene --crs utm
 
+    geoscene build --osm city.osm.pbf --source overture=buildings.parquet -o scene
+
     geoscene build --place "Norfolk, VA" -o norfolk
 
     geoscene build --point 36.8853,-76.3059 --radius 800 -o odu
 
-    geoscene build --osm city.osm.pbf --source overture=buildings.parquet -o scene
-
     Parameters
     ----------
-    osm
-        OpenStreetMap file: .osm, .osm.gz, .osm.bz2 or .osm.pbf. With --bbox, the part of it inside.
-    place
-        Name of a place, asked of Nominatim and fetched from Overpass (needs a network; answers are cached).
-    bbox
-        W,S,E,N in degrees, fetched from Overpass, or cut out of --osm, --demo or --source.
-    point
-        LAT,LON in degrees, with --radius, fetched from Overpass.
-    radius
-        Metres around --point.
-    demo
-        The bundled extract of central Helsinki; needs no network.
-    source
-        NAME=FILE of another source, whose features replace those of the map: overture=FILE, buildings of
-        Overture Maps in GeoParquet. Alone, the scene has only these. May be given several times.
-    cache
-        Directory for answers of map servers and elevation tiles; ~/.cache/geoscene by default.
-    nominatim
-        Address of another Nominatim server.
-    overpass
-        Address of another Overpass server, or several with commas, tried in turn.
-    crs
-        Frame of the scene: local (a transverse Mercator on its centre in which a metre is a metre), utm, or
-        an EPSG code such as EPSG:32618.
-    lod
-        Level of detail of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs.
-    dem
-        Elevation files: GeoTIFF, .hgt or .hgt.zip, one or more, in any CRS; or the word tiles: public
-        elevation tiles of 5 to 10 m (needs a network; tiles are cached). Level ground without.
-    dem_server
-        Address of other tiles for --dem tiles, with {z}, {x} and {y} in it: terrarium PNGs of 256 pixels.
-    dem_gaps
-        Where they do not cover the scene: error, or nearest (take the nearest height and say so).
-    driving_side
-        Side of the road that traffic keeps to: left or right. That of the map's tags or of the country
-        without.
-    only
-        What is built besides the ground, with commas: buildings, roads, landcover, trees, furniture,
-        barriers.
-    along
-        Build only the tiles that can be seen from a route: LAT,LON LAT,LON ... or a GPX, GeoJSON or CSV file
-        (such as the poses.csv of a dataset).
-    reach
-        How far can be seen from --along, metres: the reach of the sensors.
-    tile_size
-        Side of a tile in metres.
-    name
-        Name of the scene, for people.
     out
         Directory to write the scene to.
-    overwrite
-        Replace a scene that is there. What its tiles have in common with it is not computed again.
     workers
         Processes; as many as there are cores by default. The bytes do not depend on it.
-    json
-        Print the build report as JSON.
-    quiet
-        No progress bars.
     """
-    from geoscene.build import BuildOptions  # noqa: PLC0415  (half a second, not needed for --help)
-    from geoscene.build import build as build_scene  # noqa: PLC0415
-    from geoscene.plan import KINDS  # noqa: PLC0415
+    from geoscene.build import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
 
     began = time.perf_counter()
-    kept = cache or Path.home() / ".cache" / "geoscene"
-    fetched = [str(path) for path in dem or ()] == ["tiles"]
-    if dem_server and not fetched:
-        raise InputError("--dem-server goes with --dem tiles")
-    options = BuildOptions(
-        crs=crs,
-        lod=lod,
-        dem=() if fetched else tuple(map(str, dem or ())),
-        dem_gaps=dem_gaps,
-        driving_side=driving_side,
-        only=tuple(k for k in only.split(",") if k) or KINDS,
-        along=tuple(along or ()),
-        reach=reach,
-        tile_size=tile_size,
-        name=name,
-    )
-    with progress_bar(quiet=quiet) as progress:
+    if workers is not None and not 1 <= workers <= 256:
+        raise InputError(f"`workers` {workers}: give 1 to 256")
+    if source.dem_server and options.dem != ("tiles",):
+        raise InputError("`dem_server` goes with --dem tiles")
+    with progress_bar(quiet=report.quiet) as progress:
         progress("reading the map", 0, total=0)
-        asked = {"cache_dir": kept} | _servers(nominatim, overpass)
-        data = _read(
-            osm, place, bbox=bbox, point=point, radius=radius, asked=asked, demo=demo, files=source or ()
-        )
-        if fetched:
+        data = _read_map(source)
+        if options.dem == ("tiles",):
             options = replace(
-                options, dem=(_elevation(data, kept, crs=crs, template=dem_server, progress=progress),)
+                options, dem=(_fetch_elevation(source, data, crs=options.crs, progress=progress),)
             )
         scene = build_scene(
-            data, out, options=options, overwrite=overwrite, workers=_workers(workers), progress=progress
+            data,
+            out,
+            options=options,
+            overwrite=report.overwrite,
+            workers=workers or os.cpu_count() or 1,
+            progress=progress,
         )
-    report = scene.manifest | {"path": str(out), "seconds": round(time.perf_counter() - began, 2)}
-    if json:
-        print_json(report)
+    document = scene.manifest | {"path": str(out), "seconds": round(time.perf_counter() - began, 2)}
+    if report.json:
+        print_json(document)
     else:
-        _print_scene(report)
+        _print_scene(document)
         drive = f"lidar drive {out} --route random -o drive"
-        following = drive if report["counts"]["road_edges"] else f"geoscene export {out} -o scene.glb"
-        print(f"\n{report['seconds']:.1f} s; next: {following}")
+        following = drive if document["counts"]["road_edges"] else f"geoscene export {out} -o scene.glb"
+        print(f"\n{document['seconds']:.1f} s; next: {following}")
     return 0
 
 
-def _servers(nominatim: str | None, overpass: str | None) -> dict[str, Any]:
-    """The servers option for `geoscene.sources`, where other addresses are given."""
-    given: dict[str, Any] = {}
-    if nominatim:
-        given["nominatim"] = nominatim
-    if overpass:
-        given["overpass"] = tuple(overpass.split(","))
-    if not given:
-        return {}
-    from geoscene.sources import Servers  # noqa: PLC0415
-
-    return {"servers": Servers(**given)}
+def _cache_of(source: MapSource) -> Path:
+    return source.cache or Path.home() / ".cache" / "geoscene"
 
 
-def _elevation(data: Any, cache: Path, *, crs: str, template: str | None, progress: Progress) -> str:
-    """The elevation file made of tiles for a map."""
+def _fetch_elevation(source: MapSource, data: Any, *, crs: str, progress: Progress) -> str:
+    """The elevation file made of public tiles for a map."""
     from geoscene.sources import TileServer, fetch_elevation  # noqa: PLC0415
 
-    server = TileServer(template, credit=f"elevation tiles: {template}") if template else None
-    return str(fetch_elevation(data, cache_dir=cache, crs=crs, server=server, progress=progress))
+    url = source.dem_server
+    server = TileServer(url, credit=f"elevation tiles: {url}") if url else None
+    return str(fetch_elevation(data, cache_dir=_cache_of(source), crs=crs, server=server, progress=progress))
 
 
-def _workers(given: int | None) -> int:
-    if given is not None and not 1 <= given <= 256:
-        raise InputError(f"--workers {given}: give 1 to 256")
-    return given or os.cpu_count() or 1
-
-
-def _read(
-    osm: Path | None,
-    place: str | None,
-    *,
-    bbox: str | None,
-    point: str | None,
-    radius: float,
-    asked: dict[str, Any],
-    demo: bool,
-    files: Sequence[str],
-) -> Any:
+def _read_map(source: MapSource) -> Any:
     """The map that the options name, with the features of other sources merged in."""
     from geoscene import sources  # noqa: PLC0415
 
-    given = [n for n, v in (("--osm", osm), ("--place", place), ("--point", point), ("--demo", demo)) if v]
-    if bbox and not (osm or demo or files):
-        given.append("--bbox")
-    if len(given) > 1 or not (given or files):
+    bundled = source.osm or source.demo
+    given = [f"`{name}`" for name in ("osm", "place", "point", "demo") if getattr(source, name)]
+    if source.bbox and not (bundled or source.source):
+        given.append("`bbox`")
+    if len(given) > 1 or not (given or source.source):
         what = f"not {' and '.join(given)} together" if given else "none was given"
         raise InputError(
-            f"give one of --osm FILE, --place NAME, --bbox, --point, --demo or --source NAME=FILE; {what}"
+            "give one of `osm` FILE, `place` NAME, `bbox`, `point`, `demo` or `source` NAME=FILE; " + what
         )
-    box = None
-    if bbox:
-        west, south, east, north = _numbers(bbox, "--bbox", names="W,S,E,N")
-        if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
-            raise InputError(f"--bbox {bbox.strip()}: W,S,E,N must rise from west to east and south to north")
-        box = (west, south, east, north)
+    servers = sources.Servers()
+    if source.nominatim:
+        servers = replace(servers, nominatim=source.nominatim)
+    if source.overpass:
+        servers = replace(servers, overpass=tuple(source.overpass.split(",")))
+    fetched: dict[str, Any] = {"cache_dir": _cache_of(source), "servers": servers}
     data = None
-    if osm or demo:
-        data = sources.read_source("osm", osm or sources.demo_path(), bounds=box)
-    elif place:
-        data = sources.fetch_place(place, **asked)
-    elif point:
-        lat, lon = _numbers(point, "--point", names="LAT,LON")
-        if not (abs(lat) <= 90 and abs(lon) <= 180):
-            raise InputError(f"--point {point.strip()}: not a latitude and longitude in degrees")
-        data = sources.fetch_point(lat, lon, radius=radius, **asked)
-    elif given and box:
-        data = sources.fetch_bbox(box, **asked)
-    for text in files:
+    if bundled:
+        data = sources.read_source("osm", source.osm or sources.demo_path(), bounds=source.bbox)
+    elif source.place:
+        data = sources.fetch_place(source.place, **fetched)
+    elif source.point:
+        data = sources.fetch_point(*source.point, radius=source.radius, **fetched)
+    elif given and source.bbox:
+        data = sources.fetch_bbox(source.bbox, **fetched)
+    for text in source.source:
         name, equals, path = text.partition("=")
         if not (equals and path):
-            raise InputError(f"--source {text}: give NAME=FILE")
-        found = sources.read_source(name, path, bounds=data.bounds if data else box)
+            raise InputError(f"`source` {text}: give NAME=FILE")
+        found = sources.read_source(name, path, bounds=data.bounds if data else source.bbox)
         data = sources.merged(data, found) if data else found
     return data
 
@@ -280,9 +207,9 @@ def info(
     scene: Annotated[Path, Parameter(validator=validators.Path(exists=False))],
     /,
     *,
-    json: Annotated[bool, Parameter(negative=())] = False,
+    json: bool = False,
 ) -> int:
-    """Say what a scene holds: frame, extent, counts, where heights come from, repairs and drops.
+    """Describe a scene: frame, extent, counts, sources of heights, repairs and drops.
 
     Parameters
     ----------
@@ -303,7 +230,7 @@ def info(
 
 
 @app.command
-def validate(scene: Path, /, *, json: Annotated[bool, Parameter(negative=())] = False) -> int:
+def validate(scene: Path, /, *, json: bool = False) -> int:
     """Check every solid of a scene: closed, oriented, of positive volume. Exit code 1 if one is not.
 
     Parameters
@@ -332,16 +259,9 @@ def export(
     scene: Path,
     /,
     *,
-    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
-    kind: Annotated[str | None, Parameter(name="--to")] = None,
-    crs: str | None = None,
-    layers: str | None = None,
-    model: str | None = None,
-    resolution: float | None = None,
-    height_offset: float | None = None,
-    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+    out: Out,
+    options: ExportOptions = ExportOptions(),
+    report: Reporting = Report(),
 ) -> int:
     """Write a scene in another format.
 
@@ -363,51 +283,20 @@ def export(
         Directory of the scene.
     out
         File to write; for 3D Tiles a directory.
-    kind
-        cityjson, glb, 3dtiles, obj, ply, stl, gpkg, geojson, geoparquet, geotiff, opendrive or sumo; by the
-        name of the file where that says it.
-    crs
-        CRS of the export, where the format carries one: an EPSG code; the scene's own by default, or its UTM
-        zone.
-    layers
-        Layers of GIS formats, with commas; all by default.
-    model
-        Of a GeoTIFF: surface, terrain or classes.
-    resolution
-        Of a GeoTIFF: metres a cell.
-    height_offset
-        Metres added to heights, such as the geoid's height for formats that want ellipsoidal ones.
-    overwrite
-        Replace what is there.
-    json
-        Print the summary as JSON.
-    quiet
-        No progress bars.
     """
     from geoscene.export import export_scene  # noqa: PLC0415
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
 
-    with progress_bar(quiet=quiet) as progress:
+    with progress_bar(quiet=report.quiet) as progress:
         summary = export_scene(
-            open_scene(scene),
-            out,
-            kind=kind,
-            crs=crs,
-            layers=tuple(layers.split(",")) if layers else None,
-            model=model,
-            resolution=resolution,
-            height_offset=height_offset,
-            overwrite=overwrite,
-            progress=progress,
+            open_scene(scene), out, options=options, overwrite=report.overwrite, progress=progress
         )
-    if json:
-        print_json({**asdict(summary), "path": str(summary.path)})
-    else:
-        size = f"{summary.bytes / 1e6:.1f} MB"
-        what = "cells" if summary.kind == "geotiff" else "objects"
-        print(f"{summary.path}: {summary.kind}, {summary.objects} {what}, {size}, {summary.crs}")
-        for note in summary.notes:
-            print(f"  {with_flags(app, note)}")
+    _print_file(
+        summary,
+        f"{summary.kind}, {summary.objects} {'cells' if summary.kind == 'geotiff' else 'objects'}",
+        end=f", {summary.crs}",
+        json=report.json,
+    )
     return 0
 
 
@@ -416,15 +305,11 @@ def view(
     scene: Path,
     /,
     *,
-    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
-    bounds_deg: Annotated[str | None, Parameter(name="--bbox")] = None,
-    layers: str = "",
-    max_mb: Annotated[float | None, Parameter(name="--max-size")] = None,
-    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+    out: Out,
+    options: ViewOptions = ViewOptions(),
+    report: Reporting = Report(),
 ) -> int:
-    """Write a scene as one web page: turn it, click an object, read what is known of it and what is guessed.
+    """Write a scene as one web page: turn it, click an object, read its attributes and their sources.
 
     For example:
 
@@ -438,43 +323,26 @@ def view(
         Directory of the scene.
     out
         File to write.
-    bounds_deg
-        W,S,E,N in degrees: only the tiles that meet it.
-    layers
-        Only these, with commas, such as ground,buildings,trees; all by default.
-    max_mb
-        Megabytes that the page may have, 40 by default. A larger one is refused, with the bounds of a part
-        that fits.
-    overwrite
-        Replace what is there.
-    json
-        Print the summary as JSON.
-    quiet
-        No progress bars.
     """
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
-    from geoscene.view import MAX_MB, view_scene  # noqa: PLC0415
+    from geoscene.view import view_scene  # noqa: PLC0415
 
-    west, south, east, north = _numbers(bounds_deg, "--bbox", names="W,S,E,N") if bounds_deg else (0.0,) * 4
-    with progress_bar(quiet=quiet) as progress:
+    with progress_bar(quiet=report.quiet) as progress:
         summary = view_scene(
-            open_scene(scene),
-            out,
-            bounds_deg=(west, south, east, north) if bounds_deg else None,
-            layers=tuple(name for name in layers.split(",") if name),
-            max_mb=MAX_MB if max_mb is None else max_mb,
-            overwrite=overwrite,
-            progress=progress,
+            open_scene(scene), out, options=options, overwrite=report.overwrite, progress=progress
         )
+    _print_file(summary, f"{summary.faces} faces, {summary.objects} objects", json=report.json)
+    return 0
+
+
+def _print_file(summary: Any, contents: str, *, end: str = "", json: bool) -> None:
+    """Print what was written, for programs or for people."""
     if json:
         print_json({**asdict(summary), "path": str(summary.path)})
-    else:
-        print(
-            f"{summary.path}: {summary.faces} faces, {summary.objects} objects, {summary.bytes / 1e6:.1f} MB"
-        )
-        for note in summary.notes:
-            print(f"  {with_flags(app, note)}")
-    return 0
+        return
+    print(f"{summary.path}: {contents}, {summary.bytes / 1e6:.1f} MB{end}")
+    for note in summary.notes:
+        print(f"  {with_flags(app, note)}")
 
 
 def _extent(manifest: dict[str, Any]) -> dict[str, Any]:

@@ -10,9 +10,10 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
-from cyclopts import App, CycloptsError, Token
+from cyclopts import App, CycloptsError, Parameter, Token
 
 from geoscene.progress import Progress, silent
 
@@ -33,6 +34,66 @@ _NUMBERS = re.compile(r"-\d+(\.\d*)?(,-?\d+(\.\d*)?)+")
 def _guard_numbers(words: Sequence[str]) -> list[str]:
     """Put a blank before ``-30.1,-51.2``, which would be taken for an option; number parsers ignore it."""
     return [f" {word}" if _NUMBERS.fullmatch(word) else word for word in words]
+
+
+SEVERAL = Parameter(consume_multiple=True)
+"""Of an option that takes all words up to the next option."""
+
+
+def shown_default(value: object) -> str | None:
+    """A default as help shows it; None for an empty one."""
+    if isinstance(value, tuple):
+        value = ",".join(map(str, value))
+    return None if value in (None, False, "") else str(value)
+
+
+DEFAULTS = Parameter(negative=(), show_default=shown_default)
+"""Of every option of both programs."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class Report:
+    """How a command writes and what it prints."""
+
+    overwrite: bool = False
+    """Replace what exists under the output's name."""
+
+    json: bool = False
+    """Print the summary as JSON."""
+
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"])] = False
+    """Show no progress bars."""
+
+
+def _words(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
+    return tuple(word for word in tokens[0].value.lower().split(",") if word)
+
+
+WORDS = Parameter(converter=_words, n_tokens=1, metavar="STR,...")
+"""Of an option that takes words separated by commas, as a tuple in lower case."""
+
+
+def degrees(names: str) -> Parameter:
+    """Of an option that takes numbers in degrees separated by commas: W,S,E,N or LAT,LON."""
+
+    def convert(_: object, tokens: Sequence[Token]) -> tuple[float, ...]:
+        count = names.count(",") + 1
+        try:
+            values = tuple(float(v) for v in tokens[0].value.split(","))
+        except ValueError:
+            values = ()
+        if len(values) != count:
+            raise ValueError(f"give {count} numbers in degrees as {names}")
+        if names == "W,S,E,N":
+            west, south, east, north = values
+            if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
+                raise ValueError("W,S,E,N must rise from west to east and south to north")
+        elif not (abs(values[0]) <= 90 and abs(values[1]) <= 180):
+            raise ValueError("not a latitude and longitude in degrees")
+        return values
+
+    return Parameter(converter=convert, n_tokens=1, metavar=names)
 
 
 def whole(_: object, tokens: Sequence[Token]) -> int:
@@ -88,8 +149,10 @@ def with_flags(app: App, text: str) -> str:
 
     A parameter that the command does not have keeps its plain name.
     """
-    command = app[sys.argv[1]] if len(sys.argv) > 1 and sys.argv[1] in app else app
-    flags = {argument.field_info.name: argument.name for argument in command.assemble_argument_collection()}
+    flags = {}
+    if command := _command(app).strip():
+        arguments = app[command].assemble_argument_collection()
+        flags = {argument.field_info.name: argument.name for argument in arguments}
     return re.sub(r"`(\w+)`", lambda found: flags.get(found[1], found[1]), text)
 
 

@@ -1,10 +1,10 @@
-"""All that a scene's tiles are made from: features of the whole place, numbered, not yet cut."""
+"""The plan of a scene: numbered features of the whole place, not yet cut into tiles."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, cast
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 import shapely
@@ -37,6 +37,7 @@ from geoscene.ground.urban import paved_fabric
 from geoscene.objects.barriers import Barriers, read_barriers
 from geoscene.objects.furniture import Furniture, read_furniture
 from geoscene.objects.vegetation import Trees, clear_of, needle_shares, read_trees
+from geoscene.options import BuildOptions
 from geoscene.progress import Progress
 from geoscene.report import Problem
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
@@ -59,9 +60,7 @@ from geoscene.typing import Float
 
 Bounds = tuple[float, float, float, float]
 Height = Callable[[Float, Float], Float]
-
-KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
-"""What a scene may hold besides its ground; `make_plan` takes all or some."""
+T = TypeVar("T")
 
 LARGEST_KM2 = 4000.0
 """Square kilometres of the largest scene: 64,000 tiles of 250 m."""
@@ -73,7 +72,7 @@ _STANDING = 1.0  # metres: a building whose underside is higher leaves the groun
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What tiles are made from.
+    """Input of the tiles.
 
     frame     : of the scene
     terrain   : the elevation model, or level ground
@@ -81,16 +80,16 @@ class Plan:
     buildings : their table
     base      : (count,) z of each building's base
     rows      : by kind (``buildings``, ``trees``, ``furniture``, ``barriers``, ``structures``) the rows that
-                belong to each tile: those with the middle of their box in it; ``parts`` go with
-                their buildings
+                belong to each tile: those with the middle of their bounding box in it; ``parts`` belong to
+                the tiles of their buildings
     graph     : roads, with heights
-    side      : of the road that traffic keeps to, and what says so (``tag``, ``place`` or ``option``)
-    ground    : what lies on the ground
-    levels    : how high its water stands
-    trees     : mapped ones
+    side      : of the road that traffic drives on, and its source (``tag``, ``place`` or ``option``)
+    ground    : layers of the ground
+    levels    : heights of its water surfaces
+    trees     : mapped trees
     needles   : share of needle-leaved trees by row of the ground's layers
     structures : bridges and tunnels
-    openings  : where the ground is left out over each of them, None for most
+    openings  : polygon of each without ground, None for most
     layers    : the feature tables, in the order of their numbers
     """
 
@@ -123,26 +122,95 @@ class Plan:
         return sorted(ground.union(*self.rows.values()))
 
     def of_tile(self, kind: str, i: int, *, j: int) -> NDArray[np.int64]:
-        """Rows of a kind that belong to tile (i, j), rising."""
+        """Rows of a kind that belong to tile (i, j), in ascending order."""
         return self.rows[kind].get((i, j), np.empty(0, np.int64))
 
 
-def make_plan(
-    osm: OsmData,
-    crs: str,
-    *,
-    dem: tuple[str, ...],
-    dem_gaps: Literal["error", "nearest"],
-    tile_size: float,
-    only: Collection[str],
-    driving_side: str,
-    progress: Progress,
-) -> tuple[Plan, list[Problem]]:
-    """Read all features of a map, and what was repaired or dropped on the way.
+def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tuple[Plan, list[Problem]]:
+    """Plan a scene of a map; also returns what was repaired or dropped on the way.
 
-    Arguments as in `geoscene.build.BuildOptions`. Raises FrameError and InputError for a CRS or elevation
-    files that cannot serve.
+    Raises FrameError and InputError if the CRS or the elevation files cannot be used.
     """
+    problems: list[Problem] = list(osm.problems)
+    frame = Frame.at(*_checked_centre(osm), crs=options.crs)
+
+    progress("buildings", 0, total=0)
+    buildings = _noted(
+        problems, read_buildings(osm if "buildings" in options.only else _without_areas(osm), frame)
+    )
+    extent = _extent(frame, osm.bounds, buildings=buildings)
+    terrain = flat_terrain(frame)
+    if options.dem:
+        terrain = open_terrain(options.dem, frame, bounds=extent, outside=_gaps(options))
+    frame = replace(frame, vertical=terrain.vertical)
+
+    progress("roads", 0, total=0)
+    roads = _plan_roads(osm, frame, options=options, terrain=terrain, extent=extent, problems=problems)
+    footprints = buildings.footprint[: buildings.count]
+    base = base_heights(footprints, roads.height or terrain.height)
+    buildings = _noted(problems, buildings_over(buildings, base, table=roads.structures))
+
+    progress("ground", 0, total=0)
+    cover, surfaces, pads = _noted(
+        problems, _surfaces(osm, frame, extent=extent, buildings=buildings, roads=roads, only=options.only)
+    )
+    cover, surfaces = _numbered([cover, surfaces], len(buildings))
+    ground = _plan_ground([cover, surfaces, pads], roads, extent=extent, terrain=terrain, options=options)
+    objects = _noted(problems, _objects(osm, frame, ground=ground, only=options.only, side=roads.side))
+    first = len(buildings) + len(cover) + len(surfaces) + len(roads.graph)
+    trees, furniture, barriers, structures = _numbered([*objects, roads.structures], first)
+
+    layers = [
+        *building_layers(buildings, base),
+        ground_layer("landcover", cover),
+        ground_layer("road_surfaces", surfaces),
+        road_layer(roads.graph),
+        tree_layer(trees, _foot(trees.xy, roads.height)),
+        furniture_layer(furniture, _foot(furniture.xy, roads.height)),
+        barrier_layer(barriers),
+        structure_layer(structures),
+    ]
+    shapes = {
+        "buildings": footprints,
+        "parts": footprints[buildings.outline[buildings.count :]],
+        "trees": shapely.points(trees.xy),
+        "furniture": shapely.points(furniture.xy),
+        "barriers": barriers.polygon,
+        "structures": structures.polygon,
+    }
+    rows = {kind: _by_tile(column, options.tile_size) for kind, column in shapes.items()}
+    rows["parts"] = {tile: buildings.count + parts for tile, parts in rows["parts"].items()}
+    plan = Plan(
+        frame=frame,
+        terrain=terrain,
+        height=roads.height,
+        buildings=buildings,
+        base=base,
+        rows=rows,
+        graph=roads.graph,
+        side=(roads.side, roads.side_source),
+        ground=ground,
+        levels=water_levels(ground.layers, osm.ways, frame=frame, height=terrain.height),
+        trees=trees,
+        needles=needle_shares(ground, osm),
+        furniture=furniture,
+        barriers=barriers,
+        structures=structures,
+        openings=roads.openings,
+        layers=layers,
+    )
+    return plan, problems
+
+
+def _noted(problems: list[Problem], result: tuple[T, list[Problem]]) -> T:
+    """The first of a result; its problems are added to the list."""
+    value, found = result
+    problems += found
+    return value
+
+
+def _checked_centre(osm: OsmData) -> tuple[float, float]:
+    """Longitude and latitude of the middle of a map; raises InputError if it is too large for one scene."""
     west, south, east, north = osm.bounds
     area = (east - west) * (north - south) * 111.2**2 * np.cos(np.radians((south + north) / 2))
     if area > LARGEST_KM2:
@@ -150,104 +218,77 @@ def make_plan(
             f"{osm.source}: {area:,.0f} km2, more than the {LARGEST_KM2:,.0f} of one scene;"
             " cut a part out (`bbox`)"
         )
-    frame = Frame.at((west + east) / 2, (south + north) / 2, crs=crs)
-    problems: list[Problem] = list(osm.problems)
+    return (west + east) / 2, (south + north) / 2
 
-    progress("buildings", 0, total=0)
-    buildings, found = read_buildings(osm if "buildings" in only else _without_areas(osm), frame)
-    problems += found
-    extent = _extent(frame, osm.bounds, buildings=buildings)
-    terrain = open_terrain(dem, frame, bounds=extent, outside=dem_gaps) if dem else flat_terrain(frame)
-    frame = replace(frame, vertical=terrain.vertical)
 
-    progress("roads", 0, total=0)
-    graph, found = build_road_graph(osm if "roads" in only else _without_ways(osm), frame)
-    problems += found
+def _gaps(options: BuildOptions) -> Literal["error", "nearest"]:
+    return cast("Literal['error', 'nearest']", options.dem_gaps)
+
+
+@dataclass(frozen=True, slots=True)
+class _Roads:
+    """Roads of a scene and the ground that is graded to them, see `Plan` for the columns.
+
+    uneven : whether the ground or a road has heights
+    """
+
+    graph: RoadGraph
+    surfaces: RoadSurfaces
+    structures: Structures
+    openings: NDArray[np.object_]
+    side: Side
+    side_source: str
+    height: Height | None
+    uneven: bool
+
+
+def _plan_roads(
+    osm: OsmData,
+    frame: Frame,
+    *,
+    options: BuildOptions,
+    terrain: Terrain,
+    extent: Bounds,
+    problems: list[Problem],
+) -> _Roads:
+    """Graph, profiles, surfaces, bridges and tunnels."""
+    drawn = "roads" in options.only
+    graph = _noted(problems, build_road_graph(osm if drawn else _without_ways(osm), frame))
     graph = profile(graph, terrain.height, obstacles=find_obstacles(osm, frame))
     uneven = bool(terrain.grids) or any(line[:, 2].any() for line in graph.geometry)
     height = graded_ground(graph, terrain.height) if uneven else None
-    side, side_source = (cast("Side", driving_side), "option") if driving_side else found_side(osm)
-    surfaces, found = road_surfaces(
-        osm if "roads" in only else _nothing(osm),
-        graph,
-        frame=frame,
-        options=SurfaceOptions(left_hand=side == "left"),
+    side, source = found_side(osm)
+    if options.driving_side:
+        side, source = cast("Side", options.driving_side), "option"
+    surfaces = _noted(
+        problems,
+        road_surfaces(
+            osm if drawn else _nothing(osm),
+            graph,
+            frame=frame,
+            options=SurfaceOptions(left_hand=side == "left"),
+        ),
     )
-    problems += found
-    structures, found = read_structures(surfaces, graph, osm=osm, frame=frame, height=height)
-    problems += found
+    structures = _noted(problems, read_structures(surfaces, graph, osm=osm, frame=frame, height=height))
     structures = within_extent(structures, extent)
     height = ground_below(structures, height or terrain.height) if len(structures) else height
-    openings = find_openings(structures, height)
-    footprints = buildings.footprint[: buildings.count]
-    base = base_heights(footprints, height or terrain.height)
-    buildings, found = buildings_over(buildings, base, table=structures)
-    problems += found
-
-    progress("ground", 0, total=0)
-    cover, roads, pads, found = _surfaces(
-        osm, frame, extent=extent, buildings=buildings, surfaces=surfaces, only=only
+    return _Roads(
+        graph, surfaces, structures, find_openings(structures, height), side, source, height, uneven
     )
-    problems += found
-    n = len(buildings)
-    cover, roads = _numbered(cover, n), _numbered(roads, n + len(cover))
-    layers = concatenate_layers([cover, roads, pads, opening_layers(structures, openings)])
-    ground = plan_ground(
+
+
+def _plan_ground(
+    layers: list[Layers], roads: _Roads, *, extent: Bounds, terrain: Terrain, options: BuildOptions
+) -> GroundPlan:
+    size = options.tile_size
+    return plan_ground(
         extent,
-        layers,
-        tile_size=tile_size,
-        lines=_ROAD_LINES if uneven else 0.0,
-        ruled=_graded_tiles(graph, tile_size, level=not terrain.grids),
+        concatenate_layers([*layers, opening_layers(roads.structures, roads.openings)]),
+        tile_size=size,
+        lines=_ROAD_LINES if roads.uneven else 0.0,
+        ruled=_graded_tiles(roads.graph, size, level=not terrain.grids),
         coarse=terrain.lines,
     )
-    levels = water_levels(ground.layers, osm.ways, frame=frame, height=terrain.height)
-
-    trees, furniture, barriers, found = _standing(osm, frame, ground=ground, only=only, side=side)
-    problems += found
-    first = n + len(cover) + len(roads) + len(graph)
-    trees = _numbered(trees, first)
-    furniture = _numbered(furniture, first + len(trees))
-    barriers = _numbered(barriers, first + len(trees) + len(furniture))
-    structures = _numbered(structures, first + len(trees) + len(furniture) + len(barriers))
-    tables = [
-        *building_layers(buildings, base),
-        ground_layer("landcover", cover),
-        ground_layer("road_surfaces", roads),
-        road_layer(graph),
-        tree_layer(trees, _foot(trees.xy, height)),
-        furniture_layer(furniture, _foot(furniture.xy, height)),
-        barrier_layer(barriers),
-        structure_layer(structures),
-    ]
-    plan = Plan(
-        frame=frame,
-        terrain=terrain,
-        height=height,
-        buildings=buildings,
-        base=base,
-        rows={
-            "buildings": _by_tile(footprints, tile_size),
-            "parts": _by_tile(
-                footprints[buildings.outline[buildings.count :]], tile_size, first=buildings.count
-            ),
-            "trees": _by_tile(shapely.points(trees.xy), tile_size),
-            "furniture": _by_tile(shapely.points(furniture.xy), tile_size),
-            "barriers": _by_tile(barriers.polygon, tile_size),
-            "structures": _by_tile(structures.polygon, tile_size),
-        },
-        graph=graph,
-        side=(side, side_source),
-        ground=ground,
-        levels=levels,
-        trees=trees,
-        needles=needle_shares(ground, osm),
-        furniture=furniture,
-        barriers=barriers,
-        structures=structures,
-        openings=openings,
-        layers=tables,
-    )
-    return plan, problems
 
 
 def _without_areas(osm: OsmData) -> OsmData:
@@ -282,10 +323,11 @@ def _surfaces(
     *,
     extent: Bounds,
     buildings: Buildings,
-    surfaces: RoadSurfaces,
+    roads: _Roads,
     only: Collection[str],
-) -> tuple[Layers, Layers, Layers, list[Problem]]:
+) -> tuple[tuple[Layers, Layers, Layers], list[Problem]]:
     """Land cover, road surfaces and building pads."""
+    surfaces = roads.surfaces
     problems: list[Problem] = []
     count = buildings.count
     footprints = buildings.footprint[:count]
@@ -294,7 +336,7 @@ def _surfaces(
         cover, found = landcover(osm, frame, extent=extent)
         parts.append(cover)
         problems += found
-    roads = Layers.of(
+    paved = Layers.of(
         surfaces.polygon,
         klass=surfaces.klass,
         material=surfaces.material,
@@ -307,23 +349,32 @@ def _surfaces(
     pads = building_pads(
         standing, osm_id=buildings.osm_id[:count].astype(str), feature=np.arange(count, dtype=np.int32)
     )
-    return concatenate_layers(parts), roads, pads, problems
+    return (concatenate_layers(parts), paved, pads), problems
 
 
-def _standing(
+def _objects(
     osm: OsmData, frame: Frame, *, ground: GroundPlan, only: Collection[str], side: Side
-) -> tuple[Trees, Furniture, Barriers, list[Problem]]:
-    """Trees, furniture and barriers that can stand where they are."""
-    trees, problems = read_trees(osm, frame)
-    trees, found = clear_of(ground, trees)
-    furniture, more = read_furniture(osm, frame, plan=ground, left_hand=side == "left")
-    barriers, still_more = read_barriers(osm, frame, plan=ground)
-    tables: list[Any] = [trees, furniture, barriers]
-    kept = [table if kind in only else table.take(np.zeros(len(table), np.bool_))
-            for kind, table in zip(KINDS[3:], tables, strict=True)]  # fmt: skip
-    said = [problems + found, more, still_more]
-    listed = [p for kind, found in zip(KINDS[3:], said, strict=True) if kind in only for p in found]
-    return kept[0], kept[1], kept[2], listed
+) -> tuple[tuple[Trees, Furniture, Barriers], list[Problem]]:
+    """Trees, furniture and barriers at free places; empty tables for kinds not in ``only``."""
+    trees, in_trees = read_trees(osm, frame)
+    trees, moved = clear_of(ground, trees)
+    furniture, in_furniture = read_furniture(osm, frame, plan=ground, left_hand=side == "left")
+    barriers, in_barriers = read_barriers(osm, frame, plan=ground)
+    none = np.empty(0, np.int64)
+    problems: list[Problem] = []
+    if "trees" in only:
+        problems += [*in_trees, *moved]
+    else:
+        trees = trees.take(none)
+    if "furniture" in only:
+        problems += in_furniture
+    else:
+        furniture = furniture.take(none)
+    if "barriers" in only:
+        problems += in_barriers
+    else:
+        barriers = barriers.take(none)
+    return (trees, furniture, barriers), problems
 
 
 def _graded_tiles(graph: RoadGraph, tile_size: float, *, level: bool) -> set[tuple[int, int]]:
@@ -338,18 +389,21 @@ def _graded_tiles(graph: RoadGraph, tile_size: float, *, level: bool) -> set[tup
     return {(int(i), int(j)) for i, j in np.unique(tiles, axis=0)}
 
 
-def _numbered(table: Any, first: int) -> Any:
-    return replace(table, feature=np.arange(first, first + len(table), dtype=np.int32))
+def _numbered(tables: Sequence[Any], first: int) -> list[Any]:
+    """The tables with their rows numbered one after the other, from ``first``."""
+    starts = np.cumsum([first, *map(len, tables)])
+    return [
+        replace(table, feature=np.arange(a, b, dtype=np.int32))
+        for table, a, b in zip(tables, starts[:-1], starts[1:], strict=True)
+    ]
 
 
 def _foot(xy: Float, height: Height | None) -> Float:
     return np.zeros(len(xy)) if height is None else np.asarray(height(xy[:, 0], xy[:, 1]), float)
 
 
-def _by_tile(
-    shapes: NDArray[Any], tile_size: float, *, first: int = 0
-) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Rows, the first of them numbered ``first``, by the tile that holds the middle of their box."""
+def _by_tile(shapes: NDArray[Any], tile_size: float) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Rows by the tile that holds the middle of their bounding box."""
     boxes = shapely.bounds(shapes).reshape(-1, 4)
     home = np.floor((boxes[:, :2] + boxes[:, 2:]) / 2 / tile_size).astype(np.int64)
     if not len(home):
@@ -357,9 +411,7 @@ def _by_tile(
     keys, owner = np.unique(home, axis=0, return_inverse=True)
     order = np.argsort(owner.ravel(), kind="stable")
     cuts = np.searchsorted(owner.ravel()[order], np.arange(len(keys) + 1))
-    return {
-        (int(i), int(j)): first + order[a:b] for (i, j), a, b in zip(keys, cuts[:-1], cuts[1:], strict=True)
-    }
+    return {(int(i), int(j)): order[a:b] for (i, j), a, b in zip(keys, cuts[:-1], cuts[1:], strict=True)}
 
 
 def take_buildings(buildings: Buildings, rows: NDArray[np.int64], *, parts: NDArray[np.int64]) -> Buildings:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from geoscene.errors import InputError
 from geoscene.export.files import Summary
+from geoscene.options import ExportOptions
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 
@@ -74,46 +73,20 @@ def export_scene(
     scene: Scene,
     out: Path,
     *,
-    kind: str | None = None,
-    crs: str | None = None,
-    layers: Collection[str] | None = None,
-    model: str | None = None,
-    resolution: float | None = None,
-    height_offset: float | None = None,
+    options: ExportOptions = ExportOptions(),
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Summary:
-    """Write a scene in another format and say what was written.
+    """Write a scene to a file, or to a folder for 3D Tiles, and return a summary.
 
-    out    : file; for 3D Tiles a folder
-    kind   : one of `KINDS`; by default what the suffix of ``out`` means
-    crs    : CityJSON, GeoPackage, GeoParquet: of the coordinates, default the scene's (for CityJSON UTM where
-             the scene's has no EPSG code)
-    layers : names of the scene's layers to write, ``terrain`` for the bare ground, ``building_solids`` for
-             buildings as surfaces in tables; default all
-    model  : GeoTIFF: ``surface`` (the default), ``terrain`` or ``classes``
-    resolution : GeoTIFF: metres, default 0.5
-    height_offset : 3D Tiles: metres that lift the scene's heights to ellipsoidal ones, default 0
-    overwrite : replace what is there
-
-    Raises InputError for a kind or an option that cannot be, an option that the kind does not take, and a
-    name that is taken; MissingExtraError where an optional package is needed.
+    Raises InputError for an unknown kind, for an option that the kind does not take, and if ``out`` exists
+    and may not be overwritten; MissingExtraError where an optional package is needed.
     """
-    name = kind_of(out) if kind is None else kind
+    name = kind_of(out) if options.kind is None else options.kind
     if name not in KINDS:
         raise InputError(f"`kind` {name}: there are {', '.join(KINDS)}")
     told = KINDS[name]
-    given: dict[str, Any] = {
-        key: value
-        for key, value in (
-            ("crs", crs),
-            ("layers", layers),
-            ("model", model),
-            ("resolution", resolution),
-            ("height_offset", height_offset),
-        )
-        if value is not None
-    }
+    given = {key: value for key, value in asdict(options).items() if key != "kind" and value is not None}
     foreign = sorted(set(given) - told.options)
     if foreign:
         names = ", ".join(f"`{key}`" for key in foreign)

@@ -1,4 +1,3 @@
 """A scene as one web page that needs neither network nor server."""
 
-from geoscene.view.page import MAX_MB as MAX_MB
 from geoscene.view.page import view_scene as view_scene

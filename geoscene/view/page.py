@@ -20,38 +20,28 @@ from geoscene.errors import InputError
 from geoscene.export.files import Summary, size_of
 from geoscene.export.objects import attribution, read_features
 from geoscene.files import append, atomic_file, spool
+from geoscene.options import Degrees, ViewOptions
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.view.attributes import tables
 from geoscene.view.lonlat import ACCURACY, lonlat_grid
 from geoscene.view.tiles import Groups, groups_of, gzip, only, pack_shapes, pack_tile
 
-MAX_MB = 40.0
-"""Megabytes of a page by default: some four million faces, which a common graphics card turns smoothly."""
-
 SCRIPTS = ("data.js", "camera.js", "shaders.js", "draw.js", "panel.js", "main.js")
 """The viewer's parts, in the order in which they are joined."""
 
 _COPYRIGHT = "https://www.openstreetmap.org/copyright"
-
-Degrees = tuple[float, float, float, float]
 
 
 def view_scene(
     scene: Scene,
     out: Path,
     *,
-    bounds_deg: Degrees | None = None,
-    layers: Sequence[str] = (),
-    max_mb: float = MAX_MB,
+    options: ViewOptions = ViewOptions(),
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Summary:
     """Write a scene as one web page that a browser opens from disk, and say what is in it.
-
-    bounds_deg : (west, south, east, north); only tiles that meet it, each whole
-    layers     : only these groups of `Groups.names`, all if empty
-    max_mb     : megabytes that the page may have
 
     The page loads nothing: data, style and viewer (WebGL 2) are in it. Its bytes depend on the scene, the
     bounds and the layers alone.
@@ -59,7 +49,8 @@ def view_scene(
     Raises InputError for a name that is taken, bounds without a tile, a layer that is not there, and a page
     that would be too large, with the bounds of a part that is not.
     """
-    _check(out, max_mb, overwrite=overwrite)
+    _check(out, overwrite=overwrite)
+    bounds_deg, layers, max_mb = options.bounds_deg, options.layers, options.max_mb
     indices = _outwards(_tiles_within(scene, bounds_deg))
     groups = groups_of(scene)
     kept = _kept(groups, layers)
@@ -101,13 +92,11 @@ def view_scene(
     return Summary(out, "html", files, size, int(present.sum()), 0, faces, scene.frame.name, tuple(notes))
 
 
-def _check(out: Path, max_mb: float, *, overwrite: bool) -> None:
+def _check(out: Path, *, overwrite: bool) -> None:
     if out.is_dir():
         raise InputError(f"{out}: is a folder; name a file such as page.html")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: is there already; set `overwrite` to replace it")
-    if not max_mb > 0:
-        raise InputError(f"`max_mb` {max_mb:g}: must be more than 0")
 
 
 def _kept(groups: Groups, layers: Sequence[str]) -> NDArray[np.bool_]:

@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 import shapely
 
-from geoscene.build import BuildOptions, _tiles_along, build
+from geoscene.build import _tiles_along, build
 from geoscene.classes import Class
 from geoscene.ground import Layers, partition_tile, plan_ground
+from geoscene.options import BuildOptions
 from geoscene.plan import make_plan
 from geoscene.progress import silent
 from geoscene.sources import Way, read_osm
-from lidar.drive import DriveOptions, drive
+from lidar.drive import drive
+from lidar.options import DriveOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -147,15 +149,8 @@ def test_a_long_wall_is_seen_from_its_end(make_osm, town, tmp_path):
 def test_a_bridge_is_seen_from_its_end(town, tmp_path, monkeypatch):
     monkeypatch.setattr("geoscene.build._BESIDE", 0.0)
     monkeypatch.setattr("geoscene.build._CROWN", 0.0)
-    words = {
-        "dem": (),
-        "dem_gaps": "error",
-        "tile_size": 50.0,
-        "only": ("roads",),
-        "driving_side": "",
-        "progress": silent,
-    }
-    plan, _ = make_plan(read_osm(town), "local", **words)
+    options = BuildOptions(tile_size=50.0, only=("roads",))
+    plan, _ = make_plan(read_osm(town), options, progress=silent)
     found = 0
     for home, rows in plan.rows["structures"].items():
         square = shapely.box(*np.multiply(home, 50.0), *np.add(home, 1) * 50.0)

@@ -19,16 +19,18 @@ import pytest
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
-from geoscene.build import BuildOptions, build
+from geoscene.build import build
 from geoscene.classes import Class
 from geoscene.errors import GeosceneError
+from geoscene.options import BuildOptions
 from geoscene.scene import open_scene
 from geoscene.sources import demo_path, read_osm
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
-from lidar.drive import DriveOptions, drive
+from lidar.drive import drive
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.geometry.attitude import quat_from_euler
+from lidar.options import DriveOptions
 from lidar.planning.travel import plan_travel
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.ego_drive import drive_with_signals

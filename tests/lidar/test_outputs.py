@@ -19,8 +19,9 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geoscene.build import BuildOptions, build
+from geoscene.build import build
 from geoscene.classes import Class, class_codes
+from geoscene.options import BuildOptions
 from geoscene.sources import demo_path, read_osm
 from lidar.dataset.deskew import MOMENTS, deskewed
 from lidar.dataset.export.nuscenes import CATEGORIES, VERSION, export_nuscenes

@@ -18,6 +18,7 @@ from geoscene.classes import Class
 from geoscene.errors import InputError, MissingExtraError
 from geoscene.export import KINDS, export_scene, kind_of
 from geoscene.export.zbuffer import draw_triangles
+from geoscene.options import ExportOptions
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,9 @@ def scene(tmp_path_factory):
 
 
 def _raster(scene, tmp_path, **options):
-    with rasterio.open(export_scene(scene, tmp_path / "a.tif", **options).path) as raster:
+    with rasterio.open(
+        export_scene(scene, tmp_path / "a.tif", options=ExportOptions(**options)).path
+    ) as raster:
         x, y = np.meshgrid(np.arange(raster.width) + 0.5, np.arange(raster.height) + 0.5)
         told = raster.transform
         east, north = told.c + told.a * x, told.f + told.e * y
@@ -72,7 +75,7 @@ def test_the_class_map_names_what_is_seen_from_above(scene, tmp_path):
 @pytest.mark.parametrize("resolution", [0, -1, np.nan, np.inf, 1e-4])
 def test_a_resolution_that_cannot_be_is_refused(scene, tmp_path, resolution):
     with pytest.raises(InputError, match="`resolution`"):
-        export_scene(scene, tmp_path / "a.tif", resolution=resolution)
+        export_scene(scene, tmp_path / "a.tif", options=ExportOptions(resolution=resolution))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -115,7 +118,7 @@ def test_a_geopackage_has_every_layer_with_its_columns(scene, tmp_path):
     assert plan["name"][0] == "Rathaus «Süd»"
     assert np.isnan(plan["levels"][0])
     moved = geopandas.read_file(
-        export_scene(scene, tmp_path / "b.gpkg", crs="EPSG:25833").path, layer="roads"
+        export_scene(scene, tmp_path / "b.gpkg", options=ExportOptions(crs="EPSG:25833")).path, layer="roads"
     )
     assert moved.crs.to_epsg() == 25833
 
@@ -151,12 +154,12 @@ def test_a_geoparquet_table_holds_all_layers(scene, tmp_path):
 
 
 def test_one_layer_alone(scene, tmp_path):
-    summary = export_scene(scene, tmp_path / "a.geojson", layers=["trees"])
+    summary = export_scene(scene, tmp_path / "a.geojson", options=ExportOptions(layers=("trees",)))
     assert summary.objects == len(TREES)
     with pytest.raises(InputError, match=r"no layer tress; this scene has .*trees"):
-        export_scene(scene, tmp_path / "b.geojson", layers=["tress"])
+        export_scene(scene, tmp_path / "b.geojson", options=ExportOptions(layers=("tress",)))
     with pytest.raises(InputError, match=r"no layer tress; this scene has .*terrain"):
-        export_scene(scene, tmp_path / "b.glb", layers=["tress"])
+        export_scene(scene, tmp_path / "b.glb", options=ExportOptions(layers=("tress",)))
 
 
 @pytest.mark.parametrize(
@@ -171,13 +174,13 @@ def test_what_cannot_be_meant_is_said_before_anything_is_written(scene, tmp_path
     with pytest.raises(InputError, match="unknown suffix"):
         export_scene(scene, tmp_path / "a.json")
     with pytest.raises(InputError, match="`kind` dwg"):
-        export_scene(scene, tmp_path / "a", kind="dwg")
+        export_scene(scene, tmp_path / "a", options=ExportOptions(kind="dwg"))
     with pytest.raises(InputError, match=r"`resolution` does not go with PLY, which takes `layers`"):
-        export_scene(scene, tmp_path / "a.ply", resolution=1)
+        export_scene(scene, tmp_path / "a.ply", options=ExportOptions(resolution=1))
     with pytest.raises(InputError, match="EPSG:99999"):
-        export_scene(scene, tmp_path / "a.gpkg", crs="EPSG:99999")
+        export_scene(scene, tmp_path / "a.gpkg", options=ExportOptions(crs="EPSG:99999"))
     with pytest.raises(InputError, match="projected CRS"):
-        export_scene(scene, tmp_path / "a.city.json", crs="EPSG:4326")
+        export_scene(scene, tmp_path / "a.city.json", options=ExportOptions(crs="EPSG:4326"))
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "a.ply").write_text("mine")
     with pytest.raises(InputError, match="`overwrite`"):

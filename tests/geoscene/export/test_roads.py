@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from geoscene.errors import InputError
 from geoscene.export import export_scene
 from geoscene.export.planview import connecting_curve, plan_view
+from geoscene.options import ExportOptions
 from geoscene.roadgraph import write_graphml
 from geoscene.roadgraph.graph import rows_of
 from geoscene.roadgraph.routing import turn_table
@@ -100,7 +101,9 @@ def _write(graph, scene, folder, **options):
     if not path.exists():
         write_world(path)
     write_graphml(graph, scene.frame, path=SceneFiles(path).road_graph)
-    return export_scene(replace(scene, path=path), folder / "a.xodr", overwrite=True, **options).path
+    return export_scene(
+        replace(scene, path=path), folder / "a.xodr", overwrite=True, options=ExportOptions(**options)
+    ).path
 
 
 def _check_links(path):

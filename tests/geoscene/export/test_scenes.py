@@ -12,6 +12,7 @@ from geoscene.export import export_scene
 from geoscene.export.cityjson import LOD
 from geoscene.mesh import Mesh
 from geoscene.objects.shapes import shapes
+from geoscene.options import ExportOptions
 from geoscene.watertight import validate_mesh
 
 
@@ -27,7 +28,9 @@ def city(scene, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def tiles(scene, tmp_path_factory):
-    return export_scene(scene, tmp_path_factory.mktemp("out") / "tiles", kind="3dtiles").path
+    return export_scene(
+        scene, tmp_path_factory.mktemp("out") / "tiles", options=ExportOptions(kind="3dtiles")
+    ).path
 
 
 def _glb(path):
@@ -203,7 +206,7 @@ def test_a_glb_node_has_its_name_its_attributes_and_its_row(scene, tmp_path):
 
 
 def test_copies_in_a_glb_stand_where_trees_grow(scene, tmp_path):
-    path = export_scene(scene, tmp_path / "a.glb", layers=["trees"]).path
+    path = export_scene(scene, tmp_path / "a.glb", options=ExportOptions(layers=("trees",))).path
     document, _ = _glb(path)
     assert document["extensionsRequired"] == ["EXT_mesh_gpu_instancing"]
     points = _points(path) - [*scene.frame.origin, 0]
@@ -325,13 +328,18 @@ def test_a_folder_that_is_not_ours_is_not_replaced(scene, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years")
     with pytest.raises(InputError, match=r"holds no tileset\.json"):
-        export_scene(scene, tmp_path / "mine", kind="3dtiles", overwrite=True)
+        export_scene(scene, tmp_path / "mine", overwrite=True, options=ExportOptions(kind="3dtiles"))
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
 
 
 def test_heights_are_lifted_to_the_ellipsoid_on_request(scene, tmp_path, tiles):
     low, high = (
         np.array(json.loads((path / "tileset.json").read_text())["root"]["transform"])[12:15]
-        for path in (tiles, export_scene(scene, tmp_path / "t", kind="3dtiles", height_offset=39.5).path)
+        for path in (
+            tiles,
+            export_scene(
+                scene, tmp_path / "t", options=ExportOptions(kind="3dtiles", height_offset=39.5)
+            ).path,
+        )
     )
     assert np.linalg.norm(high - low) == pytest.approx(39.5)

@@ -10,10 +10,11 @@ import shapely
 import trimesh
 from helpers.export_worlds import NAMES, SOLID_VOLUMES, write_world
 
-from geoscene.build import BuildOptions, build
+from geoscene.build import build
 from geoscene.classes import Class
 from geoscene.export import export_scene
 from geoscene.mesh import Mesh
+from geoscene.options import BuildOptions, ExportOptions
 from geoscene.sources import demo_path, read_osm
 from geoscene.watertight import validate_mesh
 
@@ -45,7 +46,7 @@ def exported(scene, tmp_path_factory):
         if kind not in done:
             layers = ["building_solids"] if kind in ("gpkg", "geoparquet", "geojson") else None
             out = folder / f"world{SUFFIX.get(kind, '.' + kind)}"
-            done[kind] = export_scene(scene, out, kind=kind, layers=layers)
+            done[kind] = export_scene(scene, out, options=ExportOptions(kind=kind, layers=layers))
         return done[kind].path
 
     return path
@@ -216,7 +217,7 @@ def test_a_building_is_the_same_closed_solid(kind, exported, scene):
 def test_the_same_scene_is_the_same_bytes(kind, exported, scene, tmp_path):
     first = exported(kind)
     layers = ["building_solids"] if kind in ("gpkg", "geoparquet", "geojson") else None
-    again = export_scene(scene, tmp_path / first.name, kind=kind, layers=layers).path
+    again = export_scene(scene, tmp_path / first.name, options=ExportOptions(kind=kind, layers=layers)).path
     files = sorted(p for p in first.rglob("*") if p.is_file()) if first.is_dir() else [first]
     assert files
     for file in files:

@@ -7,7 +7,8 @@ import shapely
 from geoscene.classes import Class
 from geoscene.ground.partition import values_at, winners
 from geoscene.objects.siting import FARTHEST
-from geoscene.plan import KINDS, make_plan
+from geoscene.options import BuildOptions
+from geoscene.plan import make_plan
 from geoscene.progress import silent
 from geoscene.sources import demo_path, read_osm
 
@@ -21,16 +22,7 @@ EXTRACTS = [
 
 
 def assert_off_carriageways(path):
-    plan, problems = make_plan(
-        read_osm(path),
-        "local",
-        dem=(),
-        dem_gaps="error",
-        tile_size=250.0,
-        only=KINDS,
-        driving_side="",
-        progress=silent,
-    )
+    plan, problems = make_plan(read_osm(path), BuildOptions(), progress=silent)
     layers = plan.ground.layers
     rails = shapely.union_all(layers.polygon[layers.klass == Class.RAIL])
     for table in (plan.furniture, plan.trees):

@@ -12,11 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.build import BuildOptions, build
+from geoscene.build import build
 from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.frames import Frame
 from geoscene.mesh import Instances, Mesh
+from geoscene.options import BuildOptions, ViewOptions
 from geoscene.scene.tile_files import Tile
 from geoscene.sources import demo_path, read_osm
 from geoscene.view import view_scene
@@ -212,7 +213,9 @@ def test_the_same_scene_is_the_same_bytes(scene, path, tmp_path):
 def test_bounds_take_the_tiles_that_they_meet(scene, tmp_path):
     x, y = scene.tile_size * 0.25, scene.tile_size * 0.25
     lon, lat = scene.frame.to_geographic([x, x + 10], [y, y + 10])
-    summary = view_scene(scene, tmp_path / "part.html", bounds_deg=(lon[0], lat[0], lon[1], lat[1]))
+    summary = view_scene(
+        scene, tmp_path / "part.html", options=ViewOptions(bounds_deg=(lon[0], lat[0], lon[1], lat[1]))
+    )
     page = Page((tmp_path / "part.html").read_text("utf-8"))
     assert summary.faces == len(scene.tile(0, 0).mesh)
     assert rows(unpack_tile(page.json("scene")["tiles"][0], page.bytes("tile-0"))).tolist() == (
@@ -229,14 +232,16 @@ def test_a_page_that_is_too_large_is_refused_with_a_part_that_is_not(scene, path
     whole = path.stat().st_size / 1e6
     out = tmp_path / "page.html"
     with pytest.raises(InputError, match="`max_mb`") as caught:
-        view_scene(scene, out, max_mb=0.7 * whole)
+        view_scene(scene, out, options=ViewOptions(max_mb=0.7 * whole))
     assert not list(tmp_path.iterdir())
     told = re.search(r"`bounds_deg`=(\S+)", str(caught.value))
     west, south, east, north = map(float, told[1].split(","))
-    summary = view_scene(scene, out, bounds_deg=(west, south, east, north), max_mb=0.7 * whole)
+    summary = view_scene(
+        scene, out, options=ViewOptions(bounds_deg=(west, south, east, north), max_mb=0.7 * whole)
+    )
     assert 0 < summary.faces < scene.manifest["counts"]["faces"]
     with pytest.raises(InputError, match="give more"):
-        view_scene(scene, tmp_path / "none.html", max_mb=0.01)
+        view_scene(scene, tmp_path / "none.html", options=ViewOptions(max_mb=0.01))
 
 
 @pytest.mark.parametrize(
@@ -250,7 +255,7 @@ def test_a_page_that_is_too_large_is_refused_with_a_part_that_is_not(scene, path
 )
 def test_options_that_cannot_be_are_refused(scene, tmp_path, options, message):
     with pytest.raises(InputError, match=message):
-        view_scene(scene, tmp_path / "page.html", **options)
+        view_scene(scene, tmp_path / "page.html", options=ViewOptions(**options))
 
 
 def test_a_page_is_replaced_only_when_asked(scene, path, tmp_path):

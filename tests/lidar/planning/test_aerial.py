@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import shapely
 
-from geoscene.build import BuildOptions, build
+from geoscene.build import build
+from geoscene.options import BuildOptions
 from geoscene.scene import SceneFiles
 from geoscene.sources import demo_path, read_osm
 from lidar.dataset.formats import read_table

@@ -8,8 +8,9 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.build import BuildOptions, build
+from geoscene.build import build
 from geoscene.classes import Class
+from geoscene.options import BuildOptions
 from geoscene.sources import demo_path, read_osm
 from lidar.camera.render import RenderOptions, render
 from lidar.dataset.boxes import COLUMNS, box_rows, count_points, image_boxes

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Transformer
 
-from geoscene.build import BuildOptions, build
+from geoscene.build import build
+from geoscene.options import BuildOptions
 from geoscene.polylines import parallel
 from geoscene.sources import demo_path, read_osm
 from lidar.cli import app

@@ -1,0 +1,120 @@
+"""Options of the commands of `geoscene`: defaults, units and help stand here once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from geoscene.console import SEVERAL, WORDS, degrees, whole
+from geoscene.errors import InputError
+
+KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
+"""Kinds of features that a scene may hold besides its ground."""
+
+Degrees = tuple[float, float, float, float]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class BuildOptions:
+    """Options that shape the bytes of a scene; ``scene.json`` records them."""
+
+    crs: str = "local"
+    """Frame of the scene: local (a transverse Mercator on its centre in which a metre is a metre), utm, or an
+    EPSG code such as EPSG:32618."""
+
+    lod: Annotated[int, Parameter(converter=whole)] = 2
+    """Level of detail of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs."""
+
+    dem: Annotated[tuple[str, ...], SEVERAL] = ()
+    """Elevation files: GeoTIFF, .hgt or .hgt.zip, one or more, in any CRS; or the word tiles: public
+    elevation tiles of 5 to 10 m (needs a network; tiles are cached). By default the ground is level."""
+
+    dem_gaps: str = "error"
+    """Where elevation files do not cover the scene: error, or nearest (take the nearest height and report
+    it)."""
+
+    only: Annotated[tuple[str, ...], WORDS] = KINDS
+    """What to build besides the ground, separated by commas."""
+
+    along: Annotated[tuple[str, ...], SEVERAL] = ()
+    """Build only the tiles that can be seen from a route: LAT,LON LAT,LON ... or a GPX, GeoJSON or CSV file
+    (such as the poses.csv of a dataset)."""
+
+    reach: float = 120.0
+    """Maximum range of the sensors in metres, with --along."""
+
+    driving_side: str = ""
+    """Side of the road that traffic drives on: left or right. By default that of the map's tags, else of the
+    country."""
+
+    tile_size: float = 250.0
+    """Side of a tile in metres."""
+
+    name: str = ""
+    """Title of the scene."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if self.lod not in (0, 1, 2):
+            raise InputError(f"`lod` {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
+        if self.dem_gaps not in ("error", "nearest"):
+            raise InputError(f"`dem_gaps` {self.dem_gaps}: error or nearest")
+        if unknown := sorted(set(self.only) - set(KINDS)):
+            raise InputError(f"`only` {','.join(unknown)}: of {','.join(KINDS)}")
+        if self.driving_side not in ("", "left", "right"):
+            raise InputError(f"`driving_side` {self.driving_side}: left or right")
+        if not 0 < self.reach < 1e6:
+            raise InputError(f"`reach` {self.reach:g}: give metres, more than 0 and less than a million")
+        if not 50 <= self.tile_size <= 2000 or self.tile_size != int(self.tile_size):
+            raise InputError(f"`tile_size` {self.tile_size}: give whole metres from 50 to 2000")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class ViewOptions:
+    """Options of a web page of a scene."""
+
+    bounds_deg: Annotated[Degrees | None, Parameter(name="--bbox"), degrees("W,S,E,N")] = None
+    """W,S,E,N in degrees: only the tiles that intersect it, each whole."""
+
+    layers: Annotated[tuple[str, ...], WORDS] = ()
+    """Only these layers, separated by commas, such as ground,buildings,trees; all by default."""
+
+    max_mb: Annotated[float, Parameter(name="--max-size")] = 40.0
+    """Largest size of the page in megabytes; a larger one is an error that names the bounds of a part that
+    fits."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if not self.max_mb > 0:
+            raise InputError(f"`max_mb` {self.max_mb:g}: must be more than 0")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """Options of an export; each format takes some of them, see `geoscene.export.KINDS`."""
+
+    kind: Annotated[str | None, Parameter(name="--to")] = None
+    """cityjson, glb, 3dtiles, obj, ply, stl, gpkg, geojson, geoparquet, geotiff, opendrive or sumo; by
+    default the format of the file's suffix."""
+
+    crs: str | None = None
+    """CRS of CityJSON, GeoPackage and GeoParquet: an EPSG code; by default the scene's own, for CityJSON its
+    UTM zone where the scene's has no EPSG code."""
+
+    layers: Annotated[tuple[str, ...] | None, WORDS] = None
+    """Layers to write, separated by commas: terrain is the bare ground, building_solids buildings as surfaces
+    in tables; all by default."""
+
+    model: str | None = None
+    """GeoTIFF: surface (the default), terrain or classes."""
+
+    resolution: float | None = None
+    """GeoTIFF: metres per cell, 0.5 by default."""
+
+    height_offset: float | None = None
+    """3D Tiles: metres added to heights, such as the geoid's height to make them ellipsoidal."""
