@@ -78,19 +78,19 @@ def degrees(names: str) -> Parameter:
     """Of an option that takes numbers in degrees separated by commas: W,S,E,N or LAT,LON."""
 
     def convert(_: object, tokens: Sequence[Token]) -> tuple[float, ...]:
-        count = names.count(",") + 1
+        text, count = tokens[0].value.strip(), names.count(",") + 1
         try:
-            values = tuple(float(v) for v in tokens[0].value.split(","))
+            values = tuple(float(v) for v in text.split(","))
         except ValueError:
             values = ()
         if len(values) != count:
-            raise ValueError(f"give {count} numbers in degrees as {names}")
+            raise ValueError(f"{text}: give {count} numbers in degrees as {names}")
         if names == "W,S,E,N":
             west, south, east, north = values
             if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
-                raise ValueError("W,S,E,N must rise from west to east and south to north")
+                raise ValueError(f"{text}: W,S,E,N must rise from west to east and south to north")
         elif not (abs(values[0]) <= 90 and abs(values[1]) <= 180):
-            raise ValueError("not a latitude and longitude in degrees")
+            raise ValueError(f"{text}: not a latitude and longitude in degrees")
         return values
 
     return Parameter(converter=convert, n_tokens=1, metavar=names)
