@@ -1,4 +1,4 @@
-"""What a surface is (class) and is made of (material), as codes that scenes, points and pixels share."""
+"""Semantic classes and materials of surfaces, with the codes that scenes, points and pixels share."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Class(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ClassCodes:
-    """Lookup tables (256,) uint16 from `Class` to other people's codes.
+    """Lookup tables (256,) uint16 from `Class` to the codes of other datasets.
 
     semantic_kitti, nuscenes, waymo : their published label ids
     asprs : LAS 1.4 classification
@@ -134,13 +134,13 @@ def class_codes() -> ClassCodes:
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """What a surface is made of, as sensors see it.
+    """Optical properties of a surface material.
 
     code        : number in scene files
-    color       : sRGB 0..255, the default where a map gives none
+    color       : sRGB 0..255, used where the map has no colour
     reflectance : diffuse (hemispherical) reflectance 0..1 at 905, 1064 and 1550 nm
-    specular    : share of the reflected light that is mirror-like, 0..1
-    source      : where the numbers come from
+    specular    : share of the reflected light that is specular, 0..1
+    source      : source of the numbers
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What was repaired, dropped or guessed on the way from the map to the scene."""
+"""Problems: what was repaired or dropped between the map and the scene."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ Action = Literal["repaired", "dropped"]
 
 @dataclass(frozen=True, slots=True, order=True)
 class Problem:
-    """One feature that could not be taken as it came.
+    """One feature that could not be used as mapped.
 
-    osm_id : ``way/123``, ``relation/45`` or ``node/6``
-    kind   : what it was meant to be: ``building``, ``road``, ``water``, ``area`` ...
+    osm_id : ``way/123``, ``relation/45`` or ``node/6``; of other sources ``name:id``
+    kind   : kind of the feature: ``building``, ``road``, ``water``, ``area`` ...
     action : ``repaired`` (it is in the scene, changed) or ``dropped`` (it is not)
     reason : a short fixed slug, such as ``open-ring`` or ``missing-nodes``
-    detail : one line for people, with the amount ("moved 3 vertices by up to 0.4 mm")
+    detail : one line with the amount ("moved 3 vertices by up to 0.4 mm")
     """
 
     osm_id: str
@@ -29,7 +29,7 @@ class Problem:
 
 
 def summarise(problems: Iterable[Problem]) -> dict[str, dict[str, dict[str, int]]]:
-    """Count problems as ``{action: {kind: {reason: n}}}``, keys sorted."""
+    """Counts of problems as ``{action: {kind: {reason: n}}}``, keys sorted."""
     counts = Counter((p.action, p.kind, p.reason) for p in problems)
     out: dict[str, dict[str, dict[str, int]]] = {"repaired": {}, "dropped": {}}
     for (action, kind, reason), n in sorted(counts.items()):

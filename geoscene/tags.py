@@ -1,4 +1,4 @@
-"""Values of OpenStreetMap tags as mappers write them, as numbers."""
+"""Parses values of OpenStreetMap tags: numbers, lengths, directions, colours."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ def _first(text: str) -> str:
 
 
 def _first_quantity(text: str) -> str:
-    """The first of a list of values, in lower case, without "about"."""
+    """The first of a list of values, in lower case, without words for "about"."""
     return _ABOUT.sub("", _first(text))
 
 
 def _float(digits: str) -> float | None:
-    """A number with a decimal point or comma; with both, the last is the decimal mark and the rest groups."""
+    """A number with a decimal point or comma; if it has both, the last one is the decimal mark."""
     dot, comma = digits.rfind("."), digits.rfind(",")
     if dot >= 0 and comma >= 0:
         group, mark = (",", ".") if dot > comma else (".", ",")
@@ -78,11 +78,11 @@ def parse_number(text: str | None) -> float | None:
 
 
 def parse_length(text: str | None) -> float | None:
-    """A length in metres, or None if the value is no length.
+    """A length in metres, or None if the value is not a length.
 
-    Metres unless a unit follows ("48.5 m", "1.2 km", "574'", "5 ft 6 in", 12'6"); a decimal comma is read
-    ("9,5"); of a list ("5;6") the first counts; "~10" and "ca. 10" are 10. Typographic quotes serve as marks
-    of feet and inches. The sign is kept.
+    The unit is metres unless one follows ("48.5 m", "1.2 km", "574'", "5 ft 6 in", 12'6"); a decimal comma is
+    allowed ("9,5"); of a list ("5;6") the first counts; "~10" and "ca. 10" are 10. Typographic quotes are
+    read as marks of feet and inches. The sign is kept.
     """
     if text is None:
         return None
@@ -114,9 +114,9 @@ def parse_direction(text: str | None) -> float | None:
 
 
 def parse_color(text: str | None) -> tuple[int, int, int] | None:
-    """Red, green, blue (sRGB, 0..255) of a colour as mappers write it, or None.
+    """Red, green, blue (sRGB, 0..255) of a tagged colour, or None if it is not a colour.
 
-    CSS names ("light grey" and "dark_red" too), "#rgb", "#rrggbb" (the "#" may lack) and "rgb(1,2,3)".
+    CSS names (also "light grey" and "dark_red"), "#rgb", "#rrggbb" (with or without "#") and "rgb(1,2,3)".
     """
     if text is None:
         return None

@@ -4,7 +4,7 @@ The wavefront of Aichholzer, Aurenhammer, Alberts and Gärtner, "A novel type of
 all edges move inwards at unit speed. An edge event removes an edge that has shrunk to a point; a split event
 happens where a reflex corner hits an edge, and splits the front or joins it to that of a hole. Every step
 searches the next event among all edges and corners, so that no event is missed or handled twice; simultaneous
-events are handled one after another. If that fails on a symmetric polygon, its corners are jittered by
+events are handled one after another. If that fails on a symmetric polygon, its corners are perturbed by
 micrometres. The result is checked: each edge has one face, and the faces fill the polygon.
 """
 

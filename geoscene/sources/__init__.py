@@ -1,4 +1,4 @@
-"""Where maps come from: files, map servers, and the demo extract; elevation tiles to go with them."""
+"""Map sources: files, map servers, the demo extract, elevation tiles; `registry` lists them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _LATE = {
 
 
 def __getattr__(name: str) -> object:
-    """Functions are imported when first asked for, and with them shapely and osmium."""
+    """Import the module of a function on first access, because shapely and osmium are slow to import."""
     if name not in _LATE:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import importlib  # noqa: PLC0415

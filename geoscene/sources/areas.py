@@ -1,4 +1,4 @@
-"""Areas among map objects: closed ways and multipolygon relations."""
+"""Areas of a map: closed ways and multipolygon relations."""
 
 from __future__ import annotations
 
@@ -11,19 +11,18 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.report import Problem
-from geoscene.sources.data import Area, Tags
+from geoscene.sources.data import Area, Bounds, Tags
 from geoscene.sources.elements import Elements, Members
 from geoscene.sources.rings import Chain, assemble, close_cut_ring, polygons_of
 from geoscene.sources.tags import NOISE, area_tags, is_area, is_building, is_open_area, kind_of
 from geoscene.typing import Ints
 
-Progress = Callable[[Iterable[Any]], Iterable[Any]]
 _NO_NODES: Ints = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where nodes are, nodes at one position counted as one.
+    """Positions of nodes; nodes at the same position count as one.
 
     xy   : (n, 2) float64 degrees
     same : (n,) int64, index of the first node at the same position
@@ -42,25 +41,26 @@ class Places:
         return cls(elements.lonlat(np.arange(len(packed))), first[inverse].astype(np.int64))
 
     def merged(self, nodes: Ints) -> Ints:
-        """Node indices with the first node of each position in place of the others; -1 stays."""
+        """Node indices replaced by the first node at the same position; -1 stays."""
         return np.where(nodes >= 0, self.same[nodes], -1) if len(self.same) else nodes
 
 
-def _meaning(tags: Tags) -> Tags:
+def _descriptive(tags: Tags) -> Tags:
+    """The tags that describe the object itself."""
     return {key: value for key, value in tags.items() if key not in NOISE and key != "type"}
 
 
 def _common(tables: list[Tags]) -> Tags:
-    """The tags that all have alike."""
+    """The tags that are the same in all tables."""
     return {k: v for k, v in tables[0].items() if all(t.get(k) == v for t in tables[1:])} if tables else {}
 
 
 @dataclass(frozen=True, slots=True)
 class Claims:
-    """What relations say of ways.
+    """Ways that belong to multipolygon relations.
 
-    members : rows of ways that bound a multipolygon; such a way drawn open is no defect
-    taken   : rows of ways whose area is the relation's, so that they are none of their own
+    members : rows of ways that bound a multipolygon; such a way may be open without being a defect
+    taken   : rows of ways whose area is that of the relation, so that they are not areas themselves
     """
 
     members: set[int]
@@ -69,9 +69,9 @@ class Claims:
 
 @dataclass(frozen=True, slots=True)
 class _Boundary:
-    """A multipolygon relation, its members looked up.
+    """A multipolygon relation with its members resolved.
 
-    ways : (row of the way, inner), -1 for ways that are not here
+    ways : (row of the way, inner), row -1 for ways that are missing
     """
 
     osm_id: int
@@ -80,56 +80,58 @@ class _Boundary:
 
 
 def is_multipolygon(tags: Tags) -> bool:
-    """Whether a relation's members bound an area; those of type ``boundary`` are left as relations."""
+    """Whether a relation is of type multipolygon; relations of type ``boundary`` stay relations."""
     return tags.get("type") == "multipolygon"
 
 
-def _says_area(tags: Tags) -> bool:
+def _is_tagged_area(tags: Tags) -> bool:
     return tags.get("area") == "yes" or bool(area_tags(tags))
 
 
 def _boundary(
     elements: Elements, row_of: dict[int, int], *, osm_id: int, tags: Tags, members: Members
 ) -> tuple[_Boundary, set[int], bool]:
-    """A relation with the tags that count, the ways whose area is the relation's, whether both are tagged.
+    """A relation with its effective tags, the ways whose area is the relation's, and whether both are tagged.
 
-    A relation that no tag of its own makes an area has also the tags that its outer ways agree on, if those
-    do, as was the custom before 2016. A way is not an area of its own if it is outer and shares the
-    relation's building tag or any area tag with the same value, or inner and tagged alike. What a single
-    outer way adds to the tags of a building is taken over.
+    If no tag of its own makes a relation an area, it inherits the tags that its outer ways have in common, as
+    was the custom before 2016. An outer way is not an area itself if it has the relation's building tag or
+    shares any area tag and value with it; an inner way is not if it is tagged the same. A building inherits
+    further tags from a single outer way.
     """
     ways = [(row_of.get(i, -1), role == "inner") for kind, i, role in members if kind == "way"]
-    own = _meaning(tags)
+    own = _descriptive(tags)
     outer = sorted({row for row, inner in ways if row >= 0 and not inner})
-    common = _common([m for row in outer if _says_area(m := _meaning(elements.way_tags[row]))])
-    old_style = not _says_area(own) and _says_area(common)
+    common = _common([m for row in outer if _is_tagged_area(m := _descriptive(elements.way_tags[row]))])
+    old_style = not _is_tagged_area(own) and _is_tagged_area(common)
     if old_style:
         own = {**common, **own}
-    mine = area_tags(own)
+    area = area_tags(own)
     taken = set()
     for row, inner in ways:
         if row < 0:
             continue
-        theirs = area_tags(_meaning(elements.way_tags[row]))
-        shared = {k for k, v in theirs.items() if k in mine and (k.startswith("building") or mine[k] == v)}
-        alike = bool(shared) and all(own.get(k) == v for k, v in _meaning(elements.way_tags[row]).items())
-        if alike if inner else shared or (old_style and elements.way_tags[row].get("area") == "yes"):
+        way_tags = _descriptive(elements.way_tags[row])
+        shared = any(
+            k in area and (k.startswith("building") or area[k] == v) for k, v in area_tags(way_tags).items()
+        )
+        same_tags = shared and way_tags.items() <= own.items()
+        if same_tags if inner else shared or (old_style and elements.way_tags[row].get("area") == "yes"):
             taken.add(row)
     if len(outer) == 1 and outer[0] in taken and is_building(own):
-        own = {**_meaning(elements.way_tags[outer[0]]), **own}
+        own = {**_descriptive(elements.way_tags[outer[0]]), **own}
     kept = {k: v for k, v in tags.items() if k in NOISE or k == "type"}
     return _Boundary(osm_id, {**kept, **own} if own else {}, ways), taken, not old_style
 
 
 def _relation_area(
-    elements: Elements, places: Places, *, boundary: _Boundary, extent: tuple[float, float, float, float]
+    elements: Elements, places: Places, *, boundary: _Boundary, extent: Bounds
 ) -> tuple[Any, Problem | None]:
-    """The geometry of a multipolygon, or None, and what was wrong with it."""
+    """The geometry of a multipolygon, or None, and its problem, if any."""
     chains: list[Chain] = []
-    lost_ways = cut = lost_nodes = 0
+    missing_ways = cut = missing_nodes = 0
     for row, inner in boundary.ways:
         if row < 0:
-            lost_ways += 1
+            missing_ways += 1
             continue
         nodes = places.merged(elements.chain(row))
         missing = int((nodes < 0).sum())
@@ -139,10 +141,10 @@ def _relation_area(
                 cut += 1
                 chains.append(Chain(ring, inner))
                 continue
-        lost_nodes += missing
+        missing_nodes += missing
         breaks = np.flatnonzero(np.diff((nodes >= 0).astype(np.int8))) + 1
         chains += [Chain(run, inner) for run in np.split(nodes, breaks) if len(run) > 1 and run[0] >= 0]
-    incomplete = lost_ways + lost_nodes > 0
+    incomplete = missing_ways + missing_nodes > 0
     made = assemble(chains, places.xy, complete=not incomplete)
     reason = "incomplete-relation" if incomplete else made.reason or ("missing-nodes" if cut else "")
     osm_id = f"relation/{boundary.osm_id}"
@@ -151,16 +153,16 @@ def _relation_area(
         if made.geometry is not None:
             return made.geometry, None
         reason = "no-area"
-    told = [
+    defects = [
         f"{n} {what}"
         for n, what in (
-            (lost_ways, "member ways absent"),
-            (lost_nodes, "nodes absent"),
+            (missing_ways, "member ways absent"),
+            (missing_nodes, "nodes absent"),
             (cut, "cut rings closed"),
         )
         if n
     ]
-    detail = ", ".join(told) or f"{len(boundary.ways)} member ways"
+    detail = ", ".join(defects) or f"{len(boundary.ways)} member ways"
     if made.geometry is None:
         return None, Problem(osm_id, kind, "dropped", reason, f"{detail}; no ring closes")
     return made.geometry, Problem(osm_id, kind, "repaired", reason, detail)
@@ -170,12 +172,12 @@ def multipolygon_areas(
     elements: Elements,
     places: Places,
     *,
-    extent: tuple[float, float, float, float],
+    extent: Bounds,
     wanted: Callable[[Ints], bool],
 ) -> tuple[list[Area], list[Problem], Claims]:
-    """Areas of multipolygon relations, in order of id, with what was wrong and which ways they take.
+    """Areas of multipolygon relations in order of id, their problems, and the ways that belong to them.
 
-    wanted : whether any of the ways in these rows is of interest
+    wanted : whether any of the ways in given rows is of interest
     """
     row_of = {int(i): row for row, i in enumerate(elements.way_id)}
     areas: list[Area] = []
@@ -184,7 +186,7 @@ def multipolygon_areas(
     for osm_id, tags, members in elements.relations:
         if not is_multipolygon(tags):
             continue
-        boundary, taken, twice = _boundary(elements, row_of, osm_id=osm_id, tags=tags, members=members)
+        boundary, taken, both_tagged = _boundary(elements, row_of, osm_id=osm_id, tags=tags, members=members)
         rows = np.array([row for row, _ in boundary.ways if row >= 0], np.int64)
         claims.members.update(rows.tolist())
         if not wanted(rows):
@@ -199,15 +201,15 @@ def multipolygon_areas(
         if geometry is None:
             continue
         claims.taken.update(taken)
-        if twice:
-            told = f"bounds {name}, which is tagged alike"
+        if both_tagged:
+            detail = f"bounds {name}, which is tagged alike"
             problems += [
                 Problem(
                     f"way/{elements.way_id[row]}",
                     kind_of(elements.way_tags[row]),
                     "dropped",
                     "tagged-twice",
-                    told,
+                    detail,
                 )
                 for row in sorted(taken)
             ]
@@ -222,11 +224,11 @@ def way_areas(
     elements: Elements,
     places: Places,
     *,
-    extent: tuple[float, float, float, float],
+    extent: Bounds,
     rows: Iterable[int],
     claims: Claims,
 ) -> tuple[list[Area], list[Problem], set[int]]:
-    """Areas of ways, in order of id, with what was wrong, and the rows that were areas or meant to be."""
+    """Areas of ways in order of id, their problems, and the rows of all ways that are tagged as areas."""
     areas: list[Area] = []
     problems: list[Problem] = []
     meant: set[int] = set()
@@ -250,15 +252,15 @@ def way_areas(
             reason = "missing-nodes" if missing else "open-ring"
             cut = close_cut_ring(nodes, places.xy, extent=extent)
             if cut is None:
-                told = (
+                detail = (
                     f"{missing} of {len(nodes)} nodes absent"
                     if missing
                     else f"{len(nodes)} nodes, not closed"
                 )
-                problems.append(Problem(name, kind, "dropped", reason, told))
+                problems.append(Problem(name, kind, "dropped", reason, detail))
                 continue
-            told = f"{missing} of {len(nodes)} nodes absent, " if missing else ""
-            repair = (reason, f"{told}closed straight at the edge of the extract")
+            detail = f"{missing} of {len(nodes)} nodes absent, " if missing else ""
+            repair = (reason, f"{detail}closed straight at the edge of the extract")
             nodes = cut
         merged = places.same[nodes]
         keep = np.append(True, merged[1:] != merged[:-1])
@@ -296,7 +298,7 @@ def way_areas(
             continue
         reason = "self-touching" if why.startswith("Ring ") else "self-crossing"
         pieces = int(shapely.get_num_geometries(geometry))
-        told = f"{why.lower()}, {pieces} part{'s' * (pieces > 1)}"
-        problems.append(Problem(name, kind_of(tags), "repaired", reason, told))
+        detail = f"{why.lower()}, {pieces} part{'s' * (pieces > 1)}"
+        problems.append(Problem(name, kind_of(tags), "repaired", reason, detail))
         areas.append(Area(name, tags, geometry, _NO_NODES))
     return areas, problems, meant

@@ -1,4 +1,4 @@
-"""Features from map objects; one way for all sources."""
+"""Builds the features of a map from its nodes, ways and relations; every OpenStreetMap reader ends here."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from numpy.typing import NDArray
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.report import Action, Problem
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
-from geoscene.sources.data import OsmData, Point, Relation, Way
+from geoscene.sources.data import Bounds, OsmData, Point, Relation, Way
 from geoscene.sources.elements import UNITS, Elements
 from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
 from geoscene.typing import Ints
 
-Bounds = tuple[float, float, float, float]
-
 
 def checked_bounds(bounds: Bounds) -> Bounds:
-    """``bounds`` as floats, or one InputError that lists what is wrong with them."""
+    """``bounds`` as floats. Raises one InputError that lists all faults."""
     try:
         west, south, east, north = (float(v) for v in bounds)
     except (TypeError, ValueError):
@@ -41,7 +39,7 @@ def checked_bounds(bounds: Bounds) -> Bounds:
 
 
 def _extent(elements: Elements) -> Bounds:
-    """What the source says it covers, else the extent of its nodes."""
+    """The bounds that the source states, else the extent of its nodes."""
     if elements.bounds is not None:
         return elements.bounds
     (west, south), (east, north) = elements.node_xy.min(axis=0) / UNITS, elements.node_xy.max(axis=0) / UNITS
@@ -49,7 +47,7 @@ def _extent(elements: Elements) -> Bounds:
 
 
 def _near(elements: Elements, bounds: Bounds | None) -> NDArray[np.bool_]:
-    """(w,) whether each way's box meets the bounds; ways without nodes do not."""
+    """(w,) bool, whether each way's bounding box intersects the bounds; false for ways without nodes."""
     ways = np.repeat(np.arange(len(elements.way_id)), np.diff(elements.way_start))
     here = elements.ref >= 0
     near = np.zeros(len(elements.way_id), bool)
@@ -67,7 +65,7 @@ def _near(elements: Elements, bounds: Bounds | None) -> NDArray[np.bool_]:
 
 
 def _lines(elements: Elements, rows: list[int]) -> tuple[list[Way], list[Problem]]:
-    """Lines of ways; where nodes are missing a line is cut, so that several may share an id."""
+    """Lines of ways; a line is split where nodes are missing, so that several may have the same id."""
     ways: list[Way] = []
     problems: list[Problem] = []
     for row in rows:
@@ -79,48 +77,48 @@ def _lines(elements: Elements, rows: list[int]) -> tuple[list[Way], list[Problem
         if missing:
             breaks = np.flatnonzero(np.diff((nodes >= 0).astype(np.int8))) + 1
             runs = [run for run in np.split(nodes, breaks) if run[0] >= 0]
-        made = 0
+        count = 0
         for run in runs:
             if len(run) > 1 and (run[1:] == run[:-1]).any():
                 keep = np.append(True, run[1:] != run[:-1])
-                told = f"{np.count_nonzero(~keep)} repeats left out"
-                problems.append(Problem(name, kind_of(tags), "repaired", "repeated-node", told))
+                detail = f"{np.count_nonzero(~keep)} repeats left out"
+                problems.append(Problem(name, kind_of(tags), "repaired", "repeated-node", detail))
                 run = run[keep]  # noqa: PLW2901 - the cleaned run takes its place
             if len(run) > 1:
                 ways.append(Way(name, tags, elements.node_id[run], elements.lonlat(run)))
-                made += 1
-        if missing or not made:
-            told = f"{missing} of {len(nodes)} nodes absent" if missing else f"{len(nodes)} nodes"
-            action: Action = "repaired" if made else "dropped"
+                count += 1
+        if missing or not count:
+            detail = f"{missing} of {len(nodes)} nodes absent" if missing else f"{len(nodes)} nodes"
+            action: Action = "repaired" if count else "dropped"
             problems.append(
-                Problem(name, kind_of(tags), action, "missing-nodes" if missing else "too-short", told)
+                Problem(name, kind_of(tags), action, "missing-nodes" if missing else "too-short", detail)
             )
     return ways, problems
 
 
 def _selected(data: OsmData, bounds: Bounds) -> OsmData:
-    """The features that meet the bounds, whole, and the problems of those and of what was dropped near by."""
+    """The features that intersect the bounds, not clipped; problems of features outside are left out."""
     box = shapely.box(*bounds)
     shapely.prepare(box)
-    hit = shapely.intersects(box, np.array([a.geometry for a in data.areas], object))
-    areas = [a for a, inside in zip(data.areas, hit, strict=True) if inside]
+    intersects = shapely.intersects(box, np.array([a.geometry for a in data.areas], object))
+    areas = [a for a, inside in zip(data.areas, intersects, strict=True) if inside]
     lines = shapely.linestrings(
         np.concatenate([w.lonlat for w in data.ways]) if data.ways else np.empty((0, 2)),
         indices=np.repeat(np.arange(len(data.ways)), [len(w.nodes) for w in data.ways]),
     )
-    hit = shapely.intersects(box, lines)
-    ways = [w for w, inside in zip(data.ways, hit, strict=True) if inside]
+    intersects = shapely.intersects(box, lines)
+    ways = [w for w, inside in zip(data.ways, intersects, strict=True) if inside]
     west, south, east, north = bounds
     points = [p for p in data.points if west <= p.lon <= east and south <= p.lat <= north]
     kept = {f.osm_id for group in (areas, ways, points) for f in group}
-    away = {f.osm_id for group in (data.areas, data.ways, data.points) for f in group} - kept
+    outside = {f.osm_id for group in (data.areas, data.ways, data.points) for f in group} - kept
     return OsmData(
         bounds=bounds,
         ways=ways,
         areas=areas,
         points=points,
         relations=[r for r in data.relations if any(f"{kind}/{i}" in kept for kind, i, _ in r.members)],
-        problems=[p for p in data.problems if p.osm_id not in away],
+        problems=[p for p in data.problems if p.osm_id not in outside],
         source=data.source,
         timestamp=data.timestamp,
     )
@@ -129,10 +127,10 @@ def _selected(data: OsmData, bounds: Bounds) -> OsmData:
 def features(elements: Elements, *, bounds: Bounds | None = None, source: str = "") -> OsmData:
     """The features of a map extract, each kind in order of id.
 
-    bounds : keep the features that meet this box (west, south, east, north, degrees), whole; all if None
-    source : what the elements came from, for people and for messages
+    bounds : keep the features that intersect this box (west, south, east, north, degrees), whole; all if None
+    source : file or place that the elements are from, for messages
 
-    Raises InputError for bounds that are none, SourceNotFoundError if there is nothing (within them).
+    Raises InputError for invalid bounds, SourceNotFoundError if there are no features (within them).
     """
     if bounds is not None:
         bounds = checked_bounds(bounds)

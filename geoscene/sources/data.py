@@ -1,8 +1,9 @@
-"""What a map source yields: features with untouched tags, in longitude and latitude."""
+"""The data of a map: features with their tags as mapped, in longitude and latitude."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,10 +14,19 @@ from geoscene.report import Problem
 
 Tags = dict[str, str]
 
+Bounds = tuple[float, float, float, float]
+"""West, south, east, north in degrees."""
+
+Progress = Callable[[Iterable[Any]], Iterable[Any]]
+"""Wraps a stream of map objects or of requests, to show its progress."""
+
+METRES_PER_DEGREE = 111_195.0
+"""Of latitude, on a sphere of 6371 km, the mean radius of the Earth (IUGG)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """A line with tags: a road, a railway, a barrier, a tree row; also a building outline that is an area.
+    """A line with tags: a road, a railway, a barrier, a tree row.
 
     osm_id  : ``way/123``
     nodes   : (n,) int64 OSM node ids
@@ -31,11 +41,11 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """A polygon with tags, from a closed way or a multipolygon relation.
+    """A polygon with tags, such as a closed way or a multipolygon relation.
 
-    osm_id   : ``way/123`` or ``relation/45``
+    osm_id   : ``way/123`` or ``relation/45``; of other sources ``name:id``
     geometry : valid shapely Polygon or MultiPolygon, degrees, exteriors counter-clockwise
-    nodes    : ids of the outer ring's nodes where the area is one closed way, else empty
+    nodes    : ids of the outer ring's nodes if the area is one closed way, else empty
     """
 
     osm_id: str
@@ -56,9 +66,9 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """A relation that is no area: ``type=restriction``, ``type=building`` ...
+    """A relation that is not an area: ``type=restriction``, ``type=building`` ...
 
-    members : (kind, id, role), kind being ``node``, ``way`` or ``relation``
+    members : (kind, id, role); kind is ``node``, ``way`` or ``relation``
     """
 
     osm_id: str
@@ -88,11 +98,11 @@ class Credit:
 class OsmData:
     """One map extract.
 
-    bounds      : (west, south, east, north) degrees: the area asked for, else the extract's, else its nodes'
+    bounds      : (west, south, east, north) degrees: the requested area, else the extract's, else its nodes'
     ways        : ways with tags that are lines (``highway``, ``railway``, ``barrier``, ``waterway`` ...)
     areas       : closed ways and multipolygons that are areas
     points      : nodes with tags
-    relations   : other relations
+    relations   : relations that are not areas
     problems    : what was repaired or dropped while reading
     source      : file or place it was read from, for messages
     timestamp   : newest edit or replication time, ISO 8601, or "" if unknown
@@ -101,7 +111,7 @@ class OsmData:
     added       : credits of other sources from which features were merged in
     """
 
-    bounds: tuple[float, float, float, float]
+    bounds: Bounds
     ways: list[Way]
     areas: list[Area]
     points: list[Point]
@@ -115,18 +125,18 @@ class OsmData:
 
     @property
     def digest(self) -> str:
-        """Digest of ids, tags and coordinates: equal digests mean equal maps."""
+        """Digest of ids, tags and coordinates; equal for equal maps."""
         import shapely  # noqa: PLC0415  (this module is imported for its names alone)
 
-        found = hashlib.sha256()
+        digest = hashlib.sha256()
         for way in self.ways:
-            found.update(repr((way.osm_id, sorted(way.tags.items()))).encode() + way.lonlat.tobytes())
+            digest.update(repr((way.osm_id, sorted(way.tags.items()))).encode() + way.lonlat.tobytes())
         for area in self.areas:
-            found.update(
+            digest.update(
                 repr((area.osm_id, sorted(area.tags.items()))).encode() + shapely.to_wkb(area.geometry)
             )
         for point in self.points:
-            found.update(repr((point.osm_id, sorted(point.tags.items()), point.lon, point.lat)).encode())
+            digest.update(repr((point.osm_id, sorted(point.tags.items()), point.lon, point.lat)).encode())
         for relation in self.relations:
-            found.update(repr((relation.osm_id, sorted(relation.tags.items()), relation.members)).encode())
-        return found.hexdigest()[:20]
+            digest.update(repr((relation.osm_id, sorted(relation.tags.items()), relation.members)).encode())
+        return digest.hexdigest()[:20]

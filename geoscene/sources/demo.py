@@ -1,4 +1,4 @@
-"""The extract that comes with the software: the centre of Helsinki, about 0.6 km²."""
+"""The bundled map extract: the centre of Helsinki, about 0.6 km²."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _NAME = "helsinki_demo.osm.pbf"
 def demo_path() -> Path:
     """Path of the demo extract: in the installed package, else in ``data/`` of a checkout.
 
-    Raises SourceNotFoundError if it is in neither.
+    Raises SourceNotFoundError if it is missing.
     """
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "demo", package.parent / "data"):

@@ -1,4 +1,4 @@
-"""Map objects as they come, before they are features: columns of nodes, ways and relations."""
+"""Nodes, ways and relations of a map as columns, before features are built from them."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from geoscene.typing import Ints
 Members = tuple[tuple[str, int, str], ...]
 
 UNITS = 10_000_000
-"""OpenStreetMap's coordinates are whole numbers of 1e-7 degrees."""
+"""Coordinate units per degree: OpenStreetMap stores integers of 1e-7 degrees."""
 
 UNKNOWN = 2**31 - 1
-"""A coordinate that was not given."""
+"""Value of a missing coordinate."""
 
 
 @dataclass(frozen=True, slots=True)
 class Elements:
-    """Nodes, ways and relations, each sorted by id, each id once; independent of the order they came in.
+    """Nodes, ways and relations, each sorted by unique id, independent of the order in the file.
 
     node_id   : (n,) int64
     node_xy   : (n, 2) int32, longitude and latitude in 1e-7 degrees, within range
-    node_tags : tags of the nodes that have any, by id
+    node_tags : tags of tagged nodes, by id
     way_id    : (w,) int64
     way_start : (w + 1,) int64, way i refers to ``ref[way_start[i] : way_start[i + 1]]``
-    way_closed : (w,) bool, whether the first and last reference are the same node, here or not
+    way_closed : (w,) bool, whether the first and last reference are the same node, even if it is missing
     way_tags  : tags of each way
-    ref       : (r,) int64, node index, or -1 for a node that is not here
+    ref       : (r,) int64, node index, or -1 for a missing node
     relations : (id, tags, members)
     bounds    : (west, south, east, north) degrees as stated by the source, or None
     timestamp : ISO 8601 or ""
@@ -53,16 +53,16 @@ class Elements:
     misplaced: Ints
 
     def chain(self, way: int) -> Ints:
-        """(k,) node indices of the way in row ``way``, -1 for nodes that are not here."""
+        """(k,) node indices of the way in row ``way``, -1 for missing nodes."""
         return self.ref[self.way_start[way] : self.way_start[way + 1]]
 
     def lonlat(self, nodes: Ints) -> NDArray[np.float64]:
-        """(k, 2) degrees of nodes given by index."""
+        """Longitude and latitude (k, 2) of nodes by index, degrees."""
         return self.node_xy[nodes] / UNITS
 
 
 def _last_of_each(ids: Ints) -> Ints:
-    """Positions that sort ``ids``, the last one of equal ids only."""
+    """Indices that sort ``ids``; of equal ids only the last."""
     order = np.argsort(ids, kind="stable")
     ordered = ids[order]
     last = np.ones(len(ids), bool)
@@ -72,9 +72,9 @@ def _last_of_each(ids: Ints) -> Ints:
 
 @dataclass(slots=True)
 class Collector:
-    """Takes map objects one by one, in any order; `finish` hands them over as `Elements`.
+    """Collects map objects one by one, in any order; `finish` returns them as `Elements`.
 
-    An object that comes twice counts as it came last.
+    Of objects with the same id the last counts.
     """
 
     bounds: tuple[float, float, float, float] | None = None
@@ -90,11 +90,11 @@ class Collector:
     _relations: dict[int, tuple[Tags, Members]] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Number of objects taken."""
+        """Number of objects added."""
         return len(self._node_id) + len(self._way_id) + len(self._relations)
 
     def node(self, osm_id: int, x: int, *, y: int, tags: Tags | None) -> None:
-        """Take a node at ``x``, ``y`` (longitude, latitude in 1e-7 degrees, `UNKNOWN` if not given)."""
+        """Add a node at ``x``, ``y`` (longitude, latitude in 1e-7 degrees, `UNKNOWN` if missing)."""
         self._node_id.append(osm_id)
         self._node_x.append(x)
         self._node_y.append(y)
@@ -102,7 +102,7 @@ class Collector:
             self._node_tags[osm_id] = tags
 
     def way(self, osm_id: int, refs: Iterable[int], *, tags: Tags) -> None:
-        """Take a way by its node ids."""
+        """Add a way by its node ids."""
         before = len(self._refs)
         self._refs.extend(refs)
         self._way_id.append(osm_id)
@@ -110,11 +110,11 @@ class Collector:
         self._way_tags.append(tags)
 
     def relation(self, osm_id: int, tags: Tags, *, members: Members) -> None:
-        """Take a relation."""
+        """Add a relation."""
         self._relations[osm_id] = (tags, members)
 
     def finish(self) -> Elements:
-        """All objects taken, sorted, references resolved."""
+        """All objects, sorted by id, with node references resolved."""
         ids = np.frombuffer(self._node_id, np.int64) if self._node_id else np.empty(0, np.int64)
         keep = _last_of_each(ids)
         ids = ids[keep]

@@ -1,4 +1,4 @@
-"""Public elevation tiles: web-Mercator PNGs whose colours are heights, joined into one GeoTIFF."""
+"""Public elevation tiles: web-Mercator PNGs that encode heights, joined into one GeoTIFF."""
 
 from __future__ import annotations
 
@@ -19,12 +19,10 @@ from geoscene.errors import InputError, NetworkError
 from geoscene.files import write_atomically
 from geoscene.frames import Frame
 from geoscene.progress import Progress, silent
-from geoscene.sources.data import OsmData
+from geoscene.sources.data import Bounds, OsmData
 from geoscene.sources.http import BUSY, RefusedError, cause, open_session
 from geoscene.sources.registry import SOURCES
 from geoscene.typing import Float
-
-Box = tuple[float, float, float, float]
 
 DATUM = "the geoids of the tiles' sources, mixed (EGM96, EGM2008, NAVD88, national)"
 
@@ -40,17 +38,17 @@ _CACHE_VERSION = 1
 
 @dataclass(frozen=True, slots=True)
 class TileServer:
-    """Where elevation tiles come from, and how patiently they are asked for.
+    """A server of elevation tiles, and how requests are repeated.
 
     template   : address of a tile with {z}, {x} and {y}; 256-pixel PNGs in the terrarium encoding
-    credit     : whom to name, where the data are used
-    datum      : what heights are above, in words
-    user_agent : what the server is told of who asks
-    timeout    : seconds for one answer
-    attempts   : how often a tile is asked for while the server fails or says that it is busy
+    credit     : attribution of the data
+    datum      : vertical datum, in words
+    user_agent : header that names the client
+    timeout    : seconds per request
+    attempts   : how often a tile is requested while the server fails or is busy
     wait       : seconds before the second attempt, doubled before each further one
-    deepest    : the last zoom that the server has
-    most       : more tiles than that are not asked for
+    deepest    : largest zoom of the server
+    most       : largest number of tiles of one map
     """
 
     template: str = "https://s3.amazonaws.com/elevation-tiles-prod/terrarium/{z}/{x}/{y}.png"
@@ -64,13 +62,13 @@ class TileServer:
     most: int = 2000
 
     def __post_init__(self) -> None:
-        """Refuse an address that does not name one tile."""
+        """Raise InputError for an address without the placeholders of a tile."""
         if not all(part in self.template for part in ("{z}", "{x}", "{y}")):
             raise InputError(f"{self.template}: give the address of a tile with {{z}}, {{x}} and {{y}} in it")
 
 
 def zoom_at(lat_deg: float, *, deepest: int = 15) -> int:
-    """The first zoom whose pixels are at most 10 m wide on the ground at a latitude."""
+    """The smallest zoom whose pixels are at most 10 m wide on the ground at a latitude."""
     whole = 2 * _HALF_WORLD * math.cos(math.radians(lat_deg)) / _SIDE
     return min(max(math.ceil(math.log2(whole / _COARSEST)), 0), deepest)
 
@@ -91,20 +89,19 @@ def fetch_elevation(
 ) -> Path:
     """A GeoTIFF of the ground under a map, made from elevation tiles; for `ground.terrain.open_terrain`.
 
-    The tiles also hold the sea's floor. Where the map has a coastline, negative heights that hang together
-    with it are set to 0, the level that the water has; land that lies deeper behind a dike keeps its
-    heights.
+    The tiles include the sea floor. If the map has a coastline, connected areas of negative heights at it are
+    set to 0, the height of the water; land below sea level behind a dike keeps its heights.
 
-    cache_dir : folder that keeps tiles and the GeoTIFF; each is asked for once
-    crs       : of the scene, as `geoscene.frames.Frame.at` takes it: its rectangle is what is covered
+    cache_dir : folder for the tiles and the GeoTIFF; each tile is requested once
+    crs       : of the scene, as in `geoscene.frames.Frame.at`; the GeoTIFF covers the scene's rectangle
     server    : the public tiles if None
-    zoom      : of the tiles; by default the first with pixels of at most 10 m (5 to 10 m)
+    zoom      : of the tiles; by default the smallest with pixels of at most 10 m (5 to 10 m)
 
     Raises InputError for a map beyond 85° of latitude or larger than the server's limit, NetworkError if
-    a tile does not come.
+    a tile cannot be fetched.
     """
     server = server or TileServer()
-    west, south, east, north = _needed(osm, crs)
+    west, south, east, north = _scene_box(osm, crs)
     z = zoom_at((south + north) / 2, deepest=server.deepest) if zoom is None else zoom
     (left, top), (right, bottom) = _pixels(np.array([[west, north], [east, south]]), z)
     limit = 2**z - 1
@@ -118,9 +115,9 @@ def fetch_elevation(
         )
     coast = [way.lonlat for way in osm.ways if way.tags.get("natural") == "coastline"]
     shore = np.concatenate(coast) if coast else np.empty((0, 2))
-    recipe = hashlib.sha256(f"{_CACHE_VERSION}\n{server}\n{z} {x0} {y0} {x1} {y1}\n".encode())
-    recipe.update(np.ascontiguousarray(shore).tobytes())
-    path = cache_dir / f"elevation-z{z}-{recipe.hexdigest()[:16]}.tif"
+    cache_key = hashlib.sha256(f"{_CACHE_VERSION}\n{server}\n{z} {x0} {y0} {x1} {y1}\n".encode())
+    cache_key.update(np.ascontiguousarray(shore).tobytes())
+    path = cache_dir / f"elevation-z{z}-{cache_key.hexdigest()[:16]}.tif"
     if path.exists():
         return path
     heights = np.empty(((y1 - y0 + 1) * _SIDE, (x1 - x0 + 1) * _SIDE))
@@ -136,8 +133,8 @@ def fetch_elevation(
     return path
 
 
-def _needed(osm: OsmData, crs: str) -> Box:
-    """The box (degrees) of a scene's rectangle: the map's bounds and the buildings that reach over them."""
+def _scene_box(osm: OsmData, crs: str) -> Bounds:
+    """Bounding box (degrees) of a scene: the map's bounds and the buildings that extend beyond them."""
     import shapely  # noqa: PLC0415 - slow to import
 
     built = [a.geometry for a in osm.areas if "building" in a.tags or "building:part" in a.tags]
@@ -157,7 +154,7 @@ def _needed(osm: OsmData, crs: str) -> Box:
 
 
 def _pixels(lonlat: Float, z: int) -> Float:
-    """Fractional pixels (n, 2), x east and y south, of the world at a zoom."""
+    """Fractional pixel coordinates (n, 2) in the world's grid at a zoom, x east and y south."""
     lon, lat = np.radians(lonlat).T
     world = np.column_stack([lon, -np.arcsinh(np.tan(lat))]) / math.pi  # -1 to 1 each
     pixels: Float = (world + 1) / 2 * _SIDE * 2**z
@@ -165,25 +162,25 @@ def _pixels(lonlat: Float, z: int) -> Float:
 
 
 def _tiles(names: list[tuple[int, int]], z: int, *, cache_dir: Path, server: TileServer) -> Any:
-    """Heights (256, 256) of each tile in turn, from the cache or the server."""
+    """Yields the heights (256, 256) of each tile, from the cache or the server."""
     folder = cache_dir / "tiles" / hashlib.sha256(server.template.encode()).hexdigest()[:16] / str(z)
     folder.mkdir(parents=True, exist_ok=True)
     with open_session(server.user_agent) as session:
         for x, y in names:
             path = folder / f"{x}_{y}.png"
-            kept = _heights(path.read_bytes()) if path.exists() else None
-            if kept is None:
+            heights_of_tile = _heights(path.read_bytes()) if path.exists() else None
+            if heights_of_tile is None:
                 url = server.template.format(z=z, x=x, y=y)
                 content = _download(session, url, server=server)
-                kept = _heights(content)
-                if kept is None:
+                heights_of_tile = _heights(content)
+                if heights_of_tile is None:
                     raise NetworkError(f"{url}: no elevation tile (a PNG of 256 x 256 pixels) but other data")
                 write_atomically(path, content)
-            yield kept
+            yield heights_of_tile
 
 
 def _heights(content: bytes) -> Float | None:
-    """Heights of a tile, NaN where it is void; None if the bytes are no such tile."""
+    """Heights of a tile, NaN in voids; None if the bytes are not a tile."""
     from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - slow to import
 
     try:
@@ -197,7 +194,7 @@ def _heights(content: bytes) -> Float | None:
 
 
 def _download(session: Any, url: str, *, server: TileServer) -> bytes:
-    """The bytes at an address, asked for again while the server fails or is busy."""
+    """The bytes at an address; the request is repeated while the server fails or is busy."""
     pause = server.wait
     for attempt in range(server.attempts):
         if attempt:
@@ -220,24 +217,24 @@ def _download(session: Any, url: str, *, server: TileServer) -> bytes:
 
 
 def _without_sea_floor(heights: Float, shore: Float) -> Float:
-    """Heights with 0 instead of less wherever negative posts hang together with those at a coastline.
+    """Heights with 0 in connected areas of negative posts that touch a coastline.
 
-    shore : (n, 2) pixels (column, row) of the coastline's vertices, some outside
+    shore : (n, 2) pixels (column, row) of the coastline's vertices, possibly outside
     """
     from scipy import ndimage  # noqa: PLC0415 - slow to import
 
-    low = heights < 0.0
-    pieces, _ = ndimage.label(low, structure=np.ones((3, 3)))
+    negative = heights < 0.0
+    areas, _ = ndimage.label(negative, structure=np.ones((3, 3)))
     column, row = np.floor(shore).astype(int).T
     inside = (row >= 0) & (row < heights.shape[0]) & (column >= 0) & (column < heights.shape[1])
     near = np.zeros(heights.shape, np.bool_)
     near[row[inside], column[inside]] = True
     near = ndimage.binary_dilation(near, iterations=_SHORE, structure=np.ones((3, 3)))
-    return np.where(low & np.isin(pieces, np.unique(pieces[near & low])), 0.0, heights)
+    return np.where(negative & np.isin(areas, np.unique(areas[near & negative])), 0.0, heights)
 
 
 def _geotiff(heights: Float, z: int, *, column: int, row: int, server: TileServer) -> bytes:
-    """The bytes of a GeoTIFF of heights (float32: the tiles' 1/256 m is exact) whose first pixel is given."""
+    """The bytes of a float32 GeoTIFF of heights, whose first pixel is at (column, row) of the zoom's grid."""
     import rasterio  # noqa: PLC0415 - slow to import
     from rasterio.io import MemoryFile  # noqa: PLC0415
     from rasterio.transform import Affine  # noqa: PLC0415

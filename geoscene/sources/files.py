@@ -1,29 +1,26 @@
-"""OpenStreetMap extracts in files."""
+"""Reads OpenStreetMap extracts from files."""
 
 from __future__ import annotations
 
 import datetime as dt
 import json
-from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from geoscene.errors import InputError, SourceNotFoundError
-from geoscene.sources.assemble import Bounds, checked_bounds, features
-from geoscene.sources.data import OsmData
+from geoscene.sources.assemble import checked_bounds, features
+from geoscene.sources.data import Bounds, OsmData, Progress
 from geoscene.sources.elements import Collector
 from geoscene.sources.overpass import collect_answer
 from geoscene.sources.plain_xml import collect_xml
-
-Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 _HELP = "give an OpenStreetMap extract (.osm, .osm.gz, .osm.bz2, .osm.pbf)"
 
 
 def _format_of(path: Path) -> str:
-    """What a file's format is called, by its first bytes, whatever the file is called.
+    """The format of a file by its first bytes, not by its name.
 
-    Raises InputError for anything that is no OpenStreetMap file.
+    Raises InputError for a file that is not an OpenStreetMap file.
     """
     with path.open("rb") as file:
         head = file.read(64)
@@ -45,8 +42,8 @@ def _format_of(path: Path) -> str:
     raise InputError(f"{path}: not an OpenStreetMap file; {_HELP}")
 
 
-def _stream(file: Any, taken: Collector, *, progress: Progress) -> None:
-    """Put the objects that libosmium reads into ``taken``."""
+def _stream(file: Any, collector: Collector, *, progress: Progress) -> None:
+    """Add the objects that libosmium reads to ``collector``."""
     import osmium  # noqa: PLC0415 - heavy
 
     stream = osmium.FileProcessor(file)
@@ -57,65 +54,67 @@ def _stream(file: Any, taken: Collector, *, progress: Progress) -> None:
         if item.is_node():
             place = item.location
             tags = {tag.k: tag.v for tag in item.tags} if item.tags else None
-            taken.node(item.id, place.x, y=place.y, tags=tags)
+            collector.node(item.id, place.x, y=place.y, tags=tags)
             if tags is None:
                 continue
         elif item.is_way() and not item.deleted:
-            taken.way(item.id, [node.ref for node in item.nodes], tags={tag.k: tag.v for tag in item.tags})
+            collector.way(
+                item.id, [node.ref for node in item.nodes], tags={tag.k: tag.v for tag in item.tags}
+            )
         elif item.is_relation() and not item.deleted:
             members = tuple((kinds[m.type], m.ref, m.role) for m in item.members)
-            taken.relation(item.id, {tag.k: tag.v for tag in item.tags}, members=members)
+            collector.relation(item.id, {tag.k: tag.v for tag in item.tags}, members=members)
         else:
             continue
         if not stated:
             newest = max(newest, item.timestamp)
-    taken.timestamp = stated or (newest.strftime("%Y-%m-%dT%H:%M:%SZ") if newest.timestamp() > 0 else "")
+    collector.timestamp = stated or (newest.strftime("%Y-%m-%dT%H:%M:%SZ") if newest.timestamp() > 0 else "")
 
 
 def _collect(path: Path, progress: Progress) -> Collector:
-    """The objects of a file. Raises whatever its reader raises."""
+    """The objects of a file. Raises the errors of its reader."""
     import osmium  # noqa: PLC0415 - heavy
 
-    form = _format_of(path)
-    taken = Collector()
-    if form == "json":
-        collect_answer(json.loads(path.read_bytes()), taken)
-        return taken
-    file = osmium.io.File(str(path), form)
+    file_format = _format_of(path)
+    collector = Collector()
+    if file_format == "json":
+        collect_answer(json.loads(path.read_bytes()), collector)
+        return collector
+    file = osmium.io.File(str(path), file_format)
     box = osmium.FileProcessor(file).header.box()
     if box.valid() and box.size() > 0:
         low, high = box.bottom_left, box.top_right
-        taken.bounds = (low.lon, low.lat, high.lon, high.lat)
+        collector.bounds = (low.lon, low.lat, high.lon, high.lat)
     try:
-        _stream(file, taken, progress=progress)
-    except osmium.InvalidLocationError:  # a node's position is no number: read on without libosmium
-        taken = Collector(bounds=taken.bounds)
-        collect_xml(path, form, taken=taken, progress=progress)
-    return taken
+        _stream(file, collector, progress=progress)
+    except osmium.InvalidLocationError:  # the position of a node is not a number: read without libosmium
+        collector = Collector(bounds=collector.bounds)
+        collect_xml(path, file_format, collector=collector, progress=progress)
+    return collector
 
 
 def read_osm(path: str | Path, *, bounds: Bounds | None = None, progress: Progress = iter) -> OsmData:
     """The features of an OpenStreetMap extract: XML (plain, gzip, bzip2), PBF, o5m or Overpass JSON.
 
-    The format is told by the first bytes, not by the name. Ids may be negative and in any order, relations
-    may stand before ways. What is broken is repaired or dropped by the rules of docs/sources.md and listed in
-    ``problems``; the result does not depend on the order of the file.
+    The first bytes tell the format, not the name. Ids may be negative and in any order, and relations may
+    come before ways: the result does not depend on the order in the file. Defects are repaired or dropped by
+    the rules of docs/sources.md and listed in ``problems``.
 
     Parameters
     ----------
     path
         The file.
     bounds
-        Keep what meets this box (west, south, east, north in degrees), whole; everything if None.
+        Keep the features that intersect this box (west, south, east, north in degrees), whole; all if None.
     progress
-        Wraps the stream of map objects; they pass through it one by one.
+        Wraps the stream of map objects.
 
     Raises
     ------
     SourceNotFoundError
-        The file is absent, or holds nothing (within the bounds).
+        The file is missing, or has no features (within the bounds).
     InputError
-        The file is no OpenStreetMap file, is cut short or damaged, or the bounds are none.
+        The file is not an OpenStreetMap file, is truncated or damaged, or the bounds are invalid.
     """
     path = Path(path)
     if bounds is not None:
@@ -125,7 +124,7 @@ def read_osm(path: str | Path, *, bounds: Bounds | None = None, progress: Progre
     if path.is_dir():
         raise InputError(f"{path}: a directory; {_HELP}")
     try:
-        taken = _collect(path, progress)
+        collector = _collect(path, progress)
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}; {_HELP}") from None
     except PermissionError as error:
@@ -133,6 +132,6 @@ def read_osm(path: str | Path, *, bounds: Bounds | None = None, progress: Progre
     except (RuntimeError, OSError, ValueError, EOFError) as error:
         cause = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: damaged, cut short or no OpenStreetMap file ({cause}); {_HELP}") from error
-    if len(taken) == 0:
+    if len(collector) == 0:
         raise SourceNotFoundError(f"{path}: holds no map objects; {_HELP}")
-    return features(taken.finish(), bounds=bounds, source=path.name)
+    return features(collector.finish(), bounds=bounds, source=path.name)

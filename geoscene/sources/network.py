@@ -9,7 +9,7 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,32 +20,29 @@ import numpy as np
 from geoscene import __version__
 from geoscene.errors import InputError, NetworkError, SourceNotFoundError
 from geoscene.files import write_atomically
-from geoscene.sources.assemble import Bounds, checked_bounds, features
-from geoscene.sources.data import OsmData
+from geoscene.sources.assemble import checked_bounds, features
+from geoscene.sources.data import METRES_PER_DEGREE, Bounds, OsmData, Progress
 from geoscene.sources.elements import Collector
 from geoscene.sources.http import BUSY, RefusedError, cause, open_session
 from geoscene.sources.overpass import collect_answer, query_for
 
-Progress = Callable[[Iterable[Any]], Iterable[Any]]
-
-_METRES_PER_DEGREE = 111_195.0  # on a sphere of 6371 km, the mean radius of the Earth (IUGG)
-_SMALLEST = 400.0  # metres: a place that is a point or one house is fetched with its surroundings
+_SMALLEST = 400.0  # metres: smallest side of the box of a place
 _NOMINATIM_PAUSE = 1.0  # seconds before each request; the public server allows one a second
 _CACHE_VERSION = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Servers:
-    """Which servers are asked, and how patiently.
+    """Addresses of servers, and how requests are repeated and limited.
 
     nominatim     : base address of the geocoder
     overpass      : base addresses of map servers, tried in this order
-    user_agent    : what they are told of who asks
-    timeout       : seconds for one answer
-    rounds        : how often the whole list is tried while any server says that it is busy
-    wait          : seconds between rounds, less if the servers name a shorter time (``Retry-After``)
-    max_query_km2 : larger areas are asked for in parts
-    max_area_km2  : larger areas are refused; the public servers ask that such work be done from extracts
+    user_agent    : header that names the client
+    timeout       : seconds per request
+    rounds        : how often the whole list is tried while any server is busy
+    wait          : seconds between rounds, less if a server states a shorter time (``Retry-After``)
+    max_query_km2 : larger areas are fetched in parts
+    max_area_km2  : larger areas are refused; for these the public servers ask to use extracts
     """
 
     nominatim: str = "https://nominatim.openstreetmap.org/"
@@ -67,7 +64,7 @@ def _host(url: str) -> str:
 
 
 def _cached(cache_dir: Path | None, request: str, *, make: Callable[[], Any]) -> Any:
-    """The answer to ``request``: from the cache, else made and put there, whole or not at all."""
+    """The answer to ``request`` from the cache, else from ``make`` and then cached (atomic write)."""
     if cache_dir is None:
         return make()
     key = hashlib.sha256(f"{_CACHE_VERSION}\n{request}".encode()).hexdigest()[:24]
@@ -160,8 +157,8 @@ def _seconds_to_free_slot(session: Any, url: str, *, timeout: float) -> float:
 def _parts(bounds: Bounds, largest_km2: float) -> list[Bounds]:
     """The box cut into equal boxes of at most ``largest_km2``, each about square."""
     west, south, east, north = bounds
-    width = (east - west) * _METRES_PER_DEGREE * math.cos(math.radians((south + north) / 2)) / 1000
-    height = (north - south) * _METRES_PER_DEGREE / 1000
+    width = (east - west) * METRES_PER_DEGREE * math.cos(math.radians((south + north) / 2)) / 1000
+    height = (north - south) * METRES_PER_DEGREE / 1000
     side = math.sqrt(largest_km2)
     columns, rows = math.ceil(width / side), math.ceil(height / side)
     x = np.linspace(west, east, columns + 1).tolist()
@@ -172,7 +169,7 @@ def _parts(bounds: Bounds, largest_km2: float) -> list[Bounds]:
 def _area_km2(bounds: Bounds) -> float:
     west, south, east, north = bounds
     across = (east - west) * math.cos(math.radians((south + north) / 2))
-    return across * (north - south) * (_METRES_PER_DEGREE / 1000) ** 2
+    return across * (north - south) * (METRES_PER_DEGREE / 1000) ** 2
 
 
 def _fetch(
@@ -184,42 +181,42 @@ def _fetch(
             f"{source}: {area:,.0f} km², more than the {servers.max_area_km2:,.0f} km² that map servers"
             " may be asked for; take a part of it, or an extract of the region (`osm` FILE)"
         )
-    taken = Collector(bounds=bounds)
+    collector = Collector(bounds=bounds)
     for part in progress(_parts(bounds, servers.max_query_km2)):
         query = query_for(part, timeout=servers.timeout)
         answer = _cached(cache_dir, query, make=functools.partial(_ask_overpass, query, servers))
         try:
-            collect_answer(answer, taken)
+            collect_answer(answer, collector)
         except InputError as error:
             raise NetworkError(f"{source}: the map server's answer cannot be read ({error})") from error
-    if len(taken) == 0:
+    if len(collector) == 0:
         raise SourceNotFoundError(f"{source}: OpenStreetMap has nothing there; are the coordinates in order?")
-    return replace(features(taken.finish(), bounds=bounds, source=source), kind="overpass")
+    return replace(features(collector.finish(), bounds=bounds, source=source), kind="overpass")
 
 
 def _around(lon: float, lat: float, *, half_width: float, half_height: float) -> Bounds:
-    """The box of so many metres to each side of a point."""
-    dy = half_height / _METRES_PER_DEGREE
-    dx = half_width / (_METRES_PER_DEGREE * math.cos(math.radians(lat)))
+    """The box (degrees) around a point, by its half extents in metres."""
+    dy = half_height / METRES_PER_DEGREE
+    dx = half_width / (METRES_PER_DEGREE * math.cos(math.radians(lat)))
     return lon - dx, lat - dy, lon + dx, lat + dy
 
 
 def fetch_bbox(
-    bbox: tuple[float, float, float, float],
+    bbox: Bounds,
     *,
     cache_dir: Path | None = None,
     servers: Servers | None = None,
     progress: Progress = iter,
 ) -> OsmData:
-    """The features that meet a box, from Overpass; the same as `read_osm` gives for an extract.
+    """The features that intersect a box, from Overpass; the same as `read_osm` returns for an extract.
 
     bbox      : west, south, east, north in degrees
-    cache_dir : folder where answers are kept; the same request is then sent once. None keeps nothing
-    servers   : which servers, and how patiently; the public ones if None
-    progress  : wraps the parts in which a large area is asked for
+    cache_dir : folder for answers, so that the same request is sent once; no cache if None
+    servers   : the public ones if None
+    progress  : wraps the parts in which a large area is fetched
 
-    Raises InputError for a box that is none or too large, SourceNotFoundError if nothing is there,
-    NetworkError if no server delivers.
+    Raises InputError for an invalid or too large box, SourceNotFoundError if it is empty, NetworkError if no
+    server answers.
     """
     bounds = checked_bounds(bbox)
     source = f"OpenStreetMap, {','.join(f'{v:g}' for v in bounds)}"
@@ -235,7 +232,7 @@ def fetch_point(
     servers: Servers | None = None,
     progress: Progress = iter,
 ) -> OsmData:
-    """The features that meet the square of ``radius`` metres to each side of a point (degrees).
+    """The features that intersect the square of ``radius`` metres to each side of a point (degrees).
 
     Options and errors are those of `fetch_bbox`.
     """
@@ -251,9 +248,9 @@ def fetch_point(
 def locate(name: str, *, cache_dir: Path | None = None, servers: Servers | None = None) -> tuple[Bounds, str]:
     """The box of a place (west, south, east, north, degrees) and its full name, from Nominatim.
 
-    The first result that has an outline counts, else the first; a box below 400 m a side is widened to that.
+    The first result with an outline is taken, else the first; smaller boxes are widened to 400 m a side.
 
-    Raises SourceNotFoundError for a place that is not known, NetworkError if the server does not answer.
+    Raises SourceNotFoundError for an unknown place, NetworkError if the server does not answer.
     """
     servers = servers or Servers()
     if not name.strip():
@@ -281,7 +278,7 @@ def fetch_place(
     servers: Servers | None = None,
     progress: Progress = iter,
 ) -> OsmData:
-    """The features that meet the box of a place, found by its name as Nominatim knows it ("Norfolk, VA").
+    """The features that intersect the box of a place, given by a name for Nominatim ("Norfolk, VA").
 
     Options and errors are those of `fetch_bbox` and `locate`.
     """

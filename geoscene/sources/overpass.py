@@ -1,24 +1,22 @@
-"""Overpass: the query that fetches an area, and the JSON that answers it."""
+"""Overpass: the query for an area, and the JSON of its answer."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from geoscene.errors import InputError
-from geoscene.sources.data import Tags
+from geoscene.sources.data import Bounds, Tags
 from geoscene.sources.elements import Collector
 from geoscene.sources.plain_xml import whole_units
 
-Box = tuple[float, float, float, float]
-
 RELATIONS = "building|bridge|multipolygon|restriction|site|tunnel"
-"""Types of relations that are fetched; routes and boundaries reach far beyond and say nothing of an area."""
+"""Types of relations that are fetched; routes and boundaries extend far beyond the area and are not used."""
 
 
-def query_for(box: Box, *, timeout: int = 180) -> str:
-    """The Overpass QL query for everything a scene is made of in a box (west, south, east, north, degrees).
+def query_for(box: Bounds, *, timeout: int = 180) -> str:
+    """The Overpass QL query for all features of a scene in a box (west, south, east, north, degrees).
 
-    Ways that meet the box and multipolygons with all their ways come whole, with their nodes.
+    It returns ways that intersect the box, and multipolygons with all their ways, with all their nodes.
     """
     west, south, east, north = box
     area = f"({south:.7f},{west:.7f},{north:.7f},{east:.7f})"
@@ -33,27 +31,27 @@ def query_for(box: Box, *, timeout: int = 180) -> str:
     )
 
 
-def collect_answer(answer: Any, taken: Collector) -> None:
-    """Put the objects of one answer into ``taken``.
+def collect_answer(answer: Any, collector: Collector) -> None:
+    """Add the objects of one answer to ``collector``.
 
-    Raises InputError if it is not the JSON that Overpass answers with.
+    Raises InputError if it is not Overpass JSON.
     """
     if not isinstance(answer, dict) or not isinstance(answer.get("elements"), list):
         raise InputError("JSON, but not as Overpass answers with [out:json]: no list of elements")
     stamp = answer.get("osm3s", {}).get("timestamp_osm_base", "")
-    taken.timestamp = max(taken.timestamp, str(stamp))
+    collector.timestamp = max(collector.timestamp, str(stamp))
     try:
         for item in answer["elements"]:
             tags: Tags = item.get("tags") or {}
             kind, osm_id = item["type"], item["id"]
             if kind == "node":
-                taken.node(
+                collector.node(
                     osm_id, whole_units(item.get("lon")), y=whole_units(item.get("lat")), tags=tags or None
                 )
             elif kind == "way":
-                taken.way(osm_id, item.get("nodes", ()), tags=tags)
+                collector.way(osm_id, item.get("nodes", ()), tags=tags)
             elif kind == "relation":
                 members = tuple((m["type"], m["ref"], m["role"]) for m in item.get("members", ()))
-                taken.relation(osm_id, tags, members=members)
+                collector.relation(osm_id, tags, members=members)
     except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(f"JSON, but not as Overpass answers with [out:json]: {error!r}") from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ from pyproj.exceptions import CRSError
 
 from geoscene.errors import InputError, SourceNotFoundError, need
 from geoscene.report import Problem
-from geoscene.sources.assemble import Bounds, checked_bounds
-from geoscene.sources.data import Area, OsmData, Tags
+from geoscene.sources.assemble import checked_bounds
+from geoscene.sources.data import Area, Bounds, OsmData, Progress, Tags
 from geoscene.sources.registry import SOURCES
 from geoscene.sources.rings import polygons_of
 
@@ -44,7 +44,7 @@ def read_overture(
     path: str | Path,
     *,
     bounds: Bounds | None = None,
-    progress: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+    progress: Progress = iter,
 ) -> OsmData:
     """The buildings of a GeoParquet file, or of a folder of them, as areas with OpenStreetMap's tags.
 

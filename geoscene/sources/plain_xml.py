@@ -1,22 +1,23 @@
-"""OpenStreetMap XML with coordinates that are no coordinates, which libosmium refuses as a whole."""
+"""Reads OpenStreetMap XML with invalid coordinates, which libosmium refuses as a whole."""
 
 from __future__ import annotations
 
 import bz2
 import gzip
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
+from geoscene.sources.data import Progress
 from geoscene.sources.elements import UNITS, UNKNOWN, Collector
 
 _OPEN: dict[str, Callable[..., Any]] = {"osm": open, "osm.gz": gzip.open, "osm.bz2": bz2.open}
 
 
 def whole_units(degrees: Any) -> int:
-    """A coordinate in 1e-7 degrees; `UNKNOWN` if it is none, or far out of range."""
+    """A coordinate in 1e-7 degrees; `UNKNOWN` if it is not a number or far out of range."""
     try:
         value = float(degrees)
     except (TypeError, ValueError):
@@ -24,14 +25,12 @@ def whole_units(degrees: Any) -> int:
     return round(value * UNITS) if math.isfinite(value) and abs(value) <= 200 else UNKNOWN
 
 
-def collect_xml(
-    path: Path, form: str, *, taken: Collector, progress: Callable[[Iterable[Any]], Iterable[Any]]
-) -> None:
-    """Put the objects of an XML file into ``taken``, nodes without a position too; slower than libosmium.
+def collect_xml(path: Path, form: str, *, collector: Collector, progress: Progress) -> None:
+    """Add the objects of an XML file to ``collector``, also nodes without a position; slower than libosmium.
 
     form : ``osm``, ``osm.gz`` or ``osm.bz2``
 
-    Raises ValueError or OSError for a file that is damaged.
+    Raises ValueError or OSError for a damaged file.
     """
     try:
         with _OPEN[form](path, "rb") as file:
@@ -42,17 +41,17 @@ def collect_xml(
                 osm_id = int(item.get("id", ""))
                 if item.tag == "node":
                     x, y = whole_units(item.get("lon")), whole_units(item.get("lat"))
-                    taken.node(osm_id, x, y=y, tags=tags or None)
+                    collector.node(osm_id, x, y=y, tags=tags or None)
                 elif item.tag == "way":
-                    taken.way(osm_id, [int(nd.get("ref", "")) for nd in item.iter("nd")], tags=tags)
+                    collector.way(osm_id, [int(nd.get("ref", "")) for nd in item.iter("nd")], tags=tags)
                 else:
                     members = tuple(
                         (m.get("type", ""), int(m.get("ref", "")), m.get("role", ""))
                         for m in item.iter("member")
                     )
-                    taken.relation(osm_id, tags, members=members)
-                if not taken.timestamp or item.get("timestamp", "") > taken.timestamp:
-                    taken.timestamp = item.get("timestamp", "")
+                    collector.relation(osm_id, tags, members=members)
+                if not collector.timestamp or item.get("timestamp", "") > collector.timestamp:
+                    collector.timestamp = item.get("timestamp", "")
                 item.clear()
     except ET.ParseError as error:
         raise ValueError(str(error)) from error

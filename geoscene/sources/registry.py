@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from geoscene.errors import InputError
-from geoscene.sources.data import Credit, OsmData, Tags
+from geoscene.sources.data import Bounds, Credit, OsmData, Progress, Tags
 from geoscene.sources.tags import is_building
-
-Bounds = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,7 +97,7 @@ def read_source(
     path: str | Path,
     *,
     bounds: Bounds | None = None,
-    progress: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+    progress: Progress = iter,
 ) -> OsmData:
     """The features of a file of a source, within bounds (west, south, east, north, degrees) if given.
 

@@ -1,4 +1,4 @@
-"""Areas from the lines that bound them: segments joined by node, whatever their order, direction or role."""
+"""Areas from their boundary lines: segments are joined by node, regardless of order, direction and role."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.sources.data import METRES_PER_DEGREE, Bounds
 from geoscene.typing import Float, Ints
 
 
@@ -18,7 +19,7 @@ class Chain:
     """One member of an area's boundary.
 
     nodes : (k,) node indices, none missing
-    inner : whether it is said to bound a hole
+    inner : whether its role says that it bounds a hole
     """
 
     nodes: Ints
@@ -37,21 +38,21 @@ def polygons_of(geometry: Any) -> Any:
 
 
 def segments_of(nodes: Ints) -> Ints:
-    """(s, 2) int64 node indices of a chain's segments, the lesser first; segments of no length left out."""
+    """(s, 2) int64 node indices of a chain's segments, the smaller first; without segments of no length."""
     pairs: Ints = np.sort(np.stack([nodes[:-1], nodes[1:]], axis=1), axis=1)
     distinct: Ints = pairs[pairs[:, 0] != pairs[:, 1]]
     return distinct
 
 
 def _odd_ends(segments: Ints) -> Ints:
-    """The nodes at which an odd number of segments end: where the boundary is open."""
+    """The nodes where an odd number of segments end, so that the boundary is open."""
     nodes, count = np.unique(segments, return_counts=True)
     odd: Ints = nodes[count % 2 == 1]
     return odd
 
 
 def _prune(segments: Ints) -> Ints:
-    """Segments less those that lead to a dead end."""
+    """The segments without those that lead to a dead end."""
     while len(segments):
         _, inverse, count = np.unique(segments, return_inverse=True, return_counts=True)
         alive = (count[inverse.reshape(segments.shape)] > 1).all(axis=1)
@@ -62,7 +63,7 @@ def _prune(segments: Ints) -> Ints:
 
 
 def _inside(points: Float, a: Float, *, b: Float) -> NDArray[np.bool_]:
-    """(p,) whether a ray eastwards from each point crosses an odd number of the segments a to b."""
+    """(p,) bool, whether an eastward ray from each point crosses an odd number of segments a to b."""
     out = np.empty(len(points), bool)
     for i, (x, y) in enumerate(points):
         spans = (a[:, 1] > y) != (b[:, 1] > y)
@@ -72,10 +73,10 @@ def _inside(points: Float, a: Float, *, b: Float) -> NDArray[np.bool_]:
 
 
 def enclosed(segments: Ints, xy: Float) -> tuple[Any, bool]:
-    """The area that segments bound, by the even-odd rule, and whether any cross or overlap between nodes.
+    """The area that segments enclose by the even-odd rule, and whether any cross or overlap between nodes.
 
-    Where the boundary is open, dead ends are left out and what is still enclosed counts as inside. The area
-    is None if nothing is enclosed.
+    If the boundary is open, dead ends are removed and everything enclosed counts as inside. The area is None
+    if nothing is enclosed.
     """
     segments = _prune(segments)
     if len(segments) == 0:
@@ -93,7 +94,7 @@ def enclosed(segments: Ints, xy: Float) -> tuple[Any, bool]:
 
 
 def _joined(chains: Sequence[Ints]) -> list[list[Ints]]:
-    """Chains grouped into rings: closed ones alone, open ones with those they meet end to end."""
+    """Chains grouped into rings: each closed one alone, open ones with those that share their ends."""
     groups: list[list[Ints]] = []
     owner: dict[int, int] = {}
     for chain in chains:
@@ -101,12 +102,12 @@ def _joined(chains: Sequence[Ints]) -> list[list[Ints]]:
         if len(ends) == 1:
             groups.append([chain])
             continue
-        met = sorted({owner[end] for end in ends if end in owner})
-        target = met[0] if met else len(groups)
-        if not met:
+        groups_at_ends = sorted({owner[end] for end in ends if end in owner})
+        target = groups_at_ends[0] if groups_at_ends else len(groups)
+        if not groups_at_ends:
             groups.append([])
         groups[target].append(chain)
-        for other in met[1:]:
+        for other in groups_at_ends[1:]:
             groups[target] += groups[other]
             groups[other] = []
         for member in groups[target]:
@@ -115,7 +116,7 @@ def _joined(chains: Sequence[Ints]) -> list[list[Ints]]:
 
 
 def _union_of_rings(chains: Sequence[Ints], xy: Float) -> Any:
-    """The union of what each ring encloses; empty if none does."""
+    """The union of the areas that the rings enclose; empty if there is none."""
     areas = []
     for group in _joined(chains):
         segments = np.unique(np.concatenate([segments_of(chain) for chain in group]), axis=0)
@@ -127,10 +128,10 @@ def _union_of_rings(chains: Sequence[Ints], xy: Float) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Assembly:
-    """What `assemble` made of a boundary.
+    """Result of `assemble`.
 
     geometry : Polygon or MultiPolygon, valid, exteriors counter-clockwise; None if nothing is enclosed
-    reason   : "" if the boundary was sound, else ``open-ring``, ``self-crossing``, ``duplicate-way``
+    reason   : "" if the boundary is valid, else ``open-ring``, ``self-crossing``, ``duplicate-way``
                or ``spike``
     """
 
@@ -139,26 +140,26 @@ class Assembly:
 
 
 def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> Assembly:
-    """The area that chains bound together.
+    """The area that chains enclose.
 
-    A sound boundary (every node met an even number of times, no crossing between nodes) is taken by the
-    even-odd rule and needs no roles: segments that two rings share cancel, so that touching holes become one.
-    Otherwise, and where members are missing (not ``complete``), the rings that close are taken one by one:
-    the union of the outer less the union of the inner.
+    A valid boundary (an even number of segments at every node, no crossing between nodes) is filled by the
+    even-odd rule and needs no roles: segments shared by two rings cancel, so that touching holes
+    become one. Otherwise, or if members are missing (not ``complete``), the closed rings are used: the union
+    of the outer ones minus the union of the inner ones.
 
     xy : (n, 2) coordinates of all nodes
     """
-    seen: set[bytes] = set()
-    once: list[Chain] = []
+    known: set[bytes] = set()
+    unique: list[Chain] = []
     parts: list[Ints] = []
     spikes = False
     for chain in chains:
         segments = segments_of(chain.nodes)
         distinct = np.unique(segments, axis=0)
         key = distinct.tobytes()
-        if len(segments) and key not in seen:
-            seen.add(key)
-            once.append(chain)
+        if len(segments) and key not in known:
+            known.add(key)
+            unique.append(chain)
             spikes |= len(distinct) < len(segments)
             parts.append(segments)
     if not parts:
@@ -166,27 +167,26 @@ def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> As
     every, count = np.unique(np.concatenate(parts), axis=0, return_counts=True)
     odd = every[count % 2 == 1]
     is_open = len(_odd_ends(odd)) > 0
-    reason = (
-        "open-ring" if is_open else "duplicate-way" if len(once) < len(chains) else "spike" if spikes else ""
-    )
+    defects = (("open-ring", is_open), ("duplicate-way", len(unique) < len(chains)), ("spike", spikes))
+    reason = next((name for name, found in defects if found), "")
     crossing = False
     if complete and not is_open and len(odd):
         geometry, crossing = enclosed(odd, xy)
         if not crossing:
             return Assembly(geometry, reason)
         reason = "self-crossing"
-    outer = _union_of_rings([c.nodes for c in once if not c.inner], xy)
-    inner = _union_of_rings([c.nodes for c in once if c.inner], xy)
+    outer = _union_of_rings([c.nodes for c in unique if not c.inner], xy)
+    inner = _union_of_rings([c.nodes for c in unique if c.inner], xy)
     if complete and outer.is_empty:
         return Assembly(polygons_of(inner), reason)
     return Assembly(polygons_of(shapely.difference(outer, inner)), reason)
 
 
-def close_cut_ring(nodes: Ints, xy: Float, *, extent: tuple[float, float, float, float]) -> Ints | None:
-    """A ring that the edge of an extract cut, closed by straight edges; None if that is not sensible.
+def close_cut_ring(nodes: Ints, xy: Float, *, extent: Bounds) -> Ints | None:
+    """A ring cut off at the edge of an extract, closed by straight edges; None if the result is implausible.
 
-    It is sensible where both ends of every gap lie within 100 m of the extent's edge, the edges put in are
-    at most a third of the outline, and the outline does not cross itself and covers a square metre.
+    It is plausible if both ends of every gap lie within 100 m of the extent's edge, the added edges are at
+    most a third of the outline, and the outline does not cross itself and has at least 1 m².
 
     nodes  : (k,) node indices, -1 where a node is missing; the last need not equal the first
     xy     : (n, 2) degrees of all nodes
@@ -202,9 +202,7 @@ def close_cut_ring(nodes: Ints, xy: Float, *, extent: tuple[float, float, float,
     gap = following != here + 1
     gap[-1] = not (closed and here[-1] == len(ring) - 1)
     west, south, east, north = extent
-    metres = 111_195.0 * np.array(
-        [np.cos(np.radians((south + north) / 2)), 1.0]
-    )  # mean Earth radius, 6371 km
+    metres = METRES_PER_DEGREE * np.array([np.cos(np.radians((south + north) / 2)), 1.0])
     start = xy[kept] * metres
     end = np.roll(start, -1, axis=0)
     length = np.hypot(*(end - start).T)

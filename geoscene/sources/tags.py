@@ -1,15 +1,15 @@
-"""What tags say a map object is: an area, a line, and of which kind."""
+"""Classifies map objects by their tags: area or line, and the kind."""
 
 from __future__ import annotations
 
 from geoscene.sources.data import Tags
 
-ANY: frozenset[str] = frozenset()
+_ALL_VALUES: frozenset[str] = frozenset()
 
 NOISE = frozenset(
     {"attribution", "created_by", "fixme", "FIXME", "note", "odbl", "source", "source_ref", "todo"}
 )
-"""Keys that describe the mapping, not the thing; an object with no others counts as untagged."""
+"""Keys that describe the mapping, not the object; an object with only these counts as untagged."""
 
 _NATURAL_LINES = frozenset(
     {"arch", "arete", "cliff", "coastline", "earth_bank", "gully", "ridge", "tree_row", "valley"}
@@ -19,19 +19,19 @@ AREA_KEYS: dict[str, tuple[bool, frozenset[str]]] = {
     # key: (True, values that are lines) or (False, the only values that are areas)
     "aeroway": (True, frozenset({"jet_bridge", "parking_position", "runway", "taxiway"})),
     "amenity": (True, frozenset({"bench", "weighbridge"})),
-    "area:highway": (True, ANY),
+    "area:highway": (True, _ALL_VALUES),
     "boundary": (False, frozenset({"forest", "hazard", "national_park", "protected_area"})),
-    "building": (True, ANY),
-    "building:part": (True, ANY),
-    "club": (True, ANY),
-    "craft": (True, ANY),
+    "building": (True, _ALL_VALUES),
+    "building:part": (True, _ALL_VALUES),
+    "club": (True, _ALL_VALUES),
+    "craft": (True, _ALL_VALUES),
     "emergency": (True, frozenset({"designated", "destination", "official", "private", "yes"})),
     "golf": (True, frozenset({"cartpath", "hole", "path"})),
-    "healthcare": (True, ANY),
+    "healthcare": (True, _ALL_VALUES),
     "highway": (False, frozenset({"elevator", "escape", "platform", "rest_area", "services"})),
-    "historic": (True, ANY),
+    "historic": (True, _ALL_VALUES),
     "indoor": (True, frozenset({"corridor", "wall"})),
-    "landuse": (True, ANY),
+    "landuse": (True, _ALL_VALUES),
     "leisure": (True, frozenset({"slipway", "track"})),
     "man_made": (
         True,
@@ -51,38 +51,38 @@ AREA_KEYS: dict[str, tuple[bool, frozenset[str]]] = {
     ),
     "military": (True, frozenset({"trench"})),
     "natural": (True, _NATURAL_LINES),
-    "office": (True, ANY),
-    "place": (True, ANY),
+    "office": (True, _ALL_VALUES),
+    "place": (True, _ALL_VALUES),
     "power": (
         False,
         frozenset({"compensator", "converter", "generator", "plant", "substation", "transformer"}),
     ),
     "public_transport": (True, frozenset({"platform", "stop_position"})),
     "railway": (False, frozenset({"platform", "roundhouse", "station", "traverser", "turntable", "wash"})),
-    "ruins": (True, ANY),
-    "shop": (True, ANY),
+    "ruins": (True, _ALL_VALUES),
+    "shop": (True, _ALL_VALUES),
     "tourism": (True, frozenset({"artwork", "attraction"})),
-    "water": (True, ANY),
+    "water": (True, _ALL_VALUES),
     "waterway": (False, frozenset({"boatyard", "dam", "dock", "fuel", "riverbank"})),
 }
-"""Which tags make a closed way an area where no ``area`` tag decides.
+"""Tags that make a closed way an area if it has no ``area`` tag.
 
 After the lists that the OpenStreetMap wiki ("Overpass turbo/Polygon Features") and the id-area-keys project
 keep. Departures: piers, breakwaters, platforms and attractions are areas only with ``area=yes`` or another
-area key, for their closed ways are as often walked round as filled, and barriers never are without it.
+area key, because their closed ways are often lines around something; barriers never are without it.
 """
 
 LINE_KEYS = (
     "aerialway", "aeroway", "barrier", "golf", "highway", "leisure", "man_made", "natural", "power",
     "railway", "waterway",
 )  # fmt: skip
-"""Keys whose values, where `AREA_KEYS` does not take them for areas, are lines."""
+"""Keys whose values are lines unless `AREA_KEYS` makes them areas."""
 
 _NO = frozenset({"no", "false", "0"})
 
 
 def has_meaning(tags: Tags) -> bool:
-    """Whether any tag says what the object is."""
+    """Whether any tag describes the object itself."""
     return any(key not in NOISE for key in tags)
 
 
@@ -97,12 +97,12 @@ def area_tags(tags: Tags) -> Tags:
 
 
 def is_building(tags: Tags) -> bool:
-    """Whether it is a building or a part of one."""
+    """Whether the tags are those of a building or of a part of one."""
     return tags.get("building", "no") not in _NO or tags.get("building:part", "no") not in _NO
 
 
 def is_area(tags: Tags) -> bool:
-    """Whether a closed way with these tags is an area: ``area`` decides, then `AREA_KEYS`."""
+    """Whether a closed way with these tags is an area, by ``area``, else by `AREA_KEYS`."""
     stated = tags.get("area")
     if stated == "yes" or is_building(tags):
         return True
@@ -110,7 +110,7 @@ def is_area(tags: Tags) -> bool:
 
 
 def is_line(tags: Tags) -> bool:
-    """Whether a closed way is a line too, as a fenced playground is both its ground and its fence."""
+    """Whether a closed way is a line too: a fenced playground is both its ground and its fence."""
     if tags.get("area") == "yes":
         return False
     found = area_tags(tags)
@@ -118,7 +118,7 @@ def is_line(tags: Tags) -> bool:
 
 
 def is_open_area(tags: Tags) -> bool:
-    """Whether a way with these tags is an area even if it is drawn open, so that the open end is a defect."""
+    """Whether a way with these tags must be an area, so that it is a defect if it is open."""
     if is_building(tags):
         return True
     if any(tags.get(key, "no") not in _NO for key in LINE_KEYS if key not in area_tags(tags)):
@@ -127,7 +127,7 @@ def is_open_area(tags: Tags) -> bool:
 
 
 def kind_of(tags: Tags, *, area: bool = False) -> str:
-    """The kind under which problems with an object are counted; ``area`` if it is known to be one."""
+    """The kind under which an object's problems are counted. ``area``: the object is known to be an area."""
     if tags.get("building", "no") not in _NO:
         return "building"
     if tags.get("building:part", "no") not in _NO:
