@@ -20,7 +20,7 @@ from geoscene.options import BuildOptions
 from geoscene.plan import Plan, make_plan
 from geoscene.progress import Progress, silent
 from geoscene.report import Problem
-from geoscene.roadgraph.reach import route_line
+from geoscene.roadgraph.route_line import route_line
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.writer import SceneWriter
 from geoscene.sources import OsmData

@@ -1,4 +1,4 @@
-"""The drivable road graph: built from a map, written and read, lifted to the terrain."""
+"""The drivable road graph: built from a map, written and read as GraphML, with heights and surfaces."""
 
 from geoscene.roadgraph.build import RoadOptions as RoadOptions
 from geoscene.roadgraph.build import build_road_graph as build_road_graph
@@ -10,6 +10,6 @@ from geoscene.roadgraph.grading import graded_ground as graded_ground
 from geoscene.roadgraph.graph import RoadGraph as RoadGraph
 from geoscene.roadgraph.graphml import read_graphml as read_graphml
 from geoscene.roadgraph.graphml import write_graphml as write_graphml
-from geoscene.roadgraph.long_profile import Obstacles as Obstacles
-from geoscene.roadgraph.long_profile import ProfileOptions as ProfileOptions
-from geoscene.roadgraph.long_profile import profile as profile
+from geoscene.roadgraph.longitudinal_profile import Obstacles as Obstacles
+from geoscene.roadgraph.longitudinal_profile import ProfileOptions as ProfileOptions
+from geoscene.roadgraph.longitudinal_profile import profile as profile

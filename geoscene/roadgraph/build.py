@@ -1,4 +1,4 @@
-"""From ways to the road graph: which ways, where they meet, what becomes one edge."""
+"""The road graph from the ways of a map: choice of ways, junctions, joining of ways into edges."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from geoscene.typing import Float
 
 @dataclass(frozen=True, slots=True)
 class RoadOptions:
-    """What goes into the road graph.
+    """Contents of the road graph.
 
-    simplify : nodes only where roads meet, end or change; else every OSM node is a node
-    private  : with roads that are closed to the public, tracks and busways
+    simplify : nodes only where roads join, end or change; else every OSM node becomes a node
+    private  : include roads closed to the public, tracks and busways
     """
 
     simplify: bool = True
@@ -35,13 +35,13 @@ class RoadOptions:
 def build_road_graph(
     osm: OsmData, frame: Frame, *, options: RoadOptions | None = None
 ) -> tuple[RoadGraph, list[Problem]]:
-    """The drivable graph of a map on level ground (z = 0), and what could not be taken as it came.
+    """The drivable graph of a map on level ground (z = 0), and the problems repaired or dropped.
 
-    Roads meet where they share an OSM node, and nowhere else: a bridge does not meet the road below. A node
-    of the simplified graph is a junction, a dead end, or a place where something that an edge carries changes
+    Roads join where they share an OSM node and nowhere else: a bridge does not join the road below. A node of
+    the simplified graph is a junction, a dead end, or a place where an attribute of the edges changes
     (class, name, width, lanes, limit, direction, layer, bridge, tunnel); ways of equal tags are joined.
-    Nodes are in the order of their ids, edges in the order of the ways; the two edges of a two-way street
-    follow each other.
+    Nodes are sorted by id, edges follow the order of the ways; the two edges of a two-way street are
+    consecutive.
     """
     options = options or RoadOptions()
     problems: list[Problem] = []
@@ -71,7 +71,7 @@ def _read_streets(ways: Sequence[Way], problems: list[Problem]) -> list[Street]:
 
 
 def read_runs(ways: Sequence[Way], problems: list[Problem]) -> tuple[Runs, NDArray[np.int64], Float]:
-    """Unbroken runs of placed nodes; the nodes' ids, ascending; their longitudes and latitudes."""
+    """Unbroken runs of nodes with coordinates; the nodes' ids, ascending; their longitudes and latitudes."""
     if not ways:
         none = np.empty(0, np.int64)
         return Runs(none, none, none), none, np.empty((0, 2))
@@ -114,7 +114,7 @@ def _edges(
     places: tuple[NDArray[np.int64], Float],
     frame: Frame,
 ) -> tuple[RoadGraph, tuple[NDArray[np.int64], NDArray[np.bool_]]]:
-    """The graph without turns and controls; the chain of each edge (m,), and whether it runs against it."""
+    """The graph without turns and controls; each edge's chain (m,); whether the edge runs against it (m,)."""
     node_id, lonlat = places
     x, y = frame.from_geographic(lonlat[:, 0], lonlat[:, 1])
     xyz = np.stack([x, y, np.zeros(len(x))], axis=1)

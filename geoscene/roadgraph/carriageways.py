@@ -1,4 +1,4 @@
-"""Every carriageway of a map, whoever may use it: where it runs, how wide it is, what lies beside it."""
+"""All carriageways of a map, public or not: centre line, width, sidewalks, surface material."""
 
 from __future__ import annotations
 
@@ -41,18 +41,20 @@ def surface_material(tags: Tags, default: str) -> tuple[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Carriageways:
-    """One row a stretch of road between two nodes; a two-way street is one row. Sides as seen along the line.
+    """Stretches of road between two nodes, one row each; a two-way street is one row.
+
+    Left and right are as seen along the line.
 
     line   : (k,) shapely LineString, scene metres
     ends   : (k, 2) int32 node of the line's start and end
     node_xy : (n, 2) float64 scene metres
     node_id : (n,) int64 OSM ids
-    street : (k,) what the tags say (its ``speed`` and ``name`` are those of the first way)
+    street : (k,) attributes read from the tags (``speed`` and ``name`` are those of the first way)
     width  : (k,) float64 scene metres
     walk   : (k, 2) float64 scene metres, width of the sidewalk on the left and on the right, 0 for none
     walk_source : (k, 2) str: ``sidewalk`` (tag), ``default`` or "" (none)
     material, material_source : (k,) str
-    marked : (k,) bool, ``lane_markings`` or the class says that lanes are painted
+    marked : (k,) bool, lanes are painted, by ``lane_markings`` or by the road class
     osm_id : (k,) str
     """
 
@@ -99,7 +101,7 @@ class Carriageways:
 def place_of(layer: int, layer_source: str, *, bridge: bool, tunnel: bool) -> int:
     """0 on the ground, 1 on a bridge or an upper storey, 2 in a tunnel or a basement.
 
-    ``layer`` alone lifts nothing: a road of layer -1 that is no tunnel runs in a cutting, which is ground.
+    ``layer`` alone is not enough: a road of layer -1 without a tunnel tag runs in a cutting, on the ground.
     """
     storey = layer if layer_source == "level" else 0
     if bridge or storey > 0:
@@ -109,7 +111,7 @@ def place_of(layer: int, layer_source: str, *, bridge: bool, tunnel: bool) -> in
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """Everything that must agree where two ways become one stretch."""
+    """Attributes that must be equal for two ways to be joined into one stretch."""
 
     street: Street
     walk: tuple[float, float]
@@ -127,8 +129,8 @@ def read_carriageways(
 ) -> Carriageways:
     """The carriageways of a map.
 
-    sidewalks : ``urban`` gives streets of built-up places sidewalks where the map does not speak of them and
-                shows no footway beside them
+    sidewalks : ``urban`` gives streets in built-up areas sidewalks where the map neither has a sidewalk tag
+                nor a footway beside them
     left_hand : traffic keeps left
     """
     ways = [way for way in osm.ways if drivable(way.tags, private=True)]
@@ -181,7 +183,7 @@ def _read_kind(way: Way) -> _Kind:
 
 
 def _sidewalk(tags: Tags, side: str) -> tuple[float, str]:
-    """Width of the sidewalk on a side and its source; ``?`` where the map does not speak of it."""
+    """Width of the sidewalk on a side and its source; ``?`` where it is not tagged."""
     value = tags.get(f"sidewalk:{side}", tags.get("sidewalk:both", tags.get("sidewalk")))
     if value is None:
         return 0.0, "?"
@@ -196,7 +198,7 @@ def _sidewalk(tags: Tags, side: str) -> tuple[float, str]:
 def _guess_sidewalks(
     table: Carriageways, osm: OsmData, *, frame: Frame, urban: bool, left_hand: bool
 ) -> Carriageways:
-    """The table with its unknown sidewalks decided."""
+    """The table with widths for sidewalks that are not tagged."""
     unknown = table.walk_source == "?"
     walk, source = table.walk.copy(), np.where(unknown, "", table.walk_source)
     walked = np.array(

@@ -1,4 +1,4 @@
-"""Runs of nodes, cut where roads meet or change, and linked where they go on."""
+"""Chains of nodes that become edges: ways cut at junctions and changes, and joined in between."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """The ways' nodes, one row each, in driving order; a run is an unbroken row of nodes of one way.
+    """The ways' nodes in driving order, one row each; a run is an unbroken sequence of nodes of one way.
 
     node : (k,) int64 node index
     way  : (k,) int64 way index
@@ -26,7 +26,7 @@ class Runs:
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """What becomes an edge, or two: a line through nodes, along its ways unless these are symmetric.
+    """A line through nodes that becomes one edge or two; in the direction of its ways if that matters.
 
     node : (k,) int64 node index
     way  : (k - 1,) int64 way index of each segment
@@ -41,8 +41,8 @@ def find_cuts(
 ) -> NDArray[np.bool_]:
     """Whether a line must end at each node (nodes,): junctions, dead ends, changes.
 
-    kind      : (ways,) equal for ways that may be joined
-    symmetric : (ways,) the way is the same seen from its other end
+    kind      : (ways,) equal numbers for ways that may be joined
+    symmetric : (ways,) the way has the same attributes in both directions
     """
     first = np.flatnonzero(runs.run[1:] == runs.run[:-1])
     a, b, way = runs.node[first], runs.node[first + 1], runs.way[first]
@@ -61,7 +61,7 @@ def find_cuts(
 
 
 def link_chains(runs: Runs, cut: NDArray[np.bool_]) -> list[Chain]:
-    """The runs as lines from one cut node to the next; a loop without any is one line from its own start."""
+    """The runs as chains from cut node to cut node; a loop without any starts at its own first node."""
     pieces = _pieces(runs, cut)
     loose: dict[int, list[int]] = {}
     for number, piece in enumerate(pieces):
@@ -72,7 +72,7 @@ def link_chains(runs: Runs, cut: NDArray[np.bool_]) -> list[Chain]:
     used = [False] * len(pieces)
 
     def follow(node: int) -> list[Chain]:
-        """Pieces that go on from a node, each turned to begin where the one before ends."""
+        """Pieces that follow from a node, each reversed where needed to begin where the previous one ends."""
         found = []
         while not cut[node]:
             following = [number for number in loose[node] if not used[number]]

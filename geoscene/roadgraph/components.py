@@ -1,4 +1,4 @@
-"""Which parts of the road graph hang together."""
+"""Connected components of the road graph."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from geoscene.roadgraph.graph import RoadGraph
 
 @dataclass(frozen=True, slots=True)
 class Components:
-    """Connected parts, numbered from the largest (most nodes) on.
+    """Connected components, numbered by size; 0 has the most nodes.
 
-    weak   : (n,) int32 part of each node, one-way streets usable both ways
-    strong : (n,) int32 part of each node, within which every node is reached from every other
+    weak   : (n,) int32 component of each node, ignoring the direction of one-way streets
+    strong : (n,) int32 component of each node within which every node can be reached from every other
     """
 
     weak: NDArray[np.int32]
@@ -23,12 +23,12 @@ class Components:
 
     @property
     def largest_strong_share(self) -> float:
-        """Share of the nodes that lie in the largest strongly connected part."""
+        """Share of the nodes that lie in the largest strongly connected component."""
         return float((self.strong == 0).mean()) if len(self.strong) else 0.0
 
 
 def find_components(graph: RoadGraph) -> Components:
-    """The connected parts of the graph; turn restrictions are not considered."""
+    """The connected components of the graph; turn restrictions are not considered."""
     from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
@@ -39,7 +39,7 @@ def find_components(graph: RoadGraph) -> Components:
 
 
 def _by_size(part: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The same parts, the largest 0, equals in the order of their first node."""
+    """Components renumbered by size, the largest 0; equal ones in the order of their first node."""
     _, first, number, size = np.unique(part, return_index=True, return_inverse=True, return_counts=True)
     order = np.lexsort([first, -size])
     rank = np.empty(len(order), np.int32)
@@ -48,6 +48,6 @@ def _by_size(part: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def main_network(graph: RoadGraph) -> RoadGraph:
-    """The largest strongly connected part of the graph: from everywhere in it a car gets everywhere."""
+    """The largest strongly connected component of the graph, within which a car can reach every street."""
     strong = find_components(graph).strong
     return graph.take((strong[graph.tail] == 0) & (strong[graph.head] == 0))

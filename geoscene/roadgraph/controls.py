@@ -1,4 +1,4 @@
-"""Traffic signals, stop and give-way signs and crossings, and the direction of traffic that they speak to."""
+"""Traffic signals, stop and give-way signs and crossings, by the direction of traffic that they control."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def add_controls(
     sides: tuple[NDArray[np.int64], NDArray[np.bool_]],
     lines: tuple[Sequence[Chain], Sequence[Way], NDArray[np.int64]],
 ) -> RoadGraph:
-    """The graph with what its drivers must heed.
+    """The graph with its traffic controls.
 
-    ``direction`` tags are respected. Without one, signals and crossings speak to both directions, and a sign
-    to the traffic towards the nearer end of its road (OSM wiki, Key:direction). At a junction, signals and
-    ``stop=all`` speak to every arm, other signs to the arms of lesser class, or to all if they are equal.
+    ``direction`` tags are respected. Without one, signals and crossings control both directions, and a sign
+    controls the traffic towards the nearer end of its road (OSM wiki, Key:direction). At a junction, signals
+    and ``stop=all`` control every arm, other signs the arms of lesser class, or all if they are equal.
 
-    sides : the chain of each edge (m,), and whether the edge runs against it (m,)
+    sides : the chain of each edge (m,) and whether the edge runs against it (m,)
     lines : the chains, the ways they are made of, and the ids of the nodes that they count
     """
     one_each = ~sides[1] | (graph.twin < 0)
@@ -46,7 +46,7 @@ def add_controls(
 
     flags = {name: np.zeros(len(graph.node_id), np.bool_) for name in ("traffic_signals", "stop", "give_way")}
     rows = []
-    for edge, vertex, with_way, tags in _met(graph, points, sides=sides, lines=lines):
+    for edge, vertex, with_way, tags in _controls_on_edges(graph, points, sides=sides, lines=lines):
         plan = np.linalg.norm(np.diff(graph.geometry[edge][:, :2], axis=0), axis=1)
         length = float(graph.length[edge])
         offset = length * float(plan[:vertex].sum() / max(plan.sum(), 1e-9))
@@ -81,14 +81,14 @@ def add_controls(
     )
 
 
-def _met(
+def _controls_on_edges(
     graph: RoadGraph,
     points: Iterable[Point],
     *,
     sides: tuple[NDArray[np.int64], NDArray[np.bool_]],
     lines: tuple[Sequence[Chain], Sequence[Way], NDArray[np.int64]],
 ) -> Iterator[tuple[int, int, bool, Tags]]:
-    """Points with controls as edges meet them: (edge, vertex > 0, edge runs along the way, tags)."""
+    """Controls on edges: (edge, vertex > 0, whether the edge runs along the way, tags)."""
     chain_of, against = sides
     chains, ways, node_id = lines
     signed = {int(p.osm_id.removeprefix("node/")): p.tags for p in points if _kinds(p.tags)}
@@ -107,7 +107,7 @@ def _met(
 
 
 def _kinds(tags: Tags) -> list[str]:
-    """What a point tells drivers: a signalled crossing is a signal, too."""
+    """Kinds of control at a point; a signalled crossing is also a signal."""
     kind = tags.get("highway", "")
     if kind not in ("traffic_signals", "stop", "give_way", "crossing"):
         return []
@@ -120,6 +120,6 @@ def _kinds(tags: Tags) -> list[str]:
 
 
 def _direction(tags: Tags, kind: str) -> int:
-    """1 for traffic along the way, -1 for traffic against it, 0 if the tags do not say."""
+    """1 for traffic along the way, -1 for traffic against it, 0 if not tagged."""
     value = tags.get(f"{kind}:direction", tags.get("direction", ""))
     return {"forward": 1, "backward": -1}.get(value, 0)

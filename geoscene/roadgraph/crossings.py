@@ -1,4 +1,4 @@
-"""Where people cross the road, and the paint there."""
+"""Pedestrian crossings and their paint."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ class _Crossings:
 
 
 def crossing_rows(osm: OsmData, roads: Carriageways, *, frame: Frame) -> SurfaceRows:
-    """Crossings on the ground: the strip of road that people use, and its zebra stripes or border lines.
+    """Surfaces of crossings: the strip of road that pedestrians use, and its zebra stripes or border lines.
 
-    They come from ways that are crossings and, where no such way passes, from nodes that are. A crossing
-    that is tagged ``unmarked`` has no paint and is no strip of its own.
+    They are read from crossing ways and, where no such way passes, from crossing nodes. A crossing tagged
+    ``unmarked`` has neither paint nor a strip of its own.
     """
     ground = roads.take(roads.place == 0)
     ways = [way for way in osm.ways if _is_crossing(way.tags)]
@@ -105,7 +105,7 @@ def _is_crossing(tags: Tags) -> bool:
 
 
 def _paint(tags: Tags) -> tuple[str, str]:
-    """``stripes``, ``lines`` or ``none``, and whether a tag (``crossing``) or the ``default`` says so."""
+    """``stripes``, ``lines`` or ``none``, and its source: the tag ``crossing`` or ``default``."""
     markings, kind = tags.get("crossing:markings", ""), tags.get("crossing", "")
     if markings in ("no", "none") or (not markings and kind in ("unmarked", "no", "informal")):
         return "none", "crossing"
@@ -133,7 +133,7 @@ def _from_ways(ways: list[Way], roads: Carriageways, *, frame: Frame) -> _Crossi
 
 
 def _from_nodes(osm: OsmData, ways: list[Way], *, roads: Carriageways, frame: Frame) -> _Crossings:
-    """Crossing nodes that no crossing way passes, straight across their road."""
+    """Crossing nodes without a crossing way, as lines straight across their road."""
     passed = set(np.concatenate([way.nodes for way in ways]).tolist()) if ways else set()
     points = [
         p
@@ -168,7 +168,7 @@ def _crossings(lines: NDArray[np.object_], of: Sequence[Way | Point]) -> _Crossi
 
 
 def _stripes(lines: NDArray[np.object_], width: Float) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
-    """Stripes along the road, side by side along crossing lines, and the line of each."""
+    """Zebra stripes along the road, side by side along crossing lines, and the line of each."""
     length = shapely.length(lines)
     pitch = _STRIPE + _STRIPE_GAP
     count = np.floor((length - 0.2 + _STRIPE_GAP) / pitch).astype(np.int64)

@@ -36,18 +36,18 @@ country of the other side."""
 
 
 def side_at(lon: float, lat: float) -> Side:
-    """The side of the country that a place lies in; right at sea and in Antarctica."""
+    """The driving side of the country at a place; right at sea and in Antarctica."""
     from tzfpy import get_tz  # noqa: PLC0415  (reads the zones' outlines)
 
     return "left" if get_tz(lon, lat) in LEFT_HAND else "right"
 
 
 def driving_side(osm: OsmData) -> tuple[Side, str]:
-    """The side of a map extract and what says so: ``tag`` (what most ``driving_side`` say) or ``place``."""
+    """Driving side of a map extract and its source: ``tag`` (most frequent ``driving_side``) or ``place``."""
     tags = [item.tags for item in osm.ways] + [item.tags for item in osm.areas]
     tags += [item.tags for item in osm.relations]
-    told = Counter(side for tag in tags if (side := tag.get("driving_side")) in ("left", "right"))
-    if told:
-        return cast("Side", max(sorted(told), key=told.__getitem__)), "tag"
+    tagged = Counter(side for tag in tags if (side := tag.get("driving_side")) in ("left", "right"))
+    if tagged:
+        return cast("Side", max(sorted(tagged), key=tagged.__getitem__)), "tag"
     west, south, east, north = osm.bounds
     return side_at((west + east) / 2, (south + north) / 2), "place"

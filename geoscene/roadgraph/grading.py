@@ -1,4 +1,4 @@
-"""The ground as roads need it: banked up to ramps, cut down to underpasses, level across carriageways."""
+"""Grading: terrain filled up to ramps, cut down to underpasses and levelled across carriageways."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shapely
 from geoscene.frames import Frame
 from geoscene.roadgraph.carriageways import place_of
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.long_profile import Height, Obstacles
+from geoscene.roadgraph.longitudinal_profile import Height, Obstacles
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
 from geoscene.sources.data import OsmData, Tags
@@ -26,7 +26,7 @@ _CLEAR = {
 
 
 def find_obstacles(osm: OsmData, frame: Frame) -> Obstacles:
-    """Railways and waterways on the ground, which bridges must clear."""
+    """Railways and waterways on the ground that bridges must clear."""
     ways = [way for way in osm.ways if _clear(way.tags) is not None]
     lines = way_lines(ways, frame)
     kept = np.flatnonzero([line is not None for line in lines])
@@ -44,11 +44,11 @@ def _clear(tags: Tags) -> float | None:
 
 
 def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 2.5, batter: float = 8.0) -> Height:
-    """The ground with its roads built into it: a function of x, y (n,) that gives z (n,).
+    """The terrain with roads graded into it: a function of x, y (n,) that returns z (n,).
 
     Within a carriageway and its shoulder the ground is level across, at the road's profile; over the next
-    ``batter`` metres it passes into the terrain. Where roads meet, the nearer one counts for more. Bridges
-    and tunnels leave the ground as it is; where they begin, the road's ground ends square.
+    ``batter`` metres it blends into the terrain. Where roads meet, the nearer one has the greater weight.
+    Bridges and tunnels do not change the terrain; the grading ends square where they begin.
 
     graph  : with heights, from `profile`
     ground : height of the terrain

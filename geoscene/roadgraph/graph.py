@@ -24,7 +24,7 @@ def _no_text() -> NDArray[np.str_]:
 
 
 def rows_of(arrays: Iterable[NDArray[np.generic]]) -> NDArray[np.object_]:
-    """The arrays as a column of objects (n,), also where they are of one length."""
+    """The arrays as a column of objects (n,), even if all have the same length."""
     listed = list(arrays)
     rows = np.empty(len(listed), object)
     for k, array in enumerate(listed):
@@ -58,7 +58,7 @@ class RoadGraph:
     ref      : (m,) str, "" if none
     osm_id   : (m,) str, ``way/123``; ``way/123;way/124`` where ways of equal tags were joined
     twin     : (m,) int32, the edge of the same carriageway in the other direction, -1 if there is none
-    signals, stop, give_way : (n,) bool, traffic at the node is controlled so
+    signals, stop, give_way : (n,) bool, traffic control at the node
 
     Turn restrictions, one row each:
 
@@ -72,7 +72,7 @@ class RoadGraph:
                   order, or the only ones that may follow the first
     chain_kind  : (q,) str, as ``turn_kind``
 
-    What drivers must heed along an edge, one row each:
+    Traffic controls along edges, one row each:
 
     control_edge   : (c,) int32
     control_offset : (c,) float64, true metres in plan from the edge's tail
@@ -125,7 +125,10 @@ class RoadGraph:
         return seconds
 
     def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> RoadGraph:
-        """The chosen edges, in the given order, with the nodes they use; rows that lose an edge go too."""
+        """The chosen edges, in the given order, with the nodes they use.
+
+        Restrictions and controls of edges that are left out are left out too.
+        """
         chosen = np.arange(len(self))[keep].astype(np.int32)
         used, ends = np.unique(np.concatenate([self.tail[chosen], self.head[chosen]]), return_inverse=True)
         edge = np.full(len(self) + 1, -1, np.int32)

@@ -104,14 +104,14 @@ def _node_rows(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[dict[s
     ends = np.concatenate([graph.tail[once], graph.head[once]])
     streets = np.bincount(ends, minlength=len(graph.node_id))
     for k in range(len(graph.node_id)):
-        told = [tag for name, tag in _FLAGS.items() if getattr(graph, name)[k]]
+        at_node = [tag for name, tag in _FLAGS.items() if getattr(graph, name)[k]]
         yield {
             "x": f"{lon[k]:.10f}",
             "y": f"{lat[k]:.10f}",
             "elevation": f"{graph.node_xyz[k, 2]:.4f}" if tall else "",
             "street_count": str(streets[k]),
-            "highway": told[0] if told else "",
-            "controls": ";".join(told),
+            "highway": at_node[0] if at_node else "",
+            "controls": ";".join(at_node),
         }
 
 
@@ -182,9 +182,9 @@ def _wkt(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[str]:
 
 
 def read_graphml(path: Path, frame: Frame) -> RoadGraph:
-    """The graph that `write_graphml` wrote; places within 0.1 mm.
+    """The graph that `write_graphml` wrote, with coordinates within 0.1 mm.
 
-    Raises SceneFormatError if the file is missing, damaged, or not one of these.
+    Raises SceneFormatError if the file is missing, damaged or not written by `write_graphml`.
     """
     try:
         nodes, edges = _parse(path)
@@ -199,7 +199,7 @@ _Row = dict[str, str]
 
 
 def _parse(path: Path) -> tuple[dict[int, _Row], list[tuple[int, int, _Row]]]:
-    """The nodes' values by id, and the edges with theirs, in the order of their numbers."""
+    """Attributes of the nodes by id and of the edges in the order of their numbers."""
     keys: dict[str, str] = {}
     nodes: dict[int, _Row] = {}
     edges: list[tuple[int, int, _Row]] = []
@@ -230,14 +230,14 @@ def _graph(nodes: dict[int, _Row], edges: list[tuple[int, int, _Row]], *, frame:
     places = np.array([[float(n["x"]), float(n["y"])] for n in nodes.values()]).reshape(-1, 2)
     x, y = frame.from_geographic(places[:, 0], places[:, 1])
     z = np.array([float(n.get("elevation", 0.0)) for n in nodes.values()])
-    told = [node.get("controls", "").split(";") for node in nodes.values()]
-    flags = {name: np.array([tag in tags for tags in told], np.bool_) for name, tag in _FLAGS.items()}
-    told_turns = [
+    at_nodes = [node.get("controls", "").split(";") for node in nodes.values()]
+    flags = {name: np.array([tag in tags for tags in at_nodes], np.bool_) for name, tag in _FLAGS.items()}
+    listed = [
         (k, kind, [row_of.get(int(edge), -1) for edge in others])
         for k, row in enumerate(rows)
         for kind, *others in map(str.split, filter(None, row.get("turns", "").split(";")))
     ]
-    whole = [turn for turn in told_turns if min(turn[2]) >= 0]
+    whole = [turn for turn in listed if min(turn[2]) >= 0]
     turns = [(k, number[edges[k][1]], after[0], kind) for k, kind, after in whole if len(after) == 1]
     chains = [(np.array([k, *after], np.int32), kind) for k, kind, after in whole if len(after) > 1]
     controls = [

@@ -1,4 +1,4 @@
-"""Where carriageways meet: the joint, its rounded corners, and how far it reaches into each arm."""
+"""Surfaces of junctions: the joint of the carriageways, its rounded corners, and its reach into each arm."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ _QUAD = 6
 
 @dataclass(frozen=True, slots=True)
 class Junctions:
-    """Joints, and what goes round their corners.
+    """Joints of carriageways, with the kerbs and sidewalks round their corners.
 
     polygon : (j,) shapely, the joint's carriageway
     main    : (j,) int64 the joint's most important arm, a row of the carriageways
-    kerb, walk : (c,) shapely, kerb and sidewalk round a corner: the joint grown by their widths
+    kerb, walk : (c,) shapely, kerb and sidewalk round a corner: the joint buffered by their widths
     corner_main : (c,) int64 the more important of the corner's two arms
     """
 
@@ -61,10 +61,10 @@ class Junctions:
 def build_junctions(roads: Carriageways, importance: NDArray[np.int64]) -> Junctions:
     """The joints of all carriageways that share a node, a place and (off the ground) a layer.
 
-    A corner is two neighbouring arms closed morphologically: grown by the corner's radius and shrunk by it
-    again, which rounds the inner corner with that radius and leaves everything else where it was.
+    A corner is the morphological closing of two neighbouring arms with the corner's radius: it rounds the
+    inner corner with that radius and changes nothing else.
 
-    importance : (k,) the higher wins where joints and carriageways overlap
+    importance : (k,) rank of the carriageways; the higher wins where joints and carriageways overlap
     """
     arms = _arms(roads)
     after, between, width, radius, tangent = _corners(roads, arms)
@@ -108,9 +108,9 @@ def build_junctions(roads: Carriageways, importance: NDArray[np.int64]) -> Junct
 
 
 def junction_reach(roads: Carriageways) -> tuple[Float, NDArray[np.int64]]:
-    """How far junctions reach into each carriageway, at its start and its end, and how many arms they have.
+    """Reach of junctions into each carriageway at its start and end, and their number of arms.
 
-    Metres (k, 2), 0 where fewer than three arms meet, and arms (k, 2).
+    Metres (k, 2), 0 where fewer than three arms meet, and numbers of arms (k, 2).
     """
     arms = _arms(roads)
     after, _, width, _, tangent = _corners(roads, arms)
@@ -161,9 +161,9 @@ def _arms(roads: Carriageways) -> _Arms:
 
 
 def _corners(roads: Carriageways, arms: _Arms) -> tuple[NDArray[np.int64], Float, Float, Float, Float]:
-    """For each arm: the row of the next, the angle to it, the arm's width, the radius of the kerb between.
+    """For each arm: row of the next arm, angle to it, width of the arm, radius of the kerb between them.
 
-    Last, how far from the node their kerbs touch a circle of that radius.
+    The last column is the distance from the node at which their kerbs touch a circle of that radius.
     """
     after = _neighbour(arms.group)
     between = (arms.angle[after] - arms.angle) % (2 * np.pi)
@@ -177,7 +177,7 @@ def _corners(roads: Carriageways, arms: _Arms) -> tuple[NDArray[np.int64], Float
 
 
 def _neighbour(group: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The next arm counter-clockwise: the next row of the group, the first after the last."""
+    """The next arm counter-clockwise: the next row of the group, cyclically."""
     last = np.flatnonzero(np.diff(group, append=-1))
     first = np.flatnonzero(np.diff(group, prepend=-1))
     after = np.arange(1, len(group) + 1)
@@ -186,7 +186,7 @@ def _neighbour(group: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _stubs(roads: Carriageways, arms: _Arms, *, length: Float) -> NDArray[np.object_]:
-    """The carriageways of the arms' first metres (a,)."""
+    """Carriageways of the first metres of each arm (a,)."""
     lines = []
     for road, end, far in zip(arms.road.tolist(), arms.end.tolist(), length.tolist(), strict=True):
         xy = shapely.get_coordinates(roads.line[road])
@@ -197,7 +197,7 @@ def _stubs(roads: Carriageways, arms: _Arms, *, length: Float) -> NDArray[np.obj
 
 
 def carriageway(lines: NDArray[np.object_], half: Float) -> NDArray[np.object_]:
-    """Bands of half-widths on both sides of lines, cut square at their ends; bends keep their width."""
+    """Bands around lines, given their half-widths, with flat ends and constant width in bends."""
     bands: NDArray[np.object_] = shapely.buffer(
         lines, half, cap_style="flat", join_style="mitre", mitre_limit=1.1
     )
@@ -205,7 +205,7 @@ def carriageway(lines: NDArray[np.object_], half: Float) -> NDArray[np.object_]:
 
 
 def _tapers(roads: Carriageways, arms: _Arms, *, after: NDArray[np.int64]) -> NDArray[np.object_]:
-    """Between each arm's end and the wider next arm's, the slant from one width to the other."""
+    """Tapers between each arm's end and the wider next arm's."""
     width = roads.width[arms.road]
     wide = np.maximum(width, width[after])
     line = roads.line[arms.road]

@@ -1,4 +1,4 @@
-"""Paint along the road: centre lines, lane separators, edge lines and stop lines."""
+"""Road markings: centre lines, lane lines, edge lines and stop lines."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _EDGED = frozenset({"motorway", "trunk", "primary", "secondary"})
 
 
 def marking_rows(roads: Carriageways, edge: NDArray[np.int32], *, left_hand: bool) -> SurfaceRows:
-    """Lines along marked carriageways; they stop where streets meet, not where a driveway joins.
+    """Lines along marked carriageways, interrupted at junctions of streets but not at driveways.
 
     Between the two directions the line is solid, between lanes of one direction broken; roads of the upper
     classes have edge lines where they have no kerb.
@@ -75,7 +75,7 @@ def marking_rows(roads: Carriageways, edge: NDArray[np.int32], *, left_hand: boo
 def _offsets(
     roads: Carriageways, rows: NDArray[np.int64], *, left_hand: bool
 ) -> tuple[NDArray[np.int64], Float, NDArray[np.bool_]]:
-    """Painted lines as (position in ``rows``, metres to the left of the carriageway's middle, broken)."""
+    """Painted lines as (position in ``rows``, metres to the left of the centre line, broken)."""
     found: list[tuple[int, float, bool]] = []
     streets = [roads.street[row] for row in rows.tolist()]
     # Lanes along the line lie on its right, or on its left where traffic keeps left.
@@ -123,8 +123,8 @@ def stop_rows(
 ) -> SurfaceRows:
     """Stop lines before signals and stop signs, and broken ones before give-way signs.
 
-    They lie across the lanes of their direction: where the map has the signal or sign, but not inside the
-    junction ahead and before its crossings.
+    They cross the lanes of their direction at the mapped signal or sign, but outside the junction ahead and
+    before its crossings.
 
     crossings : (c,) shapely, the strips where people cross
     """
@@ -156,7 +156,7 @@ def stop_rows(
 
 
 def _strips(graph: RoadGraph, crossings: NDArray[np.object_]) -> dict[int, list[float]]:
-    """Where crossings begin on each controlled edge that has some: true metres from its tail."""
+    """Start of each crossing on the controlled edges: true metres from the edge's tail."""
     edges = np.unique(graph.control_edge)
     if not len(edges) or not len(crossings):
         return {}

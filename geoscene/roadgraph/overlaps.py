@@ -1,4 +1,4 @@
-"""Roads that overlap in plan side by side: those that fork, and those that run over one another."""
+"""Roads that overlap side by side in plan: at forks, or on different levels."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Overlaps:
     """Stations of bridges and tunnels that lie within another road beside them.
 
     station : (k,) int64
-    before, after, share : (k,) the other road's stations on both sides of the nearest place on it, and the
-              share (0..1) of the latter
-    away    : (k,) float64 metres between both
-    side    : (k,) int64, 1 where the station's road is over the other, -1 under it, 0 where they are one
-    fork    : (k,) float64 metres along both roads from where they part; inf where they do not hang together
+    before, after, share : (k,) the other road's stations before and after its nearest point, and the share
+              (0..1) of the latter
+    away    : (k,) float64 metres between the two
+    side    : (k,) int64, 1 where the station's road is over the other, -1 under it, 0 at the same height
+    fork    : (k,) float64 metres along both roads from the fork; inf where they are not connected
     """
 
     station: Ints
@@ -48,12 +48,12 @@ def find_overlaps(
 ) -> Overlaps:
     """All stations of bridges and tunnels within carriageways that run beside them.
 
-    Roads of unequal layers are over one another if they cross somewhere, or if the middle of one runs within
-    the other where both have had room to part in height. Where they have not, as at forks, they are one, as
-    are roads of one layer.
+    Roads of different layers lie over one another if they cross somewhere, or if the centre line of one runs
+    within the other far enough from the fork to be parted in height. Otherwise, as at forks and in the same
+    layer, they have the same height.
 
-    crossing : edges that cross one another, from `geoscene.roadgraph.stations.find_crossings`
-    room     : metres along both roads from a fork within which they part
+    crossing : edges that cross each other, from `geoscene.roadgraph.stations.find_crossings`
+    room     : metres along both roads from a fork that parting in height takes
     """
     once = np.unique(stations.edge)
     structure = graph.bridge | graph.tunnel

@@ -1,4 +1,4 @@
-"""Ways on foot and by bicycle, squares, and rails, as surfaces."""
+"""Surfaces of footways, cycleways, squares and rails."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ _RAILWAYS = frozenset({"rail", "light_rail", "tram", "subway", "narrow_gauge", "
 _GAUGE, _RAIL_HEAD = 1.435, 0.072
 
 PRIORITY = {"square": 105.0, "yard": 106.0, "path": 110.0, "footway": 114.0, "cycleway": 116.0, "rail": 175.0}
-"""Who lies over whom: land cover is below 100, carriageways are between 130 and 150."""
+"""Priorities of surfaces, higher on top: land cover is below 100, carriageways are between 130 and 150."""
 
 
 def way_lines(ways: Sequence[Way], frame: Frame) -> NDArray[np.object_]:
-    """Ways as shapely LineStrings in scene metres; None where fewer than two places are known."""
+    """Ways as shapely LineStrings in scene metres; None where fewer than two points are known."""
     lines = np.empty(len(ways), object)
     sizes = np.array([len(way.lonlat) for way in ways], np.int64)
     if not sizes.sum():
@@ -56,7 +56,7 @@ def way_lines(ways: Sequence[Way], frame: Frame) -> NDArray[np.object_]:
 
 
 def path_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
-    """Footways, cycleways, paths and steps that are mapped as lines, but for crossings."""
+    """Footways, cycleways, paths and steps mapped as lines, except crossings."""
     ways = [way for way in osm.ways if _is_path(way.tags)]
     lines = way_lines(ways, frame)
     kept = [k for k, line in enumerate(lines) if line is not None]
@@ -78,7 +78,7 @@ def path_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
         priority=[_path_priority(name) for name in kind],
         osm_id=[way.osm_id for way in ways],
         source=source,
-        **_whereabouts([way.tags for way in ways]),
+        **_place_and_level([way.tags for way in ways]),
     )
 
 
@@ -97,7 +97,7 @@ def _is_path(tags: Tags) -> bool:
     )
 
 
-def _whereabouts(tags: Sequence[Tags]) -> dict[str, Any]:
+def _place_and_level(tags: Sequence[Tags]) -> dict[str, Any]:
     """Columns ``place`` and ``level`` of tagged features."""
     layers = [read_layer(t, []) for t in tags]
     return {
@@ -110,7 +110,7 @@ def _whereabouts(tags: Sequence[Tags]) -> dict[str, Any]:
 
 
 def square_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
-    """Squares, footpaths, platforms and yards that are mapped as areas of highway."""
+    """Squares, footpaths, platforms and yards mapped as areas."""
     areas = [a for a in osm.areas if _square_class(a) is not None and a.tags.get("indoor", "no") == "no"]
     shapes = np.empty(len(areas), object)
     shapes[:] = [shapely.transform(area.geometry, _projector(frame)) for area in areas]
@@ -125,7 +125,7 @@ def square_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
         priority=[PRIORITY["yard" if y else "square"] for y in yard],
         osm_id=[area.osm_id for area in areas],
         source=[f"area/{source}" for _, source in made_of],
-        **_whereabouts([area.tags for area in areas]),
+        **_place_and_level([area.tags for area in areas]),
     )
 
 
@@ -151,7 +151,7 @@ def rail_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
     gauge = np.array([(g or 0.0) / 1000 for g in given], float)
     aside = np.where(mapped, gauge, _GAUGE) / 2 + _RAIL_HEAD / 2
     rails = shapely.offset_curve(np.tile(lines, 2), np.concatenate([aside, -aside]), join_style="mitre")
-    where = _whereabouts([way.tags for way in ways] * 2)
+    where = _place_and_level([way.tags for way in ways] * 2)
     return SurfaceRows.of(
         shapely.buffer(rails, _RAIL_HEAD / 2, cap_style="flat", join_style="mitre"),
         klass=Class.RAIL,

@@ -1,4 +1,4 @@
-"""Least squares within bounds that may give way."""
+"""Quadratic programs with soft bounds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _GAP, _FORCE = 5.0, 1000.0
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Rows ``a z >= b``; falling short by s costs ``weight s^2 / 2``.
+    """Soft bounds ``a z >= b``; a violation of s costs ``weight s^2 / 2``.
 
     a : (k, n) scipy.sparse array
     b, weight : (k,) float64
@@ -29,10 +29,10 @@ class Bounds:
 
 
 def interior_point(cost: Any, pull: Float, *, bounds: Bounds, start: Float) -> Float:
-    """The z (n,) that minimises ``z cost z / 2 - pull z`` and what falling short of the bounds costs.
+    """The z (n,) that minimises ``z cost z / 2 - pull z`` plus the cost of violated bounds.
 
     Mehrotra's predictor-corrector method (Nocedal and Wright, Numerical Optimization, 2nd edition, 16.6),
-    with one sparse factorisation a round; it ends when gaps and moves are under 0.1 mm.
+    with one sparse factorisation per iteration; it ends when residuals and steps are under 0.1 mm.
 
     cost : (n, n) scipy.sparse array, symmetric, positive definite
     """
@@ -79,6 +79,6 @@ def interior_point(cost: Any, pull: Float, *, bounds: Bounds, start: Float) -> F
 
 
 def _reach(value: Float, change: Float) -> float:
-    """How far along its change a positive value stays positive, at most 1."""
+    """Largest step, at most 1, along which positive values stay positive."""
     falling = change < 0
     return min(1.0, float((-value[falling] / change[falling]).min(initial=np.inf)))

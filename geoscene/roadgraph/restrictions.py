@@ -1,4 +1,4 @@
-"""Turn restrictions of the map as edges that follow each other."""
+"""Turn restrictions as sequences of edges."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ _HOURS = ("hour_on", "day_on")
 
 
 def add_turns(graph: RoadGraph, relations: Iterable[Relation], *, problems: list[Problem]) -> RoadGraph:
-    """The graph with the turns that relations forbid or command to cars.
+    """The graph with the turns that relations prohibit or prescribe for cars.
 
     A restriction via a node is a pair of edges, one via ways a chain of three or more. One at a place where
-    the graph has no node, or with members that are not in the graph, forbids nothing here. Those that hold at
-    times only are dropped and reported (``conditional``), as are those via ways that no drive can follow
-    (``via-way``).
+    the graph has no node, or with members that are not in the graph, has no effect. Conditional ones are
+    dropped and reported (``conditional``), as are those via ways that no drive can follow (``via-way``).
     """
     streets = _Streets.of(graph)
     pairs: set[tuple[int, int, int, str]] = set()
@@ -66,7 +65,7 @@ def add_turns(graph: RoadGraph, relations: Iterable[Relation], *, problems: list
 
 @dataclass(frozen=True, slots=True)
 class _Streets:
-    """The graph as restrictions name it.
+    """The graph indexed by the ids that restrictions refer to.
 
     ways    : for each edge the ways it was joined from, in driving direction
     of_way  : the edges of each way
@@ -115,8 +114,8 @@ def _trips(
 ) -> list[tuple[int, ...]]:
     """Chains of edges from one of the ways over all those of ``via`` into another.
 
-    They pass no node twice; of several from the same edge to the same edge the shortest is meant. Where the
-    map's ways were joined, the first edge may begin the way via, and the last may end it.
+    They pass no node twice; of several between the same two edges only the shortest is returned. Where ways
+    were joined, the first edge may include the start of the via way, and the last edge its end.
     """
     graph, ways = streets.graph, streets.ways
     best: dict[tuple[int, int], tuple[float, tuple[int, ...]]] = {}
@@ -144,7 +143,7 @@ def _trips(
 
 
 def _kind(tags: Tags) -> tuple[str, str]:
-    """``no_...`` or ``only_...`` where the relation binds cars at all times, and what binds them at times.
+    """``no_...`` or ``only_...`` where the relation always applies to cars, and the conditional value if any.
 
     The most specific of ``restriction:motorcar`` ... ``restriction`` counts; those for other vehicles
     (``restriction:hgv``) do not. ``except`` exempts from the plain tag.

@@ -1,4 +1,4 @@
-"""Where on the road graph a point is, and the best way between two places on it."""
+"""Nearest edges of points, permitted turns, and shortest paths on the road graph."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from geoscene.typing import Float
 
 @dataclass(frozen=True, slots=True)
 class RoadPath:
-    """A way through the graph: edge after edge, in driving direction.
+    """A path through the graph: consecutive edges in driving direction.
 
     edges  : (k,) int32; the head of one is the tail of the next
     start  : true metres in plan from the first edge's tail to where the path begins
@@ -49,10 +49,10 @@ def nearest_edge(
     """The nearest edge of each point: ``(edge (q,), offset (q,), distance (q,))``.
 
     The offset is in true metres in plan from the edge's tail; the distance in scene metres. Of the two edges
-    of a two-way street the lower-numbered one comes back; `shortest_path` considers both.
+    of a two-way street the lower-numbered one is returned; `shortest_path` considers both.
 
     xy   : (q, 2) scene metres
-    tree : `shapely.STRtree` of `edge_lines`, to spare building it at every call
+    tree : `shapely.STRtree` of `edge_lines`, to avoid building it at every call
 
     Raises InputError where the graph has no edges.
     """
@@ -73,8 +73,8 @@ def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.i
     """The permitted turns as pairs of edges ``(from (t,), to (t,))``.
 
     Restrictions are respected (``no_*`` forbids its turn, ``only_*`` every other turn from its edge at its
-    node) as far as pairs can say them; `turn_states` says the rest of those via ways. Turning round into the
-    street one comes from is permitted at dead ends alone unless ``u_turns``.
+    node) as far as pairs of edges can express them; `turn_states` covers restrictions via ways. U-turns into
+    the same street are permitted at dead ends only, unless ``u_turns``.
     """
     order = np.argsort(graph.tail, kind="stable").astype(np.int32)
     start = np.searchsorted(graph.tail[order], np.arange(len(graph.node_id) + 1))
@@ -100,7 +100,7 @@ def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.i
 
 
 def _commands(kind: NDArray[np.str_]) -> NDArray[np.bool_]:
-    """Which restrictions (r,) are ``only_*``."""
+    """Whether restrictions (r,) are ``only_*``."""
     return np.char.startswith(kind, "only_") if len(kind) else np.empty(0, np.bool_)
 
 
@@ -112,17 +112,17 @@ def _among(
     first: NDArray[np.int32],
     second: NDArray[np.int32],
 ) -> NDArray[np.bool_]:
-    """Which turns (t,) are one of the pairs (first, second)."""
+    """Whether turns (t,) are among the pairs (first, second)."""
     key = before.astype(np.int64) * len(graph) + after
     return np.isin(key, first.astype(np.int64) * len(graph) + second)
 
 
 @dataclass(frozen=True, slots=True)
 class TurnStates:
-    """Permitted turns between states: an edge, and what of a restriction via ways has been driven up to it.
+    """Permitted turns between states: an edge with the part of a restriction via ways driven so far.
 
     edge          : (s,) int32, the edge of each state. The first states are the edges themselves, in their
-                    order, as a drive has them that begins there or has no such restriction behind it
+                    order: a drive that begins there or has no pending restriction
     before, after : (t,) int32, states that may follow each other
     """
 
@@ -136,12 +136,12 @@ class TurnStates:
 
 
 def turn_states(graph: RoadGraph, *, u_turns: bool = False) -> TurnStates:
-    """The permitted turns with those that depend on the streets driven before.
+    """The permitted turns, including those that depend on the streets driven before.
 
-    A drive from state to state along them obeys every restriction. Those via ways bind who came along the
+    A drive from state to state obeys every restriction. Those via ways apply to drives that followed the
     chain from its first edge: ``no_*`` forbids the last turn, ``only_*`` every turn off the chain. Without
-    them the turns are those of `turn_table`. The states beyond the edges are prefixes of chains; a drive is
-    in that of the longest that it ends with (Aho and Corasick 1975).
+    them the turns are those of `turn_table`. States beyond the edges are prefixes of chains; the state of a
+    drive is the longest prefix that it ends with (Aho and Corasick 1975).
     """
     before, after = turn_table(graph, u_turns=u_turns)
     forbidden: set[tuple[int, ...]] = set()
@@ -195,12 +195,12 @@ def shortest_path(
     either_side: bool = True,
     u_turns: bool = False,
 ) -> RoadPath | None:
-    """The best path between two places on the graph, or None if there is none.
+    """The fastest or shortest path between two places on the graph, or None if there is none.
 
     start, goal : (edge, offset), as `nearest_edge` gives them
     weight      : ``time`` at the speed limits, or ``length``
-    either_side : start and goal may as well lie on the opposite edge of a two-way street
-    u_turns     : turning round is permitted at every node, not at dead ends alone
+    either_side : start and goal may also lie on the opposite edge of a two-way street
+    u_turns     : U-turns are permitted at every node, not only at dead ends
 
     Dijkstra's algorithm over the states of `turn_states`, not over nodes, so that turn restrictions hold.
     """

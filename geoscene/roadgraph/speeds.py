@@ -1,4 +1,4 @@
-"""Speed limits: as mapped, as a law that the map names, or by road class."""
+"""Speed limits: as mapped, by a legal default that the map names, or by road class."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def _one_limit(text: str) -> tuple[float, str] | None:
 def read_speeds(
     tags: Tags, highway: str, *, unread: list[str]
 ) -> tuple[tuple[float, float], tuple[str, str]]:
-    """Limits in m/s along the way and against it, and their sources; unreadable tags join ``unread``."""
+    """Limits in m/s along the way and against it, and their sources; unreadable tags go to ``unread``."""
     default = _SPEED.get(highway, _SPEED["service"]) * _KMH, "default"
     both = default
     for key in ("maxspeed", "zone:maxspeed", "maxspeed:type", "source:maxspeed", "zone:traffic"):

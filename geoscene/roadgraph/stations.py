@@ -1,4 +1,4 @@
-"""Places along the road graph at which heights are unknown, and how they hang together."""
+"""Stations along the road graph, at which heights are determined, and their neighbours."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Float, Ints
 
-# Arms of a node whose directions differ by less than this (radians) are one road that goes on.
-_GOES_ON = np.radians(40.0)
+# Arms of a node that deviate from a straight line by less than this (radians) are one continuous road.
+_STRAIGHT = np.radians(40.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Stations:
-    """Stations of a graph, the two edges of a two-way street sharing theirs.
+    """Stations of a graph; the two edges of a two-way street share theirs.
 
     xy      : (v, 2) float64 scene metres; the first rows are the graph's nodes
     row     : (r,) int64 stations edge after edge, each edge's from its tail to its head
     edge    : (r,) int64 edge of each row
     along   : (r,) float64 scene metres in plan from the edge's tail
-    drawn   : (r,) bool, the row is a vertex of the edge's line (else put in between)
+    drawn   : (r,) bool, the row is a vertex of the edge's line, not an inserted point
     """
 
     xy: Float
@@ -44,7 +44,7 @@ class Stations:
     def triples(self) -> tuple[Ints, Ints, Ints, Float, Float]:
         """Stations before, at and after each bend: (a, b, c (t,), metres from a to b, and from b to c).
 
-        Within edges, and across nodes where a road goes on.
+        Within edges, and across nodes where a road continues.
         """
         a, b, metres, edge = self.segments
         inner = np.flatnonzero(edge[1:] == edge[:-1])
@@ -57,14 +57,14 @@ class Stations:
         away = self.xy[other] - self.xy[node]
         away /= np.maximum(np.hypot(*away.T), 1e-9)[:, None]
         i, j = _pairs(node)
-        on = (away[i] * away[j]).sum(axis=1) < -np.cos(_GOES_ON)
+        on = (away[i] * away[j]).sum(axis=1) < -np.cos(_STRAIGHT)
         i, j = i[on], j[on]
         across = (other[i], node[i], other[j], far[i], far[j])
         joined = [np.concatenate(columns) for columns in zip(inside, across, strict=True)]
         return joined[0], joined[1], joined[2], joined[3], joined[4]
 
     def at(self, edge: Ints, along: Float) -> tuple[Ints, Ints, Float]:
-        """Stations before and after places on edges, and the share (0..1) of the latter."""
+        """Stations before and after places on edges, and the weight (0..1) of the latter."""
         # One rising number for all edges, so that one search serves them all.
         step = float(self.along.max(initial=0.0)) + 1.0
         key = self.edge * step + self.along
@@ -123,8 +123,8 @@ def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
 def find_crossings(graph: RoadGraph, stations: Stations) -> tuple[Ints, Float, Ints, Float, Float]:
     """Where one road runs over another: (upper edge, metres along it, lower edge, metres along it, margin).
 
-    Those are lines that cross in plan without a common node there and differ in layer, or in being bridge or
-    tunnel. The margin is how far along the upper road half the lower road's width reaches, metres.
+    These are lines that cross in plan without a common node and differ in layer or in bridge or tunnel. The
+    margin is the length in metres along the upper road that half the lower road's width takes up.
     """
     once = np.unique(stations.edge)
     lines = np.array([shapely.linestrings(graph.geometry[e][:, :2]) for e in once.tolist()], object)

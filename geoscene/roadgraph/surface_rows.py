@@ -18,20 +18,20 @@ GRID = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class SurfaceRows:
-    """Polygons in plan that compete for the ground; where two overlap the higher priority wins.
+    """Polygons in plan; where two overlap the higher priority wins.
 
     polygon  : (n,) object, valid shapely Polygon, scene metres, coordinates on a grid of 0.1 mm
     klass    : (n,) uint8, `geoscene.classes.Class`
     material : (n,) uint8, code of `geoscene.classes.materials`
     priority : (n,) float64
     osm_id   : (n,) str, the way, node or relation
-    source   : (n,) str, what shape and material rest on, as ``shape/material``: shape is ``width``,
+    source   : (n,) str, sources of shape and material, as ``shape/material``: shape is ``width``,
                ``est_width``, ``lanes`` or ``default`` (where the width comes from), ``sidewalk`` (tag),
                ``area``, ``crossing`` (tag), ``control`` (a signal or sign); material is ``surface`` or
                ``default``
     place    : (n,) int8, 0 on the ground, 1 on a bridge or an upper storey, 2 in a tunnel or a basement
     level    : (n,) int8, OSM layer
-    edge     : (n,) int32, the edge of the road graph that runs on it, -1 for none
+    edge     : (n,) int32, the edge of the road graph on it, -1 for none
     """
 
     polygon: NDArray[np.object_]
@@ -64,7 +64,7 @@ class SurfaceRows:
     ) -> SurfaceRows:
         """Rows of shapes; materials by name, every other column broadcast.
 
-        Shapes are put on the grid, made valid, and split into polygons; what has no area is left out.
+        Shapes are snapped to the grid, made valid and split into polygons; empty ones are left out.
         """
         n = (len(polygon),)
         table = materials()

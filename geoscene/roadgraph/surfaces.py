@@ -1,4 +1,4 @@
-"""What roads look like from above: carriageways, kerbs, sidewalks, paths, markings, crossings and rails."""
+"""Road surfaces in plan: carriageways, kerbs, sidewalks, paths, markings, crossings and rails."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _PARAPET = 0.5
 
 @dataclass(frozen=True, slots=True)
 class SurfaceOptions:
-    """What roads are made of where the map does not say.
+    """Defaults for road surfaces where the map has no tags.
 
-    sidewalks : ``urban`` gives paved streets of built-up places (up to 60 km/h) sidewalks where the map does
-                not speak of them and shows no footway beside them; ``mapped`` gives them none
+    sidewalks : ``urban`` gives paved streets in built-up areas (up to 60 km/h) sidewalks where the map has
+                neither a sidewalk tag nor a footway beside them; ``mapped`` gives them none
     left_hand : traffic keeps left
     """
 
@@ -55,10 +55,10 @@ class RoadSurfaces(SurfaceRows):
 def road_surfaces(
     osm: OsmData, graph: RoadGraph, *, frame: Frame, options: SurfaceOptions | None = None
 ) -> tuple[RoadSurfaces, list[Problem]]:
-    """The surfaces of roads, paths and rails in plan, and what could not be taken as it came.
+    """The surfaces of roads, paths and rails in plan, and the problems repaired or dropped.
 
-    Surfaces overlap: the kerb reaches under the carriageway and the sidewalk under the kerb, so that cutting
-    the plane by priority leaves neither gaps nor slivers between them.
+    Surfaces overlap: the kerb extends under the carriageway and the sidewalk under the kerb, so that cutting
+    by priority leaves neither gaps nor slivers between them.
     """
     options = options or SurfaceOptions()
     roads = read_carriageways(osm, frame, sidewalks=options.sidewalks, left_hand=options.left_hand)
@@ -134,7 +134,7 @@ def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[Surf
         (Class.SIDEWALK, _SIDEWALK, walk_material, "walk"),
     ):
         extra = np.where(roads.walk > 0, KERB + (roads.walk if shape == "walk" else 0.0), 0.0)
-        for rows, bands in _beside(roads, half, extra=extra):
+        for rows, bands in _widened(roads, half, extra=extra):
             out.append(
                 SurfaceRows.of(
                     bands,
@@ -174,10 +174,10 @@ def _walk_source(roads: Carriageways) -> NDArray[np.str_]:
     return np.where((roads.walk_source == "sidewalk").any(axis=1), "sidewalk", "default")
 
 
-def _beside(
+def _widened(
     roads: Carriageways, half: NDArray[np.float64], *, extra: NDArray[np.float64]
 ) -> list[tuple[NDArray[np.integer], NDArray[np.object_]]]:
-    """Bands that reach ``extra`` (k, 2) beyond the carriageway on the left and right, with their rows."""
+    """Bands ``extra`` (k, 2) wider than the carriageway on the left and right, with their rows."""
     both = np.flatnonzero((extra[:, 0] == extra[:, 1]) & (extra[:, 0] > 0))
     out: list[tuple[NDArray[np.integer], NDArray[np.object_]]] = []
     out.append((both, carriageway(roads.line[both], half[both] + extra[both, 0])))

@@ -1,4 +1,4 @@
-"""What the tags of one way say about driving on it; what they do not say is filled in, with its source."""
+"""Attributes of a street from the tags of its way, with defaults and their sources."""
 
 from __future__ import annotations
 
@@ -76,9 +76,9 @@ _ABOVE_GROUND = _NO | {"building_passage", "avalanche_protector", "covered", "cu
 
 @dataclass(frozen=True, slots=True)
 class Street:
-    """One way for cars. Pairs are (along the way, against it); a one-way street has 0 lanes the other way.
+    """A way for cars. Pairs are (along the way, against it); a one-way street has 0 lanes against it.
 
-    direction : 1 traffic runs along the way only, -1 against it only, 0 both
+    direction : 1 for traffic along the way only, -1 against it only, 0 for both
     speed     : m/s
     width     : metres, the whole carriageway
     """
@@ -100,12 +100,12 @@ class Street:
 
     @property
     def symmetric(self) -> bool:
-        """Whether it is the same street seen from its other end."""
+        """Whether both directions have the same attributes."""
         return self.direction == 0 and self.speed[0] == self.speed[1] and self.lanes[0] == self.lanes[1]
 
 
 def drivable(tags: Tags, *, private: bool = False) -> bool:
-    """Whether the public may drive a car on the way; with ``private`` whether somebody may drive something.
+    """Whether the public may drive a car on the way; with ``private``, whether it carries any vehicles.
 
     The most specific of ``motorcar``, ``motor_vehicle``, ``vehicle`` and ``access`` decides.
     """
@@ -121,7 +121,7 @@ def drivable(tags: Tags, *, private: bool = False) -> bool:
 
 
 def read_street(tags: Tags) -> tuple[Street, list[str]]:
-    """The street that the tags describe, and the tags (``key=value``) that could not be read."""
+    """The street's attributes, and the tags (``key=value``) that could not be read."""
     unread: list[str] = []
     highway = tags["highway"]
     direction = _direction(tags)
@@ -262,6 +262,6 @@ def _beside_lanes(tags: Tags) -> float:
 
 
 def _sides(tags: Tags, key: str) -> tuple[str, ...]:
-    """Sides that a tag speaks of: one-way streets carry a plain ``cycleway=lane`` on one side."""
+    """Sides that a tag applies to: on one-way streets a plain ``cycleway=lane`` means one side."""
     plain = key in tags and not any(f"{key}:{side}" in tags for side in ("left", "right", "both"))
     return ("right",) if plain and _direction(tags) else ("left", "right")

@@ -1,8 +1,8 @@
 """Bridges and tunnels."""
 
-from geoscene.structures.meeting import find_openings as find_openings
-from geoscene.structures.meeting import ground_below as ground_below
-from geoscene.structures.meeting import opening_layers as opening_layers
+from geoscene.structures.ground_contact import find_openings as find_openings
+from geoscene.structures.ground_contact import ground_below as ground_below
+from geoscene.structures.ground_contact import opening_layers as opening_layers
 from geoscene.structures.passages import buildings_over as buildings_over
 from geoscene.structures.pieces import within_extent as within_extent
 from geoscene.structures.read import read_structures as read_structures

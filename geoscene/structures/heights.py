@@ -1,4 +1,4 @@
-"""Heights of carriageways beside their centre lines."""
+"""Heights of carriageways away from their centre lines."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SHARED, PARTED = 0.5, 1.0
 """Metres of difference in height up to which carriageways share one surface, and from which on they part."""
 
 
-def foot(line: Float, xy: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
-    """Of the nearest place on a line (k, 3) to points (n, 2): its z, how far it is, whether it is no end."""
+def nearest_on_line(line: Float, xy: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
+    """Nearest point on a line (k, 3) to points (n, 2): its z, its distance, whether it is not an end."""
     start, along = line[:-1], np.diff(line, axis=0)
     square = np.maximum((along[:, :2] ** 2).sum(axis=1), 1e-12)
     t = ((xy[:, None] - start[:, :2]) * along[:, :2]).sum(axis=2) / square
@@ -37,16 +37,16 @@ def foot(line: Float, xy: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
 def surface_heights(table: Structures, piece: int, *, xy: Float) -> Float:
     """Heights (n,) of a piece's carriageway at points (n, 2).
 
-    Level across its centre line. Where carriageways join, they share the surface by the inverse fourth power
-    of their distance, so that each centre line has its own height.
+    The carriageway is level across its centre line. Where carriageways join, their heights are blended by the
+    inverse fourth power of the distance, so that each centre line keeps its own height.
     """
-    own, metres, _ = foot(table.around[piece], xy)
+    own, metres, _ = nearest_on_line(table.around[piece], xy)
     weight = _weight(metres, float(table.half[piece]))
     total, z = weight, weight * own
     for other in table.near[piece]:
         if table.edge[other] == table.edge[piece] and table.osm_id[other] == table.osm_id[piece]:
             continue  # the same line further on
-        theirs, metres, beside = foot(table.around[other], xy)
+        theirs, metres, beside = nearest_on_line(table.around[other], xy)
         weight = _weight(metres, float(table.half[other]))
         alike = np.clip((PARTED - np.abs(theirs - own)) / (PARTED - SHARED), 0.0, 1.0)
         weight = np.where(beside, weight * alike, 0.0)
@@ -56,10 +56,10 @@ def surface_heights(table: Structures, piece: int, *, xy: Float) -> Float:
 
 
 def slopes_across(table: Structures, piece: int) -> bool:
-    """Whether a piece's carriageway shares its surface with one beside it that is not as high."""
+    """Whether a piece's carriageway shares its surface with one beside it at another height."""
     for other in table.near[piece]:
         line = table.around[other]
-        z, metres, beside = foot(table.around[piece], line[:, :2])
+        z, metres, beside = nearest_on_line(table.around[piece], line[:, :2])
         shared = beside & (metres > _MERGED) & (metres < table.half[piece] + table.half[other])
         apart = np.abs(z - line[:, 2])
         if (shared & (apart > _LEVEL) & (apart < PARTED)).any():

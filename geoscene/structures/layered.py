@@ -1,4 +1,4 @@
-"""Solids over a plane cut into triangles: each triangle is solid in some layers and empty in others."""
+"""Solids in layers over a triangulated area: each triangle is solid in some layers and empty in others."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIDE = -1
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """An area cut into triangles that meet edge to edge.
+    """A conforming triangulation of an area.
 
     xy    : (n, 2) float64, scene metres
     faces : (m, 3) int64, counter-clockwise
@@ -37,12 +37,12 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Shell:
-    """The boundary of what is solid.
+    """Closed boundary of the solid layers.
 
     vertices : (v, 3) float64
     faces    : (f, 3) int64, counter-clockwise seen from the empty side
-    level    : (f,) int64, the level that a face lies on, `SIDE` for upright ones
-    up       : (f,) bool, the face looks upward
+    level    : (f,) int64, the level that a face lies on, `SIDE` for vertical ones
+    up       : (f,) bool, the face points upward
     triangle : (f,) int64, the triangle of the plan whose solid it bounds
     """
 
@@ -56,8 +56,7 @@ class Shell:
 def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
     """The triangles of an area (Polygon or MultiPolygon), none of which crosses one of the lines.
 
-    Lines are shapely line work; what lies outside the area is of no account. All is put on a grid of 1 mm by
-    snap rounding.
+    Lines are shapely geometries; parts outside the area are ignored. All is snap-rounded to a grid of 1 mm.
     """
     near = lines[shapely.intersects(lines, area)] if len(lines) else lines
     within = shapely.intersection(near, area)
@@ -81,8 +80,8 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
 def raise_shell(plan: Plan, levels: Float, *, solid: NDArray[np.bool_]) -> Shell:
     """The closed surface around the solid layers of a plan's triangles.
 
-    Where what is solid would touch itself along an upright edge alone, its smallest triangles there are left
-    out, so that every edge has two faces.
+    Where solids would touch along a vertical edge only, the smallest triangles there are left out, so that
+    every edge has two faces.
 
     levels : (n, l) float64, rising heights of the levels at each of the plan's vertices
     solid  : (m, l - 1) bool, whether a triangle is solid between one level and the next
@@ -118,7 +117,7 @@ def raise_shell(plan: Plan, levels: Float, *, solid: NDArray[np.bool_]) -> Shell
 def _unpinched(
     plan: Plan, solid: NDArray[np.bool_], *, start: Ints, own: Ints, other: Ints
 ) -> NDArray[np.bool_]:
-    """A layer (m,) in which the solid around each vertex hangs together."""
+    """The layer (m,) reduced so that the solid around each vertex is connected."""
     (ux, uy), (vx, vy) = (plan.xy[plan.faces[:, k]].T - plan.xy[plan.faces[:, 0]].T for k in (1, 2))
     area = np.repeat(ux * vy - uy * vx, 3)
     solid = solid.copy()

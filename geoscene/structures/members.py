@@ -1,4 +1,4 @@
-"""What runs on bridges and in tunnels: centre lines with heights, and where they come from the ground."""
+"""Roads and paths on bridges and in tunnels: centre lines with heights, and their ends on the ground."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ class Members:
 
     line     : (n,) object, (k, 3) float64 scene metres
     tunnel   : (n,) bool
-    foot     : (n,) bool, for people on foot or bicycles
-    width    : (n,) float64 metres of what is driven or walked on
-    rows     : (n,) object, (k,) int64 rows of the raised surfaces that are its own
-    approach : (n,) object, shapely: the first metres of the roads at its ends that are not
-               like it, on the ground or, from a tunnel, on a bridge
-    landed   : (n, 2) bool, start and end meet the ground
+    foot     : (n,) bool, for pedestrians or cyclists
+    width    : (n,) float64 metres of the carriageway or path
+    rows     : (n,) object, (k,) int64 rows of its surfaces among the raised ones
+    approach : (n,) object, shapely: the first metres of the roads at its ends that are of another kind:
+               on the ground or, from a tunnel, on a bridge
+    landed   : (n, 2) bool, start and end lie on the ground
     level    : (n,) int8
     edge     : (n,) int32, -1 for paths
     osm_id   : (n,) str
@@ -116,7 +116,7 @@ def _kind(graph: RoadGraph, edge: int) -> int:
 
 
 def _arms(graph: RoadGraph, members: NDArray[np.int64]) -> dict[int, list[tuple[int, Float, float]]]:
-    """Kind, first metres (from the node on) and width of all roads at the ends of members, by node."""
+    """Kind, first metres (from the node) and width of all roads at the ends of members, by node."""
     ends = np.unique(np.concatenate([graph.tail[members], graph.head[members]]))
     arms: dict[int, list[tuple[int, Float, float]]] = {int(node): [] for node in ends}
     for node, step in ((graph.tail, 1), (graph.head, -1)):
@@ -127,5 +127,5 @@ def _arms(graph: RoadGraph, members: NDArray[np.int64]) -> dict[int, list[tuple[
 
 
 def _band(first: Float, width: float) -> shapely.Geometry:
-    """What opens in a parapet or a wall for a road: as wide as the wider of both, and some sidewalk."""
+    """Opening in a parapet or wall for a road: as wide as the wider of both roads, plus a sidewalk."""
     return shapely.LineString(first).buffer(width / 2 + _WALK, cap_style="flat", join_style="mitre")

@@ -1,4 +1,4 @@
-"""Buildings that roads in tunnels or on bridges run through: they stand over them."""
+"""Passages through buildings for roads in tunnels or on bridges."""
 
 from __future__ import annotations
 
@@ -29,12 +29,11 @@ equally high do not leave a stair of micrometres, which the grid of solids would
 def buildings_over(
     buildings: Buildings, base: Float, *, table: Structures, options: StructureOptions | None = None
 ) -> tuple[Buildings, list[Problem]]:
-    """The buildings with a passage where a tunnel or a road bridge would run into them, and which they are.
+    """The buildings, those on a tunnel or a road bridge with a passage, and the rows of those.
 
-    What stands over the road becomes a part with its underside above the tunnel's roof or the bridge's free
-    height; the rest becomes a part that reaches down as before. Roofs of what is so divided are flat. A
-    bridge counts where the middle of its road is within the building, not where its edge touches it, and a
-    footbridge not at all: it leads into the building.
+    The part over the road gets its underside above the tunnel's roof or the bridge's free height; the rest
+    reaches down as before. Divided buildings have flat roofs. A bridge counts where its centre line lies
+    within the building, not where its edge touches it; footbridges do not count, they lead into buildings.
 
     base : (count,) z in metres of each building's base
     """
@@ -54,13 +53,13 @@ def buildings_over(
     stands = base[buildings.outline[row]]
     middle = np.array([shapely.LineString(line[:, :2]) for line in table.line[road]], object)
     within = shapely.length(shapely.intersection(buildings.footprint[row], middle)) > _SCANT
-    met = (shapely.area(common) > _SCANT) & (tunnel | within)
-    met &= (high > stands + buildings.min_height[row]) & (low < stands + buildings.height[row])
-    if not met.any():
+    hit = (shapely.area(common) > _SCANT) & (tunnel | within)
+    hit &= (high > stands + buildings.min_height[row]) & (low < stands + buildings.height[row])
+    if not hit.any():
         return buildings, []
-    corridor = table.polygon[road[met]]
-    clear = np.ceil((high - stands)[met] / _STEP - 1e-3) * _STEP
-    return _divided(buildings, row[met], corridor=corridor, clear=clear, tunnel=tunnel[met])
+    corridor = table.polygon[road[hit]]
+    clear = np.ceil((high - stands)[hit] / _STEP - 1e-3) * _STEP
+    return _divided(buildings, row[hit], corridor=corridor, clear=clear, tunnel=tunnel[hit])
 
 
 def _divided(
@@ -71,7 +70,7 @@ def _divided(
     clear: Float,
     tunnel: NDArray[np.bool_],
 ) -> tuple[Buildings, list[Problem]]:
-    """Rows (k,) divided along corridors (k,), what is in them standing ``clear`` (k,) over the base."""
+    """Rows (k,) divided along corridors (k,); the parts within start ``clear`` (k,) metres over the base."""
     footprint, underside = buildings.footprint.copy(), buildings.min_height.copy()
     source: list[int] = []
     shape: list[shapely.Geometry] = []
@@ -122,7 +121,7 @@ def _divided(
 
 
 def _polygons(shape: shapely.Geometry) -> shapely.Geometry:
-    """The polygons of a shape, on the grid of buildings, without crumbs."""
+    """The polygons of a shape, on the grid of buildings, without tiny ones."""
     parts = shapely.get_parts(shapely.set_precision(shape, GRID))
     areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0.05)
     parts = shapely.orient_polygons(shapely.set_precision(parts[areal], 0.0))

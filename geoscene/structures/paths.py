@@ -1,4 +1,4 @@
-"""Bridges and tunnels that no car takes (footways, cycleways, private roads, tracks) at their own heights."""
+"""Bridges and tunnels of footways, cycleways, private roads and railway tracks, with their heights."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.roadgraph.tags import is_tunnel, read_layer
 from geoscene.sources.data import OsmData, Way
-from geoscene.structures.heights import foot
+from geoscene.structures.heights import nearest_on_line
 from geoscene.structures.members import Members
 from geoscene.structures.table import StructureOptions
 from geoscene.typing import Float, Ints
@@ -28,22 +28,22 @@ from geoscene.typing import Float, Ints
 Height = Callable[[Float, Float], Float]
 
 _STATION = 5.0
-"""Metres between places at which heights are settled."""
+"""Maximum metres between stations."""
 
 _BESIDE = 4.0
 """Metres from a road bridge's carriageway within which a path of the same layer is on that bridge."""
 
 _COVER = 0.3
-"""Metres of ground over the roof of a tunnel for people on foot."""
+"""Metres of ground over the roof of a pedestrian tunnel."""
 
 _SPARE = 0.6
-"""Metres of cover and roof that a path over a tunnel may do without; what is left is still ground."""
+"""Metres of cover and roof that a path over a tunnel may take away."""
 
 _JOINED = 0.05
-"""Metres within which a way and a road meet in a node."""
+"""Metres within which a way and a road share a node."""
 
 _SLOPE = 0.12
-"""Greatest slope from where a path must be high or low; one in eight, a steep ramp. Assumed."""
+"""Maximum gradient of ramps; one in eight is a steep ramp. Assumed."""
 
 _TRACK_SLOPE = 0.025
 """The same for railways (EN 15273 and the TSI for infrastructure have 2.5 % on main lines, 3.5 % at most)."""
@@ -52,18 +52,18 @@ _BED = 4.4
 """Metres: width of the deck under one track."""
 
 _HANGING = 0.5
-"""Metres between a bridge's end and the ground that are reported."""
+"""Metres between a bridge's end and the ground from which they are reported."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Net:
-    """Stations along all ways, shared where ways share nodes.
+    """Network of stations along all ways, shared where ways share nodes.
 
     xy     : (v, 2) float64
     rows   : per way, its stations in order
     a, b   : (s,) neighbouring stations
     metres : (s,) between them
-    slope  : (s,) float64, greatest slope between them
+    slope  : (s,) float64, maximum gradient between them
     """
 
     xy: Float
@@ -111,12 +111,12 @@ def path_members(
     height: Height | None,
     options: StructureOptions,
 ) -> tuple[Members, list[Problem]]:
-    """Bridges and tunnels of ways that are not in the road graph, and what ends above the ground.
+    """Bridges and tunnels of ways that are not in the road graph, and those that end above the ground.
 
-    Their heights: beside a road bridge of the same layer, that bridge's; else they run evenly from ground to
-    ground, but as far over (or under) roads, tracks and water as these need, and from there fall (rise) by
-    the slope of a ramp. Tunnels below the ground go down by that slope from where they meet ways on
-    the surface, until the ground covers them, and stay there.
+    Beside a road bridge of the same layer they have its height. Otherwise they run evenly from ground to
+    ground, but with the required clearance over (or under) roads, tracks and water, from where they fall
+    (rise) with the gradient of a ramp. Tunnels below the ground descend with that gradient from their
+    junctions with ways on the surface until the ground covers them, and stay at that depth.
     """
     own = np.flatnonzero(
         (raised.edge < 0)
@@ -177,7 +177,7 @@ def _ground(xy: Float, height: Height | None) -> Float:
 
 
 def _onward(xy: Float, width: float) -> shapely.Geometry:
-    """The way's first metres beyond the start of its line, and half a turn about it."""
+    """The area of the way's first metres before the start of its line."""
     step = xy[1] - xy[0]
     step /= max(float(np.hypot(*step)), 1e-9)
     band = shapely.LineString([xy[0], xy[0] - 3.0 * step]).buffer(width, cap_style="flat")
@@ -185,7 +185,7 @@ def _onward(xy: Float, width: float) -> shapely.Geometry:
 
 
 def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]], *, slope: Float) -> _Net:
-    """Stations at the ends and along lines, whose greatest slopes (n,) are given."""
+    """Stations at the ends and along lines with given maximum gradients (n,)."""
     number: dict[int, int] = {}
     places: list[Float] = []
     rows, a, b, metres = [], [], [], []
@@ -225,7 +225,7 @@ def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]], *, slop
 
 
 def _sunk(osm: OsmData, ways: list[Way]) -> NDArray[np.bool_]:
-    """Whether tunnels (n,) are below the ground: by layer; without one where less than half is in houses."""
+    """Whether tunnels (n,) are below the ground: by layer; by default if less than half is in buildings."""
     houses = np.array([area.geometry for area in osm.areas if "building" in area.tags], object)
     tree = shapely.STRtree(houses)
     out = np.zeros(len(ways), np.bool_)
@@ -241,21 +241,21 @@ def _sunk(osm: OsmData, ways: list[Way]) -> NDArray[np.bool_]:
 
 
 def _joined(osm: OsmData, ways: list[Way]) -> NDArray[np.int8]:
-    """What start and end (n, 2) of ways meet of others: 0 nothing, 1 what is underground, 2 the surface."""
+    """Other ways at the start and end (n, 2) of ways: 0 none, 1 underground only, 2 on the surface."""
     own = {way.osm_id for way in ways}
     kind: dict[int, int] = {}
     for way in osm.ways:
         if way.osm_id in own or not ("highway" in way.tags or "railway" in way.tags):
             continue
-        met = 1 if is_tunnel(way.tags) else 2
+        place = 1 if is_tunnel(way.tags) else 2
         for node in way.nodes.tolist():
-            kind[node] = max(kind.get(node, 0), met)
+            kind[node] = max(kind.get(node, 0), place)
     at = [[kind.get(int(node), 0) for node in way.nodes[[0, -1]]] for way in ways]
     return np.array(at, np.int8).reshape(-1, 2)
 
 
 def _ends(net: _Net, sunk: NDArray[np.bool_], *, joined: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Whether a station (v,) is an end at which no other of the ways goes on, dead ends underground apart."""
+    """Whether a station (v,) is the end of one way only; not for dead ends underground."""
     ends: NDArray[np.bool_] = np.bincount(np.concatenate([net.a, net.b]), minlength=len(net.xy)) == 1
     for k in np.flatnonzero(sunk).tolist():
         station = net.rows[k][[0, -1]]
@@ -264,7 +264,7 @@ def _ends(net: _Net, sunk: NDArray[np.bool_], *, joined: NDArray[np.int8]) -> ND
 
 
 def _depths(net: _Net, sunk: NDArray[np.bool_], *, joined: NDArray[np.int8], full: Float) -> Float:
-    """Metres (v,) that stations are under the ground at least: ``full`` (n,) but for ramps; else NaN."""
+    """Minimum depth (v,) of stations under the ground: ``full`` (n,) except on ramps; NaN elsewhere."""
     depth = np.full(len(net.xy), np.nan)
     mouth = np.zeros(len(net.xy), np.bool_)
     for k, rows in enumerate(net.rows):
@@ -311,7 +311,7 @@ def _on_road_bridges(net: _Net, paths: _Paths, *, graph: RoadGraph) -> Float:
         alike = graph.tunnel[edge] == below
         for e in np.unique(edge[alike]).tolist():
             at = rows[np.unique(point[alike & (edge == e)])]
-            high, away, beside = foot(graph.geometry[e], net.xy[at])
+            high, away, beside = nearest_on_line(graph.geometry[e], net.xy[at])
             # Of another layer it is where the way leaves the road, at a node of both.
             within = graph.width[e] / 2 + _BESIDE if graph.layer[e] == layer else 0.0
             near = ((beside & (away < within)) | (away < _JOINED)) & (away < nearest[at])
@@ -320,7 +320,7 @@ def _on_road_bridges(net: _Net, paths: _Paths, *, graph: RoadGraph) -> Float:
 
 
 def _even(net: _Net, fixed: Float, *, ground: Float) -> Float:
-    """Heights (v,) that run evenly between the fixed ones; the ground's where none is fixed."""
+    """Heights (v,) interpolated along ways between fixed ones; the ground's where none is fixed."""
     from scipy.sparse import csr_array, diags_array  # noqa: PLC0415  (slow to import)
     from scipy.sparse.linalg import spsolve  # noqa: PLC0415
 
@@ -355,7 +355,7 @@ def _needs(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Float, Float
                 if is_road and own == rank[other]:
                     continue  # they meet
                 at = rows[near < _STATION]
-                on_road = foot(graph.geometry[other], xy[None])[0] if is_road else None
+                on_road = nearest_on_line(graph.geometry[other], xy[None])[0] if is_road else None
                 z = float((_ground(xy[None], crossed.height) if on_road is None else on_road)[0])
                 if over and is_road:
                     need = z + options.headroom + thick + (options.roof if graph.tunnel[other] else 0.0)
@@ -372,12 +372,12 @@ def _needs(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Float, Float
 
 
 def _rank(layer: Any, bridge: Any, *, tunnel: Any) -> Any:
-    """What is higher where ways cross: by layer, then a bridge over the ground over a tunnel."""
+    """Rank in height where ways cross: by layer, then a bridge over the ground over a tunnel."""
     return np.asarray(layer, np.int64) * 2 + np.where(tunnel, -1, np.asarray(bridge, np.int64))
 
 
 def _cones(net: _Net, bound: Float) -> Float:
-    """The greatest of all bounds (v,) less slope times distance along ways; -inf where none reaches."""
+    """Maximum over all bounds (v,) of bound minus gradient times distance along ways; -inf without any."""
     from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
     from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
 

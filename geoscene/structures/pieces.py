@@ -1,4 +1,4 @@
-"""Members cut into pieces that do not overlap, and which pieces carry on from which."""
+"""Members cut into pieces that do not overlap, and the adjacency of pieces."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geoscene import polylines
 from geoscene.classes import Class
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.structures.heights import PARTED, SHEET, foot
+from geoscene.structures.heights import PARTED, SHEET, nearest_on_line
 from geoscene.structures.layered import PRECISION
 from geoscene.structures.members import Members
 from geoscene.structures.sheets import Sheets, find_sheets, part_outlines, where_same
@@ -45,7 +45,7 @@ _CRUMB = 0.02
 def cut_pieces(members: Members, raised: SurfaceRows, *, options: StructureOptions) -> Structures:
     """The pieces of all members, in order, without piers.
 
-    Where outlines of one carriageway overlap, as they do at junctions, the smaller has the ground.
+    Where outlines of one carriageway overlap, as at junctions, the smaller one keeps the area.
     """
     member, polygon, line, around, half = _outlines(members, raised, options=options)
     tunnel = members.tunnel[member]
@@ -101,8 +101,8 @@ def cut_pieces(members: Members, raised: SurfaceRows, *, options: StructureOptio
 def _outlines(
     members: Members, raised: SurfaceRows, *, options: StructureOptions
 ) -> tuple[Ints, NDArray[np.object_], NDArray[np.object_], NDArray[np.object_], Float]:
-    """Pieces before they are told apart: member, outline, line, line with its surroundings, half-width."""
-    lines = [_without_crumbs(line) for line in members.line]
+    """Pieces before overlaps are removed: member, outline, line, extended line, half-width."""
+    lines = [_without_near_vertices(line) for line in members.line]
     whole, half = _wholes(members, lines, raised=raised, options=options)
     rows: list[tuple[int, object, Float, Float, float]] = []
     for m, line in enumerate(lines):
@@ -110,7 +110,7 @@ def _outlines(
         count = max(int(np.ceil(length / options.piece)), 1)
         cuts = np.linspace(0.0, length, count + 1)
         for k, (start, end) in enumerate(pairwise(cuts)):
-            part = _without_crumbs(polylines.cut(line, start, end=end))
+            part = _without_near_vertices(polylines.cut(line, start, end=end))
             outline = whole[m]
             if count > 1:
                 reach = _flat(part).buffer(2 * half[m] + 5.0, cap_style="flat", join_style="mitre")
@@ -134,10 +134,10 @@ def _outlines(
 def _wholes(
     members: Members, lines: list[Float], *, raised: SurfaceRows, options: StructureOptions
 ) -> tuple[list[shapely.Geometry], Float]:
-    """Outlines of members with their rims, and metres from their lines to the outside.
+    """Outlines of members with their parapets or walls, and metres from their lines to the outside.
 
-    A member ends square, but round where another one goes on from its end, so that no gap is left between
-    them on the outside of the bend.
+    A member ends square, but round where another one continues from its end, so that no gap is left on the
+    outside of the bend.
     """
     whole, half = [], np.empty(len(lines))
     for m, line in enumerate(lines):
@@ -160,7 +160,7 @@ def _wholes(
         m = row // 2
         if q == m or members.tunnel[q] != members.tunnel[m] or members.landed[m, row % 2]:
             continue
-        if abs(foot(lines[q], ends[row, None, :2])[0][0] - ends[row, 2]) < PARTED:
+        if abs(nearest_on_line(lines[q], ends[row, None, :2])[0][0] - ends[row, 2]) < PARTED:
             disc = shapely.Point(ends[row, :2]).buffer(min(half[m], half[q]))
             whole[m] = _union([whole[m], disc])
     return whole, half
@@ -170,8 +170,8 @@ def _flat(line: Float) -> shapely.LineString:
     return shapely.LineString(line[:, :2])
 
 
-def _without_crumbs(line: Float) -> Float:
-    """A line (k, 3) less the vertices right beside its ends: caps of buffers would stand askew on them."""
+def _without_near_vertices(line: Float) -> Float:
+    """The line (k, 3) without vertices close to its ends, where they would tilt the caps of buffers."""
     inner = line[1:-1]
     clear = [np.hypot(*(inner - end)[:, :2].T) > _MET for end in (line[0], line[-1])]
     return np.concatenate([line[:1], inner[clear[0] & clear[1]], line[-1:]])
@@ -198,7 +198,7 @@ def _inner(
     approach: NDArray[np.object_],
     rim: Float,
 ) -> NDArray[np.object_]:
-    """What is within the rim of a piece and its neighbours, and open to the ground's roads."""
+    """The area within the parapets of a piece and its neighbours, open towards roads on the ground."""
     inner = np.empty(len(polygon), object)
     near = sheets.near
     for k, others in enumerate(near):
@@ -226,7 +226,7 @@ def _inner(
 def _territories(
     polygon: NDArray[np.object_], around: NDArray[np.object_], *, sheets: Sheets
 ) -> NDArray[np.object_]:
-    """Outlines less those of smaller neighbours, so that none is covered altogether."""
+    """Outlines less those of smaller neighbours, so that none is covered entirely."""
     rank = np.empty(len(polygon), np.int64)
     rank[np.argsort(shapely.area(polygon), kind="stable")] = np.arange(len(polygon))
     out = np.empty(len(polygon), object)
@@ -253,7 +253,7 @@ def within_extent(table: Structures, extent: tuple[float, float, float, float]) 
 
 
 def _clean(shape: shapely.Geometry) -> shapely.MultiPolygon:
-    """A shape on the grid, opened a little: what hangs together by a hair does not belong together."""
+    """A shape on the grid, morphologically opened to remove hairline connections."""
     opened = shape.buffer(-0.005, join_style="mitre").buffer(0.005, join_style="mitre")
     parts = shapely.get_parts(shapely.set_precision(opened, PRECISION))
     areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > _CRUMB)
@@ -261,5 +261,5 @@ def _clean(shape: shapely.Geometry) -> shapely.MultiPolygon:
 
 
 def _union(polygons: Sequence[object] | NDArray[np.object_]) -> shapely.Geometry:
-    """The union on the grid, as a geometry that does not keep to it (buffers of such that do go amiss)."""
+    """The union on the grid, without its precision model, with which buffers can fail."""
     return shapely.set_precision(shapely.union_all(polygons, grid_size=PRECISION), 0.0)

@@ -1,4 +1,4 @@
-"""Where bridges stand on piers."""
+"""Piers of bridges."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.structures.heights import foot
+from geoscene.structures.heights import nearest_on_line
 from geoscene.structures.table import StructureOptions, Structures
 from geoscene.typing import Float
 
@@ -42,7 +42,7 @@ _SHIFTS = (0.0, 2.0, -2.0, 4.0, -4.0, 6.0, -6.0, 8.0, -8.0, 10.0, -10.0)
 def place_piers(
     table: Structures, ground: SurfaceRows, *, height: Height | None, options: StructureOptions
 ) -> Structures:
-    """The table with piers in the middle of equal spans, moved or left out where something passes below.
+    """The table with piers at equal spans, moved or left out where something passes below.
 
     ground : roads, paths and rails on the ground
     """
@@ -77,7 +77,7 @@ def place_piers(
 
 
 def _ends(table: Structures) -> NDArray[np.bool_]:
-    """Whether no other piece goes on from the start and from the end of each piece's line (n, 2)."""
+    """Whether no other piece continues from the start and the end of each piece's line (n, 2)."""
     places = np.array([line[[0, -1], :2] for line in table.line]).reshape(-1, 2)
     _, number, count = np.unique(np.round(places, 2), axis=0, return_inverse=True, return_counts=True)
     ends: NDArray[np.bool_] = (count[number.ravel()] == 1).reshape(-1, 2)
@@ -93,9 +93,9 @@ def _abutments(
     ways: shapely.STRtree,
     height: Height | None,
 ) -> list[shapely.Geometry]:
-    """Piers right at the ends of a piece that hang above the ground, as those of tracks without a bank do.
+    """Piers at the ends of a piece that hang above the ground, as railway bridges without an embankment do.
 
-    They keep free of roads and paths, not of the piece's own track, which ends before them.
+    They keep clear of roads and paths, but not of the piece's own track, which ends before them.
     """
     at = np.array([_END, flat.length - _END])[ends[k]]
     shapes = _piers(table, k, flat=flat, at=at)
@@ -130,19 +130,21 @@ def _stands_out(
     """Whether the bridge is well above the ground at metres along it."""
     xy = shapely.get_coordinates(shapely.line_interpolate_point(flat, at))
     ground = np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
-    high: NDArray[np.bool_] = foot(table.line[k], xy)[0] - table.body[k] > ground + _LOW
+    high: NDArray[np.bool_] = nearest_on_line(table.line[k], xy)[0] - table.body[k] > ground + _LOW
     return high
 
 
 def _on_pieces(
     table: Structures, k: int, *, pieces: shapely.STRtree, shapes: NDArray[np.object_]
 ) -> NDArray[np.bool_]:
-    """Whether each pier would stand in the way of another bridge, or over an open tunnel."""
+    """Whether each pier would stand on another bridge or over an open tunnel."""
     blocked = np.zeros(len(shapes), np.bool_)
     hit, found = pieces.query(shapes, predicate="dwithin", distance=_FREE)
     for row, other in zip(hit.tolist(), found.tolist(), strict=True):
         if other == k or other in table.near[k]:
             continue
         xy = shapely.get_coordinates(shapes[row].centroid)
-        blocked[row] |= foot(table.line[other], xy)[0][0] < foot(table.line[k], xy)[0][0]
+        blocked[row] |= (
+            nearest_on_line(table.line[other], xy)[0][0] < nearest_on_line(table.line[k], xy)[0][0]
+        )
     return blocked

@@ -1,4 +1,4 @@
-"""Bridges and tunnels of a map."""
+"""Bridges and tunnels read from a map."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from geoscene.report import Problem
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.surfaces import RoadSurfaces
 from geoscene.sources.data import OsmData
-from geoscene.structures.meeting import find_low_decks
+from geoscene.structures.ground_contact import find_low_decks
 from geoscene.structures.members import concatenate_members, road_members
 from geoscene.structures.paths import path_members
 from geoscene.structures.pieces import cut_pieces
@@ -29,10 +29,10 @@ def read_structures(
     height: Height | None = None,
     options: StructureOptions | None = None,
 ) -> tuple[Structures, list[Problem]]:
-    """The bridges and tunnels of a map, and what was changed or left out.
+    """The bridges and tunnels of a map, and the problems repaired or dropped.
 
     graph  : with heights, from `geoscene.roadgraph.profile`
-    height : of the ground with its roads (`geoscene.roadgraph.graded_ground`); level at 0 without
+    height : height of the graded ground (`geoscene.roadgraph.graded_ground`); level at 0 by default
     """
     options = options or StructureOptions()
     raised = surfaces.raised

@@ -1,4 +1,4 @@
-"""Which carriageways are one surface, which lie over each other, and where they part."""
+"""Carriageways that share a surface, those that lie over each other, and where they part."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene import polylines
-from geoscene.structures.heights import PARTED, SHEET, foot
+from geoscene.structures.heights import PARTED, SHEET, nearest_on_line
 from geoscene.typing import Float
 
 Pair = tuple[int, int]
@@ -42,11 +42,11 @@ _SAMPLE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Sheets:
-    """How pieces lie to each other.
+    """Relations between pieces.
 
-    near   : (n,) object, (k,) int64 rows that are one carriageway with this one, if only in part
-    over   : pairs of rows of which one is, if only in part, over the other
-    parted : pairs that are not equally high all over, those of `over` among them
+    near   : (n,) object, (k,) int64 rows that share a carriageway with this one, at least in part
+    over   : pairs of rows of which one lies, at least in part, over the other
+    parted : pairs that differ in height somewhere, including those of `over`
     """
 
     near: NDArray[np.object_]
@@ -54,7 +54,7 @@ class Sheets:
     parted: set[Pair]
 
     def apart(self, one: int, two: int) -> bool:
-        """Whether two pieces meet in plan, but are nowhere one carriageway."""
+        """Whether two pieces overlap in plan without sharing a carriageway anywhere."""
         return _pair(one, two) in self.parted and two not in self.near[one]
 
 
@@ -65,7 +65,7 @@ def _pair(one: int, two: int) -> Pair:
 def find_sheets(
     polygon: NDArray[np.object_], around: NDArray[np.object_], *, tunnel: NDArray[np.bool_]
 ) -> Sheets:
-    """Which pieces are one carriageway, by their heights where their outlines meet."""
+    """Relations of pieces by their heights where their outlines touch."""
     one, two = shapely.STRtree(polygon).query(polygon, predicate="dwithin", distance=_TOUCH)
     keep = (one < two) & (tunnel[one] == tunnel[two])
     one, two = one[keep], two[keep]
@@ -74,7 +74,10 @@ def find_sheets(
     least, most = np.empty((2, len(one)))
     for row, (p, q) in enumerate(zip(one.tolist(), two.tolist(), strict=True)):
         places = shapely.get_coordinates([common[row], common[row].representative_point()])
-        (z, _, beside), (other_z, _, other_beside) = foot(around[p], places), foot(around[q], places)
+        (z, _, beside), (other_z, _, other_beside) = (
+            nearest_on_line(around[p], places),
+            nearest_on_line(around[q], places),
+        )
         apart = np.abs(z - other_z)
         least[row] = apart.min()
         # Beyond its end a line has no slope, however steep: one that goes on from it is no other one.
@@ -93,9 +96,9 @@ def find_sheets(
 
 
 def where_same(line: Float, other: Float, *, within: float) -> shapely.Geometry:
-    """Where, beside a line, it is less than ``within`` metres higher or lower than another one, in strips."""
+    """Strips along a line where its height differs by less than ``within`` metres from another line's."""
     cuts, middle = _strip_cuts(line)
-    z, _, beside = foot(other, middle[:, :2])
+    z, _, beside = nearest_on_line(other, middle[:, :2])
     same = (np.abs(z - middle[:, 2]) < within) | ~beside
     return shapely.union_all(
         [_flat_part(line, cuts, k=k).buffer(_SIDE, cap_style="flat") for k in np.flatnonzero(same).tolist()]
@@ -111,14 +114,14 @@ def part_outlines(
     free: Float,
     body: Float,
 ) -> NDArray[np.object_]:
-    """Outlines (n,) none of which reaches into the free space of one that runs beside it.
+    """Outlines (n,) that keep out of the clearance of those beside them.
 
-    Widths on maps are rough: carriageways side by side overlap by a metre or two. Where they do, and one is
-    higher but not so high that the other fits under it, each keeps what is nearer to it.
+    Mapped widths are rough: carriageways side by side overlap by a metre or two. Where they do, and one is
+    higher but not enough for the other to pass below, each keeps the area nearer to its own line.
 
     half : (n,) metres from centre lines to the outside
-    free : (n,) metres of free height over a carriageway
-    body : (n,) metres of what lies under it
+    free : (n,) metres of clearance over a carriageway
+    body : (n,) metres of structure below it
     """
     lost: dict[int, list[shapely.Geometry]] = {}
     one, two = shapely.STRtree(polygon).query(polygon, predicate="intersects")
@@ -166,12 +169,12 @@ def _areal(shape: shapely.Geometry) -> shapely.Geometry:
 def _in_conflict(
     line: Float, other: Float, *, reach: float, needs: tuple[float, float], least: float
 ) -> list[shapely.Geometry]:
-    """Strips along a line where another runs beside it at a height that lets neither pass the other.
+    """Strips along a line where another runs beside it without enough height difference to pass.
 
-    needs : metres that the line must be above the other to pass over it, and below it to pass under
+    needs : metres that the line must be above the other to pass over it, and below it to pass under it
     """
     cuts, middle = _strip_cuts(line)
-    z, away, beside = foot(other, middle[:, :2])
+    z, away, beside = nearest_on_line(other, middle[:, :2])
     up = middle[:, 2] - z
     short = (np.abs(up) >= least) & (np.abs(up) < np.where(up < 0, needs[1], needs[0]) - _TIGHT)
     strips, flat = [], shapely.LineString(other[:, :2])
@@ -194,14 +197,14 @@ def _strip_cuts(line: Float) -> tuple[Float, Float]:
 
 
 def _flat_part(line: Float, cuts: Float, *, k: int) -> shapely.LineString:
-    """The line of a strip, which overlaps the next a little."""
+    """The line of a strip, which overlaps the next one slightly."""
     return shapely.LineString(polylines.cut(line, cuts[k] - _LAP, end=cuts[k + 1] + _LAP)[:, :2])
 
 
 def _nearer(
     where: shapely.Geometry, line: Float, *, half: float, other: Float, other_half: float
 ) -> shapely.Geometry:
-    """What of an area is further within the one carriageway than within the other.
+    """The part of an area that lies further within the one carriageway than within the other.
 
     By the Voronoi cells of points along the narrower one's centre line, and along the other as far from its
     outside.

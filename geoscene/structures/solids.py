@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.mesh import FLOOR, OTHER, ROOF, WALL, Mesh
+from geoscene.structures.ground_contact import tunnel_roof
 from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.layered import SIDE, Plan, Shell, cut_plan, raise_shell
-from geoscene.structures.meeting import tunnel_roof
 from geoscene.structures.table import StructureOptions, Structures
 from geoscene.typing import Float
 
@@ -32,11 +32,11 @@ def structure_meshes(
 ) -> list[Mesh]:
     """One closed solid for each of the chosen rows (all by default), in scene coordinates.
 
-    Upward faces of a carriageway have the class and material of what lies there, all others class BRIDGE or
+    Upward faces of a carriageway have the class and material of its surfaces, all others class BRIDGE or
     TUNNEL.
 
-    height   : of the ground that piers stand on and that lies on tunnels
-    openings : where the ground is open over tunnels, from `find_openings`
+    height   : height of the ground under piers and over tunnels
+    openings : areas without ground over tunnels, from `find_openings`
     """
     chosen = range(len(table)) if rows is None else [int(k) for k in rows]
     return [
@@ -69,13 +69,13 @@ def _solid(
         levels, solid = _bridge(table, k, plan=plan, z=z, ground=ground, rim=rim)
         floor = 2
     shell = raise_shell(plan, levels, solid=solid)
-    return _dressed(table, k, plan=plan, shell=shell, floor=floor, rim=rim)
+    return _with_surfaces(table, k, plan=plan, shell=shell, floor=floor, rim=rim)
 
 
 def _bridge(
     table: Structures, k: int, *, plan: Plan, z: Float, ground: Float, rim: NDArray[np.bool_]
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Levels under ground, soffit, deck, parapet; piers reach down, parapets up."""
+    """Bridge with the levels below ground, soffit, deck, parapet; piers reach down, parapets up."""
     soffit = z - table.body[k]
     levels = np.column_stack([np.minimum(ground - _STANDING, soffit - 0.1), soffit, z, z + table.rise[k]])
     pier = shapely.contains_xy(table.pier[k], *plan.middle.T)
@@ -93,7 +93,7 @@ def _tunnel(
     openings: NDArray[np.object_] | None,
     options: StructureOptions,
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Levels under the floor, floor, ceiling, roof; walls between."""
+    """Tunnel with the levels underside, floor, ceiling, roof; walls between floor and ceiling."""
     ceiling = z + table.rise[k]
     opening = None if openings is None else openings[k]
     roof = tunnel_roof(plan.xy, ceiling, ground=ground, opening=opening, options=options)
@@ -102,7 +102,7 @@ def _tunnel(
 
 
 def _linework(table: Structures, k: int, *, openings: NDArray[np.object_] | None) -> NDArray[np.object_]:
-    """Lines along which the piece is cut: what lies on it, its rim, and where its height bends."""
+    """Lines along which the piece is triangulated: outlines of its surfaces, parapets, breaks in height."""
     lines = [
         *shapely.boundary(table.surfaces.polygon[table.tops[k]]),
         shapely.boundary(table.inner[k]),
@@ -124,7 +124,7 @@ def _linework(table: Structures, k: int, *, openings: NDArray[np.object_] | None
 
 
 def _ribs(line: Float, reach: float) -> NDArray[np.object_]:
-    """Straight lines across a centre line at its vertices, where it bends or changes its slope."""
+    """Straight lines across a centre line at vertices where it bends or changes its gradient."""
     step = np.diff(line[:, :2], axis=0)
     way = step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
     at = way[:-1] + way[1:]
@@ -136,10 +136,10 @@ def _ribs(line: Float, reach: float) -> NDArray[np.object_]:
     return np.atleast_1d(ribs)
 
 
-def _dressed(
+def _with_surfaces(
     table: Structures, k: int, *, plan: Plan, shell: Shell, floor: int, rim: NDArray[np.bool_]
 ) -> Mesh:
-    """The shell as a mesh, its faces of the classes of what lies on them."""
+    """The shell as a mesh with the classes of its surfaces."""
     concrete = materials()["concrete"]
     body = Class.TUNNEL if table.tunnel[k] else Class.BRIDGE
     klass = np.full(len(shell.faces), body, np.uint8)
@@ -167,7 +167,7 @@ def _dressed(
 
 
 def _top_rows(table: Structures, k: int, *, xy: Float) -> NDArray[np.int64]:
-    """The surface (n,) that lies on top at points (n, 2), -1 where none does."""
+    """Row (n,) of the topmost surface at points (n, 2), -1 without any."""
     tops = table.tops[k]
     tops = tops[np.lexsort([-tops, table.surfaces.priority[tops]])]
     row = np.full(len(xy), -1, np.int64)

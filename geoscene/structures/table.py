@@ -16,20 +16,20 @@ THINNEST = 0.15
 
 @dataclass(frozen=True, slots=True)
 class StructureOptions:
-    """Sizes in metres that maps do not give.
+    """Sizes in metres that maps do not contain.
 
     deck         : thickness of road bridges (as `geoscene.roadgraph.ProfileOptions.deck`)
-    slab         : thickness of bridges for people on foot
+    slab         : thickness of pedestrian bridges
     parapet      : height of parapets on road bridges
-    railing      : height of those on bridges for people on foot (EN 1317-6: 1.0 and more; cyclists 1.2)
+    railing      : height of parapets on pedestrian bridges (EN 1317-6: 1.0 and more; cyclists 1.2)
     rim          : thickness of parapets
     headroom     : free height in road tunnels (as `ProfileOptions.clearance`)
-    passage      : free height in tunnels for people on foot
+    passage      : free height in pedestrian tunnels
     wall         : thickness of tunnels' walls and floors
     roof         : thickness of their roofs, less where the ground above is thin
-    margin       : from the edge of what lies in a tunnel to its walls
-    pier_spacing : between piers at most
-    piece        : length of pieces at most, so that each belongs to one tile
+    margin       : distance from the surfaces in a tunnel to its walls
+    pier_spacing : maximum distance between piers
+    piece        : maximum length of pieces, each of which belongs to one tile
     """
 
     deck: float = 0.8
@@ -50,8 +50,8 @@ class StructureOptions:
 class Structures:
     """Bridges and tunnels, one row a piece: a stretch of at most 80 m of one road, path or track.
 
-    polygon   : (n,) object, what the piece covers in plan, scene metres; pieces that carry on from each other
-                share a border and do not overlap
+    polygon   : (n,) object, outline of the piece in plan, scene metres; adjacent pieces share a border and do
+                not overlap
     line      : (n,) object, (k, 3) float64 centre line, on the carriageway's surface
     around    : (n,) object, (k, 3) float64 the same line some metres further at both ends
     tunnel    : (n,) bool, it is a tunnel; else a bridge
@@ -60,18 +60,18 @@ class Structures:
     body_source : (n,) str
     rise      : (n,) float64 metres, height of the parapet, or free height of the tunnel
     rise_source : (n,) str
-    near      : (n,) object, (k,) int64 rows that carry on from this one, or join it from the side
-    tops      : (n,) object, (k,) int64 rows of ``surfaces`` that lie on it
-    inner     : (n,) object, shapely: what parapets or walls stand around
+    near      : (n,) object, (k,) int64 rows that continue this one or join it from the side
+    tops      : (n,) object, (k,) int64 rows of ``surfaces`` on it
+    inner     : (n,) object, shapely: area within the parapets or walls
     approach  : (n,) object, shapely: the roads' first metres beyond its end, where it has one
     pier      : (n,) object, shapely MultiPolygon, its piers
-    low       : (n,) object, shapely MultiPolygon, where the ground would stand in its deck
+    low       : (n,) object, shapely MultiPolygon, area where the ground would rise into its deck
     pier_spacing : (n,) float64 metres, nominal; 0 without piers
     level     : (n,) int8, OSM layer
     edge      : (n,) int32, edge of the road graph, the first of a street's two; -1 for paths
     osm_id    : (n,) str
     feature   : (n,) int32, -1 for none
-    surfaces  : what lies on bridges and in tunnels
+    surfaces  : road and path surfaces on bridges and in tunnels
     """
 
     polygon: NDArray[np.object_]
@@ -101,7 +101,7 @@ class Structures:
         return len(self.polygon)
 
     def take(self, keep: NDArray[np.bool_]) -> Structures:
-        """The chosen rows, in their order; ``near`` names rows of the new table."""
+        """The chosen rows, in their order; ``near`` refers to rows of the new table."""
         number = np.full(len(self), -1, np.int64)
         number[keep] = np.arange(int(keep.sum()))
         columns = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name != "surfaces"}

@@ -13,7 +13,7 @@ from geoscene.objects.furniture import furniture_instances, read_furniture, shap
 from geoscene.objects.shapes import expand, shapes
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData, Point, Way
-from geoscene.structures.meeting import OPENING
+from geoscene.structures.ground_contact import OPENING
 
 FRAME = Frame.at(9.0, 50.0)
 EXTENT = (-100.0, -100.0, 100.0, 100.0)

@@ -1,4 +1,4 @@
-"""Heights along roads: smooth on the ground, over what bridges cross, under it in tunnels."""
+"""Longitudinal profiles of roads: smooth on the ground, with the clearances of bridges and tunnels."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ Height = Callable[[Float, Float], Float]
 
 @dataclass(frozen=True, slots=True)
 class ProfileOptions:
-    """How roads leave the ground. Lengths in metres, slopes as a ratio.
+    """Limits of profiles. Lengths in metres, gradients as a ratio.
 
-    clearance : free height over a road that a bridge crosses or a tunnel holds (AASHTO: 4.3 to 4.9 and more)
-    deck      : thickness of what carries a road over another
-    cover     : ground over a tunnel
-    slope     : greatest slope of ramps, bridges and tunnels (steeper only where the ground is)
-    step      : greatest change of slope from one station to the next, beyond the ground's own
-    smooth    : length over which unevenness of the ground is smoothed
-    spacing   : distance of stations
+    clearance : free height over a road below a bridge or in a tunnel (AASHTO: 4.3 to 4.9 and more)
+    deck      : thickness of bridge decks
+    cover     : thickness of the ground over a tunnel
+    slope     : maximum gradient of ramps, bridges and tunnels (exceeded only where the ground is steeper)
+    step      : maximum change of gradient from one station to the next, in addition to the ground's own
+    smooth    : length over which the ground is smoothed
+    spacing   : distance between stations
     """
 
     clearance: float = 4.7
@@ -44,10 +44,10 @@ class ProfileOptions:
 
 @dataclass(frozen=True, slots=True)
 class Obstacles:
-    """Lines on the ground that bridges cross: tracks and water.
+    """Lines on the ground that bridges cross: railway tracks and waterways.
 
     line  : (k,) shapely LineString, scene metres
-    clear : (k,) float64 metres of free height that they need
+    clear : (k,) float64 metres of free height that they require
     """
 
     line: NDArray[np.object_]
@@ -86,15 +86,15 @@ def profile(
 
     Constrained least squares over all stations at once. Minimised: the squared distance from the ground, plus
     the squared curvature in height times ``smooth`` to the fourth; bridges and tunnels have the second term
-    only, so they run on from their ramps. Bounds: a road is above one that it crosses by clearance and deck;
-    bridges and tunnels that overlap a road beside them are as high as it or that far over or under it;
+    only, so they continue their ramps. Bounds: a road is above one that it crosses by clearance and deck;
+    bridges and tunnels that overlap a road beside them have its height or that distance over or under it;
     a bridge is above obstacles and the ground; a tunnel is under the ground, deeper with the distance from
-    its mouth, and if slopes allow wholly so after 15 m; slopes; changes of slope. Bounds that contradict each
-    other (a ramp too short for its slope) give way, carriageways side by side before slopes before heights.
-    Solved by an interior-point method.
+    its mouth, and if gradients allow entirely so after 15 m; gradients; changes of gradient. Bounds that
+    contradict each other (a ramp too short for its gradient) are relaxed: first those between carriageways
+    side by side, then gradients, then heights. Solved by an interior-point method.
 
-    ground    : height of the terrain; what it returns is kept to where nothing stands against it
-    obstacles : what else bridges cross
+    ground    : height of the terrain, which roads follow where no bound prevents it
+    obstacles : railway tracks and waterways that bridges cross
     """
     options = options or ProfileOptions()
     if not len(graph):
@@ -107,7 +107,7 @@ def profile(
 
 
 def _weights(graph: RoadGraph, stations: Stations) -> Float:
-    """How firmly the ground holds each station: per metre, times the metres that the station stands for."""
+    """Weight of the distance from the ground at each station: per metre, times the station's length."""
     a, b, metres, edge = stations.segments
     structure = graph.bridge[edge] | graph.tunnel[edge]
     count = len(stations.xy)
@@ -153,7 +153,7 @@ def _bounds(
     obstacles: Obstacles | None,
     options: ProfileOptions,
 ) -> Bounds:
-    """All that heights must obey."""
+    """All bounds on heights."""
     rows = _Rows(len(stations.xy))
     a, b, metres, edge = stations.segments
     structure = graph.bridge[edge] | graph.tunnel[edge]
@@ -224,9 +224,9 @@ def _bounds(
 
 
 def _parting(high: float, options: ProfileOptions) -> tuple[float, Callable[[Float], Float]]:
-    """How roads that fork part: metres along both until they are ``high`` apart, and how far before that.
+    """Roads that part at a fork: metres until they are ``high`` apart, and their height difference before.
 
-    One rises and one falls, each bending by the greatest change of slope until it has the greatest slope.
+    One rises and one falls, each with the maximum change of gradient up to the maximum gradient.
     """
     bend = 0.5 * options.step / options.spacing
     bent = options.slope / bend
@@ -310,7 +310,7 @@ def _over_obstacles(
 def _solve(
     graph: RoadGraph, stations: Stations, *, terrain: Float, bounds: Bounds, options: ProfileOptions
 ) -> Float:
-    """Heights (v,) of least cost within the bounds."""
+    """Heights (v,) of minimum cost within the bounds."""
     from scipy.sparse import csr_array, diags_array  # noqa: PLC0415  (slow to import)
 
     weight = _weights(graph, stations)
@@ -352,7 +352,7 @@ def _solve(
 
 
 def _solve_some(cost: Any, pull: Float, *, bounds: Bounds, terrain: Float, free: NDArray[np.bool_]) -> Float:
-    """Heights (v,) of least cost within the bounds, those that are not free on the terrain."""
+    """Heights (v,) of minimum cost within the bounds; stations that are not free lie on the terrain."""
     held = np.where(free, 0.0, terrain)
     columns = np.flatnonzero(free)
     a = bounds.a[:, columns]
@@ -366,7 +366,7 @@ def _solve_some(cost: Any, pull: Float, *, bounds: Bounds, terrain: Float, free:
 
 
 def _with_heights(graph: RoadGraph, stations: Stations, *, z: Float) -> RoadGraph:
-    """The graph at the stations' heights; a line that stays level keeps the vertices that it had."""
+    """The graph with the stations' heights; a level line keeps its original vertices."""
     geometry = np.empty(len(graph), object)
     begin = np.flatnonzero(np.diff(stations.edge, prepend=-1))
     for start, stop in zip(begin.tolist(), [*begin[1:].tolist(), len(stations.edge)], strict=True):

@@ -1,4 +1,4 @@
-"""A route on the map, for building only what is seen from it."""
+"""The line of a route, for building only the tiles along it."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def route_line(words: Sequence[str], graph: RoadGraph, *, frame: Frame) -> Any:
     """The route as a shapely line or points, scene metres.
 
     words : two or more waypoints ``LAT,LON`` (joined over the road graph), or one file: GPX, GeoJSON, or CSV
-            with columns lon and lat (a dataset's ``poses.csv``), taken as it is
+            with columns lon and lat (a dataset's ``poses.csv``), used as it is
 
-    Raises InputError for words that are neither and SourceNotFoundError for a missing file.
+    Raises InputError for other words and SourceNotFoundError for a missing file.
     """
     given = [word.strip() for word in words]
     if len(given) == 1 and "," not in given[0]:

@@ -1,4 +1,4 @@
-"""Where structures meet the ground: it lies below decks, and is open where tunnels come out of it."""
+"""Ground at structures: lowered below bridge decks, and open where tunnels surface."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ _INTO = 0.1
 
 
 def ground_below(table: Structures, height: Height) -> Height:
-    """The ground lowered where it would stand above the underside of a bridge.
+    """The terrain, lowered where it would rise above the underside of a bridge.
 
-    At a bridge's end it may be as high as the deck, whence it falls by 1 in 4.
+    At a bridge's end it may reach the deck, from where it falls by 1 in 4.
     """
     bridges = np.flatnonzero(~table.tunnel)
     if not len(bridges):
@@ -71,9 +71,9 @@ def ground_below(table: Structures, height: Height) -> Height:
 
 
 def find_low_decks(table: Structures, height: Height | None) -> Structures:
-    """The table with the places (``low``) where the ground would stand in a bridge's deck.
+    """The table with the areas (``low``) where the ground would rise into a bridge's deck.
 
-    height : of the ground before `ground_below` lowers it
+    height : height of the ground before `ground_below` lowers it
     """
     low = table.low.copy()
     for k in np.flatnonzero(~table.tunnel).tolist():
@@ -90,7 +90,7 @@ def find_low_decks(table: Structures, height: Height | None) -> Structures:
 
 
 def _strips(table: Structures, k: int) -> NDArray[np.object_]:
-    """A piece's outline cut across."""
+    """A piece's outline cut into strips across its line."""
     flat = shapely.LineString(table.line[k][:, :2])
     reach = float(table.half[k]) + 5.0
     cuts = np.linspace(0.0, flat.length, max(int(np.ceil(flat.length / _STEP)), 1) + 1)
@@ -104,22 +104,22 @@ def _strips(table: Structures, k: int) -> NDArray[np.object_]:
 
 
 def _ground_on(strips: NDArray[np.object_], height: Height | None) -> tuple[Float, NDArray[np.int64], Float]:
-    """Places (n, 2) around strips, the strip of each, and the ground's height there."""
+    """Points (n, 2) around strips, the strip of each, and the ground's height there."""
     xy, strip = shapely.get_coordinates(shapely.segmentize(strips, _STEP), return_index=True)
     return xy, strip, np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
 
 
 def _areal(shape: shapely.Geometry) -> shapely.MultiPolygon:
-    """The polygons of a shape, without crumbs."""
+    """The polygons of a shape without tiny ones."""
     parts = shapely.get_parts(shape)
     areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0.01)
     return shapely.MultiPolygon(parts[areal].tolist())
 
 
 def find_openings(table: Structures, height: Height | None) -> NDArray[np.object_]:
-    """Where the ground must be open over each piece (n,): shapely polygons, None where it need not be.
+    """Areas (n,) over each tunnel piece without ground, as shapely polygons; None if there are none.
 
-    That is where it is not higher than the least roof over a tunnel's ceiling.
+    There the ground is not higher than the minimum roof over the tunnel's ceiling.
     """
     openings = np.empty(len(table), object)
     for k in np.flatnonzero(table.tunnel).tolist():
@@ -136,9 +136,9 @@ def find_openings(table: Structures, height: Height | None) -> NDArray[np.object
 
 
 def opening_layers(table: Structures, openings: NDArray[np.object_]) -> Layers:
-    """Rows for `geoscene.ground`: class TUNNEL is to leave out, class TERRAIN bare soil under low decks.
+    """Rows for `geoscene.ground`: class TUNNEL for openings, class TERRAIN for bare soil under low decks.
 
-    These are there for their outlines, along which the ground can fall away below the deck.
+    The latter provide edges along which the ground can fall below the deck.
     """
     rows = np.flatnonzero([shape is not None for shape in openings])
     low = np.flatnonzero(~shapely.is_empty(table.low))
@@ -171,7 +171,7 @@ def tunnel_roof(
     opening: shapely.Geometry | None,
     options: StructureOptions,
 ) -> Float:
-    """Heights (n,) of a tunnel's roof at points (n, 2): under the ground, or out of it where it is open."""
+    """Heights (n,) of a tunnel's roof at points (n, 2): below the ground, or above it in openings."""
     thick = ceiling + options.roof
     roof: Float = np.clip(ground - LIP, ceiling + THINNEST, thick)
     if opening is not None:
