@@ -110,6 +110,7 @@ FORMATS = {
     row.name: row
     for row in (
         Format("pcd", "pcd", ".pcd", maps=True),
+        Format("pcd-ascii", "pcd_ascii", ".ascii.pcd"),
         Format("ply", "ply", ".ply", maps=True),
         Format("csv", "text", ".csv"),
         Format("laz", "las", ".laz", frame="world", columns=_LAS, maps=True),

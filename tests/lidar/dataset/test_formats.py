@@ -1,6 +1,8 @@
-"""Every cloud format gives back what was written, to its own step, and strangers' readers agree."""
+"""Every point-cloud format gives back what was written, to its own precision, and other readers agree."""
 
 import io
+import subprocess
+import sys
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -10,15 +12,20 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pypcd4 import PointCloud
+from pypcd4 import Encoding, PointCloud
 from pyproj import CRS
 
 from geoscene.classes import Class
-from lidar.dataset.formats import las, pcd, ply, read_table, text
+from lidar.dataset.formats import FORMATS, LABELS, las, pcd, pcd_ascii, ply, read_cloud, read_table, text
 from lidar.dataset.formats.las import LasInfo, gps_seconds, open_las, read_chunks, read_crs
-from lidar.errors import FormatError
+from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
+from lidar.errors import FormatError, InputError
 
 INFO = LasInfo(CRS.from_epsg(32618), (383_000.0, 4_082_000.0, 0.0), datetime(2026, 6, 1, 10, tzinfo=UTC))
+CSV = {"x": 5.1e-5, "range": 5.1e-5, "true_range": 5.1e-5, "velocity": 5.1e-5, "intensity": 5.1e-3}
+LAS = {"x": 5.1e-4, "intensity": 0.002, "gps_time": 1e-6}
+STEPS = {"csv": {**CSV, "incidence": 5.1e-6}, "las": LAS, "laz": LAS, "kitti": {"intensity": 2e-5}}
+"""Largest error of a column by format; 0 for others."""
 
 
 def table(n, seed=0):
@@ -36,42 +43,103 @@ def table(n, seed=0):
         "label": rng.choice([int(c) for c in Class], n).astype(np.uint16),
         "instance": rng.integers(-1, 2**31 - 1, n).astype(np.int32),
         "incidence": rng.uniform(0, np.pi / 2, n).astype(np.float32),
+        "true_range": (np.linalg.norm(xyz, axis=1) * 1.001).astype(np.float32),
         "echo": np.ones(n, np.uint8),
-        "echoes": np.ones(n, np.uint8),
+        "echoes": rng.integers(1, 4, n).astype(np.uint8),
+        "velocity": rng.normal(size=n).astype(np.float32),
     }
 
 
-FORMATS = {
-    ".pcd": (pcd.write, read_table, {}),
-    ".ply": (ply.write, read_table, {}),
-    ".csv": (
-        text.write,
-        read_table,
-        {"x": 5.1e-5, "range": 5.1e-5, "intensity": 5.1e-3, "incidence": 5.1e-6},
-    ),
-}
+def write(form, path, cloud):
+    """Write a table as a drive would; returns it in the format's frame."""
+    if form.frame == "sensor":
+        form.write(path, cloud)
+        return cloud
+    placed = {k: cloud[k].astype(float) + o for k, o in zip("xyz", INFO.offset, strict=True)}
+    placed["gps_time"] = gps_seconds(INFO.created, cloud["time_ns"])
+    form.write(path, cloud | placed, info=INFO)
+    return cloud | placed
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
+@pytest.fixture(params=FORMATS)
+def form(request):
+    return FORMATS[request.param]
+
+
 @pytest.mark.parametrize("n", [0, 1, 1000])
-def test_a_cloud_comes_back_to_the_formats_own_step(tmp_path, suffix, n):
-    write, read, step = FORMATS[suffix]
-    cloud = table(n)
-    write(tmp_path / f"a{suffix}", cloud)
-    back = read(tmp_path / f"a{suffix}")
-    assert list(back) == list(cloud)
-    for name, column in cloud.items():
-        tolerance = step.get({"y": "x", "z": "x"}.get(name, name), 0.0)
-        assert back[name].shape == column.shape
-        assert np.abs(back[name].astype(float) - column.astype(float)).max(initial=0) <= tolerance, name
+def test_a_cloud_comes_back_to_the_formats_own_precision(tmp_path, form, n):
+    path = tmp_path / f"a{form.suffix}"
+    written = write(form, path, table(n))
+    back = read_table(path)
+    assert set(form.columns) <= set(back)
+    if form.frame == "sensor":
+        assert list(back) == [name for name in written if name in form.columns]
+    for name in form.columns:
+        tolerance = STEPS.get(form.name, {}).get({"y": "x", "z": "x"}.get(name, name), 0.0)
+        assert back[name].shape == written[name].shape
+        away = np.abs(back[name].astype(float) - written[name].astype(float))
+        assert away.max(initial=0) <= tolerance, name
+    assert form.count(path) == n
+    assert form.header == (path.stat().st_size > 0) or n
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_the_same_cloud_is_the_same_bytes(tmp_path, suffix):
-    write = FORMATS[suffix][0]
-    write(tmp_path / f"a{suffix}", table(100))
-    write(tmp_path / f"b{suffix}", table(100))
-    assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+def test_the_same_cloud_is_the_same_bytes(tmp_path, form):
+    paths = [tmp_path / f"{k}{form.suffix}" for k in "ab"]
+    for path in paths:
+        write(form, path, table(100))
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_a_file_is_read_as_the_cloud_that_was_written(tmp_path, form):
+    cloud = table_cloud(table(300), start_ns=7)
+    path = tmp_path / f"a{form.suffix}"
+    written = write(form, path, cloud_table(cloud))
+    if form.frame == "world":
+        with pytest.raises(InputError, match="read_table"):
+            read_cloud(path)
+        return
+    back = read_cloud(path, start_ns=7)
+    assert back.start_ns == 7
+    assert len(back) == 300
+    for name, column in cloud_table(back).items():
+        if name in form.columns:
+            tolerance = STEPS.get(form.name, {}).get({"y": "x", "z": "x"}.get(name, name), 0.0)
+            np.testing.assert_allclose(column, written[name], rtol=1e-7, atol=tolerance, err_msg=name)
+    if "range" not in form.columns:
+        np.testing.assert_allclose(back.range, cloud.range, rtol=1e-5)
+        assert (back.klass == 0).all()
+        assert (back.feature == -1).all()
+
+
+def test_a_format_can_be_named(tmp_path):
+    FORMATS["kitti"].write(tmp_path / "a.dat", table(5))
+    assert len(read_table(tmp_path / "a.dat", "kitti")["x"]) == 5
+    with pytest.raises(InputError, match="no point-cloud format"):
+        read_table(tmp_path / "a.dat")
+    with pytest.raises(InputError, match="one of pcd"):
+        read_table(tmp_path / "a.dat", "e57")
+
+
+def test_formats_are_listed_without_importing_them():
+    code = "import sys; from lidar.dataset.formats import FORMATS; assert 'numpy' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_no_two_formats_share_a_suffix_or_a_folder():
+    rows = [*FORMATS.values(), *LABELS.values()]
+    for key in (lambda row: row.suffix, lambda row: row.folder or row.name):
+        assert len({key(row) for row in rows}) == len(rows)
+
+
+@pytest.mark.parametrize("name", LABELS)
+def test_label_files_have_a_row_per_point(tmp_path, name):
+    row = LABELS[name]
+    klass = np.array([Class.CAR, Class.ROAD, Class.CAR])
+    row.write(tmp_path / "a", PointLabels(klass, np.array([4, 0, 5]), np.array([True, False, False])))
+    codes = np.fromfile(tmp_path / "a", {"semantickitti": "<u4", "nuscenes": "u1"}[name])
+    assert (
+        codes.tolist() == {"semantickitti": [252 | 4 << 16, 40, 10 | 5 << 16], "nuscenes": [17, 24, 17]}[name]
+    )
 
 
 @settings(deadline=None, max_examples=50)
@@ -90,13 +158,55 @@ def test_csv_writes_numbers_as_python_does(tmp_path_factory, metres, integers):
         assert line == f"{sign}{whole}.{rest:04d},{k}"
 
 
-def test_pypcd4_reads_our_pcd(tmp_path):
+@settings(deadline=None, max_examples=50)
+@given(st.lists(st.floats(width=32, allow_nan=False), min_size=1, max_size=30))
+def test_ascii_pcd_keeps_every_float(tmp_path_factory, values):
+    path = tmp_path_factory.mktemp("pcd") / "a.ascii.pcd"
+    column = np.array(values, np.float32)
+    pcd_ascii.write(path, {"x": column, "range": column.astype(np.float64) / 3})
+    back = read_table(path)
+    np.testing.assert_array_equal(back["x"], column)
+    np.testing.assert_array_equal(back["range"], column.astype(np.float64) / 3)
+
+
+@pytest.mark.parametrize("module", [pcd, pcd_ascii])
+def test_pypcd4_reads_our_pcd(tmp_path, module):
     cloud = table(500)
-    pcd.write(tmp_path / "a.pcd", cloud, comment="x")
+    module.write(tmp_path / "a.pcd", cloud)
     other = PointCloud.from_path(tmp_path / "a.pcd")
     assert other.fields == tuple("t" if name == "time_ns" else name for name in cloud)
     for name, column in cloud.items():
         np.testing.assert_array_equal(other.pc_data["t" if name == "time_ns" else name], column)
+
+
+@pytest.mark.parametrize("encoding", [Encoding.ASCII, Encoding.BINARY])
+def test_pcd_of_others_is_read_whatever_its_suffix(tmp_path, encoding):
+    points = np.array([[1.5, -2.25, 3.0], [0.1, -100.0, 1e6]], np.float32)
+    PointCloud.from_xyz_points(points).save(tmp_path / "a.pcd", encoding=encoding)
+    back = read_table(tmp_path / "a.pcd")
+    np.testing.assert_array_equal(np.column_stack([back[k] for k in "xyz"]), points)
+
+
+HEAD = (
+    "VERSION 0.7\nFIELDS x y\nSIZE 4 4\nTYPE F F\nCOUNT {count}\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA {data}\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("data", "count", "body", "says"),
+    [
+        ("binary_compressed", "1 1", "", "DATA binary_compressed cannot be read; convert"),
+        ("ascii", "1 3", "", "several values"),
+        ("ascii", "1 1", "1 2\n", "1 points, and its header states 2"),
+        ("ascii", "1 1", "1 2\n3 four\n", "damaged"),
+        ("binary", "1 1", "1234", "damaged"),
+    ],
+)
+def test_pcd_that_cannot_be_read_is_told_in_one_line(tmp_path, data, count, body, says):
+    (tmp_path / "a.pcd").write_text(HEAD.format(data=data, count=count) + body)
+    with pytest.raises(FormatError, match=says) as error:
+        read_table(tmp_path / "a.pcd")
+    assert "\n" not in str(error.value)
 
 
 def test_trimesh_reads_our_ply(tmp_path):
@@ -173,13 +283,16 @@ def test_a_failed_writer_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["pcd", "ply", "csv"])
-@pytest.mark.parametrize("content", [b"", b"hello\nworld\n", b"\x00\xff" * 50])
-def test_damaged_files_are_named(tmp_path, name, content):
-    path = tmp_path / f"bad.{name}"
+@pytest.mark.parametrize("content", [b"", b"hello\nworld\n", b"\x00\xff" * 51])
+def test_damaged_files_are_named_in_one_line(tmp_path, form, content):
+    path = tmp_path / f"bad{form.suffix}"
     path.write_bytes(content)
-    with pytest.raises(FormatError, match=f"bad.{name}"):
+    if not content and not form.header:
+        assert len(read_table(path)["x"]) == 0
+        return
+    with pytest.raises(FormatError, match="bad") as error:
         read_table(path)
+    assert "\n" not in str(error.value)
 
 
 def test_a_truncated_laz_is_named(tmp_path):
