@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +14,8 @@ from geoscene.console import print_json, progress_bar, whole
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
 from lidar import __version__
+from lidar.dataset.export import EXPORTERS, exporter
+from lidar.dataset.formats import FORMATS, LABELS
 from lidar.errors import InputError, LidarError
 
 app = App(
@@ -33,6 +34,24 @@ app = App(
 app.register_install_completion_command()
 
 _OUTPUT = Group("Output", sort_key=3)
+
+
+def _format_help() -> str:
+    names: dict[str, list[str]] = {"sensor": [], "world": []}
+    for row in FORMATS.values():
+        names[row.frame].append(row.name)
+    return (
+        f"Point-cloud formats, with commas: {', '.join(names['sensor'])} (sensor frame),"
+        f" {', '.join(names['world'])} (georeferenced)."
+    )
+
+
+def _label_help() -> str:
+    return f"Label files in the codes of other datasets, with commas: {', '.join(LABELS)}."
+
+
+def _exporter_help() -> str:
+    return "Layout: " + "; ".join(f"{row.name} ({row.meaning})" for row in EXPORTERS.values()) + "."
 
 
 @app.command
@@ -55,8 +74,8 @@ def drive(
     fidelity: str = "standard",
     settings: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
     traffic: str | None = None,
-    formats: Annotated[str, Parameter(name="--format", group=_OUTPUT)] = "pcd,laz",
-    labels: Annotated[str, Parameter(group=_OUTPUT)] = "",
+    formats: Annotated[str, Parameter(name="--format", group=_OUTPUT, help=_format_help())] = "pcd,laz",
+    labels: Annotated[str, Parameter(group=_OUTPUT, help=_label_help())] = "",
     deskew: Annotated[str, Parameter(group=_OUTPUT)] = "",
     crs: Annotated[str, Parameter(group=_OUTPUT)] = "utm",
     exact: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
@@ -126,11 +145,6 @@ def drive(
         and cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places);
         sumo or sumo,vehicles=20,...: the same densities, simulated by SUMO; or a file that sumo --fcd-output
         wrote, with net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed.
-    formats
-        Formats of clouds, with commas: pcd, ply, csv, kitti, nuscenes (sensor frame), laz, las
-        (georeferenced).
-    labels
-        Files of labels in others' codes beside the clouds, with commas: semantickitti, nuscenes.
     deskew
         Clouds of the sensor frame a second time, all points brought to one moment of the frame: start, middle
         or end.
@@ -368,12 +382,12 @@ def export(
     /,
     *,
     out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
-    to: str = "nuscenes",
+    to: Annotated[str, Parameter(help=_exporter_help())] = "nuscenes",
     overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
 ) -> int:
-    """Write a recorded drive in the layout of another dataset, for its development kit.
+    """Write a recorded drive in the layout of another dataset.
 
     For example:
 
@@ -387,8 +401,6 @@ def export(
         Directory of the dataset.
     out
         Directory to make.
-    to
-        Layout: nuscenes (samples and sweeps with all tables, two key frames a second).
     overwrite
         Replace a directory that is there.
     json
@@ -396,22 +408,15 @@ def export(
     quiet
         No progress bars.
     """
-    from lidar.dataset.export.nuscenes import VERSION, export_nuscenes  # noqa: PLC0415
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
 
-    if to != "nuscenes":
-        raise InputError(
-            f"--to {to}: there is nuscenes; KITTI's files are written by lidar drive --format kitti"
-        )
     with progress_bar(quiet=quiet) as progress:
-        summary = export_nuscenes(open_dataset(dataset), out, overwrite=overwrite, progress=progress)
+        summary = exporter(to).export(open_dataset(dataset), out, overwrite=overwrite, progress=progress)
     if json:
-        print_json({**asdict(summary), "path": str(out)})
+        print_json({"path": str(out), **summary.counts})
     else:
-        print(
-            f"{out}: {summary.samples} samples, {summary.clouds} clouds, {summary.images} images,"
-            f" {summary.annotations} boxes; open it with NuScenes('{VERSION}', '{out}')"
-        )
+        counts = ", ".join(f"{count:,} {kind}" for kind, count in summary.counts.items())
+        print(f"{out}: {counts}; {summary.hint}")
     return 0
 
 

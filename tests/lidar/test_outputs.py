@@ -24,7 +24,8 @@ from geoscene.classes import Class, class_codes
 from geoscene.options import BuildOptions
 from geoscene.sources import demo_path, read_osm
 from lidar.dataset.deskew import MOMENTS, deskewed
-from lidar.dataset.export.nuscenes import CATEGORIES, VERSION, export_nuscenes
+from lidar.dataset.export import EXPORTERS
+from lidar.dataset.export.nuscenes import CATEGORIES, VERSION
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.kitti import semantic_kitti_labels
 from lidar.dataset.formats.table import PointLabels
@@ -504,7 +505,7 @@ def _resolve(tables, row, key):
 
 
 def test_nuscenes_tables_lead_from_a_sample_to_points_boxes_and_pixels(dataset, tmp_path):
-    summary = export_nuscenes(dataset, tmp_path / "n")
+    counts = EXPORTERS["nuscenes"].export(dataset, tmp_path / "n").counts
     root = tmp_path / "n"
     tables = {p.stem: {r["token"]: r for r in json.loads(p.read_text())} for p in (root / VERSION).iterdir()}
     for name, rows in tables.items():  # every token leads somewhere, chains are whole
@@ -519,10 +520,10 @@ def test_nuscenes_tables_lead_from_a_sample_to_points_boxes_and_pixels(dataset, 
                 if row.get(way):
                     assert rows[row[way]][back] == row["token"], name
     samples = sorted(tables["sample"].values(), key=lambda s: s["timestamp"])
-    assert len(samples) == summary.samples == 8  # two a second for four seconds
+    assert len(samples) == counts["samples"] == 8  # two a second for four seconds
     assert np.diff([s["timestamp"] for s in samples]).tolist() == [500_000] * 7
     data = list(tables["sample_data"].values())
-    assert summary.clouds + summary.images == len(data)
+    assert counts["clouds"] + counts["images"] == len(data)
     channels = {d["filename"].split("/")[1] for d in data}
     assert channels == {"LIDAR_TOP", "AHEAD", "FRONT", "SIDE"}
     for channel in channels:
@@ -570,13 +571,13 @@ def test_nuscenes_tables_lead_from_a_sample_to_points_boxes_and_pixels(dataset, 
 def test_what_cannot_be_a_nuscenes_dataset_is_said(dataset, scene, tmp_path):
     (tmp_path / "n").mkdir()
     with pytest.raises(InputError, match="`overwrite`"):
-        export_nuscenes(dataset, tmp_path / "n")
+        EXPORTERS["nuscenes"].export(dataset, tmp_path / "n")
     options = replace(
         OPTIONS, rig="vlp16", duration=0.3, traffic=None, formats=("laz",), labels=(), deskew=""
     )
     drive(scene, tmp_path / "d", options=options)
     with pytest.raises(DatasetError, match="`formats` pcd"):
-        export_nuscenes(open_dataset(tmp_path / "d"), tmp_path / "m")
+        EXPORTERS["nuscenes"].export(open_dataset(tmp_path / "d"), tmp_path / "m")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "n"]
 
 

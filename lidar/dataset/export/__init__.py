@@ -1,1 +1,91 @@
-"""Datasets in the layouts of others."""
+"""Exporters: whole datasets in the layouts of others, one module each and one row each in `EXPORTERS`.
+
+Modules are imported when a dataset is exported, so that a list of the exporters costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from geoscene.progress import Progress, silent
+from lidar.errors import InputError
+
+if TYPE_CHECKING:
+    from lidar.dataset.layout import Dataset
+
+
+@dataclass(frozen=True, slots=True)
+class ExportSummary:
+    """What was exported.
+
+    path   : the folder
+    counts : number of objects of each kind that were written
+    hint   : how to open it
+    """
+
+    path: Path
+    counts: dict[str, int]
+    hint: str
+
+
+@dataclass(frozen=True, slots=True)
+class Exporter:
+    """A row of `EXPORTERS`, and a module with ``export``.
+
+    ``export(dataset, folder, *, progress)`` writes a dataset into an empty folder and returns the number of
+    objects that it wrote, by kind.
+
+    name    : by which users choose it
+    module  : in this folder
+    meaning : what is written, one line
+    mark    : a file that is always written: a folder is overwritten only if it holds one
+    hint    : how to open the export; ``{path}`` stands for its folder
+    """
+
+    name: str
+    module: str
+    meaning: str
+    mark: str
+    hint: str
+
+    def export(
+        self, dataset: Dataset, out: Path, *, overwrite: bool = False, progress: Progress = silent
+    ) -> ExportSummary:
+        """Write a dataset into the folder ``out``, which appears when it is complete.
+
+        Raises InputError if the folder exists and may not be overwritten, and DatasetError for a dataset that
+        lacks what the layout needs.
+        """
+        from geoscene.files import atomic_folder  # noqa: PLC0415  (imports numpy)
+
+        if out.exists() and not overwrite:
+            raise InputError(f"{out}: exists already; set `overwrite` to replace it")
+        module = importlib.import_module(f"{__name__}.{self.module}")
+        with atomic_folder(out, mark=self.mark) as folder:
+            counts = module.export(dataset, folder, progress=progress)
+        return ExportSummary(out, counts, self.hint.format(path=out))
+
+
+EXPORTERS = {
+    row.name: row
+    for row in (
+        Exporter(
+            "nuscenes",
+            "nuscenes",
+            "samples and sweeps with all tables of nuScenes, two key frames a second",
+            mark="v1.0-mini/sample.json",
+            hint="open it with NuScenes('v1.0-mini', '{path}')",
+        ),
+    )
+}
+"""Exporters by name."""
+
+
+def exporter(name: str) -> Exporter:
+    """The exporter of a name; raises InputError if there is none."""
+    if name not in EXPORTERS:
+        raise InputError(f"`to` {name}: one of {', '.join(EXPORTERS)}")
+    return EXPORTERS[name]

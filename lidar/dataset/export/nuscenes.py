@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes
-from geoscene.files import atomic_folder, write_atomically
-from geoscene.progress import Progress, silent
+from geoscene.files import write_atomically
+from geoscene.progress import Progress
 from geoscene.typing import Float
 from lidar.camera.png import write_png
 from lidar.dataset.formats import FORMATS, Format, nuscenes, read_table
 from lidar.dataset.formats.table import PointLabels, placed_returns
 from lidar.dataset.layout import Dataset, read_rows
-from lidar.errors import DatasetError, InputError
+from lidar.errors import DatasetError
 from lidar.geometry.poses import Poses, Trajectory
 
 Row = dict[str, Any]
@@ -62,24 +62,6 @@ _WALKS, _DRIVES = 0.2, 0.5
 
 
 @dataclass(frozen=True)
-class NuscenesSummary:
-    """What was written.
-
-    samples     : key frames
-    clouds      : of all scanners, sweeps included
-    images      : of all cameras, sweeps included
-    annotations : boxes
-    path        : the directory
-    """
-
-    samples: int
-    clouds: int
-    images: int
-    annotations: int
-    path: Path
-
-
-@dataclass(frozen=True)
 class _Stream:
     """A sensor's frames: numbers, times (nanoseconds since the start) and files."""
 
@@ -92,23 +74,15 @@ class _Stream:
     files: list[Path]
 
 
-def export_nuscenes(
-    dataset: Dataset, out: Path, *, overwrite: bool = False, progress: Progress = silent
-) -> NuscenesSummary:
-    """Write a finished drive as a nuScenes dataset into a new directory.
+def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, int]:
+    """Write a finished drive as a nuScenes dataset; return the numbers of samples, clouds, images and boxes.
 
     Positions are true metres east and north of a point south-west of the drive, which the scene's description
-    names. There is one scene; the map's mask is empty.
+    states. There is one scene; the map's mask is empty.
 
-    Raises InputError if the directory is there, and DatasetError for a drive without clouds in the sensor
-    frame (pcd, ply or csv).
+    Raises DatasetError for a drive without labelled clouds in the sensor frame.
     """
-    if out.exists() and not overwrite:
-        raise InputError(f"{out}: is there already; set `overwrite` to replace it")
-    streams = _streams(dataset)
-    with atomic_folder(out, mark=f"{VERSION}/sample.json") as folder:
-        counts = _Export(dataset, streams, out=folder).write(progress)
-    return NuscenesSummary(*counts, out)
+    return _Export(dataset, _streams(dataset), out=folder).write(progress)
 
 
 def _streams(dataset: Dataset) -> list[_Stream]:
@@ -176,8 +150,8 @@ class _Export:
         self.name = dataset.path.resolve().name
         self.tables: dict[str, list[Row]] = defaultdict(list)
 
-    def write(self, progress: Progress) -> tuple[int, int, int, int]:
-        """Write all; numbers of samples, clouds, images and boxes."""
+    def write(self, progress: Progress) -> dict[str, int]:
+        """Write all; return the numbers of samples, clouds, images and boxes."""
         top = next(s for s in self.streams if s.modality == "lidar")
         keys = _key_frames(top.times)
         samples = [
@@ -206,7 +180,12 @@ class _Export:
         for name in (*_TABLES, *(("lidarseg",) if self.tables["lidarseg"] else ())):
             document = json.dumps(self.tables[name], indent=0)
             write_atomically(self.out / VERSION / f"{name}.json", document.encode("utf-8"))
-        return len(samples), counts["lidar"], counts["camera"], len(self.tables["sample_annotation"])
+        return {
+            "samples": len(samples),
+            "clouds": counts["lidar"],
+            "images": counts["camera"],
+            "annotations": len(self.tables["sample_annotation"]),
+        }
 
     def _stamp(self, time_ns: int) -> int:
         """Microseconds since 1970."""
