@@ -15,6 +15,7 @@ from geoscene.files import write_atomically
 from geoscene.typing import Float, Ints
 from lidar.camera.outline import outline
 from lidar.dataset.layout import Paths
+from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.camera_model import project
 from lidar.rig.specs import CameraSpec
@@ -45,13 +46,11 @@ def box_rows(
     ego_vx, ego_vy, ego_vz : the velocity along the ego vehicle's axes, not relative to the ego's own
     moving          : whether it ever moves
     """
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415
-
     rows = actors_near(actors, ego, time_ns=time_ns, reach=reach)
     at = states(actors, rows, time_ns=time_ns)
     turn = rotations(at.angles)
     middle = _middles(actors, rows, at=at)
-    quat = Rotation.from_matrix(turn).as_quat(canonical=True) if len(rows) else np.empty((0, 4))
+    quat = quat_from_matrix(turn)
     velocity = at.velocity / [actors.scale, actors.scale, 1.0]
     pose = ego.at([time_ns])
     body = pose.rotation[0].T

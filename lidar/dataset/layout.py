@@ -21,6 +21,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pyproj import CRS
 
 from geoscene.frames import Frame
@@ -134,12 +136,14 @@ class Dataset:
         sensors = json.loads(self.paths.calibration.read_text("utf-8"))["sensors"]
         return {name: sensor for name, sensor in sensors.items() if not kinds or sensor["kind"] in kinds}
 
-    def frame_times(self, name: str) -> dict[int, int]:
-        """Start times of a sensor's frames, nanoseconds since the drive's start, by frame number.
+    def sample_times(self, name: str) -> NDArray[np.int64]:
+        """Times (n,) of a sensor's measurements or frame starts, nanoseconds since the drive's start.
 
         Raises DatasetError if the drive has not written them.
         """
-        return {int(row["frame"]): int(row["time_ns"]) for row in read_rows(self.paths.timestamps(name))}
+        frames = self.sensors()[name]["kind"] in ("lidar", "camera")
+        rows = read_rows(self.paths.timestamps(name) if frames else self.paths.measurements(name))
+        return np.array([int(row["time_ns"]) for row in rows], np.int64)
 
     def trajectory(self) -> Trajectory:
         """The ego vehicle's poses."""

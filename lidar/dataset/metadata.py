@@ -16,7 +16,7 @@ from geoscene.scene import Scene
 from lidar.dataset.kitti_sequence import write_sequence
 from lidar.dataset.layout import Paths
 from lidar.dataset.recording import Contents
-from lidar.geometry.attitude import euler_from_quat
+from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.navigation.gnss import antenna_motion, epochs, gnss_columns, observe_gnss
@@ -47,7 +47,7 @@ def pose_columns(
     """
     poses = trajectory.at(time_ns)
     x, y, z = poses.position.T
-    quat = _quaternions(poses.rotation)
+    quat = quat_from_matrix(poses.rotation)
     alpha, beta, gamma = np.moveaxis(euler_from_quat(quat), -1, 0)
     lon, lat = frame.to_geographic(x, y)
     return {
@@ -67,13 +67,6 @@ def pose_columns(
         "lat": lat,
         "h": z,
     }
-
-
-def _quaternions(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415
-
-    quat: NDArray[np.float64] = Rotation.from_matrix(rotation).as_quat(canonical=True)
-    return quat
 
 
 def _mounted(mount: Mount) -> dict[str, Any]:

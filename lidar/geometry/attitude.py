@@ -88,6 +88,17 @@ def matrix_from_quat(quat_xyzw: ArrayLike) -> Float:
     return np.stack(rows, axis=-2)
 
 
+def quat_from_matrix(matrix: ArrayLike) -> Float:
+    """Quaternions (n, 4) x, y, z, w, with w >= 0, of rotation matrices (n, 3, 3)."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
+
+    matrices = np.asarray(matrix, float)
+    quat: Float = (
+        Rotation.from_matrix(matrices).as_quat(canonical=True) if len(matrices) else np.empty((0, 4))
+    )
+    return quat
+
+
 def quat_product(first: ArrayLike, second: ArrayLike) -> Float:
     """Quaternions (..., 4) of the turns ``first @ second``, with w >= 0."""
     a, b, c, d = np.moveaxis(np.asarray(first, float), -1, 0)

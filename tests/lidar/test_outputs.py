@@ -595,7 +595,7 @@ def test_a_map_says_which_frames_are_missing(scene, rig, tmp_path):
         ({"formats": ("laz",), "deskew": "end"}, "sensor frame"),
         ({"formats": ("pcd",), "deskew": "noon"}, "start, middle, end"),
         ({"formats": ("pcd",), "labels": ("cityscapes",)}, "semantickitti"),
-        ({"formats": ()}, "pcd, ply"),
+        ({"formats": ()}, "pcd, pcd-ascii, ply"),
     ],
 )
 def test_contents_that_cannot_be_written_are_refused(change, says):

@@ -79,6 +79,13 @@ EXPORTERS = {
             mark="v1.0-mini/sample.json",
             hint="open it with NuScenes('v1.0-mini', '{path}')",
         ),
+        Exporter(
+            "tum",
+            "tum",
+            "trajectories of the vehicle and of every sensor as TUM text files",
+            mark="vehicle.tum",
+            hint="compare with evo_ape tum {path}/vehicle.tum ESTIMATE",
+        ),
     )
 }
 """Exporters by name."""

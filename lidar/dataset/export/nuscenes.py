@@ -99,7 +99,7 @@ def _streams(dataset: Dataset) -> list[_Stream]:
             continue
         lidar = sensor["kind"] == "lidar"
         first = lidar and not any(s.modality == "lidar" for s in streams)
-        at = dataset.frame_times(name)
+        at = dataset.sample_times(name).tolist()
         frames = [frame for frame, _ in found]
         streams.append(
             _Stream(

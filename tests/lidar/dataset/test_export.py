@@ -1,0 +1,105 @@
+"""Exported datasets hold what was recorded, read by parsers of their own."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from helpers.sensor_worlds import driven
+from scipy.spatial.transform import Rotation
+
+from geoscene.errors import InputError as FolderError
+from geoscene.files import write_columns, write_json
+from geoscene.frames import Frame
+from lidar.dataset.export import EXPORTERS, exporter
+from lidar.dataset.layout import Paths, open_dataset
+from lidar.errors import DatasetError, InputError
+from lidar.geometry.mounts import OPTICAL
+from lidar.geometry.trajectory_csv import write_trajectory
+
+START = datetime(2026, 6, 21, 8, 0, 0, 250_000, tzinfo=UTC)
+EPOCH_NS = 1_782_028_800_250_000_000  # date -u -d 2026-06-21T08:00:00.25 +%s%N
+VELOCITY, YAW_RATE, SCALE = np.array([8.0, 3.0, 0.1]), 0.4, 1.0006
+MOUNTS = {
+    "top": ("lidar", [1.2, 0.0, 1.9], Rotation.from_euler("ZYX", [0.3, 0.1, -0.05])),
+    "front": ("camera", [1.5, 0.2, 1.7], Rotation.from_matrix(OPTICAL)),
+    "gnss": ("gnss", [0.0, 0.0, 1.6], Rotation.identity()),
+}
+TIMES = {"top": np.arange(0, 5 * 10**9, 10**8), "front": np.arange(3, 5 * 10**9, 333_333_333)}
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """The metadata files of a drive at constant velocity and yaw rate."""
+    paths = Paths(tmp_path / "drive")
+    manifest = {"schema": 1, "frame": Frame.at(24.9, 60.2).to_json(), "start_time": START.isoformat()}
+    write_json(paths.manifest, manifest)
+    sensors = {}
+    for name, (kind, translation, rotation) in MOUNTS.items():
+        mount = np.eye(4)
+        mount[:3, :3], mount[:3, 3] = rotation.as_matrix(), translation
+        sensors[name] = {"kind": kind, "vehicle_from_sensor": mount.tolist()}
+    write_json(paths.calibration, {"sensors": sensors})
+    trajectory = driven(VELOCITY, yaw_rate=YAW_RATE, start=(50.0, -20.0, 3.0), scale=SCALE)
+    write_trajectory(paths.trajectory, trajectory)
+    for name, times in TIMES.items():
+        write_columns(paths.timestamps(name), {"frame": np.arange(len(times)), "time_ns": times})
+    write_columns(paths.measurements("gnss"), {"time_ns": [0, 2 * 10**9]})
+    return open_dataset(paths.root)
+
+
+def read_tum(path):
+    """Nanoseconds since 1970, positions and rotations of a TUM file."""
+    rows = [line.split(" ") for line in path.read_text().splitlines()]
+    assert {len(row) for row in rows} == {8}
+    seconds, rest = zip(*(row[0].split(".") for row in rows), strict=True)
+    time_ns = np.array(seconds, np.int64) * 10**9 + np.array(rest, np.int64)
+    values = np.array([row[1:] for row in rows], float)
+    return time_ns, values[:, :3], Rotation.from_quat(values[:, 3:])
+
+
+def expected_pose(name, time_ns):
+    """True metres and rotation of a sensor of the drive, by its equations."""
+    s = time_ns * 1e-9
+    vehicle = Rotation.from_rotvec(YAW_RATE * s[:, None] * [0.0, 0.0, 1.0])
+    start = np.array([50.0, -20.0, 3.0]) / [SCALE, SCALE, 1.0]
+    position = start + s[:, None] * VELOCITY
+    if name == "vehicle":
+        return position, vehicle
+    _, translation, rotation = MOUNTS[name]
+    return position + vehicle.apply(translation), vehicle * rotation
+
+
+def test_tum_trajectories_are_the_true_poses_of_vehicle_and_sensors(dataset, tmp_path):
+    summary = EXPORTERS["tum"].export(dataset, tmp_path / "tum")
+    times = {"gnss": np.array([0, 2 * 10**9]), **TIMES, "vehicle": dataset.trajectory().time_ns}
+    files = {path.stem: path for path in (tmp_path / "tum").rglob("*.tum")}
+    assert set(files) == set(times)
+    assert summary.counts == {"trajectories": 4, "poses": sum(map(len, times.values()))}
+    for name, path in files.items():
+        time_ns, position, rotation = read_tum(path)
+        np.testing.assert_array_equal(time_ns, EPOCH_NS + times[name])
+        place, turn = expected_pose(name, times[name])
+        np.testing.assert_allclose(position, place, rtol=0, atol=1e-9, err_msg=name)
+        assert (turn.inv() * rotation).magnitude().max() < 1e-9, name
+
+
+def test_an_export_is_replaced_only_on_request_and_nothing_else_is(dataset, tmp_path):
+    row = EXPORTERS["tum"]
+    row.export(dataset, tmp_path / "tum")
+    with pytest.raises(InputError, match="`overwrite`"):
+        row.export(dataset, tmp_path / "tum")
+    row.export(dataset, tmp_path / "tum", overwrite=True)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("done")
+    with pytest.raises(FolderError, match=r"holds no vehicle\.tum"):
+        row.export(dataset, tmp_path / "mine", overwrite=True)
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "done"
+
+
+def test_what_cannot_be_exported_leaves_nothing(dataset, tmp_path):
+    dataset.paths.timestamps("front").unlink()
+    with pytest.raises(DatasetError, match="was the drive finished"):
+        EXPORTERS["tum"].export(dataset, tmp_path / "tum")
+    assert [path.name for path in tmp_path.iterdir()] == ["drive"]
+    with pytest.raises(InputError, match="`to` kitti: one of nuscenes, tum"):
+        exporter("kitti")
