@@ -258,9 +258,8 @@ def straight_skeleton(polygon: Any) -> Skeleton | None:
     corners = np.concatenate(rings)
     for jitter in _JITTERS:
         # seeded by the number of corners: the same polygon always gives the same skeleton
-        noise = np.random.Generator(np.random.Philox(key=len(corners))).uniform(
-            -jitter, jitter, corners.shape
-        )
+        random = np.random.Generator(np.random.Philox(key=len(corners)))
+        noise = random.uniform(-jitter, jitter, corners.shape)
         jittered = np.split(corners + noise, np.cumsum([len(r) for r in rings])[:-1])
         found = _Front(jittered).run()
         if found is None:

@@ -32,7 +32,7 @@ _COARSEST = 10.0  # metres between posts that the chosen zoom does not exceed; i
 _LAST_LATITUDE = 85.0  # degrees; web Mercator's square ends at 85.05
 _AROUND = 8  # posts fetched beyond the box on each side
 _SHORE = 2  # posts from a coastline within which the sea's floor begins
-_LONGEST_PAUSE = 30.0  # seconds between two attempts, whatever the server asks for
+_LONGEST_PAUSE = 30.0  # seconds between two attempts, even if the server states more
 _CACHE_VERSION = 1
 
 

@@ -91,7 +91,7 @@ def read_overture(
 
 
 def _read_rows(path: Path, bounds: Bounds | None) -> list[dict[str, Any]]:
-    """The rows whose ``bbox`` meets the bounds or is not given, with the columns of the schema that exist."""
+    """Rows whose ``bbox`` intersects the bounds or is null, with the columns of the schema that exist."""
     need("pyarrow", "gis")
     arrow = need("pyarrow.dataset", "gis")
     if not path.exists():

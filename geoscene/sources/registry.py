@@ -101,7 +101,7 @@ def read_source(
 ) -> OsmData:
     """The features of a file of a source, within bounds (west, south, east, north, degrees) if given.
 
-    Raises InputError for a name that is not in the registry or has no files, and whatever the reader raises.
+    Raises InputError for a name that is not in the registry or has no files, and the errors of the reader.
     """
     known = sorted(source.name for source in SOURCES.values() if source.suffixes)
     if name not in known:

@@ -58,7 +58,7 @@ def test_any_text_gives_a_finite_value_or_none(text):
 
 
 @given(st.integers(-1000, 1000))
-def test_a_plain_number_is_itself_and_a_unit_spoils_it(value):
+def test_a_plain_number_has_no_unit(value):
     assert parse_number(str(value)) == value
     assert parse_number(f"{value};7") == value
     assert parse_number(f"{value} m") is None

@@ -92,7 +92,7 @@ def test_a_flat_building_has_the_volume_of_its_footprint_times_its_height(shape,
     np.testing.assert_array_equal(mesh.vertices, np.round(mesh.vertices, 4))
 
 
-def test_faces_say_what_they_are():
+def test_faces_have_class_surface_material_and_colour():
     table, mesh, _, _ = built(
         house(1, box(0, 0, 10, 8), height="9", building__colour="#102030", roof__material="slate"),
         house(2, box(30, 0, 10, 8), height="9", roof__shape="gabled"),
@@ -125,7 +125,7 @@ def test_faces_say_what_they_are():
         ({}, None, "inferred-type"),
     ],
 )
-def test_where_a_height_comes_from_is_said(tags, height, source):
+def test_the_source_of_a_height_is_recorded(tags, height, source):
     table, mesh, _, _ = built(house(1, box(0, 0, 10, 10), **tags))
     assert table.height_source[0] == source
     assert 0 < table.height_sigma[0] < table.height[0]
@@ -147,7 +147,7 @@ def test_parts_replace_the_outline_they_cover():
 
 
 @pytest.mark.parametrize(("use", "storeys", "low", "high"), [("church", "1", 10, 30), ("house", "1", 2, 4)])
-def test_the_one_storey_of_a_hall_says_nothing_of_its_height(use, storeys, low, high):
+def test_the_single_storey_of_a_hall_does_not_set_its_height(use, storeys, low, high):
     table, *_ = built(house(1, box(0, 0, 40, 20), building=use, **{"building:levels": storeys}))
     assert low < table.height[0] < high
     assert table.height_source[0] == ("inferred-type" if use == "church" else "levels")
@@ -164,7 +164,7 @@ def test_a_building_is_as_uncertain_as_its_highest_part():
     assert table.height_sigma[0] == pytest.approx(0.15 * 60)
 
 
-def test_what_parts_leave_of_the_outline_stays_with_its_own_height():
+def test_the_remainder_of_an_outline_keeps_its_height():
     table, _, verdict, problems = built(
         house(1, box(0, 0, 20, 10), height="6"), part(2, box(0, 0, 5, 10), height="30")
     )
@@ -195,7 +195,7 @@ def test_parts_without_an_outline_become_a_building():
     assert reasons(problems) == {("way/5", "repaired", "parts-without-outline")}
 
 
-def test_a_relation_gives_a_part_to_its_building_though_it_lies_beside_it():
+def test_a_relation_assigns_a_part_outside_the_outline():
     relation = Relation("relation/9", {"type": "building"}, (("way", 1, "outline"), ("way", 3, "part")))
     areas = (
         house(1, box(0, 0, 10, 10), height="9"),
@@ -208,7 +208,7 @@ def test_a_relation_gives_a_part_to_its_building_though_it_lies_beside_it():
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30, deadline=None)
-def test_any_pile_of_parts_is_one_sound_body_of_the_volume_of_their_union(seed):
+def test_any_stack_of_parts_is_one_solid_with_the_volume_of_the_union(seed):
     rng = np.random.default_rng(seed)
     # coordinates on a coarse grid, so that faces, edges and corners coincide as often as they can
     areas, bodies = [], []
@@ -226,7 +226,7 @@ def test_any_pile_of_parts_is_one_sound_body_of_the_volume_of_their_union(seed):
     manifold(mesh, 0)
 
 
-def test_bodies_that_meet_in_an_edge_are_parted_and_reported():
+def test_bodies_that_share_an_edge_are_separated_and_reported():
     _, _, verdict, problems = built(
         house(1, box(0, 0, 20, 20), height="5"),
         part(2, box(0, 0, 10, 10), height="5"),
@@ -256,7 +256,7 @@ TOUCHING = [(0, 5), (4, 3), (4, 7)]
         (shapely.MultiPolygon([box(0, 0, 5, 5), box(8, 8, 5, 5)]), 50, None),
     ],
 )  # fmt: skip
-def test_bad_footprints_become_sound_solids(shape, size, reason):
+def test_invalid_footprints_become_valid_solids(shape, size, reason):
     _, mesh, verdict, problems = built(house(1, shape, height="10"))
     assert verdict.volume[0] == pytest.approx(10 * size, abs=0.01)
     assert {p.reason for p in problems} == ({reason} if reason else set())
@@ -272,7 +272,7 @@ def test_footprints_of_no_size_are_dropped_and_reported(shape):
     assert reasons(problems) == {("way/1", "dropped", "too-small")}
 
 
-def test_duplicates_leave_the_one_that_is_known_better():
+def test_of_duplicates_the_one_with_more_tags_is_kept():
     shape = box(0, 0, 10, 10)
     table, _, _, problems = built(
         house(1, shape), house(2, shape, height="12"), house(3, affinity.translate(shape, 0.2, 0.1))
@@ -318,7 +318,7 @@ def test_neighbours_keep_their_common_wall():
     assert len(corners[0] & corners[1]) == 3
 
 
-def test_a_canopy_hangs_and_an_underground_building_is_left_out():
+def test_a_canopy_is_open_below_and_an_underground_building_is_dropped():
     table, _, verdict, problems = built(
         house(1, box(0, 0, 10, 10), building="roof", height="5"),
         house(2, box(20, 0, 10, 10), location="underground"),
@@ -328,7 +328,7 @@ def test_a_canopy_hangs_and_an_underground_building_is_left_out():
     assert reasons(problems) == {("way/2", "dropped", "underground")}
 
 
-def test_nonsense_heights_of_parts_are_put_right_and_reported():
+def test_contradictory_heights_of_parts_are_repaired_and_reported():
     _, _, verdict, problems = built(
         house(1, box(0, 0, 10, 10), height="10"),
         part(2, box(0, 0, 10, 10), height="8", min_height="9"),
@@ -412,7 +412,7 @@ def test_an_unknown_height_follows_its_neighbours():
     assert 4 < lone[0] < 10
 
 
-def test_a_television_tower_says_nothing_of_the_houses_below():
+def test_a_television_tower_does_not_inform_the_houses_below():
     xy = np.column_stack([np.arange(6) * 60.0, np.zeros(6)])
     use, area_ = np.full(6, "yes", dtype=object), np.array([2324.0, 2000.0, 900.0, 300.0, 700.0, 4400.0])
     alone = infer_heights(xy, use, area=area_, height=np.full(6, np.nan))[0]
@@ -422,7 +422,7 @@ def test_a_television_tower_says_nothing_of_the_houses_below():
     assert (block[1:3] > 1.2 * alone[1:3]).all()
 
 
-def test_bodies_that_meet_in_an_edge_of_a_hairline_gap_are_joined():
+def test_bodies_that_share_an_edge_with_a_narrow_gap_are_joined():
     upper = shapely.Polygon([(0, 0), (10, 0.0005), (10, 10), (-10, 10), (-10, 0.0005)])
     lower = shapely.Polygon([(0, 0), (-10, -0.0005), (-10, -10), (10, -10), (10, -0.0005)])
     footprints = shapely.set_precision(np.array([upper, lower]), 1e-4)

@@ -144,7 +144,7 @@ def test_shells_are_closed_over_all_but_the_oddest_footprints(shape):
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("degrees", [0.0, 27.0])
-def test_the_roof_of_a_rectangle_has_the_volume_of_the_textbook(shape, share, degrees):
+def test_the_roof_of_a_rectangle_has_the_textbook_volume(shape, share, degrees):
     polygon = turned(RECTANGLE, degrees)
     shell, fallback = roof_shell(polygon, RoofSpec(shape, low=0.0, high=9.0, height=3.0))
     assert fallback == ""
@@ -152,7 +152,7 @@ def test_the_roof_of_a_rectangle_has_the_volume_of_the_textbook(shape, share, de
 
 
 @pytest.mark.parametrize(("shape", "share"), [("dome", 2 / 3), ("cone", 1 / 3)])
-def test_turned_roofs_over_a_circle_have_the_volume_of_the_textbook(shape, share):
+def test_radial_roofs_over_a_circle_have_the_textbook_volume(shape, share):
     polygon = on_grid(shapely.Point(0, 0).buffer(6, quad_segs=32))
     shell, _ = roof_shell(polygon, RoofSpec(shape, low=0.0, high=10.0, height=6.0))
     # six rings inscribed in the dome miss a little of it
@@ -173,7 +173,7 @@ def test_a_gabled_l_has_two_gables_and_a_valley():
         assert shapely.distance(mid, shapely.MultiPoint(ends)) < 1e-3
 
 
-def test_the_low_side_of_a_skillion_looks_where_the_map_says():
+def test_a_skillion_slopes_down_in_the_tagged_direction():
     polygon = turned(RECTANGLE)
     for direction in (0.0, np.pi / 2, np.pi, -np.pi / 2, np.pi / 4):
         shell, _ = roof_shell(polygon, RoofSpec("skillion", 0.0, 9.0, 3.0, direction=direction))
@@ -183,7 +183,7 @@ def test_the_low_side_of_a_skillion_looks_where_the_map_says():
         assert top[np.argmin(reach), 2] == pytest.approx(9.0)
 
 
-def test_the_ridge_runs_along_the_longer_side_unless_it_is_said_to_run_across():
+def test_the_ridge_runs_along_the_longer_side_unless_tagged_across():
     for across, ends in ((False, [(0.0, 4.0), (12.0, 4.0)]), (True, [(6.0, 0.0), (6.0, 8.0)])):
         shell, _ = roof_shell(turned(RECTANGLE), RoofSpec("gabled", 0.0, 9.0, 3.0, across=across))
         top = shell.corners.reshape(-1, 3)
@@ -191,7 +191,7 @@ def test_the_ridge_runs_along_the_longer_side_unless_it_is_said_to_run_across():
         assert ridge.bounds == tuple(np.ravel(ends))
 
 
-def test_what_stands_in_for_a_shape_is_said():
+def test_a_replaced_roof_shape_is_reported():
     courtyard = turned([(0, 0), (20, 0), (20, 20), (0, 20)], holes=[[(6, 6), (6, 14), (14, 14), (14, 6)]])
     for shape, word in (("pyramidal", "hipped"), ("onion", "dome"), ("gabled", "hipped"), ("hipped", "")):
         shell, fallback = roof_shell(courtyard, RoofSpec(shape, 0.0, 9.0, 3.0))

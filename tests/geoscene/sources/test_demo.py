@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[3]
 DRIVABLE = {"primary", "secondary", "tertiary", "unclassified", "residential", "living_street"}
 
 
-def test_the_demo_holds_what_a_scene_is_made_of():
+def test_the_demo_has_features_of_all_kinds():
     assert demo_path().stat().st_size < 500_000
     data = read_osm(demo_path())
     west, south, east, north = data.bounds
@@ -26,7 +26,7 @@ def test_the_demo_holds_what_a_scene_is_made_of():
     assert sum(p.tags.get("natural") == "tree" for p in data.points) > 150
 
 
-def test_its_streets_hang_together_in_loops():
+def test_the_streets_of_the_demo_are_connected():
     data = read_osm(demo_path())
     graph = nx.Graph()
     for way in data.ways:

@@ -125,7 +125,7 @@ def mercator(lonlat):
     return HALF * lonlat[:, 0] / 180, HALF * np.arcsinh(np.tan(np.radians(lonlat[:, 1]))) / np.pi
 
 
-def test_a_surface_cut_into_tiles_comes_back_whole_across_their_seams(serve, tmp_path):
+def test_tiles_join_without_seams(serve, tmp_path):
     server = serve(slope)
     osm = area()
     path = fetch_elevation(osm, cache_dir=tmp_path, server=patient(server))
@@ -147,7 +147,7 @@ def test_a_surface_cut_into_tiles_comes_back_whole_across_their_seams(serve, tmp
     assert terrain.uncovered == 0.0
 
 
-def test_hills_are_met_to_what_ten_metre_posts_can_say(serve, tmp_path):
+def test_hills_are_as_accurate_as_posts_of_ten_metres_allow(serve, tmp_path):
     osm = area()
     path = fetch_elevation(osm, cache_dir=tmp_path, server=patient(serve(hills)))
     places = sample(osm)
@@ -157,7 +157,7 @@ def test_hills_are_met_to_what_ten_metre_posts_can_say(serve, tmp_path):
     assert np.abs(z - hills(*mercator(places))).max() < bound
 
 
-def test_tiles_cover_the_rectangle_of_a_scene_whose_grid_is_turned_against_the_map(serve, tmp_path):
+def test_tiles_cover_the_rectangle_of_a_scene_with_another_grid_north(serve, tmp_path):
     server = serve(hills)
     osm = replace(area(0.05), bounds=(11.90, 43.70, 12.00, 43.80))  # 3 degrees off the meridian of UTM 32
     frame = Frame.at(11.95, 43.75, crs="EPSG:32632")
@@ -200,11 +200,11 @@ def test_the_zoom_gives_posts_of_five_to_ten_metres_at_any_latitude(lat):
 
 
 @given(st.integers(-11_000 * 256, 9_000 * 256))
-def test_heights_survive_their_colours_to_the_last_step(count):
+def test_heights_are_decoded_exactly(count):
     assert decode_terrarium(encode(np.array([[count / 256]])))[0, 0] == count / 256
 
 
-def test_tiles_are_asked_for_once_with_a_name_and_a_damaged_one_again(serve, tmp_path):
+def test_tiles_are_cached_and_damaged_ones_fetched_again(serve, tmp_path):
     server = serve(slope)
     first = fetch_elevation(area(), cache_dir=tmp_path, server=patient(server))
     content, asked = first.read_bytes(), len(server.asked)
@@ -220,7 +220,7 @@ def test_tiles_are_asked_for_once_with_a_name_and_a_damaged_one_again(serve, tmp
     assert len(server.asked) == asked + 1
 
 
-def test_a_busy_server_is_asked_again_and_not_for_ever(serve, tmp_path):
+def test_a_busy_server_is_asked_a_limited_number_of_times(serve, tmp_path):
     server = serve(slope)
     server.refuse = [503, 429, 500]
     fetch_elevation(area(0.001), cache_dir=tmp_path / "a", server=patient(server))
@@ -231,7 +231,7 @@ def test_a_busy_server_is_asked_again_and_not_for_ever(serve, tmp_path):
     assert list((tmp_path / "b").rglob("*.*")) == []
 
 
-def test_what_is_not_there_or_no_tile_is_said_at_once(serve, tmp_path):
+def test_a_missing_or_invalid_tile_is_an_error_at_once(serve, tmp_path):
     server = serve(slope)
     server.refuse = [404]
     with pytest.raises(NetworkError, match="HTTP 404"):
@@ -242,7 +242,7 @@ def test_what_is_not_there_or_no_tile_is_said_at_once(serve, tmp_path):
         fetch_elevation(area(0.001), cache_dir=tmp_path, server=patient(server))
 
 
-def test_what_cannot_be_asked_for_is_refused_before_asking(serve, tmp_path):
+def test_invalid_requests_are_refused_before_they_are_sent(serve, tmp_path):
     server = serve(slope)
     with pytest.raises(InputError, match="85°"):
         fetch_elevation(
@@ -260,7 +260,7 @@ def program(*words):
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def test_the_program_builds_on_tiles_and_names_their_makers(serve, tmp_path):
+def test_the_program_builds_on_tiles_and_credits_them(serve, tmp_path):
     bounds = read_osm(demo_path()).bounds
     lon, lat = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2
     box = f"{lon - 0.001},{lat - 0.0005},{lon + 0.001},{lat + 0.0005}"

@@ -205,7 +205,7 @@ def test_neither_the_order_nor_the_sign_of_ids_matters(tmp_path_factory, seed, n
     assert len(data.ways) == len(data.points) == 1
 
 
-def test_every_format_says_the_same_whatever_the_file_is_called(tmp_path):
+def test_every_format_gives_the_same_features_under_any_file_name(tmp_path):
     demo = demo_path()
     xml = tmp_path / "a.osm"
     with osmium.SimpleWriter(str(xml), header=osmium.io.Reader(str(demo)).header()) as writer:
@@ -235,7 +235,7 @@ def test_overpass_json_in_a_file_is_read(tmp_path):
 # --- defects
 
 
-def test_a_line_that_misses_nodes_is_cut_there_not_drawn_across(tmp_path):
+def test_a_line_is_split_where_nodes_are_missing(tmp_path):
     town = Map()
     a, b, c, d = town.nodes([(0, 0), (10, 0), (500, 0), (510, 0)])
     street = town.way([a, b, 999, c, d, 998], {"highway": "residential"})
@@ -289,7 +289,7 @@ def test_repeated_nodes_are_left_out_and_flat_rings_dropped(tmp_path):
 
 
 @pytest.mark.parametrize("place", ['lat="NaN" lon="0"', 'lat="95" lon="0"', 'lat="1e9" lon="0"', ""])
-def test_a_node_that_is_nowhere_is_dropped_and_the_rest_is_read(tmp_path, place):
+def test_a_node_without_a_position_is_dropped_and_the_rest_is_read(tmp_path, place):
     town = Map()
     town.ring(square(0, 0), {"building": "yes"})
     path = tmp_path / "a.osm"
@@ -327,7 +327,7 @@ def test_a_multipolygon_without_tags_has_those_of_its_outer_way(tmp_path):
     assert data.problems == []
 
 
-def test_what_is_left_of_a_broken_multipolygon_is_kept(tmp_path):
+def test_closed_rings_of_a_broken_multipolygon_are_kept(tmp_path):
     town = Map()
     whole = town.ring(square(0, 0, 50))
     half = town.way(town.nodes(square(100, 0)[:3]))
@@ -346,7 +346,7 @@ def test_what_is_left_of_a_broken_multipolygon_is_kept(tmp_path):
 # --- bounds and errors
 
 
-def test_bounds_keep_what_meets_them_whole(tmp_path):
+def test_bounds_keep_intersecting_features_whole(tmp_path):
     town = Map()
     town.ring(square(-10, 0), {"building": "yes"})
     town.ring(square(500, 500), {"building": "yes"})
@@ -363,12 +363,12 @@ def test_bounds_keep_what_meets_them_whole(tmp_path):
 
 
 @pytest.mark.parametrize("bounds", [(0, 0, 1), (5, 0, 4, 1), (0, 0, float("nan"), 1), (-400, 0, 1, 1)])
-def test_bounds_that_are_none_are_refused(tmp_path, bounds):
+def test_invalid_bounds_are_refused(tmp_path, bounds):
     with pytest.raises(InputError, match="bounds"):
         read_osm(tmp_path / "never-opened.osm", bounds=bounds)
 
 
-def test_a_file_that_is_no_map_is_refused_in_one_line(tmp_path):
+def test_a_file_that_is_not_a_map_is_refused_in_one_line(tmp_path):
     pbf = demo_path().read_bytes()
     text = b'<osm version="0.6"><node id="1" lat="1" lon="2"/></osm>'
     bad = {
@@ -406,7 +406,7 @@ def test_a_file_that_is_no_map_is_refused_in_one_line(tmp_path):
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", ALL)
-def test_no_building_of_a_real_extract_vanishes_without_a_word(shared_osm, name):
+def test_no_building_of_a_real_extract_is_dropped_without_a_problem(shared_osm, name):
     """Whatever is tagged as a building is an area, or in the report, or bounds a relation's area."""
     path = shared_osm(name)
     data = read_osm(path)

@@ -233,7 +233,7 @@ def test_a_place_is_found_fetched_and_the_same_as_from_a_file(server, tmp_path):
     assert server.asked_for("/api/status") == 1
 
 
-def test_what_was_fetched_once_comes_from_the_cache(server, tmp_path):
+def test_answers_are_cached_and_damaged_ones_fetched_again(server, tmp_path):
     servers = servers_at(server)
     first = fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers)
     asked = len(server.asked)
@@ -245,7 +245,7 @@ def test_what_was_fetched_once_comes_from_the_cache(server, tmp_path):
     assert len(server.asked) == 2 * asked
 
 
-def test_a_large_area_is_asked_for_in_parts_and_is_the_same(server):
+def test_a_large_area_is_fetched_in_parts_and_is_the_same(server):
     parts = []
     servers = replace(servers_at(server), max_query_km2=0.05)
     data = fetch_bbox(BOX, servers=servers, progress=lambda items: [parts.append(i) or i for i in items])
@@ -274,14 +274,14 @@ def test_a_busy_server_is_asked_again(server):
     assert server.asked_for("/api/interpreter") == 3
 
 
-def test_a_busy_server_is_not_asked_for_ever(server):
+def test_a_busy_server_is_asked_a_limited_number_of_times(server):
     server.refuse = [429] * 99
     with pytest.raises(NetworkError, match="HTTP 429"):
         fetch_bbox(BOX, servers=servers_at(server))
     assert server.asked_for("/api/interpreter") == 3
 
 
-def test_a_server_that_fails_gives_way_to_the_next(start):
+def test_the_next_server_is_asked_if_one_fails(start):
     first, second = start(), start()
     first.refuse = [500]
     data = fetch_bbox(BOX, servers=servers_at(first, second))
@@ -289,7 +289,7 @@ def test_a_server_that_fails_gives_way_to_the_next(start):
     assert (first.asked_for("/api/interpreter"), second.asked_for("/api/interpreter")) == (1, 1)
 
 
-def test_a_server_that_fails_is_named_and_nothing_is_kept(server, tmp_path):
+def test_a_server_that_fails_is_named_and_nothing_is_cached(server, tmp_path):
     server.refuse = [500]
     with pytest.raises(NetworkError, match=r"127\.0\.0\.1:\d+: HTTP 500.*`osm` FILE.*`demo`"):
         fetch_bbox(BOX, cache_dir=tmp_path, servers=servers_at(server))
@@ -315,7 +315,7 @@ def test_an_answer_of_another_kind_is_refused(server):
         locate("nonsense", servers=servers_at(server))
 
 
-def test_without_a_network_one_line_says_what_to_do():
+def test_without_a_network_the_error_names_the_offline_options():
     servers = Servers(nominatim=nowhere(), overpass=(f"{nowhere()}/api", "http://map.invalid/api"), wait=0.0)
     for fetch in (
         lambda: fetch_place("Norfolk, VA", servers=servers),
@@ -330,14 +330,14 @@ def test_without_a_network_one_line_says_what_to_do():
         assert "`demo`" in message
 
 
-def test_a_place_nobody_knows_is_not_found(server):
+def test_an_unknown_place_is_not_found(server):
     with pytest.raises(SourceNotFoundError, match="no place called 'Atlantis'"):
         fetch_place("Atlantis", servers=servers_at(server))
     with pytest.raises(SourceNotFoundError, match="nothing"):
         fetch_bbox((0.0, 0.0, 0.01, 0.01), servers=servers_at(server))
 
 
-def test_what_cannot_be_asked_for_is_refused_before_asking(server):
+def test_invalid_requests_are_refused_before_they_are_sent(server):
     servers = servers_at(server)
     with pytest.raises(InputError, match="km²"):
         fetch_bbox((20, 60, 25, 65), servers=servers)
@@ -350,7 +350,7 @@ def test_what_cannot_be_asked_for_is_refused_before_asking(server):
     assert server.asked == []
 
 
-def test_the_program_builds_a_place_asked_of_the_servers_and_asks_once(server, tmp_path):
+def test_the_program_builds_a_place_and_fetches_it_once(server, tmp_path):
     place = next(iter(name for name, found in PLACES.items() if found))
     command = [
         sys.executable,
@@ -377,7 +377,7 @@ def test_the_program_builds_a_place_asked_of_the_servers_and_asks_once(server, t
     assert same_bytes
 
 
-def test_the_program_without_a_network_says_so_and_names_the_ways_out(tmp_path):
+def test_the_program_without_a_network_names_the_offline_options(tmp_path):
     command = [
         sys.executable,
         "-m",

@@ -124,7 +124,7 @@ def test_buildings_replace_those_of_a_map(osm, demo):
     assert both.digest != osm.digest
 
 
-def test_bounds_keep_what_they_meet_whole(demo):
+def test_bounds_keep_intersecting_buildings_whole(demo):
     every = read_source("overture", demo)
     box = (24.944, 60.167, 24.946, 60.168)
     some = read_source("overture", demo, bounds=box)

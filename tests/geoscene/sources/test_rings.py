@@ -65,7 +65,7 @@ def test_pieces_in_any_order_and_direction_make_the_area(city):
 
 @given(cities())
 @settings(max_examples=30, deadline=None)
-def test_roles_do_not_matter_where_the_boundary_is_sound(city):
+def test_roles_do_not_matter_if_the_boundary_is_valid(city):
     blocks, rng = city
     chains, xy = chains_of(blocks, rng)
     lied = [Chain(c.nodes, bool(rng.random() < 0.5)) for c in chains]
@@ -84,7 +84,7 @@ def test_a_member_listed_twice_counts_once(city):
 
 @given(cities())
 @settings(max_examples=30, deadline=None)
-def test_a_missing_piece_costs_its_ring_only(city):
+def test_a_missing_piece_drops_only_its_ring(city):
     blocks, rng = city
     chains, xy = chains_of(blocks, rng)
     lost = int(rng.integers(len(chains)))
@@ -132,7 +132,7 @@ METRE = 9e-6
 
 
 @pytest.mark.parametrize("shift", range(5))
-def test_a_cut_ring_closes_the_same_wherever_it_starts(shift):
+def test_a_cut_ring_is_closed_the_same_from_any_start(shift):
     corners = np.array([(5, 30), (5, 10), (30, 10), (30, 40), (5, 40)]) * METRE
     ring = np.roll([0, 1, 2, 3, 4, -1], shift)
     closed = close_cut_ring(np.append(ring, ring[0]), corners, extent=EDGE)
