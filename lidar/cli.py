@@ -28,7 +28,7 @@ app = App(
 
     lidar map drive -o map.laz
 
-    lidar rigs, lidar sensors and lidar settings list what there is to choose from.
+    lidar rigs, lidar sensors, lidar settings and lidar stages list what there is to choose from.
     """,
 )
 app.register_install_completion_command()
@@ -74,6 +74,7 @@ def drive(
     fidelity: str = "standard",
     settings: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
     traffic: str | None = None,
+    stage: Annotated[list[str] | None, Parameter(negative=())] = None,
     formats: Annotated[str, Parameter(name="--format", group=_OUTPUT, help=_format_help())] = "pcd,laz",
     labels: Annotated[str, Parameter(group=_OUTPUT, help=_label_help())] = "",
     deskew: Annotated[str, Parameter(group=_OUTPUT)] = "",
@@ -145,6 +146,9 @@ def drive(
         and cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places);
         sumo or sumo,vehicles=20,...: the same densities, simulated by SUMO; or a file that sumo --fcd-output
         wrote, with net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed.
+    stage
+        Change echoes, clouds or images by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or a TOML file with tables
+        [[stage]]; again for more. lidar stages lists them all.
     deskew
         Clouds of the sensor frame a second time, all points brought to one moment of the frame: start, middle
         or end.
@@ -166,6 +170,7 @@ def drive(
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from lidar.drive import drive as record  # noqa: PLC0415
     from lidar.options import DriveOptions  # noqa: PLC0415
+    from lidar.signal.registry import read_stages  # noqa: PLC0415
 
     if bool(route) == bool(survey):
         raise InputError("give one of --route and --survey, such as --route random")
@@ -190,6 +195,7 @@ def drive(
         fidelity=fidelity,
         settings=tuple(_setting(text) for text in settings or ()),
         traffic=_traffic(traffic),
+        stages=read_stages(stage or ()).stages,
         workers=workers,
     )
     with progress_bar(quiet=quiet) as progress:
@@ -417,6 +423,97 @@ def export(
     else:
         counts = ", ".join(f"{count:,} {kind}" for kind, count in summary.counts.items())
         print(f"{out}: {counts}; {summary.hint}")
+    return 0
+
+
+@app.command
+def apply(
+    dataset: Path,
+    /,
+    *,
+    stage: Annotated[list[str], Parameter(negative=())],
+    sensor: str = "",
+    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
+    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+) -> int:
+    """Apply stages to recorded data: a dataset, or point clouds of KITTI or nuScenes.
+
+    Stages before the detector take each recorded return as one echo, with the power that its intensity
+    implies; they add nothing to pulses without a return.
+
+    For example:
+
+    lidar apply drive --stage dropped_packets:loss=0.02,burst=4 -o lossy
+
+    lidar apply kitti/sequences/00 --stage cover_glass:transmission=0.7 -o dirty
+
+    Parameters
+    ----------
+    dataset
+        Directory of a dataset, or of velodyne*/*.bin (KITTI) or *.pcd.bin (nuScenes) files.
+    stage
+        NAME, NAME:KEY=VALUE,KEY=VALUE or a TOML file with tables [[stage]]; again for more. lidar stages
+        lists them all.
+    sensor
+        Scanner of KITTI's or nuScenes' clouds: a preset or a TOML file; hdl64e_s3 or hdl32e by default.
+    out
+        Directory to write to.
+    overwrite
+        Replace what is there.
+    json
+        Print the summary as JSON.
+    quiet
+        No progress bars.
+    """
+    from lidar.apply import apply_stages  # noqa: PLC0415
+    from lidar.signal.registry import read_stages  # noqa: PLC0415
+
+    with progress_bar(quiet=quiet) as progress:
+        summary = apply_stages(
+            dataset,
+            out,
+            stages=read_stages(stage).stages,
+            sensor=sensor,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    if json:
+        print_json({**asdict(summary), "path": str(out)})
+    else:
+        print(f"{out}: {summary.files} files, {summary.points:,} of {summary.points_in:,} points")
+    return 0
+
+
+@app.command
+def stages(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False) -> int:
+    """List the stages that change echoes, point clouds or images, with their parameters.
+
+    Parameters
+    ----------
+    json
+        Print them as JSON.
+    """
+    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.signal.registry import stage_rows  # noqa: PLC0415
+
+    rows = stage_rows()
+    if json:
+        print_json({"stages": rows})
+        return 0
+    cells = [["name", "parameter", "default", "from", "to", "meaning"]]
+    for row in rows:
+        meaning = f"{row['meaning']} Acts on: {', '.join(row['acts_on'])}."
+        cells.append([row["name"], "", "", "", "", meaning])
+        for p in row["parameters"]:
+            ends = [f"{p[end]:g}" if end in p else "" for end in ("low", "high")]
+            cells.append(["", p["name"], str(p["default"]), *ends, p["meaning"]])
+    print(columns(cells))
+    print(
+        "\nEvery stage also takes seed (of its random numbers; the drive's by default) and sensor (the only"
+        "\none that it acts on): lidar drive SCENE --stage NAME:KEY=VALUE,KEY=VALUE (see docs/stages.md)."
+    )
     return 0
 
 

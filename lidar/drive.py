@@ -133,6 +133,9 @@ def drive(
     sensors: list[Scanner | Camera] = [*scanners(rig), *cameras(rig)]
     if not sensors and not rig.gnss:
         raise InputError(f"rig {rig.name} has no sensors")
+    options.contents().stages.check(
+        {s.name: "lidar" if isinstance(s, Scanner) else "camera" for s in sensors}
+    )
     body = load_vehicle(options.vehicle or rig.vehicle)
     planned = plan(scene, options, body=body, sensors=sensors, progress=progress)
     trajectory = planned if isinstance(planned, Trajectory) else planned.trajectory

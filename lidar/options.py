@@ -14,6 +14,7 @@ from lidar.errors import InputError
 from lidar.planning.route import Side, Spec
 from lidar.rig.specs import load_rig, rig_digest
 from lidar.settings import settings_of
+from lidar.signal.registry import NamedStage, Stages
 from lidar.traffic.fcd import TrafficFile
 from lidar.traffic.populate import TrafficOptions
 
@@ -45,6 +46,7 @@ class DriveOptions:
     fidelity   : level of `lidar.settings.levels`: draft, standard or survey
     traffic    : other road users and parked cars, as densities or a file of SUMO; none by default
     settings   : single settings that differ from the level, as (name, text)
+    stages     : that change echoes, clouds or images, see `lidar.signal`; none by default
     workers    : threads
     """
 
@@ -68,6 +70,7 @@ class DriveOptions:
     fidelity: str = "standard"
     traffic: TrafficOptions | TrafficFile | None = None
     settings: tuple[tuple[str, str], ...] = ()
+    stages: tuple[NamedStage, ...] = ()
     workers: int = 2
 
     def __post_init__(self) -> None:
@@ -93,7 +96,8 @@ class DriveOptions:
     def contents(self) -> Contents:
         """What is written of every frame; raises InputError for what cannot be."""
         scanner, camera = settings_of(self.fidelity, self.settings)
-        return Contents(self.formats, self.labels, self.deskew, self.seed, scanner, camera)
+        stages = Stages(self.stages, self.seed)
+        return Contents(self.formats, self.labels, self.deskew, self.seed, scanner, camera, stages)
 
     def recipe(self, scene: Scene) -> dict[str, Any]:
         """What the dataset's bytes depend on, as JSON; of files their contents too."""
@@ -120,6 +124,7 @@ class DriveOptions:
             "fidelity": self.fidelity,
             "traffic": self._traffic(scene),
             "settings": [list(pair) for pair in self.settings],
+            **({"stages": [stage.to_json() for stage in self.stages]} if self.stages else {}),
         }
 
     def _traffic(self, scene: Scene) -> dict[str, Any] | None:

@@ -8,6 +8,7 @@ DATASET/
   gnss.csv, imu.csv       measured, by the receivers' and units' names
   boxes.csv               road users in 3D, at the frames of the first scanner
   <sensor>/<format>/<frame>.<ext>
+  <sensor>/truth/<frame>.npz  what stages did; only with stages
 """
 
 from __future__ import annotations
@@ -89,6 +90,10 @@ class Paths:
     def image(self, name: str, frame: int, *, kind: str) -> Path:
         """An image of a camera: ``rgb``, ``depth``, ``semantic``, ``instance`` or ``flow``."""
         return self.root / name / kind / f"{frame:06d}.png"
+
+    def truth(self, name: str, frame: int) -> Path:
+        """What stages did to a frame of a sensor."""
+        return self.root / name / "truth" / f"{frame:06d}.npz"
 
     def deskewed(self, name: str, frame: int, *, suffix: str) -> Path:
         """A de-skewed cloud of a scanner."""
@@ -209,9 +214,9 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
         return 0
     manifest = open_dataset(path).manifest
     old, new = manifest["recipe"], json.loads(json.dumps(recipe))
-    changed = [k for k in new if old.get(k) != new[k]]
+    changed = [k for k in old | new if old.get(k) != new.get(k)]
     if changed:
-        what = ", ".join(f"{k} {_said(old.get(k))} (now {_said(new[k])})" for k in changed)
+        what = ", ".join(f"{k} {_said(old.get(k))} (now {_said(new.get(k))})" for k in changed)
         raise DatasetError(
             f"{path}: holds a drive made with other options: {what};"
             " set `overwrite` to replace it, or give another directory"

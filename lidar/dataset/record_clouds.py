@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +17,23 @@ from lidar.dataset.formats.table import Table, cloud_table, point_labels
 from lidar.dataset.recording import Recording
 from lidar.random_streams import generator
 from lidar.rig.devices import Scanner
-from lidar.sensors.cloud import Cloud, no_returns
+from lidar.sensors.cloud import Cloud, TracedCloud, no_returns
 from lidar.sensors.doppler import radial_velocity, surface_velocity
-from lidar.sensors.scan import scan
+from lidar.sensors.scan import cast, scan
+from lidar.signal.run import Altered, altered_sweep, cloud_truth, unaltered, write_truth
 from lidar.world.world import World
 
 
 def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> int:
     """Scan one frame and write its clouds, labels and boxes; return the number of points."""
     paths = recording.paths(scanner, frame)
-    cloud = _scanned(recording, scanner, frame=frame, world=world)
-    _write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths)
+    if recording.has_stages(scanner):
+        altered = _altered(recording, scanner, frame=frame, world=world)
+        write_truth(paths["truth"], cloud_truth(altered, start_ns=scanner.frame_start_ns(frame)))
+        cloud: Cloud = altered.cloud
+    else:
+        cloud = _scanned(recording, scanner, frame=frame, world=world)
+    write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths)
     for form in recording.contents.label_formats:
         form.write(paths[f"labels {form.name}"], point_labels(cloud, recording.actors))
     if recording.actors is not None:
@@ -37,10 +44,8 @@ def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, world: W
 
 def _scanned(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> Cloud:
     """What a scanner measures in a frame, during the times at which scanners work."""
-    start, end = scanner.sensor.window_ns(frame)
-    on = recording.scanning_ns
-    if on is not None and not ((on[:, 0] <= end) & (on[:, 1] >= start)).any():
-        return no_returns(start)
+    if not _works(recording, scanner, frame=frame):
+        return no_returns(scanner.sensor.window_ns(frame)[0])
     with recording.watch.stage("scan"):
         cloud = scan(
             scanner.sensor,
@@ -51,11 +56,42 @@ def _scanned(recording: Recording, scanner: Scanner, *, frame: int, world: World
             seed=recording.contents.seed,
             settings=recording.contents.scanner,
         )
-    if on is None:
-        return cloud
+    return cloud if recording.scanning_ns is None else cloud.where(_while_on(recording, cloud))
+
+
+def _altered(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> Altered:
+    """What a scanner measures in a frame, after the stages on it."""
+    if not _works(recording, scanner, frame=frame):
+        return unaltered(no_returns(scanner.sensor.window_ns(frame)[0]))
+    with recording.watch.stage("scan"):
+        sweep = cast(
+            scanner.sensor,
+            scanner.spec.mount,
+            trajectory=recording.trajectory,
+            world=world,
+            frame=frame,
+            seed=recording.contents.seed,
+            settings=recording.contents.scanner,
+        )
+        altered = altered_sweep(sweep, recording.contents.stages)
+    return altered if recording.scanning_ns is None else altered.where(partial(_while_on, recording))
+
+
+def _works(recording: Recording, scanner: Scanner, *, frame: int) -> bool:
+    """Whether scanners work at any time of a frame."""
+    start, end = scanner.sensor.window_ns(frame)
+    on = recording.scanning_ns
+    return on is None or bool(((on[:, 0] <= end) & (on[:, 1] >= start)).any())
+
+
+def _while_on(recording: Recording, cloud: Cloud) -> NDArray[np.bool_]:
+    """Mask (n,) of returns at times at which scanners work."""
+    on = recording.scanning_ns
+    assert on is not None  # noqa: S101
     time_ns = _times(cloud)
     first = np.searchsorted(on[:, 0], time_ns, side="right") - 1
-    return cloud.where((first >= 0) & (time_ns <= np.maximum.accumulate(on[:, 1])[first]))
+    mask: NDArray[np.bool_] = (first >= 0) & (time_ns <= np.maximum.accumulate(on[:, 1])[first])
+    return mask
 
 
 def _times(cloud: Cloud) -> NDArray[np.int64]:
@@ -63,10 +99,19 @@ def _times(cloud: Cloud) -> NDArray[np.int64]:
     return cloud.start_ns + cloud.time_ns.astype(np.int64)
 
 
-def _write_clouds(
-    recording: Recording, scanner: Scanner, *, frame: int, cloud: Cloud, paths: dict[str, Path]
+def write_clouds(
+    recording: Recording,
+    scanner: Scanner,
+    *,
+    frame: int,
+    cloud: Cloud,
+    paths: dict[str, Path],
+    velocity: NDArray[np.float32] | None = None,
 ) -> None:
-    """Write a cloud in every format: in the sensor frame, de-skewed, and in the world frame."""
+    """Write a cloud in every format: in the sensor frame, de-skewed, and in the world frame.
+
+    velocity : (n,) radial velocities of a Doppler scanner, m/s; by default they are simulated
+    """
     contents, watch = recording.contents, recording.watch
     begin, time_ns = scanner.frame_start_ns(frame), _times(cloud)
     table = cloud_table(cloud) | {"time_ns": (time_ns - begin).astype(np.uint32)}
@@ -80,7 +125,9 @@ def _write_clouds(
             )
     if scanner.sensor.fmcw:
         with watch.stage("velocity"):
-            table["velocity"] = _velocity(recording, scanner, frame=frame, cloud=cloud, placed=placed)
+            if velocity is None:
+                velocity = _velocity(recording, scanner, frame=frame, cloud=cloud, placed=placed)
+            table["velocity"] = velocity
     deskewed_table: Table = {}
     if contents.deskew:
         moment = begin + int(MOMENTS[contents.deskew] * scanner.period_ns)
@@ -116,7 +163,12 @@ def _velocity(
     velocity = radial_velocity(cloud, mount, trajectory=recording.trajectory, moving=moving)
     if sigma and recording.contents.scanner.range_noise != "none":
         rng = generator(recording.contents.seed, scanner.name, frame, "velocity noise")
-        velocity = velocity + np.float32(sigma) * rng.standard_normal(len(velocity), np.float32)
+        if isinstance(cloud, TracedCloud):  # a return keeps its noise when stages remove others
+            row = np.where(cloud.source >= 0, cloud.source, cloud.source.max(initial=-1) + 1)
+            noise = rng.standard_normal(int(row.max(initial=-1)) + 1, np.float32)[row]
+        else:
+            noise = rng.standard_normal(len(velocity), np.float32)
+        velocity = velocity + np.float32(sigma) * noise
     return velocity
 
 

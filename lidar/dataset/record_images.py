@@ -23,6 +23,7 @@ from lidar.dataset.recording import Recording
 from lidar.geometry.poses import Poses
 from lidar.random_streams import generator
 from lidar.rig.devices import Camera
+from lidar.signal.run import altered_image, image_truth, write_truth
 from lidar.world.actors import Actors
 from lidar.world.thread_worlds import Worlds
 
@@ -46,6 +47,10 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
                 recording.actors, camera, frame=frame, pose=pose, time_ns=middle, image=image
             )
             write_columns(paths["boxes"], columns)
+    if recording.has_stages(camera):
+        original, stages = image, recording.contents.stages
+        image = altered_image(image, stages, sensor=camera.name, frame=frame)
+        write_truth(paths["truth"], image_truth(image, original))
     for kind in camera.spec.images:
         with watch.stage(f"write {kind}"):
             if kind == "flow":

@@ -25,6 +25,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.physics.settings import PLAIN as PLAIN_SCANNER
 from lidar.physics.settings import ScannerSettings
 from lidar.rig.devices import Camera, Scanner
+from lidar.signal.registry import NO_STAGES, Stages
 from lidar.world.actors import Actors
 from lidar.world.visibility import Visibility
 
@@ -46,6 +47,7 @@ class Contents:
     seed    : of the random number generators
     scanner : settings of scanners
     camera  : settings of cameras
+    stages  : that change echoes, clouds or images, see `lidar.signal`
     """
 
     formats: tuple[str, ...] = ("pcd",)
@@ -54,6 +56,7 @@ class Contents:
     seed: int = 0
     scanner: ScannerSettings = PLAIN_SCANNER
     camera: CameraSettings = PLAIN_CAMERA
+    stages: Stages = NO_STAGES
 
     def __post_init__(self) -> None:
         """Validate the names."""
@@ -126,7 +129,7 @@ class Recording:
         return LasInfo(self.geo.crs, self.geo.offset, self.start)
 
     def paths(self, sensor: Scanner | Camera, frame: int) -> dict[str, Path]:
-        """Files of one frame, by ``boxes``, image, format, ``deskewed <format>`` or ``labels <format>``."""
+        """Files of one frame, by image, format, ``deskewed <format>``, ``labels <format>``, boxes, truth."""
         return {kind: path for kind, path, _ in self._files(sensor, frame)}
 
     def is_done(self, sensor: Scanner | Camera, frame: int) -> bool:
@@ -135,6 +138,13 @@ class Recording:
             path.exists() and (not header or path.stat().st_size > 0)
             for _, path, header in self._files(sensor, frame)
         )
+
+    def has_stages(self, sensor: Scanner | Camera) -> bool:
+        """Whether stages act on a sensor's clouds or colour images."""
+        if isinstance(sensor, Camera) and "rgb" not in sensor.spec.images:
+            return False
+        kind = "camera" if isinstance(sensor, Camera) else "lidar"
+        return self.contents.stages.act_on(sensor.name, kind=kind)
 
     def count(self, sensor: Scanner | Camera, frame: int) -> int:
         """Number of points of a frame that is done; 0 for an image."""
@@ -147,6 +157,8 @@ class Recording:
         """(kind, path, whether it has a header) of each file of a frame."""
         name, paths = sensor.name, Paths(self.out)
         files = [] if self.actors is None else [("boxes", paths.frame_boxes(name, frame), True)]
+        if self.has_stages(sensor):
+            files.append(("truth", paths.truth(name, frame), True))
         if isinstance(sensor, Camera):
             return files + [(kind, paths.image(name, frame, kind=kind), True) for kind in sensor.spec.images]
         for form in self.contents.cloud_formats:

@@ -87,6 +87,9 @@ class Stages:
                 )
 
 
+NO_STAGES = Stages()
+
+
 def stage_class(name: str) -> type[Stage]:
     """The class of a stage; raises InputError if the name is unknown."""
     if name not in _STAGES:

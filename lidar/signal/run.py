@@ -45,6 +45,14 @@ class Altered:
         return Altered(cloud, self.original.where(kept))
 
 
+def unaltered(cloud: Cloud) -> Altered:
+    """A cloud that no stage has changed."""
+    n = len(cloud)
+    columns: list[Any] = [getattr(cloud, f.name) for f in fields(Cloud)]
+    columns += [np.full(n, Origin.SURFACE, np.uint8), np.arange(n, dtype=np.int32), np.full(n, -1, np.int32)]
+    return Altered(TracedCloud(*columns), cloud)
+
+
 def altered_sweep(sweep: Sweep, stages: Stages) -> Altered:
     """The point cloud of a sweep after the stages on its echoes and on the cloud."""
     sensor, m = sweep.sensor, len(sweep.echoes)
@@ -115,12 +123,10 @@ def altered_cloud(cloud: TracedCloud, stages: Stages, *, sensor: str, frame: int
 
 
 def altered_image(image: Frame, stages: Stages, *, sensor: str, frame: int | str) -> Frame:
-    """An image after the stages on it; unchanged without colour."""
-    if image.rgb is None:
-        return image
+    """An image with colours after the stages on it."""
     for named in stages.at("image", sensor):
         rng = named.rng(stages.seed, sensor, frame=frame)
-        image = cast("ImageStage", named.stage).image(image, rng=rng)
+        image = replace(image, rgb=cast("ImageStage", named.stage).image(image, rng=rng).rgb)
     return image
 
 

@@ -172,4 +172,4 @@ class ImageStage(Protocol):
     """A stage on camera images."""
 
     def image(self, frame: Frame, *, rng: np.random.Generator) -> Frame:
-        """The frame that is recorded; ``frame.rgb`` is there."""
+        """The frame that is recorded. Only its colours are used: depth and labels stay ground truth."""

@@ -52,6 +52,12 @@ def semantic_kitti_labels(labels: PointLabels) -> NDArray[np.uint32]:
     return codes
 
 
+def read_labels(path: Path) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Numbers (n,) of road users, 0 for none, and whether they move, from SemanticKITTI's labels."""
+    codes = np.fromfile(path, "<u4")
+    return (codes >> 16).astype(np.int64), np.isin(codes & 0xFFFF, list(_MOVING.values()))
+
+
 def write_labels(path: Path, labels: PointLabels) -> None:
     """Write SemanticKITTI's labels as little-endian uint32."""
     write_atomically(path, semantic_kitti_labels(labels).astype("<u4").tobytes())

@@ -1,0 +1,336 @@
+"""Stages on recorded data: datasets of this program, and point clouds of KITTI and nuScenes."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.files import write_columns, write_json
+from geoscene.progress import Progress, silent
+from lidar.camera.png import counts_to_depth, image_to_feature, read_png, write_png
+from lidar.camera.render import Frame as Image
+from lidar.dataset.boxes import merge_box_files
+from lidar.dataset.formats import FORMATS, Format
+from lidar.dataset.formats.kitti import read_labels
+from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
+from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows
+from lidar.dataset.record_clouds import write_clouds
+from lidar.dataset.recording import Contents, Recording
+from lidar.drive import Stopwatch
+from lidar.errors import DatasetError, InputError
+from lidar.geometry.georeference import Georeference, export_crs
+from lidar.rig.devices import Camera, Scanner, cameras, scanners
+from lidar.rig.scanner import Sensor, firings, load_sensor
+from lidar.rig.specs import load_rig, rig_digest
+from lidar.sensors.cloud import Cloud
+from lidar.settings import settings_of
+from lidar.signal.recorded import altered_recording
+from lidar.signal.registry import NamedStage, Stages
+from lidar.signal.run import Altered, altered_image, cloud_truth, image_truth, write_truth
+
+_KITTI, _NUSCENES = FORMATS["kitti"], FORMATS["nuscenes"]
+_SENSORS = {"kitti": "hdl64e_s3", "nuscenes": "hdl32e"}
+"""Presets of the scanners that recorded these datasets."""
+
+
+@dataclass(frozen=True, slots=True)
+class ApplySummary:
+    """What stages did to recorded data.
+
+    files          : point clouds and images that were written
+    points_in      : returns before the stages
+    points         : returns after them
+    """
+
+    path: Path
+    files: int
+    points_in: int
+    points: int
+
+
+def apply_stages(
+    source: Path,
+    out: Path,
+    *,
+    stages: Sequence[NamedStage],
+    sensor: str = "",
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> ApplySummary:
+    """Write recorded data after stages to ``out``, with truth files of what they did.
+
+    A dataset of this program is written whole. Of other folders the point clouds are written, at the same
+    relative paths: KITTI's ``*.bin`` in a folder ``velodyne*`` or in ``source`` itself, with SemanticKITTI's
+    labels if there are any, and nuScenes' ``*.pcd.bin``. Their truth files are in ``out/truth``.
+
+    sensor : preset, or TOML file, of the scanner of KITTI's or nuScenes' clouds; by default that of the
+             original datasets
+
+    Raises InputError for stages that cannot act on the data, and DatasetError for data that cannot be read.
+    """
+    if not stages:
+        raise InputError("`stages`: give one or more")
+    here, there = source.resolve(), out.resolve()
+    if here == there or here in there.parents or there in here.parents:
+        raise InputError(f"{out}: give a directory outside of {source}")
+    is_dataset = Paths(source).manifest.exists()
+    clouds = [] if is_dataset else _foreign_clouds(source)
+    if not is_dataset and not clouds:
+        raise DatasetError(f"{source}: no dataset.json, no velodyne*/*.bin and no *.pcd.bin in it")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
+        raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
+    if is_dataset:
+        if sensor:
+            raise InputError("`sensor`: a dataset has its own sensors; leave it out")
+        return _apply_to_dataset(open_dataset(source), out, stages=stages, progress=progress)
+    return _apply_to_clouds(clouds, source, out=out, stages=stages, sensor=sensor, progress=progress)
+
+
+def _apply_to_dataset(
+    dataset: Dataset, out: Path, *, stages: Sequence[NamedStage], progress: Progress
+) -> ApplySummary:
+    recipe, seed = dataset.manifest["recipe"], int(dataset.manifest["seed"])
+    if dataset.manifest["frames_done"] != dataset.frames:
+        raise DatasetError(f"{dataset.path}: the drive was not finished; finish it first")
+    if {"stages", "applied_stages"} & recipe.keys():
+        raise DatasetError(f"{dataset.path}: has stages already; apply all to the original")
+    sensors = _sensors(recipe["rig"])
+    chosen = Stages(tuple(stages), seed)
+    chosen.check({s.name: "lidar" if isinstance(s, Scanner) else "camera" for s in sensors})
+    settings = settings_of(recipe["fidelity"], [(name, text) for name, text in recipe["settings"]])
+    contents = Contents(
+        tuple(recipe["formats"]), tuple(recipe["labels"]), recipe["deskew"], seed, *settings, chosen
+    )
+    recording = Recording(
+        out,
+        dataset.frame,
+        trajectory=dataset.trajectory(),
+        start=dataset.start,
+        geo=Georeference(dataset.frame, export_crs(dataset.frame, recipe["crs"]), exact=recipe["exact"]),
+        contents=contents,
+        watch=Stopwatch(),
+    )
+    jobs = [(s, frame) for s in sensors if recording.has_stages(s) for frame in dataset.frame_times(s.name)]
+    form = _richest_format(contents) if any(isinstance(s, Scanner) for s, _ in jobs) else None
+    written = {path for job in jobs for path in recording.paths(*job).values()}
+    if Paths(out).manifest.exists():  # a former dataset, to be replaced
+        shutil.rmtree(out)
+    _copy(dataset.path, out, leave_out=written | {Paths(out).manifest})
+    points = dict(dataset.manifest["points"])
+    before = sum(points.values())
+    points |= dict.fromkeys((s.name for s, _ in jobs if isinstance(s, Scanner)), 0)
+    for done, (device, frame) in enumerate(jobs):
+        progress("stages", done, total=len(jobs))
+        if isinstance(device, Camera):
+            _apply_to_image(dataset, recording, camera=device, frame=frame)
+        elif form is not None:
+            points[device.name] += _apply_to_frame(dataset, recording, form=form, scanner=device, frame=frame)
+    progress("stages", len(jobs), total=len(jobs))
+    if Paths(out).boxes.exists():
+        merge_box_files(out)
+    applied = {"applied_stages": [stage.to_json() for stage in stages]}
+    write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe | applied, "points": points})
+    return ApplySummary(out, len(jobs), before, sum(points.values()))
+
+
+def _sensors(rig: str) -> list[Scanner | Camera]:
+    """Sensors of a rig as a recipe names it: its name or file, and a digest.
+
+    Raises InputError if the rig has changed since.
+    """
+    name = rig.rpartition(" (")[0]
+    if f"{name} ({rig_digest(name)})" != rig:
+        raise InputError(f"rig {name}: has changed since the drive")
+    loaded = load_rig(name)
+    return [*scanners(loaded), *cameras(loaded)]
+
+
+def _richest_format(contents: Contents) -> Format:
+    """The format in the sensor frame that keeps most columns.
+
+    Raises InputError if there is none.
+    """
+    found = [form for form in contents.cloud_formats if form.frame == "sensor"]
+    if not found:
+        raise InputError(
+            f"clouds are in the world frame ({','.join(contents.formats)}); record the sensor frame too"
+        )
+    return max(found, key=lambda form: len(form.columns))
+
+
+def _copy(source: Path, out: Path, *, leave_out: set[Path]) -> None:
+    """Copy a directory but for some files, named as in ``out``."""
+
+    def skip(folder: str, names: list[str]) -> list[str]:
+        place = out / Path(folder).relative_to(source)
+        return [name for name in names if place / name in leave_out]
+
+    shutil.copytree(source, out, ignore=skip, dirs_exist_ok=True)
+
+
+def _apply_to_frame(
+    dataset: Dataset, recording: Recording, *, form: Format, scanner: Scanner, frame: int
+) -> int:
+    """Write a cloud after the stages with its labels, boxes and truth; return the number of points."""
+    begin, contents = scanner.frame_start_ns(frame), recording.contents
+    source = replace(recording, out=dataset.path).paths(scanner, frame)
+    paths = recording.paths(scanner, frame)
+    for path in paths.values():
+        path.parent.mkdir(parents=True, exist_ok=True)
+    table = form.read(source[form.name])
+    recorded = _completed(table_cloud(table, start_ns=begin), scanner.sensor, columns=form.columns)
+    threshold = contents.scanner.link or contents.scanner.detection
+    altered = altered_recording(
+        recorded, contents.stages, sensor=scanner.sensor, frame=frame, threshold=threshold
+    )
+    cloud = altered.cloud
+    velocity = None
+    if "velocity" in table:
+        velocity = np.where(cloud.source >= 0, np.append(table["velocity"], 0)[cloud.source], 0)
+    write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=velocity)
+    for labels in contents.label_formats:
+        name = f"labels {labels.name}"
+        labels.write(paths[name], _labels(altered, source[name] if labels.name == "semantickitti" else None))
+    boxes = Paths(dataset.path).frame_boxes(scanner.name, frame)
+    if boxes.exists():
+        rows = read_rows(boxes)
+        columns: dict[str, Any] = {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
+        if rows:
+            hits = [np.count_nonzero(cloud.feature == int(row["instance"])) for row in rows]
+            write_columns(Paths(recording.out).frame_boxes(scanner.name, frame), columns | {"points": hits})
+    write_truth(paths["truth"], cloud_truth(altered, start_ns=begin))
+    return len(cloud)
+
+
+def _labels(altered: Altered, semantic_kitti: Path | None) -> PointLabels:
+    """Labels of a cloud after stages; road users come from its former labels of SemanticKITTI."""
+    source, n = altered.cloud.source, len(altered.cloud)
+    if semantic_kitti is None:
+        return PointLabels(altered.cloud.klass, np.zeros(n, np.int64), np.zeros(n, bool))
+    road_user, moving = read_labels(semantic_kitti)
+    return PointLabels(altered.cloud.klass, np.append(road_user, 0)[source], np.append(moving, False)[source])
+
+
+def _apply_to_image(dataset: Dataset, recording: Recording, *, camera: Camera, frame: int) -> None:
+    """Write a colour image after the stages, and its truth."""
+    source = replace(recording, out=dataset.path).paths(camera, frame)
+    paths = recording.paths(camera, frame)
+    read: dict[str, NDArray[Any]] = {
+        kind: read_png(path) for kind, path in source.items() if kind in ("rgb", *_IMAGES)
+    }
+    shape = read["rgb"].shape[:2]
+    image = Image(
+        read["rgb"],
+        counts_to_depth(read["depth"]) if "depth" in read else np.full(shape, np.inf, np.float32),
+        read.get("semantic", np.full(shape, Class.UNLABELED, np.uint8)),
+        image_to_feature(read["instance"]) if "instance" in read else np.full(shape, -1, np.int32),
+    )
+    found = altered_image(image, recording.contents.stages, sensor=camera.name, frame=frame)
+    assert found.rgb is not None  # noqa: S101
+    for path in (paths["rgb"], paths["truth"]):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(paths["rgb"], found.rgb)
+    write_truth(paths["truth"], image_truth(found, image))
+    for kind in _IMAGES & source.keys():
+        shutil.copyfile(source[kind], paths[kind])
+
+
+_IMAGES = {"depth", "semantic", "instance"}
+
+
+def _foreign_clouds(source: Path) -> list[tuple[Path, Format]]:
+    """Point clouds of KITTI and nuScenes in a folder, in order."""
+    found = []
+    for path in sorted(source.rglob("*.bin")):
+        if path.name.endswith(_NUSCENES.suffix):
+            found.append((path, _NUSCENES))
+        elif path.parent == source or any(
+            part.startswith("velodyne") for part in path.relative_to(source).parts[:-1]
+        ):
+            found.append((path, _KITTI))
+    return found
+
+
+def _apply_to_clouds(
+    clouds: Sequence[tuple[Path, Format]],
+    source: Path,
+    *,
+    out: Path,
+    stages: Sequence[NamedStage],
+    sensor: str,
+    progress: Progress,
+) -> ApplySummary:
+    devices: dict[tuple[str, str], Sensor] = {}
+    for path, form in clouds:
+        key = path.parent.name, form.name
+        if key not in devices:
+            devices[key] = load_sensor(sensor or _SENSORS[form.name], name=key[0])
+    chosen = Stages(tuple(stages))
+    chosen.check({name: "lidar" for name, _ in devices})
+    before = after = 0
+    for done, (path, form) in enumerate(clouds):
+        progress("stages", done, total=len(clouds))
+        place = path.relative_to(source)
+        stem = path.name.removesuffix(form.suffix)
+        device = devices[path.parent.name, form.name]
+        recorded = _completed(table_cloud(form.read(path)), device, columns=form.columns)
+        frame = int(stem) if stem.isdigit() else stem
+        altered = altered_recording(recorded, chosen, sensor=device, frame=frame)
+        for target in (out / place, out / "truth" / place):
+            target.parent.mkdir(parents=True, exist_ok=True)
+        form.write(out / place, cloud_table(altered.cloud))
+        write_truth((out / "truth" / place).with_name(f"{stem}.npz"), cloud_truth(altered, start_ns=0))
+        labels = path.parent.parent / "labels" / f"{stem}.label"
+        if form is _KITTI and labels.is_file():
+            _select_labels(labels, out / labels.relative_to(source), altered=altered)
+        before, after = before + len(recorded), after + len(altered.cloud)
+    progress("stages", len(clouds), total=len(clouds))
+    return ApplySummary(out, len(clouds), before, after)
+
+
+def _select_labels(path: Path, out: Path, *, altered: Altered) -> None:
+    """Write labels of SemanticKITTI for the returns after stages; added ones are unlabelled (0)."""
+    codes = np.append(np.fromfile(path, "<u4"), np.uint32(0))
+    if len(codes) != len(altered.original) + 1:
+        raise DatasetError(f"{path}: {len(codes) - 1} labels for {len(altered.original)} points")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_bytes(codes[altered.cloud.source].astype("<u4").tobytes())
+
+
+def _completed(cloud: Cloud, sensor: Sensor, *, columns: tuple[str, ...]) -> Cloud:
+    """A cloud with ring, column and time, derived from the points' directions if its format lacks them."""
+    if "column" in columns:
+        return cloud
+    pulses = firings(sensor, 0)
+    azimuth = np.arctan2(pulses.direction[:, 1], pulses.direction[:, 0])
+    own = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
+    bottom = pulses.ring == 0
+    column, time_ns = pulses.column[bottom], pulses.time_ns[bottom]
+    nearest = _nearest(azimuth[bottom], own, period=2 * np.pi)
+    ring = cloud.ring
+    if "ring" not in columns:
+        level = np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1])
+        elevation = np.zeros(int(pulses.ring.max()) + 1)
+        elevation[pulses.ring] = np.arcsin(pulses.direction[:, 2])
+        ring = _nearest(elevation, np.arctan2(cloud.xyz[:, 2], level)).astype(np.uint16)
+    return replace(
+        cloud, ring=ring, column=column[nearest], time_ns=(time_ns[nearest] - time_ns[0]).astype(np.int32)
+    )
+
+
+def _nearest(known: NDArray[np.floating], wanted: NDArray[np.floating], *, period: float = 0.0) -> Any:
+    """Index (n,) of the nearest of known values; with a period, of angles."""
+    order = np.argsort(known)
+    values = known[order]
+    if period:
+        values = np.concatenate([values[-1:] - period, values, values[:1] + period])
+        order = np.concatenate([order[-1:], order, order[:1]])
+    right = np.clip(np.searchsorted(values, wanted), 1, len(values) - 1)
+    return order[np.where(wanted - values[right - 1] < values[right] - wanted, right - 1, right)]

@@ -1,0 +1,223 @@
+"""Stages in drives and on recorded data: same bytes, truth files, command line."""
+
+import hashlib
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from geoscene.build import build
+from geoscene.options import BuildOptions
+from geoscene.sources import demo_path, read_osm
+from lidar.apply import apply_stages
+from lidar.camera.png import read_png
+from lidar.dataset.formats import FORMATS, read_cloud
+from lidar.dataset.layout import open_dataset
+from lidar.drive import drive
+from lidar.errors import DatasetError, InputError
+from lidar.options import DriveOptions
+from lidar.physics.echoes import Origin
+from lidar.signal.registry import read_stages
+from lidar.traffic.populate import TrafficOptions
+
+BOX = (24.9425, 60.1660, 24.9475, 60.1690)
+RIG = """
+name = "small"
+[[lidar]]
+name = "top"
+preset = "vlp16"
+translation = [1.2, 0.0, 1.9]
+[[camera]]
+name = "front"
+translation = [3.6, 0.0, 0.8]
+width = 64
+height = 48
+fov_deg = 90.0
+rate_hz = 5.0
+images = ["rgb", "depth", "instance"]
+"""
+STAGES = read_stages(["dropped_packets:loss=0.2,burst=3", "lost_rows:loss=0.3,rows=4"]).stages
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scene") / "demo"
+    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions())
+
+
+@pytest.fixture(scope="module")
+def options(tmp_path_factory):
+    rig = tmp_path_factory.mktemp("rig") / "small.toml"
+    rig.write_text(RIG)
+    return DriveOptions(
+        rig=str(rig),
+        duration=0.5,
+        seed=3,
+        formats=("pcd", "laz", "kitti", "nuscenes"),
+        labels=("semantickitti", "nuscenes"),
+        deskew="end",
+        traffic=TrafficOptions(),
+        workers=1,
+    )
+
+
+@pytest.fixture(scope="module")
+def plain(scene, options, tmp_path_factory):
+    out = tmp_path_factory.mktemp("plain") / "a"
+    drive(scene, out, options=options)
+    return out
+
+
+@pytest.fixture(scope="module")
+def altered(scene, options, tmp_path_factory):
+    out = tmp_path_factory.mktemp("altered") / "a"
+    drive(scene, out, options=replace(options, stages=STAGES))
+    return out
+
+
+def files(folder):
+    """Hash of every file but the manifest, by name."""
+    paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "dataset.json")
+    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in paths}
+
+
+def program(*words):
+    command = [sys.executable, "-m", "lidar.cli", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_a_drive_without_stages_has_no_trace_of_them(plain):
+    assert not list(plain.rglob("truth"))
+    assert "stage" not in (plain / "dataset.json").read_text()
+
+
+def test_truth_files_complete_the_recorded_clouds(plain, altered):
+    lost = 0
+    for path in sorted((plain / "top" / "pcd").glob("*.pcd")):
+        before, after = read_cloud(path), read_cloud(altered / "top" / "pcd" / path.name)
+        with np.load(altered / "top" / "truth" / f"{path.stem}.npz") as truth:
+            rows = np.concatenate([truth["source"], truth["removed"]])
+            assert np.array_equal(np.sort(rows), np.arange(len(before)))
+            assert np.array_equal(after.xyz, before.xyz[truth["source"]])
+            assert np.array_equal(truth["removed_xyz"], before.xyz[truth["removed"]])
+            assert np.array_equal(truth["removed_time_ns"], before.time_ns[truth["removed"]])
+            assert np.array_equal(truth["removed_feature"], before.feature[truth["removed"]])
+            assert (truth["origin"] == Origin.SURFACE).all()
+            lost += len(truth["removed"])
+    assert lost > 1000
+    for path in sorted((plain / "front" / "rgb").glob("*.png")):
+        image = read_png(altered / "front" / "rgb" / path.name).copy()
+        with np.load(altered / "front" / "truth" / f"{path.stem}.npz") as truth:
+            image[truth["changed"]] = truth["removed"]
+        assert np.array_equal(image, read_png(path))
+
+
+def test_files_hold_no_column_of_the_truth(plain, altered):
+    first = "top/pcd/000000.pcd"
+    assert FORMATS["pcd"].read(plain / first).keys() == FORMATS["pcd"].read(altered / first).keys()
+
+
+def test_bytes_do_not_depend_on_workers_or_on_a_resumed_drive(scene, options, altered, tmp_path):
+    wanted = replace(options, stages=STAGES, workers=3)
+    drive(scene, tmp_path / "a", options=wanted)
+    assert files(tmp_path / "a") == files(altered)
+    for name in ("top/truth/000002.npz", "front/rgb/000001.png"):
+        (tmp_path / "a" / name).unlink()
+    assert drive(scene, tmp_path / "a", options=wanted).resumed > 0
+    assert files(tmp_path / "a") == files(altered)
+    with pytest.raises(DatasetError, match="stages"):
+        drive(scene, tmp_path / "a", options=options)
+
+
+def test_applied_to_the_record_stages_give_the_files_of_the_drive(plain, altered, tmp_path):
+    summary = apply_stages(plain, tmp_path / "a", stages=STAGES)
+    made, expected = files(tmp_path / "a"), files(altered)
+    truth = {name for name in expected if "/truth/" in name}
+    assert made.keys() == expected.keys()
+    assert [name for name in expected if made[name] != expected[name] and name not in truth] == []
+    for name in truth:  # removed columns have the precision of the files
+        with np.load(tmp_path / "a" / name) as one, np.load(altered / name) as other:
+            assert one.files == other.files
+            assert all(np.allclose(one[key], other[key], rtol=1e-6) for key in one.files)
+    opened = open_dataset(tmp_path / "a")
+    assert opened.manifest["points"] == open_dataset(altered).manifest["points"]
+    assert summary.points == sum(opened.manifest["points"].values()) < summary.points_in
+    with pytest.raises(DatasetError, match="has stages already"):
+        apply_stages(tmp_path / "a", tmp_path / "b", stages=STAGES)
+
+
+def test_stages_on_clouds_of_kitti_and_nuscenes(plain, tmp_path):
+    for name in ("velodyne", "labels", "nuscenes"):
+        target = tmp_path / "in" / name
+        target.mkdir(parents=True)
+        for path in sorted((plain / "top" / name).iterdir()):
+            (target / path.name).write_bytes(path.read_bytes())
+    lossy = read_stages(["dropped_packets:loss=0.3"]).stages
+    summary = apply_stages(tmp_path / "in", tmp_path / "out", stages=lossy, sensor="vlp16")
+    assert summary.files == 10
+    for folder, suffix in (("velodyne", ".bin"), ("nuscenes", ".pcd.bin")):
+        name = f"000001{suffix}"
+        before, after = (
+            read_cloud(tmp_path / k / folder / name, {"velodyne": "kitti"}.get(folder, folder))
+            for k in ("in", "out")
+        )
+        with np.load(tmp_path / "out" / "truth" / folder / "000001.npz") as truth:
+            source, removed = truth["source"], truth["removed"]
+            ring, column = truth["removed_ring"], truth["removed_column"]
+        assert np.array_equal(after.xyz, before.xyz[source])
+        assert len(source) + len(removed) == len(before)
+        assert 0.1 < len(removed) / len(before) < 0.5
+        real = read_cloud(plain / "top" / "pcd" / "000001.pcd")
+        assert np.array_equal(ring, real.ring[removed])
+        assert np.abs(column - real.column[removed]).max() <= 1  # derived from the azimuth
+    labels = [np.fromfile(tmp_path / k / "labels" / "000001.label", "<u4") for k in ("in", "out")]
+    with np.load(tmp_path / "out" / "truth" / "velodyne" / "000001.npz") as truth:
+        assert np.array_equal(labels[1], labels[0][truth["source"]])
+    glass = read_stages(["cover_glass:transmission=0.3"]).stages
+    dimmed = apply_stages(tmp_path / "in", tmp_path / "dim", stages=glass, sensor="vlp16")
+    assert 0 < dimmed.points < dimmed.points_in
+
+
+def test_data_that_stages_cannot_be_applied_to(plain, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DatasetError, match="no velodyne"):
+        apply_stages(tmp_path / "empty", tmp_path / "out", stages=STAGES)
+    with pytest.raises(InputError, match="outside of"):
+        apply_stages(plain, plain / "out", stages=STAGES)
+    with pytest.raises(InputError, match="has its own sensors"):
+        apply_stages(plain, tmp_path / "out", stages=STAGES, sensor="vlp16")
+    with pytest.raises(InputError, match="no sensor 'left'"):
+        apply_stages(plain, tmp_path / "out", stages=read_stages(["dropped_packets:sensor=left"]).stages)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "note").write_text("mine")
+    with pytest.raises(DatasetError, match="is not empty"):
+        apply_stages(plain, tmp_path / "full", stages=STAGES)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("stage", ["rein", "dropped_packets:los=1", "dropped_packets:loss=2", "none.toml"])
+def test_faulty_stages_end_in_one_line_with_nothing_written(scene, plain, tmp_path, stage):
+    route = ("--route", "random", "--duration", "0.5")
+    for words in (("drive", scene.path, *route), ("apply", plain)):
+        result = program(*words, "--stage", stage, "-o", tmp_path / "out", "-q")
+        assert result.returncode == 2, result.stderr
+        assert result.stderr.count("\n") == 1
+        assert result.stderr.startswith("lidar: ")
+        assert not (tmp_path / "out").exists()
+
+
+def test_the_programs_list_and_apply_stages(plain, tmp_path):
+    listed = json.loads(program("stages", "--json").stdout)["stages"]
+    assert "dropped_packets" in [row["name"] for row in listed]
+    assert "dropped_packets" in program("stages").stdout
+    file = tmp_path / "stages.toml"
+    file.write_text('[[stage]]\nname = "dropped_packets"\nloss = 0.5\n')
+    result = program("apply", plain, "--stage", file, "-o", tmp_path / "out", "--json", "-q")
+    assert result.returncode == 0, result.stderr
+    document = json.loads(result.stdout)
+    assert document["points"] < document["points_in"]
+    assert Path(document["path"], "top", "truth", "000000.npz").exists()
