@@ -33,7 +33,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import write_trajectory
 from lidar.options import DriveOptions
 from lidar.planning.flight import Flight
-from lidar.planning.travel import Travel, plan_travel
+from lidar.planning.road_drive import RoadPlan, plan_road_drive
 from lidar.rig.devices import Camera, Scanner, cameras, scanners
 from lidar.rig.specs import Rig, load_rig
 from lidar.rig.vehicle import Vehicle, load_vehicle
@@ -105,7 +105,7 @@ class Stopwatch:
 class RoadDrive:
     """A drive on roads: its path, and its trajectory without other road users."""
 
-    travel: Travel
+    travel: RoadPlan
     trajectory: Trajectory
 
 
@@ -270,7 +270,7 @@ def plan(
 
     Raises RouteError for a route that it cannot take.
     """
-    from lidar.planning.aerial import plan_flight  # noqa: PLC0415
+    from lidar.planning.flight_planning import plan_flight  # noqa: PLC0415
     from lidar.planning.replay import read_replay  # noqa: PLC0415
 
     route = options.route
@@ -285,7 +285,7 @@ def plan(
                 " aircraft, or take the rig of one"
             )
         name = options.vehicle or load_rig(options.rig).vehicle
-        travel = plan_travel(
+        travel = plan_road_drive(
             scene,
             route,
             vehicle=name,

@@ -30,7 +30,7 @@ class DriveOptions:
                  is under way when the record starts and when it ends
     survey     : area that a craft flies over in strips instead of a route: ``all``, W,S,E,N in degrees, or a
                  GeoJSON file
-    altitude   : metres above the ground of a flight, see `lidar.planning.aerial.plan_flight`
+    altitude   : metres above the ground of a flight, see `lidar.planning.flight_planning.plan_flight`
     overlap    : share of a survey's strip that the next one covers too
     turns      : scanners work in the turns between a survey's strips too, and on the way there
     rig        : name of a rig, or a TOML file

@@ -152,7 +152,7 @@ def turns_at(line: Line, rows: NDArray[np.int64]) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def turn_round(pose: Pose, line: Line, *, setting: Setting) -> list[Track]:
+def turning_manoeuvre(pose: Pose, line: Line, *, setting: Setting) -> list[Track]:
     """Arcs, forwards and backwards in turn, after which the vehicle points the other way: 3, 5, 7 or 9.
 
     Raises BlockedError if the body touches an obstacle whatever their number.

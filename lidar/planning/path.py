@@ -23,7 +23,7 @@ from geoscene import polylines
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import BlockedError, RouteError
-from lidar.planning.clearance import ASIDE, Line, Setting, pushes, turn_round, turns_at
+from lidar.planning.clearance import ASIDE, Line, Setting, pushes, turning_manoeuvre, turns_at
 from lidar.planning.route import Route
 from lidar.planning.steering import Pose, Track, follow, relaxed
 from lidar.rig.vehicle import Vehicle
@@ -130,7 +130,7 @@ def plan_path(
             part = _shortened(part, vehicle)
         tracks = [_clear_track(part, setting, pose=pose)]
         if turns_back:
-            tracks += turn_round(tracks[-1].end, part, setting=setting)
+            tracks += turning_manoeuvre(tracks[-1].end, part, setting=setting)
         pose = tracks[-1].end
         legs += tracks
         lines += [part] * len(tracks)

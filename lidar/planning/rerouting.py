@@ -20,7 +20,7 @@ DETOURS = 40
 """Times that another way is looked for."""
 
 
-def plan_drive(
+def plan_route_and_path(
     graph: RoadGraph,
     frame: Frame,
     *,

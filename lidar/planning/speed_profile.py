@@ -42,24 +42,24 @@ class _Knots:
     dt: float
 
 
-def motion_behind(
+def motion_within(
     path: Path,
     vehicle: Vehicle,
     *,
     time_s: Float,
-    reach: Float,
+    max_distance: Float,
     rate_hz: float = 100.0,
     under_way: bool = False,
 ) -> Motion:
     """The motion along a path that never passes the distances allowed, from rest to rest.
 
     time_s    : (k,) rising seconds from 0
-    reach     : (k,) metres along the path that may be reached by then; never falling
+    max_distance : (k,) metres along the path that may be reached by then; never falling
     under_way : it is as fast at first as it may be, and need not rest when the times end
 
     It ends with the last of the times, or at the end of the path. Raises InputError for distances that fall.
     """
-    if len(time_s) < 2 or (np.diff(reach) < -1e-9).any():
+    if len(time_s) < 2 or (np.diff(max_distance) < -1e-9).any():
         raise InputError("the distances that a motion must stay behind must not fall")
     limit = speed_limits(path, vehicle)
     parts: list[tuple[Float, Float, NDArray[np.int32]]] = []
@@ -68,7 +68,7 @@ def motion_behind(
         if parts and total - begin < 2 * STEP_S:
             break
         origin, end = float(path.s[first]), float(path.s[last - 1])
-        allowed = np.clip(reach, origin, end) - origin
+        allowed = np.clip(max_distance, origin, end) - origin
         there = np.flatnonzero(allowed >= end - origin - 1e-6)
         needed = _TAIL_S + 1.5 * float((np.diff(path.s[first:last]) / limit[first : last - 1]).sum())
         until = max(float(time_s[there[0]]) - begin, 0.0) + needed if len(there) else math.inf
@@ -98,7 +98,7 @@ def motion_behind(
     return Motion(time_ns, s, v, np.gradient(v, dt), row)
 
 
-def wished_speed(path: Path, vehicle: Vehicle) -> Float:
+def desired_speed(path: Path, vehicle: Vehicle) -> Float:
     """Speed (n,) in m/s that suits a path: limits, braked for in time, and rest at the end of each leg."""
     limit = speed_limits(path, vehicle)
     out = np.empty(len(limit))

@@ -10,7 +10,7 @@ from geoscene.typing import Float
 from lidar.geometry.poses import Trajectory
 from lidar.planning.motion import drive_path, poses_along
 from lidar.planning.path import Path
-from lidar.planning.speed_profile import motion_behind
+from lidar.planning.speed_profile import motion_within
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import JunctionPlan, junction_plan
@@ -125,8 +125,8 @@ def _driven(
     trip = ego_trip(path, vehicle, under_way=under_way)
     gone = simulate_ego(trip, trips, graph=graph, plan=plan, seconds=seconds, radius=radius)
     time_s: Float = STEP_S * np.arange(len(gone), dtype=float)
-    motion = motion_behind(
-        path, vehicle, time_s=time_s, reach=gone.clip(max=path.length), under_way=under_way
+    motion = motion_within(
+        path, vehicle, time_s=time_s, max_distance=gone.clip(max=path.length), under_way=under_way
     )
     trajectory = poses_along(path, vehicle, motion=motion)
     return trajectory if duration is None else trajectory.until(round(duration * 1e9))

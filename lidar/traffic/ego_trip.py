@@ -9,7 +9,7 @@ import numpy as np
 
 from geoscene.typing import Float
 from lidar.planning.path import Path
-from lidar.planning.speed_profile import wished_speed
+from lidar.planning.speed_profile import desired_speed
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.lanes import STEP, ActorPath
 from lidar.traffic.trips import Driver
@@ -68,9 +68,7 @@ def ego_trip(path: Path, vehicle: Vehicle, *, under_way: bool = False) -> EgoTri
     )
     deceleration, acceleration = _BRAKE * vehicle.deceleration, _PULL * vehicle.acceleration
     driver = Driver(vehicle.turning_radius, vehicle.max_speed, _HEADWAY_S, acceleration, deceleration, _GAP)
-    desired_speed = np.interp(at, s, wished_speed(path, vehicle))
+    desired = np.interp(at, s, desired_speed(path, vehicle))
     if not under_way:
-        desired_speed = np.minimum(desired_speed, np.sqrt(2 * acceleration * (at + 0.2)))
-    return EgoTrip(
-        way, driver, desired_speed, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading
-    )
+        desired = np.minimum(desired, np.sqrt(2 * acceleration * (at + 0.2)))
+    return EgoTrip(way, driver, desired, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading)

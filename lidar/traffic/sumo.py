@@ -31,7 +31,7 @@ from lidar.errors import LidarError, RouteError
 from lidar.geometry.poses import Trajectory
 from lidar.planning.motion import poses_along
 from lidar.planning.path import Path as VehiclePath
-from lidar.planning.speed_profile import motion_behind
+from lidar.planning.speed_profile import motion_within
 from lidar.random_streams import generator
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.fcd import Fcd, network_projection, read_fcd
@@ -120,7 +120,9 @@ def drive_in_sumo(
         fcd = read_fcd(folder / "fcd.xml", net=net)
     time_s, allowed = _ego_progress(fcd, scene, path=path, vehicle=vehicle)
     until = len(time_s) if duration is None else int(np.searchsorted(time_s, seconds)) + 1
-    motion = motion_behind(path, vehicle, time_s=time_s[:until], reach=allowed[:until], under_way=under_way)
+    motion = motion_within(
+        path, vehicle, time_s=time_s[:until], max_distance=allowed[:until], under_way=under_way
+    )
     ego = poses_along(path, vehicle, motion=motion)
     if duration is not None:
         ego = ego.until(round(duration * 1e9))

@@ -31,7 +31,7 @@ from lidar.drive import drive
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.geometry.attitude import quat_from_euler
 from lidar.options import DriveOptions
-from lidar.planning.travel import plan_travel
+from lidar.planning.road_drive import plan_road_drive
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.populate import TrafficOptions
@@ -273,7 +273,9 @@ def test_a_random_drive_is_under_way_from_first_to_last_unless_it_is_to_be_from_
         options = replace(OPTIONS, duration=3.0, seed=seed)
         speeds = {}
         for from_rest in (False, True):
-            travel = plan_travel(scene, "random", vehicle="car", seed=seed, duration=3.0, from_rest=from_rest)
+            travel = plan_road_drive(
+                scene, "random", vehicle="car", seed=seed, duration=3.0, from_rest=from_rest
+            )
             trajectory = drive_with_signals(
                 travel.path, load_vehicle("car"), graph=scene.road_graph(), seed=seed, bounds=scene.bounds,
                 duration=3.0, under_way=travel.under_way,

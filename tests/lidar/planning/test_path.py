@@ -14,7 +14,7 @@ from lidar.errors import BlockedError, RouteError
 from lidar.geometry.attitude import matrix_from_quat, quat_from_euler
 from lidar.planning.clearance import body_outlines
 from lidar.planning.path import plan_path
-from lidar.planning.rerouting import plan_drive
+from lidar.planning.rerouting import plan_route_and_path
 from lidar.planning.route import free_route, lane_route, plan_route
 from lidar.rig.vehicle import load_vehicle
 
@@ -138,13 +138,13 @@ def test_where_it_does_not_fit_another_way_is_found():
     graph = grid(3, 2)
     across = shapely.box(120, -10, 180, 10)  # a market hall across the southern street
     lat_lon = [FRAME.to_geographic(x, y)[::-1] for x, y in [(50, 0), (200, 50)]]
-    direct, _ = plan_drive(graph, FRAME, spec=lat_lon, vehicle=CAR)
+    direct, _ = plan_route_and_path(graph, FRAME, spec=lat_lon, vehicle=CAR)
     assert direct.line[:, 1].max() < 60.0
-    route, path = plan_drive(graph, FRAME, spec=lat_lon, vehicle=CAR, obstacles=[across])
+    route, path = plan_route_and_path(graph, FRAME, spec=lat_lon, vehicle=CAR, obstacles=[across])
     assert route.line[:, 1].max() > 90.0
     assert not shapely.intersects(outlines(path), across).any()
     with pytest.raises(BlockedError, match="does not pass"):
-        plan_drive(
+        plan_route_and_path(
             graph, FRAME, spec=lat_lon, vehicle=CAR, obstacles=[across, shapely.box(120, 90, 180, 110)]
         )
 
@@ -276,7 +276,7 @@ def test_in_a_real_city_the_body_touches_no_building(shared_osm, name):
     shapes = [a.geometry for a in osm.areas if a.tags.get("building", "no") not in ("no", "roof")]
     houses = shapely.STRtree(shapely.transform(np.array(shapes, object), project))
     for seed in range(2):
-        route, path = plan_drive(
+        route, path = plan_route_and_path(
             graph, frame, spec="random", vehicle=CAR, seed=seed, duration=240.0, obstacles=houses
         )
         assert_drivable(path, CAR)

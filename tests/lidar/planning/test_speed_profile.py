@@ -9,7 +9,7 @@ from lidar.errors import InputError
 from lidar.planning.motion import motion_along, poses_along, speed_limits
 from lidar.planning.path import plan_path
 from lidar.planning.route import Route
-from lidar.planning.speed_profile import motion_behind
+from lidar.planning.speed_profile import motion_within
 from lidar.rig.vehicle import load_vehicle
 
 CAR = load_vehicle("car")
@@ -54,7 +54,7 @@ def test_whatever_it_is_held_up_by_the_drive_is_gentle_and_stays_behind(stops):
     for place, until in stops:
         reach = np.minimum(reach, np.where(time_s < until, place, np.inf))
     reach = np.maximum.accumulate(np.minimum(reach, PATH.length))
-    motion = motion_behind(PATH, CAR, time_s=time_s, reach=reach)
+    motion = motion_within(PATH, CAR, time_s=time_s, max_distance=reach)
     at = motion.time_ns * 1e-9
     assert (motion.s <= np.interp(at, time_s, reach) + 1e-6).all()
     assert (np.diff(motion.s) >= -1e-9).all()
@@ -72,14 +72,14 @@ def test_whatever_it_is_held_up_by_the_drive_is_gentle_and_stays_behind(stops):
 def test_who_is_not_held_up_is_about_as_fast_as_on_an_empty_road():
     free = motion_along(PATH, CAR)
     time_s = np.arange(0.0, 120.0, 0.1)
-    motion = motion_behind(PATH, CAR, time_s=time_s, reach=np.where(time_s > 0, PATH.length, 0.0))
+    motion = motion_within(PATH, CAR, time_s=time_s, max_distance=np.where(time_s > 0, PATH.length, 0.0))
     assert motion.time_ns[-1] < 1.05 * free.time_ns[-1]
 
 
 def test_what_is_sampled_is_one_motion():
     """Speed is the rate of distance, and the poses' velocity that of their positions."""
     time_s = np.arange(0.0, 60.0, 0.1)
-    motion = motion_behind(PATH, CAR, time_s=time_s, reach=np.clip(6.0 * (time_s - 2.0), 0.0, 120.0))
+    motion = motion_within(PATH, CAR, time_s=time_s, max_distance=np.clip(6.0 * (time_s - 2.0), 0.0, 120.0))
     np.testing.assert_allclose(np.gradient(motion.s, 0.01)[2:-2], motion.speed[2:-2], atol=2e-3)
     there = poses_along(PATH, CAR, motion=motion)
     np.testing.assert_allclose(
@@ -89,7 +89,7 @@ def test_what_is_sampled_is_one_motion():
 
 def test_distances_that_fall_are_refused():
     with pytest.raises(InputError, match="must not fall"):
-        motion_behind(PATH, CAR, time_s=np.array([0.0, 1.0, 2.0]), reach=np.array([0.0, 5.0, 4.0]))
+        motion_within(PATH, CAR, time_s=np.array([0.0, 1.0, 2.0]), max_distance=np.array([0.0, 5.0, 4.0]))
 
 
 @settings(max_examples=10, deadline=None)
@@ -101,7 +101,7 @@ def test_what_is_under_way_starts_and_ends_at_speed_and_stays_behind_too(stops):
     for place, until in stops:
         reach = np.minimum(reach, np.where(time_s < until, place, np.inf))
     reach = np.maximum.accumulate(reach)
-    motion = motion_behind(PATH, CAR, time_s=time_s, reach=reach, under_way=True)
+    motion = motion_within(PATH, CAR, time_s=time_s, max_distance=reach, under_way=True)
     at = motion.time_ns * 1e-9
     assert (motion.s <= np.interp(at, time_s, reach) + 0.1).all()
     assert (np.diff(motion.s) >= -1e-9).all()

@@ -16,7 +16,7 @@ from lidar.camera.render import RenderOptions, render
 from lidar.dataset.boxes import COLUMNS, box_rows, count_points, image_boxes
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
-from lidar.planning.travel import plan_travel
+from lidar.planning.road_drive import plan_road_drive
 from lidar.rig.scanner import load_sensor
 from lidar.rig.specs import CameraSpec
 from lidar.rig.vehicle import load_vehicle
@@ -41,7 +41,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def ego(scene):
-    travel = plan_travel(scene, "random", vehicle="car", seed=2, duration=15.0)
+    travel = plan_road_drive(scene, "random", vehicle="car", seed=2, duration=15.0)
     return drive_with_signals(
         travel.path, load_vehicle("car"), graph=scene.road_graph(), seed=2, bounds=scene.bounds,
         duration=15.0, under_way=travel.under_way,

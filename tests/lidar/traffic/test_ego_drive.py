@@ -11,7 +11,7 @@ from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks
 from lidar.planning.motion import drive_path, poses_along
 from lidar.planning.path import plan_path
 from lidar.planning.route import plan_route
-from lidar.planning.speed_profile import motion_behind
+from lidar.planning.speed_profile import motion_within
 from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
@@ -113,8 +113,8 @@ def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
     ]
     plan = junction_plan(graph, lanes, seed=1)
     gone = simulate_ego(ego_trip(path, CAR), slow, graph=graph, plan=plan, seconds=60.0, radius=600.0)
-    motion = motion_behind(
-        path, CAR, time_s=np.arange(len(gone)) * STEP_S, reach=np.minimum(gone, path.length)
+    motion = motion_within(
+        path, CAR, time_s=np.arange(len(gone)) * STEP_S, max_distance=np.minimum(gone, path.length)
     )
     ego = poses_along(path, CAR, motion=motion)
     flow = simulate_trips(slow, graph, plan=plan, ego=ego, ego_box=BOX, radius=600.0, obeys_signals=True)
@@ -141,8 +141,8 @@ def test_among_traffic_the_ego_touches_nobody_and_nobody_is_taken_out_for_it(see
         lanes, surroundings_of(lanes, alone, radius=300.0, scale=1.0), seed=seed, density=20.0
     )
     gone = simulate_ego(ego_trip(path, CAR), trips, graph=graph, plan=plan, seconds=60.0, radius=300.0)
-    motion = motion_behind(
-        path, CAR, time_s=np.arange(len(gone)) * STEP_S, reach=np.minimum(gone, path.length)
+    motion = motion_within(
+        path, CAR, time_s=np.arange(len(gone)) * STEP_S, max_distance=np.minimum(gone, path.length)
     )
     ego = poses_along(path, CAR, motion=motion)
     check_gentle(ego)

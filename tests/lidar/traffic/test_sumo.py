@@ -12,7 +12,7 @@ from geoscene.sources import demo_path, read_osm
 from lidar.cli import app
 from lidar.errors import InputError
 from lidar.planning.motion import drive_path
-from lidar.planning.travel import plan_travel
+from lidar.planning.road_drive import plan_road_drive
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.sumo import SumoOptions, drive_in_sumo
 from lidar.traffic.sweep import rectangles
@@ -32,7 +32,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def path(scene):
-    return plan_travel(scene, "random", vehicle="car", seed=2, duration=SECONDS).path
+    return plan_road_drive(scene, "random", vehicle="car", seed=2, duration=SECONDS).path
 
 
 def simulated(scene, path, seed=2):

@@ -19,8 +19,8 @@ from lidar.geometry.poses import Trajectory
 from lidar.planning.flight import Flight, survey_flight, survey_lines, times_on_lines, waypoint_flight
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
+from lidar.planning.road_drive import ROUTE_MARGIN_S, graph_on_tiles
 from lidar.planning.route import Route, Spec, plan_route
-from lidar.planning.travel import AHEAD_S, covered
 from lidar.planning.waypoints import read_track
 from lidar.rig.camera_model import unproject
 from lidar.rig.devices import Camera, Scanner
@@ -169,8 +169,8 @@ def _along(
                 f"a craft that turns within {vehicle.turning_radius:.0f} m cannot follow streets; give"
                 " `survey` all, `survey` FILE or waypoints"
             )
-        length = vehicle.max_speed * ((60.0 if duration is None else duration) + AHEAD_S)
-        graph = covered(scene.road_graph(), scene)
+        length = vehicle.max_speed * ((60.0 if duration is None else duration) + ROUTE_MARGIN_S)
+        graph = graph_on_tiles(scene.road_graph(), scene)
         line = plan_route(graph, scene.frame, spec="random", seed=seed, length=length).line
         xyz, given = np.array(line), False
     elif isinstance(spec, str | Path):

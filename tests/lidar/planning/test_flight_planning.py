@@ -22,7 +22,7 @@ from lidar.drive import drive, plan
 from lidar.errors import InputError, RouteError
 from lidar.geometry.trajectory_csv import read_trajectory
 from lidar.options import DriveOptions
-from lidar.planning.aerial import survey_area, swath
+from lidar.planning.flight_planning import survey_area, swath
 from lidar.planning.replay import read_replay
 from lidar.rig.devices import cameras, scanners
 from lidar.rig.specs import load_rig

@@ -15,13 +15,13 @@ from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.errors import RouteError
 from lidar.planning.path import Path, Surface
-from lidar.planning.rerouting import plan_drive
+from lidar.planning.rerouting import plan_route_and_path
 from lidar.planning.route import Route, Spec
 from lidar.rig.vehicle import load_vehicle
 from lidar.world.world import World
 
 _RANDOM_SECONDS = 60.0
-AHEAD_S = 15.0
+ROUTE_MARGIN_S = 15.0
 """Seconds at the speed limits by which the route of a drive that is under way is longer than its record.
 
 A car can pull up in them from any speed that streets allow."""
@@ -32,7 +32,7 @@ _DRIVEN = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD or c =
 
 
 @dataclass(frozen=True, slots=True)
-class Travel:
+class RoadPlan:
     """A planned drive on roads.
 
     route, path : the path's edges are those of the whole road graph
@@ -46,7 +46,7 @@ class Travel:
     under_way: bool = False
 
 
-def covered(graph: RoadGraph, scene: Scene) -> RoadGraph:
+def graph_on_tiles(graph: RoadGraph, scene: Scene) -> RoadGraph:
     """The part of a road graph that lies on the scene's tiles; raises as `edges_on_tiles` does."""
     kept = edges_on_tiles(graph, scene)
     return graph if kept.all() else graph.take(kept)
@@ -76,7 +76,7 @@ def edges_on_tiles(graph: RoadGraph, scene: Scene) -> NDArray[np.bool_]:
     return on_tiles
 
 
-def standing_footprints(scene: Scene) -> NDArray[np.object_]:
+def ground_footprints(scene: Scene) -> NDArray[np.object_]:
     """Footprints, scene metres, of buildings that reach down to the ground."""
     if "buildings" not in scene.layers or len(set(scene.layers["buildings"])) == 1:
         return np.empty(0, object)
@@ -106,7 +106,7 @@ def road_surface(scene: Scene) -> Surface:
     return surface
 
 
-def plan_travel(
+def plan_road_drive(
     scene: Scene,
     spec: Spec,
     *,
@@ -116,7 +116,7 @@ def plan_travel(
     side: str = "right",
     from_rest: bool = False,
     progress: Progress = silent,
-) -> Travel:
+) -> RoadPlan:
     """The route and the path of a vehicle through a scene.
 
     from_rest : whether a random drive too goes from rest to rest; else it is under way at both ends, along
@@ -129,20 +129,20 @@ def plan_travel(
     kept = edges_on_tiles(whole, scene)
     graph = whole if kept.all() else whole.take(kept)
     body = load_vehicle(vehicle)
-    obstacles = standing_footprints(scene)
+    obstacles = ground_footprints(scene)
     progress("planning", 0, total=0)
     seconds = duration if duration is not None or spec != "random" else _RANDOM_SECONDS
     under_way = spec == "random" and not from_rest
-    route, path = plan_drive(
+    route, path = plan_route_and_path(
         graph,
         scene.frame,
         spec=spec,
         vehicle=body,
         seed=seed,
-        duration=None if seconds is None else seconds + (AHEAD_S if under_way else 0.0),
+        duration=None if seconds is None else seconds + (ROUTE_MARGIN_S if under_way else 0.0),
         side=cast("Literal['left', 'right']", side),
         obstacles=obstacles,
         ground=road_surface(scene),
     )
     path = replace(path, edge=np.where(path.edge >= 0, np.flatnonzero(kept)[path.edge], -1).astype(np.int32))
-    return Travel(route, path, seconds, under_way)
+    return RoadPlan(route, path, seconds, under_way)
