@@ -117,7 +117,12 @@ def _apply_to_dataset(
         contents=contents,
         watch=Stopwatch(),
     )
-    jobs = [(s, frame) for s in sensors if recording.has_stages(s) for frame in dataset.sample_times(s.name)]
+    jobs = [
+        (s, frame)
+        for s in sensors
+        if recording.has_stages(s)
+        for frame in range(len(dataset.sample_times(s.name)))
+    ]
     form = _richest_format(contents) if any(isinstance(s, Scanner) for s, _ in jobs) else None
     written = {path for job in jobs for path in recording.paths(*job).values()}
     if Paths(out).manifest.exists():  # a former dataset, to be replaced
