@@ -27,10 +27,14 @@ STEP = 100.0
 
 
 def _route(scene_path: Path, km: float, queue: multiprocessing.Queue[NDArray[np.float64]]) -> None:
-    from lidar.planning.route import plan_route  # noqa: PLC0415
+    from lidar.planning.route import RouteOptions, plan_route  # noqa: PLC0415
 
     scene = open_scene(scene_path)
-    queue.put(plan_route(scene.road_graph(), scene.frame, spec="random", seed=1, length=1000 * km).line)
+    queue.put(
+        plan_route(
+            scene.road_graph(), scene.frame, spec="random", options=RouteOptions(seed=1, length=1000 * km)
+        ).line
+    )
 
 
 def resident() -> float:

@@ -20,7 +20,7 @@ from lidar.planning.flight import Flight, survey_flight, survey_lines, times_on_
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
 from lidar.planning.road_drive import ROUTE_MARGIN_S, graph_on_tiles
-from lidar.planning.route import Route, Spec, plan_route
+from lidar.planning.route import Route, RouteOptions, Spec, plan_route
 from lidar.planning.waypoints import read_track
 from lidar.rig.camera_model import unproject
 from lidar.rig.devices import Camera, Scanner
@@ -171,7 +171,9 @@ def _along(
             )
         length = vehicle.max_speed * ((60.0 if duration is None else duration) + ROUTE_MARGIN_S)
         graph = graph_on_tiles(scene.road_graph(), scene)
-        line = plan_route(graph, scene.frame, spec="random", seed=seed, length=length).line
+        line = plan_route(
+            graph, scene.frame, spec="random", options=RouteOptions(seed=seed, length=length)
+        ).line
         xyz, given = np.array(line), False
     elif isinstance(spec, str | Path):
         track = read_track(Path(spec), scene.frame)

@@ -1,8 +1,9 @@
-"""A route and the path along it, found together: where the vehicle does not fit, it goes another way."""
+"""Planning of a route and its path together: streets and turns that the vehicle cannot pass are avoided."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,11 @@ from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from lidar.errors import BlockedError, RouteError
 from lidar.planning.path import MARGIN, Path, Surface, plan_path
-from lidar.planning.route import TOLERANCE, Route, Side, Spec, plan_route
+from lidar.planning.route import Route, RouteOptions, Spec, plan_route
 from lidar.rig.vehicle import Vehicle
 
 DETOURS = 40
-"""Times that another way is looked for."""
+"""Maximum number of plans."""
 
 
 def plan_route_and_path(
@@ -26,42 +27,26 @@ def plan_route_and_path(
     *,
     spec: Spec,
     vehicle: Vehicle,
-    seed: int = 0,
-    duration: float | None = None,
-    length: float | None = None,
-    side: Side = "right",
-    tolerance: float = TOLERANCE,
-    as_is: bool = False,
+    options: RouteOptions | None = None,
     obstacles: Sequence[Any] | NDArray[np.object_] | shapely.STRtree | None = None,
     ground: Surface | None = None,
     margin: float = MARGIN,
 ) -> tuple[Route, Path]:
-    """A route and the path along it on which the vehicle touches no obstacle; arguments as for both.
+    """A route and a path along it on which the vehicle touches no obstacle.
 
-    Where the body does not pass, the streets or turns in question are avoided and the route is planned again:
-    a random one goes elsewhere, one through waypoints takes a detour.
+    Parameters are those of `plan_route` and `lidar.planning.path.plan_path`; ``body_width`` is the vehicle's.
+    Where the body does not pass, the route is planned again without that street or turn.
 
-    Raises RouteError as `plan_route` does, and BlockedError if no detour is left.
+    Raises RouteError as `plan_route` does, and BlockedError if every route is blocked.
     """
+    options = replace(options or RouteOptions(), body_width=vehicle.width)
     if not isinstance(obstacles, shapely.STRtree):
         obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))
     avoid: set[tuple[int, int]] = set()
     blocked: BlockedError
     for _ in range(DETOURS):
         try:
-            route = plan_route(
-                graph,
-                frame,
-                spec=spec,
-                seed=seed,
-                duration=duration,
-                length=length,
-                side=side,
-                body_width=vehicle.width,
-                tolerance=tolerance,
-                as_is=as_is,
-                avoid=avoid,
-            )
+            route = plan_route(graph, frame, spec=spec, options=options, avoid=avoid)
         except RouteError:
             if avoid:
                 break
@@ -73,8 +58,8 @@ def plan_route_and_path(
         except BlockedError as error:
             blocked = error
             fresh = set(error.turns) - avoid
-            # a turn that is avoided already and still in the way is the street's own fault
+            # a turn that is avoided already and still blocked means that its street is blocked
             avoid |= fresh or {(b, b) for _, b in error.turns}
-            if as_is:
+            if options.as_is:
                 break
     raise blocked

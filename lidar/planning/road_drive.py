@@ -1,9 +1,9 @@
-"""From a scene and a route's description to the vehicle's trajectory."""
+"""Plans of drives on roads: from a scene and the description of a route to a path."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,16 @@ from geoscene.typing import Float
 from lidar.errors import RouteError
 from lidar.planning.path import Path, Surface
 from lidar.planning.rerouting import plan_route_and_path
-from lidar.planning.route import Route, Spec
+from lidar.planning.route import Route, RouteOptions, Side, Spec
 from lidar.rig.vehicle import load_vehicle
 from lidar.world.world import World
 
 _RANDOM_SECONDS = 60.0
 ROUTE_MARGIN_S = 15.0
-"""Seconds at the speed limits by which the route of a drive that is under way is longer than its record.
+"""Seconds at the speed limits by which the route of a drive that starts and ends at speed exceeds its record.
 
-A car can pull up in them from any speed that streets allow."""
-_ABOVE = (
-    1.5  # metres over the graph's height from which the surface under the wheels is looked for, and below it
-)
+It covers the braking distance at any speed that streets allow."""
+_SEARCH_M = 1.5  # metres above and below the road graph within which the road surface is searched
 _DRIVEN = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD or c == Class.BRIDGE]
 
 
@@ -35,9 +33,9 @@ _DRIVEN = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD or c =
 class RoadPlan:
     """A planned drive on roads.
 
-    route, path : the path's edges are those of the whole road graph
-    duration   : seconds that were asked for, if any were
-    under_way  : whether it is at speed when it starts, and drives on when it ends
+    path      : along the route; its edges are those of the whole road graph
+    duration  : seconds to record, None for the whole route
+    under_way : whether the vehicle is at speed at the start and at the end of the record
     """
 
     route: Route
@@ -47,16 +45,13 @@ class RoadPlan:
 
 
 def graph_on_tiles(graph: RoadGraph, scene: Scene) -> RoadGraph:
-    """The part of a road graph that lies on the scene's tiles; raises as `edges_on_tiles` does."""
+    """The part of a road graph on the scene's tiles; raises RouteError if it is empty."""
     kept = edges_on_tiles(graph, scene)
     return graph if kept.all() else graph.take(kept)
 
 
 def edges_on_tiles(graph: RoadGraph, scene: Scene) -> NDArray[np.bool_]:
-    """Which edges (m,) of a road graph lie on the scene's tiles.
-
-    Raises RouteError if none does.
-    """
+    """Whether (m,) each edge of a road graph lies on the scene's tiles; raises RouteError if none does."""
     xmin, ymin, xmax, ymax = scene.bounds
     size = scene.tile_size
     tiles = np.array(scene.tile_indices).reshape(-1, 2)
@@ -77,7 +72,7 @@ def edges_on_tiles(graph: RoadGraph, scene: Scene) -> NDArray[np.bool_]:
 
 
 def ground_footprints(scene: Scene) -> NDArray[np.object_]:
-    """Footprints, scene metres, of buildings that reach down to the ground."""
+    """Footprints (k,) in scene metres of buildings without a passage below."""
     if "buildings" not in scene.layers or len(set(scene.layers["buildings"])) == 1:
         return np.empty(0, object)
     layer = scene.features("buildings")
@@ -87,7 +82,7 @@ def ground_footprints(scene: Scene) -> NDArray[np.object_]:
 
 
 def road_surface(scene: Scene) -> Surface:
-    """The surface of ground and bridges, as rays see it, near given heights; those where there is none."""
+    """Heights of the ground or bridge surface near given heights; the given ones where there is none."""
     world: World | None = None
 
     def surface(x: Float, y: Float, z: Float) -> Float:  # noqa: PLR0917 - a Surface
@@ -97,10 +92,10 @@ def road_surface(scene: Scene) -> Surface:
             world = World.load(scene, region=region)
         else:
             world.follow(region)
-        origins = np.column_stack([x, y, z + _ABOVE])
-        hits = world.caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape), far=2 * _ABOVE)
-        on_it = np.isfinite(hits.range) & np.isin(world.lookup(hits).klass, _DRIVEN)
-        found: Float = np.where(on_it, z + _ABOVE - np.where(on_it, hits.range, 0.0), z)
+        origins = np.column_stack([x, y, z + _SEARCH_M])
+        hits = world.caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape), far=2 * _SEARCH_M)
+        on_road = np.isfinite(hits.range) & np.isin(world.lookup(hits).klass, _DRIVEN)
+        found: Float = np.where(on_road, z + _SEARCH_M - np.where(on_road, hits.range, 0.0), z)
         return found
 
     return surface
@@ -119,11 +114,11 @@ def plan_road_drive(
 ) -> RoadPlan:
     """The route and the path of a vehicle through a scene.
 
-    from_rest : whether a random drive too goes from rest to rest; else it is under way at both ends, along
-                a route that is longer than the record
+    duration  : seconds to record; the whole route, or 60 s of a random one, by default
+    from_rest : start and end a random drive at rest; by default its route is longer than the record and the
+                vehicle is at speed at both ends
 
-    Where a street is too narrow for the vehicle between its buildings, it is left out and the route planned
-    again. Raises RouteError if no way is left.
+    Streets too narrow for the vehicle are avoided. Raises RouteError if there is no route.
     """
     whole = scene.road_graph()
     kept = edges_on_tiles(whole, scene)
@@ -138,9 +133,11 @@ def plan_road_drive(
         scene.frame,
         spec=spec,
         vehicle=body,
-        seed=seed,
-        duration=None if seconds is None else seconds + (ROUTE_MARGIN_S if under_way else 0.0),
-        side=cast("Literal['left', 'right']", side),
+        options=RouteOptions(
+            seed=seed,
+            duration=None if seconds is None else seconds + (ROUTE_MARGIN_S if under_way else 0.0),
+            side=cast("Side", side),
+        ),
         obstacles=obstacles,
         ground=road_surface(scene),
     )

@@ -1,4 +1,4 @@
-"""Routes: which streets a vehicle takes, and the middle of the lane it keeps to on them."""
+"""Routes: the streets that a vehicle takes, and the lane centre line along them."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Side = Literal["right", "left"]
 Spec = str | Path | Sequence[tuple[float, float]]
 
 TOLERANCE = 50.0
-"""Metres within which a waypoint must lie of a drivable street."""
+"""Maximum distance in metres of a waypoint from a drivable street."""
 HEADING_REACH = 5.0
 """Scene metres over which the heading of a street at a junction is taken."""
 U_TURN_S = 30.0
-"""Seconds that turning round at a dead end costs in the search for the fastest way."""
+"""Cost in seconds of a U-turn at a dead end in the search for the fastest route."""
 U_TURN = np.radians(150.0)
-"""Change of direction at a node from which on the vehicle must turn round, in radians."""
-_SET_OUT = 0.25  # share of its first street that a random route leaves out
+"""Smallest change of direction at a node, in radians, that needs a U-turn."""
+_SET_OUT = 0.25  # share of its first street at which a random route starts
 _STEP = 0.3  # metres between the lanes of two streets from which on a change of lane is drawn out
 _STRAIGHT = 0.5  # cosine of the turn up to which a junction is gone straight over
 _KEEP = 0.2  # metres between the body and the kerb where the carriageway is narrow
@@ -39,14 +39,14 @@ _KEEP = 0.2  # metres between the body and the kerb where the carriageway is nar
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """A way to drive.
+    """A lane-level route over the road graph, or a free line.
 
-    line  : (n, 3) float64 scene metres: the middle of the lane, in driving direction
+    line  : (n, 3) float64 scene metres, lane centre in driving direction
     edge  : (n,) int32 edge of the road graph under each point, -1 off the graph
     limit : (n,) m/s, speed limit from each point on
-    free  : (n,) bool, on a bridge or in a tunnel: buildings and the ground's height do not matter there
+    free  : (n,) bool, on a bridge or in a tunnel: buildings and ground are not checked there
     turns : (t,) int64 rows of `line` after which the vehicle turns round
-    edges : (k,) int32 edges in the order driven
+    edges : (k,) int32 edges in driving order
     side  : side of the street that is driven on
     """
 
@@ -64,43 +64,53 @@ class Route:
         return polylines.length(self.line)
 
 
+@dataclass(frozen=True, slots=True)
+class RouteOptions:
+    """How a route is planned.
+
+    seed       : of a random route
+    duration   : seconds of a random route at the speed limits; 600 if neither this nor `length` is given
+    length     : true metres of a random route
+    side       : side of two-way streets that is driven on
+    body_width : metres; the body stays inside narrow carriageways
+    tolerance  : maximum distance in metres of waypoints and tracks from a drivable street
+    as_is      : take a file's track as the route's line instead of matching it to streets
+    """
+
+    seed: int = 0
+    duration: float | None = None
+    length: float | None = None
+    side: Side = "right"
+    body_width: float = 1.82
+    tolerance: float = TOLERANCE
+    as_is: bool = False
+
+
 def plan_route(
     graph: RoadGraph,
     frame: Frame,
     *,
     spec: Spec,
-    seed: int = 0,
-    duration: float | None = None,
-    length: float | None = None,
-    side: Side = "right",
-    body_width: float = 1.82,
-    tolerance: float = TOLERANCE,
-    as_is: bool = False,
+    options: RouteOptions | None = None,
     avoid: Collection[tuple[int, int]] = (),
 ) -> Route:
     """A route over the road graph.
 
-    spec       : ``random``, a GPX or GeoJSON file, or two or more waypoints (latitude, longitude) in degrees
-    seed       : of a random route
-    duration   : seconds that a random route takes at least at the speed limits; with neither this nor
-                 `length`, 600
-    length     : true metres of a random route
-    side       : side of two-way streets that is driven on
-    body_width : metres of the vehicle, which keeps it inside narrow carriageways
-    tolerance  : metres within which waypoints and tracks must lie of a drivable street
-    as_is      : drive a file's track as it is, off the graph, instead of along the streets it follows
-    avoid      : turns (edge, edge) not to take; (edge, edge) of one edge twice closes it
+    spec  : ``random``, a GPX or GeoJSON file, or two or more waypoints (latitude, longitude) in degrees
+    avoid : turns (edge, edge) not to take; (edge, edge) of one edge twice closes it
 
     Raises RouteError for a waypoint off the streets, one that cannot be reached, an unreadable file, or a
     graph without streets.
     """
+    options = options or RouteOptions()
+    side, body_width, tolerance = options.side, options.body_width, options.tolerance
     if spec == "random":
         _need_streets(graph)
-        target = np.inf if length is None else length
-        seconds = np.inf if duration is None else duration
-        if length is None and duration is None:
+        metres = np.inf if options.length is None else options.length
+        seconds = np.inf if options.duration is None else options.duration
+        if options.length is None and options.duration is None:
             seconds = 600.0
-        edges = random_edges(graph, seed=seed, seconds=seconds, metres=target, avoid=avoid)
+        edges = random_edges(graph, seed=options.seed, seconds=seconds, metres=metres, avoid=avoid)
         ends = (_SET_OUT * float(graph.length[edges[0]]), 0.75 * float(graph.length[edges[-1]]))
         return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
 
@@ -108,7 +118,7 @@ def plan_route(
 
     if isinstance(spec, str | Path):
         track = read_track(Path(spec), frame)
-        if as_is:
+        if options.as_is:
             return free_route(track.xyz, side=side)
         _need_streets(graph)
         if track.dense:
@@ -128,7 +138,7 @@ def _need_streets(graph: RoadGraph) -> None:
 
 
 def turns_back(graph: RoadGraph, before: NDArray[Any], *, after: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether (k,) going from one edge to the next turns the vehicle round: by `U_TURN` or more."""
+    """Whether (k,) the turn from one edge to the next is a U-turn: `U_TURN` or more."""
     ends = np.array([polylines.end_headings(line, reach=HEADING_REACH) for line in graph.geometry])
     enter, leave = ends.reshape(-1, 2).T
     turn = np.abs((enter[after] - leave[before] + np.pi) % (2 * np.pi) - np.pi)
@@ -137,7 +147,7 @@ def turns_back(graph: RoadGraph, before: NDArray[Any], *, after: NDArray[Any]) -
 
 
 def permitted_turns(graph: RoadGraph, avoid: Collection[tuple[int, int]]) -> TurnStates:
-    """The states that may follow each other, less the turns and closed edges to avoid."""
+    """The permitted turns between states, without the turns and edges to avoid."""
     states = turn_states(graph)
     if not avoid:
         return states
@@ -169,7 +179,7 @@ def _components(
     metres = np.bincount(part, weights=graph.length[edge], minlength=count)
     loops = np.zeros(count, bool)
     loops[label[before[before == after]]] = True
-    metres[(size == 1) & ~loops] = 0.0  # one state from which there is no way back to it
+    metres[(size == 1) & ~loops] = 0.0  # a single state that cannot be reached again
     return np.asarray(label, np.int64), np.asarray(metres, float)
 
 
@@ -181,13 +191,11 @@ def random_edges(
     metres: float = np.inf,
     avoid: Collection[tuple[int, int]] = (),
 ) -> NDArray[np.int32]:
-    """Edges of a random drive that lasts ``seconds`` at the speed limits or ``metres``, whichever is sooner.
+    """Edges of a random route that lasts ``seconds`` at the speed limits or ``metres``, whichever is shorter.
 
-    They are driven from the place `_SET_OUT` of the first one's length on.
-
-    It stays in the largest part of the graph from which every street of it can be reached again, prefers
-    streets it has not driven, and turns round only at dead ends, and only where the graph has no round trip
-    without that worth the name (a fifth of what turning round would open).
+    It starts at the share `_SET_OUT` of the first edge, stays in the largest strongly connected part of the
+    graph, and prefers streets that it has not driven. U-turns at dead ends are used only if the connected
+    part without them is less than a fifth of that with them.
     """
     rng = generator(seed, "route")
     states = permitted_turns(graph, avoid)
@@ -197,7 +205,7 @@ def random_edges(
     label_back, size_back = _components(graph, states, turns=np.ones(len(use), bool))
     if not (size.max(initial=0.0) >= 0.2 * size_back.max(initial=0.0) and size.max(initial=0.0) > 0):
         use[:], label, size = True, label_back, size_back
-    # where there is none, one-way streets lead out of the map: drive until they do
+    # without a connected part, one-way streets lead out of the map: drive to their end
     round_trip = size.max(initial=0.0) > 0
     inside = label == int(np.argmax(size)) if round_trip else np.ones(len(states), bool)
     use &= inside[states.before] & inside[states.after]
@@ -216,7 +224,7 @@ def random_edges(
         far = -_SET_OUT * graph.length[edge]
         walk, time = [edge], far / graph.speed[edge]
         visits = np.zeros(len(graph))
-        # a street without length must not hold the walk up for ever
+        # streets of zero length must not make the loop endless
         while far < metres and time < seconds and len(walk) < 1_000_000:
             time, far = time + graph.length[edge] / graph.speed[edge], far + graph.length[edge]
             visits[edge] += 1
@@ -325,7 +333,7 @@ def lane_route(
 
 
 def free_route(xyz: ArrayLike, *, limit: float = np.inf, side: Side = "right") -> Route:
-    """A route along a line (n, 3) of scene metres, off any road graph; the vehicle's own speed holds."""
+    """A route along a line (n, 3) of scene metres off the road graph, with one speed limit in m/s."""
     line = np.asarray(xyz, float).reshape(-1, 3)
     if len(line) < 2 or not np.isfinite(line).all():
         raise RouteError("a route needs two points or more, all of them finite")

@@ -14,7 +14,7 @@ from lidar.errors import InputError
 from lidar.geometry.attitude import body_rates, euler_from_quat, matrix_from_quat
 from lidar.planning.motion import drive_path, motion_along, speed_limits
 from lidar.planning.path import plan_path
-from lidar.planning.route import free_route, lane_route, plan_route
+from lidar.planning.route import RouteOptions, free_route, lane_route, plan_route
 from lidar.rig.vehicle import load_vehicle
 
 FRAME = Frame.at(-76.3, 36.88)
@@ -61,7 +61,7 @@ def assert_gentle(trajectory, vehicle, *, rests=True):
 @settings(max_examples=12, deadline=None)
 def test_a_drive_through_town_is_gentle(seed, name, duration):
     vehicle = load_vehicle(name)
-    route = plan_route(grid(4, 4), FRAME, spec="random", seed=seed, length=600.0)
+    route = plan_route(grid(4, 4), FRAME, spec="random", options=RouteOptions(seed=seed, length=600.0))
     path = plan_path(route, vehicle, frame=FRAME)
     trajectory = drive_path(path, vehicle, duration=duration)
     assert_gentle(trajectory, vehicle)
@@ -75,7 +75,7 @@ def test_a_drive_through_town_is_gentle(seed, name, duration):
 @settings(max_examples=12, deadline=None)
 def test_a_drive_that_is_under_way_is_gentle_too(seed, name, duration):
     vehicle = load_vehicle(name)
-    route = plan_route(grid(4, 4), FRAME, spec="random", seed=seed, length=600.0)
+    route = plan_route(grid(4, 4), FRAME, spec="random", options=RouteOptions(seed=seed, length=600.0))
     path = plan_path(route, vehicle, frame=FRAME)
     trajectory = drive_path(path, vehicle, duration=duration, under_way=True)
     assert_gentle(trajectory, vehicle, rests=False)

@@ -15,7 +15,7 @@ from lidar.geometry.attitude import matrix_from_quat, quat_from_euler
 from lidar.planning.clearance import body_outlines
 from lidar.planning.path import plan_path
 from lidar.planning.rerouting import plan_route_and_path
-from lidar.planning.route import free_route, lane_route, plan_route
+from lidar.planning.route import RouteOptions, free_route, lane_route, plan_route
 from lidar.rig.vehicle import load_vehicle
 
 FRAME = Frame.at(-76.3, 36.88)
@@ -86,7 +86,7 @@ def test_whatever_line_it_is_given_the_path_can_be_driven_or_is_refused(line, na
 @settings(max_examples=10, deadline=None)
 def test_in_a_town_of_blocks_the_body_stays_on_the_street_and_in_its_lane(seed, side):
     graph = grid(4, 4, width=8.0)
-    route = plan_route(graph, FRAME, spec="random", seed=seed, length=1500.0, side=side)
+    route = plan_route(graph, FRAME, spec="random", options=RouteOptions(seed=seed, length=1500.0, side=side))
     path = plan_path(route, CAR, frame=FRAME)
     assert_drivable(path, CAR)
     # a kerb with the usual rounding at corners
@@ -277,7 +277,12 @@ def test_in_a_real_city_the_body_touches_no_building(shared_osm, name):
     houses = shapely.STRtree(shapely.transform(np.array(shapes, object), project))
     for seed in range(2):
         route, path = plan_route_and_path(
-            graph, frame, spec="random", vehicle=CAR, seed=seed, duration=240.0, obstacles=houses
+            graph,
+            frame,
+            spec="random",
+            options=RouteOptions(seed=seed, duration=240.0),
+            vehicle=CAR,
+            obstacles=houses,
         )
         assert_drivable(path, CAR)
         covered = (graph.bridge | graph.tunnel)[path.edge]

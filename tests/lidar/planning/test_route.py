@@ -17,7 +17,7 @@ from geoscene.roadgraph.graph import rows_of
 from geoscene.roadgraph.routing import turn_table
 from geoscene.sources import read_osm
 from lidar.errors import RouteError
-from lidar.planning.route import lane_route, plan_route, random_edges, turns_back
+from lidar.planning.route import RouteOptions, lane_route, plan_route, random_edges, turns_back
 
 FRAME = Frame.at(-76.3, 36.88)
 
@@ -62,7 +62,7 @@ def test_a_random_drive_prefers_streets_it_has_not_seen():
 
 def test_a_village_of_one_dead_end_street_is_driven_up_and_down():
     graph = road_graph([(0, 0), (150, 0), (300, 0)], [(0, 1), (1, 2)])
-    route = plan_route(graph, FRAME, spec="random", seed=3, length=1500.0)
+    route = plan_route(graph, FRAME, spec="random", options=RouteOptions(seed=3, length=1500.0))
     assert len(route.turns) >= 3
     ends = route.line[route.turns][:, 0]
     assert np.all(np.minimum(abs(ends), abs(ends - 300)) < 1.0)  # it turns at the ends only
@@ -215,7 +215,7 @@ def test_a_noisy_gpx_track_is_matched_to_the_streets_it_was_driven_on(tmp_path):
     assert nodes == [
         (100, 0), (200, 0), (200, 100), (200, 200), (100, 200), (100, 300), (200, 300)
     ]  # fmt: skip
-    as_is = plan_route(graph, FRAME, spec=path, as_is=True)
+    as_is = plan_route(graph, FRAME, spec=path, options=RouteOptions(as_is=True))
     assert (as_is.edge == -1).all()
     assert len(as_is.line) == points.count("trkpt")
 

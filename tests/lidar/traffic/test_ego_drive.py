@@ -10,7 +10,7 @@ from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks
 
 from lidar.planning.motion import drive_path, poses_along
 from lidar.planning.path import plan_path
-from lidar.planning.route import plan_route
+from lidar.planning.route import RouteOptions, plan_route
 from lidar.planning.speed_profile import motion_within
 from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.ego_trip import ego_trip
@@ -31,7 +31,9 @@ def city(*, lit, **columns):
 
 def path_on(graph, seed, seconds):
     return plan_path(
-        plan_route(graph, Plane(), spec="random", seed=seed, duration=seconds), CAR, frame=Plane()
+        plan_route(graph, Plane(), spec="random", options=RouteOptions(seed=seed, duration=seconds)),
+        CAR,
+        frame=Plane(),
     )
 
 

@@ -15,7 +15,7 @@ from geoscene.roadgraph.graph import rows_of
 from lidar.geometry.poses import Trajectory
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
-from lidar.planning.route import plan_route
+from lidar.planning.route import RouteOptions, plan_route
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.traffic.lanes import STEP, lane_shift, lanes_of, random_lanes
 from lidar.traffic.simulation import STEP_S, ego_motion, green_windows, simulate_trips
@@ -34,7 +34,7 @@ def standing(xy, seconds):
 
 
 def driving(graph, seed, seconds):
-    route = plan_route(graph, Plane(), spec="random", seed=seed, duration=seconds)
+    route = plan_route(graph, Plane(), spec="random", options=RouteOptions(seed=seed, duration=seconds))
     return drive_path(plan_path(route, CAR, frame=Plane()), CAR).until(int(seconds * 1e9))
 
 
