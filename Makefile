@@ -1,11 +1,17 @@
-# make demo   set up, build the bundled real scene, drive it, write pictures and point clouds
-# make test   set up, tests; those of the web page need chromium and chromedriver, and are skipped without
+# make demo        build the bundled real scene, drive it, write pictures and point clouds
+# make test        all tests; those of the web page need chromium and chromedriver, and are skipped without
+# make test-fast   the tests that take less than a second or two each
+# make fuzz        property tests with fresh random seeds and ten times the examples
+# make lint        style, types, layer contract
+# make wheel-test  build sdist and wheel, and run the installed wheel away from the repository
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# One worker process per core; all tests of a file run in one worker, so that they share what they record.
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile
 
-.PHONY: demo test lint clean
+.PHONY: demo test test-fast fuzz lint wheel-test clean
 
 $(STAMP): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; name one: make PYTHON=python3.12")'
@@ -17,13 +23,23 @@ $(STAMP): requirements.lock pyproject.toml
 demo: $(STAMP)
 	$(BIN)/python examples/demo.py
 
+test: $(STAMP)
+	$(PYTEST)
+
+test-fast: $(STAMP)
+	$(PYTEST) -m "not slow"
+
+fuzz: $(STAMP)
+	$(PYTEST) --hypothesis-profile=fuzz -m hypothesis
+
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
-test: $(STAMP)
-	$(BIN)/python -m pytest
+wheel-test: $(STAMP)
+	$(BIN)/python tests/wheel.py
 
 clean:
 	rm -rf $(VENV) demo build dist *.egg-info

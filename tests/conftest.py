@@ -1,22 +1,46 @@
-"""Where the real extracts are."""
+"""Fixtures that several test modules share, and how Hypothesis draws its examples."""
 
 import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
+from helpers import DEMO_BOX
+from hypothesis import HealthCheck, settings
 
-ROOT = Path(__file__).resolve().parents[1]
+from geoscene.build import build
+from geoscene.options import BuildOptions
+from geoscene.scene import Scene, open_scene
+from geoscene.sources import demo_path, read_osm
+
+# The same examples on every machine, however slow; `make fuzz` draws others, and ten times as many.
+settings.register_profile(
+    "same", derandomize=True, database=None, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.register_profile("fuzz", settings.get_profile("same"), derandomize=False, print_blob=True)
+settings.load_profile("same")
+FUZZ_FACTOR = 10
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Multiply the examples of every property test under ``--hypothesis-profile=fuzz``."""
+    if config.getoption("--hypothesis-profile") == "fuzz":
+        attribute = "_hypothesis_internal_use_settings"  # there is no public way to the settings of a test
+        functions = (item.obj for item in items if isinstance(item, pytest.Function))
+        for test in {f for f in functions if hasattr(f, attribute)}:
+            own = getattr(test, attribute)
+            setattr(test, attribute, settings(own, max_examples=FUZZ_FACTOR * own.max_examples))
 
 
 def _shared(folder: str, name: str) -> Path:
-    base = Path(os.environ.get("GEOSCENE_SHARED", ROOT.parent / "shared"))
+    given = os.environ.get("GEOSCENE_SHARED")
+    base = Path(given) if given else Path(__file__).resolve().parents[2] / "shared"
     path = base / folder / name
     if not path.exists():
-        message = f"{path} is absent; set GEOSCENE_SHARED to the folder of real extracts"
-        if os.environ.get("CI") == "true":
-            pytest.fail(message)
-        pytest.skip(message)
+        if given:
+            pytest.fail(f"{path} is absent, though GEOSCENE_SHARED is set")
+        pytest.skip("needs real extracts, not part of the repository: set GEOSCENE_SHARED to their folder")
     return path
 
 
@@ -30,3 +54,33 @@ def shared_osm() -> Callable[[str], Path]:
 def shared_dem() -> Callable[[str], Path]:
     """Path of a real terrain file by file name."""
     return lambda name: _shared("dem", name)
+
+
+@pytest.fixture(scope="session")
+def demo_scene(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scene]:
+    """The middle of the demo map in a CRS, built once for all worker processes of the test run; read only."""
+    folder = tmp_path_factory.getbasetemp()
+    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+    def built(crs: str) -> Scene:
+        path = folder / f"demo-{crs}"
+        with FileLock(path.with_suffix(".lock")):
+            if not path.exists():
+                return build(
+                    read_osm(demo_path(), bounds=DEMO_BOX), path, options=BuildOptions(name="demo", crs=crs)
+                )
+        return open_scene(path)
+
+    return built
+
+
+@pytest.fixture(scope="session")
+def scene(demo_scene: Callable[[str], Scene]) -> Scene:
+    """The middle of the demo map in a local transverse Mercator frame."""
+    return demo_scene("local")
+
+
+@pytest.fixture(scope="session")
+def scene_utm(demo_scene: Callable[[str], Scene]) -> Scene:
+    """The middle of the demo map in UTM."""
+    return demo_scene("utm")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from geoscene.frames import Frame
 from geoscene.roadgraph.carriageways import place_of
@@ -72,32 +75,54 @@ def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 2.5, ba
     square_end[last] = mouth[graph.head[once]]
     boxes = shapely.linestrings(np.stack([start[:, :2], end[:, :2]], axis=1))
     tree = shapely.STRtree(boxes)
-    reach = float(half.max()) + batter
+    return partial(
+        _graded_height,
+        ground=ground,
+        tree=tree,
+        start=start,
+        end=end,
+        half=half,
+        square_start=square_start,
+        square_end=square_end,
+        batter=batter,
+    )
 
-    def height(x: Float, y: Float) -> Float:
-        z = np.asarray(ground(x, y), float).copy()
-        xy = np.stack([x, y], axis=1)
-        point, road = tree.query(shapely.points(xy), predicate="dwithin", distance=reach)
-        along = end[road, :2] - start[road, :2]
-        square = np.maximum((along**2).sum(axis=1), 1e-12)
-        free = ((xy[point] - start[road, :2]) * along).sum(axis=1) / square
-        t = np.clip(free, 0.0, 1.0)
-        foot = start[road] + t[:, None] * (end[road] - start[road])
-        away = np.hypot(*(xy[point] - foot[:, :2]).T)
-        beyond = np.maximum(away - half[road], 0.0)
-        ahead = np.abs(free - t) * np.sqrt(square)
-        cut = np.where(free < t, square_start[road], square_end[road]) & (ahead > 0)
-        aside = np.sqrt(np.maximum(away**2 - ahead**2, 0.0)) - half[road]
-        beyond[cut] = np.hypot(np.maximum(aside, 0.0), ahead)[cut]
-        share = np.clip(1.0 - beyond / batter, 0.0, 1.0)
-        weight = share**2 / (_SHARP + (away / half[road]) ** 2) ** 2
-        total = np.bincount(point, weight, len(z))
-        near = total > 0
-        road_z = np.divide(np.bincount(point, weight * foot[:, 2], len(z)), total, out=z.copy(), where=near)
-        most = np.zeros(len(z))
-        np.maximum.at(most, point, share)
-        blend = most * most * (3.0 - 2.0 * most)
-        graded: Float = z + blend * (road_z - z)
-        return graded
 
-    return height
+def _graded_height(
+    x: Float,
+    y: Float,
+    *,
+    ground: Height,
+    tree: shapely.STRtree,
+    start: Float,
+    end: Float,
+    half: Float,
+    square_start: NDArray[np.bool_],
+    square_end: NDArray[np.bool_],
+    batter: float,
+) -> Float:
+    """The height of `graded_ground`; a function of a module, so that worker processes can take it."""
+    z = np.asarray(ground(x, y), float).copy()
+    xy = np.stack([x, y], axis=1)
+    point, road = tree.query(shapely.points(xy), predicate="dwithin", distance=float(half.max()) + batter)
+    along = end[road, :2] - start[road, :2]
+    square = np.maximum((along**2).sum(axis=1), 1e-12)
+    free = ((xy[point] - start[road, :2]) * along).sum(axis=1) / square
+    t = np.clip(free, 0.0, 1.0)
+    foot = start[road] + t[:, None] * (end[road] - start[road])
+    away = np.hypot(*(xy[point] - foot[:, :2]).T)
+    beyond = np.maximum(away - half[road], 0.0)
+    ahead = np.abs(free - t) * np.sqrt(square)
+    cut = np.where(free < t, square_start[road], square_end[road]) & (ahead > 0)
+    aside = np.sqrt(np.maximum(away**2 - ahead**2, 0.0)) - half[road]
+    beyond[cut] = np.hypot(np.maximum(aside, 0.0), ahead)[cut]
+    share = np.clip(1.0 - beyond / batter, 0.0, 1.0)
+    weight = share**2 / (_SHARP + (away / half[road]) ** 2) ** 2
+    total = np.bincount(point, weight, len(z))
+    near = total > 0
+    road_z = np.divide(np.bincount(point, weight * foot[:, 2], len(z)), total, out=z.copy(), where=near)
+    most = np.zeros(len(z))
+    np.maximum.at(most, point, share)
+    blend = most * most * (3.0 - 2.0 * most)
+    graded: Float = z + blend * (road_z - z)
+    return graded

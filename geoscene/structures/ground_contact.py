@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +16,7 @@ from geoscene.classes import Class, materials
 from geoscene.ground.layers import PADS, Layers, concatenate_layers
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 
 Height = Callable[[Float, Float], Float]
 
@@ -54,20 +55,24 @@ def ground_below(table: Structures, height: Height) -> Height:
         return height
     tree = shapely.STRtree(table.polygon[bridges])
 
-    def lowered(x: Float, y: Float) -> Float:
-        z = np.asarray(height(x, y), float).copy()
-        points = shapely.points(x, y)
-        point, found = tree.query(points, predicate="intersects")
-        for bridge in np.unique(found).tolist():
-            rows, k = point[found == bridge], int(bridges[bridge])
-            deck = surface_heights(table, k, xy=np.column_stack([x[rows], y[rows]]))
-            away = shapely.distance(points[rows], table.approach[k])
-            away = np.where(np.isnan(away), np.inf, away)
-            below = np.minimum(_FALL * away, table.body[k] + _BELOW)
-            z[rows] = np.minimum(z[rows], deck - below)
-        return z
+    return partial(_lowered_height, table=table, height=height, tree=tree, bridges=bridges)
 
-    return lowered
+
+def _lowered_height(
+    x: Float, y: Float, *, table: Structures, height: Height, tree: shapely.STRtree, bridges: Ints
+) -> Float:
+    """The height of `ground_below`; a function of a module, so that worker processes can take it."""
+    z = np.asarray(height(x, y), float).copy()
+    points = shapely.points(x, y)
+    point, found = tree.query(points, predicate="intersects")
+    for bridge in np.unique(found).tolist():
+        rows, k = point[found == bridge], int(bridges[bridge])
+        deck = surface_heights(table, k, xy=np.column_stack([x[rows], y[rows]]))
+        away = shapely.distance(points[rows], table.approach[k])
+        away = np.where(np.isnan(away), np.inf, away)
+        below = np.minimum(_FALL * away, table.body[k] + _BELOW)
+        z[rows] = np.minimum(z[rows], deck - below)
+    return z
 
 
 def find_low_decks(table: Structures, height: Height | None) -> Structures:

@@ -1,12 +1,14 @@
 """A scene is whole, closed, in its place, and the same every time."""
 
 import json
+import multiprocessing
 import shutil
 
 import geopandas
 import numpy as np
 import pytest
 import shapely
+from helpers import DEMO_BOX
 
 import geoscene.tiles
 from geoscene.build import build
@@ -18,19 +20,13 @@ from geoscene.scene import open_scene
 from geoscene.scene.tile_files import Tile, write_tile
 from geoscene.scene.validate import check_scene
 from geoscene.sources import OsmData, demo_path, read_osm
+from geoscene.sources.data import Way
 from geoscene.watertight import validate_mesh
-
-BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 
 
 @pytest.fixture(scope="module")
 def osm():
-    return read_osm(demo_path(), bounds=BOX)
-
-
-@pytest.fixture(scope="module")
-def scene(osm, tmp_path_factory):
-    return build(osm, tmp_path_factory.mktemp("scene") / "demo", options=BuildOptions(name="demo"))
+    return read_osm(demo_path(), bounds=DEMO_BOX)
 
 
 def test_every_solid_is_closed_oriented_and_of_positive_volume(scene):
@@ -135,6 +131,35 @@ def same_files(a, b):
 def test_the_same_map_is_the_same_bytes_for_any_number_of_workers(osm, scene, tmp_path, workers):
     again = build(osm, tmp_path / "again", options=BuildOptions(name="demo"), workers=workers)
     same_files(scene.path, again.path)
+
+
+def test_spawned_workers_make_the_same_bytes(tmp_path, monkeypatch):
+    spawn = multiprocessing.get_context("spawn")
+    monkeypatch.setattr("geoscene.tiles.multiprocessing.get_context", lambda: spawn)
+    # a bridge over a road, so that the ground has heights that workers need
+    slope = np.linspace(60.1655, 60.1690, 4)
+    lonlat = {n: (24.9405 + 0.002 * k, lat) for k in range(2) for n, lat in enumerate(slope, start=4 * k)}
+    lonlat |= {8: (24.9385, 60.167), 9: (24.9400, 60.167), 10: (24.9410, 60.167), 11: (24.9440, 60.167)}
+    road = {"highway": "residential"}
+    ways = [
+        (road, [0, 1, 2, 3]),
+        (road, [8, 9]),
+        (road | {"bridge": "yes", "layer": "1"}, [9, 10]),
+        (road, [10, 11]),
+    ]
+    osm = OsmData(
+        bounds=(24.9380, 60.1650, 24.9450, 60.1695),
+        ways=[
+            Way(f"way/{k}", tags, np.array(nodes, np.int64), np.array([lonlat[n] for n in nodes]))
+            for k, (tags, nodes) in enumerate(ways)
+        ],
+        areas=[],
+        points=[],
+        relations=[],
+    )
+    alone = build(osm, tmp_path / "alone", options=BuildOptions(name="bridge"))
+    assert alone.manifest["counts"]["closed_objects"] > 0
+    same_files(alone.path, build(osm, tmp_path / "both", options=BuildOptions(name="bridge"), workers=2).path)
 
 
 def test_a_killed_build_goes_on_and_ends_with_the_same_bytes(osm, scene, tmp_path, monkeypatch):

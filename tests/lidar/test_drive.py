@@ -19,12 +19,9 @@ import pytest
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
-from geoscene.build import build
 from geoscene.classes import Class
 from geoscene.errors import GeosceneError
-from geoscene.options import BuildOptions
 from geoscene.scene import open_scene
-from geoscene.sources import demo_path, read_osm
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
 from lidar.drive import drive
@@ -35,21 +32,6 @@ from lidar.planning.road_drive import plan_road_drive
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.populate import TrafficOptions
-
-BOX = (24.9405, 60.1655, 24.9475, 60.1690)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene") / "demo"
-    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions())
-
-
-@pytest.fixture(scope="module")
-def scene_utm(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene") / "utm"
-    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions(crs="utm"))
-
 
 OPTIONS = DriveOptions(rig="vlp16", duration=4.0, seed=3, formats=("pcd", "laz"))
 

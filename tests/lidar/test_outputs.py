@@ -19,10 +19,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from geoscene.build import build
 from geoscene.classes import Class, class_codes
-from geoscene.options import BuildOptions
-from geoscene.sources import demo_path, read_osm
 from lidar.dataset.deskew import MOMENTS, deskewed
 from lidar.dataset.export import EXPORTERS
 from lidar.dataset.export.nuscenes import CATEGORIES, VERSION
@@ -41,7 +38,6 @@ from lidar.rig.scanner import load_sensor
 from lidar.sensors.scan import scan
 from lidar.traffic.populate import TrafficOptions
 
-BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 ROADS = (Class.CAR, Class.VAN, Class.TRUCK, Class.BUS, Class.CYCLIST, Class.PEDESTRIAN, Class.MOTORCYCLE)
 
 SENSOR = """
@@ -114,12 +110,6 @@ OPTIONS = DriveOptions(
     deskew="end",
     traffic=TrafficOptions(vehicles=25.0, parked=0.8, pedestrians=40.0),
 )
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene") / "demo"
-    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions())
 
 
 @pytest.fixture(scope="module")

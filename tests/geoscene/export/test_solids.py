@@ -10,12 +10,10 @@ import shapely
 import trimesh
 from helpers.export_worlds import NAMES, SOLID_VOLUMES, write_world
 
-from geoscene.build import build
 from geoscene.classes import Class
 from geoscene.export import export_scene
 from geoscene.mesh import Mesh
-from geoscene.options import BuildOptions, ExportOptions
-from geoscene.sources import demo_path, read_osm
+from geoscene.options import ExportOptions
 from geoscene.watertight import validate_mesh
 
 STEPS = {
@@ -243,9 +241,8 @@ def test_cityjson_of_a_frame_without_a_code_is_in_utm_and_closed(tmp_path):
     np.testing.assert_allclose(verdict.volume, SOLID_VOLUMES[0], rtol=1e-6)
 
 
-def test_every_solid_of_a_real_place_is_still_closed_after_ply(tmp_path):
-    osm = read_osm(demo_path(), bounds=(24.9405, 60.1655, 24.9475, 60.1690))
-    scene = build(osm, tmp_path / "demo", options=BuildOptions(crs="utm"))
+def test_every_solid_of_a_real_place_is_still_closed_after_ply(demo_scene, tmp_path):
+    scene = demo_scene("utm")
     mesh = trimesh.load(export_scene(scene, tmp_path / "a.ply").path, process=False)
     rows = mesh.metadata["_ply_raw"]["face"]["data"]
     closed = np.asarray(rows["closed"]).ravel() == 1
@@ -255,9 +252,8 @@ def test_every_solid_of_a_real_place_is_still_closed_after_ply(tmp_path):
     assert len(verdict) >= scene.manifest["counts"]["solids"] > 20
 
 
-def test_every_solid_of_a_real_place_is_still_closed_after_cityjson(tmp_path):
-    osm = read_osm(demo_path(), bounds=(24.9405, 60.1655, 24.9475, 60.1690))
-    scene = build(osm, tmp_path / "demo", options=BuildOptions())
+def test_every_solid_of_a_real_place_is_still_closed_after_cityjson(demo_scene, tmp_path):
+    scene = demo_scene("local")
     document = json.loads(export_scene(scene, tmp_path / "a.city.json").path.read_text())
     points = np.array(document["vertices"]) * document["transform"]["scale"]
     solids = [

@@ -44,7 +44,7 @@ def test_the_cut_is_reproducible_byte_for_byte(shared_osm, tmp_path):
     script = ROOT / "data" / "cut_demo.py"
     source = shared_osm("helsinki_center.osm.pbf")
     subprocess.run([sys.executable, script, source, "-o", out], check=True, capture_output=True)
-    assert out.read_bytes() == (ROOT / "data" / "helsinki_demo.osm.pbf").read_bytes()
+    assert out.read_bytes() == demo_path().read_bytes()
     wrong = subprocess.run(
         [sys.executable, script, demo_path(), "-o", tmp_path / "no.pbf"],
         capture_output=True,

@@ -12,10 +12,7 @@ import numpy as np
 import pytest
 import shapely
 
-from geoscene.build import build
-from geoscene.options import BuildOptions
 from geoscene.scene import SceneFiles
-from geoscene.sources import demo_path, read_osm
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
 from lidar.drive import drive, plan
@@ -27,20 +24,6 @@ from lidar.planning.replay import read_replay
 from lidar.rig.devices import cameras, scanners
 from lidar.rig.specs import load_rig
 from lidar.rig.vehicle import load_vehicle
-
-BOX = (24.9405, 60.1655, 24.9475, 60.1690)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene") / "demo"
-    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions())
-
-
-@pytest.fixture(scope="module")
-def scene_utm(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene") / "utm"
-    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions(crs="utm"))
 
 
 def flight(scene, rig="drone", **change):

@@ -8,10 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.build import build
 from geoscene.classes import Class
-from geoscene.options import BuildOptions
-from geoscene.sources import demo_path, read_osm
 from lidar.camera.render import RenderOptions, render
 from lidar.dataset.boxes import COLUMNS, box_rows, count_points, image_boxes
 from lidar.errors import InputError
@@ -27,16 +24,8 @@ from lidar.traffic.sweep import rectangles
 from lidar.world.actors import actor_shapes, actor_transforms, alive, rotations, states, velocities
 from lidar.world.world import World
 
-BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 CAR = load_vehicle("car")
 BUSY = TrafficOptions(vehicles=25.0, cyclists=4.0, pedestrians=40.0, parked=0.7, radius=150.0)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return build(
-        read_osm(demo_path(), bounds=BOX), tmp_path_factory.mktemp("scene") / "demo", options=BuildOptions()
-    )
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Transformer
 
-from geoscene.build import build
-from geoscene.options import BuildOptions
 from geoscene.polylines import parallel
-from geoscene.sources import demo_path, read_osm
 from lidar.cli import app
 from lidar.errors import FormatError, InputError
 from lidar.geometry.poses import Trajectory
@@ -22,18 +19,10 @@ from lidar.traffic.fcd_replay import replay
 from lidar.traffic.ground import ground_heights
 from lidar.world.actors import alive, rotations, states
 
-BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 CAR = load_vehicle("car")
 UTM = "+proj=utm +zone=35 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
 OFFSET = (-385_000.0, -6_671_000.0)
 TO_NET = Transformer.from_crs("EPSG:4326", UTM, always_xy=True)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return build(
-        read_osm(demo_path(), bounds=BOX), tmp_path_factory.mktemp("scene") / "demo", options=BuildOptions()
-    )
 
 
 @pytest.fixture(scope="module")

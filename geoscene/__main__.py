@@ -1,0 +1,5 @@
+"""``python -m geoscene``."""
+
+from geoscene.cli import main
+
+main()

@@ -1,0 +1,5 @@
+"""``python -m lidar``."""
+
+from lidar.cli import main
+
+main()
