@@ -1,4 +1,4 @@
-"""CityJSON 2.0: semantic city objects, the solids as solids, the trees as copies of templates."""
+"""CityJSON 2.0: semantic city objects, solids as Solid, trees as instances of templates."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class _Palette:
 
 @dataclass(frozen=True, slots=True)
 class _Target:
-    """Where the coordinates of a file are counted from: CRS, step and zero."""
+    """Quantisation of a file's coordinates: CRS, scale and translation."""
 
     frame: Frame
     crs: CRS
@@ -117,7 +117,7 @@ class _Target:
     zero: Float
 
     def whole(self, points: Float) -> NDArray[np.int64]:
-        """Whole numbers (n, 3) of points in scene metres."""
+        """Quantised coordinates (n, 3) of points in scene metres."""
         x, y = (
             self.frame.to_projected(points[:, 0], points[:, 1])
             if self.same
@@ -128,7 +128,7 @@ class _Target:
 
 
 def _target(scene: Scene, crs: str | None) -> tuple[_Target, tuple[str, ...]]:
-    """The CRS asked for; else the scene's where it has an EPSG code, else UTM, which has one."""
+    """The given CRS; by default the scene's if it has an EPSG code, else UTM."""
     notes: tuple[str, ...] = ()
     xmin, ymin, xmax, ymax = scene.bounds
     middle = ((xmin + xmax) / 2, (ymin + ymax) / 2)
@@ -158,11 +158,11 @@ def write_cityjson(
     """Write a scene as CityJSON 2.0, tile by tile.
 
     Buildings are Solids (of several bodies: a BuildingPart for each; cavities are inner shells) with
-    RoofSurface, WallSurface, GroundSurface and, under what overhangs, OuterCeilingSurface; roads, water, land
+    RoofSurface, WallSurface, GroundSurface and, under overhangs, OuterCeilingSurface; roads, water, land
     cover and the bare terrain are surfaces, cut at the tiles' edges; trees and street furniture are geometry
-    instances. Attributes are those of ``features.gpkg``, sources of guesses included.
+    instances. Attributes are those of the scene's layers, including the sources of assumed values.
 
-    crs : projected, with an EPSG code; the scene's own where it has one, else UTM
+    crs : projected, with an EPSG code; by default the scene's if it has one, else UTM
 
     Raises InputError for a CRS that CityJSON cannot name.
     """
@@ -233,7 +233,7 @@ def _tile_objects(
     lod: str,
     first: int,
 ) -> tuple[NDArray[np.int64], list[tuple[str, dict[str, Any]]], int]:
-    """The tile's vertices as whole numbers, its city objects by name, and how many of them are solids."""
+    """The tile's quantised vertices, its city objects by name, and the number of solids among them."""
     mesh = part.mesh
     anchors = part.instances.transform[:, :, 3]
     points = np.concatenate([mesh.vertices, anchors]) + part.origin
@@ -253,7 +253,7 @@ def _tile_objects(
         kind = _TYPES.get(piece.klass, "OtherConstruction" if piece.solid else "LandUse")
         look = palette.values(mesh, piece.rows)
         name = _name(features, piece, index=part.index)
-        told = {"class": klass_name(piece.klass), **features.attributes(piece.feature)}
+        attributes = {"class": klass_name(piece.klass), **features.attributes(piece.feature)}
         if piece.solid:
             made = _solids(
                 mesh,
@@ -266,12 +266,12 @@ def _tile_objects(
                 kind=kind,
             )
             entries += _solid_entries(
-                name, kind, attributes=told, solids=[{"lod": lod, **solid} for solid in made]
+                name, kind, attributes=attributes, solids=[{"lod": lod, **solid} for solid in made]
             )
             solids += 1
         else:
             made = [{"lod": "1", **_surface(piece, corners[piece.rows] + first, look=look, kind=kind)}]
-            entries.append((name, {"type": kind, "attributes": told, "geometry": made}))
+            entries.append((name, {"type": kind, "attributes": attributes, "geometry": made}))
     entries += _copies(
         part.instances, features, library=library, index=part.index, anchors=ids[len(mesh.vertices) :] + first
     )
@@ -288,9 +288,9 @@ def _name(features: Features, piece: Piece, *, index: tuple[int, int]) -> str:
 def _solid_entries(
     name: str, kind: str, *, attributes: dict[str, Any], solids: list[dict[str, Any]]
 ) -> list[tuple[str, dict[str, Any]]]:
-    """The city objects of one object of one or more bodies, in the geometries that the schema lets each have.
+    """The city objects of a feature with one or more bodies, in geometry types that the schema permits.
 
-    Buildings, bridges and tunnels of several bodies have a part for each; plant cover is a MultiSolid always.
+    Buildings, bridges and tunnels of several bodies have a part for each; plant cover is always a MultiSolid.
     """
     if kind in _WITH_PARTS and len(solids) > 1:
         names = [f"{name}-{k + 1}" for k in range(len(solids))]
@@ -345,7 +345,7 @@ def _solids(
 def _surface_kinds(
     mesh: Mesh, piece: Piece, *, whole: NDArray[np.int64], triangles: NDArray[np.int64]
 ) -> NDArray[np.str_]:
-    """Semantic type (m,) of each face: a floor is the ground's where it lies lowest, else a ceiling's."""
+    """Semantic type (m,) of each face: the lowest floor is a GroundSurface, other floors are ceilings."""
     code = mesh.surface[piece.rows]
     height = whole[triangles, 2].max(axis=1)
     ground = height - whole[triangles, 2].min() <= 1
@@ -380,7 +380,7 @@ def _copies(
     index: tuple[int, int],
     anchors: NDArray[np.int64],
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """One object a feature, of as many copies as it has; one a copy that has no feature."""
+    """One city object per feature with all its instances; one for each instance without a feature."""
     key = np.where(instances.feature >= 0, instances.feature, -1 - np.arange(len(instances)))
     _, first, owner = np.unique(key, return_index=True, return_inverse=True)
     rows_of: list[list[int]] = [[] for _ in first]

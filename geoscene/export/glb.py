@@ -1,4 +1,4 @@
-"""One .glb of a whole scene: a named node an object, trees as GPU instances, attributes as metadata."""
+"""Binary glTF (.glb) of a whole scene: named nodes, trees as GPU instances, attributes as metadata."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def write_glb(
 ) -> Summary:
     """Write a scene as one binary glTF 2.0 file, tile by tile.
 
-    Axes as glTF wants them: x east, y up, z south, metres. The root node holds the origin of the scene's
-    frame in its CRS, the CRS stands in the root's ``extras``; vertices are float32 counted from a whole metre
-    near the middle of their object, so that nothing is lost. Every object is a node with its name, and its
-    attributes in ``extras``; the same attributes are property tables (EXT_structural_metadata), one a layer,
-    whose rows the vertices name (EXT_mesh_features). Trees and street furniture are copies
-    (EXT_mesh_gpu_instancing, EXT_instance_features).
+    Axes as in glTF: x east, y up, z south, metres. The root node's translation is the origin of the scene's
+    frame in its CRS, and its ``extras`` contain the CRS; vertices are float32 relative to a whole metre near
+    the middle of their object, without loss. Every object is a named node with its attributes in ``extras``;
+    the same attributes are property tables (EXT_structural_metadata), one per layer, whose rows the vertices
+    refer to (EXT_mesh_features). Trees and street furniture are instances (EXT_mesh_gpu_instancing,
+    EXT_instance_features).
 
     Raises InputError for more than 4 GiB.
     """
@@ -74,7 +74,7 @@ def write_glb(
 def _tables(
     writer: GlbWriter, features: Features, *, layers: Collection[str] | None
 ) -> dict[str, tuple[int, int, int]]:
-    """Number of each layer's property table, its first feature's number and how many it has."""
+    """Number of each layer's property table, its first feature number and its number of features."""
     tables = {}
     for name, columns, first in zip(features.layers, features.columns, features.starts, strict=True):
         if layers is None or name in layers:
@@ -86,17 +86,17 @@ def _tables(
 def _objects(
     writer: GlbWriter, part: Part, *, features: Features, tables: dict[str, tuple[int, int, int]]
 ) -> int:
-    """Add a node for every object of a tile; how many of them are solids."""
+    """Add a node for every object of a tile; returns the number of solids among them."""
     solids = 0
     for piece in pieces(part.mesh):
         mesh = part.mesh.take(piece.rows)
         middle = np.round((mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2)
-        told: dict[str, Any] = {}
+        metadata: dict[str, Any] = {}
         if piece.feature >= 0:
             table, first, count = tables[features.layer(piece.feature)]
             rows = np.full(len(mesh.vertices), piece.feature - first)
-            told = {"table": table, "rows": rows, "count": count}
-        number = writer.mesh(mesh, y_up(mesh.vertices - middle).astype("<f4"), **told)
+            metadata = {"table": table, "rows": rows, "count": count}
+        number = writer.mesh(mesh, y_up(mesh.vertices - middle).astype("<f4"), **metadata)
         name = features.name(piece.feature)
         writer.node(
             name=name if piece.solid else f"{name} {klass_name(piece.klass)}",
@@ -122,7 +122,7 @@ def _copies(
     shapes: dict[int, int],
     library: dict[str, Mesh],
 ) -> int:
-    """Add a node for every shape and layer of a tile's copies; how many copies there are."""
+    """Add a node for every shape and layer of a tile's instances; returns the number of instances."""
     copies = part.instances
     layer = np.searchsorted(features.starts, copies.feature, side="right")
     keys = np.column_stack([copies.shape, layer])
@@ -132,11 +132,11 @@ def _copies(
         if number not in shapes:
             mesh = library[names[number]]
             shapes[number] = writer.mesh(mesh, y_up(mesh.vertices).astype("<f4"), name=names[number])
-        told: dict[str, Any] = {}
+        metadata: dict[str, Any] = {}
         if of_layer:
             table, first, count = tables[features.layers[of_layer - 1]]
-            told = {"table": table, "rows": copies.feature[chosen] - first, "count": count}
+            metadata = {"table": table, "rows": copies.feature[chosen] - first, "count": count}
         transform = copies.transform[chosen]
         origin = np.round(transform[:, :, 3].mean(axis=0))
-        writer.copies(shapes[number], transform, name=names[number], origin=origin, **told)
+        writer.copies(shapes[number], transform, name=names[number], origin=origin, **metadata)
     return len(copies)

@@ -1,4 +1,4 @@
-"""Scene coordinates as Earth-centred ones, and as east, north, up about the scene's middle."""
+"""Earth-centred coordinates of a scene, and local east, north, up coordinates."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from geoscene.typing import Float
 
 @dataclass(frozen=True)
 class Globe:
-    """East, north, up at a point of the ellipsoid, metres; straight axes, so that the Earth bends away.
+    """Cartesian east, north, up coordinates about a point of the ellipsoid, metres.
 
     frame  : the scene's
-    lift   : metres that heights of the scene are raised by to be ellipsoidal
-    matrix : (4, 4) east, north, up to WGS 84 Earth-centred (EPSG:4978)
+    lift   : metres added to heights of the scene to make them ellipsoidal
+    matrix : (4, 4) from east, north, up to WGS 84 Earth-centred (EPSG:4978)
     """
 
     frame: Frame
@@ -26,7 +26,7 @@ class Globe:
 
     @classmethod
     def at(cls, frame: Frame, x: float, *, y: float, lift: float = 0.0) -> Globe:
-        """The globe with its zero at a point of the scene."""
+        """Local coordinates with their origin at a point of the scene."""
         lon, lat = (np.radians(float(v)) for v in frame.to_geographic(x, y))
         matrix = np.eye(4)
         matrix[:3, 0] = -np.sin(lon), np.cos(lon), 0
@@ -43,7 +43,7 @@ class Globe:
         return out
 
     def jacobian(self, points: Float) -> Float:
-        """(n, 3, 3): how east, north, up change with scene x, y and z at points in scene metres."""
+        """(n, 3, 3) derivatives of east, north, up by scene x, y, z at points in scene metres."""
         steps = np.concatenate([np.eye(3), -np.eye(3)])
         around = self.local((points[:, None] + steps).reshape(-1, 3)).reshape(-1, 6, 3)
         out: Float = ((around[:, :3] - around[:, 3:]) / 2).transpose(0, 2, 1)

@@ -1,4 +1,4 @@
-"""glTF 2.0 binary files, written as they grow: lists and buffers are spooled, joined at the end."""
+"""glTF 2.0 binary files, written incrementally: lists and buffers are spooled to disk and then joined."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _VIEWS: tuple[tuple[str, int, int], ...] = (
 
 
 def y_up(points: Float) -> Float:
-    """Points (..., 3) of x east, y north, z up as glTF has them: x east, y up, z south."""
+    """Points (..., 3) of x east, y north, z up in glTF's axes: x east, y up, z south."""
     turned: Float = np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
     return turned
 
@@ -60,9 +60,9 @@ class _Spooled:
 
 
 class GlbWriter:
-    """A .glb in the making.
+    """Writer of one .glb file.
 
-    near : a path on the disk that spools may use
+    near : a path on the disk for temporary files
     """
 
     def __init__(self, near: Path) -> None:
@@ -88,7 +88,7 @@ class GlbWriter:
 
     @property
     def nodes(self) -> int:
-        """Number of nodes so far, which is the number of the next."""
+        """Number of nodes so far, which is the index of the next."""
         return self._lists["nodes"].count
 
     def node(self, **members: Any) -> int:
@@ -98,7 +98,7 @@ class GlbWriter:
     def accessor(self, view: str, values: NDArray[Any], *, bounds: bool = False) -> int:
         """Add values (n,) or (n, k) to a view of the buffer; returns the accessor's number."""
         file = self._views[view]
-        told: dict[str, Any] = {
+        description: dict[str, Any] = {
             "bufferView": [name for name, _, _ in _VIEWS].index(view),
             "byteOffset": file.tell(),
             "componentType": _COMPONENTS[values.dtype.str[1:]],
@@ -106,13 +106,13 @@ class GlbWriter:
             "type": _SHAPES[values.shape[1] if values.ndim > 1 else 0],
         }
         if bounds:
-            told |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+            description |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         file.write(np.ascontiguousarray(values).tobytes())
         file.write(b"\0" * (-file.tell() % 4))
-        return self._lists["accessors"].add(told)
+        return self._lists["accessors"].add(description)
 
     def material(self, code: int, color: Sequence[int]) -> int:
-        """Number of the material of a code and an sRGB colour; added when it is new."""
+        """Number of the material of a code and an sRGB colour, added if new."""
         return self._materials.setdefault((code, *color), len(self._materials))
 
     def mesh(
@@ -125,10 +125,10 @@ class GlbWriter:
         rows: NDArray[np.integer] | None = None,
         count: int = 1,
     ) -> int:
-        """Add a mesh whose primitives, one a material and colour, share their vertices; returns its number.
+        """Add a mesh whose primitives, one per material and colour, share their vertices; returns its number.
 
         points : (n, 3) float32, the mesh's vertices in glTF's axes
-        table  : the property table that the features are rows of
+        table  : the features' property table
         rows   : (n,) row of each vertex's feature
         count  : number of features among them
         """
@@ -170,13 +170,13 @@ class GlbWriter:
         rows: NDArray[np.integer] | None = None,
         count: int = 1,
     ) -> int:
-        """Add a node of many copies of a mesh (EXT_mesh_gpu_instancing); returns its number.
+        """Add a node with many instances of a mesh (EXT_mesh_gpu_instancing); returns its number.
 
-        transform : (k, 3, 4), rotation and scale, then shift, x east, y north, z up
-        origin    : (3,) where the node stands; shifts are counted from there
-        rows      : (k,) row of each copy's feature in the property table
+        transform : (k, 3, 4), rotation and scale, then translation, x east, y north, z up
+        origin    : (3,) position of the node, to which translations are relative
+        rows      : (k,) row of each instance's feature in the property table
         """
-        shift, turn, size = _taken_apart(transform)
+        shift, turn, size = _decomposed(transform)
         attributes = {
             "TRANSLATION": self.accessor("copies", y_up(shift - origin).astype("<f4"), bounds=True),
             "ROTATION": self.accessor("copies", turn.astype("<f4")),
@@ -193,11 +193,11 @@ class GlbWriter:
         return self.node(name=name, mesh=mesh, translation=place, extensions=extensions)
 
     def property_table(self, name: str, columns: Mapping[str, NDArray[Any]], *, count: int) -> int:
-        """Add a table of attributes, one row a feature (EXT_structural_metadata); returns its number."""
+        """Add a table of attributes, one row per feature (EXT_structural_metadata); returns its number."""
         properties, described = {}, {}
         for column, values in columns.items():
-            told, arrays = _encoded(np.asarray(values))
-            described[column] = told
+            description, arrays = _encoded(np.asarray(values))
+            described[column] = description
             properties[column] = {role: self._column(data) for role, data in arrays.items()}
         self._classes[name] = {"name": name, "properties": described}
         self._tables.append({"name": name, "class": name, "count": count, "properties": properties})
@@ -211,7 +211,7 @@ class GlbWriter:
     def finish(self, out: IO[bytes], *, scene_nodes: Sequence[int], asset: Mapping[str, Any]) -> None:
         """Write the file.
 
-        Raises InputError where it would be larger than the 4 GiB that the format can hold.
+        Raises InputError if it would exceed the format's limit of 4 GiB.
         """
         for view in self._views.values():
             if not view.tell():
@@ -260,8 +260,8 @@ class GlbWriter:
             head["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
         if self._tables:
             schema = {"id": "geoscene", "classes": self._classes}
-            told = {"schema": schema, "propertyTables": self._tables}
-            head["extensions"] = {"EXT_structural_metadata": told}
+            description = {"schema": schema, "propertyTables": self._tables}
+            head["extensions"] = {"EXT_structural_metadata": description}
         if self._materials:
             head["materials"] = [_material(code, color) for code, *color in self._materials]
         head["buffers"] = [{"byteLength": starts[-1]}]
@@ -285,7 +285,7 @@ def _view(number: int, start: int, *, size: int) -> dict[str, Any]:
 
 
 def _material(code: int, color: Sequence[int]) -> dict[str, Any]:
-    """A dull surface of an sRGB colour; glTF wants it linear (IEC 61966-2-1)."""
+    """A matt material of an sRGB colour, converted to linear values (IEC 61966-2-1)."""
     table = {m.code: m for m in materials().values()}
     srgb = np.asarray(color) / 255.0
     linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
@@ -300,8 +300,8 @@ def _material(code: int, color: Sequence[int]) -> dict[str, Any]:
     }
 
 
-def _taken_apart(transform: Float) -> tuple[Float, Float, Float]:
-    """Shift (k, 3) as it is, and rotation (k, 4: x, y, z, w) and scale (k, 3) in glTF's axes."""
+def _decomposed(transform: Float) -> tuple[Float, Float, Float]:
+    """Translation (k, 3), and rotation (k, 4: x, y, z, w) and scale (k, 3) in glTF's axes."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
 
     linear = transform[:, :, :3]
@@ -317,16 +317,16 @@ _NO_NUMBER = -9999.0
 
 
 def _encoded(values: NDArray[Any]) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """A column as EXT_structural_metadata describes it, and its buffers."""
+    """Description of a column for EXT_structural_metadata, and its buffers."""
     if values.dtype == np.bool_:
         return {"type": "BOOLEAN"}, {"values": np.packbits(values, bitorder="little").tobytes()}
     kind = values.dtype.str[1:]
     if kind in _NUMBERS:
-        told: dict[str, Any] = {"type": "SCALAR", "componentType": _NUMBERS[kind]}
+        description: dict[str, Any] = {"type": "SCALAR", "componentType": _NUMBERS[kind]}
         if values.dtype.kind == "f":
             values = np.where(np.isfinite(values), values, _NO_NUMBER)
-            told["noData"] = _NO_NUMBER
-        return told, {"values": values.tobytes()}
+            description["noData"] = _NO_NUMBER
+        return description, {"values": values.tobytes()}
     texts = ["" if v is None else str(v) for v in values.tolist()]
     data = [text.encode() for text in texts]
     offsets = np.cumsum([0, *(len(d) for d in data)]).astype("<u4")

@@ -17,10 +17,10 @@ from geoscene.scene import Scene
 class Kind:
     """One format.
 
-    title    : for people
+    title    : name for messages
     writer   : ``module:function`` within this package
-    suffixes : of file names by which it is known, the usual one first; none for a folder
-    options  : of `export_scene` that it takes
+    suffixes : of file names, the usual one first; none for a folder
+    options  : fields of `ExportOptions` that it uses
     """
 
     title: str
@@ -57,15 +57,12 @@ KINDS: dict[str, Kind] = {
 
 
 def kind_of(out: Path) -> str:
-    """The format that a file name's suffix means.
-
-    Raises InputError for a suffix that means none.
-    """
-    name = out.name.lower()
-    for kind, told in KINDS.items():
-        if name.endswith(told.suffixes) and told.suffixes:
-            return kind
-    known = " ".join(told.suffixes[0] for told in KINDS.values() if told.suffixes)
+    """Name of the format of a file name's suffix; raises InputError for an unknown suffix."""
+    file_name = out.name.lower()
+    for name, kind in KINDS.items():
+        if kind.suffixes and file_name.endswith(kind.suffixes):
+            return name
+    known = " ".join(kind.suffixes[0] for kind in KINDS.values() if kind.suffixes)
     raise InputError(f"{out}: unknown suffix; give `kind` ({', '.join(KINDS)}) or {known}")
 
 
@@ -85,18 +82,18 @@ def export_scene(
     name = kind_of(out) if options.kind is None else options.kind
     if name not in KINDS:
         raise InputError(f"`kind` {name}: there are {', '.join(KINDS)}")
-    told = KINDS[name]
+    kind = KINDS[name]
     given = {key: value for key, value in asdict(options).items() if key != "kind" and value is not None}
-    foreign = sorted(set(given) - told.options)
+    foreign = sorted(set(given) - kind.options)
     if foreign:
         names = ", ".join(f"`{key}`" for key in foreign)
-        takes = ", ".join(f"`{key}`" for key in sorted(told.options)) or "none"
-        raise InputError(f"{names} does not go with {told.title}, which takes {takes}")
+        takes = ", ".join(f"`{key}`" for key in sorted(kind.options)) or "none"
+        raise InputError(f"{names} does not go with {kind.title}, which takes {takes}")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: is there already; set `overwrite` to replace it")
-    if out.is_dir() and told.suffixes:
-        raise InputError(f"{out}: is a folder; {told.title} is a file, name one")
-    module, function = told.writer.split(":")
+    if out.is_dir() and kind.suffixes:
+        raise InputError(f"{out}: is a folder; {kind.title} is a file, name one")
+    module, function = kind.writer.split(":")
     write = getattr(importlib.import_module(f"geoscene.export.{module}"), function)
     summary: Summary = write(scene, out, **given, progress=progress)
     return summary

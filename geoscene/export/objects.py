@@ -1,4 +1,4 @@
-"""The objects of a tile: the faces of one feature, with its name and attributes."""
+"""Objects of a tile: the faces of each feature, with its name and attributes."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ class Features:
     unique: NDArray[np.bool_]
 
     def layer(self, feature: int) -> str:
-        """Name of the layer that a feature is of."""
+        """Name of a feature's layer."""
         return self.layers[self._row(feature)[0]] if feature >= 0 else BARE
 
     def attributes(self, feature: int) -> dict[str, Any]:
-        """What is known of a feature, with where it is known from; what is not known is left out."""
+        """Attributes of a feature with their sources; unknown ones are left out."""
         if feature < 0:
             return {}
         layer, row = self._row(feature)
-        told = {name: plain(values[row]) for name, values in self.columns[layer].items()}
-        return {name: value for name, value in told.items() if value is not None}
+        attributes = {name: plain(values[row]) for name, values in self.columns[layer].items()}
+        return {name: value for name, value in attributes.items() if value is not None}
 
     def name(self, feature: int) -> str:
         """``way/123`` for the only building of that OSM id, else ``layer/number``."""
@@ -108,7 +108,7 @@ def pieces(mesh: Mesh) -> list[Piece]:
 
 
 def check_layers(scene: Scene, layers: Collection[str] | None) -> None:
-    """Refuse names of layers that the scene has not."""
+    """Raise InputError for unknown names of layers."""
     known = [*scene.layers, BARE]
     unknown = sorted(set(layers or ()) - set(known))
     if unknown:
@@ -118,7 +118,7 @@ def check_layers(scene: Scene, layers: Collection[str] | None) -> None:
 def wanted_rows(
     scene: Scene, feature: NDArray[np.int32], *, layers: Collection[str] | None
 ) -> NDArray[np.bool_]:
-    """(m,) bool: the face or copy is of one of the layers; all of them for None."""
+    """Whether faces or instances (m,) belong to one of the layers; all of them for None."""
     if layers is None:
         return np.ones(len(feature), np.bool_)
     keep = np.zeros(len(feature), np.bool_)
@@ -130,7 +130,7 @@ def wanted_rows(
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What a tile holds of the wanted layers, in tile coordinates; see `geoscene.scene.tile_files.Tile`."""
+    """The chosen layers of a tile, in tile coordinates; see `geoscene.scene.tile_files.Tile`."""
 
     index: tuple[int, int]
     origin: Float
@@ -139,7 +139,7 @@ class Part:
 
 
 def parts(scene: Scene, layers: Collection[str] | None = None) -> Iterator[Part]:
-    """The tiles of a scene one at a time, less what is not of the wanted layers."""
+    """The tiles of a scene one at a time, restricted to the chosen layers."""
     check_layers(scene, layers)
     for i, j in scene.tile_indices:
         tile = scene.tile(i, j)
@@ -152,7 +152,7 @@ def parts(scene: Scene, layers: Collection[str] | None = None) -> Iterator[Part]
 
 
 def expand(instances: Instances, library: Sequence[Mesh]) -> Mesh:
-    """The copies as one mesh, each face with its copy's feature, for formats that know no copies."""
+    """The instances as one mesh, for formats without instances; faces keep their instance's feature."""
     out = []
     for number in np.unique(instances.shape).tolist():
         chosen = instances.shape == number
@@ -160,10 +160,14 @@ def expand(instances: Instances, library: Sequence[Mesh]) -> Mesh:
         k, n = len(transform), len(shape.vertices)
         points = np.einsum("kij,nj->kni", transform[:, :, :3], shape.vertices) + transform[:, None, :, 3]
         faces = shape.faces + (np.arange(k) * n)[:, None, None]
-        told = {name: np.tile(getattr(shape, name), k) for name in ("klass", "material", "surface", "closed")}
+        attributes = {
+            name: np.tile(getattr(shape, name), k) for name in ("klass", "material", "surface", "closed")
+        }
         feature = np.repeat(instances.feature[chosen], len(shape))
         color = np.tile(shape.color, (k, 1))
-        out.append(Mesh.of(points.reshape(-1, 3), faces.reshape(-1, 3), feature=feature, color=color, **told))
+        out.append(
+            Mesh.of(points.reshape(-1, 3), faces.reshape(-1, 3), feature=feature, color=color, **attributes)
+        )
     return concatenate(out)
 
 

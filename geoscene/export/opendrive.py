@@ -49,11 +49,12 @@ _SIGNALS = {
 def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) -> Summary:
     """Write the road graph as OpenDRIVE 1.7.
 
-    Every carriageway is a road: its centre line with the corners rounded (lines and arcs, within 0.1 m of the
-    map's), its heights, its lanes in both directions, its speed limit, its signals and signs, bridges and
-    tunnels. Where roads meet is a junction with a connecting road (paramPoly3) for every permitted turn.
-    ``userData`` names the OpenStreetMap way. A lane that both directions share has the type
-    ``bidirectional``. Restrictions via ways are counted in the summary: junctions know pairs of roads alone.
+    Every carriageway is a road: its centre line with rounded corners (lines and arcs, within 0.1 m of the
+    map's), its elevation profile, its lanes in both directions, speed limit, signals and signs, bridges and
+    tunnels. Junctions have a connecting road (paramPoly3) for every permitted turn. ``userData`` contains the
+    id of the OpenStreetMap way. A lane that both directions share has the type ``bidirectional``; the rest of
+    a wide carriageway is a ``shoulder`` on each side. Restrictions via ways cannot be expressed, as junctions
+    link pairs of roads only; the summary counts them.
 
     Raises SceneFormatError for a scene without drivable roads.
     """
@@ -73,22 +74,18 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
         out.write(_header(scene).encode())
         for k in range(len(net.roads)):
             progress("OpenDRIVE", k, total=len(net.roads))
-            told = "".join(
-                _road(graph, net, k=k, junctions=junctions, controls=controls, left_hand=left_hand)
-            )
-            out.write(told.encode())
+            road = _road(graph, net, k=k, junctions=junctions, controls=controls, left_hand=left_hand)
+            out.write("".join(road).encode())
         for k, connection in enumerate(net.connections):
-            told = "".join(
-                _connecting_road(
-                    graph, net, c=connection, number=first + k, junctions=junctions, left_hand=left_hand
-                )
+            road = _connecting_road(
+                graph, net, c=connection, number=first + k, junctions=junctions, left_hand=left_hand
             )
-            out.write(told.encode())
+            out.write("".join(road).encode())
         out.write("".join(_junctions(net, junctions, first=first, left_hand=left_hand)).encode())
         out.write(b"</OpenDRIVE>\n")
     files, size = size_of(path)
     chains = len(graph.chain_edges)
-    notes = (f"{chains} turn restrictions via ways are not in it: it knows those via nodes alone",)
+    notes = (f"{chains} turn restrictions via ways are left out: OpenDRIVE has only those via nodes",)
     return Summary(
         path,
         "opendrive",
@@ -101,7 +98,7 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
 
 
 def _n(value: float) -> str:
-    """A number without noise: 1e-9 is a nanometre, and far below a nanoradian at a kilometre."""
+    """A number with 9 decimals (nanometres), without trailing zeros."""
     text = f"{value:.9f}".rstrip("0").rstrip(".")
     return "0" if text in ("-0", "") else text
 
@@ -189,7 +186,7 @@ def _geometry(s: float, x: float, *, y: float, heading: float, length: float, sh
 
 
 def _elevations(at: Float, height: Float) -> Iterator[str]:
-    """Straight slopes from vertex to vertex; those that go on as before are joined."""
+    """Constant gradients from vertex to vertex; equal ones are joined."""
     slope = np.diff(height) / np.maximum(np.diff(at), 1e-9)
     fresh = np.append(True, np.abs(np.diff(slope)) > 1e-9)
     for s, z, b in zip(at[:-1][fresh], height[:-1][fresh], slope[fresh], strict=True):
@@ -246,7 +243,7 @@ def _mark(kind: str) -> str:
 def _signals(
     road: Carriageway, k: int, *, controls: dict[int, list[tuple[float, str]]], left_hand: bool
 ) -> Iterator[str]:
-    """What drivers of each direction must heed, at the side of the road that they keep to."""
+    """Signals and signs of each direction, on the side of the road that it uses."""
     count = 0
     total = road.plan.total
     for edge in (road.edge, road.twin):
@@ -288,10 +285,10 @@ def _connecting_road(
     kind = _type(graph, c.before)
     yield f'</link>\n<type s="0" type="{kind}">{_speed(speed)}</type>\n<planView>\n'
     u, v = (dict(zip("abcd", w.tolist(), strict=True)) for w in (curve.u, curve.v))
-    told = " ".join(
+    coefficients = " ".join(
         f'{letter}{axis}="{value:.12g}"' for axis, w in (("U", u), ("V", v)) for letter, value in w.items()
     )
-    shape = f'<paramPoly3 {told} pRange="normalized"/>'
+    shape = f'<paramPoly3 {coefficients} pRange="normalized"/>'
     yield _geometry(0.0, curve.x, y=curve.y, heading=curve.heading, length=curve.length, shape=shape)
     a, b, cc, d = c.rise.tolist()
     yield (

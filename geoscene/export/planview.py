@@ -1,4 +1,4 @@
-"""Reference lines of roads: lines and arcs that meet smoothly, along a polyline."""
+"""Reference lines of roads: tangential lines and arcs along a polyline."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _STRAIGHT = 1e-7  # radians: vertices that turn by less are no corners
 
 @dataclass(frozen=True, slots=True)
 class PlanView:
-    """Pieces of a reference line; each begins where the last ended.
+    """Pieces of a reference line; each begins at the end of the previous one.
 
     s         : (k,) metres along the line to the piece's start
     x, y      : (k,) its start
     heading   : (k,) there, radians counter-clockwise from x
     length    : (k,) metres
     curvature : (k,) 1/metre, 0 for a straight line, positive to the left
-    at        : (n,) metres along the line to the place nearest each vertex of the polyline
+    at        : (n,) metres along the line to the point nearest to each vertex of the polyline
     """
 
     s: Float

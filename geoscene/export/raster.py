@@ -1,4 +1,4 @@
-"""GeoTIFFs of a scene seen from above: surface model, terrain model, class map; cloud-optimised."""
+"""Cloud-optimised GeoTIFFs of a scene: surface model, terrain model, class map."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class _Grid:
 
 
 def _grid(scene: Scene, resolution: float) -> _Grid:
-    """The scene's extent on whole multiples of the resolution, so that rasters of a CRS match."""
+    """The scene's extent aligned to multiples of the resolution, so that rasters of one CRS match."""
     if not (np.isfinite(resolution) and resolution > 0):
-        raise InputError(f"`resolution` {resolution}: give metres over 0")
+        raise InputError(f"`resolution` {resolution}: must be positive metres")
     xmin, ymin, xmax, ymax = scene.bounds
     east, north = scene.frame.origin
     left, right = np.floor((xmin + east) / resolution), np.ceil((xmax + east) / resolution)
@@ -60,7 +60,7 @@ def _grid(scene: Scene, resolution: float) -> _Grid:
     columns, rows = int(right - left), int(high - low)
     if columns * rows > MOST_CELLS:
         raise InputError(
-            f"`resolution` {resolution}: {columns} x {rows} cells are too many; take a larger one"
+            f"`resolution` {resolution}: {columns} x {rows} cells are too many; use a larger one"
         )
     return _Grid(float(left * resolution), float(high * resolution), resolution, columns, rows)
 
@@ -74,15 +74,15 @@ def write_geotiff(
     layers: Collection[str] | None = None,
     progress: Progress = silent,
 ) -> Summary:
-    """Write a scene seen from above as a cloud-optimised GeoTIFF in the scene's CRS.
+    """Write a raster of a scene as a cloud-optimised GeoTIFF in the scene's CRS.
 
-    A cell is what is highest over its middle; where there is nothing, it is NaN (heights) or 0 (classes).
+    A cell has the value of the highest face over its middle; without one it is NaN (heights) or 0 (classes).
 
     model      : ``surface`` (height of the highest face: roofs, crowns, ground), ``terrain`` (height of the
                  ground alone, under buildings and trees too) or ``classes`` (`Class` code of the highest)
-    resolution : metres, side of a cell; the grid lies on whole multiples of it
+    resolution : metres, side of a cell; the grid is aligned to multiples of it
 
-    Raises InputError for a model or a resolution that cannot be.
+    Raises InputError for an unknown model or an unusable resolution.
     """
     if model not in ("surface", "terrain", "classes"):
         raise InputError(f"`model` {model}: surface, terrain or classes")

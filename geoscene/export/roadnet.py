@@ -1,4 +1,4 @@
-"""Carriageways with lanes, and junctions that join them: the road graph as OpenDRIVE sees it."""
+"""Roads with lanes, and junctions that connect them, in the structure of OpenDRIVE."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from geoscene.roadgraph.routing import turn_table
 from geoscene.typing import Float
 
 Lane = tuple[int, float, float]
-"""Number of a lane, where its inner edge is (metres left of the centre line, looking as it drives), width."""
+"""Number of a lane, metres from the centre line to its inner edge (left of the driving direction), width."""
 
 START, END = 0, 1
 
@@ -26,14 +26,14 @@ _STRAIGHT = np.radians(0.05)
 
 @dataclass(frozen=True, slots=True)
 class Carriageway:
-    """One road: an edge of the graph and its twin, cut back where junctions are.
+    """One road: an edge of the graph and its twin, cut back at junctions.
 
     edge     : number of its edge along the reference line
-    twin     : of the other, -1 for none
+    twin     : number of the edge in the other direction, -1 for none
     line     : (n, 3) centre line as cut, scene metres
     plan     : the reference line
-    begins   : metres of the edge's centre line, before it was cut, at which ``line`` begins
-    whole    : metres of it in all
+    begins   : metres along the edge's whole centre line at which ``line`` begins
+    whole    : length of the whole centre line, metres
     width    : metres of a lane
     ahead, back : number of lanes along the edge and along its twin
     shared   : one more lane, used in both directions, between them
@@ -57,9 +57,9 @@ class Carriageway:
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """A way through a junction.
+    """A connection through a junction.
 
-    node   : the junction's
+    node   : node of the junction
     before, after : edges
     curve  : reference line
     lanes  : (k, 2) numbers of the lanes that are joined
@@ -78,10 +78,10 @@ class Connection:
 
 @dataclass(frozen=True, slots=True)
 class RoadNet:
-    """Carriageways, the nodes that are junctions, the ways through them, and joints without a junction.
+    """Roads, junctions, the connections through them, and joints of roads without a junction.
 
     roads       : in the order of their edges
-    road_of     : (m,) number of the road that each edge of the graph is a direction of, -1 for none
+    road_of     : (m,) number of the road of each edge of the graph, -1 for none
     junctions   : (n,) bool, by node
     connections : in order of nodes and edges
     joints      : (road, end) to the (road, end) that continues it
@@ -97,8 +97,8 @@ class RoadNet:
 def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
     """The road graph as carriageways and junctions.
 
-    A node where two roads of the same lanes meet within 0.05 degrees is a joint; any other where roads meet
-    is a junction, with a way through for every turn that the graph permits (`routing.turn_table`).
+    A node where two roads with equal lanes meet within 0.05 degrees is a joint; any other node where roads
+    meet is a junction, with a connection for every turn that the graph permits (`routing.turn_table`).
     """
     firsts = [
         k
@@ -155,10 +155,10 @@ def _joints(
 ) -> dict[tuple[int, int], tuple[int, int]]:
     turns = set(zip(before.tolist(), after.tolist(), strict=True))
     joints = {}
-    for met in ends.values():
-        if len(met) != 2 or met[0][0] == met[1][0]:
+    for meeting in ends.values():
+        if len(meeting) != 2 or meeting[0][0] == meeting[1][0]:
             continue
-        (a, end_a), (b, end_b) = met
+        (a, end_a), (b, end_b) = meeting
         edge_a, edge_b = firsts[a], firsts[b]
         away = _angle(_leaving(graph, edge_a, end=end_a), _leaving(graph, edge_b, end=end_b))
         if np.pi - away > _STRAIGHT:
@@ -191,14 +191,14 @@ def _gaps(
     Roads of half widths a and b that leave a node at an angle t meet (b + a cos t) / sin t from it.
     """
     gaps = np.zeros((len(firsts), 2))
-    for node, met in ends.items():
+    for node, arms in ends.items():
         if not junctions[node]:
             continue
-        heading = [_leaving(graph, firsts[k], end=end) for k, end in met]
-        half = [graph.width[firsts[k]] / 2 for k, _ in met]
-        for i, (k, end) in enumerate(met):
+        heading = [_leaving(graph, firsts[k], end=end) for k, end in arms]
+        half = [graph.width[firsts[k]] / 2 for k, _ in arms]
+        for i, (k, end) in enumerate(arms):
             need = _LEAST_GAP
-            for j in range(len(met)):
+            for j in range(len(arms)):
                 t = _angle(heading[i], heading[j])
                 if j != i and np.radians(5) < t < np.radians(170):
                     need = max(need, (half[j] + half[i] * np.cos(t)) / np.sin(t) + 1.0)
@@ -234,8 +234,8 @@ def _carriageway(graph: RoadGraph, lanes: LaneLayout, *, edge: int, gap: Float) 
 def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[Lane]:
     """The lanes of one direction of a road, from the middle outwards.
 
-    Traffic that keeps right drives along the reference line in lanes of negative number; the shared lane lies
-    on that side. ``shift`` is taken for traffic on the right: it is mirrored for the left.
+    In right-hand traffic the lanes along the reference line have negative numbers, the shared lane among
+    them. ``shift`` is that of right-hand traffic; it is mirrored for left-hand traffic.
     """
     sign = 1 if left_hand else -1  # of the lanes along the reference line
     along = edge == road.edge
@@ -260,7 +260,7 @@ def _connection(
     after: int,
     left_hand: bool,
 ) -> Connection:
-    """The way from the end of one edge to the start of another."""
+    """The connection from the end of one edge to the start of another."""
     sign = 1 if left_hand else -1
     source, target = roads[road_of[before]], roads[road_of[after]]
     start, heading, slope = _pose(source, arriving=True, along=before == source.edge)
@@ -269,7 +269,7 @@ def _connection(
     there = driven_lanes(target, after, left_hand=left_hand)
     turn = (end_heading - heading + np.pi) % (2 * np.pi) - np.pi
     count = min(len(here), len(there))
-    outer = sign * turn > np.radians(30)  # a turn towards the side that one keeps to starts in the last lane
+    outer = sign * turn > np.radians(30)  # a turn towards the kerb starts in the outermost lane
     here, there = (here[-count:], there[-count:]) if outer else (here[:count], there[:count])
     first = start[:2] + here[0][1] * np.array([-np.sin(heading), np.cos(heading)])
     last = end[:2] + there[0][1] * np.array([-np.sin(end_heading), np.cos(end_heading)])
@@ -290,7 +290,7 @@ def _connection(
 
 
 def _pose(road: Carriageway, *, arriving: bool, along: bool) -> tuple[Float, float, float]:
-    """Point (3,), heading and slope, as driven, of the end of a road where traffic leaves or enters it."""
+    """Point (3,), heading and gradient, in driving direction, where traffic enters or leaves a road."""
     last = arriving == along
     plan, line = road.plan, road.line
     rows = (-2, -1) if last else (0, 1)

@@ -1,4 +1,4 @@
-"""Solids taken apart: the closed shells of each, outer ones with the cavities inside them."""
+"""Shells of solids: outer shells with the cavities inside them."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from geoscene.watertight import edge_uses
 
 
 def shell_numbers(corners: Ints, owner: NDArray[np.integer]) -> Ints:
-    """Number (m,) of the shell each face is of: faces of one owner that hang together by edges.
+    """Shell number (m,) of each face: faces of one owner connected by edges form a shell.
 
     corners : (m, 3) ids of welded vertices
-    owner   : (m,) the object of each face
+    owner   : (m,) object of each face
     """
     from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415

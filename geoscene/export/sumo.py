@@ -1,4 +1,4 @@
-"""SUMO networks, made of our OpenDRIVE by SUMO's own netconvert."""
+"""SUMO networks, converted from OpenDRIVE by SUMO's netconvert."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _STAMP = re.compile(rb"<!--.*?-->\s*", re.DOTALL)
 def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summary:
     """Write the road graph as a SUMO network (``.net.xml``).
 
-    The network is what ``netconvert`` of the package eclipse-sumo makes of `write_opendrive`; its comments
-    hold the time of day and are left out.
+    The network is converted by ``netconvert`` of the package eclipse-sumo from the file of `write_opendrive`;
+    its comments contain the time of day and are removed.
 
-    Raises MissingExtraError without eclipse-sumo, InputError for a scene without roads, GeosceneError with
-    the last line of netconvert where that fails.
+    Raises MissingExtraError without eclipse-sumo, SceneFormatError for a scene without roads, GeosceneError
+    with the last line of netconvert's output if that fails.
     """
     home = Path(need("sumo", "sumo").SUMO_HOME)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".geoscene-") as folder:
         roads, net = Path(folder) / "roads.xodr", Path(folder) / "roads.net.xml"
-        told = write_opendrive(scene, roads, progress=progress)
+        roads_summary = write_opendrive(scene, roads, progress=progress)
         command: list[str | Path] = [
             home / "bin" / "netconvert",
             "--opendrive-files",
@@ -41,11 +41,11 @@ def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summ
         # no shell, and nothing in the command is the user's but the name of a folder
         run = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
         if run.returncode or not net.exists():
-            lines = [line for line in run.stderr.splitlines() if line.strip()] or ["it said nothing"]
+            lines = [line for line in run.stderr.splitlines() if line.strip()] or ["no message"]
             raise GeosceneError(f"netconvert failed: {lines[-1]}")
         with atomic_file(path) as out:
             out.write(_STAMP.sub(b"", net.read_bytes()))
     warned = run.stderr.count("Warning")
     files, size = size_of(path)
-    notes = (*told.notes, *([f"netconvert gave {warned} warnings"] if warned else []))
-    return Summary(path, "sumo", files, size, told.objects, crs=scene.frame.name, notes=notes)
+    notes = (*roads_summary.notes, *([f"netconvert gave {warned} warnings"] if warned else []))
+    return Summary(path, "sumo", files, size, roads_summary.objects, crs=scene.frame.name, notes=notes)

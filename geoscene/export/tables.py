@@ -1,4 +1,4 @@
-"""Features as rows: the layers of a scene in pieces, in the plan, and its buildings as surfaces in space."""
+"""Features in chunks of rows: the layers of a scene in plan, and its buildings as surfaces in 3D."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ ROWS = 20_000
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Some features of one layer.
+    """A chunk of features of one layer.
 
     layer    : its name
-    geometry : (n,) shapely, in the coordinates asked for
+    geometry : (n,) shapely, in the target CRS
     columns  : column name to (n,) values
     """
 
@@ -40,7 +40,7 @@ class Rows:
 
 
 def target_crs(scene: Scene, crs: str | None) -> CRS:
-    """The CRS of a name, or the scene's; raises InputError for a name that pyproj does not know."""
+    """The CRS of a name, by default the scene's; raises InputError for an unknown name."""
     if crs is None:
         return scene.frame.crs
     try:
@@ -50,9 +50,9 @@ def target_crs(scene: Scene, crs: str | None) -> CRS:
 
 
 def chosen_layers(scene: Scene, layers: Collection[str] | None, *, solids: bool) -> list[str]:
-    """Names of the layers to write, in the scene's order; by default all that hold anything.
+    """Names of the layers to write, in the scene's order; by default all that have features.
 
-    Raises InputError for a name that is none of the scene's.
+    Raises InputError for an unknown name.
     """
     known = [name for name, (a, b) in sorted(scene.layers.items(), key=lambda item: item[1]) if b > a]
     if layers is None:
@@ -70,7 +70,7 @@ def kinds_of_columns(scene: Scene, layer: str) -> dict[str, np.dtype[Any]]:
 
 
 def rows(scene: Scene, layer: str, *, crs: CRS) -> Iterator[Rows]:
-    """The features of a layer, some at a time, in their order (solids: tile by tile)."""
+    """The features of a layer in order, in chunks (solids: tile by tile)."""
     if layer == SOLIDS:
         yield from _solids(scene, crs)
         return
@@ -78,12 +78,14 @@ def rows(scene: Scene, layer: str, *, crs: CRS) -> Iterator[Rows]:
     same = crs == scene.frame.crs
     for first in range(0, stop - start, ROWS):
         some = scene.features(layer, geometry="projected", rows=range(first, first + ROWS))
-        geometry = some.geometry if same else _moved(scene, some.geometry, crs=crs, projected=True)
+        geometry = some.geometry if same else _transformed(scene, some.geometry, crs=crs, projected=True)
         yield Rows(layer, geometry, dict(some.columns))
 
 
-def _moved(scene: Scene, geometry: NDArray[np.object_], *, crs: CRS, projected: bool) -> NDArray[np.object_]:
-    """Geometries in scene metres, or in the frame's projected coordinates, in those of a CRS."""
+def _transformed(
+    scene: Scene, geometry: NDArray[np.object_], *, crs: CRS, projected: bool
+) -> NDArray[np.object_]:
+    """Geometries transformed to a CRS from scene metres or from the frame's projected coordinates."""
     flat = shapely.get_coordinates(geometry, include_z=True)
     east, north = scene.frame.origin if projected else (0.0, 0.0)
     x, y = scene.frame.to_crs(flat[:, 0] - east, flat[:, 1] - north, crs=crs)
@@ -107,11 +109,13 @@ def _solids(scene: Scene, crs: CRS) -> Iterator[Rows]:
             continue
         feature, geometry = surfaces(chosen.shifted(tile.origin))
         own = {name: values[feature - first] for name, values in columns.items()}
-        yield Rows(SOLIDS, _moved(scene, geometry, crs=crs, projected=False), {"feature": feature, **own})
+        yield Rows(
+            SOLIDS, _transformed(scene, geometry, crs=crs, projected=False), {"feature": feature, **own}
+        )
 
 
 def surfaces(mesh: Mesh) -> tuple[NDArray[np.int32], NDArray[np.object_]]:
-    """Feature numbers (n,) and the faces of each as a MultiPolygon Z; the mesh's faces in feature order."""
+    """Feature numbers (n,) and the faces of each as a MultiPolygon Z; the mesh is sorted by feature."""
     corners = mesh.vertices[mesh.faces]
     rings = np.concatenate([corners, corners[:, :1]], axis=1)
     feature, owner = np.unique(mesh.feature, return_inverse=True)

@@ -1,4 +1,4 @@
-"""3D Tiles 1.1: a quadtree of boxes over the scene's tiles, their content as binary glTF."""
+"""3D Tiles 1.1: a quadtree of bounding boxes over the scene's tiles, with content as binary glTF."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MARGIN = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class _Node:
-    """A tile of the tileset: its box as lowest and highest corner, and its JSON."""
+    """A tile of the tileset: the corners of its bounding box, and its JSON."""
 
     low: Float
     high: Float
@@ -45,17 +45,17 @@ def write_3dtiles(
 ) -> Summary:
     """Write a scene as a folder with ``tileset.json`` (3D Tiles 1.1), tile by tile.
 
-    Coordinates are east, north, up about the scene's middle, true to the ellipsoid (no flat Earth); the
-    root's transform takes them to EPSG:4978. Each tile of the scene has its ground and solids, and as its
-    child its copies (trees, street furniture; EXT_mesh_gpu_instancing). The geometric error of a tile is the
-    size of what is missing while its children are not there: their box's diagonal where the tile is but a
-    box, the height of the tallest copy where the copies are missing, 0 where nothing is. Features have their
-    attributes as property tables (EXT_structural_metadata, EXT_mesh_features).
+    Coordinates are east, north, up about the scene's middle and follow the ellipsoid; the root's transform
+    leads to EPSG:4978. Each tile of the scene contains its ground and solids, and has its instances (trees,
+    street furniture; EXT_mesh_gpu_instancing) as a child. The geometric error of a tile is the size of what
+    its children add: the diagonal of their bounding box for inner nodes, the height of the tallest instance
+    for tiles with instances, else 0. Features have their attributes as property tables
+    (EXT_structural_metadata, EXT_mesh_features).
 
     height_offset : metres from the zero of the scene's heights up from the WGS 84 ellipsoid (for orthometric
                     heights the geoid's undulation)
 
-    Raises InputError where the folder is something else, and for a scene without anything in it.
+    Raises InputError if the folder is not a tileset, and if the chosen layers are empty.
     """
     xmin, ymin, xmax, ymax = scene.bounds
     globe = Globe.at(scene.frame, (xmin + xmax) / 2, y=(ymin + ymax) / 2, lift=height_offset)
@@ -78,7 +78,7 @@ def write_3dtiles(
             solids += sum(piece.solid for piece in found)
             faces += len(part.mesh)
         if not nodes:
-            raise InputError(f"{scene.path}: nothing of the chosen layers in it")
+            raise InputError(f"{scene.path}: the chosen layers are empty")
         root = _quadtree(nodes)
         diagonal = float(np.linalg.norm(root.high - root.low))
         document = {
@@ -96,13 +96,13 @@ def write_3dtiles(
 
 
 def _box(low: Float, high: Float) -> dict[str, list[float]]:
-    """A bounding volume around a box; it is no smaller for being written in decimals."""
+    """The bounding volume of a box, not smaller when rounded to decimals."""
     middle, half = (low + high) / 2, (high - low) / 2 + _MARGIN
     return {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]}
 
 
 def _quadtree(nodes: dict[tuple[int, int], _Node]) -> _Node:
-    """One node over all: fours of neighbours are joined until one is left."""
+    """The root of a quadtree over nodes: neighbours are joined four by four."""
     west, south = (min(index[axis] for index in nodes) for axis in (0, 1))
     level = {(i - west, j - south): node for (i, j), node in sorted(nodes.items())}
     while len(level) > 1:
@@ -137,7 +137,7 @@ def _tile(
     names: list[str],
     library: list[Mesh],
 ) -> _Node | None:
-    """Write the contents of one tile; its node, or None where there is nothing in it."""
+    """Write the contents of one tile; returns its node, or None for an empty tile."""
     name = f"{part.index[0]}_{part.index[1]}"
     copies = None
     if len(part.instances):
@@ -171,7 +171,7 @@ def _tallest(instances: Instances, library: list[Mesh]) -> float:
 def _write_mesh(
     path: Path, scene: Scene, *, part: Part, features: Features, globe: Globe
 ) -> tuple[Float, Float]:
-    """Write the faces of a tile, a mesh a layer; the lowest and highest corner of the points as written."""
+    """Write the faces of a tile, one mesh per layer; returns the corners of the bounding box as written."""
     mesh = part.mesh
     local = globe.local(mesh.vertices + part.origin)
     middle = np.round((local.min(axis=0) + local.max(axis=0)) / 2)
@@ -182,16 +182,16 @@ def _write_mesh(
         for number in np.unique(layer).tolist():
             rows = np.flatnonzero(layer == number)
             feature, which = np.unique(mesh.feature[rows], return_inverse=True)
-            # A vertex names its feature, so that features cannot share one.
+            # Vertices refer to their feature, so that features cannot share vertices.
             key = which[:, None] * len(mesh.vertices) + mesh.faces[rows].astype(np.int64)
             own, corners = np.unique(key, return_inverse=True)
             points = (local[own % len(mesh.vertices)] - middle).astype(np.float32)
             low = np.minimum(low, points.min(axis=0) + middle)
             high = np.maximum(high, points.max(axis=0) + middle)
-            told: dict[str, Any] = {}
+            metadata: dict[str, Any] = {}
             if number:
                 table = _table(writer, features, layer=number - 1, feature=feature)
-                told = {"table": table, "rows": own // len(mesh.vertices), "count": len(feature)}
+                metadata = {"table": table, "rows": own // len(mesh.vertices), "count": len(feature)}
             faces = Mesh.of(
                 np.empty((0, 3)),
                 corners.reshape(-1, 3),
@@ -202,7 +202,7 @@ def _write_mesh(
             )
             turned = np.stack([points[:, 0], points[:, 2], -points[:, 1]], axis=1)
             name = features.layers[number - 1] if number else "terrain"
-            children.append(writer.node(name=name, mesh=writer.mesh(faces, turned, **told)))
+            children.append(writer.node(name=name, mesh=writer.mesh(faces, turned, **metadata)))
         root = writer.node(translation=y_up(middle).tolist(), children=children)
         writer.finish(out, scene_nodes=[root], asset={"copyright": attribution(scene)})
     return low, high
@@ -219,7 +219,7 @@ def _table(writer: GlbWriter, features: Features, *, layer: int, feature: NDArra
 def _write_copies(
     path: Path, scene: Scene, *, part: Part, features: Features, globe: Globe, names: list[str]
 ) -> None:
-    """Write the copies of a tile, a node a shape and layer."""
+    """Write the instances of a tile, one node per shape and layer."""
     copies = part.instances
     anchors = copies.transform[:, :, 3] + part.origin
     transform = copies.transform.copy()
@@ -237,7 +237,7 @@ def _write_copies(
             if number not in meshes:
                 mesh = shapes[names[number]]
                 meshes[number] = writer.mesh(mesh, y_up(mesh.vertices).astype("<f4"), name=names[number])
-            told: dict[str, Any] = {}
+            metadata: dict[str, Any] = {}
             if of_layer:
                 if of_layer not in tables:
                     feature = np.unique(copies.feature[layer == of_layer])
@@ -247,10 +247,12 @@ def _write_copies(
                     )
                 table, feature = tables[of_layer]
                 rows = np.searchsorted(feature, copies.feature[chosen])
-                told = {"table": table, "rows": rows, "count": len(feature)}
+                metadata = {"table": table, "rows": rows, "count": len(feature)}
             origin = np.round(transform[chosen, :, 3].mean(axis=0))
             nodes.append(
-                writer.copies(meshes[number], transform[chosen], name=names[number], origin=origin, **told)
+                writer.copies(
+                    meshes[number], transform[chosen], name=names[number], origin=origin, **metadata
+                )
             )
         writer.finish(out, scene_nodes=nodes, asset={"copyright": attribution(scene)})
 

@@ -31,7 +31,7 @@ def meshes_of(
 
 
 def _head(scene: Scene) -> list[str]:
-    """Where the coordinates are, as lines of comment."""
+    """Comment lines that describe the coordinates."""
     east, north = scene.frame.origin
     wkt = " ".join(scene.frame.wkt.split())
     ascii_only = attribution(scene).replace("©", "(c)").encode("ascii", "replace").decode()
@@ -47,9 +47,9 @@ def _head(scene: Scene) -> list[str]:
 def write_obj(
     scene: Scene, path: Path, *, layers: Collection[str] | None = None, progress: Progress = silent
 ) -> Summary:
-    """Write a scene as Wavefront OBJ with an MTL beside it: an object a feature, z up, scene metres.
+    """Write a scene as Wavefront OBJ with an MTL file: one object per feature, z up, scene metres.
 
-    Coordinates are whole tenths of a millimetre, the grid of the solids, so that nothing moves.
+    Coordinates are multiples of 0.1 mm, the grid of the solids, and so are exact.
     """
     features = read_features(scene)
     objects = solids = faces = first = 0
@@ -84,7 +84,7 @@ def write_obj(
 
 
 def _lines(form: str, values: NDArray[Any]) -> bytes:
-    """Each row of values by one printf form: one call of the interpreter for all."""
+    """Rows of values formatted by one printf format in a single call."""
     return ((form * len(values)) % tuple(values.ravel().tolist())).encode()
 
 
@@ -108,7 +108,7 @@ def write_ply(
     """Write a scene as one binary little-endian PLY: double vertices in scene metres, z up.
 
     Each face has ``feature``, ``class``, ``material``, ``surface`` (0 other, 1 wall, 2 roof, 3 floor),
-    ``closed`` (of a solid), ``red``, ``green`` and ``blue``; codes as in ``scene.json``.
+    ``closed`` (of a solid), ``red``, ``green`` and ``blue``; codes as in the scene's manifest.
     """
     solids: set[int] = set()
     vertices = faces = objects = 0
@@ -158,8 +158,8 @@ def write_stl(
 ) -> Summary:
     """Write the solids of a scene as one binary STL, z up, metres from the middle of the scene.
 
-    STL has no objects, no colours and float32 coordinates. Faces that these make degenerate are left out, and
-    so is, and is counted in the notes, a solid that they would not leave closed.
+    STL has no objects, no colours and float32 coordinates. Faces that rounding makes degenerate are left out,
+    as are solids that would no longer be closed; the notes count these.
     """
     xmin, ymin, xmax, ymax = scene.bounds
     middle = np.array([np.round((xmin + xmax) / 2), np.round((ymin + ymax) / 2), 0.0])
@@ -186,7 +186,7 @@ def write_stl(
 
 
 def _in_single_precision(mesh: Mesh) -> tuple[Mesh, int]:
-    """The solids with vertices that float32 holds, less those that are then no longer closed; how many."""
+    """The solids rounded to float32 without those that are no longer closed, and the number of the latter."""
     points = mesh.vertices.astype(np.float32).astype(np.float64)
     rounded = Mesh.of(
         points,

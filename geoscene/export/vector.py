@@ -1,4 +1,4 @@
-"""Features for geographic information systems: GeoPackage, GeoJSON, GeoParquet."""
+"""Features as GeoPackage, GeoJSON and GeoParquet."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _DATE = "2000-01-01T00:00:00Z"  # a constant, so that the same scene is the same
 def _reading(
     scene: Scene, names: list[str], *, crs: CRS, stage: str, progress: Progress
 ) -> Iterator[tuple[int, Rows]]:
-    """The rows of all layers, with a count of those before them."""
+    """The chunks of all layers, with the number of rows before each."""
     total = sum(np.subtract(*scene.layers[name][::-1]) for name in names if name != SOLIDS)
     done = 0
     for name in names:
@@ -51,10 +51,10 @@ def write_gpkg(
     layers: Collection[str] | None = None,
     progress: Progress = silent,
 ) -> Summary:
-    """Write the features as a GeoPackage: a layer a kind, and ``building_solids`` as MultiPolygon Z.
+    """Write the features as a GeoPackage: one layer for each kind, and ``building_solids`` as MultiPolygon Z.
 
     The faces of a MultiPolygon Z bound the building, counter-clockwise seen from outside: GeoPackage has no
-    type for solids, and the readers built on GEOS take no PolyhedralSurface.
+    type for solids, and readers built on GEOS do not support PolyhedralSurface.
 
     crs    : of the coordinates; default the scene's
     layers : names to write; default all
@@ -108,7 +108,7 @@ def write_geojson(
 ) -> Summary:
     """Write the features as GeoJSON (RFC 7946): longitude and latitude on WGS 84 to 1e-9 degrees (0.1 mm).
 
-    One collection of all layers; ``kind`` is the layer of a feature. What is not known is left out.
+    One collection of all layers; ``kind`` is the layer of a feature. Unknown values are left out.
 
     layers : names to write; default all, less ``building_solids``
     """
@@ -120,10 +120,10 @@ def write_geojson(
         out.write(_json(head)[:-1] + b',"features":[')
         for _, chunk in _reading(scene, names, crs=wgs84, stage="GeoJSON", progress=progress):
             geometry = _for_geojson(chunk.geometry)
-            columns = {_told_as(chunk.layer, name): v.tolist() for name, v in chunk.columns.items()}
+            columns = {_column_name(chunk.layer, name): v.tolist() for name, v in chunk.columns.items()}
             for k, shape in enumerate(shapely.to_geojson(geometry).tolist()):
-                told = {name: plain(values[k]) for name, values in columns.items()}
-                properties = {"kind": chunk.layer, **{n: v for n, v in told.items() if v is not None}}
+                attributes = {name: plain(values[k]) for name, values in columns.items()}
+                properties = {"kind": chunk.layer, **{n: v for n, v in attributes.items() if v is not None}}
                 start = b",\n" if count else b"\n"
                 head = {"type": "Feature", "id": properties["feature"], "properties": properties}
                 out.write(start + _json(head)[:-1] + b',"geometry":' + shape.encode() + b"}")
@@ -138,7 +138,7 @@ def _json(value: Any) -> bytes:
 
 
 def _for_geojson(geometry: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Rounded, and rings of polygons in the plan turned as RFC 7946 wants them."""
+    """Geometries rounded, with rings oriented as RFC 7946 requires."""
     tall = bool(shapely.has_z(geometry).any())
     digits = [9, 9, 4] if tall else [9, 9]
 
@@ -179,7 +179,7 @@ def write_geoparquet(
         for _, chunk in _reading(scene, names, crs=target, stage="GeoParquet", progress=progress):
             n = len(chunk.geometry)
             boxes = shapely.bounds(chunk.geometry)
-            own = {_told_as(chunk.layer, name): values for name, values in chunk.columns.items()}
+            own = {_column_name(chunk.layer, name): values for name, values in chunk.columns.items()}
             columns = {
                 "kind": pa.array([chunk.layer] * n),
                 **{name: _arrow(pa, own.get(name), kind=kind, n=n) for name, kind in kinds.items()},
@@ -198,17 +198,17 @@ def write_geoparquet(
     return Summary(path, "geoparquet", files, size, count, crs=_named(target))
 
 
-def _told_as(layer: str, column: str) -> str:
-    """A column's name in a table of all layers, in which ``kind`` is the layer: ``structures_kind``."""
+def _column_name(layer: str, column: str) -> str:
+    """Name of a column in a table of all layers, where ``kind`` is the layer: ``structures_kind``."""
     return f"{layer}_kind" if column == "kind" else column
 
 
 def _common_kinds(pa: Any, scene: Scene, *, names: list[str]) -> dict[str, Any]:
-    """Arrow type of each column of any layer: text where layers differ, a double for numbers of two kinds."""
+    """Arrow type of each column over all layers: text where layers differ, double for mixed numbers."""
     found: dict[str, list[np.dtype[Any]]] = {}
     for name in names:
         for column, kind in kinds_of_columns(scene, name).items():
-            found.setdefault(_told_as(name, column), []).append(kind)
+            found.setdefault(_column_name(name, column), []).append(kind)
     out = {}
     for column, dtypes in found.items():
         text = any(d.kind == "O" for d in dtypes) or len({d.kind == "b" for d in dtypes}) > 1

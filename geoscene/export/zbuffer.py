@@ -1,4 +1,4 @@
-"""The highest face over every cell of a grid."""
+"""Rasterisation: the highest face over every cell of a grid."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from geoscene.typing import Float
 def draw_triangles(
     corners: Float, label: NDArray[np.uint8], height: NDArray[np.float32], labels: NDArray[np.uint8]
 ) -> None:
-    """Raise a grid, in place, to the triangles over the middles of its cells.
+    """Rasterise triangles into a grid, in place; the highest over the middle of each cell remains.
 
     corners : (m, 3, 3) float64; x and y in cells from the grid's corner (column and row), z in metres
     label   : (m,) of each triangle
     height  : (rows, columns) float32, NaN where nothing has been drawn yet
     labels  : (rows, columns) label of the highest triangle; of two as high, the one drawn first stays
 
-    A middle on an edge counts as inside, so that triangles that share an edge leave no gap. Faces on edge
-    cover nothing.
+    A middle on an edge counts as inside, so that triangles that share an edge leave no gap. Vertical faces
+    cover no cell.
     """
     rows, columns = height.shape
     for k in range(len(corners)):

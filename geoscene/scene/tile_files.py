@@ -20,7 +20,7 @@ from geoscene.typing import Float
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """A square of the scene. A building lies wholly in the tile of its representative point; ground is cut.
+    """A square of the scene. A building lies entirely in the tile of its representative point; ground is cut.
 
     origin    : (3,) float64, whole metres: tile coordinates + origin = scene coordinates
     mesh      : in tile coordinates
@@ -33,7 +33,7 @@ class Tile:
 
 
 def pack(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """A compressed .npz whose bytes depend on the arrays alone (no time stamps)."""
+    """A compressed .npz whose bytes depend on the arrays only (no time stamps)."""
     out = BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, array in arrays.items():
@@ -78,7 +78,7 @@ def write_shapes(path: Path, shapes: Mapping[str, Mesh]) -> None:
 
 
 def read_shapes(path: Path) -> dict[str, Mesh]:
-    """The shapes that `write_shapes` wrote, in order; none if there is no such file."""
+    """The shapes that `write_shapes` wrote, in order; empty if there is no such file."""
     if not path.exists():
         return {}
     try:

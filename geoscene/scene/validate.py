@@ -1,4 +1,4 @@
-"""The verdict on every solid of a scene on disk."""
+"""Validation of all solids of a scene on disk."""
 
 from __future__ import annotations
 

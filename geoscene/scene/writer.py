@@ -1,4 +1,4 @@
-"""Writing a scene directory: whole, or not at all."""
+"""Atomic writing of scene directories."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from geoscene.scene.tile_files import write_shapes
 
 
 class SceneWriter:
-    """A scene directory in the making; it appears under its name when `finish` has been called.
+    """Writer of a scene directory, which appears under its name when `finish` is called.
 
-    Until then all lies in a folder beside it, which goes away when the work fails and stays when it is killed
-    or interrupted, so that the next build can go on from there.
+    Until then its files are in a folder beside it, which is removed if the build fails, and kept if it is
+    killed or interrupted, so that the next build can resume.
 
-    Raises SceneFormatError if the name is taken by something that may not be replaced.
+    Raises SceneFormatError if the path exists and may not be replaced.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
@@ -46,7 +46,7 @@ class SceneWriter:
         self.folder.mkdir(parents=True, exist_ok=True)
         self.files = SceneFiles(self.folder)
         for left in self.folder.iterdir():
-            if left not in (self.files.tiles, self.files.tile_journal):  # of a killed build only tiles serve
+            if left not in (self.files.tiles, self.files.tile_journal):  # a build resumes from tiles only
                 left.unlink()
 
     def finish(

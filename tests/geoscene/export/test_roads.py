@@ -153,7 +153,7 @@ def test_restrictions_that_junctions_cannot_say_are_counted(tmp_path):
     graph = replace(roads(), chain_edges=chain, chain_kind=np.array(["no_u_turn"]))
     write_graphml(graph, scene.frame, path=scene.files.road_graph)
     (note,) = export_scene(scene, tmp_path / "bound.xodr").notes
-    assert note.startswith("1 turn restrictions via ways are not in it")
+    assert note.startswith("1 turn restrictions via ways are left out")
     assert (tmp_path / "bound.xodr").read_bytes() == (tmp_path / "plain.xodr").read_bytes()
 
 
