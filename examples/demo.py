@@ -1,16 +1,18 @@
-"""The whole way on the bundled piece of Helsinki: build the scene, drive through it, map it, look at it.
+"""All steps on the bundled piece of Helsinki: build the scene, drive in traffic, make a map, draw pictures.
 
-Writes to ``demo/`` (or the folder given as the first argument) and prints what is where.
+Writes to ``demo/`` (or the folder given as the first argument) and lists the files at the end.
 """
 
+import csv
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
 from geoscene.build import build
-from geoscene.classes import class_codes
+from geoscene.classes import Class, class_codes
 from geoscene.console import progress_bar
 from geoscene.options import BuildOptions
 from geoscene.scene import SceneFiles
@@ -33,7 +35,11 @@ from lidar.maps.picture import (
 from lidar.options import DriveOptions
 from lidar.rig.specs import load_rig
 from lidar.rig.vehicle import load_vehicle
+from lidar.traffic.populate import TrafficOptions
 from lidar.world.world import World
+
+ROUTE = ((60.16765, 24.94750), (60.16640, 24.94350))
+"""Latitude and longitude of a start and an end: westwards along Pohjoisesplanadi, the sun behind."""
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")
 pictures = out / "pictures"
@@ -42,8 +48,19 @@ began = time.perf_counter()
 
 
 def say(text: str) -> None:
-    """Print a line with the time it took to get there."""
+    """Print a line with the seconds since the start."""
     print(f"[{time.perf_counter() - began:5.1f} s] {text}", flush=True)
+
+
+def busiest_frame(boxes: Path) -> str:
+    """Name of the camera frame that shows most road users, each mostly visible and of some size."""
+    with boxes.open(newline="") as file:
+        seen = Counter(
+            int(row["frame"])
+            for row in csv.DictReader(file)
+            if float(row["visibility"]) > 0.5 and int(row["pixels"]) > 800
+        )
+    return f"{max(seen, key=lambda frame: (seen[frame], -frame)):06d}"
 
 
 with progress_bar() as progress:
@@ -60,29 +77,30 @@ with progress_bar() as progress:
     broken = len(report["broken"])
     say(f"{counts['solids']} buildings, {broken} solids broken; {counts['road_km']} km of road")
 
-    # 2. The scene as a page to turn and click, from above and obliquely.
+    # 2. The scene as a web page, and pictures of it from above and obliquely.
     view_scene(scene, out / "scene.html", overwrite=True, progress=progress)
     world = World.load(scene)
     write_png(pictures / "scene_top.png", scene_picture(world, view="top", size=(1400, 1400)))
     write_png(pictures / "scene_oblique.png", scene_picture(world, view="oblique", size=(1600, 1000)))
 
-    # 3. A drive with a 3D scanner, a 2D scanner, a camera and a satellite receiver.
-    say("driving for 20 seconds")
-    options = DriveOptions(route="random", duration=20.0, seed=4, formats=("pcd", "ply", "csv", "laz"))
+    # 3. A drive with a 3D scanner, a 2D scanner, a camera and a satellite receiver in busy traffic.
+    say("driving for 38 seconds among cars, cyclists and pedestrians")
+    traffic = TrafficOptions(vehicles=30.0, cyclists=8.0, pedestrians=100.0, parked=0.9)
+    options = DriveOptions(route=ROUTE, duration=38.0, seed=3, traffic=traffic)
     summary = drive(scene, out / "drive", options=options, overwrite=True, progress=progress)
     say(f"{summary.length:.0f} m, {summary.frames} frames, {summary.written:,} returns")
 
-    # 4. One sweep by class, one camera frame.
-    middle = f"{summary.frames // 2:06d}"
-    sweep = read_table(out / "drive" / "lidar_top" / "pcd" / f"{middle}.pcd")
+    # 4. The camera frame with most road users, and the sweep of that moment by class.
+    camera = out / "drive" / "camera_front"
+    frame = busiest_frame(camera / "boxes.csv")
+    sweep = read_table(out / "drive" / "lidar_top" / "pcd" / f"{frame}.pcd")
     mount = load_rig("seed").lidars[0].mount
     xyz = np.column_stack([sweep[axis] for axis in "xyz"]) @ mount.rotation.T + mount.translation
     label = sweep["label"].astype(np.uint8)
     image = sweep_picture(xyz, class_colors(label), vehicle=load_vehicle("car"))
     write_png(pictures / "sweep_class.png", with_legend(image, label))
-    camera = out / "drive" / "camera_front"
-    write_png(pictures / "camera_rgb.png", read_png(camera / "rgb" / f"{middle}.png"))
-    depth = counts_to_depth(read_png(camera / "depth" / f"{middle}.png"))
+    write_png(pictures / "camera_rgb.png", read_png(camera / "rgb" / f"{frame}.png"))
+    depth = counts_to_depth(read_png(camera / "depth" / f"{frame}.png"))
     write_png(pictures / "camera_depth.png", depth_picture(depth))
 
     # 5. All sweeps as one georeferenced map.
@@ -90,21 +108,21 @@ with progress_bar() as progress:
     dataset = open_dataset(out / "drive")
     aggregate(dataset, out / "map.laz", voxel=0.1, sensors=("lidar_top",), progress=progress)
     points = read_table(out / "map.laz")
-    world_xyz = np.column_stack([points[axis] for axis in "xyz"])
-    colors = class_codes().color[points["label"]]
-    write_png(
-        pictures / "map_class.png",
-        with_legend(cloud_picture(world_xyz, colors, size=(1600, 1000), point=0.15), points["label"]),
-    )
+    static = points["label"] < Class.CAR  # moving road users leave trails
+    label = points["label"][static]
+    world_xyz = np.column_stack([points[axis][static] for axis in "xyz"])
+    image = cloud_picture(world_xyz, class_codes().color[label], size=(1600, 1000), point=0.15)
+    write_png(pictures / "map_class.png", with_legend(image, label))
 
 say("done; open these:")
 for path, what in {
-    out / "scene.html": "the scene, to turn and click (any browser, no network)",
-    pictures: "pictures of all of it",
+    out / "scene.html": "the scene as an interactive page (any browser, no network)",
+    pictures: "pictures of each step",
     SceneFiles(out / "scene").features: "buildings, land cover, roads (QGIS)",
     out / "map.laz": "the map, in UTM (CloudCompare, QGIS)",
-    out / "drive" / "lidar_top": "sweeps as PCD, PLY, CSV and LAZ",
+    out / "drive" / "lidar_top": "sweeps as PCD and LAZ (lidar drive --format writes others)",
     out / "drive" / "camera_front": "RGB and depth images",
-    out / "drive" / "poses.csv": "where the vehicle was",
+    out / "drive" / "boxes.csv": "3D bounding boxes of the other road users",
+    out / "drive" / "poses.csv": "pose of the vehicle at each frame",
 }.items():
     print(f"  {path}  -  {what}")
