@@ -3,7 +3,7 @@
 >>> cover, problems = landcover(osm, frame, extent=extent)                           # doctest: +SKIP
 >>> layers = concatenate_layers([cover, road_surfaces, building_pads(footprints)])   # doctest: +SKIP
 >>> plan = plan_ground(extent, layers, tile_size=250.0)                              # doctest: +SKIP
->>> meshes = [ground_tile(plan, i, j) for i, j in plan.tiles]                        # doctest: +SKIP
+>>> meshes = [ground_tile(plan, i, j=j) for i, j in plan.tiles]                        # doctest: +SKIP
 """
 
 from geoscene.ground.drape import WaterLevels as WaterLevels

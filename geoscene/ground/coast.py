@@ -13,7 +13,7 @@ from geoscene.report import Problem
 from geoscene.typing import Float
 
 _ASIDE = 0.01
-"""How far beside a coastline its land and sea are looked for, metres."""
+"""Metres to each side of a coastline at which land and sea are sampled."""
 
 
 def sea(
@@ -25,9 +25,9 @@ def sea(
     extent     : (xmin, ymin, xmax, ymax)
     osm_id     : of each coastline, for the problems
 
-    No coastline inside the extent means no sea. A coastline that ends inside the extent, as it does where an
-    extract was cut, is led on to the nearest point of the extent's border. A piece that has land and sea
-    on its wrong sides, which broken coastlines cause, is what most of its shore says.
+    Without a coastline inside the extent there is no sea. A coastline that ends inside the extent (where an
+    extract was cut) is extended to the nearest point of the border. A face whose shores contradict each
+    other, which broken coastlines cause, becomes what most metres of its shore indicate.
     """
     box = shapely.box(*extent)
     names = list(osm_id) or [""] * len(coastlines)
@@ -53,7 +53,7 @@ def sea(
 
 
 def _loose_ends(coastlines: Sequence[Float], box: Any) -> list[tuple[int, Float]]:
-    """(coastline, point) of ends within the box that no other coastline continues."""
+    """(coastline, point) of ends inside the box where no other coastline continues."""
     ends = np.array([[c[0], c[-1]] for c in coastlines]).reshape(-1, 2)
     _, place, count = np.unique(np.round(ends, 3), axis=0, return_inverse=True, return_counts=True)
     loose = (count[place.reshape(-1)] == 1) & shapely.contains_xy(box, ends[:, 0], ends[:, 1])
@@ -61,7 +61,7 @@ def _loose_ends(coastlines: Sequence[Float], box: Any) -> list[tuple[int, Float]
 
 
 def _led_over(line: Any) -> Any:
-    """The line (two points) drawn a little past its end, so that it surely crosses what it touches."""
+    """The line (two points) extended slightly past its end, so that it crosses what it touches."""
     (x0, y0), (x1, y1) = line.coords
     length = max(line.length, _ASIDE)
     return shapely.LineString(
@@ -70,7 +70,7 @@ def _led_over(line: Any) -> Any:
 
 
 def _shores(faces: NDArray[np.object_], coastlines: Sequence[Float]) -> tuple[Float, Float]:
-    """Metres of shore of each face (n,) that say sea, and that say land."""
+    """Metres of shore of each face (n,) that indicate sea, and that indicate land."""
     start = np.concatenate([c[:-1] for c in coastlines])
     step = np.concatenate([np.diff(c, axis=0) for c in coastlines])
     length = np.hypot(*step.T)
@@ -78,7 +78,7 @@ def _shores(faces: NDArray[np.object_], coastlines: Sequence[Float]) -> tuple[Fl
     right = np.stack([step[:, 1], -step[:, 0]], axis=1) / length[:, None] * _ASIDE
     tree = shapely.STRtree(faces)
     shores: list[Float] = []
-    # Long segments may cross the border of the extent: they are asked at many places.
+    # Long segments may cross the border of the extent: they are sampled at several points.
     pieces = np.maximum(np.ceil(length / 5.0).astype(int), 1)
     segment = np.repeat(np.arange(len(length)), pieces)
     nth = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)

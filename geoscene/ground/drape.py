@@ -1,4 +1,4 @@
-"""The ground's triangles at their heights: on the terrain, and water level."""
+"""Heights of the ground's triangles: on the terrain, and at water levels."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ Height = Callable[[Float, Float], Float]
 """z (n,) in metres of the terrain at scene x (n,), y (n,)."""
 
 _STATION = 20.0
-"""Spacing of places along shores and rivers at which the terrain is asked, metres."""
+"""Spacing in metres of terrain samples along shores and rivers."""
 
 _FINE = 2.0
-"""Spacing of the places at which a river's level is kept, metres."""
+"""Spacing in metres of the stations of a river's level."""
 
 _CUT = 3.0
-"""How deep a river may cut into the terrain model, metres: deeper is a fault of the model or the map."""
+"""Metres that a river may lie below the terrain; more is a fault of the elevation model or the map."""
 
 _AROUND = 2.0**-9
 _DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False) + 0.1
@@ -46,14 +46,14 @@ _DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False) + 0.1
 
 @dataclass(frozen=True, slots=True)
 class WaterLevels:
-    """How high the water stands.
+    """Levels of the water.
 
     level   : (n,) float64 metres, of each row of the layers; NaN where the row is no water, or a river
     river   : (n,) bool, the row is a river: its level at a point is that of the nearest station
     station : (k, 2) float64, places on rivers' centre lines, scene metres
     height  : (k,) float64 metres, of the water there
-    nearest : finds the station nearest to a place, None without stations
-    reversed : ids of waterways that were drawn against the fall of the terrain
+    nearest : KD-tree of the stations, None without stations
+    reversed : ids of waterways that were mapped against the fall of the terrain
     """
 
     level: Float
@@ -67,14 +67,13 @@ class WaterLevels:
 def water_levels(layers: Layers, ways: Sequence[Way], *, frame: Frame, height: Height) -> WaterLevels:
     """The level of every water row of the layers.
 
-    The sea has one level: the median of the terrain over it. Standing water, with all that touches it,
-    has one level: the sea's if the sea is among it, else the lowest terrain on its shore. A river falls
-    along its centre line, level across: every 20 m it is the lowest terrain from its source
-    to there, but not more than 3 m below the terrain; one that the map draws against a fall of more than
-    3 m is turned round and named in the result. A river's area without a centre line in it is standing
-    water.
+    The sea has one level: the median of the terrain over it. Connected standing water has one level: that of
+    the sea if they touch, else the lowest terrain on its shore. A river falls along its centre line and is
+    level across: every 20 m its level is the lowest terrain upstream, at most 3 m below the terrain. A
+    waterway that is mapped against a fall of more than 3 m is reversed and listed. A river area without a
+    centre line is standing water.
 
-    ways : whose ``waterway`` gives centre lines
+    ways : those with ``waterway`` give the centre lines
     """
     level = np.full(len(layers), np.nan)
     lines = [way for way in ways if "waterway" in way.tags and len(way.lonlat) > 1]
@@ -106,8 +105,8 @@ def drape(
     """The ground mesh in scene coordinates: faces upward, each with its cell's class, material and feature.
 
     A vertex on water, its shore included, has the water's level (where several waters meet, the lowest),
-    any other that of the terrain; 0 everywhere without ``height``. Vertices on tiles' borders are settled
-    by what lies around them, not by the tile's own cells, so that neighbouring tiles agree.
+    any other that of the terrain; 0 everywhere without ``height``. The height of a vertex on a tile's border
+    depends on all layers there, not on the tile's own cells, so that neighbouring tiles agree.
     """
     x, y = triangles.points.T
     z = np.zeros(len(x)) if height is None else np.asarray(height(x, y), float)
@@ -135,7 +134,7 @@ def ground_tile(
 
 
 def _inside(polygons: NDArray[np.object_]) -> tuple[Float, Float]:
-    """Up to about a thousand points well spread inside polygons, on a regular grid; at least one each."""
+    """Up to about a thousand points inside polygons, on a regular grid; at least one each."""
     sure = shapely.get_coordinates(shapely.point_on_surface(polygons))
     xmin, ymin, xmax, ymax = shapely.total_bounds(polygons)
     step = max(np.sqrt((xmax - xmin) * (ymax - ymin) / 1000.0), 1.0)
@@ -147,13 +146,13 @@ def _inside(polygons: NDArray[np.object_]) -> tuple[Float, Float]:
 
 
 def _still_levels(polygons: NDArray[np.object_], sea: NDArray[np.bool_], *, height: Height) -> Float:
-    """The level (n,) of waters that do not flow; those that touch stand equally high."""
+    """Levels (n,) of standing waters; waters that touch have the same level."""
     from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
     n = len(polygons)
     one, other = shapely.STRtree(polygons).query(polygons, predicate="intersects")
-    # All sea is one water, whatever land divides it.
+    # All sea has one level, even where land divides it.
     first = np.flatnonzero(sea)[:1]
     one = np.concatenate([one, np.repeat(first, sea.sum())])
     other = np.concatenate([other, np.flatnonzero(sea)[: len(one) - len(other)]])
@@ -171,7 +170,7 @@ def _still_levels(polygons: NDArray[np.object_], sea: NDArray[np.bool_], *, heig
 
 
 def _profiles(ways: Sequence[Way], frame: Frame, *, height: Height) -> tuple[Float, Float, tuple[str, ...]]:
-    """Stations (k, 2) on rivers, the water's height (k,) there, and which rivers were turned round."""
+    """Stations (k, 2) on rivers, the level (k,) there, and which rivers were reversed."""
     stations, heights, turned = [np.empty((0, 2))], [np.empty(0)], []
     for way in ways:
         line = shapely.LineString(np.column_stack(frame.from_geographic(*way.lonlat.T)))
@@ -193,7 +192,7 @@ def _profiles(ways: Sequence[Way], frame: Frame, *, height: Height) -> tuple[Flo
 def _flooded(
     plan: GroundPlan, cells: Partition, *, triangles: Triangles, z: Float, levels: WaterLevels
 ) -> Float:
-    """Heights (n,) of the points, those on water at its level."""
+    """Heights (n,) of the points; points on water take its level."""
     low, high = triangles.points.min(axis=0) - _AROUND, triangles.points.max(axis=0) + _AROUND
     if not (plan.layers.body[rows_near(plan, low[0], ymin=low[1], xmax=high[0], ymax=high[1])] != "").any():
         return z

@@ -1,4 +1,4 @@
-"""Which tags make which ground: class, material, and what lies over what."""
+"""Land cover by tags: class, material and order of precedence."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Kind:
 
     klass    : `geoscene.classes.Class`
     material : name in `geoscene.classes.materials`, where no ``surface`` tag says otherwise
-    tier     : 0..99, what lies over what; within a tier the smaller polygon lies above
+    tier     : 0..99, the higher covers the lower; within a tier the smaller polygon covers the larger
     width    : metres, for lines without a usable ``width``; 0 for areas
     body     : ``sea``, ``standing`` or ``river`` for water, else ""
     """
@@ -160,7 +160,7 @@ _RIVERS = frozenset({"river", "stream", "canal", "rapids", "ditch", "drain", "lo
 
 
 def is_underground(tags: Tags) -> bool:
-    """Whether it is not on the ground: in a tunnel, on a bridge or a roof, in or under a building."""
+    """Whether a feature is not on the ground: in a tunnel, on a bridge or a roof, in or under a building."""
     return (
         any(
             tags.get(key, "no") not in _NO
@@ -173,7 +173,7 @@ def is_underground(tags: Tags) -> bool:
 
 
 def area_kind(tags: Tags) -> Kind | None:
-    """The kind of ground an area is: of all its keys, the one that lies highest; None if it is none."""
+    """The kind of ground of an area: the highest tier of all its keys; None if it is none."""
     found = [kind for key, values in AREAS.items() if (kind := values.get(tags.get(key, ""))) is not None]
     if not found or is_underground(tags):
         return None
@@ -184,7 +184,7 @@ def area_kind(tags: Tags) -> Kind | None:
 
 
 def line_kind(tags: Tags) -> Kind | None:
-    """The kind of ground a line draws; None if it draws none."""
+    """The kind of ground of a line; None if it is none."""
     for key, values in LINES.items():
         kind = values.get(tags.get(key, ""))
         if kind is not None and not is_underground(tags):

@@ -1,4 +1,4 @@
-"""What the map says lies on the ground: areas, waterways, railways, the sea."""
+"""Mapped land cover: areas, waterways, railways, the sea."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from geoscene.tags import parse_length
 from geoscene.typing import Float
 
 _WIDEST = 3000.0
-"""A width beyond this, metres, is a slip of the pen."""
+"""Metres; larger widths are taken for typing errors."""
 
 
 def landcover(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
-    """Land cover within the extent as `Layers`, and what was repaired or dropped on the way.
+    """Land cover within the extent as `Layers`, and problems: what was repaired or dropped.
 
     Areas by `kinds.AREAS`, lines of water, rail and stone widened by their ``width`` or their kind's, and
     the sea behind coastlines. Roads and buildings are no land cover. A ``surface`` tag decides the

@@ -1,4 +1,4 @@
-"""What may lie on the ground: polygons with a class, a material and a priority, as columns."""
+"""Layers of the ground: polygons with a class, a material and a priority, as columns."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from geoscene.classes import Class, materials
 from geoscene.errors import InputError
 
 LANDCOVER, ROADS, PADS = 0.0, 100.0, 200.0
-"""Where the priorities of land cover, of road surfaces and of building pads begin."""
+"""Lowest priorities of land cover, of road surfaces and of building pads."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Layers:
     material : (n,) uint8, code of `geoscene.classes.materials`
     priority : (n,) float64
     osm_id   : (n,) str, "" for none
-    source   : (n,) str: what klass, material and shape rest on: ``tags``, ``surface`` (material from the
+    source   : (n,) str, origin of class, material and shape: ``tags``, ``surface`` (material from the
                tag), ``width`` (a line with its mapped width), ``default-width`` (a line with an assumed one),
                ``coastline``
     body     : (n,) str: kind of water, which decides its level: ``sea``, ``standing``, ``river``; else ""
@@ -42,10 +42,10 @@ class Layers:
     feature: NDArray[np.int32]
 
     def __post_init__(self) -> None:
-        """Refuse columns that disagree in length."""
+        """Raise InputError if columns differ in length."""
         lengths = {f.name: len(getattr(self, f.name)) for f in fields(self)}
         if len(set(lengths.values())) > 1:
-            raise InputError(f"layer columns disagree in length: {lengths}")
+            raise InputError(f"layer columns differ in length: {lengths}")
 
     def __len__(self) -> int:
         """Number of polygons."""
@@ -94,7 +94,7 @@ def concatenate_layers(layers: Sequence[Layers]) -> Layers:
 def building_pads(
     footprints: Sequence[object] | NDArray[np.object_], *, osm_id: ArrayLike = "", feature: ArrayLike = -1
 ) -> Layers:
-    """The ground under buildings: one pad a footprint (scene metres), which nothing lies over.
+    """The ground under buildings: one pad per footprint (scene metres), above all other layers.
 
     Footprints that are None, empty or without area make an empty row, so rows stay aligned with buildings.
     """

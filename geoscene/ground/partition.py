@@ -30,7 +30,7 @@ A power of two, so that moving a vertex by whole metres is exact in floating poi
 SLIVER = 0.02
 """A cell nowhere wider than this, metres, joins the neighbour with which it shares most border.
 
-Below the narrowest thing drawn on the ground (a kerb or a line of 0.1 m), above what mappers' hands leave
+Narrower than the narrowest surface (a kerb or a line of 0.1 m), wider than the gaps that mappers leave
 between areas meant to touch."""
 
 BEND = 0.01
@@ -44,16 +44,16 @@ _REACH = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class GroundPlan:
-    """What `partition_tile` needs of the whole scene; pickles, so that tiles can go to workers.
+    """Input of `partition_tile` for the whole scene; can be pickled for worker processes.
 
     extent    : (xmin, ymin, xmax, ymax) of the ground, scene metres, on the grid
     tile_size : side of a tile, metres
     lines     : spacing of the terrain's lines, metres, 0 for none
     ruled     : tiles that have these lines; None for all
     coarse    : spacing of the lines in the other tiles, 0 for none
-    layers    : what competes for the ground
+    layers    : the polygons that compete for the ground
     tree      : STRtree over their polygons
-    base      : (class, material code) where there is nothing
+    base      : (class, material code) where no polygon lies
     start, end : (m, 2) float64 segments of all outlines, on the grid
     string    : (m,) int64: segments of one outline that follow each other have the same number
     order, offset : segments by tile: those of tile (i, j) are
@@ -162,7 +162,7 @@ def plan_ground(
 def partition_tile(plan: GroundPlan, i: int, *, j: int) -> Partition:
     """The cells of tile (i, j), which covers [i, i + 1) x [j, j + 1) times the tile size, within the extent.
 
-    The same whatever other tiles are made. Raises InputError for a tile outside the extent.
+    The result does not depend on which other tiles are made. Raises InputError for a tile outside the extent.
     """
     place = tile_place(plan, i, j=j)
     if place is None:
@@ -219,7 +219,7 @@ def tile_place(plan: GroundPlan, i: int, *, j: int) -> int | None:
 
 
 def rows_near(plan: GroundPlan, xmin: float, *, ymin: float, xmax: float, ymax: float) -> NDArray[np.int64]:
-    """The rows of the layers whose boxes meet a box, in no particular order."""
+    """Rows of the layers whose bounding boxes intersect a box, in no particular order."""
     return np.asarray(plan.tree.query(shapely.box(xmin, ymin, xmax, ymax)), np.int64)
 
 
@@ -228,7 +228,7 @@ def winners(plan: GroundPlan, xy: Float) -> NDArray[np.int64]:
     best = np.full(len(xy), -1, np.int64)
     point, row = plan.tree.query(shapely.points(xy))
     polygons = plan.layers.polygon
-    # Only what this call prepared is let go of, for what a preparation holds is larger than its polygon.
+    # Release what this call prepared: a prepared geometry takes more memory than its polygon.
     fresh = np.unique(row)
     fresh = fresh[~shapely.is_prepared(polygons[fresh])]
     shapely.prepare(polygons[fresh])
@@ -318,7 +318,7 @@ def _spacing(plan: GroundPlan, i: int, *, j: int) -> float:
 
 
 def _multiples(low: float, high: float, *spacings: float) -> Float:
-    """Multiples of the spacings (0 for none) between two numbers, rising."""
+    """Multiples of the spacings (0 for none) between two numbers, ascending."""
     steps = [np.arange(np.floor(low / s) + 1, np.ceil(high / s)) * s for s in spacings if s > 0]
     return np.unique(np.concatenate([np.empty(0), *steps]))
 
@@ -326,7 +326,7 @@ def _multiples(low: float, high: float, *spacings: float) -> Float:
 def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float, float]) -> list[object]:
     """The tile's sides, and the terrain's lines across it.
 
-    A side has a vertex at every line of the tiles on both its hands, so that the two agree.
+    A side has a vertex at every line of both tiles that share it, so that the two agree.
     """
     xmin, ymin, xmax, ymax = box
     own = _spacing(plan, i, j=j)
@@ -357,7 +357,7 @@ def _faces(linework: object, box: tuple[float, float, float, float]) -> NDArray[
 
 @dataclass(frozen=True, slots=True)
 class _Edges:
-    """Directed edges of cells, the cell's inside always on the same hand.
+    """Directed edges of cells, the interior always on the same side.
 
     a, b   : (m,) int64, numbers of the ends
     cell   : (m,) int64
@@ -389,9 +389,9 @@ class _Edges:
 def _without_slivers(
     edges: _Edges, cells: NDArray[np.object_], *, row: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], int]:
-    """Rows in which a sliver has the row of the wider cell it shares most border with; how many changed."""
+    """Rows after each sliver took that of the wider cell it shares most border with; how many changed."""
     # The area is at most the radius of the greatest circle within times the outline (Bonnesen), so all
-    # slivers are among the few cells that pass this; those with a wider spot are then let go.
+    # slivers are among the few cells that pass this; those with a wider spot are then excluded.
     thin = 2.0 * shapely.area(cells) < SLIVER * shapely.length(cells)
     thin[thin] = shapely.is_empty(shapely.buffer(cells[thin], -SLIVER / 2, quad_segs=4))
     if not thin.any():

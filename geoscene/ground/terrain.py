@@ -29,7 +29,7 @@ _UNITS = {
 """Metres per vertical unit; the US survey foot is 1200/3937 m by its definition."""
 
 _LOWEST, _HIGHEST = -500.0, 9000.0
-"""No land lies below the Dead Sea's shore or above Everest: what does is a void without its mark."""
+"""Metres of the lowest and highest land, with a margin; other values are unmarked voids."""
 
 _MARGIN = 3
 """Posts read beyond the scene on each side."""
@@ -62,14 +62,14 @@ class Terrain:
 
     frame    : the scene frame that x and y are in
     grids    : finest first; a place takes its height from the first that covers it; none for flat ground
-    vertical : what heights are above: ``flat``, ``orthometric`` (a geoid) or ``ellipsoidal``
+    vertical : reference of heights: ``flat``, ``orthometric`` (a geoid) or ``ellipsoidal``
     datum    : the vertical datum in words, such as ``EGM96``, and how it is known
     spacing  : metres between the posts of the finest grid, 0 for flat ground
     posts    : posts read
     voids    : posts among them that held no height and were filled from their neighbours
     uncovered : share of the scene that no raster covers, which took the nearest height
     sources  : names of the files
-    credits  : what each file wants to be said where it is used, empty if it says nothing
+    credits  : attribution that each file asks for, empty if none
     """
 
     frame: Frame
@@ -134,14 +134,14 @@ def open_terrain(
     -500 m or higher than 9,000 m) are filled from around by inverse distances and counted.
 
     bounds   : (xmin, ymin, xmax, ymax), scene metres; only what lies within is read
-    unit     : of heights (``m``, ``ft``, ``us-ft``) where the files do not say or are wrong; else metres
-    vertical : what heights are above, where the files do not say; else a geoid (``orthometric``)
+    unit     : of heights (``m``, ``ft``, ``us-ft``) where the files do not state it or are wrong
+    vertical : reference of heights where the files do not state it; a geoid (``orthometric``) by default
     outside  : what to do where no raster covers the bounds: raise, or take the ``nearest`` height and tell
                the share
 
     Raises SourceNotFoundError for a missing file, InputError for one that is no raster, has no CRS or an
-    unknown unit, for rasters that do not cover the bounds, and for ones that disagree on what heights are
-    above.
+    unknown unit, for rasters that do not cover the bounds, and for ones that differ in the reference of
+    heights.
     """
     if not paths:
         raise InputError("no elevation file was given")
@@ -150,7 +150,7 @@ def open_terrain(
     kinds = {(r.vertical, r.datum) for r in rasters}
     if len({kind for kind, _ in kinds}) > 1:
         raise InputError(
-            "the elevation files disagree on what heights are above: "
+            "the elevation files differ in the reference of heights: "
             + "; ".join(f"{r.path.name}: {r.vertical}" for r in rasters)
         )
     covered = shapely.intersection(shapely.union_all([_outline(r, frame) for r in rasters]), box).area
@@ -205,7 +205,7 @@ def base_heights(
 
 @dataclass(frozen=True, slots=True)
 class _Raster:
-    """One file: where its posts lie and what its numbers mean; post (0, 0) is its first pixel's middle."""
+    """One file: lattice, unit and datum; post (0, 0) is the centre of its first pixel."""
 
     path: Path
     name: str
@@ -237,7 +237,7 @@ def _gdal_name(path: Path) -> str:
 
 
 def _open(path: Path, *, unit: str | None, vertical: Literal["orthometric", "ellipsoidal"] | None) -> _Raster:
-    """What a file says of itself, and what the caller says where it is silent."""
+    """Metadata of a file, completed by the caller's where it has none."""
     import rasterio  # noqa: PLC0415 - slow to import
     from rasterio.errors import RasterioIOError  # noqa: PLC0415
 
@@ -308,7 +308,7 @@ def _not_covered(rasters: Sequence[_Raster], frame: Frame, *, bounds: Sequence[f
 
 
 def _percent(share: float) -> str:
-    """A share in words that neither round a gap away nor call one the whole."""
+    """A share as text that shows 0 % and 100 % only where they are exact."""
     if share >= 1.0:
         return "all"
     if share < 0.001:
@@ -317,7 +317,7 @@ def _percent(share: float) -> str:
 
 
 def _shares_lattice(one: _Raster, other: _Raster) -> bool:
-    """Whether the posts of both lie on one lattice: the same CRS and steps, a whole number of steps apart."""
+    """Whether both share one lattice: the same CRS and steps, a whole number of steps apart."""
     if one.crs != other.crs or not np.allclose(one.step, other.step, rtol=1e-7, atol=0):
         return False
     apart = np.linalg.solve(one.step, other.origin - one.origin)

@@ -52,14 +52,14 @@ def triangulate(partition: Partition) -> Triangles:
     if amiss.any() or (area == 0).any():
         where = partition.polygon[np.argmax(amiss)].representative_point()
         raise GeosceneError(
-            f"{int(amiss.sum())} ground cells not triangulated wholly, {int((area == 0).sum())} triangles "
+            f"{int(amiss.sum())} ground cells not fully triangulated, {int((area == 0).sum())} triangles "
             f"have no area; look at ({where.x:.3f}, {where.y:.3f})"
         )
     return Triangles(points, faces.astype(np.int32), cell.astype(np.int32))
 
 
 def _signed_area(points: Float, faces: NDArray[np.integer]) -> Float:
-    """Areas (m,), positive for counter-clockwise faces; exact enough to tell a sliver's side on the grid."""
+    """Areas (m,), positive for counter-clockwise faces; exact enough for the sign of slivers on the grid."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     u, v = b - a, c - a  # differences of grid points are exact
     area: Float = 0.5 * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])

@@ -1,4 +1,4 @@
-"""What the ground is where the map says nothing: paved in dense town, soil elsewhere."""
+"""Ground without mapped land cover: paved in dense towns, soil elsewhere."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from geoscene.ground import Layers
 
 _CELL = 20.0  # metres
 _AROUND = 2  # cells on each side that a cell's density is taken over: 100 m in all
-_DENSE = 0.2  # share of built-up area from which yards are taken for paved; assumed
+_DENSE = 0.2  # built-up share from which yards are paved; assumed
 _PRIORITY = -1.0  # below everything that is mapped
 
 
 def paved_fabric(footprints: NDArray[Any]) -> Layers:
-    """Ground between densely standing buildings, as the lowest of all layers: a guess, marked as such.
+    """Paved ground between dense buildings, as the lowest layer: an assumption, marked as such.
 
     Where buildings cover more than a fifth of the 100 m around, unmapped ground is paved (yards, pavements);
-    in suburbs and in the country it stays what the base is. Source ``assumed-built-up``.
+    in suburbs and in the country it remains the base. Source ``assumed-built-up``.
 
     footprints : shapely polygons, scene metres
     """

@@ -24,18 +24,18 @@ from geoscene.watertight import GRID
 Height = Callable[[Float, Float], Float]
 
 _BELOW = 0.3
-"""How far a barrier reaches under the ground, metres, so that it meets a slope."""
+"""Metres by which a barrier extends below the ground, so that no gap opens on a slope."""
 
 _STATION = 5.0
-"""Metres between places at which a barrier takes the ground's height."""
+"""Metres between samples of the ground's height along a barrier."""
 
 _HIGHEST, _WIDEST = 30.0, 20.0
-"""Metres: beyond is a slip of the pen."""
+"""Metres; larger values are taken for typing errors."""
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Class, material and the sizes in metres where the map has none (assumed: what is common in towns)."""
+    """Class, material and default sizes in metres (assumed: common values in towns)."""
 
     klass: Class
     material: str
@@ -55,7 +55,7 @@ KINDS: dict[str, Kind] = {
     "hedge": Kind(Class.HEDGE, "foliage", 1.5, 0.8),
     "hedge_bank": Kind(Class.HEDGE, "foliage", 2.0, 1.5),
 }
-"""Barriers by value; others (kerbs, chains, gates) are no solids here."""
+"""Kinds by value of ``barrier``; others (kerbs, chains, gates) do not become solids."""
 
 _MATERIALS = {
     "wood": "wood", "metal": "metal", "chain_link": "metal", "wire": "metal", "concrete": "concrete",
@@ -67,12 +67,12 @@ _MATERIALS = {
 _OPENINGS = {"gate": 3.0, "lift_gate": 4.0, "swing_gate": 4.0, "sliding_gate": 4.0, "entrance": 1.5,
              "kissing_gate": 1.2, "turnstile": 1.0, "bollard": 3.0, "cycle_barrier": 2.0, "stile": 1.0,
              "toll_booth": 4.0, "wicket_gate": 1.2}  # fmt: skip
-"""Width in metres, where ``width`` has none, of what opens a barrier that passes through its node."""
+"""Default width in metres of a gate on a node of a barrier."""
 
 _APART = 0.005
-"""Metres by which bands that touch themselves in a point are made narrower on each side."""
+"""Metres by which bands that touch themselves in a point are narrowed on each side."""
 _PASSABLE = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.RAIL, Class.TUNNEL)
-"""A barrier drawn across these is open there."""
+"""Classes of ground that leave a barrier open."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,10 +107,10 @@ class Barriers:
 
 
 def read_barriers(osm: OsmData, frame: Frame, *, plan: GroundPlan) -> tuple[Barriers, list[Problem]]:
-    """The barriers on the map within the ground's extent, and what was changed or left out.
+    """The mapped barriers within the ground's extent, and problems: what was changed or left out.
 
-    A line is as wide as its ``width`` or its kind's; it is open at gates on its nodes, where the ground has a
-    road, a crossing or a track, and within buildings.
+    A line has its ``width`` or the default of its kind. It is open at gates on its nodes, on roads, crossings
+    and tracks, and within buildings.
     """
     box = shapely.box(*plan.extent)
     gates = _gates(osm)
@@ -162,8 +162,8 @@ def read_barriers(osm: OsmData, frame: Frame, *, plan: GroundPlan) -> tuple[Barr
 def barrier_meshes(barriers: Barriers, *, height: Height | None = None) -> list[Mesh]:
     """One mesh of closed solids for each barrier, in scene coordinates.
 
-    The bottom lies 0.3 m under the ground, the top the barrier's height above it, both following the
-    terrain at places at most 5 m apart.
+    The bottom lies 0.3 m below the ground, the top the barrier's height above it; both follow the terrain,
+    sampled at most every 5 m.
     """
     return [_solid(barriers, row, height=height) for row in range(len(barriers))]
 
@@ -264,7 +264,7 @@ def _gates(osm: OsmData) -> dict[int, float]:
 def _kept_open(
     polygons: NDArray[np.object_], plan: GroundPlan
 ) -> tuple[NDArray[np.object_], NDArray[np.bool_]]:
-    """Polygons less what lies on roads, tracks, buildings or outside the extent; which crossed a road."""
+    """Polygons less roads, tracks, buildings and what is outside the extent; which crossed a road."""
     out = shapely.intersection(polygons, shapely.box(*plan.extent))
     opened = np.zeros(len(polygons), bool)
     for klasses, road in ((_PASSABLE, True), ((Class.BUILDING_PAD,), False)):
@@ -279,7 +279,7 @@ def _kept_open(
 
 
 def _polygonal(geometries: NDArray[np.object_]) -> NDArray[np.object_]:
-    """The polygons among geometries' parts, those that are no crumbs."""
+    """The polygons among geometries' parts, without those of negligible area."""
     out = np.empty(len(geometries), object)
     for k, geometry in enumerate(geometries):
         parts = shapely.get_parts(geometry)

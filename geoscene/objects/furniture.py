@@ -29,10 +29,10 @@ _Row = tuple[Float, float, str, str, float, str, str, str, Float]
 """A stand with (shape, height, height source, place source, id, where it is mapped)."""
 
 _TALLEST = 60.0
-"""Metres: a taller pole is a mast or a slip of the pen."""
+"""Metres; greater heights are taken for masts or typing errors."""
 
 _FARTHEST = 30.0
-"""Metres within which the road that a thing belongs to is looked for."""
+"""Metres within which the road that an object faces is searched for."""
 
 _WITHOUT_SURFACE = 4.0
 """Metres from the centre line where no road surface is known: half a street of two lanes, and a clearance."""
@@ -59,17 +59,17 @@ _KINDS: dict[tuple[str, str], str] = {
 
 @dataclass(frozen=True, slots=True)
 class Furniture:
-    """Things that stand by the road, one row a thing.
+    """Street furniture, one row per object.
 
     xy       : (n, 2) float64, scene metres
     shape    : (n,) str, name in `geoscene.objects.shapes.shapes`
     height   : (n,) float64 metres above the ground
-    heading  : (n,) float64, radians counter-clockwise from east: where it faces
+    heading  : (n,) float64, radians counter-clockwise from east, the direction it faces
     height_source : (n,) str: ``height`` or ``default`` (the shape's own)
     place_source : (n,) str: ``node`` (where it is mapped), ``moved`` (mapped on a carriageway, moved to the
                 nearest clear place) or ``roadside`` (mapped on a road's own node, moved beside that road)
     moved    : (n,) float64 metres from where it is mapped
-    heading_source : (n,) str: ``direction``, ``road`` (against its traffic, or towards it) or ``default``
+    heading_source : (n,) str: ``direction`` (tag), ``road`` (towards its traffic or the road) or ``default``
     osm_id   : (n,) str
     feature  : (n,) int32, -1 for none
     """
@@ -86,7 +86,7 @@ class Furniture:
     feature: NDArray[np.int32]
 
     def __len__(self) -> int:
-        """Number of things."""
+        """Number of objects."""
         return len(self.shape)
 
     def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Furniture:
@@ -105,11 +105,11 @@ def read_furniture(
       side that their traffic keeps to, and face that traffic: the one that ``traffic_signals:direction``,
       ``traffic_sign:direction`` or ``direction`` names, else that of a one-way road, else (``stop`` and
       ``give_way``) the one that comes to the nearer junction, else both, each with a post of its own.
-    - What else is mapped on a carriageway is taken for imprecise and stands at the nearest clear place,
-      bollards too: vehicles pass where they are mapped, for the road graph does not close roads there.
+    - Other objects that are mapped on a carriageway are taken for imprecise and stand at the nearest clear
+      place, bollards too: the road graph does not close roads at bollards, so vehicles pass there.
 
-    Lamps face the nearest road. Signals and signs of bridges and tunnels, things inside buildings and things
-    without a clear place within `geoscene.objects.siting.FARTHEST` are left out and listed as problems.
+    Lamps face the nearest road. Left out and listed as problems are signals and signs of bridges and tunnels,
+    objects inside buildings, and those without a clear place within `geoscene.objects.siting.FARTHEST`.
 
     left_hand : traffic keeps left
     """
@@ -155,7 +155,7 @@ def read_furniture(
 
 
 def furniture_instances(furniture: Furniture, *, height: Height | None = None) -> Instances:
-    """A copy of a shape for each thing, in scene coordinates, standing on the terrain."""
+    """An instance of a shape for each object, in scene coordinates, standing on the terrain."""
     n = len(furniture)
     z = np.zeros(n) if height is None else np.asarray(height(*furniture.xy.T), float)
     usual = np.array([_usual_height(str(shape)) for shape in furniture.shape], float)
@@ -171,7 +171,7 @@ def furniture_instances(furniture: Furniture, *, height: Height | None = None) -
 
 
 def shape_of(tags: Tags) -> str | None:
-    """The shape for a node's tags, None if it is no street furniture."""
+    """Name of the shape for a node's tags, None if it is not street furniture."""
     for (key, value), shape in _KINDS.items():
         if tags.get(key) == value:
             return shape
@@ -194,7 +194,7 @@ def _sign(value: str) -> str:
 
 
 def _elsewhere(tags: Tags) -> bool:
-    """Whether it does not stand on the ground in the open."""
+    """Whether the object does not stand on the ground in the open."""
     layer = tags.get("layer", "0").lstrip("+")
     return (
         is_underground(tags)
@@ -205,12 +205,12 @@ def _elsewhere(tags: Tags) -> bool:
 
 
 def _usual_height(shape: str) -> float:
-    """How high a shape reaches, metres."""
+    """Height of a shape in metres."""
     return float(shapes()[shape].vertices[:, 2].max())
 
 
 def _height(point: Point, shape: str, *, problems: list[Problem]) -> tuple[float, str]:
-    """(metres, source) of a thing's height."""
+    """(metres, source) of the height of an object."""
     usual = _usual_height(shape)
     if "height" not in point.tags:
         return usual, "default"
@@ -224,12 +224,12 @@ def _height(point: Point, shape: str, *, problems: list[Problem]) -> tuple[float
 
 @dataclass(frozen=True, slots=True)
 class _Roads:
-    """Roads' centre lines, to be found by node and by nearness.
+    """Centre lines of roads, indexed by node and by position.
 
     lines : (n,) object, scene metres
     oneway : (n,) int8: 1, -1 or 0
     raised : (n,) bool, on a bridge or in a tunnel
-    by_node : rows and places in them of each node
+    by_node : (row, vertex index) pairs of each node
     nodes : ids of the nodes of each line
     tree : of the lines
     """
@@ -258,7 +258,7 @@ class _Roads:
         return cls(lines, np.array(oneway, np.int8), raised, by_node, nodes, shapely.STRtree(lines))
 
     def at(self, point: Point) -> list[tuple[int, int]]:
-        """Rows, and places in them, of a node that lies on roads."""
+        """(row, vertex index) pairs of a node that lies on roads."""
         return self.by_node.get(int(point.osm_id.removeprefix("node/")), [])
 
     def nearer_junction(self, row: int, index: int) -> int:
@@ -293,12 +293,12 @@ class _Roads:
 
 
 def _addresses(shape: str) -> bool:
-    """Whether a shape speaks to the traffic of one direction."""
+    """Whether a shape addresses the traffic of one direction."""
     return shape == "traffic_signals" or shape.startswith("sign_")
 
 
 def _facing(point: Point, xy: Float, *, frame: Frame) -> float | None:
-    """Heading that the tags give in degrees or as a compass point, None if they do not."""
+    """Heading from tags in degrees or as a compass point, None without one."""
     stated = parse_direction(point.tags.get("direction") or point.tags.get("light:direction"))
     if stated is None:
         return None
@@ -307,7 +307,7 @@ def _facing(point: Point, xy: Float, *, frame: Frame) -> float | None:
 
 
 def _stand(point: Point, shape: str, *, xy: Float, roads: _Roads, frame: Frame, left_hand: bool) -> _Stand:
-    """Where a thing that stands beside the road, or away from roads, faces."""
+    """Position and heading of an object that is not on a node of a road."""
     heading = _facing(point, xy, frame=frame)
     if heading is not None:
         return xy, heading, "direction"

@@ -1,4 +1,4 @@
-"""Small closed solids that a scene holds once and copies: crowns, trunks, poles, signs, benches."""
+"""Small closed solids that a scene stores once and instances: crowns, trunks, poles, signs, benches."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ clipped hedges: assumed.
 _SIDES = 8
 
 _BALL = ((0, 0), (0.65, 0.13), (0.97, 0.38), (0.97, 0.62), (0.65, 0.87), (0, 1))
-"""Diameters and heights of a crown like a ball: 64 faces."""
+"""Profile of a spherical crown: (diameter, z); 64 faces."""
 
 _CONE = ((0, 0), (1, 0.05), (0, 1))
 
@@ -38,7 +38,7 @@ _CONE = ((0, 0), (1, 0.05), (0, 1))
 def prism(
     outline: Float, bottom: float, *, top: float, taper: float = 1.0
 ) -> tuple[Float, NDArray[np.int32]]:
-    """Vertices and faces of the closed solid over a convex outline (n, 2), counter-clockwise, metres.
+    """Vertices and faces of the prism over a convex outline (n, 2), counter-clockwise, metres.
 
     taper : the upper outline's size against the lower's, about the origin, over 0
     """
@@ -55,10 +55,10 @@ def prism(
 
 
 def lathe(profile: Sequence[tuple[float, float]], *, sides: int = _SIDES) -> tuple[Float, NDArray[np.int32]]:
-    """Vertices and faces of the closed solid that a profile of (diameter, z), from pole to pole, turns out.
+    """Vertices and faces of the solid of revolution of a profile of (diameter, z), from pole to pole.
 
-    The first and last diameter are not used: there the solid comes to a point. Between, each ring has the
-    area of the circle.
+    The first and last diameter are not used: the solid ends in a point there. Each ring between has the area
+    of its circle.
     """
     rings = len(profile) - 2
     points = [np.array([[0.0, 0.0, profile[0][1]]])]
@@ -103,8 +103,7 @@ def shapes() -> dict[str, Mesh]:
     """All shapes by name, in the order of their numbers in `Instances.shape`.
 
     Crowns and trunks are of unit size (x and y from -0.5 to 0.5, z from 0 to 1), to be scaled; the rest is in
-    metres and of its usual size, x the way it faces, z up from the ground. Every shape is one or more closed
-    solids.
+    metres at its usual size, x in the direction it faces, z up from the ground. All are closed.
     """
     return {
         "trunk": solid(prism(circle(1.0, 6), 0.0, top=1.0, taper=0.7), klass=Class.TRUNK, material="bark"),
@@ -134,17 +133,17 @@ def shape_numbers() -> dict[str, int]:
 
 
 _QUARTER = np.array([[0.0, 1.0], [-1.0, 0.0]])
-"""Turns row vectors by a quarter, counter-clockwise: a triangle's corner from the right to the top."""
+"""Rotates row vectors by 90 degrees, counter-clockwise: a triangle's corner from the right to the top."""
 
 
 def _eighth() -> Float:
-    """Turns row vectors by an eighth of a quarter, so that an octagon stands on an edge."""
+    """Matrix that rotates row vectors by 22.5 degrees, so that an octagon stands on an edge."""
     c, s = np.cos(np.pi / 8), np.sin(np.pi / 8)
     return np.array([[c, s], [-s, c]])
 
 
 def _street_lamp() -> Mesh:
-    """A mast of 8 m, an arm of 1.5 m the way it faces, a head at its end."""
+    """A mast of 8 m, an arm of 1.5 m in the direction it faces, and a head at its end."""
     pole = solid(prism(circle(0.16), -0.3, top=8.0, taper=0.6), klass=Class.POLE, material="metal")
     arm = solid(prism(rectangle(1.5, 0.06, x=0.75), 7.9, top=7.98), klass=Class.POLE, material="metal")
     head = solid(prism(rectangle(0.7, 0.25, x=1.6), 7.82, top=7.95), klass=Class.POLE, material="metal")
@@ -164,10 +163,10 @@ def _traffic_signals() -> Mesh:
 
 
 def _sign(outline: Float, height: float) -> Mesh:
-    """A plate of 4 mm whose centre is at a height, on a pole; the side towards x sends light back."""
+    """A plate of 4 mm with its centre at ``height``, on a pole; the side towards x is retro-reflecting."""
     pole = solid(prism(circle(0.06), -0.3, top=height + 0.4), klass=Class.POLE, material="metal")
     points, faces = prism(outline, 0.0, top=0.004)
-    # The plate stands up: its plane's x becomes y, its y becomes z, what was above it is in front.
+    # The plate is upright: x of its plane becomes y, y becomes z, and its upper side becomes the front.
     points = np.column_stack([points[:, 2] + 0.035, points[:, 0], points[:, 1] + height])
     plate = solid((points, faces), klass=Class.TRAFFIC_SIGN, material="metal")
     front = plate.normals()[:, 0] > 0.5
@@ -185,7 +184,7 @@ def _sign(outline: Float, height: float) -> Mesh:
 
 
 def _bench() -> Mesh:
-    """A bench of 1.8 m that one sits on facing x: seat, back, two legs."""
+    """A bench of 1.8 m that faces x: seat, back, two legs."""
     boxes = [
         (rectangle(0.45, 1.8), 0.41, 0.46, "wood"),
         (rectangle(0.05, 1.8, x=-0.26), 0.5, 0.85, "wood"),
@@ -211,7 +210,7 @@ def place(
 
     name    : one name, or one a copy
     size    : factor along the shape's x, y and z, (3,) or (k, 3)
-    heading : radians counter-clockwise from east, where the shape's x points, one or (k,)
+    heading : radians counter-clockwise from east to the shape's x axis, one or (k,)
     """
     k = len(position)
     size = np.broadcast_to(np.asarray(size, float), (k, 3))
@@ -238,7 +237,7 @@ def concatenate_instances(parts: Sequence[Instances]) -> Instances:
 
 
 def shifted_instances(instances: Instances, offset: ArrayLike) -> Instances:
-    """The copies moved by ``offset`` (3,), metres, as from the scene to a tile's own coordinates."""
+    """The copies moved by ``offset`` (3,), metres, such as from scene to tile coordinates."""
     transform = instances.transform.copy()
     transform[:, :, 3] += np.asarray(offset, float)
     return replace(instances, transform=transform)

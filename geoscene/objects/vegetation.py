@@ -1,4 +1,4 @@
-"""Trees: those on the map, those of its rows, and those that its woods must have."""
+"""Trees: mapped singly, in tree rows, and sampled within woods."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from geoscene.typing import Float
 Height = Callable[[Float, Float], Float]
 
 HEIGHT = {"broadleaved": 12.0, "needleleaved": 12.0, "palm": 8.0}
-"""Height of a tree of which nothing is known, metres.
+"""Default height in metres.
 
 12 m is the median of the 19 heights given for 4,717 mapped trees of two dozen extracts; palms: assumed."""
 
 CROWN = {"broadleaved": 0.67, "needleleaved": 0.4, "palm": 0.45}
-"""Crown's diameter over height: 0.67 is the median of the 13 trees with both, the others are assumed."""
+"""Crown diameter over height: 0.67 is the median of the 13 trees with both, the others are assumed."""
 
 TRUNK = 0.0284
-"""Trunk's diameter over height: the median of 17 trees with both, 0.089 of the height around."""
+"""Trunk diameter over height: the median of 17 trees with both (girth 0.089 of the height)."""
 
 _CROWN_BASE = {"broadleaved": 0.3, "needleleaved": 0.1, "palm": 0.75}
-"""Height of the crown's lower end over the tree's: assumed."""
+"""Height of the crown's lower end over the height of the tree: assumed."""
 
 _PALMS = frozenset(
     {"areca", "phoenix", "washingtonia", "trachycarpus", "chamaerops", "cocos", "roystonea", "sabal"}
@@ -47,7 +47,7 @@ _CONIFERS = frozenset(
 )  # fmt: skip
 
 _TALLEST, _WIDEST, _THICKEST = 116.0, 60.0, 36.0
-"""Metres of the tallest tree known (Hyperion), the widest crown and the greatest girth: beyond is a slip."""
+"""Metres of the tallest known tree (Hyperion), the widest crown and the greatest girth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +92,11 @@ class Trees:
 
 
 def read_trees(osm: OsmData, frame: Frame, *, spacing: float = 8.0) -> tuple[Trees, list[Problem]]:
-    """The map's single trees and those of its tree rows, and what could not be used of their tags.
+    """The single trees and tree rows on the map, and problems: tags that could not be used.
 
     Sizes come from ``height``, ``diameter_crown`` (metres) and ``circumference`` (metres; a value over
-    36, more than any trunk, is taken as centimetres); what is missing follows from what there is by
-    `CROWN` and `TRUNK`, and the form from ``leaf_type``, else the genus.
+    36, more than any trunk, is taken as centimetres); missing sizes are derived from the others by `CROWN`
+    and `TRUNK`; the form comes from ``leaf_type``, else the genus.
 
     spacing : metres between trees of a row
     """
@@ -187,10 +187,10 @@ def forest_trees(
     seed: int = 0,
     needles: Float | None = None,
 ) -> Trees:
-    """Trees of the woods in tile (i, j): one in each square of 1 / density m2 whose trunk finds forest floor.
+    """Sampled trees of tile (i, j): one per square of 1 / density m2 whose trunk is on forest floor.
 
-    Place, size and kind are drawn for each square of one lattice over the plane from (seed, column, row)
-    alone: a tree depends neither on tiles nor on other woods. Their feature is their wood's.
+    Position, size and form are drawn from (seed, column, row) of a lattice over the plane, so a tree depends
+    neither on tiles nor on other woods. Its feature is that of its wood.
 
     density : trees per m2; 0.02 (200 to the hectare) is a closed stand of grown trees
     needles : (rows of the plan's layers,) share of needle-leaved trees, from `needle_shares`; none by default
@@ -214,7 +214,7 @@ def forest_trees(
     stands = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
     stands &= values_at(plan.layers.klass, owner, base=Class.UNLABELED) == Class.FOREST_FLOOR
     x, y, draw, owner = x[stands], y[stands], draw[:, stands], owner[stands]
-    # A trunk needs room: there must be forest half a metre away on all sides.
+    # A trunk needs half a metre of forest floor on all sides.
     dx, dy = np.array([(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)]).T[:, :, None]
     beside = values_at(
         plan.layers.klass,
@@ -232,7 +232,7 @@ def forest_trees(
     return Trees(
         np.column_stack([x, y]),
         height,
-        np.minimum(crown, 1.2 * side),  # neighbours leave each other no more
+        np.minimum(crown, 1.2 * side),  # the spacing limits the crown
         height * TRUNK,
         form,
         np.full(n, "sampled"),
@@ -267,7 +267,7 @@ def _none() -> Trees:
 def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
     """Two copies of shapes a tree, trunk then crown, in scene coordinates, standing on the terrain.
 
-    The trunk begins 0.3 m under the ground, so that it meets a slope, and ends in the middle of the crown.
+    The trunk begins 0.3 m below the ground, so that no gap opens on a slope, and ends inside the crown.
     """
     n = len(trees)
     z = np.zeros(n) if height is None else np.asarray(height(*trees.xy.T), float)
@@ -292,10 +292,10 @@ def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
 
 
 def _uniform(seed: int, column: NDArray[np.int64], *, row: NDArray[np.int64], count: int) -> Float:
-    """Numbers (count, n) in [0, 1) that depend on (seed, column, row) and nothing else.
+    """Uniform random numbers (count, n) in [0, 1) determined by (seed, column, row).
 
-    SplitMix64's finaliser (Steele, Lea and Flood 2014) over the three, which is what makes one draw for each
-    square of an endless lattice cheap.
+    SplitMix64's finaliser (Steele, Lea and Flood 2014) of the three: cheap for each square of an unbounded
+    lattice.
     """
 
     def mix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
@@ -312,7 +312,7 @@ def _uniform(seed: int, column: NDArray[np.int64], *, row: NDArray[np.int64], co
 
 
 def _along(line: Float, spacing: float) -> Float:
-    """Places (k, 2) along a line, evenly, both ends included, about ``spacing`` apart."""
+    """Evenly spaced points (k, 2) along a line, about ``spacing`` apart, both ends included."""
     geometry = shapely.LineString(line)
     count = max(round(geometry.length / spacing), 1) + 1
     stations = np.linspace(0.0, geometry.length, count)
@@ -351,7 +351,7 @@ def _sizes(tags: Tags, osm_id: str, *, problems: list[Problem]) -> tuple[float, 
 
 
 def _metres(tags: Tags, key: str, *, most: float, osm_id: str, problems: list[Problem]) -> float:
-    """A length in metres, NaN where there is none that a tree can have."""
+    """A length in metres, NaN where it is missing or out of range."""
     if key not in tags:
         return np.nan
     metres = parse_length(tags[key])
@@ -362,7 +362,7 @@ def _metres(tags: Tags, key: str, *, most: float, osm_id: str, problems: list[Pr
 
 
 def _girth(tags: Tags, osm_id: str, *, problems: list[Problem]) -> float:
-    """A trunk's circumference in metres; a bare number beyond any trunk's metres is centimetres."""
+    """Circumference of a trunk in metres; a bare number too large for metres is read as centimetres."""
     number = parse_number(tags.get("circumference"))
     if number is None or not _THICKEST < number <= 100 * _THICKEST:
         return _metres(tags, "circumference", most=_THICKEST, osm_id=osm_id, problems=problems)
@@ -372,5 +372,5 @@ def _girth(tags: Tags, osm_id: str, *, problems: list[Problem]) -> float:
 
 
 def _each_once(problems: list[Problem]) -> list[Problem]:
-    """Problems without repetition, in order: a row's tags are read for each of its trees."""
+    """Problems without duplicates, in order: the tags of a row are read once per tree."""
     return list(dict.fromkeys(problems))

@@ -1,4 +1,4 @@
-"""What is known of the features in a page, as columns of JSON."""
+"""Attribute tables of the features in a page, as columns of JSON."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Rows = NDArray[np.int64]
 
 
 def tables(features: Features, present: NDArray[np.bool_]) -> list[dict[str, Any]]:
-    """A table a layer of what is in the page, in the layers' order, empty ones left out.
+    """One table per layer with the features in the page, in the layers' order, empty ones left out.
 
     present : (n,) bool by feature number: it has faces or copies in the page
 
@@ -43,7 +43,7 @@ def _chosen(
     features: Features,
     present: NDArray[np.bool_],
 ) -> Rows:
-    """Rows of a layer that are in the page, or belong to something that is."""
+    """Rows of a layer that are in the page, or belong to a feature that is."""
     keep = own.copy()
     if layer == "building_parts" and "buildings" in features.layers:
         start = int(features.starts[features.layers.index("buildings")])

@@ -10,7 +10,7 @@ from geoscene.frames import Frame
 from geoscene.typing import Float
 
 ACCURACY = 0.01
-"""Metres that interpolation may be off."""
+"""Largest error of the interpolation in metres."""
 
 _MOST = 129
 

@@ -41,13 +41,13 @@ def view_scene(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Summary:
-    """Write a scene as one web page that a browser opens from disk, and say what is in it.
+    """Write a scene as one web page that a browser opens from disk; returns its contents.
 
     The page loads nothing: data, style and viewer (WebGL 2) are in it. Its bytes depend on the scene, the
     bounds and the layers alone.
 
-    Raises InputError for a name that is taken, bounds without a tile, a layer that is not there, and a page
-    that would be too large, with the bounds of a part that is not.
+    Raises InputError for an existing file, bounds without a tile, an unknown layer, and a page that would be
+    too large; the message then gives the bounds of a part that would fit.
     """
     _check(out, overwrite=overwrite)
     bounds_deg, layers, max_mb = options.bounds_deg, options.layers, options.max_mb
@@ -96,18 +96,18 @@ def _check(out: Path, *, overwrite: bool) -> None:
     if out.is_dir():
         raise InputError(f"{out}: is a folder; name a file such as page.html")
     if out.exists() and not overwrite:
-        raise InputError(f"{out}: is there already; set `overwrite` to replace it")
+        raise InputError(f"{out}: exists already; set `overwrite` to replace it")
 
 
 def _kept(groups: Groups, layers: Sequence[str]) -> NDArray[np.bool_]:
-    """Which groups (n,) are in the page."""
+    """Groups (n,) to include in the page."""
     if unknown := sorted(set(layers) - set(groups.names)):
         raise InputError(f"`layers`: no {', '.join(unknown)} in the scene; it has {', '.join(groups.names)}")
     return np.array([not layers or name in layers for name in groups.names])
 
 
 def _join(file: IO[bytes], scene: Scene, *, head: dict[str, Any], blobs: IO[bytes]) -> None:
-    """Write the page: the template with its words filled in, and the bytes of the scene where it has them."""
+    """Write the page: the template with its placeholders filled in and the bytes of the scene."""
     words = {
         "title": html.escape(str(head["name"])),
         "credit": _linked(attribution(scene)),
@@ -130,12 +130,12 @@ def _json(value: Any) -> bytes:
 
 
 def _blob(file: IO[bytes], name: str, *, data: bytes) -> None:
-    """Bytes as an element of the page that browsers neither run nor show."""
+    """Bytes as an element of the page that browsers neither run nor display."""
     file.write(f'<script type="text/plain" id="{name}">'.encode() + b64encode(data) + b"</script>\n")
 
 
 def _tiles_within(scene: Scene, bounds_deg: Degrees | None) -> NDArray[np.int64]:
-    """(i, j) of the tiles (n, 2) whose squares meet the bounds."""
+    """(i, j) of the tiles (n, 2) whose squares intersect the bounds."""
     indices = np.array(scene.tile_indices, np.int64).reshape(-1, 2)
     if bounds_deg is None:
         return indices
@@ -163,13 +163,13 @@ def _middle(indices: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _rings(indices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How many tiles each (n, 2) is from the middle one, along the axis on which it is more."""
+    """Chebyshev distance of each tile (n, 2) from the middle one, in tiles."""
     rings: NDArray[np.int64] = np.abs(indices - _middle(indices)).max(axis=1)
     return rings
 
 
 def _outwards(indices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Tiles in the order in which a viewer should see them: from the middle."""
+    """Tiles in loading order: from the middle outwards."""
     ordered: NDArray[np.int64] = indices[np.lexsort([indices[:, 1], indices[:, 0], _rings(indices)])]
     return ordered
 
@@ -177,7 +177,7 @@ def _outwards(indices: NDArray[np.int64]) -> NDArray[np.int64]:
 def _too_large(
     scene: Scene, indices: NDArray[np.int64], *, sizes: Sequence[int], size: int, max_mb: float
 ) -> str:
-    """How large the page would be, and which part of it would not be too large."""
+    """Error text: how large the page would be, and the bounds of a part that would fit."""
     rings, share = _rings(indices), size / sizes[-1]
     whole = size / len(sizes) * len(indices) / 1e6
     message = f"the page would have about {max(whole, 1.01 * max_mb):.3g} MB and `max_mb` is {max_mb:g}"
@@ -199,7 +199,7 @@ def _too_large(
 def _head(
     scene: Scene, told: list[dict[str, Any]], *, groups: Groups, shapes: list[list[int]]
 ) -> dict[str, Any]:
-    """What the viewer must know before it reads the bytes."""
+    """Header that the viewer needs to read the bytes."""
     low = np.min([entry["low"] for entry in told], axis=0).tolist()
     high = np.max([entry["high"] for entry in told], axis=0).tolist()
     bounds = (low[0], low[1], high[0], high[1])
@@ -232,6 +232,6 @@ def _head(
 
 
 def _linked(text: str) -> str:
-    """Text as HTML, OpenStreetMap's page on copyright as a link."""
+    """Text as HTML with a link to OpenStreetMap's copyright page."""
     link = f'<a href="{_COPYRIGHT}" target="_blank" rel="noopener">openstreetmap.org/copyright</a>'
     return re.sub(re.escape(_COPYRIGHT), link, html.escape(text)).replace("(c)", "©")

@@ -1,4 +1,4 @@
-"""Tiles as compact bytes for the page: whole steps of a grid, columns one after another, deflated."""
+"""Tiles as compact bytes for the page: quantised columns, one after another, deflated."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
 
 STEP = 1 / 128
-"""Metres between the positions that vertices can have; a power of two, so that tiles share one grid and their
-seams stay shut. Doubled for a tile that spans more than 512 m, until 16 bits hold it."""
+"""Quantisation step of vertices in metres; a power of two, so that tiles share one grid and
+leave no gaps. Doubled for a tile that spans more than 512 m, until 16 bits hold it."""
 
 TURN = 2 * np.pi / 2048
-"""Radians between the headings that upright copies can have: 5 mm at the rim of a crown of 7 m across."""
+"""Quantisation step of the heading of upright copies in radians: 5 mm at the rim of a 7 m crown."""
 
 SCALE = 1 / 256
-"""Between the scales that upright copies can have: 2 mm of a shape of a metre."""
+"""Quantisation step of the scale of upright copies: 2 mm for a shape of one metre."""
 
 GROUND = "ground"
-"""Name of the group of faces on the ground that are of no road: bare terrain, land cover, building pads."""
+"""Name of the group of ground faces other than roads: bare terrain, land cover, building pads."""
 
 _WITHIN = {"building_parts": "buildings", "landcover": GROUND, "roads": "road_surfaces"}
 
 
 def gzip(data: bytes) -> bytes:
-    """RFC 1952 bytes that depend on the data alone (no time stamp)."""
+    """Gzip bytes (RFC 1952) without a time stamp: equal data give equal bytes."""
     packer = zlib.compressobj(9, zlib.DEFLATED, 31)
     return packer.compress(data) + packer.flush()
 
 
 @dataclass(frozen=True, slots=True)
 class Groups:
-    """What a viewer shows or hides together.
+    """Groups of features that the viewer shows or hides together.
 
     names : of the groups, ground first
     of    : (n + 1,) uint8, the group of each feature; the last one's is that of feature -1
@@ -54,7 +54,7 @@ class Groups:
 
 
 def groups_of(scene: Scene) -> Groups:
-    """One group a layer that has faces or copies of its own, and the ground."""
+    """One group per layer that has faces or copies of its own, and the ground."""
     ranges = sorted(scene.layers.items(), key=lambda item: item[1])
     names = [GROUND, *(n for n, (a, b) in ranges if b > a and n not in _WITHIN)]
     of = np.zeros(max((b for _, (_, b) in ranges), default=0) + 1, np.uint8)
@@ -65,7 +65,7 @@ def groups_of(scene: Scene) -> Groups:
 
 
 def only(tile: Tile, groups: Groups, *, kept: NDArray[np.bool_]) -> Tile:
-    """The faces and copies of a tile that are in the groups (n,) kept."""
+    """The faces and copies of a tile that are in the kept groups (n,)."""
     if kept.all():
         return tile
     copies = tile.instances
@@ -75,7 +75,7 @@ def only(tile: Tile, groups: Groups, *, kept: NDArray[np.bool_]) -> Tile:
 
 
 def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
-    """What to know of a tile to read its bytes, and the bytes, deflated.
+    """Header of a tile and its bytes, deflated.
 
     Vertex q of the bytes lies at (base + q) * step in scene metres. Faces are in order of group, ``ends`` of
     which are given; copies in order of group, shape and x, of which ``runs`` are (group, shape, number).
@@ -135,7 +135,7 @@ def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
 
 
 def _upright(transform: NDArray[np.float64], step: float) -> NDArray[np.int64] | None:
-    """Columns (6, k) of whole steps for transforms (k, 3, 4), or None where they do not say all of them."""
+    """Quantised columns (6, k) of upright transforms (k, 3, 4), or None if any is not upright."""
     along, lift = np.hypot(transform[:, 0, 0], transform[:, 1, 0]), transform[:, 2, 2]
     turn = np.arctan2(transform[:, 1, 0], transform[:, 0, 0])
     told = _turned(along, lift, turn=turn)
@@ -157,7 +157,7 @@ def _transforms(columns: NDArray[np.uint16], step: float) -> NDArray[np.float64]
 def _turned(
     along: NDArray[np.float64], lift: NDArray[np.float64], *, turn: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Matrices (k, 3, 3) that scale across and upwards and turn about the vertical."""
+    """Matrices (k, 3, 3) that scale horizontally and vertically and rotate about the vertical."""
     matrix = np.zeros((len(turn), 3, 3))
     matrix[:, 0, 0] = matrix[:, 1, 1] = along * np.cos(turn)
     matrix[:, 1, 0] = along * np.sin(turn)

@@ -1,1 +1,1 @@
-"""Cameras: models, light, images by ray casting, and the files they are kept in."""
+"""Cameras: light, images by ray casting, and image files."""

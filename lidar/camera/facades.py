@@ -1,4 +1,4 @@
-"""Walls of buildings: where they begin and end, and the windows that are laid out on them."""
+"""Flat walls of buildings and the windows that are generated on them."""
 
 # mypy: disallow-untyped-decorators=False
 
@@ -22,13 +22,13 @@ from lidar.world.world import World
 
 @dataclass(frozen=True, slots=True)
 class Facades:
-    """Flat walls of buildings, and which faces belong to them.
+    """Flat walls of buildings, and the wall of each face.
 
-    wall    : (m,) int32 per face, index into the rows below, -1 for a face that is no building's wall
+    wall    : (m,) int32 per face, row of its wall below, -1 for other faces
     tangent : (k, 2) horizontal unit vector along the wall, to the right as seen from outside
-    along   : (k, 2) where the wall begins and ends along the tangent, metres
+    along   : (k, 2) start and end of the wall along the tangent, metres
     height  : (k, 2) z of the building's foot and of the wall's top, metres
-    style   : (k, 10) how its windows look, see `_styles`
+    style   : (k, 10) appearance of its windows, see `_styles`
     """
 
     wall: NDArray[np.int32]
@@ -43,7 +43,7 @@ def facades(corners: Float, normal: Float, *, feature: NDArray[np.int32], wall: 
 
     corners : (m, 3, 3) metres
     normal  : (m, 3) unit normals
-    wall    : (m,) whether a face is a building's wall at all
+    wall    : (m,) bool, the face is a wall of a building
     """
     m = len(corners)
     length = np.hypot(normal[:, 0], normal[:, 1])
@@ -55,7 +55,7 @@ def facades(corners: Float, normal: Float, *, feature: NDArray[np.int32], wall: 
     flat = normal[face, :2] / length[face, None]
     corners, feature = corners[face], feature[face]
     turn = np.arctan2(flat[:, 1], flat[:, 0])
-    # Sorting and splitting at gaps gathers what differs by rounding alone; rounding keys would not.
+    # Sorting and splitting at gaps groups values that differ by rounding errors; rounded keys would not.
     order = np.lexsort((turn, feature))
     bearing = _runs(feature[order], turn[order], gap=0.005)
     tangent = np.empty((len(face), 2))
@@ -104,7 +104,7 @@ BAY, STOREY, FLOORS, WIDE, TALL, RISE, SHOP_WIDE, SHOP_TALL, BAND, PAINT = range
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _chances(feature: NDArray[np.int32], count: int) -> Float:
-    """Numbers (k, count) from 0 to 1 that belong to feature numbers (k,)."""
+    """Hashes (k, count) from 0 to 1 of feature numbers (k,)."""
     out = np.empty((len(feature), count))
     for i in range(len(feature)):
         for j in range(count):
@@ -113,7 +113,7 @@ def _chances(feature: NDArray[np.int32], count: int) -> Float:
 
 
 def _styles(feature: NDArray[np.int32], along: Float, *, height: Float) -> Float:
-    """How windows look on each wall (k, 10), out of the building's number alone: no map says.
+    """Appearance of the windows of each wall (k, 10), a hash of the building's number: maps do not hold it.
 
     Metres, but for FLOORS (a count; 0 for a wall without windows) and PAINT (albedo of the frames).
     SHOP_WIDE is 0 where the ground floor is like the others, BAND where no line marks the storeys.

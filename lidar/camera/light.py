@@ -1,4 +1,4 @@
-"""The light of a clear day: the sun's beam, the sky's colours and what both send onto a surface."""
+"""Daylight under a clear sky: direct sunlight, sky radiance and ambient irradiance."""
 
 from __future__ import annotations
 
@@ -20,17 +20,15 @@ _AEROSOL = 0.06 * _WAVELENGTH**-1.3
 _OZONE = np.array([0.036, 0.022, 0.004])
 _FORWARD = 0.72  # asymmetry of the aerosol's Henyey-Greenstein phase function, continental haze
 _GROUND = 0.18  # albedo of what lies below the horizon
-# Light scattered more than once comes evenly from all sides and grows with the optical depth: this share of
-# the even part of the single scattering gives clear skies their measured fifth to quarter of daylight.
+# Multiple scattering is isotropic and grows with the optical depth: this multiple of the isotropic part of
+# single scattering gives clear skies their measured fifth to quarter of daylight.
 _MULTIPLE = 3.0
-_GREYING = (
-    0.4  # share of ambient light that comes by way of grey walls and pavements, not straight from the sky
-)
+_GREYING = 0.4  # share of ambient light that is reflected by grey walls and pavements
 
 
 @dataclass(frozen=True)
 class Light:
-    """Sun and sky as linear colours; 1 is the sun's green light on a surface that faces it above the air.
+    """Sun and sky as linear colours; 1 is the green irradiance of the sun above the atmosphere, facing it.
 
     direction : (3,) unit vector towards the sun, scene axes
     beam      : (3,) irradiance of the sun's beam on a surface facing it
@@ -59,7 +57,7 @@ def _air_mass(sine: Float) -> Float:
 def _sky_radiance(sine: Float, cosine: Float, *, sun_sine: float) -> Float:
     """Radiance (..., 3) of a clear sky at elevations by sine, ``cosine`` being that of the angle to the sun.
 
-    Single scattering in a plane-parallel atmosphere with the air masses of a round one.
+    Single scattering in a plane-parallel atmosphere with the air masses of a spherical one.
     """
     tau = _RAYLEIGH + _AEROSOL
     rayleigh = 0.75 * (1 + cosine**2)
@@ -102,9 +100,9 @@ def _harmonics(n: Float) -> Float:
 def daylight(direction: ArrayLike, *, rows: int = 64, columns: int = 64) -> Light:
     """The light of a clear day with the sun towards ``direction`` (3,), scene axes.
 
-    Below the horizon the sun gives no beam and the sky fades to that of a moonlit night, so that a picture
-    can still be made; exposure follows. Ambient light is kept as spherical harmonics of order 2 (Ramamoorthi
-    and Hanrahan, An efficient representation for irradiance environment maps, 2001).
+    With the sun below the horizon there is no direct light and the sky fades to that of a moonlit night; the
+    exposure follows. Ambient light is stored as spherical harmonics of order 2 (Ramamoorthi and Hanrahan, An
+    efficient representation for irradiance environment maps, 2001).
     """
     s = np.asarray(direction, float)
     s = s / np.linalg.norm(s)
@@ -114,7 +112,7 @@ def daylight(direction: ArrayLike, *, rows: int = 64, columns: int = 64) -> Ligh
     turn = np.linspace(1, -1, columns)[None]
     flat = np.sqrt(np.clip(1 - sine**2, 0, 1))
     cosine = np.clip(sine * rise + flat * np.hypot(s[0], s[1]) * turn, -1, 1)
-    # Twilight: each degree below the horizon takes the sky down by a factor of 2, to a floor.
+    # Twilight: each degree below the horizon halves the sky's radiance, down to a minimum.
     dusk = max(2.0 ** min(np.degrees(np.arcsin(rise)), 0.0), 1e-4)
     sky = _sky_radiance(np.broadcast_to(sine, cosine.shape), cosine, sun_sine=rise) * dusk
     sun_mass = float(_air_mass(np.array(max(rise, 0.0))))

@@ -1,4 +1,4 @@
-"""What a body covers of an image: its bounds, and the pixels it would fill if nothing stood before it."""
+"""2D bounding box and unoccluded pixel area of a body in an image."""
 
 # mypy: disallow-untyped-decorators=False
 from __future__ import annotations
@@ -13,10 +13,10 @@ from geoscene.typing import Float
 
 
 def outline(corners: Float, width: int, *, height: int) -> tuple[tuple[float, float, float, float], int]:
-    """Left, top, right and bottom of triangles (n, 3, 2) within an image, and the pixels they cover together.
+    """Left, top, right and bottom of triangles (n, 3, 2) in an image, and the number of pixels they cover.
 
     The image reaches from -0.5 to its size - 0.5; a pixel is covered if its centre is. Triangles with a
-    corner that is not finite are left out. Where nothing lies in the image, the bounds are not finite.
+    corner that is not finite are left out. The bounds are NaN if no triangle lies in the image.
     """
     whole = corners[np.isfinite(corners).all(axis=(1, 2))]
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
@@ -34,7 +34,7 @@ def outline(corners: Float, width: int, *, height: int) -> tuple[tuple[float, fl
 
 @njit(cache=True, nogil=True)
 def _bounds(corners: Any, right: float, bottom: float, out: Any) -> None:
-    """Widen ``out`` by what lies in the image of each triangle (Sutherland and Hodgman 1974)."""
+    """Widen ``out`` by the part of each triangle within the image (Sutherland and Hodgman 1974)."""
     here, there = np.empty((8, 2)), np.empty((8, 2))
     limit = (-0.5, -0.5, right, bottom)
     for t in range(len(corners)):
@@ -72,7 +72,7 @@ def _bounds(corners: Any, right: float, bottom: float, out: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def _cover(corners: Any, u0: int, v0: int, mask: Any) -> None:
-    """Set the pixels of ``mask``, whose first is (u0, v0), with their centre in a triangle."""
+    """Set the pixels of ``mask``, the first of which is (u0, v0), whose centre is in a triangle."""
     high, wide = mask.shape
     for t in range(len(corners)):
         ax, ay = corners[t, 0, 0] - u0, corners[t, 0, 1] - v0
@@ -81,7 +81,7 @@ def _cover(corners: Any, u0: int, v0: int, mask: Any) -> None:
         first = max(0, math.ceil(max(-1.0, min(ay, by, cy))))
         last = min(high - 1, math.floor(min(float(high), max(ay, by, cy))))
         for v in range(first, last + 1):
-            # the row crosses two or three sides: what lies between the outermost crossings is inside
+            # the row crosses two or three sides: pixels between the outermost crossings are inside
             low, up = np.inf, -np.inf
             for px, py, qx, qy in ((ax, ay, bx, by), (bx, by, cx, cy), (cx, cy, ax, ay)):
                 if min(py, qy) <= v <= max(py, qy):

@@ -21,13 +21,15 @@ DEPTH_SCALE = 256.0
 def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     """The PNG file of an image (h, w, 3) in colour or (h, w) in grey, uint8 or uint16.
 
-    Written for speed, twice that of an encoder that tries every filter on every row: each row is stored as
-    its difference from the one above, packed lightly (PNG, W3C 2003). Raises FormatError for another array.
+    Every row uses the "up" filter and light compression (PNG, W3C 2003), twice as fast as trying all filters.
+    Raises FormatError for another array.
     """
     kinds = {("uint8", 3): (8, 2), ("uint8", 2): (8, 0), ("uint16", 2): (16, 0), ("uint16", 3): (16, 2)}
     kind = kinds.get((image.dtype.name, image.ndim))
     if kind is None or image.size == 0 or image.shape[2:] not in ((), (3,)):
-        raise FormatError(f"an array {image.shape} of {image.dtype} is no PNG image that is written here")
+        raise FormatError(
+            f"an array {image.shape} of {image.dtype} is not an image of 8 or 16 bits, in grey or colour"
+        )
     height, width = image.shape[:2]
     big_endian = np.ascontiguousarray(image, image.dtype.newbyteorder(">"))
     rows = big_endian.view(np.uint8).reshape(height, -1)
@@ -47,7 +49,7 @@ def _chunk(name: bytes, data: bytes) -> bytes:
 
 
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    """Write an image as `encode_png` packs it."""
+    """Write an image as `encode_png` encodes it."""
     write_atomically(path, encode_png(image))
 
 
@@ -70,7 +72,7 @@ def read_png(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
 def depth_to_counts(depth: NDArray[np.floating]) -> NDArray[np.uint16]:
     """Depth in metres as counts of 1 / `DEPTH_SCALE` m, rounded; 0 where it is not finite or too far to hold.
 
-    A surface nearer than half a count is given 1, so that it is not taken for no data.
+    A surface nearer than half a count is stored as 1, as 0 means no data.
     """
     finite = np.isfinite(depth) & (depth >= 0)
     counts = np.rint(np.where(finite, depth, 0.0) * DEPTH_SCALE)
@@ -89,14 +91,14 @@ def counts_to_depth(counts: NDArray[np.uint16]) -> NDArray[np.float32]:
 def feature_to_image(feature: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Feature numbers (h, w) as a colour image (h, w, 3): number + 1 = R + 256 G + 65536 B, 0 for none.
 
-    The packing of COCO's panoptic format; it holds 16.7 million features.
+    The encoding of COCO's panoptic format, for up to 16.7 million features.
     """
     n = (feature + 1).astype(np.uint32)
     return np.stack([n & 255, n >> 8 & 255, n >> 16 & 255], axis=-1).astype(np.uint8)
 
 
 def image_to_feature(image: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """The feature numbers that `feature_to_image` packed, -1 for none."""
+    """The feature numbers of an image of `feature_to_image`, -1 for none."""
     return (image.astype(np.int32) @ np.array([1, 256, 65536], np.int32) - 1).astype(np.int32)
 
 
@@ -107,8 +109,8 @@ FLOW_SCALE = 64.0
 def flow_to_image(flow: NDArray[np.float32]) -> NDArray[np.uint16]:
     """Optical flow (h, w, 2) in pixels as a 16-bit colour image (h, w, 3), as in KITTI's flow benchmark.
 
-    R is 64 times the way right + 32768, G the same for down, B is 1; all are 0 where there is no flow, or
-    more than 511 pixels of it.
+    R is 64 times the flow to the right + 32768, G the same downwards, B is 1; all are 0 where the flow is
+    unknown or exceeds 511 pixels.
     """
     held = np.isfinite(flow).all(axis=2) & (np.abs(flow) < 511.5).all(axis=2)
     image = np.zeros((*held.shape, 3), np.uint16)
@@ -118,7 +120,7 @@ def flow_to_image(flow: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 
 def image_to_flow(image: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """The flow that `flow_to_image` took, to 1/128 of a pixel; NaN where there is none."""
+    """The flow of an image of `flow_to_image`, to 1/128 of a pixel; NaN where it is unknown."""
     flow = ((image[..., :2].astype(np.float64) - 32768) / FLOW_SCALE).astype(np.float32)
     flow[image[..., 2] == 0] = np.nan
     return flow

@@ -22,26 +22,26 @@ from lidar.rig.specs import CameraSpec
 from lidar.world.world import Surfaces, World
 
 _BAND = 1 << 16
-"""Rays worked on at a time: their columns stay in the processor's cache."""
+"""Rays per batch: small enough for their columns to stay in the processor's cache."""
 
 _ROLLS = 5
-"""Times that the row a point lands on is found, from the time of the row before; each gains some digits."""
+"""Fixed-point iterations for the row in which a rolling shutter sees a point; each gains some digits."""
 
 _LIFT = 1e-3
-"""Metres that a shadow ray starts off its surface; more at a distance."""
+"""Offset in metres of a shadow ray from its surface; it grows with distance."""
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How images are made.
+    """Options of the renderer.
 
     shadows     : cast shadows
-    detail      : draw windows, joints and grain where the scene has flat colour
+    detail      : draw windows, joints and grain on surfaces of uniform colour
     supersample : rays along each side of a pixel, for colour only; labels and depth are those of its centre
     visibility  : metres at which haze has taken 98 % of a contrast (Koschmieder); inf for clear air
-    exposure    : stops added to the exposure that the light asks for
-    full_well   : electrons at full scale, which set the noise of light; inf for none
-    read_noise  : electrons of noise in the dark, with a finite ``full_well``
+    exposure    : stops added to the automatic exposure
+    full_well   : electrons at full scale, which set the shot noise; inf for none
+    read_noise  : electrons (standard deviation), with a finite ``full_well``
     threads     : threads to use; the images do not depend on it
     """
 
@@ -55,9 +55,9 @@ class RenderOptions:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        """Refuse options that cannot be meant."""
+        """Raise InputError for values out of range."""
         if not (1 <= self.supersample <= 16 and self.visibility > 0 and self.full_well > 0 and self.threads):
-            raise InputError(f"camera options out of bounds: {self}")
+            raise InputError(f"camera options out of range: {self}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class Frame:
     rgb     : (h, w, 3) uint8, sRGB, or None if not asked for
     depth   : (h, w) float32, metres: along the optical axis (z) for a pinhole, along the ray for a fisheye;
               inf for sky and beyond the camera's ``far``
-    klass   : (h, w) uint8, `geoscene.classes.Class`; SKY where nothing is hit, UNLABELED where no ray goes
+    klass   : (h, w) uint8, `geoscene.classes.Class`; SKY where nothing is hit, UNLABELED without a ray
     feature : (h, w) int32, feature number in the scene, -1 for none
     """
 
@@ -84,10 +84,10 @@ class View:
     origin    : (k, 3) scene metres
     row       : (n,) int32, each ray's row of ``origin``
     direction : (n, 3) in the scene's axes
-    seen      : (n,) False for a pixel that sees nothing
+    seen      : (n,) False for a pixel outside the lens's field of view
     time      : (n,) ray times, or None
     hits      : what the rays hit
-    surfaces  : and what that is
+    surfaces  : surfaces at these hits
     """
 
     origin: Float
@@ -137,7 +137,7 @@ def render(
     if rest or not samples:
         raise InputError(f"camera {camera.name}: {len(poses)} poses for {rows} moments; see exposure_times")
     if np.isfinite(options.full_well) and random is None:
-        raise InputError(f"camera {camera.name}: noise is asked for (full_well) without a random generator")
+        raise InputError(f"camera {camera.name}: `full_well` adds noise and needs `random`")
     h, w = camera.height, camera.width
     coloured = "rgb" in camera.images
     rgb = np.empty((h, w, 3), np.uint8)
@@ -203,7 +203,7 @@ def _light(sun: tuple[float, float, float]) -> Light:
 
 
 def _finer(camera: CameraSpec, k: int) -> CameraSpec:
-    """The same camera with k by k pixels for each."""
+    """The same camera with k by k pixels for each one."""
     return replace(
         camera,
         width=camera.width * k,
@@ -232,7 +232,7 @@ def _view(
     times: Float | None,
     rows: int | None = None,
 ) -> View:
-    """What the rows first to last of a camera see in one sample of the exposure.
+    """Hits and surfaces of the rows first to last of a camera in one sample of the exposure.
 
     rows : rows of the shutter, where the camera is a finer one
     """
@@ -262,7 +262,7 @@ def _pinhole_rays(camera: CameraSpec) -> Float:
 
 
 def _scaled_rays(camera: CameraSpec) -> Float:
-    """Directions whose ray parameter is the depth that `Frame` speaks of."""
+    """Directions whose ray parameter is the depth as defined in `Frame`."""
     return pixel_rays(camera) if camera.model == "fisheye" else _pinhole_rays(camera)
 
 
@@ -337,7 +337,7 @@ def radiance(
 def _noisy(
     light: NDArray[np.float32], exposure: float, *, normal: NDArray[np.float32], options: RenderOptions
 ) -> NDArray[np.float32]:
-    """Light with the noise of a sensor: that of counting electrons, and that of reading them."""
+    """Light with shot noise and read noise."""
     electrons = np.minimum(light * exposure, 1.0) * options.full_well
     spread = np.sqrt(electrons + options.read_noise**2) / options.full_well
     noisy: NDArray[np.float32] = (light + spread * normal / exposure).astype(np.float32)
@@ -353,9 +353,9 @@ def optical_flow(
     times: Float | None = None,
     later_times: Float | None = None,
 ) -> NDArray[np.float32]:
-    """How far (h, w, 2) each pixel's surface point moves in the image to a later one, pixels right and down.
+    """Optical flow (h, w, 2) from one frame to a later one, pixels right and down.
 
-    NaN where it leaves the camera's field (not merely the image). Sky moves with the camera's turning alone.
+    NaN where a point leaves the camera's field of view (not merely the image). Sky moves with rotation only.
     Of a rolling shutter, the later row is the one that is exposed when the point is on it.
 
     poses, later       : the camera's pose in either frame, or one a row for a rolling shutter
@@ -386,7 +386,7 @@ def optical_flow(
 
 
 def _on_bodies(point: Float, hits: Hits, *, world: World, time: Float) -> Float:
-    """Points (k, 3) that are on instances, in the instances' own frames, at ray times (n,)."""
+    """Points (k, 3) on instances, in the instances' own frames, at ray times (n,)."""
     on = np.flatnonzero(hits.instance >= 0)
     place = _transforms(world, hits.instance[on], time=time[on])
     offset = (point[on] - place[:, :, 3])[..., None]
@@ -395,7 +395,7 @@ def _on_bodies(point: Float, hits: Hits, *, world: World, time: Float) -> Float:
 
 
 def _off_bodies(point: Float, body: Float, *, hits: Hits, world: World, time: Float) -> Float:
-    """The points (n, 3), those on instances (k, 3) where these have carried them at ray times (n,)."""
+    """Points (n, 3) at ray times (n,): those on instances (k, 3) moved along with them."""
     on = np.flatnonzero(hits.instance >= 0)
     place = _transforms(world, hits.instance[on], time=time[on])
     moved = point.copy()
@@ -404,7 +404,7 @@ def _off_bodies(point: Float, body: Float, *, hits: Hits, world: World, time: Fl
 
 
 def _transforms(world: World, instance: NDArray[np.int32], *, time: Float) -> Float:
-    """Transforms (k, 3, 4) of instances at ray times (k,), linear between their moments."""
+    """Transforms (k, 3, 4) of instances at ray times (k,), linearly interpolated."""
     out = np.empty((len(instance), 3, 4))
     start = 0
     for group in world.caster.instances:

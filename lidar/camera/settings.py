@@ -16,11 +16,11 @@ class CameraSettings:
     """Settings of images. The defaults are a camera without noise and one ray per pixel.
 
     shadows      : the sun casts shadows
-    detail       : windows, joints and grain are drawn where the map has flat colour
+    detail       : windows, joints and grain are drawn on surfaces of uniform colour
     supersample  : rays along each side of a pixel, for colour: 1 to 16
-    blur         : moments of an exposure (the camera's ``exposure_ns``) that are averaged: motion blur
+    blur         : samples of the exposure (the camera's ``exposure_ns``) that are averaged: motion blur
     haze         : distance in metres at which haze removes 98 % of contrast; inf for clear air
-    camera_noise : noise of counting and of reading electrons (the camera's ``full_well``, ``read_noise``)
+    camera_noise : shot noise and read noise (the camera's ``full_well``, ``read_noise``)
     """
 
     shadows: bool = True
@@ -43,7 +43,7 @@ class CameraSettings:
             raise InputError("; ".join(faults))
 
     def moments(self, camera: CameraSpec) -> int:
-        """Moments of an exposure that are rendered."""
+        """Number of samples of an exposure that are rendered."""
         return self.blur if camera.exposure_ns else 1
 
     def options(self, camera: CameraSpec) -> RenderOptions:

@@ -1,4 +1,4 @@
-"""The light that reaches each pixel: materials under sun and sky, windows, haze. Compiled, per pixel."""
+"""Radiance of each pixel: materials under sun and sky, windows, haze. Compiled, per pixel."""
 
 # mypy: disallow-untyped-decorators=False
 from __future__ import annotations
@@ -46,13 +46,13 @@ _KINDS = {
     "roof_tile": texture.SHINGLED,
     "slate": texture.SHINGLED,
 }
-# Reflectance straight on of what mirrors: Fresnel for n = 1.33 and 1.5 (two panes for a window), aluminium.
+# Specular reflectance at normal incidence: Fresnel for n = 1.33 and 1.5 (two panes for a window), aluminium.
 _MIRROR = {"water": 0.02, "glass": 0.08, "car_paint": 0.04, "metal": 0.15, "rail_steel": 0.3}
 
 
 @functools.cache
 def material_tables() -> tuple[NDArray[np.uint8], Float, NDArray[np.uint8]]:
-    """Kind of detail (256,), mirror reflectance straight on (256,) and colour (256, 3) by material code."""
+    """Detail kind (256,), specular reflectance at normal incidence (256,) and colour (256, 3) by material."""
     kind, mirror, plain = np.zeros(256, np.uint8), np.zeros(256), np.zeros((256, 3), np.uint8)
     for name, material in materials().items():
         kind[material.code] = _KINDS.get(name, texture.PLAIN)
@@ -100,9 +100,9 @@ def develop(radiance: Single, exposure: float, table: NDArray[np.uint8], out: ND
 def aim(
     rays: Float, row: NDArray[np.int32], rotation: Float, scale: Float, out: Float, seen: NDArray[np.bool_]
 ) -> None:
-    """Fill ``out`` (n, 3) with the scene's directions of camera rays (n, 3), ``seen`` (n,) with which exist.
+    """Fill ``out`` (n, 3) with scene directions of camera rays (n, 3), ``seen`` (n,) with which are valid.
 
-    The direction of a pixel that sees nothing (NaN) is the optical axis.
+    The direction of a pixel outside the field of view (NaN) is the optical axis.
     """
     for i in range(len(rays)):
         a, b, c = rays[i, 0], rays[i, 1], rays[i, 2]
@@ -126,7 +126,7 @@ def shadow_rays(
     start: Float,
     which: NDArray[np.int64],
 ) -> int:
-    """Number k of hits that face the sun; fills ``start`` (k, 3) just off them and ``which`` (k,) their rows.
+    """Number k of hits that face the sun; fills ``start`` (k, 3) of shadow rays and ``which`` (k,) rows.
 
     Normals (n, 3) are turned in place to face the viewer.
     """
@@ -170,7 +170,7 @@ def _sky(sky: Float, x: float, y: float, z: float, sun: Float, out: Float) -> No
 def _mirrored(
     sky: Float, sun: Float, d: Float, nx: float, ny: float, nz: float, town: Float, out: Float
 ) -> None:
-    """What a mirror shows: the sky where the mirrored ray climbs, else ``town``, its lit surroundings."""
+    """Radiance that a mirror reflects: the sky where the ray rises, else ``town``, the lit surroundings."""
     along = 2.0 * (nx * d[0] + ny * d[1] + nz * d[2])
     x, y, z = d[0] - along * nx, d[1] - along * ny, d[2] - along * nz
     _sky(sky, x, y, max(z, 0.0), sun, out)
@@ -181,7 +181,7 @@ def _mirrored(
 
 @compiled
 def _painted(feature: int, wall: int, albedo: Float) -> None:
-    """Turn the colour of a building whose colour no map gives into one of its own, out of its number."""
+    """Replace a building's default colour by one derived from its number."""
     shade = hashed(feature, 7, 20)
     shade = 0.5 + 0.6 * shade if wall else 0.7 + 1.1 * shade
     warm = 0.24 * (hashed(feature, 8, 20) - 0.35)
@@ -241,7 +241,7 @@ def shade(
         t = range_[i]
         if not t < np.inf:
             _sky(sky, d[0], d[1], max(d[2], 0.0), sun, glow)
-            below = min(max(-50.0 * d[2], 0.0), 1.0)  # where the world ends there is haze
+            below = min(max(-50.0 * d[2], 0.0), 1.0)  # beyond the edge of the scene there is haze
             facing = d[0] * sun[0] + d[1] * sun[1] + d[2] * sun[2]
             disc = min(max((facing - 0.999985) / 4e-6, 0.0), 1.0)  # 0.27 degrees, softened
             for c in range(3):

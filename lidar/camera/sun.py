@@ -1,4 +1,4 @@
-"""Where the sun stands."""
+"""Position of the sun."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def sun_position(when: datetime, lon_deg: ArrayLike, *, lat_deg: ArrayLike) -> t
 
     Good to 0.02° from 1950 to 2050. The low-accuracy solar coordinates of Meeus, Astronomical Algorithms
     (2nd ed., chapters 12, 22, 25), as used by the NOAA Solar Calculator, with NOAA's refraction for the
-    standard atmosphere. Delta T (about 70 s, 0.001° of the sun's way) is left out.
+    standard atmosphere. Delta T (about 70 s, 0.001° of solar motion) is neglected.
 
     when : with a time zone
 

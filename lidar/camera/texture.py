@@ -1,4 +1,4 @@
-"""Detail that no map holds, out of positions alone: grain, joints, courses, windows. Compiled, per pixel.
+"""Procedural surface detail: grain, joints, courses, windows. Compiled, per pixel.
 
 Everything is a hash of lattice points in the scene, so that the same place looks the same in every frame and
 from every camera. Detail finer than a pixel's footprint fades to its mean instead of flickering.
@@ -110,7 +110,7 @@ def courses(u: float, v: float, footprint: float) -> float:
 PLAIN, SPECKLED, SLABS, BRICK, WEATHERED, LEAFY, LIQUID, SHINGLED = range(8)
 """Kinds of detail that a material may have."""
 
-# For each kind up to three grains: amplitude, size in metres, how much longer they are across than up.
+# For each kind up to three grains: amplitude, size in metres, ratio of width to height.
 _GRAINS = np.array(
     [
         [[0.05, 1.1, 1.0], [0.04, 0.13, 1.0], [0.0, 1.0, 1.0]],
@@ -127,7 +127,7 @@ _GRAINS = np.array(
 
 @compiled
 def detail(kind: int, upright: int, x: float, y: float, z: float, u: float, footprint: float) -> float:
-    """Factor about 1 on a surface's colour at scene point (x, y, z); u runs along an upright one."""
+    """Factor around 1 on the colour at scene point (x, y, z); u runs along an upright surface."""
     if upright:
         a, b = u, z
     else:

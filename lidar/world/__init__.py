@@ -1,1 +1,1 @@
-"""What rays can meet: the static scene and the road users in it."""
+"""The world that rays intersect: the static scene and the road users in it."""

@@ -1,6 +1,6 @@
 """Bodies of road users: cars, vans, lorries, buses, two-wheelers and people, as closed parametric solids.
 
-The frame of a body: x forward, y left, z up, its zero on the ground in the middle of the box around it.
+Frame of a body: x forward, y left, z up, origin on the ground below the centre of its bounding box.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from lidar.world.people import person, rider
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """A body that actors are copies of.
+    """A body that actors are instances of.
 
-    name   : kind, and what tells it from others of its kind: ``sedan/white``
+    name   : kind and variant: ``sedan/white``
     kind   : one of `KINDS`
     klass  : its class
-    length, width, height : metres of the box around it
-    base   : metres between the axles, or the feet of a pose
+    length, width, height : of the bounding box, metres
+    base   : wheelbase in metres, or the distance between the feet of a pose
     mesh   : closed solids, frame as in the module's first lines
     """
 
@@ -69,10 +69,10 @@ PAINTS: dict[str, tuple[Rgb, float]] = {
     "green": ((40, 74, 58), 0.02),
     "beige": ((176, 162, 134), 0.02),
 }
-"""Colours of cars and their shares: assumed, close to what makers of paint report of new cars."""
+"""Colours of cars and their shares: assumed, close to the statistics of paint makers for new cars."""
 
 STRIDE = 4
-"""Poses of a stride, two steps; a walker goes through them as it moves on."""
+"""Poses of a stride (two steps) of a pedestrian."""
 CLOTHES: dict[str, tuple[Rgb, Rgb]] = {
     "navy": ((36, 44, 78), (44, 46, 52)),
     "grey": ((120, 122, 126), (52, 62, 92)),
@@ -109,7 +109,7 @@ def _car(size: tuple[float, float, float], *, profile: str, paint: Rgb) -> list[
     shell = loft(rings, color=paint)
     corner = sides(len(stations) - 1, 8)[:, 1]
     shell = repainted(shell, corner == 7, material="tyre", color=DARK)
-    # the cabin: where its glass begins and ends, and its roof
+    # the cabin: start and end of its glass, and its roof
     start, roof0, roof1, end = {
         "sedan": (0.40, 0.10, -0.42, -0.76),
         "hatchback": (0.44, 0.12, -0.74, -0.97),
@@ -173,7 +173,7 @@ def _car(size: tuple[float, float, float], *, profile: str, paint: Rgb) -> list[
 
 
 def _plate(x: float, z: float, *, y: float = 0.0) -> Mesh:
-    """A number plate, 520 by 110 mm, that stands 12 mm out of the body on either side of x."""
+    """A number plate, 520 by 110 mm, that protrudes 12 mm from the body at the front or rear."""
     return box(
         (x - 0.024, y - 0.26, z), (x + 0.024, y + 0.26, z + 0.11), material="retroreflector", color=WHITE
     )
@@ -372,7 +372,7 @@ _SIZES: dict[str, tuple[float, float, float, float]] = {
     "truck": (8.40, 2.50, 3.45, 0.62),
     "bus": (12.00, 2.55, 3.05, 0.51),
 }
-"""Length, width and height in metres and the axles' distance as a share of the length.
+"""Length, width and height in metres and the wheelbase as a share of the length.
 
 Close to cars of segments D, C and J, a large van, a lorry of 12 t and a city bus; mirrors of the large ones
 are left out.

@@ -1,4 +1,4 @@
-"""Closed solids that bodies are put together from."""
+"""Closed solids from which bodies are composed."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ WHITE: Rgb = (238, 238, 232)
 
 
 def painted(points: Float, faces: NDArray[np.integer], *, material: str, color: Rgb | None = None) -> Mesh:
-    """A closed mesh of one material, without a class yet; in the material's colour by default.
+    """A closed mesh of one material, without a class; in the material's colour by default.
 
-    Faces may all face inwards: they are turned if they do.
+    Faces that all point inwards are flipped.
     """
     of = materials()[material]
     mesh = Mesh.of(points, faces, material=of.code, color=color or of.color, closed=True)
@@ -49,7 +49,7 @@ def body(parts: Sequence[Mesh], klass: Class) -> Mesh:
 
 
 def loft(rings: ArrayLike, material: str = "car_paint", *, color: Rgb | None = None) -> Mesh:
-    """The closed solid through rings (k, n, 3) of corners, all the same way round.
+    """The closed solid through rings (k, n, 3) of corners, all in the same sense.
 
     Faces are in the order: two for each side of each span between rings, then the lids at the first and the
     last ring.
@@ -90,7 +90,7 @@ def box(
     color: Rgb | None = None,
     taper: tuple[float, float] = (1.0, 1.0),
 ) -> Mesh:
-    """A box between two corners; ``taper`` is the top's size along x and y against the bottom's."""
+    """A box between two corners; ``taper`` is the ratio of the top's size to the bottom's along x and y."""
     (x0, y0, z0), (x1, y1, z1) = low, high
     floor = np.array([[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]])
     middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2, 0.0])
@@ -99,7 +99,7 @@ def box(
 
 
 def mirrored(mesh: Mesh) -> list[Mesh]:
-    """A part on the left and its image on the right."""
+    """A part on the left and its mirror image on the right."""
     other = replace(mesh, vertices=mesh.vertices * [1.0, -1.0, 1.0], faces=mesh.faces[:, ::-1].copy())
     return [mesh, other]
 

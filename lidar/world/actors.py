@@ -1,4 +1,4 @@
-"""Everything that moves or stands about besides the ego vehicle, as columns, and where it is at any time."""
+"""Road users besides the ego vehicle, as columns, and their states at any time."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from lidar.world.actor_shapes import Shape
 Region = tuple[float, float, float, float]
 
 _AGE = 1 << 50
-"""Nanoseconds between the time axes of two actors laid end to end: 13 days."""
+"""Offset in nanoseconds between the concatenated time axes of two actors: 13 days."""
 
 
 @dataclass(frozen=True, slots=True)
 class Actors:
     """Actors, one row each, and the knots of their tracks.
 
-    shapes  : the bodies in use
-    shape   : (n,) int32 body of each actor; of a walker or rider the first pose
-    poses   : (n,) int32 poses that its body goes through as it moves: bodies from ``shape`` on
-    stride  : (n,) metres that it moves in one round of its poses
+    shapes  : the bodies
+    shape   : (n,) int32 body of each actor; of a pedestrian or rider the first pose
+    poses   : (n,) int32 number of poses of its cycle: bodies from ``shape`` on
+    stride  : (n,) metres covered in one cycle of its poses
     kind    : (n,) str, of `lidar.world.actor_shapes.KINDS`
     klass   : (n,) uint8, `geoscene.classes.Class`
-    size    : (n, 3) metres: length, width and height of its box
-    stretch : (n, 3) factors along x, y and z from the body's size to the actor's
+    size    : (n, 3) metres: length, width and height of its bounding box
+    stretch : (n, 3) scale factors along x, y and z from the body to the actor
     parked  : (n,) bool, it never moves
-    feature : (n,) int32, beyond the scene's own numbers: what points and pixels of the actor bear
+    feature : (n,) int32, feature number of the actor's points and pixels, above the scene's numbers
     first   : (n + 1,) int64 rows of the knots below
 
-    Knots, a few or many for each actor, times rising; an actor is there from its first to its last knot, one
-    that is parked always:
+    Knots of each actor, times ascending; an actor exists from its first to its last knot, a parked one
+    always:
 
     time_ns  : (k,) int64, nanoseconds since the drive's start
-    position : (k, 3) scene metres, the middle of the box, on the ground
+    position : (k, 3) scene metres, centre of the bounding box, on the ground
     angles   : (k, 3) radians: yaw from the x axis (unwrapped), pitch (nose down positive), roll
     velocity : (k, 3) scene metres a second
     gone     : (k,) metres covered
@@ -73,7 +73,7 @@ class Actors:
 class States:
     """Actors at one moment each.
 
-    position : (k, 3) scene metres, middle of the box, on the ground
+    position : (k, 3) scene metres, centre of the bounding box, on the ground
     angles   : (k, 3) yaw, pitch, roll in radians
     velocity : (k, 3) scene metres a second
     gone     : (k,) metres covered
@@ -86,14 +86,14 @@ class States:
 
 
 def alive(actors: Actors, start_ns: int, *, end_ns: int) -> NDArray[np.int64]:
-    """Actors (k,) that are there at some time of a span."""
+    """Actors (k,) that exist at some time of a span."""
     begin = actors.time_ns[actors.first[:-1]]
     end = actors.time_ns[actors.first[1:] - 1]
     return np.flatnonzero(actors.parked | ((begin <= end_ns) & (end >= start_ns)))
 
 
 def states(actors: Actors, rows: ArrayLike, *, time_ns: ArrayLike) -> States:
-    """Where actors (k,) are at times (k,); held at the ends of their tracks.
+    """States of actors (k,) at times (k,); constant beyond the ends of their tracks.
 
     Cubic between knots in position (Hermite, with the knots' velocities), linear in angles.
     """
@@ -131,7 +131,7 @@ def velocities(actors: Actors, time_ns: int) -> Float:
 
 
 def rotations(angles: Float) -> Float:
-    """Scene axes from body axes (k, 3, 3) for yaw, pitch and roll (k, 3): turned about z, then y, then x."""
+    """Rotations (k, 3, 3) from body to scene axes for yaw, pitch and roll (k, 3): about z, then y, then x."""
     (cy, cp, cr), (sy, sp, sr) = np.cos(angles).T, np.sin(angles).T
     rows = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
@@ -147,7 +147,7 @@ def actor_shapes(actors: Actors) -> list[Mesh]:
 
 
 def poses_of(actors: Actors, rows: NDArray[np.int64], *, at: States) -> NDArray[np.int32]:
-    """Bodies (k,) of actors in their states: walkers and riders take the pose of their stride."""
+    """Bodies (k,) of actors in their states: pedestrians and riders have the pose of their stride."""
     step = at.gone / actors.stride[rows] * actors.poses[rows]
     shape: NDArray[np.int32] = actors.shape[rows] + step.astype(np.int32) % actors.poses[rows]
     return shape

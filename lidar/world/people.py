@@ -11,9 +11,9 @@ from lidar.world.actor_solids import DARK, Rgb, ball, limb, loft
 Clothes = tuple[Rgb, Rgb]
 
 _LEG, _HIP, _SHOULDER, _CHIN = 0.48, 0.53, 0.82, 0.87
-"""Heights of the hips' joints, the trunk's bottom and top and the chin as shares of the stature: adults'."""
+"""Heights of hip joints, bottom and top of the torso, and chin as shares of an adult's stature."""
 _SWING = np.radians(26.0)
-"""Largest angle of a leg from upright at walking pace."""
+"""Largest angle of a leg from the vertical at walking speed."""
 _SKIN: Rgb = (198, 152, 122)
 _HAIR: Rgb = (62, 46, 36)
 
@@ -63,7 +63,7 @@ def rider(
 ) -> list[Mesh]:
     """A person who sits at ``seat`` (x, z), holds bars at ``grip`` and has the feet at ``foot``.
 
-    crank  : radians by which pedals about ``foot`` are turned; feet at rest by default
+    crank  : angle of the pedals about ``foot`` in radians; feet at rest by default
     helmet : its colour, none by default
     """
     jacket, trousers = clothes
@@ -149,7 +149,7 @@ def _arm(shoulder: Float, angle: float, *, bend: float, h: float, jacket: Rgb) -
 
 
 def _joint(a: Float, b: Float, *, first: float, second: float) -> Float:
-    """The knee between hip and ankle, bent forwards: where two bars of given lengths meet."""
+    """Position of the knee, bent forwards, for given lengths of thigh and shank."""
     d = b - a
     far = min(float(np.linalg.norm(d)), 0.999 * (first + second))
     along = (first**2 - second**2 + far**2) / (2 * far)
@@ -161,6 +161,6 @@ def _joint(a: Float, b: Float, *, first: float, second: float) -> Float:
 
 
 def _grounded(parts: list[Mesh]) -> list[Mesh]:
-    """Parts let down, or lifted, until the lowest stands on the ground."""
+    """Parts shifted vertically so that the lowest point is on the ground."""
     low = min(float(part.vertices[:, 2].min()) for part in parts)
     return [part.shifted([0.0, 0.0, -low]) for part in parts]

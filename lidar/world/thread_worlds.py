@@ -1,4 +1,4 @@
-"""The world of a frame: the static scene, and the actors where they are during it."""
+"""Worlds of the threads of a drive: the static scene and the actors during a frame."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from lidar.world.world import Region, World
 
 
 class Worlds:
-    """Worlds for the threads of a drive: one for all where nothing moves, else one each.
+    """Worlds of the threads of a drive: one for all threads without moving actors, else one per thread.
 
-    scene  : what stands still
-    margin : reach of the sensors, metres
-    actors : what moves; none by default
+    scene  : the static scene
+    margin : maximum range of the sensors, metres
+    actors : the road users; none by default
     """
 
     def __init__(self, scene: Scene, margin: float, *, actors: Actors | None = None) -> None:
@@ -26,7 +26,7 @@ class Worlds:
         self._own = threading.local()
 
     def follow(self, region: Region) -> None:
-        """Move on to another region; to be called while no thread uses a world."""
+        """Load another region. Call it only while no thread uses a world."""
         self._region = region
         if self.actors is None:
             self._shared = self._moved(self._shared, region)

@@ -1,4 +1,4 @@
-"""How much of each road user a point in the scene sees."""
+"""Visible share of each road user from a point in the scene."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from geoscene.typing import Float
 from lidar.world.actors import Actors, poses_of, rotations, states
 from lidar.world.world import World
 
-_SAMPLES = 192  # places on a body: a share is known to about 1 / sqrt(96), half of them facing away
+_SAMPLES = 192  # sample points on a body: half face away, so the error of a share is about 1 / sqrt(96)
 _R2 = np.array([0.7548776662466927, 0.5698402909980532])
-"""Steps of the sequence that fills a square evenly (Roberts, R2, 2018)."""
-_TOUCH = 1e-3  # share of the way by which a hit may come before the place it is meant for
+"""Steps of a low-discrepancy sequence in the square (Roberts, R2, 2018)."""
+_TOUCH = 1e-3  # relative distance by which a hit may precede its sample point
 
 
 class Visibility:
-    """Places all over the bodies of actors, to be looked at from sensors.
+    """Sample points on the bodies of actors, for visibility tests by shadow rays.
 
-    actors : the road users; `World.actors` are to be their bodies
+    actors : the road users; `World.actors` must be their bodies
     """
 
     def __init__(self, actors: Actors) -> None:
@@ -31,8 +31,8 @@ class Visibility:
     def seen_from(self, eye: ArrayLike, world: World, *, rows: NDArray[np.int64], time_ns: int) -> Float:
         """Share (k,) of each of the actors ``rows`` that is seen from ``eye``, 0 to 1.
 
-        It is the share of the side that faces the eye, by solid angle, which no other thing hides. Actors are
-        to stand in ``world`` so that its ray time 0 is ``time_ns``.
+        It is the unoccluded share, by solid angle, of the side facing the eye. Ray time 0 of ``world``
+        must be ``time_ns``.
 
         eye : (3,) scene metres
         """
@@ -59,7 +59,7 @@ class Visibility:
 
 
 def _spread(mesh: Mesh) -> tuple[Float, Float]:
-    """Places (n, 3) spread evenly over a mesh, and the unit normals (n, 3) there."""
+    """Points (n, 3) spread evenly over a mesh, and the unit normals (n, 3) there."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces].astype(np.float64), 1, 0)
     cross = np.cross(b - a, c - a)
     area = np.linalg.norm(cross, axis=1)

@@ -1,4 +1,4 @@
-"""The scene around a vehicle as rays see it: static tiles that come and go, actors that move."""
+"""The scene around a vehicle for ray casting: static tiles loaded by region, and moving actors."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from lidar.raycast.geometry import split
 Region = tuple[float, float, float, float]
 
 SOLID, GLASS, FOLIAGE, WATER = 1, 2, 4, 8
-"""Mask bits of a world's faces, by material: cast with ``mask=ALL & ~GLASS`` to look through windows."""
+"""Mask bits of a world's faces, by material: ``mask=ALL & ~GLASS`` lets rays pass through windows."""
 
 _SEEN_THROUGH = {"glass": GLASS, "foliage": FOLIAGE, "conifer": FOLIAGE, "water": WATER}
-_OVERHANG = 50.0  # metres by which a building may stand out of the tile it belongs to and still be loaded
-_GRID = 2048.0  # metres between the origins that float32 coordinates may be relative to
-_PARTS = 8  # numbers a tile has for its parts, one for each mask
+_OVERHANG = 50.0  # metres by which a building may extend beyond its tile and still be loaded
+_GRID = 2048.0  # spacing in metres of possible origins of float32 coordinates
+_PARTS = 8  # part numbers per tile, one for each mask
 
 
 @dataclass(frozen=True, slots=True)
 class Surfaces:
-    """What rays hit, one row a ray; a miss has feature -1 and zero elsewhere.
+    """Surfaces that rays hit, one row per ray; a miss has feature -1 and zero elsewhere.
 
     feature  : (n,) int32, feature number of the scene, or of the actor
     klass    : (n,) uint8, code of `geoscene.classes.Class`
@@ -48,7 +48,7 @@ class Surfaces:
 
 
 class Faces(NamedTuple):
-    """What the faces of a world are, for compiled code.
+    """Attributes of the faces of a world, for compiled code.
 
     A hit is on row ``face + start[instance]`` of ``what``, a miss (both -1) on its last.
 
@@ -105,7 +105,7 @@ def _shape(mesh: Mesh) -> Caster:
 
 @dataclass(frozen=True, slots=True)
 class _Tile:
-    """A loaded tile: its parts by number, what its faces are, and its copies of shapes in scene metres."""
+    """A loaded tile: its parts by number, attributes of its faces, instances of shapes in scene metres."""
 
     parts: Mapping[int, Geometry]
     surfaces: Surfaces
@@ -117,12 +117,12 @@ class _Tile:
 class World:
     """The part of a scene that rays can reach; coordinates are scene metres.
 
-    ``world.caster`` casts the rays (see `lidar.raycast.Caster`), `lookup` says what they hit. `follow` moves
-    the part along and `place_actors` puts moving things into it, both in place: look up hits before either.
+    ``world.caster`` casts the rays (see `lidar.raycast.Caster`), `lookup` returns the surfaces of their hits.
+    `follow` loads another region and `place_actors` places moving actors, both in place: look up hits first.
 
     scene  : the scene
-    margin : metres around every region: the reach of the sensors
-    actors : shapes of the things that may move (see `place_actors`), closed, in their own frames
+    margin : metres around every region: the maximum range of the sensors
+    actors : bodies of actors (see `place_actors`), closed, in their own frames
     """
 
     def __init__(self, scene: Scene, *, margin: float = 0.0, actors: Sequence[Mesh] = ()) -> None:
@@ -145,22 +145,22 @@ class World:
     def load(
         cls, scene: Scene, *, region: Region | None = None, margin: float = 0.0, actors: Sequence[Mesh] = ()
     ) -> World:
-        """The world of the tiles that touch a region.
+        """The world of the tiles that intersect a region.
 
         region : (xmin, ymin, xmax, ymax) in scene metres; the whole scene by default
-        margin : metres to add on every side: the reach of the sensors
-        actors : shapes of the things that may move later (see `place_actors`)
+        margin : metres to add on every side: the maximum range of the sensors
+        actors : bodies of actors (see `place_actors`)
 
-        Raises InputError if no tile touches the region.
+        Raises InputError if no tile intersects the region.
         """
         world = cls(scene, margin=margin, actors=actors)
         world.follow(scene.bounds if region is None else region)
         return world
 
     def follow(self, region: Region) -> None:
-        """Make this the world of another region, in place; tiles of both stay as they are.
+        """Load another region in place; tiles of both regions are kept.
 
-        What rays hit depends on the region alone, not on the regions before.
+        The hits depend on the region alone, not on earlier ones.
         """
         ranks = _touching(self.scene, region, margin=self.margin + _OVERHANG)
         if not ranks:
@@ -188,11 +188,11 @@ class World:
         )
 
     def place_actors(self, shape: NDArray[np.int32], transform: Float, *, feature: NDArray[np.int32]) -> None:
-        """Put actors into this world, in place of those there were; its static part is not built again.
+        """Replace the actors of this world; its static part is not rebuilt.
 
         shape     : (k,) int32, index into the ``actors`` of the world
         transform : (k, 3, 4) float64, scene from actor; or (k, s, 3, 4) at s >= 2 moments evenly spaced over
-                    the ray times 0 to 1: each ray meets the actor where it is at the ray's own time
+                    the ray times 0 to 1: each ray intersects the actor at its pose at the ray's own time
         feature   : (k,) int32, numbers to find in `Surfaces.feature`
         """
         self._moving = Instances(self._actors, np.asarray(shape, np.int32), transform), feature
@@ -200,7 +200,7 @@ class World:
         self.caster.update(instances=[self._still, self._moving[0]])
 
     def lookup(self, hits: Hits) -> Surfaces:
-        """What the rays hit."""
+        """Surfaces that the rays hit."""
         rows = hits.face + self._base[hits.instance]
         found = {f.name: getattr(self._surfaces, f.name)[rows] for f in fields(Surfaces)}
         copied = np.flatnonzero(hits.instance >= 0)
@@ -209,7 +209,7 @@ class World:
 
     @property
     def faces(self) -> Faces:
-        """What the faces are that rays hit, for compiled code."""
+        """Attributes of all faces, for compiled code."""
         return self._faces
 
     def _read(self, rank: int) -> _Tile:
@@ -229,7 +229,7 @@ class World:
         )
 
     def _lay(self) -> None:
-        """Lay the tables of tiles and shapes end to end, a miss last, where index -1 finds it."""
+        """Concatenate the tables of tiles and shapes, with the row of a miss last (index -1)."""
         tables = [*(tile.surfaces for tile in self._tiles.values()), *self._copied]
         starts = np.cumsum([0, *(len(table.klass) for table in tables)])
         self._first = dict(zip(self._tiles, starts.tolist(), strict=False))
@@ -257,7 +257,7 @@ class World:
         return found
 
     def _number(self) -> None:
-        """Say where the tables of all copies start and what they are called."""
+        """Set the first rows and feature numbers of all instances."""
         moving, feature = self._moving
         self._base = np.concatenate([self._of_shape[self._still.shape], self._of_actor[moving.shape], [0]])
         named = [np.asarray(rows, np.int32) for rows in (*(t.feature for t in self._tiles.values()), feature)]
@@ -281,7 +281,7 @@ def _nothing(shapes: tuple[Caster, ...]) -> tuple[Instances, NDArray[np.int32]]:
 
 
 def _touching(scene: Scene, region: Region, *, margin: float) -> list[int]:
-    """Ranks among the scene's tiles of those that touch a region grown by a margin."""
+    """Indices of the scene's tiles that intersect a region grown by a margin."""
     ij = np.array(scene.tile_indices, float).reshape(-1, 2)
     low, high = ij * scene.tile_size, (ij + 1) * scene.tile_size
     near = (low <= np.array(region[2:]) + margin) & (high >= np.array(region[:2]) - margin)

@@ -1,5 +1,5 @@
-// A camera that looks at a point. All that the graphics card sees is relative to that point, so that single
-// precision does not tremble far from the scene's zero.
+// A camera that orbits a target point. Coordinates on the graphics card are relative to the target, so that single
+// precision suffices far from the scene's origin.
 
 const FIELD = Math.PI / 4; // vertical angle of view
 const LOWEST = 0.02, HIGHEST = Math.PI / 2; // tilt
@@ -53,7 +53,7 @@ class Camera {
     this.tilt = 0.75; // below the horizon
     this.distance = (0.8 * across) / Math.min(1, aspect);
     this.target = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2] + (high[2] - low[2]) * 0.1];
-    this.move(0, -0.08 * across); // what is near looks larger
+    this.move(0, -0.08 * across); // nearby things appear larger
   }
 
   axes() {

@@ -1,14 +1,14 @@
-// Drawing: the picture, the picture of numbers and the sun's view, of the same buffers.
+// Rendering of the same buffers as picture, picking buffer (feature numbers) and shadow map.
 
 const SKY = [0.725, 0.812, 0.894, 1];
 const SUN_PIXELS = 2048;
-const FAR_PIXELS = 12; // copies smaller than that are drawn as `farShape`s
+const FAR_PIXELS = 12; // smaller copies are drawn as `farShape`s
 const LEAST_PIXELS = 0.3; // copies whose second side is smaller are not drawn
 
 class Renderer {
   constructor(canvas, head, shapes) {
     const gl = canvas.getContext("webgl2", { antialias: true });
-    if (!gl) throw new Error("This browser has no WebGL 2, with which the page draws.");
+    if (!gl) throw new Error("This browser does not support WebGL 2, which the page needs.");
     Object.assign(this, { canvas, gl, head, tiles: [], mode: 0, selected: -1, glow: 0, shadows: false, sunAzimuth: 2.6 });
     this.hidden = new Set();
     this.programs = {};
@@ -27,7 +27,7 @@ class Renderer {
     this.colorFeatures(() => null);
     this.makeSun();
     this.numbers = gl.createFramebuffer();
-    this.stale = true; // the picture of numbers
+    this.stale = true; // the picking buffer
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.CULL_FACE);
   }

@@ -1,10 +1,10 @@
-// Putting it together: reading, events, the loop that draws when something has changed.
+// Main program: loading, events, and the loop that redraws after changes.
 
 const $ = (id) => document.getElementById(id);
 const MODES = { look: 0, material: 1, class: 2, source: 3, sigma: 3 };
 
 async function start() {
-  if (!("DecompressionStream" in window)) throw new Error("This browser is too old: it cannot inflate the page's data.");
+  if (!("DecompressionStream" in window)) throw new Error("This browser is too old: it cannot decompress the page's data.");
   const head = JSON.parse($("scene").textContent);
   const shapes = readShapes(head.shapes, await blobOf("shapes"));
   const renderer = new Renderer($("canvas"), head, shapes);
@@ -31,10 +31,10 @@ async function start() {
     const waited = performance.now();
     await new Promise((done) => {
       requestAnimationFrame(() => requestAnimationFrame(done));
-      setTimeout(done, 3000); // pages that are not seen have no frames
+      setTimeout(done, 3000); // hidden pages get no animation frames
     });
     shown = performance.now();
-    pause = Math.max(250, 8 * (shown - waited)); // a slow card must not draw more than it reads
+    pause = Math.max(250, 8 * (shown - waited)); // on a slow card, loading takes precedence over drawing
   }
   $("message").hidden = true;
   if (window.innerWidth <= 640) $("controls").open = false;
@@ -44,7 +44,7 @@ async function start() {
   color(view, "look");
   fromAddress(view);
   window.addEventListener("hashchange", () => location.hash !== view.address && fromAddress(view));
-  // For tests and for tinkering in the browser's console.
+  // For tests and the browser's console.
   window.geoscene = {
     ready: true,
     pick: (x, y) => renderer.pick(camera, x, y),
@@ -59,7 +59,7 @@ async function start() {
       for (let k = 0; k < frames; k++) {
         camera.turn(0.01, 0);
         renderer.render(camera);
-        renderer.gl.readPixels(0, 0, 1, 1, renderer.gl.RGBA, renderer.gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits for the picture
+        renderer.gl.readPixels(0, 0, 1, 1, renderer.gl.RGBA, renderer.gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits until the frame is drawn
       }
       return (performance.now() - began) / frames;
     },
@@ -120,7 +120,7 @@ function click(view, x, y) {
 function select(view, feature, hit) {
   const { head, attributes, renderer } = view;
   renderer.selected = feature === null ? -1 : feature;
-  renderer.glow = attributes.layer(feature) === "landcover" ? 0.25 : 0.7; // large areas must not blind
+  renderer.glow = attributes.layer(feature) === "landcover" ? 0.25 : 0.7; // a weaker highlight for large areas
   view.dirty = true;
   const panel = $("panel");
   panel.hidden = feature === null;
@@ -202,7 +202,7 @@ function toAddress(view) {
     try {
       history.replaceState(null, "", view.address);
     } catch {
-      // Some browsers forbid it to pages from disk; the view is then not kept.
+      // Some browsers forbid it for pages from disk; the address then does not follow the view.
     }
   }, 400);
 }
@@ -227,7 +227,7 @@ function listen(view) {
     try {
       canvas.setPointerCapture(event.pointerId);
     } catch {
-      // The pointer is already gone; its events still come while it is over the canvas.
+      // The pointer was released already; its events still arrive over the canvas.
     }
     if (!pointers.size) {
       moved = 0;
@@ -319,7 +319,7 @@ function listen(view) {
   };
   $("search").oninput = list;
   $("search").onkeydown = (event) => event.key === "Enter" && find(view, $("search").value);
-  canvas.addEventListener("webglcontextlost", () => fail(new Error("The graphics card gave up; reload the page.")));
+  canvas.addEventListener("webglcontextlost", () => fail(new Error("The graphics context was lost; reload the page.")));
 }
 
 function fail(error) {

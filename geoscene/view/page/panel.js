@@ -1,4 +1,4 @@
-// Words: what is known of a feature and where from, the legend, the search.
+// Text: attributes of a feature with their sources, the legend, the search.
 
 const OSM_ID = /^(node|way|relation)\/\d+$/;
 const SURFACES = ["", "wall", "roof", "floor"];

@@ -1,12 +1,12 @@
-// Programs of the graphics card. `COPIES` is defined for shapes that are drawn many times, `PICK` for the
-// picture of numbers that tells what lies under the cursor, `DEPTH` for what the sun sees.
+// Shaders. `COPIES` is defined for instanced shapes, `PICK` for the picking buffer (the feature under the cursor),
+// `DEPTH` for the shadow map.
 
 const VERTEX = `
 precision highp float;
 precision highp int;
 uniform mat4 uMatrix;
 uniform vec3 uOffset;   // tile relative to the camera's target, metres
-uniform float uStep;    // metres between whole numbers
+uniform float uStep;    // quantisation step, metres
 uniform int uMode;      // 0 look, 1 material, 2 class, 3 feature
 uniform sampler2D uCodes;     // rows: materials, classes
 uniform sampler2D uFeatures;  // colour of feature f at (f + 1) in rows of 4096
@@ -31,7 +31,7 @@ void main() {
 #ifdef COPIES
   vec4 p = vec4(aPosition, 1.0);
   vPoint = uOffset + vec3(dot(aRow0, p), dot(aRow1, p), dot(aRow2, p));
-  // Normals turn with the cofactors, as planes do, whatever the scales.
+  // Normals transform with the cofactor matrix, which holds for any scales.
   vec3 r0 = aRow0.xyz, r1 = aRow1.xyz, r2 = aRow2.xyz;
   vNormal = vec3(dot(cross(r1, r2), aNormal), dot(cross(r2, r0), aNormal), dot(cross(r0, r1), aNormal));
 #else
@@ -68,14 +68,14 @@ void main() {
 #else
 uniform vec3 uSun;      // towards the sun
 uniform int uSelected;
-uniform float uGlow;    // share of the selected one's colour that is replaced
+uniform float uGlow;    // strength of the highlight of the selected feature
 uniform int uShadows;
 uniform mat4 uSunMatrix;
 uniform float uSunPixel;  // metres
 uniform sampler2DShadow uSunDepth;
 out vec4 color;
 float lit(vec3 normal) {
-  // A pixel and a half off the face, so that it does not shade itself.
+  // Offset by a pixel and a half, so that a face does not shade itself.
   vec3 at = (uSunMatrix * vec4(vPoint + normal * 1.5 * uSunPixel, 1.0)).xyz * 0.5 + 0.5;
   if (uShadows == 0 || any(lessThan(at, vec3(0.0))) || any(greaterThan(at, vec3(1.0)))) return 1.0;
   vec2 pixel = 0.7 / vec2(textureSize(uSunDepth, 0));
@@ -90,7 +90,7 @@ void main() {
   vec3 normal = normalize(vNormal + vec3(0.0, 0.0, 1e-6));
   float sun = max(dot(normal, uSun), 0.0);
   if (sun > 0.0) sun *= lit(normal);
-  // Light of the sky from above, of the ground from below; shares chosen so that a roof in the sun keeps its colour.
+  // Sky light from above, ground light from below; weighted so that a sunlit roof keeps its colour.
   vec3 sky = mix(vec3(0.26, 0.24, 0.22), vec3(0.42, 0.46, 0.52), normal.z * 0.5 + 0.5);
   vec3 base = max(pow(vColor, vec3(2.2)), vec3(0.012)); // edges of black walls stay visible
   if (vFeature == uSelected && vFeature >= 0) base = mix(base, vec3(0.0, 0.8, 1.0), uGlow);
