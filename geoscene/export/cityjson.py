@@ -35,7 +35,7 @@ from geoscene.scene import Scene
 from geoscene.typing import Float
 
 STEP = 1e-4
-"""Metres between whole numbers of the file: the grid that solids lie on, so that nothing moves."""
+"""Metres per unit of the file's integers: the grid of the solids, so that they are exact."""
 
 STEP_ELSEWHERE = 1e-5
 """The same in a CRS other than the scene's, where neighbours on the old grid must not fall together."""
@@ -138,7 +138,7 @@ def _target(scene: Scene, crs: str | None) -> tuple[_Target, tuple[str, ...]]:
     try:
         parsed = CRS.from_user_input(crs or scene.frame.name)
     except Exception as error:
-        raise InputError(f"`crs` {crs}: pyproj does not know it; give EPSG:<number>") from error
+        raise InputError(f"`crs` {crs}: not a CRS that pyproj can read; give EPSG:<number>") from error
     if not parsed.is_projected or parsed.to_epsg() is None:
         raise InputError(f"`crs` {crs}: CityJSON needs a projected CRS with an EPSG code")
     same = parsed == scene.frame.crs

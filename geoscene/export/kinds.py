@@ -90,9 +90,9 @@ def export_scene(
         takes = ", ".join(f"`{key}`" for key in sorted(kind.options)) or "none"
         raise InputError(f"{names} does not go with {kind.title}, which takes {takes}")
     if out.exists() and not overwrite:
-        raise InputError(f"{out}: is there already; set `overwrite` to replace it")
+        raise InputError(f"{out}: exists; set `overwrite` to replace it")
     if out.is_dir() and kind.suffixes:
-        raise InputError(f"{out}: is a folder; {kind.title} is a file, name one")
+        raise InputError(f"{out}: is a folder; {kind.title} needs a file name")
     module, function = kind.writer.split(":")
     write = getattr(importlib.import_module(f"geoscene.export.{module}"), function)
     summary: Summary = write(scene, out, **given, progress=progress)

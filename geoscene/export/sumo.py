@@ -38,7 +38,7 @@ def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summ
             "--output-file",
             net,
         ]
-        # no shell, and nothing in the command is the user's but the name of a folder
+        # no shell; only the folder's name comes from the user
         run = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
         if run.returncode or not net.exists():
             lines = [line for line in run.stderr.splitlines() if line.strip()] or ["no message"]

@@ -46,7 +46,7 @@ def target_crs(scene: Scene, crs: str | None) -> CRS:
     try:
         return CRS.from_user_input(crs)
     except CRSError as error:
-        raise InputError(f"`crs` {crs}: pyproj does not know it; give EPSG:<number>") from error
+        raise InputError(f"`crs` {crs}: not a CRS that pyproj can read; give EPSG:<number>") from error
 
 
 def chosen_layers(scene: Scene, layers: Collection[str] | None, *, solids: bool) -> list[str]:

@@ -55,17 +55,17 @@ def add_controls(
         for kind in _kinds(tags):
             side = _direction(tags, kind)
             if side:
-                speaks = side == (1 if with_way else -1)
+                applies = side == (1 if with_way else -1)
             elif kind not in ("stop", "give_way"):
-                speaks = True
+                applies = True
             elif at_end and arms[node] > 2:
-                speaks = tags.get("stop") == "all" or bool(
+                applies = tags.get("stop") == "all" or bool(
                     rank[edge] > best[node] or best[node] == worst[node]
                 )
             else:
                 ahead = float(arm_metres[node]) - length if at_end else length - offset
-                speaks = ahead <= offset
-            if speaks:
+                applies = ahead <= offset
+            if applies:
                 rows.append((edge, offset, kind))
                 if kind in flags and length - offset <= _REACH:
                     flags[kind][node] = True

@@ -21,7 +21,7 @@ from geoscene.tags import parse_length
 from geoscene.typing import Float
 
 _AREA, _PAINT = 160.0, 165.0
-# Metres: width of a crossing where the map has none, of a zebra's stripes and the gaps between, and of the
+# Metres: default width of a crossing, of a zebra's stripes and the gaps between, and of the
 # two lines of a signalled crossing (Vienna Convention: 2.5 and more; MUTCD 3B.18: lines 6 to 24 inches,
 # stripes 12 to 24, gaps not over 2.5 times that).
 _WIDTH = 3.0

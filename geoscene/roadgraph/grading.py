@@ -20,8 +20,7 @@ from geoscene.typing import Float
 _SHARP = 0.05
 """Where carriageways overlap, a road counts for most near its middle: the less this is, the more so."""
 
-# Metres of free height (railways: EN 15273 with overhead line; waterways: a rowing boat on small ones) that
-# bridges leave.
+# Metres of clearance below bridges (railways: EN 15273 with overhead line; small waterways: a rowing boat).
 _CLEAR = {
     "railway": {"rail": 5.7, "light_rail": 5.0, "tram": 4.7, "subway": 4.5, "narrow_gauge": 4.5},
     "waterway": {"river": 3.0, "canal": 3.0, "stream": 1.0, "ditch": 0.5, "drain": 0.5},

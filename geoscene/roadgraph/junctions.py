@@ -28,11 +28,11 @@ _RADIUS = {
 _RADIUS_ELSE = 2.0
 # Metres that a joint reaches into an arm at most: roads that part at a small angle have no end of joint.
 _REACH = 20.0
-# A road that goes on straight (radians) and as wide (metres) needs no joint.
+# Roads that continue within these limits of direction (radians) and width (metres) need no joint.
 _BEND, _STEP = np.radians(1.0), 0.05
 # Where a road that bends less than this (radians) changes its width, it does so by 1 in twice this number.
 _BENT, _SLANT = np.radians(30.0), 3.0
-# Neighbours closer to a straight line than this (radians) have no inner corner to round.
+# Neighbouring arms closer to a straight line than this (radians) have no corner to round.
 _ROUNDED = np.radians(8.0)
 # Arms whose directions differ by less than this (radians) have the same direction.
 _ONE_DIRECTION = 1e-6
@@ -149,7 +149,7 @@ def _arms(roads: Carriageways) -> _Arms:
     place = roads.place
     level = np.where(place == 0, 0, roads.layer.astype(np.int64) * 3 + place)
     group = np.unique(np.stack([node, level[road]]), axis=1, return_inverse=True)[1].ravel()
-    # A little way along, so that the first centimetres of a sloppily drawn line do not decide.
+    # A short distance along the line: its first centimetres may be drawn imprecisely.
     length = shapely.length(roads.line)
     ahead = np.where(end == 0, 1, -1) * np.minimum(5.0, length / 2)[road]
     there = shapely.get_coordinates(shapely.line_interpolate_point(roads.line[road], ahead))
@@ -240,7 +240,7 @@ def _wedges(arms: _Arms, between: Float, *, reach: Float) -> NDArray[np.object_]
     angle = arms.angle[:, None] + between[:, None] * turn
     radius = (2.0 * reach + 60.0)[:, None]
     rim = arms.node_xy[:, None] + np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=2)
-    # Arms of one direction have no room between them, and all of it on their other sides.
+    # Arms in one direction have no angle between them, and a full turn on their other sides.
     ring = np.concatenate([arms.node_xy[:, None], rim], axis=1)
     around = between > 2 * np.pi - _ONE_DIRECTION
     ring[around, 0] = rim[around, 0]

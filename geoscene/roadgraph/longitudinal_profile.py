@@ -55,10 +55,10 @@ class Obstacles:
 
 
 # Weights of the least-squares terms, per metre of road. Ground far from any bridge or tunnel holds a road
-# more firmly than a ramp does; what is forbidden is a hundred thousand times dearer than either.
+# more firmly than a ramp does; violated bounds cost a hundred thousand times more than either.
 _FIRM, _RAMP, _LOOSE = 100.0, 1.0, 1e-6
 _RAMP_REACH = 150.0
-# A bridge or a tunnel is a string pulled taut rather than a sprung beam over more than this length, metres.
+# Over more than this length (metres) a bridge or tunnel behaves as a taut string rather than as a beam.
 _TAUT = 30.0
 _AROUND = 400.0
 """Metres along roads from what does not lie still, within which heights are solved for at first."""
@@ -130,7 +130,7 @@ def _distance(
     if not start.any():
         return np.full(count, limit)
     a, b, metres = links
-    # One more station, linked to all starts, makes one source of them.
+    # One more station, linked to all starts, is their common source.
     source = np.flatnonzero(start)
     rows = np.concatenate([a, np.full(len(source), count)])
     columns = np.concatenate([b, source])
@@ -170,7 +170,7 @@ def _bounds(
     on_ground[a[structure]] = on_ground[b[structure]] = False
     allowed = (options.step + np.where(on_ground[p] & on_ground[q] & on_ground[r], np.abs(bend), 0.0)) * near
     turn = [(p, near / before), (q, -near / before - near / after), (r, near / after)]
-    # A jolt is one of slope: between stations close together a few centimetres make it.
+    # Bounds on the change of gradient: between close stations a few centimetres exceed them.
     firm = _STEADY * (options.spacing / np.clip(near, _CLOSE, options.spacing)) ** 2
     rows.add(turn, -allowed, weight=firm)
     rows.add([(station, -factor) for station, factor in turn], -allowed, weight=firm)
@@ -209,7 +209,7 @@ def _bounds(
     bore = np.flatnonzero(np.isfinite(tunnel))
     deep = np.minimum(options.clearance + options.cover, options.slope / 2 * tunnel[bore])
     rows.add([(bore, -1.0)], deep - terrain[bore], weight=_HARDEST)
-    # Where the ground does not rise over it, the road goes down into a cutting before its tunnel begins.
+    # Where the ground does not rise over it, the road descends into a cutting before its tunnel.
     bore = bore[tunnel[bore] >= _PORTAL]
     whole = np.full(len(bore), options.clearance + options.cover)
     rows.add([(bore, -1.0)], whole - terrain[bore], weight=_WISHED)
@@ -243,7 +243,7 @@ def _nearest(graph: RoadGraph, edge: Ints, *, xy: Float, along: Float) -> Float:
     """Metres along edges (k,) of the places nearest to points (k, 2), not far from ``along``."""
     lines = np.array([shapely.linestrings(graph.geometry[e][:, :2]) for e in edge.tolist()], object)
     found = shapely.line_locate_point(lines, shapely.points(xy)) if len(edge) else along
-    # Where a line comes near once more, as loops do, the place where they cross is meant.
+    # A loop can come near a second time: only places near the crossing count.
     far = np.hypot(*(xy - shapely.get_coordinates(shapely.line_interpolate_point(lines, along))).T)
     return np.clip(found, along - far, along + far)
 
@@ -335,7 +335,7 @@ def _solve(
     )
     cost = (stiff + rise.T @ diags_array(taut / metres) @ rise + diags_array(weight)).tocsr()
     pull = weight * terrain
-    # Where the terrain is best as it is, as on level ground far from any bridge, nothing has to be solved.
+    # Stations at which the terrain already satisfies all bounds need no solution.
     restless = np.abs(cost @ terrain - pull) > _STILL
     short = np.flatnonzero(bounds.a @ terrain < bounds.b - _STILL)
     restless[bounds.a[short].indices] = True

@@ -24,7 +24,7 @@ _LINE = 0.12
 _DASH, _GAP = 3.0, 6.0
 _STOP = 0.4
 _EDGE_IN = 0.25
-# Paint ends this far before the rounding of a junction begins, and a stop line lies there.
+# Paint ends this far (metres) before the rounding of a junction, where the stop line lies.
 _CLEAR = 1.0
 # A crossing that begins up to this far before a signal or sign belongs to it, metres.
 _STRIP_BEFORE = 12.0

@@ -87,7 +87,7 @@ def find_overlaps(
     pair = np.minimum(edge, other) * len(graph) + np.maximum(edge, other)
     crosses = np.minimum(*crossing) * len(graph) + np.maximum(*crossing)
     over = np.isin(pair, np.append(pair[roomy & deep & (side != 0)], crosses))
-    # Far from where they part, roads of unequal layers that only touch are neither: there is a wall.
+    # Far from their fork, roads of different layers that only touch are separated by a wall.
     keep = over | (both & ((side == 0) | ~roomy))
     side = np.where(over, side, 0)
     row, other, along, metres, side, fork = (
@@ -118,7 +118,7 @@ def _from_fork(
     once = np.unique(stations.edge)
     metres = stations.along[np.searchsorted(stations.edge, once, side="right") - 1]
     count = len(graph.node_id)
-    # Parallel edges between two nodes: the shortest counts.
+    # Of parallel edges between two nodes the shortest counts.
     order = np.lexsort(np.stack([metres, graph.head[once], graph.tail[once]]))
     tail, head, metres = graph.tail[once][order], graph.head[once][order], metres[order]
     first = np.flatnonzero((np.diff(tail, prepend=-1) != 0) | (np.diff(head, prepend=-1) != 0))

@@ -17,7 +17,7 @@ from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
 from geoscene.sources.data import Area, OsmData, Tags, Way
 from geoscene.tags import parse_length, parse_number
 
-# Metres and material where the map names none. Assumed: what design guides ask of each kind at least.
+# Default width (metres) and material. Assumed: minimum widths of design guides.
 _PATHS = {
     "footway": (2.0, "paving"),
     "sidewalk": (2.0, "paving"),
@@ -31,7 +31,7 @@ _SQUARES = frozenset({"pedestrian", "footway", "cycleway", "path", "platform"})
 _YARDS = frozenset({"service", "unclassified", "residential", "living_street", "rest_area", "services"})
 # Railways whose rails lie on the ground; ballast and track beds are land cover.
 _RAILWAYS = frozenset({"rail", "light_rail", "tram", "subway", "narrow_gauge", "funicular", "preserved"})
-# Metres: gauge where the map names none, and the width of a rail's head (EN 13674-1, 60E1: 72 mm).
+# Metres: default gauge, and the width of a rail's head (EN 13674-1, 60E1: 72 mm).
 _GAUGE, _RAIL_HEAD = 1.435, 0.072
 
 PRIORITY = {"square": 105.0, "yard": 106.0, "path": 110.0, "footway": 114.0, "cycleway": 116.0, "rail": 175.0}

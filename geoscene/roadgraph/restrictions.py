@@ -12,10 +12,10 @@ from geoscene.report import Problem
 from geoscene.roadgraph.graph import RoadGraph, rows_of
 from geoscene.sources.data import Relation, Tags
 
-# What a car is, the most specific first: whose restrictions bind it, and what exempts it.
+# Vehicle classes that include a car, the most specific first: for restrictions and exemptions.
 _CAR = ("motorcar", "motor_vehicle", "vehicle")
 _KEYS = (*(f"restriction:{kind}" for kind in _CAR), "restriction")
-# An older way to say when a restriction holds.
+# Older tags for the times of a restriction.
 _HOURS = ("hour_on", "day_on")
 
 

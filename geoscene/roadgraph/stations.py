@@ -65,7 +65,7 @@ class Stations:
 
     def at(self, edge: Ints, along: Float) -> tuple[Ints, Ints, Float]:
         """Stations before and after places on edges, and the weight (0..1) of the latter."""
-        # One rising number for all edges, so that one search serves them all.
+        # One ascending key over all edges, so that one search serves them all.
         step = float(self.along.max(initial=0.0)) + 1.0
         key = self.edge * step + self.along
         after = np.searchsorted(key, edge * step + along, side="right")

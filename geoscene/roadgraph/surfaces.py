@@ -24,7 +24,7 @@ from geoscene.roadgraph.tags import CLASSES
 from geoscene.sources.data import OsmData
 
 _SIDEWALK, _KERB, _CARRIAGEWAY = 112.0, 120.0, 130.0
-# A bridge is wider than what it carries: room for the parapet on each side, metres. Assumed.
+# Metres by which a bridge is wider than its surfaces on each side, for the parapet. Assumed.
 _PARAPET = 0.5
 
 

@@ -70,7 +70,7 @@ _SHUT = frozenset(
     {"no", "private", "agricultural", "forestry", "emergency", "military", "delivery", "use_sidepath"}
 )
 _NO = frozenset({"", "no", "false", "0"})
-# Tunnels in name only: the road runs through a house or under a roof, at ground level.
+# Values of tunnel at ground level: the road runs through a building or under a roof.
 _ABOVE_GROUND = _NO | {"building_passage", "avalanche_protector", "covered", "culvert", "flooded"}
 
 

@@ -16,7 +16,7 @@ from geoscene.errors import GeosceneError, SceneFormatError
 from geoscene.files import atomic_path
 from geoscene.frames import Frame
 
-_DATE = "2000-01-01T00:00:00Z"  # a constant, so that the same scene is the same bytes
+_DATE = "2000-01-01T00:00:00Z"  # constant, so that the same scene gives the same bytes
 
 
 @dataclass(frozen=True, slots=True)

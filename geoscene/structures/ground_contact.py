@@ -21,7 +21,7 @@ from geoscene.typing import Float, Ints
 Height = Callable[[Float, Float], Float]
 
 OPENING, LOW = PADS + 100.0, PADS + 50.0
-"""Priority of openings: nothing lies over them; and of the ground in decks, which nobody sees."""
+"""Priority of openings, above all others, and of the ground inside decks, which is hidden."""
 
 LIP = 0.05
 """Metres: how far a tunnel's roof stands out of open ground or lies under other."""

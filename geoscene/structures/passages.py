@@ -79,7 +79,7 @@ def _divided(
     cause: list[str] = []
     for k in np.unique(row).tolist():
         rest, first = footprint[k], len(source)
-        # The highest first: where roads cross, the building stands over the upper one.
+        # Highest first: where roads cross, the building stands over the upper one.
         for there in sorted(np.flatnonzero(row == k).tolist(), key=lambda c: -clear[c]):
             over = _polygons(shapely.intersection(rest, corridor[there]))
             rest = _polygons(shapely.difference(rest, corridor[there]))
@@ -89,7 +89,7 @@ def _divided(
                 new_low.append(clear[there])
                 cause.append(str(over_what[there]))
         if buildings.is_part[k]:
-            if rest.is_empty:  # all of it is over tunnels
+            if rest.is_empty:  # entirely over tunnels
                 rest, underside[k] = footprint[k], max(clear[row == k].max(), underside[k])
                 del source[first:], shape[first:], new_low[first:], cause[first:]
             footprint[k] = rest

@@ -193,7 +193,7 @@ def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]], *, slop
     for line, ids in zip(lines, nodes, strict=True):
         xy = shapely.get_coordinates(shapely.segmentize(line, _STATION))
         station = np.empty(len(xy), np.int64)
-        # Ways share nodes; one is found again by its place in the line.
+        # Ways share nodes, which are identified by their coordinates in the line.
         drawn = shapely.get_coordinates(line)
         whole = len(drawn) == len(ids)
         ends = (0, -1)
@@ -289,7 +289,7 @@ def _heights(net: _Net, paths: _Paths, *, ends: NDArray[np.bool_], depth: Float,
     fixed = np.where(np.isnan(on_road), fixed, on_road)
     z = _even(net, fixed, ground=ground)
     least, most = _needs(net, paths, crossed=crossed)
-    # What crosses comes after the cover: a path over a tunnel may have less of it, but does not come out.
+    # Crossings take precedence over cover: below a path a tunnel may have less cover, but stays underground.
     under = np.where(np.isnan(depth), np.inf, ground - np.maximum(depth - _SPARE, 0.0))
     least = np.minimum(least, under)
     for sign, need in ((-1.0, ground - depth), (1.0, least), (-1.0, most)):
@@ -312,7 +312,7 @@ def _on_road_bridges(net: _Net, paths: _Paths, *, graph: RoadGraph) -> Float:
         for e in np.unique(edge[alike]).tolist():
             at = rows[np.unique(point[alike & (edge == e)])]
             high, away, beside = nearest_on_line(graph.geometry[e], net.xy[at])
-            # Of another layer it is where the way leaves the road, at a node of both.
+            # In another layer the way joins the road only at a common node.
             within = graph.width[e] / 2 + _BESIDE if graph.layer[e] == layer else 0.0
             near = ((beside & (away < within)) | (away < _JOINED)) & (away < nearest[at])
             z[at[near]], nearest[at[near]] = high[near], away[near]

@@ -94,7 +94,7 @@ def cut_pieces(members: Members, raised: SurfaceRows, *, options: StructureOptio
         feature=np.full(len(member), -1, np.int32),
         surfaces=raised,
     )
-    # What a neighbour covers altogether is no piece.
+    # Pieces that a neighbour covers entirely are dropped.
     return table.take(~shapely.is_empty(polygon))
 
 
@@ -202,7 +202,7 @@ def _inner(
     inner = np.empty(len(polygon), object)
     near = sheets.near
     for k, others in enumerate(near):
-        # Neighbours' neighbours too, so that no rim stands where the next piece but one begins.
+        # Neighbours' neighbours too, so that no parapet stands where the next piece but one begins.
         beyond = np.unique(np.concatenate([others, *(near[q] for q in others)]).astype(np.int64))
         shapes = [polygon[k]]
         for q in beyond[beyond != k].tolist():
@@ -214,7 +214,7 @@ def _inner(
             shapes.append(shape)
         whole = _union([*shapes, *approach[np.r_[k, others].astype(np.int64)]])
         closed = whole.buffer(0.05, join_style="mitre").buffer(-0.05 - rim[k], join_style="mitre")
-        # Where two are squeezed together so that a wall would stand in the middle of the road, there is none.
+        # Where two are so close that a wall would stand in the middle of the road, it is left out.
         wide = min(_VEHICLE, float(half[k]) / 2)
         middle = _flat(polylines.cut(line[k], wide, end=polylines.length(line[k]) - wide)).buffer(
             wide, cap_style="flat"

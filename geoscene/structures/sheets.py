@@ -80,7 +80,7 @@ def find_sheets(
         )
         apart = np.abs(z - other_z)
         least[row] = apart.min()
-        # Beyond its end a line has no slope, however steep: one that goes on from it is no other one.
+        # Beyond its end a line is extended level: a line that continues it is not another surface.
         most[row] = apart[beside & other_beside].max(initial=least[row])
     same = least < SHEET
     over, parted = (

@@ -115,7 +115,7 @@ def _linework(table: Structures, k: int, *, openings: NDArray[np.object_] | None
         line = table.around[piece]
         flat = shapely.LineString(line[:, :2])
         lines.append(flat)
-        if sloped:  # level as far as the middle of lanes, whence it slopes to the next carriageway
+        if sloped:  # level up to the middle of lanes, sloping from there to the next carriageway
             lines.append(flat.buffer(float(table.half[piece]) / 2, cap_style="flat").boundary)
         lines += list(_ribs(line, float(table.half[piece]) + 1.0))
     out = np.empty(len(lines), object)
