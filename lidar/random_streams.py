@@ -1,4 +1,4 @@
-"""Random numbers that depend on what they are for, not on what was drawn before."""
+"""Random numbers that depend on seed and purpose alone, not on earlier draws."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def generator(seed: int, *words: object) -> np.random.Generator:
 
 
 def uniform_of(number: NDArray[np.integer], seed: int) -> Float:
-    """A number between 0 and 1, never one of them, for each whole number, the same whenever it is asked for.
+    """A number (n,) in the open interval 0 to 1 for each integer: a function of integer and seed.
 
-    SplitMix64 (Steele, Lea and Flood 2014) of number and seed.
+    Hashes both with SplitMix64 (Steele, Lea and Flood 2014).
     """
     with np.errstate(over="ignore"):
         x = number.astype(np.uint64) + np.uint64(seed % 2**64) * np.uint64(0xD1342543DE82EF95)
@@ -33,7 +33,7 @@ def uniform_of(number: NDArray[np.integer], seed: int) -> Float:
 
 
 def normal_of(number: NDArray[np.integer], seed: int) -> Float:
-    """A standard normal deviate for each whole number: `uniform_of` through the inverse distribution."""
+    """A standard normal deviate (n,) for each integer: the inverse distribution function of `uniform_of`."""
     from scipy.special import ndtri  # noqa: PLC0415  (0.2 s)
 
     normal: Float = ndtri(uniform_of(number, seed))

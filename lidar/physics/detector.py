@@ -1,4 +1,4 @@
-"""From echoes to what is reported: lost, false and measured."""
+"""The detector of a scanner: lost and false echoes, and measured ranges."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ Deviates = Callable[[str, Echoes], Float]
 
 _BLOOM_ANGLE, _BLOOM_CHANCE = np.radians(0.3), 0.3  # typical values
 _BLOOM_POWER = 0.01  # of the retro-reflector's power, assumed
-_OVERLAP = 5e-5  # probability that another scanner's pulse enters a shot, typical value (1e-5 to 1e-4)
+_OVERLAP = 5e-5  # probability that a pulse of another scanner is received, typical value (1e-5 to 1e-4)
 
 
 def received(sensor: Sensor, echoes: Echoes, *, settings: ScannerSettings) -> Float:
-    """Power over threshold of each echo."""
+    """Power (m,) of each echo over the detection threshold."""
     return amplitude(
         echoes.apparent,
         echoes.range + sensor.pattern.range_offset,
@@ -41,8 +41,8 @@ def received(sensor: Sensor, echoes: Echoes, *, settings: ScannerSettings) -> Fl
 def detected(sensor: Sensor, echoes: EchoesT, *, settings: ScannerSettings, deviates: Deviates) -> EchoesT:
     """The echoes that pass the threshold, with the apparent reflectance that the sensor measures.
 
-    With ``detection``, noise is added to each echo's power before it meets the threshold, which gives the
-    probability of `lidar.physics.link.detection_probability`, and is part of the measured reflectance.
+    With ``detection``, noise is added to the power before it is compared with the threshold, which gives the
+    probability of `lidar.physics.link.detection_probability`; the measured reflectance includes that noise.
     """
     power = received(sensor, echoes, settings=settings)
     measured = power
@@ -59,7 +59,7 @@ def false_echoes(
 ) -> list[tuple[Origin, Echoes]]:
     """Echoes of no surface, by origin: blooming, pulses of other scanners, noise over the threshold.
 
-    Each entry has at most one echo a pulse.
+    Each entry has at most one echo per pulse.
     """
     found: list[tuple[Origin, Echoes]] = []
     if settings.blooming:
@@ -81,8 +81,8 @@ def false_echoes(
     return found
 
 
-def _nothing(pulse: NDArray[np.integer], distance: Float, *, apparent: Float) -> Echoes:
-    """Echoes that belong to no surface; their true range is 0."""
+def _without_surface(pulse: NDArray[np.integer], distance: Float, *, apparent: Float) -> Echoes:
+    """Echoes of no surface, with true range 0."""
     n = len(pulse)
     return Echoes(
         pulse.astype(np.int32),
@@ -99,7 +99,7 @@ def _nothing(pulse: NDArray[np.integer], distance: Float, *, apparent: Float) ->
 def _anywhere(
     sensor: Sensor, pulse: NDArray[np.integer], *, power: Float, rng: np.random.Generator
 ) -> Echoes:
-    """Echoes of given power over threshold at ranges the sensor accepts, each as likely as the other."""
+    """Echoes with a power over the threshold, at uniformly distributed ranges within the sensor's limits."""
     distance = rng.uniform(sensor.min_range, sensor.max_range, len(pulse))
     apparent = apparent_of(
         power,
@@ -107,24 +107,24 @@ def _anywhere(
         reference_reflectance=sensor.reference_reflectance,
         reference_range=sensor.reference_range,
     )
-    return _nothing(pulse, distance - sensor.pattern.range_offset, apparent=apparent)
+    return _without_surface(pulse, distance - sensor.pattern.range_offset, apparent=apparent)
 
 
 def _blooming(pulses: Firings, echoes: Echoes, *, rng: np.random.Generator) -> Echoes:
-    """Echoes at the range of retro-reflectors in pulses that pass close by one."""
+    """Echoes at the range of a retro-reflector, of pulses that pass close to it."""
     from scipy.spatial import cKDTree  # noqa: PLC0415
 
     bright = echoes.take(echoes.apparent > RETRO)
     if not len(bright):
-        return _nothing(np.empty(0, np.int32), np.empty(0), apparent=np.empty(0))
+        return _without_surface(np.empty(0, np.int32), np.empty(0), apparent=np.empty(0))
     distance, nearest = cKDTree(pulses.direction[bright.pulse]).query(
         pulses.direction, distance_upper_bound=2 * np.sin(_BLOOM_ANGLE / 2)
     )
-    beside = np.isfinite(distance)
-    beside[bright.pulse] = False
-    pulse = np.flatnonzero(beside & (rng.random(len(pulses)) < _BLOOM_CHANCE))
+    is_close = np.isfinite(distance)
+    is_close[bright.pulse] = False
+    pulse = np.flatnonzero(is_close & (rng.random(len(pulses)) < _BLOOM_CHANCE))
     source = nearest[pulse]
-    return _nothing(pulse, bright.range[source], apparent=_BLOOM_POWER * bright.apparent[source])
+    return _without_surface(pulse, bright.range[source], apparent=_BLOOM_POWER * bright.apparent[source])
 
 
 def measured_range(

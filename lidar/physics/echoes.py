@@ -1,4 +1,4 @@
-"""From what a pulse's rays meet to the echoes it has."""
+"""Echoes of pulses: merging of surfaces, numbering, and the return modes of scanners."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidar.raycast.memory import inlined
 
 _MODES = ("strongest", "first", "last", "dual", "all")
 _STRONGEST, _FIRST, _LAST, _DUAL, _ALL = range(5)
-_FAINT = 1e-3  # share of the brightest surface's power that is as good as nothing
+_FAINT = 1e-3  # share of the brightest surface's power below which a surface is negligible
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +24,11 @@ class Echoes:
 
     pulse    : (m,) int32, row of the pulse
     range    : (m,) float64, metres from the beam's start, along the beam's axis
-    apparent : (m,) float64, reflectance of the white Lambertian target, square on and as large as the beam,
-               that would send back as much
+    apparent : (m,) float64, apparent reflectance: that of the Lambertian target at normal incidence, as large
+               as the beam, that returns the same power
     feature, klass, cosine : (m,) of the surface, as in `lidar.sensors.cloud.Cloud`; cosine of the incidence
-    true_range : (m,) float64, metres to the surface whose number and class the row bears
-    axis       : (m,) bool, the beam's axis itself meets that surface
+    true_range : (m,) float64, metres to the surface that feature and class are of
+    axis       : (m,) bool, the axis of the beam intersects that surface
     """
 
     pulse: NDArray[np.int32]
@@ -45,11 +45,11 @@ class Echoes:
         return len(self.pulse)
 
     def take(self, rows: NDArray[Any] | slice) -> Self:
-        """Chosen rows; those of a slice are not copied."""
+        """Selected rows; those of a slice are views."""
         return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def where(self, keep: NDArray[np.bool_]) -> Self:
-        """The rows of a mask, without a copy if that is all."""
+        """The rows at which a mask is true; the same object if that is all."""
         return self if keep.all() else self.take(keep)
 
 
@@ -103,12 +103,12 @@ def by_pulse(first: EchoesT, other: EchoesT) -> EchoesT:
 
 
 def merged(surfaces: EchoesT, separation: float) -> EchoesT:
-    """The echoes of pulses that meet these surfaces.
+    """The echoes of pulses that hit these surfaces.
 
-    Surfaces of a pulse that follow each other within ``separation`` metres are one echo: it lies at their
-    mean range, weighted by received power, and has their power together. It bears the feature, class,
-    incidence and true range of the surface that the beam's axis meets, if that is among them and sends
-    anything back (water and panes may not), else of the one that sends back most.
+    Consecutive surfaces of a pulse within ``separation`` metres give one echo, with the sum of their power at
+    their mean range, weighted by received power. Its other columns are those of the surface on the beam's
+    axis, if that is among them and returns power (water and panes may not), else of the surface that returns
+    most.
     """
     if not len(surfaces):
         return surfaces
@@ -121,7 +121,7 @@ def merged(surfaces: EchoesT, separation: float) -> EchoesT:
 
 @inlined
 def insert(row: Any, size: Any, new: Any, distance: Any) -> None:
-    """Put the number ``new`` into the first ``size`` of ``row``, which stay sorted by their distance."""
+    """Insert the number ``new`` into the first ``size`` entries of ``row``, which are sorted by distance."""
     j = size
     while j > 0 and distance[row[j - 1]] > distance[new]:
         row[j] = row[j - 1]
@@ -142,10 +142,13 @@ def gather(
     place: Any,
     power: Any,
 ) -> Any:
-    """Write the echoes of a pulse behind the ``count`` there are: their bearers, ranges and powers.
+    """Append the echoes of a pulse to ``bearer``, ``place`` and ``power``; return the new number of echoes.
 
-    row : numbers of its surfaces, the first ``size`` of them, sorted by range
+    row      : numbers of its ``size`` surfaces, sorted by range
     distance, apparent, axis : of surfaces, by number
+    count    : number of echoes so far
+    bearer   : number of the surface that describes each echo
+    place, power : range and apparent reflectance of each echo
     """
     total = moment = most = central = 0.0
     first, best, middle = 0, row[0], row[0]
@@ -184,7 +187,7 @@ def _merge(
     place: Any,
     power: Any,
 ) -> Any:
-    """Fill the columns of the echoes; the number of them."""
+    """Fill the columns of the echoes and return their number."""
     count = 0
     row = np.empty(256, np.int64)
     for p in range(len(starts) - 1):
@@ -198,7 +201,7 @@ def _merge(
 
 
 def numbered(echoes: Echoes) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Number of each echo in its pulse, from 1, and echoes of that pulse; rows sorted by pulse and range."""
+    """Number of each echo in its pulse, from 1, and echoes of the pulse; rows sorted by pulse and range."""
     if not len(echoes):
         return np.empty(0, np.uint8), np.empty(0, np.uint8)
     starts = np.flatnonzero(np.diff(echoes.pulse, prepend=-1))
@@ -213,8 +216,8 @@ def reported(
     """Rows that a sensor reports in a return mode; rows sorted by pulse and range.
 
     mode   : ``strongest`` (the nearer of equals), ``first``, ``last``, ``dual`` (strongest and last), ``all``
-    most   : in ``all``, the first echoes of a pulse that are reported
-    second : in ``dual``, where one echo is strongest and last, the second strongest is reported with it
+    most   : maximum number of echoes per pulse in ``all``
+    second : in ``dual``, report the second strongest too where the strongest echo is the last
     """
     rows = np.empty(len(echoes), np.int64)
     count = _reported(echoes.pulse, amplitude, _MODES.index(mode), most, second, rows)
@@ -223,7 +226,7 @@ def reported(
 
 @njit(cache=True, nogil=True)
 def _reported(pulse: Any, amplitude: Any, mode: Any, most: Any, second: Any, rows: Any) -> Any:
-    """Fill in the chosen rows; the number of them."""
+    """Fill ``rows`` with the reported rows and return their number."""
     count, stop = 0, 0
     while stop < len(pulse):
         start = stop

@@ -1,4 +1,4 @@
-"""A beam as a bundle of rays."""
+"""Sampling of a beam's cross-section by rays."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from lidar.errors import InputError
 def ring_energy(rings: int, *, waist: float = 1.0) -> Float:
     """Share of a Gaussian beam's power in each of the equally wide rings that fill its 1/e^2 radius.
 
-    The outer edges are at (i + 1/2) / (rings - 1/2) of that radius, so that ring 0 is a disc of half a ring's
-    width, as in HELIOS++ (Winiwarter et al. 2022). ``waist`` is the 1/e^2 radius over the outer edge: 1 is
-    the physical choice and leaves 13.5 % outside; HELIOS++ takes 2.
+    Outer edges are at (i + 1/2) / (rings - 1/2) of that radius, so that ring 0 is a disc of half a ring's
+    width, as in HELIOS++ (Winiwarter et al. 2022).
+
+    waist : 1/e^2 radius over the outer edge; the physical value 1 leaves 13.5 % outside, HELIOS++ uses 2
     """
     edge = (np.arange(rings) + 0.5) / (rings - 0.5)
     inside = 1 - np.exp(-2 * (edge / waist) ** 2)
@@ -25,7 +26,7 @@ def ring_energy(rings: int, *, waist: float = 1.0) -> Float:
 
 @functools.cache
 def bundle(rays: int) -> tuple[Float, Float]:
-    """Places (rays, 2) on the unit disc, the axis first, and shares of power (rays,), which add up to 1.
+    """Positions (rays, 2) on the unit disc, the axis first, and shares (rays,) of the power, with sum 1.
 
     Ring i has 6 i rays at i / (rings - 1/2) of the 1/e^2 radius: 1, 7, 19, 37 or 61 in all.
 
@@ -33,7 +34,7 @@ def bundle(rays: int) -> tuple[Float, Float]:
     """
     rings = next((k for k in range(1, 6) if 1 + 3 * k * (k - 1) == rays), 0)
     if not rings:
-        raise InputError(f"{rays} rays a pulse: 1, 7, 19, 37 or 61 are wanted")
+        raise InputError(f"`rays` {rays}: give 1, 7, 19, 37 or 61")
     if rings == 1:
         return np.zeros((1, 2)), np.ones(1)
     energy = ring_energy(rings)

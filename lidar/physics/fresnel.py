@@ -1,4 +1,4 @@
-"""Glass and water: what they mirror and what they let through."""
+"""Reflection and transmission of glass and water."""
 
 from __future__ import annotations
 
@@ -29,16 +29,18 @@ def surface_reflection(cosine: ArrayLike, index: float = WATER) -> Float:
 
 
 def pane_reflection(cosine: ArrayLike, index: float = GLASS) -> Float:
-    """Reflected share of unpolarised light at a pane: both faces, all passes between them, no loss."""
+    """Reflected share of unpolarised light at a pane: both faces and all inner reflections, lossless."""
     s, p = fresnel(cosine, index)
     return s / (1 + s) + p / (1 + p)
 
 
 def glint(cosine: ArrayLike, *, wind: float = 3.0) -> Float:
-    """Apparent reflectance of open water seen from straight above or nearly: facets that mirror back.
+    """Apparent reflectance of open water near normal incidence: specular reflection by wave facets.
 
-    R / (4 m cos^5) exp(-tan^2 / m) with the slope variance m of Cox and Munk (1954) for a wind in m/s: their
-    radar and laser cross-section, as the Lambertian reflectance that returns as much.
+    R / (4 m cos^5) exp(-tan^2 / m) with the mean square slope m of Cox and Munk (1954), expressed as the
+    Lambertian reflectance that returns the same power.
+
+    wind : m/s
     """
     c = np.maximum(np.asarray(cosine, float), 1e-3)
     slope = _SLOPE_CALM + _SLOPE_WIND * wind
@@ -48,7 +50,7 @@ def glint(cosine: ArrayLike, *, wind: float = 3.0) -> Float:
 
 
 def mirrored(direction: Float, normal: Float) -> Float:
-    """Directions (n, 3) after a mirror with unit normals (n, 3); lengths are kept."""
+    """Directions (n, 3) mirrored at surfaces with unit normals (n, 3); lengths are kept."""
     along = np.einsum("ij,ij->i", direction, normal)[:, None]
-    turned: Float = direction - 2 * along * normal
-    return turned
+    reflected: Float = direction - 2 * along * normal
+    return reflected

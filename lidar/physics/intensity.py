@@ -1,4 +1,4 @@
-"""Calibrated reflectivity as scanners code it."""
+"""Intensity codes of scanners: calibrated reflectivity."""
 
 from __future__ import annotations
 
@@ -16,9 +16,11 @@ def reflectivity_code(
 ) -> NDArray[np.float32]:
     """Codes 0 to 255 of apparent reflectances.
 
-    Linear up to ``diffuse_code`` for a perfect white Lambertian target square on, logarithmic above, 255 from
-    `BRIGHTEST` on: the rule of Velodyne, RoboSense and Ouster, whose manuals give the ranges of codes; the
-    base of the logarithm is not published. ``whole`` rounds them, as the instruments do.
+    Linear up to ``diffuse_code`` for a white Lambertian target at normal incidence, logarithmic above, 255
+    from `BRIGHTEST` on. Velodyne, RoboSense and Ouster publish the ranges of their codes in manuals, but not
+    the base of the logarithm.
+
+    whole : round the codes, as the instruments do
     """
     bright = np.log10(np.maximum(apparent, 1.0)) / np.log10(BRIGHTEST)
     code = diffuse_code * np.clip(apparent, 0, 1) + (255.0 - diffuse_code) * np.minimum(bright, 1.0)

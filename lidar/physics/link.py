@@ -1,4 +1,4 @@
-"""Power on the receiver, and whether it is noticed."""
+"""Link equation: received power, and its detection against noise."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from geoscene.typing import Float
 
 GATE = 0.3
-"""Metres of range in which noise has one chance to pass the threshold."""
+"""Metres of range per independent sample of the noise."""
 
 _DAYLIGHT = 20_000.0  # lux at which daylight doubles the noise power, typical value
 
@@ -25,8 +25,8 @@ def amplitude(
 ) -> Float:
     """Received power over the detection threshold of extended targets.
 
-    (rho / rho_ref) (R_ref / R)^2 exp(-2 alpha R): the link equation, scaled so that the target of the data
-    sheet, rho_ref at R_ref, stands at the threshold. The longest range goes with the square root of rho.
+    The link equation (rho / rho_ref) (R_ref / R)^2 exp(-2 alpha R), scaled so that the power of the data
+    sheet's target, rho_ref at R_ref, is the threshold. The maximum range is proportional to sqrt(rho).
 
     apparent   : reflectance times the law of incidence
     distance   : metres
@@ -41,9 +41,9 @@ def amplitude(
 def apparent_of(
     received: ArrayLike, distance: ArrayLike, *, reference_reflectance: float, reference_range: float
 ) -> Float:
-    """Reflectance that a scanner takes a target to have, whose power it received from a distance in metres.
+    """Reflectance that a scanner derives from received power over threshold and distance in metres.
 
-    The inverse of `amplitude` in clear air, which is what instruments assume.
+    The inverse of `amplitude` in clear air, as instruments assume.
     """
     reflectance: Float = (
         np.asarray(received) * reference_reflectance * (np.asarray(distance) / reference_range) ** 2
@@ -52,7 +52,7 @@ def apparent_of(
 
 
 def daylight_noise(noise_ratio: float, lux: float) -> float:
-    """Noise over threshold under a light on the scene: shot noise power grows with it, typical values."""
+    """Noise over threshold at an illuminance in lux, which adds shot noise; typical values."""
     return float(noise_ratio * np.sqrt(1 + lux / _DAYLIGHT))
 
 

@@ -1,4 +1,4 @@
-"""How far a measured range is off."""
+"""Errors of measured ranges."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _WALK = 0.005  # metres nearer per decade of amplitude, typical value
 
 
 def signal_sigma(received: ArrayLike, resolution: float = RESOLUTION) -> Float:
-    """Standard deviation in metres of ranges by received power over threshold.
+    """Standard deviation in metres of ranges, by received power over threshold.
 
     dR / sqrt(2 SNR), as in LISA (Kilic et al. 2021).
     """
@@ -23,10 +23,10 @@ def signal_sigma(received: ArrayLike, resolution: float = RESOLUTION) -> Float:
 
 
 def stretch_sigma(distance: ArrayLike, cosine: ArrayLike, *, divergence: float) -> Float:
-    """Standard deviation in metres that a footprint's depth on a slanted surface adds.
+    """Standard deviation in metres that the depth of the footprint on a slanted surface adds.
 
-    The 1/e^2 footprint is R B tan(theta) deep; a Gaussian has a quarter of its 1/e^2 width as deviation. Held
-    to the distance itself, for beams that graze.
+    The 1/e^2 footprint is R B tan(theta) deep, and the deviation of a Gaussian is a quarter of its 1/e^2
+    width. The depth of grazing beams is limited to the distance.
     """
     c = np.maximum(np.asarray(cosine, float), 1e-3)
     depth = np.asarray(distance, float) * divergence * np.sqrt(np.maximum(1 - c * c, 0)) / c
@@ -35,16 +35,16 @@ def stretch_sigma(distance: ArrayLike, cosine: ArrayLike, *, divergence: float) 
 
 
 def walk(received: ArrayLike) -> Float:
-    """Metres by which a bright echo appears nearer (negative): its flank crosses the threshold earlier."""
+    """Range walk in metres, negative: the flank of a bright echo crosses the threshold earlier."""
     error: Float = -_WALK * np.log10(np.maximum(np.asarray(received, float), 1.0))
     return error
 
 
 def quantised(distance: Float, quantum: float) -> Float:
-    """Distances as whole multiples of ``quantum`` metres; unchanged if that is 0."""
+    """Distances rounded to multiples of ``quantum`` metres; unchanged if that is 0."""
     if quantum <= 0:
         return distance
-    # By the steps to the metre, where they are whole: 3 steps of 2 mm are 0.006, not 0.006000000000000001.
+    # Divide by whole steps per metre: 3 steps of 2 mm are then 0.006, not 0.006000000000000001.
     steps = round(1 / quantum)
     if abs(steps * quantum - 1) < 1e-9:
         return np.round(distance * steps) / steps

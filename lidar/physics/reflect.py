@@ -1,4 +1,4 @@
-"""How much of a pulse a surface sends back: spectral reflectance and incidence laws."""
+"""Reflection at surfaces: spectral reflectance and incidence laws."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidar.errors import InputError
 from lidar.raycast.memory import inlined
 
 WAVELENGTHS_NM = (905.0, 1064.0, 1550.0)
-"""Where materials have their reflectance."""
+"""Wavelengths for which the reflectance of materials is given."""
 
 INCIDENCE_LAWS = ("lambert", "phong", "oren-nayar")
 """Laws of `apparent`."""
@@ -23,7 +23,7 @@ INCIDENCE_LAWS = ("lambert", "phong", "oren-nayar")
 _LAMBERT, _PHONG = 0, 1
 
 RETRO = 1.0
-"""Reflectance over which a material is a retro-reflector."""
+"""A material with a greater reflectance is a retro-reflector."""
 
 _ROUGHNESS = float(np.radians(20.0))  # slope deviation of rough facades, typical value
 _RETRO_FLAT, _RETRO_FALL = math.pi / 6, math.pi / 4  # sheeting: flat to 30°, 40 % at 45°, typical
@@ -34,8 +34,8 @@ _RETRO_LEFT = 0.4
 def reflectance_table(wavelength_nm: float) -> tuple[Float, Float]:
     """Reflectance (256,) and specular share (256,) by material code, at a wavelength in nanometres.
 
-    Linear between the wavelengths of the material table and held beyond them; codes without a material are
-    those of ``unknown``.
+    Linear between the wavelengths of the material table and constant beyond them. Codes without a material
+    have the values of ``unknown``.
     """
     known = materials()
     plain = known["unknown"]
@@ -51,21 +51,22 @@ def reflectance_table(wavelength_nm: float) -> tuple[Float, Float]:
 def apparent(
     reflectance: Float, cosine: Float, *, specular: Float | float = 0.0, law: str = "lambert"
 ) -> Float:
-    """Reflectance of the white Lambertian target, square on, that would send back as much.
+    """Reflectance of the Lambertian target at normal incidence that returns the same power.
 
     reflectance : diffuse reflectance at normal incidence; over `RETRO` a retro-reflector
     cosine      : of the angle between beam and normal, 0 to 1
-    specular    : mirror-like share, for ``phong``
+    specular    : specular share, for ``phong``
     law         : ``lambert``: rho cos. ``phong``: rho ((1 - ks) cos + ks |cos 2 theta|^n), as in HELIOS++
                   (Winiwarter et al. 2022), with n = 10 (typical). ``oren-nayar``: Oren and Nayar 1994,
-                  source and receiver in one place, roughness 20 degrees (typical)
+                  source and receiver coincide, roughness 20 degrees (typical)
 
-    Retro-reflective sheeting is flat to 30 degrees, falls to 40 % at 45 and to nothing at 90 under each law.
+    Under each law, retro-reflective sheeting is constant to 30 degrees and falls to 40 % at 45 degrees and 0
+    at 90.
 
-    Raises InputError for a law that is not known.
+    Raises InputError if the law is unknown.
     """
     if law not in INCIDENCE_LAWS:
-        raise InputError(f"incidence law {law!r} is not known: {', '.join(INCIDENCE_LAWS)}")
+        raise InputError(f"`law` {law!r} is unknown; there are {', '.join(INCIDENCE_LAWS)}")
     r, c, s = (
         np.ascontiguousarray(v, np.float64) for v in np.broadcast_arrays(reflectance, cosine, specular)
     )
@@ -76,7 +77,7 @@ def apparent(
 
 @inlined
 def sent_back(reflectance: Any, cosine: Any, specular: Any, law: Any) -> Any:
-    """What `apparent` says of one surface, for compiled code; ``law`` is the row of `INCIDENCE_LAWS`."""
+    """`apparent` of one surface, for compiled code; ``law`` is an index in `INCIDENCE_LAWS`."""
     if reflectance > RETRO:
         angle = np.arccos(min(max(cosine, 0.0), 1.0))
         if angle <= _RETRO_FLAT:

@@ -12,7 +12,7 @@ NOISES = ("none", "constant", "signal")
 """Models of range noise."""
 
 FOOTPRINTS = (1, 7, 19, 37, 61)
-"""Rays a pulse."""
+"""Numbers of rays per pulse that can be chosen."""
 
 
 @dataclass(frozen=True)
@@ -101,4 +101,4 @@ LEVELS: dict[str, ScannerSettings] = {
         quantise=True,
     ),
 }
-"""ScannerSettings by level of fidelity."""
+"""Settings of scanners by fidelity level."""
