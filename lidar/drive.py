@@ -270,7 +270,7 @@ def plan(
 
     Raises RouteError for a route that it cannot take.
     """
-    from lidar.planning.flight_planning import plan_flight  # noqa: PLC0415
+    from lidar.planning.flight_planning import FlightOptions, plan_flight  # noqa: PLC0415
     from lidar.planning.replay import read_replay  # noqa: PLC0415
 
     route = options.route
@@ -317,13 +317,15 @@ def plan(
         route,
         vehicle=body,
         sensors=sensors,
-        survey=options.survey,
-        altitude=options.altitude,
-        overlap=options.overlap,
-        seed=options.seed,
-        duration=seconds,
-        from_rest=options.from_rest,
-        turns=options.turns,
+        options=FlightOptions(
+            survey=options.survey,
+            altitude=options.altitude,
+            overlap=options.overlap,
+            turns=options.turns,
+            seed=options.seed,
+            duration=seconds,
+            from_rest=options.from_rest,
+        ),
     )
 
 

@@ -1,10 +1,11 @@
-"""Flights over a scene: over waypoints, along its streets, or to and fro over an area."""
+"""Plans of flights over a scene: along waypoints, along streets, or in strips over an area."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +30,39 @@ from lidar.rig.vehicle import Vehicle
 from lidar.world.world import World
 
 ALTITUDES = {"slow": 60.0, "fast": 600.0}
-"""Metres above the ground that a craft flies where nothing else is said: below and above 30 m/s."""
+"""Default metres above the ground of aircraft slower and faster than 30 m/s."""
 
-_STREET_RADIUS = 20.0  # metres of the least turn with which a craft can follow streets
+_STREET_RADIUS = 20.0  # metres, largest turning radius that can follow streets
 _HIGH = 1e4
-_LAYERS = 16  # surfaces above one another between the sky and the ground, at most
-_CLEAR = 2.0  # metres between the craft and what is below it, at least
-_STEEPEST = 0.2  # least sine of a beam's way down that counts for the swath
+_LAYERS = 16  # surfaces above the ground that a vertical ray passes at most
+_CLEAR = 2.0  # metres, minimum clearance above the scene
+_STEEPEST = 0.2  # sine of the smallest depression angle of a beam that counts for the swath
 _STEP = 10.0
 _GROUND = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD]
+
+
+@dataclass(frozen=True, slots=True)
+class FlightOptions:
+    """How a flight is planned.
+
+    survey    : ``all``, W,S,E,N in degrees, or a GeoJSON file with a polygon: the area to fly over in
+                parallel strips, instead of a route
+    altitude  : metres above the ground: for a survey above the highest ground under it, else above the ground
+                below each point. By default the heights of the route's file, or `ALTITUDES`
+    overlap   : share of a strip that the next one covers too
+    turns     : scan in the turns between strips too
+    seed      : of a random route
+    duration  : seconds; a whole survey or given route by default
+    from_rest : start a random flight at rest
+    """
+
+    survey: str = ""
+    altitude: float | None = None
+    overlap: float = 0.3
+    turns: bool = False
+    seed: int = 0
+    duration: float | None = None
+    from_rest: bool = False
 
 
 def plan_flight(
@@ -46,34 +71,28 @@ def plan_flight(
     *,
     vehicle: Vehicle,
     sensors: Sequence[Scanner | Camera],
-    survey: str = "",
-    altitude: float | None = None,
-    overlap: float = 0.3,
-    seed: int = 0,
-    duration: float | None = None,
-    from_rest: bool = False,
-    turns: bool = False,
+    options: FlightOptions,
 ) -> Flight:
-    """The flight of a craft over a scene.
+    """The flight of an aircraft over a scene.
 
-    spec     : ``random`` (over streets), a file of waypoints, or waypoints (latitude, longitude); not used
-               with a survey
-    survey   : ``all``, W,S,E,N in degrees, or a GeoJSON file with a polygon: the area is flown over in strips
-    altitude : metres above the ground: of a survey, above the highest ground under it; else above the ground
-               below each point. By default heights of the file (scene's heights), or `ALTITUDES`
-    overlap  : share of a strip that the next one covers too
-    duration : seconds; of a survey or a given route all of it by default
-    from_rest : whether a random flight too starts at rest
-    turns    : whether scanners work between the lines of a survey too
+    spec : ``random`` (over streets), a file of waypoints, or waypoints (latitude, longitude); not used for a
+           survey
 
-    Raises RouteError for a flight that cannot be flown or would meet what stands below.
+    Raises RouteError for a flight that the aircraft cannot fly or that would collide with the scene.
     """
+    survey, altitude, duration = options.survey, options.altitude, options.duration
     usual = ALTITUDES["slow" if vehicle.max_speed < 30.0 else "fast"]
     below = _Below(scene)
     if survey:
         height = usual if altitude is None else altitude
         route, lines, spacing = _strips(
-            scene, survey, vehicle=vehicle, sensors=sensors, height=height, overlap=overlap, below=below
+            scene,
+            survey,
+            vehicle=vehicle,
+            sensors=sensors,
+            height=height,
+            overlap=options.overlap,
+            below=below,
         )
     else:
         route = _along(
@@ -82,16 +101,16 @@ def plan_flight(
             vehicle=vehicle,
             altitude=altitude,
             usual=usual,
-            seed=seed,
+            seed=options.seed,
             duration=duration,
             below=below,
         )
-    under_way = spec == "random" and not survey and not from_rest
+    under_way = spec == "random" and not survey and not options.from_rest
     trajectory = drive_path(plan_path(route, vehicle, frame=scene.frame), vehicle, under_way=under_way)
     if duration is not None:
         trajectory = trajectory.until(round(duration * 1e9))
     _refuse_collisions(trajectory, below, scene=scene)
-    if not survey or turns:
+    if not survey or options.turns:
         return Flight(trajectory)
     on = times_on_lines(trajectory, lines, beside=spacing / 2)
     if not len(on):
@@ -103,7 +122,7 @@ def plan_flight(
 
 
 class _Below:
-    """What lies below points of a scene."""
+    """Heights of the scene below points, with the tiles around them loaded on demand."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -124,7 +143,7 @@ class _Below:
         return self._world
 
     def top(self, x: Float, y: Float) -> Float:
-        """Height (n,) of the uppermost surface; -inf where there is none."""
+        """Height (n,) of the highest surface; -inf where there is none."""
         world = self._load(x, y)
         origin = np.column_stack([x, y, np.full(len(x), _HIGH)])
         hits = world.caster.cast(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
@@ -132,7 +151,7 @@ class _Below:
         return height
 
     def ground(self, x: Float, y: Float) -> Float:
-        """Height (n,) of the ground under all that stands on it; the mean of the rest where there is none."""
+        """Height (n,) of the ground below buildings and trees; the mean of the others where there is none."""
         world = self._load(x, y)
         origin = np.column_stack([x, y, np.full(len(x), _HIGH)])
         found = np.full(len(x), np.nan)
@@ -162,7 +181,7 @@ def _along(
     duration: float | None,
     below: _Below,
 ) -> Route:
-    """The route over waypoints or over streets."""
+    """The route along waypoints or streets."""
     if isinstance(spec, str) and spec == "random":
         if vehicle.turning_radius > _STREET_RADIUS:
             raise RouteError(
@@ -206,7 +225,7 @@ def _strips(
     overlap: float,
     below: _Below,
 ) -> tuple[Route, Float, float]:
-    """The route to and fro over an area, strips along its longer side; these (k, 2, 2), and their spacing."""
+    """The route in strips along an area's longer side, the strips (k, 2, 2), and their spacing."""
     area = survey_area(scene, survey)
     if not 0.0 <= overlap < 1.0:
         raise InputError(f"`overlap` {overlap:g}: a share from 0 to less than 1")
@@ -268,9 +287,9 @@ def _polygon(path: Path) -> Any:
 
 
 def swath(sensors: Sequence[Scanner | Camera], height: float) -> float:
-    """Metres across the track that all scanners (or, if there are none, all cameras) see from a height.
+    """Width in metres of the swath that all scanners (without scanners, all cameras) cover from a height.
 
-    Raises RouteError where a sensor does not look down, or not that far.
+    Raises RouteError if a sensor does not look down, or its maximum range is less than the height.
     """
     lidars = [s for s in sensors if isinstance(s, Scanner)]
     return min(_swath(s, height) for s in lidars or sensors)
@@ -298,7 +317,7 @@ def _swath(sensor: Scanner | Camera, height: float) -> float:
 
 
 def _refuse_collisions(trajectory: Trajectory, below: _Below, *, scene: Scene) -> None:
-    """Raise RouteError where the craft comes too close to what is below it, or meets it."""
+    """Raise RouteError where the clearance above the scene is too small."""
     xyz = trajectory.position[::10]
     top = below.top(xyz[:, 0], xyz[:, 1])
     short = top + _CLEAR - xyz[:, 2]
@@ -306,6 +325,6 @@ def _refuse_collisions(trajectory: Trajectory, below: _Below, *, scene: Scene) -
     if short[worst] > 0:
         lon, lat = scene.frame.to_geographic(*xyz[worst, :2])
         raise RouteError(
-            f"the flight would meet what reaches up to z = {top[worst]:.0f} m at {float(lat):.6f},"
-            f" {float(lon):.6f}; fly {math.ceil(short[worst])} m higher (`altitude`)"
+            f"the flight would collide with the scene, which reaches up to z = {top[worst]:.0f} m at"
+            f" {float(lat):.6f}, {float(lon):.6f}; fly {math.ceil(short[worst])} m higher (`altitude`)"
         )

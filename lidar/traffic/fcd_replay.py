@@ -23,7 +23,7 @@ from lidar.traffic.populate import TrafficOptions, TrafficSetup, first_feature, 
 from lidar.traffic.simulation import STEP_S
 from lidar.traffic.surroundings import LEFT
 from lidar.traffic.sweep import rectangles
-from lidar.traffic.tracks import tracked
+from lidar.traffic.tracks import Tracks, actors_on_ground
 from lidar.traffic.trips import VEHICLE_SHARES, random_shape, random_stretch
 from lidar.world.actor_shapes import Shape
 from lidar.world.actors import Actors, alive, joined, states
@@ -141,9 +141,8 @@ def _moving(
     speed = np.concatenate([_monotone(np.diff(part[:, 4]) / STEP_S) for part in parts]) / scale
     middle = np.column_stack([x, y])
     foot = np.repeat([shape.kind in _KINDS["pedestrian"] for shape in shapes], knots)
-    actors = tracked(
-        scene,
-        shapes,
+    tracks = Tracks(
+        shapes=shapes,
         stretch=stretch,
         knots=knots,
         step=np.round(step).astype(np.int64),
@@ -152,8 +151,8 @@ def _moving(
         hint=_hints(graph, middle, yaw=yaw, foot=foot),
         speed=speed,
         gone=gone / scale,
-        scale=scale,
     )
+    actors = actors_on_ground(scene, tracks, scale=scale)
     return _without(actors, _touched(actors, ego, vehicle=vehicle))
 
 

@@ -15,7 +15,7 @@ from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.traffic.lanes import Lanes, lane_shift
 from lidar.traffic.sweep import rectangles
-from lidar.traffic.tracks import standing, table
+from lidar.traffic.tracks import actor_table, poses_on_ground
 from lidar.traffic.trips import random_shape
 from lidar.world.actors import Actors
 
@@ -156,7 +156,7 @@ def parked_actors(
     for first, second in zip(a[a < b].tolist(), b[a < b].tolist(), strict=True):
         keep[second] &= not keep[first]
     rows = np.flatnonzero(keep)
-    *pose, sound = standing(
+    *pose, sound = poses_on_ground(
         scene,
         spots.xy[rows],
         yaw=spots.heading[rows],
@@ -167,7 +167,7 @@ def parked_actors(
     )
     rows = rows[sound]
     height, pitch, roll = (column[sound] for column in pose)
-    return table(
+    return actor_table(
         [shapes[k] for k in rows],
         grow[rows],
         knots=np.ones(len(rows), np.int64),

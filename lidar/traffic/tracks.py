@@ -1,8 +1,9 @@
-"""From what moved along ways to actors with tracks on the ground."""
+"""Actors from simulated or recorded motion: tracks in plan become poses on the scene's ground."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,13 +24,13 @@ _STRIDE = {"cyclist": 5.6, "adult": 1.45, "small_adult": 1.35, "child": 1.05}
 
 _UPRIGHT = ("adult", "small_adult", "child")
 _LEANING = ("cyclist", "motorcycle", "bicycle")
-_TRACK = 0.8  # metres between wheels for each of width
-_SKY = 1e4  # metres above and below zero between which the ground lies
-_STEP_UP = 0.5  # metres by which the ground under a wheel may differ from that under the middle
-_STEEP, _BANKED = 0.3, 0.15  # radians
+_TRACK = 0.8  # track width over body width
+_SKY = 1e4  # metres above and below zero within which the ground is searched
+_STEP_UP = 0.5  # metres, maximum height difference between a wheel and the centre
+_STEEP, _BANKED = 0.3, 0.15  # radians, maximum pitch and roll
 
 
-def table(
+def actor_table(
     shapes: Sequence[Shape],
     stretch: ArrayLike,
     *,
@@ -42,7 +43,7 @@ def table(
     parked: bool,
     scale: float,
 ) -> Actors:
-    """Actors (n) of bodies; ``knots`` (n) is how many knots each has. Features are left at zero."""
+    """Actors (n) with ``knots`` (n,) rows of motion each; feature numbers are zero."""
     known = catalogue()
     names: dict[str, int] = {}
     first = []
@@ -78,7 +79,7 @@ def table(
 
 
 def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, scale: float) -> Actors:
-    """Actors of the trips that took place."""
+    """Actors of the trips that appeared in a simulation."""
     present, counts = np.unique(flow.trip, return_counts=True)
     ends = np.concatenate([[0], np.cumsum(counts)])
     n = len(flow.trip)
@@ -91,9 +92,8 @@ def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, 
         middle[part] = np.stack([np.interp(at, stations, xy[:, c]) for c in (0, 1)], axis=1)
         yaw[part] = np.interp(at, stations, heading)
         hint[part] = np.interp(at, stations, trip.way.xyz[:, 2])
-    return tracked(
-        scene,
-        [trips[row].shape for row in present],
+    tracks = Tracks(
+        shapes=[trips[row].shape for row in present],
         stretch=[trips[row].stretch for row in present],
         knots=counts,
         step=flow.step,
@@ -102,51 +102,59 @@ def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, 
         hint=hint,
         speed=flow.speed,
         gone=flow.gone,
-        scale=scale,
     )
+    return actors_on_ground(scene, tracks, scale=scale)
 
 
-def tracked(
-    scene: Scene,
-    shapes: Sequence[Shape],
-    *,
-    stretch: Sequence[tuple[float, float, float]],
-    knots: NDArray[np.int64],
-    step: NDArray[np.int64],
-    middle: Float,
-    yaw: Float,
-    hint: Float,
-    speed: Float,
-    gone: Float,
-    scale: float,
-) -> Actors:
-    """Actors (n) that go along tracks in plan, put on the scene's ground.
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """Motion of road users (n) in plan; each has ``knots`` of the rows (k), which are `STEP_S` apart.
 
-    knots        : (n,) how many each has of the following (k) rows, which are `STEP_S` apart
-    step         : (k,) `STEP_S` since the drive's start
-    middle, yaw  : (k, 2) scene metres and (k,) radians, unwrapped
-    hint         : (k,) height near which the ground is; NaN to take the topmost
-    speed, gone  : (k,) m/s and metres covered
+    shapes      : (n,) bodies
+    stretch     : (n,) scale factors of the bodies along x, y and z
+    knots       : (n,)
+    step        : (k,) number of `STEP_S` since the drive's start
+    middle, yaw : (k, 2) scene metres of the body's centre and (k,) radians, unwrapped
+    hint        : (k,) metres, approximate height of the ground; NaN for the topmost surface
+    speed, gone : (k,) m/s and metres covered
     """
+
+    shapes: Sequence[Shape]
+    stretch: Sequence[tuple[float, float, float]]
+    knots: NDArray[np.int64]
+    step: NDArray[np.int64]
+    middle: Float
+    yaw: Float
+    hint: Float
+    speed: Float
+    gone: Float
+
+
+def actors_on_ground(scene: Scene, tracks: Tracks, *, scale: float) -> Actors:
+    """Actors (n) that follow tracks on the scene's ground."""
+    shapes, stretch, knots = tracks.shapes, tracks.stretch, tracks.knots
+    middle, yaw, gone = tracks.middle, tracks.yaw, tracks.gone
     ends = np.concatenate([[0], np.cumsum(knots)])
     axle = np.repeat([s.base * g[0] for s, g in zip(shapes, stretch, strict=True)], knots)
     track = np.repeat([_TRACK * s.width * g[1] for s, g in zip(shapes, stretch, strict=True)], knots)
-    z, pitch, roll, _ = standing(scene, middle, yaw=yaw, hint=hint, axle=axle, track=track, scale=scale)
+    z, pitch, roll, _ = poses_on_ground(
+        scene, middle, yaw=yaw, hint=tracks.hint, axle=axle, track=track, scale=scale
+    )
     course, climb = np.empty(len(z)), np.empty(len(z))
     for k, shape in enumerate(shapes):
         part = slice(ends[k], ends[k + 1])
         course[part] = _course(middle[part], yaw[part])
         for column in (z, pitch, roll):
-            column[part] = _settled(column[part], gone[part])
+            column[part] = _smoothed(column[part], gone[part])
         pitch[part] *= shape.kind not in _UPRIGHT
         roll[part] *= shape.kind not in _UPRIGHT and shape.kind not in _LEANING
         climb[part] = _rate(z[part])
-    v = speed * scale
-    return table(
+    v = tracks.speed * scale
+    return actor_table(
         shapes,
         stretch,
         knots=knots,
-        time_ns=np.round(step * STEP_S * 1e9).astype(np.int64),
+        time_ns=np.round(tracks.step * STEP_S * 1e9).astype(np.int64),
         position=np.column_stack([middle, z]),
         angles=np.column_stack([yaw, pitch, roll]),
         velocity=np.column_stack([v * np.cos(course), v * np.sin(course), climb]),
@@ -156,19 +164,17 @@ def tracked(
     )
 
 
-def standing(
+def poses_on_ground(
     scene: Scene, middle: Float, *, yaw: Float, hint: Float, axle: Float, track: Float, scale: float
 ) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
     """Height (n,), pitch (nose down positive) and roll of bodies that stand on the ground on four wheels.
 
-    The last column says whether there is ground under the middle and under each wheel.
+    The last column (n,) is whether there is ground under the centre and under each wheel. A wheel without
+    ground is at the height of the centre, a centre without ground at the height of the hint.
 
     middle, yaw : (n, 2) scene metres and (n,) radians
-    hint        : (n,) height near which the ground is; NaN to take the topmost
+    hint        : (n,) approximate height of the ground; NaN for the topmost surface
     axle, track : (n,) true metres between axles and between wheels
-
-    Wheels that would hang over an edge are taken to stand as high as the middle, and the middle where there
-    is no ground as high as the hint.
     """
     known = np.isfinite(hint)
     points = np.column_stack([middle, np.where(known, hint, 0.0)])
@@ -201,15 +207,15 @@ def _rate(values: Float) -> Float:
 
 
 def _course(middle: Float, yaw: Float) -> Float:
-    """Direction (n,) in which the middle moves: along the track, and along the body where it stands."""
+    """Direction of motion (n,) in radians; the heading of the body where it stands."""
     d = np.gradient(middle, axis=0) if len(middle) > 1 else np.zeros_like(middle)
     moves = np.hypot(*d.T) > 0.02
     course: Float = np.where(moves, np.arctan2(d[:, 1], d[:, 0]), yaw)
     return course
 
 
-def _settled(values: Float, gone: Float) -> Float:
-    """Values at metres ``gone``, averaged over a metre: tyres and springs take steps softly."""
+def _smoothed(values: Float, gone: Float) -> Float:
+    """Values at metres ``gone``, smoothed over a metre as by tyres and springs."""
     if len(values) < 2 or gone[-1] - gone[0] < 0.5:
         return np.full(len(values), values.mean()) if len(values) else values
     even = np.arange(gone[0] - 1.0, gone[-1] + 1.0, 0.25)

@@ -119,7 +119,7 @@ def test_a_drone_without_more_words_flies_over_streets_and_sees_them(scene, tmp_
 @pytest.mark.parametrize(
     ("rig", "change", "says"),
     [
-        ("drone", {"survey": "all", "altitude": 12.0}, "would meet what reaches up"),
+        ("drone", {"survey": "all", "altitude": 12.0}, "would collide with the scene"),
         ("vlp16", {"survey": "all"}, "a car does not"),
         ("vlp16", {"altitude": 50.0}, "`altitude` is for aircraft"),
         ("aircraft", {"route": "random"}, "cannot follow streets"),
