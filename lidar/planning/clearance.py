@@ -1,4 +1,4 @@
-"""What a vehicle's body sweeps along a track, and the obstacles that it meets."""
+"""Collision checks of a vehicle's body along a track, shifts around obstacles, and turning manoeuvres."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from lidar.planning.steering import Pose, Track
 from lidar.rig.vehicle import Vehicle
 
 ASIDE = 4.0
-"""Metres that a line may be pushed aside to get past an obstacle."""
-_NEAR = 12.0  # metres from a junction within which its turn is to blame
-_SWEEP = 0.5  # metres between the poses at which the body is held against obstacles
+"""Maximum lateral shift of a line, in metres, to pass an obstacle."""
+_NEAR = 12.0  # metres from a junction within which a collision blocks its turn, not the edge
+_SWEEP = 0.5  # metres between the poses that are checked for collisions
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What a path is planned for.
+    """Parameters of path planning.
 
     tree   : obstacles, polygons in scene metres
-    margin : metres that the body keeps from them
+    margin : minimum distance in metres between body and obstacles
     step   : true metres between the rows of a track
-    side   : of the street that is driven on
+    side   : side of the street that is driven on
     """
 
     vehicle: Vehicle
@@ -41,11 +41,11 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A route's line at an even spacing.
+    """The line of a route, resampled evenly.
 
     xyz   : (n, 3) scene metres
     edge, limit, free : as for `Route`
-    turn  : (n,) bool, the vehicle turns round after this point
+    turn  : (n,) bool, the vehicle makes a U-turn after this point
     """
 
     xyz: Float
@@ -67,7 +67,7 @@ class Line:
 def body_outlines(
     xy: Float, heading: Float, *, vehicle: Vehicle, margin: float = 0.0, aside: float = 0.0
 ) -> NDArray[np.object_]:
-    """Outlines (n,) of the body in plan, longer by the margin at each end and wider by both on each side.
+    """Outlines (n,) of the body in plan, with a margin all round and ``aside`` more metres on each side.
 
     xy      : (n, 2) scene metres of the rear axle
     heading : (n,) radians
@@ -85,7 +85,7 @@ def body_outlines(
 def touching(
     track: Track, line: Line, *, setting: Setting
 ) -> tuple[NDArray[np.int64], NDArray[np.object_], NDArray[np.object_]]:
-    """Rows of a track where the body touches an obstacle, its outlines there, and the obstacles."""
+    """Rows of a track where the body intersects obstacles, its outlines there, and these obstacles."""
     every = max(round(_SWEEP / track.step), 1)
     rows = np.unique(np.append(np.arange(0, len(track.row), every), len(track.row) - 1))
     rows = rows[~line.free[track.row[rows]]]
@@ -97,9 +97,9 @@ def touching(
 
 
 def pushes(track: Track, line: Line, *, setting: Setting) -> tuple[Float, NDArray[np.int64]]:
-    """How far the line must move, positive to the left, and at which of its rows, to free the body.
+    """Lateral shifts (k,) in metres, positive to the left, and the rows (k,) of the line that need them.
 
-    Not a number where no place beside the line within `ASIDE` is free.
+    NaN where no shift within `ASIDE` frees the body.
     """
     rows = np.unique(touching(track, line, setting=setting)[0])
     if not len(rows):
@@ -131,7 +131,7 @@ def pushes(track: Track, line: Line, *, setting: Setting) -> tuple[Float, NDArra
 
 
 def _way_out(low: Float, high: Float, *, half: float) -> float:
-    """The least shift sideways that takes a body of a half width clear of intervals; NaN if none does."""
+    """The smallest lateral shift that moves a body out of all intervals; NaN if there is none."""
     ways = np.concatenate([high + half, low - half])
     ways += np.copysign(0.05, ways)
     free = ((ways[:, None] - half >= high) | (ways[:, None] + half <= low)).all(axis=1) & (
@@ -141,7 +141,7 @@ def _way_out(low: Float, high: Float, *, half: float) -> float:
 
 
 def turns_at(line: Line, rows: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """What to avoid so as not to pass rows of a line: the turn at hand, else the edge itself."""
+    """Turns (edge, edge) to avoid so that rows of a line are not passed; an edge twice if no turn is near."""
     near = math.ceil(_NEAR / line.gap)
     change = np.flatnonzero(line.edge[1:] != line.edge[:-1]) + 1
     found = set()
@@ -153,9 +153,9 @@ def turns_at(line: Line, rows: NDArray[np.int64]) -> list[tuple[int, int]]:
 
 
 def turning_manoeuvre(pose: Pose, line: Line, *, setting: Setting) -> list[Track]:
-    """Arcs, forwards and backwards in turn, after which the vehicle points the other way: 3, 5, 7 or 9.
+    """A U-turn in 3, 5, 7 or 9 arcs, alternately forwards and backwards.
 
-    Raises BlockedError if the body touches an obstacle whatever their number.
+    Raises BlockedError if the body touches an obstacle with any number of arcs.
     """
     radius, step = 1.02 * setting.vehicle.turning_radius, setting.step
     scale = float(setting.frame.scale_at(pose[0], pose[1]))

@@ -1,4 +1,4 @@
-"""How fast a vehicle goes along its path, and where it is at every moment."""
+"""Speed profiles along paths, and the trajectories that follow from them."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from lidar.planning.path import Path
 from lidar.rig.vehicle import Vehicle
 
 DWELL_S = 1.0
-"""Seconds at rest at every stop on the way, while the wheel is turned or the gear changed."""
-_SLOWEST = 0.3  # m/s below which no bend needs to slow the vehicle
-_SPARE = 0.98  # share of the limits of acceleration that the profile uses, so that sampling stays within them
-_BRIEF_S = 0.3  # of a second average, which takes the edges off the jerk
+"""Seconds at rest at every stop between legs, for steering and gear changes."""
+_SLOWEST = 0.3  # m/s, minimum of the speed limit that bends impose
+_SPARE = 0.98  # share of the acceleration limits used, a margin for sampling
+_BRIEF_S = 0.3  # seconds of the second moving average, which smooths the jerk
 _FIT = 40
 _ROWS = 65
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """A drive along a path in time; a row a moment at an even rate.
+    """A speed profile: progress along a path at an even rate.
 
     time_ns : (n,) int64
     s       : (n,) true metres along the path
     speed, acceleration : (n,) m/s, m/s^2, along the path
-    row     : (n,) int64, the row of the path last passed
+    row     : (n,) int64, the last row of the path passed
     """
 
     time_ns: NDArray[np.int64]
@@ -50,16 +50,15 @@ def drive_path(
     duration: float | None = None,
     under_way: bool = False,
 ) -> Trajectory:
-    """The trajectory of a vehicle that drives a path, from rest to rest.
+    """The trajectory of a vehicle along a path, from rest to rest, in the scene frame.
 
-    rate_hz   : poses a second
-    duration  : seconds to record: a shorter drive ends sooner; on a longer one the vehicle pulls up in time
-    under_way : it is at speed when the record starts, and drives on when it ends; the path's end is one to
-                stop at nevertheless
+    rate_hz   : poses per second
+    duration  : maximum seconds; on a longer path the vehicle stops in time
+    under_way : the vehicle is at speed at the start, and after ``duration``; it still stops at the path's end
 
-    Speed keeps to the limits and to what bends allow; its changes keep to the vehicle's acceleration,
-    deceleration and jerk. The body's x axis is along the path at the rear axle, turned only by the lean of
-    the body under acceleration. Raises InputError for a duration or rate that is not positive.
+    The speed stays within speed limits and the vehicle's lateral acceleration, acceleration, deceleration and
+    jerk. The body's x axis is along the path at the rear axle, apart from roll and pitch under acceleration.
+    Raises InputError for a duration or rate that is not positive.
     """
     motion = motion_along(path, vehicle, rate_hz=rate_hz, duration=duration, under_way=under_way)
     return poses_along(path, vehicle, motion=motion)
@@ -73,7 +72,7 @@ def motion_along(
     duration: float | None = None,
     under_way: bool = False,
 ) -> Motion:
-    """Where along its path the vehicle is, and how fast, at every moment; arguments as for `drive_path`."""
+    """The fastest speed profile along a path within all limits; arguments as for `drive_path`."""
     if not (rate_hz > 0 and (duration is None or duration > 0)):
         raise InputError("rate and duration of a drive must be positive")
     limit = speed_limits(path, vehicle)
@@ -97,7 +96,7 @@ def motion_along(
 
 
 def speed_limits(path: Path, vehicle: Vehicle) -> Float:
-    """Speed (n,) in m/s that limits, bends, crests and the turning of the wheel allow along a path."""
+    """Speed (n,) in m/s that speed limits, bends, crests and steering rate allow along a path."""
     bend = np.abs(path.curvature)
     change = np.abs(_along(path, path.curvature))
     crest = np.abs(_along(path, _softened(path, vehicle)))
@@ -116,7 +115,7 @@ def speed_limits(path: Path, vehicle: Vehicle) -> Float:
 
 
 def _softened(path: Path, vehicle: Vehicle) -> Float:
-    """Slopes as springs and wheelbase leave them: short bumps throw nobody up."""
+    """Slopes (n,) smoothed over the wheelbase: shorter bumps do not raise the body."""
     from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
 
     out = path.slope.copy()
@@ -169,12 +168,12 @@ def _all_legs(
 def _within(
     path: Path, limit: Float, *, vehicle: Vehicle, dt: float, duration: float
 ) -> tuple[Float, Float, NDArray[np.int32]]:
-    """As `_all_legs`, of as much of the path as can be driven in ``duration``, and then at rest."""
+    """As `_all_legs`, along as much of the path as fits ``duration``, and then at rest."""
 
     def until(row: int) -> tuple[Float, Float, NDArray[np.int32]]:
         return _all_legs(path.take(slice(0, row + 1)), limit[: row + 1], vehicle=vehicle, dt=dt)
 
-    # the whole drive passes here at that time; a part of it has to brake before, so it ends a little sooner
+    # upper bound: the undisturbed drive gets here in that time, one that stops ends a little before
     s, _, _ = _all_legs(path, limit, vehicle=vehicle, dt=dt)
     low, high = 1, int(np.searchsorted(path.s, s[round(duration / dt)]))
     best, back = until(1), 64
@@ -210,7 +209,7 @@ def _time_law(
         return np.zeros(2), np.zeros(2)
     half = max(math.ceil((up + down) / jerk / dt / 2), 1)
     window, brief = 2 * half + 1, 2 * max(round(_BRIEF_S / dt / 2), 1) + 1
-    if len(s) < _ROWS:  # speeds between rows are not seen
+    if len(s) < _ROWS:  # speeds between rows are not checked
         at = np.linspace(0.0, length, _ROWS)
         s, limit = at, np.interp(at, s, limit)
     lowered = limit
@@ -220,7 +219,7 @@ def _time_law(
         if excess.max() <= 1.0:
             return far, speed
         lowered = _lowered(lowered, s, far=far, excess=excess, reach=speed * (half * dt))
-    # slower throughout by what is left over, everything is within bounds
+    # stretch time by the remaining excess, so that all limits hold
     old = np.arange(len(far))
     moment = np.linspace(0.0, old[-1], math.ceil(old[-1] * excess.max()) + 1)
     return np.interp(moment, old, far), np.interp(moment, old, speed) * (len(old) - 1) / (len(moment) - 1)
@@ -254,7 +253,7 @@ def _smooth_profile(
             speed[end] = 0.0
     far = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) * (dt / 2))])
     short = float(s[-1]) - far[-1]
-    if short > 0 and rest == (False, True):  # what is under way may be a little further on at first
+    if short > 0 and rest == (False, True):  # a drive at speed may start a little further on
         return far + short, speed
     stretch = float(s[-1]) / far[-1]
     return far * stretch, speed * stretch
@@ -273,7 +272,7 @@ def _lowered(lowered: Float, s: Float, *, far: Float, excess: Float, reach: Floa
     out = lowered.copy()
     lo = np.searchsorted(s, far[over] - 0.5 * reach[over] - 0.5)
     hi = np.searchsorted(s, far[over] + 0.5 * reach[over] + 0.5, side="right")
-    # one pass per stretch of moments that belong together
+    # one pass per run of consecutive samples
     cuts = np.flatnonzero(np.diff(over) > 1) + 1
     for group in np.split(np.arange(len(over)), cuts):
         a, b = int(lo[group].min()), int(hi[group].max())
@@ -295,7 +294,7 @@ def _fastest(s: Float, limit: Float, *, up: float, down: float, rest: tuple[bool
 
 
 def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:
-    """The trajectory of a motion along a path; cubic between the path's rows, so velocity has no steps."""
+    """The trajectory of a speed profile along a path; cubic between rows, so velocity is continuous."""
     from scipy.interpolate import CubicHermiteSpline  # noqa: PLC0415  (slow to import)
 
     n = len(motion.s)
@@ -324,7 +323,7 @@ def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:
     across = motion.speed**2 * columns["curvature"] * gear
     roll = columns["bank"] + vehicle.roll_gradient * across
     pitch = -vehicle.pitch_gradient * motion.acceleration * gear
-    if vehicle.kind != "air" or vehicle.cruise:  # what hovers climbs level
+    if vehicle.kind != "air" or vehicle.cruise:  # multicopters climb level
         pitch = pitch - columns["pitch"]
     if any(vehicle.bob):
         shift = _gait(motion, vehicle, heading=heading)

@@ -1,9 +1,9 @@
-"""The best motion that stays behind a given one: how a smooth driver follows what the traffic lets him do.
+"""Smoothest speed profile that never overtakes a given one, such as that of a traffic simulation.
 
-What signals, queues and other traffic allow is a distance that must not be passed at each moment. The motion
-is the one that is as far on as possible at all times, under the limits of speed, acceleration and jerk: a
-linear programme over even steps of time, whose unknowns are accelerations at the steps, linear in between.
-Speed limits depend on the place; they are taken where the last solution was, and the programme solved again.
+Signals, queues and other traffic give an upper bound of the distance driven at each time. The profile
+maximises the sum of distances below it, within the limits of speed, acceleration and jerk: a linear programme
+over even time steps, whose unknowns are the accelerations at the steps, linear in between. Speed limits
+depend on the position; they are looked up at the last solution, and the programme is solved again.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from lidar.rig.vehicle import Vehicle
 
 STEP_S = 0.2
 """Seconds between the knots of a motion."""
-_SPARE = 0.98  # share of the limits of acceleration that is used, so that sampling stays within them
-_COMFORT = 0.8  # share of the braking with which speed is brought down to lower limits
-_AGAIN = 8  # times that speed limits are looked up anew
-_SLACK = 0.005  # share of a limit by which speed may exceed it before it is looked up anew
-_TAIL_S = 10.0  # seconds beyond those on an empty road within which a leg is driven once it is allowed
-_SETTLING_S = 10.0  # seconds over which what starts at speed falls behind by a step
-_NEAR = 0.05  # metres from its end at which a leg has been driven
-_AROUND = 1.0  # metres about a place whose limits hold there
+_SPARE = 0.98  # share of the acceleration limits used, a margin for sampling
+_COMFORT = 0.8  # share of the deceleration used before lower speed limits
+_AGAIN = 8  # maximum number of solutions
+_SLACK = 0.005  # share of a speed limit by which a solution may exceed it
+_TAIL_S = 10.0  # seconds that a leg may take longer than on an empty road
+_SETTLING_S = 10.0  # seconds over which a profile that starts at speed falls behind by one step
+_NEAR = 0.05  # metres from its end at which a leg is complete
+_AROUND = 1.0  # metres before and after a position whose speed limits count
 
 
 @dataclass(frozen=True, slots=True)
 class _Knots:
-    """A motion at even steps: metres, m/s and m/s^2, linear in acceleration between; ``dt`` seconds apart."""
+    """A profile at steps ``dt`` seconds apart: metres, m/s and m/s^2; acceleration is linear in between."""
 
     s: Float
     v: Float
@@ -51,16 +51,16 @@ def motion_within(
     rate_hz: float = 100.0,
     under_way: bool = False,
 ) -> Motion:
-    """The motion along a path that never passes the distances allowed, from rest to rest.
+    """The speed profile along a path, from rest to rest, that never exceeds given distances.
 
     time_s    : (k,) rising seconds from 0
-    max_distance : (k,) metres along the path that may be reached by then; never falling
-    under_way : it is as fast at first as it may be, and need not rest when the times end
+    max_distance : (k,) metres along the path at these times, not decreasing
+    under_way : the vehicle is at speed at the start and at the last time
 
-    It ends with the last of the times, or at the end of the path. Raises InputError for distances that fall.
+    It ends at the last time or at the end of the path. Raises InputError for decreasing distances.
     """
     if len(time_s) < 2 or (np.diff(max_distance) < -1e-9).any():
-        raise InputError("the distances that a motion must stay behind must not fall")
+        raise InputError("the maximum distances of a speed profile must not decrease")
     limit = speed_limits(path, vehicle)
     parts: list[tuple[Float, Float, NDArray[np.int32]]] = []
     begin, dt, total = 0.0, 1.0 / rate_hz, float(time_s[-1])
@@ -74,7 +74,7 @@ def motion_within(
         until = max(float(time_s[there[0]]) - begin, 0.0) + needed if len(there) else math.inf
         t = STEP_S * np.arange(max(math.floor(min(total - begin, until) / STEP_S), 2) + 1)
         rolls = under_way and not parts
-        # a knot keeps to what is allowed at the one before: so does all in between
+        # each step is bounded by the distance allowed one step before, so all times in between are too
         late = STEP_S * np.minimum(t / _SETTLING_S, 1.0) if rolls else STEP_S
         bounds = np.interp(begin + t - late, time_s, allowed)
         still = (not rolls, not under_way or until < total - begin)
@@ -99,7 +99,7 @@ def motion_within(
 
 
 def desired_speed(path: Path, vehicle: Vehicle) -> Float:
-    """Speed (n,) in m/s that suits a path: limits, braked for in time, and rest at the end of each leg."""
+    """Desired speed (n,) in m/s along a path: comfortable braking, rest at the end of each leg."""
     limit = speed_limits(path, vehicle)
     out = np.empty(len(limit))
     for first, last in legs_of(path):
@@ -110,7 +110,7 @@ def desired_speed(path: Path, vehicle: Vehicle) -> Float:
 
 
 def _braked(s: Float, limit: Float, *, vehicle: Vehicle) -> Float:
-    """Limits (n,) at distances (n,) from which there is braking in comfort for those that follow."""
+    """Speed limits (n,) at distances (n,), lowered for comfortable braking before lower ones."""
     ramp = 2 * _COMFORT * vehicle.deceleration * s
     square = np.minimum.accumulate((limit**2 + ramp)[::-1])[::-1] - ramp
     braked: Float = np.sqrt(np.maximum(square, 0.0))
@@ -118,9 +118,9 @@ def _braked(s: Float, limit: Float, *, vehicle: Vehicle) -> Float:
 
 
 def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tuple[bool, bool]) -> _Knots:
-    """The knots of the best motion along a leg that stays behind ``allowed`` (k,) metres at its steps.
+    """The best profile along a leg that never exceeds ``allowed`` (k,) metres.
 
-    rest : whether it is at rest at the first of them, and at the last
+    rest : whether the vehicle is at rest at the start, and at the end
     """
     from scipy.ndimage import minimum_filter1d  # noqa: PLC0415
 
@@ -138,7 +138,7 @@ def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tup
         if excess <= 1.0 + _SLACK:
             break
         cap = np.interp(knots.s, place, cautious)
-    # slower throughout by what is left over, everything is within bounds
+    # stretch time by the remaining excess, so that all limits hold
     late = max(excess, 1.0)
     return _Knots(knots.s, knots.v / late, knots.a / late**2, knots.dt * late)
 
@@ -194,7 +194,7 @@ def _solved(vehicle: Vehicle, allowed: Float, *, cap: Float, rest: tuple[bool, b
         method="highs-ds",
     )
     if found.status != 0:
-        raise InputError(f"no smooth motion stays behind what is allowed: {found.message}")
+        raise InputError(f"no speed profile satisfies the maximum distances: {found.message}")
     s, v, a = np.split(found.x, 3)
     return _Knots(s, np.maximum(v, 0.0), a, dt)
 

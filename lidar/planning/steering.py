@@ -1,4 +1,4 @@
-"""Steering: lines that a vehicle can follow, and the way it goes when it does."""
+"""Steering: smoothing a line to a vehicle's turning radius, and following it with a kinematic model."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Pose = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Where a vehicle goes along a line, without heights.
+    """Poses of a vehicle that follows a line, in plan.
 
     xy        : (n, 2) scene metres, the rear axle
-    heading   : (n,) radians, where the vehicle points
+    heading   : (n,) radians, of the vehicle
     curvature : (n,) 1/m, true, change of heading per metre driven
     row       : (n,) int64, the nearest row of the line
     gear      : 1 forwards, -1 backwards
@@ -72,23 +72,22 @@ def relaxed(xy: Float, cap: float, *, reach: float) -> Float:
 
 
 def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose | None = None) -> Track:
-    """The way of a vehicle that follows a line (m, 2), from the line's start or a pose, to its end.
+    """The track of a vehicle that follows a line (m, 2) from its start, or from a pose, to its end.
 
-    Feed-forward of the line's curvature and feedback of lateral and heading error, both within what the wheel
-    can do: the curvature stays within the turning radius and changes by at most ``vehicle.steering`` per
-    metre.
+    The controller adds feedback of lateral and heading error to the line's curvature. The curvature of the
+    track stays within the turning radius and changes by at most ``vehicle.steering`` per metre.
 
     scale : scene metres per true metre
     step  : true metres between the track's rows
 
-    The track of a vehicle that does not get to the end stops at the row of the line at which it gave up.
+    If the vehicle cannot reach the end, the track ends at the last row of the line that it reached.
     """
     from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
 
     most, rate = 1.0 / vehicle.turning_radius, vehicle.steering
     gap = float(np.mean(np.hypot(*np.diff(xy, axis=0).T)))
     heading, bend = polylines.headings(xy), polylines.curvatures(xy) * scale
-    # the wheel starts to turn half its turning time ahead of the bend
+    # steering starts half the steering time ahead of the bend
     bend = gaussian_filter1d(bend, max(0.5 * most / rate / gap, 0.5), mode="nearest")
     length = 1.2 * most / rate
     near, turn_in = 1.0 / length**2, 2.0 / length
@@ -110,12 +109,12 @@ def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose
         along, aside = (x - lx[j]) * c + (y - ly[j]) * s, ((y - ly[j]) * c - (x - lx[j]) * s) / scale
         if j == m - 1 and along >= -0.5 * stride:
             break
-        # between the line's points its heading turns on and its side moves over
+        # heading and lateral position of the line between its points
         bend_here = lk[j] + (lk[min(j + 1, m - 1)] - lk[j]) * max(-0.5, min(1.5, along / gap))
         aside -= 0.5 * bend_here * (along / scale) ** 2
         off = math.remainder(th - lh[j] - bend_here * along / scale, 2 * math.pi)
-        pull = 1.2 * length * math.tanh(aside / (1.2 * length))
-        want = bend_here - near * pull - turn_in * math.sin(max(-1.5, min(1.5, off)))
+        error = 1.2 * length * math.tanh(aside / (1.2 * length))
+        want = bend_here - near * error - turn_in * math.sin(max(-1.5, min(1.5, off)))
         want = max(-most, min(most, want))
         new = k + max(-rate * step, min(rate * step, want - k))
         mean = 0.5 * (k + new)

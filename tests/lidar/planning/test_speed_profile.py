@@ -88,7 +88,7 @@ def test_what_is_sampled_is_one_motion():
 
 
 def test_distances_that_fall_are_refused():
-    with pytest.raises(InputError, match="must not fall"):
+    with pytest.raises(InputError, match="must not decrease"):
         motion_within(PATH, CAR, time_s=np.array([0.0, 1.0, 2.0]), max_distance=np.array([0.0, 5.0, 4.0]))
 
 
