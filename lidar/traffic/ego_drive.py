@@ -1,4 +1,4 @@
-"""The ego's drive among the traffic: signals, signs and the others slow it down as they do each other."""
+"""Trajectories of an ego vehicle that reacts to signals, stop signs and other road users."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from lidar.traffic.simulation import STEP_S, has_traffic_control, simulate_ego
 from lidar.traffic.trips import Trip
 from lidar.world.actors import Actors
 
-_ROUNDS = 3  # times that the ego's drive is planned among those who are about during the last plan
-_SAME = 25.0  # metres between two plans that are about the same
-_LONGER = (2.0, 90.0)  # a drive to an end takes at most so many times as long as on empty roads, and seconds
-_ON_S = 10.0  # seconds that a drive that is under way is planned beyond the record's end
+_ROUNDS = 3  # maximum number of simulations of the ego vehicle
+_SAME = 25.0  # metres between two trajectories from which the surroundings are the same
+_LONGER = (2.0, 90.0)  # maximum time of a drive to its end: factor of that on empty roads, plus seconds
+_ON_S = 10.0  # seconds that are simulated beyond the record's end if the vehicle is at speed there
 
 
 def drive_with_signals(
@@ -73,14 +73,14 @@ def drive_in_traffic(
     duration: float | None = None,
     under_way: bool = False,
 ) -> tuple[Trajectory, Actors]:
-    """The trajectory of a vehicle along a path as one of the traffic, and the others.
+    """The trajectory of a vehicle along a path in simulated traffic, and the other road users.
 
-    first    : its trajectory without the others, such as `drive_with_signals` gives
+    first    : its trajectory without other road users, such as `drive_with_signals` gives
     duration, under_way : as for `drive_path`
 
-    The ego is simulated together with the others and keeps its distance as they do; its motion is then
-    smoothed to what its body and its passengers bear, never ahead of what it was allowed, and the others are
-    simulated once more around it. Raises InputError for a scene whose features cannot be read.
+    The ego is simulated together with the others. Its motion is then smoothed to its limits of acceleration
+    and jerk, never ahead of the simulated one, and the others are simulated again around it.
+    Raises InputError for a scene whose features cannot be read.
     """
     options = options or TrafficOptions()
     ego = first
@@ -117,7 +117,7 @@ def _driven(
     radius: float,
     under_way: bool,
 ) -> Trajectory:
-    """The trajectory of the ego among trips; ``alone`` says how long it takes without them."""
+    """The trajectory of the ego simulated with trips; ``alone`` is that without them."""
     factor, more = _LONGER
     seconds = duration if duration is not None else factor * alone.duration_ns * 1e-9 + more
     if duration is not None and under_way:

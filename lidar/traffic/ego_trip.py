@@ -1,4 +1,4 @@
-"""The ego vehicle as one of the traffic: what signals, signs and the others let it do."""
+"""The ego vehicle as a road user of the traffic simulation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lidar.traffic.lanes import STEP, ActorPath
 from lidar.traffic.trips import Driver
 
 _ROOM = (0.4, 0.2)
-"""Metres by which the ego's box is longer and wider to the others, for what its driver does less exactly."""
+"""Metres added to length and width of the ego's bounding box, for its deviation from the simulated motion."""
 _BRAKE = 0.7  # share of its braking that the driver uses for what is ahead, and
 _PULL = 0.8  # of its acceleration
 _HEADWAY_S, _GAP = 1.4, 2.0
@@ -23,7 +23,7 @@ _HEADWAY_S, _GAP = 1.4, 2.0
 
 @dataclass(frozen=True, slots=True)
 class EgoTrip:
-    """The ego's way, in the columns of `lidar.traffic.trips.Trip`.
+    """The ego's trip, with the columns of `lidar.traffic.trips.Trip`.
 
     xy, heading : (n, 2) and (n,) of the box's middle at each station
     """
@@ -47,7 +47,7 @@ class EgoTrip:
 
 
 def ego_trip(path: Path, vehicle: Vehicle, *, under_way: bool = False) -> EgoTrip:
-    """The ego as a mover along its path, from rest or under way; stations are `STEP` metres of it apart."""
+    """The ego's trip along its path, from rest or at speed; stations are `STEP` metres apart."""
     at = np.arange(0.0, path.length + STEP, STEP)
     # where the vehicle turns round the position stands twice
     s = path.s + 1e-9 * np.arange(len(path))

@@ -1,4 +1,4 @@
-"""Junctions: where ways cross or join, and the signals there."""
+"""Junctions and their signals."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _TOGETHER = (
     16.0  # metres between the parts of a junction with signals: carriageways apart, one set of signals
 )
 AMBER = 5.0
-"""Seconds at the end of each group's half of the cycle in which nobody has green: amber and clearing."""
+"""Seconds without green at the end of each group's half cycle: amber and clearing."""
 
 
 class Signals(NamedTuple):
-    """Fixed-time signals, a row a junction, and windows of time kept for the ego.
+    """Fixed-time signals, one row per junction, and time windows reserved for the ego.
 
     cycle, shift : (z,) seconds
     window       : (w, 4) junction, group, from and to in seconds: only that group has green then
@@ -38,7 +38,7 @@ class Signals(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Zones:
-    """Junctions: where ways cross or join; near ones are one.
+    """Areas of junctions; overlapping ones are one.
 
     polygon : (z,) shapely polygons, scene metres
     tree    : their search tree
@@ -120,7 +120,7 @@ def junction_plan(graph: RoadGraph, lanes: Lanes, *, seed: int, cycle: float = 6
 
 
 def signal_group(plan: JunctionPlan, zone: int, *, heading: float) -> int:
-    """Group of a junction's signals that speaks to traffic of a heading, -1 without signals."""
+    """Signal group of a junction for traffic of a heading, -1 without signals."""
     if not plan.lit[zone]:
         return -1
     return 0 if abs(np.cos(heading - plan.axis[zone])) >= abs(np.sin(heading - plan.axis[zone])) else 1

@@ -1,4 +1,4 @@
-"""Lanes of the road graph, and the ways that vehicles take along them."""
+"""Lanes of the road graph for traffic, and the paths of road users along them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from lidar.planning.route import HEADING_REACH
 from lidar.planning.steering import relaxed
 
 STEP = 0.5
-"""True metres between the stations of a way."""
-_KERB = 0.25  # metres that a body keeps from the edge of the carriageway where it can
-_SIDE = 0.55  # metres that two bodies in neighbouring lanes have between them at least
+"""True metres between the stations of a path."""
+_KERB = 0.25  # metres between a body and the edge of the carriageway where there is room
+_SIDE = 0.55  # metres, minimum distance between bodies in neighbouring lanes
 _QUIET = {"service": 0.02, "track": 0.0, "living_street": 0.2}
-"""How much less traffic likes a road of this kind."""
+"""Relative density of traffic on minor roads."""
 _STRAIGHT = np.radians(30.0)
-_EDGE = 60.0  # metres from the bounds of the map within which a street that ends is one that leaves it
+_EDGE = 60.0  # metres from the bounds of the map within which a dead end leaves the map
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,14 +34,14 @@ class Lanes:
     graph  : the road graph
     layout : lanes of each edge and where they lie
     count  : (m,) int64, lanes in the direction of each edge
-    max_width : (m,) metres that a body may be wide on each edge
+    max_width : (m,) metres, maximum width of a body on each edge
     side   : 1 where traffic keeps right, -1 where it keeps left
     state  : (s,) the edge of each state of `geoscene.roadgraph.routing.turn_states`
-    after  : for each state the states that may follow it
-    onward : (s,) bool, the state leads on, or out of the map: whoever is in it does not end in a dead end
+    after  : permitted next states of each state
+    onward : (s,) bool, the state does not lead into a dead end inside the map
     leave, enter : (m,) headings in which an edge is left and entered, radians
-    traffic_weight : (m,) how much traffic there is on an edge, relative
-    open   : (m,) bool, `onward` of who begins on the edge
+    traffic_weight : (m,) relative density of traffic
+    open   : (m,) bool, `onward` for a start on the edge
     exit, entry : (m,) bool, the edge ends, or begins, at the map's edge
     """
 
@@ -109,7 +109,7 @@ def _at_edge(
     end: NDArray[np.int32],
     other: NDArray[np.int32],
 ) -> NDArray[np.bool_]:
-    """Edges (m,) one end of which lies near the map's edge and joins no other street."""
+    """Whether (m,) an end of each edge is near the map's edge and joins no other street."""
     if bounds is None:
         return np.zeros(len(graph), np.bool_)
     xy = graph.node_xyz[end, :2]
@@ -120,7 +120,7 @@ def _at_edge(
 
 
 def _leading_on(before: Ints, after: Ints, *, leads_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """States (s,) from which a drive can go on for ever, or to the map's edge."""
+    """Whether (s,) a drive from each state can continue endlessly or to the map's edge."""
     leads_on = np.ones(len(leads_out), np.bool_)
     while True:
         further = leads_out.copy()
@@ -150,7 +150,7 @@ def lane_shift(lanes: Lanes, edge: int, *, lane: int, width: float, kerb: bool =
 
 @dataclass(frozen=True, slots=True)
 class ActorPath:
-    """Where a mover's middle goes, a row every `STEP` true metres.
+    """The path of a road user's centre, with stations every `STEP` true metres.
 
     xyz       : (n, 3) scene metres
     heading   : (n,) radians, unwrapped
@@ -189,7 +189,7 @@ def random_lanes(
     inside: NDArray[np.bool_],
     width: float,
 ) -> tuple[list[int], list[int]]:
-    """Edges and lanes of a random drive from an edge on, until ``metres`` or the last edge ``inside``.
+    """Edges and lanes of a random drive from an edge, up to ``metres`` or out of the edges ``inside``.
 
     Who is in the kerb's lane goes straight on or turns towards the kerb, who is in the innermost lane
     straight on or the other way, where there is such a way. Going straight on is preferred.
@@ -246,7 +246,7 @@ def path_along_lanes(
     scale: float,
     keeps_kerb: bool = False,
 ) -> ActorPath:
-    """The way along lanes of edges that follow each other, rounded to bends of ``radius`` and more.
+    """The path along lanes of consecutive edges, rounded to a turning radius.
 
     width  : metres of the body
     radius : true metres
@@ -282,7 +282,7 @@ def path_along_lanes(
 
 
 def rounded(line: Float, edge: Ints, *, lane: Ints, limit: Float, radius: float, scale: float) -> ActorPath:
-    """The way along a line (n, 3) of evenly spaced points, rounded to bends of ``radius`` and more.
+    """The path along a line (n, 3) of evenly spaced points, rounded to a turning radius.
 
     radius            : true metres
     edge, lane, limit : columns of `ActorPath` at the points

@@ -1,4 +1,4 @@
-"""Cars that stand: along kerbs and in parking lots."""
+"""Parked vehicles along kerbs and in parking lots."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from lidar.traffic.trips import random_shape
 from lidar.world.actors import Actors
 
 CARS = {"hatchback": 0.38, "sedan": 0.30, "suv": 0.22, "van": 0.10}
-"""Shares of what parks: assumed."""
-_FREE = 1.3  # metres from the middle of the lane that a parked car leaves free: half a car and a hand
-_OVER = 0.35  # metres by which a car's middle may stand beyond the kerb where the street is that narrow
-_ROOM, _BETWEEN = 0.2, 0.4  # metres to what stands there, and to each other
+"""Shares of the kinds of parked vehicles: assumed."""
+_FREE = 1.3  # metres beside the lane centre that stay free: half a car and a margin
+_OVER = 0.35  # metres that a car's centre may be beyond the kerb in narrow streets
+_ROOM, _BETWEEN = 0.2, 0.4  # metres to obstacles, and to each other
 _QUIET = ("residential", "living_street", "unclassified", "tertiary", "service")
 _BUSY = ("secondary", "primary")
-_FAST = 14.5  # m/s from which on nobody parks at the kerb
+_FAST = 14.5  # m/s, speed limit from which no vehicle parks at the kerb
 _SLOT = (2.5, 5.2)  # metres of a place in a parking lot
 _AISLE = 6.0
 
 
 @dataclass(frozen=True, slots=True)
 class ParkingSpaces:
-    """Where bodies may stand.
+    """Parking spaces.
 
     xy      : (n, 2) scene metres, the middle of the box
     heading : (n,) radians
@@ -46,14 +46,14 @@ class ParkingSpaces:
 
 
 def concatenated(parts: Sequence[ParkingSpaces]) -> ParkingSpaces:
-    """All spots, in order."""
+    """Several tables as one."""
     return ParkingSpaces(
         *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ParkingSpaces))
     )
 
 
 def kerb_spaces(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: float) -> ParkingSpaces:
-    """Places along kerbs on the edges ``near``, a share of them, at random."""
+    """A random share of the spaces along kerbs of the edges ``near``."""
     g = lanes.graph
     xy, heading, hint = [], [], []
     for e in np.flatnonzero(near).tolist():
@@ -90,7 +90,7 @@ def kerb_spaces(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: floa
 
 
 def lot_spaces(lots: NDArray[np.object_], *, seed: int, share: float) -> ParkingSpaces:
-    """Places in parking lots: rows across the lot's longer side, with aisles between pairs of rows."""
+    """A random share of the spaces in parking lots: rows along the longer side, with aisles between pairs."""
     xy, heading = [], []
     wide, deep = _SLOT
     for number, lot in enumerate(lots):
@@ -135,10 +135,10 @@ def parked_actors(
     seed: int,
     scale: float,
 ) -> Actors:
-    """Vehicles on the spots where all wheels have ground and they touch nothing, nor each other.
+    """Vehicles on the spaces where all wheels have ground and the body touches no obstacle or other vehicle.
 
     kinds : shares of the kinds of vehicles
-    trees : what stands there, and what must stay free, as polygons in plan
+    trees : obstacles and areas that must stay free, polygons in plan
     """
     n = len(spots.xy)
     rng = generator(seed, "parked", *kinds)

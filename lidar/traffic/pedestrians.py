@@ -1,4 +1,4 @@
-"""People on foot: along sidewalks and over crossings."""
+"""Trips of pedestrians along sidewalks and over crossings."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _KINDS = {"adult": 0.5, "small_adult": 0.38, "child": 0.12}
 _FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}
 """m/s, free walking: adults after Weidmann, "Transporttechnik der Fussgänger" (1993), 1.34 on average."""
 _WALK = Driver(min_radius=0.4, max_speed=2.5, headway=0.5, acceleration=0.8, deceleration=1.2, gap=0.3)
-_LANE = 0.6  # metres beside a sidewalk's line on which people keep, on the side of traffic
-_EDGE = 0.15  # metres from the edge of the sidewalk to the middle of who walks nearest to it
+_LANE = 0.6  # metres from a sidewalk's centre line to the path, on the driving side
+_EDGE = 0.15  # metres, minimum distance of a path from the edge of the sidewalk
 _OUT = (
     2.4,
     2.1,
@@ -33,8 +33,8 @@ _OUT = (
     0.95,
     0.8,
 )  # metres beyond the carriageway's edge where the line may run, best first
-_ROOM = 1.0  # metres from the lines to what stands there
-_PIECE = 12.0  # metres of a stretch of sidewalk that is worth walking
+_ROOM = 1.0  # metres, minimum distance of a sidewalk's line from obstacles
+_PIECE = 12.0  # metres, minimum length of a stretch of sidewalk
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class Sidewalks:
 def sidewalks_around(
     lanes: Lanes, area: Surroundings, *, pavement: shapely.Geometry | None, obstacles: NDArray[np.object_]
 ) -> Sidewalks:
-    """Stretches of sidewalk around the ego's way, clear of what stands there.
+    """Stretches of sidewalk around the ego, clear of obstacles.
 
     pavement : the sidewalks, None for none
     obstacles : polygons of buildings, poles and trunks
@@ -85,7 +85,7 @@ def sidewalks_around(
 
 
 def _clear(line: Float, pavement: shapely.Geometry, *, tree: shapely.STRtree) -> list[Float]:
-    """Pieces of a line on the pavement, away from what stands there."""
+    """Pieces of a line on the sidewalk and away from obstacles."""
     whole = shapely.linestrings(line)
     if len(tree):
         near = tree.geometries[tree.query(whole, predicate="dwithin", distance=_ROOM)]
@@ -99,9 +99,9 @@ def _clear(line: Float, pavement: shapely.Geometry, *, tree: shapely.STRtree) ->
 def pedestrian_trips(
     lanes: Lanes, area: Surroundings, *, walks: Sidewalks, seed: int, density: float
 ) -> list[Trip]:
-    """People at random places on the sidewalks; half of those who come to a crossing take it.
+    """Trips of pedestrians that start at random places; each takes a crossing with probability one half.
 
-    density : people per kilometre of sidewalk
+    density : pedestrians per kilometre of sidewalk
     """
     if not walks.line:
         return []
@@ -156,7 +156,7 @@ def _stroll(
     side: int,
     rng: np.random.Generator,
 ) -> tuple[list[Float], list[tuple[int, int]]]:
-    """Lines that somebody walks one after the other, and which of them are followed by which crossing.
+    """Consecutive lines that a pedestrian walks, and pairs of a line and the crossing after it.
 
     They go to the end of a stretch of sidewalk and back, or over a crossing on the way, and so on.
     """
@@ -222,7 +222,7 @@ def _crossings(lanes: Lanes, walks: Sidewalks) -> dict[int, list[tuple[int, floa
 def _way(
     parts: list[Float], over: list[tuple[int, int]], *, scale: float
 ) -> tuple[ActorPath, tuple[tuple[int, int, int], ...]]:
-    """The way along lines, and the stations between which it is on the crossings that follow some of them."""
+    """The path along lines, and first station, last station and number of each crossing on it."""
     line = np.concatenate(parts)
     ends = np.cumsum([len(p) for p in parts])
     along = polylines.stations(line)
@@ -243,13 +243,13 @@ def _way(
 
 
 def _nearest(way: ActorPath, point: Float, *, about: float) -> int:
-    """The station of a way nearest to a point, near a guess."""
+    """The station of a path nearest to a point, close to station ``about``."""
     low = int(np.clip(about - 16, 0, len(way) - 1))
     part = way.xyz[low : int(about) + 17, :2]
     return low + int(np.argmin(np.hypot(*(part - point).T)))
 
 
 def _lane(line: Float, begin: float, *, end: float, side: int) -> Float:
-    """A stretch of a sidewalk's line from one length along it to another, a little to one's own side."""
+    """A part of a sidewalk's line in walking direction, shifted to the driving side."""
     part = polylines.cut(line, min(begin, end), end=max(begin, end), least=0.1)
     return polylines.parallel(part if end >= begin else part[::-1], -side * _LANE)

@@ -1,4 +1,4 @@
-"""Trips in time: the tables of the simulation, and what comes of them."""
+"""Simulation of trips: tables for `lidar.traffic.simulation_kernel`, and its results."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from lidar.traffic.sweep import CELL, cells_under, sweep
 from lidar.traffic.trips import Trip
 
 STEP_S = 0.1
-"""Seconds of a step of the simulation."""
+"""Seconds of a simulation step."""
 _HORIZON = 60  # steps that the ego's way is known ahead: 6 s
 _KEEP = (0.8, 0.3)  # metres that others keep from the ego's box before and beside it
 _ROUNDS = 30
@@ -36,10 +36,10 @@ _LINE_ROOM = 4.0  # metres before the middle of a crossing, or a signal, at whic
 
 @dataclass(frozen=True, slots=True)
 class SimulatedTrips:
-    """What became of trips: the knots of those that came to be, by trip and in time.
+    """Motion of the trips that appeared, sorted by trip and time.
 
     trip, step : (k,) int64
-    gone, speed : (k,) metres along the way of the body's middle, m/s
+    gone, speed : (k,) metres of the body's centre along the path, m/s
     """
 
     trip: Ints
@@ -58,12 +58,12 @@ def simulate_trips(
     radius: float,
     obeys_signals: bool = False,
 ) -> SimulatedTrips:
-    """Trips in time, from the drive's start to its end.
+    """The motion of trips around a fixed ego trajectory, from its start to its end.
 
     ego_box : length, width and metres from the rear axle to the middle of the ego's box
     obeys_signals   : whether the ego's motion keeps to the signals; otherwise they are green when it comes
 
-    Those whom the ego, whose motion is given, would run into do not take place.
+    Trips that the ego would hit are left out.
     """
     if not trips:
         none = np.empty(0, np.int64)
@@ -94,7 +94,7 @@ def simulate_ego(
     seconds: float,
     radius: float,
 ) -> Float:
-    """Metres (t,) along its path that the ego gets by each step of `STEP_S` as one of the traffic.
+    """Metres (t,) along its path that the ego has driven at each step of `STEP_S`, simulated with the trips.
 
     It follows, gives way and stops at signals and signs as the others do, and they know it as one of them.
     """
@@ -113,13 +113,13 @@ def simulate_ego(
 
 
 def has_traffic_control(ego: EgoTrip, graph: RoadGraph, *, plan: JunctionPlan) -> bool:
-    """Whether there are signals or stop signs on the ego's way."""
+    """Whether there are signals or stop signs along the ego's path."""
     blocks = _blocks(ego, graph, plan=plan, ways={})
     return bool((blocks[:, 4] >= 0).any() or (blocks[:, 7] > 0).any())
 
 
 def ego_motion(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadGraph) -> EgoMotion:
-    """What the others know of the ego vehicle; ``box`` as in `simulate_trips`."""
+    """The ego's motion and the cells that it covers; ``box`` as in `simulate_trips`."""
     length, width, ahead = box
     steps = int(ego.duration_ns * 1e-9 / STEP_S) + 2
     time = np.round(np.arange(steps) * STEP_S * 1e9).astype(np.int64)
@@ -160,7 +160,7 @@ def _levels(xyz: Float, graph: RoadGraph) -> Ints:
 
 
 def _number_cells(movers: Movers, ego: EgoMotion) -> tuple[Movers, EgoMotion, int]:
-    """The tables with cells numbered from 0, and how many there are."""
+    """The tables with cells numbered from 0, and the number of cells."""
     used, number = np.unique(np.concatenate([movers.cell, ego.event_cell]), return_inverse=True)
     mine, its = np.split(number.astype(np.int32), [len(movers.cell)])
     return movers._replace(cell=mine), ego._replace(event_cell=its), len(used)
@@ -242,7 +242,7 @@ def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: Junction
 def _blocks(
     trip: Trip | EgoTrip, graph: RoadGraph, *, plan: JunctionPlan, ways: dict[tuple[int, ...], int]
 ) -> Float:
-    """Stretches through junctions (b, 8): from, to, stop, zone, group, way, rank, halt; see `Movers`."""
+    """Passages through junctions (b, 8): from, to, stop, zone, group, route, rank, sign; see `Movers`."""
     way = trip.way
     zone = zone_at(plan.zones, way.xyz[:, :2])
     half = int(np.ceil((trip.length / 2 + 0.5) / STEP))
@@ -292,7 +292,7 @@ def _stops(graph: RoadGraph, edge: int) -> bool:
 
 
 def _stop_line(way: ActorPath, graph: RoadGraph, *, edge: int, station: int) -> int:
-    """Station of the first line to stop at, on the edge that leads up to a junction at a station."""
+    """Station of the first stop line on the edge that leads to a junction at ``station``."""
     here = graph.control_edge == edge
     offset = graph.control_offset[here]
     offset = offset[graph.length[edge] - offset < _LINE_REACH]

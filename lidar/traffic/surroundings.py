@@ -1,4 +1,4 @@
-"""The surroundings of the ego vehicle, in which there are road users, as they move along with it."""
+"""The moving surroundings of the ego vehicle within which road users are simulated."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from lidar.geometry.poses import Trajectory
 from lidar.traffic.lanes import Lanes
 
 LEFT = 100.0
-"""Metres beyond its radius at which what was around the ego is forgotten."""
+"""Metres beyond the radius at which road users disappear."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """Where there are road users: within ``radius`` of the ego.
+    """The area within ``radius`` of the ego over time.
 
     lines  : (m,) the graph's edges in plan
     near   : (m,) bool, edges that ever come within radius
@@ -58,7 +58,7 @@ class Surroundings:
 
 
 def surroundings_of(lanes: Lanes, ego: Trajectory, *, radius: float, scale: float) -> Surroundings:
-    """The surroundings of the ego along its way."""
+    """The surroundings of an ego trajectory."""
     lines = edge_lines(lanes.graph)
     seconds = ego.duration_ns * 1e-9
     time = np.linspace(0.0, seconds, max(int(np.ceil(seconds)), 1) + 1)
@@ -67,13 +67,13 @@ def surroundings_of(lanes: Lanes, ego: Trajectory, *, radius: float, scale: floa
 
 
 def ego_line(ego: Trajectory) -> shapely.Geometry:
-    """The ego's way in plan."""
+    """The ego trajectory in plan, simplified."""
     xy = ego.position[:: max(len(ego.position) // 5000, 1), :2]
     return shapely.linestrings(xy).simplify(0.2) if np.ptp(xy, axis=0).max() > 0.5 else shapely.points(xy[0])
 
 
 def entrances(lanes: Lanes, area: Surroundings, *, t: float) -> list[tuple[int, float]]:
-    """Where traffic comes into the surroundings of the ego at a time: edges, and shares of their lengths.
+    """Edges, and shares of their lengths, at which traffic enters the surroundings of the ego at a time.
 
     That is where edges cross the rim inwards, and where they come into the map.
     """

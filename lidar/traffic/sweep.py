@@ -1,4 +1,4 @@
-"""The ground that a moving body covers, as cells of a grid with the stations at which it covers them."""
+"""The grid cells that a body covers along its path, with the stations at which it covers them."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from geoscene.typing import Float
 from lidar.traffic.lanes import STEP, ActorPath
 
 CELL = 0.3
-"""Metres of a cell's side. Two bodies that share no cell do not touch: cells are taken whose middle
-lies within half a diagonal of the body."""
+"""Side of a cell in metres. Bodies that share no cell do not touch: a body covers all cells whose centre is
+within half a diagonal of it."""
 _MANY = 1 << 30  # cells along a side of the grid: 322,000 km
 _SPARE = 0.05 + CELL * math.sqrt(0.5)
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """Squares that a body covers along its way, in the order of ``first``.
+    """Cells that a body covers along its path, in the order of ``first``.
 
     cell : (q,) int64, the cell's row, column and level as one number
     first  : (q,) int32, station at which the body begins to cover it
@@ -40,7 +40,7 @@ class Sweep:
 def sweep(
     xy: Float, heading: Float, *, length: float, width: float, level: NDArray[np.int64], scale: float
 ) -> Sweep:
-    """What a body of that size covers along a way, a station at a time.
+    """The cells that a body covers along a path.
 
     xy, heading : (n, 2) and (n,) of its middle
     level : (n,) 0 or 1: bridges and tunnels have cells of their own
@@ -55,7 +55,7 @@ def sweep(
 
 
 def body_poses(way: ActorPath, axle: float) -> tuple[Float, Float]:
-    """Middle (n, 2) and heading (n,) of a body at each station, whose axles stay on the way."""
+    """Centre (n, 2) and heading (n,) of a body at each station, with both axles on the path."""
     reach = axle / 2 / STEP
     rows = np.arange(len(way), dtype=float)
     ends = [np.stack([_extended(way.xyz[:, c], rows + s * reach) for c in (0, 1)], axis=1) for s in (1, -1)]
@@ -64,7 +64,7 @@ def body_poses(way: ActorPath, axle: float) -> tuple[Float, Float]:
 
 
 def _extended(values: Float, rows: Float) -> Float:
-    """Values at fractional rows, going on straight beyond the ends."""
+    """Values at fractional rows, linearly extrapolated beyond the ends."""
     n = len(values)
     low = np.clip(np.floor(rows).astype(int), 0, n - 2)
     out: Float = values[low] + (rows - low) * (values[low + 1] - values[low])
@@ -97,7 +97,7 @@ def cells_under(x: float, y: float, heading: float, half: Any, level: int, out: 
 
 @njit(cache=True, nogil=True)
 def _cover(xy: Any, heading: Any, half: Any, level: Any, most: int) -> Any:
-    """Squares with their first and last stations, by first station."""
+    """Cells with their first and last stations, by first station."""
     n = len(xy)
     cell = np.empty(most + 64 * n, np.int64)
     first, last = np.empty(len(cell), np.int32), np.empty(len(cell), np.int32)
