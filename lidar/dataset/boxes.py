@@ -1,4 +1,4 @@
-"""Boxes of road users: in the scene, about the ego vehicle, in clouds and in images."""
+"""Bounding boxes of road users: 3D boxes in the scene and from the ego vehicle, 2D boxes in images."""
 
 from __future__ import annotations
 
@@ -22,44 +22,44 @@ from lidar.rig.specs import CameraSpec
 from lidar.world.actors import Actors, States, alive, poses_of, rotations, states
 
 
-def actors_near(actors: Actors, ego: Trajectory, *, time_ns: int, reach: float) -> Ints:
-    """Actors (k,) that are there at a time, within ``reach`` true metres of the ego vehicle."""
+def actors_near(actors: Actors, ego: Trajectory, *, time_ns: int, radius: float) -> Ints:
+    """Indices (k,) of the actors present at a time within ``radius`` true metres of the ego vehicle."""
     rows = alive(actors, time_ns, end_ns=time_ns)
     away = states(actors, rows, time_ns=time_ns).position - ego.at([time_ns]).position
-    near: Ints = rows[np.hypot(*away[:, :2].T) <= reach * actors.scale]
+    near: Ints = rows[np.hypot(*away[:, :2].T) <= radius * actors.scale]
     return near
 
 
 def box_rows(
-    actors: Actors, ego: Trajectory, *, time_ns: int, frame: int, reach: float = np.inf
+    actors: Actors, ego: Trajectory, *, time_ns: int, frame: int, radius: float = np.inf
 ) -> dict[str, NDArray[Any]]:
-    """Boxes at a time as columns, one row an actor within reach, by id.
+    """Columns of the 3D boxes at a time, one row per actor within ``radius`` true metres, ordered by id.
 
     frame, time_ns  : as given
-    id, instance    : number among the actors, and the number that points and pixels bear
+    id, instance    : number among the actors; feature number in points and pixels
     class, kind     : as in `geoscene.classes.Class` and `lidar.world.actor_shapes.KINDS`
-    x, y, z         : the box's middle, scene metres
+    x, y, z         : the box's centre, scene metres
     qx, qy, qz, qw  : scene axes from the box's (x forward, y left, z up); ``yaw`` in radians from the x axis
     length, width, height : true metres
     vx, vy, vz      : true m/s along the scene's axes
-    ego_x, ego_y, ego_z, ego_yaw : the middle in the ego vehicle's frame, true metres, and the yaw about its z
+    ego_x, ego_y, ego_z, ego_yaw : the centre in the ego vehicle's frame, true metres, and the yaw about its z
     ego_vx, ego_vy, ego_vz : the velocity along the ego vehicle's axes, not relative to the ego's own
-    moving          : whether it ever moves
+    moving          : whether it moves at any time of the drive
     """
-    rows = actors_near(actors, ego, time_ns=time_ns, reach=reach)
+    rows = actors_near(actors, ego, time_ns=time_ns, radius=radius)
     at = states(actors, rows, time_ns=time_ns)
     turn = rotations(at.angles)
-    middle = _middles(actors, rows, at=at)
+    centre = _centres(actors, rows, at=at)
     quat = quat_from_matrix(turn)
     velocity = at.velocity / [actors.scale, actors.scale, 1.0]
     pose = ego.at([time_ns])
     body = pose.rotation[0].T
-    local = ((middle - pose.position) / pose.scale) @ body.T
+    local = ((centre - pose.position) / pose.scale) @ body.T
     forward = turn[:, :, 0] @ body.T
     moved = velocity @ body.T
     n = len(rows)
     names = np.array([Class(int(k)).name.lower() for k in actors.klass[rows]], np.str_)
-    triples = {"": middle, "v": velocity, "ego_": local, "ego_v": moved}
+    triples = {"": centre, "v": velocity, "ego_": local, "ego_v": moved}
     out: dict[str, NDArray[Any]] = {
         "frame": np.full(n, frame),
         "time_ns": np.full(n, time_ns),
@@ -86,15 +86,15 @@ COLUMNS = (
 """Columns of `box_rows`, in order."""
 
 
-def _middles(actors: Actors, rows: Ints, *, at: States) -> Float:
-    """Middles (k, 3) of boxes: half the height along the body's own z axis above where it stands."""
+def _centres(actors: Actors, rows: Ints, *, at: States) -> Float:
+    """Centres (k, 3) of boxes: half the height above the position, along the body's z axis."""
     up = rotations(at.angles)[:, :, 2] * [actors.scale, actors.scale, 1.0]
-    middle: Float = at.position + up * actors.size[rows, 2:] / 2
-    return middle
+    centre: Float = at.position + up * actors.size[rows, 2:] / 2
+    return centre
 
 
 def count_points(actors: Actors, rows: ArrayLike, *, feature: NDArray[np.integer]) -> Ints:
-    """How many points (k,) lie on each of the actors ``rows`` in a cloud with that feature column."""
+    """Number of points (k,) on each of the actors ``rows``, from a cloud's column of feature numbers."""
     low = int(actors.feature[0]) if len(actors) else 0
     mine = feature[(feature >= low) & (feature < low + len(actors))] - low
     counts: Ints = np.bincount(mine, minlength=len(actors))[np.asarray(rows, np.int64)]
@@ -103,13 +103,13 @@ def count_points(actors: Actors, rows: ArrayLike, *, feature: NDArray[np.integer
 
 @dataclass(frozen=True, slots=True)
 class ImageBoxes:
-    """Actors as a camera sees them, one row each.
+    """2D boxes of actors in an image.
 
-    row        : (k,) int64, the actor
-    box        : (k, 4) float64 pixels: left, top, right and bottom of what lies in the image, hidden or not
-    seen       : (k, 4) float64 pixels, of what is visible; NaN where nothing is
-    pixels     : (k,) int64, visible ones
-    visibility : (k,) 0 to 1, visible pixels against those it would have if nothing stood before it
+    row        : (k,) int64, index of the actor
+    box        : (k, 4) float64 pixels: left, top, right and bottom within the image, occluded or not
+    seen       : (k, 4) float64 pixels, of the visible pixels; NaN if there are none
+    pixels     : (k,) int64, number of visible pixels
+    visibility : (k,) 0 to 1, visible pixels over the pixels without occlusion
     """
 
     row: Ints
@@ -122,13 +122,13 @@ class ImageBoxes:
 def image_boxes(
     actors: Actors, camera: CameraSpec, *, pose: Poses, time_ns: int, instance: NDArray[np.integer]
 ) -> ImageBoxes:
-    """Actors in an image.
+    """2D boxes of the actors in an image.
 
     pose     : the camera's one pose at the time of the image
     instance : (h, w) feature numbers of the image
 
-    The pixels of an unhidden actor are those that its projected triangles cover. What reaches behind the
-    camera is left out of them.
+    The pixels without occlusion are those that the actor's projected triangles cover, except triangles that
+    extend behind the camera.
     """
     rows = alive(actors, time_ns, end_ns=time_ns)
     at = states(actors, rows, time_ns=time_ns)

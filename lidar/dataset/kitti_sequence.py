@@ -53,10 +53,10 @@ def write_sequence(
 
 
 def _write_calibration(path: Path, projections: Sequence[ArrayLike], *, camera_from_lidar: Float) -> None:
-    """Write ``calib.txt``: P0 to P3, and the way from scanner to the first camera as Tr.
+    """Write ``calib.txt``: projections P0 to P3, and Tr, the transformation from scanner to first camera.
 
-    projections : (3, 4) each, from the first camera's frame to the pixels of each camera. Loaders want four:
-                  the first stands for those that are not there, and a fifth is left out
+    projections : (3, 4) each, from the first camera's frame to the pixels of each camera. Loaders need four:
+                  the first is repeated for missing ones, a fifth is left out
     """
     four = [*projections[:4], *[projections[0]] * (4 - len(projections))]
     named = [*((f"P{k}", projection) for k, projection in enumerate(four)), ("Tr", camera_from_lidar)]
@@ -74,7 +74,7 @@ def _write_times(path: Path, time_ns: NDArray[np.integer]) -> None:
 
 
 def _write_poses(path: Path, world_from_lidar: Float, *, camera_from_lidar: Float) -> None:
-    """Write ``poses.txt``: the camera of each frame in that of the first; its first row is the identity.
+    """Write ``poses.txt``: the first camera's pose at each frame relative to the first frame.
 
     world_from_lidar : (n, 4, 4)
     """

@@ -102,10 +102,10 @@ class Paths:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A dataset directory, opened.
+    """An opened dataset directory.
 
     path     : the directory
-    manifest : what ``dataset.json`` holds
+    manifest : the document ``dataset.json``
     """
 
     path: Path
@@ -164,7 +164,7 @@ class Dataset:
 def open_dataset(path: str | Path) -> Dataset:
     """Open a dataset directory, finished or not.
 
-    Raises DatasetError if it is none or has another schema version.
+    Raises DatasetError if it is not a dataset or has another schema version.
     """
     folder = Path(path)
     manifest_path = Paths(folder).manifest
@@ -193,12 +193,13 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
 
 def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
-    """Make a directory ready for a drive made by ``recipe``; return how many frames it already holds.
+    """Prepare a directory for a drive made by ``recipe``; return the number of frames that are complete.
 
-    A directory that holds a drive of the same recipe is kept, so that a killed drive goes on; with another
-    recipe, or with other files, it is refused unless ``overwrite``, which deletes a former dataset.
+    A drive of the same recipe is kept and can be resumed. A drive of another recipe is deleted with
+    ``overwrite``.
 
-    Raises DatasetError if the directory may not be used.
+    Raises DatasetError for a drive of another recipe without ``overwrite``, and for a directory that is
+    neither empty nor a dataset.
     """
     manifest_path = Paths(path).manifest
     if path.exists() and not path.is_dir():
@@ -216,7 +217,7 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
     old, new = manifest["recipe"], json.loads(json.dumps(recipe))
     changed = [k for k in old | new if old.get(k) != new.get(k)]
     if changed:
-        what = ", ".join(f"{k} {_said(old.get(k))} (now {_said(new.get(k))})" for k in changed)
+        what = ", ".join(f"{k} {_text(old.get(k))} (now {_text(new.get(k))})" for k in changed)
         raise DatasetError(
             f"{path}: holds a drive made with other options: {what};"
             " set `overwrite` to replace it, or give another directory"
@@ -226,8 +227,8 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
     return int(manifest["frames_done"])
 
 
-def _said(value: Any) -> str:
-    """A value of a recipe in few words."""
+def _text(value: Any) -> str:
+    """A short text of a recipe's value."""
     if isinstance(value, list) and all(isinstance(v, str) for v in value):
         value = ",".join(value)
     text = "none" if value in (None, "", []) else str(value)

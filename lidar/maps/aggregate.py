@@ -1,4 +1,4 @@
-"""All clouds of a dataset as one, in the export CRS, frame by frame so that memory stays bounded."""
+"""Aggregated maps: all point clouds of a dataset as one, in its export CRS, in bounded memory."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from lidar.maps.colors import distinct, ramp
 from lidar.rig.patterns.beams import frame_ns
 
 COLORS = ("class", "height", "intensity", "sensor")
-"""What the colours of a map may show."""
+"""What red, green and blue of a map can show."""
 
 _COLUMNS = ("x", "y", "z", "intensity", "gps_time", "ring", "label", "instance", "source")
-_BUCKET = 64.0  # metres: side of the squares that voxels are gathered in
+_BUCKET = 64.0  # metres: side of the squares into which points are sorted before they are thinned
 _SHRINK_AT = 64 * 2**20  # bytes of a square's points beyond which they are thinned
-_SAMPLE = 12  # frames that the colour ramp of heights is taken from
+_SAMPLE = 12  # frames from which the range of heights for the colours is estimated
 
 
 def map_suffixes() -> list[str]:
@@ -39,7 +39,7 @@ def map_suffixes() -> list[str]:
 
 
 def _readable() -> list[Format]:
-    """Formats that keep what maps need; those in the world frame first, which need not be placed."""
+    """Formats with all columns that maps need, those in the world frame first."""
     needed = {"intensity", "ring", "label", "instance"}
     found = [form for form in FORMATS.values() if needed <= set(form.columns)]
     return sorted(found, key=lambda form: form.frame != "world")
@@ -47,13 +47,13 @@ def _readable() -> list[Format]:
 
 @dataclass(frozen=True, slots=True)
 class MapSummary:
-    """What a map holds.
+    """Numbers of points and frames of a map.
 
     points_in : returns read
     points    : points written
-    noise     : returns left out because nothing is there
+    noise     : returns of class NOISE that were left out
     frames    : frames read
-    missing   : frames of the drive that are not there, by scanner
+    missing   : number of missing frames, by scanner
     path      : the file
     """
 
@@ -76,18 +76,18 @@ def aggregate(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> MapSummary:
-    """Write the map of a dataset as LAS, LAZ, PLY or PCD, by the suffix of ``out``.
+    """Write the map of a dataset in the format of the suffix of ``out``, see `map_suffixes`.
 
-    LAS, LAZ and PLY hold easting, northing and height in the dataset's export CRS; PCD, whose readers take
-    float32 alone, the same less the whole-metre offset that its comment line states.
+    LAS, LAZ and PLY hold easting, northing and height in the dataset's export CRS. PCD, whose readers take
+    float32, holds the same minus the whole-metre offset that its comment line states.
 
-    voxel   : side in metres of cubes that keep the return nearest to their centre; all returns by default
-    color   : what red, green and blue show
-    sensors : names of the scanners to take; all by default
-    noise   : keep returns of class NOISE: false alarms and mirror images
-    overwrite : replace what is there
+    voxel     : side in metres of cubes of which each keeps the return nearest to its centre; all by default
+    color     : what red, green and blue show, of `COLORS`
+    sensors   : names of the scanners to use; all by default
+    noise     : keep returns of class NOISE: false alarms and mirror images
+    overwrite : replace an existing file
 
-    Raises InputError for options that cannot be and DatasetError where there are no clouds.
+    Raises InputError for invalid options and DatasetError for a dataset without clouds.
     """
     if out.suffix.lower() not in map_suffixes():
         raise InputError(f"{out}: maps are written as {', '.join(map_suffixes())}")
@@ -96,7 +96,7 @@ def aggregate(
     if voxel is not None and not (np.isfinite(voxel) and voxel > 0):
         raise InputError(f"`voxel` {voxel}: give a positive number of metres")
     if out.exists() and not overwrite:
-        raise InputError(f"{out}: is there already; set `overwrite` to replace it")
+        raise InputError(f"{out}: exists already; set `overwrite` to replace it")
     lidars = dataset.sensors("lidar")
     if unknown := sorted(set(sensors) - set(lidars)):
         raise InputError(f"no scanner {', '.join(unknown)} in {dataset.path}; there are {', '.join(lidars)}")
@@ -125,7 +125,7 @@ def aggregate(
 
 
 class _Source:
-    """The clouds of chosen scanners, in the export CRS, in order of frames."""
+    """The point clouds of some scanners in the export CRS, in order of frames."""
 
     def __init__(self, dataset: Dataset, names: Sequence[str]) -> None:
         self.dataset = dataset
@@ -148,13 +148,14 @@ class _Source:
         return len(self._files)
 
     def missing(self) -> dict[str, int]:
-        """Frames that the drive was to have and that are not there, by scanner."""
-        wanted = self.dataset.manifest.get("sensor_frames", {})
-        there = Counter(name for _, name, *_ in self._files)
-        short = {name: wanted.get(name, 0) - there[name] for name in self._names}
-        return {name: count for name, count in short.items() if count > 0}
+        """Number of missing frames, by scanner."""
+        expected = self.dataset.manifest.get("sensor_frames", {})
+        found = Counter(name for _, name, *_ in self._files)
+        missing = {name: expected.get(name, 0) - found[name] for name in self._names}
+        return {name: count for name, count in missing.items() if count > 0}
 
     def tables(self, every: int = 1) -> Iterator[tuple[int, Table]]:
+        """Frame number and table of every n-th file."""
         for frame, name, index, path in self._files[::every]:
             if format_of(path).frame == "world":
                 for table in read_chunks(path):
@@ -187,7 +188,7 @@ class _Source:
         }
 
     def height_range(self) -> tuple[float, float]:
-        """1st and 99th percentile of the heights of a dozen frames."""
+        """1st and 99th percentile of the heights of about `_SAMPLE` frames."""
         every = max(1, len(self) // _SAMPLE)
         z = np.concatenate([table["z"] for _, table in self.tables(every)] or [np.zeros(1)])
         low, high = np.percentile(z, (1, 99)) if len(z) else (0.0, 1.0)
@@ -207,7 +208,7 @@ def _colored(table: Table, color: str, *, limits: tuple[float, float]) -> Table:
 
 
 def _nearest_to_centre(data: NDArray[np.void], voxel: float) -> NDArray[np.void]:
-    """Of the records in each voxel the one nearest to its centre; of equals the earliest in time."""
+    """The record nearest to the centre of each voxel; of equally near ones the earliest."""
     xyz = np.column_stack([data[k] for k in "xyz"])
     cell = np.floor(xyz / voxel)
     away = ((xyz - (cell + 0.5) * voxel) ** 2).sum(axis=1)
@@ -221,12 +222,14 @@ def _nearest_to_centre(data: NDArray[np.void], voxel: float) -> NDArray[np.void]
 def _voxels(
     tables: Iterator[Table], voxel: float, *, out: Path, offset: tuple[float, float, float]
 ) -> Iterator[Table]:
-    """Thinned tables: points are gathered in squares on disk first, so that memory holds one square."""
+    """Tables with one point per voxel. Points are sorted into squares on disk first."""
     folder = out.with_name(f"{out.name}.{os.getpid()}.voxels")
     folder.mkdir(parents=True)
-    side = max(1.0, np.ceil(_BUCKET / voxel)) * voxel  # whole voxels, so that none is cut by a square's edge
+    side = (
+        max(1.0, np.ceil(_BUCKET / voxel)) * voxel
+    )  # a multiple of the voxel, so that no voxel spans two squares
     kinds: np.dtype[np.void] | None = None
-    limits: dict[Path, int] = {}  # size at which a square's file is thinned in place
+    limits: dict[Path, int] = {}  # bytes at which a square's file is thinned
     try:
         for table in tables:
             data = records(table)

@@ -14,7 +14,7 @@ _VIRIDIS = np.array(
     float,
 )  # fmt: skip
 
-# Okabe and Ito's eight colours, told apart by colour-blind people too.
+# The palette of Okabe and Ito: eight colours that colour-blind people can tell apart.
 _DISTINCT = np.array(
     [
         (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66),
@@ -35,6 +35,6 @@ def ramp(values: ArrayLike, low: float, *, high: float) -> NDArray[np.uint8]:
 
 
 def distinct(index: ArrayLike) -> NDArray[np.uint8]:
-    """Colours (..., 3) that are easy to tell apart, repeating after eight."""
+    """Colours (..., 3) of small integers; they repeat after eight."""
     rgb: NDArray[np.uint8] = _DISTINCT[np.asarray(index) % len(_DISTINCT)]
     return rgb

@@ -1,4 +1,4 @@
-"""Pictures for people: scenes and clouds from above and aslant, depth and classes of a camera, legends."""
+"""Illustrations: scenes and point clouds from above or obliquely, depth and class images, legends."""
 
 # mypy: disallow-untyped-decorators=False
 from __future__ import annotations
@@ -28,19 +28,19 @@ from lidar.world.world import World
 Pixels = NDArray[np.uint8]
 
 AFTERNOON = (-0.52, -0.37, 0.77)
-"""Direction towards a sun that gives pictures depth: south-west, 50° up."""
+"""Direction towards a sun in the south-west, 50° above the horizon."""
 
 BACKGROUND = (16, 18, 24)
-"""Colour of nothing in pictures of clouds, sRGB."""
+"""Background colour of pictures of point clouds, sRGB."""
 
 
 @dataclass(frozen=True)
 class View:
-    """From which side a picture is taken; the distance follows from what it has to hold.
+    """Viewing direction of a picture; the distance follows from the bounds that it shows.
 
-    azimuth_deg   : way that the picture looks, clockwise from the y axis (north)
-    elevation_deg : angle by which it looks down
-    fov_deg       : horizontal field of view; a narrow one keeps parallels parallel
+    azimuth_deg   : horizontal viewing direction, clockwise from the y axis (north)
+    elevation_deg : downward angle of the viewing direction
+    fov_deg       : horizontal field of view; a narrow one is close to an orthographic projection
     """
 
     azimuth_deg: float
@@ -49,7 +49,7 @@ class View:
 
 
 VIEWS = {"top": View(0.0, 90.0, 2.0), "oblique": View(25.0, 33.0), "low": View(25.0, 16.0, 45.0)}
-"""Views by name: ``top`` is a map with north up."""
+"""Views by name; ``top`` is a map with north up."""
 
 
 def scene_picture(
@@ -61,11 +61,11 @@ def scene_picture(
     sun: ArrayLike = AFTERNOON,
     options: RenderOptions | None = None,
 ) -> Pixels:
-    """A picture (h, w, 3) of a scene under sun and sky.
+    """A rendered picture (h, w, 3) of a scene.
 
-    view   : one of `VIEWS`, or another
+    view   : name in `VIEWS`, or a `View`
     size   : width and height in pixels
-    bounds : (xmin, ymin, xmax, ymax) to show, scene metres; all that the world holds by default
+    bounds : (xmin, ymin, xmax, ymax) to show, scene metres; the whole world by default
     sun    : (3,) direction towards the sun
 
     Raises InputError for an unknown view.
@@ -90,19 +90,19 @@ def _view(view: str | View) -> View:
 
 
 def _heights(world: World, area: tuple[float, float, float, float]) -> tuple[float, float]:
-    """Height of the lowest ground and of all but the tallest things in an area, by looking down on a grid."""
+    """Lowest and 98th percentile height of the surfaces in an area, sampled on a grid of vertical rays."""
     x, y = np.meshgrid(np.linspace(area[0], area[2], 96), np.linspace(area[1], area[3], 96))
     top = 1e4
     origins = np.stack([x.ravel(), y.ravel(), np.full(x.size, top)], axis=1)
     hits = world.caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
     z = top - hits.range[np.isfinite(hits.range)]
     if not len(z):
-        raise InputError(f"nothing to picture within {area}")
+        raise InputError(f"the scene has no surfaces within {area}")
     return float(z.min()), float(np.percentile(z, 98))
 
 
 def _eye(corners: Float, view: View, *, size: tuple[int, int]) -> tuple[CameraSpec, Poses]:
-    """A camera that has all corners (n, 3) just in view."""
+    """The nearest camera that sees all corners (n, 3)."""
     width, height = size
     a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
     forward = np.array([math.sin(a) * math.cos(e), math.cos(a) * math.cos(e), -math.sin(e)])
@@ -132,19 +132,19 @@ def cloud_picture(
     point: float = 0.12,
     depth: bool = True,
 ) -> Pixels:
-    """A picture (h, w, 3) of a cloud.
+    """A picture (h, w, 3) of a point cloud.
 
     points : (n, 3) metres, z up
     colors : (n, 3) uint8
-    bounds : (2, 3) least and greatest corner to show; all but the outermost half per cent by default
-    point  : size of a point in metres; it covers a pixel at least
-    depth  : darken what lies behind an edge, so that shapes stand out
+    bounds : (2, 3) lower and upper corner to show; by default 0.5th to 99.5th percentile of the points
+    point  : size of a point in metres; at least a pixel
+    depth  : darken pixels behind depth edges (eye-dome lighting)
 
     Raises InputError for a cloud without points, or an unknown view.
     """
     xyz, rgb = np.asarray(points, float), np.ascontiguousarray(colors, np.uint8)
     if not len(xyz):
-        raise InputError("a picture needs points")
+        raise InputError("a picture of a point cloud needs points")
     box = np.percentile(xyz, [0.5, 99.5], axis=0) if bounds is None else np.asarray(bounds, float)
     box[1] = np.maximum(box[1], box[0] + 1e-3)
     corners = np.array([[x, y, z] for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]])
@@ -159,14 +159,16 @@ def cloud_picture(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _splat(pixels: Float, depth: Float, colors: Pixels, reach: float, image: Pixels, nearest: Float) -> None:
-    """Draw each point as a square, the nearest on top; ``reach`` is half its side in pixels at distance 1."""
+def _splat(
+    pixels: Float, depth: Float, colors: Pixels, half_size: float, image: Pixels, nearest: Float
+) -> None:
+    """Draw points as squares with a depth buffer; ``half_size`` is half a side in pixels at distance 1."""
     height, width = nearest.shape
     for i in range(len(depth)):
         z = depth[i]
         if not (z > 0.0 and abs(pixels[i, 0]) < 1e6 and abs(pixels[i, 1]) < 1e6):
             continue
-        half = min(max(reach / z, 0.8), 12.0)
+        half = min(max(half_size / z, 0.8), 12.0)
         u0, u1 = math.ceil(pixels[i, 0] - half), math.ceil(pixels[i, 0] + half)
         v0, v1 = math.ceil(pixels[i, 1] - half), math.ceil(pixels[i, 1] + half)
         for v in range(max(v0, 0), min(v1, height)):
@@ -178,7 +180,7 @@ def _splat(pixels: Float, depth: Float, colors: Pixels, reach: float, image: Pix
 
 
 def _edged(image: Pixels, nearest: Float) -> Pixels:
-    """The image, darker where a pixel lies behind its neighbours (Boucheny, eye-dome lighting, 2009)."""
+    """The image with eye-dome lighting (Boucheny 2009): pixels behind their neighbours are darker."""
     height, width = nearest.shape
     far = np.isinf(nearest)
     span = np.where(far, np.nan, np.log(np.where(far, 1.0, nearest)))
@@ -192,7 +194,7 @@ def _edged(image: Pixels, nearest: Float) -> Pixels:
         for du in (-reach, 0, reach):
             other = around[reach + dv : reach + dv + height, reach + du : reach + du + width]
             behind += np.maximum(span - other, 0.0)
-    # Steps count against the depth of the picture, so that a map from far above is edged like a street view.
+    # Depth steps are relative to the depth range, so that a map gets the same edges as a street view.
     spread = max(float(np.percentile(span[~far], 99) - np.percentile(span[~far], 1)), 1e-6)
     light = np.where(far, 1.0, np.exp(-0.9 * np.minimum(behind / spread, 2.0)))
     return np.rint(image * light[..., None]).astype(np.uint8)
@@ -204,7 +206,7 @@ def class_colors(klass: NDArray[np.uint8]) -> Pixels:
 
 
 def depth_picture(depth: NDArray[np.floating], *, near: float = 2.0, far: float = 120.0) -> Pixels:
-    """Depths (h, w) in metres as colours (h, w, 3) by the logarithm: bright near, dark far, grey if none."""
+    """Colours (h, w, 3) of depths (h, w) in metres, logarithmic: bright near, dark far, grey if none."""
     seen = np.isfinite(depth) & (depth > 0)
     picture = ramp(-np.log(np.where(seen, depth, far)), -math.log(far), high=-math.log(near))
     picture[~seen] = (40, 40, 44)
@@ -212,7 +214,7 @@ def depth_picture(depth: NDArray[np.floating], *, near: float = 2.0, far: float 
 
 
 def with_legend(image: Pixels, klass: NDArray[np.uint8]) -> Pixels:
-    """The image with a key of all classes that occur in ``klass`` (any shape), commonest first."""
+    """The image with a legend of the classes that occur in ``klass`` (any shape), most frequent first."""
     codes, counts = np.unique(klass[klass != Class.SKY], return_counts=True)
     ranked = codes[np.argsort(-counts, kind="stable")]
     names = [Class(code).name.lower().replace("_", " ") for code in ranked]
@@ -222,7 +224,7 @@ def with_legend(image: Pixels, klass: NDArray[np.uint8]) -> Pixels:
 
 
 def with_key(image: Pixels, entries: Sequence[tuple[str, ArrayLike]]) -> Pixels:
-    """The image with a key of names and colours in its lower left corner, small enough to hold them all."""
+    """The image with a legend of names and colours in its lower left corner, scaled to fit."""
     if not entries:
         return image
     line = max(8, min(round(image.shape[0] / 36), int(0.96 * image.shape[0] / (len(entries) + 1.3))))
@@ -246,9 +248,10 @@ def with_key(image: Pixels, entries: Sequence[tuple[str, ArrayLike]]) -> Pixels:
 
 
 def vehicle_outline(length: float, width: float, *, rear: float, step: float = 0.05) -> Float:
-    """Points (n, 3) along a vehicle's outline on the ground and an arrow to its front, vehicle frame, metres.
+    """Points (n, 3) along a vehicle's outline on the ground and a forward arrow, vehicle frame, metres.
 
-    rear : metres from the rear axle, the frame's zero, to the back
+    rear : rear overhang, metres
+    step : distance of the points, metres
     """
     back, front, side = -rear, length - rear, width / 2
     tip = 0.35 * length
@@ -264,7 +267,7 @@ def vehicle_outline(length: float, width: float, *, rear: float, step: float = 0
 
 
 def range_rings(radii: Sequence[float], *, height: float = 0.0, step: float = 0.1) -> Float:
-    """Points (n, 3) on circles about the vertical through zero: a scale for pictures of a sweep, metres."""
+    """Points (n, 3) on horizontal circles about the z axis, metres: a scale for pictures of a sweep."""
     parts = []
     for radius in radii:
         turn = np.linspace(0, 2 * np.pi, max(8, round(2 * np.pi * radius / step)), endpoint=False)
@@ -278,33 +281,33 @@ def sweep_picture(
     colors: ArrayLike,
     *,
     vehicle: Vehicle | None = None,
-    reach: float = 60.0,
+    half_width: float = 60.0,
     view: str | View = "oblique",
     size: tuple[int, int] = (1600, 1000),
     point: float = 0.15,
 ) -> Pixels:
-    """A picture (h, w, 3) of one sweep about the vehicle, with the vehicle and a circle every so many metres.
+    """A picture (h, w, 3) of one sweep with the vehicle's outline and range rings.
 
     points : (n, 3) metres in the vehicle frame
     colors : (n, 3) uint8
-    reach  : metres to each side that are shown
+    half_width : metres shown to each side of the vehicle
 
     Raises InputError for a cloud without points, or an unknown view.
     """
     xyz, rgb = np.asarray(points, float), np.asarray(colors, np.uint8)
-    near = np.abs(xyz[:, :2]).max(axis=1, initial=0.0) < reach
+    near = np.abs(xyz[:, :2]).max(axis=1, initial=0.0) < half_width
     if not near.any():
-        raise InputError("a picture needs points")
-    step = next(s for s in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1e4) if reach / s <= 6)
+        raise InputError("a picture of a point cloud needs points")
+    step = next(s for s in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1e4) if half_width / s <= 6)
     low = float(np.percentile(xyz[near, 2], 2))
-    marks = [range_rings(np.arange(step, reach, step).tolist(), height=low)]
+    marks = [range_rings(np.arange(step, half_width, step).tolist(), height=low)]
     if vehicle is not None:
         marks.append(vehicle_outline(vehicle.length, vehicle.width, rear=vehicle.rear_overhang))
     drawn = np.concatenate([xyz[near], *marks])
     kinds = [(110, 116, 130), (255, 255, 255)]
     marked = [np.tile(np.array(kind, np.uint8), (len(m), 1)) for kind, m in zip(kinds, marks, strict=False)]
     box = np.percentile(xyz[near], [0.5, 99.5], axis=0)
-    box[:, :2] = [[-reach, -reach], [reach, reach]]
+    box[:, :2] = [[-half_width, -half_width], [half_width, half_width]]
     image = cloud_picture(
         drawn, np.concatenate([rgb[near], *marked]), view=view, size=size, point=point, bounds=box
     )
@@ -321,9 +324,9 @@ def sweep_picture(
 
 
 def sheet(images: Sequence[Pixels], *, columns: int = 2, gap: int = 8) -> Pixels:
-    """One picture of several, row by row, each in a cell as large as the largest."""
+    """Several images in one, row by row, in cells of the size of the largest."""
     if not images:
-        raise InputError("a sheet needs pictures")
+        raise InputError("a sheet needs images")
     height, width = (max(image.shape[k] for image in images) for k in (0, 1))
     rows = -(-len(images) // columns)
     wide = min(columns, len(images))

@@ -1,7 +1,7 @@
 """A recorded drive as a nuScenes dataset: samples, sweeps and the tables that its development kit opens.
 
-Caesar et al. 2020; the schema is that of nuscenes-devkit 1.1. Two samples a second are key frames. Clouds are
-as measured at one moment, the start of their frame, and boxes are those of that moment.
+Caesar et al. 2020; the schema is that of nuscenes-devkit 1.1. Two frames a second are key frames. Clouds are
+de-skewed to the start of their frame, and boxes are those of that moment.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from lidar.geometry.poses import Poses, Trajectory
 Row = dict[str, Any]
 
 VERSION = "v1.0-mini"
-"""Name of the folder of tables: the one that the development kit takes by default."""
+"""Folder of the tables; the development kit's default."""
 
 KEY_NS = 500_000_000
-"""Between key frames."""
+"""Nanoseconds between key frames."""
 
 CATEGORIES = (
     "noise", "animal", "human.pedestrian.adult", "human.pedestrian.child",
@@ -48,7 +48,7 @@ CATEGORIES = (
     "flat.driveable_surface", "flat.other", "flat.sidewalk", "flat.terrain", "static.manmade",
     "static.other", "static.vegetation", "vehicle.ego",
 )  # fmt: skip
-"""nuScenes-lidarseg's categories by their numbers."""
+"""Categories of nuScenes-lidarseg, in order of their codes."""
 
 _ATTRIBUTES = (
     "vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "pedestrian.moving",
@@ -56,9 +56,9 @@ _ATTRIBUTES = (
 )  # fmt: skip
 _VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
 _MARGIN = 200.0
-"""Metres from the drive to the zero of the tables' frame, whose coordinates are positive."""
-_WALKS, _DRIVES = 0.2, 0.5
-"""Metres a second from which on someone walks and something drives."""
+"""Metres from the drive's bounds to the origin of the tables' frame, so that coordinates are positive."""
+_WALKING, _DRIVING = 0.2, 0.5
+"""Speeds in m/s above which pedestrians and vehicles have the attribute ``moving``."""
 
 
 @dataclass(frozen=True)
@@ -127,19 +127,19 @@ def _formats() -> list[Format]:
 
 
 def _token(*what: object) -> str:
-    """The same 32 hexadecimal digits for the same words."""
+    """A token of 32 hexadecimal digits: a hash of the arguments."""
     return hashlib.blake2b("/".join(map(str, what)).encode(), digest_size=16).hexdigest()
 
 
 def _chained(rows: Sequence[Row]) -> None:
-    """Link rows to the ones before and after."""
+    """Fill ``prev`` and ``next`` of rows in order of time."""
     for k, row in enumerate(rows):
         row["prev"] = rows[k - 1]["token"] if k else ""
         row["next"] = rows[k + 1]["token"] if k + 1 < len(rows) else ""
 
 
 class _Export:
-    """The tables of one drive, and where they lie."""
+    """The tables of one drive, and the folder they are written to."""
 
     def __init__(self, dataset: Dataset, streams: Sequence[_Stream], *, out: Path) -> None:
         self.dataset, self.streams, self.out = dataset, streams, out
@@ -151,7 +151,7 @@ class _Export:
         self.tables: dict[str, list[Row]] = defaultdict(list)
 
     def write(self, progress: Progress) -> dict[str, int]:
-        """Write all; return the numbers of samples, clouds, images and boxes."""
+        """Write all files; return the numbers of samples, clouds, images and boxes."""
         top = next(s for s in self.streams if s.modality == "lidar")
         keys = _key_frames(top.times)
         samples = [
@@ -191,10 +191,9 @@ class _Export:
         """Microseconds since 1970."""
         return round(self.dataset.start.timestamp() * 1e6) + time_ns // 1000
 
-    def _place(self, position: Float) -> list[float]:
-        """Where something is in the tables' frame."""
-        place: list[float] = (position / self.scale - self.zero).tolist()
-        return place
+    def _position(self, position: Float) -> list[float]:
+        """A position (3,) of the scene in the tables' frame."""
+        return [float(v) for v in position / self.scale - self.zero]
 
     def _add_sensor(self, stream: _Stream) -> None:
         token = _token("sensor", stream.channel)
@@ -220,7 +219,7 @@ class _Export:
         key_times: NDArray[np.int64],
         near: NDArray[np.int64],
     ) -> Row:
-        """Write a frame's cloud or image, with its pose; its row."""
+        """Write a frame's cloud or image and add its pose; return its row of ``sample_data``."""
         time, source = stream.times[k], stream.files[k]
         token = _token(self.name, stream.channel, frame)
         key = bool((near == k).any())
@@ -230,7 +229,7 @@ class _Export:
             {
                 "token": token,
                 "timestamp": self._stamp(time),
-                "translation": self._place(pose.position[0]),
+                "translation": self._position(pose.position[0]),
                 "rotation": _wxyz(pose.rotation[0]),
             }
         )
@@ -259,7 +258,7 @@ class _Export:
     def _write_cloud(
         self, stream: _Stream, source: Path, *, time: int, path: Path, token: str, labelled: bool
     ) -> None:
-        """Write a cloud as from one moment, and of a key frame's points their classes."""
+        """Write a de-skewed cloud, and for a key frame the lidarseg classes of its points."""
         table = read_table(source)
         mount = np.array(stream.sensor["vehicle_from_sensor"])
         placed, _ = placed_returns(table, self.trajectory, start_ns=time, vehicle_from_sensor=mount)
@@ -275,12 +274,12 @@ class _Export:
             self.tables["lidarseg"].append({"token": token, "sample_data_token": token, "filename": name})
 
     def _annotate(self, top: _Stream, keys: Sequence[int], *, samples: Sequence[Row]) -> None:
-        """Boxes that the scanner sees in key frames, and the things they are of."""
+        """Add the boxes of key frames with returns or visibility, and the instances they belong to."""
         path = self.dataset.paths.sensor_boxes(top.name)
         if not path.exists():
             return
         sample_of = {top.frames[k]: sample for k, sample in zip(keys, samples, strict=True)}
-        things: dict[str, list[Row]] = defaultdict(list)
+        annotations: dict[str, list[Row]] = defaultdict(list)
         category: dict[str, str] = {}
         for box in read_rows(path):
             sample = sample_of.get(int(box["frame"]))
@@ -290,21 +289,21 @@ class _Export:
             instance = _token(self.name, "instance", box["id"])
             category[instance] = kind
             seen = int(np.searchsorted([0.4, 0.6, 0.8], float(box["visibility"]), side="right"))
-            things[instance].append(
+            annotations[instance].append(
                 {
                     "token": _token(self.name, "annotation", box["id"], box["frame"]),
                     "sample_token": sample["token"],
                     "instance_token": instance,
                     "visibility_token": str(seen + 1),
                     "attribute_tokens": [_token("attribute", name) for name in _attributes(kind, box)],
-                    "translation": self._place(np.array([float(box[k]) for k in "xyz"])),
+                    "translation": self._position(np.array([float(box[k]) for k in "xyz"])),
                     "size": [float(box[k]) for k in ("width", "length", "height")],
                     "rotation": [float(box[k]) for k in ("qw", "qx", "qy", "qz")],
                     "num_lidar_pts": int(box["points"]),
                     "num_radar_pts": 0,
                 }
             )
-        for instance, rows in things.items():
+        for instance, rows in annotations.items():
             _chained(rows)
             self.tables["sample_annotation"] += rows
             self.tables["instance"].append(
@@ -318,7 +317,7 @@ class _Export:
             )
 
     def _describe(self, samples: Sequence[Row]) -> None:
-        """The tables that hold for the whole drive."""
+        """Fill the tables that describe the whole drive."""
         manifest = self.dataset.manifest
         log, place = _token(self.name, "log"), str(manifest["scene"]["name"] or manifest["scene"]["path"])
         east, north = (self.zero * self.scale)[:2] + self.dataset.frame.origin
@@ -385,13 +384,13 @@ def _wxyz(rotation: Float) -> list[float]:
 
 
 def _key_frames(times: Sequence[int]) -> list[int]:
-    """Frames nearest to every half second, each once."""
+    """Indices of the frames nearest to every `KEY_NS`, without repetition."""
     wanted = np.arange(times[0], times[-1] + 1, KEY_NS)
     return sorted({int(k) for k in _nearest(times, wanted)})
 
 
 def _nearest(times: Sequence[int], wanted: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of rising times the index nearest to each wanted one, the earlier of equals."""
+    """Index of the nearest of increasing ``times`` to each target; of equally near ones the earlier."""
     have = np.asarray(times, np.int64)
     target = np.asarray(wanted, np.int64)
     after = np.clip(np.searchsorted(have, target), 1, max(len(have) - 1, 1))
@@ -401,14 +400,14 @@ def _nearest(times: Sequence[int], wanted: Sequence[int] | NDArray[np.int64]) ->
 
 
 def _attributes(kind: str, box: dict[str, str]) -> list[str]:
-    """What a road user is doing, in nuScenes' words."""
+    """NuScenes' attributes of a road user: moving, stopped, parked, ..."""
     speed = float(np.hypot(float(box["vx"]), float(box["vy"])))
     if kind.startswith("human"):
-        return ["pedestrian.moving" if speed > _WALKS else "pedestrian.standing"]
+        return ["pedestrian.moving" if speed > _WALKING else "pedestrian.standing"]
     if kind in ("vehicle.bicycle", "vehicle.motorcycle"):
         return ["cycle.with_rider"]
     if kind.startswith("vehicle"):
-        if speed > _DRIVES:
+        if speed > _DRIVING:
             return ["vehicle.moving"]
         return ["vehicle.stopped" if box["moving"] == "True" else "vehicle.parked"]
     return []

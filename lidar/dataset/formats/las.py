@@ -1,4 +1,4 @@
-"""LAS 1.4 and LAZ through laspy: world coordinates, CRS as WKT, ASPRS classes, GPS time."""
+"""LAS 1.4 and LAZ: projected coordinates, CRS as WKT, ASPRS classes, GPS time."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
 
 SCALE = 0.001
-"""Metres per count of a coordinate; a point is at most half of this off along each axis."""
+"""Metres per count of a coordinate; the rounding error is at most half of it along each axis."""
 
 INTENSITY_UNIT = 257.0
 """LAS intensity (16 bits) per unit of calibrated reflectivity (0 to 255)."""
 
 _FULL = 2**20
-"""Bytes of free space under which a disk is full for a compressor, which writes in large pieces."""
+"""Bytes of free space below which the disk counts as full: the compressor writes in large pieces."""
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 LEAP_SECONDS = 18
@@ -56,11 +56,11 @@ def gps_seconds(start: datetime, time_ns: NDArray[np.integer]) -> NDArray[np.flo
 
 @dataclass(frozen=True, slots=True)
 class LasInfo:
-    """What every file of a dataset shares.
+    """Properties that all files of a dataset share.
 
     crs     : of the coordinates; written as WKT
     offset  : (3,) whole metres near the data
-    created : date in the header; the drive's, so that the same drive is the same bytes
+    created : date in the header: the drive's, so that the same drive gives the same bytes
     """
 
     crs: CRS
@@ -70,11 +70,11 @@ class LasInfo:
 
 @dataclass(frozen=True)
 class _Layout:
-    """What all files with the same columns share.
+    """Properties that all files with the same columns share.
 
-    header : laspy's, with its CRS
-    start  : bytes of an uncompressed file before its points, for a file without points
-    kinds  : of a point
+    header : laspy's header, with the CRS
+    start  : bytes of an uncompressed file without points
+    kinds  : data type of a point record
     """
 
     header: Any
@@ -97,16 +97,16 @@ def _layout(info: LasInfo, extra: tuple[str, ...], *, colour: bool) -> _Layout:
     header.add_extra_dims([laspy.ExtraBytesParams(n, _EXTRA[n][0], _EXTRA[n][1]) for n in extra])
     for one in header.vlrs.get("ExtraBytesVlr"):
         for column in one.extra_bytes_structs:
-            column.options &= ~0b110  # no bounds of values: laspy takes those of one point for those of all
+            column.options &= ~0b110  # no minimum and maximum: laspy writes those of one point
     start = io.BytesIO()
     laspy.LasWriter(start, header, do_compress=False, closefd=False).close()
     return _Layout(header, start.getvalue(), header.point_format.dtype())
 
 
 class _Uncompressed:
-    """Points of a LAS file, as they are; what the header says of them is filled in at the end.
+    """A LAS file that points are appended to; numbers and bounds of points are entered at the end.
 
-    Places are those of the public header block of LAS 1.4 R15 (ASPRS 2019), table 3.
+    Byte offsets are those of the public header block of LAS 1.4 R15 (ASPRS 2019), table 3.
     """
 
     def __init__(self, path: Path, layout: _Layout) -> None:
@@ -127,7 +127,7 @@ class _Uncompressed:
         self.dest.write(points.data)
 
     def close(self) -> None:
-        """Say in the header what was written."""
+        """Enter bounds and numbers of points in the header."""
         if count := int(self._by_return.sum()):
             self.dest.seek(179)
             self.dest.write(np.stack([self._high, self._low], axis=1).astype("<f8").tobytes())
@@ -137,8 +137,8 @@ class _Uncompressed:
 
 
 @contextmanager
-def _plainly(path: Path) -> Iterator[None]:
-    """Failures of the compressor, which hides their cause, as the OSError behind them."""
+def _compressor_errors(path: Path) -> Iterator[None]:
+    """Raise the compressor's errors, which hide their cause, as the OSError behind them."""
     import lazrs  # noqa: PLC0415
 
     try:
@@ -150,7 +150,7 @@ def _plainly(path: Path) -> Iterator[None]:
 
 
 class _Compressed:
-    """Points of a LAZ file."""
+    """A LAZ file that points are appended to."""
 
     def __init__(self, path: Path, layout: _Layout) -> None:
         import laspy  # noqa: PLC0415
@@ -164,14 +164,14 @@ class _Compressed:
     def write_points(self, points: NDArray[np.void]) -> None:
         """Append points."""
         h = self._header
-        with _plainly(self._path):
+        with _compressor_errors(self._path):
             self._writer.write_points(
                 self._record(points, h.point_format, scales=h.scales, offsets=h.offsets)
             )
 
     def close(self) -> None:
-        """Write what is left."""
-        with _plainly(self._path):
+        """Write the remaining points."""
+        with _compressor_errors(self._path):
             self._writer.close()
 
 
@@ -232,11 +232,11 @@ def open_las(path: Path, info: LasInfo, *, columns: tuple[str, ...]) -> Iterator
 
 
 @njit(cache=True, nogil=True)
-def _count(place: Any, offset: float, counts: Any) -> bool:
-    """Fill in the whole number of `SCALE` from the offset to each place; whether all are numbers that fit."""
+def _count(coordinate: Any, offset: float, counts: Any) -> bool:
+    """Fill ``counts`` with multiples of `SCALE` from the offset; return whether all fit 32 bits."""
     fits = True
-    for i in range(len(place)):
-        count = np.rint((place[i] - offset) / SCALE)
+    for i in range(len(coordinate)):
+        count = np.rint((coordinate[i] - offset) / SCALE)
         fits &= abs(count) < 2.0**31
         counts[i] = np.int32(count)
     return fits
@@ -301,7 +301,7 @@ def _table(points: Any) -> Table:
 
 
 def read_crs(path: Path) -> CRS | None:
-    """The CRS a LAS or LAZ file states, if any."""
+    """The CRS of a LAS or LAZ file, None if the file has none."""
     with _opened(path) as reader:
         crs: CRS | None = reader.header.parse_crs()
         return crs

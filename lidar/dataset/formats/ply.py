@@ -1,4 +1,4 @@
-"""PLY, binary little-endian. 16-bit columns are written as 32-bit: some readers drop 16-bit properties."""
+"""PLY, binary little-endian, with 16-bit columns as 32 bits: some readers drop 16-bit properties."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _COUNT_WIDTH = 12
 
 
 def ply_table(table: Table) -> Table:
-    """The columns as PLY carries them: ``t`` in seconds (double) for ``time_ns``, 32 bits for 16."""
+    """The columns as stored: ``t`` in seconds (double) for ``time_ns``, 32 bits for 16."""
     out: Table = {}
     for name, column in table.items():
         if name == "time_ns":

@@ -1,19 +1,19 @@
-"""Point tables: named columns of equal length, the common ground of all cloud formats.
-
-A table is a plain dict. Names used here, with units and frames:
+"""Point tables: dicts of named columns of equal length, which all point-cloud formats read and write.
 
 x, y, z    float32 (sensor frame) or float64 (scene or projected coordinates), metres
 intensity  float32, calibrated reflectivity, 0 to 255
 time_ns    uint32, nanoseconds after the frame's start (or int64, after the drive's start, in maps)
-ring       uint16, rank of the beam's elevation
-column     uint32, firing block within the frame
+ring       uint16, channel: rank of the beam's elevation, 0 lowest
+column     uint32, firing block (azimuth step) within the frame
 range      float32, metres
 label      uint16, `geoscene.classes.Class`
 instance   int32, feature number in the scene, -1 for none
-incidence  float32, radians
-true_range float32, metres, before noise and quantisation; 0 for a return of nothing
-echo, echoes  uint8
-velocity   float32, m/s along the beam, positive away; of scanners that measure it
+incidence  float32, radians between beam and surface normal
+true_range float32, metres, before noise and quantisation; 0 for a false return
+echo, echoes  uint8, number of the echo (from 1) and number of echoes of its pulse
+velocity   float32, m/s along the beam, positive away; FMCW scanners only
+gps_time   float64, adjusted standard GPS time in seconds; in the world frame
+source     uint16, number of the scanner; in maps
 red, green, blue  uint8
 """
 
@@ -39,7 +39,7 @@ Table = dict[str, NDArray[Any]]
 
 
 def cloud_table(cloud: Cloud) -> Table:
-    """The table of one frame's returns, sensor frame, as files carry it."""
+    """The table of a cloud, in the sensor frame, with the types of files."""
     return {
         "x": cloud.xyz[:, 0],
         "y": cloud.xyz[:, 1],
@@ -89,15 +89,15 @@ def table_cloud(table: Table, *, start_ns: int = 0) -> Cloud:
 
 
 def rows(table: Table) -> int:
-    """Number of points; raises LidarError if columns disagree."""
+    """Number of points; raises LidarError if columns differ in length."""
     lengths = {name: len(column) for name, column in table.items()}
     if len(set(lengths.values())) > 1:
-        raise LidarError(f"columns of a point table disagree in length: {lengths}")
+        raise LidarError(f"columns of a point table differ in length: {lengths}")
     return next(iter(lengths.values()), 0)
 
 
 def records(table: Table) -> NDArray[np.void]:
-    """The table as packed little-endian records, columns in order."""
+    """The table as packed little-endian records, with the columns in order."""
     kinds = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in table.items()])
     out = np.empty(rows(table), kinds)
     for name, column in table.items():

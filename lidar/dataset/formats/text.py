@@ -1,4 +1,4 @@
-"""CSV with a header line and fixed decimals, so that the same numbers are the same bytes everywhere."""
+"""CSV with a header line and a fixed number of decimals per column."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _TYPES: dict[str, Any] = {
 
 @numba.njit(cache=True, nogil=True)
 def _format(values: NDArray[np.int64], decimals: NDArray[np.int64], out: NDArray[np.uint8]) -> int:
-    """Write fixed-point rows as text; return the number of bytes. 22 bytes a value are always enough."""
+    """Write fixed-point rows as text into ``out``, 22 bytes per value; return the number of bytes."""
     digits = np.empty(24, np.uint8)
     at = 0
     for i in range(values.shape[0]):

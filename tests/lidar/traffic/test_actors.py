@@ -195,7 +195,7 @@ def test_points_on_actors_lie_in_their_boxes_and_are_counted(actors, scene, ego)
 
 def test_boxes_are_the_same_in_the_scene_and_about_the_ego(actors, ego):
     t = 6_000_000_000
-    rows = box_rows(actors, ego, time_ns=t, frame=60, reach=100.0)
+    rows = box_rows(actors, ego, time_ns=t, frame=60, radius=100.0)
     assert tuple(rows) == COLUMNS
     assert len(rows["id"]) > 3
     pose = ego.at([t])
