@@ -44,7 +44,7 @@ def shown_default(value: object) -> str | None:
     """A default as help shows it; None for an empty one."""
     if isinstance(value, tuple):
         value = ",".join(map(str, value))
-    return None if value in (None, False, "") else str(value)
+    return None if value is None or value is False or value == "" else str(value)
 
 
 DEFAULTS = Parameter(negative=(), show_default=shown_default)

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import sys
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import App, Group, Parameter
+from cyclopts import App, Parameter
 
+from geoscene.console import DEFAULTS, Report, print_json, progress_bar
 from geoscene.console import main as run
-from geoscene.console import print_json, progress_bar, whole
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
 from lidar import __version__
 from lidar.dataset.export import EXPORTERS, exporter
-from lidar.dataset.formats import FORMATS, LABELS
 from lidar.errors import InputError, LidarError
+from lidar.options import OUTPUT, DriveOptions
 
 app = App(
     name="lidar",
     version=__version__,
+    default_parameter=DEFAULTS,
     suppress_keyboard_interrupt=False,
     help="""Drive vehicles with ray-cast sensors through scenes made by geoscene.
 
@@ -34,21 +34,8 @@ app = App(
 )
 app.register_install_completion_command()
 
-_OUTPUT = Group("Output", sort_key=3)
-
-
-def _format_help() -> str:
-    names: dict[str, list[str]] = {"sensor": [], "world": []}
-    for row in FORMATS.values():
-        names[row.frame].append(row.name)
-    return (
-        f"Point-cloud formats, with commas: {', '.join(names['sensor'])} (sensor frame),"
-        f" {', '.join(names['world'])} (georeferenced)."
-    )
-
-
-def _label_help() -> str:
-    return f"Label files in the codes of other datasets, with commas: {', '.join(LABELS)}."
+Out = Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)]
+Reporting = Annotated[Report, Parameter(group=OUTPUT)]
 
 
 def _exporter_help() -> str:
@@ -57,35 +44,7 @@ def _exporter_help() -> str:
 
 @app.command
 def drive(
-    scene: Path,
-    /,
-    *,
-    route: Annotated[list[str] | None, Parameter(consume_multiple=True, negative=())] = None,
-    survey: str = "",
-    altitude: float | None = None,
-    overlap: float = 0.3,
-    turns: Annotated[bool, Parameter(negative=())] = False,
-    duration: float | None = None,
-    from_rest: Annotated[bool, Parameter(negative=())] = False,
-    rig: str = "seed",
-    vehicle: str = "",
-    side: str = "",
-    seed: Annotated[int, Parameter(converter=whole)] = 0,
-    start: str | None = None,
-    fidelity: str = "standard",
-    settings: Annotated[list[str] | None, Parameter(name="--set", negative=())] = None,
-    traffic: str | None = None,
-    stage: Annotated[list[str] | None, Parameter(negative=())] = None,
-    formats: Annotated[str, Parameter(name="--format", group=_OUTPUT, help=_format_help())] = "pcd,laz",
-    labels: Annotated[str, Parameter(group=_OUTPUT, help=_label_help())] = "",
-    deskew: Annotated[str, Parameter(group=_OUTPUT)] = "",
-    crs: Annotated[str, Parameter(group=_OUTPUT)] = "utm",
-    exact: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
-    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    workers: Annotated[int, Parameter(group=_OUTPUT, converter=whole)] = 2,
-    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+    scene: Path, /, *, options: DriveOptions | None = None, out: Out, report: Reporting = Report()
 ) -> int:
     """Drive a route through a scene and record what the rig senses.
 
@@ -108,99 +67,18 @@ def drive(
     ----------
     scene
         Directory of the scene.
-    route
-        random, a GPX or GeoJSON file, two or more waypoints as LAT,LON in degrees, or the trajectory.csv or
-        poses.csv of an earlier drive, which is then driven again as it was.
-    survey
-        For what flies, instead of a route: all, W,S,E,N in degrees, or a GeoJSON file with a polygon, which
-        is flown over in strips.
-    altitude
-        Metres above the ground of a flight; by default heights in the route's file, or 60 (drone) or 600.
-    overlap
-        Share of a survey's strip that the next one covers too.
-    turns
-        Scan in the turns between a survey's strips too; by default scanners work from a second before each
-        strip to a second after it, as survey crews have it, and the clouds between are empty.
-    duration
-        Seconds to record; all of a given route, or 60 seconds of a random one, by default.
-    from_rest
-        Start and end a random drive at rest, as drives along a given route do; by default it is under way
-        when the record starts and when it ends.
-    rig
-        Sensors and where they sit: a rig that comes along (lidar rigs lists them), or a TOML file.
-    vehicle
-        car, van, robot, backpack, drone, aircraft, or a TOML file; the rig's own by default.
-    side
-        Side of the road that is driven on, right or left; the scene's without.
-    seed
-        Of everything random: a whole number from 0 on.
-    start
-        UTC time of the drive's start, ISO 8601 (2026-06-21T08:00:00); it sets the sun and the time stamps.
-        By default 10:00 local solar time on 21 June 2026.
-    fidelity
-        draft (one pose a frame, exact ranges, no shadows), standard (a pose a pulse, exact ranges) or survey
-        (beams with a size, several echoes, noise, lost and false returns; image noise).
-    settings
-        One setting that differs from the level, NAME=VALUE; repeat for more. lidar settings lists them.
-    traffic
-        Other road users: on, or densities such as vehicles=20,parked=0.5,pedestrians=5,cyclists=2 (vehicles
-        and cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places);
-        sumo or sumo,vehicles=20,...: the same densities, simulated by SUMO; or a file that sumo --fcd-output
-        wrote, with net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed.
-    stage
-        Change echoes, clouds or images by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or a TOML file with tables
-        [[stage]]; again for more. lidar stages lists them all.
-    deskew
-        Clouds of the sensor frame a second time, all points brought to one moment of the frame: start, middle
-        or end.
-    crs
-        CRS of LAZ files: utm, scene, or an EPSG code.
-    exact
-        Georeference every point through the full projection instead of a map that is within 0.1 mm of it.
     out
         Directory to write the dataset to.
-    overwrite
-        Replace a dataset that is there.
-    workers
-        Threads, a frame each, no more than there are cores; the bytes do not depend on it.
-    json
-        Print the summary as JSON.
-    quiet
-        No progress bars.
     """
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from lidar.drive import drive as record  # noqa: PLC0415
-    from lidar.options import DriveOptions  # noqa: PLC0415
-    from lidar.signal.registry import read_stages  # noqa: PLC0415
 
-    if bool(route) == bool(survey):
-        raise InputError("give one of --route and --survey, such as --route random")
-    options = DriveOptions(
-        route=_route(route or ["random"]),
-        survey=survey,
-        altitude=altitude,
-        overlap=overlap,
-        turns=turns,
-        duration=duration,
-        from_rest=from_rest,
-        rig=rig,
-        vehicle=vehicle,
-        formats=_words(formats),
-        labels=_words(labels),
-        deskew=deskew.lower(),
-        seed=seed,
-        start=_time(start) if start else None,
-        crs=crs,
-        exact=exact,
-        side=side,
-        fidelity=fidelity,
-        settings=tuple(_setting(text) for text in settings or ()),
-        traffic=_traffic(traffic),
-        stages=read_stages(stage or ()).stages,
-        workers=workers,
-    )
-    with progress_bar(quiet=quiet) as progress:
-        summary = record(open_scene(scene), out, options=options, overwrite=overwrite, progress=progress)
+    if options is None or bool(options.route) == bool(options.survey):
+        raise InputError("give one of `route` and `survey`, such as `route` random")
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = record(
+            open_scene(scene), out, options=options, overwrite=report.overwrite, progress=progress
+        )
     document: dict[str, Any] = {
         "path": str(summary.path),
         "frames": summary.frames,
@@ -213,7 +91,7 @@ def drive(
         "wall_s": round(summary.wall, 2),
         "stages_s": {name: round(seconds, 3) for name, seconds in summary.stages.items()},
     }
-    if json:
+    if report.json:
         print_json(document)
     else:
         total = sum(summary.points.values())
@@ -230,98 +108,19 @@ def drive(
     return 0
 
 
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(word for word in text.lower().split(",") if word)
-
-
-def _route(words: list[str]) -> str | Path | list[tuple[float, float]]:
-    given = [w.strip() for w in words if w.strip()]
-    if given == ["random"]:
-        return "random"
-    points = [_point(word) for word in given]
-    if len(given) == 1 and points[0] is None:
-        return Path(given[0])
-    if len(points) < 2 or any(p is None for p in points):
-        raise InputError(f"--route {' '.join(given)}: random, a file, or two or more LAT,LON")
-    return [p for p in points if p is not None]
-
-
-def _point(word: str) -> tuple[float, float] | None:
-    try:
-        lat, lon = (float(v) for v in word.split(","))
-    except ValueError:
-        return None
-    if not (abs(lat) <= 90 and abs(lon) <= 180):
-        raise InputError(f"--route {word}: not a latitude and longitude in degrees")
-    return lat, lon
-
-
-def _traffic(text: str | None) -> Any:
-    if text is None or text == "off":
-        return None
-    from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415
-    from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415
-    from lidar.traffic.sumo import SumoOptions  # noqa: PLC0415
-
-    if text == "on":
-        return TrafficOptions()
-    file, *words = text.split(",")
-    if file.lower().endswith((".xml", ".xml.gz")):
-        return TrafficFile(Path(file), **_words_of_file(text, words))
-    known = ("vehicles", "cyclists", "pedestrians", "parked", "radius")
-    kind = SumoOptions if file == "sumo" else TrafficOptions
-    given_words = words if file == "sumo" else text.split(",")
-    pairs = [_setting(word) if "=" in word else (word, "") for word in given_words]
-    if unknown := [name for name, _ in pairs if name not in known]:
-        raise InputError(
-            f"--traffic {text}: {', '.join(unknown)} is none of on, off, sumo, {', '.join(known)}"
-        )
-    try:
-        given: dict[str, Any] = {name: float(value) for name, value in pairs}
-        return kind(**given)
-    except ValueError as error:
-        raise InputError(f"--traffic {text}: {error}") from None
-
-
-def _words_of_file(text: str, words: list[str]) -> dict[str, Any]:
-    known = {"net": Path, "begin": float, "parked": float, "radius": float}
-    given = dict(_setting(word) for word in words)
-    if unknown := given.keys() - known.keys():
-        raise InputError(f"--traffic {text}: {', '.join(sorted(unknown))} is none of {', '.join(known)}")
-    try:
-        return {name: known[name](value) for name, value in given.items()}
-    except ValueError as error:
-        raise InputError(f"--traffic {text}: {error}") from None
-
-
-def _setting(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise InputError(f"--set {text}: give NAME=VALUE, such as rays=7")
-    return name.strip(), value.strip()
-
-
-def _time(text: str) -> datetime:
-    try:
-        when = datetime.fromisoformat(text)
-    except ValueError:
-        raise InputError(f"--start {text}: not an ISO 8601 time such as 2026-06-21T08:00:00") from None
-    return when.replace(tzinfo=UTC) if when.tzinfo is None else when.astimezone(UTC)
-
-
 @app.command(name="map")
 def map_(
     dataset: Path,
     /,
     *,
-    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
+    out: Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)],
     voxel: float | None = None,
     color: str = "class",
     sensor: Annotated[list[str] | None, Parameter(consume_multiple=True, negative=())] = None,
     noise: Annotated[bool, Parameter(negative=())] = False,
-    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+    overwrite: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
+    json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT, negative=())] = False,
 ) -> int:
     """Put all clouds of a dataset into one georeferenced cloud.
 
@@ -388,11 +187,11 @@ def export(
     dataset: Path,
     /,
     *,
-    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
+    out: Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)],
     to: Annotated[str, Parameter(help=_exporter_help())] = "nuscenes",
-    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+    overwrite: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
+    json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT, negative=())] = False,
 ) -> int:
     """Write a recorded drive in the layout of another dataset.
 
@@ -434,10 +233,10 @@ def apply(
     *,
     stage: Annotated[list[str], Parameter(negative=())],
     sensor: str = "",
-    out: Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)],
-    overwrite: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=_OUTPUT, negative=())] = False,
+    out: Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)],
+    overwrite: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
+    json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT, negative=())] = False,
 ) -> int:
     """Apply stages to recorded data: a dataset, or point clouds of KITTI or nuScenes.
 
@@ -488,7 +287,7 @@ def apply(
 
 
 @app.command
-def stages(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False) -> int:
+def stages(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False) -> int:
     """List the stages that change echoes, point clouds or images, with their parameters.
 
     Parameters
@@ -519,7 +318,7 @@ def stages(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = Fal
 
 
 @app.command
-def rigs(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False) -> int:
+def rigs(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False) -> int:
     """List the rigs that come along.
 
     Parameters
@@ -543,7 +342,7 @@ def rigs(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False
 
 
 @app.command
-def sensors(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False) -> int:
+def sensors(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False) -> int:
     """List the laser scanners that come along.
 
     Parameters
@@ -571,7 +370,7 @@ def sensors(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = Fa
 
 
 @app.command
-def settings(*, json: Annotated[bool, Parameter(group=_OUTPUT, negative=())] = False) -> int:
+def settings(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False) -> int:
     """List the fidelity settings: their values at each level, and what they do.
 
     Parameters

@@ -143,7 +143,7 @@ def drive(
     actors = None
     if options.traffic is not None:
         progress("traffic", 0, total=0)
-        traffic = replace(options.traffic, side=options.keeps(scene))
+        traffic = replace(options.traffic, side=options.side_in(scene))
         graph = scene.road_graph()
         if isinstance(traffic, TrafficFile):
             actors = replay(scene, graph, ego=trajectory, vehicle=body, seed=options.seed, options=traffic)
@@ -273,7 +273,7 @@ def plan(
     from lidar.planning.flight_planning import FlightOptions, plan_flight  # noqa: PLC0415
     from lidar.planning.replay import read_replay  # noqa: PLC0415
 
-    route = options.route
+    route = options.route or "random"
     if isinstance(route, Path) and route.suffix == ".csv" and not options.survey:
         replayed = read_replay(route, scene.frame)
         return replayed if options.duration is None else replayed.until(round(options.duration * 1e9))
@@ -291,7 +291,7 @@ def plan(
             vehicle=name,
             seed=options.seed,
             duration=options.duration,
-            side=options.keeps(scene),
+            side=options.side_in(scene),
             from_rest=options.from_rest,
             progress=progress,
         )
@@ -300,7 +300,7 @@ def plan(
             body,
             graph=scene.road_graph(),
             seed=options.seed,
-            side=options.keeps(scene),
+            side=options.side_in(scene),
             bounds=scene.bounds,
             duration=travel.duration,
             under_way=travel.under_way,

@@ -1,80 +1,225 @@
-"""How a drive is made."""
+"""Options of `lidar drive`: defaults, units, help and the recipe of a dataset come from one class."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass, replace
-from datetime import datetime
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
-from geoscene.scene import Scene
-from lidar.dataset.recording import Contents
+from cyclopts import Group, Parameter, Token
+
+from geoscene.console import SEVERAL, WORDS, whole
+from lidar.dataset.formats import FORMATS, LABELS
 from lidar.errors import InputError
-from lidar.planning.route import Side, Spec
-from lidar.rig.specs import load_rig, rig_digest
-from lidar.settings import settings_of
-from lidar.signal.registry import NamedStage, Stages
-from lidar.traffic.fcd import TrafficFile
-from lidar.traffic.populate import TrafficOptions
+
+if TYPE_CHECKING:
+    from geoscene.scene import Scene
+    from lidar.dataset.recording import Contents
+    from lidar.planning.route import Side, Spec
+    from lidar.signal.registry import NamedStage
+    from lidar.traffic.fcd import TrafficFile
+    from lidar.traffic.populate import TrafficOptions
+
+    Traffic = TrafficOptions | TrafficFile
+    StageList = tuple[NamedStage, ...]
+else:  # types that help shows; converters make the values, whose classes take a second to import
+    Spec, Traffic, StageList = list[str], str, tuple[str, ...]
+
+OUTPUT = Group("Output", sort_key=3)
+
+_BY_FRAME = {
+    frame: ", ".join(f.name for f in FORMATS.values() if f.frame == frame) for frame in ("sensor", "world")
+}
+_FORMATS = (
+    f"Formats of clouds, separated by commas: {_BY_FRAME['sensor']} (sensor frame), {_BY_FRAME['world']}"
+    " (georeferenced)."
+)
+_LABELS = f"Label files in the codes of other datasets, separated by commas: {', '.join(LABELS)}."
 
 
+def _route(_: object, tokens: Sequence[Token]) -> str | Path | list[tuple[float, float]]:
+    words = [token.value.strip() for token in tokens if token.value.strip()]
+    if words == ["random"]:
+        return "random"
+    points = [_waypoint(word) for word in words]
+    if len(words) == 1 and points[0] is None:
+        return Path(words[0])
+    if len(points) < 2 or any(p is None for p in points):
+        raise ValueError(f"{' '.join(words)}: random, a file, or two or more LAT,LON")
+    return [p for p in points if p is not None]
+
+
+def _waypoint(word: str) -> tuple[float, float] | None:
+    try:
+        lat, lon = (float(v) for v in word.split(","))
+    except ValueError:
+        return None
+    if not (abs(lat) <= 90 and abs(lon) <= 180):
+        raise ValueError(f"{word}: not a latitude and longitude in degrees")
+    return lat, lon
+
+
+def _time(_: object, tokens: Sequence[Token]) -> datetime:
+    text = tokens[0].value
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError(f"{text}: not an ISO 8601 time such as 2026-06-21T08:00:00") from None
+    return when.replace(tzinfo=UTC) if when.tzinfo is None else when.astimezone(UTC)
+
+
+def _lower(_: object, tokens: Sequence[Token]) -> str:
+    return tokens[0].value.lower()
+
+
+def _settings(_: object, tokens: Sequence[Token]) -> tuple[tuple[str, str], ...]:
+    return tuple(_pair(token.value) for token in tokens)
+
+
+def _stages(_: object, tokens: Sequence[Token]) -> Any:
+    from lidar.signal.registry import read_stages  # noqa: PLC0415
+
+    return read_stages([token.value for token in tokens]).stages
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise ValueError(f"{text}: give NAME=VALUE, such as rays=7")
+    return name.strip(), value.strip()
+
+
+def _traffic(_: object, tokens: Sequence[Token]) -> Any:
+    text = tokens[0].value
+    if text == "off":
+        return None
+    from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415
+    from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415
+    from lidar.traffic.sumo import SumoOptions  # noqa: PLC0415
+
+    if text == "on":
+        return TrafficOptions()
+    first, *rest = text.split(",")
+    densities = dict.fromkeys(("vehicles", "cyclists", "pedestrians", "parked", "radius"), float)
+    if first.lower().endswith((".xml", ".xml.gz")):
+        of_file = {"net": Path, "begin": float, "parked": float, "radius": float}
+        return TrafficFile(Path(first), **_values(text, rest, known=of_file))
+    if first == "sumo":
+        return SumoOptions(**_values(text, rest, known=densities))
+    return TrafficOptions(**_values(text, [first, *rest], known=densities))
+
+
+def _values(text: str, words: Sequence[str], *, known: dict[str, Any]) -> dict[str, Any]:
+    """Values by name of words NAME=VALUE."""
+    pairs = [_pair(word) if "=" in word else (word, "") for word in words]
+    if unknown := [name for name, _ in pairs if name not in known]:
+        raise ValueError(f"{', '.join(unknown)} is none of on, off, sumo, {', '.join(known)}")
+    try:
+        return {name: known[name](value) for name, value in pairs}
+    except ValueError as error:
+        raise ValueError(f"{text}: {error}") from None
+
+
+@Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class DriveOptions:
-    """How a drive is made. Everything here is stored in the dataset and shapes its bytes, but ``workers``.
+    """Options of a drive. The dataset stores them all; its bytes depend on all but ``workers``.
 
-    route      : ``random``, a GPX or GeoJSON file, waypoints (latitude, longitude) in degrees, or a poses.csv
-                 or trajectory.csv of an earlier drive, which is then driven again as it was
-    duration   : seconds; a whole route, or 60 seconds of a random one, by default
-    from_rest  : a random drive too starts and ends at rest, as drives along a given route do; by default it
-                 is under way when the record starts and when it ends
-    survey     : area that a craft flies over in strips instead of a route: ``all``, W,S,E,N in degrees, or a
-                 GeoJSON file
-    altitude   : metres above the ground of a flight, see `lidar.planning.flight_planning.plan_flight`
-    overlap    : share of a survey's strip that the next one covers too
-    turns      : scanners work in the turns between a survey's strips too, and on the way there
-    rig        : name of a rig, or a TOML file
-    vehicle    : name of a vehicle, or a TOML file; the rig's by default
-    formats    : of clouds, of `lidar.dataset.formats.FORMATS`
-    labels     : files of labels in others' codes, of `lidar.dataset.formats.LABELS`
-    deskew     : moment (start, middle, end) to which clouds are brought in further files; none by default
-    seed       : of everything random, 0 or more
-    start      : UTC time of the drive's start; 10:00 local solar time on 21 June 2026 by default
-    crs        : of LAZ files: ``utm``, ``scene`` or any pyproj name
-    exact      : georeference every point through the projection instead of a bounded affine map
-    side       : side of the road, left or right; the scene's by default
-    fidelity   : level of `lidar.settings.levels`: draft, standard or survey
-    traffic    : other road users and parked cars, as densities or a file of SUMO; none by default
-    settings   : single settings that differ from the level, as (name, text)
-    stages     : that change echoes, clouds or images, see `lidar.signal`; none by default
-    workers    : threads
+    In Python, ``route`` is ``random``, a path or a list of (latitude, longitude) in degrees, ``settings``
+    holds (name, text) pairs and ``traffic`` a `TrafficOptions`, `SumoOptions` or `TrafficFile`.
     """
 
-    route: Spec = "random"
+    route: Annotated[Spec, Parameter(converter=_route), SEVERAL] = ""
+    """random, a GPX or GeoJSON file, two or more waypoints as LAT,LON in degrees, or the trajectory.csv or
+    poses.csv of an earlier drive, whose trajectory is then repeated."""
+
     duration: float | None = None
+    """Seconds to record; by default all of a given route, or 60 seconds of a random one."""
+
     from_rest: bool = False
+    """Start and end a random drive at rest, as drives along a given route do; by default the vehicle is under
+    way when the record starts and when it ends."""
+
     survey: str = ""
+    """For aircraft, instead of a route: all, W,S,E,N in degrees, or a GeoJSON file with a polygon, which is
+    flown over in strips."""
+
     altitude: float | None = None
+    """Metres above the ground of a flight; by default heights in the route's file, or 60 (drone) or 600."""
+
     overlap: float = 0.3
+    """Share of a survey's strip that the next one covers too."""
+
     turns: bool = False
+    """Scan in the turns between a survey's strips too; by default scanners work from a second before each
+    strip to a second after it, and the clouds between are empty."""
+
     rig: str = "seed"
+    """Sensors and their mounts: a built-in rig (lidar rigs lists them), or a TOML file."""
+
     vehicle: str = ""
-    formats: tuple[str, ...] = ("pcd", "laz")
-    labels: tuple[str, ...] = ()
-    deskew: str = ""
-    seed: int = 0
-    start: datetime | None = None
-    crs: str = "utm"
-    exact: bool = False
+    """car, van, robot, backpack, drone, aircraft, or a TOML file; the rig's own by default."""
+
+    formats: Annotated[tuple[str, ...], Parameter(name="--format", group=OUTPUT, help=_FORMATS), WORDS] = (
+        "pcd",
+        "laz",
+    )
+
+    labels: Annotated[tuple[str, ...], Parameter(group=OUTPUT, help=_LABELS), WORDS] = ()
+
+    deskew: Annotated[str, Parameter(group=OUTPUT, converter=_lower)] = ""
+    """Write clouds of the sensor frame a second time, de-skewed to one moment of the frame: start, middle or
+    end."""
+
+    seed: Annotated[int, Parameter(converter=whole)] = 0
+    """Seed of the random number generators (non-negative integer)."""
+
+    start: Annotated[datetime | None, Parameter(converter=_time)] = None
+    """UTC time of the drive's start, ISO 8601 (2026-06-21T08:00:00); it sets the sun and the time stamps. By
+    default 10:00 local solar time on 21 June 2026."""
+
+    crs: Annotated[str, Parameter(group=OUTPUT)] = "utm"
+    """CRS of LAZ files: utm, scene, or an EPSG code."""
+
+    exact: Annotated[bool, Parameter(group=OUTPUT)] = False
+    """Georeference every point through the full projection instead of a map that is within 0.1 mm of it."""
+
     side: str = ""
+    """Side of the road to drive on, right or left; the scene's by default."""
+
     fidelity: str = "standard"
-    traffic: TrafficOptions | TrafficFile | None = None
-    settings: tuple[tuple[str, str], ...] = ()
-    stages: tuple[NamedStage, ...] = ()
-    workers: int = 2
+    """Level: draft (one pose a frame, exact ranges, no shadows), standard (a pose a pulse, exact ranges) or
+    survey (beams with a size, several echoes, noise, lost and false returns; image noise)."""
+
+    traffic: Annotated[
+        Traffic | None, Parameter(converter=_traffic, n_tokens=1, accepts_keys=False, metavar="STR")
+    ] = None
+    """Other road users: on, or densities such as vehicles=20,parked=0.5,pedestrians=5,cyclists=2 (vehicles
+    and cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places); sumo or
+    sumo,vehicles=20,...: the same densities, simulated by SUMO; or a file that sumo --fcd-output wrote, with
+    net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed."""
+
+    settings: Annotated[
+        tuple[tuple[str, str], ...],
+        Parameter(name="--set", converter=_settings, n_tokens=1, metavar="NAME=VALUE"),
+    ] = ()
+    """One setting that differs from the level; repeat for more. lidar settings lists them."""
+
+    stages: Annotated[
+        StageList,
+        Parameter(name="--stage", converter=_stages, n_tokens=1, accepts_keys=False, metavar="STAGE"),
+    ] = ()
+    """Change echoes, clouds or images by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or a TOML file with tables
+    [[stage]]; repeat for more. lidar stages lists them."""
+
+    workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2
+    """Threads, a frame each, no more than there are cores; the bytes do not depend on it."""
 
     def __post_init__(self) -> None:
-        """Refuse options that cannot be meant."""
+        """Validate the options."""
         if self.duration is not None and not 0.1 <= self.duration <= 86400:
             raise InputError(f"`duration` {self.duration}: give 0.1 to 86400 seconds")
         if self.side not in ("", "left", "right"):
@@ -82,61 +227,53 @@ class DriveOptions:
         if not 1 <= self.workers <= 256:
             raise InputError(f"`workers` {self.workers}: give 1 to 256")
         if not 0 <= self.seed < 1 << 63:
-            raise InputError(f"`seed` {self.seed}: give a whole number from 0 on")
+            raise InputError(f"`seed` {self.seed}: give a non-negative integer")
         if self.altitude is not None and not 0 < self.altitude <= 20_000:
             raise InputError(f"`altitude` {self.altitude:g}: give metres above the ground, up to 20000")
         if not 0 <= self.overlap < 1:
             raise InputError(f"`overlap` {self.overlap:g}: give a share from 0 to less than 1")
         self.contents()
 
-    def keeps(self, scene: Scene) -> Side:
-        """The side of the road that is driven on."""
+    def side_in(self, scene: Scene) -> Side:
+        """Side of the road that the vehicle drives on."""
         return cast("Side", self.side) if self.side else "left" if scene.left_hand else "right"
 
     def contents(self) -> Contents:
-        """What is written of every frame; raises InputError for what cannot be."""
+        """Files and settings of every frame; raises InputError for unknown names."""
+        from lidar.dataset.recording import Contents  # noqa: PLC0415  (a second, not needed for --help)
+        from lidar.settings import settings_of  # noqa: PLC0415
+        from lidar.signal.registry import Stages  # noqa: PLC0415
+
         scanner, camera = settings_of(self.fidelity, self.settings)
         stages = Stages(self.stages, self.seed)
         return Contents(self.formats, self.labels, self.deskew, self.seed, scanner, camera, stages)
 
     def recipe(self, scene: Scene) -> dict[str, Any]:
-        """What the dataset's bytes depend on, as JSON; of files their contents too."""
-        given = self.route
-        return {
-            "scene": scene.manifest.get("fingerprint", scene.path.name),
-            "route": _named(given) if isinstance(given, str | Path) else [list(point) for point in given],
-            "duration": self.duration,
-            "from_rest": self.from_rest,
-            "survey": _named(self.survey),
-            "altitude": self.altitude,
-            "overlap": self.overlap,
-            "turns": self.turns,
+        """All that the dataset's bytes depend on, as JSON; files with a digest of their contents."""
+        from lidar.rig.specs import load_rig, rig_digest  # noqa: PLC0415
+
+        route, side = self.route or "random", self.side_in(scene)
+        traffic = None if self.traffic is None else asdict(replace(self.traffic, side=side))
+        resolved: dict[str, Any] = {
+            "route": _digested(route) if isinstance(route, str | Path) else [list(point) for point in route],
+            "survey": _digested(self.survey),
             "rig": f"{self.rig} ({rig_digest(self.rig)})",
-            "vehicle": _named(self.vehicle or load_rig(self.rig).vehicle),
-            "formats": list(self.formats),
-            "labels": list(self.labels),
-            "deskew": self.deskew,
-            "seed": self.seed,
+            "vehicle": _digested(self.vehicle or load_rig(self.rig).vehicle),
             "start": self.start.isoformat() if self.start else None,
-            "crs": self.crs,
-            "exact": self.exact,
-            "side": self.keeps(scene),
-            "fidelity": self.fidelity,
-            "traffic": self._traffic(scene),
-            "settings": [list(pair) for pair in self.settings],
-            **({"stages": [stage.to_json() for stage in self.stages]} if self.stages else {}),
+            "side": side,
+            "traffic": traffic
+            and {k: _digested(v) if isinstance(v, Path) else v for k, v in traffic.items()},
         }
+        recipe = {"scene": scene.manifest.get("fingerprint", scene.path.name)}
+        recipe |= {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("stages", "workers")}
+        if self.stages:
+            resolved["stages"] = [stage.to_json() for stage in self.stages]
+        return recipe | resolved
 
-    def _traffic(self, scene: Scene) -> dict[str, Any] | None:
-        if self.traffic is None:
-            return None
-        told = asdict(replace(self.traffic, side=self.keeps(scene)))
-        return {name: _named(value) if isinstance(value, Path) else value for name, value in told.items()}
 
-
-def _named(what: str | Path) -> str:
-    """A name; of a file with a digest of what is in it, so that a changed one is told from the old."""
-    path = Path(what)
-    if not str(what) or not path.is_file():
-        return str(what)
-    return f"{what} ({hashlib.blake2b(path.read_bytes(), digest_size=6).hexdigest()})"
+def _digested(name: str | Path) -> str:
+    """A name; for a file with a digest of its contents, so that a changed file changes the recipe."""
+    path = Path(name)
+    if not str(name) or not path.is_file():
+        return str(name)
+    return f"{name} ({hashlib.blake2b(path.read_bytes(), digest_size=6).hexdigest()})"

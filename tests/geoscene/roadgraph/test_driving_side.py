@@ -61,8 +61,8 @@ def test_the_scene_and_the_drive_keep_to_one_side(given, tmp_path):
     side = given or "left"
     assert roads == {"driving_side": side, "driving_side_source": "option" if given else "place"}
     assert scene.left_hand == (side == "left")
-    assert DriveOptions().keeps(scene) == side
-    assert DriveOptions(side="right").keeps(scene) == "right"
+    assert DriveOptions().side_in(scene) == side
+    assert DriveOptions(side="right").side_in(scene) == "right"
 
 
 def test_a_third_side_is_refused():
