@@ -1,3 +1,42 @@
-"""A real place from OpenStreetMap as a watertight 3D scene in a projected frame."""
+"""A real place from OpenStreetMap as a watertight 3D scene in a projected frame.
+
+The pipeline itself is `geoscene.build.build`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from geoscene.export import export_scene as export_scene
+    from geoscene.options import BuildOptions as BuildOptions
+    from geoscene.options import ExportOptions as ExportOptions
+    from geoscene.options import ViewOptions as ViewOptions
+    from geoscene.scene import Scene as Scene
+    from geoscene.scene import open_scene as open_scene
+    from geoscene.sources import demo_path as demo_path
+    from geoscene.sources import read_osm as read_osm
+    from geoscene.view import view_scene as view_scene
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "BuildOptions": "options",
+    "ExportOptions": "options",
+    "Scene": "scene",
+    "ViewOptions": "options",
+    "demo_path": "sources",
+    "export_scene": "export",
+    "open_scene": "scene",
+    "read_osm": "sources",
+    "view_scene": "view",
+}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of `__all__` on first use, so that ``import geoscene`` and ``--help`` stay fast."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -1,3 +1,35 @@
-"""Vehicles with ray-cast sensors driven through a geoscene scene."""
+"""Vehicles with ray-cast sensors driven through a geoscene scene; `lidar.drive.drive` records one."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from geoscene import __version__ as __version__
+
+if TYPE_CHECKING:
+    from lidar.dataset.formats import read_cloud as read_cloud
+    from lidar.dataset.layout import Dataset as Dataset
+    from lidar.dataset.layout import open_dataset as open_dataset
+    from lidar.maps.aggregate import aggregate as aggregate
+    from lidar.options import DriveOptions as DriveOptions
+    from lidar.rig.scanner import load_sensor as load_sensor
+    from lidar.rig.specs import load_rig as load_rig
+
+_HOMES = {
+    "Dataset": "dataset.layout",
+    "DriveOptions": "options",
+    "aggregate": "maps.aggregate",
+    "load_rig": "rig.specs",
+    "load_sensor": "rig.scanner",
+    "open_dataset": "dataset.layout",
+    "read_cloud": "dataset.formats",
+}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name of `__all__` on first use, so that ``import lidar`` and ``--help`` stay fast."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
