@@ -1,6 +1,6 @@
 # make demo        build the bundled real scene, drive it, write pictures and point clouds
 # make test        all tests; those of the web page need chromium and chromedriver, and are skipped without
-# make test-fast   the tests that take less than a second or two each
+# make test-fast   the tests outside the modules that build scenes, record drives or compile kernels
 # make fuzz        property tests with fresh random seeds and ten times the examples
 # make lint        style, types, layer contract
 # make wheel-test  build sdist and wheel, and run the installed wheel away from the repository

@@ -23,8 +23,21 @@ settings.load_profile("same")
 FUZZ_FACTOR = 10
 
 
+SLOW = frozenset(
+    """
+    test_actors test_aerial test_build test_cli test_drive test_ego_drive test_elevation test_fcd test_files
+    test_network test_outputs test_overture test_raycast test_real test_render test_roofs test_scale
+    test_sensors test_siting test_structures test_sumo test_traffic test_view test_view_browser
+    """.split()
+)
+"""Modules that compile most kernels, build scenes or record drives: most of the time, 40 % of the tests."""
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Multiply the examples of every property test under ``--hypothesis-profile=fuzz``."""
+    """Mark slow tests, and multiply the examples of property tests under ``--hypothesis-profile=fuzz``."""
+    for item in items:
+        if item.path.stem in SLOW:
+            item.add_marker("slow")
     if config.getoption("--hypothesis-profile") == "fuzz":
         attribute = "_hypothesis_internal_use_settings"  # there is no public way to the settings of a test
         functions = (item.obj for item in items if isinstance(item, pytest.Function))
