@@ -24,12 +24,15 @@ FUZZ_FACTOR = 10
 
 
 SLOW = frozenset(
-    """
-    test_actors test_aerial test_build test_cli test_drive test_ego_drive test_elevation test_fcd test_files
-    test_network test_outputs test_overture test_raycast test_real test_render test_roofs test_scale
-    test_sensors test_siting test_structures test_sumo test_traffic test_view test_view_browser
-    """.split()
-)
+    (
+        "test_actors", "test_build", "test_cli", "test_drive",
+        "test_ego_drive", "test_elevation", "test_fcd", "test_files",
+        "test_flight_planning", "test_network", "test_outputs", "test_overture",
+        "test_raycast", "test_real", "test_render", "test_roofs",
+        "test_scale", "test_sensors", "test_siting", "test_structures",
+        "test_sumo", "test_traffic", "test_view", "test_view_browser",
+    )
+)  # fmt: skip
 """Modules that compile most kernels, build scenes or record drives: most of the time, 40 % of the tests."""
 
 
