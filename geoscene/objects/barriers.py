@@ -150,7 +150,7 @@ def read_barriers(osm: OsmData, frame: Frame, *, plan: GroundPlan) -> tuple[Barr
             )
             rows.append((shape, kind, _material(area.tags, kind), height, height_source, "area", area.osm_id))
     table = _table(rows)
-    polygon, opened = _kept_open(table.polygon, plan)
+    polygon, opened = _with_openings(table.polygon, plan)
     problems += [
         Problem(str(osm_id), "barrier", "repaired", "across-road", "open where a road passes")
         for osm_id in table.osm_id[opened]
@@ -261,7 +261,7 @@ def _gates(osm: OsmData) -> dict[int, float]:
     return gates
 
 
-def _kept_open(
+def _with_openings(
     polygons: NDArray[np.object_], plan: GroundPlan
 ) -> tuple[NDArray[np.object_], NDArray[np.bool_]]:
     """Polygons less roads, tracks, buildings and what is outside the extent; which crossed a road."""

@@ -102,7 +102,7 @@ def read_furniture(
     No post stands on a carriageway, a crossing, a track or in the mouth of a tunnel:
 
     - Signals and signs on a road's own node stand beside the road, half a metre off its surface, on the
-      side that their traffic keeps to, and face that traffic: the one that ``traffic_signals:direction``,
+      side on which their traffic drives, and face that traffic: the one that ``traffic_signals:direction``,
       ``traffic_sign:direction`` or ``direction`` names, else that of a one-way road, else (``stop`` and
       ``give_way``) the one that comes to the nearer junction, else both, each with a post of its own.
     - Other objects that are mapped on a carriageway are taken for imprecise and stand at the nearest clear
@@ -116,7 +116,7 @@ def read_furniture(
     chosen = [
         (point, shape)
         for point in osm.points
-        if (shape := shape_of(point.tags)) is not None and not _elsewhere(point.tags)
+        if (shape := shape_of(point.tags)) is not None and not _off_ground(point.tags)
     ]
     x, y = frame.from_geographic(*np.array([(p.lon, p.lat) for p, _ in chosen]).reshape(-1, 2).T)
     xmin, ymin, xmax, ymax = plan.extent
@@ -193,7 +193,7 @@ def _sign(value: str) -> str:
     return "sign_triangle" if value == "hazard" else "sign_rectangle"
 
 
-def _elsewhere(tags: Tags) -> bool:
+def _off_ground(tags: Tags) -> bool:
     """Whether the object does not stand on the ground in the open."""
     layer = tags.get("layer", "0").lstrip("+")
     return (
@@ -321,7 +321,7 @@ def _stand(point: Point, shape: str, *, xy: Float, roads: _Roads, frame: Frame, 
         return xy, 0.0, "default"
     if not _addresses(shape):
         return xy, float(np.arctan2(toward[1], toward[0])), "road"
-    # It faces the traffic that keeps to its side of the road.
+    # It faces the traffic on its side of the road.
     before, after = shapely.get_coordinates(line.interpolate([max(along - 1, 0), along + 1]))
     course = after - before
     right = course[0] * -toward[1] - course[1] * -toward[0] < 0
@@ -358,8 +358,8 @@ def _roadside_stands(point: Point, shape: str, *, xy: Float, roads: _Roads, fram
 def _beside_roads(table: Furniture, sites: Sites, *, left_hand: bool) -> tuple[Furniture, NDArray[np.str_]]:
     """The table with its roadside posts moved off the road, and the ids that found no place.
 
-    A post goes to the nearest clear place between straight aside, on the side that the traffic it faces keeps
-    to, and straight back: amid a junction that is the near corner.
+    A post goes to the nearest clear place between straight aside, on the side on which the traffic it faces
+    drives, and straight back: amid a junction that is the near corner.
     """
     moved = np.flatnonzero(table.place_source == "roadside")
     side = 1.0 if left_hand else -1.0

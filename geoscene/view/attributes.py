@@ -30,8 +30,8 @@ def tables(features: Features, present: NDArray[np.bool_]) -> list[dict[str, Any
             layer, columns, own=present[start : start + length], features=features, present=present
         )
         if len(rows):
-            told = {name: _column(values[rows]) for name, values in columns.items()}
-            out.append({"layer": layer, "feature": (rows + start).tolist(), "columns": told})
+            encoded = {name: _column(values[rows]) for name, values in columns.items()}
+            out.append({"layer": layer, "feature": (rows + start).tolist(), "columns": encoded})
     return out
 
 

@@ -56,7 +56,7 @@ def view_scene(
     kept = _kept(groups, layers)
     shapes, shape_bytes = pack_shapes(list(scene.shapes().values()))
     present = np.zeros(len(groups.of) - 1, np.bool_)
-    told: list[dict[str, Any]] = []
+    tiles: list[dict[str, Any]] = []
     ends: list[int] = []
     faces = 0
     with atomic_file(out) as file, spool(out) as blobs:
@@ -68,7 +68,7 @@ def view_scene(
             for column in (tile.mesh.feature, tile.instances.feature):
                 present[column[column >= 0]] = True
             entry, data = pack_tile(tile, groups)
-            told.append({"index": [i, j], **entry})
+            tiles.append({"index": [i, j], **entry})
             _blob(blobs, f"tile-{done}", data=data)
             ends.append(blobs.tell())
             if blobs.tell() > max_mb * 1e6:
@@ -76,17 +76,17 @@ def view_scene(
         _blob(blobs, "attributes", data=gzip(_json(tables(read_features(scene), present))))
         if blobs.tell() > max_mb * 1e6:
             raise InputError(_too_large(scene, indices, sizes=ends, size=blobs.tell(), max_mb=max_mb))
-        head = _head(scene, told, groups=groups, shapes=shapes)
+        head = _head(scene, tiles, groups=groups, shapes=shapes)
         _join(file, scene, head=head, blobs=blobs)
     files, size = size_of(out)
     notes = []
-    if len(told) < len(scene.tile_indices):
+    if len(tiles) < len(scene.tile_indices):
         notes.append(
-            f"{len(told)} of the scene's {len(scene.tile_indices)} tiles, whole: those within the bounds"
+            f"{len(tiles)} of the scene's {len(scene.tile_indices)} tiles, whole: those within the bounds"
         )
     if not kept.all():
         left = [name for name, keep in zip(groups.names, kept, strict=True) if not keep]
-        notes.append(f"left out as asked: {', '.join(left)}")
+        notes.append(f"layers left out: {', '.join(left)}")
     if (error := head["lonlat"]["error"]) > ACCURACY:
         notes.append(f"longitude and latitude under the cursor are within {error:.2g} m only")
     return Summary(out, "html", files, size, int(present.sum()), 0, faces, scene.frame.name, tuple(notes))
@@ -197,11 +197,11 @@ def _too_large(
 
 
 def _head(
-    scene: Scene, told: list[dict[str, Any]], *, groups: Groups, shapes: list[list[int]]
+    scene: Scene, tiles: list[dict[str, Any]], *, groups: Groups, shapes: list[list[int]]
 ) -> dict[str, Any]:
     """Header that the viewer needs to read the bytes."""
-    low = np.min([entry["low"] for entry in told], axis=0).tolist()
-    high = np.max([entry["high"] for entry in told], axis=0).tolist()
+    low = np.min([entry["low"] for entry in tiles], axis=0).tolist()
+    high = np.max([entry["high"] for entry in tiles], axis=0).tolist()
     bounds = (low[0], low[1], high[0], high[1])
     grid = lonlat_grid(scene.frame, bounds)
     middle = scene.frame.to_geographic((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
@@ -227,7 +227,7 @@ def _head(
             for material in materials().values()
         },
         "shapes": shapes,
-        "tiles": told,
+        "tiles": tiles,
     }
 
 

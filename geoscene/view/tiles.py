@@ -106,7 +106,7 @@ def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
     transform[:, :, 3] += tile.origin - base * step
     upright = _upright(transform, step)
 
-    told = {
+    header = {
         "step": step,
         "base": base.tolist(),
         "low": np.floor(low).tolist(),
@@ -131,15 +131,15 @@ def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
         (mesh.color[order], "u1"),
         (planes, "u1"),
     ]
-    return told, gzip(b"".join(values.astype(kind).tobytes() for values, kind in columns))
+    return header, gzip(b"".join(values.astype(kind).tobytes() for values, kind in columns))
 
 
 def _upright(transform: NDArray[np.float64], step: float) -> NDArray[np.int64] | None:
     """Quantised columns (6, k) of upright transforms (k, 3, 4), or None if any is not upright."""
     along, lift = np.hypot(transform[:, 0, 0], transform[:, 1, 0]), transform[:, 2, 2]
     turn = np.arctan2(transform[:, 1, 0], transform[:, 0, 0])
-    told = _turned(along, lift, turn=turn)
-    if not np.allclose(told, transform[:, :, :3], rtol=0, atol=1e-5) or (lift <= 0).any():
+    linear = _turned(along, lift, turn=turn)
+    if not np.allclose(linear, transform[:, :, :3], rtol=0, atol=1e-5) or (lift <= 0).any():
         return None
     steps = np.rint(transform[:, :, 3].T / step).astype(np.int64)
     steps[0] = np.diff(steps[0], prepend=0) % 65_536
@@ -166,7 +166,7 @@ def _turned(
     return matrix
 
 
-def unpack_tile(told: dict[str, Any], data: bytes) -> Tile:
+def unpack_tile(header: dict[str, Any], data: bytes) -> Tile:
     """The tile that `pack_tile` made, its faces in the page's order; ``closed`` is not kept."""
     raw = zlib.decompress(data, 31)
     at = 0
@@ -178,24 +178,24 @@ def unpack_tile(told: dict[str, Any], data: bytes) -> Tile:
         at += values.nbytes
         return values
 
-    n, m, k = told["vertices"], told["ends"][-1], sum(run[2] for run in told["runs"])
+    n, m, k = header["vertices"], header["ends"][-1], sum(run[2] for run in header["runs"])
     faces, feature = column("<u4", m, 3), column("<i4", m)
     copied = column("<i4", k)
-    vertices = column("<u2", n, 3) * told["step"]
+    vertices = column("<u2", n, 3) * header["step"]
     klass, material, surface, color = column("u1", m), column("u1", m), column("u1", m), column("u1", m, 3)
-    columns, size, kind = (6, 2, "<u2") if told["upright"] else (12, 4, "<f4")
+    columns, size, kind = (6, 2, "<u2") if header["upright"] else (12, 4, "<f4")
     planes = np.moveaxis(column("u1", columns, size, k), 1, 2)
     places = np.ascontiguousarray(planes).view(kind).reshape(columns, k)
     transform = (
-        _transforms(places, told["step"]) if told["upright"] else places.T.reshape(k, 3, 4).astype(float)
+        _transforms(places, header["step"]) if header["upright"] else places.T.reshape(k, 3, 4).astype(float)
     )
     mesh = Mesh.of(
         vertices, faces, feature=feature, klass=klass, material=material, surface=surface, color=color
     )
     shape = np.repeat(
-        np.array([run[1] for run in told["runs"]], np.int32), [run[2] for run in told["runs"]]
+        np.array([run[1] for run in header["runs"]], np.int32), [run[2] for run in header["runs"]]
     ).astype(np.int32)
-    return Tile(np.array(told["base"]) * told["step"], mesh, Instances(shape, transform, copied))
+    return Tile(np.array(header["base"]) * header["step"], mesh, Instances(shape, transform, copied))
 
 
 def pack_shapes(shapes: list[Mesh]) -> tuple[list[list[int]], bytes]:

@@ -176,7 +176,7 @@ def windows(
 def facades_of(world: World) -> Facades:
     """The walls of a world's own mesh, ``wall`` by the face numbers of its hits; kept with its tiles."""
     caster = world.caster
-    known, last, whole = _KNOWN.get(caster, ({}, (), None))
+    known, last, whole = _CACHE.get(caster, ({}, (), None))
     parts = caster.scene.parts
     state = tuple((number, part.first, id(part.vertices)) for number, part in parts.items())
     if whole is not None and state == last:
@@ -186,13 +186,13 @@ def facades_of(world: World) -> Facades:
         old = known.get(number)
         same = old is not None and old[0] is part.vertices
         found[number] = old if old is not None and same else (part.vertices, _of_part(world, part))
-    whole = _joined([found[number][1] for number in parts], [_numbers(part) for part in parts.values()])
-    _KNOWN[caster] = found, state, whole
+    whole = _concatenated([found[number][1] for number in parts], [_numbers(part) for part in parts.values()])
+    _CACHE[caster] = found, state, whole
     return whole
 
 
 _Part = tuple[Float, Facades]
-_KNOWN: weakref.WeakKeyDictionary[
+_CACHE: weakref.WeakKeyDictionary[
     Caster, tuple[dict[int, _Part], tuple[tuple[int, int, int], ...], Facades | None]
 ] = weakref.WeakKeyDictionary()
 
@@ -212,7 +212,7 @@ def _of_part(world: World, part: Geometry) -> Facades:
     return facades(corners, part.planes[:, :3], feature=surfaces.feature, wall=wall)
 
 
-def _joined(parts: list[Facades], numbers: list[NDArray[np.int32]]) -> Facades:
+def _concatenated(parts: list[Facades], numbers: list[NDArray[np.int32]]) -> Facades:
     """Walls of several parts whose faces have the given numbers."""
     wall = np.full(max((int(n.max(initial=-1)) for n in numbers), default=-1) + 1, -1, np.int32)
     first = 0

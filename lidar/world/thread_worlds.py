@@ -29,7 +29,7 @@ class Worlds:
         """Load another region. Call it only while no thread uses a world."""
         self._region = region
         if self.actors is None:
-            self._shared = self._moved(self._shared, region)
+            self._shared = self._loaded(self._shared, region)
 
     def during(self, start_ns: int, end_ns: int) -> World:
         """The world of this thread until its next call; ray times 0 and 1 are ``start_ns`` and ``end_ns``."""
@@ -39,7 +39,7 @@ class Worlds:
         assert region is not None, "follow comes before during"  # noqa: S101
         world: World | None = getattr(self._own, "world", None)
         if world is None or self._own.region != region:
-            world = self._moved(world, region)
+            world = self._loaded(world, region)
             self._own.world, self._own.region = world, region
         if self.actors is not None:
             m = self.margin
@@ -48,7 +48,7 @@ class Worlds:
             world.place_actors(shape, transform, feature=feature)
         return world
 
-    def _moved(self, world: World | None, region: Region) -> World:
+    def _loaded(self, world: World | None, region: Region) -> World:
         if world is None:
             shapes = actor_shapes(self.actors) if self.actors is not None else ()
             return World.load(self.scene, region=region, margin=self.margin, actors=shapes)

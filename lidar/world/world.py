@@ -137,9 +137,9 @@ class World:
         self._actors = tuple(_shape(mesh) for mesh in actors)
         self._copied = [_surfaces(mesh) for mesh in (*shapes, *actors)]
         self._tiles: dict[int, _Tile] = {}
-        self._moving: tuple[Instances, NDArray[np.int32]] = _nothing(self._actors)
+        self._moving: tuple[Instances, NDArray[np.int32]] = _no_instances(self._actors)
         self.caster = Caster(origin=np.zeros(3), dynamic=True)
-        self._lay()
+        self._concatenate_tables()
 
     @classmethod
     def load(
@@ -162,7 +162,7 @@ class World:
 
         The hits depend on the region alone, not on earlier ones.
         """
-        ranks = _touching(self.scene, region, margin=self.margin + _OVERHANG)
+        ranks = _tiles_intersecting(self.scene, region, margin=self.margin + _OVERHANG)
         if not ranks:
             raise InputError(
                 f"no tile of {self.scene.path} lies in {tuple(round(float(v), 1) for v in region)};"
@@ -179,7 +179,7 @@ class World:
         old, kept = self._tiles, self._tiles.keys() & set(ranks)
         self._tiles = {rank: old[rank] if rank in kept else self._read(rank) for rank in ranks}
         self.region = region
-        self._lay()
+        self._concatenate_tables()
         self.caster.update(
             detach=[number for rank in old.keys() - kept for number in old[rank].parts],
             attach={n: p for rank in ranks if rank not in kept for n, p in self._tiles[rank].parts.items()},
@@ -196,7 +196,7 @@ class World:
         feature   : (k,) int32, numbers to find in `Surfaces.feature`
         """
         self._moving = Instances(self._actors, np.asarray(shape, np.int32), transform), feature
-        self._number()
+        self._index_instances()
         self.caster.update(instances=[self._still, self._moving[0]])
 
     def lookup(self, hits: Hits) -> Surfaces:
@@ -228,7 +228,7 @@ class World:
             copies.feature,
         )
 
-    def _lay(self) -> None:
+    def _concatenate_tables(self) -> None:
         """Concatenate the tables of tiles and shapes, with the row of a miss last (index -1)."""
         tables = [*(tile.surfaces for tile in self._tiles.values()), *self._copied]
         starts = np.cumsum([0, *(len(table.klass) for table in tables)])
@@ -244,7 +244,7 @@ class World:
         self._bounds = int(feature.min()), int(feature.max())
         self._still = self._static()
         self._of_shape, self._of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes)])
-        self._number()
+        self._index_instances()
 
     def _leaves_of(self, starts: NDArray[np.integer]) -> NDArray[np.uint8]:
         """Kinds of leaves of all rows of the tables; ``starts`` are those of the shapes."""
@@ -256,7 +256,7 @@ class World:
             found[self._surfaces.klass == Class.HEDGE] = 1 + kinds.index("hedge")
         return found
 
-    def _number(self) -> None:
+    def _index_instances(self) -> None:
         """Set the first rows and feature numbers of all instances."""
         moving, feature = self._moving
         self._base = np.concatenate([self._of_shape[self._still.shape], self._of_actor[moving.shape], [0]])
@@ -275,12 +275,12 @@ class World:
         return Instances(self._shapes, shape, transform)
 
 
-def _nothing(shapes: tuple[Caster, ...]) -> tuple[Instances, NDArray[np.int32]]:
+def _no_instances(shapes: tuple[Caster, ...]) -> tuple[Instances, NDArray[np.int32]]:
     none = np.empty(0, np.int32)
     return Instances(shapes, none, np.empty((0, 3, 4))), none
 
 
-def _touching(scene: Scene, region: Region, *, margin: float) -> list[int]:
+def _tiles_intersecting(scene: Scene, region: Region, *, margin: float) -> list[int]:
     """Indices of the scene's tiles that intersect a region grown by a margin."""
     ij = np.array(scene.tile_indices, float).reshape(-1, 2)
     low, high = ij * scene.tile_size, (ij + 1) * scene.tile_size

@@ -87,11 +87,11 @@ def test_tags_decide_class_and_material(tags, expected):
         {"landuse": "nonsense"},
     ],
 )
-def test_what_is_not_on_the_ground_is_not_drawn_on_it(tags):
+def test_features_above_or_below_the_ground_are_no_land_cover(tags):
     assert len(cover(area(1, BOX, **tags))[0]) == 0
 
 
-def test_water_that_flows_is_told_from_water_that_stands():
+def test_rivers_are_distinguished_from_standing_water():
     layers, _ = cover(
         area(1, BOX, natural="water", water="river"),
         area(2, BOX, natural="water", water="lake"),
@@ -153,7 +153,7 @@ def test_islands_and_lagoons_follow_the_direction_of_their_ring():
     assert alone.area == pytest.approx(200 * 200 - 400)
 
 
-def test_a_coast_in_pieces_is_one_and_one_cut_short_is_led_to_the_edge():
+def test_coastlines_are_joined_and_open_ends_extended_to_the_border():
     pieces = [[(20, 0), (20, 300)], [(20, -300), (20, -50)], [(20, -50), (20, 0)]]
     assert sea_area(pieces)[0].equals(shapely.box(20, -100, 100, 100))
     water, problems = sea_area([[(20, -300), (20, 60)]])
@@ -161,12 +161,12 @@ def test_a_coast_in_pieces_is_one_and_one_cut_short_is_led_to_the_edge():
     assert water.area == pytest.approx(80 * 200, rel=1e-3)  # straight on is the shortest way to the edge
 
 
-def test_no_coast_no_sea():
+def test_without_a_coastline_there_is_no_sea():
     assert sea_area([])[0].is_empty
     assert sea_area([[(500, -300), (500, 300)]])[0].is_empty
 
 
-def test_a_coast_that_contradicts_itself_is_told():
+def test_a_contradictory_coast_is_reported():
     _, problems = sea_area([[(-20, -300), (-20, 300)], [(20, -300), (20, 300)]])
     assert [p.reason for p in problems] == ["conflict"]
     assert isinstance(problems[0], Problem)
@@ -207,7 +207,7 @@ def test_lakes_are_level_and_the_ground_closes_on_them_across_tiles(size):
     assert set(count) == {1, 2}
 
 
-def test_waters_that_touch_stand_equally_high_and_at_the_seas_level_beside_it():
+def test_connected_waters_have_one_level_that_of_the_sea_if_they_touch():
     layers = wet_layers(
         (shapely.box(-90, -90, -50, 90), "sea"),
         (shapely.box(-50, 0, -20, 20), "standing"),
@@ -220,7 +220,7 @@ def test_waters_that_touch_stand_equally_high_and_at_the_seas_level_beside_it():
     assert level[3] == pytest.approx(rising(40, 0), abs=0.01)  # the lowest of its corners
 
 
-def test_a_river_never_flows_uphill_and_is_turned_if_drawn_so():
+def test_a_river_never_flows_uphill_and_is_reversed_if_mapped_so():
     """The map draws it eastward, up the slope; the water falls to the west."""
     stream = way(1, [(-90, 0), (0, 5), (90, 0)], waterway="river")
     layers, _ = cover(stream)

@@ -46,7 +46,7 @@ def sample(count=500, seed=0):
     return np.random.default_rng(seed).uniform(-200, 200, (2, count))
 
 
-def test_a_slope_comes_back_exactly_at_every_place(tmp_path):
+def test_heights_of_a_plane_are_exact_everywhere(tmp_path):
     """Bilinear interpolation reproduces a plane: to float32's step, only if posts are at pixels' middles."""
     corner = around()
     east, north = posts(corner, (60, 60))
@@ -77,7 +77,7 @@ def test_between_four_posts_the_height_is_bilinear(tmp_path):
     )
 
 
-def test_tiles_of_one_model_are_as_one_raster_in_any_order(tmp_path):
+def test_tiles_of_one_model_equal_one_raster_in_any_order(tmp_path):
     """No seam: the strip between the last posts of one tile and the first of the next is interpolated too."""
     corner = around()
     values = np.random.default_rng(1).uniform(0, 50, (60, 60))
@@ -94,7 +94,7 @@ def test_tiles_of_one_model_are_as_one_raster_in_any_order(tmp_path):
         )
 
 
-def test_a_finer_model_goes_before_a_coarser_one(tmp_path):
+def test_a_finer_model_takes_precedence_over_a_coarser_one(tmp_path):
     coarse = write_dem(tmp_path / "coarse.tif", np.full((60, 60), 5.0), corner=around())
     shape = (10, 10)
     fine = write_dem(tmp_path / "fine.tif", np.full(shape, 9.0), corner=around(shape, 10.0), step=10.0)
@@ -129,7 +129,7 @@ def test_feet_become_metres(tmp_path, unit, factor):
     )
 
 
-def test_a_vertical_crs_says_what_heights_are_above_and_in_which_unit(tmp_path):
+def test_a_vertical_crs_gives_datum_and_unit(tmp_path):
     values = np.full((60, 60), 100.0)
     navd = write_dem(tmp_path / "navd.tif", values, corner=around(), crs="EPSG:32632+6360")  # NAVD88, US feet
     terrain = open_terrain([navd], FRAME, bounds=BOUNDS)
@@ -157,7 +157,7 @@ def test_a_model_that_does_not_cover_the_scene_is_an_error_or_a_counted_fallback
         open_terrain([path], FRAME, bounds=(500, 0, 600, 100), outside="nearest")
 
 
-def test_files_that_cannot_serve_are_refused_by_name(tmp_path):
+def test_unusable_files_are_named_in_the_error(tmp_path):
     with pytest.raises(SourceNotFoundError, match=r"none\.tif"):
         open_terrain([tmp_path / "none.tif"], FRAME, bounds=BOUNDS)
     text = tmp_path / "text.tif"
@@ -184,7 +184,7 @@ def test_files_that_cannot_serve_are_refused_by_name(tmp_path):
         open_terrain([void], FRAME, bounds=BOUNDS)
 
 
-def test_a_terrain_goes_to_workers(tmp_path):
+def test_a_terrain_can_be_pickled(tmp_path):
     path = write_dem(tmp_path / "a.tif", np.random.default_rng(2).uniform(0, 9, (60, 60)), corner=around())
     terrain = open_terrain([path], FRAME, bounds=BOUNDS)
     x, y = sample(50)

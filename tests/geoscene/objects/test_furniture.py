@@ -159,7 +159,7 @@ def test_nothing_stands_between_the_rails_of_a_track():
     assert 1.5 < abs(table.xy[0, 1] - 10) < 3.0
 
 
-def test_what_finds_no_place_is_listed():
+def test_furniture_without_a_clear_place_is_listed():
     everywhere = shapely.box(*EXTENT)
     bridge = way(4, [(-100, 50), (0, 50), (100, 50)], nodes=[30, 31, 32], highway="primary", bridge="yes")
     signals = [node(k, xy, highway="traffic_signals") for k, xy in ((2, (20, 0)), (31, (0, 50)))]
@@ -216,7 +216,7 @@ def test_height_tags_stretch_the_shape():
     assert [(p.osm_id, p.reason) for p in problems] == [("node/8", "unusable-height")]
 
 
-def test_what_is_not_in_the_open_on_the_ground_is_left_out():
+def test_furniture_indoors_and_above_or_below_the_ground_is_left_out():
     house = shapely.box(40, 40, 60, 60)
     table, problems = read(
         node(4, (50, 50), amenity="bench"),
@@ -266,7 +266,7 @@ def test_a_wall_is_a_solid_as_long_wide_and_high_as_it_is_drawn():
     assert (barriers.height_source[0], barriers.width_source[0], problems) == ("height", "width", [])
 
 
-def test_a_fence_round_a_garden_is_one_ring_with_a_gate():
+def test_a_closed_fence_is_one_ring_with_a_gate():
     ring = [(0, 0), (30, 0), (30, 20), (0, 20), (0, 0)]
     fence = way(1, ring, nodes=[1, 2, 3, 4, 1], barrier="fence")
     _, [closed], _ = solids(fence)
@@ -284,7 +284,7 @@ def test_a_barrier_is_open_where_a_road_passes_and_ends_at_houses():
     assert len(shapely.get_parts(barriers.polygon[0])) == 2
 
 
-def test_a_barrier_over_a_tunnels_mouth_does_not_bar_it():
+def test_a_barrier_is_open_over_the_mouth_of_a_tunnel():
     wall = way(1, [(-20, 0), (20, 0)], barrier="wall", height="2.2", width="0.5")
     barriers, problems = read_barriers(
         osm_of(wall), FRAME, plan=plan_with(mouths=[shapely.box(-4, -10, 5, 10)])
@@ -303,7 +303,7 @@ def test_a_barrier_follows_the_ground():
     assert volume(mesh) == pytest.approx(40 * 0.25 * 2.1, rel=1e-6)
 
 
-def test_hedges_drawn_as_areas_and_broken_numbers():
+def test_a_hedge_mapped_as_an_area_with_an_unusable_height():
     area = Area(
         "way/9",
         {"barrier": "hedge", "height": "-3"},

@@ -65,7 +65,7 @@ def test_crowns_let_light_through_and_nothing_else_does():
     assert leafy | {"hedge"} == set(LEAF_AREA_DENSITY)
 
 
-def test_signs_face_the_way_they_are_turned():
+def test_a_sign_faces_its_heading():
     """The retro-reflecting side looks along the heading."""
     sign = expand(place("sign_round", np.zeros((1, 3)), heading=np.radians(120)))
     front = sign.material == materials()["retroreflector"].code
@@ -84,7 +84,7 @@ def test_a_tree_is_as_high_and_wide_as_its_tags_say():
     assert trunk[:, 2].min() < 300.0 < crown[:, 2].min() < trunk[:, 2].max()
 
 
-def test_what_is_missing_follows_from_what_is_there_and_says_so():
+def test_missing_sizes_are_derived_from_the_others_and_name_their_source():
     tags = [
         {},
         {"diameter_crown": "8"},
@@ -148,7 +148,7 @@ def test_woods_are_filled_to_their_density_and_leave_roads_and_houses_free():
     assert len(trees) == pytest.approx(area * 0.02, rel=0.05)
 
 
-def test_a_wood_is_the_same_whatever_the_tiles_and_another_with_another_seed():
+def test_a_wood_depends_on_the_seed_and_not_on_the_tiles():
     def all_trees(size, seed=0):
         plan = wood_plan(tile_size=size)
         found = [forest_trees(plan, i, j=j, seed=seed) for i, j in plan.tiles]

@@ -149,7 +149,7 @@ def test_faces_are_in_the_group_of_their_layer_and_pads_lie_on_the_ground(scene,
     assert {"ground", "buildings", "road_surfaces", "barriers"} <= seen
 
 
-def test_the_page_asks_nothing_of_anyone(path, page):
+def test_the_page_makes_no_requests(path, page):
     text = path.read_text("utf-8")
     code = page.scripts["viewer"]
     assert "default-src 'none'" in text
@@ -210,7 +210,7 @@ def test_the_same_scene_is_the_same_bytes(scene, path, tmp_path):
     assert (tmp_path / "again.html").read_bytes() == path.read_bytes()
 
 
-def test_bounds_take_the_tiles_that_they_meet(scene, tmp_path):
+def test_bounds_take_the_tiles_that_they_intersect(scene, tmp_path):
     x, y = scene.tile_size * 0.25, scene.tile_size * 0.25
     lon, lat = scene.frame.to_geographic([x, x + 10], [y, y + 10])
     summary = view_scene(
@@ -228,7 +228,7 @@ def test_bounds_take_the_tiles_that_they_meet(scene, tmp_path):
     assert "1 of the scene's" in summary.notes[0]
 
 
-def test_a_page_that_is_too_large_is_refused_with_a_part_that_is_not(scene, path, tmp_path):
+def test_a_page_that_is_too_large_is_refused_with_the_bounds_of_a_part_that_fits(scene, path, tmp_path):
     whole = path.stat().st_size / 1e6
     out = tmp_path / "page.html"
     with pytest.raises(InputError, match="`max_mb`") as caught:
@@ -253,12 +253,12 @@ def test_a_page_that_is_too_large_is_refused_with_a_part_that_is_not(scene, path
         ({"max_mb": float("nan")}, "more than 0"),
     ],
 )
-def test_options_that_cannot_be_are_refused(scene, tmp_path, options, message):
+def test_invalid_options_are_refused(scene, tmp_path, options, message):
     with pytest.raises(InputError, match=message):
         view_scene(scene, tmp_path / "page.html", options=ViewOptions(**options))
 
 
-def test_a_page_is_replaced_only_when_asked(scene, path, tmp_path):
+def test_a_page_is_replaced_only_with_overwrite(scene, path, tmp_path):
     with pytest.raises(InputError, match="overwrite"):
         view_scene(scene, path)
     with pytest.raises(InputError, match="folder"):
@@ -305,7 +305,7 @@ def test_tiles_agree_on_a_vertex_of_their_seam(x, y, z):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.booleans())
-def test_a_copy_moves_by_less_than_two_centimetres_however_it_stands(seed, upright):
+def test_a_copy_moves_by_less_than_two_centimetres_in_any_orientation(seed, upright):
     rng = np.random.default_rng(seed)
     count = 30
     turn, along, lift = rng.uniform(-7, 7, count), rng.uniform(0.1, 9, count), rng.uniform(0.1, 30, count)
@@ -332,7 +332,7 @@ def test_a_copy_moves_by_less_than_two_centimetres_however_it_stands(seed, uprig
     assert np.linalg.norm(apart, axis=1).max() < (0.02 if upright else 0.001)
 
 
-def test_an_empty_tile_is_no_trouble():
+def test_an_empty_tile_can_be_packed():
     groups = Groups(("ground", "trees"), np.zeros(1, np.uint8))
     told, data = pack_tile(Tile(np.zeros(3), Mesh.empty(), Instances.empty()), groups)
     back = unpack_tile(told, data)
@@ -356,7 +356,7 @@ def test_groups_are_ground_and_the_layers_that_are_seen(scene):
     st.sampled_from([300.0, 3000.0, 20_000.0]),
     st.integers(0, 2**32 - 1),
 )
-def test_longitude_and_latitude_are_within_the_error_that_is_told(place, size, seed):
+def test_longitude_and_latitude_are_within_the_stated_error(place, size, seed):
     crs, lon, lat = place
     frame = Frame.at(lon, lat, crs=crs)
     grid = lonlat_grid(frame, (-size, -0.7 * size, size, 0.9 * size))

@@ -104,7 +104,7 @@ def test_the_scene_is_drawn_with_many_colours_and_shades(opened):
     assert len(np.unique(seen.reshape(-1, 3), axis=0)) > 300
 
 
-def test_a_click_on_a_roof_tells_its_osm_id_and_where_its_height_is_from(scene, opened):
+def test_a_click_on_a_roof_shows_its_osm_id_and_height_source(scene, opened):
     row, feature, buildings = tall_house(scene, opened)
     opened.click(*look_down(opened, feature))
     opened.settle()
@@ -172,7 +172,7 @@ def test_search_by_name_finds_and_says_when_there_is_none(scene, opened):
     assert "Not in this scene" in opened.text("found")
 
 
-def test_what_was_guessed_has_its_own_colours_and_a_legend(scene, opened):
+def test_assumed_values_have_their_own_colours_and_a_legend(scene, opened):
     before = middle(opened)
     opened.js("const c = document.getElementById('color'); c.value = 'source'; c.onchange();")
     assert (np.abs(middle(opened) - before).max(axis=2) > 12).mean() > 0.1
@@ -244,7 +244,7 @@ def test_fingers_turn_move_zoom_and_ask(scene, phone):
     assert int(phone.js("return document.getElementById('panel').dataset.feature")) == feature
 
 
-def test_on_a_telephone_the_scene_is_in_sight_and_nothing_sticks_out(scene, phone):
+def test_on_a_phone_the_scene_is_visible_and_nothing_overflows(scene, phone):
     assert phone.js("return innerWidth") == 390
     assert phone.js("return document.documentElement.scrollWidth") == 390
     _, feature, _ = tall_house(scene, phone)
@@ -286,7 +286,7 @@ def test_shadows_darken_and_the_sun_moves_them(opened):
     assert (np.abs(middle(opened) - with_shadows).max(axis=2) > 12).mean() > 0.2
 
 
-def test_a_browser_without_decompression_is_told_so(window, page, tmp_path):
+def test_a_browser_without_decompression_gets_a_message(window, page, tmp_path):
     text = page.read_text("utf-8").replace('"DecompressionStream" in window', '"Nothing" in window')
     (tmp_path / "old.html").write_text(text, "utf-8")
     with pytest.raises(AssertionError, match="too old"):

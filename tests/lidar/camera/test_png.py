@@ -115,7 +115,7 @@ def test_sixteen_bit_colour_is_laid_out_as_the_standard_says(tmp_path):
         read_png(tmp_path / "a.png")
 
 
-def test_a_file_that_is_no_image_is_named(tmp_path):
+def test_an_unreadable_image_is_named_in_the_error(tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(b"not a png")
     with pytest.raises(FormatError, match=r"a\.png"):

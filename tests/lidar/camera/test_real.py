@@ -103,7 +103,7 @@ def test_frames_of_a_real_place_are_the_same_every_time(column):
     assert shots[0] == shots[1]
 
 
-def test_walls_are_found_again_when_tiles_come_and_go(column):
+def test_walls_are_recomputed_when_tiles_are_loaded_and_released(column):
     scene, world = column
     whole = facades_of(world)
     x0, y0 = scene.bounds[:2]

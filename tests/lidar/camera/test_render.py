@@ -135,13 +135,13 @@ def test_a_balls_outline_is_that_of_its_tangent_cone():
     assert frame.depth.min() == pytest.approx(8.0, abs=0.01)
 
 
-def test_far_things_are_seen_but_not_measured():
+def test_surfaces_beyond_far_have_colour_but_no_depth():
     frame = render(replace(CAMERA, far=9.0), looking(), world=world(plate(10.0, feature=5)), sun=NOON)
     assert np.isinf(frame.depth).all()
     assert (frame.feature == 5).all()
 
 
-def test_nothing_nearer_than_near_is_seen():
+def test_surfaces_nearer_than_near_are_invisible():
     near = world(plate(0.5, half=0.2, feature=1), plate(10.0, feature=2))
     eye = looking((0, 0, 0.0))
     assert (render(CAMERA, eye, world=near, sun=NOON).feature == 1).any()
@@ -311,7 +311,7 @@ def _corners(rgb):
     return int(((strength == peak) & (strength > 3000)).sum())
 
 
-def test_detail_gives_odometry_something_to_hold_on_to():
+def test_detail_gives_odometry_features_to_track():
     camera = replace(CAMERA, width=640, height=480, fx=400.0, fy=400.0, cx=319.5, cy=239.5)
     town, poses = street(), looking((-20, 0, 1.5), yaw=0.1)
     smooth = RenderOptions(supersample=3)
@@ -350,7 +350,7 @@ def test_far_detail_fades_instead_of_flickering():
     assert all(near > far for near, far in pairwise(contrast))
 
 
-def test_haze_takes_the_contrast_that_its_visibility_says():
+def test_haze_removes_98_percent_of_contrast_at_the_visibility():
     def contrast(visibility):
         options = RenderOptions(detail=False, visibility=visibility)
         pair = world(
@@ -466,7 +466,7 @@ def test_night_is_dark_but_not_empty():
     assert np.ptp(frame.rgb) > 10
 
 
-def test_options_out_of_bounds_are_refused():
+def test_options_out_of_range_are_refused():
     for bad in ({"supersample": 0}, {"visibility": 0.0}, {"threads": 0}):
         with pytest.raises(InputError):
             RenderOptions(**bad)

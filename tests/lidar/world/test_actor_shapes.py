@@ -76,7 +76,7 @@ def test_vehicles_send_light_back_from_their_plates_and_rear_lamps():
             assert (seen == code).sum() >= 15, (kind, way)
 
 
-def test_a_beam_through_the_windows_of_a_car_meets_glass_then_what_is_inside():
+def test_a_beam_through_the_windows_of_a_car_hits_glass_then_the_interior():
     body = catalogue()["sedan/white"]
     caster = Caster(body.mesh.vertices, body.mesh.faces)
     start = np.array([[0.0, 5.0, 1.15]])
@@ -91,7 +91,7 @@ def test_shares_of_paints_are_shares():
     assert sum(share for _, share in PAINTS.values()) == pytest.approx(1.0)
 
 
-def test_walkers_take_steps():
+def test_pedestrians_cycle_through_the_poses_of_a_stride():
     """The feet of the poses of a stride are apart by up to a step, and change places."""
     poses = [catalogue()[f"adult/navy/{k}"].mesh for k in range(4)]
     feet = [m.vertices[m.vertices[:, 2] < 0.12] for m in poses]

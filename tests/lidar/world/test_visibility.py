@@ -58,24 +58,24 @@ def seen(*others, eye=(0.0, 0.0, 0.75), yaw=0.0):
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, 1.2, 3.0])
-def test_what_nothing_hides_is_wholly_seen(yaw):
+def test_an_unoccluded_actor_is_fully_visible(yaw):
     assert seen(yaw=yaw) == pytest.approx(1.0)
     behind = box((40.0, -9.0, 0.0), (41.0, 9.0, 9.0), feature=5)
     assert seen(behind, yaw=yaw) == pytest.approx(1.0)
 
 
-def test_what_stands_behind_a_wall_is_not_seen():
+def test_an_actor_behind_a_wall_is_invisible():
     assert seen(box((10.0, -9.0, 0.0), (10.5, 9.0, 9.0), feature=5)) == 0.0
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.75])
-def test_a_wall_that_covers_a_part_hides_that_part(share):
+def test_a_wall_hides_the_part_that_it_covers(share):
     """The end of the car, 2 m wide and 18 m away, behind a wall whose edge is 9 m away."""
     edge = (WIDTH / 2 - share * WIDTH) / 2
     assert seen(box((8.9, edge, 0.0), (9.0, 9.0, 9.0), feature=5)) == pytest.approx(1 - share, abs=0.05)
 
 
-def test_a_road_user_that_is_not_there_is_no_row():
+def test_a_road_user_that_does_not_exist_yet_has_no_row():
     assert (
         Visibility(one_car())
         .seen_from((0, 0, 0), world(box((0, 0, 0), (1, 1, 1))), rows=np.empty(0, int), time_ns=0)
@@ -106,7 +106,7 @@ def test_outlines_are_the_union_of_triangles_within_the_image(seed, count, size)
     assert pixels == pytest.approx(inside.sum(), abs=2)  # centres on an edge may fall to either side
 
 
-def test_triangles_with_corners_nowhere_are_left_out():
+def test_triangles_with_nonfinite_corners_are_left_out():
     good = np.array([[[10.0, 10.0], [20.0, 10.0], [10.0, 20.0]]])
     bad = good.copy()
     bad[0, 0, 0] = np.nan

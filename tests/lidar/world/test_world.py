@@ -77,7 +77,7 @@ def scene(tmp_path_factory):
     return open_scene(folder)
 
 
-def test_rays_meet_what_the_tiles_hold_and_know_what_it_is(scene):
+def test_rays_hit_the_faces_of_the_tiles_and_lookup_returns_their_attributes(scene):
     world = World.load(scene)
     above = np.array([[50.0, 50, 30], [70, 70, 30], [30, 30, 30], [-170, 30, 30], [450, 50, 30]])
     hits = world.caster.cast(above, np.repeat(DOWN, 5, 0), normals=True)
@@ -109,7 +109,7 @@ def test_a_region_brings_its_own_tiles_only(scene):
         World.load(scene, region=(5000, 0, 5010, 10))
 
 
-def test_what_rays_hit_does_not_depend_on_where_the_world_was_before(scene):
+def test_hits_do_not_depend_on_earlier_regions(scene):
     rng = np.random.default_rng(1)
     way = rng.normal(size=(20_000, 3))
     eye = np.array([155.0, 52.0, 3.0])
@@ -162,7 +162,7 @@ def test_the_float32_origin_follows_over_long_ways_and_ranges_stay_exact(tmp_pat
     assert world.lookup(hits).feature.tolist() == [101]
 
 
-def test_actors_are_met_where_they_are_at_each_rays_time(scene):
+def test_rays_intersect_actors_at_their_pose_at_the_ray_time(scene):
     car = box([4, 2, 1.5], [0, 0, 0.75], klass=Class.CAR, feature=7)
     world = World.load(scene, actors=[car])
     before = world.caster.cast([150.0, 50, 1], [[-1.0, 0, 0]] * 5)
