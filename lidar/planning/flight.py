@@ -1,4 +1,4 @@
-"""Flights: routes through the air, over waypoints or in parallel strips over an area."""
+"""Routes of flights: along waypoints, or in parallel strips over an area."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from lidar.planning.path import Ground
 from lidar.planning.route import Route, free_route
 
 _ARC_STEP = np.radians(2.0)
-_ALONG = np.cos(np.radians(15.0))  # least cosine between the course and a line that is flown
-_LEAD_NS = 1_000_000_000  # nanoseconds before and after a line for which scanners work
+_ALONG = np.cos(np.radians(15.0))  # minimum cosine of the angle between the course and a strip
+_LEAD_NS = 1_000_000_000  # nanoseconds before and after a strip for which scanners work
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ def survey_flight(
     ground: Ground | None = None,
     limit: float = np.inf,
 ) -> Route:
-    """The route over an area in parallel strips, to and fro.
+    """The route over an area in parallel strips, flown in alternating directions.
 
     area        : shapely polygon in scene metres
     spacing     : metres between strips: every point of the area is within half of it of one
@@ -80,7 +80,7 @@ def survey_flight(
             parts.append(np.array([[ends[0][k], y]]))
         if k + 1 == count:
             parts.append(np.array([[ends[1 if forth else 0][k], y]]))
-        else:  # a strip goes on to where the longer of it and the next one ends
+        else:  # a strip extends to the end of the longer of it and the next one
             x = max(ends[1][k : k + 2]) if forth else min(ends[0][k : k + 2])
             parts.append(_turn(float(x), y, spacing=spacing, radius=radius, way=1.0 if forth else -1.0))
     xy = np.concatenate(parts) @ back
@@ -104,7 +104,7 @@ def _strips(area: Any, spacing: float, *, heading_deg: float) -> tuple[Float, Fl
 
 
 def survey_lines(area: Any, *, spacing: float, heading_deg: float = 90.0) -> Float:
-    """Where each strip of `survey_flight` enters and leaves the area, (k, 2, 2) scene metres, as flown."""
+    """Entry and exit points (k, 2, 2) of the strips of `survey_flight`, scene metres, in flight direction."""
     west, east, middle, back = _strips(area, spacing, heading_deg=heading_deg)
     ends = np.stack([np.column_stack([west, middle]), np.column_stack([east, middle])], axis=1)
     ends[1::2] = ends[1::2, ::-1]
@@ -113,7 +113,7 @@ def survey_lines(area: Any, *, spacing: float, heading_deg: float = 90.0) -> Flo
 
 
 def times_on_lines(trajectory: Trajectory, lines: Float, *, beside: float) -> NDArray[np.int64]:
-    """When (k, 2), in nanoseconds from and to, a craft flies along lines, with a second more at both ends.
+    """Intervals (k, 2) in nanoseconds in which an aircraft is on a line, plus a second at both ends.
 
     lines  : (n, 2, 2) scene metres, from and to
     beside : scene metres across within which it is on one

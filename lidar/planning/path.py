@@ -35,21 +35,21 @@ Surface = Callable[[Float, Float, Float], Float]
 """z (n,) of the surface that wheels stand on at scene x, y (n,), near heights z (n,)."""
 
 MARGIN = 0.25
-"""Metres that the body keeps from obstacles."""
+"""Minimum distance in metres between body and obstacles."""
 _REPAIRS = 16
 _SPRING = 0.5  # metres over which tyres and springs smooth the ground
-_AXLES = 0.5  # metres between axles below which a body does not pitch with the ground under them
-_STEEP = 0.35  # rise per metre that a wheel is expected to meet
-_JOINT = 0.25  # metres of a step in the road, between rows of a path, that is driven over as a ramp
+_AXLES = 0.5  # metres, wheelbase below which a body does not pitch with the ground
+_STEEP = 0.35  # maximum gradient of the ground under a wheel
+_JOINT = 0.25  # metres of height between rows of a path from which a step becomes a ramp
 _WHEEL_STEP = 0.2  # metres: a kerb
-_PUSH = 4.0  # metres before and behind an obstacle over which the line is pushed aside
-_ASTRAY = 1.5  # turning radii from the middle of its lane beyond which a vehicle has left the street
-_WHEEL = 0.95  # share of the full lock that the line asks for, so that the wheel has some left to correct
+_PUSH = 4.0  # metres before and behind an obstacle over which the line is shifted
+_ASTRAY = 1.5  # turning radii, maximum distance of a vehicle from its lane centre
+_WHEEL = 0.95  # share of the maximum curvature of a line, a margin for feedback
 
 
 @dataclass(frozen=True, slots=True)
 class Path:
-    """Where the rear axle goes; a row every few decimetres.
+    """The path of the rear axle, with a row every few decimetres.
 
     s         : (n,) true metres driven from the start, along the slope
     position  : (n, 3) scene metres, the rear axle's centre on the ground
@@ -115,7 +115,7 @@ def plan_path(
     """
     if not isinstance(obstacles, shapely.STRtree):
         obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))
-    # what flies has no lane and bends on another scale
+    # aircraft have no lane, and larger turning radii
     step = vehicle.turning_radius / 17 if vehicle.kind == "air" else min(0.25, vehicle.turning_radius / 8)
     setting = Setting(vehicle, frame, obstacles, margin, step, route.side)
     line = _resampled(route, 2 * step if vehicle.kind == "air" else min(0.5, 2 * step))
@@ -144,7 +144,7 @@ def _resampled(route: Route, spacing: float) -> Line:
     for first, last in itertools.pairwise(ends):
         xyz = route.line[first:last]
         s = polylines.stations(xyz)
-        keep = np.append(np.diff(s) > 1e-9, True)  # of points that coincide the last says what comes
+        keep = np.append(np.diff(s) > 1e-9, True)  # of coincident points the last one counts
         xyz, s = xyz[keep], s[keep]
         if len(s) < 2 or s[-1] < 2 * spacing:
             raise RouteError(f"the route has a stretch of {s[-1]:.2f} m; too short to drive")
@@ -158,7 +158,7 @@ def _resampled(route: Route, spacing: float) -> Line:
 
 
 def _shortened(line: Line, vehicle: Vehicle) -> Line:
-    """The line without its last metres, so that the front of the body ends where the line did."""
+    """The line without its last metres, so that the front of the body stops at its end."""
     spare = min(round(vehicle.front / line.gap), len(line.edge) - 5)
     return line.take(slice(0, len(line.edge) - max(spare, 0)))
 
@@ -226,7 +226,7 @@ def _lost(track: Track, line: Line, *, xy: Float, vehicle: Vehicle) -> NDArray[n
 
 
 def _joined(legs: list[Track], lines: list[Line], *, setting: Setting, ground: Surface | None) -> Path:
-    """One path of all legs, with the ground under it."""
+    """One path of all legs, with heights."""
     heights = _heights(legs, lines, setting=setting, ground=ground)
     parts = []
     start = 0.0
@@ -255,7 +255,7 @@ def _joined(legs: list[Track], lines: list[Line], *, setting: Setting, ground: S
             )
         )
     whole = Path(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Path)))
-    # a leg may have begun from its line's own heading, whole turns away from where the leg before it ended
+    # headings of consecutive legs may differ by whole turns
     turns = np.concatenate([[0.0], np.cumsum(np.round(np.diff(whole.heading) / (2 * np.pi)) * 2 * np.pi)])
     return replace(whole, heading=whole.heading - turns)
 
@@ -274,7 +274,7 @@ def _heights(
     ]
     sizes = np.array([len(leg.row) for leg in legs])
     starts = np.cumsum(sizes)[:-1]
-    # where a leg begins the position stands twice: smooth the rows that differ, then say them twice again
+    # positions are doubled between legs: smooth without the duplicates, then repeat them
     once = np.ones(int(sizes.sum()), bool)
     once[starts] = False
     twice = np.cumsum(once) - 1
@@ -282,11 +282,11 @@ def _heights(
     over = body.turning_radius if body.kind == "air" else max(body.wheelbase, 1.0)
     width = (over if ground is None else _SPRING) / legs[0].step
     z, tilt, bank = (np.concatenate(column)[once] for column in zip(*raw, strict=True))
-    # beyond its ends the road goes on as steep as it was
+    # extrapolate the road at both ends with its gradient
     spare, wide = math.ceil(4 * over / legs[0].step) + 1, over / legs[0].step
     far = np.pad(z, spare, mode="reflect", reflect_type="odd")
     near, soft = (gaussian_filter1d(far, w)[spare : spare + len(z)] for w in (width, wide))
-    if ground is not None:  # a step, as at the joint of a bridge, is taken as a ramp
+    if ground is not None:  # a step, as at the joint of a bridge, becomes a ramp
         rise = np.gradient(z)
         step = (
             np.abs(rise - median_filter(rise, 2 * math.ceil(wide) + 1, mode="nearest")) > _JOINT / 2
@@ -330,7 +330,7 @@ def _raw_heights(
         reach = base / np.hypot(1.0, ahead)
         front, twisted = _axle(leg, rear + reach * ahead, ahead=reach, setting=setting, ground=ground)
         ahead = (front - rear) / reach
-    # a rigid body on four wheels: the twist of the ground is left to the springs
+    # a rigid body on four wheels: springs take the twist of the ground
     return rear, ahead, (across + twisted) / 2
 
 
@@ -350,7 +350,7 @@ def _axle(
     under = []
     for side in (1.0, -1.0):
         wheel = ground(x - side * half * s, y + side * half * c, middle)
-        # what is higher or lower than a wheel goes is a wall or an edge that the wheel does not stand on
+        # larger height differences are walls or edges on which no wheel stands
         under.append(np.where(np.abs(wheel - middle) <= _WHEEL_STEP + _STEEP * track / 2, wheel, middle))
     left, right = under
     return 0.5 * (left + right), (left - right) / track

@@ -1,4 +1,4 @@
-"""Drives along the poses of an earlier one."""
+"""Trajectories read from an earlier dataset."""
 
 from __future__ import annotations
 

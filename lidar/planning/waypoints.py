@@ -1,4 +1,4 @@
-"""Routes through given places: waypoints snapped to streets, and recorded tracks matched to them."""
+"""Routes through waypoints snapped to streets, and map matching of recorded tracks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Place = tuple[int, float]
 """An edge and the true metres from its tail."""
 
 _NAMED = 3
-"""Waypoints off the streets that an error names."""
+"""Maximum number of waypoints that an error names."""
 
 DENSE_M = 60.0
 """Median metres between a file's points up to which they are a track; farther apart, they are waypoints."""
@@ -193,7 +193,7 @@ def _thinned(xy: Float, gap: float) -> Float:
 
 
 class _Search:
-    """Cheapest chains of places on a graph: dynamic programming over candidates, Dijkstra between them.
+    """Cheapest sequences of places on a graph: dynamic programming over candidates, Dijkstra in between.
 
     A place is on a state of `routing.turn_states`, so that restrictions via ways hold across places.
     """
@@ -272,7 +272,7 @@ class _Search:
         score: Callable[[int, Float], Float],
         reach: Float | None = None,
     ) -> tuple[NDArray[np.int32], tuple[float, float]] | int:
-        """Edges and end offsets of the cheapest chain, or the number of the first place that none reaches."""
+        """Edges and end offsets of the cheapest sequence, or the number of the first unreachable place."""
         total, choice = own[0], []
         candidates, own = self._states(candidates, own)
         for k in range(1, len(candidates)):

@@ -23,11 +23,11 @@ from lidar.errors import FormatError, InputError
 if TYPE_CHECKING:
     from pyproj import Transformer
 
-_HEAD = 1 << 16  # bytes at a file's start in which SUMO notes its options
+_HEAD = 1 << 16  # bytes at a file's start that hold SUMO's options
 _OPTION = re.compile(
     r'<(net-file|route-files|additional-files|fcd-output\.geo|fcd-output\.utm) value="([^"]*)"'
 )
-_UNDONE = ("", "!", "-", ".")  # what a network says of its projection where that cannot be undone
+_UNDONE = ("", "!", "-", ".")  # values of projParameter without an inverse
 
 _LENGTHS = {
     "passenger": 5.0,
@@ -43,7 +43,7 @@ _LENGTHS = {
     "bicycle": 1.6,
     "pedestrian": 0.215,
 }
-"""Metres of a vehicle of a class, by SUMO's defaults."""
+"""Default length in metres of SUMO's vehicle classes."""
 
 _WORDS = (
     *(("trailer", "trailer"), ("truck", "truck"), ("lorry", "truck"), ("hgv", "truck"), ("coach", "coach")),
@@ -53,14 +53,14 @@ _WORDS = (
     *(("person", "pedestrian"), ("delivery", "delivery"), ("van", "delivery"), ("emergency", "emergency")),
     *(("taxi", "taxi"), ("bus", "bus")),
 )
-"""Words in the names of types, the first that fits counts, and their classes; "" for what is left out."""
+"""Words in the names of types, first match first, and their classes; "" for those left out."""
 _OTHER = {"private": "passenger", "evehicle": "passenger", "hov": "passenger", "vip": "passenger",
           "army": "truck", "authority": "passenger", "wheelchair": "pedestrian"}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class TrafficFile:
-    """Traffic from a file of SUMO, and who else is about.
+    """Traffic from a file of SUMO, with parked vehicles.
 
     path   : floating car data, ``.xml`` or ``.xml.gz``
     net    : SUMO's network, of which its coordinates are; by default the one that the file names, and none is
@@ -79,7 +79,7 @@ class TrafficFile:
     side: Literal["right", "left"] = "right"
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
+        """Raise InputError for values out of range."""
         if not 0 <= self.parked <= 1:
             raise InputError(f"traffic: parked = {self.parked} is not within 0 to 1")
         if not 50 <= self.radius <= 1000:
@@ -88,7 +88,7 @@ class TrafficFile:
 
 @dataclass(frozen=True, slots=True)
 class Fcd:
-    """What SUMO recorded, a row a vehicle or person and time step, by vehicle and in time.
+    """Floating car data, one row per vehicle or person and time step, sorted by vehicle and time.
 
     name     : (n,) its id, ``first`` (n + 1,) its rows
     vclass   : (n,) its class: a key of `length_of`
@@ -123,7 +123,7 @@ class Fcd:
 
 
 def read_fcd(path: Path, *, net: Path | None = None) -> Fcd:
-    """The vehicles and persons of a file; what runs on rails or swims is left out.
+    """The vehicles and persons of a file, without rail vehicles and ships.
 
     Raises FormatError for a file that is missing, broken or another one, and where the place of its network
     on Earth cannot be told.
@@ -185,7 +185,7 @@ def _class_of(kind: str) -> str:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[IO[bytes]]:
-    """A file of XML, packed or not; FormatError for one that cannot be read."""
+    """An XML file, gzipped or not; raises FormatError if it cannot be read."""
     try:
         with path.open("rb") as raw, gzip.open(raw) as unpacked:
             packed = raw.read(2) == b"\x1f\x8b"
@@ -200,7 +200,7 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
 
 
 def _noted(path: Path) -> dict[str, str]:
-    """The options that SUMO noted at the file's start."""
+    """SUMO's options in the comment at the file's start."""
     with _opened(path) as file:
         head = file.read(_HEAD).decode("utf-8", "replace")
     head, _, _ = head.partition("<fcd-export")
@@ -208,13 +208,13 @@ def _noted(path: Path) -> dict[str, str]:
 
 
 def _beside(path: Path, named: str) -> Path | None:
-    """A file that another one names, beside it or where it says."""
+    """A file named in another one, in the same folder or at the path given; None if it does not exist."""
     found = [p for p in (path.parent / named, Path(named)) if named and p.is_file()]
     return found[0] if found else None
 
 
 def _elements(file: IO[bytes], tag: str) -> Iterator[ET.Element]:
-    """Elements of a tag, forgotten when the next is asked for; the file's root first."""
+    """The root, then the elements of a tag; each is released when the next is read."""
     events = ET.iterparse(file, events=("start", "end"))  # noqa: S314  (expat bounds what entities expand to)
     _, root = next(events)
     yield root
@@ -313,7 +313,7 @@ def network_projection(net: Path) -> NetworkProjection:
 
 
 def _types(path: Path, noted: dict[str, str]) -> dict[str, tuple[str, float | None]]:
-    """Class and length of the types in the files of routes that SUMO read, as far as they are there."""
+    """Class and length of the vehicle types in the route files that exist."""
     out: dict[str, tuple[str, float | None]] = {}
     named = f"{noted.get('route-files', '')},{noted.get('additional-files', '')}"
     for name in named.split(","):

@@ -1,4 +1,4 @@
-"""Road users that go as a file of SUMO says."""
+"""Replay of SUMO's floating car data as road users of a scene."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ _KINDS: dict[str, tuple[str, ...]] = {
     "bicycle": ("cyclist",),
     "pedestrian": ("adult", "small_adult"),
 }
-"""Kinds of bodies of SUMO's classes; cars by their shares of the traffic."""
-_SHORTER = 0.85  # least factor by which a body is made as short as SUMO's
-_JUMP = (2.0, 8.0)  # one who covers more than so many times its way, and metres, between steps was moved
-_SLOW, _FAST = 5.0, 20.0  # m/s that one is taken to be able to go at least, and where the file has no speeds
-_PAUSE = 1.5  # steps between rows beyond which one was away meanwhile
-_ASIDE = (1.0, 2.0)  # metres in a step, and m/s, sideways: a change of lane at one go
-_CHANGE_S = 3.0  # seconds over which such a change is spread
-_NEAR = 12.0  # metres in plan within which the road is that one is on
-_AGAINST = 8.0  # metres that a road counts as farther for running across
-_ROOM = (0.6, 0.3)  # metres that the ego's box is longer and wider than it is to who would touch it
+"""Kinds of bodies for SUMO's vehicle classes."""
+_SHORTER = 0.85  # minimum scale factor of a body that is longer than SUMO's vehicle
+_JUMP = (2.0, 8.0)  # a move of more than this factor of speed * time plus metres is a teleport
+_SLOW, _FAST = 5.0, 20.0  # m/s, minimum of the speed in that test, and its default
+_PAUSE = 1.5  # steps between rows from which a road user was absent
+_ASIDE = (1.0, 2.0)  # metres per step, and m/s, sideways, of an instantaneous lane change
+_CHANGE_S = 3.0  # seconds over which it is spread
+_NEAR = 12.0  # metres in plan, maximum distance of a road user from its road
+_AGAINST = 8.0  # metres added to the distance of a road in the opposite direction
+_ROOM = (0.6, 0.3)  # metres added to the ego's length and width in collision checks
 
 
 def replay(
@@ -63,13 +63,13 @@ def replay(
     seed: int,
     options: TrafficFile,
 ) -> Actors:
-    """The road users of a file of SUMO around the ego vehicle, and parked vehicles out of their way.
+    """The road users of a file of SUMO around the ego vehicle, and parked vehicles clear of their paths.
 
-    Between SUMO's steps positions are cubic, never backwards, and headings linear; changes of lane that SUMO
-    makes at one go are spread over three seconds. Whom the ego would touch is left out: those of the file
-    do not know of it. Looks follow from the seed and from SUMO's ids.
+    Between SUMO's steps positions are cubic, never backwards, and headings linear; instantaneous lane changes
+    are spread over three seconds. Road users that the ego would touch are left out, as they do not react to
+    it. Bodies depend on the seed and SUMO's ids.
 
-    Raises FormatError for a file that is none, InputError if nobody of it comes into the scene or near.
+    Raises FormatError for an invalid file, InputError if no road user of it comes near the ego.
     """
     fcd = read_fcd(options.path, net=options.net)
     begin = float(fcd.time.min()) if options.begin is None else options.begin
@@ -114,7 +114,7 @@ def _moving(
     setup: TrafficSetup,
     seed: int,
 ) -> Actors:
-    """Those of a file who move in the ego's surroundings."""
+    """The moving road users of a file in the ego's surroundings."""
     scale = setup.scale
     front, heading = scene_positions(fcd, scene)
     shapes, stretch, parts = [], [], []
@@ -157,7 +157,7 @@ def _moving(
 
 
 def _nobody(fcd: Fcd, begin: float, *, anybody: bool) -> str:
-    """Why a file gave nobody."""
+    """Error message for a file without road users near the ego."""
     if anybody:
         return "traffic: nobody of the file comes near the ego vehicle; raise radius or choose another route"
     first, last = float(fcd.time.min()), float(fcd.time.max())
@@ -180,7 +180,7 @@ def scene_positions(fcd: Fcd, scene: Scene) -> tuple[Float, Float]:
 def _body(
     vclass: str, length: float, *, rng: np.random.Generator
 ) -> tuple[Shape, tuple[float, float, float]]:
-    """A body of a class, no longer than SUMO's as far as that goes, and its factors."""
+    """A body of a class and its scale factors; not longer than SUMO's vehicle if `_SHORTER` permits."""
     kinds = _KINDS[vclass]
     weight = np.cumsum([VEHICLE_SHARES.get(kind, 1.0) for kind in kinds])
     shape = random_shape(kinds[int(np.searchsorted(weight, rng.random() * weight[-1], side="right"))], rng)
@@ -191,7 +191,7 @@ def _body(
 
 
 def _runs(time: Float, front: Float, *, speed: Float, scale: float) -> list[slice]:
-    """Rows of one mover between which it moves on its own: not away meanwhile, not put elsewhere."""
+    """Runs of rows of one road user without absence or teleport."""
     if len(time) < 2:
         return []
     dt = np.diff(time)
@@ -229,7 +229,7 @@ def _sampled(time: Float, middle: Float, *, yaw: Float, until: float) -> Float:
 
 
 def _monotone(slope: Float) -> Float:
-    """Speeds (n + 1,) between those (n,) of even steps, with which a cubic never goes backwards.
+    """Speeds (n + 1,) at the knots of even steps of mean speeds (n,) for a monotone cubic.
 
     Harmonic means: Fritsch and Butland, "A method for constructing local monotone piecewise cubic
     interpolants", 1984.
@@ -240,7 +240,7 @@ def _monotone(slope: Float) -> Float:
 
 
 def _changes(time: Float, middle: Float, *, yaw: Float) -> tuple[Float, list[tuple[float, Float]]]:
-    """The middles (n, 2) without changes of lane at one go, and those: second of its middle, and offset."""
+    """Centres (n, 2) without instantaneous lane changes, and these: mean time in seconds, and offset."""
     d, dt = np.diff(middle, axis=0), np.diff(time)
     mean = (yaw[:-1] + yaw[1:]) / 2
     left = np.column_stack([-np.sin(mean), np.cos(mean)])
@@ -261,7 +261,7 @@ def _inside(xy: Float, bounds: tuple[float, float, float, float]) -> NDArray[np.
 
 
 def _about(track: Float, scene: Scene, *, ego: Trajectory, radius: float) -> list[Float]:
-    """Parts of a track on the map that come within radius of the ego, from there to where they leave it."""
+    """Parts of a track that are on the map and within ``radius`` of the ego."""
     if not len(track):
         return []
     at = ego.at(np.round(track[:, 0] * STEP_S * 1e9).astype(np.int64).clip(max=ego.duration_ns)).position[
@@ -278,7 +278,7 @@ def _about(track: Float, scene: Scene, *, ego: Trajectory, radius: float) -> lis
 
 
 def _hints(graph: RoadGraph, xy: Float, *, yaw: Float, foot: NDArray[np.bool_]) -> Float:
-    """Height (n,) of the road that each place is on, NaN where there is none: the nearest that runs that way.
+    """Height (n,) of the nearest road in the direction of each position, NaN where there is none.
 
     foot : who goes in any direction
     """
@@ -302,7 +302,7 @@ def _hints(graph: RoadGraph, xy: Float, *, yaw: Float, foot: NDArray[np.bool_]) 
 
 
 def _touched(actors: Actors, ego: Trajectory, *, vehicle: Vehicle) -> Ints:
-    """Actors whose box the ego's touches at some time."""
+    """Rows of the actors whose bounding box the ego's intersects at any time."""
     hit: list[Ints] = []
     scale = actors.scale
     length, width = (size + room for size, room in zip((vehicle.length, vehicle.width), _ROOM, strict=True))
@@ -328,7 +328,7 @@ def _touched(actors: Actors, ego: Trajectory, *, vehicle: Vehicle) -> Ints:
 
 
 def _without(actors: Actors, rows: Ints) -> Actors:
-    """The actors less some of them."""
+    """The actors without some rows."""
     keep = np.ones(len(actors), bool)
     keep[rows] = False
     knots = np.diff(actors.first)
@@ -344,7 +344,7 @@ def _without(actors: Actors, rows: Ints) -> Actors:
 
 
 def _covered(actors: Actors) -> NDArray[np.object_]:
-    """What actors cover as they go, with some room: a box every fifth knot."""
+    """Bounding boxes of actors at every fifth knot, with a margin."""
     owner = np.repeat(np.arange(len(actors)), np.diff(actors.first))[::5]
     size = actors.size[owner] * actors.scale
     room = np.hypot(*actors.velocity[::5, :2].T) * STEP_S * 5
