@@ -329,3 +329,13 @@ def test_echo_stages_treat_recorded_returns_as_echoes():
     assert injected.sum() > 5000
     assert np.linalg.norm(near.cloud.xyz[injected], axis=1) == pytest.approx(3.0, abs=0.1)
     assert (near.cloud.hidden[injected] >= 0).all()
+
+
+def test_a_rule_selects_returns_of_both_clouds():
+    found = altered_sweep(swept(return_mode="dual"), chain(Injected(3.0), DroppedPackets(0.3)))
+    early = found.where(lambda cloud: cloud.time_ns < 40_000_000)
+    assert 0 < len(early.original) < len(found.original)
+    known = early.cloud.source >= 0
+    assert known.any()
+    assert np.array_equal(early.cloud.xyz[known], early.original.xyz[early.cloud.source[known]])
+    assert_same(early.cloud, found.cloud.where(found.cloud.time_ns < 40_000_000))
