@@ -15,6 +15,7 @@ from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
 from lidar import __version__
 from lidar.dataset.export import EXPORTERS, exporter
+from lidar.dataset.formats import map_suffixes
 from lidar.errors import InputError, LidarError
 from lidar.options import OUTPUT, DriveOptions
 
@@ -113,7 +114,10 @@ def map_(
     dataset: Path,
     /,
     *,
-    out: Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)],
+    out: Annotated[
+        Path,
+        Parameter(name=["--out", "-o"], group=OUTPUT, help=f"File to write: {', '.join(map_suffixes())}."),
+    ],
     voxel: float | None = None,
     color: str = "class",
     sensor: Annotated[list[str] | None, Parameter(consume_multiple=True, negative=())] = None,
@@ -134,8 +138,6 @@ def map_(
     ----------
     dataset
         Directory of the dataset.
-    out
-        File to write: .laz, .las, .ply or .pcd.
     voxel
         Side in metres of cubes that keep one return each; all returns by default.
     color

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes
 from geoscene.progress import Progress, silent
-from lidar.dataset.formats import FORMATS, Format, format_of, read_table
+from lidar.dataset.formats import FORMATS, Format, format_of, map_suffixes, read_table
 from lidar.dataset.formats.las import LasInfo, gps_seconds, read_chunks
 from lidar.dataset.formats.table import Table, placed_returns, records, rows
 from lidar.dataset.layout import Dataset
@@ -31,11 +31,6 @@ _COLUMNS = ("x", "y", "z", "intensity", "gps_time", "ring", "label", "instance",
 _BUCKET = 64.0  # metres: side of the squares into which points are sorted before they are thinned
 _SHRINK_AT = 64 * 2**20  # bytes of a square's points beyond which they are thinned
 _SAMPLE = 12  # frames from which the range of heights for the colours is estimated
-
-
-def map_suffixes() -> list[str]:
-    """Suffixes of files that maps are written to."""
-    return [form.suffix for form in FORMATS.values() if form.maps]
 
 
 def _readable() -> list[Format]:
@@ -76,7 +71,7 @@ def aggregate(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> MapSummary:
-    """Write the map of a dataset in the format of the suffix of ``out``, see `map_suffixes`.
+    """Write the map of a dataset in the format of the suffix of ``out`` (see `map_suffixes`).
 
     LAS, LAZ and PLY hold easting, northing and height in the dataset's export CRS. PCD, whose readers take
     float32, holds the same minus the whole-metre offset that its comment line states.

@@ -147,6 +147,11 @@ def format_of(path: Path, name: str = "") -> Format:
     return max(found, key=lambda row: len(row.suffix))
 
 
+def map_suffixes() -> list[str]:
+    """Suffixes of the files that aggregated maps can be written to."""
+    return [row.suffix for row in FORMATS.values() if row.maps]
+
+
 def read_table(path: Path, format: str = "") -> Table:  # noqa: A002 - the word that users know
     """The points of a file as a table, in the frame and with the columns of its format.
 
