@@ -5,12 +5,12 @@ import tempfile
 import numpy as np
 import pytest
 import shapely
+from cyclopts import CoercionError
 
 from geoscene.build import BuildOptions, build
 from geoscene.errors import MissingExtraError
 from geoscene.sources import demo_path, read_osm
 from lidar.cli import app
-from lidar.errors import InputError
 from lidar.planning.motion import drive_path
 from lidar.planning.road_drive import plan_road_drive
 from lidar.rig.vehicle import load_vehicle
@@ -84,5 +84,5 @@ def test_without_sumo_the_extra_is_named(scene, path, monkeypatch):
 
 def test_unknown_words_after_sumo_are_named(scene, tmp_path):
     words = ["drive", str(scene.path), "--route", "random", "-o", str(tmp_path / "d"), "-q"]
-    with pytest.raises(InputError, match="speed is none of"):
+    with pytest.raises(CoercionError, match="speed is none of"):
         app([*words, "--traffic", "sumo,speed=3"], exit_on_error=False, result_action="return_value")
