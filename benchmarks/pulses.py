@@ -108,9 +108,10 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
     began = time.perf_counter()
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from lidar.dataset.recording import Contents, Recording  # noqa: PLC0415
-    from lidar.drive import Stopwatch, record_all, schedule  # noqa: PLC0415
+    from lidar.drive import record_all  # noqa: PLC0415
     from lidar.geometry.georeference import Georeference, export_crs  # noqa: PLC0415
     from lidar.geometry.trajectory_csv import read_trajectory  # noqa: PLC0415
+    from lidar.plan import schedule  # noqa: PLC0415
     from lidar.rig.devices import scanners  # noqa: PLC0415
     from lidar.rig.specs import load_rig  # noqa: PLC0415
     from lidar.settings import settings_of  # noqa: PLC0415
@@ -121,7 +122,6 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
     sensors = scanners(load_rig("vlp16"))
     geo = Georeference(scene.frame, export_crs(scene.frame))
     settings, _ = settings_of("standard", [("rays", str(rays))])
-    watch = Stopwatch()
     recording = Recording(
         out,
         scene.frame,
@@ -129,23 +129,16 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
         start=_START,
         geo=geo,
         contents=Contents(("las",), scanner=settings),
-        watch=watch,
     )
-    points = record_all(
-        scene,
-        trajectory,
-        jobs=schedule(sensors, trajectory.duration_ns),
-        sensors=sensors,
-        recording=recording,
-        workers=workers,
-    )
+    jobs = schedule(sensors, trajectory.duration_ns)
+    points = record_all(recording, jobs, scene=scene, workers=workers)
     ended = time.perf_counter()
     return {
         "import_s": imported - began,
         "loop_s": ended - imported,
         "loop_cpu_s": time.process_time() - imported_cpu,
         "points": sum(points.values()),
-        **watch.seconds,
+        **recording.watch.seconds,
     }
 
 

@@ -23,7 +23,6 @@ from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows
 from lidar.dataset.record_clouds import write_clouds
 from lidar.dataset.recording import Contents, Recording
-from lidar.drive import Stopwatch
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.rig.devices import Camera, Scanner, cameras, scanners
@@ -115,7 +114,6 @@ def _apply_to_dataset(
         start=dataset.start,
         geo=Georeference(dataset.frame, export_crs(dataset.frame, recipe["crs"]), exact=recipe["exact"]),
         contents=contents,
-        watch=Stopwatch(),
     )
     jobs = [
         (s, frame)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +32,23 @@ from lidar.world.actors import Actors
 from lidar.world.visibility import Visibility
 
 
-class StageTimer(Protocol):
-    """Measures the time that each stage of a recording takes."""
+class Stopwatch:
+    """Seconds by stage, summed over threads."""
 
-    def stage(self, name: str) -> AbstractContextManager[None]:
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
         """Add the time until the block ends to a stage."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            spent = time.perf_counter() - began
+            with self._lock:
+                self.seconds[name] = self.seconds.get(name, 0.0) + spent
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +127,7 @@ class Recording:
     start: datetime
     geo: Georeference
     contents: Contents
-    watch: StageTimer
+    watch: Stopwatch = field(default_factory=Stopwatch)
     actors: Actors | None = None
     max_range: float = 0.0
     scanning_ns: NDArray[np.int64] | None = None

@@ -15,10 +15,11 @@ import shapely
 from geoscene.scene import SceneFiles
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
-from lidar.drive import drive, plan
+from lidar.drive import drive
 from lidar.errors import InputError, RouteError
 from lidar.geometry.trajectory_csv import read_trajectory
 from lidar.options import DriveOptions
+from lidar.plan import plan_motion
 from lidar.planning.flight_planning import survey_area, swath
 from lidar.planning.replay import read_replay
 from lidar.rig.devices import cameras, scanners
@@ -33,7 +34,9 @@ def flight(scene, rig="drone", **change):
 
 
 def planned(scene, options, kit):
-    return plan(scene, options, body=load_vehicle(kit.vehicle), sensors=[*scanners(kit), *cameras(kit)])
+    return plan_motion(
+        scene, options, vehicle=load_vehicle(kit.vehicle), sensors=[*scanners(kit), *cameras(kit)]
+    )
 
 
 def test_between_the_lines_of_a_survey_scanners_are_off_unless_asked_for(scene, tmp_path):

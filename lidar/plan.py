@@ -1,0 +1,285 @@
+"""The plan of a drive: what is known before the first frame is recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geoscene.progress import Progress, silent
+from geoscene.scene import Scene
+from geoscene.typing import Ints
+from lidar import __version__
+from lidar.errors import InputError
+from lidar.geometry.georeference import Georeference, export_crs
+from lidar.geometry.poses import Trajectory
+from lidar.options import DriveOptions
+from lidar.planning.flight import Flight
+from lidar.planning.road_drive import RoadPlan, plan_road_drive
+from lidar.rig.devices import Camera, Scanner, cameras, scanners
+from lidar.rig.specs import Rig, load_rig
+from lidar.rig.vehicle import Vehicle, load_vehicle
+from lidar.traffic.ego_drive import drive_in_traffic, drive_with_signals
+from lidar.traffic.fcd import TrafficFile
+from lidar.traffic.fcd_replay import replay
+from lidar.traffic.populate import populate
+from lidar.traffic.sumo import SumoOptions, drive_in_sumo
+from lidar.world.actors import Actors
+
+_RANDOM_SECONDS = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One frame of one sensor."""
+
+    start_ns: int
+    order: int
+    frame: int
+    sensor: Scanner | Camera = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class DrivePlan:
+    """All that `drive` records, fixed before the first frame.
+
+    scene       : the scene
+    options     : the options
+    rig         : sensors and their mounts
+    sensors     : scanners and cameras of the rig, in its order
+    start       : UTC time of the drive's start
+    trajectory  : of the ego vehicle
+    actors      : other road users; None without traffic
+    scanning_ns : (k, 2) times from and until which scanners work; None for always
+    geo         : from the scene frame to the export CRS
+    jobs        : frames of all sensors in order of time
+    """
+
+    scene: Scene
+    options: DriveOptions
+    rig: Rig
+    sensors: tuple[Scanner | Camera, ...]
+    start: datetime
+    trajectory: Trajectory
+    actors: Actors | None
+    scanning_ns: Ints | None
+    geo: Georeference
+    jobs: tuple[Job, ...]
+
+    @property
+    def max_range(self) -> float:
+        """Metres beyond which no sensor measures."""
+        return max((s.reach for s in self.sensors), default=0.0)
+
+    @property
+    def length(self) -> float:
+        """True metres that the ego vehicle covers."""
+        steps = np.diff(self.trajectory.position, axis=0)
+        steps[:, :2] /= self.trajectory.scale[1:, None]
+        return float(np.linalg.norm(steps, axis=1).sum())
+
+    @property
+    def frames(self) -> dict[str, int]:
+        """Number of frames, by sensor."""
+        count = dict.fromkeys((s.name for s in self.sensors), 0)
+        for job in self.jobs:
+            count[job.sensor.name] += 1
+        return count
+
+    def manifest(self) -> dict[str, Any]:
+        """Contents of ``dataset.json`` but its counts of points and finished frames."""
+        scene, options, frames = self.scene, self.options, self.frames
+        manifest = {
+            "schema": 1,
+            "generator": f"geoscene lidar {__version__}",
+            "scene": {"name": scene.manifest.get("name", ""), "path": str(scene.path)},
+            "attribution": scene.manifest.get("attribution", ""),
+            "frame": scene.frame.to_json(),
+            "export_crs": self.geo.crs.to_wkt(),
+            "start_time": self.start.isoformat(),
+            "duration_ns": self.trajectory.duration_ns,
+            "length_m": round(self.length, 3),
+            "rig": self.rig.name,
+            "formats": list(options.formats),
+            "labels": list(options.labels),
+            "deskew": options.deskew,
+            "fidelity": options.fidelity,
+            "seed": options.seed,
+            "frames": next(iter(frames.values()), 0),
+            "sensor_frames": frames,
+        }
+        if self.scanning_ns is not None:
+            on = np.clip(self.scanning_ns, 0, self.trajectory.duration_ns)
+            manifest["scanners_on_ns"] = on.tolist()
+        return manifest | {"recipe": options.recipe(scene)}
+
+
+def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = silent) -> DrivePlan:
+    """The plan of a drive through a scene.
+
+    Raises InputError (also as RouteError, RigError) for what cannot be driven.
+    """
+    rig = load_rig(options.rig)
+    sensors = _sensors(rig, options)
+    vehicle = load_vehicle(options.vehicle or rig.vehicle)
+    motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
+    trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)
+    jobs = schedule(sensors, trajectory.duration_ns)
+    if sensors and not jobs:
+        raise InputError(f"the drive lasts {trajectory.duration_ns / 1e9:.2f} s, less than one frame")
+    return DrivePlan(
+        scene,
+        options,
+        rig,
+        sensors,
+        start=options.start or solar_start(scene),
+        trajectory=trajectory,
+        actors=actors,
+        scanning_ns=motion.on if isinstance(motion, Flight) else None,
+        geo=Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact),
+        jobs=tuple(jobs),
+    )
+
+
+def solar_start(scene: Scene) -> datetime:
+    """10:00 mean solar time on 21 June 2026 in a scene's centre, to the minute, in UTC."""
+    xmin, ymin, xmax, ymax = scene.bounds
+    lon_deg, _ = scene.frame.to_geographic((xmin + xmax) / 2, (ymin + ymax) / 2)
+    return datetime(2026, 6, 21, 10, tzinfo=UTC) - timedelta(minutes=round(float(lon_deg) * 4))
+
+
+def _sensors(rig: Rig, options: DriveOptions) -> tuple[Scanner | Camera, ...]:
+    """Scanners and cameras of a rig; raises InputError if it has no sensors, or stages on unknown ones."""
+    sensors: tuple[Scanner | Camera, ...] = (*scanners(rig), *cameras(rig))
+    if not sensors and not rig.gnss:
+        raise InputError(f"rig {rig.name} has no sensors")
+    kinds = {s.name: "lidar" if isinstance(s, Scanner) else "camera" for s in sensors}
+    options.contents().stages.check(kinds)
+    return sensors
+
+
+def schedule(sensors: Sequence[Scanner | Camera], duration_ns: int) -> list[Job]:
+    """Frames of all sensors that end within ``duration_ns``, in order of time."""
+    jobs = [
+        Job(sensor.frame_start_ns(k), i, k, sensor)
+        for i, sensor in enumerate(sensors)
+        for k in range(sensor.frame_count(duration_ns))
+    ]
+    return sorted(jobs, key=lambda job: (job.start_ns, job.order, job.frame))
+
+
+@dataclass(frozen=True, slots=True)
+class RoadMotion:
+    """A planned route with its path, and the trajectory along it without other road users."""
+
+    plan: RoadPlan
+    trajectory: Trajectory
+
+
+def plan_motion(
+    scene: Scene,
+    options: DriveOptions,
+    *,
+    vehicle: Vehicle,
+    sensors: Sequence[Scanner | Camera],
+    progress: Progress = silent,
+) -> Trajectory | RoadMotion | Flight:
+    """Trajectory of the ego vehicle alone; on roads with its path, in flight with the times of scanning.
+
+    Raises RouteError for a route that it cannot take.
+    """
+    from lidar.planning.flight_planning import FlightOptions, plan_flight  # noqa: PLC0415
+    from lidar.planning.replay import read_replay  # noqa: PLC0415
+
+    route = options.route or "random"
+    if isinstance(route, Path) and route.suffix == ".csv" and not options.survey:
+        replayed = read_replay(route, scene.frame)
+        return replayed if options.duration is None else replayed.until(round(options.duration * 1e9))
+    if vehicle.kind != "air":
+        if options.survey or options.altitude is not None:
+            option = "survey" if options.survey else "altitude"
+            raise InputError(
+                f"`{option}` is for aircraft, and a {vehicle.name} does not fly; set `vehicle` to drone or"
+                " aircraft, or take the rig of one"
+            )
+        travel = plan_road_drive(
+            scene,
+            route,
+            vehicle=options.vehicle or load_rig(options.rig).vehicle,
+            seed=options.seed,
+            duration=options.duration,
+            side=options.side_in(scene),
+            from_rest=options.from_rest,
+            progress=progress,
+        )
+        trajectory = drive_with_signals(
+            travel.path,
+            vehicle,
+            graph=scene.road_graph(),
+            seed=options.seed,
+            side=options.side_in(scene),
+            bounds=scene.bounds,
+            duration=travel.duration,
+            under_way=travel.under_way,
+        )
+        if travel.duration is not None:  # what cannot pull up within a short time is recorded until then
+            trajectory = trajectory.until(round(travel.duration * 1e9))
+        return RoadMotion(travel, trajectory)
+    progress("planning", 0, total=0)
+    seconds = options.duration
+    if seconds is None and route == "random" and not options.survey:
+        seconds = _RANDOM_SECONDS
+    return plan_flight(
+        scene,
+        route,
+        vehicle=vehicle,
+        sensors=sensors,
+        options=FlightOptions(
+            survey=options.survey,
+            altitude=options.altitude,
+            overlap=options.overlap,
+            turns=options.turns,
+            seed=options.seed,
+            duration=seconds,
+            from_rest=options.from_rest,
+        ),
+    )
+
+
+def _with_traffic(
+    scene: Scene,
+    options: DriveOptions,
+    *,
+    vehicle: Vehicle,
+    motion: Trajectory | RoadMotion | Flight,
+    progress: Progress,
+) -> tuple[Trajectory, Actors | None]:
+    """Trajectory of the ego vehicle among other road users, and these; None without traffic."""
+    trajectory = motion if isinstance(motion, Trajectory) else motion.trajectory
+    if options.traffic is None:
+        return trajectory, None
+    progress("traffic", 0, total=0)
+    traffic = replace(options.traffic, side=options.side_in(scene))
+    graph, seed = scene.road_graph(), options.seed
+    if isinstance(traffic, TrafficFile):
+        return trajectory, replay(scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic)
+    if isinstance(motion, RoadMotion):
+        simulate = drive_in_sumo if isinstance(traffic, SumoOptions) else drive_in_traffic
+        return simulate(
+            scene,
+            graph,
+            path=motion.plan.path,
+            vehicle=vehicle,
+            first=trajectory,
+            seed=seed,
+            options=traffic,
+            duration=motion.plan.duration,
+            under_way=motion.plan.under_way,
+        )
+    if isinstance(traffic, SumoOptions):
+        raise InputError("`traffic`: SUMO needs a drive along a route on roads")
+    return trajectory, populate(scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic)
