@@ -4,5 +4,4 @@ from lidar.raycast.caster import Caster as Caster
 from lidar.raycast.geometry import ALL as ALL
 from lidar.raycast.geometry import Geometry as Geometry
 from lidar.raycast.geometry import Instances as Instances
-from lidar.raycast.hits import Echoes as Echoes
 from lidar.raycast.hits import Hits as Hits

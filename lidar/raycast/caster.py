@@ -17,7 +17,7 @@ from lidar.geometry.poses import Poses
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.fallback import EmbreexScene
 from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split
-from lidar.raycast.hits import Echoes, Hits
+from lidar.raycast.hits import Hits
 from lidar.raycast.library import library
 from lidar.raycast.rays import free_rays, limited, posed_rays
 
@@ -183,24 +183,3 @@ class Caster:
         """
         rays = limited(free_rays(origins, directions), near=near, far=far, mask=mask, time=time)
         return self.scene.occluded(rays, threads=threads)
-
-    def cast_all(
-        self,
-        origins: ArrayLike,
-        directions: ArrayLike,
-        *,
-        k: int = 8,
-        near: float = 0.0,
-        far: float = np.inf,
-        mask: int = ALL,
-        time: ArrayLike | None = None,
-        threads: int = 1,
-    ) -> Echoes:
-        """The first ``k`` surfaces along each ray, nearest first; arguments as for `cast`.
-
-        A ray that meets an edge or vertex meets each of the faces there.
-        """
-        if k < 1:
-            raise InputError(f"cast_all looks for k = {k} surfaces; give 1 or more")
-        rays = limited(free_rays(origins, directions), near=near, far=far, mask=mask, time=time)
-        return self.scene.echoes(rays, k, threads=threads)

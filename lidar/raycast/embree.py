@@ -14,9 +14,8 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast import kernels
 from lidar.raycast.columns import COPIES, Rays, Target
-from lidar.raycast.echoes import COLLECT, echoes
 from lidar.raycast.geometry import Geometry, Instances
-from lidar.raycast.hits import Echoes, Hits
+from lidar.raycast.hits import Hits
 from lidar.raycast.library import (
     COHERENT,
     DYNAMIC,
@@ -39,11 +38,10 @@ from lidar.raycast.library import (
 from lidar.raycast.rays import share
 
 
-def arguments(flags: int = 0, *, context: int = 0, collect: int = 0) -> NDArray[np.int64]:
-    """An RTCIntersectArguments (or RTCOccludedArguments): flags, feature mask, context, filter, intersect."""
+def _arguments(flags: int = 0) -> NDArray[np.int64]:
+    """An RTCIntersectArguments or RTCOccludedArguments: flags, feature mask, context, filter, intersect."""
     words = np.zeros(8, np.int64)
     words.view(np.uint32)[:2] = flags, INVALID
-    words[1:3] = context, collect
     return words
 
 
@@ -81,7 +79,7 @@ class EmbreeScene:
         self._copies: list[NDArray[np.intp]] = []
         self._groups: list[_Group] = []
         self._own: tuple[list[Geometry], NDArray[np.int64]] = [], np.empty((0, 5), np.int64)
-        self._packet, self._single = arguments(COHERENT), arguments()
+        self._packet, self._single = _arguments(COHERENT), _arguments()
         self.target: Target
 
     def _attach(self, geometry: int, number: int) -> None:
@@ -212,20 +210,6 @@ class EmbreeScene:
         out, target = np.empty(len(rays.directions), np.bool_), self.target
         share(lambda lo, hi: int(kernels.occluded(target, rays, lo, hi, out)), rays, threads=threads)
         return out
-
-    def echoes(self, rays: Rays, k: int, *, threads: int) -> Echoes:
-        """The first k surfaces along each ray."""
-        n = len(rays.directions)
-        columns = (
-            np.empty(n, np.int32),
-            np.empty((n, k)),
-            np.empty((n, k), np.int32),
-            np.empty((n, k), np.int32),
-            np.empty((n, k), np.float32),
-        )
-        target = self.target
-        share(lambda lo, hi: int(echoes(target, rays, COLLECT, lo, hi, *columns)), rays, threads=threads)
-        return Echoes(*columns)
 
 
 def _addresses(part: Geometry) -> tuple[int, int, int, int, int]:

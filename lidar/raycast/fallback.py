@@ -18,9 +18,8 @@ from geoscene.typing import Float
 from lidar.errors import BackendError
 from lidar.raycast.columns import Rays
 from lidar.raycast.geometry import ALL, Geometry, Instances
-from lidar.raycast.hits import Echoes, Hits
+from lidar.raycast.hits import Hits
 from lidar.raycast.rays import in_scene
-from lidar.raycast.reference import Reference
 
 _NUDGE = 3e-7
 _GRAZING = 1e-3
@@ -62,7 +61,7 @@ def _mesh(parts: dict[int, Geometry]) -> _Soup:
 
 
 class _Body:
-    """Triangles that stand still in some frame, castable with embreex and, for echoes, in float64."""
+    """Triangles that stand still in some frame, castable with embreex."""
 
     def __init__(self, soup: _Soup) -> None:
         from embreex.mesh_construction import TriangleMesh  # noqa: PLC0415
@@ -73,7 +72,6 @@ class _Body:
         a, b, c = (soup.corners[:, k] for k in range(3))
         self.normal = np.cross(b - a, c - a)
         self._scene: Any = None
-        self._reference: Reference | None = None
         if len(soup.face):
             self._scene = EmbreeScene()
             TriangleMesh(self._scene, soup.corners.astype(np.float32))
@@ -122,12 +120,6 @@ class _Body:
         t[hit] = np.where(np.abs(cosine[hit]) < _GRAZING, held, t[hit])
         normal[hit] = n
         return t, cosine, normal
-
-    def all_met(self, o: Float, d: Float, *, k: int, near: float, far: Float) -> NDArray[np.int64]:
-        """Rows (n, k) of the first k triangles along each ray, -1 from the last on."""
-        if self._reference is None:
-            self._reference = Reference(self.soup.corners)
-        return self._reference.cast(o, d, k=k, near=near, far=far)[1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,33 +235,3 @@ class EmbreexScene:
     def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:
         """Whether anything lies on each ray."""
         return self.cast(rays, normals=False, threads=threads).face >= 0
-
-    def echoes(self, rays: Rays, k: int, *, threads: int) -> Echoes:  # noqa: ARG002
-        """The first k surfaces along each ray."""
-        start, d = in_scene(rays)
-        n, o = len(d), start - self.origin
-        far = np.broadcast_to(rays.far, (n,))
-        columns: list[list[NDArray[Any]]] = [[], [], [], []]
-        for body, local, way, axes in self._views(rays, o, d=d):
-            for rows in body.all_met(local, way, k=k, near=rays.near, far=far).T:
-                t, _, m = body.at(rows, local, d=way)
-                m = np.einsum("nij,nj->ni", axes, m)
-                length = np.linalg.norm(m, axis=1) * np.linalg.norm(d, axis=1)
-                c = -np.divide(np.einsum("ij,ij->i", m, d), length, out=np.zeros(n), where=length > 0)
-                met = rows >= 0
-                face = np.where(met, body.soup.face[rows], -1) if len(body.soup.face) else rows
-                number = np.where(met, body.soup.instance[rows], -1) if len(body.soup.face) else rows
-                for column, value in zip(columns, (t, c, face, number), strict=True):
-                    column.append(value)
-        ranges, cosines, faces, numbers = (np.stack(column, axis=1) for column in columns)
-        order = np.argsort(ranges, axis=1, kind="stable")[:, :k]
-        ranges, cosines, faces, numbers = (
-            np.take_along_axis(column, order, axis=1) for column in (ranges, cosines, faces, numbers)
-        )
-        return Echoes(
-            (faces >= 0).sum(axis=1).astype(np.int32),
-            ranges,
-            faces.astype(np.int32),
-            numbers.astype(np.int32),
-            cosines.astype(np.float32),
-        )

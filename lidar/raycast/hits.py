@@ -1,4 +1,4 @@
-"""What rays met: the first surface (`Hits`) or the first few (`Echoes`), as columns, one row a ray."""
+"""First hits of rays as columns, one row a ray."""
 
 from __future__ import annotations
 
@@ -31,25 +31,3 @@ class Hits:
     def __len__(self) -> int:
         """Number of rays."""
         return len(self.range)
-
-
-@dataclass(frozen=True, slots=True)
-class Echoes:
-    """The first k surfaces along each ray, nearest first.
-
-    count    : (n,) int32, surfaces found, at most k
-    range    : (n, k) float64, as in `Hits`; inf from ``count`` on
-    face     : (n, k) int32; -1 from ``count`` on
-    instance : (n, k) int32; -1 from ``count`` on
-    cosine   : (n, k) float32; 0 from ``count`` on
-    """
-
-    count: NDArray[np.int32]
-    range: NDArray[np.float64]
-    face: NDArray[np.int32]
-    instance: NDArray[np.int32]
-    cosine: NDArray[np.float32]
-
-    def __len__(self) -> int:
-        """Number of rays."""
-        return len(self.count)

@@ -20,8 +20,39 @@ from geoscene.typing import Float
 from lidar.raycast.columns import CHUNK, Rays, Target
 from lidar.raycast.lanes import GRAZING, cross, move_float64, move_int32, narrow, same
 from lidar.raycast.memory import aligned, float64_at, inlined, int32_at, int64_at
-from lidar.raycast.packets import RAY, ROWS, alike, first_bad, gather, nudge, trace
+from lidar.raycast.packets import alike, first_bad, gather, nudge, trace
 from lidar.raycast.planes import INVALID, meet, numbered, placed, plane_of
+from lidar.raycast.rows import (
+    COSINE,
+    FAR,
+    HIT_COPY,
+    HIT_FACE,
+    HIT_GEOMETRY,
+    HIT_INSTANCE,
+    INVERSE,
+    NX,
+    NY,
+    NZ,
+    OFFSET,
+    OX,
+    OY,
+    OZ,
+    PACKET_RAY_ROWS,
+    PACKET_ROWS,
+    RANGE,
+    RAY_FAR,
+    RAY_ID,
+    RAY_MASK,
+    RAY_NEAR,
+    RAY_OX,
+    RAY_OY,
+    RAY_OZ,
+    RAY_ROWS,
+    RAY_TIME,
+    SCALE,
+    TIME,
+    WORK_ROWS,
+)
 
 
 @inlined
@@ -36,41 +67,41 @@ def _normal(out: Float, i: int, x: float, y: float, z: float) -> None:
 def _name(target: Target, W: int, u: Any, work: Any, faces: Any, instances: Any) -> None:
     """Planes and numbers of what lanes met; a lane that met nothing has a plane without a normal."""
     for k in range(W):
-        work[13 * W + k] = work[6 * W + k]
-    geometry, copies = u.ctypes.data + 4 * 18 * W, u.ctypes.data + 4 * 19 * W
-    own = u[18 * W] != INVALID and u[19 * W] == INVALID
+        work[SCALE * W + k] = work[INVERSE * W + k]
+    geometry, copies = u.ctypes.data + 4 * HIT_GEOMETRY * W, u.ctypes.data + 4 * HIT_INSTANCE * W
+    own = u[HIT_GEOMETRY * W] != INVALID and u[HIT_INSTANCE * W] == INVALID
     if own and same(target.lanes, geometry) and same(target.lanes, copies):
         # The common case, all lanes on one mesh, without looking up for each what holds for all.
-        part = target.parts.ctypes.data + 40 * np.int64(target.rows[u[18 * W]])
+        part = target.parts.ctypes.data + 40 * np.int64(target.rows[u[HIT_GEOMETRY * W]])
         planes, numbers, first = int64_at(part, 0), int64_at(part, 3), int64_at(part, 4)
         for k in range(W):
-            prim = np.int64(u[17 * W + k])
+            prim = np.int64(u[HIT_FACE * W + k])
             plane = planes + 32 * prim
-            work[9 * W + k], work[10 * W + k] = float64_at(plane, 0), float64_at(plane, 1)
-            work[11 * W + k], work[12 * W + k] = float64_at(plane, 2), float64_at(plane, 3)
+            work[NX * W + k], work[NY * W + k] = float64_at(plane, 0), float64_at(plane, 1)
+            work[NZ * W + k], work[OFFSET * W + k] = float64_at(plane, 2), float64_at(plane, 3)
             faces[k] = first + prim
         if numbers:
             for k in range(W):
-                faces[k] = first + np.int64(int32_at(numbers, np.int64(u[17 * W + k])))
+                faces[k] = first + np.int64(int32_at(numbers, np.int64(u[HIT_FACE * W + k])))
         for k in range(W):
             instances[k] = -1
         return
     for k in range(W):
-        geom, inst, prim = u[18 * W + k], u[19 * W + k], np.int64(u[17 * W + k])
+        geom, inst, prim = u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], np.int64(u[HIT_FACE * W + k])
         if geom == INVALID:
-            work[9 * W + k], work[10 * W + k], work[11 * W + k], work[12 * W + k] = 0.0, 0.0, 0.0, 0.0
+            work[NX * W + k], work[NY * W + k], work[NZ * W + k], work[OFFSET * W + k] = 0.0, 0.0, 0.0, 0.0
             faces[k], instances[k] = -1, -1
         elif inst == INVALID:
             row = np.int64(target.rows[geom])
             plane = int64_at(target.parts.ctypes.data, 5 * row) + 32 * prim
-            work[9 * W + k], work[10 * W + k] = float64_at(plane, 0), float64_at(plane, 1)
-            work[11 * W + k], work[12 * W + k] = float64_at(plane, 2), float64_at(plane, 3)
+            work[NX * W + k], work[NY * W + k] = float64_at(plane, 0), float64_at(plane, 1)
+            work[NZ * W + k], work[OFFSET * W + k] = float64_at(plane, 2), float64_at(plane, 3)
             faces[k], instances[k] = numbered(target, row, prim), -1
         else:
-            row, instance = placed(target, geom, inst, u[20 * W + k])
-            x, y, z, d = plane_of(target, row, prim, instance, work[8 * W + k])
-            work[9 * W + k], work[10 * W + k], work[11 * W + k], work[12 * W + k] = x, y, z, d
-            work[13 * W + k] /= np.sqrt(x * x + y * y + z * z)
+            row, instance = placed(target, geom, inst, u[HIT_COPY * W + k])
+            x, y, z, d = plane_of(target, row, prim, instance, work[TIME * W + k])
+            work[NX * W + k], work[NY * W + k], work[NZ * W + k], work[OFFSET * W + k] = x, y, z, d
+            work[SCALE * W + k] /= np.sqrt(x * x + y * y + z * z)
             faces[k], instances[k] = numbered(target, row, prim), instance
 
 
@@ -94,21 +125,23 @@ def _second(
     W = len(target.lanes)
     u = f.view(np.uint32)
     for k in range(W):
-        f[k], f[W + k], f[2 * W + k] = work[k], work[W + k], work[2 * W + k]
-        f[3 * W + k], f[7 * W + k] = near / work[6 * W + k], work[8 * W + k]
-        nudge(W, k, work, f, min(work[7 * W + k], ranges[ids[k]]))
+        f[RAY_OX * W + k] = work[OX * W + k]
+        f[RAY_OY * W + k] = work[OY * W + k]
+        f[RAY_OZ * W + k] = work[OZ * W + k]
+        f[RAY_NEAR * W + k], f[RAY_TIME * W + k] = near / work[INVERSE * W + k], work[TIME * W + k]
+        nudge(W, k, work, f, min(work[FAR * W + k], ranges[ids[k]]))
         valid[k] = -1 if k < m else 0
-        u[18 * W + k] = INVALID
-        u[19 * W + k] = INVALID
-    trace(target, W, ROWS, f, valid, alike(W, work), one)
+        u[HIT_GEOMETRY * W + k] = INVALID
+        u[HIT_INSTANCE * W + k] = INVALID
+    trace(target, W, PACKET_ROWS, f, valid, alike(W, work), one)
     for k in range(m):
-        if u[18 * W + k] == INVALID:
+        if u[HIT_GEOMETRY * W + k] == INVALID:
             continue
         i = ids[k]
-        row, instance = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
-        prim = np.int64(u[17 * W + k])
+        row, instance = placed(target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k])
+        prim = np.int64(u[HIT_FACE * W + k])
         t, cosine, x, y, z = meet(target, W, k, row, prim, instance, work)
-        if t <= work[7 * W + k] and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
+        if t <= work[FAR * W + k] and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
             ranges[i], cosines[i] = t, cosine
             faces[i], instances[i] = numbered(target, row, prim), instance
             if normals.size:
@@ -134,30 +167,30 @@ def cast(
     No normals are written if ``normals`` is empty. Packets start at lo and every width from it.
     """
     W = len(target.lanes)
-    packet = aligned(4 * ROWS * W)
+    packet = aligned(4 * PACKET_ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
     one, valid = aligned(128).view(np.float32), aligned(4 * W).view(np.int32)
-    work, ids = aligned(8 * 16 * W).view(np.float64), np.zeros(W, np.int64)
+    work, ids = aligned(8 * WORK_ROWS * W).view(np.float64), np.zeros(W, np.int64)
     face, instance = aligned(4 * W).view(np.int32), aligned(4 * W).view(np.int32)
-    late, doubtful, waiting = np.zeros(18 * W), np.zeros(2 * W, np.int64), 0
+    late, doubtful, waiting = np.zeros(2 * RAY_ROWS * W), np.zeros(2 * W, np.int64), 0
     for k in range(W):
-        u[9 * W + k] = rays.mask
-        u[10 * W + k] = k
+        u[RAY_MASK * W + k] = rays.mask
+        u[RAY_ID * W + k] = k
         valid[k] = -1
     for at in range(lo, hi, W):
         m = min(W, hi - at)
         if not gather(target, rays, at, m, target.lanes, ids, work, f):
             return first_bad(W, ids, work)
         for k in range(W):
-            u[18 * W + k] = INVALID
-            u[19 * W + k] = INVALID
+            u[HIT_GEOMETRY * W + k] = INVALID
+            u[HIT_INSTANCE * W + k] = INVALID
         for k in range(m, W):
             valid[k] = 0
-        trace(target, W, ROWS, f, valid, alike(W, work), one)
+        trace(target, W, PACKET_ROWS, f, valid, alike(W, work), one)
         _name(target, W, u, work, face, instance)
         settled = cross(target.lanes, work.ctypes.data)
         if m == W and not rays.order.size:
-            exact = work.ctypes.data + 8 * 14 * W
+            exact = work.ctypes.data + 8 * RANGE * W
             move_float64(target.lanes, exact, ranges.ctypes.data + 8 * at)
             narrow(target.lanes, exact + 8 * W, cosines.ctypes.data + 4 * at)
             move_int32(target.lanes, face.ctypes.data, faces.ctypes.data + 4 * at)
@@ -165,25 +198,27 @@ def cast(
         else:
             for k in range(m):
                 i = ids[k]
-                ranges[i], cosines[i] = work[14 * W + k], work[15 * W + k]
+                ranges[i], cosines[i] = work[RANGE * W + k], work[COSINE * W + k]
                 faces[i], instances[i] = face[k], instance[k]
         if normals.size:
             for k in range(m):
-                _normal(normals, ids[k], work[9 * W + k], work[10 * W + k], work[11 * W + k])
+                _normal(normals, ids[k], work[NX * W + k], work[NY * W + k], work[NZ * W + k])
         for k in range(0 if settled else m):
             i = ids[k]
-            met = u[18 * W + k] != INVALID
-            if met and not abs(work[15 * W + k]) >= GRAZING:
-                row, copy = placed(target, u[18 * W + k], u[19 * W + k], u[20 * W + k])
-                prim = np.int64(u[17 * W + k])
+            met = u[HIT_GEOMETRY * W + k] != INVALID
+            if met and not abs(work[COSINE * W + k]) >= GRAZING:
+                row, copy = placed(
+                    target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
+                )
+                prim = np.int64(u[HIT_FACE * W + k])
                 ranges[i], cosines[i], _, _, _ = meet(target, W, k, row, prim, copy, work)
-            if not (met and ranges[i] <= work[7 * W + k]):
+            if not (met and ranges[i] <= work[FAR * W + k]):
                 ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
                 if normals.size:
                     _normal(normals, i, 0.0, 0.0, 0.0)
             elif cosines[i] >= 0.0:
                 continue
-            for r in range(9):
+            for r in range(RAY_ROWS):
                 late[r * 2 * W + waiting] = work[r * W + k]
             doubtful[waiting] = i
             waiting += 1
@@ -192,7 +227,7 @@ def cast(
         while waiting >= W or (last and waiting > 0):
             n = min(W, waiting)
             for k in range(W):
-                for r in range(9):
+                for r in range(RAY_ROWS):
                     work[r * W + k] = late[r * 2 * W + min(k, n - 1)]
                 ids[k] = doubtful[min(k, n - 1)]
             _second(
@@ -200,7 +235,7 @@ def cast(
             )
             for k in range(W):
                 doubtful[k] = doubtful[W + k]
-                for r in range(9):
+                for r in range(RAY_ROWS):
                     late[r * 2 * W + k] = late[r * 2 * W + W + k]
             waiting -= n
     return -1
@@ -210,13 +245,13 @@ def cast(
 def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_]) -> Any:
     """Fill in whether anything lies on the rays lo to hi; the first bad ray's number, or -1."""
     W = len(target.lanes)
-    packet = aligned(4 * RAY * W)
+    packet = aligned(4 * PACKET_RAY_ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
     one, valid = aligned(64).view(np.float32), aligned(4 * W).view(np.int32)
-    work, ids = np.zeros(9 * W), np.zeros(W, np.int64)
+    work, ids = np.zeros(RAY_ROWS * W), np.zeros(W, np.int64)
     for k in range(W):
-        u[9 * W + k] = rays.mask
-        u[10 * W + k] = k
+        u[RAY_MASK * W + k] = rays.mask
+        u[RAY_ID * W + k] = k
     for at in range(lo, hi, W):
         m = min(W, hi - at)
         if not gather(target, rays, at, m, target.lanes, ids, work, f):
@@ -224,10 +259,10 @@ def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_
         for k in range(W):
             valid[k] = -1 if k < m else 0
         together = alike(W, work)
-        trace(target, W, RAY, f, valid, together, one)
+        trace(target, W, PACKET_RAY_ROWS, f, valid, together, one)
         doubtful = False
         for k in range(m):
-            met = f[8 * W + k] < 0
+            met = f[RAY_FAR * W + k] < 0
             out[ids[k]] = met
             valid[k] = 0 if met else -1
             doubtful |= not met
@@ -235,9 +270,9 @@ def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_
             continue
         for k in range(W):
             if valid[k]:
-                nudge(W, k, work, f, work[7 * W + k])
-        trace(target, W, RAY, f, valid, together, one)
+                nudge(W, k, work, f, work[FAR * W + k])
+        trace(target, W, PACKET_RAY_ROWS, f, valid, together, one)
         for k in range(W):
             if valid[k]:
-                out[ids[k]] = f[8 * W + k] < 0
+                out[ids[k]] = f[RAY_FAR * W + k] < 0
     return -1

@@ -13,6 +13,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from lidar.raycast.rows import COSINE, DX, DY, DZ, FAR, NX, NY, NZ, OFFSET, OX, OY, OZ, RANGE, RAY_DX, SCALE
+
 GRAZING = 1e-3
 """Cosine below which a range is held within the face's extent along the ray."""
 HUGE = 1e100
@@ -134,10 +136,10 @@ def _settle(context: Any, lanes: Any, work: Any, packet: Any, x: Any, y: Any, z:
             _Rows(builder, lanes, address=values[2], kind=_FLOAT),
         )
         place = [rows[r] - rows.same(value) for r, value in enumerate(values[3:])]
-        way = [rows[3 + r] for r in range(3)]
+        way = [rows[DX + r] for r in range(3)]
         for r in range(3):
             rows[r] = rounded[r] = place[r]
-            rounded[4 + r] = way[r]
+            rounded[RAY_DX + r] = way[r]
         squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
         near = (abs(place[0]) + abs(place[1]) + abs(place[2])).all("<", rows.same(HUGE))
         unit = abs(squared - rows.same(1.0)).all("<", rows.same(UNIT))
@@ -147,25 +149,27 @@ def _settle(context: Any, lanes: Any, work: Any, packet: Any, x: Any, y: Any, z:
 
 
 settle: Any = _settle
-"""Make origins (rows 0 to 2) relative to a point, round them and directions (rows 3 to 5) to float32 for
-Embree's packet; whether all directions have length 1 and all origins are within reach."""
+"""Make origins relative to a point; write them and the directions to Embree's packet in float32.
+
+Returns whether all directions have length 1 and all origins are below `HUGE`."""
 
 
 @intrinsic
 def _cross(context: Any, lanes: Any, work: Any) -> Any:  # noqa: ARG001
     def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         rows = _Rows(builder, lanes, address=values[1])
-        ox, oy, oz, dx, dy, dz = (rows[r] for r in range(6))
-        nx, ny, nz, d = (rows[r] for r in range(9, 13))
+        ox, oy, oz, dx, dy, dz = (rows[r] for r in (OX, OY, OZ, DX, DY, DZ))
+        nx, ny, nz, d = (rows[r] for r in (NX, NY, NZ, OFFSET))
         along = nx * dx + ny * dy + nz * dz
         t = (d - nx * ox - ny * oy - nz * oz) / along
-        cosine = -along * rows[13]
-        rows[14], rows[15] = t, cosine
-        return builder.and_(cosine.all(">=", rows.same(GRAZING)), t.all("<=", rows[7]))
+        cosine = -along * rows[SCALE]
+        rows[RANGE], rows[COSINE] = t, cosine
+        return builder.and_(cosine.all(">=", rows.same(GRAZING)), t.all("<=", rows[FAR]))
 
     return types.boolean(lanes, types.int64), build
 
 
 cross: Any = _cross
-"""Ranges and cosines (rows 14 and 15) where rays meet planes (normals and offsets: rows 9 to 12, scale of the
-cosine: row 13); whether all are within far (row 7) and meet a front not too aslant."""
+"""Compute the ranges and cosines at which rays intersect their planes.
+
+Returns whether all ranges are within far and all rays hit the front of a face at no grazing angle."""

@@ -18,7 +18,7 @@ INDEX, VERTEX, TRANSFORM = 0, 1, 23
 UINT, UINT3, FLOAT3, FLOAT3X4_ROW_MAJOR = 0x5001, 0x5003, 0x9003, 0x9134
 DYNAMIC, ROBUST = 1 << 0, 1 << 2
 LOW, MEDIUM = 0, 1
-COHERENT, ARGUMENT_FILTER = 1 << 16, 1 << 1
+COHERENT = 1 << 16
 INVALID = 0xFFFFFFFF
 """Numbers of Embree's C interface (embree4/rtcore_*.h, version 4.4)."""
 

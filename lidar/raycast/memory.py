@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numba import njit, types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 intersect1: Any = types.ExternalFunction("rtcIntersect1", types.void(*[types.int64] * 3))
@@ -40,18 +39,6 @@ float32_at = _loader(types.float32, 4)
 int64_at = _loader(types.int64, 8)
 int32_at = _loader(types.int32, 4)
 """The number at an index of a column whose address is given."""
-
-
-@intrinsic
-def _pointer(context: Any, address: Any) -> Any:  # noqa: ARG001
-    def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        return builder.inttoptr(values[0], cgutils.voidptr_t)
-
-    return types.voidptr(types.int64), build
-
-
-pointer: Any = _pointer
-"""The void pointer to an address."""
 
 
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}

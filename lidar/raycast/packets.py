@@ -1,8 +1,6 @@
 """Packets of rays: gathered in float64, rounded for Embree, traced.
 
-Rows of numbers, one a lane, lie end to end in ``work``. Of the ray: origin (0 to 2), direction (3 to 5), one
-over its length (6), far (7), time (8). Of what it met: the plane's normal and offset (9 to 12), the scale of
-the cosine (13), range (14) and cosine (15).
+The layout of ``work`` (float64) and of Embree's packet ``f`` (float32) is in `lidar.raycast.rows`.
 """
 
 from __future__ import annotations
@@ -28,9 +26,24 @@ from lidar.raycast.memory import (
     occluded16,
     vector,
 )
-
-RAY, ROWS = 12, 21
-"""32-bit rows of RTCRayN and RTCRayHitN."""
+from lidar.raycast.rows import (
+    DX,
+    DY,
+    DZ,
+    FAR,
+    INVERSE,
+    OX,
+    OY,
+    OZ,
+    PACKET_ROWS,
+    RAY_DX,
+    RAY_DY,
+    RAY_DZ,
+    RAY_FAR,
+    RAY_NEAR,
+    RAY_TIME,
+    TIME,
+)
 
 _NUDGE = 3e-7  # radians; the smallest that closed every leak among a million rays aimed at vertices
 _COHERENT = 0.985  # cosine; packets that fan out over more than 10° are faster as single rays
@@ -52,22 +65,22 @@ def _posed(pose: Any, p: int, x: float, y: float, z: float) -> Any:
 @inlined
 def _shorten(W: int, k: int, work: Any, f: Any) -> None:
     """Give lane k of Embree's packet a direction of length 1."""
-    x, y, z = work[3 * W + k], work[4 * W + k], work[5 * W + k]
+    x, y, z = work[DX * W + k], work[DY * W + k], work[DZ * W + k]
     length = np.sqrt(x * x + y * y + z * z)
     inverse = 1.0 / length
-    work[6 * W + k] = inverse
-    f[4 * W + k], f[5 * W + k], f[6 * W + k] = x * inverse, y * inverse, z * inverse
-    f[3 * W + k] = f[3 * W + k] * length
-    f[8 * W + k] = work[7 * W + k] * length * _UP
+    work[INVERSE * W + k] = inverse
+    f[RAY_DX * W + k], f[RAY_DY * W + k], f[RAY_DZ * W + k] = x * inverse, y * inverse, z * inverse
+    f[RAY_NEAR * W + k] = f[RAY_NEAR * W + k] * length
+    f[RAY_FAR * W + k] = work[FAR * W + k] * length * _UP
 
 
 @inlined
 def first_bad(W: int, ids: Any, work: Any) -> int:
     """The first ray of the lanes that cannot be cast."""
     for k in range(W):
-        x, y, z = work[3 * W + k], work[4 * W + k], work[5 * W + k]
+        x, y, z = work[DX * W + k], work[DY * W + k], work[DZ * W + k]
         squared = x * x + y * y + z * z
-        size = abs(work[k]) + abs(work[W + k]) + abs(work[2 * W + k])
+        size = abs(work[OX * W + k]) + abs(work[OY * W + k]) + abs(work[OZ * W + k])
         if not (0.0 < squared < HUGE and size < HUGE):
             return int(ids[k])
     return -1
@@ -95,35 +108,35 @@ def gather(target: Target, rays: Rays, at: int, m: int, lanes: Any, ids: Any, wo
         for k in range(W):
             p = int64_at(pose_of, ids[k])
             x, y, z = vector(directions, ids[k])
-            work[3 * W + k], work[4 * W + k], work[5 * W + k] = _posed(pose, p, x, y, z)
-            work[k], work[W + k], work[2 * W + k] = vector(pose[0], p)
+            work[DX * W + k], work[DY * W + k], work[DZ * W + k] = _posed(pose, p, x, y, z)
+            work[OX * W + k], work[OY * W + k], work[OZ * W + k] = vector(pose[0], p)
         if shifted:
             for k in range(W):
                 x, y, z = vector(offsets, step * ids[k])
                 x, y, z = _posed(pose, int64_at(pose_of, ids[k]), x, y, z)
-                work[k] += x
-                work[W + k] += y
-                work[2 * W + k] += z
+                work[OX * W + k] += x
+                work[OY * W + k] += y
+                work[OZ * W + k] += z
     else:
         for k in range(W):
-            work[3 * W + k], work[4 * W + k], work[5 * W + k] = vector(directions, ids[k])
-            work[k], work[W + k], work[2 * W + k] = vector(offsets, step * ids[k])
+            work[DX * W + k], work[DY * W + k], work[DZ * W + k] = vector(directions, ids[k])
+            work[OX * W + k], work[OY * W + k], work[OZ * W + k] = vector(offsets, step * ids[k])
     plain = settle(lanes, work.ctypes.data, f.ctypes.data, cx, cy, cz)
     if reach:
         for k in range(W):
-            work[7 * W + k] = float64_at(far, ids[k])
+            work[FAR * W + k] = float64_at(far, ids[k])
     else:
         limit = float64_at(far, 0)
         for k in range(W):
-            work[7 * W + k] = limit
+            work[FAR * W + k] = limit
     if timed:
         for k in range(W):
-            work[8 * W + k] = float32_at(time, ids[k])
+            work[TIME * W + k] = float32_at(time, ids[k])
     for k in range(W):
-        work[6 * W + k] = 1.0
-        f[3 * W + k] = rays.near
-        f[7 * W + k] = work[8 * W + k]
-        f[8 * W + k] = work[7 * W + k] * _UP
+        work[INVERSE * W + k] = 1.0
+        f[RAY_NEAR * W + k] = rays.near
+        f[RAY_TIME * W + k] = work[TIME * W + k]
+        f[RAY_FAR * W + k] = work[FAR * W + k] * _UP
     if plain:
         return True
     if first_bad(W, ids, work) >= 0:
@@ -136,16 +149,16 @@ def gather(target: Target, rays: Rays, at: int, m: int, lanes: Any, ids: Any, wo
 @inlined
 def nudge(W: int, k: int, work: Any, f: Any, far: float) -> None:
     """Turn the direction of lane k of Embree's packet a little and let it look as far as ``far``."""
-    inverse = work[6 * W + k]
-    x, y, z = work[3 * W + k] * inverse, work[4 * W + k] * inverse, work[5 * W + k] * inverse
+    inverse = work[INVERSE * W + k]
+    x, y, z = work[DX * W + k] * inverse, work[DY * W + k] * inverse, work[DZ * W + k] * inverse
     if abs(x) <= abs(y) and abs(x) <= abs(z):
         x += _NUDGE
     elif abs(y) <= abs(z):
         y += _NUDGE
     else:
         z += _NUDGE
-    f[4 * W + k], f[5 * W + k], f[6 * W + k] = x, y, z
-    f[8 * W + k] = far / inverse * _UP
+    f[RAY_DX * W + k], f[RAY_DY * W + k], f[RAY_DZ * W + k] = x, y, z
+    f[RAY_FAR * W + k] = far / inverse * _UP
 
 
 @inlined
@@ -153,9 +166,17 @@ def alike(W: int, work: Any) -> bool:
     """Whether a sample of the lanes goes the same way from about the same place: a scan, not a shuffle."""
     same = True
     for k in (W // 3, 2 * W // 3, W - 1):
-        along = work[3 * W] * work[3 * W + k] + work[4 * W] * work[4 * W + k] + work[5 * W] * work[5 * W + k]
-        apart = abs(work[0] - work[k]) + abs(work[W] - work[W + k]) + abs(work[2 * W] - work[2 * W + k])
-        same &= (along * work[6 * W] * work[6 * W + k] > _COHERENT) & (apart < _SPREAD)
+        along = (
+            work[DX * W] * work[DX * W + k]
+            + work[DY * W] * work[DY * W + k]
+            + work[DZ * W] * work[DZ * W + k]
+        )
+        apart = (
+            abs(work[OX * W] - work[OX * W + k])
+            + abs(work[OY * W] - work[OY * W + k])
+            + abs(work[OZ * W] - work[OZ * W + k])
+        )
+        same &= (along * work[INVERSE * W] * work[INVERSE * W + k] > _COHERENT) & (apart < _SPREAD)
     return same
 
 
@@ -164,7 +185,7 @@ def trace(target: Target, W: int, rows: int, f: Any, valid: Any, together: bool,
     """Trace the valid lanes of a packet, all at once or one by one."""
     if together and W > 1:
         v, p = valid.ctypes.data, f.ctypes.data
-        if rows == ROWS:
+        if rows == PACKET_ROWS:
             if W == 16:
                 intersect16(v, target.scene, p, target.packet)
             elif W == 8:
@@ -184,9 +205,9 @@ def trace(target: Target, W: int, rows: int, f: Any, valid: Any, together: bool,
             continue
         for r in range(rows):
             one[r] = f[r * W + k]
-        if rows == ROWS:
+        if rows == PACKET_ROWS:
             intersect1(target.scene, q, target.single)
         else:
             occluded1(target.scene, q, target.single)
-        for r in range(8, rows):
+        for r in range(RAY_FAR, rows):
             f[r * W + k] = one[r]

@@ -9,6 +9,7 @@ import numpy as np
 from lidar.raycast.columns import COPIES, Target
 from lidar.raycast.lanes import GRAZING
 from lidar.raycast.memory import called, float64_at, inlined, int32_at, int64_at, vector
+from lidar.raycast.rows import DX, DY, DZ, INVERSE, OX, OY, OZ, TIME
 
 INVALID = np.uint32(0xFFFFFFFF)
 """Embree's number for no geometry and no instance."""
@@ -104,21 +105,21 @@ def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: 
 def meet(target: Target, W: int, k: int, row: int, prim: int, instance: int, work: Any) -> Any:
     """Range, cosine and normal (not unit), in float64, where lane k's ray meets the plane of a face."""
     ox, oy, oz, dx, dy, dz = (
-        work[k],
-        work[W + k],
-        work[2 * W + k],
-        work[3 * W + k],
-        work[4 * W + k],
-        work[5 * W + k],
+        work[OX * W + k],
+        work[OY * W + k],
+        work[OZ * W + k],
+        work[DX * W + k],
+        work[DY * W + k],
+        work[DZ * W + k],
     )
-    nx, ny, nz, d = plane_of(target, row, prim, instance, work[8 * W + k])
+    nx, ny, nz, d = plane_of(target, row, prim, instance, work[TIME * W + k])
     along = nx * dx + ny * dy + nz * dz
     t = (d - nx * ox - ny * oy - nz * oz) / along
-    cosine = -along * work[6 * W + k]
+    cosine = -along * work[INVERSE * W + k]
     if instance >= 0:
         cosine /= np.sqrt(nx * nx + ny * ny + nz * nz)
     if not abs(cosine) >= GRAZING:
-        low, high = _extent(target, row, prim, instance, (ox, oy, oz, dx, dy, dz), work[8 * W + k])
+        low, high = _extent(target, row, prim, instance, (ox, oy, oz, dx, dy, dz), work[TIME * W + k])
         t = high if t > high else low if not t >= low else t
         cosine = cosine if cosine == cosine else 0.0  # noqa: PLR0124
     return t, cosine, nx, ny, nz
