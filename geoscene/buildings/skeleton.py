@@ -33,7 +33,7 @@ class Skeleton:
     xy      : (n, 2) nodes, metres; the polygon's own corners first, ring by ring, exterior first
     time    : (n,) distance of each node from the edges it belongs to, metres; 0 at the polygon's corners
     faces   : nodes around the face of each edge, counter-clockwise, beginning with the edge's two corners;
-              then the faces that merging close nodes has split off
+              a tiny face may consist of these two only; then the faces that merging close nodes has split off
     corners : number of the polygon's corners, and of its edges
     """
 
@@ -300,10 +300,14 @@ def _merged(skeleton: Skeleton) -> Skeleton:
 
 
 def loops(ring: list[int]) -> list[list[int]]:
-    """A ring that may visit nodes twice, split into simple rings; the first one contains its first edge."""
+    """A ring that may visit nodes twice, split into simple rings.
+
+    The first one begins with the ring's first edge; it is this edge alone if the ring turns straight back.
+    """
     loops: list[list[int]] = []
     path: list[int] = []
-    for node in ring:
+    # ending with the first node keeps the first edge in the path
+    for node in [*ring[1:], ring[0]]:
         if node in path:
             at = path.index(node)
             if len(path) - at > 2:
@@ -311,7 +315,7 @@ def loops(ring: list[int]) -> list[list[int]]:
             del path[at + 1 :]
         else:
             path.append(node)
-    return [path, *loops]
+    return [[path[-1], *path[:-1]], *loops]
 
 
 def polygons_of(xy: Float, rings: list[list[int]]) -> NDArray[Any]:

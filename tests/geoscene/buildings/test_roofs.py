@@ -11,7 +11,7 @@ from geoscene.buildings.cells import cut, plain_cells, skeleton_cells, with_fiel
 from geoscene.buildings.footprints import clean
 from geoscene.buildings.roofs import RoofSpec, roof_shell
 from geoscene.buildings.shells import sound
-from geoscene.buildings.skeleton import straight_skeleton
+from geoscene.buildings.skeleton import loops, straight_skeleton
 from geoscene.buildings.table import SHAPES
 from geoscene.mesh import FLOOR, ROOF
 
@@ -91,15 +91,40 @@ def test_the_skeleton_roof_cut_at_a_height_is_the_footprint_moved_in_by_as_much(
     assert above in areas
 
 
+@example(footprint(11373))  # one face is smaller than the distance within which nodes are merged
 @given(footprints())
 @settings(max_examples=40, deadline=None)
 def test_skeleton_faces_lie_in_planes_through_their_edges(polygon):
     skeleton = straight_skeleton(polygon)
+    sizes = [len(shapely.get_coordinates(ring)) - 1 for ring in shapely.get_rings(polygon)]
+    edges = [
+        (s + k, s + (k + 1) % n)
+        for s, n in zip(np.cumsum([0, *sizes]), sizes, strict=False)
+        for k in range(n)
+    ]
+    assert [tuple(face[:2]) for face in skeleton.faces[: skeleton.corners]] == edges
     for face in skeleton.faces:
         a, b = skeleton.xy[face[0]], skeleton.xy[face[1]]
         inward = np.array([a[1] - b[1], b[0] - a[0]]) / np.hypot(*(b - a))
         distance = (skeleton.xy[face] - a) @ inward
         np.testing.assert_allclose(distance, skeleton.time[face], atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("ring", "simple"),
+    [
+        ([0, 1, 2, 3], [[0, 1, 2, 3]]),
+        ([0, 1, 2, 1, 3], [[0, 1, 3]]),
+        ([0, 1, 2, 3, 1, 4], [[0, 1, 4], [1, 2, 3]]),
+        ([0, 1, 2, 0, 3, 4], [[0, 1, 2], [0, 3, 4]]),
+        ([0, 1, 2, 0], [[0, 1, 2]]),
+        ([0, 1, 0, 2, 3], [[0, 1], [0, 2, 3]]),
+        ([0, 1, 0], [[0, 1]]),
+        ([0, 1, 1], [[0, 1]]),
+    ],
+)
+def test_a_ring_splits_into_simple_rings_of_which_the_first_begins_with_its_first_edge(ring, simple):
+    assert loops(ring) == simple
 
 
 @given(
