@@ -4,8 +4,8 @@ The angles of `poses.csv` are alpha about X (roll), beta about Y (pitch), gamma 
 
     R = Rz(gamma) Ry(beta) Rx(alpha)
 
-the matrix that turns vehicle vectors (x forward, y left, z up) into scene vectors: rotations about the fixed
-scene axes in the order X, Y, Z, or, read the other way, about the vehicle's own axes in the order Z, Y', X''.
+which rotates vehicle vectors (x forward, y left, z up) into scene vectors: rotations about the fixed scene
+axes in the order X, Y, Z, or equally about the vehicle's own axes in the order Z, Y', X''.
 Yaw is counter-clockwise from the scene's x axis (east), positive pitch is nose down, positive roll is left
 side up. The alternative R = Rx(alpha) Ry(beta) Rz(gamma), intrinsic X-Y'-Z'', differs at large angles; its
 functions end in ``_intrinsic``.
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from geoscene.typing import Float
 
 LOCK = 1e-7
-"""Radians from 90 degrees of the middle angle within which the outer angles cannot be told apart."""
+"""Distance in radians of the middle angle from 90 degrees below which the outer angles are ambiguous."""
 
 
 def _angles(R: Float, sign: float) -> tuple[Float, Float, Float]:
@@ -34,7 +34,7 @@ def _angles(R: Float, sign: float) -> tuple[Float, Float, Float]:
 def euler_from_quat(quat_xyzw: ArrayLike) -> Float:
     """Angles (..., 3) alpha, beta, gamma of R = Rz(gamma) Ry(beta) Rx(alpha), beta in [-pi/2, pi/2].
 
-    With the nose straight up or down roll and yaw cannot be told apart: alpha is then 0 and gamma takes both.
+    With the nose straight up or down (gimbal lock) alpha is 0 and gamma holds the whole rotation.
     """
     quat = np.asarray(quat_xyzw, float)
     out: Float = np.stack(_angles(matrix_from_quat(quat), 1.0), axis=-1)
@@ -100,7 +100,7 @@ def quat_from_matrix(matrix: ArrayLike) -> Float:
 
 
 def quat_product(first: ArrayLike, second: ArrayLike) -> Float:
-    """Quaternions (..., 4) of the turns ``first @ second``, with w >= 0."""
+    """Quaternions (..., 4) of the rotations ``first @ second``, with w >= 0."""
     a, b, c, d = np.moveaxis(np.asarray(first, float), -1, 0)
     x, y, z, w = np.moveaxis(np.asarray(second, float), -1, 0)
     out = np.stack(
@@ -123,7 +123,9 @@ def body_rates(time_s: ArrayLike, quat_xyzw: ArrayLike) -> Float:
     """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
-    t, turn = np.asarray(time_s, float), Rotation.from_quat(np.asarray(quat_xyzw, float))
-    half = (turn[:-1].inv() * turn[1:]).as_rotvec() / np.diff(t)[:, None]
-    rates: Float = np.concatenate([half[:1], half]) * 0.5 + np.concatenate([half, half[-1:]]) * 0.5
+    t, attitude = np.asarray(time_s, float), Rotation.from_quat(np.asarray(quat_xyzw, float))
+    between = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(t)[:, None]
+    rates: Float = (
+        np.concatenate([between[:1], between]) * 0.5 + np.concatenate([between, between[-1:]]) * 0.5
+    )
     return rates

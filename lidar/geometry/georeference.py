@@ -1,4 +1,4 @@
-"""Scene coordinates into an export CRS, point by point or by an affine map whose error is known."""
+"""Transformation of scene coordinates to an export CRS, exact or by an affine map of bounded error."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from geoscene.frames import Frame, utm_crs
 from geoscene.typing import Float
 
 AFFINE_LIMIT = 1e-4
-"""Metres by which an affine map may differ from the projection: a fifth of a LAS coordinate's half step."""
+"""Maximum error in metres of an affine map against the projection: a fifth of half a step in LAS files."""
 
 
 def export_crs(frame: Frame, crs: str = "utm") -> CRS:
     """The CRS of exported clouds: ``utm`` (zone of the scene's origin), ``scene``, or any pyproj name.
 
-    A scene frame that is itself a registered system (``--crs utm`` or an EPSG code) is kept for ``utm``.
-    Raises FrameError for a system that is unknown, not projected, not in metres, or not of that place.
+    For ``utm``, a scene frame in a registered CRS (an EPSG code) keeps that CRS.
+    Raises FrameError for a CRS that is unknown, not projected, not in metres, or not valid at the scene.
     """
     if crs == "scene" or (crs == "utm" and frame.name.startswith("EPSG:")):
         return frame.crs
@@ -31,12 +31,12 @@ def export_crs(frame: Frame, crs: str = "utm") -> CRS:
 
 @dataclass(frozen=True)
 class Georeference:
-    """From the scene frame to an export CRS.
+    """Transformation from the scene frame to an export CRS.
 
     frame : of the scene
     crs   : of the export
-    exact : transform every point through the projection; else by an affine map per call wherever that is
-            within `AFFINE_LIMIT` of it (it is for clouds up to about 300 m wide)
+    exact : project every point; otherwise each call uses an affine map where that is within `AFFINE_LIMIT`
+            of the projection (clouds up to about 300 m wide)
     """
 
     frame: Frame
@@ -49,7 +49,7 @@ class Georeference:
 
     @functools.cached_property
     def offset(self) -> tuple[float, float, float]:
-        """The scene's zero in the export CRS, whole metres: the offset of LAS files."""
+        """The scene's origin in the export CRS, rounded to metres: the offset of LAS files."""
         east, north = self._project(np.zeros(1), np.zeros(1))
         return float(np.round(east[0])), float(np.round(north[0])), 0.0
 
@@ -58,7 +58,7 @@ class Georeference:
         return east, north
 
     def points(self, xyz: Float) -> Float:
-        """Easting, northing, height (n, 3) of scene points (n, 3); heights stay as they are."""
+        """Easting, northing, height (n, 3) of scene points (n, 3); heights are unchanged."""
         out = np.array(xyz, np.float64)
         if not len(out):
             return out
@@ -73,7 +73,7 @@ class Georeference:
         return out
 
     def _affine(self, xy: Float) -> tuple[Float, Float, Float] | None:
-        """Origin, matrix and shift of the best affine map over the box of points; None if it is not close."""
+        """Origin, matrix and shift of the best affine map over the points; None if beyond `AFFINE_LIMIT`."""
         low, high = xy.min(axis=0), xy.max(axis=0)
         origin = (low + high) / 2
         unit = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2) / 2

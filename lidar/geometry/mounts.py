@@ -10,16 +10,16 @@ from geoscene.typing import Float
 from lidar.geometry.attitude import matrix_from_quat
 
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Axes of a body (x forward, y left, z up) from those of the camera in it (x right, y down, z forward)."""
+"""Rotation from optical axes (x right, y down, z forward) to body axes (x forward, y left, z up)."""
 OPTICAL_QUAT = (-0.5, 0.5, -0.5, 0.5)
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Where a sensor sits on the vehicle: a point s of the sensor is at translation + rotation @ s.
+    """Extrinsics of a sensor: its point s lies at translation + rotation @ s in the vehicle frame.
 
     translation : metres in the vehicle frame (origin: the rear axle's centre on the ground)
-    quat_xyzw   : vehicle axes from sensor axes
+    quat_xyzw   : rotation from sensor axes to vehicle axes
     """
 
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -27,12 +27,12 @@ class Mount:
 
     @property
     def rotation(self) -> Float:
-        """Vehicle axes from sensor axes, (3, 3)."""
+        """Rotation (3, 3) from sensor axes to vehicle axes."""
         return matrix_from_quat(self.quat_xyzw)
 
     @property
     def matrix(self) -> Float:
-        """Vehicle frame from sensor frame, (4, 4) homogeneous."""
+        """Homogeneous transform (4, 4) from the sensor frame to the vehicle frame."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = self.translation

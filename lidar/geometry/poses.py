@@ -1,4 +1,4 @@
-"""Where a rigid body is, over time."""
+"""Poses of rigid bodies and trajectories of vehicles."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 
 KNOT_NS = 200_000
-"""Poses within a scan are taken this often, nanoseconds; between two of them a point moves along the chord.
+"""Interval in nanoseconds at which poses within a sweep are computed; points move linearly in between.
 
-A car that yaws at 1 rad/s leaves the true arc by (2e-4)^2 / 8 = 5e-9 rad.
+At a yaw rate of 1 rad/s the chord deviates from the arc by (2e-4)^2 / 8 = 5e-9 rad.
 """
 
 
@@ -24,7 +24,7 @@ class Poses:
     """Poses of a body in the scene; a point b of the body is at position + scale * (rotation @ b).
 
     position : (n, 3) float64, scene metres
-    rotation : (n, 3, 3) float64, scene axes from body axes (x forward, y left, z up)
+    rotation : (n, 3, 3) float64, from body axes (x forward, y left, z up) to scene axes
     scale    : (n, 3) float64, scene metres per true metre along the scene's axes; (k, k, 1), where k is the
                projection's point scale (1 in a local frame, 0.9996 to 1.0004 and more in UTM)
     """
@@ -38,15 +38,15 @@ class Poses:
         return len(self.position)
 
     def take(self, index: ArrayLike) -> Poses:
-        """Chosen rows."""
+        """The poses at row numbers."""
         k = np.asarray(index)
         return Poses(self.position[k], self.rotation[k], self.scale[k])
 
     def mounted(self, translation: ArrayLike, rotation: ArrayLike) -> Poses:
-        """Poses of a sensor that sits on the body.
+        """Poses of a sensor mounted on the body.
 
         translation : (3,) true metres in the body frame
-        rotation    : (3, 3) body axes from sensor axes
+        rotation    : (3, 3) from sensor axes to body axes
         """
         shift = self.rotation @ np.asarray(translation, float)
         return Poses(
@@ -62,7 +62,7 @@ class Poses:
     def directions(self, vectors: Float) -> Float:
         """Ray directions (n, 3) in the scene of body vectors (n, 3), row by row.
 
-        Not unit vectors where the scale is not 1: with them, the ray parameter of a hit is a true distance.
+        They include the scale, so that the ray parameter of a hit is a true distance for unit vectors.
         """
         turned = np.einsum("nij,nj->ni", np.broadcast_to(self.rotation, (len(vectors), 3, 3)), vectors)
         scaled: Float = self.scale * turned
@@ -71,11 +71,11 @@ class Poses:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A vehicle's poses on a rising time axis; linear in position and spherical-linear in rotation between.
+    """Poses of a vehicle at increasing times, interpolated linearly in position and by slerp in rotation.
 
     time_ns  : (n,) int64, nanoseconds since the drive's start
-    position : (n, 3) float64, scene metres: the rear axle's centre, on the ground
-    quat_xyzw : (n, 4) float64, scene axes from vehicle axes
+    position : (n, 3) float64, scene metres: the centre of the rear axle, on the ground
+    quat_xyzw : (n, 4) float64, from vehicle axes to scene axes
     velocity : (n, 3) float64, true m/s along the scene's axes
     scale    : (n,) float64, scene metres per true metre, horizontally
     """
@@ -87,19 +87,19 @@ class Trajectory:
     scale: Float
 
     def __post_init__(self) -> None:
-        """Refuse a trajectory that cannot be interpolated."""
+        """Check that the trajectory can be interpolated."""
         if len(self.time_ns) < 2 or (np.diff(self.time_ns) <= 0).any():
-            raise InputError("a trajectory needs two poses or more with rising times")
+            raise InputError("a trajectory needs two or more poses at increasing times")
         if not (np.isfinite(self.position).all() and np.isfinite(self.quat_xyzw).all()):
             raise InputError("a trajectory has poses that are not finite")
 
     @property
     def duration_ns(self) -> int:
-        """Time of the last pose."""
+        """Time of the last pose, nanoseconds."""
         return int(self.time_ns[-1])
 
     def until(self, time_ns: int) -> Trajectory:
-        """The trajectory up to a time; itself if it ends before."""
+        """The trajectory up to a time (at least two poses); unchanged if it ends before."""
         if time_ns >= self.time_ns[-1]:
             return self
         n = int(np.searchsorted(self.time_ns, time_ns, side="right"))
@@ -113,7 +113,7 @@ class Trajectory:
         )
 
     def at(self, time_ns: ArrayLike) -> Poses:
-        """Poses at times (k,) in nanoseconds, held at the first and the last pose outside the drive."""
+        """Poses at times (k,) in nanoseconds, clamped to the first and last pose."""
         t = np.asarray(time_ns, np.int64).reshape(-1)
         k = len(t)
         out = Poses(np.empty((k, 3)), np.empty((k, 3, 3)), np.ones((k, 3)))
@@ -141,22 +141,22 @@ class Trajectory:
         time_ns     : (n,) nanoseconds since the drive's start
         translation, rotation : of the mount, see `Poses.mounted`
 
-        Poses are taken every `KNOT_NS` and points moved linearly between them.
+        Poses are computed every `KNOT_NS`; points are interpolated linearly between them.
         """
         if not len(points):
             return np.empty((0, 3))
-        knot, since = np.divmod(np.asarray(time_ns, np.int64), KNOT_NS)
+        knot, elapsed = np.divmod(np.asarray(time_ns, np.int64), KNOT_NS)
         first = int(knot.min())
         knots = self.at(KNOT_NS * np.arange(first, int(knot.max()) + 2)).mounted(translation, rotation)
         turn = knots.scale[:, :, None] * knots.rotation
         out: Float = np.empty((len(points), 3))
-        _place(points, knot - first, since / KNOT_NS, knots.position, turn, out)
+        _place(points, knot - first, elapsed / KNOT_NS, knots.position, turn, out)
         return out
 
 
 @njit(cache=True, nogil=True)
 def _interpolate(time: Any, knot: Any, place: Any, quat: Any, scale: Any, out: Any) -> None:
-    """Fill ``out``: position, rotation and scale at each time; the shorter way round between quaternions."""
+    """Fill ``out``: position, rotation and scale at each time; slerp takes the shorter arc."""
     position, rotation, factor = out
     last = len(knot) - 2
     for i in range(len(time)):
@@ -169,7 +169,7 @@ def _interpolate(time: Any, knot: Any, place: Any, quat: Any, scale: Any, out: A
         a, b = quat[k], quat[k + 1]
         size = np.sqrt((a * a).sum() * (b * b).sum())
         along = (a * b).sum() / size
-        # The angle from its sine too: near 1 the cosine says little of it.
+        # atan2 of sine and cosine: near 1 the cosine alone is too coarse.
         cross = np.sqrt(
             (a[3] * b[0] - a[0] * b[3] - a[1] * b[2] + a[2] * b[1]) ** 2
             + (a[3] * b[1] - a[1] * b[3] - a[2] * b[0] + a[0] * b[2]) ** 2
@@ -192,7 +192,7 @@ def _interpolate(time: Any, knot: Any, place: Any, quat: Any, scale: Any, out: A
 
 @njit(cache=True, nogil=True)
 def _place(points: Any, knot: Any, share: Any, position: Any, turn: Any, out: Any) -> None:
-    """Fill ``out`` with points moved from sensor to scene, linearly between a knot and the next."""
+    """Fill ``out`` with scene coordinates of sensor points, linear between the poses at two knots."""
     for i in range(len(points)):
         k, w = knot[i], share[i]
         for r in range(3):

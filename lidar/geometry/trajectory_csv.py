@@ -14,7 +14,7 @@ _TRAJECTORY = ("time_ns", "x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory as CSV, exactly: reading it gives the same numbers."""
+    """Write a trajectory as CSV; `read_trajectory` returns exactly the same numbers."""
     t = trajectory
     columns = [t.time_ns, *t.position.T, *t.quat_xyzw.T, *t.velocity.T, t.scale]
     write_columns(path, dict(zip(_TRAJECTORY, columns, strict=True)))
