@@ -32,7 +32,7 @@ from lidar.maps.picture import (
     sweep_picture,
     with_legend,
 )
-from lidar.options import DriveOptions
+from lidar.options import DriveOptions, MapOptions
 from lidar.rig.specs import load_rig
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.populate import TrafficOptions
@@ -106,7 +106,8 @@ with progress_bar() as progress:
     # 5. All sweeps as one georeferenced map.
     say("putting all sweeps together")
     dataset = open_dataset(out / "drive")
-    aggregate(dataset, out / "map.laz", voxel=0.1, sensors=("lidar_top",), progress=progress)
+    options = MapOptions(voxel=0.1, sensors=("lidar_top",))
+    aggregate(dataset, out / "map.laz", options=options, progress=progress)
     points = read_table(out / "map.laz")
     static = points["label"] < Class.CAR  # moving road users leave trails
     label = points["label"][static]

@@ -13,12 +13,14 @@ if TYPE_CHECKING:
     from lidar.dataset.layout import open_dataset as open_dataset
     from lidar.maps.aggregate import aggregate as aggregate
     from lidar.options import DriveOptions as DriveOptions
+    from lidar.options import MapOptions as MapOptions
     from lidar.rig.scanner import load_sensor as load_sensor
     from lidar.rig.specs import load_rig as load_rig
 
 _HOMES = {
     "Dataset": "dataset.layout",
     "DriveOptions": "options",
+    "MapOptions": "options",
     "aggregate": "maps.aggregate",
     "load_rig": "rig.specs",
     "load_sensor": "rig.scanner",

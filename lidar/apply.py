@@ -25,6 +25,7 @@ from lidar.dataset.record_clouds import write_clouds
 from lidar.dataset.recording import Contents, Recording
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
+from lidar.options import ApplyOptions
 from lidar.rig.devices import Camera, Scanner, cameras, scanners
 from lidar.rig.scanner import Sensor, firings, load_sensor
 from lidar.rig.specs import load_rig, rig_digest
@@ -58,8 +59,7 @@ def apply_stages(
     source: Path,
     out: Path,
     *,
-    stages: Sequence[NamedStage],
-    sensor: str = "",
+    options: ApplyOptions,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> ApplySummary:
@@ -69,13 +69,10 @@ def apply_stages(
     relative paths: KITTI's ``*.bin`` in a folder ``velodyne*`` or in ``source`` itself, with SemanticKITTI's
     labels if there are any, and nuScenes' ``*.pcd.bin``. Their truth files are in ``out/truth``.
 
-    sensor : preset, or TOML file, of the scanner of KITTI's or nuScenes' clouds; by default that of the
-             original datasets
+    overwrite : replace an existing directory
 
     Raises InputError for stages that cannot act on the data, and DatasetError for data that cannot be read.
     """
-    if not stages:
-        raise InputError("`stages`: give one or more")
     here, there = source.resolve(), out.resolve()
     if here == there or here in there.parents or there in here.parents:
         raise InputError(f"{out}: give a directory outside of {source}")
@@ -86,14 +83,14 @@ def apply_stages(
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
         raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
     if is_dataset:
-        if sensor:
+        if options.sensor:
             raise InputError("`sensor`: a dataset has its own sensors; leave it out")
-        return _apply_to_dataset(open_dataset(source), out, stages=stages, progress=progress)
-    return _apply_to_clouds(clouds, source, out=out, stages=stages, sensor=sensor, progress=progress)
+        return _apply_to_dataset(open_dataset(source), out, stages=options.stages, progress=progress)
+    return _apply_to_clouds(clouds, source, out=out, options=options, progress=progress)
 
 
 def _apply_to_dataset(
-    dataset: Dataset, out: Path, *, stages: Sequence[NamedStage], progress: Progress
+    dataset: Dataset, out: Path, *, stages: tuple[NamedStage, ...], progress: Progress
 ) -> ApplySummary:
     recipe, seed = dataset.manifest["recipe"], int(dataset.manifest["seed"])
     if dataset.manifest["frames_done"] != dataset.frames:
@@ -101,7 +98,7 @@ def _apply_to_dataset(
     if {"stages", "applied_stages"} & recipe.keys():
         raise DatasetError(f"{dataset.path}: has stages already; apply all to the original")
     sensors = _sensors(recipe["rig"])
-    chosen = Stages(tuple(stages), seed)
+    chosen = Stages(stages, seed)
     chosen.check({s.name: "lidar" if isinstance(s, Scanner) else "camera" for s in sensors})
     settings = settings_of(recipe["fidelity"], [(name, text) for name, text in recipe["settings"]])
     contents = Contents(
@@ -266,16 +263,15 @@ def _apply_to_clouds(
     source: Path,
     *,
     out: Path,
-    stages: Sequence[NamedStage],
-    sensor: str,
+    options: ApplyOptions,
     progress: Progress,
 ) -> ApplySummary:
     devices: dict[tuple[str, str], Sensor] = {}
     for path, form in clouds:
         key = path.parent.name, form.name
         if key not in devices:
-            devices[key] = load_sensor(sensor or _SENSORS[form.name], name=key[0])
-    chosen = Stages(tuple(stages))
+            devices[key] = load_sensor(options.sensor or _SENSORS[form.name], name=key[0])
+    chosen = Stages(options.stages)
     chosen.check({name: "lidar" for name, _ in devices})
     before = after = 0
     for done, (path, form) in enumerate(clouds):

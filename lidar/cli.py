@@ -14,10 +14,10 @@ from geoscene.console import main as run
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
 from lidar import __version__
-from lidar.dataset.export import EXPORTERS, exporter
+from lidar.dataset.export import exporter
 from lidar.dataset.formats import map_suffixes
 from lidar.errors import InputError, LidarError
-from lidar.options import OUTPUT, DriveOptions
+from lidar.options import OUTPUT, ApplyOptions, DriveOptions, ExportOptions, MapOptions
 
 app = App(
     name="lidar",
@@ -30,17 +30,14 @@ app = App(
 
     lidar map drive -o map.laz
 
-    lidar rigs, lidar sensors, lidar settings and lidar stages list what there is to choose from.
+    lidar rigs, lidar sensors, lidar settings and lidar stages list the choices.
     """,
 )
 app.register_install_completion_command()
 
 Out = Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)]
 Reporting = Annotated[Report, Parameter(group=OUTPUT)]
-
-
-def _exporter_help() -> str:
-    return "Layout: " + "; ".join(f"{row.name} ({row.meaning})" for row in EXPORTERS.values()) + "."
+JsonFlag = Annotated[bool, Parameter(group=OUTPUT)]
 
 
 @app.command
@@ -49,8 +46,7 @@ def drive(
 ) -> int:
     """Drive a route through a scene and record what the rig senses.
 
-    A run that was stopped goes on where it stopped when the same command is given again, and ends with the
-    same bytes.
+    The same command resumes an interrupted drive; the bytes are those of an uninterrupted one.
 
     For example:
 
@@ -96,10 +92,10 @@ def drive(
         print_json(document)
     else:
         total = sum(summary.points.values())
-        there = f" ({total - summary.written:,} were there)" if summary.resumed else ""
+        before = f" ({total - summary.written:,} were there)" if summary.resumed else ""
         print(
             f"{out}: {summary.duration:.1f} s, {summary.length:.0f} m, {summary.frames} frames,"
-            f" {total:,} points{there} in {summary.wall:.1f} s; next: lidar map {out} -o map.laz"
+            f" {total:,} points{before} in {summary.wall:.1f} s; next: lidar map {out} -o map.laz"
         )
     for name in (name for name, points in summary.points.items() if not points):
         print(
@@ -118,15 +114,10 @@ def map_(
         Path,
         Parameter(name=["--out", "-o"], group=OUTPUT, help=f"File to write: {', '.join(map_suffixes())}."),
     ],
-    voxel: float | None = None,
-    color: str = "class",
-    sensor: Annotated[list[str] | None, Parameter(consume_multiple=True, negative=())] = None,
-    noise: Annotated[bool, Parameter(negative=())] = False,
-    overwrite: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
-    json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT, negative=())] = False,
+    options: MapOptions = MapOptions(),
+    report: Reporting = Report(),
 ) -> int:
-    """Put all clouds of a dataset into one georeferenced cloud.
+    """Aggregate all point clouds of a dataset into one georeferenced cloud.
 
     For example:
 
@@ -138,47 +129,28 @@ def map_(
     ----------
     dataset
         Directory of the dataset.
-    voxel
-        Side in metres of cubes that keep one return each; all returns by default.
-    color
-        What colours show: class, height, intensity or sensor.
-    sensor
-        Names of the scanners to take; all by default.
-    noise
-        Keep returns from where nothing is: false alarms, mirror images.
-    overwrite
-        Replace a file that is there.
-    json
-        Print the summary as JSON.
-    quiet
-        No progress bars.
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.maps.aggregate import aggregate  # noqa: PLC0415
 
-    with progress_bar(quiet=quiet) as progress:
+    with progress_bar(quiet=report.quiet) as progress:
         summary = aggregate(
-            open_dataset(dataset),
-            out,
-            voxel=voxel,
-            color=color,
-            sensors=sensor or (),
-            noise=noise,
-            overwrite=overwrite,
-            progress=progress,
+            open_dataset(dataset), out, options=options, overwrite=report.overwrite, progress=progress
         )
-    if json:
+    if report.json:
         counts: dict[str, Any] = {"points_in": summary.points_in, "points": summary.points}
         counts["noise_left_out"] = summary.noise
         counts |= {"frames": summary.frames, "missing_frames": summary.missing}
         print_json({"path": str(out), **counts})
     else:
-        left = f"; {summary.noise:,} of noise left out (--noise keeps them)" if summary.noise else ""
-        print(f"{out}: {summary.points:,} of {summary.points_in:,} points from {summary.frames} frames{left}")
+        noise = f"; {summary.noise:,} of noise left out (--noise keeps them)" if summary.noise else ""
+        print(
+            f"{out}: {summary.points:,} of {summary.points_in:,} points from {summary.frames} frames{noise}"
+        )
     if summary.missing:
         lost = ", ".join(f"{count} of {name}" for name, count in summary.missing.items())
         print(
-            f"lidar: frames are missing: {lost}; was the drive stopped? The same command goes on with it",
+            f"lidar: frames are missing: {lost}; was the drive stopped? The same command resumes it",
             file=sys.stderr,
         )
     return 0
@@ -189,11 +161,9 @@ def export(
     dataset: Path,
     /,
     *,
-    out: Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)],
-    to: Annotated[str, Parameter(help=_exporter_help())] = "nuscenes",
-    overwrite: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
-    json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT, negative=())] = False,
+    out: Out,
+    options: ExportOptions = ExportOptions(),
+    report: Reporting = Report(),
 ) -> int:
     """Write a recorded drive in the layout of another dataset.
 
@@ -209,18 +179,14 @@ def export(
         Directory of the dataset.
     out
         Directory to make.
-    overwrite
-        Replace a directory that is there.
-    json
-        Print the summary as JSON.
-    quiet
-        No progress bars.
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
 
-    with progress_bar(quiet=quiet) as progress:
-        summary = exporter(to).export(open_dataset(dataset), out, overwrite=overwrite, progress=progress)
-    if json:
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = exporter(options.to).export(
+            open_dataset(dataset), out, overwrite=report.overwrite, progress=progress
+        )
+    if report.json:
         print_json({"path": str(out), **summary.counts})
     else:
         counts = ", ".join(f"{count:,} {kind}" for kind, count in summary.counts.items())
@@ -233,12 +199,9 @@ def apply(
     dataset: Path,
     /,
     *,
-    stage: Annotated[list[str], Parameter(negative=())],
-    sensor: str = "",
-    out: Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)],
-    overwrite: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
-    json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT, negative=())] = False,
+    options: ApplyOptions,
+    out: Out,
+    report: Reporting = Report(),
 ) -> int:
     """Apply stages to recorded data: a dataset, or point clouds of KITTI or nuScenes.
 
@@ -255,33 +218,14 @@ def apply(
     ----------
     dataset
         Directory of a dataset, or of velodyne*/*.bin (KITTI) or *.pcd.bin (nuScenes) files.
-    stage
-        NAME, NAME:KEY=VALUE,KEY=VALUE or a TOML file with tables [[stage]]; again for more. lidar stages
-        lists them all.
-    sensor
-        Scanner of KITTI's or nuScenes' clouds: a preset or a TOML file; hdl64e_s3 or hdl32e by default.
     out
         Directory to write to.
-    overwrite
-        Replace what is there.
-    json
-        Print the summary as JSON.
-    quiet
-        No progress bars.
     """
     from lidar.apply import apply_stages  # noqa: PLC0415
-    from lidar.signal.registry import read_stages  # noqa: PLC0415
 
-    with progress_bar(quiet=quiet) as progress:
-        summary = apply_stages(
-            dataset,
-            out,
-            stages=read_stages(stage).stages,
-            sensor=sensor,
-            overwrite=overwrite,
-            progress=progress,
-        )
-    if json:
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = apply_stages(dataset, out, options=options, overwrite=report.overwrite, progress=progress)
+    if report.json:
         print_json({**asdict(summary), "path": str(out)})
     else:
         print(f"{out}: {summary.files} files, {summary.points:,} of {summary.points_in:,} points")
@@ -289,7 +233,7 @@ def apply(
 
 
 @app.command
-def stages(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False) -> int:
+def stages(*, json: JsonFlag = False) -> int:
     """List the stages that change echoes, point clouds or images, with their parameters.
 
     Parameters
@@ -320,13 +264,13 @@ def stages(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = Fals
 
 
 @app.command
-def rigs(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False) -> int:
-    """List the rigs that come along.
+def rigs(*, json: JsonFlag = False) -> int:
+    """List the built-in rigs.
 
     Parameters
     ----------
     json
-        Print them as JSON, with all there is to know.
+        Print them as JSON, with all their values.
     """
     from lidar.rig.catalog import columns, rig_rows  # noqa: PLC0415
 
@@ -344,8 +288,8 @@ def rigs(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False)
 
 
 @app.command
-def sensors(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False) -> int:
-    """List the laser scanners that come along.
+def sensors(*, json: JsonFlag = False) -> int:
+    """List the built-in laser scanners.
 
     Parameters
     ----------
@@ -372,7 +316,7 @@ def sensors(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = Fal
 
 
 @app.command
-def settings(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = False) -> int:
+def settings(*, json: JsonFlag = False) -> int:
     """List the fidelity settings: their values at each level, and what they do.
 
     Parameters
@@ -385,11 +329,11 @@ def settings(*, json: Annotated[bool, Parameter(group=OUTPUT, negative=())] = Fa
 
     rows = list_settings()
     if json:
-        told = [
+        documents = [
             {"name": s.name, "of": s.of, **dict(zip(levels(), s.values, strict=True)), "meaning": s.meaning}
             for s in rows
         ]
-        print_json({"settings": told})
+        print_json({"settings": documents})
         return 0
     cells = [[s.name, s.of, *s.values, s.meaning] for s in rows]
     print(columns([["name", "of", *levels(), "meaning"], *cells]))

@@ -1,8 +1,9 @@
-"""Options of `lidar drive`: defaults, units, help and the recipe of a dataset come from one class."""
+"""Options of the commands of `lidar`: defaults, units, help and the recipe of a dataset stand here once."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 from cyclopts import Group, Parameter, Token
 
 from geoscene.console import SEVERAL, WORDS, whole
+from lidar.dataset.export import EXPORTERS
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.errors import InputError
 
@@ -30,6 +32,9 @@ else:  # types that help shows; converters make the values, whose classes take a
 
 OUTPUT = Group("Output", sort_key=3)
 
+COLORS = ("class", "height", "intensity", "sensor")
+"""What red, green and blue of a map can show."""
+
 _BY_FRAME = {
     frame: ", ".join(f.name for f in FORMATS.values() if f.frame == frame) for frame in ("sensor", "world")
 }
@@ -38,6 +43,7 @@ _FORMATS = (
     " (georeferenced)."
 )
 _LABELS = f"Label files in the codes of other datasets, separated by commas: {', '.join(LABELS)}."
+_LAYOUTS = "Layout: " + "; ".join(f"{row.name} ({row.meaning})" for row in EXPORTERS.values()) + "."
 
 
 def _route(_: object, tokens: Sequence[Token]) -> str | Path | list[tuple[float, float]]:
@@ -83,6 +89,9 @@ def _stages(_: object, tokens: Sequence[Token]) -> Any:
     from lidar.signal.registry import read_stages  # noqa: PLC0415
 
     return read_stages([token.value for token in tokens]).stages
+
+
+_STAGE = Parameter(name="--stage", converter=_stages, n_tokens=1, accepts_keys=False, metavar="STAGE")
 
 
 def _pair(text: str) -> tuple[str, str]:
@@ -208,10 +217,7 @@ class DriveOptions:
     ] = ()
     """One setting that differs from the level; repeat for more. lidar settings lists them."""
 
-    stages: Annotated[
-        StageList,
-        Parameter(name="--stage", converter=_stages, n_tokens=1, accepts_keys=False, metavar="STAGE"),
-    ] = ()
+    stages: Annotated[StageList, _STAGE] = ()
     """Change echoes, clouds or images by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or a TOML file with tables
     [[stage]]; repeat for more. lidar stages lists them."""
 
@@ -269,6 +275,57 @@ class DriveOptions:
         if self.stages:
             resolved["stages"] = [stage.to_json() for stage in self.stages]
         return recipe | resolved
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class MapOptions:
+    """Options of an aggregated map."""
+
+    voxel: float | None = None
+    """Keep only the return nearest to the centre of each cube with this side in metres; all by default."""
+
+    color: str = "class"
+    """What colours show: class, height, intensity or sensor."""
+
+    sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
+    """Names of the scanners to use; all by default."""
+
+    noise: bool = False
+    """Keep returns of class noise: false alarms and mirror images."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if self.color not in COLORS:
+            raise InputError(f"`color` {self.color}: one of {', '.join(COLORS)}")
+        if self.voxel is not None and not 0 < self.voxel < math.inf:
+            raise InputError(f"`voxel` {self.voxel}: give a positive number of metres")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class ExportOptions:
+    """Options of an export of a dataset."""
+
+    to: Annotated[str, Parameter(help=_LAYOUTS)] = "nuscenes"
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class ApplyOptions:
+    """Options of stages on recorded data."""
+
+    stages: Annotated[StageList, _STAGE]
+    """Stage to apply: NAME, NAME:KEY=VALUE,KEY=VALUE or a TOML file with tables [[stage]]; repeat for more.
+    lidar stages lists them."""
+
+    sensor: str = ""
+    """Scanner of KITTI's or nuScenes' clouds: a preset or a TOML file; hdl64e_s3 or hdl32e by default."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if not self.stages:
+            raise InputError("`stages`: give one or more")
 
 
 def _digested(name: str | Path) -> str:

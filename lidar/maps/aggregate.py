@@ -22,10 +22,8 @@ from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
 from lidar.maps.colors import distinct, ramp
+from lidar.options import MapOptions
 from lidar.rig.patterns.beams import frame_ns
-
-COLORS = ("class", "height", "intensity", "sensor")
-"""What red, green and blue of a map can show."""
 
 _COLUMNS = ("x", "y", "z", "intensity", "gps_time", "ring", "label", "instance", "source")
 _BUCKET = 64.0  # metres: side of the squares into which points are sorted before they are thinned
@@ -64,10 +62,7 @@ def aggregate(
     dataset: Dataset,
     out: Path,
     *,
-    voxel: float | None = None,
-    color: str = "class",
-    sensors: Sequence[str] = (),
-    noise: bool = False,
+    options: MapOptions = MapOptions(),
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> MapSummary:
@@ -76,28 +71,20 @@ def aggregate(
     LAS, LAZ and PLY hold easting, northing and height in the dataset's export CRS. PCD, whose readers take
     float32, holds the same minus the whole-metre offset that its comment line states.
 
-    voxel     : side in metres of cubes of which each keeps the return nearest to its centre; all by default
-    color     : what red, green and blue show, of `COLORS`
-    sensors   : names of the scanners to use; all by default
-    noise     : keep returns of class NOISE: false alarms and mirror images
     overwrite : replace an existing file
 
-    Raises InputError for invalid options and DatasetError for a dataset without clouds.
+    Raises InputError for an unknown scanner or suffix, and DatasetError for a dataset without clouds.
     """
     if out.suffix.lower() not in map_suffixes():
         raise InputError(f"{out}: maps are written as {', '.join(map_suffixes())}")
-    if color not in COLORS:
-        raise InputError(f"`color` {color}: one of {', '.join(COLORS)}")
-    if voxel is not None and not (np.isfinite(voxel) and voxel > 0):
-        raise InputError(f"`voxel` {voxel}: give a positive number of metres")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
     lidars = dataset.sensors("lidar")
-    if unknown := sorted(set(sensors) - set(lidars)):
+    if unknown := sorted(set(options.sensors) - set(lidars)):
         raise InputError(f"no scanner {', '.join(unknown)} in {dataset.path}; there are {', '.join(lidars)}")
-    chosen = [name for name in lidars if not sensors or name in sensors]
+    chosen = [name for name in lidars if not options.sensors or name in options.sensors]
     source = _Source(dataset, chosen)
-    limits = source.height_range() if color == "height" else (0.0, 0.0)
+    limits = source.height_range() if options.color == "height" else (0.0, 0.0)
 
     read = dropped = 0
     frames: set[int] = set()
@@ -109,13 +96,15 @@ def aggregate(
             frames.add(frame)
             progress("reading clouds", k + 1, total=len(source))
             real = table["label"] != Class.NOISE
-            if not noise and not real.all():
+            if not options.noise and not real.all():
                 dropped += int(np.count_nonzero(~real))
                 table = {name: column[real] for name, column in table.items()}  # noqa: PLW2901
             yield table
 
-    stream = tables() if voxel is None else _voxels(tables(), voxel, out=out, offset=source.geo.offset)
-    written = _write(out, (_colored(t, color, limits=limits) for t in stream), source=source)
+    stream = tables()
+    if options.voxel is not None:
+        stream = _voxels(stream, options.voxel, out=out, offset=source.geo.offset)
+    written = _write(out, (_colored(t, options.color, limits=limits) for t in stream), source=source)
     return MapSummary(read, written, dropped, len(frames), source.missing(), out)
 
 

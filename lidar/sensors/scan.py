@@ -21,7 +21,6 @@ from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
 from lidar.rig.scanner import firings as fire
 from lidar.sensors.cloud import Cloud
-from lidar.sensors.rays import beam_of
 from lidar.sensors.surface_echoes import surface_echoes
 from lidar.world.world import World
 
@@ -112,12 +111,9 @@ def cast(
     echoes = surface_echoes(
         sent,
         mount,
+        sensor=sensor,
         trajectory=trajectory,
         world=world,
-        beam=beam_of(settings.rays, divergence=sensor.divergence, aperture=sensor.aperture),
-        far=sensor.max_range - sensor.pattern.range_offset,
-        wavelength_nm=sensor.wavelength_nm,
-        separation=sensor.echo_separation,
         time=_ray_time(sensor, frame, pulses=firings) if _moving(world) else None,
         settings=settings,
         seed=seed,

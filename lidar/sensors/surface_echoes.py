@@ -14,8 +14,9 @@ from lidar.physics.fresnel import mirrored, pane_reflection, surface_reflection
 from lidar.physics.settings import ScannerSettings
 from lidar.raycast import Hits
 from lidar.rig.patterns.beams import Firings
+from lidar.rig.scanner import Sensor
 from lidar.sensors.foliage import Foliage
-from lidar.sensors.rays import Beam, MovingSensor, Rays
+from lidar.sensors.rays import MovingSensor, Rays, beam_of
 from lidar.sensors.reflection import EchoCollector, SurfaceOptics, glossy_codes
 from lidar.world.world import World
 
@@ -28,27 +29,25 @@ def surface_echoes(
     pulses: Firings,
     mount: Mount,
     *,
+    sensor: Sensor,
     trajectory: Trajectory,
     world: World,
-    beam: Beam,
-    far: float,
-    wavelength_nm: float,
-    separation: float,
     time: NDArray[np.float32] | None,
     settings: ScannerSettings,
     seed: int,
-    leaf_seed: int = 0,
-    threads: int = 1,
+    leaf_seed: int,
+    threads: int,
 ) -> Echoes:
-    """The echoes of pulses that a moving sensor fires, within ``far`` metres, sorted by pulse and range.
+    """The echoes of pulses that a moving sensor fires, within its maximum range, sorted by pulse and range.
 
-    separation : metres; surfaces closer than this give one echo
-    time       : (n,) ray times of the pulses; None in a static world
-    leaf_seed  : of the leaves that rays hit, if settings include foliage
+    time      : (n,) ray times of the pulses; None in a static world
+    leaf_seed : of the leaves that rays hit, if settings include foliage
     """
-    rays = len(beam)
+    beam = beam_of(settings.rays, divergence=sensor.divergence, aperture=sensor.aperture)
+    far = sensor.max_range - sensor.pattern.range_offset
+    separation, rays = sensor.echo_separation, len(beam)
     batch = max(_BATCH // rays, 1)
-    optics = SurfaceOptics(world, wavelength_nm, settings=settings, seed=seed)
+    optics = SurfaceOptics(world, sensor.wavelength_nm, settings=settings, seed=seed)
     moving = MovingSensor(pulses, mount, trajectory=trajectory, beam=beam, batch=batch)
     collector = EchoCollector(optics, beam.share, separation=separation, pulses=len(pulses))
     foliage = Foliage(world.caster, world.faces, far, leaf_seed) if settings.foliage else None

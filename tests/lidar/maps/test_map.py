@@ -24,6 +24,7 @@ from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
 from lidar.maps.aggregate import aggregate
+from lidar.options import MapOptions
 
 START = datetime(2026, 6, 21, 8, tzinfo=UTC)
 FRAME = Frame.at(24.945, 60.167)
@@ -123,8 +124,8 @@ def test_points_are_in_the_map_where_they_are_in_the_world(tmp_path, kinds):
 
 def test_ply_and_pcd_maps_hold_the_same_points(tmp_path):
     data = dataset(tmp_path / "d")
-    aggregate(data, tmp_path / "m.ply", color="height")
-    aggregate(data, tmp_path / "m.pcd", color="intensity")
+    aggregate(data, tmp_path / "m.ply", options=MapOptions(color="height"))
+    aggregate(data, tmp_path / "m.pcd", options=MapOptions(color="intensity"))
     ply = np.asarray(trimesh.load(tmp_path / "m.ply").vertices)
     assert np.abs(ply - expected()).max() < 0.001
     pcd = PointCloud.from_path(tmp_path / "m.pcd")
@@ -137,7 +138,7 @@ def test_ply_and_pcd_maps_hold_the_same_points(tmp_path):
 @pytest.mark.parametrize("voxel", [0.5003, 2.0007, 100.0001])  # no border on the millimetres of LAZ
 def test_a_voxel_keeps_the_one_return_nearest_to_its_centre(tmp_path, voxel):
     data = dataset(tmp_path / "d")
-    aggregate(data, tmp_path / "m.laz", voxel=voxel)
+    aggregate(data, tmp_path / "m.laz", options=MapOptions(voxel=voxel))
     las = laspy.read(tmp_path / "m.laz")
     offset = np.array(Georeference(FRAME, CRS_OUT).offset)
     kept = np.round(np.column_stack([las.x, las.y, las.z]) - offset, 3)
@@ -162,9 +163,9 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path, monkeypatch, v
     peaks = []
     for frames in (10, 60):
         data = dataset(tmp_path / f"d{frames}", first=100, frames=frames, n=5000)  # at rest
-        aggregate(data, tmp_path / "warm.laz", voxel=voxel, overwrite=True)
+        aggregate(data, tmp_path / "warm.laz", options=MapOptions(voxel=voxel), overwrite=True)
         tracemalloc.start()
-        aggregate(data, tmp_path / f"{frames}.laz", voxel=voxel)
+        aggregate(data, tmp_path / f"{frames}.laz", options=MapOptions(voxel=voxel))
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 2 * peaks[0]  # six times the frames
@@ -173,7 +174,7 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path, monkeypatch, v
 def test_the_same_dataset_gives_the_same_bytes(tmp_path):
     data = dataset(tmp_path / "d")
     for name in ("a.laz", "b.laz"):
-        aggregate(data, tmp_path / name, voxel=0.3)
+        aggregate(data, tmp_path / name, options=MapOptions(voxel=0.3))
     assert (tmp_path / "a.laz").read_bytes() == (tmp_path / "b.laz").read_bytes()
 
 
@@ -189,7 +190,7 @@ def test_the_same_dataset_gives_the_same_bytes(tmp_path):
 )
 def test_bad_options_are_named(tmp_path, out, change, words):
     with pytest.raises(InputError, match=words):
-        aggregate(dataset(tmp_path / "d"), tmp_path / out, **change)
+        aggregate(dataset(tmp_path / "d"), tmp_path / out, options=MapOptions(**change))
 
 
 def test_noise_is_left_out_and_counted_unless_it_is_asked_for(tmp_path):
@@ -199,7 +200,7 @@ def test_noise_is_left_out_and_counted_unless_it_is_asked_for(tmp_path):
     pcd.write(path, table | {"label": np.where(np.arange(400) < 7, Class.NOISE, table["label"])})
     summary = aggregate(data, tmp_path / "m.laz")
     assert (summary.points, summary.noise, summary.points_in) == (793, 7, 800)
-    kept = aggregate(data, tmp_path / "n.laz", noise=True)
+    kept = aggregate(data, tmp_path / "n.laz", options=MapOptions(noise=True))
     assert (kept.points, kept.noise) == (800, 0)
 
 

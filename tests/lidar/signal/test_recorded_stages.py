@@ -19,7 +19,7 @@ from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.dataset.layout import open_dataset
 from lidar.drive import drive
 from lidar.errors import DatasetError, InputError
-from lidar.options import DriveOptions
+from lidar.options import ApplyOptions, DriveOptions
 from lidar.physics.echoes import Origin
 from lidar.signal.registry import read_stages
 from lidar.traffic.populate import TrafficOptions
@@ -134,7 +134,7 @@ def test_bytes_do_not_depend_on_workers_or_on_a_resumed_drive(scene, options, al
 
 
 def test_applied_to_the_record_stages_give_the_files_of_the_drive(plain, altered, tmp_path):
-    summary = apply_stages(plain, tmp_path / "a", stages=STAGES)
+    summary = apply_stages(plain, tmp_path / "a", options=ApplyOptions(STAGES))
     made, expected = files(tmp_path / "a"), files(altered)
     truth = {name for name in expected if "/truth/" in name}
     assert made.keys() == expected.keys()
@@ -147,7 +147,7 @@ def test_applied_to_the_record_stages_give_the_files_of_the_drive(plain, altered
     assert opened.manifest["points"] == open_dataset(altered).manifest["points"]
     assert summary.points == sum(opened.manifest["points"].values()) < summary.points_in
     with pytest.raises(DatasetError, match="has stages already"):
-        apply_stages(tmp_path / "a", tmp_path / "b", stages=STAGES)
+        apply_stages(tmp_path / "a", tmp_path / "b", options=ApplyOptions(STAGES))
 
 
 def test_stages_on_clouds_of_kitti_and_nuscenes(plain, tmp_path):
@@ -157,7 +157,7 @@ def test_stages_on_clouds_of_kitti_and_nuscenes(plain, tmp_path):
         for path in sorted((plain / "top" / name).iterdir()):
             (target / path.name).write_bytes(path.read_bytes())
     lossy = read_stages(["dropped_packets:loss=0.3"]).stages
-    summary = apply_stages(tmp_path / "in", tmp_path / "out", stages=lossy, sensor="vlp16")
+    summary = apply_stages(tmp_path / "in", tmp_path / "out", options=ApplyOptions(lossy, sensor="vlp16"))
     assert summary.files == 10
     for folder, suffix in (("velodyne", ".bin"), ("nuscenes", ".pcd.bin")):
         name = f"000001{suffix}"
@@ -178,24 +178,25 @@ def test_stages_on_clouds_of_kitti_and_nuscenes(plain, tmp_path):
     with np.load(tmp_path / "out" / "truth" / "velodyne" / "000001.npz") as truth:
         assert np.array_equal(labels[1], labels[0][truth["source"]])
     glass = read_stages(["cover_glass:transmission=0.3"]).stages
-    dimmed = apply_stages(tmp_path / "in", tmp_path / "dim", stages=glass, sensor="vlp16")
+    dimmed = apply_stages(tmp_path / "in", tmp_path / "dim", options=ApplyOptions(glass, sensor="vlp16"))
     assert 0 < dimmed.points < dimmed.points_in
 
 
 def test_data_that_stages_cannot_be_applied_to(plain, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match="no velodyne"):
-        apply_stages(tmp_path / "empty", tmp_path / "out", stages=STAGES)
+        apply_stages(tmp_path / "empty", tmp_path / "out", options=ApplyOptions(STAGES))
     with pytest.raises(InputError, match="outside of"):
-        apply_stages(plain, plain / "out", stages=STAGES)
+        apply_stages(plain, plain / "out", options=ApplyOptions(STAGES))
     with pytest.raises(InputError, match="has its own sensors"):
-        apply_stages(plain, tmp_path / "out", stages=STAGES, sensor="vlp16")
+        apply_stages(plain, tmp_path / "out", options=ApplyOptions(STAGES, sensor="vlp16"))
+    left = ApplyOptions(read_stages(["dropped_packets:sensor=left"]).stages)
     with pytest.raises(InputError, match="no sensor 'left'"):
-        apply_stages(plain, tmp_path / "out", stages=read_stages(["dropped_packets:sensor=left"]).stages)
+        apply_stages(plain, tmp_path / "out", options=left)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "note").write_text("mine")
     with pytest.raises(DatasetError, match="is not empty"):
-        apply_stages(plain, tmp_path / "full", stages=STAGES)
+        apply_stages(plain, tmp_path / "full", options=ApplyOptions(STAGES))
     assert not (tmp_path / "out").exists()
 
 
