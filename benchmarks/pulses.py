@@ -10,9 +10,6 @@ it.
 
 Rates are of the whole process and, without imports, of the drive, by the clock and by seconds of one core
 (which other programs on the machine do not slow down as much).
-
-The peer's figures are those of HELIOS++ 2.2.2 for the same city and sensor with two threads, the best of
-several runs, without its loading (9.8 s) and imports.
 """
 
 from __future__ import annotations
@@ -31,12 +28,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-PEER = {1: 202e3, 7: 25e3, 19: 11.9e3, 61: 3.7e3}
-"""Pulses a second of HELIOS++ by rays a pulse."""
-
-PEER_LOAD, PEER_MEMORY = 9.8, 1.94 * 1024
-"""Its seconds of loading and its peak memory in MiB."""
 
 _TILE = 250.0  # metres
 _START = datetime(2026, 6, 21, 10, tzinfo=UTC)
@@ -154,7 +145,7 @@ def load(work: Path) -> dict[str, float]:
 
 
 def child(arguments: dict[str, Any]) -> dict[str, float]:
-    """What `record` or `load` says in a process of its own, with its wall and CPU seconds and peak MiB."""
+    """Result of `record` or `load` run in a process of its own, with its wall and CPU seconds and peak MiB."""
     command = [sys.executable, __file__, "--child", json.dumps(arguments)]
     began = time.perf_counter()
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
@@ -201,8 +192,6 @@ def measure(work: Path, rays: int, seconds: float) -> dict[str, float]:
         "rate_loop": total / two["loop_s"],
         "rate_cpu": total / two["loop_cpu_s"],
         "rate_one_worker": total / found[1]["wall_s"],
-        "to_peer": total / two["wall_s"] / PEER[rays] if rays in PEER else 0.0,
-        "to_peer_loop": total / two["loop_s"] / PEER[rays] if rays in PEER else 0.0,
         "same_bytes": len(kept) == 1,
         **two,
     }
@@ -235,9 +224,9 @@ def main() -> None:
         loads = [child({"work": str(work)}) for _ in range(3)]
         quickest = min(loads, key=lambda row: row["load_s"])
         print(
-            f"whole scene loaded in {quickest['load_s']:.2f} s (peer {PEER_LOAD} s),"
-            f" process {quickest['peak_mib']:.0f} MiB (peer {PEER_MEMORY:.0f} MiB)\n"
-            "rays driven s  pulses   wall s  k pulses/s  x peer  without imports  x peer  per core s"
+            f"whole scene loaded in {quickest['load_s']:.2f} s,"
+            f" process {quickest['peak_mib']:.0f} MiB\n"
+            "rays driven s  pulses   wall s  k pulses/s  without imports  per core s"
             "  1 worker  peak MiB  same bytes"
         )
         rows = []
@@ -248,7 +237,7 @@ def main() -> None:
             rows.append(row)
             print(
                 f"{rays:4} {seconds:8.1f} {row['pulses']:8} {row['wall_s']:7.2f} {row['rate'] / 1e3:11.0f}"
-                f" {row['to_peer']:7.1f} {row['rate_loop'] / 1e3:16.0f} {row['to_peer_loop']:7.1f}"
+                f" {row['rate_loop'] / 1e3:16.0f}"
                 f" {row['rate_cpu'] / 1e3:11.0f} {row['rate_one_worker'] / 1e3:9.0f}"
                 f" {row['peak_mib']:9.0f}  {row['same_bytes']}",
                 flush=True,
