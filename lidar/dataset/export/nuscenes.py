@@ -331,7 +331,7 @@ class _Export:
                 "last_sample_token": samples[-1]["token"],
                 "name": "scene-0001",
                 "description": f"simulated in {place}; zero at {east:.3f}, {north:.3f} of"
-                f" {self.dataset.frame.name}; (c) OpenStreetMap contributors, ODbL",
+                f" {self.dataset.frame.name}; {manifest['attribution']}",
             }
         ]
         date = self.dataset.start.date().isoformat()
