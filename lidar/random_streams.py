@@ -7,6 +7,7 @@ import hashlib
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.splitmix import GOLDEN, mix
 from geoscene.typing import Float
 
 
@@ -18,16 +19,10 @@ def generator(seed: int, *words: object) -> np.random.Generator:
 
 
 def uniform_of(number: NDArray[np.integer], seed: int) -> Float:
-    """A number (n,) in the open interval 0 to 1 for each integer: a function of integer and seed.
-
-    Hashes both with SplitMix64 (Steele, Lea and Flood 2014).
-    """
+    """A number (n,) in the open interval 0 to 1 for each integer: a function of integer and seed."""
     with np.errstate(over="ignore"):
         x = number.astype(np.uint64) + np.uint64(seed % 2**64) * np.uint64(0xD1342543DE82EF95)
-        x = (x + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
-        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        x ^= x >> np.uint64(31)
+        x = mix((x + np.uint64(1)) * GOLDEN)
     uniform: Float = ((x >> np.uint64(11)).astype(np.float64) + 0.5) / 2.0**53
     return uniform
 

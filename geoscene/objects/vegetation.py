@@ -18,6 +18,7 @@ from geoscene.objects.shapes import concatenate_instances, place
 from geoscene.objects.siting import Sites
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
+from geoscene.splitmix import GOLDEN, mix
 from geoscene.tags import parse_length, parse_number
 from geoscene.typing import Float
 
@@ -292,22 +293,11 @@ def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
 
 
 def _uniform(seed: int, column: NDArray[np.int64], *, row: NDArray[np.int64], count: int) -> Float:
-    """Uniform random numbers (count, n) in [0, 1) determined by (seed, column, row).
-
-    SplitMix64's finaliser (Steele, Lea and Flood 2014) of the three: cheap for each square of an unbounded
-    lattice.
-    """
-
-    def mix(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
-        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        return state ^ (state >> np.uint64(31))
-
-    golden = np.uint64(0x9E3779B97F4A7C15)
+    """Uniform random numbers (count, n) in [0, 1) determined by (seed, column, row)."""
     with np.errstate(over="ignore"):
-        state = mix(column.astype(np.uint64) + golden * np.uint64(seed + 1))
-        state = mix(state ^ (row.astype(np.uint64) * golden))
-        draws = [mix(state + golden * np.uint64(k + 1)) >> np.uint64(11) for k in range(count)]
+        state = mix(column.astype(np.uint64) + GOLDEN * np.uint64(seed + 1))
+        state = mix(state ^ (row.astype(np.uint64) * GOLDEN))
+        draws = [mix(state + GOLDEN * np.uint64(k + 1)) >> np.uint64(11) for k in range(count)]
     return np.stack(draws) * 2.0**-53
 
 
