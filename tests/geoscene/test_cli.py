@@ -5,26 +5,17 @@ import subprocess
 import sys
 
 import pytest
+from helpers.programs import run_program
 
 from geoscene.sources import demo_path
 
 BOX = "24.9405,60.1655,24.9475,60.1690"
 
 
-def program(name, *words, **options):
-    return subprocess.run(
-        [sys.executable, "-m", f"{name}.cli", *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-        **options,
-    )
-
-
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
     out = tmp_path_factory.mktemp("cli") / "scene"
-    done = program("geoscene", "build", "--osm", demo_path(), "--bbox", BOX, "-o", out, "--json")
+    done = run_program("geoscene", "build", "--osm", demo_path(), "--bbox", BOX, "-o", out, "--json")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     assert json.loads(done.stdout)["counts"]["buildings"] > 20
@@ -32,19 +23,19 @@ def scene(tmp_path_factory):
 
 
 def test_info_is_for_programs_and_for_people(scene):
-    report = json.loads(program("geoscene", "info", scene, "--json").stdout)
+    report = json.loads(run_program("geoscene", "info", scene, "--json").stdout)
     counts = report["counts"]
     assert counts["buildings"] == counts["solids"] + counts["dropped"]
     assert report["frame"]["name"].startswith("Local transverse Mercator")
     assert sum(report["heights"].values()) == counts["solids"]
     assert report["extent"]["width_m"] > 300
-    text = program("geoscene", "info", scene).stdout
+    text = run_program("geoscene", "info", scene).stdout
     for word in ("frame", "extent", "buildings", "heights", "OpenStreetMap"):
         assert word in text
 
 
 def test_validate_passes_a_sound_scene(scene):
-    done = program("geoscene", "validate", scene, "--json")
+    done = run_program("geoscene", "validate", scene, "--json")
     assert done.returncode == 0
     assert json.loads(done.stdout)["broken"] == []
 
@@ -63,15 +54,15 @@ def test_a_drive_and_its_map(scene, tmp_path):
         "5",
         "--json",
     ]
-    done = program("lidar", "drive", scene, *words, "-o", tmp_path / "drive")
+    done = run_program("lidar", "drive", scene, *words, "-o", tmp_path / "drive")
     assert done.returncode == 0, done.stderr
     first = json.loads(done.stdout)
     assert first["frames"] == 20
-    again = json.loads(program("lidar", "drive", scene, *words, "-o", tmp_path / "drive").stdout)
+    again = json.loads(run_program("lidar", "drive", scene, *words, "-o", tmp_path / "drive").stdout)
     assert again["resumed"] == 20
     assert again["points"] == first["points"] == first["written"] > 10_000
     assert again["written"] == 0
-    done = program("lidar", "map", tmp_path / "drive", "-o", tmp_path / "m.laz", "--voxel", "0.2")
+    done = run_program("lidar", "map", tmp_path / "drive", "-o", tmp_path / "m.laz", "--voxel", "0.2")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "m.laz").stat().st_size > 10_000
 
@@ -103,7 +94,7 @@ def test_a_drive_and_its_map(scene, tmp_path):
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_two(tmp_path, name, words, says):
-    done = program(name, *words, cwd=tmp_path)
+    done = run_program(name, *words, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1
@@ -125,7 +116,7 @@ def test_bad_input_is_one_line_and_exit_code_two(tmp_path, name, words, says):
     ],
 )
 def test_bad_drives_are_one_line_and_exit_code_two(scene, tmp_path, words, says):
-    done = program("lidar", "drive", scene, *words, "-o", "x", cwd=tmp_path)
+    done = run_program("lidar", "drive", scene, *words, "-o", "x", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1, done.stderr
     assert says in done.stderr
@@ -136,12 +127,12 @@ def test_bad_drives_are_one_line_and_exit_code_two(scene, tmp_path, words, says)
     ("name", "commands"), [("geoscene", ["build", "info", "validate"]), ("lidar", ["drive", "map"])]
 )
 def test_help_teaches_every_command(name, commands):
-    assert program(name, "--version").stdout.strip() == "0.1.0"
-    top = program(name, "--help").stdout
+    assert run_program(name, "--version").stdout.strip() == "0.1.0"
+    top = run_program(name, "--help").stdout
     assert "--install-completion" in top
     for command in commands:
         assert command in top
-        text = program(name, command, "--help").stdout
+        text = run_program(name, command, "--help").stdout
         assert len(text.splitlines()) > 8
 
 

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.programs import ENVIRONMENT
 
 import geoscene
 from geoscene.errors import InputError
@@ -42,7 +43,6 @@ def test_a_foreign_module_installed_over_ours_is_noticed(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("package", ["geoscene", "lidar"])
 def test_packages_run_as_modules(package):
-    done = subprocess.run(
-        [sys.executable, "-m", package, "--version"], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-m", package, "--version"]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, f"{geoscene.__version__}\n")

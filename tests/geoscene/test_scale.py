@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from helpers.programs import ENVIRONMENT, command
 
 from geoscene.build import _tiles_along, build
 from geoscene.classes import Class
@@ -85,7 +86,7 @@ def test_who_holds_a_place_is_found_without_looking_at_what_is_far(monkeypatch):
 
 
 def build_words(town, out):
-    words = [sys.executable, "-m", "geoscene.cli", "build", "--osm", str(town), "--out", str(out)]
+    words = command("geoscene", "build", "--osm", town, "--out", out)
     return [*words, "--tile-size", "100", "--lod", "1", "--workers", "2", "--quiet"]
 
 
@@ -106,7 +107,9 @@ def alive(group):
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_a_build_killed_outright_goes_on_and_ends_with_the_same_bytes(town, scene, tmp_path):
     out = tmp_path / "scene"
-    process = subprocess.Popen(build_words(town, out), start_new_session=True, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        build_words(town, out), env=ENVIRONMENT, start_new_session=True, stdout=subprocess.DEVNULL
+    )
     tiles = tmp_path / "scene.part" / "tiles"
     while process.poll() is None and len(list(tiles.glob("*.npz"))) < 5:
         time.sleep(0.02)
@@ -124,7 +127,7 @@ def test_a_build_killed_outright_goes_on_and_ends_with_the_same_bytes(town, scen
     (tiles / "99_99.npz").write_bytes(b"old")
     (tiles.parent / "features.123.part.gpkg").write_bytes(b"half")
 
-    subprocess.run(build_words(town, out), check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(build_words(town, out), env=ENVIRONMENT, check=True, stdout=subprocess.DEVNULL)
     assert files_of(out) == files_of(scene.path)
     taken = {name for name, written in left.items() if (out / "tiles" / name).stat().st_mtime_ns == written}
     assert taken  # tiles in the journal are not made again

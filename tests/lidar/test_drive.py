@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -16,6 +15,7 @@ from datetime import UTC, datetime
 import laspy
 import numpy as np
 import pytest
+from helpers.programs import ENVIRONMENT, command
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
@@ -121,10 +121,9 @@ def test_any_number_of_workers_gives_the_same_bytes(scene, dataset, tmp_path):
 
 def test_a_killed_drive_goes_on_and_ends_with_the_same_bytes(scene, dataset, tmp_path):
     out = tmp_path / "c"
-    program = [sys.executable, "-m", "lidar.cli", "drive", str(scene.path), "-o", str(out)]
     options = "--route random --rig vlp16 --duration 4 --seed 3 --format pcd,laz"
-    program += options.split()
-    process = subprocess.Popen(program)
+    program = command("lidar", "drive", scene.path, "-o", out, *options.split())
+    process = subprocess.Popen(program, env=ENVIRONMENT)
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and not list(out.glob("lidar_top/laz/*5.laz")):
         time.sleep(0.05)
@@ -132,7 +131,7 @@ def test_a_killed_drive_goes_on_and_ends_with_the_same_bytes(scene, dataset, tmp
     process.wait()
     assert json.loads((out / "dataset.json").read_text())["frames_done"] == 0
     assert len(list(out.glob("lidar_top/laz/0*.laz"))) < dataset.frames
-    subprocess.run(program, check=True)
+    subprocess.run(program, env=ENVIRONMENT, check=True)
     done = {name: value for name, value in digest(out).items() if ".part" not in name}
     assert done == digest(dataset.path)
 

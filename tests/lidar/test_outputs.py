@@ -4,8 +4,6 @@ import csv
 import json
 import re
 import resource
-import subprocess
-import sys
 import zlib
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -14,6 +12,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
+from helpers.programs import run_program
 from helpers.sensor_worlds import driven, plate, world
 from PIL import Image
 from scipy.spatial import cKDTree
@@ -509,6 +508,8 @@ def test_nuscenes_tables_lead_from_a_sample_to_points_boxes_and_pixels(dataset, 
             for way, back in (("next", "prev"), ("prev", "next")):
                 if row.get(way):
                     assert rows[row[way]][back] == row["token"], name
+    (described,) = tables["scene"].values()
+    assert described["description"].endswith(f"; {dataset.manifest['attribution']}")
     samples = sorted(tables["sample"].values(), key=lambda s: s["timestamp"])
     assert len(samples) == counts["samples"] == 8  # two a second for four seconds
     assert np.diff([s["timestamp"] for s in samples]).tolist() == [500_000] * 7
@@ -593,14 +594,8 @@ def test_contents_that_cannot_be_written_are_refused(change, says):
         Contents(**change)
 
 
-def program(*words, **options):
-    return subprocess.run(
-        [sys.executable, "-m", "lidar.cli", *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-        **options,
-    )
+def program(*words):
+    return run_program("lidar", *words)
 
 
 def test_a_sensor_that_sees_nothing_is_spoken_of(scene, tmp_path):

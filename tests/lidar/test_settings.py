@@ -2,11 +2,10 @@
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import fields
 
 import pytest
+from helpers.programs import run_program
 
 from lidar.camera.settings import CameraSettings
 from lidar.errors import InputError
@@ -18,9 +17,7 @@ from lidar.settings import levels, list_settings, settings_of
 
 
 def program(*words, cwd=None):
-    return subprocess.run(
-        [sys.executable, "-m", "lidar.cli", *words], capture_output=True, text=True, check=False, cwd=cwd
-    )
+    return run_program("lidar", *words, cwd=cwd)
 
 
 def test_every_setting_is_listed_with_its_value_at_each_level_and_a_meaning():

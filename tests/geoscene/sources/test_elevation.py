@@ -3,14 +3,13 @@
 import io
 import json
 import socket
-import subprocess
-import sys
 import threading
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
+from helpers.programs import run_program
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -256,8 +255,7 @@ def test_invalid_requests_are_refused_before_they_are_sent(serve, tmp_path):
 
 
 def program(*words):
-    command = [sys.executable, "-m", "geoscene.cli", "build", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return run_program("geoscene", "build", *words)
 
 
 def test_the_program_builds_on_tiles_and_credits_them(serve, tmp_path):

@@ -3,8 +3,6 @@
 import json
 import re
 import socket
-import subprocess
-import sys
 import threading
 import time
 import urllib.parse
@@ -15,6 +13,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import osmium
 import pytest
 from helpers.extracts import same
+from helpers.programs import run_program
 
 from geoscene.errors import InputError, NetworkError, SourceNotFoundError
 from geoscene.sources import Servers, demo_path, fetch_bbox, fetch_place, fetch_point, read_osm
@@ -352,22 +351,13 @@ def test_invalid_requests_are_refused_before_they_are_sent(server):
 
 def test_the_program_builds_a_place_and_fetches_it_once(server, tmp_path):
     place = next(iter(name for name, found in PLACES.items() if found))
-    command = [
-        sys.executable,
-        "-m",
-        "geoscene.cli",
-        "build",
-        "--place",
-        place,
-        "--cache",
-        str(tmp_path / "c"),
-    ]
-    command += ["--nominatim", server.url, "--overpass", f"{server.url}/api", "--json"]
-    done = subprocess.run([*command, "-o", str(tmp_path / "a")], capture_output=True, text=True, check=False)
+    words = ["build", "--place", place, "--cache", tmp_path / "c"]
+    words += ["--nominatim", server.url, "--overpass", f"{server.url}/api", "--json"]
+    done = run_program("geoscene", *words, "-o", tmp_path / "a")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["counts"]["buildings"] > 10
     asked = len(server.asked)
-    done = subprocess.run([*command, "-o", str(tmp_path / "b")], capture_output=True, text=True, check=False)
+    done = run_program("geoscene", *words, "-o", tmp_path / "b")
     assert done.returncode == 0, done.stderr
     assert server.asked_for("/api/interpreter") == 1
     assert len(server.asked) == asked
@@ -378,18 +368,8 @@ def test_the_program_builds_a_place_and_fetches_it_once(server, tmp_path):
 
 
 def test_the_program_without_a_network_names_the_offline_options(tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "geoscene.cli",
-        "build",
-        "--place",
-        "Norfolk, VA",
-        "--nominatim",
-        nowhere(),
-    ]
-    command += ["--cache", str(tmp_path / "c"), "-o", str(tmp_path / "a")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    words = ["build", "--place", "Norfolk, VA", "--nominatim", nowhere()]
+    done = run_program("geoscene", *words, "--cache", tmp_path / "c", "-o", tmp_path / "a")
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
     assert "--osm" in done.stderr

@@ -1,13 +1,13 @@
 """Buildings of Overture Maps: those of the demo extract in Overture's schema, and odd rows by hand."""
 
 import json
-import subprocess
 import sys
 
 import numpy as np
 import pyarrow as pa
 import pytest
 import shapely
+from helpers.programs import run_program
 from pyarrow import parquet
 from pyproj import CRS
 
@@ -245,18 +245,9 @@ def test_every_row_of_the_registry_is_complete():
 
 @pytest.mark.parametrize("roads", [True, False])
 def test_the_program_builds_with_buildings_of_overture(demo, tmp_path, roads):
-    command = [
-        sys.executable,
-        "-m",
-        "geoscene.cli",
-        "build",
-        "--source",
-        f"overture={demo}",
-        "-o",
-        str(tmp_path / "s"),
-    ]
-    command += ["--bbox", "24.944,60.1668,24.947,60.1680", "--json", *(["--demo"] if roads else [])]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    words = ["build", "--source", f"overture={demo}", "-o", tmp_path / "s", "--json"]
+    words += ["--bbox", "24.944,60.1668,24.947,60.1680", *(["--demo"] if roads else [])]
+    done = run_program("geoscene", *words)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["counts"]["solids"] > 10

@@ -3,14 +3,13 @@
 import csv
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 
 import laspy
 import numpy as np
 import pytest
 import shapely
+from helpers.programs import run_program
 
 from geoscene.scene import SceneFiles
 from lidar.dataset.formats import read_table
@@ -200,13 +199,7 @@ def test_poses_of_other_programs_need_no_dataset(scene, driven, tmp_path):
 
 
 def program(*words, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", "lidar.cli", *map(str, words)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=cwd,
-    )
+    return run_program("lidar", *words, cwd=cwd)
 
 
 @pytest.mark.parametrize(

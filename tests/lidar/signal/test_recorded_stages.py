@@ -2,13 +2,12 @@
 
 import hashlib
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.programs import run_program
 
 from geoscene.build import build
 from geoscene.options import BuildOptions
@@ -86,8 +85,7 @@ def files(folder):
 
 
 def program(*words):
-    command = [sys.executable, "-m", "lidar.cli", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return run_program("lidar", *words)
 
 
 def test_a_drive_without_stages_has_no_trace_of_them(plain):

@@ -1,0 +1,22 @@
+"""The programs of the checkout under test, each run in a process of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+_ROOT = Path(__file__).resolve().parents[2]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(_ROOT)}
+"""Makes a process import this checkout from any folder, whatever version is installed."""
+
+
+def command(name, *words):
+    """Arguments of a process that runs the program ``name``."""
+    return [sys.executable, "-m", f"{name}.cli", *map(str, words)]
+
+
+def run_program(name, *words, cwd=None):
+    """The completed process of the program ``name``, with its output as text."""
+    return subprocess.run(
+        command(name, *words), cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, check=False
+    )
