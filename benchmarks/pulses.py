@@ -145,7 +145,7 @@ def load(work: Path) -> dict[str, float]:
 
 
 def child(arguments: dict[str, Any]) -> dict[str, float]:
-    """Result of `record` or `load` run in a process of its own, with its wall and CPU seconds and peak MiB."""
+    """What `record` or `load` returns in its own process, with wall and CPU seconds and peak MiB."""
     command = [sys.executable, __file__, "--child", json.dumps(arguments)]
     began = time.perf_counter()
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)

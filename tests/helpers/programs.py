@@ -15,8 +15,8 @@ def command(name, *words):
     return [sys.executable, "-m", f"{name}.cli", *map(str, words)]
 
 
-def run_program(name, *words, cwd=None):
-    """The completed process of the program ``name``, with its output as text."""
+def run_program(name, *words, **options):
+    """The completed process of the program ``name``, with its output as text; options of `subprocess.run`."""
     return subprocess.run(
-        command(name, *words), cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, check=False
+        command(name, *words), env=ENVIRONMENT, capture_output=True, text=True, check=False, **options
     )

@@ -594,8 +594,8 @@ def test_contents_that_cannot_be_written_are_refused(change, says):
         Contents(**change)
 
 
-def program(*words):
-    return run_program("lidar", *words)
+def program(*words, **options):
+    return run_program("lidar", *words, **options)
 
 
 def test_a_sensor_that_sees_nothing_is_spoken_of(scene, tmp_path):
