@@ -1,4 +1,4 @@
-"""Camera models: which way each pixel looks, and where a point is seen."""
+"""Camera models: the ray of each pixel, and the pixel of each point."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _TOLERANCE = 1e-12
 
 
 def intrinsic_matrix(camera: CameraSpec) -> Float:
-    """K (3, 3): pixels (u, v, 1) of normalised image coordinates (x, y, 1)."""
+    """K (3, 3), which maps normalised image coordinates (x, y, 1) to pixels (u, v, 1)."""
     return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
 
 
 def pixel_rays(camera: CameraSpec) -> Float:
     """Unit directions (height * width, 3) of the pixels' centres, row by row, in the camera frame.
 
-    NaN where a pixel sees nothing: outside a fisheye's circle, or where a distortion folds over. The array is
-    shared between calls and cannot be written to.
+    NaN for pixels without a ray: outside a fisheye's image circle, or where the distortion is not one to one.
+    The array is read-only and shared between calls.
     """
     return _pixel_rays(
         camera.model,
@@ -57,7 +57,7 @@ def _pixel_rays(
 
 
 def unproject(camera: CameraSpec, pixels: ArrayLike) -> Float:
-    """Unit directions (n, 3) in the camera frame in which pixels (n, 2) look; NaN where none does."""
+    """Unit directions (n, 3) of pixels (n, 2) in the camera frame; NaN for pixels without a ray."""
     uv = np.asarray(pixels, float)
     distorted = (uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     if camera.model == "fisheye":
@@ -68,8 +68,8 @@ def unproject(camera: CameraSpec, pixels: ArrayLike) -> Float:
 def project(camera: CameraSpec, points: ArrayLike) -> tuple[Float, Float]:
     """Pixels (n, 2) at which points (n, 3) of the camera frame appear, and their depth z (n,), metres.
 
-    NaN where a point is not seen: behind a pinhole, or beyond the field in which the distortion is one to
-    one. Pixels may lie outside the image; the centre of its top-left pixel is (0, 0).
+    NaN for points that are not imaged: behind a pinhole camera, or beyond the field in which the distortion
+    is one to one. Pixels may lie outside the image; the centre of its top-left pixel is (0, 0).
     """
     p = np.asarray(points, float)
     distorted = (
@@ -80,11 +80,11 @@ def project(camera: CameraSpec, points: ArrayLike) -> tuple[Float, Float]:
     return distorted * [camera.fx, camera.fy] + [camera.cx, camera.cy], p[:, 2]
 
 
-# Pinhole with the distortion of Brown (Photogrammetric Engineering 32, 1966) as OpenCV writes it.
+# Pinhole with the distortion of Brown (Photogrammetric Engineering 32, 1966) in the form of OpenCV.
 
 
 def _distortion(x: Float, y: Float, *, k: tuple[float, ...]) -> tuple[Float, Float, Float, Float, Float]:
-    """Distorted x and y and the Jacobian's xx, xy, yy at normalised coordinates."""
+    """Distorted x and y of normalised coordinates, and the elements xx, xy and yy of the Jacobian."""
     k1, k2, p1, p2, k3 = k
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -97,8 +97,8 @@ def _distortion(x: Float, y: Float, *, k: tuple[float, ...]) -> tuple[Float, Flo
     return xd, yd, xx, xy, yy
 
 
-def _reach(k: tuple[float, ...]) -> float:
-    """Square of the radius up to which the radial part rises; inf if it always does."""
+def _squared_limit(k: tuple[float, ...]) -> float:
+    """Squared radius up to which the radial distortion increases; inf without a limit."""
     k1, k2, _, _, k3 = k
     return _first_root(7 * k3, 5 * k2, 3 * k1, 1.0)
 
@@ -118,12 +118,12 @@ def _distort(points: Float, k: tuple[float, ...]) -> Float:
         return np.stack([x, y], axis=1)
     with np.errstate(invalid="ignore", over="ignore"):
         xd, yd, xx, xy, yy = _distortion(x, y, k=k)
-        seen = (x * x + y * y < _reach(k)) & (xx * yy - xy * xy > 0) & (xx > 0)
+        seen = (x * x + y * y < _squared_limit(k)) & (xx * yy - xy * xy > 0) & (xx > 0)
     return np.where(seen[:, None], np.stack([xd, yd], axis=1), np.nan)
 
 
 def _rays(distorted: Float, k: tuple[float, ...]) -> Float:
-    """Unit directions of distorted coordinates (n, 2), by Newton's method from the middle outwards."""
+    """Unit directions of distorted coordinates (n, 2), by Newton's method."""
     x, y = distorted.T.copy()
     if any(k):
         x, y = _undistort(distorted, k)
@@ -135,9 +135,9 @@ def _rays(distorted: Float, k: tuple[float, ...]) -> Float:
 def _undistort(distorted: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
     xd, yd = distorted.T
     x, y = xd.copy(), yd.copy()
-    limit = _reach(k)
+    limit = _squared_limit(k)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        # A start beyond the fold would lead away: begin inside it.
+        # Newton's method diverges from a start beyond the one-to-one region, so start inside it.
         far = x * x + y * y >= limit
         shrink = np.where(far, 0.9 * np.sqrt(limit / np.where(far, x * x + y * y, 1.0)), 1.0)
         x *= shrink
@@ -157,7 +157,7 @@ def _undistort(distorted: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
     return np.where(found, x, np.nan), np.where(found, y, np.nan)
 
 
-# Fisheye: Kannala and Brandt (IEEE PAMI 28, 2006) as OpenCV writes it; equidistant without coefficients.
+# Fisheye: Kannala and Brandt (IEEE PAMI 28, 2006) in the form of OpenCV; equidistant if all are zero.
 
 
 def _fisheye_radius(theta: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
@@ -169,8 +169,8 @@ def _fisheye_radius(theta: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
     return radius, slope
 
 
-def _fisheye_reach(k: tuple[float, ...]) -> float:
-    """Angle from the axis up to which the distorted angle rises, at most pi."""
+def _fisheye_limit(k: tuple[float, ...]) -> float:
+    """Angle from the optical axis up to which the distorted angle increases, at most pi."""
     k1, k2, k3, k4 = k
     return float(min(np.pi, np.sqrt(_first_root(9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0))))
 
@@ -179,7 +179,7 @@ def _fisheye_distort(points: Float, k: tuple[float, ...]) -> Float:
     flat = np.hypot(points[:, 0], points[:, 1])
     theta = np.arctan2(flat, points[:, 2])
     radius, _ = _fisheye_radius(theta, k)
-    seen = (theta < _fisheye_reach(k)) & ((flat > 0) | (points[:, 2] > 0))
+    seen = (theta < _fisheye_limit(k)) & ((flat > 0) | (points[:, 2] > 0))
     factor = np.where(seen, radius / np.where(flat > 0, flat, 1.0), np.nan)
     distorted: Float = points[:, :2] * factor[:, None]
     return distorted
@@ -187,10 +187,10 @@ def _fisheye_distort(points: Float, k: tuple[float, ...]) -> Float:
 
 def _fisheye_rays(distorted: Float, k: tuple[float, ...]) -> Float:
     radius = np.hypot(distorted[:, 0], distorted[:, 1])
-    limit = _fisheye_reach(k)
+    limit = _fisheye_limit(k)
     edge, _ = _fisheye_radius(np.array(limit), k)
-    # The distorted angle rises from 0 to the edge, so the root is bracketed: Newton's step, or half the
-    # bracket where that leaves it.
+    # The distorted angle increases from 0 to the edge, so the root is bracketed: take Newton's step, or
+    # bisect where the step leaves the bracket.
     low, high = np.zeros_like(radius), np.full_like(radius, limit)
     theta = np.minimum(radius, 0.5 * limit)
     for _ in range(60):

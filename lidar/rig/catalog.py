@@ -1,4 +1,4 @@
-"""What comes along: rigs, sensors and vehicles, as rows for people and programs."""
+"""Built-in rigs and sensors as rows of tables."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from lidar.rig.specs import load_rig, rig_names
 
 
 def sensor_rows() -> list[dict[str, Any]]:
-    """A row a preset: name, maker, model, kind, how many beams, rates, range, wavelength, and sources."""
+    """One row per preset: name, maker, model, kind, channels, rates, range, wavelength and sources."""
     return [_sensor_row(name, load_sensor(name)) for name in sensor_names()]
 
 
 def _sensor_row(name: str, sensor: Sensor) -> dict[str, Any]:
     pulses = firings(sensor, 0)
-    down = np.degrees(np.arcsin(np.clip(pulses.direction[:, 2], -1, 1)))
+    elevation = np.degrees(np.arcsin(np.clip(pulses.direction[:, 2], -1, 1)))
     return {
         "name": name,
         "maker": sensor.maker,
@@ -26,7 +26,7 @@ def _sensor_row(name: str, sensor: Sensor) -> dict[str, Any]:
         "channels": int(pulses.channel.max()) + 1 if sensor.kind == "spinning" else 1,
         "pulses_per_s": round(len(pulses) * sensor.rate_hz),
         "rate_hz": sensor.rate_hz,
-        "elevation_deg": [round(float(down.min()), 2), round(float(down.max()), 2)],
+        "elevation_deg": [round(float(elevation.min()), 2), round(float(elevation.max()), 2)],
         "min_range_m": sensor.min_range,
         "max_range_m": sensor.max_range,
         "wavelength_nm": sensor.wavelength_nm,
@@ -39,7 +39,7 @@ def _sensor_row(name: str, sensor: Sensor) -> dict[str, Any]:
 
 
 def rig_rows() -> list[dict[str, Any]]:
-    """A row a rig: name, vehicle, its sensors and where its numbers come from."""
+    """One row per rig: name, vehicle, sensors and the source of its figures."""
     rows = []
     for name in rig_names():
         rig = load_rig(name)
@@ -58,8 +58,8 @@ def rig_rows() -> list[dict[str, Any]]:
 
 
 def columns(rows: list[list[str]]) -> str:
-    """Rows of cells as lines with cells below one another."""
-    wide = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    """Rows of cells as lines of text with aligned columns."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     return "\n".join(
-        "  ".join(cell.ljust(w) for cell, w in zip(row, wide, strict=True)).rstrip() for row in rows
+        "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows
     )

@@ -1,4 +1,4 @@
-"""Scanners and cameras of a rig, ready to work: when their frames start, how many there are."""
+"""Scanners and cameras of a rig: maximum range, start times and number of frames."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lidar.rig.specs import CameraSpec, LidarSpec, Rig
 
 @dataclass(frozen=True, slots=True)
 class Scanner:
-    """A laser scanner of the rig, ready to fire."""
+    """A laser scanner of the rig with its preset."""
 
     spec: LidarSpec
     sensor: Sensor
@@ -23,20 +23,20 @@ class Scanner:
 
     @property
     def reach(self) -> float:
-        """Metres beyond which nothing is seen."""
+        """Maximum range, metres."""
         return self.sensor.max_range
 
     @property
     def period_ns(self) -> int:
-        """Nanoseconds a frame lasts, rounded down."""
+        """Duration of a frame in nanoseconds, rounded down."""
         return int(frame_ns(self.sensor.rate_hz))
 
     def frame_start_ns(self, frame: int) -> int:
-        """Time at which a frame starts, since the drive's start."""
+        """Start of a frame, nanoseconds since the drive's start."""
         return self.sensor.frame_start_ns(frame)
 
     def frame_count(self, duration_ns: int) -> int:
-        """Number of frames that end within a drive of that length."""
+        """Number of frames that end within a drive of this duration."""
         return self.sensor.frame_count(duration_ns)
 
 
@@ -53,7 +53,7 @@ class Camera:
 
     @property
     def reach(self) -> float:
-        """Metres beyond which nothing is seen."""
+        """Maximum range, metres."""
         return self.spec.far
 
     @property
@@ -62,18 +62,18 @@ class Camera:
         return int(frame_ns(self.spec.rate_hz))
 
     def frame_start_ns(self, frame: int) -> int:
-        """Time at which the shutter opens, since the drive's start."""
+        """Time at which the shutter opens, nanoseconds since the drive's start."""
         return self.spec.time_offset_ns + int(frame * frame_ns(self.spec.rate_hz))
 
     def frame_count(self, duration_ns: int) -> int:
-        """Number of frames whose period ends within a drive of that length, as for scanners."""
+        """Number of frames whose period ends within a drive of this duration."""
         return max(0, int((duration_ns - self.spec.time_offset_ns) // frame_ns(self.spec.rate_hz)))
 
 
 def scanners(rig: Rig) -> list[Scanner]:
     """The rig's laser scanners with their presets.
 
-    Raises RigError for a preset that is unknown or bad.
+    Raises RigError for an unknown or invalid preset.
     """
     return [
         Scanner(

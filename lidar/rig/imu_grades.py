@@ -1,4 +1,4 @@
-"""Noise of known inertial measurement units."""
+"""Noise of inertial measurement units."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Allan parameters of an inertial unit; see `ImuSpec`."""
+    """Allan parameters of an inertial measurement unit; units as in `ImuSpec`."""
 
     gyro_noise: float
     gyro_walk: float
@@ -38,4 +38,4 @@ PRESETS = {
         accel_instability=7.35e-4,
     ),
 }
-"""Noise of known units; a figure of 0 is one that the source does not give."""
+"""Noise of units by name; 0 for figures that the source does not give."""

@@ -1,4 +1,4 @@
-"""A scanner: how it fires, how far it sees and how well it measures, read from a TOML file."""
+"""Specification of a laser scanner: firing pattern, range, noise and beam, read from a TOML file."""
 
 from __future__ import annotations
 
@@ -20,43 +20,43 @@ from lidar.rig.patterns.sweep import read_listed, read_sweep
 from lidar.rig.toml_table import Table, read_table
 
 RETURN_MODES = ("strongest", "last", "first", "dual", "all")
-"""What a sensor can report of the echoes of a pulse."""
+"""Which echoes of a pulse a sensor can report."""
 
 KINDS = ("spinning", "prism", "sweep", "table", "flash", "scan2d", "line")
-"""Kinds of scanner; a preset has a table of that name."""
+"""Kinds of scanner; a preset describes its pattern in a table of this name."""
 
 _FWHM = 1.699
-"""1/e^2 full angle of a Gaussian beam over its full width at half maximum, sqrt(2 / ln 2)."""
+"""Ratio of the 1/e^2 full angle of a Gaussian beam to its full width at half maximum, sqrt(2 / ln 2)."""
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A scanner set to one rate and one return mode.
+    """A scanner at one rate and in one return mode.
 
-    name          : its name on the rig; random numbers are keyed by it
+    name          : name on the rig, which also keys its random numbers
     kind          : of `KINDS`
     wavelength_nm : nanometres
     rate_hz       : revolutions or frames a second
-    start_ns      : time frame 0 starts, since the drive's start
-    min_range, max_range : metres, hard limits of the range as reported
+    start_ns      : start of frame 0, since the drive's start
+    min_range, max_range : metres, limits of the reported range
     range_quantum : metres, step of the reported range; 0 for none
-    range_sigma   : metres, one standard deviation of a single measurement on a good target
-    bias_sigma    : metres, spread of the lasers' constant errors
-    angle_sigma   : radians, one standard deviation of the beam's angle
-    reference_range, reference_reflectance : a Lambertian target of that reflectance, square on and larger
-                    than the beam, is seen at that range, metres, with probability 1/2 (dark, clear air)
-    noise_ratio   : standard deviation of the receiver's noise over its threshold
-    divergence    : (2,) radians, full angles, level and upright, at which power has fallen to 1/e^2
-    aperture      : (2,) metres, the beam's size where it leaves
+    range_sigma   : metres, standard deviation of a single measurement on a target with a strong return
+    bias_sigma    : metres, standard deviation of the lasers' constant errors
+    angle_sigma   : radians, standard deviation of the beam's angle
+    reference_range, reference_reflectance : range in metres at which a Lambertian target of that reflectance,
+                    normal to the beam and larger than it, is detected with probability 1/2 (dark, clear air)
+    noise_ratio   : ratio of the standard deviation of the receiver's noise to its threshold
+    divergence    : (2,) radians, full angles, horizontal and vertical, at which power has fallen to 1/e^2
+    aperture      : (2,) metres, width and height of the beam at its start
     pulse_ns      : nanoseconds, the pulse's full width at half maximum
-    echo_separation : metres, echoes closer than this are one
-    max_echoes    : most echoes of a pulse that are told apart
+    echo_separation : metres; surfaces closer than this give one echo
+    max_echoes    : maximum number of echoes per pulse
     return_mode   : of `RETURN_MODES`
-    second_strongest : in dual mode, where one echo is strongest and last, the second strongest comes with it
+    second_strongest : in dual mode, report the second strongest echo if the strongest is also the last
     diffuse_code  : intensity code of a perfect white Lambertian target
-    fmcw          : measures the radial velocity too
-    velocity_sigma : m/s, one standard deviation of that velocity
-    pattern       : how it fires
+    fmcw          : also measures radial velocity
+    velocity_sigma : m/s, standard deviation of the radial velocity
+    pattern       : firing pattern
     note          : what the preset does not model exactly
     source        : where each number of the preset comes from
     """
@@ -92,11 +92,11 @@ class Sensor:
     source: dict[str, str] = field(default_factory=dict)
 
     def frame_start_ns(self, frame: int) -> int:
-        """Time at which a frame starts, nanoseconds since the drive's start."""
+        """Start of a frame, nanoseconds since the drive's start."""
         return self.start_ns + int(frame * frame_ns(self.rate_hz))
 
     def window_ns(self, frame: int) -> tuple[int, int]:
-        """Times within which all pulses of a frame are fired, nanoseconds since the drive's start."""
+        """Interval in which all pulses of a frame are fired, nanoseconds since the drive's start."""
         return self.frame_start_ns(frame), self.frame_start_ns(frame + 1) + self.pattern.tail_ns
 
     def footprint(self, distance: float) -> tuple[float, float]:
@@ -105,7 +105,7 @@ class Sensor:
         return wide, high
 
     def frame_count(self, duration_ns: int) -> int:
-        """Number of frames that end within a drive of that length."""
+        """Number of frames that end within a drive of this duration."""
         return max(0, int((duration_ns - self.start_ns) // frame_ns(self.rate_hz)))
 
 
@@ -115,7 +115,7 @@ def firings(sensor: Sensor, frame: int) -> Firings:
 
 
 def sensor_names() -> list[str]:
-    """Names of the presets that come with the package."""
+    """Names of the built-in presets."""
     folder = resources.files("lidar.rig") / "sensors"
     return sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml"))
 
@@ -130,19 +130,17 @@ def load_sensor(
 ) -> Sensor:
     """A scanner from a preset (one of `sensor_names`) or a TOML file.
 
-    name        : its name on the rig; the preset's by default
+    name        : name on the rig; the preset's by default
     rate_hz     : revolutions or frames a second; 0 for the first of the preset's rates
     return_mode : the first of the preset's modes by default
-    start_ns    : time frame 0 starts
+    start_ns    : start of frame 0, nanoseconds since the drive's start
 
-    Raises RigError, naming file, line and key, for anything missing, unknown or out of bounds.
+    Raises RigError, naming file, line and key, for keys that are missing, unknown or out of bounds.
     """
     if str(preset).endswith(".toml"):
         path = Path(preset)
         if not path.is_file():
-            raise RigError(
-                f"{path}: no such sensor file; presets that come along: {', '.join(sensor_names())}"
-            )
+            raise RigError(f"{path}: no such sensor file; built-in presets are {', '.join(sensor_names())}")
         table = read_table(path)
     else:
         if str(preset) not in sensor_names():
@@ -167,8 +165,8 @@ def _read(table: Table, name: str, *, rate_hz: float, return_mode: str, start_ns
     near = table.number("min_range", low=0.0)
     far = table.number("max_range", above=near, high=1e5)
     pulse_ns = table.number("pulse_ns", above=0.0)
-    broad = _FWHM if table.text("divergence_at", "1/e2", among=("1/e2", "fwhm")) == "fwhm" else 1.0
-    across, along = (broad * b / 1000 for b in table.numbers("divergence_mrad", count=2, spread=True))
+    widening = _FWHM if table.text("divergence_at", "1/e2", among=("1/e2", "fwhm")) == "fwhm" else 1.0
+    across, along = (widening * b / 1000 for b in table.numbers("divergence_mrad", count=2, spread=True))
     wide, high = (a / 1000 for a in table.numbers("aperture_mm", 0.0, count=2, spread=True))
     sensor = Sensor(
         name=name,

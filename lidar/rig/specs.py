@@ -1,4 +1,4 @@
-"""What a vehicle carries: sensors, where they sit and when they work, read from TOML."""
+"""Specification of a rig: the sensors of a vehicle, their mounts and their timing, read from TOML."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class LidarSpec:
     """A laser scanner on the rig.
 
     preset         : name of a built-in preset, or the path of a TOML file
-    mount          : vehicle from sensor (x forward, y left, z up)
+    mount          : pose in the vehicle's frame of the sensor frame (x forward, y left, z up)
     rate_hz        : revolutions or frames a second; 0 for the preset's own
     time_offset_ns : start of frame 0 after the drive's start
     return_mode    : one of the preset's modes; empty for its first
@@ -40,19 +40,19 @@ class LidarSpec:
 class CameraSpec:
     """A camera on the rig.
 
-    mount          : vehicle from camera (z forward, x right, y down)
+    mount          : pose in the vehicle's frame of the camera frame (z forward, x right, y down)
     width, height  : pixels
     fx, fy, cx, cy : pixels; the centre of the top-left pixel is (0, 0)
     distortion     : pinhole: k1, k2, p1, p2, k3 (Brown-Conrady); fisheye: k1, k2, k3, k4 (equidistant)
-    near, far      : metres along the optical axis within which surfaces are seen
+    near, far      : metres along the optical axis; surfaces outside these limits are not imaged
     rate_hz        : frames a second
-    time_offset_ns : frame 0 after the drive's start
-    images         : what is written, of `IMAGES`
-    exposure_ns    : time the shutter is open for a row
-    row_ns         : time from one row to the next; 0 for a global shutter
-    exposure_ev    : stops added to the exposure that the light asks for
-    full_well      : electrons of a pixel at full scale, which set the noise of light (if that is asked for)
-    read_noise     : electrons of noise in the dark
+    time_offset_ns : start of frame 0 after the drive's start
+    images         : kinds of image to write, of `IMAGES`
+    exposure_ns    : exposure time of a row
+    row_ns         : time from the start of one row to the next; 0 for a global shutter
+    exposure_ev    : exposure compensation in stops, added to the automatic exposure
+    full_well      : electrons of a pixel at full scale, which determine the photon noise
+    read_noise     : standard deviation of the read-out noise, electrons
     model          : pinhole or fisheye
     """
 
@@ -79,22 +79,22 @@ class CameraSpec:
 
 
 SYSTEMS = ("gps", "glonass", "galileo", "beidou")
-"""Names of the systems, in the order of satellites."""
+"""Names of the satellite systems, in the order in which satellites are numbered."""
 
 IMAGES = ("rgb", "depth", "semantic", "instance", "flow")
-"""What a camera can write."""
+"""Kinds of image that a camera can write."""
 
 
 @dataclass(frozen=True, slots=True)
 class GnssSpec:
-    """A satellite receiver on the rig.
+    """A GNSS receiver on the rig.
 
     mount          : its translation is the lever arm to the antenna
     rate_hz        : fixes a second
     time_offset_ns : first fix after the drive's start
-    mode           : single, sbas, rtk or ideal
+    mode           : of `GNSS_MODES`
     mask_deg       : elevation below which satellites are not used
-    constellations : systems that it receives, of gps, glonass, galileo, beidou
+    constellations : satellite systems that it receives, of `SYSTEMS`
     """
 
     name: str
@@ -107,18 +107,18 @@ class GnssSpec:
 
 
 GNSS_MODES = ("single", "sbas", "rtk", "ideal")
-"""What a receiver can be."""
+"""Modes of a GNSS receiver."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImuSpec:
-    """An inertial unit on the rig, noise as Allan parameters; the defaults are EuRoC's for its ADIS16448.
+    """An inertial measurement unit; the noise defaults are EuRoC's Allan parameters of its ADIS16448.
 
     gyro_noise : rad/s/sqrt(Hz)
     gyro_walk  : rad/s^2/sqrt(Hz)
     accel_noise : m/s^2/sqrt(Hz)
     accel_walk : m/s^3/sqrt(Hz)
-    gyro_instability, accel_instability : rad/s and m/s^2, of the bias (flicker)
+    gyro_instability, accel_instability : rad/s and m/s^2, bias instability (flicker noise)
     """
 
     name: str
@@ -135,10 +135,10 @@ class ImuSpec:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """Everything one vehicle carries.
+    """The sensors of one vehicle.
 
-    vehicle : kind of vehicle the mounts are meant for (car, drone, ...)
-    source  : where the mounts come from
+    vehicle : default vehicle, for which the mounts are given (car, drone, ...)
+    source  : reference for the mounts
     """
 
     name: str
@@ -158,14 +158,14 @@ def _mount(table: Table, *, camera: bool = False) -> Mount:
         w, x, y, z = table.numbers("quat_wxyz", count=4)
         if not 0.99 < w * w + x * x + y * y + z * z < 1.01:
             raise table.error("quat_wxyz", "not a unit quaternion")
-        turn = np.array([x, y, z, w]) / np.sqrt(w * w + x * x + y * y + z * z)
+        rotation = np.array([x, y, z, w]) / np.sqrt(w * w + x * x + y * y + z * z)
     else:
         roll, pitch, yaw = np.radians(table.numbers("rpy_deg", (0.0, 0.0, 0.0), count=3))
-        turn = quat_from_euler(roll, pitch, gamma=yaw)
+        rotation = quat_from_euler(roll, pitch, gamma=yaw)
         if camera:
-            turn = quat_product(turn, OPTICAL_QUAT)
+            rotation = quat_product(rotation, OPTICAL_QUAT)
     a, b, c = translation
-    qx, qy, qz, qw = (float(q) for q in turn)
+    qx, qy, qz, qw = (float(q) for q in rotation)
     return Mount((a, b, c), (qx, qy, qz, qw))
 
 
@@ -235,23 +235,23 @@ def _gnss(table: Table) -> GnssSpec:
 
 
 def _imu(table: Table) -> ImuSpec:
-    plain = PRESETS[table.text("model", "adis16448", among=tuple(PRESETS))]
+    preset = PRESETS[table.text("model", "adis16448", among=tuple(PRESETS))]
     return ImuSpec(
         name=table.text("name", "imu"),
         mount=_mount(table),
         rate_hz=table.number("rate_hz", 100.0, above=0.0, high=1e5),
         time_offset_ns=table.integer("time_offset_ns", 0, low=0),
-        gyro_noise=table.number("gyro_noise", plain.gyro_noise, low=0.0),
-        gyro_walk=table.number("gyro_walk", plain.gyro_walk, low=0.0),
-        accel_noise=table.number("accel_noise", plain.accel_noise, low=0.0),
-        accel_walk=table.number("accel_walk", plain.accel_walk, low=0.0),
-        gyro_instability=table.number("gyro_instability", plain.gyro_instability, low=0.0),
-        accel_instability=table.number("accel_instability", plain.accel_instability, low=0.0),
+        gyro_noise=table.number("gyro_noise", preset.gyro_noise, low=0.0),
+        gyro_walk=table.number("gyro_walk", preset.gyro_walk, low=0.0),
+        accel_noise=table.number("accel_noise", preset.accel_noise, low=0.0),
+        accel_walk=table.number("accel_walk", preset.accel_walk, low=0.0),
+        gyro_instability=table.number("gyro_instability", preset.gyro_instability, low=0.0),
+        accel_instability=table.number("accel_instability", preset.accel_instability, low=0.0),
     )
 
 
 def rig_names() -> list[str]:
-    """Names of the rigs that come with the package."""
+    """Names of the built-in rigs."""
     folder = resources.files("lidar.rig") / "rigs"
     return sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml"))
 
@@ -259,14 +259,14 @@ def rig_names() -> list[str]:
 def load_rig(name: str | Path) -> Rig:
     """A rig by name (one of `rig_names`) or from a TOML file.
 
-    A preset given as a path ending in ``.toml`` is looked for beside the rig's file. Raises RigError, naming
-    file, line and key, for anything missing, unknown or out of bounds.
+    A preset given as a path ending in ``.toml`` is relative to the folder of the rig's file. Raises RigError,
+    naming file, line and key, for keys that are missing, unknown or out of bounds.
     """
     folder = Path(name).parent
     if str(name).endswith(".toml"):
         path = Path(name)
         if not path.is_file():
-            raise RigError(f"{path}: no such rig file; rigs that come along: {', '.join(rig_names())}")
+            raise RigError(f"{path}: no such rig file; built-in rigs are {', '.join(rig_names())}")
         root = read_table(path)
     else:
         if str(name) not in rig_names():
@@ -290,7 +290,7 @@ def load_rig(name: str | Path) -> Rig:
 
 
 def rig_digest(name: str | Path) -> str:
-    """A digest of what the files of a rig say: its own, its scanners' and their lists of directions.
+    """Digest of the contents of a rig's files: its own, its scanners' and their lists of directions.
 
     Raises RigError as `load_rig` does, and for a scanner's file that cannot be read.
     """
@@ -315,7 +315,7 @@ def rig_digest(name: str | Path) -> str:
 
 
 def _check_names(tables: dict[str, list[Table]]) -> None:
-    """Refuse unknown keys, and names that are taken twice or cannot be the name of a folder."""
+    """Raise RigError for unknown keys, repeated names, and names that cannot name a folder."""
     seen: set[str] = set()
     for kind, group in tables.items():
         for table in group:

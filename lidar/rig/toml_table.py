@@ -18,7 +18,7 @@ _KEY = re.compile(r"^\s*([A-Za-z0-9_.\-\"']+)\s*=")
 
 
 def _lines(text: str) -> dict[tuple[str, ...], int]:
-    """Line of every header and key; the third ``[[a]]`` is ('a', '2')."""
+    """Line number of every header and key; the third ``[[a]]`` has the key ('a', '2')."""
     found: dict[tuple[str, ...], int] = {}
     counts: dict[str, int] = {}
     section: tuple[str, ...] = ()
@@ -37,16 +37,16 @@ def _lines(text: str) -> dict[tuple[str, ...], int]:
 
 @dataclass(slots=True)
 class Table:
-    """One table of a TOML file. Every key is taken once; `close` refuses the ones nobody took."""
+    """One table of a TOML file. `close` raises an error for keys that were never read."""
 
     path: str
     data: dict[str, Any]
     place: tuple[str, ...] = ()
     lines: dict[tuple[str, ...], int] = field(default_factory=dict)
-    asked: list[str] = field(default_factory=list)
+    read: list[str] = field(default_factory=list)
 
     def error(self, key: str, message: str) -> RigError:
-        """A RigError that says where the key stands."""
+        """A RigError with the file and line of a key."""
         spot = (*self.place, *key.split(".")) if key else self.place
         line = next((self.lines[spot[:k]] for k in range(len(spot), 0, -1) if spot[:k] in self.lines), None)
         where = f"{self.path}, line {line}" if line else self.path
@@ -54,12 +54,12 @@ class Table:
         return RigError(f"{where}: {name}: {message}" if name else f"{where}: {message}")
 
     def _take(self, key: str, default: Any) -> Any:
-        self.asked.append(key)
+        self.read.append(key)
         if key in self.data:
             return self.data[key]
         if default is ...:
             near = get_close_matches(key, self.data, 1, 0.75)
-            hint = f"; is {near[0]} meant for it?" if near else ""
+            hint = f"; is {near[0]} a misspelling of it?" if near else ""
             raise self.error(key, f"this key is missing{hint}")
         return default
 
@@ -72,7 +72,7 @@ class Table:
         high: float = 1e18,
         above: float | None = None,
     ) -> float:
-        """A finite number within [low, high], and over ``above``."""
+        """A finite number within [low, high] and greater than ``above``."""
         value = self._take(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
             raise self.error(key, f"{value!r} is not a number")
@@ -84,7 +84,7 @@ class Table:
         return float(value)
 
     def integer(self, key: str, default: Any = ..., *, low: int = -(2**62), high: int = 2**62) -> int:
-        """A whole number within [low, high]."""
+        """An integer within [low, high]."""
         value = self._take(key, default)
         if isinstance(value, bool) or not isinstance(value, int):
             raise self.error(key, f"{value!r} is not a whole number")
@@ -93,7 +93,7 @@ class Table:
         return value
 
     def text(self, key: str, default: Any = ..., *, among: Iterable[str] = ()) -> str:
-        """A string, one of ``among`` if those are given."""
+        """A string; one of ``among`` unless that is empty."""
         value = self._take(key, default)
         if not isinstance(value, str):
             raise self.error(key, f"{value!r} is not a string")
@@ -102,7 +102,7 @@ class Table:
         return value
 
     def texts(self, key: str, default: Any = ..., *, among: Iterable[str] = ()) -> tuple[str, ...]:
-        """A list of strings, each one of ``among`` if those are given."""
+        """A list of strings, each one of ``among`` unless that is empty."""
         value, known = self._take(key, default), tuple(among)
         if not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
             raise self.error(key, f"{value!r} is not a list of strings")
@@ -111,7 +111,7 @@ class Table:
         return tuple(value)
 
     def flag(self, key: str, default: Any = ...) -> bool:
-        """True or false."""
+        """A boolean."""
         value = self._take(key, default)
         if not isinstance(value, bool):
             raise self.error(key, f"{value!r} is not true or false")
@@ -120,7 +120,7 @@ class Table:
     def numbers(
         self, key: str, default: Any = ..., *, count: int | Sequence[int] = 0, spread: bool = False
     ) -> tuple[float, ...]:
-        """Finite numbers, as many as one of the given counts; with ``spread``, one number serves for all."""
+        """Finite numbers, ``count`` of them (0: any count); ``spread`` repeats a single number."""
         value = self._take(key, default)
         lengths = (count,) if isinstance(count, int) else tuple(count)
         if spread and isinstance(value, int | float) and not isinstance(value, bool):
@@ -132,7 +132,7 @@ class Table:
                 raise self.error(key, f"entry {k + 1}, {v!r}, is not a number")
         if lengths != (0,) and len(value) not in lengths:
             wanted = " or ".join(str(n) for n in lengths)
-            raise self.error(key, f"{len(value)} numbers where {wanted} are wanted")
+            raise self.error(key, f"{len(value)} numbers where {wanted} are needed")
         return tuple(float(v) for v in value)
 
     def has(self, key: str) -> bool:
@@ -140,26 +140,26 @@ class Table:
         return key in self.data
 
     def table(self, key: str, default: Any = ...) -> Table:
-        """A table within."""
+        """A nested table."""
         value = self._take(key, default)
         if not isinstance(value, dict):
             raise self.error(key, f"{value!r} is not a table")
         return Table(self.path, value, (*self.place, key), self.lines)
 
     def tables(self, key: str) -> list[Table]:
-        """A list of tables within, empty if there is none."""
+        """A list of nested tables; empty if the key is missing."""
         value = self._take(key, [])
         if not isinstance(value, list) or not all(isinstance(v, dict) for v in value):
-            raise self.error(key, f"it is to be written as [[{key}]]")
+            raise self.error(key, f"write it as [[{key}]]")
         return [Table(self.path, v, (*self.place, key, str(k)), self.lines) for k, v in enumerate(value)]
 
     def close(self) -> None:
-        """Refuse keys that nobody asked for."""
+        """Raise RigError for keys that were never read."""
         for key in self.data:
-            if key not in self.asked:
-                near = get_close_matches(key, self.asked, 1)
-                hint = f"; is {near[0]} meant?" if near else ""
-                known = ", ".join(dict.fromkeys(self.asked))
+            if key not in self.read:
+                near = get_close_matches(key, self.read, 1)
+                hint = f"; did you mean {near[0]}?" if near else ""
+                known = ", ".join(dict.fromkeys(self.read))
                 raise self.error(key, f"unknown key{hint} (known are {known})")
 
 

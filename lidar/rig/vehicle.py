@@ -1,4 +1,4 @@
-"""Vehicles as data: size, what they can do and how they lean."""
+"""Vehicles: dimensions, limits of motion and body roll and pitch, read from TOML."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from lidar.errors import InputError
 
 KINDS = ("road", "foot", "air")
-"""How a vehicle moves: on the carriageway, on the ground without one, or through the air."""
+"""Where a vehicle moves: on the carriageway, on foot, or through the air."""
 
 _POSITIVE = (
     *("length", "width", "turning_radius", "steering", "max_speed"),
@@ -27,20 +27,20 @@ class Vehicle:
     """A vehicle. Its frame has the origin at the rear axle's centre on the ground, x forward, y left, z up.
 
     kind            : road, foot or air
-    length, width, height : metres of the box around it
-    wheelbase, rear_overhang, track : metres; rear_overhang is from the rear axle to the back of the box
-    turning_radius  : least radius of the rear axle's centre, metres
-    steering        : largest change of curvature per metre driven, 1/m^2
+    length, width, height : metres, of the bounding box
+    wheelbase, rear_overhang, track : metres; rear_overhang is from the rear axle to the rear end
+    turning_radius  : minimum turning radius of the rear axle's centre, metres
+    steering        : maximum change of curvature per metre of path, 1/m^2
     max_speed       : m/s
-    acceleration, deceleration, jerk : largest along the path, m/s^2, m/s^2, m/s^3
-    lateral_acceleration, lateral_jerk : largest across the path, m/s^2, m/s^3
-    roll_gradient, pitch_gradient : lean of the body in radians for 1 m/s^2 across and along; positive leans
-                                    out
-                      of bends and back under acceleration (springs), negative into them and forward (lift)
-    cruise          : whether it is already at speed when the drive starts and still when it ends (aircraft)
-    bob             : metres of sway to each side, metres of rise at each step, and steps a second at full
+    acceleration, deceleration, jerk : maxima along the path, m/s^2, m/s^2, m/s^3
+    lateral_acceleration, lateral_jerk : maxima across the path, m/s^2, m/s^3
+    roll_gradient, pitch_gradient : roll and pitch of the body in radians per m/s^2 of lateral and
+                      longitudinal acceleration; positive: out of bends and backwards (suspension), negative:
+                      into bends and forwards (aircraft)
+    cruise          : at cruising speed from the start of the drive to its end (aircraft)
+    bob             : gait: lateral sway in metres, vertical rise per step in metres, steps per second at full
                       speed
-    source          : where the numbers come from
+    source          : reference for the figures
     """
 
     name: str
@@ -67,15 +67,15 @@ class Vehicle:
 
     @property
     def front(self) -> float:
-        """Metres from the rear axle to the front of the box."""
+        """Metres from the rear axle to the front of the bounding box."""
         return self.length - self.rear_overhang
 
 
 def rear_axle_radius(turning_circle: float, wheelbase: float, *, track: float) -> float:
-    """Least radius of the rear axle's centre of a car with a kerb-to-kerb turning circle, metres.
+    """Minimum turning radius in metres of a car's rear axle centre, from its kerb-to-kerb turning circle.
 
-    turning_circle : a diameter. The outer front wheel runs on the circle; front wheels steer about a point on
-                     the rear axle's line (Ackermann).
+    turning_circle : diameter in metres of the outer front wheel's path; the wheels turn about a point on the
+                     line of the rear axle (Ackermann)
     """
     return float(np.sqrt((turning_circle / 2) ** 2 - wheelbase**2) - track / 2)
 
@@ -89,8 +89,7 @@ def vehicle_names() -> list[str]:
 def load_vehicle(name: str | Path) -> Vehicle:
     """A built-in vehicle by name, or one from a TOML file with the keys of `Vehicle`.
 
-    Raises InputError for an unknown name, an unknown or missing key, or a value out of range: all in one
-    message.
+    Raises InputError for an unknown name, and one for all unknown or missing keys and values out of range.
     """
     path = Path(name)
     if path.suffix == ".toml":
@@ -100,9 +99,7 @@ def load_vehicle(name: str | Path) -> Vehicle:
     elif str(name) in vehicle_names():
         text = resources.files("lidar.rig").joinpath("vehicles", f"{name}.toml").read_text("utf-8")
     else:
-        raise InputError(
-            f"no vehicle {name}; there are {', '.join(vehicle_names())}, or give a .toml file of your own"
-        )
+        raise InputError(f"unknown vehicle {name}; give a .toml file or one of {', '.join(vehicle_names())}")
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -111,7 +108,7 @@ def load_vehicle(name: str | Path) -> Vehicle:
 
 
 def _checked(table: dict[str, object], name: str) -> Vehicle:
-    """A vehicle from a table of keys; every fault in one InputError."""
+    """A vehicle from a table of keys; raises one InputError for all faults."""
     known = {f.name: f for f in fields(Vehicle)}
     faults = [
         f"unknown key {key}; known are {', '.join(known)}" for key in sorted(table.keys() - known.keys())

@@ -1,4 +1,4 @@
-"""When and where a scanner fires in one frame, as columns; and the clock that numbers its firings."""
+"""Pulses of one frame of a scanner as columns, and the clock of its firing blocks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Firings:
     ring      : (n,) uint16, rank of the beam's elevation, 0 lowest
     column    : (n,) int32, firing block within the frame
     channel   : (n,) uint16, number of the laser
-    order     : (n,) int32, permutation in which neighbouring rays go almost the same way
+    order     : (n,) int32, permutation in which neighbouring rays have similar directions
     """
 
     time_ns: NDArray[np.int64]
@@ -41,7 +41,7 @@ class Firings:
 
 
 class Pattern(Protocol):
-    """What every kind of scanner can do."""
+    """Firing pattern of a scanner."""
 
     @property
     def range_offset(self) -> float:
@@ -49,17 +49,17 @@ class Pattern(Protocol):
 
     @property
     def tail_ns(self) -> int:
-        """Nanoseconds after the end of its frame by which the last pulse may be late."""
+        """Maximum delay of the last pulse after the end of its frame, nanoseconds."""
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
-        """The pulses of frame ``frame``; ``start_ns`` is the time frame 0 starts."""
+        """The pulses of frame ``frame``; frame 0 starts at ``start_ns``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Blocks:
     """The firing blocks that start within one frame.
 
-    first   : number of the first block since frame 0 began
+    first   : number of the first block, counted from the start of frame 0
     phase   : time from the frame's start to that block, in frames (0 to 1)
     step    : time from block to block, in frames
     time_ns : (n,) int64, start of each block
@@ -76,15 +76,15 @@ class Blocks:
 
 
 def frame_ns(rate_hz: float) -> Fraction:
-    """Nanoseconds a frame lasts, exactly."""
+    """Exact duration of a frame in nanoseconds."""
     return 10**9 / Fraction(rate_hz).limit_denominator(10**6)
 
 
 def blocks(frame: int, rate_hz: float, *, block_ns: Fraction, start_ns: int) -> Blocks:
-    """The blocks of a clock that ticks every ``block_ns``, whatever the frames do, within one frame.
+    """The blocks within one frame of a clock with the period ``block_ns``.
 
-    The clock is not reset by a frame: where the frame is no multiple of the block, one frame in a few has a
-    block more and the grid moves on from frame to frame, as it does in the instruments.
+    The clock runs on across frames, as in real instruments: if a frame is not a multiple of a block, the
+    phase of the blocks shifts from frame to frame, and some frames have one block more.
     """
     period = frame_ns(rate_hz)
     first, stop = (-(-frame_edge // block_ns) for frame_edge in (frame * period, (frame + 1) * period))
@@ -95,14 +95,14 @@ def blocks(frame: int, rate_hz: float, *, block_ns: Fraction, start_ns: int) -> 
 
 
 def ranks(elevation: Float) -> NDArray[np.uint16]:
-    """Rank of each elevation (n,), 0 lowest; equal elevations in the order given."""
+    """Rank of each elevation (n,), 0 lowest; equal elevations keep their order."""
     rank = np.empty(len(elevation), np.uint16)
     rank[np.argsort(elevation, kind="stable")] = np.arange(len(elevation))
     return rank
 
 
 def frozen(array: NDArray[T]) -> NDArray[T]:
-    """The same array, made read-only: it is shared between frames."""
+    """The same array, made read-only because frames share it."""
     array.flags.writeable = False
     return array
 

@@ -1,4 +1,4 @@
-"""Scanners with a grid of pixels: all at one time (flash), or row by row."""
+"""Scanners with a grid of pixels that measure all at once (flash) or row by row."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Flash:
 
     columns, rows : pixels
     width, height : radians, field of view between the outer pixels' outer edges
-    rectilinear   : pixels are even on a plane (a lens without distortion); else even in angle
-    row_ns        : nanoseconds from one row to the next; 0 if all pixels see at one time
+    rectilinear   : pixels evenly spaced on a plane (a lens without distortion), else in angle
+    row_ns        : nanoseconds from one row to the next; 0 if all pixels measure at once
     """
 
     columns: int
@@ -33,7 +33,7 @@ class Flash:
 
     @property
     def tail_ns(self) -> int:
-        """Nanoseconds after the end of its frame by which the last pulse may be late: none."""
+        """Maximum delay of the last pulse after the end of its frame, nanoseconds."""
         return 0
 
     @functools.cached_property
@@ -82,7 +82,7 @@ def read_flash(table: Table, rate_hz: float) -> Flash:
     rectilinear = table.text("lens", "rectilinear", among=("rectilinear", "angular")) == "rectilinear"
     fov = table.numbers("fov_deg", count=2)
     if min(fov) <= 0 or max(fov) > (170 if rectilinear else 360):
-        raise table.error("fov_deg", "width and height are to be over 0 and under 170 degrees (angular: 360)")
+        raise table.error("fov_deg", "width and height must be over 0 and at most 170 degrees (angular: 360)")
     row_us = table.number("row_us", 0.0, low=0.0)
     if row_us * rows > 1e6 / rate_hz:
         raise table.error("row_us", f"{rows} rows take longer than a frame")

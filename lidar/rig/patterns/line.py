@@ -1,4 +1,4 @@
-"""Airborne scanners: a mirror swings one beam across the track below."""
+"""Airborne scanners: a mirror deflects one beam across the flight line."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from lidar.rig.patterns.beams import Firings, blocks
 from lidar.rig.toml_table import Table
 
 LAWS = ("polygon", "zigzag", "sine", "conical")
-"""How the mirror moves."""
+"""Laws of motion of the mirror."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """One beam that looks down (-z) and is swung to left and right of the track (x).
+    """One beam that points down (-z) and is deflected to the left and right of the flight line (x).
 
-    polygon  : from right to left again and again: theta = -t/2 + t frac(L s), t the turn; pulses beyond the
-               half angle are not fired
-    zigzag   : to and fro evenly: theta = a tri(L s / 2)
+    polygon  : right to left, repeatedly: theta = t (frac(L s) - 1/2), t the turn; no pulses beyond the half
+               angle
+    zigzag   : back and forth at a constant rate: theta = a tri(L s / 2)
     sine     : theta = a sin(pi L s)
     conical  : a circle: (sin a cos(2 pi L s), sin a sin(2 pi L s), -cos a)
 
     law        : of `LAWS`
     half_angle : radians, a
-    turn       : radians, of the polygon's beam from line to line
+    turn       : radians, angle of one line of the polygon
     line_hz    : lines a second, L
     pulse_hz   : pulses a second
     """
@@ -41,7 +41,7 @@ class Line:
     tail_ns: int = 0
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
-        """The pulses of frame ``frame``; the mirror moves on from frame to frame."""
+        """The pulses of frame ``frame``; the mirror's motion continues across frames."""
         block = blocks(frame, rate_hz, block_ns=10**9 / self.pulse_hz, start_ns=start_ns)
         seconds = (block.first + np.arange(len(block))) / float(self.pulse_hz)
         swing = self.line_hz * seconds

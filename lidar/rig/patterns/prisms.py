@@ -1,4 +1,4 @@
-"""Scanners that steer their beams with turning wedge prisms, and the pattern never closes."""
+"""Scanners that deflect their beams with rotating wedge prisms; the pattern does not repeat."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from lidar.rig.toml_table import Table
 
 @dataclass(frozen=True, eq=False)
 class Prisms:
-    """Beams along the prisms' common axis that all fire together.
+    """Beams along the prisms' common axis that fire simultaneously.
 
     incident : (b, 3) unit vectors of the beams before the prisms, which stand along +y
     wedge    : (k,) radians, angle between the faces of each prism; positive if the inclined face comes first
     index    : (k,) refractive index
-    turn_hz  : (k,) turns a second, the sign says which way
+    turn_hz  : (k,) revolutions per second; the sign gives the direction
     pulse_hz : pulses a second of each beam
     """
 
@@ -34,7 +34,7 @@ class Prisms:
     tail_ns: int = 0
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
-        """The pulses of frame ``frame``; the prisms turn on from frame to frame."""
+        """The pulses of frame ``frame``; the prisms' rotation continues across frames."""
         block = blocks(frame, rate_hz, block_ns=10**9 / self.pulse_hz, start_ns=start_ns)
         seconds = (block.first + np.arange(len(block))) / float(self.pulse_hz)
         beams = len(self.incident)

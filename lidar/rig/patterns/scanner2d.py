@@ -1,4 +1,4 @@
-"""Scanners that turn one beam in a plane."""
+"""Scanners that rotate one beam in a plane."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lidar.rig.toml_table import Table
 
 @dataclass(frozen=True)
 class Scan2d:
-    """A beam that turns counter-clockwise in the sensor's x-y plane, seen from above, and fires in a sector.
+    """A beam that rotates counter-clockwise (from above) in the sensor's x-y plane and fires in a sector.
 
-    steps : firing positions in a full turn
+    steps : firing positions per revolution
     first, last : radians, the sector's ends, counter-clockwise from forward; both fire
     """
 
@@ -41,7 +41,7 @@ class Scan2d:
         )
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
-        """The pulses of turn ``frame``: the sector is swept first, the blind rest of the turn follows."""
+        """The pulses of revolution ``frame``, which starts with the first pulse of the sector."""
         direction, origin, column, zero = self._beams
         time = blocks(frame, rate_hz, block_ns=frame_ns(rate_hz) / self.steps, start_ns=start_ns).time_ns[
             : len(column)
@@ -56,7 +56,7 @@ def read_scan2d(table: Table, rate_hz: float, *, rates_hz: tuple[float, ...]) ->
     """
     first, last = table.numbers("sector_deg", count=2)
     if not 0 < last - first <= 360:
-        raise table.error("sector_deg", "the second angle is to be larger than the first, by 360 at most")
+        raise table.error("sector_deg", "the second angle must exceed the first, by at most 360")
     step = table.numbers("step_deg", count=len(rates_hz), spread=True)
     if rate_hz not in rates_hz and len(set(step)) > 1:
         known = ", ".join(f"{r:g}" for r in rates_hz)
@@ -64,6 +64,6 @@ def read_scan2d(table: Table, rate_hz: float, *, rates_hz: tuple[float, ...]) ->
     chosen = step[rates_hz.index(rate_hz)] if rate_hz in rates_hz else step[0]
     steps = round(360 / chosen) if chosen > 0 else 0
     if not steps or abs(steps * chosen - 360) > 0.01:
-        raise table.error("step_deg", f"{chosen} does not divide the full turn")
+        raise table.error("step_deg", f"{chosen} does not divide 360 degrees")
     table.close()
     return Scan2d(steps, float(np.radians(first)), float(np.radians(last)))

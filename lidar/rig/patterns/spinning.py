@@ -1,4 +1,4 @@
-"""Scanners that turn a column of lasers about the vertical."""
+"""Scanners that rotate a column of lasers about the vertical axis."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from lidar.rig.toml_table import Table
 
 @dataclass(frozen=True, eq=False)
 class Spinning:
-    """Lasers k fire at times ``fire_ns[k]`` into a block; blocks follow each other without a pause.
+    """A rotating column of lasers. Laser k fires ``fire_ns[k]`` after the start of each block.
 
-    At the time t of a firing the encoder stands at ``start + turn * 2 pi t / period``; the beam leaves at
-    that angle plus ``azimuth[k]`` (in the direction of rotation), at ``elevation[k]``.
+    Blocks follow each other without a pause. At the time t of a pulse the encoder's angle is
+    ``start + turn * 2 pi t / period``. The beam's azimuth is that angle plus ``azimuth[k]`` (in the
+    direction of rotation), its elevation is ``elevation[k]``.
 
     elevation, azimuth : (k,) radians
     fire_ns  : (k,) nanoseconds
-    block_ns : nanoseconds from block to block; 0 where ``columns`` says it
-    columns  : blocks a revolution for scanners whose blocks are locked to the encoder, else 0
+    block_ns : nanoseconds from block to block; 0 if ``columns`` is given
+    columns  : blocks per revolution of scanners whose blocks are locked to the encoder, else 0
     turn     : -1 clockwise seen from above, 1 counter-clockwise
-    start    : radians, encoder's angle when a frame starts, counter-clockwise from forward
+    start    : radians, encoder's angle at the start of a frame, counter-clockwise from forward
     forward  : (k,) metres, start of the beam ahead of the axis, along the encoder's angle
     left     : (k,) metres, start of the beam to the left, seen along the beam
     up       : (k,) metres
@@ -48,7 +49,7 @@ class Spinning:
 
     @functools.cached_property
     def tail_ns(self) -> int:
-        """Nanoseconds after the end of its frame by which the last pulse may be late."""
+        """Maximum delay of the last pulse after the end of its frame, nanoseconds."""
         return int(self.fire_ns.max())
 
     @functools.cached_property
@@ -56,17 +57,17 @@ class Spinning:
         """Whether all beams start on the axis."""
         return not (self.forward.any() or self.left.any())
 
-    def _starts(self, encoder: Any, late: Any, *, ahead: Any) -> Float:
-        """Where the beams start, (blocks * lasers, 3)."""
+    def _origins(self, encoder: Any, late: Any, *, ahead: Any) -> Float:
+        """Start points (blocks * lasers, 3) of the beams."""
         origin = np.empty((len(encoder), len(late), 3))
         x = self.forward * np.cos(late) - self.left * np.sin(ahead)
         y = self.forward * np.sin(late) + self.left * np.cos(ahead)
-        _turned(encoder, x, y=y, out=origin)
+        _rotate(encoder, x, y=y, out=origin)
         origin[:, :, 2] = self.up
         return origin.reshape(-1, 3)
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
-        """The pulses of revolution ``frame``; no two have the same azimuths unless encoder-locked."""
+        """The pulses of revolution ``frame``; azimuths repeat only if encoder-locked."""
         period = frame_ns(rate_hz)
         block = blocks(
             frame,
@@ -80,10 +81,10 @@ class Spinning:
         ahead = late + self.turn * self.azimuth
         level = np.cos(self.elevation)
         direction = np.empty((len(block), len(late), 3))
-        _turned(encoder, level * np.cos(ahead), y=level * np.sin(ahead), out=direction)
+        _rotate(encoder, level * np.cos(ahead), y=level * np.sin(ahead), out=direction)
         direction[:, :, 2] = np.sin(self.elevation)
         ring, column, channel, order, up = _labels(self, len(block))
-        origin = up if self._central else self._starts(encoder, late, ahead=ahead)
+        origin = up if self._central else self._origins(encoder, late, ahead=ahead)
         time = (block.time_ns[:, None] + self.fire_ns).ravel()
         return Firings(time, direction.reshape(-1, 3), origin, ring, column, channel, order)
 
@@ -92,7 +93,7 @@ class Spinning:
 def _labels(
     pattern: Spinning, count: int
 ) -> tuple[NDArray[np.uint16], NDArray[np.int32], NDArray[np.uint16], NDArray[np.int32], Float]:
-    """Ring, column, channel, ring-major order and beams' starts on the axis of ``count`` blocks."""
+    """Ring, column, channel, ring-major order and start points on the axis, for ``count`` blocks."""
     lasers = len(pattern.elevation)
     rank = ranks(pattern.elevation)
     number = np.arange(count * lasers, dtype=np.int32).reshape(count, lasers)
@@ -105,8 +106,8 @@ def _labels(
     )
 
 
-def _turned(angle: Any, x: Any, *, y: Any, out: Float) -> None:
-    """Write (x, y) of each laser, turned by the angle of each block, into ``out[:, :, :2]``."""
+def _rotate(angle: Any, x: Any, *, y: Any, out: Float) -> None:
+    """Write (x, y) of each laser, rotated by the angle of each block, into ``out[:, :, :2]``."""
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     out[:, :, 0] = c * x - s * y
     out[:, :, 1] = s * x + c * y
@@ -119,7 +120,7 @@ def read_spinning(table: Table) -> Spinning:
     """
     elevation = np.radians(table.numbers("elevation_deg"))
     if (np.abs(elevation) >= np.pi / 2).any():
-        raise table.error("elevation_deg", "elevations are to be within 90 degrees")
+        raise table.error("elevation_deg", "elevations must be within 90 degrees")
     k = len(elevation)
     columns = table.integer("columns", 0, low=0, high=1 << 20)
     block_us = Fraction(str(table.number("block_us", 0.0 if columns else ..., low=0.0)))

@@ -1,4 +1,4 @@
-"""Patterns given by a law or by a list of directions: sweeps and tables."""
+"""Patterns given by a formula (sweep) or by a list of directions (table)."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from lidar.rig.toml_table import Table
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Lines that take turns; the azimuth turns evenly while the elevation goes up and down.
+    """Beams that fire in turn: azimuth at a constant rate, elevation as a triangle wave.
 
-    azimuth = 2 pi f_a t, elevation = middle + half tri(f_e t + line / lines), tri a triangle wave, -1 to 1.
+    azimuth = 2 pi f_a t, elevation = centre + half range * tri(f_e t + line / lines), tri from -1 to 1.
 
     low, high : radians, elevations
-    lines     : beams, pulse by pulse one after the other
+    lines     : number of beams, which fire one after the other
     """
 
     azimuth_hz: float
@@ -34,7 +34,7 @@ class Sweep:
     tail_ns: int = 0
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
-        """The pulses of frame ``frame``; the pattern goes on from frame to frame."""
+        """The pulses of frame ``frame``; the pattern continues across frames."""
         block = blocks(frame, rate_hz, block_ns=10**9 / self.pulse_hz, start_ns=start_ns)
         number = block.first + np.arange(len(block))
         seconds = number / float(self.pulse_hz)
@@ -49,9 +49,9 @@ class Sweep:
 
 @dataclass(frozen=True, eq=False)
 class Listed:
-    """A list of directions that is gone through again and again.
+    """A list of directions that repeats.
 
-    after_ns : (n,) int64 nanoseconds after the start of the list, rising
+    after_ns : (n,) int64 nanoseconds after the start of the list, in increasing order
     azimuth, elevation : (n,) radians, counter-clockwise from forward, and up
     period_ns : nanoseconds from one start of the list to the next
     """
@@ -64,7 +64,7 @@ class Listed:
     tail_ns: int = 0
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
-        """The pulses of frame ``frame``; the list goes on from frame to frame."""
+        """The pulses of frame ``frame``; the list continues across frames."""
         first, stop = (-(-k * frame_ns(rate_hz) // 1) for k in (frame, frame + 1))
         rounds = np.arange(first // self.period_ns, stop // self.period_ns + 1, dtype=np.int64)
         time = (rounds[:, None] * self.period_ns + self.after_ns).ravel()
@@ -101,9 +101,7 @@ def read_sweep(table: Table) -> Sweep:
     """
     low, high = np.radians(table.numbers("elevation_deg", count=2))
     if not -np.pi / 2 <= low < high <= np.pi / 2:
-        raise table.error(
-            "elevation_deg", "the lowest and the highest elevation are wanted, within 90 degrees"
-        )
+        raise table.error("elevation_deg", "give the lowest and the highest elevation, within 90 degrees")
     pattern = Sweep(
         azimuth_hz=table.number("azimuth_hz"),
         elevation_hz=table.number("elevation_hz"),
@@ -119,8 +117,8 @@ def read_sweep(table: Table) -> Sweep:
 def read_listed(table: Table) -> Listed:
     """The pattern that a ``[table]`` table describes: a CSV file beside the preset, and its period.
 
-    The file has a header and the columns time in seconds, azimuth and zenith angle in degrees, as the pattern
-    files that Livox publishes. Raises RigError if it cannot be read or its times do not rise.
+    The file has a header and the columns time in seconds, azimuth and zenith angle in degrees, as in the
+    pattern files of Livox. Raises RigError if it cannot be read or its times do not increase.
     """
     name = table.text("file")
     path = Path(table.path).parent / name

@@ -98,7 +98,7 @@ def test_every_vehicle_is_whole_and_a_bad_one_is_refused_with_every_fault(tmp_pa
     assert rear_axle_radius(11.4, 2.71, track=1.55) == pytest.approx(
         load_vehicle("car").turning_radius, abs=0.01
     )
-    with pytest.raises(InputError, match="no vehicle tank; there are aircraft, backpack, car"):
+    with pytest.raises(InputError, match="unknown vehicle tank"):
         load_vehicle("tank")
     path = tmp_path / "mine.toml"
     path.write_text('name = "mine"\nkind = "boat"\nlength = -1\nwings = 2\nsteering = "soft"\n')
