@@ -44,11 +44,11 @@ def build(
 ) -> Scene:
     """Build a scene of a map extract and write it to a directory.
 
-    A build that was killed goes on where it stopped; one that replaces a scene takes over what its options
-    leave the same. The bytes do not depend on ``workers``, nor on what was there before.
+    An interrupted build resumes when repeated; one that replaces a scene reuses the tiles that its options
+    leave unchanged. The bytes depend neither on ``workers`` nor on earlier builds.
 
-    Raises SourceNotFoundError for an extract without anything to build, FrameError for a CRS that cannot
-    serve and SceneFormatError for a directory that may not be used.
+    Raises SourceNotFoundError for an extract without anything to build, FrameError for an unsuitable CRS
+    and SceneFormatError for a directory that may not be overwritten.
     """
     if not (osm.areas or osm.ways):
         raise SourceNotFoundError(f"{osm.source or 'the extract'}: nothing in it to build from")

@@ -18,7 +18,7 @@ from cyclopts import App, CycloptsError, Parameter, Token
 from geoscene.progress import Progress, silent
 
 DONE, FAILURE, USAGE = 0, 1, 2
-"""Exit codes: it worked, it failed, the input or the options cannot be used."""
+"""Exit codes: success, failure, unusable input or options."""
 
 _HINTS = {
     errno.ENOSPC: "; free some space and run the same command again",
@@ -37,7 +37,7 @@ def _guard_numbers(words: Sequence[str]) -> list[str]:
 
 
 SEVERAL = Parameter(consume_multiple=True)
-"""Of an option that takes all words up to the next option."""
+"""Parameter of an option that takes all words up to the next option."""
 
 
 def shown_default(value: object) -> str | None:
@@ -48,7 +48,7 @@ def shown_default(value: object) -> str | None:
 
 
 DEFAULTS = Parameter(negative=(), show_default=shown_default)
-"""Of every option of both programs."""
+"""Parameter of every option of both programs."""
 
 
 @Parameter(name="*")
@@ -71,11 +71,11 @@ def _words(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
 
 
 WORDS = Parameter(converter=_words, n_tokens=1, metavar="STR,...")
-"""Of an option that takes words separated by commas, as a tuple in lower case."""
+"""Parameter of an option that takes comma-separated words, as a tuple in lower case."""
 
 
 def degrees(names: str) -> Parameter:
-    """Of an option that takes numbers in degrees separated by commas: W,S,E,N or LAT,LON."""
+    """Parameter of an option that takes comma-separated degrees: W,S,E,N or LAT,LON."""
 
     def convert(_: object, tokens: Sequence[Token]) -> tuple[float, ...]:
         text, count = tokens[0].value.strip(), names.count(",") + 1
@@ -108,7 +108,7 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
     """Run a program and exit with its code.
 
     roots : errors that are shown as one line, exit code 1
-    usage : those of them that are the user's to mend, exit code 2
+    usage : those of them that the input or the options cause, exit code 2
     """
     logging.basicConfig(
         level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
@@ -124,7 +124,7 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
         _complain(app, error)
         sys.exit(USAGE if isinstance(error, usage) else FAILURE)
     except KeyboardInterrupt:
-        _complain(app, "interrupted; the same command goes on from here")
+        _complain(app, "interrupted; repeat the command to resume")
         sys.exit(_INTERRUPTED)
     except MemoryError:
         _complain(app, "out of memory; take a smaller area or fewer workers")
@@ -139,9 +139,9 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
 
 
 def _command(app: App) -> str:
-    """The name of the command that was asked for and a blank, if it is one."""
-    asked = sys.argv[1] if len(sys.argv) > 1 else ""
-    return f"{asked} " if asked in app else ""
+    """The name of the command on the command line and a blank; empty if there is no such command."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    return f"{name} " if name in app else ""
 
 
 def with_flags(app: App, text: str) -> str:

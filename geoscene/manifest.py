@@ -1,4 +1,4 @@
-"""What ``scene.json`` says of a build."""
+"""The contents of ``scene.json`` for a build."""
 
 from __future__ import annotations
 

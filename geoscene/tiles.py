@@ -164,9 +164,9 @@ def build_tiles(
     """Make all tiles that ``folder`` does not hold yet, and report on every one, in no particular order.
 
     Workers are processes of the start method in force (`multiprocessing.set_start_method`): forked ones
-    share the plan's pages, spawned ones get a copy each and need a main module that can be imported. A tile
-    and its report lie in ``folder`` as soon as they are made, so that a build that was killed goes on from
-    there. Tiles of a ``former`` scene whose keys are the same are copied, or give their ground.
+    share the plan's pages, spawned ones get a copy each and need a main module that can be imported. Each
+    tile and its report are written to ``folder`` at once, so that an interrupted build can resume. Tiles
+    of a ``former`` scene with the same keys are copied, or their ground is reused.
     """
     files = SceneFiles(folder)
     files.tiles.mkdir(parents=True, exist_ok=True)
@@ -258,11 +258,11 @@ def _unpickled_job(data: bytes) -> _Job:
 
 
 _job: _Job
-"""In a worker process: the job it works on."""
+"""The job of a worker process."""
 
 
 def _start_worker(job: _Job) -> None:
-    """Keep the job, and see to it that this worker does not outlive a build that is killed."""
+    """Store the job, and end this worker when the build's own process ends."""
     global _job  # noqa: PLW0603  (of this process alone)
     _job = job
     parent = multiprocessing.parent_process()
@@ -299,7 +299,7 @@ def _known(folder: Path, keys: Keys) -> dict[tuple[int, int], TileReport]:
     for line in path.read_text("utf-8").splitlines() if path.exists() else ():
         try:
             document = json.loads(line)
-        except ValueError:  # the last line of a build that was killed
+        except ValueError:  # the incomplete last line of an interrupted build
             continue
         if document.pop("keys") == asdict(keys) and files.tile(document["i"], document["j"]).exists():
             known[document["i"], document["j"]] = _report(document)
