@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 
     Traffic = TrafficOptions | TrafficFile
     StageList = tuple[NamedStage, ...]
-else:  # types that help shows; converters make the values, whose classes take a second to import
-    Spec, Traffic, StageList = list[str], str, tuple[str, ...]
+else:  # types that help shows; converters make the values, whose classes take a second to import; Any, as
+    # cyclopts checks values against these types where pydantic is imported
+    Spec, Traffic, StageList = list[str] | Any, str | Any, tuple[str, ...] | Any
 
 OUTPUT = Group("Output", sort_key=3)
 
@@ -141,7 +142,7 @@ class DriveOptions:
     holds (name, text) pairs and ``traffic`` a `TrafficOptions`, `SumoOptions` or `TrafficFile`.
     """
 
-    route: Annotated[Spec, Parameter(converter=_route), SEVERAL] = ""
+    route: Annotated[Spec, Parameter(converter=_route, metavar="ROUTE"), SEVERAL] = ""
     """random, a GPX or GeoJSON file, two or more waypoints as LAT,LON in degrees, or the trajectory.csv or
     poses.csv of an earlier drive, whose trajectory is then repeated."""
 

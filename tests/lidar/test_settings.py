@@ -7,7 +7,9 @@ from dataclasses import fields
 import pytest
 from helpers.programs import run_program
 
+from geoscene.errors import SceneFormatError
 from lidar.camera.settings import CameraSettings
+from lidar.cli import app
 from lidar.errors import InputError
 from lidar.physics.settings import ScannerSettings
 from lidar.rig.catalog import rig_rows, sensor_rows
@@ -95,3 +97,11 @@ def test_a_bad_rig_or_sensor_is_named_with_line_and_key(tmp_path):
     (tmp_path / "s.toml").write_text('kind = "flash"\nrates_hz = [10.0]\nmin_range = "near"\n')
     with pytest.raises(InputError, match=r"s.toml, line 3: min_range: 'near' is not a number"):
         load_sensor(tmp_path / "s.toml")
+
+
+def test_options_are_read_where_pydantic_is_imported(tmp_path):
+    """The command line's parser checks values against types if that package is there."""
+    pytest.importorskip("pydantic")
+    words = ["drive", str(tmp_path / "none"), "--route", "60.1,24.9", "60.2,24.8", "--traffic", "vehicles=3"]
+    with pytest.raises(SceneFormatError, match="no such scene"):
+        app([*words, "-o", str(tmp_path / "out")], exit_on_error=False, result_action="return_value")
