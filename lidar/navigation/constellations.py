@@ -1,7 +1,7 @@
-"""Satellite constellations at their nominal places: circular orbits of published inclinations and radii.
+"""Nominal satellite constellations: circular orbits of published inclinations and radii.
 
-It is a model sky, not an almanac: as many satellites, as high and as well spread as each system is designed
-to give, the same at the same time.
+They are a model, not an almanac: number, elevations and spread of the satellites follow each system's design.
+Positions depend on the time alone.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lidar.errors import InputError
 from lidar.rig.specs import SYSTEMS
 
 _MU = 3.986004418e14  # m^3/s^2, WGS 84
-_STATIONARY = 42164.2e3  # metres, radius at which an orbit takes a sidereal day
+_STATIONARY = 42164.2e3  # metres, radius of an orbit with a period of one sidereal day
 _J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
 
 
@@ -26,11 +26,11 @@ _J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
 class Constellation:
     """Orbits of a system's satellites.
 
-    letter : of the system, as RINEX has it
+    letter : RINEX code of the system
     tilt, node, phase : (k,) radians: inclination, right ascension of the ascending node and argument of
              latitude at the epoch
     radius : (k,) metres
-    source : where the numbers come from
+    source : citation of the orbital parameters
     """
 
     letter: str
@@ -43,7 +43,7 @@ class Constellation:
 
     @property
     def names(self) -> list[str]:
-        """Of the satellites, such as G01."""
+        """Names of the satellites, such as G01."""
         return [f"{self.letter}{k + 1:02d}" for k in range(len(self.node))]
 
 
@@ -58,10 +58,11 @@ def walker(
     epoch: datetime,
     source: str,
 ) -> Constellation:
-    """A constellation of evenly filled planes.
+    """A constellation with evenly spaced satellites in each plane.
 
     planes    : degrees, right ascensions of their ascending nodes
-    first_deg : argument of latitude of the first satellite of each plane; the others follow evenly
+    first_deg : argument of latitude of the first satellite of each plane
+    each      : satellites per plane
     """
     count = each * len(planes)
     phase = np.add.outer(first_deg, 360.0 / each * np.arange(each)).ravel()
@@ -94,7 +95,7 @@ def _gps() -> Constellation:
 
 def _beidou() -> Constellation:
     epoch = datetime(2020, 8, 1, tzinfo=UTC)
-    middle = walker(
+    medium = walker(
         "C",
         55.0,
         planes=(0.0, 120.0, 240.0),
@@ -104,17 +105,17 @@ def _beidou() -> Constellation:
         epoch=epoch,
         source="",
     )
-    # those above the equator stand over a longitude; the inclined ones cross it there at the epoch and after
-    # a third and two thirds of a day
+    # Geostationary satellites stay above a longitude. The inclined geosynchronous ones cross the equator at
+    # one longitude, a third of a day apart.
     sidereal = float(sidereal_angle((epoch - _J2000).total_seconds()))
-    over = np.radians([80.0, 110.5, 140.0]) + sidereal
+    longitude = np.radians([80.0, 110.5, 140.0]) + sidereal
     node = np.radians(118.0) + sidereal + np.radians([0.0, 120.0, 240.0])
     return Constellation(
         "C",
-        np.concatenate([middle.tilt, np.zeros(3), np.full(3, np.radians(55.0))]),
-        np.concatenate([middle.node, over, node]),
-        np.concatenate([middle.phase, np.zeros(3), -np.radians([0.0, 120.0, 240.0])]),
-        np.concatenate([middle.radius, np.full(6, _STATIONARY)]),
+        np.concatenate([medium.tilt, np.zeros(3), np.full(3, np.radians(55.0))]),
+        np.concatenate([medium.node, longitude, node]),
+        np.concatenate([medium.phase, np.zeros(3), -np.radians([0.0, 120.0, 240.0])]),
+        np.concatenate([medium.radius, np.full(6, _STATIONARY)]),
         epoch,
         "BeiDou Open Service Performance Standard: Walker 24/3/1 at 21,528 km and 55 degrees, three"
         " geostationary at 80, 110.5 and 140 degrees east, three inclined geosynchronous; places along the"
@@ -123,7 +124,7 @@ def _beidou() -> Constellation:
 
 
 def constellations() -> dict[str, Constellation]:
-    """The systems that there are, by name."""
+    """The supported systems by name."""
     return {
         "gps": _gps(),
         "glonass": walker(
@@ -153,7 +154,7 @@ def constellations() -> dict[str, Constellation]:
 
 
 def check_systems(systems: Sequence[str]) -> None:
-    """Raise InputError for systems that there are not, none, or one named twice."""
+    """Raise InputError if no system is named, a name is unknown or a name is repeated."""
     unknown = [name for name in systems if name not in SYSTEMS]
     if unknown or not systems or len(set(systems)) < len(systems):
         raise InputError(
@@ -176,20 +177,20 @@ def sidereal_angle(seconds: ArrayLike) -> Float:
 
 
 def satellites(start: datetime, time_ns: NDArray[np.integer], *, systems: Sequence[str] = SYSTEMS) -> Float:
-    """Earth-fixed positions (n, k, 3) in metres of the satellites at nanoseconds after a UTC start.
+    """Earth-fixed positions (n, k, 3) in metres of the satellites at nanoseconds (n,) after a UTC start.
 
-    Raises InputError for systems that there are not.
+    Raises InputError for an unknown system.
     """
     check_systems(systems)
     known = constellations()
     t = np.asarray(time_ns, float) * 1e-9
-    turned = sidereal_angle((start - _J2000).total_seconds() + t)[:, None]
+    earth_angle = sidereal_angle((start - _J2000).total_seconds() + t)[:, None]
     parts = []
     for orbit in (known[name] for name in systems):
         since = (start - orbit.epoch).total_seconds() + t
         motion = np.sqrt(_MU / orbit.radius**3)
         u = orbit.phase + np.mod(motion * since[:, None], 2 * np.pi)
-        node = orbit.node - turned
+        node = orbit.node - earth_angle
         x, y = np.cos(u), np.sin(u) * np.cos(orbit.tilt)
         parts.append(
             orbit.radius[:, None]

@@ -1,10 +1,10 @@
-"""A satellite receiver: where it truly is and what it reports.
+"""Satellite receivers: ground truth and measured fixes.
 
     measured = antenna + b + m + w
 
-w is white; b a first-order Gauss-Markov process (what atmosphere, orbits and clocks leave); m another one for
-the reflections and detours between buildings, in proportion to the share of the sky that is blocked.
-Everything is in metres along true east, true north and up.
+w is white noise; b a first-order Gauss-Markov process (residual errors of atmosphere, orbits and clocks); m
+another one (multipath), in proportion to the share of the sky that is blocked. All are in metres along true
+east, true north and up.
 
 Heights are the scene's: above the assumed level ground in a ``flat`` scene, above the geoid in an
 ``orthometric`` one, above the ellipsoid in an ``ellipsoidal`` one; see `Frame.vertical`.
@@ -31,12 +31,12 @@ from lidar.rig.specs import GnssSpec
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Size of a receiver's errors; one standard deviation along each of east and north, and up.
+    """Standard deviations of a receiver's errors along each horizontal axis, and up.
 
     white, bias, blocked : (horizontal, vertical) metres: of w, of b, and of m where the whole sky is blocked
     tau      : seconds, correlation time of b
     speed    : m/s along each axis, white
-    quality  : what NMEA sentences call the fix
+    quality  : fix quality in NMEA sentences
     """
 
     white: tuple[float, float]
@@ -55,35 +55,34 @@ STATES = {
     "fixed": Errors((0.008, 0.015), (0.006, 0.010), 100.0, (0.02, 0.04), 0.02, 4),
     "ideal": Errors((0.0, 0.0), (0.0, 0.0), 1.0, (0.0, 0.0), 0.0, 1),
 }
-"""Typical magnitudes, not those of any one model; ``blocked`` is what street canyons do."""
+"""Typical magnitudes, not those of one product; ``blocked`` models street canyons."""
 NAMES = tuple(STATES)
 MULTIPATH_TAU_S = 60.0
-"""Correlation time of m, which changes as the surroundings pass by."""
+"""Correlation time of the multipath error m, seconds."""
 SETTLE_S = 3.0
-"""Seconds that a better state must have been possible before the receiver reports it."""
-_LADDER = {  # states by mode, best first, with the satellites of one system and the dilution they need
+"""Seconds for which a better state must be possible before the receiver reports it."""
+_LADDER = {  # by mode, best first: state, minimum satellites (of one system), maximum PDOP
     "ideal": (("ideal", 0, np.inf),),
     "single": (("single", 4, 25.0),),
     "sbas": (("sbas", 5, 25.0), ("single", 4, 25.0)),
     "rtk": (("fixed", 6, 4.0), ("float", 5, 8.0), ("single", 4, 25.0)),
 }
-"""Dilution in position beyond which there is no such fix: 25 is what u-blox receivers come set to; those of
-carrier phase are assumed."""
+"""A maximum PDOP of 25 is the default of u-blox receivers; the limits of carrier-phase states are assumed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fixes:
-    """What a receiver reports, and the truth; a row an epoch. Without a fix the reported numbers are NaN.
+    """Measurements of a receiver and ground truth, one row per epoch; measurements without a fix are NaN.
 
     time_ns   : (n,) int64, since the drive's start
     state     : (n,) int8, row of `NAMES`
-    quality   : (n,) int8, NMEA's: 0 none, 1 single, 2 differential, 4 fixed, 5 float
+    quality   : (n,) int8, as in NMEA: 0 none, 1 single, 2 differential, 4 fixed, 5 float
     satellites : (n,) int8, used
     dop       : (n, 3) dilution of precision, horizontal, vertical, in position
-    lonlath   : (n, 3) degrees, degrees, metres, reported
-    speed     : (n,) m/s over ground, reported
-    course    : (n,) radians clockwise from true north, reported; as before while standing
-    error     : (n, 3) metres east, north, up: reported less true
+    lonlath   : (n, 3) degrees, degrees, metres, measured
+    speed     : (n,) m/s over ground, measured
+    course    : (n,) radians clockwise from true north, measured; held at standstill
+    error     : (n, 3) metres east, north, up: measured minus true
     true_lonlath : (n, 3) of the antenna
     true_velocity : (n, 3) m/s true east, north, up, of the antenna
     used      : (n, k) bool, satellites used
@@ -110,7 +109,7 @@ class Fixes:
 
 
 def epochs(spec: GnssSpec, duration_ns: int) -> NDArray[np.int64]:
-    """Times (n,) of a receiver's fixes in a drive of that length, nanoseconds since its start."""
+    """Times (n,) of a receiver's fixes in a drive of ``duration_ns``, nanoseconds since its start."""
     last = (duration_ns - spec.time_offset_ns) * spec.rate_hz / 1e9
     count = int(np.floor(last + 1e-9)) + 1 if last >= 0 else 0
     return np.round(np.arange(count) * (1e9 / spec.rate_hz)).astype(np.int64) + spec.time_offset_ns
@@ -151,14 +150,16 @@ def observe_gnss(
 ) -> Fixes:
     """The fixes of a receiver along a drive.
 
-    start : UTC of the drive's start, which says where the satellites are
-    sky   : of `sky_view` at `epochs` and `antenna_motion`; the open sky by default
+    start : UTC of the drive's start, which determines the positions of the satellites
+    sky   : `sky_view` at `epochs` and `antenna_motion`; the open sky by default
 
     Random numbers are keyed by seed and receiver and drawn epoch by epoch from the start, so that a shorter
-    drive has the same first fixes, bit for bit. Raises InputError for a mode that there is not.
+    drive has the same first fixes, bit for bit. Raises InputError for an unknown mode.
     """
     if spec.mode not in _LADDER:
-        raise InputError(f"receiver {spec.name}: no mode {spec.mode}; there are {', '.join(_LADDER)}")
+        raise InputError(
+            f"receiver {spec.name}: unknown mode {spec.mode}; choose one of {', '.join(_LADDER)}"
+        )
     time_ns = epochs(spec, trajectory.duration_ns)
     position, velocity = antenna_motion(trajectory, frame, spec=spec, time_ns=time_ns)
     if sky is None:
@@ -169,11 +170,11 @@ def observe_gnss(
     state = _states(spec, sky, pdop=dop[:, 2])
     error = _errors(spec, sky, dop=dop, state=state, seed=seed)
     sizes = np.array([STATES[name].speed for name in NAMES])[state]
-    shake = generator(seed, spec.name, "velocity").standard_normal((len(time_ns), 3))
-    moving = velocity + sizes[:, None] * shake
+    velocity_noise = generator(seed, spec.name, "velocity").standard_normal((len(time_ns), 3))
+    measured_velocity = velocity + sizes[:, None] * velocity_noise
     lon, lat = frame.to_geographic(position[:, 0], position[:, 1])
     true = np.column_stack([lon, lat, position[:, 2]])
-    speed = np.hypot(moving[:, 0], moving[:, 1])
+    speed = np.hypot(measured_velocity[:, 0], measured_velocity[:, 1])
     return Fixes(
         time_ns=time_ns,
         state=state.astype(np.int8),
@@ -182,7 +183,7 @@ def observe_gnss(
         dop=dop,
         lonlath=_shifted(frame, position, error=error),
         speed=speed,
-        course=_course(moving, speed, least=3.0 * np.nan_to_num(sizes) + 0.01),
+        course=_course(measured_velocity, speed, least=3.0 * np.nan_to_num(sizes) + 0.01),
         error=error,
         true_lonlath=true,
         true_velocity=velocity,
@@ -192,12 +193,12 @@ def observe_gnss(
 
 
 def _states(spec: GnssSpec, sky: Sky, *, pdop: Float) -> NDArray[np.int64]:
-    """State (n,) at each epoch: worse at once, better after it has been possible for `SETTLE_S`."""
+    """State (n,) at each epoch: drops at once, improves after `SETTLE_S`."""
     ladder = _LADDER[spec.mode]
     rank = np.full(len(sky.count), len(ladder))
     for k in reversed(range(len(ladder))):
         rank[(sky.spare >= ladder[k][1]) & (pdop <= ladder[k][2])] = k
-    # the best rank that held throughout the time to settle; before the start it is taken to have been as then
+    # The worst rank over the settling time; before the start, the first rank is assumed.
     wait = max(round(SETTLE_S * spec.rate_hz), 1)
     held = np.concatenate([np.full(wait - 1, rank[0]), rank]) if len(rank) else rank
     worst = np.lib.stride_tricks.sliding_window_view(held, wait).max(axis=1) if len(rank) else rank
@@ -215,27 +216,26 @@ def _errors(spec: GnssSpec, sky: Sky, *, dop: Float, state: NDArray[np.int64], s
         pairs = np.array([getattr(row, name) for row in table])[state]
         return np.column_stack([pairs[:, 0], pairs[:, 0], pairs[:, 1]])
 
-    # what stands in the way also spoils the geometry: errors grow as the dilution does
-    whole = dilution(sky.azimuth, sky.elevation, used=sky.above, names=sky.names)
+    # Blocked satellites also degrade the geometry: errors scale with the dilution of precision.
+    unblocked = dilution(sky.azimuth, sky.elevation, used=sky.above, names=sky.names)
     with np.errstate(invalid="ignore"):
-        worse = np.where(np.isfinite(dop[:, :2]), dop[:, :2] / whole[:, :2], 1.0)
-    worse = np.where(np.isfinite(worse), worse, 1.0)[:, [0, 0, 1]]
+        growth = np.where(np.isfinite(dop[:, :2]), dop[:, :2] / unblocked[:, :2], 1.0)
+    growth = np.where(np.isfinite(growth), growth, 1.0)[:, [0, 0, 1]]
     white = generator(seed, spec.name, "white").standard_normal((n, 3))
     tau = np.array([row.tau for row in table])[state]
     bias = gauss_markov(generator(seed, spec.name, "bias"), 1.0 / spec.rate_hz, tau=tau)
-    path = gauss_markov(
+    multipath = gauss_markov(
         generator(seed, spec.name, "path"), 1.0 / spec.rate_hz, tau=np.full(n, MULTIPATH_TAU_S)
     )
-    near = worse * (sizes("white") * white + sizes("bias") * bias)
-    total: Float = near + sizes("blocked") * sky.blocked[:, None] * path
+    local = growth * (sizes("white") * white + sizes("bias") * bias)
+    total: Float = local + sizes("blocked") * sky.blocked[:, None] * multipath
     return total
 
 
 def gauss_markov(rng: np.random.Generator, dt: float, *, tau: Float) -> Float:
-    """Three independent first-order Gauss-Markov processes (n, 3) of unit variance, from their steady state.
+    """Three independent first-order Gauss-Markov processes (n, 3), stationary, of unit variance.
 
-    u[k] = phi u[k-1] + sqrt(1 - phi^2) N(0, 1) with phi = exp(-dt / tau[k]), computed in order from the
-    first.
+    u[k] = phi u[k-1] + sqrt(1 - phi^2) N(0, 1) with phi = exp(-dt / tau[k])
     """
     noise = rng.standard_normal((len(tau), 3))
     phi = np.exp(-dt / tau)
@@ -263,7 +263,7 @@ def _shifted(frame: Frame, position: Float, *, error: Float) -> Float:
 
 
 def _course(velocity: Float, speed: Float, *, least: Float) -> Float:
-    """Course (n,) clockwise from true north; below the least speed the last one known, 0 before any."""
+    """Course (n,) clockwise from true north; below the least speed the last known one, initially 0."""
     course = np.asarray(np.mod(np.arctan2(velocity[:, 0], velocity[:, 1]), 2 * np.pi))
     known: NDArray[np.int64] = np.where(speed > least, np.arange(len(speed)), -1)
     last: NDArray[np.int64] = np.maximum.accumulate(known)
@@ -272,7 +272,7 @@ def _course(velocity: Float, speed: Float, *, least: Float) -> Float:
 
 
 def gnss_columns(fixes: Fixes) -> dict[str, NDArray[Any]]:
-    """Columns of ``gnss.csv``: measured and, with the prefix ``true_``, true; degrees, metres, m/s."""
+    """Columns of ``gnss.csv``: measurements, and ground truth prefixed ``true_``; degrees, metres, m/s."""
     return {
         "time_ns": fixes.time_ns,
         "lon": fixes.lonlath[:, 0],

@@ -1,11 +1,11 @@
-"""An inertial unit: the rates and specific forces that it truly feels and what it reports.
+"""Inertial measurement units: true angular rates and specific forces, and their measurements.
 
-    gyro  = omega + b_g + n_g        omega: turning of the unit against the stars, rad/s
-    accel = f + b_a + n_a            f = a - g: what a mass on springs in the unit feels, m/s^2
+    gyro  = omega + b_g + n_g        omega: angular rate in inertial space, rad/s
+    accel = f + b_a + n_a            f = a - g: specific force, m/s^2
 
-both along the unit's own axes. n is white; b a random walk and flicker (bias instability). At rest f is the
-gravity's reaction, upwards. The Earth turns under the unit (and the unit's own travel around it turns the
-vertical); both are in omega, and the Coriolis acceleration is in f.
+both along the unit's axes. n is white noise; b a random walk plus flicker noise (bias instability). At rest
+f points upwards with the magnitude of gravity. omega includes the Earth rate and the transport rate (rotation
+of the local vertical due to travel); f includes the Coriolis acceleration.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from lidar.random_streams import generator
 from lidar.rig.specs import ImuSpec
 
 _FLICKER_TIMES = 0.1 * np.exp(np.arange(12))
-"""Seconds, correlation times of the processes that add up to flicker: from 0.1 s to 100 minutes."""
+"""Correlation times in seconds of the processes that add up to flicker noise: 0.1 s to 100 minutes."""
 
 EARTH_RATE = 7.292115e-5
-"""Turning of the Earth, rad/s (WGS 84)."""
+"""Angular rate of the Earth, rad/s (WGS 84)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Inertial:
-    """What a unit reports, and the truth, in its own axes; a row a moment.
+    """Measurements of a unit and ground truth, in its own axes, one row per time.
 
     time_ns     : (n,) int64, since the drive's start
-    gyro, accel : (n, 3) rad/s and m/s^2, reported
+    gyro, accel : (n, 3) rad/s and m/s^2, measured
     true_gyro, true_accel : (n, 3) without noise and bias
     """
 
@@ -48,7 +48,7 @@ class Inertial:
 
 
 def normal_gravity(lat_deg: ArrayLike, h: ArrayLike) -> Float:
-    """Gravity in m/s^2 (Somigliana, WGS 84) less 3.086e-6 a metre of height."""
+    """Gravity in m/s^2 (Somigliana, WGS 84), decreased by 3.086e-6 per metre of height."""
     s2 = np.sin(np.radians(np.asarray(lat_deg, float))) ** 2
     at_zero = 9.7803253359 * (1 + 0.00193185265241 * s2) / np.sqrt(1 - E2 * s2)
     gravity: Float = at_zero - 3.086e-6 * np.asarray(h, float)
@@ -58,10 +58,9 @@ def normal_gravity(lat_deg: ArrayLike, h: ArrayLike) -> Float:
 def true_inertial(
     trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, time_ns: NDArray[np.int64]
 ) -> tuple[Float, Float]:
-    """Angular rate (n, 3) and specific force (n, 3) that a unit feels, in its own axes.
+    """True angular rate (n, 3) and specific force (n, 3) of a unit, in its own axes.
 
-    From central differences of the trajectory's attitudes and of the unit's velocity, linear between its
-    rows.
+    Central differences of the trajectory's attitudes and of the unit's velocity, interpolated linearly.
     """
     seconds = trajectory.time_ns * 1e-9
     R = matrix_from_quat(trajectory.quat_xyzw)
@@ -69,38 +68,39 @@ def true_inertial(
     arm = np.asarray(spec.mount.translation, float)
     velocity = trajectory.velocity + np.einsum("nij,nj->ni", R, np.cross(turn, arm))
     acceleration = np.gradient(velocity, seconds, axis=0)
-    earth, travel, gravity = _planet(trajectory, frame, velocity=velocity)
-    felt = acceleration + np.cross(2 * earth + travel, velocity)
-    felt[:, 2] += gravity
-    rate = turn + np.einsum("nji,nj->ni", R, earth + travel)
-    force = np.einsum("nji,nj->ni", R, felt)
+    earth, transport, gravity = _earth(trajectory, frame, velocity=velocity)
+    specific_force = acceleration + np.cross(2 * earth + transport, velocity)
+    specific_force[:, 2] += gravity
+    rate = turn + np.einsum("nji,nj->ni", R, earth + transport)
+    force = np.einsum("nji,nj->ni", R, specific_force)
     at = np.asarray(time_ns, float) * 1e-9
     own = spec.mount.rotation
     out = [np.stack([np.interp(at, seconds, v[:, k]) for k in range(3)], axis=1) @ own for v in (rate, force)]
     return out[0], out[1]
 
 
-def _planet(trajectory: Trajectory, frame: Frame, *, velocity: Float) -> tuple[Float, Float, Float]:
-    """Turning (n, 3) of the Earth and of the vertical as one travels, scene axes; and gravity (n,)."""
+def _earth(trajectory: Trajectory, frame: Frame, *, velocity: Float) -> tuple[Float, Float, Float]:
+    """Earth rate (n, 3) and transport rate (n, 3) in scene axes, rad/s, and gravity (n,), m/s^2."""
     x, y, z = trajectory.position.T
     lon, lat = frame.to_geographic(x, y)
-    turn, phi = frame.convergence(lon, lat), np.radians(lat)
-    # true north lies ``turn`` to the left of grid north
-    north = np.stack([-np.sin(turn), np.cos(turn), np.zeros_like(turn)], axis=1)
+    convergence, phi = frame.convergence(lon, lat), np.radians(lat)
+    # True north is rotated by the convergence, counter-clockwise from grid north.
+    north = np.stack([-np.sin(convergence), np.cos(convergence), np.zeros_like(convergence)], axis=1)
     up = np.array([0.0, 0.0, 1.0])
     earth = EARTH_RATE * (np.cos(phi)[:, None] * north + np.sin(phi)[:, None] * up)
     w = np.sqrt(1 - E2 * np.sin(phi) ** 2)
-    east = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
+    east = np.stack([np.cos(convergence), np.sin(convergence), np.zeros_like(convergence)], axis=1)
     to_east, to_north = (velocity * east).sum(axis=1), (velocity * north).sum(axis=1)
-    # about the vertical the axes of the grid keep their direction, where those of true north would turn
-    travel = (to_east / (A / w + z))[:, None] * north - (to_north / (A * (1 - E2) / w**3 + z))[:, None] * east
-    return earth, travel, normal_gravity(lat, z)
+    # No vertical component: grid axes, unlike true north, keep their direction about the vertical.
+    meridian, normal = A * (1 - E2) / w**3, A / w  # radii of curvature
+    transport = (to_east / (normal + z))[:, None] * north - (to_north / (meridian + z))[:, None] * east
+    return earth, transport, normal_gravity(lat, z)
 
 
 def observe_imu(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, seed: int) -> Inertial:
-    """What an inertial unit reports along a drive.
+    """The measurements of an inertial unit along a drive.
 
-    Random numbers are keyed by seed and unit and drawn moment by moment from the start, so that a shorter
+    Random numbers are keyed by seed and unit and drawn in time order from the start, so that a shorter
     drive has the same first rows, bit for bit.
     """
     step = 1e9 / spec.rate_hz
@@ -112,7 +112,7 @@ def observe_imu(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, seed: in
 
 
 def inertial_noise(spec: ImuSpec, count: int, *, seed: int) -> Float:
-    """Errors (n, 6) of gyros, rad/s, and accelerometers, m/s^2: white noise, a random walk, flicker."""
+    """Errors (n, 6) of gyros, rad/s, and accelerometers, m/s^2: white noise, random walk, flicker."""
     draw = generator(seed, spec.name, "imu").standard_normal((count, 12))
     dt = 1.0 / spec.rate_hz
     white = np.repeat([spec.gyro_noise, spec.accel_noise], 3) / np.sqrt(dt)
@@ -130,22 +130,22 @@ def _flicker(count: int, dt: float, *, seed: int, name: str) -> Float:
     """Three columns (n, 3) of noise whose spectrum is 1 / (2 pi f), with an Allan deviation of 0.664.
 
     The sum of stationary first-order Gauss-Markov processes, a factor of e apart in correlation time, each of
-    variance 1 / pi: their spectra add up to it between the shortest and the longest time (IEEE Std 952-1997,
+    variance 1 / pi: between the shortest and the longest time their spectra add up to it (IEEE Std 952-1997,
     annex C, for the spectrum of bias instability and its Allan deviation, B sqrt(2 ln 2 / pi)).
     """
     from scipy.signal import lfilter  # noqa: PLC0415 - slow to import
 
     total = np.zeros((count, 3))
     for time in _FLICKER_TIMES:
-        kept = np.exp(-dt / time)
+        phi = np.exp(-dt / time)
         noise = generator(seed, name, time).standard_normal((count, 3)) / np.sqrt(np.pi)
-        noise[1:] *= np.sqrt(1 - kept**2)
-        total += lfilter([1.0], [1.0, -kept], noise, axis=0)
+        noise[1:] *= np.sqrt(1 - phi**2)
+        total += lfilter([1.0], [1.0, -phi], noise, axis=0)
     return total
 
 
 def allan_deviation(rate: Float, rate_hz: float, *, windows: NDArray[np.integer]) -> Float:
-    """Overlapping Allan deviation (w, k) of readings (n, k) for averaging windows of so many readings."""
+    """Overlapping Allan deviation (w, k) of readings (n, k) for averaging windows (w,), in readings."""
     total = np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(rate, axis=0)]) / rate_hz
     out = np.empty((len(windows), rate.shape[1]))
     for row, m in enumerate(windows):
@@ -155,7 +155,7 @@ def allan_deviation(rate: Float, rate_hz: float, *, windows: NDArray[np.integer]
 
 
 def imu_columns(rows: Inertial) -> dict[str, NDArray[Any]]:
-    """Columns of ``imu.csv``: measured and, with the prefix ``true_``, true; rad/s and m/s^2."""
+    """Columns of ``imu.csv``: measurements, and ground truth prefixed ``true_``; rad/s and m/s^2."""
     out: dict[str, NDArray[Any]] = {"time_ns": rows.time_ns}
     for prefix in ("", "true_"):
         for name in ("gyro", "accel"):

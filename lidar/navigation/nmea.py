@@ -1,4 +1,4 @@
-"""NMEA 0183 sentences of fixes: GGA, RMC, VTG and GSA, as version 4.10 has them for several systems."""
+"""NMEA 0183 sentences of fixes: GGA, RMC, VTG and GSA, in version 4.10 (several systems)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from lidar.navigation.gnss import Fixes
 KNOT = 1852.0 / 3600.0
 """Metres per second in a knot."""
 _SYSTEMS = {"G": ("GP", 1, 0), "R": ("GL", 2, 64), "E": ("GA", 3, 0), "C": ("GB", 4, 0)}
-"""Talker, system number and what is added to a satellite's own number, by the letter of the system."""
+"""Talker, system number and offset of satellite numbers, by the letter of the system."""
 _MODES = {0: "N", 1: "A", 2: "D", 4: "R", 5: "F"}  # NMEA's mode by fix quality
 
 
 def checksum(body: str) -> str:
-    """Two hexadecimal digits: the exclusive or of the characters between $ and *."""
+    """Checksum: exclusive or of the characters between $ and *, as two hexadecimal digits."""
     total = 0
     for byte in body.encode("ascii"):
         total ^= byte
@@ -24,24 +24,24 @@ def checksum(body: str) -> str:
 
 
 def sentence(body: str) -> str:
-    """A whole sentence, with checksum, carriage return and line feed."""
+    """A complete sentence, with checksum, carriage return and line feed."""
     return f"${body}*{checksum(body)}\r\n"
 
 
 def latitude(deg: float) -> str:
-    """Latitude in degrees as ``ddmm.mmmmmm,N``; nothing but the comma where it is not known."""
+    """Latitude in degrees as ``ddmm.mmmmmm,N``; only the comma if it is NaN."""
     return _angle(deg, 2, signs="NS")
 
 
 def longitude(deg: float) -> str:
-    """Longitude in degrees as ``dddmm.mmmmmm,E``; nothing but the comma where it is not known."""
+    """Longitude in degrees as ``dddmm.mmmmmm,E``; only the comma if it is NaN."""
     return _angle(deg, 3, signs="EW")
 
 
 def _angle(deg: float, digits: int, *, signs: str) -> str:
     if not math.isfinite(deg):
         return ","
-    micro = round(abs(deg) * 60e6)  # whole millionths of a minute, so that 59.9999999 never prints as 60
+    micro = round(abs(deg) * 60e6)  # whole millionths of a minute: 59.9999999 never prints as 60
     degrees, minutes = divmod(micro, 60_000_000)
     return f"{degrees:0{digits}d}{minutes / 1e6:09.6f},{signs[deg < 0]}"
 
@@ -53,15 +53,15 @@ def _number(value: float, decimals: int) -> str:
 def nmea(fixes: Fixes, start: datetime, *, geoid: float | None = None) -> list[str]:
     """Sentences for each fix: GGA, RMC, VTG, and a GSA for each system; at most 82 characters each.
 
-    The talker is GN for a receiver of several systems, else that of the one. GSA names at most twelve
-    satellites of a system, those of GLONASS from 65 on, and ends with the number of the system.
+    The talker is GN for a receiver of several systems, else that of its system. GSA lists at most twelve
+    satellites of a system (GLONASS from 65 on) and ends with the number of the system.
 
     start : UTC of the drive's start; sentences carry UTC
     geoid : height of the geoid above the ellipsoid, metres. With it, heights of fixes are taken as
-            ellipsoidal and GGA gives height above the geoid and the separation; without it, they are given as
-            they are and the separation is left empty
+            ellipsoidal and GGA gives height above the geoid and the separation; without it, heights are
+            unchanged and the separation is empty
 
-    Without a fix, the fields that it would fill are empty.
+    Fields of a missing fix are empty.
     """
     lines: list[str] = []
     for k in range(len(fixes)):

@@ -1,4 +1,4 @@
-"""The satellites overhead, and which of them a receiver sees between the buildings."""
+"""Positions of satellites in the sky and their visibility between buildings."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ A, F = 6378137.0, 1 / 298.257223563
 """WGS 84: semi-major axis in metres, flattening."""
 E2 = F * (2 - F)
 
-_RINGS = 6  # rings of the dome that is looked at for how much of it is blocked
+_RINGS = 6  # rings of directions that sample the blocked share of the sky
 _SPOKES = 16
-_BLOCK_M = 100.0  # metres of road whose epochs share one world
+_BLOCK_M = 100.0  # metres of the drive whose epochs share one loaded region
 REACH = 400.0
-"""Metres within which buildings are held against the satellites."""
+"""Distance in metres within which buildings can block satellites."""
 
 
 class _Caster(Protocol):
@@ -37,13 +37,13 @@ class _World(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Sky:
-    """What a receiver has overhead at each of n epochs.
+    """Satellites in the sky of a receiver at each of n epochs.
 
     azimuth, elevation : (n, k) radians, azimuth clockwise from true north
     visible : (n, k) bool, above the mask and not blocked
     above   : (n, k) bool, above the mask
-    blocked : (n,) share of the dome above the mask that something stands in front of, 0 in the open
-    names   : (k,) of the satellites; the first letter is their system's
+    blocked : (n,) share of the sky above the mask that is blocked
+    names   : (k,) of the satellites; the first letter identifies the system
     """
 
     azimuth: Float
@@ -61,14 +61,14 @@ class Sky:
 
     @property
     def spare(self) -> NDArray[np.int64]:
-        """Satellites in view (n,) less one for each system after the first: for the offset of its clock."""
+        """Satellites in view (n,) minus one for the clock offset of each system after the first."""
         seen = [self.visible[:, rows].any(axis=1) for rows in systems_of(self.names)]
         spare: NDArray[np.int64] = self.count - np.maximum(np.sum(seen, axis=0) - 1, 0)
         return spare
 
 
 def systems_of(names: NDArray[np.str_]) -> list[NDArray[np.int64]]:
-    """The satellites of each system, in the order in which they come."""
+    """Columns of the satellites of each system, in order of first appearance."""
     letters = [str(name)[:1] for name in names]
     return [np.flatnonzero(np.array(letters) == letter) for letter in dict.fromkeys(letters)]
 
@@ -107,7 +107,7 @@ def look_up(
     time_ns: NDArray[np.integer],
     systems: Sequence[str] = SYSTEMS,
 ) -> tuple[Float, Float]:
-    """True azimuth and elevation (n, k) in radians of the satellites from n places, one a time."""
+    """True azimuth and elevation (n, k) in radians of the satellites from n places, one per time."""
     d = satellites(start, time_ns, systems=systems) - ecef(lon_deg, lat_deg, h=h)[:, None, :]
     e, n, u = np.moveaxis(np.einsum("nij,nkj->nki", enu_axes(lon_deg, lat_deg), d), -1, 0)
     return np.mod(np.arctan2(e, n), 2 * np.pi), np.arctan2(u, np.hypot(e, n))
@@ -131,9 +131,9 @@ def open_sky(
     mask_deg: float,
     systems: Sequence[str] = SYSTEMS,
 ) -> Sky:
-    """The sky over antenna positions (n, 3) in scene metres, with nothing in the way.
+    """The sky over antenna positions (n, 3) in scene metres, without obstacles.
 
-    systems : of `SYSTEMS`; raises InputError for others
+    Raises InputError for an unknown system.
     """
     lon, lat = frame.to_geographic(antenna[:, 0], antenna[:, 1])
     azimuth, elevation = look_up(lon, lat, h=antenna[:, 2], start=start, time_ns=time_ns, systems=systems)
@@ -151,17 +151,16 @@ def sky_view(
     mask_deg: float,
     systems: Sequence[str] = SYSTEMS,
 ) -> Sky:
-    """The sky over antenna positions (n, 3) between what stands around them.
+    """The sky over antenna positions (n, 3) in scene metres, with satellites blocked by the surroundings.
 
-    Each satellite above the mask is a ray, and so are 96 directions that share the dome above the mask
-    evenly.
+    A ray is cast to each satellite above the mask, and 96 rays sample the sky above the mask uniformly.
 
-    world_at : the world that covers a region (xmin, ymin, xmax, ymax), such as `World.follow`; asked once for
-               every hundred metres or so of the drive, with `REACH` around them
+    world_at : returns the world of a region (xmin, ymin, xmax, ymax), such as `World.follow`; called about
+               once per hundred metres of the drive, with a margin of `REACH`
     """
     sky = open_sky(frame, antenna, start=start, time_ns=time_ns, mask_deg=mask_deg, systems=systems)
     lon, lat = frame.to_geographic(antenna[:, 0], antenna[:, 1])
-    turn = frame.convergence(lon, lat)
+    convergence = frame.convergence(lon, lat)
     ring = np.repeat((np.arange(_RINGS) + 0.5) / _RINGS, _SPOKES)  # equal steps of sine: equal areas
     low = np.sin(np.radians(mask_deg))
     rise = np.arcsin(low + (1 - low) * ring)
@@ -172,27 +171,29 @@ def sky_view(
         caster = world_at((x.min() - REACH, y.min() - REACH, x.max() + REACH, y.max() + REACH)).caster
         k, satellite = np.nonzero(sky.above[rows])
         way = grid_directions(
-            sky.azimuth[rows][k, satellite], sky.elevation[rows][k, satellite], convergence=turn[rows][k]
+            sky.azimuth[rows][k, satellite],
+            sky.elevation[rows][k, satellite],
+            convergence=convergence[rows][k],
         )
         visible[rows[k], satellite] = ~caster.occluded(antenna[rows[k]], way)
-        dome = grid_directions(spoke[None, :], rise[None, :], convergence=turn[rows, None]).reshape(-1, 3)
-        hit = caster.occluded(np.repeat(antenna[rows], len(ring), axis=0), dome)
+        dome = grid_directions(spoke[None, :], rise[None, :], convergence=convergence[rows, None])
+        hit = caster.occluded(np.repeat(antenna[rows], len(ring), axis=0), dome.reshape(-1, 3))
         blocked[rows] = hit.reshape(len(rows), -1).mean(axis=1)
     return Sky(sky.azimuth, sky.elevation, visible, sky.above, blocked, sky.names)
 
 
 def _blocks(antenna: Float) -> list[NDArray[np.int64]]:
-    """Rows in order, cut where the way since the last cut exceeds a block."""
+    """Rows of consecutive positions, split every `_BLOCK_M` along the path."""
     step = np.hypot(*np.diff(antenna[:, :2], axis=0).T) if len(antenna) > 1 else np.empty(0)
     block = np.floor(np.concatenate([[0.0], np.cumsum(step)]) / _BLOCK_M)
     return np.split(np.arange(len(antenna)), np.flatnonzero(np.diff(block)) + 1)
 
 
 def dilution(azimuth: Float, elevation: Float, *, used: Bools, names: NDArray[np.str_]) -> Float:
-    """Dilution of precision (n, 3): horizontal, vertical and in position; infinite where too few are used.
+    """Dilution of precision (n, 3): HDOP, VDOP and PDOP; infinite with too few satellites.
 
-    Each system in use has a clock of its own that must be solved for: three coordinates and a clock need four
-    satellites, and one more for each further system. ``names`` as of `Sky`.
+    The unknowns are three coordinates and a clock offset per system in use: four satellites, and one more for
+    each further system. ``names`` as in `Sky`.
     """
     systems = systems_of(names)
     clocks = np.zeros((len(names), len(systems)))
@@ -203,9 +204,9 @@ def dilution(azimuth: Float, elevation: Float, *, used: Bools, names: NDArray[np
     )
     h = np.concatenate([toward, np.broadcast_to(clocks, (*azimuth.shape, len(systems)))], axis=-1)
     normal = np.einsum("nki,nkj,nk->nij", h, h, used.astype(float))
-    idle = 3 + np.arange(len(systems))
-    unused = normal[:, idle, idle] == 0.0
-    normal[:, idle, idle] += unused  # the clock of a system that is not in use is nobody's unknown
+    clock_rows = 3 + np.arange(len(systems))
+    unused = normal[:, clock_rows, clock_rows] == 0.0
+    normal[:, clock_rows, clock_rows] += unused  # keeps the matrix regular for systems that are not in use
     out = np.full((len(azimuth), 3), np.inf)
     needed = 3 + (~unused).sum(axis=1)
     enough = (used.sum(axis=1) >= np.maximum(needed, 4)) & (np.linalg.cond(normal) < 1e8)

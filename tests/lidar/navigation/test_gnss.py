@@ -163,7 +163,7 @@ def test_epochs_come_at_the_rate_from_the_offset_on():
 
 
 def test_an_unknown_mode_is_refused():
-    with pytest.raises(InputError, match="no mode ppp; there are ideal, single, sbas, rtk"):
+    with pytest.raises(InputError, match="unknown mode ppp; choose one of ideal, single, sbas, rtk"):
         observe_gnss(standing(1.0), FRAME, spec=spec("ppp"), seed=0, start=START)
 
 
