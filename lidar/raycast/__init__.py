@@ -1,4 +1,4 @@
-"""Rays against triangles: exact ranges, instances, motion within a sweep, echoes."""
+"""Ray casting against triangles: exact ranges, instances, motion within a sweep."""
 
 from lidar.raycast.caster import Caster as Caster
 from lidar.raycast.geometry import ALL as ALL

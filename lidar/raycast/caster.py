@@ -1,4 +1,4 @@
-"""Rays in, what they met out."""
+"""The ray caster: first hits and shadow rays against a mesh and instances."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _NUMBERS: Mapping[int, int] = {}
 
 
 @functools.cache
-def _works(backend: str) -> bool:
-    """Whether to use Embree directly; says once if that was wished for and cannot be."""
+def _uses_embree(backend: str) -> bool:
+    """Whether to call Embree directly; logs one warning if ``auto`` falls back to embreex."""
     if backend not in ("auto", "embree", "embreex"):
-        raise InputError(f"backend {backend!r} is none of auto, embree and embreex")
+        raise InputError(f"backend {backend!r}: choose one of auto, embree, embreex")
     if backend == "embreex":
         return False
     try:
@@ -45,21 +45,21 @@ def _works(backend: str) -> bool:
 
 
 class Caster:
-    """A mesh, and copies of other casters' meshes, ready to be hit by rays.
+    """Casts rays at a mesh and at instances of other casters' meshes.
 
-    All coordinates are float64 metres in one frame of the caller's choice (scene axes, as a rule). Ranges are
-    ray parameters: a hit lies at origin + range * direction. Directions need not be unit vectors.
+    All coordinates are float64 metres in one frame, usually the scene's. Ranges are ray parameters: a hit
+    lies at origin + range * direction. Directions need not be unit vectors.
 
     vertices, faces : (n, 3) and (m, 3), the caster's own mesh
-    mask            : (m,) bits per face, of which a ray's ``mask`` must share one; all bits by default
-    instances       : copies of other casters; their numbers run through all groups in the given order
-    origin          : (3,) metres, within a few kilometres of all vertices and rays: what float32 coordinates
-                      are relative to; the middle of the vertices by default
+    mask            : (m,) bits per face; a ray hits faces that share one with its ``mask``; all by default
+    instances       : groups of instances, numbered consecutively through all groups
+    origin          : (3,) metres, origin of the float32 coordinates, within a few kilometres of all vertices
+                      and rays; the middle of the vertices by default
     dynamic         : whether `update` will exchange parts of the mesh
-    backend         : ``embree``; ``embreex``, which needs no more than that package's own interface and gives
-                      the same results at a fifth of the speed; or ``auto``: Embree if it works here
+    backend         : ``embree``; ``embreex``, the package's Python interface with the same results at a fifth
+                      of the speed; or ``auto``: Embree if it is available, else embreex
 
-    Raises InputError for meshes that cannot be cast at and BackendError if Embree does not work here.
+    Raises InputError for an invalid mesh and BackendError if Embree is not available.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Caster:
     ) -> None:
         v, f = checked(vertices, faces)
         self.origin: Float = middle(v) if origin is None else np.array(origin, np.float64)
-        scene = EmbreeScene if _works(backend) else EmbreexScene
+        scene = EmbreeScene if _uses_embree(backend) else EmbreexScene
         self.scene = scene(self.origin, dynamic=dynamic)
         self.instances: tuple[Instances, ...] = ()
         self.update(attach=dict(enumerate(split(v - self.origin, f, mask=mask))), instances=instances)
@@ -88,13 +88,13 @@ class Caster:
         first: Mapping[int, int] = _NUMBERS,
         instances: Sequence[Instances] | None = None,
     ) -> None:
-        """Exchange parts of the mesh, in place; trees of the parts that stay are kept.
+        """Exchange parts of the mesh in place; unchanged parts keep their acceleration structures.
 
-        detach    : numbers of parts to take away
-        attach    : parts to add, relative to ``origin``, by number; the same set of numbered parts gives the
-                    same hits, whatever came and went before
-        first     : numbers of the first faces of parts, by the part's number; as they were by default
-        instances : all copies from now on; as they were by default
+        detach    : numbers of parts to remove
+        attach    : parts to add, relative to ``origin``, by number; hits depend on the present parts and
+                    their numbers only, not on earlier updates
+        first     : numbers of the first faces of parts, by part number; unchanged by default
+        instances : replacement of all instances; unchanged by default
         """
         for number in detach:
             self.scene.detach(number)
@@ -126,11 +126,11 @@ class Caster:
         origins    : (n, 3) or (3,) metres
         directions : (n, 3), any length but zero
         near, far  : bounds of the ray parameter
-        mask       : bits; faces and instances that share none are not there
+        mask       : bits; rays pass faces and instances that share none
         time       : (n,) ray times 0 to 1 within the motion of moving instances; 0 by default
-        order      : (n,) permutation: the order in which neighbouring rays are worked on together. Rays are
-                     fastest where 16 in a row go almost the same way (16 azimuths of one channel, 16 pixels)
-        normals    : whether to fill in `Hits.normal`
+        order      : (n,) permutation, the order in which rays form packets; fastest where 16 rays in a
+                     row are nearly parallel (16 azimuths of one channel, 16 pixels)
+        normals    : whether to compute `Hits.normal`
         threads    : threads to use; the result does not depend on it
 
         Raises InputError for rays that are not finite or have a direction of length zero.
@@ -153,14 +153,14 @@ class Caster:
         normals: bool = False,
         threads: int = 1,
     ) -> Hits:
-        """The first hit of each ray of a sensor that moves; ranges are true metres for unit directions.
+        """The first hit of each ray of a moving sensor; ranges are true metres for unit directions.
 
         poses      : p poses of the sensor
         pose_index : (n,) each ray's row of ``poses``
         directions : (n, 3) unit vectors in the sensor frame
-        offsets    : (n, 3) where each beam starts in the sensor frame, true metres; its zero by default
+        offsets    : (n, 3) start of each beam in the sensor frame, true metres; the frame's origin by default
 
-        ``near`` and ``far`` count from the beam's start in true metres; the rest as for `cast`.
+        ``near`` and ``far`` are true metres from the start of the beam; other parameters as for `cast`.
         """
         rays = posed_rays(poses, pose_index, directions=directions, offsets=offsets)
         rays = limited(rays, near=near, far=far, mask=mask, time=time, order=order)
@@ -177,9 +177,9 @@ class Caster:
         time: ArrayLike | None = None,
         threads: int = 1,
     ) -> NDArray[np.bool_]:
-        """Whether anything lies on each ray (n,) between ``near`` and ``far`` (a number or (n,)).
+        """Whether each ray (n,) hits anything between ``near`` and ``far`` (a number or (n,)).
 
-        Lift the origins of shadow rays off their surface by a millimetre along its normal, or they hit it.
+        Offset the origins of shadow rays by a millimetre along the normal, or they hit their own surface.
         """
         rays = limited(free_rays(origins, directions), near=near, far=far, mask=mask, time=time)
         return self.scene.occluded(rays, threads=threads)

@@ -1,4 +1,4 @@
-"""What compiled kernels are given: rays, and what they are cast at, as tuples of columns."""
+"""Arguments of the compiled kernels: rays and their target as tuples of columns."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 
 COPIES = 256
-"""Numbers of an Embree scene's geometries for copies; those of its mesh follow. A commit looks at all
+"""Geometry numbers below this are for instances, numbers from it on for the mesh. Embree's commit visits all
 numbers up to the highest."""
 
 CHUNK = 8192
-"""Rays that a thread takes at a time; a multiple of every packet width, so that packets stay as they are."""
+"""Rays per unit of work of a thread; a multiple of all packet widths, so that packets never change."""
 
 
 class Target(NamedTuple):
-    """What rays are cast at.
+    """The target of rays.
 
     scene, packet, single : addresses of the Embree scene and of the arguments for packets and for single rays
-    lanes      : as many zeros as rays in a packet: its length is a constant to the compiler
+    lanes      : as many zeros as rays in a packet: their number is a compile-time constant
     origin     : (3,) float64, subtracted from scene coordinates
-    parts      : (p, 5) int64, addresses of a geometry's planes, vertices, faces and face numbers (0: they
-                 count up) and the first number
-    rows       : (g,) int32, row of ``parts`` of Embree's geometry g, if it is one of triangles
-    starts     : (g,) int64, start in ``numbers`` of Embree's geometry g, if it is one of instances
+    parts      : (p, 5) int64, addresses of a geometry's planes, vertices, faces and face numbers (0:
+                 consecutive) and the first number
+    rows       : (g,) int32, row of ``parts`` of Embree's geometry g, if it holds triangles
+    starts     : (g,) int64, start in ``numbers`` of Embree's geometry g, if it holds instances
     numbers    : (k,) int32, instance numbers in Embree's order
     shape      : (k,) int32, first row of ``parts`` of the instance's shape
     first      : (k,) int64, first row of ``transforms``
-    steps      : (k,) int64, rows of ``transforms``; 1 for an instance at rest
-    transforms : (r, 12) float64, caster from instance, each relative to its own origin
+    steps      : (k,) int64, rows of ``transforms``; 1 for a static instance
+    transforms : (r, 12) float64, from instance to caster, each relative to its own origin
     """
 
     scene: int
@@ -52,15 +52,15 @@ class Target(NamedTuple):
 class Rays(NamedTuple):
     """Rays as contiguous columns.
 
-    directions : (n, 3) float64, in the pose's axes where there are poses
-    offsets    : (n, 3) float64, origins in the pose's frame; (1, 3) serves all, (0, 3) is the frame's zero
+    directions : (n, 3) float64, in the axes of the pose if ``pose`` is not empty
+    offsets    : (n, 3) float64, origins in the pose's frame; (1, 3) for all rays, (0, 3) for zero
     pose       : (n,) int64, row of the poses; empty: directions and offsets are in the caster's frame
     position   : (p, 3) float64, of the poses
     matrix     : (p, 3, 3) float64, scale * rotation of the poses (see `lidar.geometry.poses.Poses`)
-    order      : (n,) int64, order of work; empty: as they come
+    order      : (n,) int64, order of work; empty: as given
     time       : (n,) float32, ray times; empty: all 0
     near       : ray parameter
-    far        : (n,) float64, ray parameter; (1,) serves all
+    far        : (n,) float64, ray parameter; (1,) for all rays
     mask       : bits
     """
 

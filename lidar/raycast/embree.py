@@ -1,4 +1,4 @@
-"""Embree scenes: triangles and copies of them, and what kernels need to know about both."""
+"""Embree scenes of triangles and instances, and their tables for the kernels."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _arguments(flags: int = 0) -> NDArray[np.int64]:
 
 
 class _Group(NamedTuple):
-    """Copies of scenes' geometries: where they are, relative to the scene's origin, in so many geometries."""
+    """A group of instances, its transforms relative to the scene's origin, and its number of geometries."""
 
     copies: Instances
     shapes: Sequence[EmbreeScene]
@@ -55,15 +55,15 @@ class _Group(NamedTuple):
 
 
 class EmbreeScene:
-    """An Embree scene of geometries, by number, and of copies of other scenes' geometries.
+    """An Embree scene of numbered geometries and of instances of other scenes.
 
-    Changes take effect with `commit`, which builds anew only what was attached or placed since: geometries
-    that stay keep their trees (Embree's dynamic scenes have a tree for each, and merge the tops).
+    Changes take effect with `commit`, which rebuilds only what was attached or placed since: in a dynamic
+    scene Embree keeps a tree per geometry and merges their tops.
 
-    origin  : (3,) float64, what the geometries' vertices are relative to
-    dynamic : whether geometries come and go
+    origin  : (3,) float64, origin of the geometries' vertices
+    dynamic : whether geometries are attached and detached later
 
-    Raises BackendError if Embree is not to be had or refuses.
+    Raises BackendError if Embree is not available or reports an error.
     """
 
     def __init__(self, origin: Float, *, dynamic: bool = False) -> None:
@@ -73,7 +73,7 @@ class EmbreeScene:
         weakref.finalize(self, self._lib.embree.rtcReleaseScene, self.address)
         self._lib.call("rtcSetSceneFlags", self.address, ROBUST | (DYNAMIC if dynamic else 0))
         if dynamic:
-            # Only in scenes of low quality does Embree keep a tree for each geometry; those are made well.
+            # Embree keeps a tree per geometry only in low-quality scenes; the trees have medium quality.
             self._lib.call("rtcSetSceneBuildQuality", self.address, LOW)
         self.parts: dict[int, Geometry] = {}
         self._copies: list[NDArray[np.intp]] = []
@@ -88,7 +88,7 @@ class EmbreeScene:
         self._lib.call("rtcReleaseGeometry", geometry)
 
     def attach(self, number: int, part: Geometry) -> None:
-        """Add a geometry under a free number. Trees depend on the numbers, not on the order of attaching."""
+        """Add a geometry under a free number. Results depend on the numbers, not on the order of calls."""
         self.parts[number] = part
         if len(part) == 0:
             return
@@ -105,9 +105,9 @@ class EmbreeScene:
             self._lib.call("rtcDetachGeometry", self.address, COPIES + number)
 
     def place(self, groups: Sequence[Instances], scenes: Sequence[Sequence[EmbreeScene]]) -> None:
-        """Replace all copies; ``scenes`` holds each group's shapes. The first groups, if the same, are kept.
+        """Replace all instances; ``scenes`` holds each group's shapes. Unchanged leading groups are kept.
 
-        Raises InputError for too many masks.
+        Raises InputError for more than `COPIES` masks.
         """
         kept = 0
         while kept < min(len(groups), len(self._groups)) and groups[kept] is self._groups[kept].copies:
@@ -125,7 +125,7 @@ class EmbreeScene:
             mask = np.full(len(group), INVALID, np.uint32) if group.mask is None else group.mask
             masks = np.unique(mask)
             if len(self._copies) + len(masks) > COPIES:
-                raise InputError(f"copies have more than {COPIES} different masks")
+                raise InputError(f"instances have more than {COPIES} different masks")
             for bits in masks:
                 rows = np.flatnonzero(mask == bits)
                 self._attach(
@@ -139,9 +139,9 @@ class EmbreeScene:
     def _copy(
         self, shapes: Sequence[EmbreeScene], shape: NDArray[np.int32], *, placed: Float, mask: int
     ) -> int:
-        """An Embree geometry of copies with one mask."""
+        """Address of an Embree geometry of instances with one mask."""
         lib = self._lib
-        if len(shape) == 1:  # of an array of one, Embree takes the first shape whatever its index
+        if len(shape) == 1:  # for a single instance Embree ignores the shape index and takes the first
             shapes, shape = [shapes[int(shape[0])]], np.zeros(1, np.int32)
         copies: int = lib.call("rtcNewGeometry", lib.device, INSTANCE_ARRAY)
         addresses = (c.c_void_p * len(shapes))(*(one.address for one in shapes))
@@ -156,11 +156,11 @@ class EmbreeScene:
         return copies
 
     def commit(self) -> None:
-        """Build what changed and tell the kernels."""
+        """Rebuild what changed, and the tables for the kernels."""
         self._lib.call("rtcCommitScene", self.address)
         numbers = sorted(self.parts)
         parts = [self.parts[number] for number in numbers]
-        # Columns must live as long as their addresses.
+        # Keep the columns alive while the kernels use their addresses.
         self._own = parts, np.array([_addresses(part) for part in parts], np.int64).reshape(-1, 5)
         kept = [self._own]
         rows = np.zeros(COPIES + max(self.parts, default=-1) + 1, np.int32)
@@ -206,7 +206,7 @@ class EmbreeScene:
         return hits
 
     def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:
-        """Whether anything lies on each ray."""
+        """Whether each ray hits anything."""
         out, target = np.empty(len(rays.directions), np.bool_), self.target
         share(lambda lo, hi: int(kernels.occluded(target, rays, lo, hi, out)), rays, threads=threads)
         return out

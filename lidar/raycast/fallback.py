@@ -1,8 +1,7 @@
-"""Rays through embreex's own interface: the same results, slower, for when Embree itself is out of reach.
+"""Ray casting through embreex's Python interface: the same results, slower, without Embree.
 
-embreex casts single float32 rays at triangles and knows neither masks nor copies: copies at rest are written
-out as triangles, faces that a mask hides are left out of a scene of their own, and things that move are cast
-at one by one in their own frames.
+embreex casts single float32 rays at triangles without masks and instances. Static instances are expanded into
+triangles, each mask gets a scene without its hidden faces, and moving instances are tested in their frames.
 """
 
 from __future__ import annotations
@@ -61,14 +60,14 @@ def _mesh(parts: dict[int, Geometry]) -> _Soup:
 
 
 class _Body:
-    """Triangles that stand still in some frame, castable with embreex."""
+    """Static triangles in one frame, castable with embreex."""
 
     def __init__(self, soup: _Soup) -> None:
         from embreex.mesh_construction import TriangleMesh  # noqa: PLC0415
         from embreex.rtcore_scene import EmbreeScene  # noqa: PLC0415
 
         self.soup = soup
-        self._seen: dict[int, _Body] = {}
+        self._by_mask: dict[int, _Body] = {}
         a, b, c = (soup.corners[:, k] for k in range(3))
         self.normal = np.cross(b - a, c - a)
         self._scene: Any = None
@@ -76,31 +75,31 @@ class _Body:
             self._scene = EmbreeScene()
             TriangleMesh(self._scene, soup.corners.astype(np.float32))
 
-    def seen(self, mask: int) -> _Body:
-        """The part of the body that a mask shows."""
+    def visible(self, mask: int) -> _Body:
+        """The body without the faces that a mask hides."""
         shown = (self.soup.mask & np.uint32(mask)) != 0
         if shown.all():
             return self
-        if mask not in self._seen:
-            self._seen[mask] = _Body(self.soup.take(shown))
-        return self._seen[mask]
+        if mask not in self._by_mask:
+            self._by_mask[mask] = _Body(self.soup.take(shown))
+        return self._by_mask[mask]
 
-    def met(self, o: Float, d: Float, *, near: float, far: Float, turned: bool) -> NDArray[np.int64]:
-        """Rows of the triangles that rays meet first, -1 for none."""
+    def first_hits(self, o: Float, d: Float, *, near: float, far: Float, turned: bool) -> NDArray[np.int64]:
+        """Rows (n,) of the triangles that rays hit first; -1 for a miss."""
         if self._scene is None:
             return np.full(len(d), -1)
         length = np.linalg.norm(d, axis=1)
         unit = d / length[:, None]
         if turned:
             unit[np.arange(len(d)), np.argmin(np.abs(unit), axis=1)] += _NUDGE
-        # The bounds are written over with the ranges found, so they must be a copy; unbounded is 1e37.
+        # embreex overwrites the bounds with ranges, so they must be a copy; 1e37 is unbounded.
         reach = np.minimum((far - near) * length * (1 + 2.0**-23), 1e37).astype(np.float32)
         start = (o + near * d).astype(np.float32)
         found = self._scene.run(start, unit.astype(np.float32), dists=reach, query="INTERSECT", output=1)
         return np.asarray(found["primID"], np.int64)
 
     def at(self, rows: NDArray[np.int64], o: Float, *, d: Float) -> tuple[Float, Float, Float]:
-        """Range, cosine and normal (not unit) of rays that meet triangles; inf, 0 and 0 for row -1."""
+        """Range, cosine and normal (not unit) where rays hit triangles; inf, 0 and 0 for row -1."""
         t, cosine = np.full(len(d), np.inf), np.zeros(len(d))
         normal = np.zeros((len(d), 3))
         hit = np.flatnonzero(rows >= 0)
@@ -111,7 +110,7 @@ class _Body:
         steep = np.abs(cosine[hit]) > 0
         gap = np.einsum("ij,ij->i", n, corners[:, 0] - o[hit])
         t[hit] = np.divide(gap, along, out=np.zeros_like(along), where=steep)
-        # At a grazing angle the range is held within the face's extent along the ray.
+        # At grazing incidence the range is clipped to the face's extent along the ray.
         extent = (
             np.einsum("ikj,ij->ik", corners - o[hit, None], d[hit])
             / np.einsum("ij,ij->i", d[hit], d[hit])[:, None]
@@ -124,7 +123,7 @@ class _Body:
 
 @dataclass(frozen=True, slots=True)
 class _Mover:
-    """A thing that moves: its instance number, body and transforms (s, 3, 4) over ray times 0 to 1."""
+    """A moving instance: its number, mask, body and transforms (s, 3, 4) over ray times 0 to 1."""
 
     instance: int
     mask: int
@@ -142,7 +141,7 @@ class _Mover:
 
 
 class EmbreexScene:
-    """The interface of `lidar.raycast.embree.EmbreeScene`, by way of embreex."""
+    """Same interface as `lidar.raycast.embree.EmbreeScene`, through embreex."""
 
     def __init__(self, origin: Float, *, dynamic: bool = False) -> None:  # noqa: ARG002
         self.origin = origin
@@ -164,15 +163,15 @@ class EmbreexScene:
         groups: Sequence[Instances],
         scenes: Sequence[Sequence[Any]],
     ) -> None:
-        """Replace all copies; ``scenes`` holds each group's shapes."""
+        """Replace all instances; ``scenes`` holds the shapes of each group."""
         self._groups = list(zip(groups, scenes, strict=True))
 
     def commit(self) -> None:
-        """Write the copies at rest out and note those that move."""
+        """Expand the static instances into triangles and collect the moving ones."""
         soups, self._movers, start = [_mesh(self.parts)], [], 0
         for group, shapes in self._groups:
             if any(not isinstance(shape, EmbreexScene) for shape in shapes):
-                raise BackendError("shapes that are copied need the backend of the caster that copies them")
+                raise BackendError("instances and their shapes need the same backend")
             masks = np.full(len(group), ALL, np.uint32) if group.mask is None else group.mask
             meshes = [_mesh(shape.parts) for shape in shapes]
             for k, (which, matrix, bits) in enumerate(zip(group.shape, group.transform, masks, strict=True)):
@@ -190,11 +189,11 @@ class EmbreexScene:
         self._rest = _Body(_joined(soups))
 
     def _views(self, rays: Rays, o: Float, *, d: Float) -> list[tuple[_Body, Float, Float, Float]]:
-        """Bodies that rays can see, with the rays' origins and directions and the axes of their normals."""
-        views = [(self._rest.seen(rays.mask), o, d, np.broadcast_to(np.eye(3), (len(d), 3, 3)))]
+        """Bodies visible to rays, each with the rays' origins, directions and normal matrices."""
+        views = [(self._rest.visible(rays.mask), o, d, np.broadcast_to(np.eye(3), (len(d), 3, 3)))]
         for mover in self._movers:
             if mover.mask & rays.mask:
-                body = mover.body.seen(rays.mask)
+                body = mover.body.visible(rays.mask)
                 M = mover.frames(rays.time, len(d))
                 back = np.linalg.inv(M[:, :, :3])
                 local = np.einsum("nij,nj->ni", back, o - M[:, :, 3])
@@ -213,7 +212,7 @@ class EmbreexScene:
         for turned in (False, True):
             todo = np.flatnonzero((face < 0) | (cosine < 0)) if turned else np.arange(n)
             for body, local, way, axes in views:
-                rows = body.met(local[todo], way[todo], near=rays.near, far=far[todo], turned=turned)
+                rows = body.first_hits(local[todo], way[todo], near=rays.near, far=far[todo], turned=turned)
                 t, c, m = body.at(rows, local[todo], d=way[todo])
                 m = np.einsum("nij,nj->ni", axes[todo], m)
                 length = np.linalg.norm(m, axis=1) * np.linalg.norm(d[todo], axis=1)
@@ -233,5 +232,5 @@ class EmbreexScene:
         return Hits(best, face, instance, cosine.astype(np.float32), unit)
 
     def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:
-        """Whether anything lies on each ray."""
+        """Whether each ray hits anything."""
         return self.cast(rays, normals=False, threads=threads).face >= 0

@@ -1,4 +1,4 @@
-"""What rays are cast against: triangles with their planes, and copies of them."""
+"""Targets of rays: triangles with their planes, and instances of them."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ if TYPE_CHECKING:
 
 
 ALL = 0xFFFFFFFF
-"""The mask that sees every face."""
+"""The mask that includes every face."""
 
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Triangles that rays see alike, ready to be cast at.
+    """Triangles with one mask, and their planes.
 
     vertices : (n, 3) float64, metres, relative to the caster's origin
     faces    : (m, 3) int32
-    planes   : (m, 4) float64: unit normal n and offset d of each face; n @ x = d on it. Zero without area
-    numbers  : (m,) int32, what `Hits.face` calls each face, less ``first``; empty: they count up
+    planes   : (m, 4) float64: unit normal n and offset d of each face; n @ x = d on it; zeros for zero area
+    numbers  : (m,) int32, `Hits.face` of each face minus ``first``; empty: consecutive
     first    : number of the first face
-    mask     : bits of which a ray's mask must share one
+    mask     : bits; rays hit the faces if their masks share one
     """
 
     vertices: Float
@@ -44,14 +44,14 @@ class Geometry:
 
 
 def middle(vertices: Float) -> Float:
-    """The whole metres (3,) nearest the middle of vertices (n, 3): an origin for them."""
+    """Centre (3,) of the extent of vertices (n, 3), rounded to metres: an origin for them."""
     return np.round((vertices.min(axis=0) + vertices.max(axis=0)) / 2) if len(vertices) else np.zeros(3)
 
 
 def checked(vertices: ArrayLike, faces: ArrayLike) -> tuple[Float, NDArray[np.int32]]:
     """Vertices (n, 3) float64 and faces (m, 3) int32, contiguous.
 
-    Raises InputError for vertices that are not finite and faces that name vertices there are not.
+    Raises InputError for vertices that are not finite and for vertex numbers out of range.
     """
     v = np.ascontiguousarray(vertices, np.float64).reshape(-1, 3)
     f = np.ascontiguousarray(faces, np.int32).reshape(-1, 3)
@@ -76,9 +76,9 @@ def planes(vertices: Float, faces: NDArray[np.int32]) -> Float:
 
 
 def split(vertices: Float, faces: NDArray[np.int32], *, mask: ArrayLike | None = None) -> list[Geometry]:
-    """Geometries of checked vertices, relative to the origin, and faces: one for each mask that occurs.
+    """Geometries of checked vertices and faces, relative to the origin: one for each distinct mask.
 
-    mask : (m,) bits, or one for all; all bits by default
+    mask : (m,) bits, or one number for all faces; all bits by default
     """
     bits = np.broadcast_to(np.asarray(ALL if mask is None else mask, np.uint32), (len(faces),))
     found = np.unique(bits)
@@ -98,15 +98,14 @@ def split(vertices: Float, faces: NDArray[np.int32], *, mask: ArrayLike | None =
 
 @dataclass(frozen=True, slots=True)
 class Instances:
-    """Copies of other casters' meshes, at rest or moving.
+    """Instances of other casters' meshes, static or moving.
 
-    shapes    : the casters that are copied (without instances of their own)
+    shapes    : the instanced casters (without instances of their own)
     shape     : (k,) int32, index into ``shapes``
-    transform : (k, 3, 4) float64, caster's coordinates from the shape's: rotation and scale, then shift;
-                or (k, s, 3, 4): the transform at s >= 2 moments evenly spaced over ray times 0 to 1, linear
-                between neighbours
-    mask      : (k,) uint32, bits of which a ray's mask must share one to see the copy, or None for all bits;
-                the face's own mask counts as well
+    transform : (k, 3, 4) float64, from shape to caster: rotation and scale, then translation; or
+                (k, s, 3, 4): at s >= 2 times evenly spaced over ray times 0 to 1, linear in between
+    mask      : (k,) uint32, bits; rays hit an instance if their masks share one, and one with the face; None:
+                all bits
     """
 
     shapes: tuple[Caster, ...]
@@ -115,7 +114,7 @@ class Instances:
     mask: NDArray[np.uint32] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse columns that disagree, and shapes and transforms that cannot be cast at."""
+        """Check the columns' lengths, the transforms and the shapes."""
         k = len(self.shape)
         if self.transform.shape[:1] != (k,) or self.transform.shape[-2:] != (3, 4):
             raise InputError(f"{k} instances need transforms ({k}, 3, 4), not {self.transform.shape}")
@@ -126,12 +125,12 @@ class Instances:
         if not np.isfinite(self.transform).all():
             raise InputError("an instance has a transform that is not finite")
         if k and not (self.shape.min() >= 0 and self.shape.max() < len(self.shapes)):
-            raise InputError(f"an instance names a shape beyond the {len(self.shapes)} there are")
+            raise InputError(f"an instance has a shape number beyond the {len(self.shapes)} shapes")
         if self.mask is not None and len(self.mask) != k:
             raise InputError(f"{len(self.mask)} masks for {k} instances")
         if any(len(shape.instances) for shape in self.shapes):
-            raise InputError("a shape that is copied cannot hold instances of its own")
+            raise InputError("a shape of instances cannot have instances itself")
 
     def __len__(self) -> int:
-        """Number of copies."""
+        """Number of instances."""
         return len(self.shape)

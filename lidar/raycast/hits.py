@@ -16,10 +16,10 @@ class Hits:
                from `Poses.directions`); inf for a miss
     face     : (n,) int32, face in the caster's mesh, or in the mesh of the instance's shape; -1 for a miss
     instance : (n,) int32, instance that was hit; -1 for the caster's own mesh and for a miss
-    cosine   : (n,) float32, cosine between the face's normal and the way back along the ray: positive on the
-               side from which the face's corners run counter-clockwise, negative on its back; 0 for a miss
+    cosine   : (n,) float32, cosine of the incidence angle: positive on the front (counter-clockwise corners),
+               negative on the back; 0 for a miss
     normal   : (n, 3) float64, the face's unit normal in the caster's axes, zero for a miss; (0, 3) unless
-               asked for
+               requested
     """
 
     range: NDArray[np.float64]

@@ -1,11 +1,11 @@
-"""Compiled loops between the caller's rays and Embree: packets out, float64 ranges back. All release the GIL.
+"""Compiled loops that trace packets of rays with Embree and compute float64 ranges. All release the GIL.
 
-Embree traces in float32; a hit tells which face was met, and the range is computed again in float64 from that
-face's plane. In robust mode no ray passes between two faces at their shared edge, but about 0.3 % of the rays
-aimed exactly at a vertex do. Such a ray misses, or meets the back of a face: it is traced once more with its
-direction turned a little, and a nearer front face counts. Such rays wait until they fill a packet.
+Embree traces in float32 and identifies the face; the range is then computed in float64 from the plane of that
+face. In robust mode no ray passes between two faces at their shared edge, but about 0.3 % of the rays aimed
+exactly at a vertex do. A ray that misses or hits the back of a face is therefore retried with a perturbed
+direction, and a nearer front face is accepted. Rays to retry are buffered until they fill a packet.
 
-Work on a packet goes step by step over all its lanes, arithmetic on all at once (`lidar.raycast.lanes`).
+Each step processes all lanes of a packet, with vector arithmetic (`lidar.raycast.lanes`).
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ def _normal(out: Float, i: int, x: float, y: float, z: float) -> None:
 
 
 @inlined
-def _name(target: Target, W: int, u: Any, work: Any, faces: Any, instances: Any) -> None:
-    """Planes and numbers of what lanes met; a lane that met nothing has a plane without a normal."""
+def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: Any) -> None:
+    """Write planes, faces and instances of the lanes' hits; a miss gets a plane with a zero normal."""
     for k in range(W):
         work[SCALE * W + k] = work[INVERSE * W + k]
     geometry, copies = u.ctypes.data + 4 * HIT_GEOMETRY * W, u.ctypes.data + 4 * HIT_INSTANCE * W
     own = u[HIT_GEOMETRY * W] != INVALID and u[HIT_INSTANCE * W] == INVALID
     if own and same(target.lanes, geometry) and same(target.lanes, copies):
-        # The common case, all lanes on one mesh, without looking up for each what holds for all.
+        # The common case, all lanes on one mesh: look up the mesh once.
         part = target.parts.ctypes.data + 40 * np.int64(target.rows[u[HIT_GEOMETRY * W]])
         planes, numbers, first = int64_at(part, 0), int64_at(part, 3), int64_at(part, 4)
         for k in range(W):
@@ -106,7 +106,7 @@ def _name(target: Target, W: int, u: Any, work: Any, faces: Any, instances: Any)
 
 
 @inlined
-def _second(
+def _retry(
     target: Target,
     near: float,
     m: int,
@@ -121,7 +121,7 @@ def _second(
     cosines: Any,
     normals: Any,
 ) -> None:
-    """Trace m rays once more, turned a little, and keep what they meet if it is nearer."""
+    """Retry m rays with perturbed directions and keep nearer hits."""
     W = len(target.lanes)
     u = f.view(np.uint32)
     for k in range(W):
@@ -162,9 +162,9 @@ def cast(
     cosines: NDArray[np.float32],
     normals: Float,
 ) -> Any:
-    """Cast the rays lo to hi of the order into the columns of `Hits`; the first bad ray's number, or -1.
+    """Cast rays lo to hi of the order into the columns of `Hits`; returns the first invalid ray, or -1.
 
-    No normals are written if ``normals`` is empty. Packets start at lo and every width from it.
+    No normals are written if ``normals`` is empty. Packets are consecutive from lo.
     """
     W = len(target.lanes)
     packet = aligned(4 * PACKET_ROWS * W)
@@ -187,7 +187,7 @@ def cast(
         for k in range(m, W):
             valid[k] = 0
         trace(target, W, PACKET_ROWS, f, valid, alike(W, work), one)
-        _name(target, W, u, work, face, instance)
+        _identify(target, W, u, work, face, instance)
         settled = cross(target.lanes, work.ctypes.data)
         if m == W and not rays.order.size:
             exact = work.ctypes.data + 8 * RANGE * W
@@ -222,7 +222,7 @@ def cast(
                 late[r * 2 * W + waiting] = work[r * W + k]
             doubtful[waiting] = i
             waiting += 1
-        # Threads take chunks: at the end of each, nothing waits, so that their number changes no packet.
+        # The buffer is emptied at the end of each chunk, so that the number of threads changes no packet.
         last = hi - at <= W or (at - lo + W) % CHUNK == 0
         while waiting >= W or (last and waiting > 0):
             n = min(W, waiting)
@@ -230,9 +230,7 @@ def cast(
                 for r in range(RAY_ROWS):
                     work[r * W + k] = late[r * 2 * W + min(k, n - 1)]
                 ids[k] = doubtful[min(k, n - 1)]
-            _second(
-                target, rays.near, n, work, ids, f, valid, one, ranges, faces, instances, cosines, normals
-            )
+            _retry(target, rays.near, n, work, ids, f, valid, one, ranges, faces, instances, cosines, normals)
             for k in range(W):
                 doubtful[k] = doubtful[W + k]
                 for r in range(RAY_ROWS):
@@ -243,7 +241,7 @@ def cast(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_]) -> Any:
-    """Fill in whether anything lies on the rays lo to hi; the first bad ray's number, or -1."""
+    """Write whether rays lo to hi hit anything; returns the first invalid ray, or -1."""
     W = len(target.lanes)
     packet = aligned(4 * PACKET_RAY_ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)

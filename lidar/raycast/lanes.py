@@ -1,8 +1,8 @@
-"""Arithmetic on all lanes of a packet at once: vector instructions written out.
+"""Arithmetic on all lanes of a packet as explicit vector instructions.
 
-A packet's numbers are rows of float64, one number a lane, end to end; `lidar.raycast.packets` names them.
-Left to itself the compiler widens loops over lanes here and not there, as its estimate of their cost falls.
-Each function takes a tuple with an item for each lane, which makes their number a constant.
+A packet is a sequence of float64 rows with one number per lane; `lidar.raycast.rows` names the rows. The
+compiler does not vectorise loops over lanes reliably. Each function takes a tuple with an item per lane:
+its length is a compile-time constant.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from numba.extending import intrinsic
 from lidar.raycast.rows import COSINE, DX, DY, DZ, FAR, NX, NY, NZ, OFFSET, OX, OY, OZ, RANGE, RAY_DX, SCALE
 
 GRAZING = 1e-3
-"""Cosine below which a range is held within the face's extent along the ray."""
+"""Cosine below which a range is clipped to the face's extent along the ray."""
 HUGE = 1e100
-"""Squared lengths and coordinates from here on cannot be cast."""
+"""Rays with squared lengths or coordinates from this on are invalid."""
 UNIT = 1e-12
-"""How far the squared length of a unit vector may be from 1."""
+"""Tolerance of the squared length of a unit vector."""
 
 _DOUBLE, _FLOAT, _INT = ir.DoubleType(), ir.FloatType(), ir.IntType(32)
 
 
 class _Row:
-    """A row's numbers in code that is being built."""
+    """A row of numbers in generated code."""
 
     def __init__(self, builder: Any, value: Any) -> None:
         self.builder, self.value = builder, value
@@ -54,7 +54,7 @@ class _Row:
         return _Row(self.builder, self.builder.call(function, [self.value]))
 
     def all(self, relation: str, other: _Row) -> Any:
-        """Whether the relation holds in every lane; it does not where a number is NaN."""
+        """Whether the relation holds in every lane; false if a number is NaN."""
         flags = self.builder.fcmp_ordered(relation, self.value, other.value)
         bits = ir.IntType(flags.type.count)
         whole = ir.Constant(bits, 2**flags.type.count - 1)
@@ -62,7 +62,7 @@ class _Row:
 
 
 class _Rows:
-    """Rows of numbers from an address on, end to end, in code that is being built."""
+    """Contiguous rows of numbers at an address in generated code."""
 
     def __init__(self, builder: Any, lanes: Any, *, address: Any, kind: Any = _DOUBLE) -> None:
         self.builder, self.lanes, self.kind = builder, lanes.count, ir.VectorType(kind, lanes.count)
@@ -82,7 +82,7 @@ class _Rows:
         self.builder.store(value, self._place(row), align=self.size)
 
     def same(self, number: Any) -> _Row:
-        """A row of one number, a constant or a value of the code."""
+        """A row filled with one number, a constant or a value of the generated code."""
         if isinstance(number, float):
             return _Row(self.builder, ir.Constant(self.kind, [number] * self.lanes))
         one = self.builder.insert_element(ir.Constant(self.kind, ir.Undefined), number, ir.Constant(_INT, 0))

@@ -1,4 +1,4 @@
-"""Embree 4 as the embreex wheel brings it: found, checked and typed. No compiler is needed."""
+"""Embree 4 from the embreex wheel: loaded, checked and typed. No compiler is needed."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ _PROTOTYPES: dict[str, tuple[Any, ...]] = {
 
 @dataclass(frozen=True)
 class Library:
-    """The library with one device of it.
+    """The loaded library and a device.
 
     embree : the loaded library, functions typed
     device : address of the device
-    width  : widest packet the processor has registers for: 16, 8 or 4, else 1
+    width  : widest packet that the processor supports: 16, 8 or 4, else 1
     """
 
     embree: c.CDLL
@@ -65,7 +65,7 @@ class Library:
     width: int
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """What an Embree function returns; raises BackendError if Embree reports an error."""
+        """The result of an Embree function; raises BackendError if Embree reports an error."""
         result = getattr(self.embree, name)(*arguments)
         if error := self.embree.rtcGetDeviceError(self.device):
             raise BackendError(f"Embree: {name} failed with error {error}")
@@ -80,7 +80,7 @@ def _path() -> Path:
     folders = (package.with_name("embreex.libs"), package / ".dylibs", package)
     found = sorted(p for folder in folders for p in folder.glob("*embree4*") if p.suffix != ".py")
     if not found:
-        raise BackendError(f"no Embree 4 library in or beside {package}")
+        raise BackendError(f"no Embree 4 library in or next to {package}")
     return found[0]
 
 
@@ -88,7 +88,7 @@ def _path() -> Path:
 def library() -> Library:
     """The library, loaded and checked once in a process.
 
-    Raises BackendError if it is missing, not of version 4, or misses a ray whose hit is known.
+    Raises BackendError if it is missing, not of version 4, or gives a wrong result for a test ray.
     """
     path = _path()
     try:
@@ -99,14 +99,14 @@ def library() -> Library:
         _publish(embree)
     except (OSError, AttributeError) as error:
         raise BackendError(f"{path.name}: not a usable Embree 4 library ({error})") from error
-    # One build thread: the order of triangles in the tree, and so which of two faces wins at a shared edge,
-    # does not depend on the machine; and nothing but the caller's threads has to survive a fork.
+    # With one build thread the order of triangles in the tree, and so the face hit at a shared edge, does not
+    # depend on the machine, and no threads are lost in a fork.
     device = embree.rtcNewDevice(b"threads=1,start_threads=0")
     if not device:
         raise BackendError(f"{path.name}: no device (error {embree.rtcGetDeviceError(None)})")
     version = embree.rtcGetDeviceProperty(device, _VERSION)
     if version // 10000 != 4:
-        raise BackendError(f"{path.name}: Embree version {version}, this program drives version 4.x")
+        raise BackendError(f"{path.name}: Embree version {version}; version 4.x is needed")
     width = next((w for w, code in _PACKETS if embree.rtcGetDeviceProperty(device, code)), 1)
     loaded = Library(embree, device, width)
     _check(loaded)
@@ -114,7 +114,7 @@ def library() -> Library:
 
 
 def _publish(embree: c.CDLL) -> None:
-    """Make the tracing functions known to numba by name, so that compiled kernels can be cached on disk."""
+    """Register the tracing functions with numba by name, so that compiled kernels can be cached on disk."""
     import llvmlite.binding as llvm  # noqa: PLC0415
 
     for name in _TRACERS:
@@ -122,14 +122,14 @@ def _publish(embree: c.CDLL) -> None:
 
 
 def fill(lib: Library, geometry: int, *, kind: int, slot: int, form: int, rows: np.ndarray[Any, Any]) -> None:
-    """Give a geometry a buffer of its own with the rows (n, ...) of a contiguous array."""
+    """Copy the rows (n, ...) of a contiguous array into a new buffer of a geometry."""
     size = rows.itemsize * (rows.size // len(rows))
     target = lib.call("rtcSetNewGeometryBuffer", geometry, kind, slot, form, size, len(rows))
     c.memmove(target, rows.ctypes.data, rows.nbytes)
 
 
 def _check(lib: Library) -> None:
-    """Cast one ray at the second copy of a triangle and compare every field with what must come back."""
+    """Cast one ray at the second instance of a triangle and compare every field with the known hit."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     shape, top = (lib.call("rtcNewScene", lib.device) for _ in range(2))
     triangle = lib.call("rtcNewGeometry", lib.device, TRIANGLE)
@@ -156,4 +156,4 @@ def _check(lib: Library) -> None:
         lib.call("rtcReleaseScene", scene)
     hit = (float(ray.view(np.float32)[8]), *(int(v) for v in ray[17:21]))
     if hit != (2.0, 1, 0, 0, 1):
-        raise BackendError(f"Embree answers a known ray with {hit} instead of (2.0, 1, 0, 0, 1)")
+        raise BackendError(f"Embree returns {hit} for a test ray instead of (2.0, 1, 0, 0, 1)")

@@ -1,4 +1,4 @@
-"""Raw memory and Embree's functions as compiled code reaches them."""
+"""Access of compiled code to raw memory and to Embree's functions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _packets: list[Any] = [
     for width in (4, 8, 16)
 ]
 intersect4, intersect8, intersect16, occluded4, occluded8, occluded16 = _packets
-"""Embree's tracing functions, by the names that `lidar.raycast.library` publishes; all arguments are
+"""Embree's tracing functions, by the names that `lidar.raycast.library` registers; all arguments are
 addresses."""
 
 
@@ -38,7 +38,7 @@ float64_at = _loader(types.float64, 8)
 float32_at = _loader(types.float32, 4)
 int64_at = _loader(types.int64, 8)
 int32_at = _loader(types.int32, 4)
-"""The number at an index of a column whose address is given."""
+"""The number at an index of the column at an address."""
 
 
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}
@@ -53,15 +53,15 @@ def aligned(size: int) -> Any:
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """The function compiled into its callers, and without counting references to its arrays.
+    """The function inlined into its callers, without reference counting of arrays.
 
-    The caller holds the arrays; counting references for every ray takes ten times as long as the rest.
+    The caller holds the arrays; counting references for every ray would take ten times as long as the rest.
     """
     return njit(nogil=True, error_model="numpy", forceinline=True, **_UNCOUNTED)(function)
 
 
 def called(function: Callable[..., Any]) -> Any:
-    """The function compiled for callers who seldom need it; it too leaves references uncounted."""
+    """The function compiled out of line, for rare cases, without reference counting of arrays."""
     return njit(nogil=True, error_model="numpy", **_UNCOUNTED)(function)
 
 

@@ -45,10 +45,10 @@ from lidar.raycast.rows import (
     TIME,
 )
 
-_NUDGE = 3e-7  # radians; the smallest that closed every leak among a million rays aimed at vertices
+_NUDGE = 3e-7  # radians; the smallest that closed all leaks of a million rays aimed at vertices
 _COHERENT = 0.985  # cosine; packets that fan out over more than 10° are faster as single rays
-_SPREAD = 4.0  # metres; so are packets whose origins lie farther apart
-_UP = 1.0 + 2.0**-23  # what lifts a float64 above the float32 it is rounded to
+_SPREAD = 4.0  # metres; likewise packets whose origins lie farther apart
+_UP = 1.0 + 2.0**-23  # factor that compensates rounding down to float32
 
 
 @inlined
@@ -64,7 +64,7 @@ def _posed(pose: Any, p: int, x: float, y: float, z: float) -> Any:
 
 @inlined
 def _shorten(W: int, k: int, work: Any, f: Any) -> None:
-    """Give lane k of Embree's packet a direction of length 1."""
+    """Normalise the direction of lane k of Embree's packet."""
     x, y, z = work[DX * W + k], work[DY * W + k], work[DZ * W + k]
     length = np.sqrt(x * x + y * y + z * z)
     inverse = 1.0 / length
@@ -76,7 +76,7 @@ def _shorten(W: int, k: int, work: Any, f: Any) -> None:
 
 @inlined
 def first_bad(W: int, ids: Any, work: Any) -> int:
-    """The first ray of the lanes that cannot be cast."""
+    """The first invalid ray of the lanes, or -1."""
     for k in range(W):
         x, y, z = work[DX * W + k], work[DY * W + k], work[DZ * W + k]
         squared = x * x + y * y + z * z
@@ -88,9 +88,9 @@ def first_bad(W: int, ids: Any, work: Any) -> int:
 
 @inlined
 def gather(target: Target, rays: Rays, at: int, m: int, lanes: Any, ids: Any, work: Any, f: Any) -> bool:
-    """Load rays ``at`` to ``at + m`` of the order, the last again in lanes left over; whether all will do.
+    """Load rays ``at`` to ``at + m`` of the order; spare lanes repeat the last. Whether all are valid.
 
-    Embree's packet ``f`` gets directions of length 1 and far rounded up.
+    Embree's packet ``f`` gets unit directions and far rounded up.
     """
     W = len(lanes)
     ordered, posed, timed, reach = rays.order.size, rays.pose.size, rays.time.size, rays.far.size > 1
@@ -148,7 +148,7 @@ def gather(target: Target, rays: Rays, at: int, m: int, lanes: Any, ids: Any, wo
 
 @inlined
 def nudge(W: int, k: int, work: Any, f: Any, far: float) -> None:
-    """Turn the direction of lane k of Embree's packet a little and let it look as far as ``far``."""
+    """Perturb the direction of lane k of Embree's packet and set its far."""
     inverse = work[INVERSE * W + k]
     x, y, z = work[DX * W + k] * inverse, work[DY * W + k] * inverse, work[DZ * W + k] * inverse
     if abs(x) <= abs(y) and abs(x) <= abs(z):
@@ -163,7 +163,7 @@ def nudge(W: int, k: int, work: Any, f: Any, far: float) -> None:
 
 @inlined
 def alike(W: int, work: Any) -> bool:
-    """Whether a sample of the lanes goes the same way from about the same place: a scan, not a shuffle."""
+    """Whether a sample of the lanes is nearly parallel and starts at nearly the same point."""
     same = True
     for k in (W // 3, 2 * W // 3, W - 1):
         along = (

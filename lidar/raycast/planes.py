@@ -1,4 +1,4 @@
-"""Faces that rays have met: their numbers, their planes, and where a ray crosses these, in float64."""
+"""Numbers and planes of hit faces, and intersections of rays with these planes, in float64."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def transform_of(target: Target, instance: int, time: float) -> Any:
 
 @inlined
 def placed(target: Target, geom: Any, inst: Any, place: Any) -> Any:
-    """Row of ``parts`` and instance of what Embree names by geometry, instance geometry and place in it."""
+    """Row of ``parts`` and instance for Embree's geometry, instance geometry and index within it."""
     if inst == INVALID:
         return np.int64(target.rows[np.int64(geom)]), np.int64(-1)
     instance = np.int64(target.numbers[target.starts[np.int64(inst)] + np.int64(place)])
@@ -68,7 +68,7 @@ def plane_of(target: Target, row: int, prim: int, instance: int, time: float) ->
     if instance < 0:
         return nx, ny, nz, d
     a, b, c, x, e, f, g, y, h, i, j, z = transform_of(target, instance, time)
-    # Normals turn with the cofactors; a point of the plane is its offset times its unit normal.
+    # Normals transform by the cofactor matrix; a point of the plane is its offset times its unit normal.
     mx = (f * j - g * i) * nx + (g * h - e * j) * ny + (e * i - f * h) * nz
     my = (c * i - b * j) * nx + (a * j - c * h) * ny + (b * h - a * i) * nz
     mz = (b * g - c * f) * nx + (c * e - a * g) * ny + (a * f - b * e) * nz
@@ -103,7 +103,7 @@ def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: 
 
 @inlined
 def meet(target: Target, W: int, k: int, row: int, prim: int, instance: int, work: Any) -> Any:
-    """Range, cosine and normal (not unit), in float64, where lane k's ray meets the plane of a face."""
+    """Range, cosine and normal (not unit), in float64, where lane k's ray intersects the plane of a face."""
     ox, oy, oz, dx, dy, dz = (
         work[OX * W + k],
         work[OY * W + k],

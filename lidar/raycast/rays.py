@@ -1,4 +1,4 @@
-"""Rays checked and laid out for the kernels, and shared out among threads."""
+"""Checks rays, arranges them for the kernels and distributes them among threads."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def posed_rays(
     index = np.ascontiguousarray(pose_index, np.int64)
     if len(o) not in (0, 1, len(d)) or index.shape != (len(d),):
         raise InputError(f"{len(d)} directions, {len(o)} offsets and {len(index)} pose numbers disagree")
-    if len(index) and not int(index.view(np.uint64).max()) < len(poses):  # what is below zero is huge
-        raise InputError(f"a ray names a pose beyond the {len(poses)} there are")
+    if len(index) and not int(index.view(np.uint64).max()) < len(poses):  # negative numbers become huge
+        raise InputError(f"a ray has a pose number beyond the {len(poses)} poses")
     level = bool((poses.scale == 1.0).all())
     matrix = poses.rotation if level else poses.scale[:, :, None] * poses.rotation
     return _plain(
@@ -98,7 +98,7 @@ def limited(
 def in_scene(rays: Rays) -> tuple[Float, Float]:
     """Origins and directions (n, 3) in the caster's frame.
 
-    Raises InputError for a ray that cannot be cast, as the kernels do.
+    Raises InputError for an invalid ray, as the kernels do.
     """
     d, o = rays.directions, rays.offsets
     if rays.pose.size:
@@ -127,7 +127,7 @@ def _refusal(rays: Rays, bad: int) -> InputError:
 
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that stay: starting them takes as long as a small frame."""
+    """A persistent thread pool: starting threads takes as long as a small frame."""
     return ThreadPoolExecutor(threads, "rays")
 
 
@@ -136,9 +136,9 @@ if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's
 
 
 def share(work: Callable[[int, int], int], rays: Rays, *, threads: int) -> None:
-    """Have threads do the rays in chunks of the order; ``work`` returns a ray that cannot be cast, or -1.
+    """Call ``work`` for chunks of the order of rays in threads; it returns an invalid ray, or -1.
 
-    Raises InputError for such a ray.
+    Raises InputError for an invalid ray.
     """
     n = len(rays.directions)
     if threads <= 1 or n <= CHUNK:

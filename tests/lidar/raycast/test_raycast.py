@@ -354,7 +354,7 @@ def test_without_the_library_rays_are_cast_by_embreex_and_that_is_said_once(monk
         raise BackendError("no Embree 4 library")
 
     monkeypatch.setattr(caster, "library", missing)
-    caster._works.cache_clear()
+    caster._uses_embree.cache_clear()
     try:
         with caplog.at_level(logging.WARNING):
             hits = [
@@ -365,7 +365,7 @@ def test_without_the_library_rays_are_cast_by_embreex_and_that_is_said_once(monk
         with pytest.raises(BackendError, match="no Embree 4"):
             Caster(backend="embree")
     finally:
-        caster._works.cache_clear()
+        caster._uses_embree.cache_clear()
 
 
 def test_a_wrong_library_is_refused(monkeypatch, tmp_path):
