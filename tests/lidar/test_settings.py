@@ -90,7 +90,7 @@ def test_a_bad_rig_or_sensor_is_named_with_line_and_key(tmp_path):
         'name = "mine"\n\n[[lidar]]\nname = "top"\npreset = "s.toml"\n\n[[camera]]\nname = "c"\nwidht = 10\n'
     )
     (tmp_path / "s.toml").write_text('kind = "flash"\nmaker = "a"\nmodel = "b"\nwavelength_nm = 20.0\n')
-    with pytest.raises(InputError, match=r"mine.toml, line \d+: camera.width: .*is widht a misspelling of it"):
+    with pytest.raises(InputError, match=r"mine.toml, line \d+: camera.width: .*widht a misspelling"):
         load_rig(tmp_path / "mine.toml")
     with pytest.raises(InputError, match=r"s.toml(, line \d+)?: rates_hz: this key is missing"):
         load_sensor(tmp_path / "s.toml")
