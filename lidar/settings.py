@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
@@ -78,7 +79,7 @@ def list_settings() -> list[Setting]:
         ("lidar", ScannerSettings, scanner_settings.LEVELS),
         ("camera", CameraSettings, camera_settings.LEVELS),
     ):
-        meanings = _meanings(kind.__doc__ or "")
+        meanings = _meanings(inspect.getdoc(kind) or "")
         for f in fields(kind):
             values = tuple(_text(getattr(by_level[level], f.name)) for level in levels())
             found.append(Setting(f.name, of, values, meanings.get(f.name, "")))
@@ -88,7 +89,7 @@ def list_settings() -> list[Setting]:
 def _meanings(docstring: str) -> dict[str, str]:
     """Meaning of each field by its name: ``name : text``, which may continue in further, indented lines."""
     meanings = {}
-    for name, entry in re.findall(r"^ {4}(\w+) *: (.+(?:\n {8,}\S.*)*)", docstring, re.MULTILINE):
+    for name, entry in re.findall(r"^(\w+) *: (.+(?:\n {4,}\S.*)*)", docstring, re.MULTILINE):
         text = re.sub(r",? of `[\w.]+`", "", entry)
         meanings[name] = re.sub(r"\s+", " ", text.replace("`", "")).strip()
         if name in _CHOICES:
