@@ -219,7 +219,7 @@ def plan_motion(
         trajectory = drive_with_signals(
             travel.path,
             vehicle,
-            graph=scene.road_graph(),
+            graph=travel.graph,
             seed=options.seed,
             side=options.side_in(scene),
             bounds=scene.bounds,
@@ -264,7 +264,8 @@ def _with_traffic(
         return trajectory, None
     progress("traffic", 0, total=0)
     traffic = replace(options.traffic, side=options.side_in(scene))
-    graph, seed = scene.road_graph(), options.seed
+    graph = motion.plan.graph if isinstance(motion, RoadMotion) else scene.road_graph()
+    seed = options.seed
     if isinstance(traffic, TrafficFile):
         return trajectory, replay(scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic)
     if isinstance(motion, RoadMotion):

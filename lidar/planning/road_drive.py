@@ -33,11 +33,13 @@ _DRIVEN = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD or c =
 class RoadPlan:
     """A planned drive on roads.
 
-    path      : along the route; its edges are those of the whole road graph
+    graph     : road graph of the scene
+    path      : along the route; its edges are those of ``graph``
     duration  : seconds to record, None for the whole route
     under_way : whether the vehicle is at speed at the start and at the end of the record
     """
 
+    graph: RoadGraph
     route: Route
     path: Path
     duration: float | None
@@ -142,4 +144,4 @@ def plan_road_drive(
         ground=road_surface(scene),
     )
     path = replace(path, edge=np.where(path.edge >= 0, np.flatnonzero(kept)[path.edge], -1).astype(np.int32))
-    return RoadPlan(route, path, seconds, under_way)
+    return RoadPlan(whole, route, path, seconds, under_way)
