@@ -2,7 +2,7 @@
 
     python benchmarks/drives.py SCENE [--seconds 6] [--survey-seconds 1.5] [--workers 2] [--json]
 
-Each row is a drive of `lidar.drive.drive` along the same random route, clouds as PCD, images as PNG, after
+Each row is a drive of `lidar.pipeline.drive` along the same random route, clouds as PCD, images as PNG, after
 one that is not counted and compiles kernels. ``x real time`` is simulated seconds by seconds of the clock,
 planning of the route and loading of tiles included, imports not. Shares are of the seconds of all threads.
 """
@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.scene import Scene, open_scene
-from lidar.drive import drive
 from lidar.options import DriveOptions
+from lidar.pipeline import drive
 
 RIGS = {"VLP-16": "vlp16", "HDL-64E": "hdl64e_s3", "OS1-128": "os1_128", "nuScenes": ""}
 """Sensor preset of each rig of one scanner; the nuScenes rig has a scanner and six cameras."""

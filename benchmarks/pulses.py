@@ -99,9 +99,9 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
     began = time.perf_counter()
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from lidar.dataset.recording import Contents, Recording  # noqa: PLC0415
-    from lidar.drive import record_all  # noqa: PLC0415
     from lidar.geometry.georeference import Georeference, export_crs  # noqa: PLC0415
     from lidar.geometry.trajectory_csv import read_trajectory  # noqa: PLC0415
+    from lidar.pipeline import record_all  # noqa: PLC0415
     from lidar.plan import schedule  # noqa: PLC0415
     from lidar.rig.devices import scanners  # noqa: PLC0415
     from lidar.rig.specs import load_rig  # noqa: PLC0415

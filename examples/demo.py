@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.build import build
 from geoscene.classes import Class, class_codes
 from geoscene.console import progress_bar
 from geoscene.options import BuildOptions
+from geoscene.pipeline import build
 from geoscene.scene import SceneFiles
 from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
@@ -22,7 +22,6 @@ from geoscene.view import view_scene
 from lidar.camera.png import counts_to_depth, read_png, write_png
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
-from lidar.drive import drive
 from lidar.maps.aggregate import aggregate
 from lidar.maps.picture import (
     class_colors,
@@ -33,6 +32,7 @@ from lidar.maps.picture import (
     with_legend,
 )
 from lidar.options import DriveOptions, MapOptions
+from lidar.pipeline import drive
 from lidar.rig.specs import load_rig
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.populate import TrafficOptions

@@ -1,7 +1,4 @@
-"""A real place from OpenStreetMap as a watertight 3D scene in a projected frame.
-
-The pipeline itself is `geoscene.build.build`.
-"""
+"""A real place from OpenStreetMap as a watertight 3D scene in a projected frame."""
 
 from __future__ import annotations
 
@@ -13,6 +10,7 @@ if TYPE_CHECKING:
     from geoscene.options import BuildOptions as BuildOptions
     from geoscene.options import ExportOptions as ExportOptions
     from geoscene.options import ViewOptions as ViewOptions
+    from geoscene.pipeline import build as build
     from geoscene.scene import Scene as Scene
     from geoscene.scene import open_scene as open_scene
     from geoscene.sources import demo_path as demo_path
@@ -26,6 +24,7 @@ _HOMES = {
     "ExportOptions": "options",
     "Scene": "scene",
     "ViewOptions": "options",
+    "build": "pipeline",
     "demo_path": "sources",
     "export_scene": "export",
     "open_scene": "scene",

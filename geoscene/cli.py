@@ -119,7 +119,7 @@ def build(
     workers
         Processes; as many as there are cores by default. The bytes do not depend on it.
     """
-    from geoscene.build import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
+    from geoscene.pipeline import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
 
     began = time.perf_counter()
     if workers is not None and not 1 <= workers <= 256:

@@ -1,4 +1,4 @@
-"""Vehicles with ray-cast sensors driven through a geoscene scene; `lidar.drive.drive` records one."""
+"""Vehicles with ray-cast sensors driven through a geoscene scene."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from lidar.maps.aggregate import aggregate as aggregate
     from lidar.options import DriveOptions as DriveOptions
     from lidar.options import MapOptions as MapOptions
+    from lidar.pipeline import drive as drive
     from lidar.rig.scanner import load_sensor as load_sensor
     from lidar.rig.specs import load_rig as load_rig
 
@@ -22,6 +23,7 @@ _HOMES = {
     "DriveOptions": "options",
     "MapOptions": "options",
     "aggregate": "maps.aggregate",
+    "drive": "pipeline",
     "load_rig": "rig.specs",
     "load_sensor": "rig.scanner",
     "open_dataset": "dataset.layout",

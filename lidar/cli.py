@@ -68,7 +68,7 @@ def drive(
         Directory to write the dataset to.
     """
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
-    from lidar.drive import drive as record  # noqa: PLC0415
+    from lidar.pipeline import drive as record  # noqa: PLC0415
 
     if options is None or bool(options.route) == bool(options.survey):
         raise InputError("give one of `route` and `survey`, such as `route` random")

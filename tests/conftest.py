@@ -9,8 +9,8 @@ from filelock import FileLock
 from helpers import DEMO_BOX
 from hypothesis import HealthCheck, settings
 
-from geoscene.build import build
 from geoscene.options import BuildOptions
+from geoscene.pipeline import build
 from geoscene.scene import Scene, open_scene
 from geoscene.sources import demo_path, read_osm
 

@@ -11,11 +11,11 @@ import shapely
 from helpers import DEMO_BOX
 
 import geoscene.tiles
-from geoscene.build import build
 from geoscene.classes import Class
 from geoscene.errors import InputError, SceneFormatError, SourceNotFoundError
 from geoscene.mesh import concatenate
 from geoscene.options import BuildOptions
+from geoscene.pipeline import build
 from geoscene.scene import open_scene
 from geoscene.scene.tile_files import Tile, write_tile
 from geoscene.scene.validate import check_scene

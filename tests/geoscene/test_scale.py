@@ -14,15 +14,15 @@ import pytest
 import shapely
 from helpers.programs import ENVIRONMENT, command
 
-from geoscene.build import _tiles_along, build
 from geoscene.classes import Class
 from geoscene.ground import Layers, partition_tile, plan_ground
 from geoscene.options import BuildOptions
+from geoscene.pipeline import _tiles_along, build
 from geoscene.plan import make_plan
 from geoscene.progress import silent
 from geoscene.sources import Way, read_osm
-from lidar.drive import drive
 from lidar.options import DriveOptions
+from lidar.pipeline import drive
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -150,8 +150,8 @@ def test_a_long_wall_is_seen_from_its_end(make_osm, town, tmp_path):
 
 
 def test_a_bridge_is_seen_from_its_end(town, tmp_path, monkeypatch):
-    monkeypatch.setattr("geoscene.build._BESIDE", 0.0)
-    monkeypatch.setattr("geoscene.build._CROWN", 0.0)
+    monkeypatch.setattr("geoscene.pipeline._BESIDE", 0.0)
+    monkeypatch.setattr("geoscene.pipeline._CROWN", 0.0)
     options = BuildOptions(tile_size=50.0, only=("roads",))
     plan, _ = make_plan(read_osm(town), options, progress=silent)
     found = 0

@@ -24,10 +24,10 @@ from geoscene.errors import GeosceneError
 from geoscene.scene import open_scene
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
-from lidar.drive import drive
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.geometry.attitude import quat_from_euler
 from lidar.options import DriveOptions
+from lidar.pipeline import drive
 from lidar.planning.road_drive import plan_road_drive
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.ego_drive import drive_with_signals
@@ -277,7 +277,7 @@ def test_no_more_threads_work_than_there_are_cores(scene, tmp_path, monkeypatch)
             sizes.append(size)
             super().__init__(size)
 
-    monkeypatch.setattr("lidar.drive.ThreadPoolExecutor", Pool)
+    monkeypatch.setattr("lidar.pipeline.ThreadPoolExecutor", Pool)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     for workers in (1, 64):
         drive(scene, tmp_path / str(workers), options=replace(OPTIONS, duration=0.2, workers=workers))

@@ -27,12 +27,12 @@ from lidar.dataset.formats.kitti import semantic_kitti_labels
 from lidar.dataset.formats.table import PointLabels
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.recording import Contents
-from lidar.drive import drive
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.mounts import Mount
 from lidar.maps.aggregate import aggregate
 from lidar.options import DriveOptions
+from lidar.pipeline import drive
 from lidar.rig.scanner import load_sensor
 from lidar.sensors.scan import scan
 from lidar.traffic.populate import TrafficOptions

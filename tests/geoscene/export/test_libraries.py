@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from helpers.export_worlds import write_world
 
-from geoscene.build import build
 from geoscene.errors import MissingExtraError, SceneFormatError
 from geoscene.export.libraries import to_networkx, to_open3d, to_trimesh
 from geoscene.options import BuildOptions
+from geoscene.pipeline import build
 from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
 

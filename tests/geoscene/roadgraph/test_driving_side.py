@@ -6,9 +6,9 @@ import zoneinfo
 import numpy as np
 import pytest
 
-from geoscene.build import build
 from geoscene.errors import InputError
 from geoscene.options import BuildOptions
+from geoscene.pipeline import build
 from geoscene.roadgraph.driving_side import LEFT_HAND, driving_side, side_at
 from geoscene.sources.data import OsmData, Way
 from lidar.options import DriveOptions

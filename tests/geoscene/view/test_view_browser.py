@@ -8,10 +8,10 @@ import pytest
 from helpers.browser import CHROMIUM, DRIVER, browser
 from PIL import Image
 
-from geoscene.build import build
 from geoscene.classes import Class
 from geoscene.cli import app
 from geoscene.options import BuildOptions
+from geoscene.pipeline import build
 from geoscene.sources import demo_path, read_osm
 
 BOX = (24.9405, 60.1655, 24.9450, 60.1680)

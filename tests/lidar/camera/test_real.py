@@ -6,8 +6,8 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from geoscene.build import build
 from geoscene.classes import Class
+from geoscene.pipeline import build
 from geoscene.sources import read_osm
 from lidar.camera.facades import facades_of
 from lidar.camera.png import depth_to_counts, encode_png

@@ -14,10 +14,10 @@ from helpers.programs import run_program
 from geoscene.scene import SceneFiles
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
-from lidar.drive import drive
 from lidar.errors import InputError, RouteError
 from lidar.geometry.trajectory_csv import read_trajectory
 from lidar.options import DriveOptions
+from lidar.pipeline import drive
 from lidar.plan import plan_motion
 from lidar.planning.flight_planning import survey_area, swath
 from lidar.planning.replay import read_replay

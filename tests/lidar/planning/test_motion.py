@@ -233,6 +233,6 @@ def test_a_crest_is_taken_without_taking_off():
 
 def test_planning_a_drive_loads_no_splines_and_no_spatial_searches():
     """They take a second to load, which is longer than planning takes."""
-    code = "import sys, lidar.planning.motion, lidar.planning.replay, lidar.drive; print(*sys.modules)"
+    code = "import sys, lidar.planning.motion, lidar.planning.replay, lidar.pipeline; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert not {"scipy.interpolate", "scipy.spatial", "scipy.optimize"} & set(loaded.split())

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from helpers.programs import run_program
 
-from geoscene.build import build
 from geoscene.options import BuildOptions
+from geoscene.pipeline import build
 from geoscene.sources import demo_path, read_osm
 from lidar.apply import apply_stages
 from lidar.camera.png import read_png
 from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.dataset.layout import open_dataset
-from lidar.drive import drive
 from lidar.errors import DatasetError, InputError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.physics.echoes import Origin
+from lidar.pipeline import drive
 from lidar.signal.registry import read_stages
 from lidar.traffic.populate import TrafficOptions
 

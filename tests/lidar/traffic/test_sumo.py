@@ -7,8 +7,8 @@ import pytest
 import shapely
 from cyclopts import CoercionError
 
-from geoscene.build import BuildOptions, build
 from geoscene.errors import MissingExtraError
+from geoscene.pipeline import BuildOptions, build
 from geoscene.sources import demo_path, read_osm
 from lidar.cli import app
 from lidar.planning.motion import drive_path
