@@ -87,7 +87,7 @@ def main() -> None:
             row = {
                 "km": float(stops[k] / 1000),
                 "resident_mib": resident(),
-                "triangles": len(world.faces.what),
+                "triangles": len(world.faces.packed),
                 "hits": int((hits.face >= 0).sum()),
                 "seconds": time.perf_counter() - began,
             }

@@ -162,7 +162,7 @@ def record_all(
     pending = [job for job in jobs if not recording.is_done(job.sensor, job.frame)]
     done = len(jobs) - len(pending)
     progress("driving", done, total=len(jobs))
-    max_range = max((job.sensor.reach for job in jobs), default=0.0)
+    max_range = max((job.sensor.max_range for job in jobs), default=0.0)
     worlds = Worlds(scene, max_range, actors=recording.actors)
     points: dict[str, int] = {}
     workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another

@@ -73,7 +73,7 @@ class DrivePlan:
     @property
     def max_range(self) -> float:
         """Metres beyond which no sensor measures."""
-        return max((s.reach for s in self.sensors), default=0.0)
+        return max((s.max_range for s in self.sensors), default=0.0)
 
     @property
     def length(self) -> float:

@@ -18,10 +18,10 @@ from geoscene.ground.partition import (
     GroundPlan,
     Partition,
     partition_tile,
+    rows_at,
     rows_near,
     tile_box,
     values_at,
-    winners,
 )
 from geoscene.ground.triangulate import Triangles, triangulate
 from geoscene.mesh import Mesh
@@ -209,7 +209,7 @@ def _flooded(
     around = triangles.points[edge][:, None] + _AROUND * np.stack(
         [np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)], axis=1
     )
-    beside = winners(plan, around.reshape(-1, 2))
+    beside = rows_at(plan, around.reshape(-1, 2))
     vertex = np.concatenate([vertex, np.repeat(np.flatnonzero(edge), len(_DIRECTIONS))])
     row = np.concatenate([row, beside])
     on_water = values_at(plan.layers.body, row, base="") != ""

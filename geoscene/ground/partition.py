@@ -175,7 +175,7 @@ def partition_tile(plan: GroundPlan, i: int, *, j: int) -> Partition:
     ]
     cells = _faces(shapely.union_all(lines, grid_size=PRECISION), box)
     inside = shapely.get_coordinates(shapely.point_on_surface(cells))
-    row = winners(plan, inside)
+    row = rows_at(plan, inside)
     edges = _Edges.of(cells)
     row, slivers = _without_slivers(edges, cells, row=row)
     level = np.isin(values_at(plan.layers.body, row, base=""), ("sea", "standing"))
@@ -223,7 +223,7 @@ def rows_near(plan: GroundPlan, xmin: float, *, ymin: float, xmax: float, ymax: 
     return np.asarray(plan.tree.query(shapely.box(xmin, ymin, xmax, ymax)), np.int64)
 
 
-def winners(plan: GroundPlan, xy: Float) -> NDArray[np.int64]:
+def rows_at(plan: GroundPlan, xy: Float) -> NDArray[np.int64]:
     """The row of the layers (n,) that holds each point (n, 2), -1 where none does."""
     best = np.full(len(xy), -1, np.int64)
     point, row = plan.tree.query(shapely.points(xy))

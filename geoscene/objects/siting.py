@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.ground.partition import GroundPlan, values_at, winners
+from geoscene.ground.partition import GroundPlan, rows_at, values_at
 from geoscene.typing import Float
 
 CLEARANCE = 0.5
@@ -50,7 +50,7 @@ class Sites:
     def classes(self, xy: Float) -> NDArray[np.uint8]:
         """Class (n,) of the ground at points (n, 2), RAIL between and beside the rails of a track."""
         klass: NDArray[np.uint8] = values_at(
-            self.plan.layers.klass, winners(self.plan, xy), base=self.plan.base[0]
+            self.plan.layers.klass, rows_at(self.plan, xy), base=self.plan.base[0]
         )
         point, track = self.tracks.query(shapely.points(xy))
         on = shapely.contains_xy(self.tracks.geometries[track], *xy[point].T)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.frames import Frame
-from geoscene.ground.partition import GroundPlan, rows_near, tile_box, values_at, winners
+from geoscene.ground.partition import GroundPlan, rows_at, rows_near, tile_box, values_at
 from geoscene.mesh import Instances
 from geoscene.objects.shapes import concatenate_instances, place
 from geoscene.objects.siting import Sites
@@ -211,7 +211,7 @@ def forest_trees(
     )
     draw = _uniform(seed, column, row=row, count=4)
     x, y = (column + 0.1 + 0.8 * draw[0]) * side, (row + 0.1 + 0.8 * draw[1]) * side
-    owner = winners(plan, np.column_stack([x, y]))
+    owner = rows_at(plan, np.column_stack([x, y]))
     stands = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
     stands &= values_at(plan.layers.klass, owner, base=Class.UNLABELED) == Class.FOREST_FLOOR
     x, y, draw, owner = x[stands], y[stands], draw[:, stands], owner[stands]
@@ -219,7 +219,7 @@ def forest_trees(
     dx, dy = np.array([(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)]).T[:, :, None]
     beside = values_at(
         plan.layers.klass,
-        winners(plan, np.column_stack([(x + dx).ravel(), (y + dy).ravel()])),
+        rows_at(plan, np.column_stack([(x + dx).ravel(), (y + dy).ravel()])),
         base=Class.UNLABELED,
     ).reshape(4, -1)
     roomy = (beside == Class.FOREST_FLOOR).all(axis=0)

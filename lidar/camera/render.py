@@ -250,7 +250,7 @@ def _view(
     origin = poses.position[sample] if moments == 1 else poses.position[row]
     hits = world.caster.cast(origin, direction, near=camera.near, time=time, normals=True)
     if not seen.all():
-        hits = _without(hits, ~seen)
+        hits = _with_misses(hits, ~seen)
     return View(poses.position, row, direction, seen, time, hits, world.lookup(hits))
 
 
@@ -266,13 +266,13 @@ def _scaled_rays(camera: CameraSpec) -> Float:
     return pixel_rays(camera) if camera.model == "fisheye" else _pinhole_rays(camera)
 
 
-def _without(hits: Hits, gone: NDArray[np.bool_]) -> Hits:
+def _with_misses(hits: Hits, missed: NDArray[np.bool_]) -> Hits:
     """The hits with some rays turned into misses."""
     return Hits(
-        np.where(gone, np.inf, hits.range),
-        np.where(gone, np.int32(-1), hits.face),
-        np.where(gone, np.int32(-1), hits.instance),
-        np.where(gone, np.float32(0), hits.cosine),
+        np.where(missed, np.inf, hits.range),
+        np.where(missed, np.int32(-1), hits.face),
+        np.where(missed, np.int32(-1), hits.instance),
+        np.where(missed, np.float32(0), hits.cosine),
         hits.normal,
     )
 

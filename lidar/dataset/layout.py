@@ -30,7 +30,7 @@ from geoscene.frames import Frame
 from lidar.dataset.formats import Format
 from lidar.errors import DatasetError
 from lidar.geometry.poses import Trajectory
-from lidar.geometry.trajectory_csv import read_trajectory
+from lidar.geometry.trajectory_csv import MANIFEST, read_trajectory
 
 SCHEMA = 1
 """Version of the dataset directory; a reader refuses others."""
@@ -45,7 +45,7 @@ class Paths:
     @property
     def manifest(self) -> Path:
         """Schema, scene, rig, options, seed, frames and licence; updated last."""
-        return self.root / "dataset.json"
+        return self.root / MANIFEST
 
     @property
     def calibration(self) -> Path:
@@ -217,9 +217,9 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
     old, new = manifest["recipe"], json.loads(json.dumps(recipe))
     changed = [k for k in old | new if old.get(k) != new.get(k)]
     if changed:
-        what = ", ".join(f"{k} {_text(old.get(k))} (now {_text(new.get(k))})" for k in changed)
+        changes = ", ".join(f"{k} {_text(old.get(k))} (now {_text(new.get(k))})" for k in changed)
         raise DatasetError(
-            f"{path}: holds a drive made with other options: {what};"
+            f"{path}: holds a drive made with other options: {changes};"
             " set `overwrite` to replace it, or give another directory"
         )
     for left in path.rglob("*.part"):  # of a drive that was killed

@@ -1,4 +1,4 @@
-"""A trajectory as CSV: ``trajectory.csv`` of a dataset."""
+"""A trajectory as CSV: ``trajectory.csv`` of a dataset, beside the manifest that holds its frame."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ import numpy as np
 from geoscene.files import write_columns
 from lidar.errors import DatasetError
 from lidar.geometry.poses import Trajectory
+
+MANIFEST = "dataset.json"
+"""Name of a dataset's manifest; its key ``frame`` is the frame of the trajectory beside it."""
 
 _TRAJECTORY = ("time_ns", "x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "scale")
 

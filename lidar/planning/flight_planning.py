@@ -304,14 +304,14 @@ def _swath(sensor: Scanner | Camera, height: float) -> float:
         way = unproject(c, edge)
     way = way @ sensor.spec.mount.rotation.T
     down = way[-way[:, 2] > _STEEPEST]
-    if height >= sensor.reach:
+    if height >= sensor.max_range:
         raise RouteError(
-            f"`altitude` {height:g}: {sensor.name} sees {sensor.reach:g} m; fly lower, or take another sensor"
+            f"`altitude` {height:g}: the maximum range of {sensor.name} is {sensor.max_range:g} m; fly lower"
         )
     if not len(down):
         raise RouteError(f"{sensor.name} does not look down; a survey needs a rig such as drone or aircraft")
     aside = down[:, 1] / -down[:, 2] * height
-    furthest = math.sqrt(sensor.reach**2 - height**2)
+    furthest = math.sqrt(sensor.max_range**2 - height**2)
     left, right = np.percentile(aside, 98), -np.percentile(aside, 2)
     return 2.0 * float(min(left, right, furthest))
 

@@ -15,7 +15,7 @@ from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import FormatError, RouteError
 from lidar.geometry.poses import Trajectory
-from lidar.geometry.trajectory_csv import read_trajectory
+from lidar.geometry.trajectory_csv import MANIFEST, read_trajectory
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -39,7 +39,7 @@ def read_replay(path: Path, frame: Frame) -> Trajectory:
         raise RouteError(f"{path} does not exist")
     with path.open(encoding="utf-8") as file:
         names = file.readline().strip().split(",")
-    manifest = path.with_name("dataset.json")
+    manifest = path.with_name(MANIFEST)
     recorded = frame
     if manifest.is_file():
         recorded = Frame.from_json(json.loads(manifest.read_text("utf-8"))["frame"])

@@ -234,8 +234,8 @@ class _Search:
     def _dijkstra(self, source: int, reach: float) -> tuple[Float, NDArray[np.int32]]:
         from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
 
-        far, came = dijkstra(self.links, indices=source, return_predecessors=True, limit=reach)
-        return far, came
+        far, previous = dijkstra(self.links, indices=source, return_predecessors=True, limit=reach)
+        return far, previous
 
     def _share(self, place: Place) -> float:
         edge, offset = place
@@ -297,11 +297,11 @@ class _Search:
         """Edges of the cheapest way from one place to another, both included."""
         if a[0] == b[0] and b[1] >= a[1] - self.slack:
             return [a[0]]
-        far, came = self._dijkstra(a[0], np.inf)
+        far, previous = self._dijkstra(a[0], np.inf)
         walk = [b[0]]
         if a[0] == b[0]:
             before, cost = self._into(b[0])
             walk.append(int(before[np.argmin(far[before] + cost)]))
         while walk[-1] != a[0]:
-            walk.append(int(came[walk[-1]]))
+            walk.append(int(previous[walk[-1]]))
         return walk[::-1]

@@ -21,7 +21,7 @@ from lidar.raycast.columns import CHUNK, Rays, Target
 from lidar.raycast.lanes import GRAZING, cross, move_float64, move_int32, narrow, same
 from lidar.raycast.memory import aligned, float64_at, inlined, int32_at, int64_at
 from lidar.raycast.packets import alike, first_bad, gather, nudge, trace
-from lidar.raycast.planes import INVALID, meet, numbered, placed, plane_of
+from lidar.raycast.planes import INVALID, intersection, numbered, placed, plane_of
 from lidar.raycast.rows import (
     COSINE,
     FAR,
@@ -140,7 +140,7 @@ def _retry(
         i = ids[k]
         row, instance = placed(target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k])
         prim = np.int64(u[HIT_FACE * W + k])
-        t, cosine, x, y, z = meet(target, W, k, row, prim, instance, work)
+        t, cosine, x, y, z = intersection(target, W, k, row, prim, instance, work)
         if t <= work[FAR * W + k] and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
             ranges[i], cosines[i] = t, cosine
             faces[i], instances[i] = numbered(target, row, prim), instance
@@ -205,14 +205,14 @@ def cast(
                 _normal(normals, ids[k], work[NX * W + k], work[NY * W + k], work[NZ * W + k])
         for k in range(0 if settled else m):
             i = ids[k]
-            met = u[HIT_GEOMETRY * W + k] != INVALID
-            if met and not abs(work[COSINE * W + k]) >= GRAZING:
+            hit = u[HIT_GEOMETRY * W + k] != INVALID
+            if hit and not abs(work[COSINE * W + k]) >= GRAZING:
                 row, copy = placed(
                     target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
                 )
                 prim = np.int64(u[HIT_FACE * W + k])
-                ranges[i], cosines[i], _, _, _ = meet(target, W, k, row, prim, copy, work)
-            if not (met and ranges[i] <= work[FAR * W + k]):
+                ranges[i], cosines[i], _, _, _ = intersection(target, W, k, row, prim, copy, work)
+            if not (hit and ranges[i] <= work[FAR * W + k]):
                 ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
                 if normals.size:
                     _normal(normals, i, 0.0, 0.0, 0.0)
@@ -260,10 +260,10 @@ def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_
         trace(target, W, PACKET_RAY_ROWS, f, valid, together, one)
         doubtful = False
         for k in range(m):
-            met = f[RAY_FAR * W + k] < 0
-            out[ids[k]] = met
-            valid[k] = 0 if met else -1
-            doubtful |= not met
+            hit = f[RAY_FAR * W + k] < 0
+            out[ids[k]] = hit
+            valid[k] = 0 if hit else -1
+            doubtful |= not hit
         if not doubtful:
             continue
         for k in range(W):

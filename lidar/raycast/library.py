@@ -24,7 +24,7 @@ INVALID = 0xFFFFFFFF
 
 _PACKETS = ((16, 34), (8, 33), (4, 32))
 _VERSION = 0
-_TRACERS = [f"rtc{what}{width}" for what in ("Intersect", "Occluded") for width in (1, 4, 8, 16)]
+_TRACERS = [f"rtc{query}{width}" for query in ("Intersect", "Occluded") for width in (1, 4, 8, 16)]
 
 _P, _U, _Z, _I = c.c_void_p, c.c_uint, c.c_size_t, c.c_int
 _PROTOTYPES: dict[str, tuple[Any, ...]] = {

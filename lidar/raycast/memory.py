@@ -12,8 +12,8 @@ from numba.extending import intrinsic
 intersect1: Any = types.ExternalFunction("rtcIntersect1", types.void(*[types.int64] * 3))
 occluded1: Any = types.ExternalFunction("rtcOccluded1", types.void(*[types.int64] * 3))
 _packets: list[Any] = [
-    types.ExternalFunction(f"rtc{what}{width}", types.void(*[types.int64] * 4))
-    for what in ("Intersect", "Occluded")
+    types.ExternalFunction(f"rtc{query}{width}", types.void(*[types.int64] * 4))
+    for query in ("Intersect", "Occluded")
     for width in (4, 8, 16)
 ]
 intersect4, intersect8, intersect16, occluded4, occluded8, occluded16 = _packets

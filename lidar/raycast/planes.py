@@ -102,7 +102,7 @@ def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: 
 
 
 @inlined
-def meet(target: Target, W: int, k: int, row: int, prim: int, instance: int, work: Any) -> Any:
+def intersection(target: Target, W: int, k: int, row: int, prim: int, instance: int, work: Any) -> Any:
     """Range, cosine and normal (not unit), in float64, where lane k's ray intersects the plane of a face."""
     ox, oy, oz, dx, dy, dz = (
         work[OX * W + k],

@@ -22,7 +22,7 @@ class Scanner:
         return self.spec.name
 
     @property
-    def reach(self) -> float:
+    def max_range(self) -> float:
         """Maximum range, metres."""
         return self.sensor.max_range
 
@@ -52,7 +52,7 @@ class Camera:
         return self.spec.name
 
     @property
-    def reach(self) -> float:
+    def max_range(self) -> float:
         """Maximum range, metres."""
         return self.spec.far
 

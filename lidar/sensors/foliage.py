@@ -73,8 +73,8 @@ class Foliage:
 
     def _kind(self, hits: Hits) -> NDArray[np.int64]:
         """Kind of foliage (n,) of the surfaces hit; 0 for none."""
-        packed: NDArray[np.int64] = self.faces.what[hits.face + self.faces.start[hits.instance]]
-        return (packed >> 16) & 255
+        attributes: NDArray[np.int64] = self.faces.packed[hits.face + self.faces.start[hits.instance]]
+        return (attributes >> 16) & 255
 
 
 class _Passage:

@@ -125,7 +125,7 @@ class EchoCollector:
         ray, row = glossy[:, :found]
         if found:
             wet = (
-                self._optics.faces.what[_face_row(self._optics.faces, hits, ray=ray)] & 255
+                self._optics.faces.packed[_face_row(self._optics.faces, hits, ray=ray)] & 255
                 == glossy_codes()[1]
             )
             echoes.apparent[row[wet]] = (
@@ -159,7 +159,7 @@ def _columns(n: int) -> Echoes:
 
 
 def _face_row(faces: Faces, hits: Hits, *, ray: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Row of ``faces.what`` of each ray's hit."""
+    """Row of ``faces.packed`` of each ray's hit."""
     row: NDArray[np.int64] = hits.face[ray] + faces.start[hits.instance[ray]]
     return row
 
@@ -180,14 +180,14 @@ def _receive(
     distance, face, instance, cosine = hits
     rays = len(share)
     # Fields of a tuple that are read in a loop cost a reference count each time.
-    starts, named, whats, own = faces.start, faces.named, faces.what, len(faces.start) - 1
+    starts, named, packed, own = faces.start, faces.named, faces.packed, len(faces.start) - 1
     reflectance, specular, factor, mirrors = tables.reflectance, tables.specular, tables.factor, tables.glossy
     low, law, spread = tables.low, tables.law, len(tables.factor) > 0
     numbers, ranges, apparents, features, classes, cosines, trues, axes = out
     back, away, slant = np.empty(rays), np.empty(rays), np.empty(rays)
     axis = np.zeros(rays, np.bool_)
     axis[0] = True
-    what = np.empty(rays, np.int64)
+    surfaces = np.empty(rays, np.int64)
     row, bearer = np.empty(rays, np.int64), np.empty(rays, np.int64)
     place, power = np.empty(rays), np.empty(rays)
     count = found = 0
@@ -198,7 +198,7 @@ def _receive(
             if face[i] < 0:
                 continue
             copy = instance[i]
-            surface = whats[face[i] + starts[copy if copy >= 0 else own]]
+            surface = packed[face[i] + starts[copy if copy >= 0 else own]]
             if copy >= 0:
                 surface = (np.int64(named[copy]) << 32) | (surface & 0xFFFFFFFF)
             material = surface & 255
@@ -207,7 +207,7 @@ def _receive(
                 one_off = rho * factor[max((surface >> 32) - low, 0)]
                 rho = one_off if rho > RETRO else min(one_off, RETRO)
             c = min(abs(np.float64(cosine[i])), 1.0)
-            what[k], slant[k], away[k] = surface, c, distance[i]
+            surfaces[k], slant[k], away[k] = surface, c, distance[i]
             back[k] = sent_back(rho, c, specular[material], law) * share[k]
             insert(row, size, k, away)
             size += 1
@@ -221,13 +221,13 @@ def _receive(
             for j in range(size):
                 k = row[j]
                 bearer[j], place[j], power[j] = k, away[k], back[k]
-                if mirrors[what[k] & 255]:
+                if mirrors[surfaces[k] & 255]:
                     glossy[0, found], glossy[1, found] = first + k, count + j
                     found += 1
         for j in range(echoes):
             k = bearer[j]
             numbers[count], ranges[count], apparents[count] = number, place[j], power[j]
-            features[count], classes[count] = what[k] >> 32, (what[k] >> 8) & 255
+            features[count], classes[count] = surfaces[k] >> 32, (surfaces[k] >> 8) & 255
             cosines[count], trues[count], axes[count] = slant[k], away[k], axis[k]
             apart[count] = not plain
             count += 1

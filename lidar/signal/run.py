@@ -164,14 +164,15 @@ def cloud_truth(altered: Altered, *, start_ns: int) -> dict[str, NDArray[Any]]:
     cloud, original = altered.cloud, altered.original
     kept = cloud.source[(cloud.source >= 0) & (cloud.origin != Origin.MOVED)]
     removed = np.setdiff1d(np.arange(len(original), dtype=np.int32), kept)
-    gone = {f.name: getattr(original, f.name)[removed] for f in fields(Cloud)[1:]}
-    gone["time_ns"] = (original.start_ns - start_ns + gone["time_ns"].astype(np.int64)).astype(np.int64)
+    removed_columns = {f.name: getattr(original, f.name)[removed] for f in fields(Cloud)[1:]}
+    time_ns = original.start_ns - start_ns + removed_columns["time_ns"].astype(np.int64)
+    removed_columns["time_ns"] = time_ns.astype(np.int64)
     return {
         "origin": cloud.origin,
         "source": cloud.source,
         "hidden": cloud.hidden,
         "removed": removed,
-        **{f"removed_{name}": column for name, column in gone.items()},
+        **{f"removed_{name}": column for name, column in removed_columns.items()},
     }
 
 

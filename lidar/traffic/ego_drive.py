@@ -123,10 +123,10 @@ def _driven(
     if duration is not None and under_way:
         seconds += _ON_S
     trip = ego_trip(path, vehicle, under_way=under_way)
-    gone = simulate_ego(trip, trips, graph=graph, plan=plan, seconds=seconds, radius=radius)
-    time_s: Float = STEP_S * np.arange(len(gone), dtype=float)
+    travelled = simulate_ego(trip, trips, graph=graph, plan=plan, seconds=seconds, radius=radius)
+    time_s: Float = STEP_S * np.arange(len(travelled), dtype=float)
     motion = motion_within(
-        path, vehicle, time_s=time_s, max_distance=gone.clip(max=path.length), under_way=under_way
+        path, vehicle, time_s=time_s, max_distance=travelled.clip(max=path.length), under_way=under_way
     )
     trajectory = poses_along(path, vehicle, motion=motion)
     return trajectory if duration is None else trajectory.until(round(duration * 1e9))

@@ -28,7 +28,7 @@ class EgoTrip:
     xy, heading : (n, 2) and (n,) of the box's middle at each station
     """
 
-    way: ActorPath
+    path: ActorPath
     driver: Driver
     desired_speed: Float
     length: float
@@ -57,7 +57,7 @@ def ego_trip(path: Path, vehicle: Vehicle, *, under_way: bool = False) -> EgoTri
     axle = np.stack([np.interp(at, s, path.position[:, c]) for c in range(3)], axis=1)
     xy = axle[:, :2] + ahead * np.column_stack([np.cos(heading), np.sin(heading)])
     row = np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(path) - 1)
-    way = ActorPath(
+    actor_path = ActorPath(
         np.column_stack([xy, axle[:, 2]]),
         heading,
         path.curvature[row],
@@ -71,4 +71,6 @@ def ego_trip(path: Path, vehicle: Vehicle, *, under_way: bool = False) -> EgoTri
     desired = np.interp(at, s, desired_speed(path, vehicle))
     if not under_way:
         desired = np.minimum(desired, np.sqrt(2 * acceleration * (at + 0.2)))
-    return EgoTrip(way, driver, desired, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading)
+    return EgoTrip(
+        actor_path, driver, desired, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading
+    )

@@ -125,13 +125,13 @@ class Fcd:
 def read_fcd(path: Path, *, net: Path | None = None) -> Fcd:
     """The vehicles and persons of a file, without rail vehicles and ships.
 
-    Raises FormatError for a file that is missing, broken or another one, and where the place of its network
-    on Earth cannot be told.
+    Raises FormatError for a file that is missing, damaged or no floating car data, and if the position of
+    its network on Earth is unknown.
     """
     noted = _noted(path)
     rows, names, kinds = _rows(path)
     if not len(rows):
-        raise FormatError(f"{path}: nobody is in it; is it what sumo --fcd-output wrote?")
+        raise FormatError(f"{path}: no vehicles and no persons in it; write it with sumo --fcd-output")
     number, time, x, y, angle, speed = rows.T
     geo = noted.get("fcd-output.geo") == "true"
     net = net or _beside(path, noted.get("net-file", ""))
@@ -144,8 +144,8 @@ def read_fcd(path: Path, *, net: Path | None = None) -> Fcd:
         ahead = np.column_stack([lon + metre * c / np.cos(np.radians(lat)), lat + metre * s])
     elif net is None:
         raise FormatError(
-            f"{path}: x and y are of a network that is not there; add net=FILE.net.xml, or run sumo with"
-            " --fcd-output.geo"
+            f"{path}: x and y are coordinates of a network that was not found; add net=FILE.net.xml, or run"
+            " sumo with --fcd-output.geo"
         )
     else:
         projection = network_projection(net)
@@ -304,7 +304,7 @@ def network_projection(net: Path) -> NetworkProjection:
     if proj in _UNDONE:
         raise FormatError(
             f"{net}: has no projection that can be undone ({proj!r}); run sumo with a network that"
-            " geoscene export --to sumo or netconvert --proj made"
+            " geoscene exported or that netconvert --proj made"
         )
     try:
         return NetworkProjection(shift, Transformer.from_crs(CRS(proj), "EPSG:4326", always_xy=True))

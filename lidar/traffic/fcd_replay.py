@@ -137,7 +137,7 @@ def _moving(
     if not parts:
         raise InputError(_nobody(fcd, begin, anybody=anybody))
     knots = np.array([len(part) for part in parts], np.int64)
-    step, x, y, yaw, gone = np.concatenate(parts).T
+    step, x, y, yaw, travelled = np.concatenate(parts).T
     speed = np.concatenate([_monotone(np.diff(part[:, 4]) / STEP_S) for part in parts]) / scale
     middle = np.column_stack([x, y])
     foot = np.repeat([shape.kind in _KINDS["pedestrian"] for shape in shapes], knots)
@@ -150,7 +150,7 @@ def _moving(
         yaw=yaw,
         hint=_hints(graph, middle, yaw=yaw, foot=foot),
         speed=speed,
-        gone=gone / scale,
+        travelled=travelled / scale,
     )
     actors = actors_on_ground(scene, tracks, scale=scale)
     return _without(actors, _touched(actors, ego, vehicle=vehicle))
@@ -196,8 +196,9 @@ def _runs(time: Float, front: Float, *, speed: Float, scale: float) -> list[slic
         return []
     dt = np.diff(time)
     moved = np.hypot(*np.diff(front, axis=0).T) / scale
-    told = np.maximum(speed[:-1], speed[1:])
-    most = np.where(np.isfinite(told), np.maximum(told, _SLOW), max(_FAST, float(np.median(moved / dt))))
+    reported = np.maximum(speed[:-1], speed[1:])
+    usual = max(_FAST, float(np.median(moved / dt)))
+    most = np.where(np.isfinite(reported), np.maximum(reported, _SLOW), usual)
     cut = (dt > _PAUSE * np.median(dt)) | (moved > _JUMP[0] * most * dt + _JUMP[1]) | (dt <= 0)
     ends = [0, *(np.flatnonzero(cut) + 1).tolist(), len(time)]
     return [slice(a, b) for a, b in itertools.pairwise(ends) if b - a > 1]
@@ -224,8 +225,8 @@ def _sampled(time: Float, middle: Float, *, yaw: Float, until: float) -> Float:
     for moment, offset in aside:
         u = np.clip((t - moment) / _CHANGE_S + 0.5, 0.0, 1.0)
         xy += (u**3 * (10 - 15 * u + 6 * u**2))[:, None] * offset
-    gone = polylines.stations(xy)
-    return np.column_stack([step, xy, np.interp(t, time, yaw), gone])
+    travelled = polylines.stations(xy)
+    return np.column_stack([step, xy, np.interp(t, time, yaw), travelled])
 
 
 def _monotone(slope: Float) -> Float:
@@ -334,7 +335,7 @@ def _without(actors: Actors, rows: Ints) -> Actors:
     knots = np.diff(actors.first)
     kept = np.repeat(keep, knots)
     each = ("shape", "poses", "stride", "kind", "klass", "size", "stretch", "parked", "feature")
-    every = ("time_ns", "position", "angles", "velocity", "gone")
+    every = ("time_ns", "position", "angles", "velocity", "travelled")
     return replace(
         actors,
         **{name: getattr(actors, name)[keep] for name in each},

@@ -38,10 +38,10 @@ class Lanes:
     side   : 1 where traffic keeps right, -1 where it keeps left
     state  : (s,) the edge of each state of `geoscene.roadgraph.routing.turn_states`
     after  : permitted next states of each state
-    onward : (s,) bool, the state does not lead into a dead end inside the map
+    leads_on : (s,) bool, the state does not lead into a dead end inside the map
     leave, enter : (m,) headings in which an edge is left and entered, radians
     traffic_weight : (m,) relative density of traffic
-    open   : (m,) bool, `onward` for a start on the edge
+    open   : (m,) bool, `leads_on` for a start on the edge
     exit, entry : (m,) bool, the edge ends, or begins, at the map's edge
     """
 
@@ -52,7 +52,7 @@ class Lanes:
     side: int
     state: Ints
     after: Sequence[Ints]
-    onward: NDArray[np.bool_]
+    leads_on: NDArray[np.bool_]
     leave: Float
     enter: Float
     traffic_weight: Float
@@ -83,7 +83,7 @@ def lanes_of(
     leads_out = _at_edge(graph, bounds, end=graph.head, other=graph.tail)
     leads_in = _at_edge(graph, bounds, end=graph.tail, other=graph.head)
     straight_on = graph.twin[state[before]] != state[after]
-    onward = _leading_on(before[straight_on], after[straight_on], leads_out=leads_out[state])
+    leads_on = _leading_on(before[straight_on], after[straight_on], leads_out=leads_out[state])
     return Lanes(
         graph,
         layout,
@@ -92,11 +92,11 @@ def lanes_of(
         1 if side == "right" else -1,
         state,
         follow,
-        onward,
+        leads_on,
         leave,
         enter,
         traffic_weight,
-        onward[: len(graph)],
+        leads_on[: len(graph)],
         leads_out,
         leads_in,
     )
@@ -211,7 +211,7 @@ def random_lanes(
         turns = np.array([turn(lanes, edge, b=int(w)) for w in ways])
         weight = lanes.traffic_weight[ways] * np.where(np.abs(turns) < _STRAIGHT, 3.0, 1.0)
         weight = weight * np.where(np.abs(turns) > np.radians(140), 0.02, 1.0)
-        weight = weight * np.where(lanes.onward[states], 1.0, 1e-9)
+        weight = weight * np.where(lanes.leads_on[states], 1.0, 1e-9)
         if lanes.count[edge] > 1:
             inward = turns * lanes.side > _STRAIGHT
             outward = turns * lanes.side < -_STRAIGHT

@@ -175,7 +175,7 @@ def parked_actors(
         position=np.column_stack([spots.xy[rows], height]),
         angles=np.column_stack([spots.heading[rows], pitch, roll]),
         velocity=np.zeros((len(rows), 3)),
-        gone=np.zeros(len(rows)),
+        travelled=np.zeros(len(rows)),
         parked=True,
         scale=scale,
     )

@@ -127,13 +127,13 @@ def pedestrian_trips(
                 side=lanes.side,
                 rng=rng,
             )
-            way, crossed = _way(line, over, scale=area.scale)
-            desired_speed = np.full(len(way), pace)
+            path, crossed = _walking_path(line, over, scale=area.scale)
+            desired_speed = np.full(len(path), pace)
             trips.append(
                 Trip(
                     shape,
                     grow,
-                    way,
+                    path,
                     _WALK,
                     desired_speed,
                     0,
@@ -158,7 +158,7 @@ def _stroll(
 ) -> tuple[list[Float], list[tuple[int, int]]]:
     """Consecutive lines that a pedestrian walks, and pairs of a line and the crossing after it.
 
-    They go to the end of a stretch of sidewalk and back, or over a crossing on the way, and so on.
+    They go to the end of a stretch of sidewalk and back, or over a crossing on the path, and so on.
     """
     parts: list[Float] = []
     over: list[tuple[int, int]] = []
@@ -219,7 +219,7 @@ def _crossings(lanes: Lanes, walks: Sidewalks) -> dict[int, list[tuple[int, floa
     return found
 
 
-def _way(
+def _walking_path(
     parts: list[Float], over: list[tuple[int, int]], *, scale: float
 ) -> tuple[ActorPath, tuple[tuple[int, int, int], ...]]:
     """The path along lines, and first station, last station and number of each crossing on it."""
@@ -231,21 +231,23 @@ def _way(
     keep = np.concatenate([[True], np.diff(along) > 1e-6])
     points = polylines.points_at(line[keep], even, along=along[keep])
     nowhere = np.full(len(even), -1, np.int64)
-    way = rounded(
+    path = rounded(
         points, nowhere, lane=nowhere, limit=np.full(len(even), np.inf), radius=_WALK.min_radius, scale=scale
     )
     crossed = []
     for part, number in over:
-        # rounded corners shorten the way a little: the crossing is found by its ends
-        first, last = (_nearest(way, line[k, :2], about=along[k] / gap) for k in (ends[part] - 1, ends[part]))
+        # rounded corners shorten the path a little: the crossing is found by its ends
+        first, last = (
+            _nearest(path, line[k, :2], about=along[k] / gap) for k in (ends[part] - 1, ends[part])
+        )
         crossed.append((first + 1, max(last - 1, first + 2), number))
-    return way, tuple(crossed)
+    return path, tuple(crossed)
 
 
-def _nearest(way: ActorPath, point: Float, *, about: float) -> int:
+def _nearest(path: ActorPath, point: Float, *, about: float) -> int:
     """The station of a path nearest to a point, close to station ``about``."""
-    low = int(np.clip(about - 16, 0, len(way) - 1))
-    part = way.xyz[low : int(about) + 17, :2]
+    low = int(np.clip(about - 16, 0, len(path) - 1))
+    part = path.xyz[low : int(about) + 17, :2]
     return low + int(np.argmin(np.hypot(*(part - point).T)))
 
 

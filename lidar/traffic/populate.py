@@ -245,7 +245,7 @@ def _swept(trips: list[Trip]) -> NDArray[np.object_]:
     """Bounding boxes (k,) of moving road users along their paths, with a margin."""
     parts = [np.empty(0, object)]
     for trip in trips:
-        xy, heading = body_poses(trip.way, trip.axle)
+        xy, heading = body_poses(trip.path, trip.axle)
         every = slice(0, None, 2 if trip.on_foot else 4)
         parts.append(
             rectangles(xy[every], heading[every], length=max(trip.length, 1.0) + 0.5, width=trip.width + 0.3)

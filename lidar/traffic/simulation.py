@@ -26,7 +26,7 @@ from lidar.traffic.trips import Trip
 
 STEP_S = 0.1
 """Seconds of a simulation step."""
-_HORIZON = 60  # steps that the ego's way is known ahead: 6 s
+_HORIZON = 60  # steps that the ego's path is known ahead: 6 s
 _KEEP = (0.8, 0.3)  # metres that others keep from the ego's box before and beside it
 _ROUNDS = 30
 _NEAR = 6.0  # metres in plan from an edge's middle within which the ego may be on it
@@ -39,12 +39,12 @@ class SimulatedTrips:
     """Motion of the trips that appeared, sorted by trip and time.
 
     trip, step : (k,) int64
-    gone, speed : (k,) metres of the body's centre along the path, m/s
+    travelled, speed : (k,) metres of the body's centre along the path, m/s
     """
 
     trip: Ints
     step: Ints
-    gone: Float
+    travelled: Float
     speed: Float
 
 
@@ -61,7 +61,7 @@ def simulate_trips(
     """The motion of trips around a fixed ego trajectory, from its start to its end.
 
     ego_box : length, width and metres from the rear axle to the middle of the ego's box
-    obeys_signals   : whether the ego's motion keeps to the signals; otherwise they are green when it comes
+    obeys_signals   : whether the ego's motion obeys the signals; otherwise they turn green for it
 
     Trips that the ego would hit are left out.
     """
@@ -96,7 +96,7 @@ def simulate_ego(
 ) -> Float:
     """Metres (t,) along its path that the ego has driven at each step of `STEP_S`, simulated with the trips.
 
-    It follows, gives way and stops at signals and signs as the others do, and they know it as one of them.
+    It follows, gives way and obeys signals and signs like the other road users, and they react to it.
     """
     movers = _movers([ego, *trips], graph, plan=plan)
     steps = int(np.ceil(seconds / STEP_S)) + 1
@@ -107,14 +107,14 @@ def simulate_ego(
     excluded = np.zeros(len(trips) + 1, bool)
     log, _ = run(movers, known, plan.signals, excluded, cells, STEP_S, steps, _HORIZON, radius + LEFT, 0)
     mine = log[:, 0] == 0
-    gone = np.zeros(steps)
-    gone[log[mine, 1].astype(int)] = log[mine, 2]
-    return np.maximum.accumulate(gone)
+    travelled = np.zeros(steps)
+    travelled[log[mine, 1].astype(int)] = log[mine, 2]
+    return np.maximum.accumulate(travelled)
 
 
 def has_traffic_control(ego: EgoTrip, graph: RoadGraph, *, plan: JunctionPlan) -> bool:
     """Whether there are signals or stop signs along the ego's path."""
-    blocks = _blocks(ego, graph, plan=plan, ways={})
+    blocks = _blocks(ego, graph, plan=plan, routes={})
     return bool((blocks[:, 4] >= 0).any() or (blocks[:, 7] > 0).any())
 
 
@@ -186,14 +186,14 @@ def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: Junction
     columns: dict[str, list[NDArray[Any]]] = {
         name: [] for name in ("desired_speed", "x", "y", "heading", "cell", "first", "last", "leave", "block")
     }
-    ways: dict[tuple[int, ...], int] = {}
+    routes: dict[tuple[int, ...], int] = {}
     covered = graph.bridge | graph.tunnel
     for trip in trips:
-        way = trip.way
+        path = trip.path
         xy, heading = trip.body()
-        level = np.where(way.edge >= 0, covered[way.edge], False).astype(np.int64)
-        swept = sweep(xy, heading, length=trip.length, width=trip.width, level=level, scale=way.scale)
-        found = _blocks(trip, graph, plan=plan, ways=ways)
+        level = np.where(path.edge >= 0, covered[path.edge], False).astype(np.int64)
+        swept = sweep(xy, heading, length=trip.length, width=trip.width, level=level, scale=path.scale)
+        found = _blocks(trip, graph, plan=plan, routes=routes)
         columns["desired_speed"].append(trip.desired_speed)
         columns["x"].append(xy[:, 0])
         columns["y"].append(xy[:, 1])
@@ -201,7 +201,7 @@ def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: Junction
         for name in ("cell", "first", "last", "leave"):
             columns[name].append(getattr(swept, name))
         columns["block"].append(found)
-        station.append(station[-1] + len(way))
+        station.append(station[-1] + len(path))
         cell.append(cell[-1] + len(swept.cell))
         blocks.append(blocks[-1] + len(found))
     whole = {name: np.concatenate(parts) for name, parts in columns.items()}
@@ -240,18 +240,18 @@ def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: Junction
 
 
 def _blocks(
-    trip: Trip | EgoTrip, graph: RoadGraph, *, plan: JunctionPlan, ways: dict[tuple[int, ...], int]
+    trip: Trip | EgoTrip, graph: RoadGraph, *, plan: JunctionPlan, routes: dict[tuple[int, ...], int]
 ) -> Float:
     """Passages through junctions (b, 8): from, to, stop, zone, group, route, rank, sign; see `Movers`."""
-    way = trip.way
-    zone = zone_at(plan.zones, way.xyz[:, :2])
+    path = trip.path
+    zone = zone_at(plan.zones, path.xyz[:, :2])
     half = int(np.ceil((trip.length / 2 + 0.5) / STEP))
     rows: list[list[float]] = []
     for first, last, number in trip.crossing:
         if last >= trip.begin:
             z = int(zone[(first + last) // 2])
-            group = signal_group(plan, z, heading=float(way.heading[(first + last) // 2])) if z >= 0 else -1
-            key = ways.setdefault((-1, number), len(ways))
+            group = signal_group(plan, z, heading=float(path.heading[(first + last) // 2])) if z >= 0 else -1
+            key = routes.setdefault((-1, number), len(routes))
             rows.append([first, last, first - 1, z, group, key, 99.0, 0.0])
     if trip.on_foot:
         return np.array(rows, float).reshape(-1, 8)
@@ -260,27 +260,27 @@ def _blocks(
         z = int(zone[a])
         if z < 0 or b - 1 + half < trip.begin:
             continue
-        before, behind = max(a - 1, 0), min(b, len(way) - 1)
+        before, behind = max(a - 1, 0), min(b, len(path) - 1)
         through = (
             z,
-            *(int(v) for v in (way.edge[before], way.lane[before], way.edge[behind], way.lane[behind])),
+            *(int(v) for v in (path.edge[before], path.lane[before], path.edge[behind], path.lane[behind])),
         )
-        heading, entry = float(way.heading[before]), int(way.edge[before])
+        heading, entry = float(path.heading[before]), int(path.edge[before])
         start, end = a - half, b - 1 + half
-        stop = min(start - 2, _stop_line(way, graph, edge=entry, station=a) - half)
-        if stop < 4 and isinstance(trip, EgoTrip):  # it sets out from within
+        stop = min(start - 2, _stop_line(path, graph, edge=entry, station=a) - half)
+        if stop < 4 and isinstance(trip, EgoTrip):  # it starts inside the junction
             continue
         if rows and stop - rows[-1][1] < 2:  # no room to stand between two junctions
             rows[-1][1] = end
-            rows[-1][5] = ways.setdefault((int(rows[-1][5]), -1, *through), len(ways))
+            rows[-1][5] = routes.setdefault((int(rows[-1][5]), -1, *through), len(routes))
             continue
-        bend = (float(way.heading[behind]) - heading + np.pi) % (2 * np.pi) - np.pi
+        bend = (float(path.heading[behind]) - heading + np.pi) % (2 * np.pi) - np.pi
         rank = 2.0 * road_rank(str(graph.highway[entry]) if entry >= 0 else "") + 0.5 * (abs(bend) > 0.5)
         signs = graph.control_kind[graph.control_edge == entry]
         rank += 3.0 if np.isin(signs, ("stop", "give_way")).any() else 0.0
         group = signal_group(plan, z, heading=heading)
         halt = group < 0 and _stops(graph, entry)
-        rows.append([start, end, stop, z, group, ways.setdefault(through, len(ways)), rank, float(halt)])
+        rows.append([start, end, stop, z, group, routes.setdefault(through, len(routes)), rank, float(halt)])
     return np.array(rows, float).reshape(-1, 8)
 
 
@@ -291,7 +291,7 @@ def _stops(graph: RoadGraph, edge: int) -> bool:
     return edge >= 0 and bool(near.any() or graph.stop[graph.head[edge]])
 
 
-def _stop_line(way: ActorPath, graph: RoadGraph, *, edge: int, station: int) -> int:
+def _stop_line(path: ActorPath, graph: RoadGraph, *, edge: int, station: int) -> int:
     """Station of the first stop line on the edge that leads to a junction at ``station``."""
     here = graph.control_edge == edge
     offset = graph.control_offset[here]
@@ -303,5 +303,5 @@ def _stop_line(way: ActorPath, graph: RoadGraph, *, edge: int, station: int) -> 
     at = float(offset.min()) / max(float(graph.length[edge]), 1e-9) * along[-1]
     point = polylines.points_at(line, [at], along=along)[0]
     first = max(station - int(2 * _LINE_REACH / STEP), 0)
-    distance = np.hypot(*(way.xyz[first : station + 1, :2] - point).T)
+    distance = np.hypot(*(path.xyz[first : station + 1, :2] - point).T)
     return first + int(np.argmin(distance)) - int(_LINE_ROOM / STEP)

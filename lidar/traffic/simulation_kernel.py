@@ -131,7 +131,7 @@ class _Reservations(NamedTuple):
 class _State(NamedTuple):
     """State of the road users (n).
 
-    active, gone       : has appeared; has disappeared
+    active, departed       : has appeared; has disappeared
     s, v               : metres along the path, m/s
     ahead              : row of the first cell that the body has not reached
     reserved, released : rows reserved, and rows (in the order of leaving) released
@@ -141,7 +141,7 @@ class _State(NamedTuple):
     """
 
     active: Flags
-    gone: Flags
+    departed: Flags
     s: Float
     v: Float
     ahead: Ints
@@ -207,7 +207,7 @@ def run(
             row = m.station_start[ego_row] + int(st.s[ego_row] / STEP)
             ego.x[step], ego.y[step] = m.x[row], m.y[row]
         for i in range(n):
-            if st.gone[i] or not (st.active[i] or _try_to_appear(i, step, step * dt, m, g, st)):
+            if st.departed[i] or not (st.active[i] or _try_to_appear(i, step, step * dt, m, g, st)):
                 continue
             _move(i, step, dt, m, g, st, ego, signals)
             row = m.station_start[i] + int(st.s[i] / STEP)
@@ -218,7 +218,7 @@ def run(
             log[rows, 0], log[rows, 1], log[rows, 2], log[rows, 3] = i, step, st.s[i], st.v[i]
             rows += 1
             if math.hypot(m.x[row] - ego.x[step], m.y[row] - ego.y[step]) > radius:
-                st.gone[i] = True
+                st.departed[i] = True
             if _boxes_overlap(i, row, step, m, ego):
                 hit_ego[i] = True
             _release_behind(i, m, g, st)
@@ -250,7 +250,7 @@ def _try_to_appear(i: int, step: int, t: float, m: Any, g: Any, st: Any) -> bool
         return False
     # those of the first step appear at once or never, later ones may wait at the rim
     if step > m.appear[i] + (_PATIENCE if m.appear[i] else 0):
-        st.gone[i] = True
+        st.departed[i] = True
         return False
     base, k = m.station_start[i], m.begin[i]
     stations = m.station_start[i + 1] - base
@@ -293,7 +293,7 @@ def _release_behind(i: int, m: Any, g: Any, st: Any) -> None:
     """Release the cells behind a road user and the junction that it has left."""
     q0, q1 = m.cell_start[i], m.cell_start[i + 1]
     k = int(st.s[i] / STEP)
-    while st.released[i] < q1 and (st.gone[i] or m.last[m.leave[st.released[i]] + q0] < k):
+    while st.released[i] < q1 and (st.departed[i] or m.last[m.leave[st.released[i]] + q0] < k):
         row = m.leave[st.released[i]] + q0
         if row < st.reserved[i] and m.last[row] >= m.begin[i]:
             p = m.cell[row]
@@ -302,7 +302,7 @@ def _release_behind(i: int, m: Any, g: Any, st: Any) -> None:
                 g.owner[p] = _NOBODY
         st.released[i] += 1
     b = st.block[i]
-    if b == m.block_start[i + 1] or not (st.gone[i] or k > m.block_to[b]):
+    if b == m.block_start[i + 1] or not (st.departed[i] or k > m.block_to[b]):
         return
     _release_junction(i, m, g, st)
     st.rested[i] = 0
@@ -396,7 +396,7 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     st.s[i] = min(s + (v + new) / 2 * dt, max(end - 1, k) * STEP)
     st.v[i] = new
     if m.leaves[i] and st.s[i] > (end - 3) * STEP:
-        st.gone[i] = True
+        st.departed[i] = True
 
 
 @njit(cache=True, nogil=True)
@@ -436,7 +436,7 @@ def _obstacle(
 def _may_enter(i: int, k: int, t: float, m: Any, g: Any, st: Any, signals: Any) -> bool:
     """Whether a road user may enter its next junction."""
     b = st.block[i]
-    zone, group, way = m.block_zone[b], m.block_group[b], m.block_route[b]
+    zone, group, route = m.block_zone[b], m.block_group[b], m.block_route[b]
     base = m.station_start[i]
     pace = max(st.v[i], 1.2 if m.whole_block[i] else 3.0)
     eta = max(m.block_stop[b] - k, 0) * STEP / pace
@@ -450,13 +450,13 @@ def _may_enter(i: int, k: int, t: float, m: Any, g: Any, st: Any, signals: Any) 
         o = g.owner[p]
         if q >= st.reserved[i] and o not in (_NOBODY, i) and not behind:
             theirs = m.heading[m.station_start[o] + int(st.s[o] / STEP)]
-            same = st.block[o] < m.block_start[o + 1] and m.block_route[st.block[o]] == way
+            same = st.block[o] < m.block_start[o + 1] and m.block_route[st.block[o]] == route
             moves = st.v[o] > 0.5 * pace and math.cos(theirs - m.heading[base + m.first[q]]) > 0.5
             if not moves or not (same or m.first[q] > m.block_from[b]):
                 return False
             behind = True
         if m.first[q] >= m.block_from[b]:
-            if g.hold[p] not in (_NOBODY, way) and m.first[q] <= m.block_to[b]:
+            if g.hold[p] not in (_NOBODY, route) and m.first[q] <= m.block_to[b]:
                 return False
             if _needed_by_ego(g, p, t, (m.last[q] - k) * STEP / pace + 2.0):
                 return False
@@ -469,7 +469,7 @@ def _yields(i: int, eta: float, m: Any, st: Any) -> bool:
     b = st.block[i]
     for j in range(len(st.v)):
         c = st.block[j]
-        if j == i or not st.active[j] or st.gone[j] or st.granted[j] or c == m.block_start[j + 1]:
+        if j == i or not st.active[j] or st.departed[j] or st.granted[j] or c == m.block_start[j + 1]:
             continue
         rival = m.block_zone[c] == m.block_zone[b] and m.block_route[c] != m.block_route[b]
         if not rival or (m.block_group[c] >= 0 and m.block_group[c] != m.block_group[b]):

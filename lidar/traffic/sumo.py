@@ -303,10 +303,10 @@ def _ego_progress(fcd: Fcd, scene: Scene, *, path: VehiclePath, vehicle: Vehicle
         [np.cos(heading[rows]), np.sin(heading[rows])]
     )
     time = fcd.time[rows] - fcd.time[rows][0]
-    gone = np.zeros(len(axle))
+    travelled = np.zeros(len(axle))
     k = 0
     for n, point in enumerate(axle):
         window = slice(k, int(np.searchsorted(path.s, path.s[k] + 15.0)) + 1)
         k += int(np.argmin(np.hypot(*(path.position[window, :2] - point).T)))
-        gone[n] = path.s[k]
-    return time, np.maximum.accumulate(gone)
+        travelled[n] = path.s[k]
+    return time, np.maximum.accumulate(travelled)

@@ -54,11 +54,11 @@ def sweep(
     return Sweep(cell, first, last, np.argsort(last, kind="stable").astype(np.int32))
 
 
-def body_poses(way: ActorPath, axle: float) -> tuple[Float, Float]:
+def body_poses(path: ActorPath, axle: float) -> tuple[Float, Float]:
     """Centre (n, 2) and heading (n,) of a body at each station, with both axles on the path."""
     reach = axle / 2 / STEP
-    rows = np.arange(len(way), dtype=float)
-    ends = [np.stack([_extended(way.xyz[:, c], rows + s * reach) for c in (0, 1)], axis=1) for s in (1, -1)]
+    rows = np.arange(len(path), dtype=float)
+    ends = [np.stack([_extended(path.xyz[:, c], rows + s * reach) for c in (0, 1)], axis=1) for s in (1, -1)]
     d = ends[0] - ends[1]
     return (ends[0] + ends[1]) / 2, np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
 

@@ -39,7 +39,7 @@ def actor_table(
     position: Float,
     angles: Float,
     velocity: Float,
-    gone: Float,
+    travelled: Float,
     parked: bool,
     scale: float,
 ) -> Actors:
@@ -73,7 +73,7 @@ def actor_table(
         position=position.reshape(-1, 3),
         angles=angles.reshape(-1, 3),
         velocity=velocity.reshape(-1, 3),
-        gone=gone,
+        travelled=travelled,
         scale=scale,
     )
 
@@ -86,12 +86,12 @@ def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, 
     middle, yaw, hint = np.empty((n, 2)), np.empty(n), np.empty(n)
     for k, row in enumerate(present.tolist()):
         trip, part = trips[row], slice(ends[k], ends[k + 1])
-        at = flow.gone[part] / STEP
-        xy, heading = body_poses(trip.way, trip.axle)
+        at = flow.travelled[part] / STEP
+        xy, heading = body_poses(trip.path, trip.axle)
         stations = np.arange(len(xy))
         middle[part] = np.stack([np.interp(at, stations, xy[:, c]) for c in (0, 1)], axis=1)
         yaw[part] = np.interp(at, stations, heading)
-        hint[part] = np.interp(at, stations, trip.way.xyz[:, 2])
+        hint[part] = np.interp(at, stations, trip.path.xyz[:, 2])
     tracks = Tracks(
         shapes=[trips[row].shape for row in present],
         stretch=[trips[row].stretch for row in present],
@@ -101,7 +101,7 @@ def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, 
         yaw=yaw,
         hint=hint,
         speed=flow.speed,
-        gone=flow.gone,
+        travelled=flow.travelled,
     )
     return actors_on_ground(scene, tracks, scale=scale)
 
@@ -116,7 +116,7 @@ class Tracks:
     step        : (k,) number of `STEP_S` since the drive's start
     middle, yaw : (k, 2) scene metres of the body's centre and (k,) radians, unwrapped
     hint        : (k,) metres, approximate height of the ground; NaN for the topmost surface
-    speed, gone : (k,) m/s and metres covered
+    speed, travelled : (k,) m/s and metres covered
     """
 
     shapes: Sequence[Shape]
@@ -127,13 +127,13 @@ class Tracks:
     yaw: Float
     hint: Float
     speed: Float
-    gone: Float
+    travelled: Float
 
 
 def actors_on_ground(scene: Scene, tracks: Tracks, *, scale: float) -> Actors:
     """Actors (n) that follow tracks on the scene's ground."""
     shapes, stretch, knots = tracks.shapes, tracks.stretch, tracks.knots
-    middle, yaw, gone = tracks.middle, tracks.yaw, tracks.gone
+    middle, yaw, travelled = tracks.middle, tracks.yaw, tracks.travelled
     ends = np.concatenate([[0], np.cumsum(knots)])
     axle = np.repeat([s.base * g[0] for s, g in zip(shapes, stretch, strict=True)], knots)
     track = np.repeat([_TRACK * s.width * g[1] for s, g in zip(shapes, stretch, strict=True)], knots)
@@ -145,7 +145,7 @@ def actors_on_ground(scene: Scene, tracks: Tracks, *, scale: float) -> Actors:
         part = slice(ends[k], ends[k + 1])
         course[part] = _course(middle[part], yaw[part])
         for column in (z, pitch, roll):
-            column[part] = _smoothed(column[part], gone[part])
+            column[part] = _smoothed(column[part], travelled[part])
         pitch[part] *= shape.kind not in _UPRIGHT
         roll[part] *= shape.kind not in _UPRIGHT and shape.kind not in _LEANING
         climb[part] = _rate(z[part])
@@ -158,7 +158,7 @@ def actors_on_ground(scene: Scene, tracks: Tracks, *, scale: float) -> Actors:
         position=np.column_stack([middle, z]),
         angles=np.column_stack([yaw, pitch, roll]),
         velocity=np.column_stack([v * np.cos(course), v * np.sin(course), climb]),
-        gone=gone,
+        travelled=travelled,
         parked=False,
         scale=scale,
     )
@@ -214,14 +214,14 @@ def _course(middle: Float, yaw: Float) -> Float:
     return course
 
 
-def _smoothed(values: Float, gone: Float) -> Float:
-    """Values at metres ``gone``, smoothed over a metre as by tyres and springs."""
-    if len(values) < 2 or gone[-1] - gone[0] < 0.5:
+def _smoothed(values: Float, travelled: Float) -> Float:
+    """Values at metres ``travelled``, smoothed over a metre as by tyres and springs."""
+    if len(values) < 2 or travelled[-1] - travelled[0] < 0.5:
         return np.full(len(values), values.mean()) if len(values) else values
-    even = np.arange(gone[0] - 1.0, gone[-1] + 1.0, 0.25)
+    even = np.arange(travelled[0] - 1.0, travelled[-1] + 1.0, 0.25)
     from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
 
     smooth: Float = np.interp(
-        gone, even, gaussian_filter1d(np.interp(even, gone, values), 3.0, mode="nearest")
+        travelled, even, gaussian_filter1d(np.interp(even, travelled, values), 3.0, mode="nearest")
     )
     return smooth

@@ -78,7 +78,7 @@ class Trip:
 
     shape         : body
     stretch       : scale factors of the body along x, y and z
-    way           : path, n stations
+    path           : path, n stations
     driver        : driver model
     desired_speed : (n,) m/s at each station
     begin         : station of the start
@@ -90,7 +90,7 @@ class Trip:
 
     shape: Shape
     stretch: tuple[float, float, float]
-    way: ActorPath
+    path: ActorPath
     driver: Driver
     desired_speed: Float
     begin: int
@@ -116,7 +116,7 @@ class Trip:
 
     def body(self) -> tuple[Float, Float]:
         """Centre (n, 2) in scene metres and heading (n,) in radians of the body at each station."""
-        return body_poses(self.way, self.axle)
+        return body_poses(self.path, self.axle)
 
 
 def vehicle_trips(
@@ -211,11 +211,11 @@ def _trip(
         complete = len(whole) - last <= shape.length / STEP + 4
         if not complete or last - begin < _MIN_STATIONS:
             continue
-        way = whole.part(first, last)
+        path = whole.part(first, last)
         end = edges[-1]
         leaves = bool(lanes.exit[end] or not area.near[end])
-        desired = speed_profile(way, driver, pace=pace)
-        return Trip(shape, grow, way, driver, desired, begin - first, span[0], leaves)
+        desired = speed_profile(path, driver, pace=pace)
+        return Trip(shape, grow, path, driver, desired, begin - first, span[0], leaves)
     return None
 
 
@@ -241,24 +241,24 @@ def random_stretch(rng: np.random.Generator) -> tuple[float, float, float]:
 
 
 def _stations_on_carriageway(
-    way: ActorPath, shape: Shape, *, grow: Sequence[float], ground: shapely.Geometry | None, begin: int
+    path: ActorPath, shape: Shape, *, grow: Sequence[float], ground: shapely.Geometry | None, begin: int
 ) -> tuple[int, int]:
     """First and last station (exclusive) around ``begin`` between which the body stays on the carriageway."""
     if ground is None:
-        return 0, len(way)
-    xy, heading = body_poses(way, shape.base * grow[0])
+        return 0, len(path)
+    xy, heading = body_poses(path, shape.base * grow[0])
     boxes = rectangles(
-        xy, heading, length=shape.length * grow[0] * way.scale, width=shape.width * grow[1] * way.scale
+        xy, heading, length=shape.length * grow[0] * path.scale, width=shape.width * grow[1] * path.scale
     )
     off = np.flatnonzero(~shapely.covers(ground, boxes))
     before, behind = off[off <= begin], off[off > begin]
-    return int(before[-1]) + 1 if len(before) else 0, int(behind[0]) if len(behind) else len(way)
+    return int(before[-1]) + 1 if len(before) else 0, int(behind[0]) if len(behind) else len(path)
 
 
-def speed_profile(way: ActorPath, driver: Driver, *, pace: float) -> Float:
+def speed_profile(path: ActorPath, driver: Driver, *, pace: float) -> Float:
     """Desired speed (n,) in m/s: speed limit times ``pace``, slower in bends and in time before them."""
-    bend = np.maximum(np.abs(way.curvature), 1e-6)
-    v = np.minimum(np.minimum(way.limit * pace, driver.max_speed), np.sqrt(_LATERAL / bend))
+    bend = np.maximum(np.abs(path.curvature), 1e-6)
+    v = np.minimum(np.minimum(path.limit * pace, driver.max_speed), np.sqrt(_LATERAL / bend))
     v = np.maximum(v, 1.0)
     ramp = 2 * driver.deceleration * 0.8 * STEP * np.arange(len(v))
     back = np.minimum.accumulate((v**2 + ramp)[::-1])[::-1] - ramp

@@ -42,7 +42,7 @@ class Actors:
     position : (k, 3) scene metres, centre of the bounding box, on the ground
     angles   : (k, 3) radians: yaw from the x axis (unwrapped), pitch (nose down positive), roll
     velocity : (k, 3) scene metres a second
-    gone     : (k,) metres covered
+    travelled     : (k,) metres covered
     scale    : scene metres per true metre
     """
 
@@ -61,7 +61,7 @@ class Actors:
     position: Float
     angles: Float
     velocity: Float
-    gone: Float
+    travelled: Float
     scale: float
 
     def __len__(self) -> int:
@@ -76,13 +76,13 @@ class States:
     position : (k, 3) scene metres, centre of the bounding box, on the ground
     angles   : (k, 3) yaw, pitch, roll in radians
     velocity : (k, 3) scene metres a second
-    gone     : (k,) metres covered
+    travelled     : (k,) metres covered
     """
 
     position: Float
     angles: Float
     velocity: Float
-    gone: Float
+    travelled: Float
 
 
 def alive(actors: Actors, start_ns: int, *, end_ns: int) -> NDArray[np.int64]:
@@ -121,7 +121,7 @@ def states(actors: Actors, rows: ArrayLike, *, time_ns: ArrayLike) -> States:
         position,
         actors.angles[low] + w * (actors.angles[high] - actors.angles[low]),
         velocity,
-        actors.gone[low] + w[:, 0] * (actors.gone[high] - actors.gone[low]),
+        actors.travelled[low] + w[:, 0] * (actors.travelled[high] - actors.travelled[low]),
     )
 
 
@@ -148,7 +148,7 @@ def actor_shapes(actors: Actors) -> list[Mesh]:
 
 def poses_of(actors: Actors, rows: NDArray[np.int64], *, at: States) -> NDArray[np.int32]:
     """Bodies (k,) of actors in their states: pedestrians and riders have the pose of their stride."""
-    step = at.gone / actors.stride[rows] * actors.poses[rows]
+    step = at.travelled / actors.stride[rows] * actors.poses[rows]
     shape: NDArray[np.int32] = actors.shape[rows] + step.astype(np.int32) % actors.poses[rows]
     return shape
 
@@ -201,7 +201,7 @@ def joined(groups: Sequence[Actors], *, first_feature: int) -> Actors:
     columns = {
         name: np.concatenate([getattr(g, name) for g in groups])
         for name in ("poses", "stride", "kind", "klass", "size", "stretch", "parked",
-                     "time_ns", "position", "angles", "velocity", "gone")
+                     "time_ns", "position", "angles", "velocity", "travelled")
     }  # fmt: skip
     shape = np.concatenate(
         [

@@ -50,31 +50,31 @@ class Surfaces:
 class Faces(NamedTuple):
     """Attributes of the faces of a world, for compiled code.
 
-    A hit is on row ``face + start[instance]`` of ``what``, a miss (both -1) on its last.
+    A hit is on row ``face + start[instance]`` of ``packed``, a miss (both -1) on its last.
 
     start : (k + 1,) int64, first row of each instance's shape; the last is 0, the caster's own mesh
     named : (k,) int32, feature number of each instance
-    what  : (m,) int64, feature << 32 | kind of leaves << 16 | class << 8 | material
+    packed : (m,) int64, feature << 32 | kind of leaves << 16 | class << 8 | material
     low, high : bounds of all feature numbers
     leaves : (l,) float64, m2/m3, leaf area per volume behind a face by its kind of leaves; 0 for kind 0, none
     """
 
     start: NDArray[np.int64]
     named: NDArray[np.int32]
-    what: NDArray[np.int64]
+    packed: NDArray[np.int64]
     low: int
     high: int
     leaves: Float
 
 
 def packed(surfaces: Surfaces, leaves: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
-    """The column `Faces.what` of surfaces and of their kinds of leaves (none by default)."""
-    what = surfaces.feature.astype(np.int64) << 32
+    """The column `Faces.packed` of surfaces and of their kinds of leaves (none by default)."""
+    column = surfaces.feature.astype(np.int64) << 32
     if leaves is not None:
-        what |= leaves.astype(np.int64) << 16
-    what |= surfaces.klass.astype(np.int64) << 8
-    what |= surfaces.material
-    return what
+        column |= leaves.astype(np.int64) << 16
+    column |= surfaces.klass.astype(np.int64) << 8
+    column |= surfaces.material
+    return column
 
 
 def _surfaces(mesh: Mesh) -> Surfaces:
@@ -239,7 +239,7 @@ class World:
                 for f in fields(Surfaces)
             )
         )
-        self._what = packed(self._surfaces, self._leaves_of(starts[len(self._tiles) :]))
+        self._packed = packed(self._surfaces, self._leaves_of(starts[len(self._tiles) :]))
         feature = self._surfaces.feature
         self._bounds = int(feature.min()), int(feature.max())
         self._still = self._static()
@@ -266,7 +266,7 @@ class World:
         if len(self._feature):
             low, high = min(low, int(self._feature.min())), max(high, int(self._feature.max()))
         leaves = np.array([0.0, *self._leaves.values()])
-        self._faces = Faces(self._base, self._feature, self._what, low, high, leaves)
+        self._faces = Faces(self._base, self._feature, self._packed, low, high, leaves)
 
     def _static(self) -> Instances:
         tiles = self._tiles.values()

@@ -22,8 +22,8 @@ def tracks(trips, flow):
     out = np.full((int(flow.step.max()) + 1, len(trips), 3), np.nan)
     for k in np.unique(flow.trip):
         rows = flow.trip == k
-        xy, heading = body_poses(trips[k].way, trips[k].axle)
-        at = flow.gone[rows] / STEP
+        xy, heading = body_poses(trips[k].path, trips[k].axle)
+        at = flow.travelled[rows] / STEP
         for c, column in enumerate((*xy.T, heading)):
             out[flow.step[rows], k, c] = np.interp(at, np.arange(len(xy)), column)
     return out

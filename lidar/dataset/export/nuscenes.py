@@ -126,9 +126,9 @@ def _formats() -> list[Format]:
     return [form for form in FORMATS.values() if form.frame == "sensor" and needed <= set(form.columns)]
 
 
-def _token(*what: object) -> str:
+def _token(*parts: object) -> str:
     """A token of 32 hexadecimal digits: a hash of the arguments."""
-    return hashlib.blake2b("/".join(map(str, what)).encode(), digest_size=16).hexdigest()
+    return hashlib.blake2b("/".join(map(str, parts)).encode(), digest_size=16).hexdigest()
 
 
 def _chained(rows: Sequence[Row]) -> None:

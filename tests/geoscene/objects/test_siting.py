@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from geoscene.classes import Class
-from geoscene.ground.partition import values_at, winners
+from geoscene.ground.partition import rows_at, values_at
 from geoscene.objects.siting import FARTHEST
 from geoscene.options import BuildOptions
 from geoscene.plan import make_plan
@@ -26,7 +26,7 @@ def assert_off_carriageways(path):
     layers = plan.ground.layers
     rails = shapely.union_all(layers.polygon[layers.klass == Class.RAIL])
     for table in (plan.furniture, plan.trees):
-        klass = values_at(layers.klass, winners(plan.ground, table.xy), base=plan.ground.base[0])
+        klass = values_at(layers.klass, rows_at(plan.ground, table.xy), base=plan.ground.base[0])
         driven = np.isin(klass, [Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.RAIL, Class.TUNNEL])
         assert table.osm_id[driven].tolist() == []
         assert table.osm_id[klass == Class.BUILDING_PAD].tolist() == []

@@ -81,7 +81,7 @@ def test_the_swath_is_that_of_the_sensor():
     aircraft = load_rig("aircraft")
     # 30 degrees to each side
     assert swath(scanners(aircraft), 600.0) == pytest.approx(2 * 600 * np.tan(np.radians(30)), rel=0.05)
-    with pytest.raises(RouteError, match="sees 6000 m"):
+    with pytest.raises(RouteError, match="is 6000 m"):
         swath(scanners(aircraft), 7000.0)
 
 
@@ -127,7 +127,7 @@ def test_a_drone_without_more_words_flies_over_streets_and_sees_them(scene, tmp_
         ("aircraft", {"route": "random"}, "cannot follow streets"),
         ("drone", {"survey": "nowhere.geojson"}, "neither all"),
         ("drone", {"survey": "3,4,5,6"}, "does not touch"),
-        ("drone", {"survey": "all", "altitude": 800.0}, "sees 450 m"),
+        ("drone", {"survey": "all", "altitude": 800.0}, "is 450 m"),
     ],
 )
 def test_flights_that_cannot_be_are_refused_in_one_line(scene, rig, change, says):

@@ -114,9 +114,9 @@ def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
         if t.appear_s == 0.0 and t.begin > 60
     ]
     plan = junction_plan(graph, lanes, seed=1)
-    gone = simulate_ego(ego_trip(path, CAR), slow, graph=graph, plan=plan, seconds=60.0, radius=600.0)
+    travelled = simulate_ego(ego_trip(path, CAR), slow, graph=graph, plan=plan, seconds=60.0, radius=600.0)
     motion = motion_within(
-        path, CAR, time_s=np.arange(len(gone)) * STEP_S, max_distance=np.minimum(gone, path.length)
+        path, CAR, time_s=np.arange(len(travelled)) * STEP_S, max_distance=np.minimum(travelled, path.length)
     )
     ego = poses_along(path, CAR, motion=motion)
     flow = simulate_trips(slow, graph, plan=plan, ego=ego, ego_box=BOX, radius=600.0, obeys_signals=True)
@@ -124,7 +124,7 @@ def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
     check_gentle(ego)
     ahead = min((k for k in range(len(slow))), key=lambda k: slow[k].begin)
     rows = flow.trip == ahead
-    tail = slow[ahead].way.xyz[0, 0] + flow.gone[rows] - slow[ahead].length / 2
+    tail = slow[ahead].path.xyz[0, 0] + flow.travelled[rows] - slow[ahead].length / 2
     middle, _ = middle_of(ego, flow.step[rows] * STEP_S)
     gap = tail - middle[:, 0] - CAR.length / 2
     assert gap.min() > 1.5
@@ -142,9 +142,9 @@ def test_among_traffic_the_ego_touches_nobody_and_nobody_is_taken_out_for_it(see
     trips = vehicle_trips(
         lanes, surroundings_of(lanes, alone, radius=300.0, scale=1.0), seed=seed, density=20.0
     )
-    gone = simulate_ego(ego_trip(path, CAR), trips, graph=graph, plan=plan, seconds=60.0, radius=300.0)
+    travelled = simulate_ego(ego_trip(path, CAR), trips, graph=graph, plan=plan, seconds=60.0, radius=300.0)
     motion = motion_within(
-        path, CAR, time_s=np.arange(len(gone)) * STEP_S, max_distance=np.minimum(gone, path.length)
+        path, CAR, time_s=np.arange(len(travelled)) * STEP_S, max_distance=np.minimum(travelled, path.length)
     )
     ego = poses_along(path, CAR, motion=motion)
     check_gentle(ego)
@@ -155,5 +155,5 @@ def test_among_traffic_the_ego_touches_nobody_and_nobody_is_taken_out_for_it(see
     for mine, moment in zip(own[::2], poses[::2], strict=True):
         if np.isfinite(moment).any():
             assert not shapely.intersects(mine, boxes_at(trips, moment)).any()
-    assert gone[-1] > 80.0  # it gets on
-    assert STEP < gone[-1] <= path.length + STEP
+    assert travelled[-1] > 80.0  # it gets on
+    assert STEP < travelled[-1] <= path.length + STEP

@@ -162,10 +162,10 @@ def test_who_brakes_to_a_stop_neither_overshoots_nor_goes_back(scene, graph, str
     actors = played(scene, graph, path, standing(street[0] + 60.0), net=net_at(tmp_path / "n.net.xml"))
     t = np.arange(0.0, 7.0, 0.02)
     _, front = fronts(actors, 0, t)
-    gone = shapely.line_locate_point(shapely.linestrings(street), shapely.points(front[:, :2]))
-    assert np.diff(gone).min() > -2e-3
+    travelled = shapely.line_locate_point(shapely.linestrings(street), shapely.points(front[:, :2]))
+    assert np.diff(travelled).min() > -2e-3
     resting = (t > 3.0) & (t < 5.0)
-    np.testing.assert_allclose(gone[resting], 33.0, atol=0.02)
+    np.testing.assert_allclose(travelled[resting], 33.0, atol=0.02)
 
 
 def test_classes_become_bodies_and_what_runs_on_rails_is_left_out(scene, graph, street, tmp_path):
@@ -289,7 +289,7 @@ BROKEN = {
     "cut": ('<fcd-export><timestep time="0.00"><vehicle id="a"', "broken XML"),
     "empty": ("", "broken XML"),
     "another": ("<routes><vehicle id='a'/></routes>", "<routes> is not floating car data"),
-    "nobody": ('<fcd-export><timestep time="0.00"/></fcd-export>', "nobody is in it"),
+    "nobody": ('<fcd-export><timestep time="0.00"/></fcd-export>', "no vehicles and no persons in it"),
     "no_x": (
         '<fcd-export><timestep time="3"><vehicle id="a" y="1" angle="0"/></timestep></fcd-export>',
         "vehicle 'a' at 3 s: x is missing",

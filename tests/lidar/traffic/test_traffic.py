@@ -119,9 +119,9 @@ def test_speed_changes_as_a_vehicle_can():
         change = np.diff(speed) / STEP_S
         assert change.max(initial=0.0) <= trips[k].driver.acceleration + 1e-6
         assert change.min(initial=0.0) >= -HARD - 1e-6
-        gone = np.diff(flow.gone[flow.trip == k])
-        np.testing.assert_allclose(gone, (speed[1:] + speed[:-1]) / 2 * STEP_S, atol=0.02)
-        assert (gone >= -1e-9).all()
+        travelled = np.diff(flow.travelled[flow.trip == k])
+        np.testing.assert_allclose(travelled, (speed[1:] + speed[:-1]) / 2 * STEP_S, atol=0.02)
+        assert (travelled >= -1e-9).all()
 
 
 def test_braking_is_mild_almost_always():
@@ -193,12 +193,13 @@ def test_nobody_enters_a_junction_on_red():
     entered = 0
     for k in np.unique(flow.trip):
         rows = flow.trip == k
-        zone = zone_at(plan.zones, trips[k].way.xyz[:, :2])
-        front = np.minimum(flow.gone[rows] / STEP + trips[k].length / 2 / STEP, len(zone) - 1).astype(int)
+        zone = zone_at(plan.zones, trips[k].path.xyz[:, :2])
+        station = (flow.travelled[rows] + trips[k].length / 2) / STEP
+        front = np.minimum(station, len(zone) - 1).astype(int)
         here = zone[front]
         for i in np.flatnonzero((np.diff(here) != 0) & (here[1:] >= 0)):
             z = int(here[i + 1])
-            group = signal_group(plan, z, heading=float(trips[k].way.heading[front[i]]))
+            group = signal_group(plan, z, heading=float(trips[k].path.heading[front[i]]))
             t = float(flow.step[rows][i + 1]) * STEP_S
             # green now or, for who was let in while it was, within amber and clearing
             lately = [is_green(z, group, t - ago, plan.signals) for ago in np.arange(0.0, AMBER, 0.5)]
@@ -228,11 +229,11 @@ def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
         trips = vehicle_trips(lanes, area, seed=1, density=10.0, ground=road)
         assert len(trips) > 10
         for trip in trips:
-            xy, heading = body_poses(trip.way, trip.axle)
+            xy, heading = body_poses(trip.path, trip.axle)
             assert shapely.covers(road, rectangles(xy, heading, length=trip.length, width=trip.width)).all()
-            line = shapely.LineString(graph.geometry[trip.way.edge[trip.begin]][:, :2])
-            ring = shapely.LinearRing([*line.coords, trip.way.xyz[trip.begin, :2]])
-            if abs(trip.way.curvature[trip.begin]) < 1e-3:
+            line = shapely.LineString(graph.geometry[trip.path.edge[trip.begin]][:, :2])
+            ring = shapely.LinearRing([*line.coords, trip.path.xyz[trip.begin, :2]])
+            if abs(trip.path.curvature[trip.begin]) < 1e-3:
                 assert ring.is_ccw == (sign < 0)
 
 
@@ -246,9 +247,9 @@ def test_the_same_seed_gives_the_same_traffic():
     graph = city(lit=True)
     ego = driving(graph, 1, 20.0)
     first, second, other = (flow_on(graph, ego, seed=s, radius=200.0)[1] for s in (7, 7, 8))
-    for name in ("trip", "step", "gone", "speed"):
+    for name in ("trip", "step", "travelled", "speed"):
         assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
-    assert first.gone.tobytes() != other.gone.tobytes()
+    assert first.travelled.tobytes() != other.travelled.tobytes()
 
 
 def test_more_density_is_more_traffic():

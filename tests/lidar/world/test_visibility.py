@@ -41,7 +41,7 @@ def one_car(place=(20.0, 0.0, 0.0), *, yaw=0.0, velocity=(0.0, 0.0, 0.0), turnin
         position=np.array(place) + s[:, None] * np.array(velocity),
         angles=angles,
         velocity=np.tile(np.array(velocity, float), (n, 1)),
-        gone=np.zeros(n),
+        travelled=np.zeros(n),
         scale=1.0,
     )
 
