@@ -80,7 +80,7 @@ def overlaps(boxes):
 @given(seed=st.integers(0, 10_000), lit=st.booleans(), lanes=st.sampled_from([1.0, 2.0]))
 def test_no_two_vehicles_ever_touch_and_none_jumps(seed, lit, lanes):
     graph = city(lit=lit, lanes=lanes, width=7.0 * lanes)
-    trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 65.0), seed=seed, radius=600.0)
+    trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 65.0), seed=seed, density=12.0, radius=600.0)
     assert len(np.unique(flow.trip)) > 15
     assert flow.step.max() * STEP_S > 60
     poses = tracks(trips, flow)
