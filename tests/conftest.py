@@ -49,14 +49,20 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             setattr(test, attribute, settings(own, max_examples=FUZZ_FACTOR * own.max_examples))
 
 
-def _shared(folder: str, name: str) -> Path:
-    given = os.environ.get("GEOSCENE_SHARED")
-    base = Path(given) if given else Path(__file__).resolve().parents[2] / "shared"
-    path = base / folder / name
-    if not path.exists():
-        if given:
-            pytest.fail(f"{path} is absent, though GEOSCENE_SHARED is set")
+SHARED = Path(os.environ.get("GEOSCENE_SHARED") or Path(__file__).resolve().parents[2] / "shared")
+"""Folder of the real extracts, which are no part of the repository."""
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip the tests of absent extracts, all from one line, so that the summary has one line for them."""
+    if item.get_closest_marker("shared") and "GEOSCENE_SHARED" not in os.environ and not SHARED.exists():
         pytest.skip("needs real extracts, not part of the repository: set GEOSCENE_SHARED to their folder")
+
+
+def _shared(folder: str, name: str) -> Path:
+    path = SHARED / folder / name
+    if not path.exists():
+        pytest.fail(f"{path} is absent: GEOSCENE_SHARED names another folder, or the extracts are incomplete")
     return path
 
 
