@@ -21,8 +21,7 @@ NOTCH = 2e-3
 def to_grid(xy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Coordinates rounded to the 0.1 mm grid."""
     # like GEOS: division by 1e4 gives the float nearest to the decimal, multiplication by 1e-4 does not
-    rounded: NDArray[np.float64] = np.rint(xy * 1e4) / 1e4
-    return rounded
+    return np.rint(xy * 1e4) / 1e4
 
 
 def object_array(shapes: Sequence[Any]) -> Polygons:

@@ -79,8 +79,7 @@ def _triangles_or_none(polygon: Any) -> Any:
 def _double_area(xy: Float) -> Float:
     """Twice the signed areas of triangles (m, 3, 2)."""
     a, b = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
-    area: Float = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    return area
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def lift(xy: Float, z: Float) -> Float:

@@ -118,8 +118,7 @@ def _mean_heights(buildings: Buildings) -> Float:
     area = np.where(buildings.drawn, shapely.area(buildings.footprint), 0.0)
     total = np.bincount(buildings.outline, weights=area, minlength=len(buildings))
     sums = np.bincount(buildings.outline, weights=area * buildings.height, minlength=len(buildings))
-    mean: Float = np.divide(sums, total, out=buildings.height.copy(), where=total > 0)
-    return mean
+    return np.divide(sums, total, out=buildings.height.copy(), where=total > 0)
 
 
 def _simplified(pieces: _Pieces) -> _Pieces:

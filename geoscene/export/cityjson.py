@@ -92,8 +92,7 @@ class _Palette:
         looks = np.column_stack([mesh.material[rows], mesh.color[rows]])
         known, which = np.unique(looks, axis=0, return_inverse=True)
         numbers = [self._numbers.setdefault(tuple(look), len(self._numbers)) for look in known.tolist()]
-        chosen: NDArray[np.int64] = np.array(numbers, np.int64)[which.ravel()]
-        return chosen
+        return np.array(numbers, np.int64)[which.ravel()]
 
     def to_json(self) -> dict[str, Any]:
         """CityJSON's ``appearance``."""

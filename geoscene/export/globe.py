@@ -37,17 +37,13 @@ class Globe:
 
     def local(self, points: Float) -> Float:
         """East, north, up (n, 3) of points in scene metres."""
-        out: Float = (earth_centred(self.frame, points, lift=self.lift) - self.matrix[:3, 3]) @ self.matrix[
-            :3, :3
-        ]
-        return out
+        return (earth_centred(self.frame, points, lift=self.lift) - self.matrix[:3, 3]) @ self.matrix[:3, :3]
 
     def jacobian(self, points: Float) -> Float:
         """(n, 3, 3) derivatives of east, north, up by scene x, y, z at points in scene metres."""
         steps = np.concatenate([np.eye(3), -np.eye(3)])
         around = self.local((points[:, None] + steps).reshape(-1, 3)).reshape(-1, 6, 3)
-        out: Float = ((around[:, :3] - around[:, 3:]) / 2).transpose(0, 2, 1)
-        return out
+        return ((around[:, :3] - around[:, 3:]) / 2).transpose(0, 2, 1)
 
 
 def earth_centred(frame: Frame, points: Float, *, lift: float = 0.0) -> Float:

@@ -36,8 +36,7 @@ _VIEWS: tuple[tuple[str, int, int], ...] = (
 
 def y_up(points: Float) -> Float:
     """Points (..., 3) of x east, y north, z up in glTF's axes: x east, y up, z south."""
-    turned: Float = np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
-    return turned
+    return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
 
 
 def dump(value: Any) -> bytes:

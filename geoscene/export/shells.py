@@ -30,8 +30,7 @@ def shell_numbers(corners: Ints, owner: NDArray[np.integer]) -> Ints:
     _, first, numbers = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
-    shells: Ints = rank[numbers]
-    return shells
+    return rank[numbers]
 
 
 def bodies(points: Float, faces: NDArray[np.integer], *, shell: Ints) -> list[list[Ints]]:

@@ -220,5 +220,4 @@ def _flooded(
         stand[flows] = levels.height[levels.nearest.query(triangles.points[vertex[flows]])[1]]
     level = np.full(len(z), np.inf)
     np.minimum.at(level, vertex, stand)
-    flooded: Float = np.where(np.isinf(level), z, level)
-    return flooded
+    return np.where(np.isinf(level), z, level)

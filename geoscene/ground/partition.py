@@ -262,8 +262,7 @@ def distinct(points: Float) -> tuple[Float, Ints]:
 
 
 def _snap(values: Float) -> Float:
-    snapped: Float = np.round(values / PRECISION) * PRECISION
-    return snapped
+    return np.round(values / PRECISION) * PRECISION
 
 
 def _outlines(polygons: NDArray[np.object_], box: Float) -> tuple[Float, Float, Ints]:

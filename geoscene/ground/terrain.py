@@ -199,8 +199,7 @@ def base_heights(
         fine = shapely.segmentize(shapely.boundary(outlines[first : first + _AT_ONCE]), 2.0)
         xy, owner = shapely.get_coordinates(fine, return_index=True)
         np.minimum.at(lowest, first + owner, height(xy[:, 0], xy[:, 1]))
-    base: Float = np.where(np.isinf(lowest), np.nan, lowest)
-    return base
+    return np.where(np.isinf(lowest), np.nan, lowest)
 
 
 @dataclass(frozen=True, slots=True)

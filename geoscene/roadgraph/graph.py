@@ -121,8 +121,7 @@ class RoadGraph:
     @property
     def travel_time(self) -> Float:
         """Seconds (m,) that each edge takes at its speed limit."""
-        seconds: Float = self.length / self.speed
-        return seconds
+        return self.length / self.speed
 
     def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> RoadGraph:
         """The chosen edges, in the given order, with the nodes they use.

@@ -70,8 +70,7 @@ class LaneLayout:
         middle = self.span / 2 - (np.asarray(lane) + 0.5) * self.span / self.count
         middle = np.where(self.shared & (self.count == 1), self.carriageway / 4, middle)
         room = np.maximum(self.carriageway / 2 - body_width / 2 - clearance, 0.0)
-        offset: Float = np.clip(middle, -room, room)
-        return offset
+        return np.clip(middle, -room, room)
 
     def take(self, rows: ArrayLike) -> LaneLayout:
         """Chosen rows."""

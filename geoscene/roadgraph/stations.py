@@ -155,5 +155,4 @@ def _heading(lines: NDArray[np.object_], along: Float) -> Float:
 
 
 def _cross(a: Float, b: Float) -> Float:
-    turn: Float = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    return turn
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

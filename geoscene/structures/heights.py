@@ -51,8 +51,7 @@ def surface_heights(table: Structures, piece: int, *, xy: Float) -> Float:
         alike = np.clip((PARTED - np.abs(theirs - own)) / (PARTED - SHARED), 0.0, 1.0)
         weight = np.where(beside, weight * alike, 0.0)
         total, z = total + weight, z + weight * theirs
-    heights: Float = z / total
-    return heights
+    return z / total
 
 
 def slopes_across(table: Structures, piece: int) -> bool:
@@ -69,5 +68,4 @@ def slopes_across(table: Structures, piece: int) -> bool:
 
 def _weight(metres: Float, half: float) -> Float:
     share = np.clip(1.0 - (metres - half) / _FADE, 1e-4, 1.0)
-    weight: Float = share**2 / (metres + 0.03) ** 4
-    return weight
+    return share**2 / (metres + 0.03) ** 4

@@ -170,8 +170,7 @@ def _rings(indices: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _outwards(indices: NDArray[np.int64]) -> NDArray[np.int64]:
     """Tiles in loading order: from the middle outwards."""
-    ordered: NDArray[np.int64] = indices[np.lexsort([indices[:, 1], indices[:, 0], _rings(indices)])]
-    return ordered
+    return indices[np.lexsort([indices[:, 1], indices[:, 0], _rings(indices)])]
 
 
 def _too_large(
