@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, TypeVar, cast
 
@@ -56,10 +56,9 @@ from geoscene.structures import (
     read_structures,
     within_extent,
 )
-from geoscene.typing import Float
+from geoscene.typing import Float, Height
 
 Bounds = tuple[float, float, float, float]
-Height = Callable[[Float, Float], Float]
 T = TypeVar("T")
 
 LARGEST_KM2 = 4000.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,10 +26,7 @@ from geoscene.ground.partition import (
 from geoscene.ground.triangulate import Triangles, triangulate
 from geoscene.mesh import Mesh
 from geoscene.sources.data import Way
-from geoscene.typing import Float
-
-Height = Callable[[Float, Float], Float]
-"""z (n,) in metres of the terrain at scene x (n,), y (n,)."""
+from geoscene.typing import Float, Height
 
 _STATION = 20.0
 """Spacing in metres of terrain samples along shores and rivers."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,7 @@ from pyproj import CRS, Transformer
 
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.frames import Frame
-from geoscene.typing import Float
+from geoscene.typing import Float, Height
 
 Vertical = Literal["flat", "orthometric", "ellipsoidal"]
 
@@ -184,9 +184,7 @@ def open_terrain(
     )
 
 
-def base_heights(
-    footprints: Sequence[object] | NDArray[np.object_], height: Callable[[Float, Float], Float]
-) -> Float:
+def base_heights(footprints: Sequence[object] | NDArray[np.object_], height: Height) -> Float:
     """The lowest ground (n,) along each footprint's outline, metres: where a building on a slope stands.
 
     ``height`` (z of the ground at x, y) is asked at the outline's vertices and at most 2 m apart between

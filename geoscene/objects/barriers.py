@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -18,10 +17,8 @@ from geoscene.mesh import Mesh, concatenate
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
 from geoscene.tags import parse_length
-from geoscene.typing import Float
+from geoscene.typing import Float, Height
 from geoscene.watertight import GRID
-
-Height = Callable[[Float, Float], Float]
 
 _BELOW = 0.3
 """Metres by which a barrier extends below the ground, so that no gap opens on a slope."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -20,9 +19,8 @@ from geoscene.report import Problem
 from geoscene.roadgraph.tags import is_bridge, is_tunnel
 from geoscene.sources.data import OsmData, Point, Tags
 from geoscene.tags import parse_direction, parse_length
-from geoscene.typing import Float
+from geoscene.typing import Float, Height
 
-Height = Callable[[Float, Float], Float]
 _Stand = tuple[Float, float, str]
 """(place, heading, heading source)."""
 _Row = tuple[Float, float, str, str, float, str, str, str, Float]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -20,9 +19,7 @@ from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
 from geoscene.splitmix import GOLDEN, mix
 from geoscene.tags import parse_length, parse_number
-from geoscene.typing import Float
-
-Height = Callable[[Float, Float], Float]
+from geoscene.typing import Float, Height
 
 HEIGHT = {"broadleaved": 12.0, "needleleaved": 12.0, "palm": 8.0}
 """Default height in metres.

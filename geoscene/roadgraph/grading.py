@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from geoscene.frames import Frame
 from geoscene.roadgraph.carriageways import place_of
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.longitudinal_profile import Height, Obstacles
+from geoscene.roadgraph.longitudinal_profile import Obstacles
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
 from geoscene.sources.data import OsmData, Tags
-from geoscene.typing import Float
+from geoscene.typing import Float, Height
 
 _SHARP = 0.05
 """Where carriageways overlap, a road counts for most near its middle: the less this is, the more so."""

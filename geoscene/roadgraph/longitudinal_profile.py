@@ -14,10 +14,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.overlaps import find_overlaps
 from geoscene.roadgraph.quadratic import Bounds, interior_point
 from geoscene.roadgraph.stations import Stations, find_crossings, place_stations
-from geoscene.typing import Float, Ints
-
-Height = Callable[[Float, Float], Float]
-"""z (n,) in metres of the ground at scene x (n,), y (n,)."""
+from geoscene.typing import Float, Height, Ints
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -16,9 +15,7 @@ from geoscene.classes import Class, materials
 from geoscene.ground.layers import PADS, Layers, concatenate_layers
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
-from geoscene.typing import Float, Ints
-
-Height = Callable[[Float, Float], Float]
+from geoscene.typing import Float, Height, Ints
 
 OPENING, LOW = PADS + 100.0, PADS + 50.0
 """Priority of openings, above all others, and of the ground inside decks, which is hidden."""

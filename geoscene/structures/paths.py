@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,9 +22,7 @@ from geoscene.sources.data import OsmData, Way
 from geoscene.structures.heights import nearest_on_line
 from geoscene.structures.members import Members
 from geoscene.structures.table import StructureOptions
-from geoscene.typing import Float, Ints
-
-Height = Callable[[Float, Float], Float]
+from geoscene.typing import Float, Height, Ints
 
 _STATION = 5.0
 """Maximum metres between stations."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +12,7 @@ from geoscene.classes import Class
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.structures.heights import nearest_on_line
 from geoscene.structures.table import StructureOptions, Structures
-from geoscene.typing import Float
-
-Height = Callable[[Float, Float], Float]
+from geoscene.typing import Float, Height
 
 _KEPT_FREE = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.SIDEWALK, Class.KERB, Class.RAIL)
 """No pier stands on these."""

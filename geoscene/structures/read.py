@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from geoscene.frames import Frame
 from geoscene.report import Problem
 from geoscene.roadgraph.graph import RoadGraph
@@ -15,9 +13,7 @@ from geoscene.structures.paths import path_members
 from geoscene.structures.pieces import cut_pieces
 from geoscene.structures.piers import place_piers
 from geoscene.structures.table import StructureOptions, Structures
-from geoscene.typing import Float
-
-Height = Callable[[Float, Float], Float]
+from geoscene.typing import Height
 
 
 def read_structures(

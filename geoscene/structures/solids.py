@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -14,9 +14,7 @@ from geoscene.structures.ground_contact import tunnel_roof
 from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.layered import SIDE, Plan, Shell, cut_plan, raise_shell
 from geoscene.structures.table import StructureOptions, Structures
-from geoscene.typing import Float
-
-Height = Callable[[Float, Float], Float]
+from geoscene.typing import Float, Height
 
 _STANDING = 0.5
 """Metres that piers and abutments reach under the ground."""
