@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.shells import boundary, distinct_corners, lift, triangulate
 from geoscene.buildings.skeleton import Skeleton, loops, polygons_of
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 from geoscene.watertight import weld
 
 ON_LINE = 1e-3
@@ -31,7 +31,7 @@ class Cells:
 
     xy: Float
     field: Float
-    face: NDArray[np.int64]
+    face: Ints
 
 
 def plain_cells(polygon: Any) -> Cells:
@@ -94,7 +94,7 @@ def joined(cells: list[Cells]) -> Cells:
     )
 
 
-def outlines(xy: Float, face: NDArray[np.int64]) -> Polygons | None:
+def outlines(xy: Float, face: Ints) -> Polygons | None:
     """Unions of the triangles (m, 3, 2) with the same number, as polygons with all vertices on their edges.
 
     None if the edges do not form valid polygons, as when rounding to the grid has inverted a triangle.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.table import GRID
 from geoscene.frames import Frame
+from geoscene.typing import Bools, Float, Ints
 
 Polygons = NDArray[Any]
 
@@ -18,7 +19,7 @@ NOTCH = 2e-3
 """Half the diagonal of the notch that separates two rings touching in a point, metres."""
 
 
-def to_grid(xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def to_grid(xy: Float) -> Float:
     """Coordinates rounded to the 0.1 mm grid."""
     # like GEOS: division by 1e4 gives the float nearest to the decimal, multiplication by 1e-4 does not
     return np.rint(xy * 1e4) / 1e4
@@ -31,7 +32,7 @@ def object_array(shapes: Sequence[Any]) -> Polygons:
     return out
 
 
-def groups(number: NDArray[np.integer]) -> list[NDArray[np.int64]]:
+def groups(number: NDArray[np.integer]) -> list[Ints]:
     """Ascending positions of each distinct number, in order of the numbers."""
     order = np.argsort(number, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(number[order])) + 1) if len(order) else []
@@ -45,7 +46,7 @@ def project(geometry: Polygons, frame: Frame) -> Polygons:
     return out
 
 
-def clean(polygons: Polygons) -> tuple[Polygons, NDArray[np.bool_]]:
+def clean(polygons: Polygons) -> tuple[Polygons, Bools]:
     """Valid polygons on the grid (n,), and which of them had to be repaired.
 
     A repaired polygon may be a MultiPolygon, or empty. Rings of the result do not touch: a notch of 2 mm (up
@@ -86,7 +87,7 @@ def _flatten(parts: Polygons, row: NDArray[np.integer]) -> tuple[Polygons, NDArr
     return inner[keep], row[keep]
 
 
-def _pinched(polygons: Polygons) -> NDArray[np.bool_]:
+def _pinched(polygons: Polygons) -> Bools:
     """(n,) bool, whether rings of the polygon touch."""
     return np.asarray(~shapely.is_simple(shapely.boundary(polygons)), np.bool_)
 

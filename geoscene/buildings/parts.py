@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import Polygons, clean, groups, subtract
 from geoscene.buildings.table import GRID, Texts
 from geoscene.report import Problem
 from geoscene.sources.data import Relation
+from geoscene.typing import Bools, Float, Ints
 
-Rows = NDArray[np.int64]
+Rows = Ints
 
 
-def overlapping(a: Polygons, b: Polygons, *, least: float = 1e-4) -> tuple[Rows, Rows, NDArray[np.float64]]:
+def overlapping(a: Polygons, b: Polygons, *, least: float = 1e-4) -> tuple[Rows, Rows, Float]:
     """Pairs of rows of a and b that share more than ``least`` square metres, and the shared areas."""
     j, i = shapely.STRtree(a).query(b, predicate="intersects")  # first row: index into b
     j, i = i.astype(np.int64), j.astype(np.int64)
@@ -30,8 +30,8 @@ def overlapping(a: Polygons, b: Polygons, *, least: float = 1e-4) -> tuple[Rows,
 
 
 def duplicates(
-    osm_id: Sequence[str] | Texts, footprint: Polygons, *, score: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], list[Problem]]:
+    osm_id: Sequence[str] | Texts, footprint: Polygons, *, score: Float
+) -> tuple[Bools, list[Problem]]:
     """Which buildings (n,) repeat another one, and the problems.
 
     Two buildings are the same if they share over 90 % of both areas. The one with the higher score is kept,
@@ -113,8 +113,8 @@ def cut_overlaps(
     footprint: Polygons,
     *,
     owner: Rows,
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
+    low: Float,
+    high: Float,
 ) -> tuple[Polygons, list[Problem]]:
     """Footprints (n,) without the overlaps between buildings, and the problems.
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import object_array
 from geoscene.buildings.heights import HIGHEST, SIGMA_PRIOR, Tagged, infer_heights
@@ -16,7 +15,7 @@ from geoscene.buildings.roof_tags import RoofTags, default_roof_height
 from geoscene.buildings.table import BuildingOptions, Texts
 from geoscene.report import Problem
 from geoscene.sources.data import Tags
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float, Ints
 
 _HALLS = (
     "church", "cathedral", "chapel", "mosque", "synagogue", "temple", "stadium", "sports_hall", "hangar",
@@ -123,9 +122,9 @@ def _resolve_roofs(rows: Sequence[Row], roofs: Sequence[RoofTags], *, h: Heights
 
 def _resolve_buildings(
     rows: Sequence[Row],
-    is_part: NDArray[np.bool_],
+    is_part: Bools,
     *,
-    outline: NDArray[np.int64],
+    outline: Ints,
     h: Heights,
     options: BuildingOptions,
 ) -> None:
@@ -153,9 +152,7 @@ def _resolve_buildings(
     h.high[gaps], h.sigma[gaps], h.source[gaps] = inferred[lacking], sigma[lacking], rule[lacking]
 
 
-def _resolve_remainders(
-    rows: Sequence[Row], is_part: NDArray[np.bool_], *, outline: NDArray[np.int64], h: Heights
-) -> None:
+def _resolve_remainders(rows: Sequence[Row], is_part: Bools, *, outline: Ints, h: Heights) -> None:
     """Set the heights of the remainders of outlines, in place.
 
     The outline's tags apply, unless a part on the ground is as high: the tags then describe that part, and

@@ -12,7 +12,7 @@ from shapely.errors import GEOSException
 
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.mesh import FLOOR, ROOF, WALL
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 from geoscene.watertight import degenerate_faces, edge_uses, weld
 
 
@@ -118,10 +118,10 @@ def close(top: Triangles, floor: Triangles, *, underside: Float) -> Triangles:
     return shells.take(distinct_corners(shells.corners))
 
 
-def distinct_corners(triangles: Float) -> NDArray[np.bool_]:
+def distinct_corners(triangles: Float) -> Bools:
     """(m,) bool, whether the three corners of triangles (m, 3, 2 or 3) are different grid points."""
     c = np.rint(triangles * 1e4)
-    distinct: NDArray[np.bool_] = ~(c == np.roll(c, -1, axis=1)).all(axis=2).any(axis=1)
+    distinct: Bools = ~(c == np.roll(c, -1, axis=1)).all(axis=2).any(axis=1)
     return distinct
 
 
@@ -134,7 +134,7 @@ def prisms(polygons: Polygons, piece: Ints, *, low: Float, high: Float) -> Trian
     return Triangles(shells.corners, piece[shells.piece], shells.surface)
 
 
-def sound(shells: Triangles, n: int) -> NDArray[np.bool_]:
+def sound(shells: Triangles, n: int) -> Bools:
     """(n,) bool, whether each piece is a closed, oriented, non-degenerate surface of positive volume."""
     ids, first = weld(shells.corners.reshape(-1, 3), np.repeat(shells.piece, 3))
     faces = ids.reshape(-1, 3)
@@ -148,5 +148,5 @@ def sound(shells: Triangles, n: int) -> NDArray[np.bool_]:
     anchor[shells.piece] = shells.corners[:, 0]
     a, b, c = (shells.corners[:, k] - anchor[shells.piece] for k in range(3))
     volume = np.bincount(shells.piece, weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0, minlength=n)
-    fine: NDArray[np.bool_] = (bad == 0) & (volume > 0)
+    fine: Bools = (bad == 0) & (volume > 0)
     return fine

@@ -18,7 +18,7 @@ from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.mesh import ROOF, Mesh
 from geoscene.report import Problem
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 from geoscene.watertight import weld
 
 
@@ -31,7 +31,7 @@ class _Pieces:
     building: Ints
     low: Float
     high: Float
-    flat: NDArray[np.bool_]
+    flat: Bools
 
     def take(self, keep: NDArray[Any]) -> _Pieces:
         return _Pieces(
@@ -44,9 +44,7 @@ class _Pieces:
         )
 
 
-def build_solids(
-    buildings: Buildings, *, base: NDArray[np.float64], lod: int = 2
-) -> tuple[Mesh, list[Problem]]:
+def build_solids(buildings: Buildings, *, base: Float, lod: int = 2) -> tuple[Mesh, list[Problem]]:
     """One closed, oriented body of positive volume per building, and what was simplified or dropped.
 
     Vertices lie on the 0.1 mm grid. Faces have the building's row as feature, class BUILDING, and surface,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float
 
 Texts = NDArray[np.object_]
 
@@ -73,14 +73,14 @@ class Buildings:
 
     osm_id: Texts
     footprint: NDArray[Any]
-    is_part: NDArray[np.bool_]
+    is_part: Bools
     outline: NDArray[np.int32]
     min_height: Float
     height: Float
     roof_height: Float
     roof_shape: Texts
     roof_direction: Float
-    roof_across: NDArray[np.bool_]
+    roof_across: Bools
     height_source: Texts
     height_sigma: Float
     min_height_source: Texts
@@ -105,7 +105,7 @@ class Buildings:
         return int(np.count_nonzero(~self.is_part))
 
     @property
-    def drawn(self) -> NDArray[np.bool_]:
+    def drawn(self) -> Bools:
         """(n,) bool, whether the row is built as a solid; false for an outline that its parts replace."""
         replaced = np.zeros(len(self), np.bool_)
         replaced[self.outline[self.is_part]] = True

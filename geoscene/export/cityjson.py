@@ -32,7 +32,7 @@ from geoscene.frames import Frame, utm_crs
 from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 
 STEP = 1e-4
 """Metres per unit of the file's integers: the grid of the solids, so that they are exact."""
@@ -87,7 +87,7 @@ class _Palette:
     def __init__(self) -> None:
         self._numbers: dict[tuple[int, ...], int] = {}
 
-    def values(self, mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    def values(self, mesh: Mesh, rows: Ints) -> Ints:
         """Number of the material (m,) of each face."""
         looks = np.column_stack([mesh.material[rows], mesh.color[rows]])
         known, which = np.unique(looks, axis=0, return_inverse=True)
@@ -115,7 +115,7 @@ class _Target:
     step: float
     zero: Float
 
-    def whole(self, points: Float) -> NDArray[np.int64]:
+    def whole(self, points: Float) -> Ints:
         """Quantised coordinates (n, 3) of points in scene metres."""
         x, y = (
             self.frame.to_projected(points[:, 0], points[:, 1])
@@ -231,7 +231,7 @@ def _tile_objects(
     palette: _Palette,
     lod: str,
     first: int,
-) -> tuple[NDArray[np.int64], list[tuple[str, dict[str, Any]]], int]:
+) -> tuple[Ints, list[tuple[str, dict[str, Any]]], int]:
     """The tile's quantised vertices, its city objects by name, and the number of solids among them."""
     mesh = part.mesh
     anchors = part.instances.transform[:, :, 3]
@@ -315,10 +315,10 @@ def _solids(
     mesh: Mesh,
     piece: Piece,
     *,
-    whole: NDArray[np.int64],
-    triangles: NDArray[np.int64],
-    shell: NDArray[np.int64],
-    look: NDArray[np.int64],
+    whole: Ints,
+    triangles: Ints,
+    shell: Ints,
+    look: Ints,
     first: int,
     kind: str,
 ) -> list[dict[str, Any]]:
@@ -341,9 +341,7 @@ def _solids(
     return out
 
 
-def _surface_kinds(
-    mesh: Mesh, piece: Piece, *, whole: NDArray[np.int64], triangles: NDArray[np.int64]
-) -> NDArray[np.str_]:
+def _surface_kinds(mesh: Mesh, piece: Piece, *, whole: Ints, triangles: Ints) -> NDArray[np.str_]:
     """Semantic type (m,) of each face: the lowest floor is a GroundSurface, other floors are ceilings."""
     code = mesh.surface[piece.rows]
     height = whole[triangles, 2].max(axis=1)
@@ -355,9 +353,7 @@ def _surface_kinds(
     )
 
 
-def _surface(
-    piece: Piece, triangles: NDArray[np.int64], *, look: NDArray[np.int64], kind: str
-) -> dict[str, Any]:
+def _surface(piece: Piece, triangles: Ints, *, look: Ints, kind: str) -> dict[str, Any]:
     out: dict[str, Any] = {
         "type": "CompositeSurface" if kind == "TINRelief" else "MultiSurface",
         "boundaries": triangles[:, None].tolist(),
@@ -377,7 +373,7 @@ def _copies(
     *,
     library: Sequence[Mesh],
     index: tuple[int, int],
-    anchors: NDArray[np.int64],
+    anchors: Ints,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """One city object per feature with all its instances; one for each instance without a feature."""
     key = np.where(instances.feature >= 0, instances.feature, -1 - np.arange(len(instances)))

@@ -14,7 +14,7 @@ from geoscene.errors import InputError
 from geoscene.export.files import plain
 from geoscene.mesh import Instances, Mesh, concatenate
 from geoscene.scene import Scene
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float, Ints
 
 BARE = "terrain"
 """Name of the layer of faces that belong to no feature."""
@@ -30,10 +30,10 @@ class Features:
     unique  : (n,) bool, the feature is the only one of its layer with its ``osm_id``
     """
 
-    starts: NDArray[np.int64]
+    starts: Ints
     layers: tuple[str, ...]
     columns: tuple[dict[str, NDArray[Any]], ...]
-    unique: NDArray[np.bool_]
+    unique: Bools
 
     def layer(self, feature: int) -> str:
         """Name of a feature's layer."""
@@ -87,7 +87,7 @@ class Piece:
     solid   : the faces bound a solid; else they are a surface
     """
 
-    rows: NDArray[np.int64]
+    rows: Ints
     feature: int
     klass: int
     solid: bool
@@ -115,9 +115,7 @@ def check_layers(scene: Scene, layers: Collection[str] | None) -> None:
         raise InputError(f"no layer {', '.join(unknown)}; this scene has {', '.join(known)}")
 
 
-def wanted_rows(
-    scene: Scene, feature: NDArray[np.int32], *, layers: Collection[str] | None
-) -> NDArray[np.bool_]:
+def wanted_rows(scene: Scene, feature: NDArray[np.int32], *, layers: Collection[str] | None) -> Bools:
     """Whether faces or instances (m,) belong to one of the layers; all of them for None."""
     if layers is None:
         return np.ones(len(feature), np.bool_)

@@ -13,7 +13,7 @@ from geoscene.export.planview import Curve, PlanView, connecting_curve, plan_vie
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
 from geoscene.roadgraph.routing import turn_table
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float, Ints
 
 Lane = tuple[int, float, float]
 """Number of a lane, metres from the centre line to its inner edge (left of the driving direction), width."""
@@ -71,7 +71,7 @@ class Connection:
     before: int
     after: int
     curve: Curve
-    lanes: NDArray[np.int64]
+    lanes: Ints
     widths: tuple[float, float]
     rise: Float
 
@@ -88,8 +88,8 @@ class RoadNet:
     """
 
     roads: list[Carriageway]
-    road_of: NDArray[np.int64]
-    junctions: NDArray[np.bool_]
+    road_of: Ints
+    junctions: Bools
     connections: list[Connection]
     joints: dict[tuple[int, int], tuple[int, int]]
 
@@ -184,7 +184,7 @@ def _gaps(
     firsts: list[int],
     *,
     ends: dict[int, list[tuple[int, int]]],
-    junctions: NDArray[np.bool_],
+    junctions: Bools,
 ) -> Float:
     """Metres (roads, 2) that each road is cut back at its ends, so that it clears its neighbours' sides.
 
@@ -255,7 +255,7 @@ def _connection(
     graph: RoadGraph,
     roads: list[Carriageway],
     *,
-    road_of: NDArray[np.int64],
+    road_of: Ints,
     before: int,
     after: int,
     left_hand: bool,

@@ -26,6 +26,7 @@ from geoscene.export.tables import (
 from geoscene.files import atomic_file, atomic_path
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.typing import Float
 
 _DATE = "2000-01-01T00:00:00Z"  # a constant, so that the same scene is the same bytes
 
@@ -142,7 +143,7 @@ def _for_geojson(geometry: NDArray[np.object_]) -> NDArray[np.object_]:
     tall = bool(shapely.has_z(geometry).any())
     digits = [9, 9, 4] if tall else [9, 9]
 
-    def rounded(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rounded(xyz: Float) -> Float:
         return np.column_stack([np.round(c, d) for c, d in zip(xyz.T, digits, strict=True)])
 
     out: NDArray[np.object_] = shapely.transform(geometry, rounded, include_z=tall)
@@ -237,7 +238,7 @@ def _type_names(geometry: NDArray[np.object_]) -> set[str]:
     return {names[kind] + (" Z" if tall else "") for kind, tall in pairs.tolist()}
 
 
-def _geoparquet_metadata(crs: CRS, types: list[str], *, bounds: NDArray[np.float64] | None) -> dict[str, Any]:
+def _geoparquet_metadata(crs: CRS, types: list[str], *, bounds: Float | None) -> dict[str, Any]:
     column: dict[str, Any] = {
         "encoding": "WKB",
         "geometry_types": types,

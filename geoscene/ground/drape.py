@@ -26,7 +26,7 @@ from geoscene.ground.partition import (
 from geoscene.ground.triangulate import Triangles, triangulate
 from geoscene.mesh import Mesh
 from geoscene.sources.data import Way
-from geoscene.typing import Float, Height
+from geoscene.typing import Bools, Float, Height
 
 _STATION = 20.0
 """Spacing in metres of terrain samples along shores and rivers."""
@@ -54,7 +54,7 @@ class WaterLevels:
     """
 
     level: Float
-    river: NDArray[np.bool_]
+    river: Bools
     station: Float
     height: Float
     nearest: Any
@@ -142,7 +142,7 @@ def _inside(polygons: NDArray[np.object_]) -> tuple[Float, Float]:
     return every[:, 0], every[:, 1]
 
 
-def _still_levels(polygons: NDArray[np.object_], sea: NDArray[np.bool_], *, height: Height) -> Float:
+def _still_levels(polygons: NDArray[np.object_], sea: Bools, *, height: Height) -> Float:
     """Levels (n,) of standing waters; waters that touch have the same level."""
     from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
+from geoscene.typing import Bools, Float
 
 LANDCOVER, ROADS, PADS = 0.0, 100.0, 200.0
 """Lowest priorities of land cover, of road surfaces and of building pads."""
@@ -35,7 +36,7 @@ class Layers:
     polygon: NDArray[np.object_]
     klass: NDArray[np.uint8]
     material: NDArray[np.uint8]
-    priority: NDArray[np.float64]
+    priority: Float
     osm_id: NDArray[np.str_]
     source: NDArray[np.str_]
     body: NDArray[np.str_]
@@ -79,7 +80,7 @@ class Layers:
             np.broadcast_to(np.asarray(feature, np.int32), n).copy(),
         )
 
-    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Layers:
+    def take(self, keep: Bools | NDArray[np.integer]) -> Layers:
         """The chosen rows, in the given order."""
         return Layers(*(getattr(self, f.name)[keep] for f in fields(self)))
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, materials
 from geoscene.errors import GeosceneError, InputError
 from geoscene.ground.layers import Layers
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 
 PRECISION = 2.0**-13
 """Side of the grid that ground vertices lie on, 0.12 mm.
@@ -218,12 +218,12 @@ def tile_place(plan: GroundPlan, i: int, *, j: int) -> int | None:
     return (j - south) * (east - west + 1) + i - west if west <= i <= east and south <= j <= north else None
 
 
-def rows_near(plan: GroundPlan, xmin: float, *, ymin: float, xmax: float, ymax: float) -> NDArray[np.int64]:
+def rows_near(plan: GroundPlan, xmin: float, *, ymin: float, xmax: float, ymax: float) -> Ints:
     """Rows of the layers whose bounding boxes intersect a box, in no particular order."""
     return np.asarray(plan.tree.query(shapely.box(xmin, ymin, xmax, ymax)), np.int64)
 
 
-def rows_at(plan: GroundPlan, xy: Float) -> NDArray[np.int64]:
+def rows_at(plan: GroundPlan, xy: Float) -> Ints:
     """The row of the layers (n,) that holds each point (n, 2), -1 where none does."""
     best = np.full(len(xy), -1, np.int64)
     point, row = plan.tree.query(shapely.points(xy))
@@ -385,9 +385,7 @@ class _Edges:
         return cls(a, b, cell.astype(np.int64), other.astype(np.int64), points)
 
 
-def _without_slivers(
-    edges: _Edges, cells: NDArray[np.object_], *, row: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], int]:
+def _without_slivers(edges: _Edges, cells: NDArray[np.object_], *, row: Ints) -> tuple[Ints, int]:
     """Rows after each sliver took that of the wider cell it shares most border with; how many changed."""
     # The area is at most the radius of the greatest circle within times the outline (Bonnesen), so all
     # slivers are among the few cells that pass this; those with a wider spot are then excluded.
@@ -419,12 +417,12 @@ def _without_slivers(
 
 def _dissolve(
     edges: _Edges,
-    row: NDArray[np.int64],
+    row: Ints,
     *,
     box: tuple[float, float, float, float],
     lines: float,
-    level: NDArray[np.bool_],
-) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+    level: Bools,
+) -> tuple[NDArray[np.object_], Ints]:
     """Cells of one row joined, over the terrain's lines only where they are level, and their rows.
 
     Vertices on what remains of the borders all stay.

@@ -16,7 +16,7 @@ from pyproj import CRS, Transformer
 
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.frames import Frame
-from geoscene.typing import Float, Height
+from geoscene.typing import Bools, Float, Height
 
 Vertical = Literal["flat", "orthometric", "ellipsoidal"]
 
@@ -53,7 +53,7 @@ class Grid:
     origin: Float
     step: Float
     values: Float
-    known: NDArray[np.bool_]
+    known: Bools
 
 
 @dataclass(frozen=True)
@@ -369,7 +369,7 @@ def _read(
     return grid, float(np.hypot(np.diff(sx[[0, 1]]), np.diff(sy[[0, 1]]))[0]), posts, voids
 
 
-def _filled(values: Float, known: NDArray[np.bool_]) -> Float:
+def _filled(values: Float, known: Bools) -> Float:
     """Values without gaps: voids by inverse distances, posts outside all rasters by the nearest."""
     from rasterio.fill import fillnodata  # noqa: PLC0415 - slow to import
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
@@ -397,7 +397,7 @@ def _posts(grid: Grid, transformer: Transformer, *, frame: Frame, x: Float, y: F
     return column, row
 
 
-def _bilinear(grid: Grid, column: Float, *, row: Float) -> tuple[Float, NDArray[np.bool_]]:
+def _bilinear(grid: Grid, column: Float, *, row: Float) -> tuple[Float, Bools]:
     """Heights (n,) at fractional posts (n,), and whether a raster covers the place (its pixels do)."""
     rows, columns = grid.values.shape
     column, row = np.clip(column, 0.0, columns - 1.0), np.clip(row, 0.0, rows - 1.0)

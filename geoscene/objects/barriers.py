@@ -17,7 +17,7 @@ from geoscene.mesh import Mesh, concatenate
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
 from geoscene.tags import parse_length
-from geoscene.typing import Float, Height
+from geoscene.typing import Bools, Float, Height
 from geoscene.watertight import GRID
 
 _BELOW = 0.3
@@ -98,7 +98,7 @@ class Barriers:
         """Number of barriers."""
         return len(self.polygon)
 
-    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Barriers:
+    def take(self, keep: Bools | NDArray[np.integer]) -> Barriers:
         """The chosen rows, in the given order."""
         return Barriers(*(getattr(self, f.name)[keep] for f in fields(self)))
 
@@ -258,9 +258,7 @@ def _gates(osm: OsmData) -> dict[int, float]:
     return gates
 
 
-def _with_openings(
-    polygons: NDArray[np.object_], plan: GroundPlan
-) -> tuple[NDArray[np.object_], NDArray[np.bool_]]:
+def _with_openings(polygons: NDArray[np.object_], plan: GroundPlan) -> tuple[NDArray[np.object_], Bools]:
     """Polygons less roads, tracks, buildings and what is outside the extent; which crossed a road."""
     out = shapely.intersection(polygons, shapely.box(*plan.extent))
     opened = np.zeros(len(polygons), bool)

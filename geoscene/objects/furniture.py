@@ -19,7 +19,7 @@ from geoscene.report import Problem
 from geoscene.roadgraph.tags import is_bridge, is_tunnel
 from geoscene.sources.data import OsmData, Point, Tags
 from geoscene.tags import parse_direction, parse_length
-from geoscene.typing import Float, Height
+from geoscene.typing import Bools, Float, Height, Ints
 
 _Stand = tuple[Float, float, str]
 """(place, heading, heading source)."""
@@ -87,7 +87,7 @@ class Furniture:
         """Number of objects."""
         return len(self.shape)
 
-    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Furniture:
+    def take(self, keep: Bools | NDArray[np.integer]) -> Furniture:
         """The chosen rows, in the given order."""
         return Furniture(*(getattr(self, f.name)[keep] for f in fields(self)))
 
@@ -234,9 +234,9 @@ class _Roads:
 
     lines: NDArray[np.object_]
     oneway: NDArray[np.int8]
-    raised: NDArray[np.bool_]
+    raised: Bools
     by_node: dict[int, list[tuple[int, int]]]
-    nodes: list[NDArray[np.int64]]
+    nodes: list[Ints]
     tree: shapely.STRtree
 
     @classmethod

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.ground.partition import GroundPlan, rows_at, values_at
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float
 
 CLEARANCE = 0.5
 """Metres between the edge of a carriageway and a post beside it: the lateral clearance of traffic signs."""
@@ -57,11 +57,11 @@ class Sites:
         klass[point[on & (klass[point] != Class.BUILDING_PAD)]] = Class.RAIL
         return klass
 
-    def driven(self, xy: Float) -> NDArray[np.bool_]:
+    def driven(self, xy: Float) -> Bools:
         """Whether points (n, 2) lie on a carriageway, a crossing, a track or in the mouth of a tunnel."""
         return np.isin(self.classes(xy), _DRIVEN)
 
-    def nearest_clear(self, xy: Float, *, angles: Float | None = None) -> tuple[Float, NDArray[np.bool_]]:
+    def nearest_clear(self, xy: Float, *, angles: Float | None = None) -> tuple[Float, Bools]:
         """For points (n, 2) the nearest places to stand, `CLEARANCE` beyond the edge, and which were found.
 
         Points without a clear place within `FARTHEST` are returned as they are.

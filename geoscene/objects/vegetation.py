@@ -19,7 +19,7 @@ from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
 from geoscene.splitmix import GOLDEN, mix
 from geoscene.tags import parse_length, parse_number
-from geoscene.typing import Float, Height
+from geoscene.typing import Bools, Float, Height, Ints
 
 HEIGHT = {"broadleaved": 12.0, "needleleaved": 12.0, "palm": 8.0}
 """Default height in metres.
@@ -84,7 +84,7 @@ class Trees:
         """Number of trees."""
         return len(self.height)
 
-    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Trees:
+    def take(self, keep: Bools | NDArray[np.integer]) -> Trees:
         """The chosen trees, in the given order."""
         return Trees(*(getattr(self, f.name)[keep] for f in fields(self)))
 
@@ -289,7 +289,7 @@ def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
     return concatenate_instances([trunks, crowns])
 
 
-def _uniform(seed: int, column: NDArray[np.int64], *, row: NDArray[np.int64], count: int) -> Float:
+def _uniform(seed: int, column: Ints, *, row: Ints, count: int) -> Float:
     """Uniform random numbers (count, n) in [0, 1) determined by (seed, column, row)."""
     with np.errstate(over="ignore"):
         state = mix(column.astype(np.uint64) + GOLDEN * np.uint64(seed + 1))

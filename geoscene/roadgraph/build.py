@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.frames import Frame
 from geoscene.report import Problem
@@ -17,7 +16,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.restrictions import add_turns
 from geoscene.roadgraph.tags import Street, drivable, read_street
 from geoscene.sources.data import OsmData, Way
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +69,7 @@ def _read_streets(ways: Sequence[Way], problems: list[Problem]) -> list[Street]:
     return streets
 
 
-def read_runs(ways: Sequence[Way], problems: list[Problem]) -> tuple[Runs, NDArray[np.int64], Float]:
+def read_runs(ways: Sequence[Way], problems: list[Problem]) -> tuple[Runs, Ints, Float]:
     """Unbroken runs of nodes with coordinates; the nodes' ids, ascending; their longitudes and latitudes."""
     if not ways:
         none = np.empty(0, np.int64)
@@ -111,9 +110,9 @@ def _edges(
     ways: Sequence[Way],
     *,
     streets: Sequence[Street],
-    places: tuple[NDArray[np.int64], Float],
+    places: tuple[Ints, Float],
     frame: Frame,
-) -> tuple[RoadGraph, tuple[NDArray[np.int64], NDArray[np.bool_]]]:
+) -> tuple[RoadGraph, tuple[Ints, Bools]]:
     """The graph without turns and controls; each edge's chain (m,); whether the edge runs against it (m,)."""
     node_id, lonlat = places
     x, y = frame.from_geographic(lonlat[:, 0], lonlat[:, 1])

@@ -17,7 +17,7 @@ from geoscene.roadgraph.chains import find_cuts, link_chains
 from geoscene.roadgraph.tags import Street, drivable, read_street
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.tags import parse_length
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float, Ints
 
 KERB = 0.15
 """Metres, plan width of a kerb stone (usual sizes are 0.12 to 0.15)."""
@@ -61,21 +61,21 @@ class Carriageways:
     line: NDArray[np.object_]
     ends: NDArray[np.int32]
     node_xy: Float
-    node_id: NDArray[np.int64]
+    node_id: Ints
     street: list[Street]
     width: Float
     walk: Float
     walk_source: NDArray[np.str_]
     material: NDArray[np.str_]
     material_source: NDArray[np.str_]
-    marked: NDArray[np.bool_]
+    marked: Bools
     osm_id: NDArray[np.str_]
 
     def __len__(self) -> int:
         """Number of stretches."""
         return len(self.line)
 
-    def take(self, keep: NDArray[np.bool_]) -> Carriageways:
+    def take(self, keep: Bools) -> Carriageways:
         """The chosen stretches; nodes stay as they are."""
         columns = {
             f.name: getattr(self, f.name)[keep]
@@ -218,9 +218,7 @@ def _guess_sidewalks(
     return replace(table, walk=walk, walk_source=source)
 
 
-def _footway_beside(
-    table: Carriageways, rows: NDArray[np.int64], *, osm: OsmData, frame: Frame
-) -> NDArray[np.bool_]:
+def _footway_beside(table: Carriageways, rows: Ints, *, osm: OsmData, frame: Frame) -> Bools:
     """Whether a mapped footway runs along the left and the right of each stretch (len(rows), 2)."""
     found = np.zeros((len(rows), 2), np.bool_)
     lines = [

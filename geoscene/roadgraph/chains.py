@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+
+from geoscene.typing import Bools, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,9 +20,9 @@ class Runs:
     run  : (k,) int64 run number, ascending
     """
 
-    node: NDArray[np.int64]
-    way: NDArray[np.int64]
-    run: NDArray[np.int64]
+    node: Ints
+    way: Ints
+    run: Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,13 +33,11 @@ class Chain:
     way  : (k - 1,) int64 way index of each segment
     """
 
-    node: NDArray[np.int64]
-    way: NDArray[np.int64]
+    node: Ints
+    way: Ints
 
 
-def find_cuts(
-    runs: Runs, kind: NDArray[np.int64], *, symmetric: NDArray[np.bool_], nodes: int
-) -> NDArray[np.bool_]:
+def find_cuts(runs: Runs, kind: Ints, *, symmetric: Bools, nodes: int) -> Bools:
     """Whether a line must end at each node (nodes,): junctions, dead ends, changes.
 
     kind      : (ways,) equal numbers for ways that may be joined
@@ -49,7 +48,7 @@ def find_cuts(
     at, other = np.concatenate([a, b]), np.concatenate([b, a])
     ways, leaving = np.concatenate([way, way]), np.arange(len(at)) < len(a)
     degree = np.bincount(at, minlength=nodes)
-    cut: NDArray[np.bool_] = degree != 2
+    cut: Bools = degree != 2
     pair = np.argsort(at, kind="stable")
     pair = pair[degree[at[pair]] == 2].reshape(-1, 2)
     one, two = pair.T
@@ -60,7 +59,7 @@ def find_cuts(
     return cut
 
 
-def link_chains(runs: Runs, cut: NDArray[np.bool_]) -> list[Chain]:
+def link_chains(runs: Runs, cut: Bools) -> list[Chain]:
     """The runs as chains from cut node to cut node; a loop without any starts at its own first node."""
     pieces = _pieces(runs, cut)
     loose: dict[int, list[int]] = {}
@@ -95,7 +94,7 @@ def link_chains(runs: Runs, cut: NDArray[np.bool_]) -> list[Chain]:
     return chains
 
 
-def _pieces(runs: Runs, cut: NDArray[np.bool_]) -> list[Chain]:
+def _pieces(runs: Runs, cut: Bools) -> list[Chain]:
     """The runs cut at cut nodes."""
     edge = np.flatnonzero(np.diff(runs.run, prepend=-1, append=-1))
     pieces = []

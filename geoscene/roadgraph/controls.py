@@ -6,12 +6,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.roadgraph.chains import Chain
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.tags import CLASSES
 from geoscene.sources.data import Point, Tags, Way
+from geoscene.typing import Bools, Ints
 
 # Metres before a node within which a signal or a sign is the node's own.
 _REACH = 30.0
@@ -21,8 +21,8 @@ def add_controls(
     graph: RoadGraph,
     points: Iterable[Point],
     *,
-    sides: tuple[NDArray[np.int64], NDArray[np.bool_]],
-    lines: tuple[Sequence[Chain], Sequence[Way], NDArray[np.int64]],
+    sides: tuple[Ints, Bools],
+    lines: tuple[Sequence[Chain], Sequence[Way], Ints],
 ) -> RoadGraph:
     """The graph with its traffic controls.
 
@@ -85,8 +85,8 @@ def _controls_on_edges(
     graph: RoadGraph,
     points: Iterable[Point],
     *,
-    sides: tuple[NDArray[np.int64], NDArray[np.bool_]],
-    lines: tuple[Sequence[Chain], Sequence[Way], NDArray[np.int64]],
+    sides: tuple[Ints, Bools],
+    lines: tuple[Sequence[Chain], Sequence[Way], Ints],
 ) -> Iterator[tuple[int, int, bool, Tags]]:
     """Controls on edges: (edge, vertex > 0, whether the edge runs along the way, tags)."""
     chain_of, against = sides

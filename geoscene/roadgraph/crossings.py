@@ -18,7 +18,7 @@ from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows, concatenate_rows
 from geoscene.sources.data import OsmData, Point, Tags, Way
 from geoscene.tags import parse_length
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 
 _AREA, _PAINT = 160.0, 165.0
 # Metres: default width of a crossing, of a zebra's stripes and the gaps between, and of the
@@ -167,7 +167,7 @@ def _crossings(lines: NDArray[np.object_], of: Sequence[Way | Point]) -> _Crossi
     )
 
 
-def _stripes(lines: NDArray[np.object_], width: Float) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+def _stripes(lines: NDArray[np.object_], width: Float) -> tuple[NDArray[np.object_], Ints]:
     """Zebra stripes along the road, side by side along crossing lines, and the line of each."""
     length = shapely.length(lines)
     pitch = _STRIPE + _STRIPE_GAP

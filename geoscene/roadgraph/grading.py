@@ -6,7 +6,6 @@ from functools import partial
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene.frames import Frame
 from geoscene.roadgraph.carriageways import place_of
@@ -15,7 +14,7 @@ from geoscene.roadgraph.longitudinal_profile import Obstacles
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
 from geoscene.sources.data import OsmData, Tags
-from geoscene.typing import Float, Height
+from geoscene.typing import Bools, Float, Height
 
 _SHARP = 0.05
 """Where carriageways overlap, a road counts for most near its middle: the less this is, the more so."""
@@ -96,8 +95,8 @@ def _graded_height(
     start: Float,
     end: Float,
     half: Float,
-    square_start: NDArray[np.bool_],
-    square_end: NDArray[np.bool_],
+    square_start: Bools,
+    square_end: Bools,
     batter: float,
 ) -> Float:
     """The height of `graded_ground`; a function of a module, so that worker processes can take it."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float, Ints
 
 
 def _no_rows() -> NDArray[np.int32]:
@@ -79,7 +79,7 @@ class RoadGraph:
     control_kind   : (c,) str: ``traffic_signals``, ``stop``, ``give_way`` or ``crossing``
     """
 
-    node_id: NDArray[np.int64]
+    node_id: Ints
     node_xyz: Float
     tail: NDArray[np.int32]
     head: NDArray[np.int32]
@@ -91,19 +91,19 @@ class RoadGraph:
     lanes_source: NDArray[np.str_]
     width: Float
     width_source: NDArray[np.str_]
-    oneway: NDArray[np.bool_]
+    oneway: Bools
     layer: NDArray[np.int8]
     layer_source: NDArray[np.str_]
-    bridge: NDArray[np.bool_]
-    tunnel: NDArray[np.bool_]
+    bridge: Bools
+    tunnel: Bools
     highway: NDArray[np.str_]
     name: NDArray[np.str_]
     ref: NDArray[np.str_]
     osm_id: NDArray[np.str_]
     twin: NDArray[np.int32]
-    signals: NDArray[np.bool_]
-    stop: NDArray[np.bool_]
-    give_way: NDArray[np.bool_]
+    signals: Bools
+    stop: Bools
+    give_way: Bools
     turn_from: NDArray[np.int32] = field(default_factory=_no_rows)
     turn_via: NDArray[np.int32] = field(default_factory=_no_rows)
     turn_to: NDArray[np.int32] = field(default_factory=_no_rows)
@@ -123,7 +123,7 @@ class RoadGraph:
         """Seconds (m,) that each edge takes at its speed limit."""
         return self.length / self.speed
 
-    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> RoadGraph:
+    def take(self, keep: Bools | NDArray[np.integer]) -> RoadGraph:
         """The chosen edges, in the given order, with the nodes they use.
 
         Restrictions and controls of edges that are left out are left out too.

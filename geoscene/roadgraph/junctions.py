@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene import polylines
 from geoscene.roadgraph.carriageways import KERB, Carriageways
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 
 # Metres, radius of the kerb at a corner by the lesser road of the two. Assumed within the usual ranges of
 # street design guides (NACTO: 3 to 4.5 on city streets; larger where lorries turn).
@@ -52,13 +52,13 @@ class Junctions:
     """
 
     polygon: NDArray[np.object_]
-    main: NDArray[np.int64]
+    main: Ints
     kerb: NDArray[np.object_]
     walk: NDArray[np.object_]
-    corner_main: NDArray[np.int64]
+    corner_main: Ints
 
 
-def build_junctions(roads: Carriageways, importance: NDArray[np.int64]) -> Junctions:
+def build_junctions(roads: Carriageways, importance: Ints) -> Junctions:
     """The joints of all carriageways that share a node, a place and (off the ground) a layer.
 
     A corner is the morphological closing of two neighbouring arms with the corner's radius: it rounds the
@@ -107,7 +107,7 @@ def build_junctions(roads: Carriageways, importance: NDArray[np.int64]) -> Junct
     return Junctions(polygon, main[best][first], kerb, walk, main[walked])
 
 
-def junction_reach(roads: Carriageways) -> tuple[Float, NDArray[np.int64]]:
+def junction_reach(roads: Carriageways) -> tuple[Float, Ints]:
     """Reach of junctions into each carriageway at its start and end, and their number of arms.
 
     Metres (k, 2), 0 where fewer than three arms meet, and numbers of arms (k, 2).
@@ -134,9 +134,9 @@ class _Arms:
     node_xy : (a, 2) float64
     """
 
-    group: NDArray[np.int64]
-    road: NDArray[np.int64]
-    end: NDArray[np.int64]
+    group: Ints
+    road: Ints
+    end: Ints
     angle: Float
     walk: Float
     node_xy: Float
@@ -160,7 +160,7 @@ def _arms(roads: Carriageways) -> _Arms:
     return _Arms(group[order], road[order], end[order], angle[order], walk[order], roads.node_xy[node[order]])
 
 
-def _corners(roads: Carriageways, arms: _Arms) -> tuple[NDArray[np.int64], Float, Float, Float, Float]:
+def _corners(roads: Carriageways, arms: _Arms) -> tuple[Ints, Float, Float, Float, Float]:
     """For each arm: row of the next arm, angle to it, width of the arm, radius of the kerb between them.
 
     The last column is the distance from the node at which their kerbs touch a circle of that radius.
@@ -176,7 +176,7 @@ def _corners(roads: Carriageways, arms: _Arms) -> tuple[NDArray[np.int64], Float
     return after, between, width, radius, np.clip(np.where(between < np.pi, tangent, 0.0), 0.0, _REACH)
 
 
-def _neighbour(group: NDArray[np.int64]) -> NDArray[np.int64]:
+def _neighbour(group: Ints) -> Ints:
     """The next arm counter-clockwise: the next row of the group, cyclically."""
     last = np.flatnonzero(np.diff(group, append=-1))
     first = np.flatnonzero(np.diff(group, prepend=-1))
@@ -204,7 +204,7 @@ def carriageway(lines: NDArray[np.object_], half: Float) -> NDArray[np.object_]:
     return bands
 
 
-def _tapers(roads: Carriageways, arms: _Arms, *, after: NDArray[np.int64]) -> NDArray[np.object_]:
+def _tapers(roads: Carriageways, arms: _Arms, *, after: Ints) -> NDArray[np.object_]:
     """Tapers between each arm's end and the wider next arm's."""
     width = roads.width[arms.road]
     wide = np.maximum(width, width[after])
@@ -249,9 +249,7 @@ def _wedges(arms: _Arms, between: Float, *, reach: Float) -> NDArray[np.object_]
     return wedges
 
 
-def _parts(
-    shapes: NDArray[np.object_], group: NDArray[np.int64]
-) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+def _parts(shapes: NDArray[np.object_], group: Ints) -> tuple[NDArray[np.object_], Ints]:
     """Polygons and the position of their group, for `shapely.multipolygons`."""
     parts, of = shapely.get_parts(shapes, return_index=True)
     areal = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON

@@ -10,10 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 
 WIDEST_LANE = 4.5
 """Metres: the lanes of a carriageway with several are not wider; the rest is for parking and bicycles."""
@@ -31,7 +31,7 @@ class LaneLayout:
 
     own: Ints
     other: Ints
-    shared: NDArray[np.bool_]
+    shared: Bools
     carriageway: Float
 
     @property
@@ -78,7 +78,7 @@ class LaneLayout:
         return LaneLayout(self.own[k], self.other[k], self.shared[k], self.carriageway[k])
 
 
-def lane_layout(along: Float, against: Float, *, two_way: NDArray[np.bool_], width: Float) -> LaneLayout:
+def lane_layout(along: Float, against: Float, *, two_way: Bools, width: Float) -> LaneLayout:
     """The lanes of carriageways.
 
     along, against : (m,) lanes of each direction as mapped; where both are fractions, as in 1.5 and 1.5,

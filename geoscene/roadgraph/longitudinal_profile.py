@@ -14,7 +14,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.overlaps import find_overlaps
 from geoscene.roadgraph.quadratic import Bounds, interior_point
 from geoscene.roadgraph.stations import Stations, find_crossings, place_stations
-from geoscene.typing import Float, Height, Ints
+from geoscene.typing import Bools, Float, Height, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +117,7 @@ def _weights(graph: RoadGraph, stations: Stations) -> Float:
     return np.maximum(held * per_metre, _LOOSE)
 
 
-def _distance(
-    count: int, links: tuple[Ints, Ints, Float], *, start: NDArray[np.bool_], limit: float
-) -> Float:
+def _distance(count: int, links: tuple[Ints, Ints, Float], *, start: Bools, limit: float) -> Float:
     """Metres along links from the nearest start, at most ``limit``."""
     from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
     from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
@@ -348,7 +346,7 @@ def _solve(
     return z
 
 
-def _solve_some(cost: Any, pull: Float, *, bounds: Bounds, terrain: Float, free: NDArray[np.bool_]) -> Float:
+def _solve_some(cost: Any, pull: Float, *, bounds: Bounds, terrain: Float, free: Bools) -> Float:
     """Heights (v,) of minimum cost within the bounds; stations that are not free lie on the terrain."""
     held = np.where(free, 0.0, terrain)
     columns = np.flatnonzero(free)

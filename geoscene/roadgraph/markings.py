@@ -14,7 +14,7 @@ from geoscene.roadgraph.junctions import junction_reach
 from geoscene.roadgraph.lanes import graph_lanes, lane_layout
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float, Ints
 
 PRIORITY = 170.0
 
@@ -72,9 +72,7 @@ def marking_rows(roads: Carriageways, edge: NDArray[np.int32], *, left_hand: boo
     )
 
 
-def _offsets(
-    roads: Carriageways, rows: NDArray[np.int64], *, left_hand: bool
-) -> tuple[NDArray[np.int64], Float, NDArray[np.bool_]]:
+def _offsets(roads: Carriageways, rows: Ints, *, left_hand: bool) -> tuple[Ints, Float, Bools]:
     """Painted lines as (position in ``rows``, metres to the left of the centre line, broken)."""
     found: list[tuple[int, float, bool]] = []
     streets = [roads.street[row] for row in rows.tolist()]
@@ -103,7 +101,7 @@ def _offsets(
     )
 
 
-def _dashes(lines: NDArray[np.object_]) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+def _dashes(lines: NDArray[np.object_]) -> tuple[NDArray[np.object_], Ints]:
     """The dashes of broken lines, as lines, and the line of each."""
     length = shapely.length(lines)
     count = np.maximum(np.floor((length + _GAP) / (_DASH + _GAP)), 0).astype(np.int64)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.errors import InputError
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.i
     return before[~forbidden], after[~forbidden]
 
 
-def _commands(kind: NDArray[np.str_]) -> NDArray[np.bool_]:
+def _commands(kind: NDArray[np.str_]) -> Bools:
     """Whether restrictions (r,) are ``only_*``."""
     return np.char.startswith(kind, "only_") if len(kind) else np.empty(0, np.bool_)
 
@@ -111,7 +111,7 @@ def _among(
     after: NDArray[np.int32],
     first: NDArray[np.int32],
     second: NDArray[np.int32],
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Whether turns (t,) are among the pairs (first, second)."""
     key = before.astype(np.int64) * len(graph) + after
     return np.isin(key, first.astype(np.int64) * len(graph) + second)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 
 # Arms of a node that deviate from a straight line by less than this (radians) are one continuous road.
 _STRAIGHT = np.radians(40.0)
@@ -31,7 +31,7 @@ class Stations:
     row: Ints
     edge: Ints
     along: Float
-    drawn: NDArray[np.bool_]
+    drawn: Bools
 
     @property
     def segments(self) -> tuple[Ints, Ints, Float, Ints]:

@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import materials
+from geoscene.typing import Bools, Float
 
 GRID = 1e-4
 """Metres: coordinates of surfaces are whole multiples of it."""
@@ -37,7 +38,7 @@ class SurfaceRows:
     polygon: NDArray[np.object_]
     klass: NDArray[np.uint8]
     material: NDArray[np.uint8]
-    priority: NDArray[np.float64]
+    priority: Float
     osm_id: NDArray[np.str_]
     source: NDArray[np.str_]
     place: NDArray[np.int8]
@@ -89,7 +90,7 @@ class SurfaceRows:
         """The columns by name, in order."""
         return {f.name: getattr(self, f.name) for f in fields(SurfaceRows)}
 
-    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> SurfaceRows:
+    def take(self, keep: Bools | NDArray[np.integer]) -> SurfaceRows:
         """The chosen rows, in the given order."""
         return SurfaceRows(**{name: column[keep] for name, column in self.columns().items()})
 

@@ -22,6 +22,7 @@ from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows, concatenate_rows
 from geoscene.roadgraph.tags import CLASSES
 from geoscene.sources.data import OsmData
+from geoscene.typing import Float
 
 _SIDEWALK, _KERB, _CARRIAGEWAY = 112.0, 120.0, 130.0
 # Metres by which a bridge is wider than its surfaces on each side, for the parapet. Assumed.
@@ -175,7 +176,7 @@ def _walk_source(roads: Carriageways) -> NDArray[np.str_]:
 
 
 def _widened(
-    roads: Carriageways, half: NDArray[np.float64], *, extra: NDArray[np.float64]
+    roads: Carriageways, half: Float, *, extra: Float
 ) -> list[tuple[NDArray[np.integer], NDArray[np.object_]]]:
     """Bands ``extra`` (k, 2) wider than the carriageway on the left and right, with their rows."""
     both = np.flatnonzero((extra[:, 0] == extra[:, 1]) & (extra[:, 0] > 0))

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene.report import Problem
 from geoscene.sources.data import Area, Bounds, Tags
 from geoscene.sources.elements import Elements, Members
 from geoscene.sources.rings import Chain, assemble, close_cut_ring, polygons_of
 from geoscene.sources.tags import NOISE, area_tags, is_area, is_building, is_open_area, kind_of
-from geoscene.typing import Ints
+from geoscene.typing import Float, Ints
 
 _NO_NODES: Ints = np.empty(0, np.int64)
 
@@ -28,7 +27,7 @@ class Places:
     same : (n,) int64, index of the first node at the same position
     """
 
-    xy: NDArray[np.float64]
+    xy: Float
     same: Ints
 
     @classmethod

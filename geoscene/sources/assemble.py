@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.report import Action, Problem
@@ -12,7 +11,7 @@ from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, 
 from geoscene.sources.data import Bounds, OsmData, Point, Relation, Way
 from geoscene.sources.elements import UNITS, Elements
 from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
-from geoscene.typing import Ints
+from geoscene.typing import Bools, Ints
 
 
 def checked_bounds(bounds: Bounds) -> Bounds:
@@ -46,7 +45,7 @@ def _extent(elements: Elements) -> Bounds:
     return float(west), float(south), float(east), float(north)
 
 
-def _near(elements: Elements, bounds: Bounds | None) -> NDArray[np.bool_]:
+def _near(elements: Elements, bounds: Bounds | None) -> Bools:
     """(w,) bool, whether each way's bounding box intersects the bounds; false for ways without nodes."""
     ways = np.repeat(np.arange(len(elements.way_id)), np.diff(elements.way_start))
     here = elements.ref >= 0

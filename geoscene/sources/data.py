@@ -7,10 +7,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from geoscene.report import Problem
+from geoscene.typing import Float, Ints
 
 Tags = dict[str, str]
 
@@ -35,8 +33,8 @@ class Way:
 
     osm_id: str
     tags: Tags
-    nodes: NDArray[np.int64]
-    lonlat: NDArray[np.float64]
+    nodes: Ints
+    lonlat: Float
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +49,7 @@ class Area:
     osm_id: str
     tags: Tags
     geometry: Any
-    nodes: NDArray[np.int64]
+    nodes: Ints
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.sources.data import Tags
-from geoscene.typing import Ints
+from geoscene.typing import Bools, Float, Ints
 
 Members = tuple[tuple[str, int, str], ...]
 
@@ -44,7 +44,7 @@ class Elements:
     node_tags: dict[int, Tags]
     way_id: Ints
     way_start: Ints
-    way_closed: NDArray[np.bool_]
+    way_closed: Bools
     way_tags: list[Tags]
     ref: Ints
     relations: list[tuple[int, Tags, Members]]
@@ -56,7 +56,7 @@ class Elements:
         """(k,) node indices of the way in row ``way``, -1 for missing nodes."""
         return self.ref[self.way_start[way] : self.way_start[way + 1]]
 
-    def lonlat(self, nodes: Ints) -> NDArray[np.float64]:
+    def lonlat(self, nodes: Ints) -> Float:
         """Longitude and latitude (k, 2) of nodes by index, degrees."""
         return self.node_xy[nodes] / UNITS
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene.sources.data import METRES_PER_DEGREE, Bounds
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +61,7 @@ def _prune(segments: Ints) -> Ints:
     return segments
 
 
-def _inside(points: Float, a: Float, *, b: Float) -> NDArray[np.bool_]:
+def _inside(points: Float, a: Float, *, b: Float) -> Bools:
     """(p,) bool, whether an eastward ray from each point crosses an odd number of segments a to b."""
     out = np.empty(len(points), bool)
     for i, (x, y) in enumerate(points):

@@ -105,7 +105,7 @@ def _strips(table: Structures, k: int) -> NDArray[np.object_]:
     return np.append(across, shapely.get_parts(_areal(rest)))
 
 
-def _ground_on(strips: NDArray[np.object_], height: Height | None) -> tuple[Float, NDArray[np.int64], Float]:
+def _ground_on(strips: NDArray[np.object_], height: Height | None) -> tuple[Float, Ints, Float]:
     """Points (n, 2) around strips, the strip of each, and the ground's height there."""
     xy, strip = shapely.get_coordinates(shapely.segmentize(strips, _STEP), return_index=True)
     return xy, strip, np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.structures.table import Structures
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float
 
 _FADE = 1.5
 """Metres beyond its outside over which a carriageway's height ceases to count."""
@@ -21,7 +20,7 @@ SHARED, PARTED = 0.5, 1.0
 """Metres of difference in height up to which carriageways share one surface, and from which on they part."""
 
 
-def nearest_on_line(line: Float, xy: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
+def nearest_on_line(line: Float, xy: Float) -> tuple[Float, Float, Bools]:
     """Nearest point on a line (k, 3) to points (n, 2): its z, its distance, whether it is not an end."""
     start, along = line[:-1], np.diff(line, axis=0)
     square = np.maximum((along[:, :2] ** 2).sum(axis=1), 1e-12)

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 
 PRECISION = 1e-3
 """Metres: the grid that plans are cut on, ten times that on which solids are checked."""
@@ -49,7 +49,7 @@ class Shell:
     vertices: Float
     faces: Ints
     level: Ints
-    up: NDArray[np.bool_]
+    up: Bools
     triangle: Ints
 
 
@@ -77,7 +77,7 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
     return Plan(grid * PRECISION, faces[twice != 0].astype(np.int64))
 
 
-def raise_shell(plan: Plan, levels: Float, *, solid: NDArray[np.bool_]) -> Shell:
+def raise_shell(plan: Plan, levels: Float, *, solid: Bools) -> Shell:
     """The closed surface around the solid layers of a plan's triangles.
 
     Where solids would touch along a vertical edge only, the smallest triangles there are left out, so that
@@ -114,9 +114,7 @@ def raise_shell(plan: Plan, levels: Float, *, solid: NDArray[np.bool_]) -> Shell
     )
 
 
-def _unpinched(
-    plan: Plan, solid: NDArray[np.bool_], *, start: Ints, own: Ints, other: Ints
-) -> NDArray[np.bool_]:
+def _unpinched(plan: Plan, solid: Bools, *, start: Ints, own: Ints, other: Ints) -> Bools:
     """The layer (m,) reduced so that the solid around each vertex is connected."""
     (ux, uy), (vx, vy) = (plan.xy[plan.faces[:, k]].T - plan.xy[plan.faces[:, 0]].T for k in (1, 2))
     area = np.repeat(ux * vy - uy * vx, 3)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float, Ints
 
 _APPROACH = 6.0
 """Metres of the road on the ground that tell which way a bridge or tunnel opens."""
@@ -41,12 +41,12 @@ class Members:
     """
 
     line: NDArray[np.object_]
-    tunnel: NDArray[np.bool_]
-    foot: NDArray[np.bool_]
+    tunnel: Bools
+    foot: Bools
     width: Float
     rows: NDArray[np.object_]
     approach: NDArray[np.object_]
-    landed: NDArray[np.bool_]
+    landed: Bools
     level: NDArray[np.int8]
     edge: NDArray[np.int32]
     osm_id: NDArray[np.str_]
@@ -115,7 +115,7 @@ def _kind(graph: RoadGraph, edge: int) -> int:
     return 2 if graph.tunnel[edge] else int(graph.bridge[edge])
 
 
-def _arms(graph: RoadGraph, members: NDArray[np.int64]) -> dict[int, list[tuple[int, Float, float]]]:
+def _arms(graph: RoadGraph, members: Ints) -> dict[int, list[tuple[int, Float, float]]]:
     """Kind, first metres (from the node) and width of all roads at the ends of members, by node."""
     ends = np.unique(np.concatenate([graph.tail[members], graph.head[members]]))
     arms: dict[int, list[tuple[int, Float, float]]] = {int(node): [] for node in ends}

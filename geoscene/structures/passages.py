@@ -13,7 +13,7 @@ from geoscene.buildings.table import GRID
 from geoscene.report import Problem
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.table import StructureOptions, Structures
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float, Ints
 
 _SCANT = 1.0
 """Square metres; a smaller overlap of building and road is left as it is."""
@@ -64,11 +64,11 @@ def buildings_over(
 
 def _divided(
     buildings: Buildings,
-    row: NDArray[np.int64],
+    row: Ints,
     *,
     corridor: NDArray[np.object_],
     clear: Float,
-    tunnel: NDArray[np.bool_],
+    tunnel: Bools,
 ) -> tuple[Buildings, list[Problem]]:
     """Rows (k,) divided along corridors (k,); the parts within start ``clear`` (k,) metres over the base."""
     footprint, underside = buildings.footprint.copy(), buildings.min_height.copy()

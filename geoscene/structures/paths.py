@@ -22,7 +22,7 @@ from geoscene.sources.data import OsmData, Way
 from geoscene.structures.heights import nearest_on_line
 from geoscene.structures.members import Members
 from geoscene.structures.table import StructureOptions
-from geoscene.typing import Float, Height, Ints
+from geoscene.typing import Bools, Float, Height, Ints
 
 _STATION = 5.0
 """Maximum metres between stations."""
@@ -94,7 +94,7 @@ class _Paths:
     body   : (n,) metres from the surface to the underside of the deck
     """
 
-    tunnel: NDArray[np.bool_]
+    tunnel: Bools
     level: NDArray[np.int8]
     body: Float
 
@@ -181,7 +181,7 @@ def _onward(xy: Float, width: float) -> shapely.Geometry:
     return band.union(shapely.Point(xy[0]).buffer(width / 2))
 
 
-def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]], *, slope: Float) -> _Net:
+def _network(lines: NDArray[np.object_], nodes: list[Ints], *, slope: Float) -> _Net:
     """Stations at the ends and along lines with given maximum gradients (n,)."""
     number: dict[int, int] = {}
     places: list[Float] = []
@@ -221,7 +221,7 @@ def _network(lines: NDArray[np.object_], nodes: list[NDArray[np.int64]], *, slop
     return _Net(np.array(places), rows, np.concatenate(a), np.concatenate(b), np.concatenate(metres), steep)
 
 
-def _sunk(osm: OsmData, ways: list[Way]) -> NDArray[np.bool_]:
+def _sunk(osm: OsmData, ways: list[Way]) -> Bools:
     """Whether tunnels (n,) are below the ground: by layer; by default if less than half is in buildings."""
     houses = np.array([area.geometry for area in osm.areas if "building" in area.tags], object)
     tree = shapely.STRtree(houses)
@@ -251,16 +251,16 @@ def _joined(osm: OsmData, ways: list[Way]) -> NDArray[np.int8]:
     return np.array(at, np.int8).reshape(-1, 2)
 
 
-def _ends(net: _Net, sunk: NDArray[np.bool_], *, joined: NDArray[np.int8]) -> NDArray[np.bool_]:
+def _ends(net: _Net, sunk: Bools, *, joined: NDArray[np.int8]) -> Bools:
     """Whether a station (v,) is the end of one way only; not for dead ends underground."""
-    ends: NDArray[np.bool_] = np.bincount(np.concatenate([net.a, net.b]), minlength=len(net.xy)) == 1
+    ends: Bools = np.bincount(np.concatenate([net.a, net.b]), minlength=len(net.xy)) == 1
     for k in np.flatnonzero(sunk).tolist():
         station = net.rows[k][[0, -1]]
         ends[station[joined[k] == 0]] = False
     return ends
 
 
-def _depths(net: _Net, sunk: NDArray[np.bool_], *, joined: NDArray[np.int8], full: Float) -> Float:
+def _depths(net: _Net, sunk: Bools, *, joined: NDArray[np.int8], full: Float) -> Float:
     """Minimum depth (v,) of stations under the ground: ``full`` (n,) except on ramps; NaN elsewhere."""
     depth = np.full(len(net.xy), np.nan)
     mouth = np.zeros(len(net.xy), np.bool_)
@@ -276,7 +276,7 @@ def _depths(net: _Net, sunk: NDArray[np.bool_], *, joined: NDArray[np.int8], ful
     return ramped
 
 
-def _heights(net: _Net, paths: _Paths, *, ends: NDArray[np.bool_], depth: Float, crossed: _Crossed) -> Float:
+def _heights(net: _Net, paths: _Paths, *, ends: Bools, depth: Float, crossed: _Crossed) -> Float:
     """Heights (v,) of stations; ``ends`` (v,) lie on the ground, tunnels at least ``depth`` (v,) under it."""
     if not len(net.xy):
         return np.empty(0)

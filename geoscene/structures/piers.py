@@ -12,7 +12,7 @@ from geoscene.classes import Class
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.structures.heights import nearest_on_line
 from geoscene.structures.table import StructureOptions, Structures
-from geoscene.typing import Float, Height
+from geoscene.typing import Bools, Float, Height
 
 _KEPT_FREE = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.SIDEWALK, Class.KERB, Class.RAIL)
 """No pier stands on these."""
@@ -73,11 +73,11 @@ def place_piers(
     return replace(table, pier=pier, pier_spacing=spacing)
 
 
-def _ends(table: Structures) -> NDArray[np.bool_]:
+def _ends(table: Structures) -> Bools:
     """Whether no other piece continues from the start and the end of each piece's line (n, 2)."""
     places = np.array([line[[0, -1], :2] for line in table.line]).reshape(-1, 2)
     _, number, count = np.unique(np.round(places, 2), axis=0, return_inverse=True, return_counts=True)
-    ends: NDArray[np.bool_] = (count[number.ravel()] == 1).reshape(-1, 2)
+    ends: Bools = (count[number.ravel()] == 1).reshape(-1, 2)
     return ends
 
 
@@ -86,7 +86,7 @@ def _abutments(
     k: int,
     *,
     flat: shapely.LineString,
-    ends: NDArray[np.bool_],
+    ends: Bools,
     ways: shapely.STRtree,
     height: Height | None,
 ) -> list[shapely.Geometry]:
@@ -123,17 +123,15 @@ def _piers(table: Structures, k: int, *, flat: shapely.LineString, at: Float) ->
 
 def _stands_out(
     table: Structures, k: int, *, flat: shapely.LineString, at: Float, height: Height | None
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Whether the bridge is well above the ground at metres along it."""
     xy = shapely.get_coordinates(shapely.line_interpolate_point(flat, at))
     ground = np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
-    high: NDArray[np.bool_] = nearest_on_line(table.line[k], xy)[0] - table.body[k] > ground + _LOW
+    high: Bools = nearest_on_line(table.line[k], xy)[0] - table.body[k] > ground + _LOW
     return high
 
 
-def _on_pieces(
-    table: Structures, k: int, *, pieces: shapely.STRtree, shapes: NDArray[np.object_]
-) -> NDArray[np.bool_]:
+def _on_pieces(table: Structures, k: int, *, pieces: shapely.STRtree, shapes: NDArray[np.object_]) -> Bools:
     """Whether each pier would stand on another bridge or over an open tunnel."""
     blocked = np.zeros(len(shapes), np.bool_)
     hit, found = pieces.query(shapes, predicate="dwithin", distance=_FREE)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene import polylines
 from geoscene.structures.heights import PARTED, SHEET, nearest_on_line
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float
 
 Pair = tuple[int, int]
 
@@ -62,9 +62,7 @@ def _pair(one: int, two: int) -> Pair:
     return min(one, two), max(one, two)
 
 
-def find_sheets(
-    polygon: NDArray[np.object_], around: NDArray[np.object_], *, tunnel: NDArray[np.bool_]
-) -> Sheets:
+def find_sheets(polygon: NDArray[np.object_], around: NDArray[np.object_], *, tunnel: Bools) -> Sheets:
     """Relations of pieces by their heights where their outlines touch."""
     one, two = shapely.STRtree(polygon).query(polygon, predicate="dwithin", distance=_TOUCH)
     keep = (one < two) & (tunnel[one] == tunnel[two])
@@ -110,7 +108,7 @@ def part_outlines(
     around: NDArray[np.object_],
     *,
     half: Float,
-    tunnel: NDArray[np.bool_],
+    tunnel: Bools,
     free: Float,
     body: Float,
 ) -> NDArray[np.object_]:

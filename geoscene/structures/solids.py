@@ -14,7 +14,7 @@ from geoscene.structures.ground_contact import tunnel_roof
 from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.layered import SIDE, Plan, Shell, cut_plan, raise_shell
 from geoscene.structures.table import StructureOptions, Structures
-from geoscene.typing import Float, Height
+from geoscene.typing import Bools, Float, Height, Ints
 
 _STANDING = 0.5
 """Metres that piers and abutments reach under the ground."""
@@ -71,8 +71,8 @@ def _solid(
 
 
 def _bridge(
-    table: Structures, k: int, *, plan: Plan, z: Float, ground: Float, rim: NDArray[np.bool_]
-) -> tuple[Float, NDArray[np.bool_]]:
+    table: Structures, k: int, *, plan: Plan, z: Float, ground: Float, rim: Bools
+) -> tuple[Float, Bools]:
     """Bridge with the levels below ground, soffit, deck, parapet; piers reach down, parapets up."""
     soffit = z - table.body[k]
     levels = np.column_stack([np.minimum(ground - _STANDING, soffit - 0.1), soffit, z, z + table.rise[k]])
@@ -87,10 +87,10 @@ def _tunnel(
     plan: Plan,
     z: Float,
     ground: Float,
-    rim: NDArray[np.bool_],
+    rim: Bools,
     openings: NDArray[np.object_] | None,
     options: StructureOptions,
-) -> tuple[Float, NDArray[np.bool_]]:
+) -> tuple[Float, Bools]:
     """Tunnel with the levels underside, floor, ceiling, roof; walls between floor and ceiling."""
     ceiling = z + table.rise[k]
     opening = None if openings is None else openings[k]
@@ -134,9 +134,7 @@ def _ribs(line: Float, reach: float) -> NDArray[np.object_]:
     return np.atleast_1d(ribs)
 
 
-def _with_surfaces(
-    table: Structures, k: int, *, plan: Plan, shell: Shell, floor: int, rim: NDArray[np.bool_]
-) -> Mesh:
+def _with_surfaces(table: Structures, k: int, *, plan: Plan, shell: Shell, floor: int, rim: Bools) -> Mesh:
     """The shell as a mesh with the classes of its surfaces."""
     concrete = materials()["concrete"]
     body = Class.TUNNEL if table.tunnel[k] else Class.BRIDGE
@@ -164,7 +162,7 @@ def _with_surfaces(
     return mesh.take(np.ones(len(mesh), np.bool_))
 
 
-def _top_rows(table: Structures, k: int, *, xy: Float) -> NDArray[np.int64]:
+def _top_rows(table: Structures, k: int, *, xy: Float) -> Ints:
     """Row (n,) of the topmost surface at points (n, 2), -1 without any."""
     tops = table.tops[k]
     tops = tops[np.lexsort([-tops, table.surfaces.priority[tops]])]

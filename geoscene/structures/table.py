@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float
 
 THINNEST = 0.15
 """Metres: least thickness of a tunnel's roof."""
@@ -77,7 +77,7 @@ class Structures:
     polygon: NDArray[np.object_]
     line: NDArray[np.object_]
     around: NDArray[np.object_]
-    tunnel: NDArray[np.bool_]
+    tunnel: Bools
     half: Float
     body: Float
     body_source: NDArray[np.str_]
@@ -100,7 +100,7 @@ class Structures:
         """Number of pieces."""
         return len(self.polygon)
 
-    def take(self, keep: NDArray[np.bool_]) -> Structures:
+    def take(self, keep: Bools) -> Structures:
         """The chosen rows, in their order; ``near`` refers to rows of the new table."""
         number = np.full(len(self), -1, np.int64)
         number[keep] = np.arange(int(keep.sum()))

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from geoscene.export.files import plain
 from geoscene.export.objects import Features
+from geoscene.typing import Bools, Ints
 
-Rows = NDArray[np.int64]
+Rows = Ints
 
 
-def tables(features: Features, present: NDArray[np.bool_]) -> list[dict[str, Any]]:
+def tables(features: Features, present: Bools) -> list[dict[str, Any]]:
     """One table per layer with the features in the page, in the layers' order, empty ones left out.
 
     present : (n,) bool by feature number: it has faces or copies in the page
@@ -39,9 +40,9 @@ def _chosen(
     layer: str,
     columns: dict[str, NDArray[Any]],
     *,
-    own: NDArray[np.bool_],
+    own: Bools,
     features: Features,
-    present: NDArray[np.bool_],
+    present: Bools,
 ) -> Rows:
     """Rows of a layer that are in the page, or belong to a feature that is."""
     keep = own.copy()

@@ -13,7 +13,6 @@ from string import Template
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes, materials
 from geoscene.errors import InputError
@@ -23,6 +22,7 @@ from geoscene.files import append, atomic_file, spool
 from geoscene.options import Degrees, ViewOptions
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.typing import Bools, Ints
 from geoscene.view.attributes import tables
 from geoscene.view.lonlat import ACCURACY, lonlat_grid
 from geoscene.view.tiles import Groups, groups_of, gzip, only, pack_shapes, pack_tile
@@ -99,7 +99,7 @@ def _check(out: Path, *, overwrite: bool) -> None:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
 
 
-def _kept(groups: Groups, layers: Sequence[str]) -> NDArray[np.bool_]:
+def _kept(groups: Groups, layers: Sequence[str]) -> Bools:
     """Groups (n,) to include in the page."""
     if unknown := sorted(set(layers) - set(groups.names)):
         raise InputError(f"`layers`: no {', '.join(unknown)} in the scene; it has {', '.join(groups.names)}")
@@ -134,7 +134,7 @@ def _blob(file: IO[bytes], name: str, *, data: bytes) -> None:
     file.write(f'<script type="text/plain" id="{name}">'.encode() + b64encode(data) + b"</script>\n")
 
 
-def _tiles_within(scene: Scene, bounds_deg: Degrees | None) -> NDArray[np.int64]:
+def _tiles_within(scene: Scene, bounds_deg: Degrees | None) -> Ints:
     """(i, j) of the tiles (n, 2) whose squares intersect the bounds."""
     indices = np.array(scene.tile_indices, np.int64).reshape(-1, 2)
     if bounds_deg is None:
@@ -153,29 +153,27 @@ def _tiles_within(scene: Scene, bounds_deg: Degrees | None) -> NDArray[np.int64]
             f"bounds {bounds_deg}: the scene has nothing there; it covers "
             f"{lon[0]:.5f},{lat[0]:.5f},{lon[1]:.5f},{lat[1]:.5f}"
         )
-    chosen: NDArray[np.int64] = indices[meets]
+    chosen: Ints = indices[meets]
     return chosen
 
 
-def _middle(indices: NDArray[np.int64]) -> NDArray[np.int64]:
-    middle: NDArray[np.int64] = (indices.min(axis=0) + indices.max(axis=0)) // 2
+def _middle(indices: Ints) -> Ints:
+    middle: Ints = (indices.min(axis=0) + indices.max(axis=0)) // 2
     return middle
 
 
-def _rings(indices: NDArray[np.int64]) -> NDArray[np.int64]:
+def _rings(indices: Ints) -> Ints:
     """Chebyshev distance of each tile (n, 2) from the middle one, in tiles."""
-    rings: NDArray[np.int64] = np.abs(indices - _middle(indices)).max(axis=1)
+    rings: Ints = np.abs(indices - _middle(indices)).max(axis=1)
     return rings
 
 
-def _outwards(indices: NDArray[np.int64]) -> NDArray[np.int64]:
+def _outwards(indices: Ints) -> Ints:
     """Tiles in loading order: from the middle outwards."""
     return indices[np.lexsort([indices[:, 1], indices[:, 0], _rings(indices)])]
 
 
-def _too_large(
-    scene: Scene, indices: NDArray[np.int64], *, sizes: Sequence[int], size: int, max_mb: float
-) -> str:
+def _too_large(scene: Scene, indices: Ints, *, sizes: Sequence[int], size: int, max_mb: float) -> str:
     """Error text: how large the page would be, and the bounds of a part that would fit."""
     rings, share = _rings(indices), size / sizes[-1]
     whole = size / len(sizes) * len(indices) / 1e6

@@ -13,6 +13,7 @@ from geoscene.classes import Class
 from geoscene.mesh import Instances, Mesh
 from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
+from geoscene.typing import Bools, Float, Ints
 
 STEP = 1 / 128
 """Quantisation step of vertices in metres; a power of two, so that tiles share one grid and
@@ -64,7 +65,7 @@ def groups_of(scene: Scene) -> Groups:
     return Groups(tuple(names), of)
 
 
-def only(tile: Tile, groups: Groups, *, kept: NDArray[np.bool_]) -> Tile:
+def only(tile: Tile, groups: Groups, *, kept: Bools) -> Tile:
     """The faces and copies of a tile that are in the kept groups (n,)."""
     if kept.all():
         return tile
@@ -134,7 +135,7 @@ def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
     return header, gzip(b"".join(values.astype(kind).tobytes() for values, kind in columns))
 
 
-def _upright(transform: NDArray[np.float64], step: float) -> NDArray[np.int64] | None:
+def _upright(transform: Float, step: float) -> Ints | None:
     """Quantised columns (6, k) of upright transforms (k, 3, 4), or None if any is not upright."""
     along, lift = np.hypot(transform[:, 0, 0], transform[:, 1, 0]), transform[:, 2, 2]
     turn = np.arctan2(transform[:, 1, 0], transform[:, 0, 0])
@@ -147,16 +148,14 @@ def _upright(transform: NDArray[np.float64], step: float) -> NDArray[np.int64] |
     return None if whole.max(initial=0) > 65_535 else whole.astype(np.int64)
 
 
-def _transforms(columns: NDArray[np.uint16], step: float) -> NDArray[np.float64]:
+def _transforms(columns: NDArray[np.uint16], step: float) -> Float:
     """Transforms (k, 3, 4) of the columns of upright copies."""
     x, y, z, turn, along, lift = columns.astype(np.int64)
     place = np.column_stack([np.cumsum(x) % 65_536, y, z]) * step
     return np.dstack([_turned(along * SCALE, lift * SCALE, turn=turn * TURN), place[:, :, None]])
 
 
-def _turned(
-    along: NDArray[np.float64], lift: NDArray[np.float64], *, turn: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _turned(along: Float, lift: Float, *, turn: Float) -> Float:
     """Matrices (k, 3, 3) that scale horizontally and vertically and rotate about the vertical."""
     matrix = np.zeros((len(turn), 3, 3))
     matrix[:, 0, 0] = matrix[:, 1, 1] = along * np.cos(turn)
