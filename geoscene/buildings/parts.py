@@ -109,12 +109,7 @@ def remainder(outline: Any, parts: Polygons, *, covered: float) -> tuple[Any, fl
 
 
 def cut_overlaps(
-    osm_id: Sequence[str] | Texts,
-    footprint: Polygons,
-    *,
-    owner: Rows,
-    low: Float,
-    high: Float,
+    osm_id: Sequence[str] | Texts, footprint: Polygons, *, owner: Rows, low: Float, high: Float
 ) -> tuple[Polygons, list[Problem]]:
     """Footprints (n,) without the overlaps between buildings, and the problems.
 

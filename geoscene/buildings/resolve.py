@@ -121,12 +121,7 @@ def _resolve_roofs(rows: Sequence[Row], roofs: Sequence[RoofTags], *, h: Heights
 
 
 def _resolve_buildings(
-    rows: Sequence[Row],
-    is_part: Bools,
-    *,
-    outline: Ints,
-    h: Heights,
-    options: BuildingOptions,
+    rows: Sequence[Row], is_part: Bools, *, outline: Ints, h: Heights, options: BuildingOptions
 ) -> None:
     """Set missing heights of buildings, in place: at least that of their highest part, else inferred."""
     own = np.flatnonzero(is_part & np.isfinite(h.high) & ~np.array([r.is_remainder for r in rows], np.bool_))

@@ -203,8 +203,7 @@ def _hipped_ends(cells: Cells, up: Float, *, low: float, span: float) -> Cells:
     def height(xy: Float, count: int) -> Float:
         planes = [0.5 + 2 * (xy @ along - start) / span for along, start in hips[:count]]
         return np.asarray(
-            np.minimum.reduce([_profile(xy @ up - low, span, profile=SECTIONS["gabled"]), *planes]),
-            float,
+            np.minimum.reduce([_profile(xy @ up - low, span, profile=SECTIONS["gabled"]), *planes]), float
         )
 
     for k, (along, start) in enumerate(hips):

@@ -312,15 +312,7 @@ def _solid_entries(
 
 
 def _solids(
-    mesh: Mesh,
-    piece: Piece,
-    *,
-    whole: Ints,
-    triangles: Ints,
-    shell: Ints,
-    look: Ints,
-    first: int,
-    kind: str,
+    mesh: Mesh, piece: Piece, *, whole: Ints, triangles: Ints, shell: Ints, look: Ints, first: int, kind: str
 ) -> list[dict[str, Any]]:
     """A Solid for each body."""
     names, values = np.unique(

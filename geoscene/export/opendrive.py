@@ -87,13 +87,7 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
     chains = len(graph.chain_edges)
     notes = (f"{chains} turn restrictions via ways are left out: OpenDRIVE has only those via nodes",)
     return Summary(
-        path,
-        "opendrive",
-        files,
-        size,
-        len(net.roads),
-        crs=scene.frame.name,
-        notes=notes if chains else (),
+        path, "opendrive", files, size, len(net.roads), crs=scene.frame.name, notes=notes if chains else ()
     )
 
 

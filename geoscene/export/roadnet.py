@@ -180,11 +180,7 @@ def _joints(
 
 
 def _gaps(
-    graph: RoadGraph,
-    firsts: list[int],
-    *,
-    ends: dict[int, list[tuple[int, int]]],
-    junctions: Bools,
+    graph: RoadGraph, firsts: list[int], *, ends: dict[int, list[tuple[int, int]]], junctions: Bools
 ) -> Float:
     """Metres (roads, 2) that each road is cut back at its ends, so that it clears its neighbours' sides.
 
@@ -252,13 +248,7 @@ def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[Lane]
 
 
 def _connection(
-    graph: RoadGraph,
-    roads: list[Carriageway],
-    *,
-    road_of: Ints,
-    before: int,
-    after: int,
-    left_hand: bool,
+    graph: RoadGraph, roads: list[Carriageway], *, road_of: Ints, before: int, after: int, left_hand: bool
 ) -> Connection:
     """The connection from the end of one edge to the start of another."""
     sign = 1 if left_hand else -1

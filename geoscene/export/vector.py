@@ -15,14 +15,7 @@ from pyproj import CRS
 from geoscene.errors import need
 from geoscene.export.files import Summary, plain, size_of
 from geoscene.export.objects import attribution
-from geoscene.export.tables import (
-    SOLIDS,
-    Rows,
-    chosen_layers,
-    kinds_of_columns,
-    rows,
-    target_crs,
-)
+from geoscene.export.tables import SOLIDS, Rows, chosen_layers, kinds_of_columns, rows, target_crs
 from geoscene.files import atomic_file, atomic_path
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene

@@ -416,12 +416,7 @@ def _without_slivers(edges: _Edges, cells: NDArray[np.object_], *, row: Ints) ->
 
 
 def _dissolve(
-    edges: _Edges,
-    row: Ints,
-    *,
-    box: tuple[float, float, float, float],
-    lines: float,
-    level: Bools,
+    edges: _Edges, row: Ints, *, box: tuple[float, float, float, float], lines: float, level: Bools
 ) -> tuple[NDArray[np.object_], Ints]:
     """Cells of one row joined, over the terrain's lines only where they are level, and their rows.
 

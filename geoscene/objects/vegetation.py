@@ -177,13 +177,7 @@ def needle_shares(plan: GroundPlan, osm: OsmData) -> Float:
 
 
 def forest_trees(
-    plan: GroundPlan,
-    i: int,
-    *,
-    j: int,
-    density: float = 0.02,
-    seed: int = 0,
-    needles: Float | None = None,
+    plan: GroundPlan, i: int, *, j: int, density: float = 0.02, seed: int = 0, needles: Float | None = None
 ) -> Trees:
     """Sampled trees of tile (i, j): one per square of 1 / density m2 whose trunk is on forest floor.
 

@@ -51,12 +51,7 @@ def interior_point(cost: Any, pull: Float, *, bounds: Bounds, start: Float) -> F
         system = (cost + across @ diags_array(stiff) @ a).tocsc()
         # Positive definite: pivots stay on the diagonal, which keeps the factor sparse. On street grids of a
         # whole city minimum degree on a + a' fills five times as much as this order, elsewhere a little less.
-        factor = splu(
-            system,
-            permc_spec="COLAMD",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
+        factor = splu(system, permc_spec="COLAMD", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
         def step(complement: Float) -> tuple[Float, Float, Float]:
             short = -primal - complement / force  # noqa: B023

@@ -50,12 +50,7 @@ _ZONES: dict[str, dict[str, float]] = {
     "ES": {"rural": 90, "trunk": 90, "motorway": 120},
     "FI": {"rural": 80, "trunk": 100, "motorway": 120},
     "FR": {"rural": 80, "trunk": 110, "motorway": 130},
-    "GB": {
-        "nsl_restricted": 48.28032,
-        "nsl_single": 96.56064,
-        "nsl_dual": 112.65408,
-        "motorway": 112.65408,
-    },
+    "GB": {"nsl_restricted": 48.28032, "nsl_single": 96.56064, "nsl_dual": 112.65408, "motorway": 112.65408},
     "GR": {"rural": 90, "trunk": 110, "motorway": 130},
     "HU": {"rural": 90, "trunk": 110, "motorway": 130},
     "IT": {"rural": 90, "trunk": 110, "motorway": 130},

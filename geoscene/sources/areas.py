@@ -168,11 +168,7 @@ def _relation_area(
 
 
 def multipolygon_areas(
-    elements: Elements,
-    places: Places,
-    *,
-    extent: Bounds,
-    wanted: Callable[[Ints], bool],
+    elements: Elements, places: Places, *, extent: Bounds, wanted: Callable[[Ints], bool]
 ) -> tuple[list[Area], list[Problem], Claims]:
     """Areas of multipolygon relations in order of id, their problems, and the ways that belong to them.
 
@@ -220,12 +216,7 @@ def multipolygon_areas(
 
 
 def way_areas(
-    elements: Elements,
-    places: Places,
-    *,
-    extent: Bounds,
-    rows: Iterable[int],
-    claims: Claims,
+    elements: Elements, places: Places, *, extent: Bounds, rows: Iterable[int], claims: Claims
 ) -> tuple[list[Area], list[Problem], set[int]]:
     """Areas of ways in order of id, their problems, and the rows of all ways that are tagged as areas."""
     areas: list[Area] = []

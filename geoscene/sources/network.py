@@ -202,11 +202,7 @@ def _around(lon: float, lat: float, *, half_width: float, half_height: float) ->
 
 
 def fetch_bbox(
-    bbox: Bounds,
-    *,
-    cache_dir: Path | None = None,
-    servers: Servers | None = None,
-    progress: Progress = iter,
+    bbox: Bounds, *, cache_dir: Path | None = None, servers: Servers | None = None, progress: Progress = iter
 ) -> OsmData:
     """The features that intersect a box, from Overpass; the same as `read_osm` returns for an extract.
 
@@ -272,11 +268,7 @@ def locate(name: str, *, cache_dir: Path | None = None, servers: Servers | None 
 
 
 def fetch_place(
-    name: str,
-    *,
-    cache_dir: Path | None = None,
-    servers: Servers | None = None,
-    progress: Progress = iter,
+    name: str, *, cache_dir: Path | None = None, servers: Servers | None = None, progress: Progress = iter
 ) -> OsmData:
     """The features that intersect the box of a place, given by a name for Nominatim ("Norfolk, VA").
 

@@ -40,12 +40,7 @@ _OTHERS = ("id", "geometry", "class", "subtype", "is_underground", "sources")
 _NO_NODES = np.empty(0, np.int64)
 
 
-def read_overture(
-    path: str | Path,
-    *,
-    bounds: Bounds | None = None,
-    progress: Progress = iter,
-) -> OsmData:
+def read_overture(path: str | Path, *, bounds: Bounds | None = None, progress: Progress = iter) -> OsmData:
     """The buildings of a GeoParquet file, or of a folder of them, as areas with OpenStreetMap's tags.
 
     An area's ``osm_id`` is ``overture:<id>``; its ``building`` tag is the class, else the subtype, else

@@ -80,7 +80,7 @@ SOURCES: dict[str, Source] = {
 """All sources by name."""
 
 _LAYERS: dict[str, tuple[Callable[[Tags], bool], frozenset[str]]] = {
-    "buildings": (is_building, frozenset({"building", "building-part"})),
+    "buildings": (is_building, frozenset({"building", "building-part"}))
 }
 """By what a source gives: whether a feature belongs to it, and the kinds of its problems."""
 
@@ -93,11 +93,7 @@ def reader_of(name: str) -> Callable[..., Any]:
 
 
 def read_source(
-    name: str,
-    path: str | Path,
-    *,
-    bounds: Bounds | None = None,
-    progress: Progress = iter,
+    name: str, path: str | Path, *, bounds: Bounds | None = None, progress: Progress = iter
 ) -> OsmData:
     """The features of a file of a source, within bounds (west, south, east, north, degrees) if given.
 

@@ -166,12 +166,7 @@ def opening_layers(table: Structures, openings: NDArray[np.object_]) -> Layers:
 
 
 def tunnel_roof(
-    xy: Float,
-    ceiling: Float,
-    *,
-    ground: Float,
-    opening: shapely.Geometry | None,
-    options: StructureOptions,
+    xy: Float, ceiling: Float, *, ground: Float, opening: shapely.Geometry | None, options: StructureOptions
 ) -> Float:
     """Heights (n,) of a tunnel's roof at points (n, 2): below the ground, or above it in openings."""
     thick = ceiling + options.roof

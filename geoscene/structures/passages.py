@@ -63,12 +63,7 @@ def buildings_over(
 
 
 def _divided(
-    buildings: Buildings,
-    row: Ints,
-    *,
-    corridor: NDArray[np.object_],
-    clear: Float,
-    tunnel: Bools,
+    buildings: Buildings, row: Ints, *, corridor: NDArray[np.object_], clear: Float, tunnel: Bools
 ) -> tuple[Buildings, list[Problem]]:
     """Rows (k,) divided along corridors (k,); the parts within start ``clear`` (k,) metres over the base."""
     footprint, underside = buildings.footprint.copy(), buildings.min_height.copy()

@@ -37,12 +37,7 @@ def tables(features: Features, present: Bools) -> list[dict[str, Any]]:
 
 
 def _chosen(
-    layer: str,
-    columns: dict[str, NDArray[Any]],
-    *,
-    own: Bools,
-    features: Features,
-    present: Bools,
+    layer: str, columns: dict[str, NDArray[Any]], *, own: Bools, features: Features, present: Bools
 ) -> Rows:
     """Rows of a layer that are in the page, or belong to a feature that is."""
     keep = own.copy()
