@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from geoscene.errors import GeosceneError
 from geoscene.typing import Float
 
@@ -121,7 +122,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
 
 @dataclass(frozen=True, slots=True)
-class Instances:
+class Instances(Columns):
     """Copies of shapes, such as trees.
 
     shape     : (k,) int32, index into the scene's shapes
@@ -132,10 +133,6 @@ class Instances:
     shape: NDArray[np.int32]
     transform: Float
     feature: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        """Number of copies."""
-        return len(self.shape)
 
     @classmethod
     def empty(cls) -> Instances:

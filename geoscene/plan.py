@@ -27,7 +27,6 @@ from geoscene.ground import (
     Layers,
     WaterLevels,
     building_pads,
-    concatenate_layers,
     landcover,
     plan_ground,
     water_levels,
@@ -282,7 +281,7 @@ def _plan_ground(
     size = options.tile_size
     return plan_ground(
         extent,
-        concatenate_layers([*layers, opening_layers(roads.structures, roads.openings)]),
+        Layers.concatenate([*layers, opening_layers(roads.structures, roads.openings)]),
         tile_size=size,
         lines=_ROAD_LINES if roads.uneven else 0.0,
         ruled=_graded_tiles(roads.graph, size, level=not terrain.grids),
@@ -348,7 +347,7 @@ def _surfaces(
     pads = building_pads(
         standing, osm_id=buildings.osm_id[:count].astype(str), feature=np.arange(count, dtype=np.int32)
     )
-    return (concatenate_layers(parts), paved, pads), problems
+    return (Layers.concatenate(parts), paved, pads), problems
 
 
 def _objects(

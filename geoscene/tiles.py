@@ -25,7 +25,6 @@ from geoscene.ground import ground_tile, tile_place
 from geoscene.mesh import Instances, Mesh, concatenate
 from geoscene.objects.barriers import barrier_meshes
 from geoscene.objects.furniture import furniture_instances
-from geoscene.objects.shapes import concatenate_instances
 from geoscene.objects.vegetation import forest_trees, tree_instances
 from geoscene.plan import Plan, take_buildings
 from geoscene.report import Problem
@@ -99,7 +98,7 @@ def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances]:
         meshes += barrier_meshes(plan.barriers.take(rows), height=plan.height)
     if len(rows := plan.of_tile("structures", i, j=j)):
         meshes += structure_meshes(plan.structures, rows, height=plan.height, openings=plan.openings)
-    return concatenate(meshes), concatenate_instances(copies)
+    return concatenate(meshes), Instances.concatenate([Instances.empty(), *copies])
 
 
 def build_tile(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.shells import boundary, distinct_corners, lift, triangulate
 from geoscene.buildings.skeleton import Skeleton, loops, polygons_of
+from geoscene.columns import Columns
 from geoscene.typing import Float, Ints
 from geoscene.watertight import weld
 
@@ -21,7 +22,7 @@ ON_LINE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Cells:
+class Cells(Columns):
     """Triangles of a footprint in plan and a continuous field, linear on each triangle.
 
     xy    : (m, 3, 2) metres on the grid, counter-clockwise
@@ -82,16 +83,8 @@ def cut(cells: Cells, level: float) -> Cells:
         (q[u], c[u], r[u], at[u], fc[u], at[u], face[u] + 1 - tip[u]),
     ]
     pieces = [Cells(np.stack(x[:3], axis=1), np.stack(x[3:6], axis=1), x[6]) for x in parts]
-    return _without_degenerate(joined([whole, *pieces]))
-
-
-def joined(cells: list[Cells]) -> Cells:
-    """All cells, in order."""
-    return Cells(
-        np.concatenate([c.xy for c in cells]),
-        np.concatenate([c.field for c in cells]),
-        np.concatenate([c.face for c in cells]),
-    )
+    cut_cells = Cells.concatenate([whole, *pieces])
+    return cut_cells.take(distinct_corners(cut_cells.xy))
 
 
 def outlines(xy: Float, face: Ints) -> Polygons | None:
@@ -162,12 +155,6 @@ def _crossing(a: Float, b: Float, *, fa: Float, fb: Float, level: float) -> Floa
     span = np.where(f1 == f0, 1.0, f1 - f0)
     part = np.clip((level - f0) / span, 0.0, 1.0)
     return to_grid(first + part[:, None] * (last - first))
-
-
-def _without_degenerate(cells: Cells) -> Cells:
-    """The cells whose three corners differ."""
-    keep = distinct_corners(cells.xy)
-    return Cells(cells.xy[keep], cells.field[keep], cells.face[keep])
 
 
 def skeleton_cells(skeleton: Skeleton) -> Cells:

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from shapely.errors import GEOSException
 
 from geoscene.buildings.footprints import Polygons, to_grid
+from geoscene.columns import Columns
 from geoscene.mesh import FLOOR, ROOF, WALL
 from geoscene.typing import Bools, Float, Ints
 from geoscene.watertight import degenerate_faces, edge_uses, weld
 
 
 @dataclass(frozen=True, slots=True)
-class Triangles:
+class Triangles(Columns):
     """Triangles given by their corners, each belonging to one piece.
 
     corners : (m, 3, 3) metres, counter-clockwise seen from outside
@@ -28,25 +29,6 @@ class Triangles:
     corners: Float
     piece: Ints
     surface: NDArray[np.uint8]
-
-    def __len__(self) -> int:
-        """Number of triangles."""
-        return len(self.corners)
-
-    def take(self, keep: NDArray[Any]) -> Triangles:
-        """The chosen triangles."""
-        return Triangles(self.corners[keep], self.piece[keep], self.surface[keep])
-
-
-def join(groups: list[Triangles]) -> Triangles:
-    """All triangles of the groups, in order."""
-    if not groups:
-        return Triangles(np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty(0, np.uint8))
-    return Triangles(
-        np.concatenate([g.corners for g in groups]),
-        np.concatenate([g.piece for g in groups]),
-        np.concatenate([g.surface for g in groups]),
-    )
 
 
 def triangulate(polygons: Polygons) -> tuple[Float, Ints]:
@@ -113,7 +95,7 @@ def close(top: Triangles, floor: Triangles, *, underside: Float) -> Triangles:
     walls = np.concatenate([np.stack([a0, b0, b], axis=1), np.stack([a0, b, a], axis=1)])
     wall = Triangles(walls, np.tile(piece, 2), np.full(len(walls), WALL, np.uint8))
     bottom = Triangles(floor.corners[:, ::-1], floor.piece, np.full(len(floor), FLOOR, np.uint8))
-    shells = join([top, wall, bottom])
+    shells = Triangles.concatenate([top, wall, bottom])
     # a wall of no height has triangles with two equal corners; real slivers must stay, or the shell opens
     return shells.take(distinct_corners(shells.corners))
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import clean
 from geoscene.buildings.roofs import RoofSpec, roof_shell
-from geoscene.buildings.shells import Triangles, join, prisms, sound
+from geoscene.buildings.shells import Triangles, prisms, sound
 from geoscene.buildings.table import Buildings
 from geoscene.buildings.unions import unite
 from geoscene.classes import Class
+from geoscene.columns import Columns
 from geoscene.errors import InputError
 from geoscene.mesh import ROOF, Mesh
 from geoscene.report import Problem
@@ -23,7 +24,7 @@ from geoscene.watertight import weld
 
 
 @dataclass(frozen=True, slots=True)
-class _Pieces:
+class _Pieces(Columns):
     """Single polygons to extrude: one or several per row of the table."""
 
     polygon: NDArray[Any]
@@ -32,16 +33,6 @@ class _Pieces:
     low: Float
     high: Float
     flat: Bools
-
-    def take(self, keep: NDArray[Any]) -> _Pieces:
-        return _Pieces(
-            self.polygon[keep],
-            self.row[keep],
-            self.building[keep],
-            self.low[keep],
-            self.high[keep],
-            self.flat[keep],
-        )
 
 
 def build_solids(buildings: Buildings, *, base: Float, lod: int = 2) -> tuple[Mesh, list[Problem]]:
@@ -65,8 +56,7 @@ def build_solids(buildings: Buildings, *, base: Float, lod: int = 2) -> tuple[Me
     pieces = _pieces(buildings, base, lod=lod)
     problems: list[Problem] = []
 
-    done: list[Triangles] = []
-    rows: list[Ints] = []
+    done = [Triangles(np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty(0, np.uint8))]
     for attempt in ("", "flat-roof", "cleaned-footprint"):
         if not len(pieces.row):
             break
@@ -78,8 +68,7 @@ def build_solids(buildings: Buildings, *, base: Float, lod: int = 2) -> tuple[Me
         problems += notes
         fine = ~np.isin(shells.piece, np.flatnonzero(np.isin(pieces.building, failed)))
         good = shells.take(fine)
-        done.append(good)
-        rows.append(pieces.row[good.piece])
+        done.append(replace(good, piece=pieces.row[good.piece]))
         if attempt:
             made = np.setdiff1d(pieces.building, failed)
             problems += [_problem(buildings, b, action="repaired", reason=attempt) for b in made]
@@ -87,7 +76,7 @@ def build_solids(buildings: Buildings, *, base: Float, lod: int = 2) -> tuple[Me
     problems += [
         _problem(buildings, b, action="dropped", reason="no-solid") for b in np.unique(pieces.building)
     ]
-    return _mesh(buildings, join(done), row=np.concatenate(rows) if rows else np.empty(0, np.int64)), problems
+    return _mesh(buildings, Triangles.concatenate(done)), problems
 
 
 def _problem(buildings: Buildings, row: int, *, action: Any, reason: str, detail: str = "") -> Problem:
@@ -149,7 +138,7 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
         if fallback:
             notes.append(_problem(buildings, row, action="repaired", reason="roof-fallback", detail=fallback))
         groups.append(replace(shell, piece=np.full(len(shell), k, np.int64)))
-    shells = join(groups)
+    shells = Triangles.concatenate(groups)
     fine = sound(shells, n)
     failed = set(np.unique(pieces.building[~fine]).tolist())
 
@@ -174,18 +163,18 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
             notes.append(
                 _problem(buildings, building, action="repaired", reason="touching-bodies", detail=note)
             )
-    result = join(out)
+    result = Triangles.concatenate(out)
     united_fine = sound(replace(result, piece=pieces.building[result.piece]), len(buildings))
     failed |= {int(b) for b in np.unique(pieces.building) if not united_fine[b]}
     bad = np.array(sorted(failed), np.int64)
     return result, bad, [p for p in notes if p.osm_id not in {buildings.osm_id[b] for b in bad}]
 
 
-def _mesh(buildings: Buildings, triangles: Triangles, *, row: Ints) -> Mesh:
-    """The mesh of all triangles, sorted by building and welded within each; ``row`` are their table rows."""
+def _mesh(buildings: Buildings, triangles: Triangles) -> Mesh:
+    """The mesh of all triangles (pieces: rows of the table), sorted by building and welded within each."""
+    triangles = triangles.take(np.argsort(buildings.outline[triangles.piece], kind="stable"))
+    row = triangles.piece
     feature = buildings.outline[row].astype(np.int64)
-    order = np.argsort(feature, kind="stable")
-    triangles, row, feature = triangles.take(order), row[order], feature[order]
     corners = triangles.corners.reshape(-1, 3)
     ids, first = weld(corners, np.repeat(feature, 3))
     roof = (triangles.surface == ROOF)[:, None]

@@ -145,7 +145,7 @@ def parts(scene: Scene, layers: Collection[str] | None = None) -> Iterator[Part]
         if layers is not None:
             mesh = mesh.take(wanted_rows(scene, mesh.feature, layers=layers))
             keep = wanted_rows(scene, copies.feature, layers=layers)
-            copies = Instances(copies.shape[keep], copies.transform[keep], copies.feature[keep])
+            copies = copies.take(keep)
         yield Part((i, j), tile.origin, mesh, copies)
 
 

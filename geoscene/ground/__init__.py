@@ -1,7 +1,7 @@
 """One ground surface: a partition of the plane by what lies on it, triangulated and draped on terrain.
 
 >>> cover, problems = landcover(osm, frame, extent=extent)                           # doctest: +SKIP
->>> layers = concatenate_layers([cover, road_surfaces, building_pads(footprints)])   # doctest: +SKIP
+>>> layers = Layers.concatenate([cover, road_surfaces, building_pads(footprints)])   # doctest: +SKIP
 >>> plan = plan_ground(extent, layers, tile_size=250.0)                              # doctest: +SKIP
 >>> meshes = [ground_tile(plan, i, j=j) for i, j in plan.tiles]                        # doctest: +SKIP
 """
@@ -16,7 +16,6 @@ from geoscene.ground.layers import PADS as PADS
 from geoscene.ground.layers import ROADS as ROADS
 from geoscene.ground.layers import Layers as Layers
 from geoscene.ground.layers import building_pads as building_pads
-from geoscene.ground.layers import concatenate_layers as concatenate_layers
 from geoscene.ground.partition import GroundPlan as GroundPlan
 from geoscene.ground.partition import Partition as Partition
 from geoscene.ground.partition import partition as partition

@@ -13,7 +13,7 @@ from geoscene.classes import materials
 from geoscene.frames import Frame
 from geoscene.ground.coast import sea
 from geoscene.ground.kinds import SEA, SURFACES, Kind, area_kind, line_kind
-from geoscene.ground.layers import Layers, concatenate_layers
+from geoscene.ground.layers import Layers
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.tags import parse_length
@@ -47,7 +47,7 @@ def landcover(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[L
         source="coastline",
         body=SEA.body,
     )
-    cut = _cut(concatenate_layers([areas, lines, water]), extent)
+    cut = _cut(Layers.concatenate([areas, lines, water]), extent)
     return cut, problems + more + still_more
 
 
@@ -105,7 +105,7 @@ def _lines(ways: Sequence[Way], frame: Frame) -> tuple[Layers, list[Problem]]:
         source.append("default-width" if metres == kind.width else "width")
         problems += problem
     if not found:
-        return concatenate_layers([]), problems
+        return Layers.empty(), problems
     xy = _to_scene(frame, np.concatenate([way.lonlat for way, _ in found]))
     line = np.repeat(np.arange(len(found)), [len(way.lonlat) for way, _ in found])
     strips = shapely.buffer(shapely.linestrings(xy, indices=line), np.array(width) / 2, quad_segs=2)

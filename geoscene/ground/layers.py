@@ -10,15 +10,16 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class, materials
+from geoscene.columns import Columns
 from geoscene.errors import InputError
-from geoscene.typing import Bools, Float
+from geoscene.typing import Float
 
 LANDCOVER, ROADS, PADS = 0.0, 100.0, 200.0
 """Lowest priorities of land cover, of road surfaces and of building pads."""
 
 
 @dataclass(frozen=True, slots=True)
-class Layers:
+class Layers(Columns):
     """Polygons that compete for the ground; where two overlap the higher priority wins, then the earlier row.
 
     polygon  : (n,) object, shapely Polygon or MultiPolygon, scene metres
@@ -48,10 +49,6 @@ class Layers:
         if len(set(lengths.values())) > 1:
             raise InputError(f"layer columns differ in length: {lengths}")
 
-    def __len__(self) -> int:
-        """Number of polygons."""
-        return len(self.polygon)
-
     @classmethod
     def of(
         cls,
@@ -80,16 +77,10 @@ class Layers:
             np.broadcast_to(np.asarray(feature, np.int32), n).copy(),
         )
 
-    def take(self, keep: Bools | NDArray[np.integer]) -> Layers:
-        """The chosen rows, in the given order."""
-        return Layers(*(getattr(self, f.name)[keep] for f in fields(self)))
-
-
-def concatenate_layers(layers: Sequence[Layers]) -> Layers:
-    """One table of all rows, in order."""
-    if not layers:
-        return Layers.of([], klass=0, material=0, priority=0.0)
-    return Layers(*(np.concatenate([getattr(part, f.name) for part in layers]) for f in fields(Layers)))
+    @classmethod
+    def empty(cls) -> Layers:
+        """No polygons."""
+        return cls.of([], klass=0, material=0, priority=0.0)
 
 
 def building_pads(

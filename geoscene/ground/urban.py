@@ -27,7 +27,7 @@ def paved_fabric(footprints: NDArray[Any]) -> Layers:
     """
     shapes = footprints[~shapely.is_empty(footprints)] if len(footprints) else footprints
     if not len(shapes):
-        return Layers.of([], klass=0, material=0, priority=0.0)
+        return Layers.empty()
     boxes = shapely.bounds(shapes)
     low = np.floor(boxes[:, :2].min(axis=0) / _CELL).astype(int) - _AROUND
     high = np.ceil(boxes[:, 2:].max(axis=0) / _CELL).astype(int) + _AROUND

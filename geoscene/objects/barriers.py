@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
+from geoscene.columns import Columns
 from geoscene.frames import Frame
 from geoscene.ground.kinds import is_underground
 from geoscene.ground.partition import GroundPlan
@@ -73,7 +74,7 @@ _PASSABLE = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.RAIL, Class.T
 
 
 @dataclass(frozen=True, slots=True)
-class Barriers:
+class Barriers(Columns):
     """Barriers as columns, one row a map object.
 
     polygon  : (n,) object, shapely Polygon or MultiPolygon, what it covers in plan, scene metres
@@ -93,14 +94,6 @@ class Barriers:
     width_source: NDArray[np.str_]
     osm_id: NDArray[np.str_]
     feature: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        """Number of barriers."""
-        return len(self.polygon)
-
-    def take(self, keep: Bools | NDArray[np.integer]) -> Barriers:
-        """The chosen rows, in the given order."""
-        return Barriers(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 def read_barriers(osm: OsmData, frame: Frame, *, plan: GroundPlan) -> tuple[Barriers, list[Problem]]:
@@ -152,7 +145,7 @@ def read_barriers(osm: OsmData, frame: Frame, *, plan: GroundPlan) -> tuple[Barr
         Problem(str(osm_id), "barrier", "repaired", "across-road", "open where a road passes")
         for osm_id in table.osm_id[opened]
     ]
-    table = Barriers(polygon, *(getattr(table, f.name) for f in fields(Barriers)[1:]))
+    table = replace(table, polygon=polygon)
     return table.take(shapely.area(table.polygon) > 0.01), problems
 
 

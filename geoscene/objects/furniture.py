@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from geoscene.columns import Columns
 from geoscene.frames import Frame
 from geoscene.ground.kinds import is_underground
 from geoscene.ground.partition import GroundPlan
@@ -56,7 +57,7 @@ _KINDS: dict[tuple[str, str], str] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Furniture:
+class Furniture(Columns):
     """Street furniture, one row per object.
 
     xy       : (n, 2) float64, scene metres
@@ -82,14 +83,6 @@ class Furniture:
     heading_source: NDArray[np.str_]
     osm_id: NDArray[np.str_]
     feature: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        """Number of objects."""
-        return len(self.shape)
-
-    def take(self, keep: Bools | NDArray[np.integer]) -> Furniture:
-        """The chosen rows, in the given order."""
-        return Furniture(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 def read_furniture(

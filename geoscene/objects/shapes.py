@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -224,45 +224,3 @@ def place(
     return Instances(
         number.astype(np.int32), transform, np.broadcast_to(np.asarray(feature, np.int32), (k,)).copy()
     )
-
-
-def concatenate_instances(parts: Sequence[Instances]) -> Instances:
-    """All copies of all parts, in order."""
-    return Instances(
-        *(
-            np.concatenate([getattr(part, f.name) for part in [Instances.empty(), *parts]])
-            for f in fields(Instances)
-        )
-    )
-
-
-def shifted_instances(instances: Instances, offset: ArrayLike) -> Instances:
-    """The copies moved by ``offset`` (3,), metres, such as from scene to tile coordinates."""
-    transform = instances.transform.copy()
-    transform[:, :, 3] += np.asarray(offset, float)
-    return replace(instances, transform=transform)
-
-
-def expand(instances: Instances) -> Mesh:
-    """The copies as one mesh, each face with its copy's feature: for formats without instancing."""
-    parts = []
-    library = list(shapes().values())
-    for number in np.unique(instances.shape):
-        chosen = instances.shape == number
-        shape, transform = library[number], instances.transform[chosen]
-        k, n = len(transform), len(shape.vertices)
-        points = np.einsum("kij,nj->kni", transform[:, :, :3], shape.vertices) + transform[:, None, :, 3]
-        faces = shape.faces + (np.arange(k) * n)[:, None, None]
-        parts.append(
-            Mesh.of(
-                points.reshape(-1, 3),
-                faces.reshape(-1, 3),
-                feature=np.repeat(instances.feature[chosen], len(shape)),
-                klass=np.tile(shape.klass, k),
-                material=np.tile(shape.material, k),
-                surface=np.tile(shape.surface, k),
-                color=np.tile(shape.color, (k, 1)),
-                closed=np.tile(shape.closed, k),
-            )
-        )
-    return concatenate(parts)

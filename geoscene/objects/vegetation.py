@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,16 +10,17 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from geoscene.columns import Columns
 from geoscene.frames import Frame
 from geoscene.ground.partition import GroundPlan, rows_at, rows_near, tile_box, values_at
 from geoscene.mesh import Instances
-from geoscene.objects.shapes import concatenate_instances, place
+from geoscene.objects.shapes import place
 from geoscene.objects.siting import Sites
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
 from geoscene.splitmix import GOLDEN, mix
 from geoscene.tags import parse_length, parse_number
-from geoscene.typing import Bools, Float, Height, Ints
+from geoscene.typing import Float, Height, Ints
 
 HEIGHT = {"broadleaved": 12.0, "needleleaved": 12.0, "palm": 8.0}
 """Default height in metres.
@@ -49,7 +50,7 @@ _TALLEST, _WIDEST, _THICKEST = 116.0, 60.0, 36.0
 
 
 @dataclass(frozen=True, slots=True)
-class Trees:
+class Trees(Columns):
     """Trees as columns, one row a tree.
 
     xy      : (n, 2) float64, scene metres
@@ -79,14 +80,6 @@ class Trees:
     moved: Float
     osm_id: NDArray[np.str_]
     feature: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        """Number of trees."""
-        return len(self.height)
-
-    def take(self, keep: Bools | NDArray[np.integer]) -> Trees:
-        """The chosen trees, in the given order."""
-        return Trees(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 def read_trees(osm: OsmData, frame: Frame, *, spacing: float = 8.0) -> tuple[Trees, list[Problem]]:
@@ -280,7 +273,7 @@ def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
         heading=heading,
         feature=trees.feature,
     )
-    return concatenate_instances([trunks, crowns])
+    return Instances.concatenate([trunks, crowns])
 
 
 def _uniform(seed: int, column: Ints, *, row: Ints, count: int) -> Float:

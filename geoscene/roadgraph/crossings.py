@@ -10,12 +10,13 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from geoscene.columns import Columns
 from geoscene.frames import Frame
 from geoscene.polylines import directions
 from geoscene.roadgraph.carriageways import Carriageways
 from geoscene.roadgraph.junctions import carriageway
 from geoscene.roadgraph.paths import way_lines
-from geoscene.roadgraph.surface_rows import SurfaceRows, concatenate_rows
+from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.sources.data import OsmData, Point, Tags, Way
 from geoscene.tags import parse_length
 from geoscene.typing import Float, Ints
@@ -32,7 +33,7 @@ _STRIPES = frozenset({"zebra", "marked", "uncontrolled", "yes", "island", "pelic
 
 
 @dataclass(frozen=True, slots=True)
-class _Crossings:
+class _Crossings(Columns):
     """Crossings as lines from kerb to kerb.
 
     line  : (c,) shapely LineString
@@ -57,14 +58,13 @@ def crossing_rows(osm: OsmData, roads: Carriageways, *, frame: Frame) -> Surface
     """
     ground = roads.take(roads.place == 0)
     ways = [way for way in osm.ways if _is_crossing(way.tags)]
-    found = [
-        _from_ways([w for w in ways if _paint(w.tags)[0] != "none"], ground, frame=frame),
-        _from_nodes(osm, ways, roads=ground, frame=frame),
-    ]
-    line, width, paint, source, osm_id = (
-        np.concatenate([getattr(part, name) for part in found])
-        for name in ("line", "width", "paint", "source", "osm_id")
+    found = _Crossings.concatenate(
+        [
+            _from_ways([w for w in ways if _paint(w.tags)[0] != "none"], ground, frame=frame),
+            _from_nodes(osm, ways, roads=ground, frame=frame),
+        ]
     )
+    line, width, paint, source, osm_id = found.line, found.width, found.paint, found.source, found.osm_id
     out = [
         SurfaceRows.of(
             carriageway(line, width / 2),
@@ -93,7 +93,7 @@ def crossing_rows(osm: OsmData, roads: Carriageways, *, frame: Frame) -> Surface
                 source=np.char.add(source[row], "/default"),
             )
         )
-    return concatenate_rows(out)
+    return SurfaceRows.concatenate(out)
 
 
 def _is_crossing(tags: Tags) -> bool:

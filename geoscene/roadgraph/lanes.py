@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from geoscene.columns import Columns
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Bools, Float, Ints
 
@@ -20,7 +21,7 @@ WIDEST_LANE = 4.5
 
 
 @dataclass(frozen=True, slots=True)
-class LaneLayout:
+class LaneLayout(Columns):
     """Lanes of directed edges, one row each.
 
     own    : (m,) int64, lanes that only traffic along the edge uses
@@ -71,11 +72,6 @@ class LaneLayout:
         middle = np.where(self.shared & (self.count == 1), self.carriageway / 4, middle)
         room = np.maximum(self.carriageway / 2 - body_width / 2 - clearance, 0.0)
         return np.clip(middle, -room, room)
-
-    def take(self, rows: ArrayLike) -> LaneLayout:
-        """Chosen rows."""
-        k = np.asarray(rows)
-        return LaneLayout(self.own[k], self.other[k], self.shared[k], self.carriageway[k])
 
 
 def lane_layout(along: Float, against: Float, *, two_way: Bools, width: Float) -> LaneLayout:

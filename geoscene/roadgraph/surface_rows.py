@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import materials
-from geoscene.typing import Bools, Float
+from geoscene.columns import Columns
+from geoscene.typing import Float
 
 GRID = 1e-4
 """Metres: coordinates of surfaces are whole multiples of it."""
 
 
 @dataclass(frozen=True, slots=True)
-class SurfaceRows:
+class SurfaceRows(Columns):
     """Polygons in plan; where two overlap the higher priority wins.
 
     polygon  : (n,) object, valid shapely Polygon, scene metres, coordinates on a grid of 0.1 mm
@@ -44,10 +44,6 @@ class SurfaceRows:
     place: NDArray[np.int8]
     level: NDArray[np.int8]
     edge: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        """Number of polygons."""
-        return len(self.polygon)
 
     @classmethod
     def of(
@@ -85,16 +81,3 @@ class SurfaceRows:
             np.broadcast_to(np.asarray(level, np.int8), n)[row],
             np.broadcast_to(np.asarray(edge, np.int32), n)[row],
         )
-
-    def columns(self) -> dict[str, Any]:
-        """The columns by name, in order."""
-        return {f.name: getattr(self, f.name) for f in fields(SurfaceRows)}
-
-    def take(self, keep: Bools | NDArray[np.integer]) -> SurfaceRows:
-        """The chosen rows, in the given order."""
-        return SurfaceRows(**{name: column[keep] for name, column in self.columns().items()})
-
-
-def concatenate_rows(parts: Sequence[SurfaceRows]) -> SurfaceRows:
-    """One table of all rows, in order."""
-    return SurfaceRows(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(SurfaceRows)))

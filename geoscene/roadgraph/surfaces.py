@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -19,7 +19,7 @@ from geoscene.roadgraph.junctions import build_junctions, carriageway
 from geoscene.roadgraph.markings import marking_rows, stop_rows
 from geoscene.roadgraph.paths import path_surfaces, rail_surfaces, square_surfaces
 from geoscene.roadgraph.routing import edge_lines
-from geoscene.roadgraph.surface_rows import SurfaceRows, concatenate_rows
+from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.roadgraph.tags import CLASSES
 from geoscene.sources.data import OsmData
 from geoscene.typing import Float
@@ -66,7 +66,7 @@ def road_surfaces(
     edge = _edges_below(roads, graph)
     crossings = crossing_rows(osm, roads, frame=frame)
     strips = crossings.polygon[crossings.priority == crossings.priority.min(initial=np.inf)]
-    rows = concatenate_rows(
+    rows = SurfaceRows.concatenate(
         [
             square_surfaces(osm, frame),
             path_surfaces(osm, frame),
@@ -78,7 +78,8 @@ def road_surfaces(
         ]
     )
     ground = rows.take(rows.place == 0)
-    return RoadSurfaces(**ground.columns(), raised=rows.take(rows.place != 0)), []
+    columns = {f.name: getattr(ground, f.name) for f in fields(ground)}
+    return RoadSurfaces(**columns, raised=rows.take(rows.place != 0)), []
 
 
 def _edges_below(roads: Carriageways, graph: RoadGraph) -> NDArray[np.int32]:

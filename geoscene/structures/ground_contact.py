@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene import polylines
 from geoscene.classes import Class, materials
-from geoscene.ground.layers import PADS, Layers, concatenate_layers
+from geoscene.ground.layers import PADS, Layers
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
 from geoscene.typing import Float, Height, Ints
@@ -144,7 +144,7 @@ def opening_layers(table: Structures, openings: NDArray[np.object_]) -> Layers:
     """
     rows = np.flatnonzero([shape is not None for shape in openings])
     low = np.flatnonzero(~shapely.is_empty(table.low))
-    return concatenate_layers(
+    return Layers.concatenate(
         [
             Layers.of(
                 openings[rows],

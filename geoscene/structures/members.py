@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from geoscene import polylines
+from geoscene.columns import Columns
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.typing import Bools, Float, Ints
@@ -24,7 +25,7 @@ _WALK = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Members:
+class Members(Columns):
     """Roads and paths on bridges and in tunnels, one row each.
 
     line     : (n,) object, (k, 3) float64 scene metres
@@ -50,15 +51,6 @@ class Members:
     level: NDArray[np.int8]
     edge: NDArray[np.int32]
     osm_id: NDArray[np.str_]
-
-    def __len__(self) -> int:
-        """Number of members."""
-        return len(self.line)
-
-
-def concatenate_members(parts: list[Members]) -> Members:
-    """One table of all rows, in order."""
-    return Members(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Members)))
 
 
 def road_members(graph: RoadGraph, raised: SurfaceRows) -> Members:

@@ -8,7 +8,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.surfaces import RoadSurfaces
 from geoscene.sources.data import OsmData
 from geoscene.structures.ground_contact import find_low_decks
-from geoscene.structures.members import concatenate_members, road_members
+from geoscene.structures.members import Members, road_members
 from geoscene.structures.paths import path_members
 from geoscene.structures.pieces import cut_pieces
 from geoscene.structures.piers import place_piers
@@ -33,6 +33,6 @@ def read_structures(
     options = options or StructureOptions()
     raised = surfaces.raised
     paths, problems = path_members(raised, osm, frame=frame, graph=graph, height=height, options=options)
-    table = cut_pieces(concatenate_members([road_members(graph, raised), paths]), raised, options=options)
+    table = cut_pieces(Members.concatenate([road_members(graph, raised), paths]), raised, options=options)
     table = place_piers(table, surfaces, height=height, options=options)
     return find_low_decks(table, height), problems

@@ -71,8 +71,7 @@ def only(tile: Tile, groups: Groups, *, kept: Bools) -> Tile:
         return tile
     copies = tile.instances
     faces, whole = kept[groups.faces(tile.mesh)], kept[groups.of[copies.feature]]
-    chosen = Instances(copies.shape[whole], copies.transform[whole], copies.feature[whole])
-    return Tile(tile.origin, tile.mesh.take(faces), chosen)
+    return Tile(tile.origin, tile.mesh.take(faces), copies.take(whole))
 
 
 def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:

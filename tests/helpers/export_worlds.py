@@ -9,7 +9,7 @@ import shapely
 from geoscene.classes import Class
 from geoscene.frames import Frame
 from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh, concatenate
-from geoscene.objects.shapes import concatenate_instances, place, prism, rectangle, shapes, shifted_instances
+from geoscene.objects.shapes import place, prism, rectangle, shapes
 from geoscene.scene import open_scene
 from geoscene.scene.geopackage import Layer
 from geoscene.scene.tile_files import Tile, write_tile
@@ -141,7 +141,7 @@ def write_world(path, crs="utm"):
     x, y, height = np.array(TREES).T
     base = np.column_stack([x, y, SLOPE * x])
     feature = tree + np.arange(3)
-    copies = concatenate_instances(
+    copies = Instances.concatenate(
         [
             place(
                 "trunk", base, size=np.column_stack([0.03 * height, 0.03 * height, 0.6 * height]),
@@ -171,9 +171,10 @@ def write_world(path, crs="utm"):
             standing += [hedge(tree + len(TREES))] if (i, j) == (0, -1) else []
             mesh = concatenate([*standing, _ground(i, j, size, first)])
             here = (np.floor(copies.transform[:, :2, 3] / size) == (i, j)).all(axis=1)
-            some = Instances(copies.shape[here], copies.transform[here], copies.feature[here])
+            some = copies.take(here)
             origin = np.array([i * size, j * size, np.floor(mesh.vertices[:, 2].min())])
-            tile = Tile(origin, mesh.shifted(-origin), shifted_instances(some, -origin))
+            some.transform[:, :, 3] -= origin
+            tile = Tile(origin, mesh.shifted(-origin), some)
             write_tile(writer.files.tile(i, j), tile)
         writer.finish(
             frame=frame, layers=layers, graph=graph, shapes=shapes(), problems=[], tiles={}, manifest=manifest

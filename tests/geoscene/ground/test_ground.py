@@ -11,7 +11,6 @@ from geoscene.errors import InputError
 from geoscene.ground import (
     Layers,
     building_pads,
-    concatenate_layers,
     drape,
     ground_tile,
     partition,
@@ -164,7 +163,7 @@ def test_a_gap_thinner_than_a_sliver_is_closed_and_a_kerb_is_not():
 def test_pads_win_over_roads_and_carry_the_buildings_number():
     house = shapely.box(0, 0, 10, 10)
     road = Layers.of([shapely.box(-20, 4, 20, 6)], klass=Class.ROAD, material=1, priority=100.0)
-    layers = concatenate_layers([building_pads([None, house], feature=[7, 8]), road])
+    layers = Layers.concatenate([building_pads([None, house], feature=[7, 8]), road])
     cells = partition((-20, -20, 20, 20), layers)
     area = {int(k): shapely.area(cells.polygon[cells.klass == k]).sum() for k in np.unique(cells.klass)}
     assert area == pytest.approx({Class.BUILDING_PAD: 100.0, Class.ROAD: 60.0, Class.TERRAIN: 1440.0})
@@ -198,9 +197,9 @@ def test_faces_keep_class_material_and_feature_of_their_cell():
 @pytest.mark.parametrize("extent", [(0, 0, 0, 5), (0, 0, np.nan, 5), (3, 0, 1, 5)])
 def test_an_extent_without_area_is_refused(extent):
     with pytest.raises(InputError, match="extent"):
-        plan_ground(extent, concatenate_layers([]))
+        plan_ground(extent, Layers.empty())
 
 
 def test_a_tile_outside_the_extent_is_refused():
     with pytest.raises(InputError, match=r"\(9, 9\)"):
-        partition_tile(plan_ground(EXTENT, concatenate_layers([])), 9, j=9)
+        partition_tile(plan_ground(EXTENT, Layers.empty()), 9, j=9)

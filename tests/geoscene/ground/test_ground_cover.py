@@ -9,7 +9,6 @@ from geoscene.frames import Frame
 from geoscene.ground import (
     Layers,
     building_pads,
-    concatenate_layers,
     ground_tile,
     landcover,
     partition,
@@ -251,7 +250,7 @@ def test_the_ground_of_real_places_is_one_surface(shared_osm, name):
     houses = shapely.transform(
         np.array(houses, object), lambda c: np.column_stack(frame.from_geographic(*c.T))
     )
-    plan = plan_ground(extent, concatenate_layers([layers, building_pads(houses)]))
+    plan = plan_ground(extent, Layers.concatenate([layers, building_pads(houses)]))
     mesh = concatenate([ground_tile(plan, i, j=j) for i, j in plan.tiles])
     points, number = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = number.reshape(-1)[mesh.faces]

@@ -6,11 +6,12 @@ import pytest
 import shapely
 
 from geoscene.classes import Class, materials
+from geoscene.export.objects import expand
 from geoscene.frames import Frame
-from geoscene.ground import Layers, building_pads, concatenate_layers, plan_ground
+from geoscene.ground import Layers, building_pads, plan_ground
 from geoscene.objects.barriers import barrier_meshes, read_barriers
 from geoscene.objects.furniture import furniture_instances, read_furniture, shape_of
-from geoscene.objects.shapes import expand, shapes
+from geoscene.objects.shapes import shapes
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData, Point, Way
 from geoscene.structures.ground_contact import OPENING
@@ -42,7 +43,7 @@ def osm_of(*features):
 def plan_with(roads=(), houses=(), mouths=()):
     road = Layers.of(list(roads), klass=Class.ROAD, material=1, priority=130.0)
     mouth = Layers.of(list(mouths), klass=Class.TUNNEL, material=1, priority=OPENING)
-    return plan_ground(EXTENT, concatenate_layers([road, building_pads(list(houses)), mouth]))
+    return plan_ground(EXTENT, Layers.concatenate([road, building_pads(list(houses)), mouth]))
 
 
 STREET = shapely.box(-100, -3, 100, 3)
@@ -192,7 +193,7 @@ def test_a_lamp_beside_the_road_leans_over_it_and_keeps_its_place():
     np.testing.assert_allclose(table.xy, [(0, 5), (0, -5)], atol=1e-6)
     np.testing.assert_allclose(facing(table), [(0, -1), (1, 0)], atol=1e-4)
     assert table.heading_source.tolist() == ["road", "direction"]
-    lit = expand(furniture_instances(table))
+    lit = expand(furniture_instances(table), list(shapes().values()))
     arm = lit.vertices[lit.faces[: len(shapes()["street_lamp"])]].reshape(-1, 3)
     assert arm[:, 1].min() < 4.0  # over the street, south of the mast
 
@@ -210,7 +211,7 @@ def test_height_tags_stretch_the_shape():
         node(7, (0, 5), highway="street_lamp", height="12"),
         node(8, (9, 5), highway="street_lamp", height="very"),
     )
-    mesh = expand(furniture_instances(table, height=lambda x, y: 0 * x * y + 40.0))
+    mesh = expand(furniture_instances(table, height=lambda x, y: 0 * x * y + 40.0), list(shapes().values()))
     assert mesh.vertices[:, 2].max() == pytest.approx(52.0)
     assert table.height_source.tolist() == ["height", "default"]
     assert [(p.osm_id, p.reason) for p in problems] == [("node/8", "unusable-height")]
@@ -323,7 +324,7 @@ def test_every_barrier_of_a_real_place_is_closed(shared_osm, name):
     west, south, east, north = osm.bounds
     frame = Frame.at((west + east) / 2, (south + north) / 2)
     x, y = frame.from_geographic([west, east], [south, north])
-    plan = plan_ground((x.min(), y.min(), x.max(), y.max()), concatenate_layers([]))
+    plan = plan_ground((x.min(), y.min(), x.max(), y.max()), Layers.empty())
     barriers, _ = read_barriers(osm, frame, plan=plan)
     assert len(barriers) > 50
     assert all(volume(mesh) > 0 for mesh in barrier_meshes(barriers))

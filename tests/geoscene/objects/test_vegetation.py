@@ -6,10 +6,11 @@ import pytest
 import shapely
 
 from geoscene.classes import Class, materials
+from geoscene.export.objects import expand
 from geoscene.frames import Frame
-from geoscene.ground import Layers, building_pads, concatenate_layers, plan_ground
+from geoscene.ground import Layers, building_pads, plan_ground
 from geoscene.mesh import Mesh
-from geoscene.objects.shapes import LEAF_AREA_DENSITY, expand, place, shape_numbers, shapes
+from geoscene.objects.shapes import LEAF_AREA_DENSITY, place, shape_numbers, shapes
 from geoscene.objects.vegetation import clear_of, forest_trees, read_trees, tree_instances
 from geoscene.sources.data import OsmData, Point, Way
 
@@ -37,7 +38,7 @@ def wood_plan(extent=(-100, -100, 200, 100), **options):
         osm_id="way/9",
     )
     house = building_pads([shapely.box(30, 30, 60, 60)])
-    return plan_ground(extent, concatenate_layers([wood, road, house]), **options)
+    return plan_ground(extent, Layers.concatenate([wood, road, house]), **options)
 
 
 @pytest.mark.parametrize("name", shapes())
@@ -67,7 +68,7 @@ def test_crowns_let_light_through_and_nothing_else_does():
 
 def test_a_sign_faces_its_heading():
     """The retro-reflecting side looks along the heading."""
-    sign = expand(place("sign_round", np.zeros((1, 3)), heading=np.radians(120)))
+    sign = expand(place("sign_round", np.zeros((1, 3)), heading=np.radians(120)), list(shapes().values()))
     front = sign.material == materials()["retroreflector"].code
     normal = sign.normals()[front].mean(axis=0)
     np.testing.assert_allclose(normal, [np.cos(np.radians(120)), np.sin(np.radians(120)), 0], atol=1e-12)
@@ -75,7 +76,7 @@ def test_a_sign_faces_its_heading():
 
 def test_a_tree_is_as_high_and_wide_as_its_tags_say():
     trees, problems = read_trees(osm_of([((11.0, 50.0), {"height": "21 m", "diameter_crown": "9"})]), FRAME)
-    mesh = expand(tree_instances(trees, height=lambda x, y: 0 * x * y + 300.0))
+    mesh = expand(tree_instances(trees, height=lambda x, y: 0 * x * y + 300.0), list(shapes().values()))
     assert problems == []
     crown = mesh.vertices[mesh.faces[mesh.klass == Class.TREE_CROWN]].reshape(-1, 3)
     assert crown[:, 2].max() == pytest.approx(321.0)
@@ -161,7 +162,7 @@ def test_a_wood_depends_on_the_seed_and_not_on_the_tiles():
 
 def test_expanded_copies_are_the_shapes_moved():
     copies = place(["bench", "bollard"], np.array([[1.0, 2, 3], [4, 5, 6]]), feature=[7, 8])
-    mesh = expand(copies)
+    mesh = expand(copies, list(shapes().values()))
     assert isinstance(mesh, Mesh)
     bollard = mesh.take(mesh.feature == 8)
     np.testing.assert_allclose(bollard.vertices, shapes()["bollard"].shifted((4, 5, 6)).vertices)

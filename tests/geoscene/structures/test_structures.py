@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.classes import Class
 from geoscene.frames import Frame
-from geoscene.ground import concatenate_layers, ground_tile, plan_ground
+from geoscene.ground import ground_tile, plan_ground
 from geoscene.ground.layers import Layers
 from geoscene.ground.terrain import open_terrain
 from geoscene.mesh import Mesh, concatenate
@@ -542,7 +542,7 @@ def test_carriageways_side_by_side_part_in_the_middle_between_them():
 def ground_mesh(town, extent):
     """The ground of a map's extent, cut along lines 10 m apart, with what its structures ask for."""
     bare = Layers.of([shapely.box(*extent)], klass=Class.GRASS, material=7, priority=1.0)
-    layers = concatenate_layers([bare, opening_layers(town.table, town.openings)])
+    layers = Layers.concatenate([bare, opening_layers(town.table, town.openings)])
     plan = plan_ground(extent, layers, lines=10.0)
     return concatenate([ground_tile(plan, int(i), j=int(j), height=town.height) for i, j in plan.tiles])
 
