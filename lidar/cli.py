@@ -92,14 +92,14 @@ def drive(
         print_json(document)
     else:
         total = sum(summary.points.values())
-        before = f" ({total - summary.written:,} were there)" if summary.resumed else ""
+        before = f" ({total - summary.written:,} recorded before)" if summary.resumed else ""
         print(
             f"{out}: {summary.duration:.1f} s, {summary.length:.0f} m, {summary.frames} frames,"
             f" {total:,} points{before} in {summary.wall:.1f} s; next: lidar map {out} -o map.laz"
         )
     for name in (name for name, points in summary.points.items() if not points):
         print(
-            f"lidar: {name} saw nothing in the whole drive; is anything within its range, where it looks?",
+            f"lidar: {name} has no returns in the whole drive; check its mount and maximum range",
             file=sys.stderr,
         )
     return 0

@@ -1,4 +1,4 @@
-"""What a drive records lies where it says, is the same every time, and survives being killed."""
+"""Recorded drives: georeferencing, reproducibility, resuming after a kill."""
 
 import csv
 import hashlib
@@ -90,7 +90,7 @@ def test_returns_from_buildings_lie_on_those_buildings_after_georeferencing_and_
     near, count = 0, 0
     for path in sorted((tmp_path / "d" / "lidar_top" / "laz").glob("*.laz"))[::7]:
         las = laspy.read(path)
-        # an independent way back: the file's own CRS to degrees, degrees to the scene's CRS
+        # an independent inverse: the file's own CRS to degrees, degrees to the scene's CRS
         to_degrees = Transformer.from_crs(las.header.parse_crs(), CRS.from_epsg(4326), always_xy=True)
         to_scene = Transformer.from_crs(CRS.from_epsg(4326), CRS.from_wkt(frame["wkt"]), always_xy=True)
         x, y = to_scene.transform(*to_degrees.transform(np.asarray(las.x), np.asarray(las.y)))
@@ -119,7 +119,7 @@ def test_any_number_of_workers_gives_the_same_bytes(scene, dataset, tmp_path):
     assert digest(tmp_path / "b") == digest(dataset.path)
 
 
-def test_a_killed_drive_goes_on_and_ends_with_the_same_bytes(scene, dataset, tmp_path):
+def test_a_killed_drive_resumes_and_gives_the_same_bytes(scene, dataset, tmp_path):
     out = tmp_path / "c"
     options = "--route random --rig vlp16 --duration 4 --seed 3 --format pcd,laz"
     program = command("lidar", "drive", scene.path, "-o", out, *options.split())
@@ -136,7 +136,7 @@ def test_a_killed_drive_goes_on_and_ends_with_the_same_bytes(scene, dataset, tmp
     assert done == digest(dataset.path)
 
 
-def test_another_drive_is_not_written_over(scene, dataset):
+def test_a_drive_with_other_options_is_not_overwritten(scene, dataset):
     with pytest.raises(DatasetError, match=r"other options: seed 3 \(now 4\);.*`overwrite`"):
         drive(scene, dataset.path, options=replace(OPTIONS, seed=4))
     assert digest(dataset.path)
@@ -161,7 +161,7 @@ def test_pose_rows_agree_with_each_other_and_with_the_earth(scene, dataset):
     np.testing.assert_allclose(np.abs((quat * given).sum(axis=1)), 1.0, atol=1e-12)
 
 
-def test_intensity_tells_materials_and_angles_apart(dataset):
+def test_intensity_depends_on_material_and_incidence(dataset):
     cloud = read_table(dataset.path / "lidar_top" / "pcd" / "000010.pcd")
     wall = cloud["label"] == Class.BUILDING
     steep = wall & (cloud["incidence"] < 0.5)
@@ -191,7 +191,7 @@ def test_every_point_of_a_revolution_has_its_own_time_and_ring(dataset):
         ({"vehicle": "ship"}, "ship"),
     ],
 )
-def test_what_cannot_be_driven_is_said_in_one_line(scene, tmp_path, change, words):
+def test_invalid_drives_are_refused_in_one_line(scene, tmp_path, change, words):
     with pytest.raises(InputError, match=words) as error:
         drive(scene, tmp_path / "x", options=replace(OPTIONS, **change))
     assert "\n" not in str(error.value)
@@ -208,7 +208,7 @@ def test_a_drive_that_fails_before_its_first_frame_leaves_nothing(scene, tmp_pat
     assert not (tmp_path / "d").exists()
 
 
-def test_a_scene_opens_again(scene):
+def test_a_written_scene_opens(scene):
     again = open_scene(scene.path)
     assert again.frame == scene.frame
     assert again.tile_indices == scene.tile_indices
@@ -248,8 +248,8 @@ def test_traffic_is_labelled_boxed_and_the_same_for_any_number_of_workers(scene,
         assert inside.all(axis=1).mean() > 0.98
 
 
-def test_a_random_drive_is_under_way_from_first_to_last_unless_it_is_to_be_from_rest(scene):
-    """Of a few seconds too: a record of a street is not one of a parked car."""
+def test_a_random_drive_starts_and_ends_at_speed_by_default(scene):
+    """Also a record of a few seconds, which would otherwise show a parked car."""
     for seed in (0, 1, 2):
         options = replace(OPTIONS, duration=3.0, seed=seed)
         speeds = {}
@@ -269,7 +269,7 @@ def test_a_random_drive_is_under_way_from_first_to_last_unless_it_is_to_be_from_
         assert options.recipe(scene) != replace(options, from_rest=True).recipe(scene)
 
 
-def test_no_more_threads_work_than_there_are_cores(scene, tmp_path, monkeypatch):
+def test_the_number_of_threads_does_not_exceed_the_cores(scene, tmp_path, monkeypatch):
     sizes = []
 
     class Pool(ThreadPoolExecutor):

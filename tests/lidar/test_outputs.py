@@ -1,4 +1,4 @@
-"""What a drive writes beside points: boxes, labels, velocities, clouds of one moment, images that agree."""
+"""Outputs of a drive besides points: boxes, labels, velocities, de-skewed clouds, images, exports."""
 
 import csv
 import json
@@ -155,7 +155,7 @@ def placed(dataset, sensor, frame, cloud):
     return dataset.trajectory().place(xyz, time_ns, translation=mount[:3, 3], rotation=mount[:3, :3]), time_ns
 
 
-def test_every_camera_frame_has_boxes_around_what_its_instance_image_shows(dataset):
+def test_every_camera_frame_has_boxes_around_its_instances(dataset):
     first = max(stop for _, stop in _layers(dataset).values())
     shown = hidden = 0
     for camera, frames in (("front", 40), ("side", 20)):
@@ -191,7 +191,7 @@ def _layers(dataset):
     return scene["layers"]
 
 
-def test_solid_boxes_say_how_much_is_seen_and_how_many_points_of_each_scanner_hit(dataset):
+def test_boxes_in_3d_give_visibility_and_points_of_each_scanner(dataset):
     rows = table(dataset.path / "boxes.csv")
     calibration = mounts(dataset)[0]
     assert calibration["ahead"]["rate_hz"] == 20.0
@@ -233,7 +233,7 @@ def test_a_static_wall_is_straight_after_deskewing_while_the_vehicle_turns():
         np.testing.assert_allclose(pose.place(points.astype(float)), where, atol=1e-4)
 
 
-def test_deskewed_files_hold_the_points_where_the_sensor_is_when_the_frame_ends(dataset):
+def test_deskewed_files_have_the_sensor_frame_at_the_frames_end(dataset):
     for sensor, period in (("top", 100_000_000), ("ahead", 50_000_000)):
         frame = 30
         raw = read_table(dataset.path / sensor / "pcd" / f"{frame:06d}.pcd")
@@ -248,7 +248,7 @@ def test_deskewed_files_hold_the_points_where_the_sensor_is_when_the_frame_ends(
         assert len(read_table(dataset.path / sensor / "deskewed" / f"{frame:06d}.bin")["x"]) == len(where)
 
 
-def test_radial_velocities_are_those_of_the_ego_and_of_what_is_hit(dataset):
+def test_radial_velocities_include_ego_motion_and_moving_surfaces(dataset):
     mount = mounts(dataset)[1]["ahead"]
     trajectory = dataset.trajectory()
     boxes = table(dataset.path / "ahead" / "boxes.csv")
@@ -320,7 +320,7 @@ def test_labels_are_those_of_semantic_kitti_nuscenes_and_asprs(dataset):
     assert seen_moving > 50
 
 
-def test_what_moves_has_numbers_of_its_own_in_semantic_kitti():
+def test_moving_road_users_have_their_own_semantic_kitti_classes():
     klass = np.array(
         [Class.CAR, Class.CAR, Class.PEDESTRIAN, Class.CYCLIST, Class.BUS, Class.TRUCK, Class.ROAD]
     )
@@ -331,7 +331,7 @@ def test_what_moves_has_numbers_of_its_own_in_semantic_kitti():
     assert (labels >> 16).tolist() == [7, 8, 9, 10, 11, 0, 0]
 
 
-def test_a_scanners_folder_is_a_sequence_that_kittis_loaders_place(dataset):
+def test_a_scanners_folder_is_a_kitti_sequence(dataset):
     """Read as semantic-kitti-api does: pose = inv(Tr) P Tr is the scanner in the first scan's frame."""
     folder = dataset.path / "top"
     calib = {}
@@ -395,13 +395,13 @@ def test_a_scanners_points_lie_at_the_depth_of_their_pixels_on_a_real_drive(data
         before += int((z < 0.998 * low - 0.02).sum())
         total += len(z)
     assert total > 5000
-    # the scanner looks over some things from 20 cm higher up; none hangs in the air before a pixel
+    # the scanner sees over some surfaces from 20 cm higher up; no point is in front of a pixel's depth
     assert near / total > 0.97
     assert before / total < 0.003
 
 
-def test_flow_leads_from_a_pixel_to_where_its_surface_is_seen_next(dataset):
-    """Depth and poses alone say where still things go; the flow file says the same."""
+def test_flow_gives_the_pixel_of_the_surface_in_the_next_frame(dataset):
+    """For static surfaces, flow computed from depth and poses equals the flow file."""
     calibration, mount = mounts(dataset)
     camera, trajectory = calibration["front"], dataset.trajectory()
     speed = np.linalg.norm(trajectory.velocity, axis=1)[: len(trajectory.time_ns) - 20]
@@ -441,7 +441,7 @@ def _sixteen_bit_colour(path):
     return image.copy().view(">u2").reshape(height, width, 3).astype(int)
 
 
-def test_a_drive_that_goes_on_counts_all_of_its_points(scene, rig, recorded, tmp_path):
+def test_a_resumed_drive_counts_all_of_its_points(scene, rig, recorded, tmp_path):
     dataset, summary = recorded
     assert set(summary.points) == {"top", "ahead"}
     counted = sum(len(read_table(p)["x"]) for p in (dataset.path / "top" / "pcd").glob("*.pcd"))
@@ -458,7 +458,7 @@ def test_a_drive_that_goes_on_counts_all_of_its_points(scene, rig, recorded, tmp
                 drive(scene, tmp_path / "ply", options=replace(options, formats=("csv",), seed=12))
 
 
-def test_settings_of_cameras_are_reached_and_leave_truth_as_it_is(scene, rig, tmp_path):
+def test_camera_settings_change_colours_but_not_ground_truth(scene, rig, tmp_path):
     options = replace(OPTIONS, rig=rig, duration=0.3, traffic=None, formats=("pcd",), labels=(), deskew="")
     changes = {
         "plain": {},
@@ -480,7 +480,7 @@ def test_settings_of_cameras_are_reached_and_leave_truth_as_it_is(scene, rig, tm
     for name in ("noise", "shadows", "fine", "evening"):
         assert np.abs(images[name][0] - plain[0]).mean() > 0.2, name
         np.testing.assert_array_equal(images[name][1], plain[1])
-    np.testing.assert_array_equal(images["sharp"][0], plain[0])  # its shutter is not open for any time
+    np.testing.assert_array_equal(images["sharp"][0], plain[0])  # its exposure time is zero
     assert np.abs(images["noise"][0] - plain[0]).mean() < 10
 
 
@@ -493,11 +493,11 @@ def _resolve(tables, row, key):
     return tables[key.removesuffix("_token")][row[key]]
 
 
-def test_nuscenes_tables_lead_from_a_sample_to_points_boxes_and_pixels(dataset, tmp_path):
+def test_nuscenes_tables_link_samples_to_points_boxes_and_pixels(dataset, tmp_path):
     counts = EXPORTERS["nuscenes"].export(dataset, tmp_path / "n").counts
     root = tmp_path / "n"
     tables = {p.stem: {r["token"]: r for r in json.loads(p.read_text())} for p in (root / VERSION).iterdir()}
-    for name, rows in tables.items():  # every token leads somewhere, chains are whole
+    for name, rows in tables.items():  # every token refers to a row, and chains are complete
         for row in rows.values():
             for key in row:
                 if key.endswith("_token") and key not in ("first_sample_token", "last_sample_token"):
@@ -541,12 +541,16 @@ def test_nuscenes_tables_lead_from_a_sample_to_points_boxes_and_pixels(dataset, 
             thing = tables["instance"][box["instance_token"]]
             kind = tables["category"][thing["category_token"]]["name"]
             local = Rotation.from_quat(np.roll(box["rotation"], -1)).inv().apply(points - box["translation"])
-            size = np.array(box["size"])[[1, 0, 2]] / 2 + [1.4, 0.05, 0.03]  # driven on during the frame
+            size = np.array(box["size"])[[1, 0, 2]] / 2 + [
+                1.4,
+                0.05,
+                0.03,
+            ]  # and motion during the frame
             held = (np.abs(local) < size).all(axis=1) & (labels == CATEGORIES.index(kind))
             inside, total = inside + held.sum(), total + box["num_lidar_pts"]
     assert total > 200
     assert inside == pytest.approx(total, rel=0.03)
-    # As far from each other as in the drive's own clouds on Earth.
+    # Distances between points equal those of the drive's georeferenced clouds.
     scene = tables["scene"].popitem()[1]["description"]
     east, north = map(float, re.search(r"zero at (-?[\d.]+), (-?[\d.]+) of", scene).groups())
     earth = np.concatenate(walls) * place + [east, north, 0.0] - [*dataset.frame.origin, 0.0]
@@ -559,7 +563,7 @@ def test_nuscenes_tables_lead_from_a_sample_to_points_boxes_and_pixels(dataset, 
     assert np.quantile(away, 0.9) < 0.002
 
 
-def test_what_cannot_be_a_nuscenes_dataset_is_said(dataset, scene, tmp_path):
+def test_datasets_without_the_files_that_nuscenes_needs_are_refused(dataset, scene, tmp_path):
     (tmp_path / "n").mkdir()
     with pytest.raises(InputError, match="`overwrite`"):
         EXPORTERS["nuscenes"].export(dataset, tmp_path / "n")
@@ -572,7 +576,7 @@ def test_what_cannot_be_a_nuscenes_dataset_is_said(dataset, scene, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "n"]
 
 
-def test_a_map_says_which_frames_are_missing(scene, rig, tmp_path):
+def test_a_map_reports_missing_frames(scene, rig, tmp_path):
     options = replace(OPTIONS, rig=rig, duration=0.5, traffic=None, formats=("pcd",), labels=(), deskew="")
     drive(scene, tmp_path / "d", options=options)
     assert aggregate(open_dataset(tmp_path / "d"), tmp_path / "m.ply").missing == {}
@@ -589,7 +593,7 @@ def test_a_map_says_which_frames_are_missing(scene, rig, tmp_path):
         ({"formats": ()}, "pcd, pcd-ascii, ply"),
     ],
 )
-def test_contents_that_cannot_be_written_are_refused(change, says):
+def test_invalid_contents_are_refused(change, says):
     with pytest.raises(InputError, match=says):
         Contents(**change)
 
@@ -598,17 +602,17 @@ def program(*words, **options):
     return run_program("lidar", *words, **options)
 
 
-def test_a_sensor_that_sees_nothing_is_spoken_of(scene, tmp_path):
+def test_a_sensor_without_returns_is_reported(scene, tmp_path):
     text = 'name = "up"\n[[lidar]]\nname = "sky"\npreset = "ust10lx"\ntranslation = [0.0, 0.0, 60.0]\n'
     (tmp_path / "up.toml").write_text(text)
     words = ["--rig", tmp_path / "up.toml", "--route", "random", "--duration", "0.5", "--format", "pcd"]
     done = program("drive", scene.path, *words, "-o", tmp_path / "d")
     assert done.returncode == 0
-    assert "sky saw nothing" in done.stderr
+    assert "sky has no returns" in done.stderr
 
 
-def test_a_full_disk_is_one_line(scene, tmp_path):
-    """Files may not grow beyond 100 kB here, which a sweep as LAZ does."""
+def test_a_full_disk_ends_the_drive_with_one_line(scene, tmp_path):
+    """Files are limited to 100 kB here, less than a sweep as LAZ."""
 
     def limit():
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
@@ -633,7 +637,7 @@ def test_a_full_disk_is_one_line(scene, tmp_path):
     assert not list((tmp_path / "d").rglob("*.part"))
 
 
-def test_turned_bodies_are_boxed_by_their_own_axes(dataset):
+def test_boxes_of_rotated_bodies_follow_the_body_axes(dataset):
     rows = table(dataset.path / "boxes.csv")[::40]
     yaw = Rotation.from_quat([[float(r[k]) for k in ("qx", "qy", "qz", "qw")] for r in rows]).as_euler("ZYX")[
         :, 0

@@ -1,4 +1,4 @@
-"""Fidelity levels and settings, and what is listed of them."""
+"""Fidelity levels, settings and the listings of both."""
 
 import json
 import re
@@ -37,7 +37,7 @@ def test_every_setting_is_listed_with_its_value_at_each_level_and_a_meaning():
     assert "oren-nayar" in by_name["law"].meaning
 
 
-def test_each_listed_value_can_be_set_and_comes_back():
+def test_each_listed_value_can_be_set():
     for k, level in enumerate(levels()):
         pairs = [(s.name, s.values[k]) for s in list_settings()]
         assert settings_of("standard", pairs) == settings_of(level)
@@ -61,7 +61,7 @@ def test_unknown_settings_are_named_with_similar_ones(level, given, says):
     assert "\n" not in str(error.value)
 
 
-def test_listings_name_all_that_comes_along():
+def test_listings_contain_all_built_in_rigs_and_sensors():
     assert [row["name"] for row in sensor_rows()] == sensor_names()
     assert [row["name"] for row in rig_rows()] == rig_names()
     vlp16 = next(row for row in sensor_rows() if row["name"] == "vlp16")
@@ -77,7 +77,7 @@ def test_listings_name_all_that_comes_along():
 @pytest.mark.parametrize(
     ("command", "key"), [("rigs", "rigs"), ("sensors", "sensors"), ("settings", "settings")]
 )
-def test_listings_are_for_people_and_for_programs(command, key):
+def test_listings_have_a_text_and_a_json_form(command, key):
     rows = json.loads(program(command, "--json").stdout)[key]
     text = program(command).stdout
     assert len(rows) > 4
@@ -100,7 +100,7 @@ def test_a_bad_rig_or_sensor_is_named_with_line_and_key(tmp_path):
 
 
 def test_options_are_read_where_pydantic_is_imported(tmp_path):
-    """The command line's parser checks values against types if that package is there."""
+    """The command-line parser checks values against types if pydantic is imported."""
     pytest.importorskip("pydantic")
     words = ["drive", str(tmp_path / "none"), "--route", "60.1,24.9", "60.2,24.8", "--traffic", "vehicles=3"]
     with pytest.raises(SceneFormatError, match="no such scene"):

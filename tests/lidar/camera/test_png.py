@@ -33,7 +33,7 @@ IMAGES = st.one_of(
 
 @settings(max_examples=60, deadline=None)
 @given(image=IMAGES)
-def test_another_reader_finds_the_same_pixels(image, tmp_path_factory):
+def test_pillow_reads_the_same_pixels(image, tmp_path_factory):
     path = tmp_path_factory.mktemp("png") / "a.png"
     write_png(path, image)
     with Image.open(path) as opened:
@@ -68,7 +68,7 @@ def test_depth_counts_are_those_of_kitti():
 
 @settings(max_examples=50, deadline=None)
 @given(depth=hnp.arrays(np.float32, 50, elements=st.floats(0.0625, 255.875, width=32)))
-def test_depth_there_and_back_within_half_a_count(depth):
+def test_depth_round_trips_within_half_a_count(depth):
     back = counts_to_depth(depth_to_counts(depth))
     np.testing.assert_allclose(back, depth, atol=0.5 / 256 + 1e-4)
 
@@ -79,7 +79,7 @@ def test_no_data_comes_back_as_infinity():
 
 @settings(max_examples=30, deadline=None)
 @given(feature=hnp.arrays(np.int32, (4, 5), elements=st.integers(-1, 2**24 - 2)))
-def test_instances_there_and_back(feature):
+def test_instances_round_trip(feature):
     image = feature_to_image(feature)
     assert image.dtype == np.uint8
     np.testing.assert_array_equal(image_to_feature(image), feature)
@@ -94,7 +94,7 @@ def test_flow_counts_are_those_of_kitti():
     assert np.isnan(back[0, 1:]).all()
 
 
-def test_sixteen_bit_colour_is_laid_out_as_the_standard_says(tmp_path):
+def test_sixteen_bit_colour_follows_the_png_layout(tmp_path):
     # Pillow reads only half of each number, so the file is taken apart by hand.
     image = np.random.default_rng(0).integers(0, 65535, (7, 5, 3), np.uint16)
     data = encode_png(image)

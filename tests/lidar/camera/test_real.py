@@ -35,7 +35,7 @@ def column(shared_osm, tmp_path_factory):
 
 
 def _column(world):
-    """Where the tallest thing of the scene stands (x, y)."""
+    """Position (x, y) of the tallest object of the scene."""
     x0, y0, x1, y1 = world.region
     x, y = (g.ravel() for g in np.meshgrid(np.arange(x0, x1), np.arange(y0, y1)))
     hits = world.caster.cast(np.stack([x, y, np.full(x.size, 500.0)], 1), np.tile([0.0, 0, -1], (x.size, 1)))
@@ -44,7 +44,7 @@ def _column(world):
 
 
 def _street_view(world, *, yaw):
-    """A camera 80 m from the column, 1.6 m over the ground, that looks there along a bearing from east."""
+    """A camera 80 m from the column, 1.6 m above the ground, facing it along a bearing from east."""
     spot = np.array([*_column(world) - 80 * np.array([np.cos(yaw), np.sin(yaw)]), 100.0])
     ground = 100.0 - world.caster.cast(spot, np.array([[0.0, 0.0, -1.0]])).range[0]
     c, s = np.cos(yaw), np.sin(yaw)
@@ -57,7 +57,7 @@ def test_a_scanners_points_lie_on_the_pixels_that_show_them(column):
     poses = _street_view(world, yaw=0.4)
     sun = sun_direction(scene.frame, datetime(2026, 6, 21, 9, tzinfo=UTC))
     frame = render(CAMERA, poses, world=world, sun=sun)
-    # A scanner at the camera itself sees just what it sees, so that nothing is hidden.
+    # A scanner at the camera's position has no parallax, so nothing is hidden.
     directions = np.random.default_rng(0).normal(size=(20000, 3)) * [1, 1, 0.3]
     hits = world.caster.cast(poses.position[0], directions)
     hit = np.isfinite(hits.range)
@@ -73,7 +73,7 @@ def test_a_scanners_points_lie_on_the_pixels_that_show_them(column):
     feature = world.lookup(hits).feature[hit][inside]
     alone = np.stack([frame.feature[v + j, u + i] for i in (-1, 0, 1) for j in (-1, 0, 1)])
     alone = (alone == alone[0]).all(axis=0)
-    # What is thinner than a pixel may lie between its neighbours' rays.
+    # Surfaces thinner than a pixel may lie between the rays of neighbouring pixels.
     assert (frame.feature[v, u] == feature)[alone].mean() > 0.995
 
 

@@ -1,4 +1,4 @@
-"""Images show the world as a camera would: geometry to the pixel, light by the laws of light."""
+"""Rendered images: geometry to the pixel, and illumination."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -43,7 +43,7 @@ def ground(*, color=(118, 118, 118), material="asphalt", half=400.0):
 
 
 def house(low, high, *, feature=1, material="plaster"):
-    """A box with walls and a roof that know what they are."""
+    """A box with the classes of walls and a roof."""
     mesh = box(low, high, feature=feature, material=material)
     up = mesh.normals()[:, 2]
     color = np.broadcast_to(np.array(materials()[material].color, np.uint8), (len(mesh), 3))
@@ -61,7 +61,7 @@ def street():
 
 def test_depth_is_measured_along_the_optical_axis():
     frame = render(CAMERA, looking(), world=world(plate(10.0)), sun=NOON)
-    # A plate square to the axis is everywhere equally deep, though its corners are farther away.
+    # A plate perpendicular to the axis has one depth, though its corners are farther away.
     np.testing.assert_allclose(frame.depth, 10.0, atol=1e-5)
 
 
@@ -107,7 +107,7 @@ def test_points_of_a_scanner_lie_in_the_depth_image(camera):
     np.testing.assert_array_equal(flat[0][alone], surface[alone])
 
 
-def test_a_box_covers_the_pixels_its_size_demands():
+def test_a_box_covers_the_computed_pixels():
     # 4 m wide and 2 m high, its face 20 m away, f = 100 px: 20 by 10 pixels.
     frame = render(
         CAMERA, looking((0, 0, 1.0)), world=world(box((20, -2, 0), (22, 2, 2), feature=7)), sun=NOON
@@ -155,7 +155,7 @@ def _above():
 
 
 @pytest.mark.parametrize("azimuth_deg", [0, 90, 200, 315])
-def test_shadows_fall_away_from_the_sun_as_long_as_its_height_says(azimuth_deg):
+def test_shadows_point_away_from_the_sun_with_the_computed_length(azimuth_deg):
     town = world(ground(), box((-1, -1, 0), (1, 1, 6), feature=1))
     elevation, azimuth = np.radians(30), np.radians(azimuth_deg)
     flat = np.array([np.sin(azimuth), np.cos(azimuth)])
@@ -253,7 +253,7 @@ def test_a_rolling_shutter_slants_an_upright_edge():
         render(camera, looking(), world=edge, sun=NOON)
 
 
-def test_an_open_shutter_blurs_what_moves():
+def test_a_finite_exposure_blurs_motion():
     camera = replace(CAMERA, exposure_ns=10_000_000)
     times = exposure_times(camera, 0, samples=5)
     assert times.tolist() == [1_000_000, 3_000_000, 5_000_000, 7_000_000, 9_000_000]
@@ -331,7 +331,7 @@ def test_detail_stays_in_its_place_when_the_camera_moves():
         .astype(float)
         for y in (0.0, 1.0)
     )
-    # 1 m to the left at 10 m: everything moves right by 200 / 10 = 20 pixels, and nowhere else.
+    # 1 m to the left at 10 m: everything moves right by 200 / 10 = 20 pixels.
     here = np.abs(a[:, :280] - b[:, 20:300]).mean()
     for shift in (0, 10, 19, 21, 30):
         assert here < 0.6 * np.abs(a[:, :280] - b[:, shift : shift + 280]).mean()
@@ -374,7 +374,7 @@ def test_flow_of_a_still_world_is_the_cameras_own_motion():
     np.testing.assert_allclose(flow[..., 1], 0, atol=1e-4)
 
 
-def test_flow_of_a_rolling_shutter_ends_on_the_row_that_sees_the_point():
+def test_flow_of_a_rolling_shutter_ends_on_the_row_that_exposes_the_point():
     camera = replace(CAMERA, row_ns=100_000)
     rows, period = np.arange(120) * 1e-4, 0.1
     up, left = 8.0, 3.0  # metres a second
@@ -383,7 +383,7 @@ def test_flow_of_a_rolling_shutter_ends_on_the_row_that_sees_the_point():
         return stacked([looking((0.0, left * s, 1.5 + up * s)) for s in t])
 
     flow = optical_flow(camera, exposed(rows), later=exposed(rows + period), world=world(plate(10.0)))
-    # A point sinks by k pixels a second and is met d rows on, d k times later: d = k (period + d row).
+    # A point sinks by k pixels a second and is exposed d rows further down: d = k (period + d row).
     k = 100 / 10 * up
     down = k * period / (1 - k * 1e-4)
     inside = np.arange(120) + down < 119
@@ -394,7 +394,7 @@ def test_flow_of_a_rolling_shutter_ends_on_the_row_that_sees_the_point():
         optical_flow(camera, looking(), later=looking(), world=world(plate(10.0)))
 
 
-def test_the_sky_moves_with_turning_alone():
+def test_flow_of_the_sky_depends_on_rotation_alone():
     sky = world(box((-5, -5, -100), (5, 5, -99)))
     np.testing.assert_allclose(
         optical_flow(CAMERA, looking(), later=looking((5, 3, 2)), world=sky), 0, atol=1e-4

@@ -1,4 +1,4 @@
-"""The sun stands where almanacs put it, and its light behaves like light."""
+"""Position of the sun and daylight against almanacs and physics."""
 
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
@@ -27,14 +27,14 @@ ALMANAC = [
 
 
 @pytest.mark.parametrize(("place", "lon", "lat", "when", "azimuth", "elevation"), ALMANAC)
-def test_the_sun_stands_where_the_almanac_says(place, lon, lat, when, azimuth, elevation):
+def test_sun_positions_agree_with_astropy(place, lon, lat, when, azimuth, elevation):
     a, e = sun_position(datetime.fromisoformat(when), lon, lat_deg=lat)
     true = e - refraction(np.radians(elevation))
     assert abs(np.degrees(a) - azimuth) < 0.02, place
     assert abs(np.degrees(true) - elevation) < 0.02, place
 
 
-def test_the_example_of_the_solar_position_algorithm():
+def test_sun_position_agrees_with_the_published_example():
     # Reda and Andreas, NREL/TP-560-34302 (2008), appendix A.5: zenith 50.11162, azimuth 194.34024.
     when = datetime.fromisoformat("2003-10-17T12:30:30-07:00")
     azimuth, elevation = np.degrees(sun_position(when, -105.1786, lat_deg=39.742476))
@@ -55,8 +55,8 @@ def test_a_time_without_a_zone_is_refused():
         sun_position(datetime(2024, 1, 1, 12), 0.0, lat_deg=0.0)  # noqa: DTZ001
 
 
-def test_the_grids_north_is_not_the_suns():
-    # Far from its central meridian a UTM grid is turned by over a degree; the sun does not care.
+def test_sun_directions_are_rotated_to_grid_north():
+    # Far from its central meridian a UTM grid is rotated by over a degree.
     when = datetime(2024, 6, 21, 10, tzinfo=UTC)
     local = sun_direction(Frame.at(24.9384, 60.1699), when)
     utm = sun_direction(Frame.at(24.9384, 60.1699, crs="utm"), when)
@@ -116,7 +116,7 @@ def test_ambient_light_falls_mostly_from_above():
 
 
 @pytest.mark.parametrize("elevation", [90, 45, 5, 0, -0.2, -6, -40, -90])
-def test_there_is_light_to_see_by_at_any_hour(elevation):
+def test_light_and_exposure_are_positive_at_any_hour(elevation):
     light = _sun(elevation)
     for values in (light.beam, light.ambient, light.sky, light.horizon):
         assert np.isfinite(values).all()

@@ -1,4 +1,4 @@
-"""Exported datasets hold what was recorded, read by parsers of their own."""
+"""Exported datasets equal the recorded ones, read with independent parsers."""
 
 from datetime import UTC, datetime
 
@@ -96,7 +96,7 @@ def test_an_export_is_replaced_only_on_request_and_nothing_else_is(dataset, tmp_
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "done"
 
 
-def test_what_cannot_be_exported_leaves_nothing(dataset, tmp_path):
+def test_a_failed_export_leaves_no_files(dataset, tmp_path):
     dataset.paths.timestamps("front").unlink()
     with pytest.raises(DatasetError, match="was the drive finished"):
         EXPORTERS["tum"].export(dataset, tmp_path / "tum")

@@ -1,4 +1,4 @@
-"""Every point-cloud format gives back what was written, to its own precision, and other readers agree."""
+"""Point-cloud formats: round trips within their precision, and agreement with other readers."""
 
 import io
 import subprocess
@@ -67,7 +67,7 @@ def form(request):
 
 
 @pytest.mark.parametrize("n", [0, 1, 1000])
-def test_a_cloud_comes_back_to_the_formats_own_precision(tmp_path, form, n):
+def test_a_cloud_round_trips_within_the_precision_of_the_format(tmp_path, form, n):
     path = tmp_path / f"a{form.suffix}"
     written = write(form, path, table(n))
     back = read_table(path)
@@ -180,7 +180,7 @@ def test_pypcd4_reads_our_pcd(tmp_path, module):
 
 
 @pytest.mark.parametrize("encoding", [Encoding.ASCII, Encoding.BINARY])
-def test_pcd_of_others_is_read_whatever_its_suffix(tmp_path, encoding):
+def test_pcd_files_of_other_programs_are_read_with_any_suffix(tmp_path, encoding):
     points = np.array([[1.5, -2.25, 3.0], [0.1, -100.0, 1e6]], np.float32)
     PointCloud.from_xyz_points(points).save(tmp_path / "a.pcd", encoding=encoding)
     back = read_table(tmp_path / "a.pcd")
@@ -202,7 +202,7 @@ HEAD = (
         ("binary", "1 1", "1234", "damaged"),
     ],
 )
-def test_pcd_that_cannot_be_read_is_told_in_one_line(tmp_path, data, count, body, says):
+def test_unreadable_pcd_is_refused_in_one_line(tmp_path, data, count, body, says):
     (tmp_path / "a.pcd").write_text(HEAD.format(data=data, count=count) + body)
     with pytest.raises(FormatError, match=says) as error:
         read_table(tmp_path / "a.pcd")
@@ -245,7 +245,7 @@ def test_laspy_reads_world_coordinates_crs_classes_and_time(tmp_path, suffix):
     assert read_crs(path).to_epsg() == 32618
 
 
-def test_an_uncompressed_file_in_parts_is_what_laspy_writes_of_its_points(tmp_path):
+def test_an_uncompressed_file_written_in_parts_equals_that_of_laspy(tmp_path):
     cloud = table(900)
     world = cloud | {"gps_time": cloud["time_ns"] * 1e-9}
     for axis, shift in zip("xyz", INFO.offset, strict=True):
@@ -259,7 +259,7 @@ def test_an_uncompressed_file_in_parts_is_what_laspy_writes_of_its_points(tmp_pa
     assert (tmp_path / "a.las").read_bytes() == copy.getvalue()
 
 
-def test_a_point_beyond_what_las_can_count_is_refused(tmp_path):
+def test_a_point_outside_the_las_integer_range_is_refused(tmp_path):
     far = table(3) | {"x": np.array([0.0, 1.0, 3e6])}
     with pytest.raises(FormatError, match="too far"):
         las.write(tmp_path / "a.las", far, info=replace(INFO, offset=(0.0, 0.0, 0.0)))

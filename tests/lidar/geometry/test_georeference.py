@@ -1,4 +1,4 @@
-"""A scene point has one place on Earth, whichever way it is computed."""
+"""Georeferencing of scene points, checked against independent transformations."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_utm_scale_and_convergence_of_known_places(place):
 
 @settings(deadline=None, max_examples=15)
 @given(places, st.floats(-5000, 5000), st.floats(-5000, 5000))
-def test_a_metre_is_a_metre_in_the_local_frame(place, x, y):
+def test_the_local_frame_has_scale_one(place, x, y):
     frame = Frame.at(*place)
     lon0, lat0 = frame.to_geographic(0, 0)
     lon, lat = frame.to_geographic(x, y)
@@ -42,7 +42,7 @@ def test_a_metre_is_a_metre_in_the_local_frame(place, x, y):
 
 @settings(deadline=None, max_examples=15)
 @given(places, st.floats(-20000, 20000), st.floats(-20000, 20000), st.sampled_from(["local", "utm"]))
-def test_there_and_back_is_the_same_place(place, x, y, crs):
+def test_the_inverse_projection_returns_the_same_point(place, x, y, crs):
     frame = Frame.at(place[0], place[1], crs=crs)
     np.testing.assert_allclose(frame.from_geographic(*frame.to_geographic(x, y)), (x, y), atol=1e-6)
     again = Frame.from_json(frame.to_json())
@@ -51,7 +51,7 @@ def test_there_and_back_is_the_same_place(place, x, y, crs):
 
 @settings(deadline=None, max_examples=15)
 @given(places, st.floats(-10000, 10000), st.floats(-10000, 10000), st.sampled_from([20.0, 200.0, 5000.0]))
-def test_the_affine_short_cut_is_within_its_limit(place, x, y, width):
+def test_the_affine_approximation_is_within_its_limit(place, x, y, width):
     frame = Frame.at(*place)
     crs = export_crs(frame)
     rng = np.random.default_rng(1)
@@ -63,7 +63,7 @@ def test_the_affine_short_cut_is_within_its_limit(place, x, y, width):
     assert np.abs(back - points).max() < 1e-5
 
 
-def test_the_export_system_is_the_zone_of_the_scene_or_its_own():
+def test_the_export_crs_is_the_utm_zone_or_the_scenes_crs():
     assert export_crs(Frame.at(-76.3, 36.9)).to_epsg() == 32618
     assert export_crs(Frame.at(-76.3, -36.9)).to_epsg() == 32718
     assert export_crs(Frame.at(10.7, 59.9)).to_epsg() == 32632
@@ -74,11 +74,11 @@ def test_the_export_system_is_the_zone_of_the_scene_or_its_own():
 
 
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:2263", "EPSG:3857", "nonsense"])
-def test_a_system_that_cannot_carry_a_scene_is_refused(crs):
+def test_an_unsuitable_crs_is_refused(crs):
     with pytest.raises(FrameError, match=crs):
         Frame.at(-73.99, 60.72, crs=crs)
 
 
-def test_utm_ends_at_the_poles():
+def test_utm_is_refused_at_the_poles():
     with pytest.raises(FrameError, match="local"):
         utm_crs(10.0, 87.0)

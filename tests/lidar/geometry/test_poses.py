@@ -1,4 +1,4 @@
-"""Attitudes convert without loss, and the table of poses says what its documentation says."""
+"""Attitudes convert without loss, and the pose table follows its documentation."""
 
 from datetime import UTC, datetime
 
@@ -37,7 +37,7 @@ def rz(g):
 
 @given(angles, angles, angles)
 @settings(max_examples=200, deadline=None)
-def test_the_matrix_is_what_the_convention_says(a, b, g):
+def test_the_rotation_matrix_follows_the_convention(a, b, g):
     np.testing.assert_allclose(
         matrix_from_quat(quat_from_euler(a, b, gamma=g)), rz(g) @ ry(b) @ rx(a), atol=1e-12
     )
@@ -48,7 +48,7 @@ def test_the_matrix_is_what_the_convention_says(a, b, g):
 
 @given(angles, angles, angles)
 @settings(max_examples=200, deadline=None)
-def test_angles_survive_the_round_trip_even_with_the_nose_straight_up(a, b, g):
+def test_angles_round_trip_even_at_gimbal_lock(a, b, g):
     for there, back in (
         (quat_from_euler, euler_from_quat),
         (quat_from_euler_intrinsic, euler_from_quat_intrinsic),
@@ -72,7 +72,7 @@ def test_both_conventions_agree_with_another_implementation_and_differ_at_large_
     assert np.linalg.norm((Rotation.from_quat(one).inv() * Rotation.from_quat(two)).as_rotvec()) > 0.3
 
 
-def test_signs_are_those_of_a_car():
+def test_positive_angles_lower_the_nose_raise_the_left_and_turn_left():
     forward = np.array([1.0, 0, 0])
     left = np.array([0, 1.0, 0])
     nose_down = matrix_from_quat(quat_from_euler(0.0, 0.1, gamma=0.0))
@@ -90,7 +90,7 @@ def test_body_rates_of_a_steady_spin_are_exact():
     np.testing.assert_allclose(body_rates(t, quat), np.broadcast_to(rate, (101, 3)), atol=1e-12)
 
 
-def test_the_table_of_poses_puts_the_vehicle_where_it_is():
+def test_the_pose_table_agrees_with_the_trajectory():
     frame = Frame.at(-76.3059, 36.8853, crs="EPSG:32618")
     n = 11
     quat = quat_from_euler(np.full(n, 0.02), np.full(n, -0.05), gamma=np.linspace(0.0, 3.0, n))

@@ -1,4 +1,4 @@
-"""A map is all that was recorded, where it was recorded, and needs no more memory for a longer drive."""
+"""Aggregated maps: all points at their world coordinates, in constant memory."""
 
 import json
 import tracemalloc
@@ -101,7 +101,7 @@ def expected(frames=6, n=400):
     return Georeference(FRAME, CRS_OUT, exact=True).points(xyz)
 
 
-def test_trajectories_come_back_exactly(tmp_path):
+def test_trajectories_round_trip_exactly(tmp_path):
     write_trajectory(tmp_path / "t.csv", trajectory())
     back = read_trajectory(tmp_path / "t.csv")
     for name in ("time_ns", "position", "quat_xyzw", "velocity", "scale"):
@@ -109,7 +109,7 @@ def test_trajectories_come_back_exactly(tmp_path):
 
 
 @pytest.mark.parametrize("kinds", [("laz",), ("pcd",)])
-def test_points_are_in_the_map_where_they_are_in_the_world(tmp_path, kinds):
+def test_map_points_have_their_world_coordinates(tmp_path, kinds):
     summary = aggregate(dataset(tmp_path / "d", kinds=kinds), tmp_path / "m.laz")
     las = laspy.read(tmp_path / "m.laz")
     assert summary.points == summary.points_in == len(las) == 2400
@@ -193,7 +193,7 @@ def test_bad_options_are_named(tmp_path, out, change, words):
         aggregate(dataset(tmp_path / "d"), tmp_path / out, options=MapOptions(**change))
 
 
-def test_noise_is_left_out_and_counted_unless_it_is_asked_for(tmp_path):
+def test_noise_is_left_out_and_counted_by_default(tmp_path):
     data = dataset(tmp_path / "d", frames=2, kinds=("pcd",))
     path = tmp_path / "d" / "top" / "pcd" / "000001.pcd"
     table = dict(pcd.read(path))
@@ -204,7 +204,7 @@ def test_noise_is_left_out_and_counted_unless_it_is_asked_for(tmp_path):
     assert (kept.points, kept.noise) == (800, 0)
 
 
-def test_a_map_that_is_there_is_replaced_only_when_asked(tmp_path):
+def test_an_existing_map_is_replaced_only_on_request(tmp_path):
     data = dataset(tmp_path / "d", frames=1)
     (tmp_path / "m.ply").write_text("mine")
     with pytest.raises(InputError, match="`overwrite`"):

@@ -1,4 +1,4 @@
-"""Pictures show what is there, where it is."""
+"""Pictures show points and scenes at their positions and in their colours."""
 
 from dataclasses import dataclass, replace
 
@@ -47,7 +47,7 @@ def _where(image, color):
     size=st.tuples(st.integers(20, 2000), st.integers(20, 2000)),
     span=st.tuples(*[st.floats(0.1, 1000)] * 3),
 )
-def test_everything_is_in_view_and_the_view_is_filled(azimuth, elevation, fov, size, span):
+def test_all_points_are_in_view_and_fill_it(azimuth, elevation, fov, size, span):
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * span + [50, -70, 9]
     camera, pose = _eye(corners, View(azimuth, elevation, fov), size=size)
     pixels, depth = project(camera, (corners - pose.position) @ pose.rotation[0])
@@ -56,7 +56,7 @@ def test_everything_is_in_view_and_the_view_is_filled(azimuth, elevation, fov, s
     assert share.min() >= 0
     assert share.max() <= 1
     edges = np.stack([share.min(axis=0), 1 - share.max(axis=0)])
-    assert (edges < 0.03).all(axis=0).any()  # one way it touches both sides of the picture
+    assert (edges < 0.03).all(axis=0).any()  # along one axis it touches both sides of the picture
 
 
 def test_from_above_north_is_up_and_east_is_right():
@@ -106,7 +106,7 @@ def test_edges_in_depth_are_darkened_and_flats_are_not():
     assert row[40] == row[160] == 200
 
 
-def test_what_cannot_be_pictured_is_said():
+def test_invalid_pictures_are_refused():
     with pytest.raises(InputError, match="needs points"):
         cloud_picture(np.empty((0, 3)), np.empty((0, 3)))
     with pytest.raises(InputError, match="top, oblique"):
@@ -117,7 +117,7 @@ def test_what_cannot_be_pictured_is_said():
 
 @dataclass
 class Area(MeshWorld):
-    """A small world that knows its region."""
+    """A small world with its region."""
 
     region = (-50.0, -50.0, 50.0, 50.0)
 
@@ -140,7 +140,7 @@ def test_a_scene_from_above_is_a_map():
     assert v.mean() == pytest.approx(150 - 25 * scale, abs=3)
 
 
-def test_a_scene_aslant_shows_walls_and_shadows():
+def test_an_oblique_picture_shows_walls_and_shadows():
     image = scene_picture(_village(), size=(320, 200), options=PLAIN).astype(int)
     red = (image[..., 0] > 2 * image[..., 1]) & (image[..., 0] > 60)
     assert len(np.unique(image[red][:, 0])) >= 2  # roof and walls are lit differently
@@ -163,7 +163,7 @@ def test_depth_is_bright_near_and_dark_far_and_grey_where_unknown():
     assert (picture[4:] == (40, 40, 44)).all()
 
 
-def test_the_legend_names_what_occurs_and_leaves_the_rest_alone():
+def test_the_legend_names_the_classes_in_the_picture_and_covers_only_a_corner():
     klass = np.full((200, 300), Class.ROAD, np.uint8)
     klass[:50] = Class.CAR
     klass[50:60] = Class.SKY
@@ -182,7 +182,7 @@ def test_the_legend_names_what_occurs_and_leaves_the_rest_alone():
     np.testing.assert_array_equal(image, class_colors(klass))
 
 
-def test_the_legend_names_every_class_even_where_many_occur():
+def test_the_legend_has_room_for_every_class():
     classes = [k for k in Class if k != Class.SKY]
     klass = np.repeat(np.array(classes, np.uint8), 4000)[: 300 * 400].reshape(300, 400)
     keyed = with_legend(np.zeros((300, 400, 3), np.uint8), klass).reshape(-1, 3)
@@ -192,8 +192,8 @@ def test_the_legend_names_every_class_even_where_many_occur():
     assert {tuple(class_codes().color[k].tolist()) for k in present} <= shown
 
 
-def test_a_sweep_shows_the_vehicle_and_how_far_things_are():
-    """Seen from above: an outline in the middle, circles about it, 10 m from one to the next."""
+def test_a_sweep_picture_shows_the_vehicle_and_range_rings():
+    """From above: the vehicle's outline in the middle, rings around it at intervals of 10 m."""
     far = np.array([[55.0, 0.0, 0.0], [-55.0, 0.0, 0.0], [0.0, 55.0, 0.0], [90.0, 90.0, 0.0]])
     colors = np.array([RED, RED, RED, BLUE], np.uint8)
     image = sweep_picture(far, colors, vehicle=load_vehicle("car"), view="top", size=(600, 600))
@@ -221,6 +221,6 @@ def test_a_sheet_holds_its_pictures_in_order():
     assert (whole[14:, 24:] == 255).all()
 
 
-def test_nothing_is_drawn_where_nothing_is():
+def test_a_picture_of_two_points_is_mostly_background():
     image = cloud_picture([[0, 0, 0.0], [1, 1, 1]], [RED, RED], size=(100, 80), depth=False)
     assert (image == BACKGROUND).all(axis=2).mean() > 0.9

@@ -1,4 +1,4 @@
-"""Receivers report what the table of errors says, where the vehicle is, in sentences that others read."""
+"""Satellite receivers: error statistics, satellite visibility and NMEA sentences."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -102,11 +102,11 @@ def test_course_and_speed_are_those_of_the_geodesic(heading_deg):
     assert (middle - azimuth + 180) % 360 - 180 == pytest.approx(0.0, abs=0.01)
     assert metres / 60.0 == pytest.approx(10.0, abs=2e-3)
     np.testing.assert_allclose(fixes.speed, 10.0, atol=1e-9)
-    # a grid heading taken for a true one would be 0.78 degrees off
+    # grid heading instead of true heading would be an error of 0.78 degrees
     assert abs((90.0 - heading_deg - azimuth + 180) % 360 - 180) > 0.7
 
 
-def test_a_gauss_markov_process_has_its_variance_and_its_memory():
+def test_a_gauss_markov_process_has_its_variance_and_correlation_time():
     n, dt, tau = 100_000, 1.0, 30.0
     u = gauss_markov(generator(1, "test"), dt, tau=np.full(n, tau))
     assert u.std() == pytest.approx(1.0, rel=0.05)
@@ -116,8 +116,8 @@ def test_a_gauss_markov_process_has_its_variance_and_its_memory():
 
 
 @pytest.mark.parametrize(("mode", "state"), [("single", "single"), ("sbas", "sbas"), ("rtk", "fixed")])
-def test_errors_are_as_large_as_the_table_says(mode, state):
-    # one epoch in ten correlation times: as good as independent
+def test_errors_have_the_deviations_of_the_table(mode, state):
+    # one epoch in ten correlation times: practically independent
     table = STATES[state]
     rate = 0.1 / table.tau
     n = 4000
@@ -130,13 +130,13 @@ def test_errors_are_as_large_as_the_table_says(mode, state):
     assert across == pytest.approx(np.hypot(table.white[0], table.bias[0]), rel=0.05)
     assert up == pytest.approx(np.hypot(table.white[1], table.bias[1]), rel=0.05)
     assert np.abs(fixes.error.mean(axis=0)).max() < 0.1 * up
-    # white: from one fix to the next in a tenth of a second the bias stands still
+    # white noise only: the bias is constant from one fix to the next, 0.1 s apart
     quick = observe_gnss(standing(400.0), FRAME, spec=spec(mode, 10.0), seed=3, start=START)
     step = np.diff(quick.error, axis=0)[:, :2].std()
     assert step == pytest.approx(np.sqrt(2) * table.white[0], rel=0.06)
 
 
-def test_a_fix_does_not_depend_on_what_comes_after_it():
+def test_a_fix_does_not_depend_on_later_motion():
     short, long = (
         observe_gnss(standing(s), FRAME, spec=spec("rtk"), seed=9, start=START) for s in (20.0, 60.0)
     )
@@ -146,7 +146,7 @@ def test_a_fix_does_not_depend_on_what_comes_after_it():
     assert (other.lonlath != short.lonlath).all()
 
 
-def test_what_is_reported_is_the_truth_plus_the_error():
+def test_a_fix_is_the_true_position_plus_the_error():
     fixes = observe_gnss(eastward(), FRAME, spec=spec("single"), seed=2, start=START)
     azimuth, _, metres = GEOD.inv(*fixes.true_lonlath[:, :2].T, *fixes.lonlath[:, :2].T)
     a = np.radians(azimuth)
@@ -191,7 +191,7 @@ def test_the_constellation_repeats_every_sidereal_day_and_is_as_full_as_gps():
             np.zeros(len(hours)), full, h=0 * full, start=START, time_ns=hours, systems=("gps",)
         )
         count = (elevation > np.radians(5)).sum(axis=1)
-        assert count.min() >= 5  # the baseline constellation's promise is four in view
+        assert count.min() >= 5  # the standard guarantees four in view
         assert 7 <= count.mean() <= 10
         assert elevation.max() > np.radians(45 if lat > 80 else 70)
         used = elevation > np.radians(5)
@@ -206,7 +206,7 @@ def test_dilution_of_four_satellites_is_that_of_the_textbook():
     dop = dilution(azimuth, elevation, used=np.ones((1, 4), bool), names=one)
     np.testing.assert_allclose(dop[0, :2], np.sqrt(4 / 3), atol=1e-12)
     assert np.isinf(dilution(azimuth, elevation, used=np.array([[True, True, True, False]]), names=one)).all()
-    # a clock of a second system takes the satellite that would solve for it
+    # the clock of a second system needs one more satellite
     two = np.array(["G01", "G02", "G03", "E01"])
     assert np.isinf(dilution(azimuth, elevation, used=np.ones((1, 4), bool), names=two)).all()
 
@@ -229,7 +229,7 @@ def test_orbits_have_the_published_periods_and_inclinations(system):
     np.testing.assert_allclose(later[..., 2], place[..., 2], atol=150e3)
 
 
-def test_beidou_stands_over_asia_and_its_inclined_ones_draw_an_eight_there():
+def test_beidou_geosynchronous_satellites_stay_over_asia():
     time_ns = np.arange(0, 86_164, 600) * 10**9
     place = satellites(START, time_ns, systems=("beidou",))
     assert place.shape[1] == 30
@@ -241,7 +241,7 @@ def test_beidou_stands_over_asia_and_its_inclined_ones_draw_an_eight_there():
 
 
 def test_satellites_of_a_walker_constellation_keep_apart():
-    """No two are ever at one place, as a wrong phase between planes would have it."""
+    """A wrong phase between planes would put two satellites at one position."""
     for system in ("glonass", "galileo"):
         place = satellites(START, np.arange(0, 43_200, 900) * 10**9, systems=(system,))
         for moment in place:
@@ -265,7 +265,7 @@ def test_four_systems_see_more_and_place_better_than_one():
     assert set(constellations()) == set(SYSTEMS)
 
 
-def test_systems_that_there_are_not_are_refused():
+def test_unknown_constellations_are_refused():
     for systems in (("gps", "loran"), (), ("gps", "gps")):
         with pytest.raises(InputError, match="give one or more of gps, glonass"):
             satellites(START, np.array([0]), systems=systems)
@@ -329,7 +329,7 @@ def test_high_walls_hide_the_satellites_beside_the_street_and_not_those_along_it
     assert len(asked) < 10
 
 
-def test_in_the_open_the_sky_is_whole():
+def test_in_the_open_nothing_blocks_the_sky():
     s = spec("rtk", rate=1.0, arm=(0.0, 0.0, 1.6))
     sky, _, position = view(eastward(30.0), s, 1.0)
     open_ = open_sky(FRAME, position, start=START, time_ns=epochs(s, 30 * 10**9), mask_deg=10.0)
@@ -339,7 +339,7 @@ def test_in_the_open_the_sky_is_whole():
     np.testing.assert_array_equal(fixes[0].lonlath, fixes[1].lonlath)
 
 
-def test_a_street_canyon_spoils_fixes():
+def test_a_street_canyon_degrades_fixes():
     s = spec("single", rate=0.02, arm=(0.0, 0.0, 1.6), constellations=("gps",))
     trajectory = standing(200_000.0)
     low, high = (view(trajectory, s, h)[0] for h in (1.0, 15.0))
@@ -352,7 +352,7 @@ def test_a_street_canyon_spoils_fixes():
 
 
 def test_in_a_street_of_five_storeys_four_systems_nearly_always_have_a_fix():
-    """And fixes there are off by what receivers are off in street canyons: 5 to 10 m, where GPS has none."""
+    """Errors are those of receivers in street canyons, 5 to 10 m, where GPS alone has no fix."""
     trajectory = standing(100_000.0)
     shares, errors = {}, {}
     for systems in (("gps",), SYSTEMS):
@@ -365,7 +365,7 @@ def test_in_a_street_of_five_storeys_four_systems_nearly_always_have_a_fix():
     assert 3.0 < errors[4] < 10.0
 
 
-def test_rtk_falls_at_once_and_recovers_after_it_has_settled():
+def test_rtk_degrades_at_once_and_recovers_after_the_settling_time():
     n, s = 200, spec("rtk", rate=10.0)
     visible = np.zeros((n, 24), bool)
     visible[:, :9] = True
@@ -395,7 +395,7 @@ def read(lines):
 
 
 @pytest.mark.parametrize("mode", ["single", "sbas", "rtk"])
-def test_another_reader_reads_the_fixes(mode):
+def test_pynmeagps_reads_the_fixes(mode):
     fixes = observe_gnss(eastward(5.0), FRAME, spec=spec(mode, constellations=("gps",)), seed=1, start=START)
     lines = nmea(fixes, START)
     assert max(map(len, lines)) <= 82
@@ -436,7 +436,7 @@ def test_a_receiver_of_four_systems_names_the_satellites_of_each():
         assert [int(p) for p in said if p != ""] == own[:12]
 
 
-def test_no_fix_leaves_fields_empty_and_says_so():
+def test_sentences_without_a_fix_have_empty_fields_and_quality_0():
     sky = Sky(
         *(np.full((6, 24), 0.5),) * 2, *(np.zeros((6, 24), bool),) * 2, np.ones(6), satellite_names(("gps",))
     )
@@ -448,7 +448,7 @@ def test_no_fix_leaves_fields_empty_and_says_so():
     assert gsa.navMode == 1
 
 
-def test_the_separation_of_the_geoid_is_taken_off_the_height():
+def test_sentences_give_the_height_above_the_geoid():
     fixes = observe_gnss(standing(0.5, height=-30.0), FRAME, spec=spec(), seed=0, start=START)
     gga = read(nmea(fixes, START, geoid=-38.0)[:1])[0]
     assert gga.alt == pytest.approx(8.0)
@@ -456,7 +456,7 @@ def test_the_separation_of_the_geoid_is_taken_off_the_height():
     assert read(nmea(fixes, START)[:1])[0].sep == ""
 
 
-def test_columns_are_named_and_whole():
+def test_columns_have_one_value_per_fix():
     fixes = observe_gnss(eastward(2.0), FRAME, spec=spec("rtk"), seed=1, start=START)
     columns = gnss_columns(fixes)
     assert {len(c) for c in columns.values()} == {21}

@@ -1,4 +1,4 @@
-"""Inertial units feel what physics says and add what their Allan parameters say."""
+"""Inertial units measure rotation and specific force with the noise of their Allan parameters."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def test_gravity_is_that_of_wgs84():
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3, 2.5])
-def test_at_rest_it_feels_gravity_upwards_and_the_turning_earth(tilt):
+def test_an_imu_at_rest_measures_gravity_and_the_earth_rate(tilt):
     still = track(np.zeros(3), np.zeros(3), quat_from_euler(tilt, 0.0, gamma=np.pi / 2))  # heading north
     rate, force = true_inertial(still, FRAME, spec=ImuSpec("imu", Mount()), time_ns=TIMES)
     g = float(normal_gravity(52.516275, 0.0))
@@ -62,7 +62,7 @@ def circling(radius=20.0, rate=0.3):
     return Trajectory(TIMES, position, quat_from_euler(0 * t, 0 * t, gamma=yaw), velocity, np.ones(len(t)))
 
 
-def test_in_a_circle_it_feels_the_turn_and_the_pull_to_the_centre():
+def test_an_imu_on_a_circle_measures_yaw_rate_and_centripetal_acceleration():
     rate, force = true_inertial(circling(), FRAME, spec=ImuSpec("imu", Mount()), time_ns=TIMES)
     inner = slice(2, -2)
     np.testing.assert_allclose(rate[inner, 2], 0.3 + EARTH_RATE * np.sin(PHI), atol=1e-9)
@@ -71,7 +71,7 @@ def test_in_a_circle_it_feels_the_turn_and_the_pull_to_the_centre():
     np.testing.assert_allclose(force[inner, 0], 0.0, atol=1e-4)
 
 
-def test_a_unit_off_the_axle_feels_the_lever_arm_and_its_own_axes():
+def test_an_imu_off_the_axle_measures_its_lever_arm_in_its_own_axes():
     turned = Rotation.from_euler("z", 90, degrees=True).as_quat()
     off = ImuSpec("imu", Mount((2.0, 0.0, 0.0), tuple(turned)))
     _, axle = true_inertial(circling(), FRAME, spec=ImuSpec("imu", Mount()), time_ns=TIMES)
@@ -82,7 +82,7 @@ def test_a_unit_off_the_axle_feels_the_lever_arm_and_its_own_axes():
     np.testing.assert_allclose(force[inner, 0], axle[inner, 1], atol=1e-4)
 
 
-def test_dead_reckoning_of_the_true_signals_gives_the_drive_back():
+def test_dead_reckoning_of_the_true_signals_reproduces_the_drive():
     trajectory = circling()
     rate, force = true_inertial(trajectory, FRAME, spec=ImuSpec("imu", Mount()), time_ns=TIMES)
     earth = EARTH_RATE * np.array([0.0, np.cos(PHI), np.sin(PHI)])
@@ -118,7 +118,7 @@ def test_allan_deviation_is_that_of_the_parameters(name):
     assert np.diff(noise[:, 0]).std() / np.sqrt(2) == pytest.approx(p.gyro_noise * np.sqrt(20.0), rel=0.02)
 
 
-def test_the_bias_wanders_as_its_instability_says():
+def test_the_bias_has_the_given_instability():
     spec = ImuSpec(
         "imu", Mount(), rate_hz=10.0, **SILENT, gyro_instability=2.18e-6, accel_instability=7.35e-4
     )
@@ -129,12 +129,12 @@ def test_the_bias_wanders_as_its_instability_says():
         np.testing.assert_allclose(np.sqrt((every**2).mean(axis=1)), 0.664 * b, rtol=0.08)
 
 
-def test_white_and_walk_cross_where_they_should():
+def test_white_noise_and_random_walk_cross_at_the_published_time():
     p = PRESETS["adis16448"]
     assert np.sqrt(3) * p.gyro_noise / p.gyro_walk == pytest.approx(15.2, abs=0.1)
 
 
-def test_a_reading_does_not_depend_on_what_comes_after_it():
+def test_a_reading_does_not_depend_on_later_motion():
     whole = circling()
     half = Trajectory(
         *(getattr(whole, f)[:500] for f in ("time_ns", "position", "quat_xyzw", "velocity", "scale"))
@@ -147,7 +147,7 @@ def test_a_reading_does_not_depend_on_what_comes_after_it():
     assert (observe_imu(whole, FRAME, spec=spec, seed=6).gyro != two.gyro).all()
 
 
-def test_without_noise_it_reports_the_truth():
+def test_an_imu_without_noise_reports_the_truth():
     rows = observe_imu(circling(), FRAME, spec=ImuSpec("imu", Mount(), rate_hz=50.0, **SILENT), seed=0)
     np.testing.assert_array_equal(rows.gyro, rows.true_gyro)
     np.testing.assert_array_equal(rows.accel, rows.true_accel)

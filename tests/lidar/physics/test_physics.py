@@ -1,4 +1,4 @@
-"""Laws of the returns against published and computed values."""
+"""Physics of returns against published and computed values."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ OS0 = {"reference_reflectance": 0.8, "reference_range": 50.0}
         (53.06, 0.0770, 0.0),
     ],
 )
-def test_water_reflects_as_fresnel_says(angle_deg, s, p):
+def test_water_reflects_by_fresnels_equations(angle_deg, s, p):
     found = fresnel(np.cos(np.radians(angle_deg)), WATER)
     assert found[0] == pytest.approx(s, abs=2e-4)
     assert found[1] == pytest.approx(p, abs=2e-4)
@@ -51,12 +51,12 @@ def test_a_pane_reflects_with_both_faces(angle_deg, share):
 
 
 @given(st.floats(0.0, 1.0), st.sampled_from([1.33, 1.5]))
-def test_nothing_reflects_more_than_it_gets(cosine, index):
+def test_no_surface_reflects_more_than_it_receives(cosine, index):
     for share in (surface_reflection(cosine, index), pane_reflection(cosine, index)):
         assert -1e-12 <= share <= 1 + 1e-12
 
 
-def test_glint_is_bright_below_and_gone_to_the_side():
+def test_glint_is_bright_below_and_zero_to_the_side():
     """At 3 m/s the slope variance is 0.01836: R / (4 m) = 0.0200 / 0.0734."""
     assert glint(1.0) == pytest.approx(0.0200 / (4 * (0.003 + 0.00512 * 3)), rel=0.01)
     assert glint(np.cos(np.radians(45.0))) < 1e-9
@@ -72,7 +72,7 @@ def test_a_mirror_keeps_length_and_angle():
     assert mirrored(m, n) == pytest.approx(d)
 
 
-def test_longest_range_goes_with_the_root_of_reflectance():
+def test_maximum_range_is_proportional_to_the_root_of_reflectance():
     """From the figure of the 80 % target, that of the 10 % one: 50 m -> 17.7 m; data sheet 120 -> 42.4 m."""
     for rho, cosine in ((0.1, 1.0), (0.8, 0.5), (0.3, 0.2)):
         longest = 50.0 * np.sqrt(rho * cosine / 0.8)
@@ -83,13 +83,13 @@ def test_longest_range_goes_with_the_root_of_reflectance():
     assert amplitude(0.1, longest, reference_reflectance=0.8, reference_range=120.0) == pytest.approx(1.0)
 
 
-def test_air_takes_its_share_on_both_ways():
+def test_air_attenuates_out_and_back():
     clear = amplitude(0.5, 30.0, **OS0)
     assert amplitude(0.5, 30.0, extinction=0.01, **OS0) == pytest.approx(clear * np.exp(-0.6))
 
 
 @given(st.floats(1e-3, 1e3), st.floats(0.1, 500.0))
-def test_the_sensor_takes_a_target_in_clear_air_for_what_it_is(rho, distance):
+def test_apparent_reflectance_in_clear_air_is_the_true_one(rho, distance):
     assert apparent_of(amplitude(rho, distance, **OS0), distance, **OS0) == pytest.approx(rho)
 
 
@@ -130,7 +130,7 @@ def test_quantisation_rounds_and_its_error_is_uniform(quantum):
     assert quantised(x, 0.0) is x
 
 
-def test_walk_draws_bright_echoes_nearer():
+def test_range_walk_shortens_the_range_of_bright_echoes():
     assert walk([0.5, 1.0, 10.0, 100.0]) == pytest.approx([0, 0, -0.005, -0.010])
 
 
@@ -146,14 +146,14 @@ def test_materials_reflect_by_wavelength():
 
 
 @pytest.mark.parametrize("law", ["lambert", "phong", "oren-nayar"])
-def test_incidence_laws_start_at_the_reflectance_and_end_at_nothing(law):
+def test_incidence_laws_fall_from_the_reflectance_to_zero(law):
     rho = np.array([0.2, 0.2])
     back = apparent(rho, np.array([1.0, 0.0]), specular=0.0, law=law)
-    assert back[0] == pytest.approx(0.2, rel=0.15)  # Oren-Nayar loses some to roughness
+    assert back[0] == pytest.approx(0.2, rel=0.15)  # Oren-Nayar loses some light to roughness
     assert back[1] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_phong_keeps_the_reflectance_square_on_whatever_the_specular_share():
+def test_phong_at_normal_incidence_does_not_depend_on_the_specular_share():
     for share in (0.0, 0.3, 1.0):
         assert apparent(np.array([0.4]), np.array([1.0]), specular=share, law="phong") == pytest.approx(0.4)
     at_45 = apparent(np.array([0.4]), np.array([np.sqrt(0.5)]), specular=0.3, law="phong")
@@ -204,7 +204,7 @@ def surfaces(rows):
     )
 
 
-def test_near_surfaces_are_one_echo_between_them_and_far_ones_are_two():
+def test_close_surfaces_merge_into_one_echo_and_distant_ones_give_two():
     """5 ns resolve 0.75 m: 10.0 and 10.4 m merge, 10 and 12 m do not."""
     close = merged(surfaces([(0, 10.0, 0.5, True), (0, 10.4, 0.5, False)]), 0.75)
     assert len(close) == 1
@@ -213,7 +213,7 @@ def test_near_surfaces_are_one_echo_between_them_and_far_ones_are_two():
     assert apart.range == pytest.approx([10.0, 12.0])
 
 
-def test_an_edge_that_crosses_the_beam_moves_the_point_over_monotonically():
+def test_the_range_changes_monotonically_as_an_edge_crosses_the_beam():
     at = [
         merged(surfaces([(0, 10.0, 1 - w, w < 0.5), (0, 10.4, w, w >= 0.5)]), 0.75).range[0]
         for w in np.linspace(0, 1, 21)
@@ -223,7 +223,7 @@ def test_an_edge_that_crosses_the_beam_moves_the_point_over_monotonically():
     assert (np.diff(at) > 0).all()
 
 
-def test_an_echo_bears_the_label_of_the_beams_axis_else_of_the_brightest():
+def test_an_echo_has_the_label_on_the_beams_axis_else_of_the_brightest():
     rows = [(0, 10.0, 0.2, True), (0, 10.1, 0.5, False), (1, 8.0, 0.1, False), (1, 8.2, 0.6, False)]
     echoes = merged(surfaces(rows), 0.75)
     assert echoes.feature.tolist() == [0, 3]
@@ -250,7 +250,7 @@ def test_merging_keeps_power_and_separates_echoes(rows, separation):
     assert number.max() == count.max()
 
 
-def test_return_modes_choose_the_echoes_they_name():
+def test_return_modes_select_the_echoes_that_they_name():
     echoes = surfaces(
         [(0, 5, 0.1, True), (0, 10, 0.9, False), (0, 20, 0.2, False), (3, 7, 0.5, True), (3, 9, 0.5, False)]
     )
@@ -259,7 +259,7 @@ def test_return_modes_choose_the_echoes_they_name():
     def chosen(mode, **options):
         return reported(echoes, power, mode=mode, most=options.pop("most", 5), **options).tolist()
 
-    assert chosen("strongest") == [1, 3]  # of equals the nearer
+    assert chosen("strongest") == [1, 3]  # of equal echoes the nearer one
     assert chosen("first") == [0, 3]
     assert chosen("last") == [2, 4]
     assert chosen("dual") == [1, 2, 3, 4]
@@ -267,14 +267,14 @@ def test_return_modes_choose_the_echoes_they_name():
     assert chosen("all", most=2) == [0, 1, 3, 4]
 
 
-def test_dual_with_one_echo_both_strongest_and_last():
+def test_dual_mode_with_one_echo_that_is_strongest_and_last():
     echoes = surfaces([(0, 5, 0.1, True), (0, 10, 0.9, False)])
     power = np.array([0.1, 0.9])
     assert reported(echoes, power, mode="dual", most=2).tolist() == [1]
     assert reported(echoes, power, mode="dual", most=2, second=True).tolist() == [0, 1]
 
 
-def test_no_echoes_are_no_trouble():
+def test_empty_echoes_are_accepted():
     empty = surfaces([(0, 1, 1, True)]).take(np.empty(0, np.int64))
     assert len(merged(empty, 1.0)) == 0
     assert len(numbered(empty)[0]) == 0

@@ -1,4 +1,4 @@
-"""Each effect of the returns, seen in what a scanner reports."""
+"""Each physical setting in the returns of a scanner."""
 
 from math import erfc
 
@@ -33,8 +33,8 @@ def seen(name, scene, settings, *, frame=0, seed=1, **options):
     )
 
 
-def test_link_ends_where_the_root_of_reflectance_says():
-    """VLP-16: 10 % at 50 m; a brick wall of 40 % is seen to 100 m * sqrt(cos), grazing parts not."""
+def test_the_detection_range_follows_the_root_of_reflectance():
+    """VLP-16: 10 % at 50 m; a brick wall of 40 % returns up to 100 m * sqrt(cos)."""
     cloud = seen("vlp16", wall(40.0, material="brick"), ScannerSettings(link=True))
     rho = materials()["brick"].reflectance[0]
     longest = 50 * np.sqrt(rho * np.cos(cloud.incidence) / 0.1)
@@ -46,7 +46,7 @@ def test_link_ends_where_the_root_of_reflectance_says():
 
 
 def test_detection_follows_the_data_sheet_in_a_scan():
-    """The OS0's 80 % target, seen half the time at 50 m and 90 % at 45 m; here as brick."""
+    """The OS0's 80 % target: detected with probability 0.5 at 50 m and 0.9 at 45 m; here as brick."""
     sensor = load_sensor("os0_128")
     reflectance = np.interp(865, (905, 1064, 1550), materials()["brick"].reflectance)
     for share, at in ((0.5, 1.0), (0.9, 0.9)):
@@ -87,7 +87,7 @@ def test_noise_of_dim_targets_is_larger():
         assert np.std(cloud.range - cloud.true_range) == pytest.approx(expected, rel=0.1)
 
 
-def test_bias_belongs_to_the_laser_and_stays():
+def test_bias_is_constant_for_each_laser():
     first, later = (seen("vlp16", wall(), ScannerSettings(bias=True), frame=k) for k in (0, 4))
     errors = []
     for cloud in (first, later):
@@ -105,7 +105,7 @@ def test_quantisation_gives_whole_steps_and_codes():
     assert (cloud.intensity == np.round(cloud.intensity)).all()
 
 
-def test_angle_noise_is_not_seen_in_the_angles_but_in_the_ranges():
+def test_angle_noise_changes_ranges_but_not_reported_angles():
     scene = wall(20.0, tilt=np.radians(60))
     plain, noisy = (
         scan(
@@ -142,7 +142,7 @@ def test_false_alarms_come_at_the_computed_rate():
     assert not cloud.true_range.any()
 
 
-def test_interference_grows_with_the_number_of_others():
+def test_interference_grows_with_the_number_of_other_scanners():
     nothing = world(box((500, 500, 500), (501, 501, 501)))
     few, many = (len(seen("vlp16", nothing, ScannerSettings(interference=m))) for m in (100, 1000))
     pulses = len(firings(load_sensor("vlp16"), 0))
@@ -189,11 +189,11 @@ def test_a_footprint_on_a_flat_wall_changes_little():
     assert np.array_equal(clouds[0].time_ns[near[0]], clouds[1].time_ns[near[1]])
     assert not off[0].any()
     assert np.median(np.abs(off[1])) < 0.001
-    assert 0.001 < np.abs(off[1]).max() < 0.2  # where the wall is met at 75 degrees
+    assert 0.001 < np.abs(off[1]).max() < 0.2  # at an incidence of 75 degrees
     assert code[0] == pytest.approx(code[1], abs=0.5)
 
 
-def test_glass_lets_through_and_mirrors():
+def test_glass_transmits_and_reflects():
     """A pane at 5 m, a wall behind it at 15 m and one behind the sensor at -10 m, which appears at 20 m."""
     scene = world(
         plate(5.0, half=2.0, feature=1, material="glass"),
@@ -208,7 +208,7 @@ def test_glass_lets_through_and_mirrors():
         assert (feature == number).any()
     ghosts = cloud.klass == Class.NOISE
     assert (cloud.feature[ghosts] == 3).all()
-    # Two ways through the pane: the wall behind keeps (1 - R)^2 of its code, the ghost R^2.
+    # Two passes through the pane: the wall behind keeps (1 - R)^2 of its code, the ghost R^2.
     rho = materials()["plaster"].reflectance[0] * 100
     middle = np.abs(np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])) < np.radians(0.2)
     share = pane_reflection(1.0)
@@ -235,7 +235,7 @@ def test_water_mirrors_the_far_bank_and_glints_below():
     ghosts = cloud.klass == Class.NOISE
     assert ghosts.any()
     assert (cloud.xyz[ghosts, 2] + 2 < 0).all()  # the bank's image lies below the water
-    assert not (cloud.klass == Class.WATER).any()  # at 15 degrees and less nothing comes straight back
+    assert not (cloud.klass == Class.WATER).any()  # seen at 15 degrees or less
     down = Mount((0.0, 0.0, 30.0), (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)))
     below = scan(
         load_sensor("mid40"),
@@ -263,7 +263,7 @@ def test_a_retro_reflector_saturates_and_blooms():
     assert np.degrees(beside).max() < 0.31
 
 
-def test_spread_belongs_to_the_object():
+def test_reflectance_spread_is_constant_for_each_object():
     scene = world(*(box((10, y, -5), (10.1, y + 1, 5), feature=y + 20) for y in range(-20, 20)))
     cloud = seen("vlp16", scene, ScannerSettings(spread=0.2))
     plain = seen("vlp16", scene, ScannerSettings())
@@ -273,7 +273,7 @@ def test_spread_belongs_to_the_object():
     assert np.std(np.log([r[0] for r in each])) == pytest.approx(0.2, rel=0.4)
 
 
-def test_fog_dims_far_things_more():
+def test_fog_attenuates_distant_surfaces_more():
     clear, foggy = (seen("vlp16", wall(40.0), ScannerSettings(link=True, extinction=a)) for a in (0.0, 0.02))
     assert len(foggy) < len(clear)
     assert foggy.range.max() < clear.range.max()

@@ -1,4 +1,4 @@
-"""Flights and walks: strips cover the area, wings lean into bends, walkers sway."""
+"""Flights and walks: strips cover the area, aircraft bank into turns, walkers sway."""
 
 import numpy as np
 import pytest
@@ -76,7 +76,7 @@ def test_a_drone_climbs_level_and_tips_forward_to_speed_up():
     assert high.position[-1, 2] == pytest.approx(25.0, abs=0.2)
 
 
-def test_a_walker_sways_and_rises_with_every_step():
+def test_a_backpack_sways_and_rises_with_every_step():
     walker = load_vehicle("backpack")
     trajectory = drive_path(plan_path(free_route([[0.0, 0, 0], [60.0, 0, 0]]), walker, frame=FRAME), walker)
     middle = slice(1000, 3000)
@@ -91,7 +91,7 @@ def test_a_walker_sways_and_rises_with_every_step():
     )
 
 
-def test_every_vehicle_is_whole_and_a_bad_one_is_refused_with_every_fault(tmp_path):
+def test_every_built_in_vehicle_loads_and_an_error_lists_every_fault(tmp_path):
     for name in vehicle_names():
         assert load_vehicle(name).name == name
         assert len(load_vehicle(name).source) > 20
@@ -108,6 +108,6 @@ def test_every_vehicle_is_whole_and_a_bad_one_is_refused_with_every_fault(tmp_pa
         assert word in str(caught.value)
 
 
-def test_a_survey_of_nothing_is_refused():
+def test_a_survey_of_an_empty_area_is_refused():
     with pytest.raises(RouteError, match="above zero"):
         survey_flight(shapely.box(0, 0, 1, 1), spacing=0.0, height=10.0, radius=5.0)

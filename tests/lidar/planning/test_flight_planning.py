@@ -1,4 +1,4 @@
-"""Flights over scenes, and drives along the poses of earlier ones."""
+"""Flights over scenes, and replays of recorded poses."""
 
 import csv
 import json
@@ -38,7 +38,7 @@ def planned(scene, options, kit):
     )
 
 
-def test_between_the_lines_of_a_survey_scanners_are_off_unless_asked_for(scene, tmp_path):
+def test_scanners_are_off_between_survey_lines_by_default(scene, tmp_path):
     options = DriveOptions(rig="drone", survey="all", altitude=90.0, overlap=0.0, formats=("pcd",))
     kit = load_rig("drone")
     whole = planned(scene, options, kit)
@@ -77,7 +77,7 @@ def test_a_survey_flies_over_every_part_of_its_area(scene):
     assert trajectory.position[0, 2] == pytest.approx(90.0, abs=3.0)  # the scene is level
 
 
-def test_the_swath_is_that_of_the_sensor():
+def test_the_swath_follows_from_the_field_of_view():
     aircraft = load_rig("aircraft")
     # 30 degrees to each side
     assert swath(scanners(aircraft), 600.0) == pytest.approx(2 * 600 * np.tan(np.radians(30)), rel=0.05)
@@ -85,7 +85,7 @@ def test_the_swath_is_that_of_the_sensor():
         swath(scanners(aircraft), 7000.0)
 
 
-def test_more_overlap_is_more_strips_and_files_and_boxes_name_areas(scene, tmp_path):
+def test_more_overlap_gives_more_strips_and_areas_come_from_files_or_boxes(scene, tmp_path):
     wide, narrow = (flight(scene, survey="all", altitude=90.0, overlap=o) for o in (0.0, 0.7))
     assert narrow.duration_ns > 2 * wide.duration_ns
     west, south, east, north = 24.942, 60.166, 24.945, 60.168
@@ -97,7 +97,7 @@ def test_more_overlap_is_more_strips_and_files_and_boxes_name_areas(scene, tmp_p
     assert of_box.area == pytest.approx(166.7 * 222.7, rel=0.01)
 
 
-def test_waypoints_are_flown_over_above_the_ground(scene, tmp_path):
+def test_a_flight_passes_over_its_waypoints_above_the_ground(scene, tmp_path):
     places = [(60.1660, 24.9420), (60.1680, 24.9450), (60.1670, 24.9465)]
     trajectory = flight(scene, route=places, altitude=70.0)
     x, y = scene.frame.from_geographic(*np.array(places)[:, ::-1].T)
@@ -109,7 +109,7 @@ def test_waypoints_are_flown_over_above_the_ground(scene, tmp_path):
     assert flight(scene, route=tmp_path / "way.geojson").position[:, 2] == pytest.approx(95.0, abs=1e-6)
 
 
-def test_a_drone_without_more_words_flies_over_streets_and_sees_them(scene, tmp_path):
+def test_a_drone_flies_over_streets_and_scans_them_by_default(scene, tmp_path):
     summary = drive(scene, tmp_path / "d", options=DriveOptions(rig="drone", duration=1.0, formats=("laz",)))
     assert summary.points["lidar_down"] > 50_000
     las = laspy.read(next((tmp_path / "d" / "lidar_down" / "laz").glob("*5.laz")))
@@ -130,7 +130,7 @@ def test_a_drone_without_more_words_flies_over_streets_and_sees_them(scene, tmp_
         ("drone", {"survey": "all", "altitude": 800.0}, "is 450 m"),
     ],
 )
-def test_flights_that_cannot_be_are_refused_in_one_line(scene, rig, change, says):
+def test_impossible_flights_are_refused_in_one_line(scene, rig, change, says):
     with pytest.raises(InputError, match=says) as error:
         flight(scene, rig, **change)
     assert "\n" not in str(error.value)
@@ -146,7 +146,7 @@ def driven(scene, tmp_path_factory):
     return out
 
 
-def test_a_trajectory_is_driven_again_bit_for_bit(scene, driven, tmp_path):
+def test_a_replayed_trajectory_is_bit_identical(scene, driven, tmp_path):
     options = DriveOptions(rig="vlp16", route=driven / "trajectory.csv", formats=("pcd",), duration=2.0)
     drive(scene, tmp_path / "b", options=options)
     again = read_trajectory(tmp_path / "b" / "trajectory.csv")
@@ -157,7 +157,7 @@ def test_a_trajectory_is_driven_again_bit_for_bit(scene, driven, tmp_path):
         assert (tmp_path / "b" / name).read_bytes() == (driven / name).read_bytes()
 
 
-def test_poses_are_driven_again_to_within_centimetres(scene, driven):
+def test_replayed_poses_agree_within_centimetres(scene, driven):
     again = read_replay(driven / "poses.csv", scene.frame)
     first = read_trajectory(driven / "trajectory.csv")
     span = again.time_ns[again.time_ns < 5_800_000_000]
@@ -166,7 +166,7 @@ def test_poses_are_driven_again_to_within_centimetres(scene, driven):
 
 
 @pytest.mark.parametrize("name", ["trajectory.csv", "poses.csv"])
-def test_a_drive_in_one_frame_is_at_the_same_places_on_earth_in_another(scene, scene_utm, driven, name):
+def test_a_drive_replayed_in_another_frame_keeps_its_geographic_positions(scene, scene_utm, driven, name):
     here, there = read_replay(driven / name, scene.frame), read_replay(driven / name, scene_utm.frame)
     lon, lat = scene.frame.to_geographic(*here.position[::100, :2].T)
     np.testing.assert_allclose(
@@ -179,7 +179,7 @@ def test_a_drive_in_one_frame_is_at_the_same_places_on_earth_in_another(scene, s
     np.testing.assert_allclose(np.column_stack(found), one[:, :2], atol=1e-4)
 
 
-def test_tables_that_are_no_poses_are_refused(scene, tmp_path):
+def test_tables_without_poses_are_refused(scene, tmp_path):
     (tmp_path / "x.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match=r"neither a poses.csv nor a trajectory.csv"):
         read_replay(tmp_path / "x.csv", scene.frame)
@@ -213,7 +213,7 @@ def program(*words, cwd):
         (["--route", "random", "--deskew", "noon"], "start, middle, end"),
     ],
 )
-def test_words_that_cannot_be_are_one_line_and_exit_code_two(scene, tmp_path, words, says):
+def test_invalid_flight_options_end_with_one_line_and_exit_code_2(scene, tmp_path, words, says):
     done = program("drive", scene.path, *words, "-o", "x", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1, done.stderr

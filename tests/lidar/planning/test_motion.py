@@ -1,4 +1,4 @@
-"""Drives have no teleports: speed, acceleration, jerk and curvature are bounded, from rest to rest."""
+"""Drives have bounded speed, acceleration, jerk and curvature, from rest to rest."""
 
 import subprocess
 import sys
@@ -73,7 +73,7 @@ def test_a_drive_through_town_is_gentle(seed, name, duration):
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["car", "van", "robot"]), st.floats(0.5, 40.0))
 @settings(max_examples=12, deadline=None)
-def test_a_drive_that_is_under_way_is_gentle_too(seed, name, duration):
+def test_a_drive_that_starts_at_speed_is_gentle_too(seed, name, duration):
     vehicle = load_vehicle(name)
     route = plan_route(grid(4, 4), FRAME, spec="random", options=RouteOptions(seed=seed, length=600.0))
     path = plan_path(route, vehicle, frame=FRAME)
@@ -84,7 +84,7 @@ def test_a_drive_that_is_under_way_is_gentle_too(seed, name, duration):
     assert motion.time_ns[-1] == pytest.approx(duration * 1e9, abs=5.1e6)
 
 
-def test_what_is_under_way_is_at_the_limit_from_first_to_last():
+def test_a_drive_from_speed_to_speed_stays_at_the_speed_limit():
     path = plan_path(straight(1000.0), CAR, frame=FRAME)
     trajectory = drive_path(path, CAR, duration=30.0, under_way=True)
     speed = np.linalg.norm(trajectory.velocity, axis=1)
@@ -95,7 +95,7 @@ def test_what_is_under_way_is_at_the_limit_from_first_to_last():
     assert whole.position[-1, 0] == pytest.approx(1000.0, abs=1e-3)
 
 
-def test_before_a_bend_what_is_under_way_starts_slowly_enough_for_it():
+def test_a_drive_that_starts_at_speed_before_a_bend_is_slow_enough_for_it():
     corner = free_route([[0.0, 0, 0], [12.0, 0, 0], [12.0, 100.0, 0]], limit=13.9)
     trajectory = drive_path(plan_path(corner, CAR, frame=FRAME), CAR, under_way=True)
     assert 2.0 < np.linalg.norm(trajectory.velocity[0]) < 8.0
@@ -110,7 +110,7 @@ def test_before_a_bend_what_is_under_way_starts_slowly_enough_for_it():
     st.floats(-0.12, 0.12),
 )
 @settings(max_examples=30, deadline=None)
-def test_whatever_the_limits_the_speed_keeps_to_them(stretches, grade):
+def test_speed_stays_within_any_limits(stretches, grade):
     ends = np.cumsum([0.0, *(length for length, _ in stretches)])
     line = np.column_stack([ends, np.zeros(len(ends)), grade * ends])
     route = free_route(line)
@@ -142,7 +142,7 @@ def test_on_an_open_road_the_limit_is_reached_and_held():
     assert held > 0.75
 
 
-def test_the_steepest_curve_is_taken_slowly_and_the_body_leans_out_of_it():
+def test_the_tightest_bend_is_driven_slowly_and_the_body_leans_outwards():
     corner = free_route([[0.0, 0, 0], [100.0, 0, 0], [100.0, 100.0, 0]], limit=13.9)
     path = plan_path(corner, CAR, frame=FRAME)
     trajectory = drive_path(path, CAR)
@@ -169,7 +169,7 @@ def test_braking_dips_the_nose_and_a_hill_lifts_it():
     assert steady.sum() > 100
 
 
-def test_at_a_dead_end_it_stops_five_times_and_drives_backwards_once():
+def test_a_turn_at_a_dead_end_has_five_stops_and_one_reverse_leg():
     graph = road_graph([(0, 0), (60, 0)], [(0, 1)])
     path = plan_path(lane_route(graph, [0, 1], ends=(0.0, 60.0)), CAR, frame=FRAME)
     trajectory = drive_path(path, CAR)
@@ -182,7 +182,7 @@ def test_at_a_dead_end_it_stops_five_times_and_drives_backwards_once():
     assert len(stops) == 5
 
 
-def test_a_recording_of_given_length_ends_at_rest_and_is_no_slower_than_it_must_be():
+def test_a_drive_of_given_duration_ends_at_rest_and_slows_only_to_stop():
     path = plan_path(straight(2000.0), CAR, frame=FRAME)
     trajectory = drive_path(path, CAR, duration=30.0)
     assert trajectory.duration_ns == 30_000_000_000
@@ -193,7 +193,7 @@ def test_a_recording_of_given_length_ends_at_rest_and_is_no_slower_than_it_must_
 
 
 @pytest.mark.parametrize("rate", [7.0, 10.0, 100.0, 250.0])
-def test_poses_come_at_the_rate_and_on_the_same_way(rate):
+def test_poses_have_the_given_rate_and_lie_on_the_same_line(rate):
     path = plan_path(straight(150.0), CAR, frame=FRAME)
     one, fine = drive_path(path, CAR, rate_hz=rate), drive_path(path, CAR, rate_hz=100.0)
     np.testing.assert_allclose(np.diff(one.time_ns), 1e9 / rate, atol=1.0)
@@ -218,7 +218,7 @@ def test_bad_options_are_refused():
             drive_path(path, CAR, **options)
 
 
-def test_a_crest_is_taken_without_taking_off():
+def test_over_a_crest_the_wheels_stay_on_the_ground():
     x = np.arange(0.0, 401.0, 4.0)
     hill = free_route(
         np.column_stack([x, np.zeros(len(x)), 20.0 * np.exp(-(((x - 200.0) / 25.0) ** 2))]), limit=25.0
@@ -232,7 +232,7 @@ def test_a_crest_is_taken_without_taking_off():
 
 
 def test_planning_a_drive_loads_no_splines_and_no_spatial_searches():
-    """They take a second to load, which is longer than planning takes."""
+    """These modules take a second to import, longer than planning takes."""
     code = "import sys, lidar.planning.motion, lidar.planning.replay, lidar.pipeline; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert not {"scipy.interpolate", "scipy.spatial", "scipy.optimize"} & set(loaded.split())

@@ -1,4 +1,4 @@
-"""Paths can be driven, keep to the street and touch nothing."""
+"""Paths are drivable, stay on the street and avoid obstacles."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def outlines(path, vehicle=CAR):
 
 
 def afloat(path, ground):
-    """Metres (4, n) by which each wheel of the car stands above the ground, as its attitude has it."""
+    """Height (4, n) of each wheel of the car above the ground, metres, from its attitude."""
     turn = matrix_from_quat(quat_from_euler(path.bank, -path.pitch, gamma=path.heading))
     out = []
     for ahead in (0.0, CAR.wheelbase):
@@ -38,7 +38,7 @@ def afloat(path, ground):
 
 
 def assert_drivable(path, vehicle, scale=1.0):
-    """Curvature as the wheel can turn it, position along the heading, no jumps."""
+    """Assert bounded curvature and steering rate, motion along the heading and no jumps."""
     assert np.abs(path.curvature).max() <= 1.0 / vehicle.turning_radius + 1e-9
     for leg in np.unique(path.leg):
         p = path.take(path.leg == leg)
@@ -60,7 +60,7 @@ def assert_drivable(path, vehicle, scale=1.0):
 
 @st.composite
 def crooked_lines(draw):
-    """Lines with any kinks up to 140 degrees and stretches of 4 to 80 m."""
+    """Lines with kinks of up to 140 degrees and segments of 4 to 80 m."""
     turns = draw(st.lists(st.floats(-2.4, 2.4), min_size=1, max_size=8))
     steps = draw(st.lists(st.floats(4.0, 80.0), min_size=len(turns) + 1, max_size=len(turns) + 1))
     heading = np.cumsum([0.0, *turns])
@@ -71,7 +71,7 @@ def crooked_lines(draw):
 
 @given(crooked_lines(), st.sampled_from(["car", "van", "robot"]))
 @settings(max_examples=60, deadline=None)
-def test_whatever_line_it_is_given_the_path_can_be_driven_or_is_refused(line, name):
+def test_any_line_gives_a_drivable_path_or_an_error(line, name):
     vehicle = load_vehicle(name)
     try:
         path = plan_path(free_route(line), vehicle, frame=FRAME)
@@ -84,7 +84,7 @@ def test_whatever_line_it_is_given_the_path_can_be_driven_or_is_refused(line, na
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["right", "left"]))
 @settings(max_examples=10, deadline=None)
-def test_in_a_town_of_blocks_the_body_stays_on_the_street_and_in_its_lane(seed, side):
+def test_among_city_blocks_the_body_stays_on_the_street_and_in_its_lane(seed, side):
     graph = grid(4, 4, width=8.0)
     route = plan_route(graph, FRAME, spec="random", options=RouteOptions(seed=seed, length=1500.0, side=side))
     path = plan_path(route, CAR, frame=FRAME)
@@ -134,7 +134,7 @@ def test_buildings_do_not_matter_in_tunnels_and_on_bridges():
     assert shapely.intersects(outlines(path), house).any()
 
 
-def test_where_it_does_not_fit_another_way_is_found():
+def test_a_street_that_the_vehicle_does_not_fit_is_bypassed():
     graph = grid(3, 2)
     across = shapely.box(120, -10, 180, 10)  # a market hall across the southern street
     lat_lon = [FRAME.to_geographic(x, y)[::-1] for x, y in [(50, 0), (200, 50)]]
@@ -177,7 +177,7 @@ def test_on_a_slope_the_vehicle_stands_on_the_ground():
     assert path.length == pytest.approx(200.0 * np.hypot(1, 0.1), rel=1e-3)
 
 
-def test_a_ground_that_is_given_lifts_and_banks_the_vehicle():
+def test_the_ground_sets_height_and_roll_of_the_vehicle():
     line = np.array([[0.0, 0.0, 0.0], [200.0, 0.0, 0.0]])
 
     def ground(x, y, _near=None):
@@ -192,7 +192,7 @@ def test_a_ground_that_is_given_lifts_and_banks_the_vehicle():
 
 
 def test_on_faceted_hairpins_each_wheel_keeps_to_the_ground():
-    """Rows of hillside facets that meet at edges, up to 20 % steep: neither afloat nor dug in."""
+    """A hillside of facets up to 20 % steep: wheels are neither above the ground nor in it."""
     t = np.linspace(0.0, np.pi, 60)
     bend = np.column_stack([60.0 + 9.0 * np.sin(t), 9.0 * (1 - np.cos(t)), 0 * t])
     line = np.concatenate([[[0.0, 0.0, 0.0]], bend, [[0.0, 18.0, 0.0]]])
@@ -220,8 +220,8 @@ def test_on_a_plane_however_steep_all_wheels_stand_on_it(ahead, aside, way):
     assert np.abs(afloat(path, ground)[:, 20:-20]).max() < 1e-3
 
 
-def test_a_street_may_be_as_steep_as_stairs_and_is_no_step():
-    """27 to 33 %, then 52 to 58 %: the wheels keep to its facets as closely on the one as on the other."""
+def test_a_street_as_steep_as_stairs_is_not_treated_as_a_step():
+    """Gradients of 27 to 33 %, then 52 to 58 %: the wheels follow the facets equally closely on both."""
     worst = []
     for base in (0.30, 0.55):
         x = np.arange(0.0, 201.0, 10.0)
@@ -293,7 +293,7 @@ def test_in_a_real_city_the_body_touches_no_building(shared_osm, name):
         assert route.edges.size > 10
 
 
-def test_of_stacked_surfaces_the_one_near_the_road_is_driven_on():
+def test_of_stacked_surfaces_the_vehicle_drives_on_the_one_nearest_to_the_road():
     graph = road_graph(
         [(0, 0), (100, 0), (150, 0), (250, 0)],
         [(0, 1), (1, 2), (2, 3)],
@@ -316,7 +316,7 @@ def test_velocity_along_a_hilly_path_is_its_derivative():
     np.testing.assert_allclose(rise, np.sin(0.5 * (path.slope[1:] + path.slope[:-1])), atol=2e-3)
 
 
-def test_every_row_of_the_path_knows_its_street():
+def test_every_row_of_the_path_has_its_street():
     graph = road_graph(
         [(0, 0), (80, 0), (160, 0), (240, 0)], [(0, 1), (1, 2), (2, 3)], speed=[9.0, 9, 5, 5, 12, 12]
     )

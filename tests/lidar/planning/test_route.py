@@ -1,4 +1,4 @@
-"""Routes keep to the streets, to the law of the road and to their side."""
+"""Routes follow streets, turn restrictions and the driving side."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ def follows(graph, edges):
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 5), st.integers(2, 5))
 @settings(max_examples=25, deadline=None)
-def test_a_random_drive_follows_streets_and_never_turns_round_where_it_need_not(seed, columns, rows):
+def test_a_random_drive_follows_streets_without_needless_turns_back(seed, columns, rows):
     graph = grid(columns, rows)
     edges = random_edges(graph, seed=seed, seconds=300.0)
     assert follows(graph, edges)
@@ -44,13 +44,13 @@ def test_a_random_drive_follows_streets_and_never_turns_round_where_it_need_not(
     assert np.array_equal(edges, random_edges(graph, seed=seed, seconds=300.0))
 
 
-def test_other_seeds_drive_elsewhere():
+def test_other_seeds_give_other_routes():
     graph = grid(5, 5)
     drives = {tuple(random_edges(graph, seed=seed, metres=2000.0).tolist()) for seed in range(10)}
     assert len(drives) == 10
 
 
-def test_a_random_drive_prefers_streets_it_has_not_seen():
+def test_a_random_drive_prefers_new_streets():
     graph = grid(5, 5)
     seen = []
     for seed in range(20):
@@ -104,7 +104,7 @@ def test_the_lane_is_the_outer_one_inside_the_carriageway(width, lanes, twoway, 
     np.testing.assert_allclose(-route.line[:, 1], offset, atol=0.011)
 
 
-def test_waypoints_are_joined_by_the_fastest_way():
+def test_waypoints_are_joined_by_the_fastest_route():
     graph = grid(3, 2)
     south = np.array([line[:, 1].max() == 0 for line in graph.geometry])
     graph = dataclasses.replace(graph, speed=np.where(south, 2.0, graph.speed))
@@ -179,7 +179,7 @@ def test_waypoints_take_no_turn_that_is_forbidden_via_a_way(between):
     assert (passed < 4.0).all()
 
 
-def test_of_many_waypoints_off_the_streets_three_are_named_and_the_rest_counted():
+def test_an_error_names_three_waypoints_off_the_streets_and_counts_the_rest():
     said = r"^waypoint 1 .*; waypoint 2 .*; waypoint 3 .*; and so are 37 more$"
     with pytest.raises(RouteError, match=said):
         plan_route(grid(2, 2), FRAME, spec=[(36.5, -76.0)] * 40)

@@ -1,4 +1,4 @@
-"""A driver who is held up drives as smoothly as one who is not, and never ahead of what he is allowed."""
+"""Speed profiles under a maximum distance at each time: smooth, and never ahead of it."""
 
 import numpy as np
 import pytest
@@ -46,8 +46,8 @@ def jerks(motion):
 
 @settings(max_examples=12, deadline=None)
 @given(stops=st.lists(st.tuples(st.floats(5.0, 280.0), st.floats(3.0, 90.0)), max_size=4))
-def test_whatever_it_is_held_up_by_the_drive_is_gentle_and_stays_behind(stops):
-    """A stop is a place that must not be passed before a time."""
+def test_any_held_up_drive_is_gentle_and_stays_behind_its_bound(stops):
+    """Each stop is a position that must not be passed before a time."""
     time_s = np.arange(0.0, 150.0, 0.1)
     free = motion_along(PATH, CAR)
     reach = np.interp(time_s, free.time_ns * 1e-9, free.s)
@@ -69,15 +69,14 @@ def test_whatever_it_is_held_up_by_the_drive_is_gentle_and_stays_behind(stops):
     assert motion.s[-1] == pytest.approx(PATH.length, abs=0.1)
 
 
-def test_who_is_not_held_up_is_about_as_fast_as_on_an_empty_road():
+def test_without_hold_ups_the_drive_is_about_as_fast_as_on_an_empty_road():
     free = motion_along(PATH, CAR)
     time_s = np.arange(0.0, 120.0, 0.1)
     motion = motion_within(PATH, CAR, time_s=time_s, max_distance=np.where(time_s > 0, PATH.length, 0.0))
     assert motion.time_ns[-1] < 1.05 * free.time_ns[-1]
 
 
-def test_what_is_sampled_is_one_motion():
-    """Speed is the rate of distance, and the poses' velocity that of their positions."""
+def test_speed_and_velocity_are_the_derivatives_of_distance_and_position():
     time_s = np.arange(0.0, 60.0, 0.1)
     motion = motion_within(PATH, CAR, time_s=time_s, max_distance=np.clip(6.0 * (time_s - 2.0), 0.0, 120.0))
     np.testing.assert_allclose(np.gradient(motion.s, 0.01)[2:-2], motion.speed[2:-2], atol=2e-3)
@@ -87,14 +86,14 @@ def test_what_is_sampled_is_one_motion():
     )
 
 
-def test_distances_that_fall_are_refused():
+def test_decreasing_distances_are_refused():
     with pytest.raises(InputError, match="must not decrease"):
         motion_within(PATH, CAR, time_s=np.array([0.0, 1.0, 2.0]), max_distance=np.array([0.0, 5.0, 4.0]))
 
 
 @settings(max_examples=10, deadline=None)
 @given(stops=st.lists(st.tuples(st.floats(30.0, 280.0), st.floats(3.0, 30.0)), max_size=3))
-def test_what_is_under_way_starts_and_ends_at_speed_and_stays_behind_too(stops):
+def test_a_drive_that_starts_at_speed_ends_at_speed_behind_its_bound(stops):
     time_s = np.arange(0.0, 18.0, 0.1)
     free = motion_along(PATH, CAR, under_way=True)
     reach = np.interp(time_s, free.time_ns * 1e-9, free.s - free.s[0])

@@ -1,4 +1,4 @@
-"""Rays: exact wherever the scene lies, no leaks, the same whoever casts them."""
+"""Ray casting: exact far from the origin, no leaks, the same hits with both backends."""
 
 import logging
 import multiprocessing
@@ -21,7 +21,7 @@ BACKENDS = pytest.mark.parametrize("backend", ["embree", "embreex"])
 
 
 def sheet(normal, point, size=1e5):
-    """A square of four triangles through a point, seen from the side the normal points to."""
+    """A square of four triangles through a point, its front on the side of the normal."""
     n = np.asarray(normal) / np.linalg.norm(normal)
     u = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
     u /= np.linalg.norm(u)
@@ -111,7 +111,7 @@ def test_first_hits_are_those_of_a_float64_intersection_of_all_faces(seed, place
     hits = Caster(vertices + place, faces).cast(origins + place, way)
     shift = np.round(place)
     ranges, found = first_hits((vertices + place)[faces] - shift, origins + place - shift, way)
-    # A ray within float32's reach of a triangle's rim may go either way.
+    # A ray within float32 rounding of a triangle's edge may hit or miss.
     agree = hits.face == found
     assert agree.mean() > 0.999
     met = agree & (hits.face >= 0)
@@ -152,7 +152,7 @@ def test_no_ray_from_outside_passes_through_the_near_side_of_a_solid():
     assert (hits.cosine > 0).all()
 
 
-def test_the_number_of_threads_changes_nothing():
+def test_hits_do_not_depend_on_the_number_of_threads():
     rng = np.random.default_rng(5)
     vertices, faces = soup(rng, 3000)
     way = directions(rng, 50_000)
@@ -181,7 +181,7 @@ def test_coherent_packets_and_single_rays_agree():
 
 
 def crowd(rng, backend, steps=None):
-    """A soup with masks and copies of a box, at rest and moving, some hidden from some masks."""
+    """Random triangles with masks, and instances of a box, static and moving, hidden from some masks."""
     vertices, faces = soup(rng, 500)
     box = trimesh.creation.box([2, 3, 4])
     shape = Caster(box.vertices + 1000.0, box.faces, mask=np.arange(12) % 2 + 1, backend=backend)
@@ -222,7 +222,7 @@ def test_plain_embreex_gives_the_same_hits(mask, near, far):
 
 
 @BACKENDS
-def test_each_ray_meets_a_moving_thing_where_it_is_at_the_rays_time(backend):
+def test_each_ray_intersects_a_moving_instance_at_its_own_time(backend):
     wall = Caster(*sheet([-1, 0, 0], np.zeros(3), size=5.0), backend=backend)
     path = np.tile(np.eye(3, 4), (1, 3, 1, 1))
     path[0, :, 0, 3] = [10, 20, 20]
@@ -234,7 +234,7 @@ def test_each_ray_meets_a_moving_thing_where_it_is_at_the_rays_time(backend):
 
 
 @BACKENDS
-def test_a_mirrored_copy_still_faces_outwards(backend):
+def test_a_mirrored_instance_still_faces_outwards(backend):
     box = trimesh.creation.box([2, 2, 2])
     shape = Caster(box.vertices, box.faces, backend=backend)
     mirror = np.array([[[-1.0, 0, 0, 10], [0, 3, 0, 0], [0, 0, 1, 0]]])
@@ -242,7 +242,7 @@ def test_a_mirrored_copy_still_faces_outwards(backend):
         [0, 2.5, 0.3], [[1.0, 0, 0]], normals=True
     )
     np.testing.assert_allclose(hits.range, 9)
-    # The mirror turns every face inside out, and so the cosine says.
+    # The mirrored faces are inside out, and so is the sign of the cosine.
     np.testing.assert_allclose(hits.normal, [[1, 0, 0]], atol=1e-12)
     assert hits.cosine == pytest.approx(-1)
 
@@ -250,7 +250,7 @@ def test_a_mirrored_copy_still_faces_outwards(backend):
 @settings(max_examples=20, deadline=None)
 @given(st.floats(0.9, 1.1), st.integers(0, 2**32 - 1))
 def test_ranges_of_posed_rays_are_true_distances_on_a_stretched_map(k, seed):
-    """A room of known size is drawn on a map with point scale k; a sensor in it measures true metres."""
+    """A sensor in a room of known size on a map of point scale k measures true metres."""
     rng = np.random.default_rng(seed)
     room = trimesh.creation.box([20, 14, 6])
     drawn = room.vertices * [k, k, 1] + [500_000.0, 4e6, 100.0]
@@ -280,7 +280,7 @@ def test_one_posed_ray_starts_at_its_offset():
 
 
 @BACKENDS
-def test_bounds_hold(backend):
+def test_hits_lie_between_near_and_far(backend):
     cast = Caster(*sheet([0, 0, 1], np.zeros(3)), backend=backend)
     down = [[0, 0, -2.0]]
     assert cast.cast([0.3, 0.2, 10], down).range == pytest.approx(5)
@@ -292,7 +292,7 @@ def test_bounds_hold(backend):
 
 
 @BACKENDS
-def test_rays_that_cannot_be_cast_are_refused_by_number(backend):
+def test_invalid_rays_are_refused_with_their_number(backend):
     cast = Caster(*sheet([0, 0, 1], np.zeros(3)), backend=backend)
     good = np.tile([0.0, 0, -1], (30, 1))
     for bad in ([np.nan, 0, 1], [0, 0, 0], [np.inf, 0, 0]):
@@ -312,7 +312,7 @@ def test_rays_that_cannot_be_cast_are_refused_by_number(backend):
         cast.cast([0, 0, 1], good, time=np.full(30, 2.0))
 
 
-def test_meshes_that_cannot_be_cast_at_are_refused():
+def test_invalid_meshes_are_refused():
     with pytest.raises(InputError, match="vertex 1 of 3"):
         Caster([[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     with pytest.raises(InputError, match="face 0 names"):
@@ -323,15 +323,15 @@ def test_meshes_that_cannot_be_cast_at_are_refused():
 
 
 @BACKENDS
-def test_an_empty_mesh_is_missed(backend):
+def test_rays_miss_an_empty_mesh(backend):
     hits = Caster(backend=backend).cast([0, 0, 0], np.eye(3))
     assert np.isinf(hits.range).all()
     assert (hits.face == -1).all()
     assert len(Caster(backend=backend).cast([0, 0, 0], np.empty((0, 3)))) == 0
 
 
-def test_hits_depend_on_the_parts_not_on_their_history():
-    """Parts that come and go leave the same hits as building the final set at once."""
+def test_hits_do_not_depend_on_earlier_updates():
+    """Parts attached and detached step by step give the same hits as the final set at once."""
     rng = np.random.default_rng(11)
     parts = {k: caster.split(*caster.checked(*soup(rng, 50)))[0] for k in range(8)}
     way = directions(rng, 20_000)
@@ -349,7 +349,7 @@ def test_hits_depend_on_the_parts_not_on_their_history():
         assert (a.face >= 0).mean() > 0.05
 
 
-def test_without_the_library_rays_are_cast_by_embreex_and_that_is_said_once(monkeypatch, caplog):
+def test_without_the_library_embreex_casts_the_rays_with_one_warning(monkeypatch, caplog):
     def missing():
         raise BackendError("no Embree 4 library")
 
@@ -368,7 +368,7 @@ def test_without_the_library_rays_are_cast_by_embreex_and_that_is_said_once(monk
         caster._uses_embree.cache_clear()
 
 
-def test_a_wrong_library_is_refused(monkeypatch, tmp_path):
+def test_an_unsuitable_library_is_refused(monkeypatch, tmp_path):
     fake = tmp_path / "libembree4.so"
     fake.write_bytes(b"not a library")
     monkeypatch.setattr(library, "_path", lambda: fake)
@@ -397,7 +397,7 @@ raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-def test_a_lone_copy_is_the_shape_it_says():
+def test_a_single_instance_has_its_own_shape():
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
     shapes = [Caster(corners + np.array([0.0, 0.0, height]), [[0, 1, 2]]) for height in (1.0, 2.0, 3.0)]
     stay = np.eye(3, 4)[None]
@@ -412,7 +412,7 @@ def _cast_in_child(solid, start, way, out):
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
-def test_a_forked_process_casts_with_threads_of_its_own():
+def test_a_forked_process_casts_with_its_own_threads():
     rng = np.random.default_rng(0)
     solid = Caster(*soup(rng, 200))
     way, start = directions(rng, 20_000), np.zeros((20_000, 3))

@@ -1,4 +1,4 @@
-"""Where pixels look and points appear."""
+"""Rays of pixels and pixels of points."""
 
 from dataclasses import replace
 
@@ -113,7 +113,7 @@ def test_projecting_a_pixels_ray_gives_the_pixel(k1, k2, p1, p2, k3):
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), k1=st.floats(-0.4, 0.4), k2=st.floats(-0.1, 0.1))
-def test_a_points_pixel_looks_at_the_point(seed, k1, k2):
+def test_the_ray_of_a_points_pixel_passes_through_the_point(seed, k1, k2):
     camera = replace(PINHOLE, distortion=(k1, k2, 1e-3, -1e-3, 0.0))
     points = np.random.default_rng(seed).uniform([-2, -2, 1], [2, 2, 9], (20, 3))
     pixels, depth = project(camera, points)
@@ -133,7 +133,7 @@ def test_every_pixel_of_a_real_strongly_distorted_camera_has_a_ray():
     assert np.isfinite(pixel_rays(raw)).all()
 
 
-def test_pixels_beyond_a_fold_see_nothing():
+def test_pixels_beyond_the_distortion_limit_have_no_ray():
     camera = replace(PINHOLE, distortion=(-0.8, 0.0, 0.0, 0.0, 0.0))
     # r (1 - 0.8 r^2) is greatest at r = 0.6455, where it is 0.4303: no ray arrives farther out.
     rays = pixel_rays(camera)
@@ -142,7 +142,7 @@ def test_pixels_beyond_a_fold_see_nothing():
     np.testing.assert_array_equal(np.isnan(rays[:, 0]), radius > 0.43033)
 
 
-def test_points_behind_or_beyond_the_fold_are_not_seen():
+def test_points_behind_the_camera_or_beyond_the_distortion_limit_have_no_pixel():
     folded = replace(PINHOLE, distortion=(-0.8, 0.0, 0.0, 0.0, 0.0))
     pixels, depth = project(folded, [[0, 0, -1], [0.9, 0, 1], [0.3, 0, 1]])
     np.testing.assert_array_equal(np.isnan(pixels[:, 0]), [True, True, False])
@@ -158,7 +158,7 @@ def test_an_equidistant_fisheye_maps_angles_to_radii():
 
 @settings(max_examples=60, deadline=None)
 @given(k=st.tuples(*[st.floats(-0.05, 0.05)] * 4))
-def test_fisheye_there_and_back(k):
+def test_fisheye_projection_inverts_its_rays(k):
     camera = replace(FISHEYE, distortion=k)
     rays = pixel_rays(camera)
     seen = np.isfinite(rays[:, 0])
@@ -177,6 +177,6 @@ def test_a_fisheye_sees_nothing_outside_its_circle():
     assert 0 < outside.sum() < outside.size
 
 
-def test_the_shared_rays_cannot_be_spoilt():
+def test_cached_pixel_rays_are_read_only():
     with pytest.raises(ValueError, match="read-only"):
         pixel_rays(PINHOLE)[0] = 0

@@ -22,7 +22,7 @@ def test_all_rigs_load_and_their_sensors_too():
             load_sensor(spec.preset, name=spec.name, rate_hz=spec.rate_hz, return_mode=spec.return_mode)
 
 
-def test_the_seed_rig_is_the_papers():
+def test_the_seed_rig_matches_the_paper():
     rig = load_rig("seed")
     roof, front = rig.lidars
     assert (roof.preset, roof.mount.translation) == ("vlp16", (1.2, 0.0, 1.9))
@@ -63,7 +63,7 @@ def test_nuscenes_points_fall_on_the_published_pixels():
     assert z == pytest.approx(14.2254, abs=1e-4)
 
 
-def test_nuscenes_cameras_look_all_round():
+def test_nuscenes_cameras_cover_all_directions():
     yaw = {}
     for camera in load_rig("nuscenes").cameras:
         axis = camera.mount.rotation[:, 2]
@@ -108,7 +108,7 @@ def test_a_user_adds_a_rig_without_python(tmp_path):
     assert (rig.cameras[0].cx, rig.cameras[0].cy) == (319.5, 239.5)
 
 
-def test_an_inertial_unit_goes_by_its_model(tmp_path):
+def test_the_model_of_an_inertial_unit_sets_its_noise(tmp_path):
     text = RIG + '\n[[imu]]\nname = "unit"\nmodel = "tactical"\ngyro_walk = 0.5\n'
     unit = load_rig(written(tmp_path, text)).imus[-1]
     assert (unit.gyro_noise, unit.gyro_instability, unit.gyro_walk) == (1.75e-5, 2.18e-6, 0.5)
@@ -121,7 +121,7 @@ def test_a_rig_names_a_sensor_file_beside_it(tmp_path):
     assert load_sensor(rig.lidars[1].preset).model == "Own"
 
 
-def test_a_rigs_digest_tells_a_changed_sensor_file_and_a_changed_list_of_directions(tmp_path):
+def test_a_rigs_digest_covers_its_sensor_files_and_lists_of_directions(tmp_path):
     rig = written(tmp_path, RIG.replace('"xt32"', '"own.toml"'))
     own, rows = tmp_path / "own.toml", tmp_path / "rows.csv"
     own.write_text(SENSOR)
@@ -223,7 +223,7 @@ def test_a_mistake_in_a_sensor_is_named_with_file_line_and_key(tmp_path, change,
         assert f"line {line}" in message
 
 
-def test_a_rate_or_mode_that_the_sensor_has_not_is_refused():
+def test_an_unsupported_rate_or_return_mode_is_refused():
     with pytest.raises(RigError, match="30 Hz is not within 5 to 20"):
         load_sensor("vlp16", rate_hz=30)
     with pytest.raises(RigError, match="strongest, last, dual"):
@@ -242,7 +242,7 @@ def test_every_number_of_every_preset_has_a_source():
 
 @settings(max_examples=60, deadline=None)
 @given(st.text(alphabet='abk_=[]"#.\n 019-{}', max_size=120))
-def test_no_file_gets_past_the_loader_with_another_error(tmp_path_factory, text):
+def test_the_loader_raises_only_rig_errors(tmp_path_factory, text):
     path = tmp_path_factory.mktemp("rig") / "rig.toml"
     path.write_text(text)
     with contextlib.suppress(RigError):

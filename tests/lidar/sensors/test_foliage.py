@@ -39,7 +39,7 @@ def along(cloud):
 
 
 @pytest.mark.parametrize("depth", [0.5, 2.0, 5.0])
-def test_the_share_that_passes_falls_as_beer_and_lambert_say(depth):
+def test_transmission_follows_the_beer_lambert_law(depth):
     slab, wall = hedge((10, -40, -40), (10 + depth, 40, 40)), plate(30.0, feature=3)
     cloud = seen(world(slab, wall))
     ahead = along(cloud) > 0.7
@@ -51,7 +51,7 @@ def test_the_share_that_passes_falls_as_beer_and_lambert_say(depth):
     assert passed.mean() == pytest.approx(expected.mean(), abs=4 * spread)
 
 
-def test_leaves_are_met_at_depths_that_fall_off_exponentially_and_face_all_ways():
+def test_hits_in_foliage_have_exponential_depths_and_random_incidence():
     cloud = seen(world(hedge((10, -400, -400), (200, 400, 400))))
     front = along(cloud) > 0.7
     depth = cloud.range[front] - 10 / along(cloud)[front]
@@ -64,7 +64,7 @@ def test_leaves_are_met_at_depths_that_fall_off_exponentially_and_face_all_ways(
     assert (cloud.feature[front] == 7).all()
 
 
-def test_what_lies_behind_keeps_its_exact_range():
+def test_surfaces_behind_foliage_keep_their_exact_range():
     slab, wall = hedge((10, -40, -40), (11, 40, 40)), plate(30.0, feature=3)
     through, bare = seen(world(slab, wall)), seen(world(wall), BARE)
     behind = through.feature == 3
@@ -73,17 +73,17 @@ def test_what_lies_behind_keeps_its_exact_range():
     assert through.range[behind] == pytest.approx(ranges, abs=1e-9)
 
 
-def test_a_ray_that_starts_among_leaves_meets_one_or_comes_out():
+def test_a_ray_that_starts_inside_a_crown_hits_a_leaf_or_leaves_it():
     around = world(hedge((-2, -2, -2), (2, 2, 2)), plate(30.0, feature=3))
     cloud = seen(around, name="vlp16")
     passed = (along(cloud) > 0.9) & (cloud.feature == 3)
-    # The scanner sees nothing within its least range: what passed is counted against what was fired.
+    # Nothing is reported below the minimum range: count passed rays against fired ones.
     fired = along(seen(world(plate(30.0, feature=3)), BARE, name="vlp16"))
     expected = np.exp(-PROJECTION * LEAVES * 2 / fired[fired > 0.9])
     assert passed.sum() / len(expected) == pytest.approx(expected.mean(), abs=0.03)
 
 
-def test_crowns_that_overlap_are_as_dense_as_both():
+def test_densities_of_overlapping_crowns_add_up():
     both = world(
         hedge((10, -40, -40), (12, 40, 40), 7),
         hedge((10.5, -39, -39), (12.5, 39, 39), 8),
@@ -95,7 +95,7 @@ def test_crowns_that_overlap_are_as_dense_as_both():
     assert (cloud.feature[ahead] == 3).mean() == pytest.approx(expected.mean(), abs=0.01)
 
 
-def test_leaves_stay_where_they_are_for_any_number_of_threads_and_change_from_frame_to_frame():
+def test_hits_in_foliage_differ_between_frames_but_not_with_threads():
     scene = world(hedge((10, -40, -40), (12, 40, 40)), plate(30.0, feature=3))
     one, two = seen(scene), seen(scene, threads=2)
     assert np.array_equal(one.range, two.range)
@@ -104,6 +104,6 @@ def test_leaves_stay_where_they_are_for_any_number_of_threads_and_change_from_fr
     assert not np.array_equal(one.range, seen(scene, seed=2).range)
 
 
-def test_hedges_are_walls_unless_asked_for():
+def test_hedges_are_opaque_by_default():
     cloud = seen(world(hedge((10, -40, -40), (12, 40, 40)), plate(30.0, feature=3)), BARE)
     assert (cloud.feature[along(cloud) > 0.9] == 7).all()

@@ -1,4 +1,4 @@
-"""What a scanner reports of a small world."""
+"""Scans of small worlds."""
 
 from dataclasses import fields, replace
 
@@ -50,7 +50,7 @@ def test_points_of_a_moving_turning_vehicle_lie_on_the_surfaces():
         assert off[mine].max() < 2e-5  # float32 metres
 
 
-def test_one_pose_a_frame_smears_the_same_drive():
+def test_one_pose_per_frame_distorts_the_cloud():
     drive = driven((20.0, 0.0, 0.0), start=(-20, -10, 0))
     cloud = scan(load_sensor("vlp16"), ROOF, trajectory=drive, world=ROOM, frame=3, settings=LEVELS["draft"])
     assert not cloud.time_ns.any()
@@ -84,7 +84,7 @@ def test_intensity_is_reflectance_times_cosine():
     expected = 100 * materials()["brick"].reflectance[0] * np.cos(cloud.incidence)
     assert cloud.intensity == pytest.approx(expected, rel=1e-5)
     assert cloud.intensity.max() > 39
-    # Square on, the beam's own direction is the wall's normal.
+    # At normal incidence the beam's direction is the wall's normal.
     x = cloud.xyz - firings(load_sensor("vlp16"), 0).origin[0]
     assert np.cos(cloud.incidence) == pytest.approx(cloud.xyz[:, 0] / np.linalg.norm(x, axis=1), abs=5e-3)
 
@@ -100,13 +100,13 @@ def test_the_range_has_hard_limits():
     assert len(scan(vlp16, Mount(), trajectory=driven(), world=world(plate(100.01)), frame=0)) == 0
 
 
-def test_something_within_the_blind_zone_still_hides_what_is_behind():
+def test_a_surface_within_the_minimum_range_still_occludes():
     blocked = world(box((0.1, -5, -5), (0.2, 5, 5)), plate(10.0, feature=3))
     cloud = scan(load_sensor("vlp16"), Mount(), trajectory=driven(), world=blocked, frame=0)
     assert np.abs(cloud.xyz[cloud.feature == 3, 1]).min(initial=99) > 5
 
 
-def test_a_frame_alone_is_the_frame_of_a_run():
+def test_a_frame_scanned_alone_equals_that_of_a_run():
     sensor = load_sensor("vlp16")
     drive = driven((10.0, 0.0, 0.0), start=(-20, -10, 0))
     run = [
@@ -130,8 +130,8 @@ def test_a_frame_alone_is_the_frame_of_a_run():
     )
 
 
-def test_every_effect_changes_the_returns_and_none_is_on_by_default():
-    """Each setting changes something on its own, in a world where it can."""
+def test_every_setting_changes_the_returns_and_none_is_on_by_default():
+    """Each setting alone changes the returns, in a world that has what it acts on."""
     sensor = load_sensor("vlp16", return_mode="dual")
     scene = world(
         ROOM.mesh,

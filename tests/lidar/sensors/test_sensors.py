@@ -1,4 +1,4 @@
-"""Scanners: when and where they fire."""
+"""Firing times and directions of scanners."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from lidar.sensors.scan import scan
 
 
 def azimuth_deg(direction):
-    """Clockwise from forward, as Velodyne counts."""
+    """Azimuth clockwise from forward, as in Velodyne's data."""
     return np.degrees(np.arctan2(-direction[:, 1], direction[:, 0])) % 360
 
 
@@ -26,13 +26,13 @@ def test_vlp16_turns_by_the_published_step():
     ("elevation", "azimuth", "reach", "point"),
     [(-15, 0, 10, (9.65926, 0, -2.58819)), (15, 90, 20, (0, -19.31852, 5.17638))],
 )
-def test_vlp16_points_lie_where_the_manual_says(elevation, azimuth, reach, point):
+def test_vlp16_points_agree_with_the_manual(elevation, azimuth, reach, point):
     f = firings(load_sensor("vlp16"), 0)
     step = np.radians(0.199066)
     of_it = f.channel == {-15: 0, 15: 15}[elevation]
     near = np.argmin(np.abs(azimuth_deg(f.direction[of_it]) - azimuth))
     found = reach * f.direction[of_it][near]
-    # The grid of azimuths is free, so the nearest firing is within half a step.
+    # Azimuths start anywhere, so the nearest firing is within half a step.
     assert np.abs(found - point).max() < reach * step / 2 + 1e-5
     assert found[2] == pytest.approx(point[2], abs=1e-5)
     assert np.hypot(*found[:2]) == pytest.approx(np.hypot(*point[:2]), abs=1e-5)
@@ -72,7 +72,7 @@ def test_rings_rank_elevations():
         assert elevation[f.ring == ring].max() < elevation[f.ring == ring + 1].min()
 
 
-def test_order_puts_neighbours_together():
+def test_order_sorts_firings_by_direction():
     f = firings(load_sensor("vlp16"), 0)
     assert sorted(f.order) == list(range(len(f)))
     d = f.direction[f.order]
@@ -91,7 +91,7 @@ def test_2d_scanners_sweep_their_sector_counter_clockwise(name, beams, step_deg,
     assert np.diff(angle) == pytest.approx(step_deg)
     assert angle[0] == pytest.approx(-135)
     assert f.time_ns[0] == 2 * period_ns
-    # The blind sector takes its share of the turn.
+    # The blind sector shortens the part of the revolution with returns.
     assert f.time_ns[-1] - f.time_ns[0] == pytest.approx(period_ns * (beams - 1) * step_deg / 360, abs=1)
 
 
@@ -132,7 +132,7 @@ def test_every_preset_fires_unit_vectors_in_time_order_over_its_frame():
     }.items(),
 )
 def test_a_turn_has_the_published_number_of_points(name, points):
-    """The rest of a turn that is no whole block shifts the grid, so that some turns have a block more."""
+    """A revolution is no whole number of blocks, so the azimuths shift and some have a block more."""
     sensor = load_sensor(name)
     sizes = {len(firings(sensor, k)) for k in range(20)}
     lasers = int(firings(sensor, 0).channel.max()) + 1 if sensor.kind == "spinning" else 0
@@ -144,7 +144,7 @@ def test_a_turn_has_the_published_number_of_points(name, points):
     ("column", "row", "reach", "point"),
     [(0, 0, 10.0, (-9.31481, 0.68451, 3.60606)), (256, 63, 25.0, (-1.83412, 24.93229, -0.08592))],
 )
-def test_os1_points_lie_where_the_makers_code_puts_them(column, row, reach, point):
+def test_os1_points_agree_with_the_makers_code(column, row, reach, point):
     sensor = load_sensor("os1_128")
     f = firings(sensor, 4)
     k = np.flatnonzero((f.column == column) & (f.channel == row))[0]
@@ -166,7 +166,7 @@ def test_hdl32e_beams_cross_the_axis_at_the_published_heights():
 
 
 def test_hdl64e_beams_start_beside_the_axis():
-    """By turns 2.6 cm to the left and to the right of it, as seen along the beam."""
+    """Alternately 2.6 cm to the left and to the right of the axis, looking along the beam."""
     f = firings(load_sensor("hdl64e_s3"), 0)
     level = f.direction[:, :2] / np.linalg.norm(f.direction[:, :2], axis=1, keepdims=True)
     left = -level[:, 1] * f.origin[:, 0] + level[:, 0] * f.origin[:, 1]
@@ -182,7 +182,7 @@ def test_lasers_of_a_group_fire_together():
 
 
 @pytest.mark.parametrize(("name", "degrees"), [("mid40", 19.16), ("mid70", 35.19)])
-def test_prisms_reach_the_computed_angle_and_no_farther(name, degrees):
+def test_prisms_deflect_up_to_the_computed_angle(name, degrees):
     sensor = load_sensor(name)
     forward = np.concatenate([firings(sensor, k).direction[:, 0] for k in range(10)])
     assert np.degrees(np.arccos(forward.min())) == pytest.approx(degrees, abs=0.05)
@@ -212,7 +212,7 @@ def test_patterns_that_do_not_repeat_cover_more_with_time(name):
     assert not np.array_equal(firings(sensor, 0).direction, firings(sensor, 1).direction)
 
 
-def test_mid360_keeps_to_its_field_of_view_and_says_that_it_is_approximate():
+def test_mid360_stays_in_its_field_of_view_and_is_marked_approximate():
     sensor = load_sensor("mid360")
     elevation = np.degrees(np.arcsin(firings(sensor, 0).direction[:, 2]))
     assert elevation.min() == pytest.approx(-7, abs=0.1)
@@ -220,7 +220,7 @@ def test_mid360_keeps_to_its_field_of_view_and_says_that_it_is_approximate():
     assert "approximate" in sensor.note
 
 
-def test_a_flash_sees_with_all_pixels_at_one_time():
+def test_all_pixels_of_a_flash_fire_at_one_time():
     f = firings(load_sensor("flash"), 3)
     assert np.ptp(f.time_ns) == 0
     assert len(f) == 128 * 32
@@ -245,7 +245,7 @@ def test_airborne_footprint_and_spacing():
     assert left[nadir + 1] - left[nadir] == pytest.approx(step, rel=0.01)
 
 
-def test_an_oscillating_mirror_goes_to_and_fro_and_a_polygon_only_to():
+def test_an_oscillating_mirror_scans_both_ways_and_a_polygon_one_way():
     swing = np.arcsin(firings(load_sensor("altm3100"), 0).direction[:, 1])
     assert np.degrees(np.abs(swing).max()) == pytest.approx(25, abs=0.05)
     assert np.mean(np.diff(swing) > 0) == pytest.approx(0.5, abs=0.1)
@@ -255,7 +255,7 @@ def test_an_oscillating_mirror_goes_to_and_fro_and_a_polygon_only_to():
     assert np.count_nonzero(np.diff(turn) < 0) == 9  # ten lines in a tenth of a second
 
 
-def test_a_list_of_directions_is_gone_through_again_and_again(tmp_path):
+def test_a_list_of_directions_repeats(tmp_path):
     rows = ["Time/s,Azimuth/deg,Zenith/deg", *(f"{k / 1000},{k * 10},{90 - k}" for k in range(30))]
     (tmp_path / "pattern.csv").write_text("\n".join(rows))
     text = """
@@ -285,8 +285,8 @@ def test_a_list_of_directions_is_gone_through_again_and_again(tmp_path):
     assert elevation == pytest.approx([*range(20, 30), *range(10)])
 
 
-def test_radial_velocity_is_that_of_approach():
-    """At 10 m/s towards a wall returns close in at 10 m/s times the cosine to the way."""
+def test_radial_velocity_is_negative_on_approach():
+    """At 10 m/s towards a wall it is -10 m/s times the cosine of the angle to the direction of travel."""
     sensor, mount, drive = load_sensor("fmcw"), Mount((2.0, 0.0, 0.0)), driven((10.0, 0.0, 0.0))
     cloud = scan(sensor, mount, trajectory=drive, world=world(plate(60.0, feature=5)), frame=0)
     ahead = cloud.xyz[:, 0] / np.linalg.norm(cloud.xyz, axis=1)

@@ -180,7 +180,7 @@ def test_stages_on_clouds_of_kitti_and_nuscenes(plain, tmp_path):
     assert 0 < dimmed.points < dimmed.points_in
 
 
-def test_data_that_stages_cannot_be_applied_to(plain, tmp_path):
+def test_stages_refuse_data_without_clouds_or_matching_sensors(plain, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(DatasetError, match="no velodyne"):
         apply_stages(tmp_path / "empty", tmp_path / "out", options=ApplyOptions(STAGES))

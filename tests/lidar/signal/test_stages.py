@@ -1,4 +1,4 @@
-"""Stages on a frame: what they change, what stays, and the truth about it."""
+"""Stages on a frame: changed returns, unchanged returns and the ground truth of both."""
 
 from dataclasses import dataclass, fields, replace
 
@@ -78,7 +78,7 @@ def assert_same(cloud, other):
 
 @pytest.mark.parametrize("effects", [PLAIN, NOISY])
 @pytest.mark.parametrize("mode", ["strongest", "dual"])
-def test_stages_with_nothing_to_do_leave_the_returns(effects, mode):
+def test_stages_without_an_effect_leave_the_returns_unchanged(effects, mode):
     idle = read_stages(["cover_glass:transmission=1", "dropped_packets:loss=0"], seed=5)
     found = altered_sweep(swept(effects, return_mode=mode), idle)
     expected = plain(effects, return_mode=mode)
@@ -112,7 +112,7 @@ def test_kept_and_removed_returns_are_the_original(loss, burst, columns, seed):
 SWEPT, PLAIN_CLOUD = swept(), plain()
 
 
-def test_lost_packets_have_the_share_and_the_bursts_that_were_asked_for():
+def test_lost_packets_have_the_given_loss_and_burst_length():
     rows = 400_000
     cloud = altered_sweep(SWEPT, Stages()).cloud
     many = replace(

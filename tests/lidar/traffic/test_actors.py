@@ -1,4 +1,4 @@
-"""Road users of a real place: where they are, what sees them, and that they keep apart."""
+"""Road users in a real place: positions, visibility, bounding boxes, no collisions."""
 
 import itertools
 
@@ -49,7 +49,7 @@ def outlines(actors, rows, t):
     )
 
 
-def test_there_are_road_users_of_all_sorts(actors):
+def test_there_are_road_users_of_every_kind(actors):
     moving = set(actors.kind[~actors.parked])
     assert {"cyclist", "adult"} <= moving
     assert moving & {"sedan", "hatchback", "suv"}
@@ -59,7 +59,7 @@ def test_there_are_road_users_of_all_sorts(actors):
     assert not v[np.repeat(actors.parked, np.diff(actors.first))].any()
 
 
-def test_nobody_touches_anybody_nor_the_ego(actors, ego):
+def test_no_road_user_touches_another_or_the_ego(actors, ego):
     for t in range(0, ego.duration_ns, 300_000_000):
         rows = alive(actors, t, end_ns=t)
         boxes = outlines(actors, rows, t)
@@ -74,7 +74,7 @@ def test_nobody_touches_anybody_nor_the_ego(actors, ego):
         assert not shapely.intersects(own, boxes).any()
 
 
-def test_nobody_stands_in_a_building(actors, scene):
+def test_no_road_user_stands_in_a_building(actors, scene):
     layer = scene.features("buildings")
     walls = shapely.STRtree(layer.geometry[np.asarray(layer.columns["min_height"], float) < 2.5])
     for t in (0, 7_000_000_000):
@@ -83,7 +83,7 @@ def test_nobody_stands_in_a_building(actors, scene):
 
 
 def test_vehicles_stand_on_the_ground(actors, scene):
-    """Rays cast up from below the tyres meet the road where the vehicle stands."""
+    """Rays cast up from below the tyres hit the road under the vehicle."""
     world = World.load(scene)
     rows = alive(actors, 0, end_ns=0)
     at = states(actors, rows, time_ns=0)
@@ -93,7 +93,7 @@ def test_vehicles_stand_on_the_ground(actors, scene):
     assert np.abs(off).max() < 0.15
 
 
-def test_features_follow_the_scenes_own(actors, scene):
+def test_feature_numbers_follow_those_of_the_scene(actors, scene):
     beyond = max(stop for _, stop in scene.layers.values())
     np.testing.assert_array_equal(actors.feature, beyond + np.arange(len(actors)))
 
@@ -106,7 +106,7 @@ def test_the_same_seed_gives_the_same_actors_and_another_seed_others(actors, sce
     assert other.position.tobytes() != actors.position.tobytes()
 
 
-def test_an_empty_place_has_nobody(scene, ego):
+def test_an_empty_scene_has_no_road_users(scene, ego):
     none = TrafficOptions(vehicles=0.0, cyclists=0.0, pedestrians=0.0, parked=0.0)
     actors = populate(scene, scene.road_graph(), ego=ego, vehicle=CAR, seed=1, options=none)
     assert len(actors) == 0
@@ -120,7 +120,7 @@ def test_an_empty_place_has_nobody(scene, ego):
 
 @settings(max_examples=20, deadline=None)
 @given(t=st.integers(100_000_000, 14_000_000_000), dt=st.integers(1_000_000, 50_000_000))
-def test_positions_change_as_velocities_say(actors, t, dt):
+def test_velocities_are_the_derivatives_of_positions(actors, t, dt):
     rows = alive(actors, t, end_ns=t + dt)
     born = actors.time_ns[actors.first[rows]] <= t
     lasts = actors.time_ns[actors.first[rows + 1] - 1] >= t + dt
@@ -132,14 +132,14 @@ def test_positions_change_as_velocities_say(actors, t, dt):
     np.testing.assert_allclose(moved, mean * (times[-1] - times[0]) * 1e-9, atol=2e-3)
 
 
-def test_transforms_put_bodies_where_states_say(actors):
+def test_transforms_agree_with_the_states(actors):
     start, end = 2_000_000_000, 2_100_000_000
     shape, transform, feature = actor_transforms(actors, start, end_ns=end, moments=3)
     rows = feature - actors.feature[0]
     for k, t in enumerate((start, (start + end) // 2, end)):
         at = states(actors, rows, time_ns=t)
         np.testing.assert_allclose(transform[:, k, :, 3], at.position)
-        # the body's nose points the way it is turned
+        # the body's front points along its yaw
         nose = transform[:, k, :, 0] / np.linalg.norm(transform[:, k, :, 0], axis=1, keepdims=True)
         np.testing.assert_allclose(nose, rotations(at.angles)[:, :, 0], atol=1e-12)
     assert (shape < len(actor_shapes(actors))).all()
@@ -152,7 +152,7 @@ def test_transforms_put_bodies_where_states_say(actors):
     assert set(feature[x > region[0]]) <= set(some)
 
 
-def test_walkers_change_pose_as_they_go(actors):
+def test_pedestrians_change_pose_as_they_walk(actors):
     t = np.arange(0, 3_000_000_000, 100_000_000)
     seen = {}
     for k in t:
@@ -214,7 +214,7 @@ def test_boxes_are_the_same_in_the_scene_and_about_the_ego(actors, ego):
     np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0)
 
 
-def test_an_image_shows_what_is_in_the_way(actors, scene, ego):
+def test_image_boxes_give_the_visible_share(actors, scene, ego):
     """A parked car alone before the camera is all visible; behind another body it is partly so."""
     k = int(np.flatnonzero(actors.parked & (actors.klass == Class.CAR))[0])
     at = states(actors, [k], time_ns=0)
@@ -232,7 +232,7 @@ def test_an_image_shows_what_is_in_the_way(actors, scene, ego):
     for blocked in (False, True):
         shape, transform, feature = actor_transforms(actors, 0, end_ns=1000, moments=2)
         mine = feature == actors.feature[k]
-        # a small body of the same sort, half in the way or far above
+        # a small body of the same kind, half in front of the car or far above it
         board = transform[mine].copy()
         board[:, :, :, :3] *= 0.1
         board[:, :, :, 3] = eye + 1.0 * ahead - np.array([0.0, 0.0, 0.25]) + 0.15 * left
@@ -259,6 +259,6 @@ def test_an_image_shows_what_is_in_the_way(actors, scene, ego):
     "change",
     [{"vehicles": -1.0}, {"parked": 1.2}, {"radius": 5.0}, {"side": "middle"}, {"pedestrians": float("nan")}],
 )
-def test_densities_that_cannot_be_meant_are_refused(change):
+def test_invalid_densities_are_refused(change):
     with pytest.raises(InputError, match=next(iter(change))):
         TrafficOptions(**change)

@@ -1,4 +1,4 @@
-"""The ego is one of the traffic: it stops at red and at stop signs, keeps its distance, and is gentle."""
+"""The ego vehicle in traffic: signals, stop signs, gaps and smooth motion."""
 
 from dataclasses import replace
 
@@ -71,13 +71,13 @@ def test_the_ego_enters_no_junction_on_red(seed, under_way):
     assert len(entries) >= 2
     for k in entries[times[entries] > 5.0]:
         group = signal_group(plan, int(zone[k]), heading=float(heading[k]))
-        ago = np.arange(0.0, AMBER, 0.5)  # let in while it was green, or a little late by smoothness
+        ago = np.arange(0.0, AMBER, 0.5)  # entered on green, or slightly later (smoothing)
         assert any(is_green(int(zone[k]), group, float(times[k] - a), plan.signals) for a in ago)
     check_gentle(ego)
-    assert (speed_of(ego)[500:-500] < 0.05).any()  # it did have to wait
+    assert (speed_of(ego)[500:-500] < 0.05).any()  # it had to wait
 
 
-def test_at_stop_signs_the_ego_stops_and_goes_on():
+def test_the_ego_stops_at_stop_signs_and_continues():
     graph = city(lit=False)
     edges = np.arange(len(graph), dtype=np.int32)
     signs = replace(
@@ -102,7 +102,7 @@ def test_at_stop_signs_the_ego_stops_and_goes_on():
     assert speed_of(free)[300:-500].min() > 1.0  # without signs it does not stop
 
 
-def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
+def test_the_ego_keeps_its_distance_from_a_slow_leader():
     graph = road_graph([(0.0, 0.0), (600.0, 0.0)], [(0, 1)], twoway=False, width=4.0)
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 700.0, 30.0))
     path = path_on(graph, 1, 60.0)
@@ -120,7 +120,7 @@ def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
     )
     ego = poses_along(path, CAR, motion=motion)
     flow = simulate_trips(slow, graph, plan=plan, ego=ego, ego_box=BOX, radius=600.0, obeys_signals=True)
-    assert len(np.unique(flow.trip)) == len(slow)  # nobody had to be taken out of its way
+    assert len(np.unique(flow.trip)) == len(slow)  # no road user was removed
     check_gentle(ego)
     ahead = min((k for k in range(len(slow))), key=lambda k: slow[k].begin)
     rows = flow.trip == ahead
@@ -133,7 +133,7 @@ def test_the_ego_keeps_its_distance_from_who_goes_slowly_ahead():
 
 
 @pytest.mark.parametrize(("seed", "lit"), [(1, True), (2, False), (3, True)])
-def test_among_traffic_the_ego_touches_nobody_and_nobody_is_taken_out_for_it(seed, lit):
+def test_in_traffic_the_ego_touches_no_road_user_and_none_is_removed(seed, lit):
     graph = city(lit=lit)
     lanes = lanes_of(graph, bounds=BOUNDS)
     plan = junction_plan(graph, lanes, seed=seed)
@@ -155,5 +155,5 @@ def test_among_traffic_the_ego_touches_nobody_and_nobody_is_taken_out_for_it(see
     for mine, moment in zip(own[::2], poses[::2], strict=True):
         if np.isfinite(moment).any():
             assert not shapely.intersects(mine, boxes_at(trips, moment)).any()
-    assert travelled[-1] > 80.0  # it gets on
+    assert travelled[-1] > 80.0  # it makes progress
     assert STEP < travelled[-1] <= path.length + STEP

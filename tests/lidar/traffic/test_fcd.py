@@ -1,4 +1,4 @@
-"""Traffic of SUMO goes where SUMO says, on our ground, and broken files are told in one line."""
+"""Replays of SUMO's floating car data: positions, bodies, and one-line errors for broken files."""
 
 import gzip
 
@@ -91,7 +91,7 @@ def fcd_at(path, scene, steps, *, head="", geo=False):
 
 
 def along(line, metres, *, name="a", kind="car", every=1.0, start=0.0):
-    """Steps of one who is ``metres`` (n,) along a line at ``start`` and every so many seconds after."""
+    """Steps of a road user at ``metres`` (n,) along a line, from ``start`` at equal intervals."""
     rows = np.arange(len(line))
     heading = np.unwrap(heading_of(line))
     x, y, h = (np.interp(metres, rows, c) for c in (*line.T, heading))
@@ -116,7 +116,7 @@ def fronts(actors, k, t):
 
 
 @pytest.mark.parametrize("form", ["net", "named", "geo", "packed"])
-def test_the_front_bumper_is_where_sumo_has_it(form, scene, graph, street, tmp_path):
+def test_the_front_bumper_has_sumos_position(form, scene, graph, street, tmp_path):
     metres = 20.0 + 7.0 * np.arange(8)
     steps = along(street, metres, start=100.0)
     head, net = "", None
@@ -136,9 +136,7 @@ def test_the_front_bumper_is_where_sumo_has_it(form, scene, graph, street, tmp_p
     assert np.hypot(*at.velocity[1:-1, :2].T) == pytest.approx(np.full(6, 7.0), rel=0.05)
 
 
-def test_who_is_in_the_file_from_when_to_when_is_there_then_and_begin_moves_it(
-    scene, graph, street, tmp_path
-):
+def test_road_users_exist_for_their_time_in_the_file_shifted_by_begin(scene, graph, street, tmp_path):
     net = net_at(tmp_path / "n.net.xml")
     steps = together(
         along(street, 10.0 + 5.0 * np.arange(6), name="early", start=50.0),
@@ -156,7 +154,7 @@ def test_who_is_in_the_file_from_when_to_when_is_there_then_and_begin_moves_it(
     assert [there(t, begin=54.0) for t in (0.5, 1.5, 2.5, 4.9, 5.2)] == [1, 0, 1, 1, 0]
 
 
-def test_who_brakes_to_a_stop_neither_overshoots_nor_goes_back(scene, graph, street, tmp_path):
+def test_a_vehicle_that_brakes_to_a_stop_neither_overshoots_nor_reverses(scene, graph, street, tmp_path):
     metres = np.array([5.0, 17.0, 27.0, 33.0, 33.0, 33.0, 34.0, 40.0])
     path = fcd_at(tmp_path / "fcd.xml", scene, along(street, metres))
     actors = played(scene, graph, path, standing(street[0] + 60.0), net=net_at(tmp_path / "n.net.xml"))
@@ -168,7 +166,7 @@ def test_who_brakes_to_a_stop_neither_overshoots_nor_goes_back(scene, graph, str
     np.testing.assert_allclose(travelled[resting], 33.0, atol=0.02)
 
 
-def test_classes_become_bodies_and_what_runs_on_rails_is_left_out(scene, graph, street, tmp_path):
+def test_vehicle_classes_select_bodies_and_rail_vehicles_are_left_out(scene, graph, street, tmp_path):
     kinds = {
         "DEFAULT_VEHTYPE": {"sedan", "hatchback", "suv"},
         "bus_bus": {"bus"},
@@ -196,7 +194,7 @@ def test_classes_become_bodies_and_what_runs_on_rails_is_left_out(scene, graph, 
             assert first in bodies
 
 
-def test_a_change_of_lane_at_one_go_takes_three_seconds(scene, graph, street, tmp_path):
+def test_an_instant_lane_change_is_spread_over_three_seconds(scene, graph, street, tmp_path):
     steps = along(street, 10.0 + 0.8 * np.arange(80), every=0.1)
     heading = heading_of(street)[20]
     left = 3.0 * np.array([-np.sin(heading), np.cos(heading)])
@@ -221,7 +219,7 @@ def test_a_change_of_lane_at_one_go_takes_three_seconds(scene, graph, street, tm
     assert np.abs(at.velocity[:, :2] @ left / 3.0).max() < 2.5
 
 
-def test_who_is_put_elsewhere_is_another_from_then_on(scene, graph, street, tmp_path):
+def test_a_teleported_vehicle_becomes_another_road_user(scene, graph, street, tmp_path):
     metres = np.array([5.0, 12.0, 19.0, 80.0, 87.0, 94.0]).clip(max=len(street) - 3)
     path = fcd_at(tmp_path / "fcd.xml", scene, along(street, metres))
     actors = played(scene, graph, path, standing(street[0] + 60.0), net=net_at(tmp_path / "n.net.xml"))
@@ -229,7 +227,7 @@ def test_who_is_put_elsewhere_is_another_from_then_on(scene, graph, street, tmp_
     assert np.hypot(*actors.velocity[:, :2].T).max() < 15.0
 
 
-def test_whom_the_ego_would_touch_is_left_out_and_parked_cars_keep_clear(scene, graph, street, tmp_path):
+def test_road_users_that_would_touch_the_ego_are_removed(scene, graph, street, tmp_path):
     net = net_at(tmp_path / "n.net.xml")
     path = fcd_at(
         tmp_path / "fcd.xml",
@@ -267,7 +265,7 @@ def test_the_same_file_and_seed_give_the_same_bytes(scene, graph, street, tmp_pa
     angle=st.floats(0.0, 359.9),
     shift=st.tuples(st.floats(-1e6, 1e6), st.floats(-1e7, 1e7)),
 )
-def test_coordinates_come_back_through_the_networks_projection(tmp_path_factory, lon, lat, angle, shift):
+def test_the_networks_projection_inverts_its_coordinates(tmp_path_factory, lon, lat, angle, shift):
     folder = tmp_path_factory.mktemp("net")
     net = net_at(folder / "n.net.xml", offset=shift)
     shift = [float(f"{v:.2f}") for v in shift]
@@ -306,7 +304,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("fault", BROKEN)
-def test_files_that_cannot_be_used_are_told_in_one_line(fault, tmp_path):
+def test_unusable_files_are_refused_in_one_line(fault, tmp_path):
     text, said = BROKEN[fault]
     path = tmp_path / "fcd.xml"
     if text is not None:
@@ -327,7 +325,7 @@ def test_files_that_cannot_be_used_are_told_in_one_line(fault, tmp_path):
         ('<net><location netOffset="0,0" projParameter="+proj=nothing"/></net>', "projParameter"),
     ],
 )
-def test_networks_that_lie_nowhere_are_told(text, said, tmp_path):
+def test_networks_without_a_usable_projection_are_refused(text, said, tmp_path):
     path, net = tmp_path / "fcd.xml", tmp_path / "n.net.xml"
     path.write_text(
         '<fcd-export><timestep time="3"><vehicle id="a" x="1" y="1" angle="0"/></timestep></fcd-export>'
@@ -338,7 +336,7 @@ def test_networks_that_lie_nowhere_are_told(text, said, tmp_path):
     assert "\n" not in str(error.value)
 
 
-def test_traffic_of_another_place_is_told(scene, graph, street, tmp_path):
+def test_traffic_of_another_place_is_refused(scene, graph, street, tmp_path):
     net = net_at(tmp_path / "n.net.xml", offset=(OFFSET[0] - 9000.0, OFFSET[1]))
     path = fcd_at(tmp_path / "fcd.xml", scene, along(street, 20.0 + np.arange(6.0)))
     with pytest.raises(InputError, match="this place"):
@@ -356,7 +354,7 @@ def test_traffic_of_another_place_is_told(scene, graph, street, tmp_path):
         ("none.xml,parked=2", "parked = 2.0"),
     ],
 )
-def test_the_program_tells_what_it_cannot_play(words, said, scene, tmp_path, capsys):
+def test_the_command_line_refuses_invalid_traffic(words, said, scene, tmp_path, capsys):
     out = tmp_path / "drive"
     with pytest.raises((InputError, CoercionError), match=said):
         app(

@@ -1,4 +1,4 @@
-"""SUMO's traffic around an ego vehicle that is one of SUMO's vehicles."""
+"""Traffic simulated by SUMO, with the ego vehicle as one of its vehicles."""
 
 import tempfile
 

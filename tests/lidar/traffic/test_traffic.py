@@ -1,4 +1,4 @@
-"""Traffic keeps its distance, its lane and the lights, and out of the way of the ego vehicle."""
+"""Built-in simulation: gaps, lanes, signals and the ego vehicle."""
 
 import itertools
 from dataclasses import replace
@@ -67,7 +67,7 @@ def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
     drives = [drive(bound, seed) for seed in range(20)]
     for driven in drives:
         assert chains.isdisjoint(zip(driven, driven[1:], driven[2:], strict=False))
-    # Two of them make a trap of a corner, where a drive ends; the others go on.
+    # Two restrictions make a corner a dead end, where paths end; the others continue.
     assert np.mean([len(driven) > 15 for driven in drives]) > 0.9
 
 
@@ -78,7 +78,7 @@ def overlaps(boxes):
 
 @settings(max_examples=4, deadline=None)
 @given(seed=st.integers(0, 10_000), lit=st.booleans(), lanes=st.sampled_from([1.0, 2.0]))
-def test_no_two_vehicles_ever_touch_and_none_jumps(seed, lit, lanes):
+def test_vehicles_do_not_collide_or_jump(seed, lit, lanes):
     graph = city(lit=lit, lanes=lanes, width=7.0 * lanes)
     trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 65.0), seed=seed, density=12.0, radius=600.0)
     assert len(np.unique(flow.trip)) > 15
@@ -90,8 +90,8 @@ def test_no_two_vehicles_ever_touch_and_none_jumps(seed, lit, lanes):
     assert np.nanmax(moved) < 13.9 * 1.1 * STEP_S + 0.1
 
 
-def test_not_even_reckless_drivers_touch():
-    """Who keeps no gap and no headway still stops within the ground that is his."""
+def test_reckless_drivers_do_not_collide():
+    """A driver without gap and headway still stops within the cells it has reserved."""
     graph = city(lit=False)
     ego = standing((400.0, 400.0), 45.0)
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
@@ -112,7 +112,7 @@ def test_not_even_reckless_drivers_touch():
     assert flow.speed.max() > 14.0
 
 
-def test_speed_changes_as_a_vehicle_can():
+def test_speed_changes_within_the_limits_of_the_vehicle():
     trips, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=3, radius=600.0)
     for k in np.unique(flow.trip):
         speed = flow.speed[flow.trip == k]
@@ -129,7 +129,7 @@ def test_braking_is_mild_almost_always():
     same = np.diff(flow.trip) == 0
     change = np.diff(flow.speed)[same] / STEP_S
     assert (change < -4.0).mean() < 0.01
-    assert flow.speed.mean() > 2.0  # and yet they get on
+    assert flow.speed.mean() > 2.0  # traffic still flows
 
 
 @settings(max_examples=3, deadline=None)
@@ -186,7 +186,7 @@ def test_the_gap_to_a_leader_grows_with_speed():
     assert np.percentile(space[fast] / v[fast], 2) > 0.9
 
 
-def test_nobody_enters_a_junction_on_red():
+def test_no_road_user_enters_a_junction_on_red():
     graph = city(lit=True)
     trips, flow, plan = flow_on(graph, standing((400.0, 400.0), 70.0), seed=4, radius=600.0)
     poses = tracks(trips, flow)
@@ -201,7 +201,7 @@ def test_nobody_enters_a_junction_on_red():
             z = int(here[i + 1])
             group = signal_group(plan, z, heading=float(trips[k].path.heading[front[i]]))
             t = float(flow.step[rows][i + 1]) * STEP_S
-            # green now or, for who was let in while it was, within amber and clearing
+            # green now, or it entered on green and is within amber and clearing
             lately = [is_green(z, group, t - ago, plan.signals) for ago in np.arange(0.0, AMBER, 0.5)]
             if i > 20:
                 assert any(lately)
@@ -252,7 +252,7 @@ def test_the_same_seed_gives_the_same_traffic():
     assert first.travelled.tobytes() != other.travelled.tobytes()
 
 
-def test_more_density_is_more_traffic():
+def test_higher_density_gives_more_traffic():
     graph = city(lit=False)
     ego = standing((135.0, 135.0), 5.0)
     few, many = (len(flow_on(graph, ego, seed=1, density=d)[0]) for d in (5.0, 20.0))

@@ -1,4 +1,4 @@
-"""Bodies of road users are closed, of their size, and made of what they are made of."""
+"""Bodies of road users are closed solids with the expected sizes and materials."""
 
 import numpy as np
 import pytest
@@ -58,11 +58,11 @@ def test_bodies_stand_on_the_ground_in_the_middle_of_a_box_of_the_usual_size(kin
             assert small <= value <= large, (body.name, size)
 
 
-def test_bodies_are_light_enough_for_hundreds_of_copies():
+def test_bodies_have_few_enough_triangles_for_hundreds_of_instances():
     assert max(len(s.mesh) for s in catalogue().values()) < 1000
 
 
-def test_vehicles_send_light_back_from_their_plates_and_rear_lamps():
+def test_plates_and_rear_lamps_of_vehicles_are_retro_reflective():
     code = materials()["retroreflector"].code
     for kind in ("sedan", "hatchback", "suv", "van", "truck", "bus", "motorcycle", "bicycle"):
         body = next(s for s in catalogue().values() if s.kind == kind)
@@ -84,12 +84,12 @@ def test_beams_at_the_windows_of_a_car_hit_glass_on_either_side():
     assert (body.mesh.material[hits.face] == materials()["glass"].code).all()
 
 
-def test_shares_of_paints_are_shares():
+def test_paint_shares_add_up_to_one():
     assert sum(share for _, share in PAINTS.values()) == pytest.approx(1.0)
 
 
 def test_pedestrians_cycle_through_the_poses_of_a_stride():
-    """The feet of the poses of a stride are apart by up to a step, and change places."""
+    """The feet are up to one step apart and swap places within a stride."""
     poses = [catalogue()[f"adult/navy/{k}"].mesh for k in range(4)]
     feet = [m.vertices[m.vertices[:, 2] < 0.12] for m in poses]
     left = [f[f[:, 1] > 0, 0].mean() for f in feet]

@@ -1,4 +1,4 @@
-"""How much of a road user is seen, from a point and in an image; velocities of what lies on it."""
+"""Visible share of a road user from a point and in an image; velocities of points on it."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ LENGTH, WIDTH, HEIGHT = 4.0, 2.0, 1.5
 
 
 def one_car(place=(20.0, 0.0, 0.0), *, yaw=0.0, velocity=(0.0, 0.0, 0.0), turning=0.0, seconds=2.0):
-    """One box on wheels without wheels, feature 100, that drives straight or turns on the spot."""
+    """One box, feature 100, that drives straight or turns on the spot."""
     mesh = box((-LENGTH / 2, -WIDTH / 2, 0.0), (LENGTH / 2, WIDTH / 2, HEIGHT), klass=Class.CAR)
     shape = Shape("box", "sedan", Class.CAR, LENGTH, WIDTH, HEIGHT, 2.5, mesh)
     t = np.arange(0, round(seconds * 1e9) + 1, 100_000_000, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""The scene around a vehicle: tiles in place, copies named, actors met where they are."""
+"""The scene around a vehicle: tiles, instances and actors as rays intersect them."""
 
 import json
 
@@ -33,7 +33,7 @@ def box(size, at, **columns):
 
 
 def tile(i, j, rank):
-    """Ground, a house of 20 m with one glass front to the south, and a tree standing 1.5 times its size."""
+    """Ground, a house of 20 m with a glass front to the south, and a tree scaled by 1.5."""
     house = box([10, 10, 20], [20.0, 20.0, 10.0], klass=Class.BUILDING, feature=100 + rank, surface=WALL)
     material = house.material.copy()
     material[house.normals()[:, 1] < -0.5] = materials()["glass"].code
@@ -99,7 +99,7 @@ def test_masks_look_through_glass_and_foliage(scene):
     assert world.caster.cast([30, 30, 30], DOWN, mask=ALL & ~FOLIAGE).range == pytest.approx(30)
 
 
-def test_a_region_brings_its_own_tiles_only(scene):
+def test_a_region_loads_only_its_own_tiles(scene):
     world = World.load(scene, region=(110, 50, 120, 60), margin=10)
     down = world.caster.cast(
         [[150.0, 50, 30], [50, 50, 30], [250, 50, 30], [-150, 50, 30], [350, 50, 30]], [[0, 0, -1.0]] * 5
@@ -136,7 +136,7 @@ def test_following_keeps_only_the_tiles_around(scene):
         assert world.caster.cast([x, 50, 3], DOWN).range == pytest.approx(3)
 
 
-def test_the_float32_origin_follows_over_long_ways_and_ranges_stay_exact(tmp_path):
+def test_ranges_stay_exact_over_long_drives(tmp_path):
     files = SceneFiles(tmp_path)
     files.tiles.mkdir()
     indices = [(0, 0), (400, 7)]
@@ -185,7 +185,7 @@ def test_rays_intersect_actors_at_their_pose_at_the_ray_time(scene):
     np.testing.assert_array_equal(world.caster.cast([150.0, 50, 1], [[-1.0, 0, 0]] * 5).range, before.range)
 
 
-def test_actors_stay_when_the_world_moves_on(scene):
+def test_actors_stay_when_another_region_is_loaded(scene):
     car = box([4, 2, 1.5], [0, 0, 0.75], klass=Class.CAR)
     world = World.load(scene, region=(50, 50, 50, 50), margin=10, actors=[car])
     here = np.eye(3, 4)[None].copy()
