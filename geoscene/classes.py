@@ -1,4 +1,4 @@
-"""Semantic classes and materials of surfaces, with the codes that scenes, points and pixels share."""
+"""Semantic classes and materials of surfaces; scenes, point clouds and images share their codes."""
 
 from __future__ import annotations
 

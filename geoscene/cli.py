@@ -41,7 +41,7 @@ app = App(
 )
 app.register_install_completion_command()
 
-_SOURCE = Group("Where the map comes from (one of)", sort_key=1)
+_SOURCE = Group("Source of the map (one of)", sort_key=1)
 _OUTPUT = Group("Output", sort_key=3)
 
 Out = Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)]
@@ -51,20 +51,20 @@ Reporting = Annotated[Report, Parameter(group=_OUTPUT)]
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class MapSource:
-    """Where the map and its elevation come from."""
+    """Sources of the map and its elevation."""
 
     osm: Path | None = None
-    """OpenStreetMap file: .osm, .osm.gz, .osm.bz2 or .osm.pbf. With --bbox, the part of it inside."""
+    """OpenStreetMap file: .osm, .osm.gz, .osm.bz2 or .osm.pbf. With --bbox, only that part of it."""
 
     place: str | None = None
-    """Name of a place, looked up in Nominatim and fetched from Overpass (needs a network; answers
+    """Name of a place, found by Nominatim and downloaded from Overpass (needs a network; answers
     are cached)."""
 
     bbox: Annotated[Degrees | None, degrees("W,S,E,N")] = None
-    """W,S,E,N in degrees, fetched from Overpass, or cut out of --osm, --demo or --source."""
+    """W,S,E,N in degrees, downloaded from Overpass, or cut out of --osm, --demo or --source."""
 
     point: Annotated[tuple[float, float] | None, degrees("LAT,LON")] = None
-    """LAT,LON in degrees, with --radius, fetched from Overpass."""
+    """LAT,LON in degrees, with --radius; downloaded from Overpass."""
 
     radius: float = 500.0
     """Metres around --point."""
@@ -73,20 +73,20 @@ class MapSource:
     """The bundled extract of central Helsinki; needs no network."""
 
     source: tuple[str, ...] = ()
-    """NAME=FILE of another source, whose features replace those of the map: overture=FILE, buildings of
-    Overture Maps in GeoParquet. Alone, the scene has only these. May be given several times."""
+    """NAME=FILE of another source, whose features replace those of the map: overture=FILE for buildings of
+    Overture Maps in GeoParquet. Without a map, the scene has only these. May be given several times."""
 
     cache: Path | None = None
     """Directory for answers of map servers and elevation tiles; ~/.cache/geoscene by default."""
 
     nominatim: str | None = None
-    """Address of another Nominatim server."""
+    """URL of another Nominatim server."""
 
     overpass: str | None = None
-    """Address of another Overpass server, or several separated by commas, tried in turn."""
+    """URL of another Overpass server, or several separated by commas, tried in turn."""
 
     dem_server: str | None = None
-    """Address of other tiles for --dem tiles, with {z}, {x} and {y} in it: terrarium PNGs of 256 pixels."""
+    """URL of other tiles for --dem tiles, with {z}, {x} and {y}: terrarium PNGs of 256 pixels."""
 
 
 @app.command
@@ -117,15 +117,15 @@ def build(
     out
         Directory to write the scene to.
     workers
-        Processes; as many as there are cores by default. The bytes do not depend on it.
+        Number of processes, by default one per core. The scene does not depend on it.
     """
     from geoscene.pipeline import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
 
-    began = time.perf_counter()
+    started = time.perf_counter()
     if workers is not None and not 1 <= workers <= 256:
         raise InputError(f"`workers` {workers}: give 1 to 256")
     if source.dem_server and options.dem != ("tiles",):
-        raise InputError("`dem_server` goes with --dem tiles")
+        raise InputError("`dem_server` needs --dem tiles")
     with progress_bar(quiet=report.quiet) as progress:
         progress("reading the map", 0, total=0)
         data = _read_map(source)
@@ -141,14 +141,14 @@ def build(
             workers=workers or os.cpu_count() or 1,
             progress=progress,
         )
-    document = scene.manifest | {"path": str(out), "seconds": round(time.perf_counter() - began, 2)}
+    document = scene.manifest | {"path": str(out), "seconds": round(time.perf_counter() - started, 2)}
     if report.json:
         print_json(document)
     else:
         _print_scene(document)
         drive = f"lidar drive {out} --route random -o drive"
-        following = drive if document["counts"]["road_edges"] else f"geoscene export {out} -o scene.glb"
-        print(f"\n{document['seconds']:.1f} s; next: {following}")
+        next_command = drive if document["counts"]["road_edges"] else f"geoscene export {out} -o scene.glb"
+        print(f"\n{document['seconds']:.1f} s; next: {next_command}")
     return 0
 
 
@@ -157,7 +157,7 @@ def _cache_of(source: MapSource) -> Path:
 
 
 def _fetch_elevation(source: MapSource, data: Any, *, crs: str, progress: Progress) -> str:
-    """The elevation file made of public tiles for a map."""
+    """Path of the elevation file of a map, merged from public tiles."""
     from geoscene.sources import TileServer, fetch_elevation  # noqa: PLC0415
 
     url = source.dem_server
@@ -166,17 +166,17 @@ def _fetch_elevation(source: MapSource, data: Any, *, crs: str, progress: Progre
 
 
 def _read_map(source: MapSource) -> Any:
-    """The map that the options name, with the features of other sources merged in."""
+    """The map of the options, merged with the features of other sources."""
     from geoscene import sources  # noqa: PLC0415
 
-    bundled = source.osm or source.demo
+    local = source.osm or source.demo
     given = [f"`{name}`" for name in ("osm", "place", "point", "demo") if getattr(source, name)]
-    if source.bbox and not (bundled or source.source):
+    if source.bbox and not (local or source.source):
         given.append("`bbox`")
     if len(given) > 1 or not (given or source.source):
-        what = f"not {' and '.join(given)} together" if given else "none was given"
+        reason = f"not {' and '.join(given)} together" if given else "none was given"
         raise InputError(
-            "give one of `osm` FILE, `place` NAME, `bbox`, `point`, `demo` or `source` NAME=FILE; " + what
+            "give one of `osm` FILE, `place` NAME, `bbox`, `point`, `demo` or `source` NAME=FILE; " + reason
         )
     servers = sources.Servers()
     if source.nominatim:
@@ -185,7 +185,7 @@ def _read_map(source: MapSource) -> Any:
         servers = replace(servers, overpass=tuple(source.overpass.split(",")))
     fetched: dict[str, Any] = {"cache_dir": _cache_of(source), "servers": servers}
     data = None
-    if bundled:
+    if local:
         data = sources.read_source("osm", source.osm or sources.demo_path(), bounds=source.bbox)
     elif source.place:
         data = sources.fetch_place(source.place, **fetched)
@@ -209,7 +209,7 @@ def info(
     *,
     json: bool = False,
 ) -> int:
-    """Describe a scene: frame, extent, counts, sources of heights, repairs and drops.
+    """Describe a scene: frame, extent, counts, sources of heights, repaired and dropped features.
 
     Parameters
     ----------
@@ -231,14 +231,14 @@ def info(
 
 @app.command
 def validate(scene: Path, /, *, json: bool = False) -> int:
-    """Check every solid of a scene: closed, oriented, of positive volume. Exit code 1 if one is not.
+    """Check that every solid of a scene is closed, oriented and of positive volume; exit code 1 if not.
 
     Parameters
     ----------
     scene
         Directory of the scene.
     json
-        Print the verdicts as JSON.
+        Print the result as JSON.
     """
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from geoscene.scene.validate import check_scene  # noqa: PLC0415
@@ -249,8 +249,8 @@ def validate(scene: Path, /, *, json: bool = False) -> int:
     else:
         for row in report["broken"]:
             print(f"{row['osm_id']} (feature {row['feature']}): {row['fault']}")
-        sound = report["solids"] - len(report["broken"])
-        print(f"{report['solids']} solids, {sound} closed, oriented and of positive volume")
+        valid = report["solids"] - len(report["broken"])
+        print(f"{report['solids']} solids, {valid} closed, oriented and of positive volume")
     return FAILURE if report["broken"] else 0
 
 
@@ -309,13 +309,13 @@ def view(
     options: ViewOptions = ViewOptions(),
     report: Reporting = Report(),
 ) -> int:
-    """Write a scene as one web page: turn it, click an object, read its attributes and their sources.
+    """Write a scene as one web page: rotate it, click an object, read its attributes and their sources.
 
     For example:
 
     geoscene view scene -o page.html
 
-    The page needs no network and no server; open it from disk with any browser that has WebGL 2.
+    The page needs no network and no server; open the file in any browser with WebGL 2.
 
     Parameters
     ----------
@@ -336,7 +336,7 @@ def view(
 
 
 def _print_file(summary: Any, contents: str, *, end: str = "", json: bool) -> None:
-    """Print what was written, for programs or for people."""
+    """Print a summary of a written file, as JSON or as text."""
     if json:
         print_json({**asdict(summary), "path": str(summary.path)})
         return
@@ -373,8 +373,8 @@ def _print_scene(report: dict[str, Any]) -> None:
     }
     if report["options"]["along"]:
         rows["along"] = (
-            f"{len(report['tiles'])} tiles are built, those seen from the route; solids and watertight count"
-            " what is in them, all else the whole map"
+            f"{len(report['tiles'])} tiles are built, those in range of the route; solids and watertight"
+            " count these tiles, all other figures the whole map"
         )
     print(report["name"] or report["path"])
     for title, text in rows.items():
@@ -389,7 +389,7 @@ def _steep_roads(counts: dict[str, Any]) -> str:
     if counts["road_km_steep"] < 0.005 * counts["road_km"]:
         return ""
     steep = counts["road_km_steep"]
-    return f", {steep:.1f} km steeper than 20 %; is the terrain model coarser than the streets?"
+    return f", {steep:.1f} km steeper than 20 %; the terrain model may be too coarse"
 
 
 def _listed(counts: dict[str, int]) -> str:

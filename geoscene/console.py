@@ -1,4 +1,4 @@
-"""What the two command-line programs share: errors as one line, exit codes, progress bars, JSON."""
+"""Shared by both command-line programs: option parsing, one-line errors, exit codes, progress bars, JSON."""
 
 from __future__ import annotations
 
@@ -20,28 +20,30 @@ from geoscene.progress import Progress, silent
 DONE, FAILURE, USAGE = 0, 1, 2
 """Exit codes: success, failure, unusable input or options."""
 
+_NO_SPACE = "; free some space and run the same command again"
+_PERMISSION = "; give a path that you may write to and files that you may read"
 _HINTS = {
-    errno.ENOSPC: "; free some space and run the same command again",
-    errno.EDQUOT: "; free some space and run the same command again",
-    errno.EACCES: "; name a place that you may write to and files that you may read",
-    errno.EPERM: "; name a place that you may write to and files that you may read",
-    errno.EROFS: "; name a place that you may write to",
+    errno.ENOSPC: _NO_SPACE,
+    errno.EDQUOT: _NO_SPACE,
+    errno.EACCES: _PERMISSION,
+    errno.EPERM: _PERMISSION,
+    errno.EROFS: "; give a path that you may write to",
 }
 _INTERRUPTED = 130
 _NUMBERS = re.compile(r"-\d+(\.\d*)?(,-?\d+(\.\d*)?)+")
 
 
 def _guard_numbers(words: Sequence[str]) -> list[str]:
-    """Put a blank before ``-30.1,-51.2``, which would be taken for an option; number parsers ignore it."""
+    """Put a space before ``-30.1,-51.2``, so that it is not parsed as an option; number parsers ignore it."""
     return [f" {word}" if _NUMBERS.fullmatch(word) else word for word in words]
 
 
 SEVERAL = Parameter(consume_multiple=True)
-"""Parameter of an option that takes all words up to the next option."""
+"""Parameter of an option that takes all values up to the next option."""
 
 
 def shown_default(value: object) -> str | None:
-    """A default as help shows it; None for an empty one."""
+    """Text of a default value in help; None for an empty default."""
     if isinstance(value, tuple):
         value = ",".join(map(str, value))
     return None if value is None or value is False or value == "" else str(value)
@@ -54,10 +56,10 @@ DEFAULTS = Parameter(negative=(), show_default=shown_default)
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class Report:
-    """How a command writes and what it prints."""
+    """Options of a command's output."""
 
     overwrite: bool = False
-    """Replace what exists under the output's name."""
+    """Replace an existing output."""
 
     json: bool = False
     """Print the summary as JSON."""
@@ -97,7 +99,7 @@ def degrees(names: str) -> Parameter:
 
 
 def whole(_: object, tokens: Sequence[Token]) -> int:
-    """A whole number of the command line, for options: 1.5 is refused, not rounded."""
+    """Converter of options that take a whole number; 1.5 is an error."""
     try:
         return int(tokens[0].value)
     except ValueError:
@@ -107,8 +109,8 @@ def whole(_: object, tokens: Sequence[Token]) -> int:
 def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exception], ...]) -> None:
     """Run a program and exit with its code.
 
-    roots : errors that are shown as one line, exit code 1
-    usage : those of them that the input or the options cause, exit code 2
+    roots : exceptions printed as one line, exit code 1
+    usage : those of them caused by input or options, exit code 2
     """
     logging.basicConfig(
         level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
@@ -117,37 +119,37 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
         words = _guard_numbers(sys.argv[1:])
         code = app(words, result_action="return_value", exit_on_error=False, print_error=False)
     except CycloptsError as error:
-        what = str(error).rstrip(".")
-        _complain(app, f"{what}; see {app.name[0]} {_command(app)}--help")
+        message = str(error).rstrip(".")
+        _print_error(app, f"{message}; see {app.name[0]} {_command(app)}--help")
         sys.exit(USAGE)
     except roots as error:
-        _complain(app, error)
+        _print_error(app, error)
         sys.exit(USAGE if isinstance(error, usage) else FAILURE)
     except KeyboardInterrupt:
-        _complain(app, "interrupted; repeat the command to resume")
+        _print_error(app, "interrupted; repeat the command to resume")
         sys.exit(_INTERRUPTED)
     except MemoryError:
-        _complain(app, "out of memory; take a smaller area or fewer workers")
+        _print_error(app, "out of memory; take a smaller area or fewer workers")
         sys.exit(FAILURE)
     except OSError as error:
-        # Files are written under names of their own at first: <name>.<process>.part
+        # Files are first written as <name>.<process>.part; the message names the final file.
         name = re.sub(r"\.\d+\.part(?=$|\.)|\.part$", "", str(error.filename or "the system"))
         hint = _HINTS.get(error.errno or 0, "")
-        _complain(app, f"{name}: {error.strerror or error}{hint}")
+        _print_error(app, f"{name}: {error.strerror or error}{hint}")
         sys.exit(FAILURE)
     sys.exit(code if isinstance(code, int) else DONE)
 
 
 def _command(app: App) -> str:
-    """The name of the command on the command line and a blank; empty if there is no such command."""
+    """The command named on the command line, followed by a space; empty if there is none."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     return f"{name} " if name in app else ""
 
 
 def with_flags(app: App, text: str) -> str:
-    """A message of the library with its parameters, `` `tile_size` ``, as flags of this command, --tile-size.
+    """A library message with parameters (`` `tile_size` ``) replaced by flags of the command (--tile-size).
 
-    A parameter that the command does not have keeps its plain name.
+    Parameters that the command does not have keep their name.
     """
     flags = {}
     if command := _command(app).strip():
@@ -156,8 +158,8 @@ def with_flags(app: App, text: str) -> str:
     return re.sub(r"`(\w+)`", lambda found: flags.get(found[1], found[1]), text)
 
 
-def _complain(app: App, what: object) -> None:
-    text = " ".join(with_flags(app, str(what)).split())
+def _print_error(app: App, message: object) -> None:
+    text = " ".join(with_flags(app, str(message)).split())
     print(f"{app.name[0]}: {text}", file=sys.stderr)
 
 
@@ -168,9 +170,9 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 @contextmanager
 def progress_bar(*, quiet: bool = False) -> Iterator[Progress]:
-    """A `Progress` that draws bars on standard error; silent when that is not a terminal.
+    """Yield a `Progress` that draws bars on standard error, or a silent one if that is not a terminal.
 
-    A bar appears once its stage has taken a second or so.
+    A bar appears once its stage has taken about a second.
     """
     if quiet or not sys.stderr.isatty():
         yield silent
@@ -186,14 +188,14 @@ def progress_bar(*, quiet: bool = False) -> Iterator[Progress]:
 
 def _bar_callback(bars: Any) -> Progress:
     tasks: dict[str, Any] = {}
-    began: dict[str, float] = {}
+    started: dict[str, float] = {}
 
-    def note(stage: str, done: int, *, total: int) -> None:
+    def update(stage: str, done: int, *, total: int) -> None:
         now = time.monotonic()
         if stage not in tasks:
-            if now - began.setdefault(stage, now) < 1.0:
+            if now - started.setdefault(stage, now) < 1.0:
                 return
             tasks[stage] = bars.add_task(stage, total=total or None)
         bars.update(tasks[stage], completed=done, total=total or None)
 
-    return note
+    return update

@@ -1,4 +1,4 @@
-"""Everything geoscene raises on purpose.
+"""Exceptions of geoscene.
 
 Messages name parameters in backquotes (`tile_size`); the command line shows them as flags (--tile-size), see
 `geoscene.console.with_flags`.
@@ -11,23 +11,23 @@ from types import ModuleType
 
 
 class GeosceneError(Exception):
-    """Root of what this package raises on purpose; the command line shows it as one line, exit code 1."""
+    """Base class of the exceptions of geoscene; the command line prints one line and exits with code 1."""
 
 
 class InputError(GeosceneError, ValueError):
-    """The user's input or options cannot be used; the command line exits with code 2."""
+    """Invalid input or options; the command line exits with code 2."""
 
 
 class SourceNotFoundError(InputError):
-    """A file, place or area that does not exist or holds nothing."""
+    """A file, place or area that does not exist or has no features."""
 
 
 class NetworkError(GeosceneError, OSError):
-    """A map server could not be reached or refused."""
+    """A map server that cannot be reached or refuses the request."""
 
 
 class FrameError(InputError):
-    """A coordinate reference system that cannot serve, or coordinates outside its area of use."""
+    """An unsuitable coordinate reference system, or coordinates outside its area of use."""
 
 
 class SceneFormatError(InputError):
@@ -43,7 +43,7 @@ class MissingExtraError(InputError, ImportError):
 
 
 def need(module: str, extra: str) -> ModuleType:
-    """Import an optional module, or raise `MissingExtraError` that names the extra which brings it."""
+    """Import an optional module; raises MissingExtraError, which names the extra, if it is not installed."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Files and folders written atomically: they appear complete under their name, or not at all."""
+"""Atomic writes of files and folders: a path never holds a partly written result."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from geoscene.errors import InputError
 
 @contextmanager
 def atomic_path(path: Path, *, keep_suffix: bool = False) -> Iterator[Path]:
-    """Yield a temporary path in the same folder, and rename what was written there to ``path``.
+    """Yield a temporary path in the same folder; the file written there is renamed to ``path`` afterwards.
 
-    If the block raises, what was written is deleted and ``path`` stays as it was. If the block writes
-    nothing, there is no file at ``path`` afterwards.
+    If the block raises, the temporary file is deleted and ``path`` is left unchanged. If the block writes
+    no file, an existing ``path`` is deleted.
 
-    keep_suffix : the temporary name ends like ``path``, for libraries that choose a format by it; by default
-                  it ends in ``.part``
+    keep_suffix : give the temporary file the suffix of ``path``, for libraries that choose the format by it,
+                  instead of ``.part``
     """
     middle = f".{os.getpid()}.part"
     part = path.with_name(f"{path.stem}{middle}{path.suffix}" if keep_suffix else f"{path.name}{middle}")
@@ -45,18 +45,18 @@ def atomic_path(path: Path, *, keep_suffix: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[IO[bytes]]:
-    """Yield a binary file to write (and read) that gets the name ``path`` unless the block raises."""
+    """Yield a binary file, open for writing and reading, that becomes ``path`` unless the block raises."""
     with atomic_path(path) as part, part.open("w+b") as file:
         yield file
 
 
 @contextmanager
 def atomic_folder(path: Path, *, mark: str) -> Iterator[Path]:
-    """Yield a folder to write into that replaces ``path`` unless the block raises.
+    """Yield a temporary folder that replaces ``path`` unless the block raises.
 
-    mark : file by which a folder of this kind is recognised; only such a folder, or an empty one, is replaced
+    mark : name of a file that marks folders of this kind
 
-    Raises InputError if ``path`` is anything else.
+    Raises InputError if ``path`` exists and is neither empty nor a folder with the mark.
     """
     if path.exists() and not (path / mark).is_file() and not (path.is_dir() and not any(path.iterdir())):
         raise InputError(f"{path}: exists and holds no {mark}; give another folder")
@@ -84,7 +84,7 @@ def write_json(path: Path, document: Mapping[str, Any], *, indent: int = 2) -> N
 
 
 def write_columns(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> None:
-    """Write columns as CSV with a header; floats in the shortest text that reads back the same."""
+    """Write columns as CSV with a header; floats as the shortest text that reads back the same value."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -94,12 +94,12 @@ def write_columns(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]
 
 @contextmanager
 def spool(near: Path) -> Iterator[IO[bytes]]:
-    """Yield a nameless temporary file on the disk of ``near``, for what a format stores after its header."""
+    """Yield an unnamed temporary file on the disk of ``near``, for data whose size the header states."""
     with tempfile.TemporaryFile(dir=near.parent) as file:
         yield file
 
 
 def append(target: IO[bytes], source: IO[bytes]) -> None:
-    """Copy all of a spool to the end of a file."""
+    """Append the contents of a `spool` to a file."""
     source.seek(0)
     shutil.copyfileobj(source, target, 1 << 20)

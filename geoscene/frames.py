@@ -20,7 +20,7 @@ _GEOGRAPHIC = "EPSG:4326"
 
 
 def _local_wkt(lon_deg: float, lat_deg: float) -> str:
-    """WKT 2 of a transverse Mercator with scale 1 on the given point, so that a metre is a metre there."""
+    """WKT 2 of the transverse Mercator projection with origin and scale 1 at the given point."""
     return str(
         ProjectedCRS(
             TransverseMercatorConversion(lat_deg, lon_deg, scale_factor_natural_origin=1.0),
@@ -31,10 +31,10 @@ def _local_wkt(lon_deg: float, lat_deg: float) -> str:
 
 
 def utm_crs(lon_deg: float, lat_deg: float) -> str:
-    """EPSG code (``EPSG:326xx`` or ``EPSG:327xx``) of the WGS 84 UTM zone that holds a point.
+    """EPSG code (``EPSG:326xx`` or ``EPSG:327xx``) of the WGS 84 UTM zone of a point.
 
-    With the wide zones of south-west Norway (32V) and Svalbard (31X, 33X, 35X, 37X).
-    Raises FrameError outside 80° S to 84° N, where UTM is not defined.
+    Includes the exceptions of south-west Norway (32V) and Svalbard (31X, 33X, 35X, 37X). Raises FrameError
+    outside 80° S to 84° N, where UTM is not defined.
     """
     if not -80.0 <= lat_deg <= 84.0:
         raise FrameError(f"no UTM zone at {lat_deg:.4f}, {lon_deg:.4f}; use the local frame (`crs` local)")
@@ -49,12 +49,12 @@ def utm_crs(lon_deg: float, lat_deg: float) -> str:
 
 @dataclass(frozen=True)
 class Frame:
-    """The scene frame: x east, y north of the grid, z up, metres, float64.
+    """The scene frame: x grid east, y grid north, z up, metres, float64.
 
     wkt      : the projected CRS as WKT 2
-    origin   : (easting, northing) of the scene's zero in that CRS, whole metres
-    vertical : what z means: ``flat`` (height above an assumed level ground), ``orthometric`` (above the
-               geoid of the terrain model) or ``ellipsoidal`` (above WGS 84)
+    origin   : (easting, northing) of x = y = 0 in that CRS, whole metres
+    vertical : reference of z: ``flat`` (an assumed level ground), ``orthometric`` (the geoid of the terrain
+               model) or ``ellipsoidal`` (WGS 84)
     """
 
     wkt: str
@@ -65,10 +65,11 @@ class Frame:
     def at(cls, lon_deg: float, lat_deg: float, *, crs: str = "local", vertical: str = "flat") -> Frame:
         """The frame of a scene centred on a point.
 
-        crs : ``local`` (transverse Mercator with scale 1 on the centre), ``utm`` (the zone of the centre),
-              or anything pyproj reads that is projected and in metres (``EPSG:32618``)
+        crs : ``local`` (transverse Mercator with scale 1 at the centre), ``utm`` (the zone of the centre),
+              or any projected CRS in metres that pyproj reads (``EPSG:32618``)
 
-        Raises FrameError for a CRS that is unknown, not projected, not in metres, or not usable at the point.
+        Raises FrameError if the CRS is unknown, not projected, not in metres, or distorts lengths
+        by over 10 %.
         """
         if not (np.isfinite(lon_deg) and np.isfinite(lat_deg) and abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
             raise FrameError(f"the centre {lat_deg}, {lon_deg} is not a latitude and longitude in degrees")
@@ -77,7 +78,7 @@ class Frame:
         try:
             parsed = CRS.from_user_input(utm_crs(lon_deg, lat_deg) if crs == "utm" else crs)
         except CRSError as error:
-            raise FrameError(f"`crs` {crs}: pyproj does not know it; give utm or EPSG:<number>") from error
+            raise FrameError(f"`crs` {crs}: unknown to pyproj; give utm or EPSG:<number>") from error
         if not parsed.is_projected:
             raise FrameError(f"`crs` {crs} ({parsed.name}) is not projected; give utm or EPSG:<number>")
         if any(axis.unit_conversion_factor != 1.0 for axis in parsed.axis_info[:2]):
@@ -100,7 +101,7 @@ class Frame:
 
     @functools.cached_property
     def name(self) -> str:
-        """``EPSG:n`` where the CRS has such a code, else its name."""
+        """``EPSG:n`` if the CRS has an EPSG code, else its name."""
         code = self.crs.to_authority(min_confidence=100)
         return ":".join(code) if code else str(self.crs.name)
 
@@ -163,11 +164,11 @@ class Frame:
         return angle
 
     def to_json(self) -> dict[str, object]:
-        """The frame as `scene.json` stores it."""
+        """The JSON object of ``scene.json``."""
         return {"name": self.name, "wkt": self.wkt, "origin": list(self.origin), "vertical": self.vertical}
 
     @classmethod
     def from_json(cls, document: dict[str, Any]) -> Frame:
-        """The frame that `to_json` wrote."""
+        """The frame of a JSON object of `to_json`."""
         east, north = document["origin"]
         return cls(document["wkt"], (float(east), float(north)), document["vertical"])

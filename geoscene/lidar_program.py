@@ -1,7 +1,7 @@
-"""The program ``lidar``, unless an unrelated package hides the module `lidar` of this one.
+"""Entry point of the program ``lidar``: checks that the module `lidar` is that of this package.
 
-A package on the public index (lake and depression mapping) has the same module name. Installed into the same
-environment it overwrites files of this one; elsewhere on the module path it may be found first.
+An unrelated package on the public index (lake and depression mapping) installs a module of the same name,
+which overwrites files of this package or is found first on the module path.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from geoscene.errors import InputError
 
 
 def check_lidar() -> None:
-    """Raise InputError if ``import lidar`` would not import the module of this package."""
+    """Raises InputError if ``import lidar`` would import the module of another package."""
     spec = find_spec("lidar")
     found = Path(spec.origin) if spec is not None and spec.origin else None
-    beside = Path(__file__).resolve().parents[1] / "lidar" / "__init__.py"
-    if found is None or found.resolve() != beside or "geoscene" not in found.read_text("utf-8"):
+    own = Path(__file__).resolve().parents[1] / "lidar" / "__init__.py"
+    if found is None or found.resolve() != own or "geoscene" not in found.read_text("utf-8"):
         raise InputError(
-            f"{found or beside} is not the module `lidar` of geoscene; an unrelated package on the index"
+            f"{found or own} is not the module `lidar` of geoscene; an unrelated package on the index"
             " has the same name: pip uninstall lidar, then install geoscene again"
         )
 

@@ -19,7 +19,7 @@ from geoscene.sources import SOURCES, OsmData, credits_of
 from geoscene.tiles import TileReport
 
 STEEP = 0.2
-"""Slope of a road that is worth a word: few streets are steeper (1 in 5)."""
+"""Gradient above which roads are counted as steep; few streets exceed it."""
 
 
 def scene_manifest(
@@ -31,7 +31,7 @@ def scene_manifest(
     problems: Sequence[Problem],
     fingerprint: str,
 ) -> dict[str, Any]:
-    """Sources, options, counts, where heights come from, repairs and drops."""
+    """The JSON object: sources, options, counts, sources of heights, repaired and dropped features."""
     xmin, ymin, xmax, ymax = plan.extent
     terrain = plan.terrain
     sources = _sources(osm, plan)
@@ -70,7 +70,7 @@ def scene_manifest(
 
 
 def _sources(osm: OsmData, plan: Plan) -> list[dict[str, str]]:
-    """Every source of the scene, with licence and attribution where they are known."""
+    """All sources of the scene, with licence and attribution if known."""
     licences = {source.attribution: source.licence for source in SOURCES.values()}
     maps = [
         {
@@ -92,13 +92,13 @@ def _sources(osm: OsmData, plan: Plan) -> list[dict[str, str]]:
 
 
 def _open_area(plan: Plan) -> float:
-    """Square metres of the extent without ground, where tunnels come out of it."""
+    """Square metres of the extent without ground, at tunnel mouths."""
     openings = [shape for shape in plan.openings if shape is not None]
     return float(shapely.intersection(shapely.union_all(openings), shapely.box(*plan.extent)).area)
 
 
 def steep_metres(graph: RoadGraph) -> float:
-    """Metres of road that climb or fall by more than `STEEP`."""
+    """Length in metres of road segments with a gradient above `STEEP`."""
     total = 0.0
     for line in graph.geometry:
         metres = np.hypot(*np.diff(line[:, :2], axis=0).T)

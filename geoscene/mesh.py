@@ -1,4 +1,4 @@
-"""Triangle meshes with what every face is: columns, no loops."""
+"""Triangle meshes with one column per face attribute, and instances of shapes."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Mesh:
 
     vertices : (n, 3) float64, metres
     faces    : (m, 3) int32, counter-clockwise seen from outside (or from above)
-    feature  : (m,) int32, the scene-wide feature number, -1 for none
+    feature  : (m,) int32, scene-wide feature number, -1 for none
     klass    : (m,) uint8, code of `geoscene.classes`
-    material : (m,) uint8, code of `geoscene.materials`
+    material : (m,) uint8, code of `geoscene.classes.Material`
     surface  : (m,) uint8, OTHER, WALL, ROOF or FLOOR
     color    : (m, 3) uint8, sRGB
-    closed   : (m,) bool, the face belongs to a closed solid (a feature's closed faces together bound it)
+    closed   : (m,) bool, the face belongs to a closed solid, bounded by all closed faces of its feature
     """
 
     vertices: Float
@@ -40,8 +40,8 @@ class Mesh:
     closed: NDArray[np.bool_]
 
     def __post_init__(self) -> None:
-        """Refuse columns that disagree in length."""
-        for name in ("feature", "klass", "material", "surface", "color", "closed"):
+        """Raises GeosceneError if the columns differ in length."""
+        for name in _COLUMNS:
             if len(getattr(self, name)) != len(self.faces):
                 raise GeosceneError(
                     f"mesh column {name} has {len(getattr(self, name))} rows for {len(self.faces)} faces"
@@ -64,7 +64,7 @@ class Mesh:
         color: Sequence[int] | NDArray[np.integer] = (128, 128, 128),
         closed: bool | NDArray[np.bool_] = False,
     ) -> Mesh:
-        """A mesh from vertices (n, 3) and faces (m, 3); every other column is broadcast over the faces."""
+        """A mesh of vertices (n, 3) and faces (m, 3); the other columns are broadcast over the faces."""
         m = len(faces)
         return cls(
             np.ascontiguousarray(vertices, np.float64).reshape(-1, 3),
@@ -83,12 +83,10 @@ class Mesh:
         return cls.of(np.empty((0, 3)), np.empty((0, 3), np.int32))
 
     def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Mesh:
-        """The chosen faces, in the given order, with the vertices they use, in their old order."""
+        """The selected faces in the given order, and the vertices they use in their original order."""
         faces = self.faces[keep]
         used, renumbered = np.unique(faces, return_inverse=True)
-        columns = {
-            f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name not in ("vertices", "faces")
-        }
+        columns = {name: getattr(self, name)[keep] for name in _COLUMNS}
         return Mesh(self.vertices[used], renumbered.reshape(-1, 3).astype(np.int32), **columns)
 
     def shifted(self, offset: Sequence[float] | Float) -> Mesh:
@@ -104,16 +102,15 @@ class Mesh:
         return unit
 
 
+_COLUMNS = tuple(f.name for f in fields(Mesh) if f.name not in ("vertices", "faces"))
+
+
 def concatenate(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh of all faces, in order; vertices are not merged."""
+    """One mesh of the faces of all meshes, in order; vertices are not merged."""
     if not meshes:
         return Mesh.empty()
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
-    columns = {
-        f.name: np.concatenate([getattr(m, f.name) for m in meshes])
-        for f in fields(Mesh)
-        if f.name not in ("vertices", "faces")
-    }
+    columns = {name: np.concatenate([getattr(m, name) for m in meshes]) for name in _COLUMNS}
     return Mesh(
         np.concatenate([m.vertices for m in meshes]),
         np.concatenate([m.faces + np.int32(s) for m, s in zip(meshes, starts, strict=True)]),
@@ -123,11 +120,11 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
 @dataclass(frozen=True, slots=True)
 class Instances(Columns):
-    """Copies of shapes, such as trees.
+    """Instances of shapes, such as trees.
 
     shape     : (k,) int32, index into the scene's shapes
-    transform : (k, 3, 4) float64, shape to tile: rotation and scale, then shift
-    feature   : (k,) int32
+    transform : (k, 3, 4) float64, shape to tile: [rotation and scale | translation]
+    feature   : (k,) int32, scene-wide feature number
     """
 
     shape: NDArray[np.int32]
@@ -136,5 +133,5 @@ class Instances(Columns):
 
     @classmethod
     def empty(cls) -> Instances:
-        """No copies."""
+        """No instances."""
         return cls(np.empty(0, np.int32), np.empty((0, 3, 4)), np.empty(0, np.int32))

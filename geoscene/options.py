@@ -1,4 +1,4 @@
-"""Options of the commands of `geoscene`: defaults, units and help stand here once."""
+"""Options of the commands of `geoscene`, with their defaults and help texts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from geoscene.console import SEVERAL, WORDS, degrees, whole
 from geoscene.errors import InputError
 
 KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
-"""Kinds of features that a scene may hold besides its ground."""
+"""Kinds of features that a scene can have besides its ground."""
 
 Degrees = tuple[float, float, float, float]
 
@@ -19,35 +19,34 @@ Degrees = tuple[float, float, float, float]
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class BuildOptions:
-    """Options that shape the bytes of a scene; ``scene.json`` records them."""
+    """Options that determine the bytes of a scene; recorded in ``scene.json``."""
 
     crs: str = "local"
-    """Frame of the scene: local (a transverse Mercator on its centre in which a metre is a metre), utm, or an
-    EPSG code such as EPSG:32618."""
+    """CRS of the scene: local (transverse Mercator with scale 1 at the centre), utm, or an EPSG code such as
+    EPSG:32618."""
 
     lod: Annotated[int, Parameter(converter=whole)] = 2
     """Level of detail of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs."""
 
     dem: Annotated[tuple[str, ...], SEVERAL] = ()
-    """Elevation files: GeoTIFF, .hgt or .hgt.zip, one or more, in any CRS; or the word tiles: public
-    elevation tiles of 5 to 10 m (needs a network; tiles are cached). By default the ground is level."""
+    """Elevation files (GeoTIFF, .hgt or .hgt.zip) in any CRS; or the word tiles: public elevation tiles with
+    5 to 10 m between heights (needs a network; tiles are cached). By default the ground is level."""
 
     dem_gaps: str = "error"
-    """Where elevation files do not cover the scene: error, or nearest (take the nearest height and report
-    it)."""
+    """If elevation files do not cover the scene: error, or nearest (use the nearest height and report it)."""
 
     only: Annotated[tuple[str, ...], WORDS] = KINDS
-    """What to build besides the ground, separated by commas."""
+    """Kinds of features to build besides the ground, separated by commas."""
 
     along: Annotated[tuple[str, ...], SEVERAL] = ()
-    """Build only the tiles that can be seen from a route: LAT,LON LAT,LON ... or a GPX, GeoJSON or CSV file
+    """Build only the tiles within sensor range of a route: LAT,LON LAT,LON ... or a GPX, GeoJSON or CSV file
     (such as the poses.csv of a dataset)."""
 
     reach: float = 120.0
     """Maximum range of the sensors in metres, with --along."""
 
     driving_side: str = ""
-    """Side of the road that traffic drives on: left or right. By default that of the map's tags, else of the
+    """Side of the road that traffic drives on: left or right. By default from the map's tags, else from the
     country."""
 
     tile_size: float = 250.0
@@ -75,17 +74,16 @@ class BuildOptions:
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class ViewOptions:
-    """Options of a web page of a scene."""
+    """Options of the web page of a scene."""
 
     bounds_deg: Annotated[Degrees | None, Parameter(name="--bbox"), degrees("W,S,E,N")] = None
-    """W,S,E,N in degrees: only the tiles that intersect it, each whole."""
+    """W,S,E,N in degrees: only tiles that intersect this box, uncut."""
 
     layers: Annotated[tuple[str, ...], WORDS] = ()
-    """Only these layers, separated by commas, such as ground,buildings,trees; all by default."""
+    """Layers to show, separated by commas, such as ground,buildings,trees; all by default."""
 
     max_mb: Annotated[float, Parameter(name="--max-size")] = 40.0
-    """Largest size of the page in megabytes; a larger one is an error that names the bounds of a part that
-    fits."""
+    """Maximum size of the page in megabytes; for a larger one, the error names a --bbox that fits."""
 
     def __post_init__(self) -> None:
         """Validate the options."""
@@ -99,22 +97,22 @@ class ExportOptions:
     """Options of an export; each format takes some of them, see `geoscene.export.KINDS`."""
 
     kind: Annotated[str | None, Parameter(name="--to")] = None
-    """cityjson, glb, 3dtiles, obj, ply, stl, gpkg, geojson, geoparquet, geotiff, opendrive or sumo; by
-    default the format of the file's suffix."""
+    """Format: cityjson, glb, 3dtiles, obj, ply, stl, gpkg, geojson, geoparquet, geotiff, opendrive or sumo;
+    by default from the suffix of the file."""
 
     crs: str | None = None
-    """CRS of CityJSON, GeoPackage and GeoParquet: an EPSG code; by default the scene's own, for CityJSON its
-    UTM zone where the scene's has no EPSG code."""
+    """CRS of CityJSON, GeoPackage and GeoParquet: an EPSG code; by default that of the scene (CityJSON: the
+    UTM zone, if the CRS of the scene has no EPSG code)."""
 
     layers: Annotated[tuple[str, ...] | None, WORDS] = None
-    """Layers to write, separated by commas: terrain is the bare ground, building_solids buildings as surfaces
-    in tables; all by default."""
+    """Layers to write, separated by commas; all by default. terrain is the bare ground; building_solids, in
+    tables, the surfaces of buildings."""
 
     model: str | None = None
     """GeoTIFF: surface (the default), terrain or classes."""
 
     resolution: float | None = None
-    """GeoTIFF: metres per cell, 0.5 by default."""
+    """GeoTIFF: cell size in metres, 0.5 by default."""
 
     height_offset: float | None = None
-    """3D Tiles: metres added to heights, such as the geoid's height to make them ellipsoidal."""
+    """3D Tiles: metres added to all heights, such as the geoid height to make them ellipsoidal."""

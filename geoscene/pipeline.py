@@ -26,11 +26,11 @@ from geoscene.scene.writer import SceneWriter
 from geoscene.sources import OsmData
 from geoscene.tiles import Keys, TileReport, build_tiles, tiles_document
 
-_BESIDE = 15.0
-"""Metres from a road's middle to its outermost lane and to a sensor there, at most."""
+_OFFSET = 15.0
+"""Metres, maximum distance of a sensor from the centre line of its road."""
 
 _CROWN, _ARM = 5.0, 10.0
-"""Metres by which the crown of a forest's tree and the arm of a lamp or a signal reach beyond their feet."""
+"""Metres, maximum horizontal extent of forest trees and of lamps and signals from their position."""
 
 
 def build(
@@ -44,14 +44,14 @@ def build(
 ) -> Scene:
     """Build a scene of a map extract and write it to a directory.
 
-    An interrupted build resumes when repeated; one that replaces a scene reuses the tiles that its options
-    leave unchanged. The bytes depend neither on ``workers`` nor on earlier builds.
+    An interrupted build resumes when repeated. A build that overwrites a scene reuses its unchanged tiles.
+    The bytes depend neither on ``workers`` nor on earlier builds.
 
-    Raises SourceNotFoundError for an extract without anything to build, FrameError for an unsuitable CRS
-    and SceneFormatError for a directory that may not be overwritten.
+    Raises SourceNotFoundError for an empty extract, FrameError for an unsuitable CRS and SceneFormatError for
+    a directory that must not be overwritten.
     """
     if not (osm.areas or osm.ways):
-        raise SourceNotFoundError(f"{osm.source or 'the extract'}: nothing in it to build from")
+        raise SourceNotFoundError(f"{osm.source or 'the extract'}: has no features to build a scene from")
     with SceneWriter(out, overwrite=overwrite) as writer:
         plan, problems = make_plan(osm, options, progress=progress)
         keys = _keys(osm, options)
@@ -88,17 +88,17 @@ def _tile_problems(reports: Sequence[TileReport]) -> list[Problem]:
 
 
 def _tiles_along(plan: Plan, options: BuildOptions) -> list[tuple[int, int]]:
-    """Tiles to build: all, or those of which anything lies within reach of the route."""
+    """Tiles to build: all, or those with a feature or ground within sensor range of the route."""
     tiles = plan.tiles()
     if not options.along:
         return tiles
     line = route_line(options.along, plan.graph, frame=plan.frame)
     shapely.prepare(line)
-    reach = options.reach + _BESIDE
+    reach = options.reach + _OFFSET
     size = options.tile_size
     squares = shapely.box(*(np.array(tiles) * size).T, *((np.array(tiles) + 1) * size).T)
-    seen = set(itertools.compress(tiles, shapely.dwithin(line, squares, reach + _CROWN)))
-    # What stands in a tile may stick out of it, a long wall or bridge by far.
+    in_range = set(itertools.compress(tiles, shapely.dwithin(line, squares, reach + _CROWN)))
+    # Features can extend beyond their tile, long walls and bridges by far.
     buildings = shapely.dwithin(line, plan.buildings.footprint, reach)
     near = {
         "buildings": buildings,
@@ -109,12 +109,12 @@ def _tiles_along(plan: Plan, options: BuildOptions) -> list[tuple[int, int]]:
         "structures": shapely.dwithin(line, plan.structures.polygon, reach),
     }
     for kind, by_tile in plan.rows.items():
-        seen |= {tile for tile, rows in by_tile.items() if near[kind][rows].any()}
-    return sorted(seen)
+        in_range |= {tile for tile, rows in by_tile.items() if near[kind][rows].any()}
+    return sorted(in_range)
 
 
 def _keys(osm: OsmData, options: BuildOptions) -> Keys:
-    """Digests of what ground and solids of a tile depend on."""
+    """Digests of all inputs of the ground and of the solids of tiles."""
     dem = [(str(p), Path(p).stat().st_size, Path(p).stat().st_mtime_ns) for p in options.dem]
     common = [
         __version__,

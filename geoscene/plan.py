@@ -1,4 +1,4 @@
-"""The plan of a scene: numbered features of the whole place, not yet cut into tiles."""
+"""The plan of a scene: numbered features of the whole map, before they are cut into tiles."""
 
 from __future__ import annotations
 
@@ -61,34 +61,34 @@ Bounds = tuple[float, float, float, float]
 T = TypeVar("T")
 
 LARGEST_KM2 = 4000.0
-"""Square kilometres of the largest scene: 64,000 tiles of 250 m."""
+"""Maximum size of a scene in square kilometres: 64,000 tiles of 250 m."""
 
-_ROAD_LINES = 10.0  # metres between the lines along which the ground bends to roads
-_ROAD_REACH = 25.0  # metres from a road's middle within which the ground is graded to it, at most
-_STANDING = 1.0  # metres: a building whose underside is higher leaves the ground under it as it is
+_ROAD_LINES = 10.0  # metres between the lines at which ground graded to roads can bend
+_ROAD_REACH = 25.0  # metres, maximum distance from a centre line of ground that is graded to the road
+_RAISED = 1.0  # metres, minimum height of an underside for a building to have no pad
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Input of the tiles.
+    """All that tiles are built from.
 
-    frame     : of the scene
-    terrain   : the elevation model, or level ground
-    height    : z of the ground at x, y, roads graded into it; None where all is at 0
-    buildings : their table
+    frame     : frame of the scene
+    terrain   : elevation model, or level ground
+    height    : z of the ground at x, y, graded to roads; None if it is 0 everywhere
+    buildings : table of buildings and building parts
     base      : (count,) z of each building's base
-    rows      : by kind (``buildings``, ``trees``, ``furniture``, ``barriers``, ``structures``) the rows that
-                belong to each tile: those with the middle of their bounding box in it; ``parts`` belong to
-                the tiles of their buildings
-    graph     : roads, with heights
-    side      : of the road that traffic drives on, and its source (``tag``, ``place`` or ``option``)
-    ground    : layers of the ground
-    levels    : heights of its water surfaces
+    rows      : rows of each tile by kind (``buildings``, ``trees``, ``furniture``, ``barriers``,
+                ``structures``): features whose bounding box has its centre in the tile; ``parts`` are in the
+                tiles of their buildings
+    graph     : road graph with heights
+    side      : side of the road that traffic drives on, and its source (``tag``, ``place`` or ``option``)
+    ground    : polygons of the ground
+    levels    : heights of water surfaces
     trees     : mapped trees
-    needles   : share of needle-leaved trees by row of the ground's layers
+    needles   : share of needle-leaved trees in each polygon of the ground
     structures : bridges and tunnels
-    openings  : polygon of each without ground, None for most
-    layers    : the feature tables, in the order of their numbers
+    openings  : area of each structure where the ground is left out, None for most
+    layers    : feature tables in the order of feature numbers
     """
 
     frame: Frame
@@ -111,50 +111,50 @@ class Plan:
 
     @property
     def extent(self) -> Bounds:
-        """(xmin, ymin, xmax, ymax) of the ground, scene metres."""
+        """(xmin, ymin, xmax, ymax) of the ground in scene metres."""
         return self.ground.extent
 
     def tiles(self) -> list[tuple[int, int]]:
-        """All tiles, in order."""
+        """Indices (i, j) of all tiles, sorted."""
         ground = {(int(i), int(j)) for i, j in self.ground.tiles}
         return sorted(ground.union(*self.rows.values()))
 
     def of_tile(self, kind: str, i: int, *, j: int) -> NDArray[np.int64]:
-        """Rows of a kind that belong to tile (i, j), in ascending order."""
+        """Rows of a kind of feature in tile (i, j), ascending."""
         return self.rows[kind].get((i, j), np.empty(0, np.int64))
 
 
 def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tuple[Plan, list[Problem]]:
-    """Plan a scene of a map; also returns what was repaired or dropped on the way.
+    """The plan of a scene of a map, and the features that were repaired or dropped.
 
-    Raises FrameError and InputError if the CRS or the elevation files cannot be used.
+    Raises FrameError or InputError if the CRS or the elevation files cannot be used.
     """
     problems: list[Problem] = list(osm.problems)
     frame = Frame.at(*_checked_centre(osm), crs=options.crs)
 
     progress("buildings", 0, total=0)
-    buildings = _noted(
-        problems, read_buildings(osm if "buildings" in options.only else _without_areas(osm), frame)
-    )
+    built = osm if "buildings" in options.only else replace(osm, areas=[], relations=[])
+    buildings = _collect(problems, read_buildings(built, frame))
     extent = _extent(frame, osm.bounds, buildings=buildings)
     terrain = flat_terrain(frame)
     if options.dem:
-        terrain = open_terrain(options.dem, frame, bounds=extent, outside=_gaps(options))
+        gaps = cast("Literal['error', 'nearest']", options.dem_gaps)
+        terrain = open_terrain(options.dem, frame, bounds=extent, outside=gaps)
     frame = replace(frame, vertical=terrain.vertical)
 
     progress("roads", 0, total=0)
     roads = _plan_roads(osm, frame, options=options, terrain=terrain, extent=extent, problems=problems)
     footprints = buildings.footprint[: buildings.count]
     base = base_heights(footprints, roads.height or terrain.height)
-    buildings = _noted(problems, buildings_over(buildings, base, table=roads.structures))
+    buildings = _collect(problems, buildings_over(buildings, base, table=roads.structures))
 
     progress("ground", 0, total=0)
-    cover, surfaces, pads = _noted(
+    cover, surfaces, pads = _collect(
         problems, _surfaces(osm, frame, extent=extent, buildings=buildings, roads=roads, only=options.only)
     )
     cover, surfaces = _numbered([cover, surfaces], len(buildings))
     ground = _plan_ground([cover, surfaces, pads], roads, extent=extent, terrain=terrain, options=options)
-    objects = _noted(problems, _objects(osm, frame, ground=ground, only=options.only, side=roads.side))
+    objects = _collect(problems, _objects(osm, frame, ground=ground, only=options.only, side=roads.side))
     first = len(buildings) + len(cover) + len(surfaces) + len(roads.graph)
     trees, furniture, barriers, structures = _numbered([*objects, roads.structures], first)
 
@@ -200,34 +200,30 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
     return plan, problems
 
 
-def _noted(problems: list[Problem], result: tuple[T, list[Problem]]) -> T:
-    """The first of a result; its problems are added to the list."""
+def _collect(problems: list[Problem], result: tuple[T, list[Problem]]) -> T:
+    """The value of a result; adds its problems to the list."""
     value, found = result
     problems += found
     return value
 
 
 def _checked_centre(osm: OsmData) -> tuple[float, float]:
-    """Longitude and latitude of the middle of a map; raises InputError if it is too large for one scene."""
+    """Longitude and latitude of the centre of a map; raises InputError if it is too large for a scene."""
     west, south, east, north = osm.bounds
     area = (east - west) * (north - south) * 111.2**2 * np.cos(np.radians((south + north) / 2))
     if area > LARGEST_KM2:
         raise InputError(
-            f"{osm.source}: {area:,.0f} km2, more than the {LARGEST_KM2:,.0f} of one scene;"
-            " cut a part out (`bbox`)"
+            f"{osm.source}: {area:,.0f} km2, more than the maximum of {LARGEST_KM2:,.0f} km2 for a scene;"
+            " select a part of it with `bbox`"
         )
     return (west + east) / 2, (south + north) / 2
 
 
-def _gaps(options: BuildOptions) -> Literal["error", "nearest"]:
-    return cast("Literal['error', 'nearest']", options.dem_gaps)
-
-
 @dataclass(frozen=True, slots=True)
 class _Roads:
-    """Roads of a scene and the ground that is graded to them, see `Plan` for the columns.
+    """Roads of a scene and the ground graded to them; see `Plan` for the columns.
 
-    uneven : whether the ground or a road has heights
+    uneven : the ground or a road has heights other than 0
     """
 
     graph: RoadGraph
@@ -249,25 +245,25 @@ def _plan_roads(
     extent: Bounds,
     problems: list[Problem],
 ) -> _Roads:
-    """Graph, profiles, surfaces, bridges and tunnels."""
-    drawn = "roads" in options.only
-    graph = _noted(problems, build_road_graph(osm if drawn else _without_ways(osm), frame))
+    """Road graph with heights, road surfaces, bridges and tunnels."""
+    mapped = osm if "roads" in options.only else replace(osm, areas=[], ways=[], relations=[], points=[])
+    graph = _collect(problems, build_road_graph(mapped, frame))
     graph = profile(graph, terrain.height, obstacles=find_obstacles(osm, frame))
     uneven = bool(terrain.grids) or any(line[:, 2].any() for line in graph.geometry)
     height = graded_ground(graph, terrain.height) if uneven else None
     side, source = found_side(osm)
     if options.driving_side:
         side, source = cast("Side", options.driving_side), "option"
-    surfaces = _noted(
+    surfaces = _collect(
         problems,
         road_surfaces(
-            osm if drawn else _nothing(osm),
+            mapped,
             graph,
             frame=frame,
             options=SurfaceOptions(left_hand=side == "left"),
         ),
     )
-    structures = _noted(problems, read_structures(surfaces, graph, osm=osm, frame=frame, height=height))
+    structures = _collect(problems, read_structures(surfaces, graph, osm=osm, frame=frame, height=height))
     structures = within_extent(structures, extent)
     height = ground_below(structures, height or terrain.height) if len(structures) else height
     return _Roads(
@@ -289,20 +285,8 @@ def _plan_ground(
     )
 
 
-def _without_areas(osm: OsmData) -> OsmData:
-    return replace(osm, areas=[], relations=[])
-
-
-def _without_ways(osm: OsmData) -> OsmData:
-    return replace(osm, ways=[], relations=[], points=[])
-
-
-def _nothing(osm: OsmData) -> OsmData:
-    return replace(osm, areas=[], ways=[], relations=[], points=[])
-
-
 def _extent(frame: Frame, bounds: Bounds, *, buildings: Buildings) -> Bounds:
-    """The ground's rectangle: around the extract's bounds and all buildings, out to whole metres."""
+    """Rectangle of the ground in whole metres: contains the bounds of the map and all buildings."""
     west, south, east, north = bounds
     step = max((east - west) / 8, (north - south) / 8, 1e-6)
     rim = shapely.segmentize(shapely.box(west, south, east, north), step)
@@ -324,7 +308,7 @@ def _surfaces(
     roads: _Roads,
     only: Collection[str],
 ) -> tuple[tuple[Layers, Layers, Layers], list[Problem]]:
-    """Land cover, road surfaces and building pads."""
+    """Land cover, road surfaces and building pads, as layers of the ground."""
     surfaces = roads.surfaces
     problems: list[Problem] = []
     count = buildings.count
@@ -342,10 +326,10 @@ def _surfaces(
         osm_id=surfaces.osm_id,
         source=surfaces.source,
     )
-    standing = footprints.copy()
-    standing[buildings.min_height[:count] >= _STANDING] = None
+    on_ground = footprints.copy()
+    on_ground[buildings.min_height[:count] >= _RAISED] = None
     pads = building_pads(
-        standing, osm_id=buildings.osm_id[:count].astype(str), feature=np.arange(count, dtype=np.int32)
+        on_ground, osm_id=buildings.osm_id[:count].astype(str), feature=np.arange(count, dtype=np.int32)
     )
     return (Layers.concatenate(parts), paved, pads), problems
 
@@ -353,7 +337,7 @@ def _surfaces(
 def _objects(
     osm: OsmData, frame: Frame, *, ground: GroundPlan, only: Collection[str], side: Side
 ) -> tuple[tuple[Trees, Furniture, Barriers], list[Problem]]:
-    """Trees, furniture and barriers at free places; empty tables for kinds not in ``only``."""
+    """Trees, furniture and barriers, moved off carriageways; empty tables for kinds not in ``only``."""
     trees, in_trees = read_trees(osm, frame)
     trees, moved = clear_of(ground, trees)
     furniture, in_furniture = read_furniture(osm, frame, plan=ground, left_hand=side == "left")
@@ -376,7 +360,7 @@ def _objects(
 
 
 def _graded_tiles(graph: RoadGraph, tile_size: float, *, level: bool) -> set[tuple[int, int]]:
-    """Tiles whose ground is graded to roads; on ``level`` ground those with ramps alone."""
+    """Tiles whose ground is graded to roads; on ``level`` ground only those with ramps."""
     if not len(graph):
         return set()
     points = np.concatenate(list(graph.geometry))
@@ -388,7 +372,7 @@ def _graded_tiles(graph: RoadGraph, tile_size: float, *, level: bool) -> set[tup
 
 
 def _numbered(tables: Sequence[Any], first: int) -> list[Any]:
-    """The tables with their rows numbered one after the other, from ``first``."""
+    """The tables with consecutive feature numbers, starting at ``first``."""
     starts = np.cumsum([first, *map(len, tables)])
     return [
         replace(table, feature=np.arange(a, b, dtype=np.int32))
@@ -401,7 +385,7 @@ def _foot(xy: Float, height: Height | None) -> Float:
 
 
 def _by_tile(shapes: NDArray[Any], tile_size: float) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Rows by the tile that holds the middle of their bounding box."""
+    """Rows of shapes by tile: that of the centre of their bounding box."""
     boxes = shapely.bounds(shapes).reshape(-1, 4)
     home = np.floor((boxes[:, :2] + boxes[:, 2:]) / 2 / tile_size).astype(np.int64)
     if not len(home):
@@ -413,7 +397,7 @@ def _by_tile(shapes: NDArray[Any], tile_size: float) -> dict[tuple[int, int], ND
 
 
 def take_buildings(buildings: Buildings, rows: NDArray[np.int64], *, parts: NDArray[np.int64]) -> Buildings:
-    """The chosen buildings (rows below ``count``, rising) with all their parts (rows), as a table."""
+    """The table of some buildings (rows below ``count``, ascending) and of their parts (rows)."""
     keep = np.concatenate([rows, parts])
     columns = {f.name: getattr(buildings, f.name)[keep] for f in fields(Buildings)}
     return Buildings(**(columns | {"outline": np.searchsorted(rows, columns["outline"]).astype(np.int32)}))

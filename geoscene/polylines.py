@@ -1,7 +1,7 @@
-"""Polylines as arrays of points (n, 2) or (n, 3): length, cutting, resampling, parallels, headings.
+"""Polylines as arrays of points (n, 2) or (n, 3): length, cutting, resampling, offset lines, headings.
 
-Lengths, stations and offsets are measured in plan (x, y); heights are interpolated with the other columns.
-A station is the distance along the line from its first point.
+Lengths, stations and offsets are measured in plan (x, y); heights are interpolated. A station is the distance
+along the line from its first point.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ def stations(line: Float) -> Float:
 
 
 def points_at(line: Float, at: Float | list[float], *, along: Float | None = None) -> Float:
-    """Points (k, 2 or 3) of the line at stations (k,); beyond an end, that end.
+    """Points (k, 2 or 3) of the line at stations (k,), clamped to its ends.
 
-    along : stations of the line's points, where they are known already
+    along : stations of the line's points, if already computed
     """
-    known = stations(line) if along is None else along
-    return np.stack([np.interp(at, known, column) for column in line.T], axis=1)
+    along = stations(line) if along is None else along
+    return np.stack([np.interp(at, along, column) for column in line.T], axis=1)
 
 
 def cut(line: Float, start: float, *, end: float, gap: float = 0.0, least: float = 0.0) -> Float:
-    """The part (k, 2 or 3) of the line between two stations; at least its two ends.
+    """The part (k, 2 or 3) of the line between two stations, always with both end points.
 
-    An end before the start gives the two points alone.
+    If ``end`` is before ``start``, only these two points are returned.
 
     gap   : vertices within this distance of the new ends are left out
-    least : smallest length of the part: its end moves on where it would be shorter
+    least : minimum length of the part; its end is moved further along the line to reach it
     """
     along = stations(line)
     start, end = max(start, 0.0), min(max(end, start + least) if least else end, float(along[-1]))
@@ -47,9 +47,9 @@ def cut(line: Float, start: float, *, end: float, gap: float = 0.0, least: float
 
 
 def parallel(line: Float, offset: float) -> Float:
-    """The line (k, 3) moved by ``offset`` to its left vertex by vertex, with mitred corners.
+    """The line (k, 3) with every vertex moved ``offset`` to the left, with mitred corners.
 
-    Repeated points are left out. Loops that form inside tight bends stay; see `offset_curve`.
+    Repeated points are left out. Loops inside tight bends are kept; `offset_curve` removes them.
     """
     step = np.diff(line[:, :2], axis=0)
     size = np.hypot(*step.T)
@@ -66,9 +66,9 @@ def parallel(line: Float, offset: float) -> Float:
 
 
 def offset_curve(line: Float, offset: float) -> Float:
-    """The line (k, 3) ``offset`` to the left without the loops inside bends; heights of the nearest place.
+    """The line (k, 3) offset to the left without loops inside bends; heights are those of the nearest points.
 
-    Where bends leave less than half of the line, its points are moved one by one instead.
+    If the offset line would be shorter than half the line, each vertex is moved instead, loops included.
     """
     centre = shapely.linestrings(line[:, :2])
     if offset == 0.0 or centre.length < 1e-6:
@@ -85,13 +85,13 @@ def offset_curve(line: Float, offset: float) -> Float:
 
 
 def unit(vector: Float) -> Float:
-    """Unit vectors along vectors (..., 2); zero for zero."""
+    """Unit vectors of vectors (..., 2); zero vectors stay zero."""
     size: Float = np.maximum(np.hypot(vector[..., 0], vector[..., 1]), 1e-9)
     return vector / size[..., None]
 
 
 def end_headings(line: Float, *, reach: float) -> tuple[float, float]:
-    """Headings, radians, in which the line begins and ends, over ``reach`` or up to its other end."""
+    """Headings in radians of the line's first and last part, each measured over the length ``reach``."""
     found = []
     for xy, sign in ((line[:, :2], 1.0), (line[::-1, :2], -1.0)):
         far = np.flatnonzero(np.hypot(*(xy - xy[0]).T) >= reach)
@@ -118,7 +118,7 @@ def curvatures(line: Float) -> Float:
 
 
 def directions(lines: NDArray[np.object_], at: Float, *, reach: ArrayLike) -> Float:
-    """Unit vectors (k, 2) along shapely lines (k,) at stations (k,), over ``reach`` before and behind."""
+    """Unit vectors (k, 2) along shapely lines (k,) at stations (k,), measured ``reach`` to both sides."""
     total = shapely.length(lines)
     back, ahead = (
         shapely.get_coordinates(shapely.line_interpolate_point(lines, np.clip(at + step, 0.0, total)))

@@ -1,4 +1,4 @@
-"""How long work says how far it is."""
+"""Callback by which long tasks report progress."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Called with the name of the stage and how much of it is done; must be cheap and never raise."""
+    """Progress callback; implementations must be fast and must not raise."""
 
     def __call__(self, stage: str, done: int, *, total: int) -> None:
-        """Take note: ``done`` of ``total`` steps of a stage; a total of 0 means it is not known."""
+        """Report that ``done`` of ``total`` steps of a stage are complete; ``total`` is 0 if unknown."""
 
 
 def silent(stage: str, done: int, *, total: int) -> None:
-    """Take no note."""
+    """Report nothing."""

@@ -1,4 +1,4 @@
-"""Problems: what was repaired or dropped between the map and the scene."""
+"""Problems: features that were repaired or dropped between the map and the scene."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Action = Literal["repaired", "dropped"]
 class Problem:
     """One feature that could not be used as mapped.
 
-    osm_id : ``way/123``, ``relation/45`` or ``node/6``; of other sources ``name:id``
+    osm_id : ``way/123``, ``relation/45`` or ``node/6``; ``name:id`` for other sources
     kind   : kind of the feature: ``building``, ``road``, ``water``, ``area`` ...
-    action : ``repaired`` (it is in the scene, changed) or ``dropped`` (it is not)
-    reason : a short fixed slug, such as ``open-ring`` or ``missing-nodes``
-    detail : one line with the amount ("moved 3 vertices by up to 0.4 mm")
+    action : ``repaired`` (changed, in the scene) or ``dropped`` (not in the scene)
+    reason : a fixed slug such as ``open-ring`` or ``missing-nodes``
+    detail : one line with amounts ("moved 3 vertices by up to 0.4 mm")
     """
 
     osm_id: str

@@ -45,7 +45,7 @@ _POINTS = {"north": "n", "east": "e", "south": "s", "west": "w"}
 
 
 def _first(text: str) -> str:
-    """The first of a list of values, in lower case."""
+    """The first of a list of values separated by semicolons, in lower case."""
     return text.split(";", 1)[0].translate(_QUOTES).replace("''", '"').strip().lower()
 
 
@@ -80,9 +80,9 @@ def parse_number(text: str | None) -> float | None:
 def parse_length(text: str | None) -> float | None:
     """A length in metres, or None if the value is not a length.
 
-    The unit is metres unless one follows ("48.5 m", "1.2 km", "574'", "5 ft 6 in", 12'6"); a decimal comma is
-    allowed ("9,5"); of a list ("5;6") the first counts; "~10" and "ca. 10" are 10. Typographic quotes are
-    read as marks of feet and inches. The sign is kept.
+    The unit is metres unless given ("48.5 m", "1.2 km", "574'", "5 ft 6 in", 12'6"). Accepts decimal commas
+    ("9,5"), typographic quotes for feet and inches, a sign, and "~10" or "ca. 10". Of a list ("5;6") the
+    first value counts.
     """
     if text is None:
         return None
@@ -120,7 +120,7 @@ def parse_color(text: str | None) -> tuple[int, int, int] | None:
     """
     if text is None:
         return None
-    from PIL import ImageColor  # noqa: PLC0415 - only its table of names and its reader of hex are used
+    from PIL import ImageColor  # noqa: PLC0415 (Pillow is needed for colours only)
 
     value = re.sub(r"[\s_-]", "", _first(text))
     if re.fullmatch(r"[0-9a-f]{6}|[0-9a-f]{3}", value):

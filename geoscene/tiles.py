@@ -1,4 +1,4 @@
-"""One tile at a time, by any number of workers, and never twice."""
+"""Builds the tiles of a scene in parallel, and resumes interrupted builds."""
 
 from __future__ import annotations
 
@@ -36,13 +36,14 @@ from geoscene.watertight import validate_mesh
 
 @dataclass(frozen=True, slots=True)
 class TileReport:
-    """What is in a tile.
+    """Contents of a tile.
 
-    solids, watertight : closed objects of the mesh, and how many of them passed the check
-    buildings  : of which buildings
-    faces      : of the mesh
-    instances  : copies of shapes
-    area       : ground in plan, square metres
+    solids     : number of closed solids, buildings included
+    watertight : number of solids that passed the check
+    buildings  : number of building solids
+    faces      : number of faces
+    instances  : number of instances of shapes
+    area       : plan area of the ground in square metres
     problems   : buildings that were simplified or dropped
     """
 
@@ -59,14 +60,14 @@ class TileReport:
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """What the parts of a tile depend on, as digests: equal keys mean equal parts."""
+    """Digests of the inputs of a tile's ground and solids: equal digests mean equal bytes."""
 
     ground: str
     solids: str
 
 
 def make_solids(plan: Plan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, list[Problem]]:
-    """Buildings of tile (i, j), scene coordinates, numbered as in the plan."""
+    """Mesh of the buildings of tile (i, j) in scene metres, and their problems."""
     i, j = tile
     rows = plan.of_tile("buildings", i, j=j)
     if not len(rows):
@@ -77,14 +78,14 @@ def make_solids(plan: Plan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, l
 
 
 def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances]:
-    """Ground, barriers, bridges, tunnels, trees and furniture of tile (i, j), scene coordinates."""
+    """Mesh (ground, barriers, structures) and instances (trees, furniture) of tile (i, j), scene metres."""
     i, j = tile
     covered = tile_place(plan.ground, i, j=j) is not None
     meshes = []
     if covered:
         ground = ground_tile(plan.ground, i, j=j, height=plan.height, levels=plan.levels)
-        solid = ground.klass != Class.TUNNEL  # open where tunnels come out
-        meshes.append(ground if solid.all() else ground.take(solid))
+        kept = ground.klass != Class.TUNNEL  # the ground is open at tunnel mouths
+        meshes.append(ground if kept.all() else ground.take(kept))
     copies = []
     if len(rows := plan.of_tile("trees", i, j=j)):
         copies.append(tree_instances(plan.trees.take(rows), height=plan.height))
@@ -104,9 +105,9 @@ def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances]:
 def build_tile(
     plan: Plan, folder: Path, *, tile: tuple[int, int], lod: int, former: Path | None
 ) -> TileReport:
-    """Make tile (i, j), write it into ``folder`` and say what is in it.
+    """Build tile (i, j), write it into ``folder`` and return a report of its contents.
 
-    former : a tile whose ground is the same and is taken from it
+    former : tile file of an earlier build whose ground is reused
     """
     size = plan.ground.tile_size
     solids, problems = make_solids(plan, tile, lod=lod)
@@ -160,41 +161,41 @@ def build_tiles(
     workers: int,
     former: Path | None,
 ) -> Iterator[TileReport]:
-    """Make all tiles that ``folder`` does not hold yet, and report on every one, in no particular order.
+    """Build all tiles that are not in ``folder`` yet; yields reports of all tiles, in no particular order.
 
-    Workers are processes of the start method in force (`multiprocessing.set_start_method`): forked ones
-    share the plan's pages, spawned ones get a copy each and need a main module that can be imported. Each
-    tile and its report are written to ``folder`` at once, so that an interrupted build can resume. Tiles
-    of a ``former`` scene with the same keys are copied, or their ground is reused.
+    Workers are processes started with the current method (`multiprocessing.set_start_method`). Forked workers
+    share the memory of the plan; spawned ones get a copy each and need an importable main module. Each tile
+    is entered in a journal in ``folder`` once written, so an interrupted build can resume. Tiles of the
+    ``former`` scene with the same keys are copied, or their ground is reused.
     """
     files = SceneFiles(folder)
     files.tiles.mkdir(parents=True, exist_ok=True)
-    wanted = set(tiles)
-    known = {tile: report for tile, report in _known(folder, keys).items() if tile in wanted}
-    kept = {files.tile(*tile) for tile in known}
+    journal = _read_journal(folder, keys)
+    finished = {tile: journal[tile] for tile in tiles if tile in journal}
+    kept = {files.tile(*tile) for tile in finished}
     for path in files.tiles.iterdir():
-        if path not in kept:  # of another build, or half written
+        if path not in kept:  # of a build with other options, or partly written
             path.unlink()
-    yield from known.values()
-    todo = [tile for tile in tiles if tile not in known]
+    yield from finished.values()
+    remaining = [tile for tile in tiles if tile not in finished]
     source = _Former.of(former, keys)
-    if workers > 1 and len(todo) > 1:
+    if workers > 1 and len(remaining) > 1:
         with ProcessPoolExecutor(
             workers,
             mp_context=multiprocessing.get_context(),
             initializer=_start_worker,
             initargs=(_Job(plan, folder, lod, source),),
         ) as pool:
-            for task in as_completed([pool.submit(_work, tile) for tile in todo]):
-                yield _noted(folder, keys, report=task.result())
+            for task in as_completed([pool.submit(_build_in_worker, tile) for tile in remaining]):
+                yield _journalled(folder, keys, report=task.result())
     else:
-        for tile in todo:
-            yield _noted(folder, keys, report=source.build(plan, folder, tile=tile, lod=lod))
+        for tile in remaining:
+            yield _journalled(folder, keys, report=source.build(plan, folder, tile=tile, lod=lod))
 
 
 @dataclass(frozen=True, slots=True)
 class _Former:
-    """A scene built before, and which parts of its tiles may be taken over."""
+    """The scene of an earlier build, and which parts of its tiles can be reused."""
 
     folder: Path | None
     tiles: frozenset[tuple[int, int]]
@@ -227,7 +228,7 @@ class _Former:
 
 @dataclass(frozen=True)
 class _Job:
-    """What all tiles share. Pickled for spawned workers with the precision of its geometries."""
+    """Inputs of all tiles; pickled for spawned workers with the precision of its geometries."""
 
     plan: Plan
     folder: Path
@@ -241,11 +242,11 @@ class _Job:
 
 
 class _Pickler(pickle.Pickler):
-    """Keeps the precision of geometries: overlays depend on it, and shapely's own pickling drops it."""
+    """Keeps the precision of geometries, on which overlays depend; shapely's own pickling drops it."""
 
-    def reducer_override(self, thing: Any) -> Any:
-        grid = shapely.get_precision(thing) if isinstance(thing, shapely.Geometry) else 0.0
-        return (_on_grid, (shapely.to_wkb(thing), grid)) if grid else NotImplemented
+    def reducer_override(self, value: Any) -> Any:
+        grid = shapely.get_precision(value) if isinstance(value, shapely.Geometry) else 0.0
+        return (_on_grid, (shapely.to_wkb(value), grid)) if grid else NotImplemented
 
 
 def _on_grid(wkb: bytes, grid: float) -> shapely.Geometry:
@@ -261,7 +262,7 @@ _job: _Job
 
 
 def _start_worker(job: _Job) -> None:
-    """Store the job, and end this worker when the build's own process ends."""
+    """Store the job, and exit when the parent process ends."""
     global _job  # noqa: PLW0603  (of this process alone)
     _job = job
     parent = multiprocessing.parent_process()
@@ -275,7 +276,7 @@ def _start_worker(job: _Job) -> None:
     threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
 
 
-def _work(tile: tuple[int, int]) -> TileReport:
+def _build_in_worker(tile: tuple[int, int]) -> TileReport:
     return _job.source.build(_job.plan, _job.folder, tile=tile, lod=_job.lod)
 
 
@@ -283,28 +284,28 @@ def _report(document: dict[str, Any]) -> TileReport:
     return TileReport(**(document | {"problems": tuple(Problem(**p) for p in document["problems"])}))
 
 
-def _noted(folder: Path, keys: Keys, *, report: TileReport) -> TileReport:
-    """Append a report to the folder's journal."""
+def _journalled(folder: Path, keys: Keys, *, report: TileReport) -> TileReport:
+    """Append a report to the journal in the folder, and return it."""
     with SceneFiles(folder).tile_journal.open("a", encoding="utf-8") as journal:
         journal.write(json.dumps({"keys": asdict(keys), **asdict(report)}) + "\n")
     return report
 
 
-def _known(folder: Path, keys: Keys) -> dict[tuple[int, int], TileReport]:
-    """Reports of the tiles that a build with the same keys has left in the folder."""
+def _read_journal(folder: Path, keys: Keys) -> dict[tuple[int, int], TileReport]:
+    """Reports by tile of an interrupted build with the same keys in the folder."""
     files = SceneFiles(folder)
     path = files.tile_journal
-    known: dict[tuple[int, int], TileReport] = {}
+    reports: dict[tuple[int, int], TileReport] = {}
     for line in path.read_text("utf-8").splitlines() if path.exists() else ():
         try:
             document = json.loads(line)
         except ValueError:  # the incomplete last line of an interrupted build
             continue
         if document.pop("keys") == asdict(keys) and files.tile(document["i"], document["j"]).exists():
-            known[document["i"], document["j"]] = _report(document)
-    return known
+            reports[document["i"], document["j"]] = _report(document)
+    return reports
 
 
 def tiles_document(keys: Keys, reports: Sequence[TileReport]) -> dict[str, Any]:
-    """The document of tile reports of a finished scene."""
+    """The JSON object of the tile reports of a finished scene."""
     return {"keys": asdict(keys), "tiles": [asdict(r) for r in sorted(reports, key=lambda r: (r.i, r.j))]}

@@ -1,4 +1,4 @@
-"""Whether solids are solid: closed, oriented, of positive volume, without degenerate faces."""
+"""Checks of solids: closed, consistently oriented, of positive volume, without degenerate faces."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from geoscene.mesh import Mesh
 from geoscene.typing import Float, Ints
 
 GRID = 1e-4
-"""Step of the grid that solids' vertices lie on, metres; vertices in the same cell are one."""
+"""Metres, cell size of the grid on which vertices are welded: those in one cell count as one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """One row per feature with closed faces, in order of feature number.
+    """Result of the checks, one row per feature with closed faces, in order of feature number.
 
     feature    : (n,) int32
     faces      : (n,) int64, number of faces
     finite     : (n,) bool, no vertex is NaN or infinite
-    closed     : (n,) bool, after welding every edge has exactly two faces
-    oriented   : (n,) bool, and they pass it in opposite directions
-    positive   : (n,) bool, the signed volume is over 0
+    closed     : (n,) bool, every edge has exactly two faces after welding
+    oriented   : (n,) bool, adjacent faces run along their common edge in opposite directions
+    positive   : (n,) bool, the signed volume is positive
     degenerate : (n,) int64, faces without area after welding
     volume     : (n,) float64, cubic metres; NaN where not finite
     """
@@ -43,12 +43,12 @@ class Verdict:
 
     @property
     def ok(self) -> NDArray[np.bool_]:
-        """(n,) bool, nothing is wrong with the feature."""
-        fine: NDArray[np.bool_] = self.finite & self.closed & self.oriented & self.positive
-        return np.asarray(fine & (self.degenerate == 0), np.bool_)
+        """(n,) bool, the feature passes all checks."""
+        passed = self.finite & self.closed & self.oriented & self.positive & (self.degenerate == 0)
+        return np.asarray(passed, np.bool_)
 
     def fault(self, row: int) -> str:
-        """The first thing wrong with a feature as a slug, "" if nothing."""
+        """The first failed check of a feature as a slug, "" if it passes all."""
         checks = (
             ("not-finite", self.finite[row]),
             ("degenerate-faces", self.degenerate[row] == 0),
@@ -56,12 +56,12 @@ class Verdict:
             ("not-oriented", self.oriented[row]),
             ("no-volume", self.positive[row]),
         )
-        return next((slug for slug, fine in checks if not fine), "")
+        return next((slug for slug, passed in checks if not passed), "")
 
 
 def _pair_ids(a: Ints, b: Ints) -> tuple[Ints, Ints]:
     """Numbers 0..k-1 of the distinct pairs (a, b), and the first index of each."""
-    # both are dense counts or grid numbers here, so that the product stays below 2**63
+    # a and b are ids or grid numbers, so the product stays below 2**63
     low = b.min(initial=0)
     key = a * (b.max(initial=0) - low + 1) + (b - low)
     _, first, ids = np.unique(key, return_index=True, return_inverse=True)
@@ -69,9 +69,9 @@ def _pair_ids(a: Ints, b: Ints) -> tuple[Ints, Ints]:
 
 
 def weld(points: Float, owner: NDArray[np.integer], *, grid: float = GRID) -> tuple[Ints, Ints]:
-    """Ints (n,) of points that are one (same owner, same cell of the grid), and the first index of each id.
+    """Id (n,) of each point, equal for points of one owner in one grid cell, and the first point of each id.
 
-    points : (n, 3) metres, finite, within 1e5 m of zero
+    points : (n, 3) metres, finite, within 1e5 m of the origin
     """
     cell = np.rint(points * (1.0 / grid)).astype(np.int64)
     cell -= cell.min(axis=0, initial=np.iinfo(np.int64).max, keepdims=True) if len(cell) else 0
@@ -81,10 +81,10 @@ def weld(points: Float, owner: NDArray[np.integer], *, grid: float = GRID) -> tu
 
 
 def edge_uses(corners: Ints) -> tuple[Ints, Ints, Ints]:
-    """Edge number of every half-edge (3 m,), and per edge its number of uses and their balance.
+    """Edge number of every half-edge (3 m,), and of each edge the number and the balance of its half-edges.
 
     corners : (m, 3) welded vertex ids. Half-edge k of face i is number 3 i + k and goes from corner k to
-              corner k + 1; the balance counts one direction as +1 and the other as -1.
+              corner k + 1; the balance counts half-edges of one direction as +1, those of the other as -1.
     """
     start, stop = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
     edge, first = _pair_ids(np.minimum(start, stop), np.maximum(start, stop))
@@ -94,17 +94,17 @@ def edge_uses(corners: Ints) -> tuple[Ints, Ints, Ints]:
 
 
 def degenerate_faces(points: Float, faces: NDArray[np.integer], *, grid: float = GRID) -> NDArray[np.bool_]:
-    """(m,) bool: the three corners lie on one line, exactly, once they are on the grid."""
+    """(m,) bool: the three corners, rounded to the grid, are collinear."""
     cell = np.rint(points * (1.0 / grid)).astype(np.int64)
     a, b, c = (cell[faces[:, k]] for k in range(3))
-    # integer differences below 2**31 (200 km) keep the cross product exact
+    # the cross product is exact for differences below 2**31 grid cells (200 km)
     return np.asarray(~np.cross(b - a, c - a).any(axis=1), np.bool_)
 
 
 def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
-    """The verdict on every feature that has closed faces (`Mesh.closed`).
+    """Check every feature that has closed faces (`Mesh.closed`).
 
-    Vertices of one feature within the same cell of the grid count as one, as they will in a file that rounds.
+    Vertices of a feature in one grid cell count as one, because files with rounded coordinates merge them.
     """
     rows = np.flatnonzero(mesh.closed)
     faces = mesh.faces[rows].astype(np.int64)
@@ -113,11 +113,11 @@ def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
 
     finite_face = np.isfinite(mesh.vertices[faces]).all(axis=(1, 2))
     finite = np.bincount(owner, weights=~finite_face, minlength=n) == 0
-    sound = finite[owner]
-    corners, owners = mesh.vertices[faces[sound]].reshape(-1, 3), np.repeat(owner[sound], 3)
+    checked = finite[owner]
+    corners, owners = mesh.vertices[faces[checked]].reshape(-1, 3), np.repeat(owner[checked], 3)
     ids, first = weld(corners, owners, grid=grid)
     points, triangles = corners[first], ids.reshape(-1, 3)
-    owner_of = owner[sound]
+    owner_of = owner[checked]
 
     edge, uses, balance = edge_uses(triangles)
     edge_owner = np.zeros(len(uses), np.int64)
@@ -141,7 +141,7 @@ def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
 
 
 def _volumes(points: Float, triangles: Ints, *, owner: Ints, n: int) -> Float:
-    """Signed volume (n,) of each owner's triangles, summed about its own first vertex to keep digits."""
+    """Signed volume (n,) of each owner's triangles, summed about its first vertex for precision."""
     if not len(triangles):
         return np.zeros(n)
     anchor = np.zeros((n, 3))

@@ -236,8 +236,8 @@ def test_a_build_that_fails_leaves_nothing(osm, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_to_build_is_said(tmp_path):
-    with pytest.raises(SourceNotFoundError, match="nothing"):
+def test_map_without_features_is_refused(tmp_path):
+    with pytest.raises(SourceNotFoundError, match="no features"):
         build(OsmData((24.9, 60.1, 24.91, 60.11), [], [], [], []), tmp_path / "x")
 
 

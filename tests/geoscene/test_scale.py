@@ -150,7 +150,7 @@ def test_a_long_wall_is_seen_from_its_end(make_osm, town, tmp_path):
 
 
 def test_a_bridge_is_seen_from_its_end(town, tmp_path, monkeypatch):
-    monkeypatch.setattr("geoscene.pipeline._BESIDE", 0.0)
+    monkeypatch.setattr("geoscene.pipeline._OFFSET", 0.0)
     monkeypatch.setattr("geoscene.pipeline._CROWN", 0.0)
     options = BuildOptions(tile_size=50.0, only=("roads",))
     plan, _ = make_plan(read_osm(town), options, progress=silent)
