@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,19 +13,19 @@ from pyproj import CRS
 
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
-from geoscene.export.files import Summary, size_of
+from geoscene.export.files import Summary, compact_json
 from geoscene.export.objects import (
     Features,
     Part,
     Piece,
     attribution,
-    geoscene_lod,
     klass_name,
     parts,
     pieces,
     read_features,
 )
 from geoscene.export.shells import bodies, shell_numbers
+from geoscene.export.tables import target_crs
 from geoscene.files import append, atomic_file, spool
 from geoscene.frames import Frame, utm_crs
 from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh
@@ -44,40 +43,28 @@ LOD = {0: "1.1", 1: "1.3", 2: "2.1"}
 """The scene's level of detail in the terms of Biljecki, Ledoux and Stoter, "An improved LOD specification
 for 3D building models" (2016): blocks; parts of several heights; roofs over indented outlines."""
 
+_STREET_FURNITURE = (Class.POLE, Class.TRAFFIC_SIGN, Class.TRAFFIC_LIGHT, Class.BOLLARD, Class.BENCH)
 _TYPES: dict[int, str] = {
-    Class.ROAD: "Road",
-    Class.LANE_MARKING: "Road",
-    Class.CROSSING: "Road",
-    Class.SIDEWALK: "Road",
-    Class.KERB: "Road",
-    Class.PARKING: "Road",
-    Class.RAIL: "Railway",
-    Class.TERRAIN: "TINRelief",
-    Class.GRASS: "LandUse",
-    Class.FOREST_FLOOR: "LandUse",
-    Class.SAND: "LandUse",
-    Class.BUILDING_PAD: "LandUse",
-    Class.WATER: "WaterBody",
-    Class.BUILDING: "Building",
-    Class.BRIDGE: "Bridge",
-    Class.TUNNEL: "Tunnel",
-    Class.WALL: "CityFurniture",
-    Class.FENCE: "CityFurniture",
-    Class.HEDGE: "PlantCover",
-    Class.TREE_CROWN: "SolitaryVegetationObject",
-    Class.TRUNK: "SolitaryVegetationObject",
-    Class.POLE: "CityFurniture",
-    Class.TRAFFIC_SIGN: "CityFurniture",
-    Class.TRAFFIC_LIGHT: "CityFurniture",
-    Class.BOLLARD: "CityFurniture",
-    Class.BENCH: "CityFurniture",
-    Class.OTHER_STRUCTURE: "OtherConstruction",
+    klass: name
+    for name, classes in {
+        "Road": (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.SIDEWALK, Class.KERB, Class.PARKING),
+        "Railway": (Class.RAIL,),
+        "TINRelief": (Class.TERRAIN,),
+        "LandUse": (Class.GRASS, Class.FOREST_FLOOR, Class.SAND, Class.BUILDING_PAD),
+        "WaterBody": (Class.WATER,),
+        "Building": (Class.BUILDING,),
+        "Bridge": (Class.BRIDGE,),
+        "Tunnel": (Class.TUNNEL,),
+        "CityFurniture": (Class.WALL, Class.FENCE, *_STREET_FURNITURE),
+        "PlantCover": (Class.HEDGE,),
+        "SolitaryVegetationObject": (Class.TREE_CROWN, Class.TRUNK),
+        "OtherConstruction": (Class.OTHER_STRUCTURE,),
+    }.items()
+    for klass in classes
 }
 _CONSTRUCTIONS = frozenset({"Building", "Bridge", "Tunnel", "OtherConstruction"})
 _WITH_PARTS = frozenset({"Building", "Bridge", "Tunnel"})
 _AUXILIARY = frozenset({Class.KERB, Class.LANE_MARKING})
-
-
 _PARTS = {"Railway": "TrafficArea", "WaterBody": "WaterSurface"}
 
 
@@ -134,10 +121,7 @@ def _target(scene: Scene, crs: str | None) -> tuple[_Target, tuple[str, ...]]:
     if crs is None and not scene.frame.name.startswith("EPSG:"):
         crs = utm_crs(*(float(v) for v in scene.frame.to_geographic(*middle)))
         notes = (f"CityJSON names a CRS by its code and the scene's has none: coordinates are in {crs}",)
-    try:
-        parsed = CRS.from_user_input(crs or scene.frame.name)
-    except Exception as error:
-        raise InputError(f"`crs` {crs}: not a CRS that pyproj can read; give EPSG:<number>") from error
+    parsed = target_crs(scene, crs)
     if not parsed.is_projected or parsed.to_epsg() is None:
         raise InputError(f"`crs` {crs}: CityJSON needs a projected CRS with an EPSG code")
     same = parsed == scene.frame.crs
@@ -169,23 +153,22 @@ def write_cityjson(
     features = read_features(scene)
     library = list(scene.shapes().values())
     palette = _Palette()
-    lod = LOD[geoscene_lod(scene)]
+    lod = LOD[int(scene.manifest.get("options", {}).get("lod", 2))]
     objects = solids = faces = count = 0
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     with atomic_file(path) as out, spool(path) as vertices:
         out.write(b'{"type":"CityJSON","version":"2.0","CityObjects":{')
-        for done, part in enumerate(parts(scene, layers)):
-            progress("CityJSON", done, total=len(scene.tile_indices))
+        for part in parts(scene, layers, stage="CityJSON", progress=progress):
             whole, entries, closed = _tile_objects(
                 part, features, library=library, target=target, palette=palette, lod=lod, first=count
             )
             for name, entry in entries:
                 out.write(b",\n" if objects else b"\n")
-                out.write(_json(name) + b":" + _json(entry))
+                out.write(compact_json(name) + b":" + compact_json(entry))
                 objects += 1
             if len(whole):
                 vertices.write(b",\n" if count else b"\n")
-                vertices.write(_json(whole.tolist())[1:-1])
+                vertices.write(compact_json(whole.tolist())[1:-1])
                 low, high = np.minimum(low, whole.min(axis=0)), np.maximum(high, whole.max(axis=0))
             count += len(whole)
             solids += closed
@@ -194,21 +177,15 @@ def write_cityjson(
         append(out, vertices)
         out.write(b"],\n")
         if library:
-            out.write(b'"geometry-templates":' + _json(_templates(library, palette)) + b",\n")
-        out.write(b'"appearance":' + _json(palette.to_json()) + b",\n")
+            out.write(b'"geometry-templates":' + compact_json(_templates(library, palette)) + b",\n")
+        out.write(b'"appearance":' + compact_json(palette.to_json()) + b",\n")
         extent = np.concatenate([low, high]) * target.step + np.tile(target.zero, 2)
-        out.write(b'"transform":' + _json({"scale": [target.step] * 3, "translate": target.zero.tolist()}))
-        out.write(
-            b',\n"metadata":' + _json(_metadata(scene, target, extent=extent if count else None)) + b"}\n"
-        )
-    files, size = size_of(path)
-    return Summary(
-        path, "cityjson", files, size, objects, solids, faces, f"EPSG:{target.crs.to_epsg()}", notes
-    )
-
-
-def _json(value: Any) -> bytes:
-    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
+        transform = {"scale": [target.step] * 3, "translate": target.zero.tolist()}
+        out.write(b'"transform":' + compact_json(transform))
+        metadata = _metadata(scene, target, extent=extent if count else None)
+        out.write(b',\n"metadata":' + compact_json(metadata) + b"}\n")
+    name = f"EPSG:{target.crs.to_epsg()}"
+    return Summary.of(path, "cityjson", objects=objects, solids=solids, faces=faces, crs=name, notes=notes)
 
 
 def _metadata(scene: Scene, target: _Target, *, extent: Float | None) -> dict[str, Any]:

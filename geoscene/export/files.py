@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,11 @@ class Summary:
     crs: str = ""
     notes: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, path: Path, kind: str, **fields: Any) -> Summary:
+        """The summary of what was written to a path, with the number and size of the files there."""
+        return cls(path, kind, *size_of(path), **fields)
+
 
 def size_of(path: Path) -> tuple[int, int]:
     """Number of files and of bytes at a path."""
@@ -48,3 +54,8 @@ def plain(value: Any) -> Any:
     if value is None or value == "" or (isinstance(value, float) and not np.isfinite(value)):
         return None
     return value
+
+
+def compact_json(value: Any) -> bytes:
+    """A value as JSON without spaces."""
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from geoscene.export.files import Summary, size_of
-from geoscene.export.gltf import GlbWriter, y_up
+from geoscene.export.files import Summary
+from geoscene.export.gltf import GlbWriter, add_instances, y_up
 from geoscene.export.objects import Features, Part, attribution, klass_name, parts, pieces, read_features
 from geoscene.files import atomic_file
-from geoscene.mesh import Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 
@@ -38,13 +38,18 @@ def write_glb(
         tables = _tables(writer, features, layers=layers)
         shapes: dict[int, int] = {}
         tiles = []
-        for done, part in enumerate(parts(scene, layers)):
-            progress("GLB", done, total=len(scene.tile_indices))
-            first = writer.nodes
-            closed = _objects(writer, part, features=features, tables=tables)
-            objects += writer.nodes - first
-            solids += closed
-            objects += _copies(writer, part, features=features, tables=tables, shapes=shapes, library=library)
+
+        def metadata(layer: int, feature: NDArray[np.int32]) -> dict[str, Any]:
+            table, start, count = tables[features.layers[layer]]
+            return {"table": table, "rows": feature - start, "count": count}
+
+        for part in parts(scene, layers, stage="GLB", progress=progress):
+            first, copies = writer.nodes, part.instances
+            solids += _objects(writer, part, features=features, tables=tables)
+            objects += writer.nodes - first + len(copies)
+            add_instances(
+                writer, copies, features=features, library=library, meshes=shapes, metadata=metadata
+            )
             faces += len(part.mesh)
             if writer.nodes > first:
                 name = f"tile {part.index[0]} {part.index[1]}"
@@ -59,8 +64,7 @@ def write_glb(
             extras={"crs": scene.frame.name, "wkt": scene.frame.wkt, "vertical": scene.frame.vertical},
         )
         writer.finish(out, scene_nodes=[root], asset={"copyright": attribution(scene)})
-    files, size = size_of(path)
-    return Summary(path, "glb", files, size, objects, solids, faces, scene.frame.name)
+    return Summary.of(path, "glb", objects=objects, solids=solids, faces=faces, crs=scene.frame.name)
 
 
 def _tables(
@@ -103,32 +107,3 @@ def _objects(
         )
         solids += piece.solid
     return solids
-
-
-def _copies(
-    writer: GlbWriter,
-    part: Part,
-    *,
-    features: Features,
-    tables: dict[str, tuple[int, int, int]],
-    shapes: dict[int, int],
-    library: dict[str, Mesh],
-) -> int:
-    """Add a node for every shape and layer of a tile's instances; returns the number of instances."""
-    copies = part.instances
-    layer = np.searchsorted(features.starts, copies.feature, side="right")
-    keys = np.column_stack([copies.shape, layer])
-    names: Sequence[str] = list(library)
-    for number, of_layer in np.unique(keys, axis=0).tolist():
-        chosen = (keys == (number, of_layer)).all(axis=1)
-        if number not in shapes:
-            mesh = library[names[number]]
-            shapes[number] = writer.mesh(mesh, y_up(mesh.vertices).astype("<f4"), name=names[number])
-        metadata: dict[str, Any] = {}
-        if of_layer:
-            table, first, count = tables[features.layers[of_layer - 1]]
-            metadata = {"table": table, "rows": copies.feature[chosen] - first, "count": count}
-        transform = copies.transform[chosen]
-        origin = np.round(transform[:, :, 3].mean(axis=0))
-        writer.copies(shapes[number], transform, name=names[number], origin=origin, **metadata)
-    return len(copies)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -15,8 +14,10 @@ from numpy.typing import NDArray
 
 from geoscene.classes import materials
 from geoscene.errors import InputError
+from geoscene.export.files import compact_json
+from geoscene.export.objects import Features
 from geoscene.files import append, spool
-from geoscene.mesh import Mesh
+from geoscene.mesh import Instances, Mesh
 from geoscene.typing import Float
 
 _COMPONENTS = {"u2": 5123, "u4": 5125, "f4": 5126}
@@ -39,11 +40,6 @@ def y_up(points: Float) -> Float:
     return np.stack([points[..., 0], points[..., 2], -points[..., 1]], axis=-1)
 
 
-def dump(value: Any) -> bytes:
-    """Compact JSON."""
-    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
-
-
 class _Spooled:
     """A JSON list on disk."""
 
@@ -53,7 +49,7 @@ class _Spooled:
 
     def add(self, value: Any) -> int:
         """Append a value; returns its number."""
-        self.file.write((b"," if self.count else b"") + dump(value))
+        self.file.write((b"," if self.count else b"") + compact_json(value))
         self.count += 1
         return self.count - 1
 
@@ -265,7 +261,7 @@ class GlbWriter:
             head["materials"] = [_material(code, color) for code, *color in self._materials]
         head["buffers"] = [{"byteLength": starts[-1]}]
         head["bufferViews"] = [_view(k, starts[k], size=sizes[k]) for k in range(len(sizes))]
-        text = dump({k: v for k, v in head.items() if v})
+        text = compact_json({k: v for k, v in head.items() if v})
         out.write(text[:-1])
         for name, values in self._lists.items():
             if values.count:
@@ -273,6 +269,36 @@ class GlbWriter:
                 append(out, values.file)
                 out.write(b"]")
         out.write(b"}")
+
+
+def add_instances(
+    writer: GlbWriter,
+    instances: Instances,
+    *,
+    features: Features,
+    library: Mapping[str, Mesh],
+    meshes: dict[int, int],
+    metadata: Callable[[int, NDArray[np.int32]], dict[str, Any]],
+) -> list[int]:
+    """Add a node for every shape and layer of instances; returns the nodes' numbers.
+
+    meshes   : numbers of the meshes of shapes that the file has already; new ones are added
+    metadata : the arguments ``table``, ``rows`` and ``count`` of `GlbWriter.copies` for a layer's number and
+               the features of its instances
+    """
+    layer = np.searchsorted(features.starts, instances.feature, side="right") - 1
+    keys = np.column_stack([instances.shape, layer])
+    names, nodes = list(library), []
+    for number, of_layer in np.unique(keys, axis=0).tolist():
+        chosen = (keys == (number, of_layer)).all(axis=1)
+        name = names[number]
+        if number not in meshes:
+            meshes[number] = writer.mesh(library[name], y_up(library[name].vertices).astype("<f4"), name=name)
+        ids = metadata(of_layer, instances.feature[chosen]) if of_layer >= 0 else {}
+        transform = instances.transform[chosen]
+        origin = np.round(transform[:, :, 3].mean(axis=0))
+        nodes.append(writer.copies(meshes[number], transform, name=name, origin=origin, **ids))
+    return nodes
 
 
 def _view(number: int, start: int, *, size: int) -> dict[str, Any]:

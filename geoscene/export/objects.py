@@ -13,6 +13,7 @@ from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.export.files import plain
 from geoscene.mesh import Instances, Mesh, concatenate
+from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Bools, Float, Ints
 
@@ -107,14 +108,6 @@ def pieces(mesh: Mesh) -> list[Piece]:
     ]
 
 
-def check_layers(scene: Scene, layers: Collection[str] | None) -> None:
-    """Raise InputError for unknown names of layers."""
-    known = [*scene.layers, BARE]
-    unknown = sorted(set(layers or ()) - set(known))
-    if unknown:
-        raise InputError(f"no layer {', '.join(unknown)}; this scene has {', '.join(known)}")
-
-
 def wanted_rows(scene: Scene, feature: NDArray[np.int32], *, layers: Collection[str] | None) -> Bools:
     """Whether faces or instances (m,) belong to one of the layers; all of them for None."""
     if layers is None:
@@ -136,10 +129,18 @@ class Part:
     instances: Instances
 
 
-def parts(scene: Scene, layers: Collection[str] | None = None) -> Iterator[Part]:
-    """The tiles of a scene one at a time, restricted to the chosen layers."""
-    check_layers(scene, layers)
-    for i, j in scene.tile_indices:
+def parts(
+    scene: Scene, layers: Collection[str] | None = None, *, stage: str = "", progress: Progress = silent
+) -> Iterator[Part]:
+    """The tiles of a scene one at a time, restricted to the chosen layers.
+
+    Raises InputError for unknown names of layers.
+    """
+    known = [*scene.layers, BARE]
+    if unknown := sorted(set(layers or ()) - set(known)):
+        raise InputError(f"no layer {', '.join(unknown)}; this scene has {', '.join(known)}")
+    for done, (i, j) in enumerate(scene.tile_indices):
+        progress(stage, done, total=len(scene.tile_indices))
         tile = scene.tile(i, j)
         mesh, copies = tile.mesh, tile.instances
         if layers is not None:
@@ -172,11 +173,6 @@ def expand(instances: Instances, library: Sequence[Mesh]) -> Mesh:
 def klass_name(code: int) -> str:
     """``building`` for 14."""
     return Class(code).name.lower()
-
-
-def geoscene_lod(scene: Scene) -> int:
-    """Level of detail that the scene's buildings were built at."""
-    return int(scene.manifest.get("options", {}).get("lod", 2))
 
 
 def attribution(scene: Scene) -> str:

@@ -10,7 +10,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from geoscene.export.files import Summary, size_of
+from geoscene.export.files import Summary
 from geoscene.export.objects import attribution
 from geoscene.export.roadnet import END, START, Carriageway, Connection, RoadNet, road_net
 from geoscene.files import atomic_file
@@ -21,15 +21,10 @@ from geoscene.typing import Float
 
 _TYPES = {
     "motorway": "motorway",
-    "motorway_link": "motorway",
     "trunk": "townExpressway",
-    "trunk_link": "townExpressway",
     "primary": "townArterial",
-    "primary_link": "townArterial",
     "secondary": "townArterial",
-    "secondary_link": "townArterial",
     "tertiary": "townCollector",
-    "tertiary_link": "townCollector",
     "unclassified": "townLocal",
     "residential": "townLocal",
     "living_street": "townPlayStreet",
@@ -83,12 +78,10 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
             out.write("".join(road).encode())
         out.write("".join(_junctions(net, junctions, first=first, left_hand=left_hand)).encode())
         out.write(b"</OpenDRIVE>\n")
-    files, size = size_of(path)
     chains = len(graph.chain_edges)
-    notes = (f"{chains} turn restrictions via ways are left out: OpenDRIVE has only those via nodes",)
-    return Summary(
-        path, "opendrive", files, size, len(net.roads), crs=scene.frame.name, notes=notes if chains else ()
-    )
+    lost = (f"{chains} turn restrictions via ways are left out: OpenDRIVE has only those via nodes",)
+    notes = lost if chains else ()
+    return Summary.of(path, "opendrive", objects=len(net.roads), crs=scene.frame.name, notes=notes)
 
 
 def _n(value: float) -> str:
@@ -166,7 +159,7 @@ def _road(
 
 
 def _type(graph: RoadGraph, edge: int) -> str:
-    kind = _TYPES.get(str(graph.highway[edge]), "unknown")
+    kind = _TYPES.get(str(graph.highway[edge]).removesuffix("_link"), "unknown")
     return "rural" if kind != "motorway" and graph.speed[edge] > _FAST else kind
 
 

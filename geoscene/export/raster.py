@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes
 from geoscene.errors import InputError
-from geoscene.export.files import Summary, size_of
+from geoscene.export.files import Summary
 from geoscene.export.objects import attribution, expand, parts
 from geoscene.export.zbuffer import draw_triangles
 from geoscene.files import atomic_path
@@ -96,8 +96,7 @@ def write_geotiff(
         labels = np.memmap(Path(folder) / "labels", np.uint8, "w+", shape=shape)
         for top in range(0, grid.rows, _BLOCK):
             height[top : top + _BLOCK] = np.nan
-        for done, part in enumerate(parts(scene, layers)):
-            progress("GeoTIFF", done, total=len(scene.tile_indices))
+        for part in parts(scene, layers, stage="GeoTIFF", progress=progress):
             mesh = part.mesh
             if model == "terrain":
                 mesh = mesh.take(~mesh.closed & ~np.isin(mesh.klass, _STRUCTURES))
@@ -108,9 +107,8 @@ def write_geotiff(
         draft = Path(folder) / "draft.tif"
         _write_draft(draft, scene, grid=grid, cells=labels if model == "classes" else height, model=model)
         _write_cog(draft, path, model=model)
-    files, size = size_of(path)
     count = grid.columns * grid.rows
-    return Summary(path, "geotiff", files, size, count, faces=faces, crs=scene.frame.name)
+    return Summary.of(path, "geotiff", objects=count, faces=faces, crs=scene.frame.name)
 
 
 def _draw(

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 from geoscene.errors import GeosceneError, need
-from geoscene.export.files import Summary, size_of
+from geoscene.export.files import Summary
 from geoscene.export.opendrive import write_opendrive
 from geoscene.files import atomic_file
 from geoscene.progress import Progress, silent
@@ -31,13 +31,7 @@ def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summ
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".geoscene-") as folder:
         roads, net = Path(folder) / "roads.xodr", Path(folder) / "roads.net.xml"
         roads_summary = write_opendrive(scene, roads, progress=progress)
-        command: list[str | Path] = [
-            home / "bin" / "netconvert",
-            "--opendrive-files",
-            roads,
-            "--output-file",
-            net,
-        ]
+        command = (home / "bin" / "netconvert", "--opendrive-files", roads, "--output-file", net)
         # no shell; only the folder's name comes from the user
         run = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
         if run.returncode or not net.exists():
@@ -46,6 +40,5 @@ def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summ
         with atomic_file(path) as out:
             out.write(_STAMP.sub(b"", net.read_bytes()))
     warned = run.stderr.count("Warning")
-    files, size = size_of(path)
     notes = (*roads_summary.notes, *([f"netconvert gave {warned} warnings"] if warned else []))
-    return Summary(path, "sumo", files, size, roads_summary.objects, crs=scene.frame.name, notes=notes)
+    return Summary.of(path, "sumo", objects=roads_summary.objects, crs=scene.frame.name, notes=notes)

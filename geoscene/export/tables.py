@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,26 +16,13 @@ from geoscene.errors import InputError
 from geoscene.export.objects import read_features
 from geoscene.mesh import Mesh
 from geoscene.scene import Scene
+from geoscene.scene.geopackage import Layer
 
 SOLIDS = "building_solids"
 """Name of the layer of buildings as MultiPolygon Z, which a scene does not store as features."""
 
 ROWS = 20_000
 """Features that are in memory at once."""
-
-
-@dataclass(frozen=True, slots=True)
-class Rows:
-    """A chunk of features of one layer.
-
-    layer    : its name
-    geometry : (n,) shapely, in the target CRS
-    columns  : column name to (n,) values
-    """
-
-    layer: str
-    geometry: NDArray[np.object_]
-    columns: dict[str, NDArray[Any]]
 
 
 def target_crs(scene: Scene, crs: str | None) -> CRS:
@@ -69,7 +55,7 @@ def kinds_of_columns(scene: Scene, layer: str) -> dict[str, np.dtype[Any]]:
     return dict(scene.schema("buildings" if layer == SOLIDS else layer).columns)
 
 
-def rows(scene: Scene, layer: str, *, crs: CRS) -> Iterator[Rows]:
+def rows(scene: Scene, layer: str, *, crs: CRS) -> Iterator[Layer]:
     """The features of a layer in order, in chunks (solids: tile by tile)."""
     if layer == SOLIDS:
         yield from _solids(scene, crs)
@@ -79,7 +65,7 @@ def rows(scene: Scene, layer: str, *, crs: CRS) -> Iterator[Rows]:
     for first in range(0, stop - start, ROWS):
         some = scene.features(layer, geometry="projected", rows=range(first, first + ROWS))
         geometry = some.geometry if same else _transformed(scene, some.geometry, crs=crs, projected=True)
-        yield Rows(layer, geometry, dict(some.columns))
+        yield Layer(layer, geometry, some.columns)
 
 
 def _transformed(
@@ -97,7 +83,7 @@ def _transformed(
     return out
 
 
-def _solids(scene: Scene, crs: CRS) -> Iterator[Rows]:
+def _solids(scene: Scene, crs: CRS) -> Iterator[Layer]:
     features = read_features(scene)
     columns = features.columns[features.layers.index("buildings")]
     first, stop = scene.layers["buildings"]
@@ -109,7 +95,7 @@ def _solids(scene: Scene, crs: CRS) -> Iterator[Rows]:
             continue
         feature, geometry = surfaces(chosen.shifted(tile.origin))
         own = {name: values[feature - first] for name, values in columns.items()}
-        yield Rows(
+        yield Layer(
             SOLIDS, _transformed(scene, geometry, crs=crs, projected=False), {"feature": feature, **own}
         )
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.errors import InputError
-from geoscene.export.files import Summary, size_of
+from geoscene.export.files import Summary, compact_json
 from geoscene.export.globe import Globe
-from geoscene.export.gltf import GlbWriter, y_up
+from geoscene.export.gltf import GlbWriter, add_instances, y_up
 from geoscene.export.objects import Features, Part, attribution, expand, parts, pieces, read_features
 from geoscene.files import atomic_file, atomic_folder, write_atomically
-from geoscene.mesh import Instances, Mesh
+from geoscene.mesh import Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float
@@ -60,17 +59,13 @@ def write_3dtiles(
     xmin, ymin, xmax, ymax = scene.bounds
     globe = Globe.at(scene.frame, (xmin + xmax) / 2, y=(ymin + ymax) / 2, lift=height_offset)
     features = read_features(scene)
-    library = list(scene.shapes().values())
-    names = list(scene.shapes())
+    library = scene.shapes()
     objects = solids = faces = 0
     with atomic_folder(path, mark="tileset.json") as folder:
         (folder / "content").mkdir()
         nodes: dict[tuple[int, int], _Node] = {}
-        for done, part in enumerate(parts(scene, layers)):
-            progress("3D Tiles", done, total=len(scene.tile_indices))
-            node = _tile(
-                folder, scene, part=part, features=features, globe=globe, names=names, library=library
-            )
+        for part in parts(scene, layers, stage="3D Tiles", progress=progress):
+            node = _tile(folder, scene, part=part, features=features, globe=globe, library=library)
             if node is not None:
                 nodes[part.index] = node
             found = pieces(part.mesh)
@@ -86,13 +81,13 @@ def write_3dtiles(
             "geometricError": max(diagonal, root.document["geometricError"]),
             "root": {**root.document, "transform": globe.matrix.T.ravel().tolist()},
         }
-        text = json.dumps(document, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-        write_atomically(folder / "tileset.json", text.encode())
+        write_atomically(folder / "tileset.json", compact_json(document))
     notes: tuple[str, ...] = ()
     if scene.frame.vertical != "ellipsoidal" and not height_offset:
         notes = (f"{scene.frame.vertical} heights stand as ellipsoidal ones; `height_offset` raises them",)
-    files, size = size_of(path)
-    return Summary(path, "3dtiles", files, size, objects, solids, faces, "EPSG:4978", notes)
+    return Summary.of(
+        path, "3dtiles", objects=objects, solids=solids, faces=faces, crs="EPSG:4978", notes=notes
+    )
 
 
 def _box(low: Float, high: Float) -> dict[str, list[float]]:
@@ -127,45 +122,38 @@ def _joined(children: list[_Node]) -> _Node:
     return _Node(low, high, document)
 
 
-def _tile(
-    folder: Path,
-    scene: Scene,
-    *,
-    part: Part,
-    features: Features,
-    globe: Globe,
-    names: list[str],
-    library: list[Mesh],
-) -> _Node | None:
-    """Write the contents of one tile; returns its node, or None for an empty tile."""
-    name = f"{part.index[0]}_{part.index[1]}"
-    copies = None
-    if len(part.instances):
-        file = folder / "content" / f"{name}_copies.glb"
-        _write_copies(file, scene, part=part, features=features, globe=globe, names=names)
-        copies = _copies_node(f"content/{file.name}", part, globe=globe, library=library)
-    if not len(part.mesh):
-        return copies
-    low, high = _write_mesh(
-        folder / "content" / f"{name}.glb", scene, part=part, features=features, globe=globe
-    )
-    document: dict[str, Any] = {
-        "boundingVolume": _box(low, high),
-        "geometricError": 0.0,
-        "refine": "ADD",
-        "content": {"uri": f"content/{name}.glb", "boundingVolume": _box(low, high)},
-    }
-    if copies is not None:
-        low, high = np.minimum(low, copies.low), np.maximum(high, copies.high)
-        document["boundingVolume"] = _box(low, high)
-        document["geometricError"] = float(_tallest(part.instances, library))
-        document["children"] = [copies.document]
+def _leaf(uri: str, low: Float, *, high: Float) -> _Node:
+    """A tile with content and without children."""
+    box = _box(low, high)
+    content = {"uri": uri, "boundingVolume": box}
+    document = {"boundingVolume": box, "geometricError": 0.0, "refine": "ADD", "content": content}
     return _Node(low, high, document)
 
 
-def _tallest(instances: Instances, library: list[Mesh]) -> float:
-    heights = np.array([np.ptp(shape.vertices[:, 2]) for shape in library])
-    return float((heights[instances.shape] * np.linalg.norm(instances.transform[:, :, 2], axis=1)).max())
+def _tile(
+    folder: Path, scene: Scene, *, part: Part, features: Features, globe: Globe, library: dict[str, Mesh]
+) -> _Node | None:
+    """Write the contents of one tile; returns its node, or None for an empty tile."""
+    name = f"content/{part.index[0]}_{part.index[1]}"
+    copies = None
+    if len(part.instances):
+        uri = f"{name}_copies.glb"
+        _write_copies(folder / uri, scene, part=part, features=features, globe=globe, library=library)
+        points = globe.local(expand(part.instances, list(library.values())).vertices + part.origin)
+        copies = _leaf(uri, points.min(axis=0) - _MARGIN, high=points.max(axis=0) + _MARGIN)
+    if not len(part.mesh):
+        return copies
+    uri = f"{name}.glb"
+    low, high = _write_mesh(folder / uri, scene, part=part, features=features, globe=globe)
+    leaf = _leaf(uri, low, high=high)
+    if copies is None:
+        return leaf
+    low, high = np.minimum(low, copies.low), np.maximum(high, copies.high)
+    heights = np.array([np.ptp(shape.vertices[:, 2]) for shape in library.values()])
+    scale = np.linalg.norm(part.instances.transform[:, :, 2], axis=1)
+    tallest = float((heights[part.instances.shape] * scale).max())
+    added = {"boundingVolume": _box(low, high), "geometricError": tallest, "children": [copies.document]}
+    return _Node(low, high, leaf.document | added)
 
 
 def _write_mesh(
@@ -192,17 +180,11 @@ def _write_mesh(
             if number:
                 table = _table(writer, features, layer=number - 1, feature=feature)
                 metadata = {"table": table, "rows": own // len(mesh.vertices), "count": len(feature)}
-            faces = Mesh.of(
-                np.empty((0, 3)),
-                corners.reshape(-1, 3),
-                feature=mesh.feature[rows],
-                klass=mesh.klass[rows],
-                material=mesh.material[rows],
-                color=mesh.color[rows],
-            )
-            turned = np.stack([points[:, 0], points[:, 2], -points[:, 1]], axis=1)
+            faces = replace(mesh.take(rows), faces=corners.reshape(-1, 3).astype(np.int32))
             name = features.layers[number - 1] if number else "terrain"
-            children.append(writer.node(name=name, mesh=writer.mesh(faces, turned, **metadata)))
+            children.append(
+                writer.node(name=name, mesh=writer.mesh(faces, y_up(points).astype("<f4"), **metadata))
+            )
         root = writer.node(translation=y_up(middle).tolist(), children=children)
         writer.finish(out, scene_nodes=[root], asset={"copyright": attribution(scene)})
     return low, high
@@ -217,54 +199,27 @@ def _table(writer: GlbWriter, features: Features, *, layer: int, feature: NDArra
 
 
 def _write_copies(
-    path: Path, scene: Scene, *, part: Part, features: Features, globe: Globe, names: list[str]
+    path: Path, scene: Scene, *, part: Part, features: Features, globe: Globe, library: dict[str, Mesh]
 ) -> None:
     """Write the instances of a tile, one node per shape and layer."""
-    copies = part.instances
-    anchors = copies.transform[:, :, 3] + part.origin
-    transform = copies.transform.copy()
+    feature = part.instances.feature
+    anchors = part.instances.transform[:, :, 3] + part.origin
+    transform = part.instances.transform.copy()
     transform[:, :, :3] = globe.jacobian(anchors) @ transform[:, :, :3]
     transform[:, :, 3] = globe.local(anchors)
-    shapes = scene.shapes()
-    layer = np.searchsorted(features.starts, copies.feature, side="right")
-    keys = np.column_stack([copies.shape, layer])
+    copies = replace(part.instances, transform=transform)
+    layers = np.searchsorted(features.starts, feature, side="right") - 1
     with atomic_file(path) as out, GlbWriter(path) as writer:
         tables: dict[int, tuple[int, NDArray[np.integer]]] = {}
-        meshes: dict[int, int] = {}
-        nodes = []
-        for number, of_layer in np.unique(keys, axis=0).tolist():
-            chosen = (keys == (number, of_layer)).all(axis=1)
-            if number not in meshes:
-                mesh = shapes[names[number]]
-                meshes[number] = writer.mesh(mesh, y_up(mesh.vertices).astype("<f4"), name=names[number])
-            metadata: dict[str, Any] = {}
-            if of_layer:
-                if of_layer not in tables:
-                    feature = np.unique(copies.feature[layer == of_layer])
-                    tables[of_layer] = (
-                        _table(writer, features, layer=of_layer - 1, feature=feature),
-                        feature,
-                    )
-                table, feature = tables[of_layer]
-                rows = np.searchsorted(feature, copies.feature[chosen])
-                metadata = {"table": table, "rows": rows, "count": len(feature)}
-            origin = np.round(transform[chosen, :, 3].mean(axis=0))
-            nodes.append(
-                writer.copies(
-                    meshes[number], transform[chosen], name=names[number], origin=origin, **metadata
-                )
-            )
+
+        def metadata(layer: int, chosen: NDArray[np.int32]) -> dict[str, Any]:
+            if layer not in tables:
+                present = np.unique(feature[layers == layer])
+                tables[layer] = _table(writer, features, layer=layer, feature=present), present
+            table, present = tables[layer]
+            return {"table": table, "rows": np.searchsorted(present, chosen), "count": len(present)}
+
+        nodes = add_instances(
+            writer, copies, features=features, library=library, meshes={}, metadata=metadata
+        )
         writer.finish(out, scene_nodes=nodes, asset={"copyright": attribution(scene)})
-
-
-def _copies_node(uri: str, part: Part, *, globe: Globe, library: list[Mesh]) -> _Node:
-    points = globe.local(expand(part.instances, library).vertices + part.origin)
-    low, high = points.min(axis=0) - _MARGIN, points.max(axis=0) + _MARGIN
-    box = _box(low, high)
-    document = {
-        "boundingVolume": box,
-        "geometricError": 0.0,
-        "refine": "ADD",
-        "content": {"uri": uri, "boundingVolume": box},
-    }
-    return _Node(low, high, document)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,7 @@ def meshes_of(
 ) -> Iterator[tuple[tuple[int, int], Mesh]]:
     """Index and mesh of each tile in scene metres, its copies expanded."""
     library = list(scene.shapes().values())
-    for done, part in enumerate(parts(scene, layers)):
-        progress(stage, done, total=len(scene.tile_indices))
+    for part in parts(scene, layers, stage=stage, progress=progress):
         copies = [expand(part.instances, library)] if len(part.instances) else []
         yield part.index, concatenate([part.mesh, *copies]).shifted(part.origin)
 
@@ -131,8 +131,7 @@ def write_ply(
         append(out, rest)
         out.seek(0)
         out.write(_ply_head(scene, vertices, faces=faces))
-    files, size = size_of(path)
-    return Summary(path, "ply", files, size, objects, len(solids), faces, scene.frame.name)
+    return Summary.of(path, "ply", objects=objects, solids=len(solids), faces=faces, crs=scene.frame.name)
 
 
 def _ply_head(scene: Scene, vertices: int, *, faces: int) -> bytes:
@@ -180,24 +179,16 @@ def write_stl(
             broken += lost
         out.seek(80)
         out.write(np.array(facets, "<u4").tobytes())
-    files, size = size_of(path)
     notes = (f"{broken} solids left out: float32 coordinates would not leave them closed",) if broken else ()
-    return Summary(path, "stl", files, size, solids, solids, facets, scene.frame.name, notes)
+    return Summary.of(
+        path, "stl", objects=solids, solids=solids, faces=facets, crs=scene.frame.name, notes=notes
+    )
 
 
 def _in_single_precision(mesh: Mesh) -> tuple[Mesh, int]:
     """The solids rounded to float32 without those that are no longer closed, and the number of the latter."""
     points = mesh.vertices.astype(np.float32).astype(np.float64)
-    rounded = Mesh.of(
-        points,
-        mesh.faces,
-        feature=mesh.feature,
-        klass=mesh.klass,
-        material=mesh.material,
-        surface=mesh.surface,
-        color=mesh.color,
-        closed=mesh.closed,
-    )
+    rounded = replace(mesh, vertices=points)
     rounded = rounded.take(~degenerate_faces(points, mesh.faces))
     verdict = validate_mesh(rounded)
     bad = verdict.feature[~verdict.ok]

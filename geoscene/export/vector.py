@@ -13,20 +13,19 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from geoscene.errors import need
-from geoscene.export.files import Summary, plain, size_of
+from geoscene.export.files import Summary, compact_json, plain
 from geoscene.export.objects import attribution
-from geoscene.export.tables import SOLIDS, Rows, chosen_layers, kinds_of_columns, rows, target_crs
-from geoscene.files import atomic_file, atomic_path
+from geoscene.export.tables import SOLIDS, chosen_layers, kinds_of_columns, rows, target_crs
+from geoscene.files import atomic_file
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.scene.geopackage import Layer, open_geopackage
 from geoscene.typing import Float
-
-_DATE = "2000-01-01T00:00:00Z"  # a constant, so that the same scene is the same bytes
 
 
 def _reading(
     scene: Scene, names: list[str], *, crs: CRS, stage: str, progress: Progress
-) -> Iterator[tuple[int, Rows]]:
+) -> Iterator[tuple[int, Layer]]:
     """The chunks of all layers, with the number of rows before each."""
     total = sum(np.subtract(*scene.layers[name][::-1]) for name in names if name != SOLIDS)
     done = 0
@@ -34,7 +33,7 @@ def _reading(
         for chunk in rows(scene, name, crs=crs):
             progress(stage, min(done, int(total)), total=int(total))
             yield done, chunk
-            done += len(chunk.geometry)
+            done += len(chunk)
 
 
 def write_gpkg(
@@ -53,43 +52,20 @@ def write_gpkg(
     crs    : of the coordinates; default the scene's
     layers : names to write; default all
     """
-    import pyogrio  # noqa: PLC0415  (0.3 s)
-    from pyogrio.raw import write  # noqa: PLC0415
-
     target = target_crs(scene, crs)
     names = chosen_layers(scene, layers, solids=True)
-    before = {"OGR_CURRENT_DATE": pyogrio.get_gdal_config_option("OGR_CURRENT_DATE")}
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE})
     objects = solids = faces = 0
-    try:
-        with atomic_path(path, keep_suffix=True) as part:
-            for _, chunk in _reading(scene, names, crs=target, stage="GeoPackage", progress=progress):
-                write(
-                    str(part),
-                    geometry=shapely.to_wkb(chunk.geometry),
-                    field_data=list(chunk.columns.values()),
-                    fields=list(chunk.columns),
-                    geometry_type=_geometry_type(scene, chunk),
-                    crs=target.to_wkt(),
-                    layer=chunk.layer,
-                    driver="GPKG",
-                    append=part.exists(),
-                    layer_options={"FID": "fid", "SPATIAL_INDEX": "YES"},
-                )
-                objects += len(chunk.geometry)
-                if chunk.layer == SOLIDS:
-                    solids += len(chunk.geometry)
-                    faces += int(shapely.get_num_geometries(chunk.geometry).sum())
-    finally:
-        pyogrio.set_gdal_config_options(before)
-    files, size = size_of(path)
-    return Summary(path, "gpkg", files, size, objects, solids, faces, _named(target))
-
-
-def _geometry_type(scene: Scene, chunk: Rows) -> str:
-    if chunk.layer == SOLIDS:
-        return "MultiPolygon Z"
-    return scene.schema(chunk.layer).geometry_type
+    with open_geopackage(path) as append:
+        for _, chunk in _reading(scene, names, crs=target, stage="GeoPackage", progress=progress):
+            solid = chunk.name == SOLIDS
+            append(
+                chunk, "MultiPolygon Z" if solid else scene.schema(chunk.name).geometry_type, target.to_wkt()
+            )
+            objects += len(chunk)
+            if solid:
+                solids += len(chunk)
+                faces += int(shapely.get_num_geometries(chunk.geometry).sum())
+    return Summary.of(path, "gpkg", objects=objects, solids=solids, faces=faces, crs=_named(target))
 
 
 def _named(crs: CRS) -> str:
@@ -111,24 +87,19 @@ def write_geojson(
     count = 0
     with atomic_file(path) as out:
         head: dict[str, Any] = {"type": "FeatureCollection", "attribution": attribution(scene)}
-        out.write(_json(head)[:-1] + b',"features":[')
+        out.write(compact_json(head)[:-1] + b',"features":[')
         for _, chunk in _reading(scene, names, crs=wgs84, stage="GeoJSON", progress=progress):
             geometry = _for_geojson(chunk.geometry)
-            columns = {_column_name(chunk.layer, name): v.tolist() for name, v in chunk.columns.items()}
+            columns = {_column_name(chunk.name, name): v.tolist() for name, v in chunk.columns.items()}
             for k, shape in enumerate(shapely.to_geojson(geometry).tolist()):
                 attributes = {name: plain(values[k]) for name, values in columns.items()}
-                properties = {"kind": chunk.layer, **{n: v for n, v in attributes.items() if v is not None}}
+                properties = {"kind": chunk.name, **{n: v for n, v in attributes.items() if v is not None}}
                 start = b",\n" if count else b"\n"
                 head = {"type": "Feature", "id": properties["feature"], "properties": properties}
-                out.write(start + _json(head)[:-1] + b',"geometry":' + shape.encode() + b"}")
+                out.write(start + compact_json(head)[:-1] + b',"geometry":' + shape.encode() + b"}")
                 count += 1
         out.write(b"\n]}\n")
-    files, size = size_of(path)
-    return Summary(path, "geojson", files, size, count, crs="OGC:CRS84")
-
-
-def _json(value: Any) -> bytes:
-    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
+    return Summary.of(path, "geojson", objects=count, crs="OGC:CRS84")
 
 
 def _for_geojson(geometry: NDArray[np.object_]) -> NDArray[np.object_]:
@@ -171,25 +142,24 @@ def write_geoparquet(
     count = 0
     with atomic_file(path) as out, parquet.ParquetWriter(out, schema, compression="zstd") as writer:
         for _, chunk in _reading(scene, names, crs=target, stage="GeoParquet", progress=progress):
-            n = len(chunk.geometry)
+            n = len(chunk)
             boxes = shapely.bounds(chunk.geometry)
-            own = {_column_name(chunk.layer, name): values for name, values in chunk.columns.items()}
+            own = {_column_name(chunk.name, name): values for name, values in chunk.columns.items()}
             columns = {
-                "kind": pa.array([chunk.layer] * n),
+                "kind": pa.array([chunk.name] * n),
                 **{name: _arrow(pa, own.get(name), kind=kind, n=n) for name, kind in kinds.items()},
                 "bbox": pa.StructArray.from_arrays([pa.array(c) for c in boxes.T], fields=list(box)),
                 "geometry": pa.array(shapely.to_wkb(chunk.geometry, flavor="iso").tolist()),
             }
             writer.write_table(pa.table(columns, schema=schema))
-            types |= _type_names(chunk.geometry)
+            types |= {shape.geom_type + " Z" * shape.has_z for shape in chunk.geometry}
             bounds = np.concatenate(
                 [np.fmin(bounds[:2], boxes[:, :2].min(axis=0)), np.fmax(bounds[2:], boxes[:, 2:].max(axis=0))]
             )
             count += n
         geo = _geoparquet_metadata(target, sorted(types), bounds=bounds if count else None)
         writer.add_key_value_metadata({"geo": json.dumps(geo)})
-    files, size = size_of(path)
-    return Summary(path, "geoparquet", files, size, count, crs=_named(target))
+    return Summary.of(path, "geoparquet", objects=count, crs=_named(target))
 
 
 def _column_name(layer: str, column: str) -> str:
@@ -216,19 +186,6 @@ def _arrow(pa: Any, values: NDArray[Any] | None, *, kind: Any, n: int) -> Any:
     if kind == pa.string():
         return pa.array([None if plain(v) is None else str(v) for v in values.tolist()], kind)
     return pa.array(values, from_pandas=True).cast(kind)
-
-
-def _type_names(geometry: NDArray[np.object_]) -> set[str]:
-    names = {
-        1: "LineString",
-        3: "Polygon",
-        5: "MultiLineString",
-        6: "MultiPolygon",
-        0: "Point",
-        4: "MultiPoint",
-    }
-    pairs = np.unique(np.column_stack([shapely.get_type_id(geometry), shapely.has_z(geometry)]), axis=0)
-    return {names[kind] + (" Z" if tall else "") for kind, tall in pairs.tolist()}
 
 
 def _geoparquet_metadata(crs: CRS, types: list[str], *, bounds: Float | None) -> dict[str, Any]:

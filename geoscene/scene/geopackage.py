@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -46,62 +47,64 @@ def _column(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _geometry_type(geometry: NDArray[np.object_]) -> str:
-    kinds = {str(k) for k in np.unique(shapely.get_type_id(geometry))}
-    names = {
-        frozenset("0"): "Point",
-        frozenset("1"): "LineString",
-        frozenset("3"): "Polygon",
-        frozenset("6"): "MultiPolygon",
-        frozenset("36"): "MultiPolygon",
-        frozenset("5"): "MultiLineString",
-        frozenset("15"): "MultiLineString",
-    }
-    name = names.get(frozenset(kinds), "Unknown")
-    return f"{name} Z" if name != "Unknown" and shapely.has_z(geometry).any() else name
+    """GDAL's name of the type: a multi-part one if any shape is; ``Unknown`` for shapes of several kinds."""
+    kinds = {shape.geom_type for shape in geometry}
+    if len({kind.removeprefix("Multi") for kind in kinds}) > 1:
+        return "Unknown"
+    return str(max(kinds, key=len)) + " Z" * bool(shapely.has_z(geometry).any())
 
 
-def write_geopackage(path: Path, layers: Sequence[Layer], *, frame: Frame) -> None:
-    """Write layers in the frame's projected CRS; empty layers are left out."""
+@contextmanager
+def open_geopackage(path: Path) -> Iterator[Callable[[Layer, str, str], None]]:
+    """Yield a function that appends rows: a layer, its geometry type and the WKT of its CRS.
+
+    The file appears under its name unless the block raises; the same rows give the same bytes.
+
+    Raises GeosceneError if GDAL cannot write.
+    """
     import pyogrio  # noqa: PLC0415  (0.3 s)
     from pyogrio.errors import DataSourceError  # noqa: PLC0415
     from pyogrio.raw import write  # noqa: PLC0415
 
     before = {"OGR_CURRENT_DATE": pyogrio.get_gdal_config_option("OGR_CURRENT_DATE")}
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE})
-    shift = np.array(frame.origin)
     try:
         with atomic_path(path, keep_suffix=True) as part:
-            for layer in layers:
-                if not len(layer):
-                    continue
-                kind = _geometry_type(layer.geometry)
-                geometry = layer.geometry
-                if kind.startswith("Multi"):
-                    parts, owner = shapely.get_parts(geometry, return_index=True)
-                    gather = shapely.multipolygons if "Polygon" in kind else shapely.multilinestrings
-                    geometry = gather(parts, indices=owner)
-                has_z = kind.endswith(" Z")
-                moved = shapely.transform(
-                    geometry,
-                    (lambda c: c + np.append(shift, 0.0)) if has_z else (lambda c: c + shift),
-                    include_z=has_z,
-                )
+
+            def append(rows: Layer, kind: str, crs: str) -> None:  # noqa: PLR0917
                 write(
                     str(part),
-                    geometry=shapely.to_wkb(moved),
-                    field_data=[_column(np.asarray(v)) for v in layer.columns.values()],
-                    fields=list(layer.columns),
+                    geometry=shapely.to_wkb(rows.geometry),
+                    field_data=list(rows.columns.values()),
+                    fields=list(rows.columns),
                     geometry_type=kind,
-                    crs=frame.wkt,
-                    layer=layer.name,
+                    crs=crs,
+                    layer=rows.name,
                     driver="GPKG",
                     append=part.exists(),
                     layer_options={"FID": "fid", "SPATIAL_INDEX": "YES"},
                 )
+
+            yield append
     except DataSourceError as error:
         raise GeosceneError(f"{path}: cannot be written ({error}); is the disk full?") from error
     finally:
         pyogrio.set_gdal_config_options(before)
+
+
+def write_geopackage(path: Path, layers: Sequence[Layer], *, frame: Frame) -> None:
+    """Write layers in the frame's projected CRS; empty layers are left out."""
+    with open_geopackage(path) as append:
+        for layer in filter(len, layers):
+            kind, geometry = _geometry_type(layer.geometry), layer.geometry
+            if kind.startswith("Multi"):
+                parts, owner = shapely.get_parts(geometry, return_index=True)
+                gather = shapely.multipolygons if "Polygon" in kind else shapely.multilinestrings
+                geometry = gather(parts, indices=owner)
+            shift = np.array([*frame.origin, 0.0][: 3 if kind.endswith(" Z") else 2])
+            moved = shapely.transform(geometry, partial(np.add, shift), include_z=len(shift) == 3)
+            columns = {name: _column(np.asarray(values)) for name, values in layer.columns.items()}
+            append(Layer(layer.name, moved, columns), kind, frame.wkt)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 import re
 from base64 import b64encode
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ import numpy as np
 
 from geoscene.classes import Class, class_codes, materials
 from geoscene.errors import InputError
-from geoscene.export.files import Summary, size_of
+from geoscene.export.files import Summary, compact_json
 from geoscene.export.objects import attribution, read_features
 from geoscene.files import append, atomic_file, spool
 from geoscene.options import Degrees, ViewOptions
@@ -73,12 +72,11 @@ def view_scene(
             ends.append(blobs.tell())
             if blobs.tell() > max_mb * 1e6:
                 break
-        _blob(blobs, "attributes", data=gzip(_json(tables(read_features(scene), present))))
+        _blob(blobs, "attributes", data=gzip(compact_json(tables(read_features(scene), present))))
         if blobs.tell() > max_mb * 1e6:
             raise InputError(_too_large(scene, indices, sizes=ends, size=blobs.tell(), max_mb=max_mb))
         head = _head(scene, tiles, groups=groups, shapes=shapes)
         _join(file, scene, head=head, blobs=blobs)
-    files, size = size_of(out)
     notes = []
     if len(tiles) < len(scene.tile_indices):
         notes.append(
@@ -89,7 +87,8 @@ def view_scene(
         notes.append(f"layers left out: {', '.join(left)}")
     if (error := head["lonlat"]["error"]) > ACCURACY:
         notes.append(f"longitude and latitude under the cursor are within {error:.2g} m only")
-    return Summary(out, "html", files, size, int(present.sum()), 0, faces, scene.frame.name, tuple(notes))
+    count, crs = int(present.sum()), scene.frame.name
+    return Summary.of(out, "html", objects=count, faces=faces, crs=crs, notes=tuple(notes))
 
 
 def _check(out: Path, *, overwrite: bool) -> None:
@@ -112,7 +111,7 @@ def _join(file: IO[bytes], scene: Scene, *, head: dict[str, Any], blobs: IO[byte
         "title": html.escape(str(head["name"])),
         "credit": _linked(attribution(scene)),
         "style": _part("page.css"),
-        "scene": _json(head).decode().replace("<", "\\u003c"),
+        "scene": compact_json(head).decode().replace("<", "\\u003c"),
         "script": "\n".join(_part(name) for name in SCRIPTS),
     }
     before, after = (Template(half).substitute(words).encode() for half in _part("page.html").split("$blobs"))
@@ -123,10 +122,6 @@ def _join(file: IO[bytes], scene: Scene, *, head: dict[str, Any], blobs: IO[byte
 
 def _part(name: str) -> str:
     return resources.files("geoscene.view").joinpath("page", name).read_text("utf-8")
-
-
-def _json(value: Any) -> bytes:
-    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
 
 
 def _blob(file: IO[bytes], name: str, *, data: bytes) -> None:
