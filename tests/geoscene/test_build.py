@@ -37,7 +37,7 @@ def test_every_solid_is_closed_oriented_and_of_positive_volume(scene):
     assert report["volume"] > 1e5
 
 
-def test_a_broken_solid_is_found_and_named(scene, tmp_path):
+def test_check_scene_reports_a_broken_solid(scene, tmp_path):
     shutil.copytree(scene.path, tmp_path / "broken")
     broken = open_scene(tmp_path / "broken")
     i, j = next(k for k in broken.tile_indices if broken.tile(*k).mesh.closed.any())
@@ -50,7 +50,7 @@ def test_a_broken_solid_is_found_and_named(scene, tmp_path):
     assert report["broken"][0]["osm_id"].startswith(("way/", "relation/"))
 
 
-def test_the_ground_covers_the_extent_once(scene):
+def test_ground_covers_the_extent_exactly_once(scene):
     xmin, ymin, xmax, ymax = scene.bounds
     area = 0.0
     for tile in scene.tiles():
@@ -85,7 +85,7 @@ def test_ground_triangles_meet_edge_to_edge_over_all_tiles(scene):
     assert (on_rim | shapely.within(at, tunnels)).all()
 
 
-def test_footprints_in_the_geopackage_are_where_openstreetmap_has_them(scene, osm):
+def test_footprints_in_the_geopackage_match_openstreetmap(scene, osm):
     layer = geopandas.read_file(scene.path / "features.gpkg", layer="buildings").to_crs(4326)
     mapped = {area.osm_id: area.geometry for area in osm.areas}
     shares = []
@@ -110,7 +110,7 @@ def test_face_features_are_rows_of_the_geopackage(scene):
             assert corners[..., 2].max() == pytest.approx(row.height, abs=0.01)
 
 
-def test_heights_say_where_they_come_from(scene):
+def test_every_building_height_has_a_source(scene):
     layer = geopandas.read_file(scene.path / "features.gpkg", layer="buildings")
     assert (layer.height > 0).all()
     assert (layer.height_source != "").all()
@@ -128,12 +128,12 @@ def same_files(a, b):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_the_same_map_is_the_same_bytes_for_any_number_of_workers(osm, scene, tmp_path, workers):
+def test_number_of_workers_does_not_change_the_bytes(osm, scene, tmp_path, workers):
     again = build(osm, tmp_path / "again", options=BuildOptions(name="demo"), workers=workers)
     same_files(scene.path, again.path)
 
 
-def test_spawned_workers_make_the_same_bytes(tmp_path, monkeypatch):
+def test_spawned_workers_give_the_same_bytes(tmp_path, monkeypatch):
     spawn = multiprocessing.get_context("spawn")
     monkeypatch.setattr("geoscene.tiles.multiprocessing.get_context", lambda: spawn)
     # a bridge over a road, so that the ground has heights that workers need
@@ -162,7 +162,7 @@ def test_spawned_workers_make_the_same_bytes(tmp_path, monkeypatch):
     same_files(alone.path, build(osm, tmp_path / "both", options=BuildOptions(name="bridge"), workers=2).path)
 
 
-def test_a_killed_build_goes_on_and_ends_with_the_same_bytes(osm, scene, tmp_path, monkeypatch):
+def test_interrupted_build_resumes_with_the_same_bytes(osm, scene, tmp_path, monkeypatch):
     made = []
     whole = geoscene.tiles.build_tile
 
@@ -186,7 +186,7 @@ def test_a_killed_build_goes_on_and_ends_with_the_same_bytes(osm, scene, tmp_pat
 @pytest.mark.parametrize(
     ("change", "grounds"), [({"lod": 1}, 0), ({"name": "other"}, 0), ({"tile_size": 200}, 1)]
 )
-def test_a_rebuild_makes_anew_only_what_the_options_change(
+def test_rebuild_reuses_ground_that_the_options_do_not_change(
     osm, scene, tmp_path, monkeypatch, change, grounds
 ):
     shutil.copytree(scene.path, tmp_path / "scene")
@@ -199,7 +199,7 @@ def test_a_rebuild_makes_anew_only_what_the_options_change(
     same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
 
 
-def test_tiles_along_a_route_are_the_tiles_of_the_whole_scene(osm, tmp_path):
+def test_tiles_along_a_route_equal_those_of_the_whole_scene(osm, tmp_path):
     along = ("60.1665,24.9420", "60.1668,24.9440")
     options = BuildOptions(name="demo", along=along, reach=20.0, tile_size=100.0)
     part = build(osm, tmp_path / "part", options=options)
@@ -210,7 +210,7 @@ def test_tiles_along_a_route_are_the_tiles_of_the_whole_scene(osm, tmp_path):
         assert (part.path / name).read_bytes() == (whole.path / name).read_bytes()
 
 
-def test_only_what_is_asked_for_is_built(osm, tmp_path):
+def test_only_selected_kinds_are_built(osm, tmp_path):
     scene = build(osm, tmp_path / "s", options=BuildOptions(only=("buildings",)))
     counts = scene.manifest["counts"]
     assert counts["solids"] > 20
@@ -219,7 +219,7 @@ def test_only_what_is_asked_for_is_built(osm, tmp_path):
     assert ground["area"] + ground["open_area"] == pytest.approx(ground["extent_area"], rel=1e-6)
 
 
-def test_a_scene_is_not_written_over_unless_asked(osm, scene, tmp_path):
+def test_scene_is_replaced_only_with_overwrite(osm, scene, tmp_path):
     with pytest.raises(SceneFormatError, match="`overwrite`"):
         build(osm, scene.path)
     (tmp_path / "letters").mkdir()
@@ -229,7 +229,7 @@ def test_a_scene_is_not_written_over_unless_asked(osm, scene, tmp_path):
     assert (tmp_path / "letters" / "a.txt").exists()
 
 
-def test_a_build_that_fails_leaves_nothing(osm, tmp_path, monkeypatch):
+def test_failed_build_leaves_no_files(osm, tmp_path, monkeypatch):
     monkeypatch.setattr("geoscene.tiles.ground_tile", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         build(osm, tmp_path / "half")
@@ -242,12 +242,12 @@ def test_map_without_features_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("change", [{"lod": 3}, {"tile_size": 10.5}, {"tile_size": 1e6}])
-def test_options_out_of_bounds_are_refused(change):
+def test_invalid_build_options_are_refused(change):
     with pytest.raises(InputError, match="`"):
         BuildOptions(**change)
 
 
-def test_damaged_scenes_are_named(tmp_path):
+def test_error_names_the_fault_of_a_damaged_scene(tmp_path):
     with pytest.raises(SceneFormatError, match="no such scene"):
         open_scene(tmp_path / "nowhere")
     (tmp_path / "scene.json").write_text("{")

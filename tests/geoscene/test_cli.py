@@ -22,7 +22,7 @@ def scene(tmp_path_factory):
     return out
 
 
-def test_info_is_for_programs_and_for_people(scene):
+def test_info_prints_json_or_text(scene):
     report = json.loads(run_program("geoscene", "info", scene, "--json").stdout)
     counts = report["counts"]
     assert counts["buildings"] == counts["solids"] + counts["dropped"]
@@ -34,13 +34,13 @@ def test_info_is_for_programs_and_for_people(scene):
         assert word in text
 
 
-def test_validate_passes_a_sound_scene(scene):
+def test_valid_scene_passes_validate(scene):
     done = run_program("geoscene", "validate", scene, "--json")
     assert done.returncode == 0
     assert json.loads(done.stdout)["broken"] == []
 
 
-def test_a_drive_and_its_map(scene, tmp_path):
+def test_drive_resumes_and_its_map_is_written(scene, tmp_path):
     words = [
         "--route",
         "random",
@@ -93,7 +93,7 @@ def test_a_drive_and_its_map(scene, tmp_path):
         ("lidar", ["map", "nowhere", "-o", "x.laz"], "nowhere"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_two(tmp_path, name, words, says):
+def test_invalid_input_gives_one_line_and_exit_code_two(tmp_path, name, words, says):
     done = run_program(name, *words, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
@@ -115,7 +115,7 @@ def test_bad_input_is_one_line_and_exit_code_two(tmp_path, name, words, says):
         (["--route", "random", "--crs", "EPSG:1"], "EPSG:1"),
     ],
 )
-def test_bad_drives_are_one_line_and_exit_code_two(scene, tmp_path, words, says):
+def test_invalid_drive_options_give_one_line_and_exit_code_two(scene, tmp_path, words, says):
     done = run_program("lidar", "drive", scene, *words, "-o", "x", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1, done.stderr
@@ -126,7 +126,7 @@ def test_bad_drives_are_one_line_and_exit_code_two(scene, tmp_path, words, says)
 @pytest.mark.parametrize(
     ("name", "commands"), [("geoscene", ["build", "info", "validate"]), ("lidar", ["drive", "map"])]
 )
-def test_help_teaches_every_command(name, commands):
+def test_help_describes_every_command(name, commands):
     assert run_program(name, "--version").stdout.strip() == "0.1.0"
     top = run_program(name, "--help").stdout
     assert "--install-completion" in top
@@ -136,7 +136,7 @@ def test_help_teaches_every_command(name, commands):
         assert len(text.splitlines()) > 8
 
 
-def test_help_loads_nothing_heavy():
+def test_help_does_not_import_large_libraries():
     code = (
         "import sys, geoscene.cli, lidar.cli;"
         "heavy = {'osmnx', 'geopandas', 'rasterio', 'trimesh', 'numba', 'scipy', 'shapely'};"

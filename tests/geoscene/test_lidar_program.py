@@ -14,7 +14,7 @@ from geoscene.lidar_program import check_lidar
 RUN = "from geoscene.lidar_program import main; main()"
 
 
-def test_a_foreign_module_found_first_is_named_in_one_line(tmp_path):
+def test_unrelated_lidar_module_found_first_is_reported_in_one_line(tmp_path):
     (tmp_path / "lidar").mkdir()
     (tmp_path / "lidar" / "__init__.py").write_text('"""Lakes and depressions."""\n')
     code = f"import sys; sys.path.append({str(Path(geoscene.__file__).parents[1])!r}); {RUN}"
@@ -27,7 +27,7 @@ def test_a_foreign_module_found_first_is_named_in_one_line(tmp_path):
     assert "pip uninstall lidar" in done.stderr
 
 
-def test_a_foreign_module_installed_over_ours_is_noticed(tmp_path, monkeypatch):
+def test_unrelated_lidar_module_installed_over_ours_is_reported(tmp_path, monkeypatch):
     check_lidar()
     for package in ("geoscene", "lidar"):
         (tmp_path / package).mkdir()

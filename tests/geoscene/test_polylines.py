@@ -16,7 +16,7 @@ def lines(draw):
 
 
 @given(lines(), st.floats(0, 1), st.floats(0, 1))
-def test_a_cut_is_as_long_as_asked_and_lies_on_the_line(line, a, b):
+def test_cut_has_the_requested_length_and_ends_on_the_line(line, a, b):
     total = polylines.length(line)
     start, end = sorted((a * total, b * total))
     part = polylines.cut(line, start, end=end)
@@ -25,17 +25,17 @@ def test_a_cut_is_as_long_as_asked_and_lies_on_the_line(line, a, b):
 
 
 @given(lines())
-def test_stations_of_a_lines_points_give_its_points(line):
+def test_points_at_vertex_stations_are_the_vertices(line):
     np.testing.assert_allclose(polylines.points_at(line, polylines.stations(line)), line, atol=1e-9)
     assert polylines.stations(line)[-1] == pytest.approx(polylines.length(line))
 
 
-def test_cutting_keeps_heights_in_place():
+def test_cut_interpolates_heights():
     line = np.array([[0, 0, 0], [10, 0, 1], [10, 30, 4.0]])
     np.testing.assert_allclose(polylines.cut(line, 5.0, end=30.0), [[5, 0, 0.5], [10, 0, 1], [10, 20, 3]])
 
 
-def test_a_cut_ends_within_the_line_has_a_least_length_and_leaves_out_vertices_near_its_ends():
+def test_cut_is_clamped_to_the_line_and_respects_least_length_and_gap():
     line = np.array([[0.0, 0], [10, 0], [20, 0]])
     np.testing.assert_allclose(polylines.cut(line, -5.0, end=99.0), line)
     np.testing.assert_allclose(polylines.cut(line, 3.0, end=1.0, least=0.5), [[3, 0], [3.5, 0]])
@@ -43,13 +43,13 @@ def test_a_cut_ends_within_the_line_has_a_least_length_and_leaves_out_vertices_n
 
 
 @pytest.mark.parametrize("moved", [polylines.parallel, polylines.offset_curve])
-def test_parallels_run_on_the_left_with_mitred_corners(moved):
+def test_positive_offsets_are_on_the_left_with_mitred_corners(moved):
     line = np.array([[0, 0, 1], [10, 0, 2], [10, 10, 3.0]])
     np.testing.assert_allclose(moved(line, 2.0), [[0, 2, 1], [8, 2, 1.8], [8, 10, 3]], atol=0.21)
     np.testing.assert_allclose(moved(line, 2.0)[:, :2], [[0, 2], [8, 2], [8, 10]], atol=1e-9)
 
 
-def test_headings_of_ends_reach_over_short_segments():
+def test_end_headings_span_short_segments():
     line = np.array([[0, 0], [0, 0.1], [10, 0], [20, 0], [20, 10.0]])
     first, last = polylines.end_headings(line, reach=5.0)
     assert (first, last) == (0.0, np.pi / 2)

@@ -53,7 +53,7 @@ def files_of(folder):
     return {p.relative_to(folder): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_a_made_up_city_is_the_same_each_time_and_grows_with_its_number(make_osm, town, tmp_path):
+def test_synthetic_city_is_reproducible_and_has_the_requested_size(make_osm, town, tmp_path):
     make_osm.write_city(make_osm.make_city(150, seed=1), tmp_path / "again.osm.pbf")
     assert (tmp_path / "again.osm.pbf").read_bytes() == town.read_bytes()
     small, large = (read_osm(town), make_osm.make_city(1500, seed=1))
@@ -62,7 +62,7 @@ def test_a_made_up_city_is_the_same_each_time_and_grows_with_its_number(make_osm
     assert np.ptp(large.places, axis=0).min() > 2 * 111_195 * (small.bounds[3] - small.bounds[1]) / 2
 
 
-def test_a_made_up_city_builds_without_a_repair(scene):
+def test_synthetic_city_builds_without_repairs(scene):
     counts = scene.manifest["counts"]
     assert counts["watertight"] == counts["closed_objects"] >= counts["solids"] == counts["buildings"]
     assert counts["dropped"] == 0
@@ -70,7 +70,7 @@ def test_a_made_up_city_builds_without_a_repair(scene):
     assert scene.layers["structures"][1] > scene.layers["structures"][0]
 
 
-def test_who_holds_a_place_is_found_without_looking_at_what_is_far(monkeypatch):
+def test_partition_of_a_tile_ignores_distant_polygons(monkeypatch):
     prepared = []
     whole = shapely.prepare
     monkeypatch.setattr(
@@ -105,7 +105,7 @@ def alive(group):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
-def test_a_build_killed_outright_goes_on_and_ends_with_the_same_bytes(town, scene, tmp_path):
+def test_build_resumes_after_sigkill_with_the_same_bytes(town, scene, tmp_path):
     out = tmp_path / "scene"
     process = subprocess.Popen(
         build_words(town, out), env=ENVIRONMENT, start_new_session=True, stdout=subprocess.DEVNULL
@@ -133,7 +133,7 @@ def test_a_build_killed_outright_goes_on_and_ends_with_the_same_bytes(town, scen
     assert taken  # tiles in the journal are not made again
 
 
-def test_a_long_wall_is_seen_from_its_end(make_osm, town, tmp_path):
+def test_long_wall_in_range_adds_its_tile(make_osm, town, tmp_path):
     lonlat = make_osm.on_globe(np.array([(-300.0, 0.0), (-60.0, 0.0), (-180.0, 15.0), (-180.0, 265.0)]))
     route = tuple(f"{lat},{lon}" for lon, lat in lonlat[:2].tolist())
     options = BuildOptions(tile_size=100.0, lod=0, along=route, reach=10.0, only=("roads", "barriers"))
@@ -149,7 +149,7 @@ def test_a_long_wall_is_seen_from_its_end(make_osm, town, tmp_path):
     assert (walled.tile(*home).mesh.klass == Class.WALL).any()
 
 
-def test_a_bridge_is_seen_from_its_end(town, tmp_path, monkeypatch):
+def test_bridge_with_an_end_in_range_adds_its_tile(town, tmp_path, monkeypatch):
     monkeypatch.setattr("geoscene.pipeline._OFFSET", 0.0)
     monkeypatch.setattr("geoscene.pipeline._CROWN", 0.0)
     options = BuildOptions(tile_size=50.0, only=("roads",))
@@ -169,7 +169,7 @@ def test_a_bridge_is_seen_from_its_end(town, tmp_path, monkeypatch):
     assert found  # a bridge that sticks out of its tile
 
 
-def test_a_drive_is_the_same_bytes_on_the_tiles_along_its_route(make_osm, town, scene, tmp_path):
+def test_drive_on_tiles_along_its_route_gives_the_same_bytes(make_osm, town, scene, tmp_path):
     lonlat = make_osm.on_globe(np.array([(-300.0, 0.0), (-60.0, 0.0)]))
     route = tuple((lat, lon) for lon, lat in lonlat.tolist())
     along = tuple(f"{lat},{lon}" for lat, lon in route)

@@ -31,7 +31,7 @@ def test_a_length_is_read_in_metres(text, expected):
     metres,
     st.sampled_from([("m", 1.0), ("", 1.0), ("km", 1000.0), ("ft", 0.3048), ("'", 0.3048), ("mi", 1609.344)]),
 )
-def test_unit_space_and_decimal_comma_do_not_matter(value, unit):
+def test_units_spaces_and_decimal_commas_are_accepted(value, unit):
     name, size = unit
     for text in (
         f"{value}{name}",

@@ -90,7 +90,7 @@ BROKEN = {
     st.booleans(),
 )
 @settings(max_examples=60, deadline=None)
-def test_a_box_anywhere_on_the_grid_is_a_solid_of_its_volume(at, size, as_soup):
+def test_box_on_the_grid_is_valid_and_has_its_volume(at, size, as_soup):
     at, size = np.array(at) / 1e4, np.array(size) / 1e4
     mesh = box(at=at, size=size)
     verdict = validate_mesh(soup(mesh) if as_soup else mesh)
@@ -101,7 +101,7 @@ def test_a_box_anywhere_on_the_grid_is_a_solid_of_its_volume(at, size, as_soup):
 
 @pytest.mark.parametrize("spoil", BROKEN, ids=lambda f: f.__name__)
 @pytest.mark.parametrize("as_soup", [False, True])
-def test_a_broken_solid_is_found_among_sound_ones(spoil, as_soup):
+def test_broken_solid_is_found_among_valid_ones(spoil, as_soup):
     broken = spoil(box(7, at=(3, 4, 5), size=(2, 3, 4)))
     mesh = concatenate([box(2), broken, box(9, at=(3, 4, 9), size=(2, 3, 4))])
     verdict = validate_mesh(soup(mesh) if as_soup else mesh)
@@ -110,26 +110,26 @@ def test_a_broken_solid_is_found_among_sound_ones(spoil, as_soup):
     assert verdict.fault(1) == BROKEN[spoil]
 
 
-def test_features_that_share_a_wall_do_not_disturb_each_other():
+def test_features_are_checked_separately_from_their_neighbours():
     mesh = concatenate([box(0), box(1, at=(1, 0, 0)), box(2, at=(1, 1, 0)), box(3)])
     assert validate_mesh(mesh).ok.all()
 
 
-def test_faces_that_claim_no_solid_are_left_out():
+def test_open_faces_are_not_checked():
     ground = Mesh.of(CORNERS, BOX[:2], feature=5)
     verdict = validate_mesh(concatenate([ground, box(6)]))
     assert verdict.feature.tolist() == [6]
     assert len(validate_mesh(ground)) == len(validate_mesh(Mesh.empty())) == 0
 
 
-def test_a_cavity_is_part_of_the_solid_and_counts_off():
+def test_cavity_reduces_the_volume():
     hole = inside_out(box(at=(0.25, 0.25, 0.25), size=(0.5, 0.5, 0.5)))
     verdict = validate_mesh(concatenate([box(), hole]))
     assert verdict.ok.all()
     assert verdict.volume[0] == pytest.approx(1 - 0.125)
 
 
-def test_a_crack_below_the_grid_is_welded_and_one_above_is_open():
+def test_gaps_are_welded_up_to_the_grid_size():
     for crack, whole in ((2e-5, True), (3e-4, False)):
         mesh = soup(box())
         vertices = mesh.vertices.copy()

@@ -153,7 +153,7 @@ def test_the_single_storey_of_a_hall_does_not_set_its_height(use, storeys, low, 
     assert table.height_source[0] == ("inferred-type" if use == "church" else "levels")
 
 
-def test_a_building_is_as_uncertain_as_its_highest_part():
+def test_building_has_the_height_uncertainty_of_its_highest_part():
     table, *_ = built(
         house(1, box(0, 0, 20, 10)),
         part(2, box(0, 0, 10, 10), height="12"),
@@ -164,7 +164,7 @@ def test_a_building_is_as_uncertain_as_its_highest_part():
     assert table.height_sigma[0] == pytest.approx(0.15 * 60)
 
 
-def test_the_remainder_of_an_outline_keeps_its_height():
+def test_uncovered_part_of_an_outline_keeps_its_height():
     table, _, verdict, problems = built(
         house(1, box(0, 0, 20, 10), height="6"), part(2, box(0, 0, 5, 10), height="30")
     )
@@ -175,7 +175,7 @@ def test_the_remainder_of_an_outline_keeps_its_height():
     assert reasons(problems) == {("way/1", "repaired", "partly-covered")}
 
 
-def test_a_part_without_height_takes_its_buildings_and_one_without_colour_its_colour():
+def test_parts_inherit_missing_height_and_colour_from_their_building():
     table, *_ = built(
         house(1, box(0, 0, 20, 10), height="21", building__colour="red"),
         part(2, box(0, 0, 10, 10)),
@@ -266,7 +266,7 @@ def test_invalid_footprints_become_valid_solids(shape, size, reason):
 @pytest.mark.parametrize(
     "shape", [shapely.Polygon([(0, 0), (5, 0), (10, 0)]), box(0, 0, 0.3, 0.3), shapely.Polygon()]
 )
-def test_footprints_of_no_size_are_dropped_and_reported(shape):
+def test_footprints_without_area_are_dropped_and_reported(shape):
     table, _, _, problems = built(house(1, shape, height="10"), house(2, box(30, 0, 10, 10)))
     assert table.osm_id.tolist() == ["way/2"]
     assert reasons(problems) == {("way/1", "dropped", "too-small")}
@@ -300,7 +300,7 @@ def test_overlapping_buildings_share_no_volume_and_leave_no_hole(seed):
             assert shapely.intersection(table.footprint[i], table.footprint[j]).area < 1e-2
 
 
-def test_a_bridge_between_houses_may_pass_over_another():
+def test_building_raised_above_another_keeps_its_footprint():
     table, _, verdict, problems = built(
         house(1, box(0, 0, 10, 10), height="5"), house(2, box(0, 4, 10, 2), height="12", min_height="8")
     )
@@ -355,7 +355,7 @@ def test_the_order_of_the_map_does_not_matter():
     np.testing.assert_array_equal(one.faces, other.faces)
 
 
-def test_levels_of_detail_get_finer():
+def test_higher_levels_of_detail_add_parts_and_roofs():
     areas = (
         house(1, box(0, 0, 20, 10), height="12", roof__shape="gabled", roof__height="4"),
         house(2, box(40, 0, 20, 10)),
@@ -395,7 +395,7 @@ def test_a_roof_direction_is_from_true_north():
     )
 
 
-def test_an_unknown_height_follows_its_neighbours():
+def test_unknown_height_is_inferred_from_neighbours():
     rng = np.random.default_rng(0)
     n = 200
     xy = rng.uniform(0, 400, (n, 2))
@@ -412,7 +412,7 @@ def test_an_unknown_height_follows_its_neighbours():
     assert 4 < lone[0] < 10
 
 
-def test_a_television_tower_does_not_inform_the_houses_below():
+def test_tower_height_is_not_used_for_houses_nearby():
     xy = np.column_stack([np.arange(6) * 60.0, np.zeros(6)])
     use, area_ = np.full(6, "yes", dtype=object), np.array([2324.0, 2000.0, 900.0, 300.0, 700.0, 4400.0])
     alone = infer_heights(xy, use, area=area_, height=np.full(6, np.nan))[0]
@@ -433,7 +433,7 @@ def test_bodies_that_share_an_edge_with_a_narrow_gap_are_joined():
     assert body.corners[..., 2].max() < 9.01
 
 
-def test_a_building_does_not_inform_its_own_guess():
+def test_inferred_height_excludes_the_building_itself():
     xy = np.array([[0.0, 0.0], [10.0, 0.0]])
     use, area_ = np.array(["yes", "yes"], dtype=object), np.array([100.0, 100.0])
     first, _, _ = infer_heights(xy, use, area=area_, height=np.array([30.0, np.nan]))
@@ -447,7 +447,7 @@ def test_an_empty_map_has_no_buildings():
     assert len(table) == table.count == len(mesh) == len(problems) == 0
 
 
-def test_wrong_options_are_refused():
+def test_invalid_arguments_are_refused():
     table, _ = read_buildings(osm(house(1, box(0, 0, 5, 5))), FRAME)
     with pytest.raises(InputError, match="level of detail 3"):
         build_solids(table, base=np.zeros(1), lod=3)

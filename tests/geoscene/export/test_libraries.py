@@ -20,7 +20,7 @@ def demo(tmp_path_factory):
     return build(data, tmp_path_factory.mktemp("demo") / "scene", options=BuildOptions())
 
 
-def test_trimesh_sees_the_same_triangles_and_solids(demo):
+def test_trimesh_mesh_has_the_same_triangles_and_solids(demo):
     found = to_trimesh(demo)
     assert {"road", "building", "tree_crown"} < set(found.geometry)
     buildings = found.geometry["building"]
@@ -43,14 +43,14 @@ def test_osmnx_routes_on_the_graph(demo):
     assert length == pytest.approx(1000 * demo.manifest["counts"]["road_km"], abs=1)
 
 
-def test_open3d_sees_the_same_triangles(demo):
+def test_open3d_mesh_has_the_same_triangles(demo):
     pytest.importorskip("open3d")
     assert {k: len(m.triangle.indices) for k, m in to_open3d(demo).items()} == {
         k: len(m.faces) for k, m in to_trimesh(demo).geometry.items()
     }
 
 
-def test_what_is_missing_is_named(tmp_path, monkeypatch):
+def test_error_names_missing_roads_or_the_missing_extra(tmp_path, monkeypatch):
     scene = write_world(tmp_path / "world")
     scene.files.road_graph.unlink(missing_ok=True)
     with pytest.raises(SceneFormatError, match="no roads"):

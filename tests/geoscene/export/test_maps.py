@@ -37,7 +37,7 @@ def _raster(scene, tmp_path, **options):
         return raster.read(1), *place, raster.profile, raster.tags(ns="IMAGE_STRUCTURE")
 
 
-def test_the_terrain_model_is_the_ground_under_all_that_stands_on_it(scene, tmp_path):
+def test_terrain_model_is_the_ground_below_all_objects(scene, tmp_path):
     height, x, _, profile, layout = _raster(scene, tmp_path, model="terrain", resolution=0.5)
     assert height.shape == (400, 400)
     np.testing.assert_allclose(height, SLOPE * x, atol=1e-5)
@@ -46,7 +46,7 @@ def test_the_terrain_model_is_the_ground_under_all_that_stands_on_it(scene, tmp_
     assert layout["LAYOUT"] == "COG"
 
 
-def test_the_surface_model_is_the_roof_over_the_ground(scene, tmp_path):
+def test_surface_model_includes_roofs(scene, tmp_path):
     height, x, y, _, _ = _raster(scene, tmp_path, model="surface", resolution=0.5)
     box = (np.abs(x - 12.5) < 5) & (np.abs(y + 20.25) < 10)
     assert box.sum() == 20 * 39  # two more rows lie on the edge
@@ -58,7 +58,7 @@ def test_the_surface_model_is_the_roof_over_the_ground(scene, tmp_path):
     assert (height[crown] > 0.8 * tall).all()
 
 
-def test_the_class_map_names_what_is_seen_from_above(scene, tmp_path):
+def test_class_map_has_the_classes_visible_from_above(scene, tmp_path):
     klass, x, y, profile, _ = _raster(scene, tmp_path, model="classes", resolution=1.0)
     box = (np.abs(x - 12.5) < 5) & (np.abs(y + 20.25) < 10)
     assert set(klass[box]) == {Class.BUILDING}
@@ -73,7 +73,7 @@ def test_the_class_map_names_what_is_seen_from_above(scene, tmp_path):
 
 
 @pytest.mark.parametrize("resolution", [0, -1, np.nan, np.inf, 1e-4])
-def test_a_resolution_that_cannot_be_is_refused(scene, tmp_path, resolution):
+def test_invalid_resolution_is_refused(scene, tmp_path, resolution):
     with pytest.raises(InputError, match="`resolution`"):
         export_scene(scene, tmp_path / "a.tif", options=ExportOptions(resolution=resolution))
     assert list(tmp_path.iterdir()) == []
@@ -86,7 +86,7 @@ triangles = st.lists(
 
 @settings(max_examples=60, deadline=None)
 @given(triangles)
-def test_the_grid_is_the_highest_plane_over_each_middle(corners):
+def test_cell_has_the_height_of_the_highest_triangle_at_its_centre(corners):
     corners = np.array(corners, float)
     height, labels = np.full((20, 20), np.nan, np.float32), np.zeros((20, 20), np.uint8)
     draw_triangles(corners, np.arange(1, len(corners) + 1, dtype=np.uint8), height, labels)
@@ -123,7 +123,7 @@ def test_a_geopackage_has_every_layer_with_its_columns(scene, tmp_path):
     assert moved.crs.to_epsg() == 25833
 
 
-def test_geojson_is_where_rfc_7946_wants_it(scene, tmp_path):
+def test_geojson_follows_rfc_7946(scene, tmp_path):
     path = export_scene(scene, tmp_path / "a.geojson").path
     document = json.loads(path.read_text())
     kinds = [f["properties"]["kind"] for f in document["features"]]
@@ -153,7 +153,7 @@ def test_a_geoparquet_table_holds_all_layers(scene, tmp_path):
     assert some["osm_id"].tolist() == ["way/1"]
 
 
-def test_one_layer_alone(scene, tmp_path):
+def test_selected_layer_is_exported_and_unknown_layers_are_refused(scene, tmp_path):
     summary = export_scene(scene, tmp_path / "a.geojson", options=ExportOptions(layers=("trees",)))
     assert summary.objects == len(TREES)
     with pytest.raises(InputError, match=r"no layer tress; this scene has .*trees"):
@@ -166,11 +166,11 @@ def test_one_layer_alone(scene, tmp_path):
     ("name", "kind"),
     [(f"Some.Name{s}", k) for k, told in KINDS.items() for s in told.suffixes] + [("A.GLB", "glb")],
 )
-def test_the_suffix_says_the_kind(tmp_path, name, kind):
+def test_suffix_selects_the_format(tmp_path, name, kind):
     assert kind_of(tmp_path / name) == kind
 
 
-def test_what_cannot_be_meant_is_said_before_anything_is_written(scene, tmp_path):
+def test_invalid_options_are_refused_before_writing(scene, tmp_path):
     with pytest.raises(InputError, match="unknown suffix"):
         export_scene(scene, tmp_path / "a.json")
     with pytest.raises(InputError, match="`kind` dwg"):
@@ -189,13 +189,13 @@ def test_what_cannot_be_meant_is_said_before_anything_is_written(scene, tmp_path
     assert export_scene(scene, tmp_path / "a.ply", overwrite=True).bytes > 1000
 
 
-def test_without_sumo_the_extra_is_named(scene, tmp_path, monkeypatch):
+def test_missing_sumo_error_names_the_extra(scene, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "sumo", None)
     with pytest.raises(MissingExtraError, match=r"geoscene\[sumo\]"):
         export_scene(scene, tmp_path / "a.net.xml")
 
 
-def test_a_file_that_failed_leaves_the_old_one(tmp_path):
+def test_failed_write_keeps_the_old_file(tmp_path):
     (tmp_path / "a").write_bytes(b"old")
     with pytest.raises(ZeroDivisionError), files.atomic_file(tmp_path / "a") as out:
         out.write(bytes(1 // 0))

@@ -133,20 +133,20 @@ def _check_links(path):
 
 
 @pytest.mark.parametrize("left_hand", [False, True])
-def test_lanes_meet_in_junctions(scene, tmp_path, left_hand):
+def test_lanes_are_continuous_through_junctions(scene, tmp_path, left_hand):
     path = export_scene(_keeping(scene, left_hand), tmp_path / "a.xodr").path
     assert _check_links(path) >= 12
 
 
 @pytest.mark.parametrize("lanes", [0.5, 1.0, 2.0, [2, 1] * 24])
 @pytest.mark.parametrize("left_hand", [False, True])
-def test_lanes_meet_in_a_grid_of_any_width(scene, tmp_path, lanes, left_hand):
+def test_lanes_are_continuous_in_a_grid_of_any_lane_count(scene, tmp_path, lanes, left_hand):
     graph = grid(width=9.0)
     graph = replace(graph, lanes=np.broadcast_to(np.asarray(lanes, float), len(graph)).copy())
     assert _check_links(_write(graph, _keeping(scene, left_hand), tmp_path)) > 100
 
 
-def test_restrictions_that_junctions_cannot_say_are_counted(tmp_path):
+def test_restrictions_without_opendrive_equivalent_are_counted(tmp_path):
     scene = write_world(tmp_path / "world")
     assert export_scene(scene, tmp_path / "plain.xodr").notes == ()
     chain = rows_of([np.array([0, 2, 3], np.int32)])
@@ -157,7 +157,7 @@ def test_restrictions_that_junctions_cannot_say_are_counted(tmp_path):
     assert (tmp_path / "bound.xodr").read_bytes() == (tmp_path / "plain.xodr").read_bytes()
 
 
-def test_the_ways_through_a_junction_are_the_permitted_turns(scene, tmp_path):
+def test_connecting_roads_are_the_permitted_turns(scene, tmp_path):
     document, found = _roads(export_scene(scene, tmp_path / "a.xodr").path)
     graph = roads()
     before, after = turn_table(graph)
@@ -188,7 +188,7 @@ def test_the_ways_through_a_junction_are_the_permitted_turns(scene, tmp_path):
     assert (name[0], name[6]) not in taken  # the left turn that the map forbids
 
 
-def test_signs_stand_beside_the_traffic_they_are_for(scene, tmp_path):
+def test_signs_are_on_the_side_of_the_traffic_they_address(scene, tmp_path):
     document, _ = _roads(export_scene(scene, tmp_path / "a.xodr").path)
     told = {
         s.get("name"): (s.get("orientation"), _number(s, "t"), _number(s, "s"), r.get("length"))
@@ -201,7 +201,7 @@ def test_signs_stand_beside_the_traffic_they_are_for(scene, tmp_path):
     assert told["stop"][:2] == ("-", 4.0)
 
 
-def test_the_file_says_where_it_is(scene, tmp_path):
+def test_opendrive_header_has_the_georeference(scene, tmp_path):
     document, found = _roads(export_scene(scene, tmp_path / "a.xodr").path)
     header = document.find("header")
     assert "+proj=utm +zone=33" in header.find("geoReference").text
@@ -215,7 +215,7 @@ def test_the_file_says_where_it_is(scene, tmp_path):
     assert speeds == {13.9}
 
 
-def test_bridges_and_shared_lanes_are_told(scene, tmp_path):
+def test_bridges_and_bidirectional_lanes_are_marked(scene, tmp_path):
     graph = road_graph([(0, 0), (100, 0), (200, 50)], [(0, 1), (1, 2)], lanes=0.5, width=4.0)
     graph = replace(graph, bridge=np.array([True, True, False, False]))
     document, _ = _roads(_write(graph, scene, tmp_path))
@@ -229,7 +229,7 @@ def test_bridges_and_shared_lanes_are_told(scene, tmp_path):
     assert sorted(kinds) == ["bidirectional", "bidirectional", "none", "none"]
 
 
-def test_a_scene_without_roads_says_so(scene, tmp_path):
+def test_scene_without_roads_is_refused(scene, tmp_path):
     folder = tmp_path / "none"
     folder.mkdir()
     with pytest.raises(InputError, match="no drivable roads"):
@@ -267,7 +267,7 @@ def test_a_reference_line_is_smooth_and_near_its_polyline(steps):
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-3, 3), st.floats(-2.8, 2.8), st.floats(2, 60))
-def test_a_connecting_curve_is_near_an_arc_and_as_long_as_it_says(heading, turn, chord):
+def test_connecting_curve_is_near_an_arc_of_the_stated_length(heading, turn, chord):
     direction = heading + turn / 2
     end = chord * np.array([np.cos(direction), np.sin(direction)])
     curve = connecting_curve(np.zeros(2), heading, end=end, end_heading=heading + turn)

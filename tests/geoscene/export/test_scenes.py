@@ -86,7 +86,7 @@ def _points(path):
     return _z_up(np.concatenate(out))
 
 
-def test_surfaces_of_a_building_say_what_they_are(city):
+def test_cityjson_building_surfaces_have_semantic_types(city):
     tower = city["CityObjects"]["relation/4"]
     geometry = tower["geometry"][0]
     assert (tower["type"], geometry["type"], geometry["lod"]) == ("Building", "Solid", LOD[2])
@@ -109,7 +109,7 @@ def test_surfaces_of_a_building_say_what_they_are(city):
     assert {"roof_tile", "brick", "asphalt"} <= looks
 
 
-def test_bodies_and_cavities_are_shells_of_their_own(city):
+def test_cityjson_bodies_and_cavities_are_separate_shells(city):
     objects = city["CityObjects"]
     pair, hollow = objects["way/2"], objects["way/3"]["geometry"][0]
     assert pair["geometry"] == []
@@ -139,13 +139,13 @@ ALLOWED = {
 }
 
 
-def test_every_kind_of_object_has_a_geometry_that_the_schema_lets_it_have(city):
+def test_cityjson_geometry_types_are_allowed_by_the_schema(city):
     for told in city["CityObjects"].values():
         assert {g["type"] for g in told["geometry"]} <= ALLOWED[told["type"]]
     assert {told["type"] for told in city["CityObjects"].values()} == set(ALLOWED)
 
 
-def test_a_tree_in_cityjson_stands_where_it_grows(city, scene):
+def test_cityjson_tree_is_at_its_position(city, scene):
     trees = {n: o for n, o in city["CityObjects"].items() if o["type"] == "SolitaryVegetationObject"}
     assert len(trees) == len(TREES)
     templates = city["geometry-templates"]
@@ -205,7 +205,7 @@ def test_a_glb_node_has_its_name_its_attributes_and_its_row(scene, tmp_path):
     assert root["extras"]["crs"] == "EPSG:32633"
 
 
-def test_copies_in_a_glb_stand_where_trees_grow(scene, tmp_path):
+def test_glb_tree_instances_are_at_tree_positions(scene, tmp_path):
     path = export_scene(scene, tmp_path / "a.glb", options=ExportOptions(layers=("trees",))).path
     document, _ = _glb(path)
     assert document["extensionsRequired"] == ["EXT_mesh_gpu_instancing"]
@@ -217,7 +217,7 @@ def test_copies_in_a_glb_stand_where_trees_grow(scene, tmp_path):
     assert len(points) == len(TREES) * sum(len(shapes()[n].vertices) for n in ("trunk", "crown_broadleaved"))
 
 
-def test_boxes_of_tiles_hold_their_content_and_errors_fall(tiles):
+def test_bounding_boxes_of_3d_tiles_contain_their_content_and_errors_decrease(tiles):
     document = json.loads((tiles / "tileset.json").read_text())
     assert document["asset"]["version"] == "1.1"
     contents = []
@@ -244,7 +244,7 @@ def test_boxes_of_tiles_hold_their_content_and_errors_fall(tiles):
 NODE = {"boundingVolume", "geometricError", "refine", "transform", "content", "children"}
 
 
-def test_a_tileset_keeps_to_the_schema_and_children_lie_within_their_parents(tiles):
+def test_tileset_follows_the_schema_and_parents_contain_their_children(tiles):
     document = json.loads((tiles / "tileset.json").read_text())
     assert set(document) == {"asset", "geometricError", "root"}
 
@@ -272,7 +272,7 @@ def test_a_tileset_keeps_to_the_schema_and_children_lie_within_their_parents(til
     assert np.linalg.det(matrix[:3, :3]) == pytest.approx(1)
 
 
-def test_points_of_tiles_are_where_the_projection_says(scene, tiles):
+def test_points_of_3d_tiles_match_the_projection(scene, tiles):
     import pyproj  # noqa: PLC0415
 
     document = json.loads((tiles / "tileset.json").read_text())
@@ -289,7 +289,7 @@ def test_points_of_tiles_are_where_the_projection_says(scene, tiles):
     assert gap.max() < 2e-3
 
 
-def test_tables_of_tiles_have_as_many_rows_as_they_say(tiles):
+def test_tables_of_3d_tiles_have_the_stated_number_of_rows(tiles):
     seen = 0
     for path in sorted(tiles.rglob("*.glb")):
         document, buffer = _glb(path)
@@ -324,7 +324,7 @@ def test_tables_of_tiles_have_as_many_rows_as_they_say(tiles):
     assert seen > 10
 
 
-def test_a_folder_that_is_not_ours_is_not_replaced(scene, tmp_path):
+def test_folder_of_another_kind_is_not_replaced(scene, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years")
     with pytest.raises(InputError, match=r"holds no tileset\.json"):
@@ -332,7 +332,7 @@ def test_a_folder_that_is_not_ours_is_not_replaced(scene, tmp_path):
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
 
 
-def test_heights_are_lifted_to_the_ellipsoid_on_request(scene, tmp_path, tiles):
+def test_height_offset_is_added_to_heights(scene, tmp_path, tiles):
     low, high = (
         np.array(json.loads((path / "tileset.json").read_text())["root"]["transform"])[12:15]
         for path in (

@@ -187,7 +187,7 @@ def _read(kind, path, scene):
 
 
 @pytest.mark.parametrize("kind", STEPS)
-def test_a_building_is_the_same_closed_solid(kind, exported, scene):
+def test_building_is_the_same_closed_solid_in_every_format(kind, exported, scene):
     found = _read(kind, exported(kind), scene)
     assert set(found) == set(NAMES)
     truth = {}
@@ -212,7 +212,7 @@ def test_a_building_is_the_same_closed_solid(kind, exported, scene):
 
 
 @pytest.mark.parametrize("kind", STEPS)
-def test_the_same_scene_is_the_same_bytes(kind, exported, scene, tmp_path):
+def test_exports_are_reproducible(kind, exported, scene, tmp_path):
     first = exported(kind)
     layers = ["building_solids"] if kind in ("gpkg", "geoparquet", "geojson") else None
     again = export_scene(scene, tmp_path / first.name, options=ExportOptions(kind=kind, layers=layers)).path

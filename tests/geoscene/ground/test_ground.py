@@ -109,7 +109,7 @@ def test_a_point_belongs_to_the_highest_polygon_over_it(seed):
 
 @given(st.integers(0, 2**32))
 @settings(max_examples=15, deadline=None)
-def test_a_tile_does_not_depend_on_which_others_are_made(seed):
+def test_a_tile_is_independent_of_other_tiles(seed):
     rng = np.random.default_rng(seed)
     layers = layers_of(blobs(seed), rng)
     plan = plan_ground(EXTENT, layers, tile_size=16.0, lines=8.0)
@@ -123,7 +123,7 @@ def test_a_tile_does_not_depend_on_which_others_are_made(seed):
     np.testing.assert_array_equal(alone.feature, without_the_far.feature)
 
 
-def test_outlines_on_tile_borders_and_grid_ties_still_meet():
+def test_outlines_on_tile_borders_and_grid_ties_leave_no_gaps():
     """Edges along a tile's side, corners on it, and crossings half a grid step off it."""
     half = PRECISION / 2
     polygons = [
@@ -140,14 +140,14 @@ def test_outlines_on_tile_borders_and_grid_ties_still_meet():
     assert_one_surface(*welded(mesh), EXTENT)
 
 
-def test_vertices_stay_where_they_are_when_moved_to_a_tile():
+def test_vertices_are_exact_in_tile_coordinates():
     """A power of two as the grid: whole metres off and on again give the same numbers."""
     plan = plan_ground(EXTENT, layers_of(blobs(3), np.random.default_rng(3)), tile_size=25.0)
     mesh = ground_tile(plan, 0, j=0)
     assert (mesh.shifted((-5000, 4000, 0)).shifted((5000, -4000, 0)).vertices == mesh.vertices).all()
 
 
-def test_a_gap_thinner_than_a_sliver_is_closed_and_a_kerb_is_not():
+def test_slivers_are_merged_and_kerbs_are_kept():
     gap = SLIVER / 2
     left, right = shapely.box(0, 0, 10, 10), shapely.box(10 + gap, 0, 20, 10)
     kerb = shapely.box(0, 10, 20, 10.1)
@@ -160,7 +160,7 @@ def test_a_gap_thinner_than_a_sliver_is_closed_and_a_kerb_is_not():
     assert shapely.area(cells.polygon[cells.klass == Class.KERB]).sum() == pytest.approx(2.0, abs=0.01)
 
 
-def test_pads_win_over_roads_and_carry_the_buildings_number():
+def test_building_pads_cover_roads_and_have_the_feature_of_the_building():
     house = shapely.box(0, 0, 10, 10)
     road = Layers.of([shapely.box(-20, 4, 20, 6)], klass=Class.ROAD, material=1, priority=100.0)
     layers = Layers.concatenate([building_pads([None, house], feature=[7, 8]), road])
@@ -170,7 +170,7 @@ def test_pads_win_over_roads_and_carry_the_buildings_number():
     assert set(cells.feature[cells.klass == Class.BUILDING_PAD]) == {8}
 
 
-def test_rings_that_touch_in_a_point_and_courtyards_are_triangulated_wholly():
+def test_rings_touching_in_a_point_and_courtyards_are_triangulated_completely():
     holes = [[(2, 2), (4, 5), (2, 8)], [(4, 5), (8, 2), (8, 8)]]  # they touch at (4, 5)
     block = shapely.Polygon([(0, 0), (10, 0), (10, 10), (0, 10)], holes)
     cells = partition((-5, -5, 15, 15), Layers.of([block], klass=Class.GRASS, material=GRASS, priority=1))

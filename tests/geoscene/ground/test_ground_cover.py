@@ -114,7 +114,7 @@ def test_lines_are_as_wide_as_their_tag_or_their_kind():
     assert [(p.osm_id, p.reason) for p in problems] == [("way/3", "unreadable-width")]
 
 
-def test_the_smaller_of_two_areas_of_a_kind_lies_above():
+def test_smaller_area_of_the_same_kind_covers_the_larger():
     big, small = (
         area(1, BOX, landuse="grass"),
         area(2, shapely.box(0, 0, 9, 9), leisure="garden", surface="sand"),
@@ -125,7 +125,7 @@ def test_the_smaller_of_two_areas_of_a_kind_lies_above():
         assert sand == pytest.approx(81, rel=1e-5)
 
 
-def test_cover_outside_the_extent_is_left_out():
+def test_land_cover_outside_the_extent_is_left_out():
     layers, _ = cover(area(1, shapely.box(200, 0, 300, 50), landuse="grass"), area(2, BOX, landuse="grass"))
     assert layers.osm_id.tolist() == ["way/2"]
 
@@ -269,7 +269,7 @@ def test_the_ground_of_real_places_is_one_surface(shared_osm, name):
 
 
 @pytest.mark.shared
-def test_monaco_lies_on_the_sea_and_rises_behind_it(shared_osm, shared_dem):
+def test_monaco_starts_at_sea_level_and_rises_inland(shared_osm, shared_dem):
     osm = read_osm(shared_osm("monaco.osm.pbf"))
     frame = Frame.at(7.42, 43.735)
     extent = (-600.0, -600.0, 1000.0, 600.0)

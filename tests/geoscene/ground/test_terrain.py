@@ -46,7 +46,7 @@ def sample(count=500, seed=0):
     return np.random.default_rng(seed).uniform(-200, 200, (2, count))
 
 
-def test_heights_of_a_plane_are_exact_everywhere(tmp_path):
+def test_interpolated_heights_of_a_plane_are_exact(tmp_path):
     """Bilinear interpolation reproduces a plane: to float32's step, only if posts are at pixels' middles."""
     corner = around()
     east, north = posts(corner, (60, 60))
@@ -63,7 +63,7 @@ def test_heights_of_a_plane_are_exact_everywhere(tmp_path):
     assert terrain.vertical == "orthometric"
 
 
-def test_between_four_posts_the_height_is_bilinear(tmp_path):
+def test_height_between_four_posts_is_bilinear(tmp_path):
     corner = around((4, 4))
     values = np.zeros((4, 4))
     values[1, 1], values[1, 2], values[2, 1], values[2, 2] = 10, 20, 30, 80
@@ -103,7 +103,7 @@ def test_a_finer_model_takes_precedence_over_a_coarser_one(tmp_path):
     assert terrain.spacing == pytest.approx(10.0, rel=1e-3)
 
 
-def test_voids_are_filled_from_around_and_counted(tmp_path):
+def test_voids_are_filled_from_their_surroundings_and_counted(tmp_path):
     corner = around()
     east, _ = posts(corner, (60, 60))
     slope = 0.1 * (east - 500000) + 300
@@ -139,7 +139,7 @@ def test_a_vertical_crs_gives_datum_and_unit(tmp_path):
     assert told.vertical == "ellipsoidal"
 
 
-def test_a_model_that_does_not_cover_the_scene_is_an_error_or_a_counted_fallback(tmp_path):
+def test_incomplete_coverage_is_an_error_or_filled_with_the_nearest_height(tmp_path):
     corner = around()
     east, _ = posts(corner, (60, 20))  # its eastern edge is 250 m west of the raster's middle
     path = write_dem(tmp_path / "a.tif", east - 499000, corner=corner)
@@ -192,7 +192,7 @@ def test_a_terrain_can_be_pickled(tmp_path):
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(terrain)).height(x, y), before)  # noqa: S301
 
 
-def test_flat_ground_is_at_zero():
+def test_flat_terrain_has_height_zero():
     terrain = flat_terrain(FRAME)
     assert (terrain.height(np.zeros((2, 3)), 7.0) == np.zeros((2, 3))).all()
     assert terrain.vertical == "flat"

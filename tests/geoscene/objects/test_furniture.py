@@ -142,13 +142,13 @@ def test_poles_and_bollards_mapped_on_the_carriageway_move_beside_it(tags):
     assert problems == []
 
 
-def test_a_bollard_on_a_footway_stays_in_it():
+def test_bollard_on_a_footway_is_not_moved():
     path = way(3, [(0, 5), (0, 50)], nodes=[20, 21], highway="footway")
     table, _ = read(street(), path, node(21, (0, 50), barrier="bollard"))
     np.testing.assert_allclose(table.xy, [(0, 50)], atol=1e-6)
 
 
-def test_nothing_stands_between_the_rails_of_a_track():
+def test_no_object_stands_between_the_rails_of_a_track():
     rails = Layers.of(
         [shapely.box(-100, y - 0.036, 100, y + 0.036) for y in (9.2, 10.8)],
         klass=Class.RAIL,
@@ -160,7 +160,7 @@ def test_nothing_stands_between_the_rails_of_a_track():
     assert 1.5 < abs(table.xy[0, 1] - 10) < 3.0
 
 
-def test_furniture_without_a_clear_place_is_listed():
+def test_furniture_without_a_clear_place_is_reported():
     everywhere = shapely.box(*EXTENT)
     bridge = way(4, [(-100, 50), (0, 50), (100, 50)], nodes=[30, 31, 32], highway="primary", bridge="yes")
     signals = [node(k, xy, highway="traffic_signals") for k, xy in ((2, (20, 0)), (31, (0, 50)))]
@@ -173,13 +173,13 @@ def test_furniture_without_a_clear_place_is_listed():
     }
 
 
-def test_a_hydrant_below_the_ground_is_no_pillar():
+def test_underground_hydrant_has_no_pillar():
     hydrant = {"emergency": "fire_hydrant", "fire_hydrant:type": "underground"}
     table, problems = read(node(7, (0, 9), **hydrant))
     assert (len(table), problems) == (0, [])
 
 
-def test_at_a_crossing_of_streets_signals_stand_at_corners_off_both():
+def test_signals_at_a_junction_stand_at_corners_off_both_streets():
     cross = shapely.box(17, -100, 23, 100)
     table, _ = read(street(), node(2, (20, 0), highway="traffic_signals"), roads=[STREET, cross])
     assert len(table) == 2
@@ -187,7 +187,7 @@ def test_at_a_crossing_of_streets_signals_stand_at_corners_off_both():
         assert 0.2 < spot.distance(shapely.union(STREET, cross)) < 1.0
 
 
-def test_a_lamp_beside_the_road_leans_over_it_and_keeps_its_place():
+def test_lamp_beside_a_road_keeps_its_position_and_faces_the_road():
     lamps = [node(7, (0, 5), highway="street_lamp"), node(8, (0, -5), highway="street_lamp", direction="E")]
     table, _ = read(street(), *lamps)
     np.testing.assert_allclose(table.xy, [(0, 5), (0, -5)], atol=1e-6)
@@ -206,7 +206,7 @@ def test_a_sign_on_the_right_faces_oncoming_traffic():
     assert table.shape.tolist() == ["sign_round", "sign_triangle"]
 
 
-def test_height_tags_stretch_the_shape():
+def test_height_tags_scale_the_shape():
     table, problems = read(
         node(7, (0, 5), highway="street_lamp", height="12"),
         node(8, (9, 5), highway="street_lamp", height="very"),
@@ -217,7 +217,7 @@ def test_height_tags_stretch_the_shape():
     assert [(p.osm_id, p.reason) for p in problems] == [("node/8", "unusable-height")]
 
 
-def test_furniture_indoors_and_above_or_below_the_ground_is_left_out():
+def test_furniture_indoors_or_off_the_ground_is_left_out():
     house = shapely.box(40, 40, 60, 60)
     table, problems = read(
         node(4, (50, 50), amenity="bench"),
@@ -257,7 +257,7 @@ def solids(*features, roads=(), houses=(), height=None):
     return barriers, barrier_meshes(barriers, height=height), problems
 
 
-def test_a_wall_is_a_solid_as_long_wide_and_high_as_it_is_drawn():
+def test_wall_is_a_solid_of_the_mapped_length_width_and_height():
     wall = way(1, [(-20, 0), (20, 0)], barrier="wall", height="2.2", width="0.5", material="brick")
     barriers, [mesh], problems = solids(wall)
     assert volume(mesh) == pytest.approx(40 * 0.5 * (2.2 + 0.3), rel=1e-6)

@@ -38,7 +38,7 @@ def assert_off_carriageways(path):
     return plan, problems
 
 
-def test_nothing_stands_on_the_carriageways_of_the_demo():
+def test_no_object_of_the_demo_stands_on_a_carriageway():
     plan, _ = assert_off_carriageways(demo_path())
     assert (plan.furniture.place_source == "moved").sum() > 100
     assert np.median(plan.furniture.moved[plan.furniture.place_source == "moved"]) < 3.0
@@ -46,5 +46,5 @@ def test_nothing_stands_on_the_carriageways_of_the_demo():
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", EXTRACTS)
-def test_nothing_stands_on_the_carriageways_of_a_real_place(shared_osm, name):
+def test_no_object_of_a_real_place_stands_on_a_carriageway(shared_osm, name):
     assert_off_carriageways(shared_osm(name))

@@ -54,14 +54,14 @@ def test_every_shape_is_made_of_closed_solids_facing_outward(name):
 
 
 @pytest.mark.parametrize("name", ["crown_broadleaved", "crown_needleleaved", "crown_palm", "trunk"])
-def test_shapes_to_be_scaled_are_of_unit_size(name):
+def test_scalable_shapes_have_unit_size(name):
     low, high = shapes()[name].vertices.min(axis=0), shapes()[name].vertices.max(axis=0)
     assert low[2] == 0.0
     assert high[2] == 1.0
     assert np.abs([low[:2], high[:2]]).max() == pytest.approx(0.5, abs=0.06)
 
 
-def test_crowns_let_light_through_and_nothing_else_does():
+def test_only_crowns_and_hedges_have_a_leaf_area_density():
     leafy = {name for name, shape in shapes().items() if (shape.klass == Class.TREE_CROWN).any()}
     assert leafy | {"hedge"} == set(LEAF_AREA_DENSITY)
 
@@ -85,7 +85,7 @@ def test_a_tree_is_as_high_and_wide_as_its_tags_say():
     assert trunk[:, 2].min() < 300.0 < crown[:, 2].min() < trunk[:, 2].max()
 
 
-def test_missing_sizes_are_derived_from_the_others_and_name_their_source():
+def test_missing_sizes_are_derived_from_known_ones_with_their_source():
     tags = [
         {},
         {"diameter_crown": "8"},
@@ -117,7 +117,7 @@ def test_the_genus_decides_the_form():
     assert crowns.tolist() == [shape_numbers()[name] for name in names]
 
 
-def test_a_row_has_a_tree_at_both_ends_and_none_on_the_road_that_crosses_it():
+def test_tree_row_has_trees_at_both_ends_and_none_on_a_crossing_road():
     row = Way("way/5", {"natural": "tree_row"}, np.arange(2), lonlat_of((0, -40), (0, 40)))
     trees, _ = read_trees(osm_of(ways=[row]), FRAME, spacing=8.0)
     np.testing.assert_allclose(trees.xy[:, 1], np.linspace(-40, 40, 11), atol=1e-6)
@@ -137,7 +137,7 @@ def test_a_mapped_tree_in_a_building_is_dropped_and_one_on_a_road_moves_beside_i
     assert [(p.osm_id, p.action, p.reason) for p in problems] == [("node/0", "dropped", "in-building")]
 
 
-def test_woods_are_filled_to_their_density_and_leave_roads_and_houses_free():
+def test_forests_have_the_tree_density_and_leave_roads_and_buildings_free():
     plan = wood_plan(tile_size=400.0)
     trees = np.vstack([forest_trees(plan, i, j=j, density=0.02).xy for i, j in plan.tiles])
     x, y = trees.T
@@ -149,7 +149,7 @@ def test_woods_are_filled_to_their_density_and_leave_roads_and_houses_free():
     assert len(trees) == pytest.approx(area * 0.02, rel=0.05)
 
 
-def test_a_wood_depends_on_the_seed_and_not_on_the_tiles():
+def test_forest_trees_depend_on_the_seed_and_not_on_the_tiles():
     def all_trees(size, seed=0):
         plan = wood_plan(tile_size=size)
         found = [forest_trees(plan, i, j=j, seed=seed) for i, j in plan.tiles]
@@ -160,7 +160,7 @@ def test_a_wood_depends_on_the_seed_and_not_on_the_tiles():
     assert not np.isin(all_trees(50.0, seed=1), all_trees(50.0)).any()
 
 
-def test_expanded_copies_are_the_shapes_moved():
+def test_expanded_instances_are_transformed_shapes():
     copies = place(["bench", "bollard"], np.array([[1.0, 2, 3], [4, 5, 6]]), feature=[7, 8])
     mesh = expand(copies, list(shapes().values()))
     assert isinstance(mesh, Mesh)

@@ -44,18 +44,18 @@ def test_cities_keep_to_the_side_of_their_country(side, place):
     assert side_at(*place) == side
 
 
-def test_every_zone_is_one_of_the_zones_there_are():
+def test_left_hand_time_zones_exist():
     assert zoneinfo.available_timezones() >= LEFT_HAND
 
 
-def test_what_the_map_says_counts_for_more_than_the_place():
+def test_driving_side_tags_override_the_country():
     assert driving_side(extract(street(1))) == ("left", "place")
     assert driving_side(extract(street(1), street(2, driving_side="right"))) == ("right", "tag")
     assert driving_side(extract(street(1, driving_side="both"))) == ("left", "place")
 
 
 @pytest.mark.parametrize("given", ["", "left", "right"])
-def test_the_scene_and_the_drive_keep_to_one_side(given, tmp_path):
+def test_scene_and_drive_use_the_same_driving_side(given, tmp_path):
     scene = build(extract(street(1)), tmp_path / "scene", options=BuildOptions(driving_side=given))
     roads = json.loads((tmp_path / "scene" / "scene.json").read_text())["roads"]
     side = given or "left"
@@ -65,6 +65,6 @@ def test_the_scene_and_the_drive_keep_to_one_side(given, tmp_path):
     assert DriveOptions(side="right").side_in(scene) == "right"
 
 
-def test_a_third_side_is_refused():
+def test_unknown_driving_side_is_refused():
     with pytest.raises(InputError, match="`driving_side` middle: left or right"):
         BuildOptions(driving_side="middle")

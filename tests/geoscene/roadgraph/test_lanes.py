@@ -37,7 +37,7 @@ def layout(along, against=0.0, *, width=7.0):
         (3.5, 0.0, (3, 0, False)),
     ],
 )
-def test_mapped_lanes_are_whole_lanes_and_a_shared_one(along, against, found):
+def test_mapped_lanes_are_divided_into_own_other_and_shared_lanes(along, against, found):
     lanes = layout(along, against)
     assert (lanes.own[0], lanes.other[0], lanes.shared[0]) == found
     assert lanes.width[0] * lanes.count[0] == pytest.approx(7.0)
@@ -51,12 +51,12 @@ def test_wide_carriageways_leave_room_beside_their_lanes():
     assert layout(1.0, width=8.0).width == 8.0  # a single lane takes all of it
 
 
-def test_bodies_stay_inside_the_carriageway():
+def test_vehicles_stay_inside_the_carriageway():
     assert layout(1.0, 1.0, width=4.0).offsets(body_width=2.0, clearance=0.25) == pytest.approx(0.75)
     assert layout(1.0, 1.0, width=2.0).offsets(body_width=2.0, clearance=0.25) == 0.0
 
 
-def test_the_divider_parts_the_directions():
+def test_divider_separates_the_directions():
     assert layout(1.0, 1.0).divider == 0.0
     assert layout(1.5, 1.5).divider == pytest.approx(0.0)
     assert layout(2.0, 1.0, width=9.0).divider == pytest.approx(-1.5)
@@ -88,7 +88,7 @@ def test_routes_traffic_and_opendrive_agree(tmp_path, lanes, width):
 
 @pytest.mark.parametrize("side", ["right", "left"])
 @pytest.mark.parametrize("tags", [{"lanes": "3"}, {"lanes": "3", "lanes:forward": "2"}, {"lanes": "4"}])
-def test_paint_lies_between_the_lanes_that_are_driven(side: Side, tags):
+def test_lane_markings_lie_between_driven_lanes(side: Side, tags):
     way = {"highway": "primary", "width": "24", "sidewalk": "both", **tags}
     street = Way("way/1", way, np.array([1, 2]), np.array([[0.0, 0.0], [0.002, 0.0]]))
     osm = OsmData((0.0, -0.001, 0.002, 0.001), [street], [], [], [])

@@ -44,7 +44,7 @@ STREET = {"highway": "residential", "width": "6", "sidewalk": "no"}
 CROSS = {1: (0, 0), 2: (100, 0), 3: (0, 100), 4: (-100, 0), 5: (0, -100)}
 
 
-def test_a_straight_street_has_the_area_that_its_tags_give_it():
+def test_straight_street_has_the_area_of_its_tagged_width():
     rows = surfaces_of({1: (0, 0), 2: (100, 0)}, [(STREET | {"sidewalk": "left"}, [1, 2])])
     assert shapely.area(rows.polygon[rows.klass == Class.ROAD]).sum() == pytest.approx(600, abs=0.1)
     assert visible(rows, Class.SIDEWALK).area == pytest.approx(200, abs=0.1)
@@ -64,7 +64,7 @@ def test_corners_are_rounded_with_the_radius_of_their_class():
     assert not road.interiors
 
 
-def test_round_the_corner_the_sidewalk_goes_on():
+def test_sidewalk_continues_around_corners():
     both = STREET | {"sidewalk": "both"}
     rows = surfaces_of(CROSS, [(both, [2, 1, 4]), (both, [3, 1, 5])])
     walk = visible(rows, Class.SIDEWALK)
@@ -73,7 +73,7 @@ def test_round_the_corner_the_sidewalk_goes_on():
 
 
 @pytest.mark.parametrize("angle_deg", [15, 40, 90, 140, 175])
-def test_joints_leave_no_gaps(angle_deg):
+def test_road_segments_join_without_gaps(angle_deg):
     a = np.radians(angle_deg)
     places = {1: (0, 0), 2: (80, 0), 3: (80 * np.cos(a), 80 * np.sin(a)), 4: (-80, 1)}
     wide = STREET | {"width": "9", "name": "other"}
@@ -101,7 +101,7 @@ def test_lines_are_painted_between_lanes_but_not_across_junctions():
     np.testing.assert_allclose(shapely.area(dashes), 3 * 0.12, atol=0.01)
 
 
-def test_a_driveway_does_not_interrupt_the_paint():
+def test_driveway_does_not_interrupt_lane_markings():
     main = {"highway": "primary", "lanes": "2", "width": "7", "sidewalk": "both"}
     rows = surfaces_of(CROSS, [(main, [2, 1, 4]), ({"highway": "service"}, [1, 3])])
     lines = shapely.union_all(rows.polygon[rows.klass == Class.LANE_MARKING])
@@ -109,7 +109,7 @@ def test_a_driveway_does_not_interrupt_the_paint():
 
 
 @pytest.mark.parametrize(("left_hand", "side"), [(False, -1), (True, 1)])
-def test_stop_lines_lie_across_the_lanes_of_those_who_stop(left_hand, side):
+def test_stop_lines_cross_only_the_lanes_that_stop(left_hand, side):
     street = STREET | {"width": "8", "lanes": "2"}
     ways = [(street, [2, 1]), (street, [1, 4]), (street | {"highway": "primary"}, [3, 1, 5])]
     rows = surfaces_of(CROSS, ways, [(1, {"highway": "stop"})], left_hand=left_hand)
@@ -121,7 +121,7 @@ def test_stop_lines_lie_across_the_lanes_of_those_who_stop(left_hand, side):
     assert np.sign(west[1]) == side
 
 
-def test_a_zebra_spans_its_road_and_belongs_to_it():
+def test_zebra_spans_the_width_of_its_road():
     places = {1: (0, 0), 2: (100, 0), 3: (50, -8), 4: (50, 8), 5: (50, 0)}
     crossing = {"highway": "footway", "footway": "crossing", "crossing": "zebra"}
     rows = surfaces_of(places, [(STREET, [1, 5, 2]), (crossing, [3, 5, 4])])
@@ -143,7 +143,7 @@ def test_a_crossing_node_is_painted_as_it_is_tagged(tags, painted):
     assert ((rows.klass == Class.CROSSING) & (rows.material == PAINT)).sum() == painted
 
 
-def test_bridges_and_tunnels_leave_the_ground_alone():
+def test_bridges_and_tunnels_add_no_road_surface_on_the_ground():
     places = {1: (0, 0), 2: (100, 0), 3: (50, -50), 4: (50, 50), 5: (0, 200), 6: (100, 200)}
     ways = [
         (STREET, [1, 2]),
@@ -160,7 +160,7 @@ def test_bridges_and_tunnels_leave_the_ground_alone():
     assert set(rows.raised.osm_id[rows.raised.place == 2]) == {"way/102"}
 
 
-def test_sidewalks_are_guessed_in_town_and_not_beside_a_mapped_footway():
+def test_sidewalks_are_assumed_in_towns_except_beside_a_mapped_footway():
     plain = {"highway": "residential", "width": "6"}
     places = {1: (0, 0), 2: (100, 0), 3: (0, 5.5), 4: (100, 5.5)}
     footway = {"highway": "footway", "footway": "sidewalk"}
@@ -174,13 +174,13 @@ def test_sidewalks_are_guessed_in_town_and_not_beside_a_mapped_footway():
         assert set(rows.klass) == {Class.ROAD}
 
 
-def test_what_a_road_is_made_of():
+def test_surface_tag_decides_the_material():
     rows = surfaces_of({1: (0, 0), 2: (50, 0)}, [(STREET | {"surface": "sett"}, [1, 2])])
     assert set(rows.material) == {materials()["stone"].code}
     assert set(rows.source) == {"width/surface"}
 
 
-def test_two_rails_a_gauge_apart():
+def test_track_has_two_rails_one_gauge_apart():
     rows = surfaces_of({1: (0, 0), 2: (50, 0)}, [({"railway": "rail", "gauge": "1000"}, [1, 2])])
     assert set(rows.klass) == {Class.RAIL}
     ys = np.sort(shapely.get_coordinates(shapely.centroid(rows.polygon))[:, 1])
@@ -245,7 +245,7 @@ _SHARP_LOOP = {0: (0, 1), 1: (1, 0), 3: (2, 0), 4: (2, 0), 5: (-2, 2)}
 @example((_SHARP_LOOP, [({"highway": "track"}, [0, 3, 5, 0, 3]), ({"highway": "primary"}, [4, 1, 0])], []))
 @settings(max_examples=50, deadline=None)
 @given(networks())
-def test_whatever_the_network_polygons_are_valid_and_cover_their_lines(network):
+def test_road_polygons_are_valid_and_cover_their_centre_lines(network):
     places, ways, points = network
     rows = surfaces_of(places, ways, points)
     check_rows(rows)
@@ -262,7 +262,7 @@ def test_whatever_the_network_polygons_are_valid_and_cover_their_lines(network):
 
 @pytest.mark.shared
 @pytest.mark.parametrize("name", ["monaco.osm.pbf", "norfolk_odu_roads.osm.gz", "berlin_neukoelln.osm.gz"])
-def test_real_places(shared_osm, name):
+def test_road_surfaces_of_real_places_are_valid_and_reproducible(shared_osm, name):
     osm = read_osm(shared_osm(name))
     west, south, east, north = osm.bounds
     frame = Frame.at((west + east) / 2, (south + north) / 2)

@@ -71,7 +71,7 @@ def edge_between(graph, tail, head):
     return int(rows[0])
 
 
-def test_nodes_are_junctions_ends_and_changes_alone():
+def test_nodes_are_only_junctions_ends_and_tag_changes():
     places = {k: (10 * k, 0) for k in range(10)} | {20: (30, 40)}
     graph = graph_of(
         places, [({}, [0, 1, 2, 3, 4]), ({}, [3, 20]), ({}, [4, 5, 6]), ({"bridge": "yes"}, [6, 7, 8])]
@@ -119,7 +119,7 @@ def test_roads_that_cross_without_a_common_node_do_not_meet():
         ({"highway": "service", "area": "yes"}, set()),
     ],
 )
-def test_traffic_runs_where_the_tags_let_it(tags, pairs):
+def test_tags_decide_the_permitted_directions(tags, pairs):
     graph = graph_of({1: (0, 0), 2: (100, 0)}, [(tags, [1, 2])])
     found = {
         (int(graph.node_id[t]), int(graph.node_id[h])) for t, h in zip(graph.tail, graph.head, strict=True)
@@ -155,7 +155,7 @@ def test_speed_limits_as_mappers_write_them(text, kmh, source):
 
 
 @pytest.mark.parametrize("text", ["none", "signals", "fast", "", "-5", "0", "XX:nowhere"])
-def test_no_number_no_limit(text):
+def test_speed_limit_without_a_number_is_ignored(text):
     assert speed_limit(text) is None
 
 
@@ -183,7 +183,7 @@ def test_a_limit_for_one_direction_binds_that_direction():
          ("lanes", "lanes")),
     ],
 )  # fmt: skip
-def test_lanes_and_width_say_where_they_come_from(tags, lanes, width, sources):
+def test_lanes_and_width_have_sources(tags, lanes, width, sources):
     street, _ = read_street({"highway": "residential"} | tags)
     assert street.lanes == lanes
     assert street.width == pytest.approx(width)
@@ -202,7 +202,7 @@ def test_lanes_and_width_say_where_they_come_from(tags, lanes, width, sources):
         ({"bridge": "no", "layer": "x"}, 0, "default", False, False),
     ],
 )
-def test_layers(tags, layer, source, bridge, tunnel):
+def test_tags_decide_layer_bridge_and_tunnel(tags, layer, source, bridge, tunnel):
     street, unread = read_street({"highway": "service"} | tags)
     assert (street.layer, street.layer_source, street.bridge, street.tunnel) == (
         layer,
@@ -226,7 +226,7 @@ def test_a_gap_in_a_way_is_not_bridged_but_reported():
     }
 
 
-def test_loops_have_a_node_and_come_back_to_it():
+def test_loops_start_and_end_at_a_node():
     places = {1: (0, 0), 2: (50, 0), 3: (50, 50), 4: (-90, 0), 11: (500, 0), 12: (550, 0), 13: (550, 50)}
     graph = graph_of(places, [({}, [4, 1, 2, 3, 1]), ({"oneway": "yes"}, [11, 12, 13, 11])])
     loop = np.flatnonzero(graph.tail == graph.head)
@@ -243,7 +243,7 @@ def only(kind, via, way_in, way_out):
 ARMS = [({}, [2, 1]), ({}, [1, 3]), ({}, [4, 1]), ({}, [1, 5])]
 
 
-def test_a_forbidden_turn_is_driven_round():
+def test_route_avoids_a_forbidden_turn():
     places = CROSS | {6: (100, 100), 7: (200, 0), 8: (0, 200)}
     ways = [*ARMS, ({}, [3, 6, 2]), ({}, [2, 7]), ({}, [3, 8])]
     free = graph_of(places, ways)
@@ -257,7 +257,7 @@ def test_a_forbidden_turn_is_driven_round():
     assert bound.turn_kind.tolist() == ["no_right_turn"]
 
 
-def test_a_commanded_turn_forbids_all_others_and_exceptions_do_not_bind_cars():
+def test_mandatory_turn_forbids_all_others_unless_cars_are_excepted():
     tags, members = only("only_straight_on", 1, 100, 102)
     bound = graph_of(CROSS, ARMS, (), [(tags, members)])
     before, after = turn_table(bound)
@@ -302,7 +302,7 @@ def driven_nodes(graph, path):
     return [int(graph.node_id[graph.tail[path.edges[0]]]), *graph.node_id[graph.head[path.edges]].tolist()]
 
 
-def test_a_turn_forbidden_via_a_way_binds_only_who_came_from_its_first_street():
+def test_turn_forbidden_via_a_way_applies_only_from_its_first_street():
     bound = graph_of(DUAL, CARRIAGEWAYS, (), [via_ways("no_u_turn", 100, [102], 101)])
     assert [chain.tolist() for chain in bound.chain_edges] == [
         [edge_between(bound, 1, 2), edge_between(bound, 2, 7), edge_between(bound, 7, 8)]
@@ -318,7 +318,7 @@ def test_a_turn_forbidden_via_a_way_binds_only_who_came_from_its_first_street():
     assert driven_nodes(bound, onward) == [1, 2, 7, 10]
 
 
-def test_a_turn_commanded_via_a_way_leaves_no_other():
+def test_mandatory_turn_via_a_way_forbids_all_others():
     bound = graph_of(DUAL, CARRIAGEWAYS, (), [via_ways("only_straight_on", 106, [102], 107)])
     start = edge_between(bound, 9, 2)
     before, after = turn_table(bound)
@@ -337,7 +337,7 @@ def test_a_turn_commanded_via_a_way_leaves_no_other():
     assert driven_nodes(bound, others) == [1, 2, 7, 8]
 
 
-def test_a_restriction_runs_over_all_of_its_ways_also_where_the_graph_joined_or_cut_them():
+def test_restriction_covers_all_its_ways_in_the_simplified_graph():
     places = {k: (10 * k, 0) for k in range(7)} | {20: (20, 50), 30: (30, 50), 50: (60, 50), 60: (60, -50)}
     ways = [
         ({}, [0, 1]),  # 100, joined with 101
@@ -379,7 +379,7 @@ def test_a_restriction_runs_over_all_of_its_ways_also_where_the_graph_joined_or_
     ],
 )
 @pytest.mark.parametrize("via", ["node", "way"])
-def test_what_binds_a_car(tags, binds, via):
+def test_restrictions_for_other_vehicles_do_not_apply_to_cars(tags, binds, via):
     if via == "node":
         world = (CROSS, ARMS)
         members = (("way", 100, "from"), ("node", 1, "via"), ("way", 103, "to"))
@@ -400,7 +400,7 @@ def test_what_binds_a_car(tags, binds, via):
         {"restriction": "no_left_turn", "hour_on": "07:00", "hour_off": "09:00"},
     ],
 )
-def test_a_restriction_at_times_does_not_bind_but_is_reported(tags):
+def test_time_dependent_restriction_is_ignored_and_reported(tags):
     members = (("way", 100, "from"), ("node", 1, "via"), ("way", 103, "to"))
     graph, problems = build_road_graph(
         town(CROSS, ARMS, (), [({"type": "restriction"} | tags, members)]), FRAME
@@ -409,7 +409,7 @@ def test_a_restriction_at_times_does_not_bind_but_is_reported(tags):
     assert [(p.osm_id, p.kind, p.reason) for p in problems] == [("relation/0", "turn", "conditional")]
 
 
-def test_a_restriction_whose_ways_no_drive_can_follow_is_reported():
+def test_restriction_on_ways_that_cannot_be_driven_is_reported():
     relations = [via_ways("no_u_turn", 101, [102], 100), via_ways("no_u_turn", 100, [999], 101)]
     graph, problems = build_road_graph(town(DUAL, CARRIAGEWAYS, (), relations), FRAME)
     assert not len(graph.chain_edges)
@@ -435,7 +435,7 @@ def obeys(edges, graph, pairs):
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_drives_along_states_are_those_that_break_no_rule(data):
+def test_turn_states_allow_exactly_the_legal_drives(data):
     square = {1: (0, 0), 2: (50, 0), 3: (50, 50), 4: (0, 50), 5: (90, 0)}
     base = graph_of(square, [({}, ends) for ends in ([1, 2], [2, 3], [3, 4], [4, 1], [1, 3], [2, 5])])
     before, after = turn_table(base, u_turns=True)
@@ -464,7 +464,7 @@ def test_drives_along_states_are_those_that_break_no_rule(data):
         drives = longer
 
 
-def test_nobody_turns_round_but_at_a_dead_end():
+def test_u_turns_are_allowed_only_at_dead_ends():
     graph = graph_of(CROSS, ARMS)
     before, after = turn_table(graph)
     rounds = before[graph.twin[before] == after]
@@ -483,7 +483,7 @@ def test_a_street_is_entered_on_either_side_and_a_one_way_street_never_driven_ba
     np.testing.assert_allclose(path_line(two_way, path)[:, 0], [60, 40], atol=1e-3)
 
 
-def test_time_and_length_choose_different_ways():
+def test_fastest_and_shortest_routes_differ():
     places = {1: (0, 0), 2: (100, 0), 3: (50, 60)}
     slow, fast = {"maxspeed": "5"}, {"maxspeed": "100"}
     graph = graph_of(places, [(slow, [1, 2]), (fast, [1, 3, 2])])
@@ -495,7 +495,7 @@ def test_time_and_length_choose_different_ways():
     assert by_time.time < by_length.time
 
 
-def test_signals_and_signs_speak_to_the_right_drivers():
+def test_signals_and_signs_apply_to_the_right_direction():
     places = CROSS | {7: (80, 0), 8: (-80, 0), 9: (0, 30)}
     ways = [
         ({}, [2, 7, 1]),
@@ -545,7 +545,7 @@ def test_true_lengths_do_not_depend_on_the_projection():
     np.testing.assert_allclose(build_road_graph(osm, utm)[0].length, local_length, rtol=1e-7)
 
 
-def test_no_roads_make_an_empty_graph_and_a_clear_error():
+def test_map_without_roads_gives_an_empty_graph_and_a_clear_error():
     graph, problems = build_road_graph(town({}, []), FRAME)
     assert (len(graph), len(graph.node_id), problems) == (0, 0, [])
     assert find_components(graph).largest_strong_share == 0.0
@@ -576,7 +576,7 @@ def maps(draw):
 
 @settings(max_examples=60, deadline=None)
 @given(maps())
-def test_every_segment_of_the_map_is_on_the_graph_once_a_direction(osm):
+def test_every_map_segment_is_in_the_graph_once_per_direction(osm):
     graph, _ = build_road_graph(osm, FRAME)
     full, _ = build_road_graph(osm, FRAME, options=RoadOptions(simplify=False))
     expected = []
@@ -643,7 +643,7 @@ def test_restrictions_via_ways_survive_graphml_and_a_cut(tmp_path):
     assert len(graph.take(np.arange(len(graph)) != edge_between(graph, 7, 8)).chain_edges) == 1
 
 
-def test_osmnx_opens_what_we_write(tmp_path):
+def test_osmnx_reads_our_graphml(tmp_path):
     import osmnx as ox  # noqa: PLC0415  (slow to import)
 
     graph = graph_of(CROSS | {6: (0, 200)}, [*ARMS, ({"name": "A & B"}, [3, 6])])
@@ -660,7 +660,7 @@ def test_osmnx_opens_what_we_write(tmp_path):
     assert ox.shortest_path(theirs, 2, 6) == [2, 1, 3, 6]
 
 
-def test_a_file_that_is_no_road_graph_says_so(tmp_path):
+def test_file_without_a_road_graph_is_refused(tmp_path):
     path = tmp_path / "roads.graphml"
     for text in ("not xml", "<graphml><graph><node id='1'/></graph></graphml>"):
         path.write_text(text)
@@ -668,7 +668,7 @@ def test_a_file_that_is_no_road_graph_says_so(tmp_path):
             read_graphml(path, FRAME)
 
 
-def test_what_is_private_is_left_out_unless_asked_for():
+def test_private_roads_are_left_out_by_default():
     assert not drivable({"highway": "service", "access": "private"})
     assert drivable({"highway": "service", "access": "private"}, private=True)
     assert not drivable({"highway": "track"})
@@ -679,7 +679,7 @@ def test_what_is_private_is_left_out_unless_asked_for():
     ("name", "share"),
     [("monaco.osm.pbf", 0.85), ("norfolk_odu_roads.osm.gz", 0.95), ("liechtenstein.osm.pbf", 0.97)],
 )
-def test_real_places_hang_together(shared_osm, name, share):
+def test_road_graphs_of_real_places_are_connected(shared_osm, name, share):
     osm = read_osm(shared_osm(name))
     west, south, east, north = osm.bounds
     frame = Frame.at((west + east) / 2, (south + north) / 2)

@@ -101,7 +101,7 @@ def test_a_tunnel_dives_under_the_road_above_and_stays_under_the_ground():
     assert np.interp(0, bore[:, 0], bore[:, 2]) < -HIGH + 0.5
 
 
-def test_three_levels_stand_above_each_other():
+def test_three_levels_of_roads_clear_each_other():
     places = OVER | {7: (-300, -300), 8: (300, 300)}
     ways = [
         (ROAD | {"bridge": "yes", "layer": "1"}, [1, 4]),
@@ -114,7 +114,7 @@ def test_three_levels_stand_above_each_other():
     assert max(line[:, 2].max() for line in graph.geometry) >= 2 * HIGH - 0.02
 
 
-def test_bridges_one_above_the_other_keep_their_distance_though_their_lines_never_cross():
+def test_stacked_bridges_whose_lines_never_cross_keep_their_clearance():
     places = dict(enumerate(
         [(x, y) for y in (0.0, 2.0) for x in (-600, -150, 150, 600)], start=1))  # fmt: skip
     upper = BRIDGE | {"layer": "2"}
@@ -127,7 +127,7 @@ def test_bridges_one_above_the_other_keep_their_distance_though_their_lines_neve
     assert apart.min() > HIGH - 0.05
 
 
-def test_branches_are_equally_high_where_they_fork_and_part_where_they_are_clear_of_each_other():
+def test_branches_are_equally_high_at_a_fork_and_separate_beyond_it():
     places = {1: (-500, 0), 2: (-100, 0), 3: (0, 0), 4: (250, 25), 5: (250, -25), 6: (600, 60), 7: (600, -60)}
     way = {"oneway": "yes", "lanes": "2"}
     ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (BRIDGE | way, [3, 4]), (BRIDGE | way | {"layer": "2"}, [3, 5]),
@@ -182,7 +182,7 @@ def test_a_bridge_clears_railways_and_rivers():
     assert middle[1] >= 5.7 + OPTIONS.deck - 0.01
 
 
-def test_without_structures_on_level_ground_nothing_changes():
+def test_roads_on_level_ground_without_structures_stay_level():
     graph = graph_of(OVER, [(ROAD, [1, 2, 3, 4])])
     same = profile(graph, lambda x, y: 7.0 + flat(x, y))
     for one, two in zip(graph.geometry, same.geometry, strict=True):
@@ -200,7 +200,7 @@ def test_on_the_ground_a_road_follows_the_terrain():
     assert steps_beyond(graph, hills).max() <= OPTIONS.step + 1e-3
 
 
-def test_metres_steeper_than_a_fifth_are_told():
+def test_steep_metres_are_counted():
     def cliff(x, y):
         return np.where(x > 0, 0.3 * x, 0.1 * x) + 0 * y
 
@@ -243,7 +243,7 @@ def test_the_ground_is_built_up_and_cut_down_to_the_road(slope, half, angle_deg,
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 12))
-def test_interior_point_finds_the_constrained_minimum(seed, n, k):
+def test_interior_point_solver_finds_the_constrained_minimum(seed, n, k):
     rng = np.random.default_rng(seed)
     cost = csr_array(diags_array(rng.uniform(0.5, 5, n)))
     pull, a, b = rng.normal(size=n), rng.normal(size=(k, n)), rng.normal(size=k)
@@ -256,7 +256,7 @@ def test_interior_point_finds_the_constrained_minimum(seed, n, k):
 
 
 @pytest.mark.shared
-def test_monaco_on_its_terrain(shared_osm, shared_dem):
+def test_roads_of_monaco_are_smooth_and_clear_each_other(shared_osm, shared_dem):
     osm = read_osm(shared_osm("monaco.osm.pbf"))
     west, south, east, north = osm.bounds
     frame = Frame.at((west + east) / 2, (south + north) / 2)

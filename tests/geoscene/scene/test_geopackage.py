@@ -27,7 +27,7 @@ def layers():
     ]
 
 
-def test_geopandas_sees_the_features_where_they_are(tmp_path):
+def test_geopandas_reads_features_at_their_positions(tmp_path):
     frame = Frame.at(-76.3059, 36.8853, crs="utm")
     path = tmp_path / "features.gpkg"
     write_geopackage(path, layers(), frame=frame)
@@ -50,7 +50,7 @@ def test_reading_back_gives_scene_coordinates(tmp_path):
     assert back.columns["feature"].tolist() == [0, 1]
 
 
-def test_the_same_features_are_the_same_bytes(tmp_path):
+def test_geopackage_is_reproducible(tmp_path):
     frame = Frame.at(13.4, 52.5)
     for name in ("a.gpkg", "b.gpkg"):
         write_geopackage(tmp_path / name, layers(), frame=frame)

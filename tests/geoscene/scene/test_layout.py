@@ -11,7 +11,7 @@ from geoscene.scene import SceneFiles, layout
 REPOSITORY = Path(__file__).parents[3]
 
 
-def test_no_other_module_spells_the_name_of_a_file_of_a_scene():
+def test_scene_file_names_occur_only_in_the_layout_module():
     files = SceneFiles(Path())
     named = [files.manifest, files.features, files.road_graph, files.problems, files.shapes]
     names = {str(path) for path in [*named, files.tile_reports, files.tile_journal]}
@@ -26,7 +26,7 @@ def test_no_other_module_spells_the_name_of_a_file_of_a_scene():
     assert not spelled
 
 
-def test_features_come_in_scene_metres_in_projected_ones_or_without_geometry(tmp_path):
+def test_features_are_read_in_scene_or_projected_metres_or_without_geometry(tmp_path):
     scene = write_world(tmp_path / "scene")
     near, far = (scene.features("roads", geometry=kind) for kind in ("scene", "projected"))
     east, north = scene.frame.origin

@@ -39,7 +39,7 @@ def test_the_streets_of_the_demo_are_connected():
 
 
 @pytest.mark.shared
-def test_the_cut_is_reproducible_byte_for_byte(shared_osm, tmp_path):
+def test_demo_extract_is_reproducible(shared_osm, tmp_path):
     out = tmp_path / "cut.osm.pbf"
     script = ROOT / "data" / "cut_demo.py"
     source = shared_osm("helsinki_center.osm.pbf")
@@ -55,7 +55,7 @@ def test_the_cut_is_reproducible_byte_for_byte(shared_osm, tmp_path):
     assert "sha256" in wrong.stderr
 
 
-def test_importing_the_sources_is_light():
+def test_importing_sources_does_not_import_large_libraries():
     heavy = ("osmnx", "osmium", "shapely", "pandas")
     code = f"import sys, geoscene.sources; print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

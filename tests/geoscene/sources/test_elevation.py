@@ -146,7 +146,7 @@ def test_tiles_join_without_seams(serve, tmp_path):
     assert terrain.uncovered == 0.0
 
 
-def test_hills_are_as_accurate_as_posts_of_ten_metres_allow(serve, tmp_path):
+def test_hills_have_the_accuracy_of_ten_metre_posts(serve, tmp_path):
     osm = area()
     path = fetch_elevation(osm, cache_dir=tmp_path, server=patient(serve(hills)))
     places = sample(osm)
@@ -167,7 +167,7 @@ def test_tiles_cover_the_rectangle_of_a_scene_with_another_grid_north(serve, tmp
     assert terrain.uncovered == 0.0
 
 
-def test_the_sea_floor_is_at_the_sea_s_level_and_a_polder_keeps_its_depth(serve, tmp_path):
+def test_sea_floor_is_raised_to_sea_level_and_polders_keep_their_depth(serve, tmp_path):
     """West of the coast the ground falls to -40 m; east of it a polder lies 3 m deep behind a dike."""
     coast_east = HALF * LON / 180
 
@@ -219,7 +219,7 @@ def test_tiles_are_cached_and_damaged_ones_fetched_again(serve, tmp_path):
     assert len(server.asked) == asked + 1
 
 
-def test_a_busy_server_is_asked_a_limited_number_of_times(serve, tmp_path):
+def test_retries_of_a_busy_server_are_limited(serve, tmp_path):
     server = serve(slope)
     server.refuse = [503, 429, 500]
     fetch_elevation(area(0.001), cache_dir=tmp_path / "a", server=patient(server))
@@ -275,7 +275,7 @@ def test_the_program_builds_on_tiles_and_credits_them(serve, tmp_path):
     assert len(server.asked) >= 1
 
 
-def test_the_program_without_a_network_says_so_in_one_line(tmp_path):
+def test_program_without_a_network_fails_with_one_line(tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         nowhere = f"http://127.0.0.1:{probe.getsockname()[1]}/{{z}}/{{x}}/{{y}}.png"

@@ -168,7 +168,7 @@ def test_an_area_is_counter_clockwise_with_its_nodes_in_the_order_of_its_corners
     np.testing.assert_allclose(np.array(area.geometry.exterior.coords), corners, atol=1e-7)
 
 
-def test_points_and_other_relations_come_with_their_tags(tmp_path):
+def test_points_and_other_relations_have_their_tags(tmp_path):
     town = Map()
     town.node(1, 2, {"natural": "tree", "height": "7"})
     street = town.way(town.nodes([(0, 0), (9, 0)]), {"highway": "service"})
@@ -186,7 +186,7 @@ def test_points_and_other_relations_come_with_their_tags(tmp_path):
 
 @given(st.integers(0, 2**32 - 1), st.booleans())
 @settings(max_examples=20, deadline=None)
-def test_neither_the_order_nor_the_sign_of_ids_matters(tmp_path_factory, seed, negative):
+def test_order_and_sign_of_ids_do_not_change_the_features(tmp_path_factory, seed, negative):
     town = Map()
     outer = town.nodes(square(0, 0, 50))
     one, two = town.way(outer[:3]), town.way([*outer[2:], outer[0]])
@@ -430,7 +430,7 @@ def test_no_building_of_a_real_extract_is_dropped_without_a_problem(shared_osm, 
 
 
 @pytest.mark.shared
-def test_buildings_are_as_many_as_libosmium_finds(shared_osm):
+def test_number_of_buildings_equals_that_of_libosmium(shared_osm):
     """Where libosmium can read a file whole (ids positive and sorted, nothing cut) it finds the same."""
     for name in ("monaco.osm.pbf", "bayreuth_north.osm.gz", "brumadinho.osm.gz"):
         path = shared_osm(name)

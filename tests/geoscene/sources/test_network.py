@@ -224,7 +224,7 @@ def assert_is_the_box(data) -> None:
     assert len(data.relations) > 1
 
 
-def test_a_place_is_found_fetched_and_the_same_as_from_a_file(server, tmp_path):
+def test_fetched_place_equals_the_same_map_from_a_file(server, tmp_path):
     data = fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers_at(server))
     assert_is_the_box(data)
     assert data.source == "OpenStreetMap, Esplanadi, Helsinki, Finland"
@@ -244,7 +244,7 @@ def test_answers_are_cached_and_damaged_ones_fetched_again(server, tmp_path):
     assert len(server.asked) == 2 * asked
 
 
-def test_a_large_area_is_fetched_in_parts_and_is_the_same(server):
+def test_large_area_fetched_in_parts_equals_one_request(server):
     parts = []
     servers = replace(servers_at(server), max_query_km2=0.05)
     data = fetch_bbox(BOX, servers=servers, progress=lambda items: [parts.append(i) or i for i in items])
@@ -266,21 +266,21 @@ def test_a_place_that_is_a_point_is_widened_to_a_scene(server):
     assert west < 24.945 < east
 
 
-def test_a_busy_server_is_asked_again(server):
+def test_busy_server_is_retried(server):
     server.refuse = [429, 504]
     data = fetch_bbox(BOX, servers=servers_at(server))
     assert_is_the_box(data)
     assert server.asked_for("/api/interpreter") == 3
 
 
-def test_a_busy_server_is_asked_a_limited_number_of_times(server):
+def test_retries_of_a_busy_server_are_limited(server):
     server.refuse = [429] * 99
     with pytest.raises(NetworkError, match="HTTP 429"):
         fetch_bbox(BOX, servers=servers_at(server))
     assert server.asked_for("/api/interpreter") == 3
 
 
-def test_the_next_server_is_asked_if_one_fails(start):
+def test_next_server_is_used_if_one_fails(start):
     first, second = start(), start()
     first.refuse = [500]
     data = fetch_bbox(BOX, servers=servers_at(first, second))
@@ -288,7 +288,7 @@ def test_the_next_server_is_asked_if_one_fails(start):
     assert (first.asked_for("/api/interpreter"), second.asked_for("/api/interpreter")) == (1, 1)
 
 
-def test_a_server_that_fails_is_named_and_nothing_is_cached(server, tmp_path):
+def test_failed_server_is_named_and_no_answer_is_cached(server, tmp_path):
     server.refuse = [500]
     with pytest.raises(NetworkError, match=r"127\.0\.0\.1:\d+: HTTP 500.*`osm` FILE.*`demo`"):
         fetch_bbox(BOX, cache_dir=tmp_path, servers=servers_at(server))
@@ -309,7 +309,7 @@ def test_a_query_waits_for_a_free_slot(server):
     assert server.asked_for("/api/interpreter") == 1
 
 
-def test_an_answer_of_another_kind_is_refused(server):
+def test_answer_of_unexpected_content_is_refused(server):
     with pytest.raises(NetworkError, match="no list of places"):
         locate("nonsense", servers=servers_at(server))
 
@@ -329,7 +329,7 @@ def test_without_a_network_the_error_names_the_offline_options():
         assert "`demo`" in message
 
 
-def test_an_unknown_place_is_not_found(server):
+def test_unknown_place_is_an_error(server):
     with pytest.raises(SourceNotFoundError, match="no place called 'Atlantis'"):
         fetch_place("Atlantis", servers=servers_at(server))
     with pytest.raises(SourceNotFoundError, match="nothing"):

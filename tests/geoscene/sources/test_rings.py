@@ -120,7 +120,7 @@ def test_overlapping_outlines_are_united_not_cancelled():
     assert made.geometry.area == 16 + 16 - 4
 
 
-def test_a_boundary_that_never_closes_encloses_nothing():
+def test_open_boundary_has_no_area():
     xy = np.array([(0, 0), (4, 0), (4, 4)], float)
     made = assemble([Chain(np.array([0, 1, 2]), inner=False)], xy)
     assert made.geometry is None
@@ -141,7 +141,7 @@ def test_a_cut_ring_is_closed_the_same_from_any_start(shift):
     assert shapely.Polygon(corners[closed]).area / METRE**2 == pytest.approx(750)
 
 
-def test_a_ring_is_not_closed_where_the_gap_makes_most_of_it_or_lies_inland():
+def test_ring_with_a_long_or_inland_gap_is_not_closed():
     corners = np.array([(5, 40), (5, 5), (30, 5), (30, 40)]) * METRE
     assert close_cut_ring(np.arange(4), corners, extent=EDGE) is not None
     assert close_cut_ring(np.arange(3), corners, extent=EDGE) is None

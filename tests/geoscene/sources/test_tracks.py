@@ -17,7 +17,7 @@ def test_tracks_come_before_routes_and_waypoints_and_heights_are_read(tmp_path):
     np.testing.assert_array_equal(read_track(path), [[4, 3, 5.5], [7, 6, 0]])
 
 
-def test_files_that_are_no_tracks_are_refused(tmp_path):
+def test_files_without_tracks_are_refused(tmp_path):
     path = tmp_path / "a.gpx"
     with pytest.raises(SourceNotFoundError, match="does not exist"):
         read_track(path)

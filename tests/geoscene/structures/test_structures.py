@@ -170,7 +170,7 @@ def tunnel():
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(2, 6), st.integers(0, 2**32 - 1))
-def test_whatever_stands_on_a_slab_or_hangs_from_it_is_one_closed_solid(size, seed):
+def test_random_parts_above_and_below_a_slab_form_one_closed_solid(size, seed):
     rng = np.random.default_rng(seed)
     lines = np.array(
         [shapely.LineString(rng.uniform(0, size, (2, 2))) for _ in range(size)] + [shapely.Point(0, 0)],
@@ -185,7 +185,7 @@ def test_whatever_stands_on_a_slab_or_hangs_from_it_is_one_closed_solid(size, se
     assert verdict.ok.all(), verdict.fault(0)
 
 
-def test_a_shell_holds_what_is_solid_and_no_more():
+def test_shell_volume_is_that_of_the_solid_layers():
     plan = Plan(np.array([[0, 0], [2, 0], [2, 2], [0, 2.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
     levels = np.tile([0.0, 1.0, 3.0], (4, 1))
     shell = raise_shell(plan, levels, solid=np.array([[True, True], [True, False]]))
@@ -195,7 +195,7 @@ def test_a_shell_holds_what_is_solid_and_no_more():
     assert set(plan.xy[:, 0]) == {0.0, 2.0}
 
 
-def test_the_deck_is_where_the_road_graph_says(bridge):
+def test_deck_height_is_that_of_the_road_graph(bridge):
     points = bridge.centre_lines("bridge")
     z, klass = first_below(bridge.mesh(), moved(points, 0, 0, 2))
     np.testing.assert_allclose(z, points[:, 2], atol=1e-3)
@@ -225,7 +225,7 @@ def test_parapets_stand_on_both_sides_and_not_across(bridge):
         assert not crosses(mesh, moved(node, 3.0 * np.sign(node[0]), 0, 0.5), onto)
 
 
-def test_piers_keep_off_the_road_below(bridge):
+def test_piers_avoid_the_road_below(bridge):
     piers = shapely.union_all(bridge.table.pier)
     assert len(bridge.table.pier[0].geoms) + len(bridge.table.pier[1].geoms) >= 2
     below = shapely.LineString([(0, -300), (0, 300)]).buffer(3.25)
@@ -235,7 +235,7 @@ def test_piers_keep_off_the_road_below(bridge):
     assert low < bridge.height(*foot.T).min()  # they reach into the ground
 
 
-def test_the_ground_leaves_a_bridge_free(bridge):
+def test_ground_stays_below_a_bridge(bridge):
     points = bridge.centre_lines("bridge")
     ground = bridge.height(points[:, 0], points[:, 1])
     assert (ground < points[:, 2]).all()
@@ -278,7 +278,7 @@ def test_the_ground_is_open_over_the_mouths_and_closed_over_the_middle(tunnel):
     assert -2.0 < roof[0] < 0.0
 
 
-def test_around_an_opening_the_shell_stands_as_high_as_the_ground(tunnel):
+def test_tunnel_shell_reaches_the_ground_around_an_opening(tunnel):
     opening = shapely.union_all([shape for shape in tunnel.openings if shape is not None])
     rim = shapely.get_coordinates(shapely.segmentize(shapely.boundary(opening), 1.0))
     mouth = np.abs(np.abs(rim[:, 0]) - 60) < 0.2
@@ -301,7 +301,7 @@ def test_a_road_that_forks_on_its_bridge_has_one_deck_there():
     assert shapely.area(apart[~np.eye(len(apart), dtype=bool)]).max() < 0.1
 
 
-def test_a_building_stands_over_the_tunnel_that_would_run_into_it(tunnel):
+def test_building_is_raised_over_a_tunnel_that_crosses_it(tunnel):
     outline = lonlat([(-58, -15), (-40, -15), (-40, 15), (-58, 15)])
     house = Area(
         "way/900",
@@ -323,7 +323,7 @@ def test_a_building_stands_over_the_tunnel_that_would_run_into_it(tunnel):
     assert solid.vertices[:, 2].max() == pytest.approx(base[0] + buildings.height[0], abs=1e-3)
 
 
-def test_a_building_over_two_tunnels_that_cross_stands_over_the_upper_one():
+def test_building_over_two_crossing_tunnels_is_raised_over_the_upper_one():
     places = {
         1: (-400, 0),
         2: (-90, 0),
@@ -351,7 +351,7 @@ def test_a_building_over_two_tunnels_that_cross_stands_over_the_upper_one():
             assert not crosses(solid, moved(along[0], 0, 0, up), moved(along[-1], 0, 0, up))
 
 
-def test_a_building_over_a_road_bridge_lets_its_traffic_through_and_one_beside_it_stays_whole(bridge):
+def test_building_over_a_road_bridge_leaves_headroom_and_one_beside_it_is_unchanged(bridge):
     points = bridge.centre_lines("bridge")
     high = points[points[:, 2] > 2.0]
     x = float(high[0, 0])
@@ -423,7 +423,7 @@ def test_a_footway_on_a_road_bridge_is_as_high_as_the_road():
     assert (klass == Class.SIDEWALK).mean() > 0.9
 
 
-def test_long_bridges_come_in_pieces_that_fit():
+def test_pieces_of_a_long_bridge_join_without_gaps():
     long = Town(
         town(
             {1: (-600, 0), 2: (-300, 0), 3: (300, 40), 4: (600, 40)},
@@ -438,7 +438,7 @@ def test_long_bridges_come_in_pieces_that_fit():
     np.testing.assert_allclose(z, points[:, 2], atol=0.01)  # no crack between pieces
 
 
-def test_every_guess_has_its_source(bridge, tunnel):
+def test_every_default_size_has_a_source(bridge, tunnel):
     for table in (bridge.table, tunnel.table):
         assert set(table.body_source) == set(table.rise_source) == {"default"}
     assert bridge.table.pier_spacing.max() <= SIZES.pier_spacing
@@ -463,7 +463,7 @@ def blocked(mesh, points, up=1.0):
     return sum(crosses(mesh, moved(a, 0, 0, up), moved(b, 0, 0, up)) for a, b in pairwise(points))
 
 
-def test_tunnels_that_fork_have_one_room_there_and_no_wall_in_the_way():
+def test_forking_tunnels_share_one_tube_without_walls_across_lanes():
     # A branch rises beside the street that goes on down; they overlap for 60 m.
     places = {1: (-400, 0), 2: (-120, 0), 3: (0, 0), 4: (160, 0), 5: (160, 20), 6: (500, 0), 7: (500, 80)}
     branch = TUNNEL | {"oneway": "yes", "width": "5"}
@@ -519,7 +519,7 @@ def test_pieces_of_a_straight_tunnel_cover_all_of_it(angle_deg, length):
     assert covered.symmetric_difference(whole).area < 0.5
 
 
-def test_carriageways_side_by_side_part_in_the_middle_between_them():
+def test_adjacent_carriageways_are_divided_midway():
     # On maps they overlap by two metres; the northern one is two metres higher.
     places = dict(enumerate(
         [(x, y) for y in (0.0, 5.0) for x in (-300, -60, 60, 300)], start=1))  # fmt: skip
@@ -557,7 +557,7 @@ def test_ground_on_a_steep_slope_stays_below_a_low_deck():
     assert set(klass) <= {Class.ROAD, Class.LANE_MARKING}
 
 
-def test_a_scene_ends_at_its_extent_and_so_do_its_structures(bridge, tunnel):
+def test_structures_end_at_the_extent(bridge, tunnel):
     extent = (-55.0, -100.0, 20.0, 100.0)
     for whole in (bridge, tunnel):
         cut = within_extent(whole.table, extent)
@@ -637,7 +637,7 @@ def test_a_tunnel_of_no_layer_is_level_within_a_house_and_else_below_the_ground(
     assert (lowest == pytest.approx(0.0, abs=0.01)) == level
 
 
-def test_undersides_over_a_tunnel_in_pieces_come_in_whole_steps():
+def test_building_undersides_over_a_tunnel_are_rounded_to_equal_heights():
     places = {1: (-500, 0), 2: (-130, 0), 3: (-20, 0), 4: (25, 0), 5: (130, 0), 6: (500, 0)}
     ways = [(ROAD, [1, 2]), (TUNNEL, [2, 3]), (TUNNEL, [3, 4]), (TUNNEL, [4, 5]), (ROAD, [5, 6])]
     boxes = [(-110, -20, 110, 20), (-110, -20, -30, 20), (-30, -20, 40, 20), (40, -20, 110, 20)]
@@ -676,7 +676,7 @@ def test_undersides_over_a_tunnel_in_pieces_come_in_whole_steps():
         ("monaco.osm.pbf", (7.4205, 43.7320, 7.4305, 43.7395), "N43E007.hgt.zip"),
     ],
 )
-def test_real_bridges_and_tunnels(shared_osm, shared_dem, name, bounds, dem):
+def test_bridges_and_tunnels_of_real_places_are_passable(shared_osm, shared_dem, name, bounds, dem):
     osm = read_osm(shared_osm(name), bounds=bounds)
     west, south, east, north = osm.bounds
     frame = Frame.at((west + east) / 2, (south + north) / 2)

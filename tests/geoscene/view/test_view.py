@@ -113,7 +113,7 @@ def moved_corners(scene, table):
     return np.einsum("kij,kcj->kci", matrix[:, :, :3], corners) + matrix[:, None, :, 3]
 
 
-def test_the_page_holds_every_triangle_and_every_copy_of_the_scene(scene, page):
+def test_page_contains_every_triangle_and_instance_of_the_scene(scene, page):
     told = page.json("scene")["tiles"]
     assert len(told) == len(scene.tile_indices) > 4
     faces = number = 0
@@ -160,12 +160,12 @@ def test_the_page_makes_no_requests(path, page):
     assert not {"img", "iframe", "object", "embed", "video", "audio"} & set(page.tags)
 
 
-def test_the_credit_is_in_the_page_itself(page):
+def test_page_contains_the_attribution(page):
     assert "© OpenStreetMap contributors, ODbL" in page.credit
     assert "https://www.openstreetmap.org/copyright" in page.links
 
 
-def test_a_name_from_the_map_stays_text(scene, tmp_path):
+def test_names_from_the_map_are_escaped(scene, tmp_path):
     name = '</script><script>document.title="x"</script>&amp;$title'
     odd = replace(scene, manifest={**scene.manifest, "name": name})
     view_scene(odd, tmp_path / "page.html")
@@ -205,12 +205,12 @@ def test_road_edges_come_with_the_surfaces_of_their_ways(scene, page):
     assert len(tables["roads"]["feature"]) > 20
 
 
-def test_the_same_scene_is_the_same_bytes(scene, path, tmp_path):
+def test_page_is_reproducible(scene, path, tmp_path):
     view_scene(scene, tmp_path / "again.html")
     assert (tmp_path / "again.html").read_bytes() == path.read_bytes()
 
 
-def test_bounds_take_the_tiles_that_they_intersect(scene, tmp_path):
+def test_bounds_select_the_tiles_that_they_intersect(scene, tmp_path):
     x, y = scene.tile_size * 0.25, scene.tile_size * 0.25
     lon, lat = scene.frame.to_geographic([x, x + 10], [y, y + 10])
     summary = view_scene(
@@ -277,7 +277,7 @@ COORDINATES = st.floats(-300, 300, allow_nan=False)
     st.sampled_from([1.0, 30.0, 4000.0]),
     st.tuples(st.integers(-9999, 9999), st.integers(-9999, 9999)),
 )
-def test_a_vertex_moves_by_at_most_half_a_step(points, scale, place):
+def test_quantisation_moves_a_vertex_by_at_most_half_a_step(points, scale, place):
     vertices = np.array(points) * scale
     faces = np.arange(len(points) // 3 * 3).reshape(-1, 3)
     tile = Tile(np.array([*place, 0.0]), Mesh.of(vertices, faces))
@@ -290,7 +290,7 @@ def test_a_vertex_moves_by_at_most_half_a_step(points, scale, place):
 
 @settings(max_examples=30, deadline=None)
 @given(COORDINATES, COORDINATES, COORDINATES)
-def test_tiles_agree_on_a_vertex_of_their_seam(x, y, z):
+def test_adjacent_tiles_quantise_shared_vertices_equally(x, y, z):
     groups = Groups(("ground",), np.zeros(1, np.uint8))
     corner = np.array([x, y, z])
     found = []
@@ -305,7 +305,7 @@ def test_tiles_agree_on_a_vertex_of_their_seam(x, y, z):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.booleans())
-def test_a_copy_moves_by_less_than_two_centimetres_in_any_orientation(seed, upright):
+def test_quantisation_moves_an_instance_by_less_than_two_centimetres(seed, upright):
     rng = np.random.default_rng(seed)
     count = 30
     turn, along, lift = rng.uniform(-7, 7, count), rng.uniform(0.1, 9, count), rng.uniform(0.1, 30, count)
@@ -339,7 +339,7 @@ def test_an_empty_tile_can_be_packed():
     assert len(back.mesh) == len(back.instances) == 0
 
 
-def test_groups_are_ground_and_the_layers_that_are_seen(scene):
+def test_groups_are_the_ground_and_the_visible_layers(scene):
     groups = groups_of(scene)
     assert groups.names[0] == "ground"
     assert {"building_parts", "landcover", "roads"}.isdisjoint(groups.names)

@@ -150,7 +150,7 @@ def test_a_layer_that_is_switched_off_is_not_drawn_and_not_picked(scene, opened)
     assert np.array_equal(middle(opened), before)
 
 
-def test_search_by_id_goes_there(scene, opened):
+def test_search_by_id_shows_the_feature(scene, opened):
     row, feature, buildings = tall_house(scene, opened)
     opened.js("document.getElementById('search').focus()")
     opened.write(buildings["osm_id"][row])
@@ -162,7 +162,7 @@ def test_search_by_id_goes_there(scene, opened):
     assert np.allclose(target, opened.js("return geoscene.boxes.middle(arguments[0])", feature), atol=1e-6)
 
 
-def test_search_by_name_finds_and_says_when_there_is_none(scene, opened):
+def test_search_by_name_lists_matches_or_reports_none(scene, opened):
     names = scene.features("buildings").columns["name"]
     name = next(name for name in names if name)
     assert opened.js("return geoscene.select(arguments[0])", name.upper())
@@ -185,7 +185,7 @@ def test_assumed_values_have_their_own_colours_and_a_legend(scene, opened):
     assert np.array_equal(middle(opened), before)
 
 
-def test_mouse_and_keys_turn_move_and_zoom(opened):
+def test_mouse_and_keys_rotate_move_and_zoom(opened):
     def state():
         opened.settle()
         return opened.js("const c = geoscene.camera; return [c.azimuth, c.tilt, c.distance, ...c.target]")
@@ -222,7 +222,7 @@ def camera_of(window):
     return dict(zip(names, window.js(script), strict=True))
 
 
-def test_fingers_turn_move_zoom_and_ask(scene, phone):
+def test_touch_gestures_rotate_move_zoom_and_select(scene, phone):
     first = camera_of(phone)
     phone.touch([(200, 400)], [(240, 420)], [(280, 440)])
     turned = camera_of(phone)
