@@ -1,4 +1,4 @@
-"""Milliseconds of one core that it takes to put moving actors into a scene's world, once a frame.
+"""CPU time per frame to place moving actors in a scene's world, milliseconds.
 
 python benchmarks/actors.py SCENE --actors 230 470
 """
@@ -17,12 +17,12 @@ from geoscene.scene import open_scene
 from lidar.world.actor_shapes import catalogue
 from lidar.world.world import World
 
-_REACH = 200.0  # metres around the scene's middle
+_REACH = 200.0  # metres around the centre of the scene
 _FIRST = 10**6  # feature number of the first actor
 
 
 def driving(count: int, frame: int, still: float) -> NDArray[np.float64]:
-    """Transforms (count, 3, 3, 4) of actors that go a metre a frame, a share of which stands still."""
+    """Transforms (count, 3, 3, 4) of actors that move 1 m per frame or, a share of them, stand still."""
     rng = np.random.default_rng(1)
     out = np.tile(np.eye(3, 4), (count, 3, 1, 1))
     out[:, :, :2, 3] = rng.uniform(-_REACH, _REACH, (count, 1, 2))
@@ -44,7 +44,7 @@ def main() -> None:
     scene = open_scene(options.scene)
     x, y = ((scene.bounds[k] + scene.bounds[k + 2]) / 2 for k in (0, 1))
     world = World.load(scene, region=(x - 1, y - 1, x + 1, y + 1), margin=_REACH, actors=shapes)
-    print("actors  ms a frame")
+    print("actors  ms per frame")
     for count in options.actors:
         shape = np.random.default_rng(2).integers(0, len(shapes), count).astype(np.int32)
         feature = np.arange(_FIRST, _FIRST + count, dtype=np.int32)

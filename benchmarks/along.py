@@ -1,11 +1,10 @@
-"""What a build along a route saves, and that a drive cannot tell it from the whole.
+"""Cost of a build along a route compared with the whole extract; both must give the same drive.
 
     python benchmarks/along.py EXTRACT --route LAT,LON LAT,LON [...] [--reach 120] [--duration 20]
                                [--workers 2] [--folder DIR] [--json]
 
-Builds the whole extract and the part that is seen from the route, drives the route through both with a
-16-beam scanner, and compares the tiles that both hold and the clouds, byte by byte. Costs as in
-benchmarks/scale.py.
+Builds the whole extract and the part along the route, drives the route through both with a 16-beam scanner,
+and compares the common tiles and the point clouds byte by byte. Costs as in benchmarks/scale.py.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from geoscene.scene import SceneFiles
 
 
 def along(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
-    """Cost of the whole build and of the one along a route, and whether what is there is the same."""
+    """Costs of the whole build and of the build along a route, and whether tiles and clouds are equal."""
     rows, clouds, tiles = [], [], []
     extra = {"whole": [], "along": ["--along", *given.route, "--reach", str(given.reach)]}
     for name, words in extra.items():
@@ -57,7 +56,7 @@ def along(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
 
 
 def _bytes(folder: Path, pattern: str) -> dict[Path, bytes]:
-    """Files below a folder by their path in it."""
+    """Files in a folder by their relative path."""
     found = (path for path in sorted(folder.rglob(pattern)) if path.is_file())
     return {path.relative_to(folder): path.read_bytes() for path in found}
 
@@ -67,7 +66,7 @@ def _mib(files: dict[Path, bytes]) -> float:
 
 
 def main() -> None:
-    """Measure the extract that the words name."""
+    """Measure the extract of the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

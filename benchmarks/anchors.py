@@ -1,9 +1,8 @@
-"""Published figures that the software must reproduce: expected, got, deviation.
+"""Published figures that the software must reproduce: published value, computed value, deviation.
 
     python benchmarks/anchors.py
 
-What is got is computed by the software at each run. The tests hold many more figures than these; rain, fog,
-snow and attacks are not modelled yet and so have no row.
+The tests contain many more figures than these.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ from lidar.rig.scanner import firings, load_sensor
 from lidar.rig.specs import load_rig
 
 Row = tuple[str, float, float, str, str]
-"""Quantity, expected, got, unit, source."""
+"""Quantity, published value, computed value, unit, source."""
 
 _VLP16 = "Velodyne VLP-16 manual 63-9243"
 
 
 def _azimuth_deg(direction: np.ndarray) -> np.ndarray:
-    """Clockwise from forward, as Velodyne counts."""
+    """Azimuth clockwise from forward, as in Velodyne's data."""
     turn: np.ndarray = np.degrees(np.arctan2(-direction[:, 1], direction[:, 0])) % 360
     return turn
 
@@ -57,17 +56,17 @@ def scanners() -> Iterator[Row]:
 
 
 def physics() -> Iterator[Row]:
-    """Reflection, and noise of inertial units."""
+    """Reflection of water; noise of inertial units."""
     s, p = (float(v) for v in fresnel(np.cos(np.radians(60.0)), WATER))
     yield "water at 60 deg, R_s", 0.1137, s, "", "Fresnel's equations, n = 1.33"
     yield "water at 60 deg, R_p", 0.0044, p, "", "Fresnel's equations, n = 1.33"
     unit = PRESETS["adis16448"]
     crossing = float(np.sqrt(3) * unit.gyro_noise / unit.gyro_walk)
-    yield "EuRoC gyro, white noise meets random walk", 15.2, crossing, "s", "IEEE Std 952; EuRoC sensor.yaml"
+    yield "EuRoC gyro, white noise equals random walk", 15.2, crossing, "s", "IEEE Std 952; EuRoC sensor.yaml"
 
 
 def frames() -> Iterator[Row]:
-    """Projections of the Earth and of cameras."""
+    """Map projection and camera projections."""
     frame = Frame.at(-76.3059, 36.8853, crs="utm")
     east, north = frame.to_projected(*frame.from_geographic(-76.3059, 36.8853))
     yield "UTM 18N of Norfolk, E", 383629.0124, float(east), "m", "transverse Mercator, WGS 84"
@@ -89,7 +88,7 @@ def frames() -> Iterator[Row]:
 
 def main() -> None:
     """Print the table."""
-    print("| quantity | expected | got | deviation | unit | source |\n|---|---|---|---|---|---|")
+    print("| quantity | published | computed | deviation | unit | source |\n|---|---|---|---|---|---|")
     for rows in (scanners(), physics(), frames()):
         for quantity, expected, got, unit, source in rows:
             print(

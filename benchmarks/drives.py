@@ -1,10 +1,11 @@
-"""How fast whole drives are, in multiples of real time, by rig and fidelity, and where the time goes.
+"""Speed of whole drives as multiples of real time, by rig and fidelity level, with the share of each stage.
 
     python benchmarks/drives.py SCENE [--seconds 6] [--survey-seconds 1.5] [--workers 2] [--json]
 
-Each row is a drive of `lidar.pipeline.drive` along the same random route, clouds as PCD, images as PNG, after
-one that is not counted and compiles kernels. ``x real time`` is simulated seconds by seconds of the clock,
-planning of the route and loading of tiles included, imports not. Shares are of the seconds of all threads.
+Each row is a drive of `lidar.pipeline.drive` along the same random route with clouds as PCD and images as
+PNG, after an uncounted drive that compiles the kernels. ``x real time`` is simulated seconds per second of
+wall time, including route planning and loading of tiles but not imports. Shares are of the time of all
+threads.
 """
 
 from __future__ import annotations

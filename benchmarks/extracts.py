@@ -1,12 +1,11 @@
-"""One row for every extract: buildings in, solids out, what became of the rest, and what it cost.
+"""One row per extract: buildings on the map, solids built, repaired and dropped buildings, and the cost.
 
     python benchmarks/extracts.py FOLDER_OR_FILE [...] [--lod 2] [--workers 1] [--json]
 
-Builds each extract with the program and lets ``geoscene validate`` judge every solid of the scene that was
-written. Costs as in benchmarks/scale.py. Rows are printed as they come, as Markdown or one JSON object a
-line. ``ground`` is by how much the area of the ground's triangles and of the openings over tunnels' mouths
-misses the extent's, relative. ``repaired`` counts buildings that were put right, ``dropped`` those that were
-not built.
+Builds each extract with the program and checks every solid of the written scene with ``geoscene validate``.
+Costs as in benchmarks/scale.py. Rows are printed one by one, as Markdown or as one JSON object per line.
+``ground`` is the relative difference between the area of the ground (its triangles plus the openings over
+tunnel mouths) and that of the extent. ``repaired`` counts repaired buildings, ``dropped`` those not built.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ def row_of(extract: Path, folder: Path, *, lod: int, workers: int) -> dict[str, 
 
 
 def markdown(row: dict[str, Any]) -> str:
-    """A row as a line of a table."""
+    """A row as a line of a Markdown table."""
     if "error" in row:
         return f"| {row['extract']} | {row['error']} |"
     cells = []
@@ -83,7 +82,7 @@ def markdown(row: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Measure the extracts that the words name."""
+    """Measure the extracts of the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -1,12 +1,11 @@
-"""How well missing building heights are inferred: known ones are hidden, guessed, and compared.
+"""Accuracy of inferred building heights: known heights are hidden, inferred and compared.
 
     python benchmarks/height_inference.py EXTRACT [EXTRACT ...] [--json]
 
 For every extract, shares of the buildings with tagged heights (height, est_height, building:levels, or those
-of parts) are hidden at random, inferred from the rest, and compared with a constant for all: 10 m, and the
-best constant there is, the median of the heights that are left (of the hidden ones themselves when all are
-hidden). With 5 % hidden the map is nearly as it is; with all hidden only the type of building and its
-footprint are left.
+of parts) are hidden at random and inferred from the rest. The comparison is a constant height for all: 10 m,
+and the best constant, the median of the remaining heights (of the hidden ones if all are hidden). With 5 %
+hidden the map is nearly complete; with all hidden only the type and the footprint of buildings remain.
 """
 
 from __future__ import annotations
@@ -43,8 +42,7 @@ def errors(path: Path) -> list[dict[str, float]]:
     for share in HIDDEN:
         rng = np.random.default_rng(0)
         count = max(1, round(share * len(known)))
-        # so many rounds that every building is hidden about four times
-        rounds = 1 if share == 1 else max(4, round(4 / share))
+        rounds = 1 if share == 1 else max(4, round(4 / share))  # every building is hidden about four times
         wrong, tens, best, inside = [], [], [], []
         for _ in range(rounds):
             hidden = rng.permutation(known)[:count]

@@ -1,11 +1,10 @@
-"""A made-up city as an OpenStreetMap extract, for measuring builds of any size.
+"""A synthetic city as an OpenStreetMap extract, for measuring builds of any size.
 
     python benchmarks/make_osm.py 100000 city.osm.pbf [--seed 0]
 
-Blocks between streets, the densest in the middle: closed courts, terraces that share their walls, detached
-houses with garages, works, towers of parts, parks; a river with bridges; forest and fields around. A third of
-the buildings say how high they are. The same number and seed give the same map; its area grows with the
-number.
+Blocks between streets, densest in the centre: closed courts, terraced houses, detached houses with garages,
+factories, towers of several parts, parks; a river with bridges; forest and fields around. A third of the
+buildings have a height or a number of storeys. The same number of buildings and seed give the same map.
 """
 
 from __future__ import annotations
@@ -22,27 +21,27 @@ Float = NDArray[np.float64]
 Tags = dict[str, str]
 
 CENTRE = (8.4037, 49.0069)
-"""Longitude and latitude of the city's middle, degrees."""
+"""Longitude and latitude of the city centre, degrees."""
 
 TURN = np.radians(17.0)
-"""Angle of the streets against the axes, so that none runs along a grid line."""
+"""Angle between streets and axes, so that no street lies along a grid line."""
 
 PITCH = (124.0, 92.0)
-"""Metres from street to street; blocks of European towns measure about 100 m by 70 m."""
+"""Metres between streets; blocks of European towns are about 100 m by 70 m."""
 
 HALF_STREET = 8.0
-"""Metres from a street's middle to the plots beside it."""
+"""Metres from a street's centre line to the adjacent plots."""
 
 A_BLOCK = 12.5
-"""Buildings of an average block, which sets how many blocks the city has."""
+"""Buildings in an average block; it determines the number of blocks."""
 
 RIVER_ROW = -2
-"""The row of blocks that the river takes."""
+"""Row of blocks that the river replaces."""
 
 
 @dataclass(slots=True)
 class City:
-    """A map in the making; coordinates in metres along and across the streets."""
+    """A map under construction; coordinates in metres along and across the streets."""
 
     places: list[tuple[float, float]] = field(default_factory=list)
     node_tags: dict[int, Tags] = field(default_factory=dict)
@@ -51,7 +50,7 @@ class City:
     buildings: int = 0
 
     def node(self, x: float, y: float, tags: Tags | None = None) -> int:
-        """A new node's id."""
+        """Id of a new node."""
         self.places.append((x, y))
         if tags:
             self.node_tags[len(self.places)] = tags
@@ -62,12 +61,12 @@ class City:
         return [self.node(x, y) for x, y in xy.tolist()]
 
     def way(self, refs: list[int], tags: Tags) -> int:
-        """A new way's id."""
+        """Id of a new way."""
         self.ways.append((refs, tags))
         return len(self.ways)
 
     def ring(self, refs: list[int], tags: Tags) -> int:
-        """A new closed way's id."""
+        """Id of a new closed way."""
         return self.way([*refs, refs[0]], tags)
 
     def building(self, refs: list[int], tags: Tags) -> None:
@@ -83,13 +82,13 @@ def rectangle(x: float, y: float, width: float, depth: float, *, angle: float = 
 
 
 def turned(xy: Float, angle: float) -> Float:
-    """Points (n, 2) turned about zero."""
+    """Points (n, 2) rotated about the origin."""
     c, s = np.cos(angle), np.sin(angle)
     return xy @ np.array([[c, s], [-s, c]])
 
 
 def height_tags(rng: np.random.Generator, levels: int) -> Tags:
-    """What mappers say of a building's height: mostly nothing, often the storeys, rarely metres."""
+    """Height tags of a building: mostly none, often the storeys, rarely metres."""
     draw = rng.random()
     if draw < 0.25:
         return {"building:levels": str(levels)}
@@ -97,7 +96,7 @@ def height_tags(rng: np.random.Generator, levels: int) -> Tags:
 
 
 def roof_tags(rng: np.random.Generator, shapes: tuple[str, ...]) -> Tags:
-    """A roof's shape, for every third building."""
+    """Tags of a roof shape, for every third building."""
     if rng.random() > 0.33:
         return {}
     tags = {"roof:shape": str(rng.choice(shapes))}
@@ -166,7 +165,7 @@ def houses(city: City, rng: np.random.Generator, box: Float) -> None:
 
 
 def works(city: City, rng: np.random.Generator, box: Float) -> None:
-    """Halls with a chimney and a car park."""
+    """Factory halls with a chimney and a car park."""
     x = np.linspace(box[0], box[2], 4)
     for a, b in pairwise(x):
         corners = rectangle((a + b) / 2, (box[1] + box[3]) / 2, (b - a) * 0.8, (box[3] - box[1]) * 0.6)
@@ -177,7 +176,7 @@ def works(city: City, rng: np.random.Generator, box: Float) -> None:
 
 
 def towers(city: City, rng: np.random.Generator, box: Float) -> None:
-    """Two towers on a base, mapped as parts, in a lawn with trees."""
+    """Two towers on a base, mapped as building parts, on a lawn with trees."""
     for x in np.linspace(box[0] + 28.0, box[2] - 28.0, 2):
         y = (box[1] + box[3]) / 2
         levels = int(rng.integers(9, 22))
@@ -208,7 +207,7 @@ def park(city: City, rng: np.random.Generator, box: Float) -> None:
 
 
 def block(city: City, rng: np.random.Generator, box: Float, away: float) -> None:
-    """One block; ``away`` is its distance from the middle as a share of the city's radius."""
+    """One block; ``away`` is its distance from the centre as a share of the city's radius."""
     draw = rng.random()
     if draw < 0.05:
         park(city, rng, box)
@@ -235,7 +234,7 @@ def outskirts(city: City, rng: np.random.Generator, box: Float) -> None:
 
 
 def street_tags(line: int, *, across: bool) -> Tags:
-    """Class, lanes and limit of the street on a grid line."""
+    """Class, lanes and speed limit of the street on a grid line."""
     name = {"name": f"{'Quer' if across else 'Lang'}straße {line}"}
     if line % 8 == 0:
         return name | {"highway": "primary", "lanes": "4", "maxspeed": "50", "sidewalk": "both"}
@@ -264,7 +263,7 @@ def streets(city: City, half: int) -> None:
                 city.way(city.nodes(row[a : a + 2]), {"natural": "tree_row"})
     for i in lines:
         tags, column = street_tags(i, across=False), [joint[i, j] for j in lines]
-        # a street ends at the banks, and where it crosses, a bridge is a way of its own
+        # a street ends at the banks; where it crosses the river, the bridge is a separate way
         at = RIVER_ROW + half
         if not 0 <= at < len(lines) - 1:
             city.way(column, tags)
@@ -286,7 +285,7 @@ def river(city: City, half: int) -> None:
 
 
 def make_city(buildings: int, seed: int) -> City:
-    """A city of that many buildings (a block may end up to 20 beyond)."""
+    """A city of ``count`` buildings (up to 20 more, since blocks are complete)."""
     city = City()
     half = max(int(np.ceil(np.sqrt(buildings / A_BLOCK) / 2)) + 1, 3)
     cells = np.array([(i, j) for i in range(-half, half) for j in range(-half, half)])
@@ -310,7 +309,7 @@ def make_city(buildings: int, seed: int) -> City:
 
 
 def on_globe(xy: Float) -> Float:
-    """Longitudes and latitudes (n, 2) in degrees of places in the city, on a sphere of 6371 km."""
+    """Longitudes and latitudes (n, 2) in degrees of points in the city, on a sphere of 6371 km."""
     metre = np.degrees(1.0 / 6_371_000.0)
     lonlat: Float = CENTRE + turned(xy, TURN) * metre / np.array([np.cos(np.radians(CENTRE[1])), 1.0])
     return lonlat

@@ -1,10 +1,10 @@
-"""Memory along a long route: the world around the vehicle comes and goes, and must not grow.
+"""Memory along a long route: tiles are loaded and released around the vehicle, and memory must not grow.
 
     python benchmarks/memory.py SCENE [--km 20] [--reach 120] [--json]
 
-A random route through the scene; every 100 m the world is moved along as a drive does it and 28,800 rays are
-cast all round from 1.9 m above the road. Resident memory is the process's own, without the planning of the
-route, which is done in a process of its own.
+Follows a random route through the scene. Every 100 m it loads the tiles around the vehicle, as a drive does,
+and casts 28,800 rays in all directions from 1.9 m above the road. Resident memory is that of this process;
+the route is planned in another one.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from geoscene.scene import open_scene
 from lidar.world.world import World
 
 STEP = 100.0
-"""Metres between the places from which rays are cast."""
+"""Metres between the positions from which rays are cast."""
 
 
 def _route(scene_path: Path, km: float, queue: multiprocessing.Queue[NDArray[np.float64]]) -> None:
@@ -75,7 +75,7 @@ def main() -> None:
     rays, world = all_round(), None
     began = time.perf_counter()
     if not arguments.json:
-        print("| km | resident MiB | triangles around | hits | s since the start |\n|---|---|---|---|---|")
+        print("| km | resident MiB | loaded triangles | hits | s since the start |\n|---|---|---|---|---|")
     for k, (x, y, z) in enumerate(places.tolist()):
         region = (x - STEP, y - STEP, x + STEP, y + STEP)
         if world is None:

@@ -1,15 +1,14 @@
-"""Pulses a second from a scene on disk to LAS files: a VLP-16 drives through a made-up city.
+"""Pulses per second from a scene on disk to LAS files: a VLP-16 drives through a synthetic city.
 
-The city comes from a generator that is given by its path and called with a folder, into which it writes
-``city.npz`` (V, F, part, bid) and ``route.csv`` (t, x, y, z, yaw_deg). It is turned into a scene directory
-and a trajectory, and recorded by what ``lidar drive`` records with, each time in a fresh process: its figures
-hold imports, loading, scanning and writing. Compiled kernels are on disk: a run that is not counted sees to
-it.
+The city comes from a generator program: called with a folder, it writes ``city.npz`` (V, F, part, bid) and
+``route.csv`` (t, x, y, z, yaw_deg) there. The benchmark converts them to a scene directory and a trajectory
+and records the drive like ``lidar drive``, each time in a new process: figures include imports, loading,
+scanning and writing. An uncounted run compiles the kernels to disk.
 
     python benchmarks/pulses.py MAKE_CITY --seconds 60 --rays 1 7 19 61 --json pulses.json
 
-Rates are of the whole process and, without imports, of the drive, by the clock and by seconds of one core
-(which other programs on the machine do not slow down as much).
+Rates are those of the whole process and of the drive without imports, per second of wall time and per second
+of CPU time (which other programs on the machine affect less).
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _START = datetime(2026, 6, 21, 10, tzinfo=UTC)
 
 
 def convert(city: Path, out: Path) -> None:
-    """Write the generator's city as a scene directory ``out`` / scene and its route as a trajectory."""
+    """Write the generator's city as a scene in ``out`` / scene, and its route as a trajectory."""
     from geoscene.classes import Class, materials  # noqa: PLC0415
     from geoscene.files import write_json  # noqa: PLC0415
     from geoscene.frames import Frame  # noqa: PLC0415
@@ -55,7 +54,7 @@ def convert(city: Path, out: Path) -> None:
         material=np.where(built, codes["plaster"], codes["asphalt"]),
         closed=built,
     )
-    # A building lies in the tile of its middle, the ground in that of each face's.
+    # A building belongs to the tile of its centre, a face of the ground to the tile of its own centre.
     middle = vertices[faces, :2].mean(axis=1)
     owner = np.where(built, building, building.max() + 1 + np.arange(len(faces)))
     _, owner = np.unique(owner, return_inverse=True)
@@ -95,7 +94,7 @@ def convert(city: Path, out: Path) -> None:
 
 
 def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) -> dict[str, float]:
-    """Record the drive; seconds of the stages and the number of points."""
+    """Record the drive; returns seconds per stage and the number of points."""
     began = time.perf_counter()
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from lidar.dataset.recording import Contents, Recording  # noqa: PLC0415
@@ -134,7 +133,7 @@ def record(work: Path, out: Path, *, rays: int, seconds: float, workers: int) ->
 
 
 def load(work: Path) -> dict[str, float]:
-    """Load the whole scene; seconds it took, without imports."""
+    """Load the whole scene; returns the seconds without imports."""
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
     from lidar.world.world import World  # noqa: PLC0415
 
@@ -166,7 +165,7 @@ def pulses(work: Path, seconds: float) -> int:
 
 
 def digest(folder: Path) -> str:
-    """Of names and bytes of all files of a folder."""
+    """Digest of names and contents of all files of a folder."""
     total = hashlib.blake2b()
     for path in sorted(folder.rglob("*.las")):
         total.update(path.name.encode() + hashlib.blake2b(path.read_bytes()).digest())
@@ -174,7 +173,7 @@ def digest(folder: Path) -> str:
 
 
 def measure(work: Path, rays: int, seconds: float) -> dict[str, float]:
-    """One row: the drive with one and with two workers, each in a fresh process."""
+    """One row: the drive with one and with two workers, each in a new process."""
     found, kept = {}, set()
     for workers in (1, 2):
         out = work / "out"
@@ -203,10 +202,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("generator", type=Path, nargs="?", help="program that makes the city")
-    parser.add_argument("--seconds", type=float, default=60.0, help="of driving at one ray a pulse")
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, help="length of the drive at one ray per pulse"
+    )
     parser.add_argument("--rays", type=int, nargs="+", default=[1, 7, 19, 61])
-    parser.add_argument("--rounds", type=int, default=1, help="the best of so many")
-    parser.add_argument("--json", type=Path, help="write the rows there too")
+    parser.add_argument("--rounds", type=int, default=1, help="rounds; the best one counts")
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
@@ -220,7 +221,7 @@ def main() -> None:
         work = Path(folder)
         subprocess.run([sys.executable, options.generator, work], check=True)
         convert(work, work)
-        measure(work, 7, 1.0)  # compiles
+        measure(work, 7, 1.0)  # compiles the kernels
         loads = [child({"work": str(work)}) for _ in range(3)]
         quickest = min(loads, key=lambda row: row["load_s"])
         print(
@@ -231,7 +232,7 @@ def main() -> None:
         )
         rows = []
         for rays in options.rays:
-            # Bundles take longer: an eighth of the drive is enough to drown imports.
+            # Several rays per pulse take longer: an eighth of the drive outweighs the imports.
             seconds = options.seconds if rays == 1 else max(options.seconds / 4, 2.0)
             row = max((measure(work, rays, seconds) for _ in range(options.rounds)), key=lambda r: r["rate"])
             rows.append(row)

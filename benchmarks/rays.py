@@ -1,13 +1,13 @@
-"""Rays a second of this path, of plain embreex, of Open3D and of a native loop, in turns in one process.
+"""Rays per second of `lidar.raycast`, plain embreex, Open3D and a native loop, in turns in one process.
 
-The native loop is C, compiled here by gcc -O3 -march=native if that is found. For each packet of 16 it turns
-float64 directions by the rays' float64 poses, rounds to float32, calls rtcIntersect16 of the same library on
-the same scene with the same flags, and writes 8 bytes a ray: Embree's float32 range and the face's number. It
-leaves out the exact range, the cosine, instances, limits, checks of the input and the second look at rays
-that miss or meet a back. It is the limit; ratios to it are given.
+The native loop is C, compiled by gcc -O3 -march=native if gcc is installed. For each packet of 16 it
+rotates float64 directions by the rays' float64 poses, rounds them to float32, calls rtcIntersect16 of the
+same library on the same scene with the same flags, and writes 8 bytes per ray: Embree's float32 range and
+the face number. It has no exact range, cosine, instances, range limits or input checks, and does not retry
+rays that miss or hit a back face. It is the upper limit; the table gives ratios to it.
 
-Plain embreex and Open3D get rays made outside the clock; this path and the native loop make theirs inside it.
-Open3D's `cast_rays` also gives normals and barycentric coordinates: it has no call for less.
+Rays of plain embreex and Open3D are prepared outside the measured time, those of `lidar` and the native
+loop within it. Open3D's `cast_rays` always also returns normals and barycentric coordinates.
 
     python benchmarks/rays.py --triangles 0.1 1 5 --rounds 5 --json rays.json --markdown rays.md
     python benchmarks/rays.py --leaks 10_000_000
@@ -83,7 +83,7 @@ void cast(trace_t trace, void *scene, void *args, const double *position, const 
 
 @dataclass(frozen=True)
 class Row:
-    """One measurement: millions of rays a second of CPU and of wall time, medians over the rounds."""
+    """One measurement: millions of rays per second of CPU and of wall time, medians over the rounds."""
 
     triangles: int
     sensor: str
@@ -96,7 +96,7 @@ class Row:
 
 
 def city(triangles: float, seed: int = 7) -> tuple[Float, NDArray[np.int32]]:
-    """Boxes on streets over a rolling ground, about that many million triangles; vertices and faces."""
+    """Vertices and faces of boxes along streets on hilly ground, about that many million triangles."""
     rng = np.random.default_rng(seed)
     lots = 50
     half = lots * 15.0 + 60
@@ -177,7 +177,7 @@ def scanner(low: float, high: float, rings: int, columns: int = 1800) -> tuple[F
 
 
 def camera(width: int = 1280, height: int = 720) -> tuple[Float, NDArray[np.int64]]:
-    """Directions of a pinhole camera with 90° across, row by row, in the vehicle's axes."""
+    """Directions of a pinhole camera with 90° horizontal field of view, row by row, in vehicle axes."""
     u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     d = np.stack([np.full(u.shape, width / 2), -u, -v], -1).reshape(-1, 3)
     return d / np.linalg.norm(d, axis=1, keepdims=True), np.zeros(width * height, np.int64)
@@ -191,7 +191,7 @@ SENSORS: dict[str, Callable[[], tuple[Float, NDArray[np.int64]]]] = {
 
 
 def drive(frames: int, columns: int) -> list[Poses]:
-    """Poses along a street, one a firing column, a metre of travel a turn."""
+    """Poses along a street, one per firing column, 1 m of travel per revolution."""
     out = []
     for start in np.linspace(-250, 250, frames):
         x = start + np.linspace(0, 1, columns)
@@ -201,7 +201,7 @@ def drive(frames: int, columns: int) -> list[Poses]:
 
 
 def native() -> c.CDLL | None:
-    """The compiled native loop; none without gcc."""
+    """The compiled native loop; None without gcc."""
     if shutil.which("gcc") is None:
         return None
     folder = Path(tempfile.mkdtemp())
@@ -213,7 +213,7 @@ def native() -> c.CDLL | None:
 
 
 def paths(vertices: Float, faces: NDArray[np.int32], threads: int) -> dict[str, Callable[..., object]]:
-    """Name to a function of (poses, pose numbers, directions) that casts them all."""
+    """Functions by name that cast all rays of (poses, pose numbers, directions)."""
     caster = Caster(vertices, faces)
     out: dict[str, Callable[..., object]] = {
         "lidar": lambda p, k, d: caster.cast_posed(p, k, directions=d, threads=threads),
@@ -269,7 +269,7 @@ def paths(vertices: Float, faces: NDArray[np.int32], threads: int) -> dict[str, 
 def plain_embreex(
     vertices: Float, faces: NDArray[np.int32], origin: Float, threads: int
 ) -> Callable[[Poses, NDArray[np.int64], Float], object]:
-    """Embreex's own run() on rays made with NumPy outside the clock."""
+    """Embreex's own run() on rays prepared with NumPy outside the measured time."""
     scene = EmbreeScene()
     TriangleMesh(scene, vertices.astype(np.float32), faces)
     ready: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
@@ -292,7 +292,7 @@ def plain_embreex(
 
 
 def share(work: Callable[[int], object], starts: range, threads: int) -> list[object]:
-    """Do the parts on that many threads."""
+    """Run the parts on that many threads."""
     if threads == 1:
         return [work(lo) for lo in starts]
     with ThreadPoolExecutor(threads) as pool:
@@ -300,7 +300,7 @@ def share(work: Callable[[int], object], starts: range, threads: int) -> list[ob
 
 
 def measure(triangles: float, sensor: str, threads: int, rounds: int, frames: int) -> list[Row]:
-    """Rows of all paths, timed in turns."""
+    """Rows of all ray casters, timed in turns."""
     vertices, faces = city(triangles)
     directions, index = SENSORS[sensor]()
     poses = drive(frames, int(index.max()) + 1)
@@ -338,7 +338,7 @@ def measure(triangles: float, sensor: str, threads: int, rounds: int, frames: in
 
 
 def leaks(rays: int) -> dict[str, int]:
-    """Rays from inside closed solids at their vertices and edges that hit nothing, by solid."""
+    """Number, by solid, of rays from inside at its vertices and edges that hit nothing."""
     rng = np.random.default_rng(1)
     turn = trimesh.transformations.euler_matrix(0.3, 0.6, 0.2)
     ball = trimesh.creation.icosphere(subdivisions=4, radius=10.0)
@@ -361,7 +361,7 @@ def leaks(rays: int) -> dict[str, int]:
 
 
 def table(rows: list[Row]) -> str:
-    """A Markdown table: a line for each scene, sensor and number of threads."""
+    """A Markdown table, one line per scene, sensor and number of threads."""
     paths = ["lidar", "native", "embreex", "open3d"]
     heads = ["triangles", "sensor", "threads", *paths, "to native", "to embreex"]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
@@ -389,15 +389,15 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--frames", type=int, default=10)
     parser.add_argument("--leaks", type=int, default=0, metavar="RAYS", help="count leaks instead")
-    parser.add_argument("--markdown", type=Path, help="write the table there too")
-    parser.add_argument("--json", type=Path, help="write the rows there too")
+    parser.add_argument("--markdown", type=Path, help="also write the table to this file")
+    parser.add_argument("--json", type=Path, help="also write the rows to this file")
     options = parser.parse_args()
     if options.leaks:
-        print(f"rays from inside at vertices and edges that leave: {leaks(options.leaks)}")
+        print(f"rays from inside at vertices and edges that hit nothing: {leaks(options.leaks)}")
         return
     for what, program in (("native loop: gcc", shutil.which("gcc")), ("Open3D", find_spec("open3d"))):
         if program is None:
-            print(f"{what} is not installed: no such column")
+            print(f"{what} is not installed and left out")
     rows: list[Row] = []
     print(f"{'triangles':>9} {'sensor':8} threads {'path':8} M rays/CPU-s  M rays/s  x native  x embreex")
     for triangles in options.triangles:
@@ -412,7 +412,7 @@ def main() -> None:
                         f" {to[0]} {to[1]}",
                         flush=True,
                     )
-    print("\nMillions of rays a second: of CPU time for one thread, by the clock for more.\n")
+    print("\nMillions of rays per second: of CPU time for one thread, of wall time for more.\n")
     print(table(rows))
     if options.markdown:
         options.markdown.write_text(table(rows), "utf-8")

@@ -1,15 +1,15 @@
-"""What builds cost as cities grow, and how fast buildings are made.
+"""Cost of builds by city size, and speed of building reconstruction.
 
     python benchmarks/scale.py sizes [1000 10000 100000] [--workers 2] [--lod 2] [--folder DIR] [--json]
     python benchmarks/scale.py stages EXTRACT [EXTRACT ...] [--dem FILE [FILE ...]] [--json]
 
-``sizes`` makes cities (benchmarks/make_osm.py) and builds them with the program, one after another.
-``stages`` times the stages of buildings in one process, tile by tile as the build does it, without parsing
-and without the ground; with elevation files also on their terrain, which is asked for every building's base.
+``sizes`` generates cities (benchmarks/make_osm.py) and builds them with the program, one after another.
+``stages`` times the stages of buildings in one process, tile by tile as in a build, without parsing and
+without the ground; with elevation files also on terrain, including the base height of every building.
 
 CPU time is that of all processes. ``peak_mib`` is the greatest sum of proportional set sizes of the process
-and its children (what forked workers share counts once), looked at twice a second; ``largest_mib`` is
-the greatest resident set of any one of them, shared pages included. Linux only.
+and its children (pages shared by forked workers count once), sampled twice per second; ``largest_mib`` is the
+greatest resident set of one of them, shared pages included. Linux only.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from geoscene.sources import read_osm
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one command: seconds by the clock and of all processors, MiB at the peak of all and of one."""
+    """Cost of one command: wall and CPU seconds, peak MiB of all processes and of the largest one."""
 
     wall_s: float
     cpu_s: float
@@ -48,7 +48,7 @@ class Cost:
 
 
 def run(command: list[str], *, errors: IO[bytes] | None = None) -> Cost:
-    """The cost of a command whose complaints go to a file; raises CalledProcessError where it fails."""
+    """The cost of a command whose stderr goes to a file; raises CalledProcessError if it fails."""
     began = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
     peak = 0
@@ -73,7 +73,7 @@ def _family(root: int) -> list[int]:
         if entry.name.isdigit():
             try:
                 parent = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
-            except OSError:  # it has ended meanwhile
+            except OSError:  # the process has ended
                 continue
             children.setdefault(parent, []).append(int(entry.name))
     family = [root]
@@ -85,20 +85,20 @@ def _family(root: int) -> list[int]:
 def _proportional_kib(pid: int) -> int:
     try:
         text = Path(f"/proc/{pid}/smaps_rollup").read_text()
-    except OSError:  # it has ended meanwhile
+    except OSError:  # the process has ended
         return 0
     found = [line.split()[1] for line in text.splitlines() if line.startswith("Pss:")]
     return int(found[0]) if found else 0
 
 
 def build_command(osm: Path, out: Path, *extra: str) -> list[str]:
-    """The words that build a scene of an extract."""
+    """Command line that builds a scene of an extract."""
     words = [sys.executable, "-m", "geoscene.cli", "build", "--osm", str(osm), "--out", str(out)]
     return [*words, "--overwrite", "--quiet", *extra]
 
 
 def sizes(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
-    """Cost of the build of cities, one row a size."""
+    """Cost of building cities, one row per size."""
     rows = []
     for count in given.buildings:
         osm, out = folder / f"city_{count}.osm.pbf", folder / f"city_{count}"
@@ -124,7 +124,7 @@ def sizes(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
 
 
 def stages(given: argparse.Namespace) -> list[dict[str, Any]]:
-    """Buildings per second and processor of reading footprints, heights and looks, and of making solids."""
+    """Buildings per CPU second: reading footprints, heights and colours, and making solids."""
     rows = []
     for path in given.extract:
         began = time.process_time()
@@ -132,14 +132,14 @@ def stages(given: argparse.Namespace) -> list[dict[str, Any]]:
         parse = time.process_time() - began
         west, south, east, north = osm.bounds
         frame = Frame.at((west + east) / 2, (south + north) / 2)
-        read_buildings(osm, frame)  # what is imported on the first call is not counted
+        read_buildings(osm, frame)  # imports of the first call are not counted
         parsed = time.process_time()
         table, _ = read_buildings(osm, frame)
         read = time.process_time()
         count, footprints = table.count, table.footprint[: table.count]
         row: dict[str, Any] = {"extract": path.name, "buildings": count, "parse_s": round(parse, 2)}
         row["read_s"] = round(read - parsed, 2)
-        _solids(table, np.zeros(count), 2, _tiles(table)[:1])  # again the imports
+        _solids(table, np.zeros(count), 2, _tiles(table)[:1])  # imports, not counted
         terrains = {"level": flat_terrain(frame)}
         if given.dem:
             bounds = tuple(shapely.total_bounds(footprints).tolist())
@@ -156,7 +156,7 @@ def stages(given: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def _solids(table: Any, base: Any, lod: int, tiles: list[tuple[Any, Any]]) -> None:
-    """Make the solids of tiles and let go of them."""
+    """Make the solids of tiles and discard them."""
     for chosen, parts in tiles:
         build_solids(take_buildings(table, chosen, parts=parts), base=base[chosen], lod=lod)
 
@@ -179,7 +179,7 @@ def _tiles(table: Any) -> list[tuple[Any, Any]]:
 
 
 def show(rows: list[dict[str, Any]], *, as_json: bool) -> None:
-    """Print rows as JSON, or under the names of their columns."""
+    """Print rows as JSON or as a table."""
     if as_json:
         print(json.dumps(rows, indent=1))
         return
@@ -191,7 +191,7 @@ def show(rows: list[dict[str, Any]], *, as_json: bool) -> None:
 
 
 def main() -> None:
-    """Measure what the words ask for."""
+    """Run the measurement of the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

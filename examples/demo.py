@@ -1,4 +1,4 @@
-"""All steps on the bundled piece of Helsinki: build the scene, drive in traffic, make a map, draw pictures.
+"""Demo on the bundled extract of Helsinki: build the scene, drive in traffic, make a map, draw pictures.
 
 Writes to ``demo/`` (or the folder given as the first argument) and lists the files at the end.
 """
@@ -39,7 +39,7 @@ from lidar.traffic.populate import TrafficOptions
 from lidar.world.world import World
 
 ROUTE = ((60.16765, 24.94750), (60.16640, 24.94350))
-"""Latitude and longitude of a start and an end: westwards along Pohjoisesplanadi, the sun behind."""
+"""Latitude and longitude of start and end: westwards along Pohjoisesplanadi, with the sun behind."""
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")
 pictures = out / "pictures"
@@ -53,7 +53,7 @@ def say(text: str) -> None:
 
 
 def busiest_frame(boxes: Path) -> str:
-    """Name of the camera frame that shows most road users, each mostly visible and of some size."""
+    """Name of the camera frame with the most road users that are mostly visible and not too small."""
     with boxes.open(newline="") as file:
         seen = Counter(
             int(row["frame"])

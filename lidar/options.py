@@ -201,7 +201,7 @@ class DriveOptions:
     """Side of the road to drive on, right or left; the scene's by default."""
 
     fidelity: str = "standard"
-    """Level: draft (one pose a frame, exact ranges, no shadows), standard (a pose a pulse, exact ranges) or
+    """Level: draft (one pose per frame, exact ranges, no shadows), standard (one per pulse, exact ranges) or
     survey (beams with a size, several echoes, noise, lost and false returns; image noise)."""
 
     traffic: Annotated[

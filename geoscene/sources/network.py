@@ -27,7 +27,7 @@ from geoscene.sources.http import BUSY, RefusedError, cause, open_session
 from geoscene.sources.overpass import collect_answer, query_for
 
 _SMALLEST = 400.0  # metres: smallest side of the box of a place
-_NOMINATIM_PAUSE = 1.0  # seconds before each request; the public server allows one a second
+_NOMINATIM_PAUSE = 1.0  # seconds before each request; the public server allows one per second
 _CACHE_VERSION = 1
 
 

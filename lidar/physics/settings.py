@@ -26,7 +26,7 @@ class ScannerSettings:
     detection    : lose echoes near the threshold with a probability; includes ``link``
     daylight_lux : illuminance of the scene, which raises the receiver's noise
     extinction   : extinction coefficient of the air, 1/m, one way
-    rays         : rays a pulse, of `FOOTPRINTS`: a beam with a size, mixed pixels, several echoes
+    rays         : rays per pulse, of `FOOTPRINTS`: a beam with a size, mixed pixels, several echoes
     mirrors      : glass transmits and reflects, water reflects
     foliage      : tree crowns and hedges let rays pass between their leaves
     blooming     : pulses that pass close to a retro-reflector may return its range

@@ -1,4 +1,4 @@
-"""First hits of rays as columns, one row a ray."""
+"""First hits of rays as columns, one row per ray."""
 
 from __future__ import annotations
 

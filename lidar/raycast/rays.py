@@ -30,7 +30,7 @@ def free_rays(origins: ArrayLike, directions: ArrayLike) -> Rays:
     o = np.ascontiguousarray(origins, np.float64)
     o = _rows(o[None] if o.ndim == 1 else o, "origins")
     if len(o) not in (1, len(d)):
-        raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one a ray")
+        raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one per ray")
     return _plain(d, o, pose=np.empty(0, np.int64), position=np.empty((0, 3)), matrix=np.empty((0, 3, 3)))
 
 
@@ -77,7 +77,7 @@ def limited(
     n = len(rays.directions)
     reach = np.ascontiguousarray(far, np.float64).reshape(-1)
     if len(reach) not in (1, n) or not (near >= 0 and (reach >= near).all()):
-        raise InputError("rays need 0 <= near <= far, far one number or one a ray")
+        raise InputError("rays need 0 <= near <= far, far one number or one per ray")
     limits = rays._replace(near=float(near), far=reach, mask=int(mask) & ALL)
     if time is not None:
         moments = np.ascontiguousarray(time, np.float32)

@@ -36,7 +36,7 @@ class Sensor:
     name          : name on the rig, which also keys its random numbers
     kind          : of `KINDS`
     wavelength_nm : nanometres
-    rate_hz       : revolutions or frames a second
+    rate_hz       : revolutions or frames per second
     start_ns      : start of frame 0, since the drive's start
     min_range, max_range : metres, limits of the reported range
     range_quantum : metres, step of the reported range; 0 for none
@@ -131,7 +131,7 @@ def load_sensor(
     """A scanner from a preset (one of `sensor_names`) or a TOML file.
 
     name        : name on the rig; the preset's by default
-    rate_hz     : revolutions or frames a second; 0 for the first of the preset's rates
+    rate_hz     : revolutions or frames per second; 0 for the first of the preset's rates
     return_mode : the first of the preset's modes by default
     start_ns    : start of frame 0, nanoseconds since the drive's start
 

@@ -23,7 +23,7 @@ class LidarSpec:
 
     preset         : name of a built-in preset, or the path of a TOML file
     mount          : pose in the vehicle's frame of the sensor frame (x forward, y left, z up)
-    rate_hz        : revolutions or frames a second; 0 for the preset's own
+    rate_hz        : revolutions or frames per second; 0 for the preset's own
     time_offset_ns : start of frame 0 after the drive's start
     return_mode    : one of the preset's modes; empty for its first
     """
@@ -45,7 +45,7 @@ class CameraSpec:
     fx, fy, cx, cy : pixels; the centre of the top-left pixel is (0, 0)
     distortion     : pinhole: k1, k2, p1, p2, k3 (Brown-Conrady); fisheye: k1, k2, k3, k4 (equidistant)
     near, far      : metres along the optical axis; surfaces outside these limits are not imaged
-    rate_hz        : frames a second
+    rate_hz        : frames per second
     time_offset_ns : start of frame 0 after the drive's start
     images         : kinds of image to write, of `IMAGES`
     exposure_ns    : exposure time of a row
@@ -90,7 +90,7 @@ class GnssSpec:
     """A GNSS receiver on the rig.
 
     mount          : its translation is the lever arm to the antenna
-    rate_hz        : fixes a second
+    rate_hz        : fixes per second
     time_offset_ns : first fix after the drive's start
     mode           : of `GNSS_MODES`
     mask_deg       : elevation below which satellites are not used

@@ -31,7 +31,7 @@ class Beam:
     share: Float
 
     def __len__(self) -> int:
-        """Rays a pulse."""
+        """Rays per pulse."""
         return len(self.share)
 
 

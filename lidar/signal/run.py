@@ -22,7 +22,7 @@ from lidar.sensors.scan import Sweep, detect, deviates_of, report
 from lidar.signal.registry import Stages
 from lidar.signal.stage import CloudStage, EchoStage, ImageStage, Pulses, pulses_of
 
-_FALSE_KINDS = 3  # kinds of false echoes, each at most one a pulse
+_FALSE_KINDS = 3  # kinds of false echoes, each at most one per pulse
 
 
 @dataclass(frozen=True, slots=True)

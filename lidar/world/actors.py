@@ -41,7 +41,7 @@ class Actors:
     time_ns  : (k,) int64, nanoseconds since the drive's start
     position : (k, 3) scene metres, centre of the bounding box, on the ground
     angles   : (k, 3) radians: yaw from the x axis (unwrapped), pitch (nose down positive), roll
-    velocity : (k, 3) scene metres a second
+    velocity : (k, 3) scene metres per second
     travelled     : (k,) metres covered
     scale    : scene metres per true metre
     """
@@ -75,7 +75,7 @@ class States:
 
     position : (k, 3) scene metres, centre of the bounding box, on the ground
     angles   : (k, 3) yaw, pitch, roll in radians
-    velocity : (k, 3) scene metres a second
+    velocity : (k, 3) scene metres per second
     travelled     : (k,) metres covered
     """
 
@@ -126,7 +126,7 @@ def states(actors: Actors, rows: ArrayLike, *, time_ns: ArrayLike) -> States:
 
 
 def velocities(actors: Actors, time_ns: int) -> Float:
-    """Velocities (n, 3) of all actors at a time, scene metres a second."""
+    """Velocities (n, 3) of all actors at a time, scene metres per second."""
     return states(actors, np.arange(len(actors)), time_ns=time_ns).velocity
 
 

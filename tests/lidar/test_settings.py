@@ -66,7 +66,7 @@ def test_listings_contain_all_built_in_rigs_and_sensors():
     assert [row["name"] for row in rig_rows()] == rig_names()
     vlp16 = next(row for row in sensor_rows() if row["name"] == "vlp16")
     assert (vlp16["channels"], vlp16["rate_hz"], vlp16["max_range_m"]) == (16, 10.0, 100.0)
-    # the maker's 300,000 points a second, less the time of the blocks' recharge
+    # the maker's 300,000 points per second, less the time of the blocks' recharge
     assert vlp16["pulses_per_s"] == pytest.approx(16 / 55.296e-6, rel=1e-3)
     for row in sensor_rows():
         assert row["source"]

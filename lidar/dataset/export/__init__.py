@@ -75,7 +75,7 @@ EXPORTERS = {
         Exporter(
             "nuscenes",
             "nuscenes",
-            "samples and sweeps with all tables of nuScenes, two key frames a second",
+            "samples and sweeps with all tables of nuScenes, two key frames per second",
             mark="v1.0-mini/sample.json",
             hint="open it with NuScenes('v1.0-mini', '{path}')",
         ),

@@ -1,7 +1,7 @@
 """A recorded drive as a nuScenes dataset: samples, sweeps and the tables that its development kit opens.
 
-Caesar et al. 2020; the schema is that of nuscenes-devkit 1.1. Two frames a second are key frames. Clouds are
-de-skewed to the start of their frame, and boxes are those of that moment.
+Caesar et al. 2020; the schema is that of nuscenes-devkit 1.1. Two frames per second are key frames. Clouds
+are de-skewed to the start of their frame, and boxes are those of that moment.
 """
 
 from __future__ import annotations

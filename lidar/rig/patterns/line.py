@@ -28,8 +28,8 @@ class Line:
     law        : of `LAWS`
     half_angle : radians, a
     turn       : radians, angle of one line of the polygon
-    line_hz    : lines a second, L
-    pulse_hz   : pulses a second
+    line_hz    : lines per second, L
+    pulse_hz   : pulses per second
     """
 
     law: str

@@ -22,7 +22,7 @@ class Prisms:
     wedge    : (k,) radians, angle between the faces of each prism; positive if the inclined face comes first
     index    : (k,) refractive index
     turn_hz  : (k,) revolutions per second; the sign gives the direction
-    pulse_hz : pulses a second of each beam
+    pulse_hz : pulses per second of each beam
     """
 
     incident: Float

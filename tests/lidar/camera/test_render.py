@@ -377,13 +377,13 @@ def test_flow_of_a_still_world_is_the_cameras_own_motion():
 def test_flow_of_a_rolling_shutter_ends_on_the_row_that_exposes_the_point():
     camera = replace(CAMERA, row_ns=100_000)
     rows, period = np.arange(120) * 1e-4, 0.1
-    up, left = 8.0, 3.0  # metres a second
+    up, left = 8.0, 3.0  # metres per second
 
     def exposed(t):
         return stacked([looking((0.0, left * s, 1.5 + up * s)) for s in t])
 
     flow = optical_flow(camera, exposed(rows), later=exposed(rows + period), world=world(plate(10.0)))
-    # A point sinks by k pixels a second and is exposed d rows further down: d = k (period + d row).
+    # A point sinks by k pixels per second and is exposed d rows further down: d = k (period + d row).
     k = 100 / 10 * up
     down = k * period / (1 - k * 1e-4)
     inside = np.arange(120) + down < 119

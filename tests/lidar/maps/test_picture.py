@@ -133,7 +133,7 @@ def test_a_scene_from_above_is_a_map():
     image = scene_picture(_village(), view="top", size=(400, 300), sun=(0, 0, 1), options=PLAIN)
     redness = (image[..., 0] > 150) & (image[..., 1] < 60)
     v, u = np.nonzero(redness)
-    scale = 300 / 100 * 0.98  # pixels a metre: the height of the picture is the tighter fit
+    scale = 300 / 100 * 0.98  # pixels per metre: the height of the picture is the tighter fit
     assert np.ptp(u) + 1 == pytest.approx(20 * scale, abs=3)
     assert np.ptp(v) + 1 == pytest.approx(10 * scale, abs=3)
     assert u.mean() == pytest.approx(200 + 30 * scale, abs=3)
