@@ -23,8 +23,7 @@ def uniform_of(number: NDArray[np.integer], seed: int) -> Float:
     with np.errstate(over="ignore"):
         x = number.astype(np.uint64) + np.uint64(seed % 2**64) * np.uint64(0xD1342543DE82EF95)
         x = mix((x + np.uint64(1)) * GOLDEN)
-    uniform: Float = ((x >> np.uint64(11)).astype(np.float64) + 0.5) / 2.0**53
-    return uniform
+    return ((x >> np.uint64(11)).astype(np.float64) + 0.5) / 2.0**53
 
 
 def normal_of(number: NDArray[np.integer], seed: int) -> Float:

@@ -50,8 +50,7 @@ class Light:
 def _air_mass(sine: Float) -> Float:
     """Air mass towards an elevation by its sine >= 0; Kasten and Young, Applied Optics 28 (1989)."""
     h = np.degrees(np.arcsin(np.clip(sine, 0.0, 1.0)))
-    mass: Float = 1.0 / (np.sin(np.radians(h)) + 0.50572 * (h + 6.07995) ** -1.6364)
-    return mass
+    return 1.0 / (np.sin(np.radians(h)) + 0.50572 * (h + 6.07995) ** -1.6364)
 
 
 def _sky_radiance(sine: Float, cosine: Float, *, sun_sine: float) -> Float:
@@ -73,14 +72,13 @@ def _sky_radiance(sine: Float, cosine: Float, *, sun_sine: float) -> Float:
         tau * np.exp(-tau * sun),
         (np.exp(-tau * sun) - np.exp(-tau * view)) / np.where(near, 1.0, gap),
     )
-    radiance: Float = _SUN * np.exp(-_OZONE * sun) * phase / (4 * np.pi) * view * slab
-    return radiance
+    return _SUN * np.exp(-_OZONE * sun) * phase / (4 * np.pi) * view * slab
 
 
 def _harmonics(n: Float) -> Float:
     """Real spherical harmonics (..., 9) of order 0 to 2 at unit vectors (..., 3)."""
     x, y, z = n[..., 0], n[..., 1], n[..., 2]
-    basis: Float = np.stack(
+    return np.stack(
         [
             np.full_like(x, 0.282095),
             0.488603 * y,
@@ -94,7 +92,6 @@ def _harmonics(n: Float) -> Float:
         ],
         axis=-1,
     )
-    return basis
 
 
 def daylight(direction: ArrayLike, *, rows: int = 64, columns: int = 64) -> Light:

@@ -82,10 +82,7 @@ def depth_to_counts(depth: NDArray[np.floating]) -> NDArray[np.uint16]:
 
 def counts_to_depth(counts: NDArray[np.uint16]) -> NDArray[np.float32]:
     """Depth in metres, inf where there is no data: what `depth_to_counts` took, to half a count (2 mm)."""
-    depth: NDArray[np.float32] = np.where(counts > 0, counts / np.float32(DEPTH_SCALE), np.inf).astype(
-        np.float32
-    )
-    return depth
+    return np.where(counts > 0, counts / np.float32(DEPTH_SCALE), np.inf).astype(np.float32)
 
 
 def feature_to_image(feature: NDArray[np.int32]) -> NDArray[np.uint8]:

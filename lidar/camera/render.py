@@ -106,8 +106,7 @@ def exposure_times(camera: CameraSpec, start_ns: int, *, samples: int = 1) -> ND
     """
     within = (2 * np.arange(samples) + 1) * camera.exposure_ns // (2 * samples)
     rows = np.arange(camera.height) * camera.row_ns if camera.row_ns else np.zeros(1, np.int64)
-    times: NDArray[np.int64] = (start_ns + within[:, None] + rows[None]).ravel().astype(np.int64)
-    return times
+    return (start_ns + within[:, None] + rows[None]).ravel().astype(np.int64)
 
 
 def render(
@@ -257,8 +256,7 @@ def _view(
 @functools.lru_cache(maxsize=4)
 def _pinhole_rays(camera: CameraSpec) -> Float:
     rays = pixel_rays(camera)
-    scaled: Float = rays / rays[:, 2:]
-    return scaled
+    return rays / rays[:, 2:]
 
 
 def _scaled_rays(camera: CameraSpec) -> Float:
@@ -390,8 +388,7 @@ def _on_bodies(point: Float, hits: Hits, *, world: World, time: Float) -> Float:
     on = np.flatnonzero(hits.instance >= 0)
     place = _transforms(world, hits.instance[on], time=time[on])
     offset = (point[on] - place[:, :, 3])[..., None]
-    body: Float = np.linalg.solve(place[:, :, :3], offset)[..., 0].astype(np.float64)
-    return body
+    return np.linalg.solve(place[:, :, :3], offset)[..., 0].astype(np.float64)
 
 
 def _off_bodies(point: Float, body: Float, *, hits: Hits, world: World, time: Float) -> Float:

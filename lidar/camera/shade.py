@@ -65,8 +65,7 @@ def material_tables() -> tuple[NDArray[np.uint8], Float, NDArray[np.uint8]]:
 def linear_table() -> Float:
     """Linear light 0..1 of sRGB bytes (256,); IEC 61966-2-1."""
     s = np.arange(256) / 255
-    linear: Float = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-    return linear
+    return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
 
 
 _STEPS = 8192

@@ -89,16 +89,14 @@ COLUMNS = (
 def _centres(actors: Actors, rows: Ints, *, at: States) -> Float:
     """Centres (k, 3) of boxes: half the height above the position, along the body's z axis."""
     up = rotations(at.angles)[:, :, 2] * [actors.scale, actors.scale, 1.0]
-    centre: Float = at.position + up * actors.size[rows, 2:] / 2
-    return centre
+    return at.position + up * actors.size[rows, 2:] / 2
 
 
 def count_points(actors: Actors, rows: ArrayLike, *, feature: NDArray[np.integer]) -> Ints:
     """Number of points (k,) on each of the actors ``rows``, from a cloud's column of feature numbers."""
     low = int(actors.feature[0]) if len(actors) else 0
     mine = feature[(feature >= low) & (feature < low + len(actors))] - low
-    counts: Ints = np.bincount(mine, minlength=len(actors))[np.asarray(rows, np.int64)]
-    return counts
+    return np.bincount(mine, minlength=len(actors))[np.asarray(rows, np.int64)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -90,8 +90,7 @@ def _while_on(recording: Recording, cloud: Cloud) -> NDArray[np.bool_]:
     assert on is not None  # noqa: S101
     time_ns = _times(cloud)
     first = np.searchsorted(on[:, 0], time_ns, side="right") - 1
-    mask: NDArray[np.bool_] = (first >= 0) & (time_ns <= np.maximum.accumulate(on[:, 1])[first])
-    return mask
+    return (first >= 0) & (time_ns <= np.maximum.accumulate(on[:, 1])[first])
 
 
 def _times(cloud: Cloud) -> NDArray[np.int64]:

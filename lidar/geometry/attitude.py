@@ -37,8 +37,7 @@ def euler_from_quat(quat_xyzw: ArrayLike) -> Float:
     With the nose straight up or down (gimbal lock) alpha is 0 and gamma holds the whole rotation.
     """
     quat = np.asarray(quat_xyzw, float)
-    out: Float = np.stack(_angles(matrix_from_quat(quat), 1.0), axis=-1)
-    return out
+    return np.stack(_angles(matrix_from_quat(quat), 1.0), axis=-1)
 
 
 def quat_from_euler(alpha: ArrayLike, beta: ArrayLike, *, gamma: ArrayLike) -> Float:
@@ -54,8 +53,7 @@ def quat_from_euler(alpha: ArrayLike, beta: ArrayLike, *, gamma: ArrayLike) -> F
         ],
         axis=-1,
     )
-    positive: Float = np.where(quat[..., 3:] < 0, -quat, quat)
-    return positive
+    return np.where(quat[..., 3:] < 0, -quat, quat)
 
 
 def euler_from_quat_intrinsic(quat_xyzw: ArrayLike) -> Float:
@@ -63,8 +61,7 @@ def euler_from_quat_intrinsic(quat_xyzw: ArrayLike) -> Float:
     quat = np.asarray(quat_xyzw, float)
     # the inverse of Rx Ry Rz is Rz(-gamma) Ry(-beta) Rx(-alpha)
     R = np.swapaxes(matrix_from_quat(quat), -1, -2)
-    out: Float = np.stack(_angles(R, -1.0), axis=-1)
-    return out
+    return np.stack(_angles(R, -1.0), axis=-1)
 
 
 def quat_from_euler_intrinsic(alpha: ArrayLike, beta: ArrayLike, *, gamma: ArrayLike) -> Float:
@@ -93,10 +90,7 @@ def quat_from_matrix(matrix: ArrayLike) -> Float:
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
 
     matrices = np.asarray(matrix, float)
-    quat: Float = (
-        Rotation.from_matrix(matrices).as_quat(canonical=True) if len(matrices) else np.empty((0, 4))
-    )
-    return quat
+    return Rotation.from_matrix(matrices).as_quat(canonical=True) if len(matrices) else np.empty((0, 4))
 
 
 def quat_product(first: ArrayLike, second: ArrayLike) -> Float:
@@ -112,8 +106,7 @@ def quat_product(first: ArrayLike, second: ArrayLike) -> Float:
         ],
         axis=-1,
     )
-    positive: Float = np.where(out[..., 3:] < 0, -out, out)
-    return positive
+    return np.where(out[..., 3:] < 0, -out, out)
 
 
 def body_rates(time_s: ArrayLike, quat_xyzw: ArrayLike) -> Float:
@@ -125,7 +118,4 @@ def body_rates(time_s: ArrayLike, quat_xyzw: ArrayLike) -> Float:
 
     t, attitude = np.asarray(time_s, float), Rotation.from_quat(np.asarray(quat_xyzw, float))
     between = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(t)[:, None]
-    rates: Float = (
-        np.concatenate([between[:1], between]) * 0.5 + np.concatenate([between, between[-1:]]) * 0.5
-    )
-    return rates
+    return np.concatenate([between[:1], between]) * 0.5 + np.concatenate([between, between[-1:]]) * 0.5

@@ -172,8 +172,7 @@ def satellite_names(systems: Sequence[str] = SYSTEMS) -> NDArray[np.str_]:
 def sidereal_angle(seconds: ArrayLike) -> Float:
     """Greenwich mean sidereal time in radians (IAU 1982, linear part), seconds after 2000-01-01 12:00 UTC."""
     turns = 0.7790572732640 + 1.00273781191135448 * np.asarray(seconds, float) / 86400.0
-    angle: Float = 2 * np.pi * np.mod(turns, 1.0)
-    return angle
+    return 2 * np.pi * np.mod(turns, 1.0)
 
 
 def satellites(start: datetime, time_ns: NDArray[np.integer], *, systems: Sequence[str] = SYSTEMS) -> Float:

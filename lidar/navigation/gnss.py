@@ -228,8 +228,7 @@ def _errors(spec: GnssSpec, sky: Sky, *, dop: Float, state: NDArray[np.int64], s
         generator(seed, spec.name, "path"), 1.0 / spec.rate_hz, tau=np.full(n, MULTIPATH_TAU_S)
     )
     local = growth * (sizes("white") * white + sizes("bias") * bias)
-    total: Float = local + sizes("blocked") * sky.blocked[:, None] * multipath
-    return total
+    return local + sizes("blocked") * sky.blocked[:, None] * multipath
 
 
 def gauss_markov(rng: np.random.Generator, dt: float, *, tau: Float) -> Float:
@@ -267,8 +266,7 @@ def _course(velocity: Float, speed: Float, *, least: Float) -> Float:
     course = np.asarray(np.mod(np.arctan2(velocity[:, 0], velocity[:, 1]), 2 * np.pi))
     known: NDArray[np.int64] = np.where(speed > least, np.arange(len(speed)), -1)
     last: NDArray[np.int64] = np.maximum.accumulate(known)
-    held: Float = np.where(last >= 0, course[np.maximum(last, 0)], 0.0)
-    return held
+    return np.where(last >= 0, course[np.maximum(last, 0)], 0.0)
 
 
 def gnss_columns(fixes: Fixes) -> dict[str, NDArray[Any]]:

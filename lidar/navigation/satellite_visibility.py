@@ -78,7 +78,7 @@ def ecef(lon_deg: ArrayLike, lat_deg: ArrayLike, *, h: ArrayLike) -> Float:
     lon, lat = np.radians(np.asarray(lon_deg, float)), np.radians(np.asarray(lat_deg, float))
     n = A / np.sqrt(1 - E2 * np.sin(lat) ** 2)
     h = np.asarray(h, float)
-    out: Float = np.stack(
+    return np.stack(
         [
             (n + h) * np.cos(lat) * np.cos(lon),
             (n + h) * np.cos(lat) * np.sin(lon),
@@ -86,7 +86,6 @@ def ecef(lon_deg: ArrayLike, lat_deg: ArrayLike, *, h: ArrayLike) -> Float:
         ],
         axis=-1,
     )
-    return out
 
 
 def enu_axes(lon_deg: ArrayLike, lat_deg: ArrayLike) -> Float:
@@ -94,8 +93,7 @@ def enu_axes(lon_deg: ArrayLike, lat_deg: ArrayLike) -> Float:
     lon, lat = np.radians(np.asarray(lon_deg, float)), np.radians(np.asarray(lat_deg, float))
     cl, sl, cp, sp = np.cos(lon), np.sin(lon), np.cos(lat), np.sin(lat)
     rows = [[-sl, cl, np.zeros_like(cl)], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]]
-    out: Float = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    return out
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def look_up(
@@ -116,10 +114,9 @@ def look_up(
 def grid_directions(azimuth: Float, elevation: Float, *, convergence: Float) -> Float:
     """Unit vectors (..., 3) in scene axes of true azimuths and elevations; convergence as of `Frame`."""
     grid, elevation = np.broadcast_arrays(azimuth - convergence, elevation)
-    out: Float = np.stack(
+    return np.stack(
         [np.sin(grid) * np.cos(elevation), np.cos(grid) * np.cos(elevation), np.sin(elevation)], axis=-1
     )
-    return out
 
 
 def open_sky(

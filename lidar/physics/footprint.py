@@ -20,8 +20,7 @@ def ring_energy(rings: int, *, waist: float = 1.0) -> Float:
     """
     edge = (np.arange(rings) + 0.5) / (rings - 0.5)
     inside = 1 - np.exp(-2 * (edge / waist) ** 2)
-    energy: Float = np.diff(inside, prepend=0.0)
-    return energy
+    return np.diff(inside, prepend=0.0)
 
 
 @functools.cache

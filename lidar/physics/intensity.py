@@ -32,5 +32,4 @@ def apparent_of_code(code: NDArray[np.floating], *, diffuse_code: float = 100.0)
     """Apparent reflectances of codes: the inverse of `reflectivity_code`."""
     above = (np.asarray(code, np.float64) - diffuse_code) / (255.0 - diffuse_code)
     bright = BRIGHTEST ** np.clip(above, 0.0, 1.0)
-    apparent: Float = np.where(above > 0, bright, np.clip(code, 0, diffuse_code) / diffuse_code)
-    return apparent
+    return np.where(above > 0, bright, np.clip(code, 0, diffuse_code) / diffuse_code)

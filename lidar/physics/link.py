@@ -45,10 +45,7 @@ def apparent_of(
 
     The inverse of `amplitude` in clear air, as instruments assume.
     """
-    reflectance: Float = (
-        np.asarray(received) * reference_reflectance * (np.asarray(distance) / reference_range) ** 2
-    )
-    return reflectance
+    return np.asarray(received) * reference_reflectance * (np.asarray(distance) / reference_range) ** 2
 
 
 def daylight_noise(noise_ratio: float, lux: float) -> float:

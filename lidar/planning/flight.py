@@ -108,8 +108,7 @@ def survey_lines(area: Any, *, spacing: float, heading_deg: float = 90.0) -> Flo
     west, east, middle, back = _strips(area, spacing, heading_deg=heading_deg)
     ends = np.stack([np.column_stack([west, middle]), np.column_stack([east, middle])], axis=1)
     ends[1::2] = ends[1::2, ::-1]
-    lines: Float = ends @ back
-    return lines
+    return ends @ back
 
 
 def times_on_lines(trajectory: Trajectory, lines: Float, *, beside: float) -> NDArray[np.int64]:
@@ -151,5 +150,4 @@ def _turn(x: float, y: float, *, spacing: float, radius: float, way: float) -> F
 
 def _arc(radius: float, first: float, *, last: float, centre: Sequence[float]) -> Float:
     angle = np.linspace(first, last, max(math.ceil(abs(last - first) / _ARC_STEP), 2) + 1)
-    arc: Float = np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return arc
+    return np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)

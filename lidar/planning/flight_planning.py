@@ -147,8 +147,7 @@ class _Below:
         world = self._load(x, y)
         origin = np.column_stack([x, y, np.full(len(x), _HIGH)])
         hits = world.caster.cast(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))
-        height: Float = _HIGH - hits.range
-        return height
+        return _HIGH - hits.range
 
     def ground(self, x: Float, y: Float) -> Float:
         """Height (n,) of the ground below buildings and trees; the mean of the others where there is none."""

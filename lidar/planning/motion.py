@@ -289,8 +289,7 @@ def _fastest(s: Float, limit: Float, *, up: float, down: float, rest: tuple[bool
             square[end] = 0.0
     ahead = np.minimum.accumulate(square - 2 * up * s) + 2 * up * s
     back = np.minimum.accumulate((ahead + 2 * down * s)[::-1])[::-1] - 2 * down * s
-    speed: Float = np.sqrt(np.maximum(back, 0.0))
-    return speed
+    return np.sqrt(np.maximum(back, 0.0))
 
 
 def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:

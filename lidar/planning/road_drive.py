@@ -79,8 +79,7 @@ def ground_footprints(scene: Scene) -> NDArray[np.object_]:
         return np.empty(0, object)
     layer = scene.features("buildings")
     low = np.asarray(layer.columns["min_height"], float)
-    standing: NDArray[np.object_] = layer.geometry[low < 2.5]
-    return standing
+    return layer.geometry[low < 2.5]
 
 
 def road_surface(scene: Scene) -> Surface:
@@ -97,8 +96,7 @@ def road_surface(scene: Scene) -> Surface:
         origins = np.column_stack([x, y, z + _SEARCH_M])
         hits = world.caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape), far=2 * _SEARCH_M)
         on_road = np.isfinite(hits.range) & np.isin(world.lookup(hits).klass, _DRIVEN)
-        found: Float = np.where(on_road, z + _SEARCH_M - np.where(on_road, hits.range, 0.0), z)
-        return found
+        return np.where(on_road, z + _SEARCH_M - np.where(on_road, hits.range, 0.0), z)
 
     return surface
 

@@ -113,8 +113,7 @@ def _braked(s: Float, limit: Float, *, vehicle: Vehicle) -> Float:
     """Speed limits (n,) at distances (n,), lowered for comfortable braking before lower ones."""
     ramp = 2 * _COMFORT * vehicle.deceleration * s
     square = np.minimum.accumulate((limit**2 + ramp)[::-1])[::-1] - ramp
-    braked: Float = np.sqrt(np.maximum(square, 0.0))
-    return braked
+    return np.sqrt(np.maximum(square, 0.0))
 
 
 def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tuple[bool, bool]) -> _Knots:

@@ -181,8 +181,7 @@ def _fisheye_distort(points: Float, k: tuple[float, ...]) -> Float:
     radius, _ = _fisheye_radius(theta, k)
     seen = (theta < _fisheye_limit(k)) & ((flat > 0) | (points[:, 2] > 0))
     factor = np.where(seen, radius / np.where(flat > 0, flat, 1.0), np.nan)
-    distorted: Float = points[:, :2] * factor[:, None]
-    return distorted
+    return points[:, :2] * factor[:, None]
 
 
 def _fisheye_rays(distorted: Float, k: tuple[float, ...]) -> Float:

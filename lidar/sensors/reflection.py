@@ -31,8 +31,7 @@ def glossy_codes() -> tuple[int, int]:
 @functools.lru_cache(maxsize=8)
 def _factors(low: int, high: int, *, spread: float, seed: int) -> Float:
     """Log-normal factors of the reflectance of features ``low`` to ``high``."""
-    factors: Float = np.exp(spread * normal_of(np.arange(low, high + 1), seed))
-    return factors
+    return np.exp(spread * normal_of(np.arange(low, high + 1), seed))
 
 
 class ReflectionTables(NamedTuple):
@@ -160,8 +159,7 @@ def _columns(n: int) -> Echoes:
 
 def _face_row(faces: Faces, hits: Hits, *, ray: NDArray[np.int32]) -> NDArray[np.int64]:
     """Row of ``faces.packed`` of each ray's hit."""
-    row: NDArray[np.int64] = hits.face[ray] + faces.start[hits.instance[ray]]
-    return row
+    return hits.face[ray] + faces.start[hits.instance[ray]]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -216,5 +216,4 @@ def _moving(world: World) -> bool:
 def _ray_time(sensor: Sensor, frame: int, *, pulses: Firings) -> NDArray[np.float32]:
     """Ray times (n,) of the pulses, 0 to 1 over `Sensor.window_ns`."""
     start, stop = sensor.window_ns(frame)
-    share: NDArray[np.float32] = ((pulses.time_ns - start) / (stop - start)).astype(np.float32)
-    return share
+    return ((pulses.time_ns - start) / (stop - start)).astype(np.float32)

@@ -150,8 +150,7 @@ class _RepeatedNoise:
         sweep = self._sweep
         rng = generator(sweep.seed, sweep.sensor.name, sweep.frame, purpose, "altered")
         known = self._known[purpose][cast("TracedEchoes", echoes).source]
-        drawn: Float = np.where(np.isnan(known), rng.standard_normal(len(echoes)), known)
-        return drawn
+        return np.where(np.isnan(known), rng.standard_normal(len(echoes)), known)
 
 
 def cloud_truth(altered: Altered, *, start_ns: int) -> dict[str, NDArray[Any]]:

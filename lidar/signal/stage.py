@@ -32,8 +32,7 @@ def parameter(
     among     : allowed words of a text; any if empty
     """
     bounds = {"meaning": meaning, "low": low, "high": high, "among": among}
-    declared: T = field(default=default, metadata=bounds)
-    return declared
+    return field(default=default, metadata=bounds)
 
 
 @dataclass(frozen=True)

@@ -227,8 +227,7 @@ def _places(lanes: _Lanes, rows: Ints, *, metres: float, rng: np.random.Generato
     length = shapely.length(lanes.line[rows])
     chosen = rng.choice(rows, size=2 + int(metres / 50), p=length / length.sum())
     away = np.cumsum(shapely.distance(lanes.line[chosen[1:]], lanes.line[chosen[:-1]]))
-    out: Ints = chosen[: 2 + int(np.searchsorted(away, metres))]
-    return out
+    return chosen[: 2 + int(np.searchsorted(away, metres))]
 
 
 def _ego(lanes: _Lanes, path: VehiclePath, *, vehicle: Vehicle, under_way: bool) -> str:

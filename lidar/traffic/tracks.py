@@ -202,16 +202,14 @@ def poses_on_ground(
 
 def _rate(values: Float) -> Float:
     """Change of values at knots `STEP_S` apart, per second."""
-    rate: Float = np.gradient(values, STEP_S) if len(values) > 1 else np.zeros(len(values))
-    return rate
+    return np.gradient(values, STEP_S) if len(values) > 1 else np.zeros(len(values))
 
 
 def _course(middle: Float, yaw: Float) -> Float:
     """Direction of motion (n,) in radians; the heading of the body where it stands."""
     d = np.gradient(middle, axis=0) if len(middle) > 1 else np.zeros_like(middle)
     moves = np.hypot(*d.T) > 0.02
-    course: Float = np.where(moves, np.arctan2(d[:, 1], d[:, 0]), yaw)
-    return course
+    return np.where(moves, np.arctan2(d[:, 1], d[:, 0]), yaw)
 
 
 def _smoothed(values: Float, travelled: Float) -> Float:

@@ -149,8 +149,7 @@ def actor_shapes(actors: Actors) -> list[Mesh]:
 def poses_of(actors: Actors, rows: NDArray[np.int64], *, at: States) -> NDArray[np.int32]:
     """Bodies (k,) of actors in their states: pedestrians and riders have the pose of their stride."""
     step = at.travelled / actors.stride[rows] * actors.poses[rows]
-    shape: NDArray[np.int32] = actors.shape[rows] + step.astype(np.int32) % actors.poses[rows]
-    return shape
+    return actors.shape[rows] + step.astype(np.int32) % actors.poses[rows]
 
 
 def actor_transforms(
