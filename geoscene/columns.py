@@ -1,28 +1,40 @@
-"""Tables: frozen dataclasses whose fields are columns of one length."""
+"""Tables: frozen dataclasses whose arrays are columns of one length."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """A table; each field of a subclass is a column."""
+    """A table; each array of a subclass is a column, other fields hold for all rows."""
 
     def __len__(self) -> int:
         """Number of rows."""
-        return len(getattr(self, fields(self)[0].name))
+        return len(next(iter(self.columns().values())))
 
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.integer[Any]] | int) -> Self:
-        """The chosen rows, in the given order."""
-        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns by name."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: column for name, column in values.items() if isinstance(column, np.ndarray)}
+
+    def take(self, rows: ArrayLike | slice) -> Self:
+        """The chosen rows, in the given order; those of a slice are views."""
+        index = rows if isinstance(rows, slice) else np.asarray(rows)
+        return replace(self, **{name: column[index] for name, column in self.columns().items()})
+
+    def where(self, keep: NDArray[np.bool_]) -> Self:
+        """The rows at which a mask is true; the same object if that is all."""
+        return self if keep.all() else self.take(keep)
 
     @classmethod
     def concatenate(cls, tables: Sequence[Self]) -> Self:
-        """All rows of one or more tables, in order."""
-        return cls(*(np.concatenate([getattr(table, f.name) for table in tables]) for f in fields(cls)))
+        """All rows of one or more tables, in order; fields that are not columns are the first table's."""
+        names = tables[0].columns()
+        joined = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
+        return replace(tables[0], **joined)

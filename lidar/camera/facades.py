@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import math
 import weakref
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from geoscene.columns import Columns
 from geoscene.mesh import WALL
 from geoscene.typing import Float
 from lidar.camera.texture import covered, hashed, pulses, span
@@ -21,7 +22,7 @@ from lidar.world.world import World
 
 
 @dataclass(frozen=True, slots=True)
-class Facades:
+class Facades(Columns):
     """Flat walls of buildings, and the wall of each face.
 
     wall    : (m,) int32 per face, row of its wall below, -1 for other faces
@@ -220,8 +221,4 @@ def _concatenated(parts: list[Facades], numbers: list[NDArray[np.int32]]) -> Fac
         wall[number] = np.where(part.wall >= 0, part.wall + np.int32(first), -1)
         first += len(part.style)
     none = Facades(wall, np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 10)))
-    tangent, along, height, style = (
-        np.concatenate([getattr(p, name) for p in (none, *parts)])
-        for name in ("tangent", "along", "height", "style")
-    )
-    return Facades(wall, tangent, along, height, style)
+    return replace(Facades.concatenate([none, *parts]), wall=wall)

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 
@@ -20,7 +21,7 @@ At a yaw rate of 1 rad/s the chord deviates from the arc by (2e-4)^2 / 8 = 5e-9 
 
 
 @dataclass(frozen=True, slots=True)
-class Poses:
+class Poses(Columns):
     """Poses of a body in the scene; a point b of the body is at position + scale * (rotation @ b).
 
     position : (n, 3) float64, scene metres
@@ -32,15 +33,6 @@ class Poses:
     position: Float
     rotation: Float
     scale: Float
-
-    def __len__(self) -> int:
-        """Number of poses."""
-        return len(self.position)
-
-    def take(self, index: ArrayLike) -> Poses:
-        """The poses at row numbers."""
-        k = np.asarray(index)
-        return Poses(self.position[k], self.rotation[k], self.scale[k])
 
     def mounted(self, translation: ArrayLike, rotation: ArrayLike) -> Poses:
         """Poses of a sensor mounted on the body.
@@ -70,7 +62,7 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Trajectory(Columns):
     """Poses of a vehicle at increasing times, interpolated linearly in position and by slerp in rotation.
 
     time_ns  : (n,) int64, nanoseconds since the drive's start
@@ -103,14 +95,7 @@ class Trajectory:
         if time_ns >= self.time_ns[-1]:
             return self
         n = int(np.searchsorted(self.time_ns, time_ns, side="right"))
-        keep = slice(max(n, 2))
-        return Trajectory(
-            self.time_ns[keep],
-            self.position[keep],
-            self.quat_xyzw[keep],
-            self.velocity[keep],
-            self.scale[keep],
-        )
+        return self.take(slice(max(n, 2)))
 
     def at(self, time_ns: ArrayLike) -> Poses:
         """Poses at times (k,) in nanoseconds, clamped to the first and last pose."""

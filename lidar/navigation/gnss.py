@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import InputError
@@ -71,7 +72,7 @@ _LADDER = {  # by mode, best first: state, minimum satellites (of one system), m
 
 
 @dataclass(frozen=True, slots=True)
-class Fixes:
+class Fixes(Columns):
     """Measurements of a receiver and ground truth, one row per epoch; measurements without a fix are NaN.
 
     time_ns   : (n,) int64, since the drive's start
@@ -102,10 +103,6 @@ class Fixes:
     true_velocity: Float
     used: NDArray[np.bool_]
     names: NDArray[np.str_]
-
-    def __len__(self) -> int:
-        """Number of epochs."""
-        return len(self.time_ns)
 
 
 def epochs(spec: GnssSpec, duration_ns: int) -> NDArray[np.int64]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.raycast.memory import inlined
 
@@ -19,7 +20,7 @@ _FAINT = 1e-3  # share of the brightest surface's power below which a surface is
 
 
 @dataclass(frozen=True, slots=True)
-class Echoes:
+class Echoes(Columns):
     """Surfaces or echoes, one row each, sorted by pulse.
 
     pulse    : (m,) int32, row of the pulse
@@ -39,18 +40,6 @@ class Echoes:
     cosine: Float
     true_range: Float
     axis: NDArray[np.bool_]
-
-    def __len__(self) -> int:
-        """Number of rows."""
-        return len(self.pulse)
-
-    def take(self, rows: NDArray[Any] | slice) -> Self:
-        """Selected rows; those of a slice are views."""
-        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def where(self, keep: NDArray[np.bool_]) -> Self:
-        """The rows at which a mask is true; the same object if that is all."""
-        return self if keep.all() else self.take(keep)
 
 
 class Origin(IntEnum):
@@ -79,9 +68,8 @@ class TracedEchoes(Echoes):
 
 def traced(echoes: Echoes, origin: Origin, *, source: NDArray[np.integer]) -> TracedEchoes:
     """Echoes with an origin and their sources (m,)."""
-    columns: list[Any] = [getattr(echoes, f.name) for f in fields(Echoes)]
-    columns += [np.full(len(echoes), origin, np.uint8), source.astype(np.int32)]
-    return TracedEchoes(*columns)
+    added: list[Any] = [np.full(len(echoes), origin, np.uint8), source.astype(np.int32)]
+    return TracedEchoes(*echoes.columns().values(), *added)
 
 
 EchoesT = TypeVar("EchoesT", bound=Echoes)
@@ -92,13 +80,13 @@ def joined(first: EchoesT, *others: EchoesT) -> EchoesT:
     together = (first, *(other for other in others if len(other)))
     if len(together) == 1:
         return first
-    both = type(first)(*(np.concatenate([getattr(e, f.name) for e in together]) for f in fields(first)))
+    both = type(first).concatenate(together)
     return both.take(np.lexsort((both.range, both.pulse)))
 
 
 def by_pulse(first: EchoesT, other: EchoesT) -> EchoesT:
     """All rows, sorted by pulse; no pulse may be in both."""
-    both = type(first)(*(np.concatenate([getattr(e, f.name) for e in (first, other)]) for f in fields(first)))
+    both = type(first).concatenate((first, other))
     return both.take(np.argsort(both.pulse, kind="stable"))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import BlockedError
@@ -40,7 +41,7 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class Line(Columns):
     """The line of a route, resampled evenly.
 
     xyz   : (n, 3) scene metres
@@ -58,10 +59,6 @@ class Line:
     def gap(self) -> float:
         """Mean distance between points in plan, scene metres."""
         return float(np.hypot(*np.diff(self.xyz[:, :2], axis=0).T).mean())
-
-    def take(self, keep: slice) -> Line:
-        """Chosen rows."""
-        return Line(self.xyz[keep], self.edge[keep], self.limit[keep], self.free[keep], self.turn[keep])
 
 
 def body_outlines(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene import polylines
+from geoscene.columns import Columns
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import BlockedError, RouteError
@@ -48,7 +49,7 @@ _WHEEL = 0.95  # share of the maximum curvature of a line, a margin for feedback
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class Path(Columns):
     """The path of the rear axle, with a row every few decimetres.
 
     s         : (n,) true metres driven from the start, along the slope
@@ -80,18 +81,10 @@ class Path:
     edge: NDArray[np.int32]
     offset: Float
 
-    def __len__(self) -> int:
-        """Number of rows."""
-        return len(self.s)
-
     @property
     def length(self) -> float:
         """True metres driven."""
         return float(self.s[-1])
-
-    def take(self, keep: NDArray[Any] | slice) -> Path:
-        """Chosen rows."""
-        return Path(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
 def plan_path(
@@ -154,7 +147,7 @@ def _resampled(route: Route, spacing: float) -> Line:
         turn[-1] = last < len(route.line)
         new = polylines.points_at(xyz, at, along=s)
         parts.append(Line(new, route.edge[index], route.limit[index], route.free[index], turn))
-    return Line(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Line)))
+    return Line.concatenate(parts)
 
 
 def _shortened(line: Line, vehicle: Vehicle) -> Line:
@@ -254,7 +247,7 @@ def _joined(legs: list[Track], lines: list[Line], *, setting: Setting, ground: S
                 offset=(d[:, 1] * np.cos(heading) - d[:, 0] * np.sin(heading)) / scale,
             )
         )
-    whole = Path(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Path)))
+    whole = Path.concatenate(parts)
     # headings of consecutive legs may differ by whole turns
     turns = np.concatenate([[0.0], np.cumsum(np.round(np.diff(whole.heading) / (2 * np.pi)) * 2 * np.pi)])
     return replace(whole, heading=whole.heading - turns)

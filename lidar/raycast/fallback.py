@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import BackendError
 from lidar.raycast.columns import Rays
@@ -25,7 +26,7 @@ _GRAZING = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class _Soup:
+class _Soup(Columns):
     """Triangles relative to an origin: corners (m, 3, 3), and their face, instance and mask (m,)."""
 
     corners: Float
@@ -33,19 +34,10 @@ class _Soup:
     instance: NDArray[np.int32]
     mask: NDArray[np.uint32]
 
-    def take(self, rows: NDArray[np.bool_]) -> _Soup:
-        return _Soup(self.corners[rows], self.face[rows], self.instance[rows], self.mask[rows])
-
 
 def _joined(soups: Sequence[_Soup]) -> _Soup:
     none = _Soup(np.empty((0, 3, 3)), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.uint32))
-    every = [none, *soups]
-    return _Soup(
-        np.concatenate([s.corners for s in every]),
-        np.concatenate([s.face for s in every]),
-        np.concatenate([s.instance for s in every]),
-        np.concatenate([s.mask for s in every]),
-    )
+    return _Soup.concatenate([none, *soups])
 
 
 def _mesh(parts: dict[int, Geometry]) -> _Soup:
@@ -158,11 +150,7 @@ class EmbreexScene:
         """Remove the geometry of a number."""
         del self.parts[number]
 
-    def place(
-        self,
-        groups: Sequence[Instances],
-        scenes: Sequence[Sequence[Any]],
-    ) -> None:
+    def place(self, groups: Sequence[Instances], scenes: Sequence[Sequence[Any]]) -> None:
         """Replace all instances; ``scenes`` holds the shapes of each group."""
         self._groups = list(zip(groups, scenes, strict=True))
 

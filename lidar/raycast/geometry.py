@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 
@@ -97,7 +98,7 @@ def split(vertices: Float, faces: NDArray[np.int32], *, mask: ArrayLike | None =
 
 
 @dataclass(frozen=True, slots=True)
-class Instances:
+class Instances(Columns):
     """Instances of other casters' meshes, static or moving.
 
     shapes    : the instanced casters (without instances of their own)
@@ -130,7 +131,3 @@ class Instances:
             raise InputError(f"{len(self.mask)} masks for {k} instances")
         if any(len(shape.instances) for shape in self.shapes):
             raise InputError("a shape of instances cannot have instances itself")
-
-    def __len__(self) -> int:
-        """Number of instances."""
-        return len(self.shape)

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
+
 
 @dataclass(frozen=True, slots=True)
-class Hits:
+class Hits(Columns):
     """The first surface along each ray.
 
     range    : (n,) float64, ray parameter of the hit (metres for unit directions; true metres for directions
@@ -27,7 +29,3 @@ class Hits:
     instance: NDArray[np.int32]
     cosine: NDArray[np.float32]
     normal: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        """Number of rays."""
-        return len(self.range)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from lidar.errors import LidarError
 
 
 @dataclass(frozen=True, slots=True)
-class Cloud:
+class Cloud(Columns):
     """The returns of one frame, in the order of their pulses.
 
     start_ns : time of the frame's first firing, nanoseconds since the drive's start
@@ -46,17 +47,9 @@ class Cloud:
 
     def __post_init__(self) -> None:
         """Check that all columns have the same length."""
-        for f in fields(self)[1:]:
-            if (rows := len(getattr(self, f.name))) != len(self.xyz):
-                raise LidarError(f"cloud column {f.name} has {rows} rows for {len(self.xyz)}")
-
-    def __len__(self) -> int:
-        """Number of returns."""
-        return len(self.xyz)
-
-    def where(self, keep: NDArray[np.bool_]) -> Self:
-        """The returns at which a mask (n,) is true."""
-        return type(self)(self.start_ns, *(getattr(self, f.name)[keep] for f in fields(self)[1:]))
+        for name, column in self.columns().items():
+            if len(column) != len(self.xyz):
+                raise LidarError(f"cloud column {name} has {len(column)} rows for {len(self.xyz)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import KNOT_NS, Poses, Trajectory
@@ -18,8 +19,8 @@ from lidar.rig.patterns.beams import Firings
 
 
 @dataclass(frozen=True, slots=True)
-class Beam:
-    """Rays that sample the cross-section of a pulse.
+class Beam(Columns):
+    """Rays that sample the cross-section of a pulse, one row per ray.
 
     spread : (rays, 2) radians, to the left and up, off the beam's axis, which comes first
     size   : (rays, 2) metres, to the left and up, where the rays start
@@ -29,10 +30,6 @@ class Beam:
     spread: Float
     size: Float
     share: Float
-
-    def __len__(self) -> int:
-        """Rays per pulse."""
-        return len(self.share)
 
 
 def beam_of(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -116,7 +115,7 @@ class EchoCollector:
             self._optics.faces,
             self._optics.tables,
             self._separation,
-            tuple(getattr(echoes, f.name) for f in fields(Echoes)),
+            tuple(echoes.columns().values()),
             self._glossy[start : start + n],
             glossy,
         )
@@ -142,11 +141,9 @@ class EchoCollector:
         """Grow the columns so that ``rows`` more echoes fit."""
         if self._count + rows <= len(self._glossy):
             return
-        old, flags, size = self._columns, self._glossy, 2 * len(self._glossy) + rows
-        self._columns, self._glossy = _columns(size), np.empty(size, np.bool_)
-        for name in (f.name for f in fields(Echoes)):
-            getattr(self._columns, name)[: self._count] = getattr(old, name)[: self._count]
-        self._glossy[: self._count] = flags[: self._count]
+        more = len(self._glossy) + rows
+        self._columns = Echoes.concatenate([self._columns, _columns(more)])
+        self._glossy = np.append(self._glossy, np.empty(more, np.bool_))
 
 
 def _columns(n: int) -> Echoes:

@@ -121,7 +121,7 @@ def _beyond(
         is_glossy = (hits.face >= 0) & np.isin(material, (glass, water)) & (travelled + hits.range < far)
         if not is_glossy.any():
             break
-        hits, pulse, power = _rows(hits, is_glossy), pulse[is_glossy], power[is_glossy]
+        hits, pulse, power = hits.take(is_glossy), pulse[is_glossy], power[is_glossy]
         start, direction, material = start[is_glossy], direction[is_glossy], material[is_glossy]
         travelled, time = travelled[is_glossy], None if time is None else time[is_glossy]
         cosine = np.minimum(np.abs(hits.cosine).astype(np.float64), 1.0)
@@ -173,9 +173,3 @@ def _along(
         distance,
         np.zeros(len(hit), bool),
     )
-
-
-def _rows(hits: Hits, rows: NDArray[np.bool_]) -> Hits:
-    """The hits at which a mask is true."""
-    normal = hits.normal[rows] if len(hits.normal) else hits.normal
-    return Hits(hits.range[rows], hits.face[rows], hits.instance[rows], hits.cosine[rows], normal)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any, cast
@@ -48,9 +48,12 @@ class Altered:
 def unaltered(cloud: Cloud) -> Altered:
     """A cloud that no stage has changed."""
     n = len(cloud)
-    columns: list[Any] = [getattr(cloud, f.name) for f in fields(Cloud)]
-    columns += [np.full(n, Origin.SURFACE, np.uint8), np.arange(n, dtype=np.int32), np.full(n, -1, np.int32)]
-    return Altered(TracedCloud(*columns), cloud)
+    added: list[Any] = [
+        np.full(n, Origin.SURFACE, np.uint8),
+        np.arange(n, dtype=np.int32),
+        np.full(n, -1, np.int32),
+    ]
+    return Altered(TracedCloud(cloud.start_ns, *cloud.columns().values(), *added), cloud)
 
 
 def altered_sweep(sweep: Sweep, stages: Stages) -> Altered:
@@ -108,9 +111,8 @@ def linked(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> Traced
         at = np.minimum(np.searchsorted(first.pulse[lost], echoes.pulse), len(lost) - 1)
         hides = (source < 0) & (first.pulse[lost[at]] == echoes.pulse)
         hidden[hides] = lost[at[hides]]
-    columns: list[Any] = [getattr(cloud, f.name) for f in fields(Cloud)]
-    columns += [echoes.origin, source, hidden]
-    return TracedCloud(*columns)
+    added: list[Any] = [echoes.origin, source, hidden]
+    return TracedCloud(cloud.start_ns, *cloud.columns().values(), *added)
 
 
 def altered_cloud(cloud: TracedCloud, stages: Stages, *, sensor: str, frame: int | str) -> TracedCloud:
@@ -163,7 +165,7 @@ def cloud_truth(altered: Altered, *, start_ns: int) -> dict[str, NDArray[Any]]:
     cloud, original = altered.cloud, altered.original
     kept = cloud.source[(cloud.source >= 0) & (cloud.origin != Origin.MOVED)]
     removed = np.setdiff1d(np.arange(len(original), dtype=np.int32), kept)
-    removed_columns = {f.name: getattr(original, f.name)[removed] for f in fields(Cloud)[1:]}
+    removed_columns = original.take(removed).columns()
     time_ns = original.start_ns - start_ns + removed_columns["time_ns"].astype(np.int64)
     removed_columns["time_ns"] = time_ns.astype(np.int64)
     return {

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.camera.render import Frame
 from lidar.errors import InputError
@@ -65,7 +66,7 @@ def _fault(declared: Any, value: Any) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Pulses:
+class Pulses(Columns):
     """The pulses of one frame in the order they are fired.
 
     sensor     : the scanner
@@ -88,10 +89,6 @@ class Pulses:
     channel: NDArray[np.uint16]
     power: Float
     extinction: float = 0.0
-
-    def __len__(self) -> int:
-        """Number of pulses."""
-        return len(self.time_ns)
 
     def received(self, echoes: Echoes) -> Float:
         """Power (m,) of echoes over the detection threshold."""

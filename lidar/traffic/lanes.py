@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene import polylines
+from geoscene.columns import Columns
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
 from geoscene.roadgraph.routing import turn_states
@@ -149,7 +150,7 @@ def lane_shift(lanes: Lanes, edge: int, *, lane: int, width: float, kerb: bool =
 
 
 @dataclass(frozen=True, slots=True)
-class ActorPath:
+class ActorPath(Columns):
     """The path of a road user's centre, with stations every `STEP` true metres.
 
     xyz       : (n, 3) scene metres
@@ -168,15 +169,6 @@ class ActorPath:
     lane: Ints
     limit: Float
     scale: float
-
-    def __len__(self) -> int:
-        """Number of stations."""
-        return len(self.xyz)
-
-    def part(self, first: int, last: int) -> ActorPath:
-        """The stations from the first up to, not including, the last."""
-        columns = {f.name: getattr(self, f.name)[first:last] for f in fields(self) if f.name != "scale"}
-        return replace(self, **columns)
 
 
 def random_lanes(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from geoscene import polylines
+from geoscene.columns import Columns
 from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.random_streams import generator
@@ -32,7 +33,7 @@ _AISLE = 6.0
 
 
 @dataclass(frozen=True, slots=True)
-class ParkingSpaces:
+class ParkingSpaces(Columns):
     """Parking spaces.
 
     xy      : (n, 2) scene metres, the middle of the box
@@ -43,13 +44,6 @@ class ParkingSpaces:
     xy: Float
     heading: Float
     hint: Float
-
-
-def concatenated(parts: Sequence[ParkingSpaces]) -> ParkingSpaces:
-    """Several tables as one."""
-    return ParkingSpaces(
-        *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ParkingSpaces))
-    )
 
 
 def kerb_spaces(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: float) -> ParkingSpaces:

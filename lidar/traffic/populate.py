@@ -19,7 +19,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import Lanes, lane_shift, lanes_of
-from lidar.traffic.parked import CARS, concatenated, kerb_spaces, lot_spaces, parked_actors
+from lidar.traffic.parked import CARS, ParkingSpaces, kerb_spaces, lot_spaces, parked_actors
 from lidar.traffic.pedestrians import pedestrian_trips, sidewalks_around
 from lidar.traffic.simulation import simulate_trips
 from lidar.traffic.surroundings import Surroundings, ego_line, surroundings_of
@@ -220,7 +220,7 @@ def parked_vehicles(
         np.empty(0, object) if structures is None else shapely.buffer(structures.geometry, 0.5),
     ]
     trees = [shapely.STRtree(part) for part in (setup.obstacles, np.concatenate(free))]
-    spots = concatenated(
+    spots = ParkingSpaces.concatenate(
         [
             kerb_spaces(lanes, setup.area.near, seed=seed, share=share),
             lot_spaces(lots, seed=seed, share=share),

@@ -211,7 +211,7 @@ def _trip(
         complete = len(whole) - last <= shape.length / STEP + 4
         if not complete or last - begin < _MIN_STATIONS:
             continue
-        path = whole.part(first, last)
+        path = whole.take(slice(first, last))
         end = edges[-1]
         leaves = bool(lanes.exit[end] or not area.near[end])
         desired = speed_profile(path, driver, pace=pace)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.columns import Columns
 from geoscene.mesh import Mesh
 from geoscene.typing import Float
 from lidar.world.actor_shapes import Shape
@@ -20,7 +21,7 @@ _AGE = 1 << 50
 
 
 @dataclass(frozen=True, slots=True)
-class Actors:
+class Actors(Columns):
     """Actors, one row each, and the knots of their tracks.
 
     shapes  : the bodies
@@ -64,13 +65,9 @@ class Actors:
     travelled: Float
     scale: float
 
-    def __len__(self) -> int:
-        """Number of actors."""
-        return len(self.shape)
-
 
 @dataclass(frozen=True, slots=True)
-class States:
+class States(Columns):
     """Actors at one moment each.
 
     position : (k, 3) scene metres, centre of the bounding box, on the ground
@@ -177,7 +174,7 @@ def actor_transforms(
     turn = rotations(at.angles) * actors.stretch[np.repeat(rows, moments), None, :]
     turn[:, :2] *= actors.scale
     transform = np.concatenate([turn, at.position[:, :, None]], axis=2).reshape(k, moments, 3, 4)
-    shape = poses_of(actors, rows, at=States(*(getattr(at, f.name)[::moments] for f in fields(States))))
+    shape = poses_of(actors, rows, at=at.take(slice(None, None, moments)))
     if region is not None:
         x, y = transform[:, 0, :2, 3].T
         reach = actors.size[rows, 0]
@@ -197,11 +194,6 @@ def joined(groups: Sequence[Actors], *, first_feature: int) -> Actors:
     for group in groups:
         shapes |= {shape.name: shape for shape in group.shapes}
     number = {name: k for k, name in enumerate(shapes)}
-    columns = {
-        name: np.concatenate([getattr(g, name) for g in groups])
-        for name in ("poses", "stride", "kind", "klass", "size", "stretch", "parked",
-                     "time_ns", "position", "angles", "velocity", "travelled")
-    }  # fmt: skip
     shape = np.concatenate(
         [
             np.array([number[s.name] for s in g.shapes], np.int32)[g.shape] if len(g) else g.shape
@@ -209,11 +201,10 @@ def joined(groups: Sequence[Actors], *, first_feature: int) -> Actors:
         ]
     )
     knots = np.concatenate([np.diff(g.first) for g in groups])
-    return Actors(
+    return replace(
+        Actors.concatenate(groups),
         shapes=tuple(shapes.values()),
         shape=shape,
         feature=(first_feature + np.arange(len(shape))).astype(np.int32),
         first=np.concatenate([[0], np.cumsum(knots)]).astype(np.int64),
-        scale=groups[0].scale,
-        **columns,
     )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
+from geoscene.columns import Columns
 from geoscene.mesh import Mesh
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.scene import Scene
@@ -30,7 +31,7 @@ _PARTS = 8  # part numbers per tile, one for each mask
 
 
 @dataclass(frozen=True, slots=True)
-class Surfaces:
+class Surfaces(Columns):
     """Surfaces that rays hit, one row per ray; a miss has feature -1 and zero elsewhere.
 
     feature  : (n,) int32, feature number of the scene, or of the actor
@@ -202,10 +203,10 @@ class World:
     def lookup(self, hits: Hits) -> Surfaces:
         """Surfaces that the rays hit."""
         rows = hits.face + self._base[hits.instance]
-        found = {f.name: getattr(self._surfaces, f.name)[rows] for f in fields(Surfaces)}
+        found = self._surfaces.take(rows)
         copied = np.flatnonzero(hits.instance >= 0)
-        found["feature"][copied] = self._feature[hits.instance[copied]]
-        return Surfaces(**found)
+        found.feature[copied] = self._feature[hits.instance[copied]]
+        return found
 
     @property
     def faces(self) -> Faces:
@@ -233,12 +234,7 @@ class World:
         tables = [*(tile.surfaces for tile in self._tiles.values()), *self._copied]
         starts = np.cumsum([0, *(len(table.klass) for table in tables)])
         self._first = dict(zip(self._tiles, starts.tolist(), strict=False))
-        self._surfaces = Surfaces(
-            *(
-                np.concatenate([*(getattr(t, f.name) for t in tables), getattr(_MISS, f.name)])
-                for f in fields(Surfaces)
-            )
-        )
+        self._surfaces = Surfaces.concatenate([*tables, _MISS])
         self._packed = packed(self._surfaces, self._leaves_of(starts[len(self._tiles) :]))
         feature = self._surfaces.feature
         self._bounds = int(feature.min()), int(feature.max())

@@ -9,13 +9,14 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from geoscene.typing import Float
 
 T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True, slots=True)
-class Firings:
+class Firings(Columns):
     """The pulses of one frame in the order they are fired. Arrays may be shared between frames: do not write.
 
     time_ns   : (n,) int64, nanoseconds since the drive's start
@@ -35,10 +36,6 @@ class Firings:
     channel: NDArray[np.uint16]
     order: NDArray[np.int32]
 
-    def __len__(self) -> int:
-        """Number of pulses."""
-        return len(self.time_ns)
-
 
 class Pattern(Protocol):
     """Firing pattern of a scanner."""
@@ -56,7 +53,7 @@ class Pattern(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Blocks:
+class Blocks(Columns):
     """The firing blocks that start within one frame.
 
     first   : number of the first block, counted from the start of frame 0
@@ -69,10 +66,6 @@ class Blocks:
     phase: float
     step: float
     time_ns: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        """Number of blocks."""
-        return len(self.time_ns)
 
 
 def frame_ns(rate_hz: float) -> Fraction:
