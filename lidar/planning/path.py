@@ -45,6 +45,7 @@ _JOINT = 0.25  # metres of height between rows of a path from which a step becom
 _WHEEL_STEP = 0.2  # metres: a kerb
 _PUSH = 4.0  # metres before and behind an obstacle over which the line is shifted
 _ASTRAY = 1.5  # turning radii, maximum distance of a vehicle from its lane centre
+_FINISH = 3.0  # turning radii, maximum distance between the ends of a path and of its line off the roads
 _WHEEL = 0.95  # share of the maximum curvature of a line, a margin for feedback
 
 
@@ -211,11 +212,12 @@ def _lost(track: Track, line: Line, *, xy: Float, vehicle: Vehicle) -> NDArray[n
     """The row of the line, pushed to ``xy`` (n, 2), where the track leaves it; none if it does not."""
     if track.row[-1] < len(line.edge) - 1:
         return track.row[-1:]
-    d = track.xy - xy[track.row]
-    astray = (line.edge[track.row] >= 0) & (np.hypot(*d.T) > _ASTRAY * vehicle.turning_radius)
-    rows = track.row[astray]
-    worst = int(np.argmax(np.hypot(*d.T)))
-    return track.row[worst : worst + 1] if len(rows) else rows
+    off = np.hypot(*(track.xy - xy[track.row]).T) / vehicle.turning_radius
+    astray = (line.edge[track.row] >= 0) & (off > _ASTRAY)
+    if astray.any():
+        worst = int(np.argmax(off))
+        return track.row[worst : worst + 1]
+    return track.row[-1:] if off[-1] > _FINISH else track.row[:0]
 
 
 def _joined(legs: list[Track], lines: list[Line], *, setting: Setting, ground: Surface | None) -> Path:

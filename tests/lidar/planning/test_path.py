@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 from helpers.roadgrids import grid, road_graph
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from geoscene.frames import Frame
@@ -69,6 +69,14 @@ def crooked_lines(draw):
     return np.column_stack([xy, np.zeros(len(xy))])
 
 
+LOOP = [  # tighter than a car can turn: it leaves the line and comes out far from its end
+    (0, 0), (20, 0), (23.51033025, -1.91770215), (22.79734602, 2.01824163), (18.83737604, 2.58272167),
+    (16.22280156, -0.44448832), (17.3574503, -4.28018541), (19.62914699, -0.9878619),
+    (23.62694466, -1.12057876), (27.62474234, -1.25329563),
+]  # fmt: skip
+
+
+@example(np.column_stack([LOOP, np.zeros(len(LOOP))]), "car")
 @given(crooked_lines(), st.sampled_from(["car", "van", "robot"]))
 @settings(max_examples=60, deadline=None)
 def test_any_line_gives_a_drivable_path_or_an_error(line, name):
