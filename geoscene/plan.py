@@ -254,15 +254,7 @@ def _plan_roads(
     side, source = found_side(osm)
     if options.driving_side:
         side, source = cast("Side", options.driving_side), "option"
-    surfaces = _collect(
-        problems,
-        road_surfaces(
-            mapped,
-            graph,
-            frame=frame,
-            options=SurfaceOptions(left_hand=side == "left"),
-        ),
-    )
+    surfaces = road_surfaces(mapped, graph, frame=frame, options=SurfaceOptions(left_hand=side == "left"))
     structures = _collect(problems, read_structures(surfaces, graph, osm=osm, frame=frame, height=height))
     structures = within_extent(structures, extent)
     height = ground_below(structures, height or terrain.height) if len(structures) else height

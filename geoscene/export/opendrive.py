@@ -57,9 +57,7 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
     left_hand = scene.left_hand
     net = road_net(graph, left_hand=left_hand)
     controls: dict[int, list[tuple[float, str]]] = defaultdict(list)
-    for edge, offset, kind in zip(
-        graph.control_edge.tolist(), graph.control_offset.tolist(), graph.control_kind.tolist(), strict=True
-    ):
+    for edge, offset, kind in graph.controls:
         controls[edge].append((offset / max(float(graph.length[edge]), 1e-9), kind))
     first = len(net.roads) + 1
     junctions = {

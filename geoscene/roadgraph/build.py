@@ -10,7 +10,7 @@ import numpy as np
 
 from geoscene.frames import Frame
 from geoscene.report import Problem
-from geoscene.roadgraph.chains import Chain, Runs, find_cuts, link_chains
+from geoscene.roadgraph.chains import Chain, Runs, chains_of, link_chains
 from geoscene.roadgraph.controls import add_controls
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.restrictions import add_turns
@@ -48,13 +48,9 @@ def build_road_graph(
     streets = _read_streets(ways, problems)
     runs, node_id, lonlat = read_runs(ways, problems)
     if options.simplify:
-        kinds = {street: number for number, street in enumerate(dict.fromkeys(streets))}
-        kind = np.array([kinds[street] for street in streets], np.int64)
-        symmetric = np.array([street.symmetric for street in streets], np.bool_)
-        cut = find_cuts(runs, kind, symmetric=symmetric, nodes=len(node_id))
+        chains = chains_of(runs, streets, nodes=len(node_id))
     else:
-        cut = np.ones(len(node_id), np.bool_)
-    chains = link_chains(runs, cut)
+        chains = link_chains(runs, np.ones(len(node_id), np.bool_))
     graph, sides = _edges(chains, ways, streets=streets, places=(node_id, lonlat), frame=frame)
     graph = add_turns(graph, osm.relations, problems=problems)
     return add_controls(graph, osm.points, sides=sides, lines=(chains, ways, node_id)), problems

@@ -13,7 +13,7 @@ from geoscene.frames import Frame
 from geoscene.ground.kinds import SURFACES
 from geoscene.report import Problem
 from geoscene.roadgraph.build import read_runs
-from geoscene.roadgraph.chains import find_cuts, link_chains
+from geoscene.roadgraph.chains import chains_of
 from geoscene.roadgraph.tags import Street, drivable, read_street
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.tags import parse_length
@@ -137,14 +137,7 @@ def read_carriageways(
     kinds = [_read_kind(way) for way in ways]
     ignored: list[Problem] = []  # reported with the road graph
     runs, node_id, lonlat = read_runs(ways, ignored)
-    number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
-    cut = find_cuts(
-        runs,
-        np.array([number[kind] for kind in kinds], np.int64),
-        symmetric=np.array([kind.symmetric for kind in kinds], np.bool_),
-        nodes=len(node_id),
-    )
-    chains = link_chains(runs, cut)
+    chains = chains_of(runs, kinds, nodes=len(node_id))
     x, y = frame.from_geographic(lonlat[:, 0], lonlat[:, 1])
     xy = np.stack([x, y], axis=1)
     sizes = [len(chain.node) for chain in chains]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
@@ -35,6 +36,22 @@ class Chain:
 
     node: Ints
     way: Ints
+
+
+class Kind(Protocol):
+    """Attributes of a way; equal ones may be joined."""
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether both directions have the same attributes."""
+
+
+def chains_of(runs: Runs, kinds: Sequence[Kind], *, nodes: int) -> list[Chain]:
+    """The runs as chains from junction, dead end or change of kind (ways,) to the next."""
+    number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
+    kind = np.array([number[kind] for kind in kinds], np.int64)
+    symmetric = np.array([kind.symmetric for kind in kinds], np.bool_)
+    return link_chains(runs, find_cuts(runs, kind, symmetric=symmetric, nodes=nodes))
 
 
 def find_cuts(runs: Runs, kind: Ints, *, symmetric: Bools, nodes: int) -> Bools:

@@ -120,15 +120,14 @@ def _paint(tags: Tags) -> tuple[str, str]:
 
 def _from_ways(ways: list[Way], roads: Carriageways, *, frame: Frame) -> _Crossings:
     """Crossing ways, cut to the carriageways that they cross."""
-    lines = way_lines(ways, frame)
-    number = np.flatnonzero([line is not None for line in lines])
+    ways, lines = way_lines(ways, frame)
     bands = carriageway(roads.line, roads.width / 2)
-    way, band = shapely.STRtree(bands).query(lines[number], predicate="intersects")
-    pieces = shapely.intersection(lines[number][way], bands[band])
-    cut = [shapely.line_merge(shapely.union_all(pieces[way == k])) for k in range(len(number))]
+    way, band = shapely.STRtree(bands).query(lines, predicate="intersects")
+    pieces = shapely.intersection(lines[way], bands[band])
+    cut = [shapely.line_merge(shapely.union_all(pieces[way == k])) for k in range(len(ways))]
     parts, index = shapely.get_parts(np.array(cut, object), return_index=True)
     long = (shapely.get_type_id(parts) == shapely.GeometryType.LINESTRING) & (shapely.length(parts) > 2.0)
-    of = [ways[k] for k in number[index[long]].tolist()]
+    of = [ways[k] for k in index[long].tolist()]
     return _crossings(parts[long], of)
 
 

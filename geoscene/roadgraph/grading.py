@@ -28,10 +28,8 @@ _CLEAR = {
 
 def find_obstacles(osm: OsmData, frame: Frame) -> Obstacles:
     """Railways and waterways on the ground that bridges must clear."""
-    ways = [way for way in osm.ways if _clear(way.tags) is not None]
-    lines = way_lines(ways, frame)
-    kept = np.flatnonzero([line is not None for line in lines])
-    return Obstacles(lines[kept], np.array([_clear(ways[k].tags) for k in kept.tolist()], float))
+    ways, lines = way_lines([way for way in osm.ways if _clear(way.tags) is not None], frame)
+    return Obstacles(lines, np.array([_clear(way.tags) for way in ways], float))
 
 
 def _clear(tags: Tags) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -21,15 +21,6 @@ def _no_objects() -> NDArray[np.object_]:
 
 def _no_text() -> NDArray[np.str_]:
     return np.empty(0, np.str_)
-
-
-def rows_of(arrays: Iterable[NDArray[np.generic]]) -> NDArray[np.object_]:
-    """The arrays as a column of objects (n,), even if all have the same length."""
-    listed = list(arrays)
-    rows = np.empty(len(listed), object)
-    for k, array in enumerate(listed):
-        rows[k] = array
-    return rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +110,12 @@ class RoadGraph:
         return len(self.tail)
 
     @property
+    def controls(self) -> Iterator[tuple[int, float, str]]:
+        """Edge, offset and kind of each traffic control."""
+        columns = (self.control_edge, self.control_offset, self.control_kind)
+        return zip(*(column.tolist() for column in columns), strict=True)
+
+    @property
     def travel_time(self) -> Float:
         """Seconds (m,) that each edge takes at its speed limit."""
         return self.length / self.speed
@@ -155,7 +152,7 @@ class RoadGraph:
             turn_via=node[self.turn_via[whole]],
             turn_to=edge[self.turn_to[whole]],
             turn_kind=self.turn_kind[whole],
-            chain_edges=rows_of([edge[chain] for chain in self.chain_edges[unbroken]]),
+            chain_edges=np.fromiter((edge[chain] for chain in self.chain_edges[unbroken]), object),
             chain_kind=self.chain_kind[unbroken],
             control_edge=edge[self.control_edge[there]],
             control_offset=self.control_offset[there],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -18,38 +18,9 @@ from numpy.typing import NDArray
 from geoscene.errors import SceneFormatError
 from geoscene.files import write_atomically
 from geoscene.frames import Frame
-from geoscene.roadgraph.graph import RoadGraph, rows_of
+from geoscene.roadgraph.graph import RoadGraph
 
 _XMLNS = "http://graphml.graphdrawing.org/xmlns"
-_GRAPH_KEYS = ("crs", "simplified", "created_with")
-_NODE_KEYS = ("x", "y", "elevation", "street_count", "highway", "controls")
-_EDGE_KEYS = (
-    "osmid",
-    "highway",
-    "name",
-    "ref",
-    "oneway",
-    "reversed",
-    "length",
-    "maxspeed",
-    "speed_kph",
-    "speed_source",
-    "travel_time",
-    "lanes",
-    "lanes_ahead",
-    "lanes_source",
-    "width",
-    "width_source",
-    "layer",
-    "layer_source",
-    "bridge",
-    "tunnel",
-    "edge",
-    "twin",
-    "turns",
-    "controls",
-    "geometry",
-)
 _FLAGS = {"signals": "traffic_signals", "stop": "stop", "give_way": "give_way"}
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 
@@ -68,26 +39,34 @@ def write_graphml(graph: RoadGraph, frame: Frame, *, path: Path) -> None:
 
 
 def _document(graph: RoadGraph, frame: Frame) -> Iterator[str]:
+    tall = bool(np.any(graph.node_xyz[:, 2])) or any(bool(line[:, 2].any()) for line in graph.geometry)
+    header = {"crs": "EPSG:4326", "simplified": "True", "created_with": "geoscene"}
+    node_keys, nodes = _with_keys(_node_rows(graph, frame, tall=tall))
+    edge_keys, edges = _with_keys(_edge_rows(graph, frame, tall=tall))
     keys: dict[tuple[str, str], str] = {}
     yield "<?xml version='1.0' encoding='utf-8'?>"
     yield f'<graphml xmlns="{_XMLNS}">'
-    for domain, names in (("graph", _GRAPH_KEYS), ("node", _NODE_KEYS), ("edge", _EDGE_KEYS)):
+    for domain, names in (("graph", list(header)), ("node", node_keys), ("edge", edge_keys)):
         for name in names:
             keys[domain, name] = f"d{len(keys)}"
             yield f'<key id="{keys[domain, name]}" for="{domain}" attr.name="{name}" attr.type="string"/>'
     yield '<graph edgedefault="directed">'
-    header = {"crs": "EPSG:4326", "simplified": "True", "created_with": "geoscene"}
     yield _data("graph", header, keys=keys)
-    tall = bool(np.any(graph.node_xyz[:, 2])) or any(bool(line[:, 2].any()) for line in graph.geometry)
-    for node, row in zip(graph.node_id.tolist(), _node_rows(graph, frame, tall=tall), strict=True):
+    for node, row in zip(graph.node_id.tolist(), nodes, strict=True):
         yield f'<node id="{node}">{_data("node", row, keys=keys)}</node>'
     copies: Counter[tuple[int, int]] = Counter()
     ends = np.stack([graph.node_id[graph.tail], graph.node_id[graph.head]], axis=1)
-    for (tail, head), row in zip(ends.tolist(), _edge_rows(graph, frame, tall=tall), strict=True):
+    for (tail, head), row in zip(ends.tolist(), edges, strict=True):
         start = f'<edge source="{tail}" target="{head}" id="{copies[tail, head]}">'
         yield f"{start}{_data('edge', row, keys=keys)}</edge>"
         copies[tail, head] += 1
     yield "</graph></graphml>\n"
+
+
+def _with_keys(rows: Iterator[dict[str, str]]) -> tuple[list[str], Iterator[dict[str, str]]]:
+    """The keys of rows, and the rows."""
+    first = next(rows, None)
+    return ([], rows) if first is None else (list(first), chain([first], rows))
 
 
 def _data(domain: str, row: Mapping[str, str], *, keys: Mapping[tuple[str, str], str]) -> str:
@@ -156,13 +135,11 @@ def _lists(graph: RoadGraph) -> tuple[dict[int, list[str]], dict[int, list[str]]
         graph.turn_from.tolist(), graph.turn_to.tolist(), graph.turn_kind.tolist(), strict=True
     ):
         turns.setdefault(edge, []).append(f"{kind} {after}")
-    for chain, kind in zip(graph.chain_edges, graph.chain_kind.tolist(), strict=True):
-        edge, *others = chain.tolist()
+    for passed, kind in zip(graph.chain_edges, graph.chain_kind.tolist(), strict=True):
+        edge, *others = passed.tolist()
         turns.setdefault(edge, []).append(" ".join([kind, *map(str, others)]))
     controls: dict[int, list[str]] = {}
-    for edge, offset, kind in zip(
-        graph.control_edge.tolist(), graph.control_offset.tolist(), graph.control_kind.tolist(), strict=True
-    ):
+    for edge, offset, kind in graph.controls:
         controls.setdefault(edge, []).append(f"{offset:.4f} {kind}")
     return turns, controls
 
@@ -273,7 +250,7 @@ def _graph(nodes: dict[int, _Row], edges: list[tuple[int, int, _Row]], *, frame:
         turn_via=np.array([turn[1] for turn in turns], np.int32),
         turn_to=np.array([turn[2] for turn in turns], np.int32),
         turn_kind=np.array([turn[3] for turn in turns], np.str_),
-        chain_edges=rows_of(chain for chain, _ in chains),
+        chain_edges=np.fromiter((chain for chain, _ in chains), object),
         chain_kind=np.array([kind for _, kind in chains], np.str_),
         control_edge=np.array([control[0] for control in controls], np.int32),
         control_offset=np.array([control[1] for control in controls], float),
@@ -286,13 +263,10 @@ def _way_ids(osmid: str) -> str:
 
 
 def _lines(rows: list[_Row], frame: Frame) -> NDArray[np.object_]:
-    lines = np.empty(len(rows), object)
     if not rows:
-        return lines
+        return np.empty(0, object)
     shapes = shapely.from_wkt([row["geometry"] for row in rows])
     points, index = shapely.get_coordinates(shapes, include_z=True, return_index=True)
     x, y = frame.from_geographic(points[:, 0], points[:, 1])
     xyz = np.stack([x, y, np.nan_to_num(points[:, 2])], axis=1)
-    for k, line in enumerate(np.split(xyz, np.flatnonzero(np.diff(index)) + 1)):
-        lines[k] = line
-    return lines
+    return np.fromiter(np.split(xyz, np.flatnonzero(np.diff(index)) + 1), object)

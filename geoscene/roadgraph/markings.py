@@ -138,9 +138,7 @@ def stop_rows(
 
     strips = _strips(graph, crossings)
     lines: dict[tuple[int, int], tuple[int, float, str]] = {}
-    for edge, offset, kind in zip(
-        graph.control_edge.tolist(), graph.control_offset.tolist(), graph.control_kind.tolist(), strict=True
-    ):
+    for edge, offset, kind in graph.controls:
         first = str(graph.osm_id[edge]).split(";")[0]
         if kind == "crossing" or graph.width[edge] < 4 or not paved.get(first, False):
             continue

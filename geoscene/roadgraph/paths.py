@@ -38,12 +38,11 @@ PRIORITY = {"square": 105.0, "yard": 106.0, "path": 110.0, "footway": 114.0, "cy
 """Priorities of surfaces, higher on top: land cover is below 100, carriageways are between 130 and 150."""
 
 
-def way_lines(ways: Sequence[Way], frame: Frame) -> NDArray[np.object_]:
-    """Ways as shapely LineStrings in scene metres; None where fewer than two points are known."""
-    lines = np.empty(len(ways), object)
+def way_lines(ways: Sequence[Way], frame: Frame) -> tuple[list[Way], NDArray[np.object_]]:
+    """Ways of which two or more points are known, and their shapely LineStrings in scene metres."""
     sizes = np.array([len(way.lonlat) for way in ways], np.int64)
     if not sizes.sum():
-        return lines
+        return [], np.empty(0, object)
     lonlat = np.concatenate([way.lonlat for way in ways])
     index = np.repeat(np.arange(len(ways)), sizes)
     known = np.isfinite(lonlat).all(axis=1)
@@ -51,16 +50,13 @@ def way_lines(ways: Sequence[Way], frame: Frame) -> NDArray[np.object_]:
     enough = fresh & (np.bincount(index[fresh], minlength=len(ways)) > 1)[index]
     x, y = frame.from_geographic(*lonlat[enough].T)
     rows = np.unique(index[enough])
-    lines[rows] = shapely.linestrings(np.stack([x, y], axis=1), indices=np.searchsorted(rows, index[enough]))
-    return lines
+    lines = shapely.linestrings(np.stack([x, y], axis=1), indices=np.searchsorted(rows, index[enough]))
+    return [ways[k] for k in rows.tolist()], lines
 
 
 def path_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
     """Footways, cycleways, paths and steps mapped as lines, except crossings."""
-    ways = [way for way in osm.ways if _is_path(way.tags)]
-    lines = way_lines(ways, frame)
-    kept = [k for k, line in enumerate(lines) if line is not None]
-    ways, lines = [ways[k] for k in kept], lines[kept]
+    ways, lines = way_lines([way for way in osm.ways if _is_path(way.tags)], frame)
     kind = ["sidewalk" if w.tags.get("footway") == "sidewalk" else w.tags["highway"] for w in ways]
     width, source, material = [], [], []
     for way, name in zip(ways, kind, strict=True):
@@ -112,8 +108,7 @@ def _place_and_level(tags: Sequence[Tags]) -> dict[str, Any]:
 def square_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
     """Squares, footpaths, platforms and yards mapped as areas."""
     areas = [a for a in osm.areas if _square_class(a) is not None and a.tags.get("indoor", "no") == "no"]
-    shapes = np.empty(len(areas), object)
-    shapes[:] = [shapely.transform(area.geometry, _projector(frame)) for area in areas]
+    shapes = np.fromiter((shapely.transform(area.geometry, _projector(frame)) for area in areas), object)
     yard = [_square_class(area) == Class.ROAD for area in areas]
     made_of = [
         surface_material(area.tags, "asphalt" if y else "paving") for area, y in zip(areas, yard, strict=True)
@@ -142,10 +137,7 @@ def _projector(frame: Frame) -> Any:
 
 def rail_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
     """The two rails of each track, as thin bands of steel."""
-    ways = [way for way in osm.ways if way.tags.get("railway") in _RAILWAYS]
-    lines = way_lines(ways, frame)
-    kept = [k for k, line in enumerate(lines) if line is not None]
-    ways, lines = [ways[k] for k in kept], lines[kept]
+    ways, lines = way_lines([way for way in osm.ways if way.tags.get("railway") in _RAILWAYS], frame)
     given = [parse_number(way.tags.get("gauge")) for way in ways]
     mapped = np.array([g is not None and 300 <= g <= 2200 for g in given], np.bool_)
     gauge = np.array([(g or 0.0) / 1000 for g in given], float)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geoscene.report import Problem
-from geoscene.roadgraph.graph import RoadGraph, rows_of
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.sources.data import Relation, Tags
 
 # Vehicle classes that include a car, the most specific first: for restrictions and exemptions.
@@ -58,7 +58,7 @@ def add_turns(graph: RoadGraph, relations: Iterable[Relation], *, problems: list
         turn_via=np.array([row[1] for row in rows], np.int32),
         turn_to=np.array([row[2] for row in rows], np.int32),
         turn_kind=np.array([row[3] for row in rows], np.str_),
-        chain_edges=rows_of(np.array(trip, np.int32) for trip, _ in long),
+        chain_edges=np.fromiter((np.array(trip, np.int32) for trip, _ in long), object),
         chain_kind=np.array([value for _, value in long], np.str_),
     )
 

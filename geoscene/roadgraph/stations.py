@@ -54,8 +54,7 @@ class Stations:
         node = np.concatenate([a[begins], b[ends]])
         other = np.concatenate([b[begins], a[ends]])
         far = np.concatenate([metres[begins], metres[ends]])
-        away = self.xy[other] - self.xy[node]
-        away /= np.maximum(np.hypot(*away.T), 1e-9)[:, None]
+        away = polylines.unit(self.xy[other] - self.xy[node])
         i, j = _pairs(node)
         on = (away[i] * away[j]).sum(axis=1) < -np.cos(_STRAIGHT)
         i, j = i[on], j[on]

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.frames import Frame
-from geoscene.report import Problem
 from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, read_carriageways
 from geoscene.roadgraph.crossings import crossing_rows
 from geoscene.roadgraph.graph import RoadGraph
@@ -55,8 +54,8 @@ class RoadSurfaces(SurfaceRows):
 
 def road_surfaces(
     osm: OsmData, graph: RoadGraph, *, frame: Frame, options: SurfaceOptions | None = None
-) -> tuple[RoadSurfaces, list[Problem]]:
-    """The surfaces of roads, paths and rails in plan, and the problems repaired or dropped.
+) -> RoadSurfaces:
+    """The surfaces of roads, paths and rails in plan.
 
     Surfaces overlap: the kerb extends under the carriageway and the sidewalk under the kerb, so that cutting
     by priority leaves neither gaps nor slivers between them.
@@ -79,7 +78,7 @@ def road_surfaces(
     )
     ground = rows.take(rows.place == 0)
     columns = {f.name: getattr(ground, f.name) for f in fields(ground)}
-    return RoadSurfaces(**columns, raised=rows.take(rows.place != 0)), []
+    return RoadSurfaces(**columns, raised=rows.take(rows.place != 0))
 
 
 def _edges_below(roads: Carriageways, graph: RoadGraph) -> NDArray[np.int32]:
@@ -130,34 +129,26 @@ def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[Surf
             **at(joints.main),
         ),
     ]
+    tagged = (roads.walk_source == "sidewalk").any(axis=1)
+    walk_source = np.where(tagged, "sidewalk/default", "default/default")
     walk_material = np.where(np.isin(roads.material, list(PAVED)), "paving", "gravel")
     for klass, priority, material, shape in (
         (Class.KERB, _KERB, np.full(len(roads), "concrete"), "kerb"),
         (Class.SIDEWALK, _SIDEWALK, walk_material, "walk"),
     ):
         extra = np.where(roads.walk > 0, KERB + (roads.walk if shape == "walk" else 0.0), 0.0)
-        for rows, bands in _widened(roads, half, extra=extra):
+        corners = (joints.corner_main, getattr(joints, shape))
+        for rows, bands in (*_widened(roads, half, extra=extra), corners):
             out.append(
                 SurfaceRows.of(
                     bands,
                     klass=klass,
                     material=material[rows],
                     priority=priority,
-                    source=np.char.add(_walk_source(roads)[rows], "/default"),
+                    source=walk_source[rows],
                     **at(rows),
                 )
             )
-        corner = joints.corner_main
-        out.append(
-            SurfaceRows.of(
-                getattr(joints, shape),
-                klass=klass,
-                material=material[corner],
-                priority=priority,
-                source=np.char.add(_walk_source(roads)[corner], "/default"),
-                **at(corner),
-            )
-        )
     bridge = np.flatnonzero(place == 1)
     out.append(
         SurfaceRows.of(
@@ -169,11 +160,6 @@ def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[Surf
         )
     )
     return out
-
-
-def _walk_source(roads: Carriageways) -> NDArray[np.str_]:
-    """Source of each carriageway's sidewalks; ``sidewalk`` if either is mapped."""
-    return np.where((roads.walk_source == "sidewalk").any(axis=1), "sidewalk", "default")
 
 
 def _widened(

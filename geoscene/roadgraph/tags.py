@@ -37,15 +37,10 @@ _LANES = dict.fromkeys(CLASSES, 1.0) | {"motorway": 2.0, "service": 0.5, "track"
 # 3.75 on motorways) and the AASHTO Green Book (2.7 to 3.6).
 _LANE_WIDTH = {
     "motorway": 3.75,
-    "motorway_link": 3.75,
     "trunk": 3.5,
-    "trunk_link": 3.5,
     "primary": 3.5,
-    "primary_link": 3.5,
     "secondary": 3.25,
-    "secondary_link": 3.25,
     "tertiary": 3.25,
-    "tertiary_link": 3.25,
     "unclassified": 3.0,
     "residential": 3.0,
     "living_street": 2.75,
@@ -242,7 +237,7 @@ def _width(tags: Tags, direction: int, *, counted: tuple[float, str], unread: li
         unread.append(f"{key}={text}")
     if highway == "service" and lanes_source == "default":
         return _SERVICE_WIDTH.get(tags.get("service", ""), _SERVICE_WIDTH_ELSE), "default"
-    width = lanes * _LANE_WIDTH.get(highway, 3.5)
+    width = lanes * _LANE_WIDTH.get(highway.removesuffix("_link"), 3.5)
     if direction and lanes_source == "default":
         width = max(width, _ONEWAY_AT_LEAST)
     return width + _beside_lanes(tags), lanes_source

@@ -121,14 +121,15 @@ def path_members(
         & ((raised.place == 1) | ((raised.place == 2) & (raised.klass != Class.RAIL)))
     )
     place = dict(zip(raised.osm_id[own].tolist(), raised.place[own].tolist(), strict=True))
-    ways = [way for way in osm.ways if way.osm_id in place and len(way.nodes) > 1]
-    lines = way_lines(ways, frame)
-    kept = [
-        k
-        for k, way in enumerate(ways)
-        if lines[k] is not None and way.nodes[0] != way.nodes[-1] and np.isfinite(way.lonlat).all()
+    chosen = [
+        way
+        for way in osm.ways
+        if way.osm_id in place
+        and len(way.nodes) > 1
+        and way.nodes[0] != way.nodes[-1]
+        and np.isfinite(way.lonlat).all()
     ]
-    ways, lines = [ways[k] for k in kept], lines[kept]
+    ways, lines = way_lines(chosen, frame)
     ids = np.array([way.osm_id for way in ways], np.str_)
     tunnel = np.array([place[name] == 2 for name in ids.tolist()], np.bool_)
     rows = [own[raised.osm_id[own] == name] for name in ids.tolist()]

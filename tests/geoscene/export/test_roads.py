@@ -15,7 +15,6 @@ from geoscene.export import export_scene
 from geoscene.export.planview import connecting_curve, plan_view
 from geoscene.options import ExportOptions
 from geoscene.roadgraph import write_graphml
-from geoscene.roadgraph.graph import rows_of
 from geoscene.roadgraph.routing import turn_table
 from geoscene.scene import SceneFiles
 
@@ -149,7 +148,7 @@ def test_lanes_are_continuous_in_a_grid_of_any_lane_count(scene, tmp_path, lanes
 def test_restrictions_without_opendrive_equivalent_are_counted(tmp_path):
     scene = write_world(tmp_path / "world")
     assert export_scene(scene, tmp_path / "plain.xodr").notes == ()
-    chain = rows_of([np.array([0, 2, 3], np.int32)])
+    chain = np.fromiter([np.array([0, 2, 3], np.int32)], object)
     graph = replace(roads(), chain_edges=chain, chain_kind=np.array(["no_u_turn"]))
     write_graphml(graph, scene.frame, path=scene.files.road_graph)
     (note,) = export_scene(scene, tmp_path / "bound.xodr").notes

@@ -30,7 +30,7 @@ def surfaces_of(places, ways, points=(), **options):
         relations=[],
     )
     graph, _ = build_road_graph(osm, FRAME)
-    return road_surfaces(osm, graph, frame=FRAME, options=SurfaceOptions(**options))[0]
+    return road_surfaces(osm, graph, frame=FRAME, options=SurfaceOptions(**options))
 
 
 def visible(rows, klass):
@@ -267,10 +267,10 @@ def test_road_surfaces_of_real_places_are_valid_and_reproducible(shared_osm, nam
     west, south, east, north = osm.bounds
     frame = Frame.at((west + east) / 2, (south + north) / 2)
     graph, _ = build_road_graph(osm, frame)
-    rows, _ = road_surfaces(osm, graph, frame=frame)
+    rows = road_surfaces(osm, graph, frame=frame)
     check_rows(rows)
     check_rows(rows.raised)
-    again, _ = road_surfaces(osm, graph, frame=frame)
+    again = road_surfaces(osm, graph, frame=frame)
     assert shapely.equals_exact(rows.polygon, again.polygon, 0.0).all()
     ground = ~graph.bridge & ~graph.tunnel & (graph.layer_source != "level")
     lines = [shapely.LineString(graph.geometry[e][:, :2]) for e in np.flatnonzero(ground)]

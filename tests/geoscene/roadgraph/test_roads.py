@@ -18,7 +18,6 @@ from geoscene.roadgraph import (
     read_graphml,
     write_graphml,
 )
-from geoscene.roadgraph.graph import rows_of
 from geoscene.roadgraph.routing import (
     edge_lines,
     nearest_edge,
@@ -447,7 +446,7 @@ def test_turn_states_allow_exactly_the_legal_drives(data):
             chain.append(data.draw(st.sampled_from(onward[chain[-1]])))
         chains.append(np.array(chain, np.int32))
     kinds = data.draw(st.lists(st.sampled_from(["no_u_turn", "only_straight_on"]), min_size=5, max_size=5))
-    graph = replace(base, chain_edges=rows_of(chains), chain_kind=np.array(kinds[: len(chains)]))
+    graph = replace(base, chain_edges=np.fromiter(chains, object), chain_kind=np.array(kinds[: len(chains)]))
 
     states = turn_states(graph, u_turns=True)
     np.testing.assert_array_equal(states.edge[: len(graph)], np.arange(len(graph)))

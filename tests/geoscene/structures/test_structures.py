@@ -65,7 +65,7 @@ class Town:
         graph, _ = build_road_graph(osm, frame)
         self.graph = profile(graph, ground, obstacles=find_obstacles(osm, frame))
         graded = graded_ground(self.graph, ground)
-        surfaces, _ = road_surfaces(osm, self.graph, frame=frame)
+        surfaces = road_surfaces(osm, self.graph, frame=frame)
         self.ground_rows = surfaces
         self.table, self.problems = read_structures(surfaces, self.graph, osm=osm, frame=frame, height=graded)
         self.height = ground_below(self.table, graded)

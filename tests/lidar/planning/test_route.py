@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from geoscene.errors import InputError
 from geoscene.frames import Frame
 from geoscene.roadgraph import build_road_graph
-from geoscene.roadgraph.graph import rows_of
 from geoscene.roadgraph.routing import turn_table
 from geoscene.sources import read_osm
 from lidar.errors import RouteError
@@ -143,7 +142,7 @@ def test_waypoints_respect_one_way_streets_and_forbidden_turns():
 
 def chained(graph, *chains):
     """The graph with chains of edges forbidden."""
-    edges = rows_of(np.array(chain, np.int32) for chain in chains)
+    edges = np.fromiter((np.array(chain, np.int32) for chain in chains), object)
     return dataclasses.replace(graph, chain_edges=edges, chain_kind=np.full(len(chains), "no_u_turn"))
 
 

@@ -11,7 +11,6 @@ from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.roadgraph.graph import rows_of
 from lidar.geometry.poses import Trajectory
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
@@ -62,7 +61,7 @@ def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
         )[0]
 
     chains = {tuple(drive(lanes_of(graph), seed)[k : k + 3]) for seed in range(4) for k in (1, 6)}
-    edges = rows_of(np.array(chain, np.int32) for chain in chains)
+    edges = np.fromiter((np.array(chain, np.int32) for chain in chains), object)
     bound = lanes_of(replace(graph, chain_edges=edges, chain_kind=np.full(len(chains), "no_u_turn")))
     drives = [drive(bound, seed) for seed in range(20)]
     for driven in drives:
