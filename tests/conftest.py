@@ -1,4 +1,4 @@
-"""Fixtures that several test modules share, and how Hypothesis draws its examples."""
+"""Shared fixtures, marks of slow tests, and profiles of Hypothesis."""
 
 import os
 from collections.abc import Callable

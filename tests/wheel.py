@@ -1,6 +1,6 @@
-"""Build sdist and wheel, and run both programs from a fresh environment that has the wheel alone.
+"""Build sdist and wheel, and run both programs from a new environment with only the wheel installed.
 
-python tests/wheel.py    needs the packages of requirements.lock; leaves sdist and wheel in dist/
+python tests/wheel.py    needs the packages of requirements.lock; writes sdist and wheel to dist/
 """
 
 import os
@@ -24,7 +24,7 @@ def run(*words: str | Path, cwd: Path) -> None:
 
 
 def build_packages(folder: Path) -> Path:
-    """Write the sdist to dist/ and the wheel, built of the sdist alone, beside it; the wheel's path."""
+    """Write the sdist and the wheel built from it to dist/; returns the path of the wheel."""
     dist = ROOT / "dist"
     shutil.rmtree(dist, ignore_errors=True)
     dist.mkdir()

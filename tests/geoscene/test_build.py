@@ -1,4 +1,4 @@
-"""A scene is whole, closed, in its place, and the same every time."""
+"""Built scenes are complete, watertight, georeferenced and reproducible."""
 
 import json
 import multiprocessing
@@ -78,7 +78,7 @@ def test_ground_triangles_meet_edge_to_edge_over_all_tiles(scene):
     on_rim = np.zeros(len(p), bool)
     for axis, value in ((0, xmin), (0, xmax), (1, ymin), (1, ymax)):
         on_rim |= (np.abs(p[:, axis] - value) < 1e-3) & (np.abs(q[:, axis] - value) < 1e-3)
-    # The ground is open where tunnels come out of it.
+    # The ground is open at tunnel mouths.
     structures = geopandas.read_file(scene.path / "features.gpkg", layer="structures")
     tunnels = structures.geometry[structures.kind == "tunnel"].union_all().buffer(0.01)
     at = shapely.points(*scene.frame.to_projected(*((p + q) / 2).T))
@@ -136,7 +136,7 @@ def test_number_of_workers_does_not_change_the_bytes(osm, scene, tmp_path, worke
 def test_spawned_workers_give_the_same_bytes(tmp_path, monkeypatch):
     spawn = multiprocessing.get_context("spawn")
     monkeypatch.setattr("geoscene.tiles.multiprocessing.get_context", lambda: spawn)
-    # a bridge over a road, so that the ground has heights that workers need
+    # With a bridge, the height function of the ground must be pickled for the workers.
     slope = np.linspace(60.1655, 60.1690, 4)
     lonlat = {n: (24.9405 + 0.002 * k, lat) for k in range(2) for n, lat in enumerate(slope, start=4 * k)}
     lonlat |= {8: (24.9385, 60.167), 9: (24.9400, 60.167), 10: (24.9410, 60.167), 11: (24.9440, 60.167)}
@@ -178,7 +178,7 @@ def test_interrupted_build_resumes_with_the_same_bytes(osm, scene, tmp_path, mon
     assert not (tmp_path / "scene").exists()
     monkeypatch.setattr(geoscene.tiles, "build_tile", lambda *a, **o: made.append(a) or whole(*a, **o))
     again = build(osm, tmp_path / "scene", options=BuildOptions(name="demo"))
-    assert len(made) == len(scene.tile_indices)  # no tile twice
+    assert len(made) == len(scene.tile_indices)  # no tile is built twice
     same_files(scene.path, again.path)
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 

@@ -1,4 +1,4 @@
-"""The two programs as users meet them: words in, files out, one clear line when something is wrong."""
+"""Both command-line programs: output files, summaries, help, and one-line errors."""
 
 import json
 import subprocess
@@ -68,7 +68,7 @@ def test_drive_resumes_and_its_map_is_written(scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "words", "says"),
+    ("name", "words", "message"),
     [
         ("geoscene", ["build", "-o", "x"], "none was given"),
         ("geoscene", ["build", "--demo", "--place", "Rome", "-o", "x"], "--place and --demo"),
@@ -93,18 +93,18 @@ def test_drive_resumes_and_its_map_is_written(scene, tmp_path):
         ("lidar", ["map", "nowhere", "-o", "x.laz"], "nowhere"),
     ],
 )
-def test_invalid_input_gives_one_line_and_exit_code_two(tmp_path, name, words, says):
+def test_invalid_input_gives_one_line_and_exit_code_two(tmp_path, name, words, message):
     done = run_program(name, *words, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1
-    assert says in done.stderr
+    assert message in done.stderr
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (["--route", "-30.1,-51.2", "-30.2,-51.3"], "-30.1"),
         (["--route", "60.166,24.944"], "two or more"),
@@ -115,11 +115,11 @@ def test_invalid_input_gives_one_line_and_exit_code_two(tmp_path, name, words, s
         (["--route", "random", "--crs", "EPSG:1"], "EPSG:1"),
     ],
 )
-def test_invalid_drive_options_give_one_line_and_exit_code_two(scene, tmp_path, words, says):
+def test_invalid_drive_options_give_one_line_and_exit_code_two(scene, tmp_path, words, message):
     done = run_program("lidar", "drive", scene, *words, "-o", "x", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.count("\n") == 1, done.stderr
-    assert says in done.stderr
+    assert message in done.stderr
     assert list(tmp_path.iterdir()) == []
 
 

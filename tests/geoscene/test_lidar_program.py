@@ -1,4 +1,4 @@
-"""The program ``lidar`` where an unrelated package has the same module name."""
+"""The program ``lidar`` beside an unrelated package of the same module name."""
 
 import subprocess
 import sys

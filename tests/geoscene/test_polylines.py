@@ -1,4 +1,4 @@
-"""Polylines: what holds for every line, and the corner cases of cuts and parallels."""
+"""Polylines: properties of random lines, and corner cases of cuts and offset lines."""
 
 import numpy as np
 import pytest

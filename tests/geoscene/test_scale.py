@@ -1,4 +1,4 @@
-"""Large scenes: what a tile costs and gives does not depend on what lies elsewhere; killed builds go on."""
+"""Large scenes: tiles are independent of distant features, and killed builds resume."""
 
 import importlib.util
 import os
@@ -80,9 +80,9 @@ def test_partition_of_a_tile_ignores_distant_polygons(monkeypatch):
     layers = Layers.of(shapely.box(x, y, x + 9.0, y + 9.0), klass=1, material=1, priority=0.0)
     plan = plan_ground((0, 0, 1000, 1000), layers, tile_size=50.0)
     cells = partition_tile(plan, 3, j=4)
-    assert len(cells) == 26  # five by five squares and what is between them
+    assert len(cells) == 26  # five by five squares and the ground between them
     assert 25 <= sum(prepared) <= 49
-    assert not shapely.is_prepared(layers.polygon).any()  # nothing stays behind
+    assert not shapely.is_prepared(layers.polygon).any()  # prepared geometries are released
 
 
 def build_words(town, out):
@@ -91,7 +91,7 @@ def build_words(town, out):
 
 
 def alive(group):
-    """Processes of a group."""
+    """Running processes of a process group."""
     found = []
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -118,11 +118,11 @@ def test_build_resumes_after_sigkill_with_the_same_bytes(town, scene, tmp_path):
     deadline = time.monotonic() + 20
     while alive(process.pid) and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert alive(process.pid) == []  # its workers have ended with it
+    assert alive(process.pid) == []  # its workers have exited
     left = {p.name: p.stat().st_mtime_ns for p in tiles.glob("*.npz")}
     assert not out.exists()
     assert 5 <= len(left) < len(scene.tile_indices)
-    # what a kill in the middle of writing leaves, and a tile that another build had made
+    # a partly written tile and table, and a tile of a build with other options
     (tiles / "0_0.npz.123.part").write_bytes(b"half")
     (tiles / "99_99.npz").write_bytes(b"old")
     (tiles.parent / "features.123.part.gpkg").write_bytes(b"half")

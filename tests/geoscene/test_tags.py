@@ -1,4 +1,4 @@
-"""Tag values as mappers write them."""
+"""Parsing of tag values."""
 
 import math
 

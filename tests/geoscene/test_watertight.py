@@ -1,4 +1,4 @@
-"""A broken solid is found, whatever else is in the mesh."""
+"""Checks of solids: valid ones pass, and each kind of defect is found."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ def box(feature=0, *, at=(0.0, 0.0, 0.0), size=(1.0, 1.0, 1.0)):
 
 
 def soup(mesh):
-    """The same triangles, each with vertices of its own."""
+    """The same triangles without shared vertices."""
     return replace(
         mesh,
         vertices=mesh.vertices[mesh.faces].reshape(-1, 3),
@@ -65,7 +65,7 @@ def with_a_twin_at_an_edge(mesh):
 
 
 def with_a_point_on_an_edge(mesh):
-    """A face of three corners on a line, which closes the surface and bounds nothing."""
+    """The mesh with a degenerate face that closes the surface."""
     vertices = np.vstack([mesh.vertices, mesh.vertices[[0, 1]].mean(axis=0)])
     split = np.array([[8, 1, 5], [0, 8, 5], [0, 1, 8]])
     faces = np.vstack([np.delete(mesh.faces, 4, axis=0), split])

@@ -1,4 +1,4 @@
-"""Worlds, grids of roads and a browser for tests."""
+"""Scenes, road graphs, programs and a browser for tests."""
 
 DEMO_BOX = (24.9405, 60.1655, 24.9475, 60.1690)
-"""West, south, east, north of the part of the demo map that the fixture ``scene`` holds."""
+"""West, south, east, north in degrees of the part of the demo map in the fixture ``scene``."""

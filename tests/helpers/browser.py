@@ -1,4 +1,4 @@
-"""A headless Chromium, driven by the W3C WebDriver protocol through chromedriver; nothing but Python."""
+"""A headless Chromium, controlled by the W3C WebDriver protocol through chromedriver."""
 
 import base64
 import json
@@ -34,7 +34,7 @@ _FLAGS = (
 
 
 class Browser:
-    """One window."""
+    """A browser window."""
 
     def __init__(self, port: int) -> None:
         self._base = f"http://127.0.0.1:{port}/session"
@@ -63,7 +63,7 @@ class Browser:
         self._base += f"/{told['sessionId']}"
 
     def open(self, page: Path, address: str = "") -> None:
-        """Open a page from disk, anew, and wait until it says that it is ready."""
+        """Open or reload a page from disk, and wait until it is ready."""
         self._call("POST", "/url", {"url": "about:blank"})
         self._call("POST", "/url", {"url": page.as_uri() + address})
         end = time.monotonic() + 120
@@ -73,15 +73,15 @@ class Browser:
         assert state == "yes", self.text("message")
 
     def js(self, script: str, *args: Any) -> Any:
-        """What a script returns."""
+        """The return value of a script."""
         return self._call("POST", "/execute/sync", {"script": script, "args": list(args)})
 
     def text(self, element: str) -> str:
-        """The text of an element, "" where it is hidden."""
+        """The text of an element, "" if it is hidden."""
         return str(self.js("return document.getElementById(arguments[0]).innerText", element))
 
     def mouse(self, *actions: dict[str, Any]) -> None:
-        """Do what a mouse does."""
+        """Perform mouse actions."""
         source = {"type": "pointer", "id": "mouse", "actions": list(actions)}
         self._call("POST", "/actions", {"actions": [source]})
 
@@ -91,27 +91,27 @@ class Browser:
         self.mouse(to, {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0})
 
     def drag(self, start: tuple[int, int], stop: tuple[int, int], button: int = 0) -> None:
-        """Press, move and release."""
+        """Drag with the mouse."""
         first, last = ({"type": "pointerMove", "x": x, "y": y, "duration": 50} for x, y in (start, stop))
         self.mouse(
             first, {"type": "pointerDown", "button": button}, last, {"type": "pointerUp", "button": button}
         )
 
     def keys(self, *keys: str) -> None:
-        """Press keys, one after another."""
+        """Press keys in sequence."""
         pressed = [{"type": kind, "value": key} for key in keys for kind in ("keyDown", "keyUp")]
         self._call("POST", "/actions", {"actions": [{"type": "key", "id": "keys", "actions": pressed}]})
 
     def write(self, text: str) -> None:
-        """Put text where the caret is, as an input method does; keys need a layout for that."""
+        """Insert text at the caret, like an input method, independent of the keyboard layout."""
         self.tell("Input.insertText", text=text)
 
     def tell(self, command: str, **params: Any) -> None:
-        """Give a command of the browser's own protocol."""
+        """Send a command of the Chrome DevTools protocol."""
         self._call("POST", "/goog/cdp/execute", {"cmd": command, "params": params})
 
     def phone(self, width: int, height: int) -> None:
-        """Be a telephone with a touch screen; with width 0 what it was before."""
+        """Emulate a phone with a touch screen; width 0 ends the emulation."""
         if width:
             self.tell(
                 "Emulation.setDeviceMetricsOverride",
@@ -125,7 +125,7 @@ class Browser:
         self.tell("Emulation.setTouchEmulationEnabled", enabled=bool(width), maxTouchPoints=5)
 
     def touch(self, *steps: list[tuple[float, float]]) -> None:
-        """Put fingers down where the first step says, move them through the others, and lift them."""
+        """Touch at the positions of the first step, move through the others, and release."""
         for number, places in enumerate(steps):
             points = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(places)]
             kind = "touchMove" if number else "touchStart"
@@ -135,14 +135,14 @@ class Browser:
         self.settle()
 
     def settle(self) -> None:
-        """Wait until what has changed is drawn."""
+        """Wait until changes are drawn."""
         script = (
             "const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => done(1)))"
         )
         self._call("POST", "/execute/async", {"script": script, "args": []})
 
     def screenshot(self) -> bytes:
-        """The window as PNG."""
+        """A screenshot of the window as PNG."""
         self.settle()
         return base64.b64decode(self._call("GET", "/screenshot"))
 
@@ -151,7 +151,7 @@ class Browser:
         return [entry["message"] for entry in self._call("POST", "/se/log", {"type": "browser"})]
 
     def requests(self) -> set[str]:
-        """Addresses that the browser has asked for since the last call."""
+        """URLs that the browser has requested since the last call."""
         entries = [
             json.loads(e["message"])["message"]
             for e in self._call("POST", "/se/log", {"type": "performance"})
@@ -165,7 +165,7 @@ class Browser:
 
 @contextmanager
 def browser(folder: Path) -> Iterator[Browser]:
-    """A window of its own, with an empty profile in a folder."""
+    """A new window with an empty profile in a folder."""
     with subprocess.Popen(
         [DRIVER or "chromedriver", "--port=0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as driver:

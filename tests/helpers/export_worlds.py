@@ -1,4 +1,4 @@
-"""A small scene with every kind of object that exports must carry."""
+"""A small scene with every kind of object that exports must contain."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -18,7 +18,7 @@ from helpers.roadgrids import road_graph
 
 NAMES = ("way/1", "way/2", "way/3", "relation/4")
 SOLID_VOLUMES = (10 * 20 * 30.0, 2 * 8 * 8 * 10.0, 20**3 - 10**3)
-"""Of the first three buildings: a box, two boxes, a box with a cavity."""
+"""Volumes of the first three buildings: a box, two boxes, a box with a cavity."""
 
 TREES = ((30.25, -40.5, 12.0), (-60.0, 33.0, 8.0), (-61.5, 30.0, 20.0))
 SLOPE = 0.02
@@ -37,7 +37,7 @@ def _solid(points, faces, feature, wall=16, roof=21):
 
 
 def buildings():
-    """One mesh of four buildings; the last is turned, tapered and 100 m up a tower."""
+    """One mesh of four buildings; the last is rotated, tapered and 100 m above the ground."""
     box = _solid(*prism(rectangle(10, 20, x=12.5, y=-20.25), 0.0, top=30.0), 0)
     west = _solid(*prism(rectangle(8, 8, x=-80, y=60), 1.0, top=11.0), 1)
     east = _solid(*prism(rectangle(8, 8, x=-60, y=60), 1.0, top=11.0), 1)
@@ -82,7 +82,7 @@ def _ground(i, j, size, first):
 
 
 def roads():
-    """A crossing of four arms with a bend in one, a signal and a forbidden left turn; a one-way arm."""
+    """A junction of four arms, one bent and one one-way, with a signal and a forbidden left turn."""
     nodes = [(0, 0, 0), (-100, 0, -2), (100, 0, 2), (0, -100, 0), (0, 100, 0)]
     bends = {(0, 4): [(0, 0, 0), (5, 40, 0.5), (0, 100, 0)]}
     graph = road_graph(nodes, [(1, 0), (0, 2), (3, 0), (0, 4)], twoway=[True, True, True, False], bends=bends)
@@ -99,7 +99,7 @@ def roads():
 
 
 def write_world(path, crs="utm"):
-    """The scene, written and opened."""
+    """The scene, written to a folder and opened."""
     frame = Frame.at(13.35, 52.51, crs=crs, vertical="orthometric")
     solids, size = buildings(), 100.0
     first, tree = len(NAMES), len(NAMES) + 1

@@ -4,7 +4,7 @@ from geoscene.sources import OsmData
 
 
 def same(a: OsmData, b: OsmData) -> None:
-    """Assert that two extracts hold the same features."""
+    """Assert that two extracts have the same features."""
     assert [(w.osm_id, w.tags, w.nodes.tolist()) for w in a.ways] == [
         (w.osm_id, w.tags, w.nodes.tolist()) for w in b.ways
     ]

@@ -1,4 +1,4 @@
-"""The programs of the checkout under test, each run in a process of its own."""
+"""Runs the programs of the checkout under test in processes of their own."""
 
 import os
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(_ROOT)}
-"""Makes a process import this checkout from any folder, whatever version is installed."""
+"""Environment of processes that import this checkout, even if another version is installed."""
 
 
 def command(name, *words):

@@ -54,7 +54,7 @@ def box(low, high, *, feature=0, klass=Class.BUILDING, material="brick"):
 
 
 def plate(x, *, half=500.0, feature=0, klass=Class.WALL, material="plaster", tilt=0.0):
-    """A large square through (x, 0, 0) that faces the origin, turned by ``tilt`` about the vertical."""
+    """A large square through (x, 0, 0) that faces the origin, rotated by ``tilt`` about the vertical."""
     c, s = np.cos(tilt), np.sin(tilt)
     vertices = [
         [x + s * u, c * u, v] for u, v in ((-half, -half), (half, -half), (half, half), (-half, half))

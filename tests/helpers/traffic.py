@@ -11,14 +11,14 @@ BOX = (CAR.length, CAR.width, CAR.length / 2 - CAR.rear_overhang)
 
 
 class Plane:
-    """A frame in which a metre is a metre."""
+    """A frame with scale 1 at its centre."""
 
     def scale_at(self, x, y):
         return np.ones(np.broadcast_shapes(np.shape(x), np.shape(y)))
 
 
 def tracks(trips, flow):
-    """Middles and headings (steps, trips, 3) of bodies; NaN where they are not there."""
+    """Centres and headings (steps, trips, 3) of road users; NaN while they are absent."""
     out = np.full((int(flow.step.max()) + 1, len(trips), 3), np.nan)
     for k in np.unique(flow.trip):
         rows = flow.trip == k

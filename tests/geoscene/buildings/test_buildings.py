@@ -1,4 +1,4 @@
-"""From map areas to solids: nothing is lost, doubled, open or guessed in silence."""
+"""Buildings become closed solids without losses or overlaps, and all assumptions and repairs are recorded."""
 
 import random
 from dataclasses import replace
@@ -31,7 +31,7 @@ def box(x, y, width, depth):
 
 
 def area(osm_id, shape, **tags):
-    """A map area whose scene coordinates are those of shape; ``__`` in a key stands for a colon."""
+    """A map area with the scene coordinates of a shape; ``__`` in a key stands for a colon."""
     lonlat = shapely.transform(shape, lambda xy: np.column_stack(FRAME.to_geographic(xy[:, 0], xy[:, 1])))
     tags = {key.replace("__", ":"): value for key, value in tags.items()}
     return Area(osm_id, tags, lonlat, np.empty(0, np.int64))
@@ -60,7 +60,7 @@ def built(*areas, relations=(), base=0.0, lod=2, options=None):
 
 
 def manifold(mesh, feature):
-    """The solid of a feature as manifold3d sees it after its own check."""
+    """The solid of a feature as manifold3d reads it."""
     mine = mesh.take(mesh.feature == feature)
     body = m3.Manifold(m3.Mesh64(mine.vertices, mine.faces.astype(np.uint64)))
     assert body.status() == m3.Error.NoError
@@ -73,7 +73,7 @@ def reasons(problems):
 
 @st.composite
 def blocks(draw):
-    """Unions of boxes, turned, often with courtyards, with a decimal number of metres nowhere."""
+    """Rotated unions of boxes, often with courtyards, with coordinates that are not round numbers."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     corner, size = rng.uniform(-20, 20, (5, 2)), rng.uniform(1, 25, (5, 2))
     shape = shapely.union_all([shapely.box(*c, *(c + s)) for c, s in zip(corner, size, strict=True)])

@@ -1,4 +1,4 @@
-"""Real extracts: every building is a solid, and the famous ones stand as they should."""
+"""Buildings of real extracts: all are valid solids, and landmarks have their known shapes."""
 
 import manifold3d as m3
 import numpy as np
@@ -36,7 +36,7 @@ def test_every_building_is_a_solid(shared_osm, name):
     assert verdict.feature.tolist() == list(range(table.count))
     assert verdict.ok.all()
     assert not [p for p in problems if p.reason == "no-solid"]
-    # manifold3d has the last word; it reads a closed mesh of many bodies as one
+    # manifold3d reads a closed mesh of several bodies as one
     whole = m3.Manifold(m3.Mesh64(mesh.vertices, mesh.faces.astype(np.uint64)))
     assert whole.status() == m3.Error.NoError
     assert whole.volume() == pytest.approx(verdict.volume.sum(), rel=1e-9)

@@ -1,4 +1,4 @@
-"""Skeletons and roofs: closed over any footprint, with the volume that geometry asks for."""
+"""Straight skeletons and roofs: closed over any footprint, with the exact volume."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def turned(points, degrees=0.0, holes=()):
 
 
 def footprint(seed):
-    """A star, a regular polygon, or boxes united, straight or askew, often with a courtyard; or None."""
+    """A star, a regular polygon or a union of (rotated) boxes, often with a courtyard; or None."""
     rng = np.random.default_rng(seed)
     kind = rng.choice(["star", "boxes", "askew", "regular"])
     if kind == "star":

@@ -1,4 +1,4 @@
-"""Scenes as objects of other libraries."""
+"""Scenes as objects of trimesh, Open3D and networkx."""
 
 import sys
 

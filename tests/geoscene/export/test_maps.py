@@ -1,4 +1,4 @@
-"""Rasters and tables of a scene: where things are, how high, what they are, and in which CRS."""
+"""Rasters and tables of a scene: positions, heights, classes, attributes and CRS."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""OpenDRIVE: lanes meet where roads meet, and only permitted turns can be taken."""
+"""OpenDRIVE: lanes are continuous through junctions, and only permitted turns have connecting roads."""
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -29,7 +29,7 @@ def _number(element, name):
 
 
 def _place(geometry, ds):
-    """Position and heading on one piece of a reference line, by the standard's formulae."""
+    """Position and heading on one segment of a reference line, by the formulae of the standard."""
     x, y, h, length = (_number(geometry, name) for name in ("x", "y", "hdg", "length"))
     shape = geometry[0]
     if shape.tag == "line":
@@ -49,7 +49,7 @@ def _place(geometry, ds):
 
 
 class _Road:
-    """One road of a file: its ends with their lanes' edges in space."""
+    """A road of a file, with the edges of its lanes at both ends."""
 
     def __init__(self, element):
         self.element, self.id = element, element.get("id")
@@ -89,13 +89,13 @@ def _roads(path):
 
 
 def _keeping(scene, left_hand):
-    """The scene with traffic on the left or the right."""
+    """The scene with left-hand or right-hand traffic."""
     roads = {"driving_side": "left" if left_hand else "right"}
     return replace(scene, manifest={**scene.manifest, "roads": roads})
 
 
 def _write(graph, scene, folder, **options):
-    """A graph as OpenDRIVE, by way of a scene that has it."""
+    """Path of the OpenDRIVE file of a scene with this graph."""
     path = folder / "scene"
     if not path.exists():
         write_world(path)
@@ -106,7 +106,7 @@ def _write(graph, scene, folder, **options):
 
 
 def _check_links(path):
-    """Every connecting road begins and ends at the edges of the lanes that it joins; how many lanes."""
+    """Assert that connecting roads begin and end at the edges of the lanes they join; the number of lanes."""
     _, found = _roads(path)
     joined = 0
     for road in found.values():

@@ -1,4 +1,4 @@
-"""What else a CityJSON, a GLB and a 3D Tiles folder must say."""
+"""Semantics, attributes and positions in CityJSON, GLB and 3D Tiles."""
 
 import json
 import struct
@@ -34,7 +34,7 @@ def tiles(scene, tmp_path_factory):
 
 
 def _glb(path):
-    """JSON and buffer of a binary glTF, after its lengths have been checked."""
+    """JSON and buffer of a binary glTF; asserts that its lengths are right."""
     data = path.read_bytes()
     magic, version, length, size, kind = struct.unpack_from("<4sIII4s", data)
     assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON")
@@ -58,7 +58,7 @@ def _z_up(points):
 
 
 def _points(path):
-    """All points of a GLB, x east, y north, z up: those of its meshes and those of its copies."""
+    """All points of the meshes and instances of a GLB, x east, y north, z up."""
     document, buffer = _glb(path)
     parents = {c: k for k, node in enumerate(document["nodes"]) for c in node.get("children", [])}
     out = []

@@ -1,4 +1,4 @@
-"""The same building is the same solid in every format that claims solids."""
+"""A building is the same closed solid in every format with solids."""
 
 import json
 
@@ -37,7 +37,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def exported(scene, tmp_path_factory):
-    """Path of the scene in a format, written once."""
+    """Path of the scene in a format; written on first use."""
     folder, done = tmp_path_factory.mktemp("out"), {}
 
     def path(kind):
@@ -71,7 +71,7 @@ def _cityjson(path, scene):
 
 
 def _parts(pieces):
-    """Triangles as one soup."""
+    """Triangles (n, 3, 3) without shared vertices."""
     soup = np.concatenate(pieces)
     return soup.reshape(-1, 3), np.arange(len(soup) * 3).reshape(-1, 3)
 
@@ -116,7 +116,7 @@ def _tiles(path, scene):
 
 
 def _features_in(file):
-    """Feature numbers of the rows of a tile's table of buildings, read by hand."""
+    """Feature numbers in a tile's property table of buildings."""
     data = file.read_bytes()
     size = int.from_bytes(data[12:16], "little")
     document = json.loads(data[20 : 20 + size])
@@ -148,7 +148,7 @@ def _ply(path, _):
 
 
 def _stl(path, _):
-    """STL has no names: a triangle is of the building whose place it is in."""
+    """Triangles by building; STL has no names, so they are assigned by position."""
     soup = trimesh.load(path, process=False).triangles
     places = (12.5, -20.25), (-70, 60), (60, 60), (-30.5, -60.25)
     middles = dict(zip(NAMES, places, strict=True))

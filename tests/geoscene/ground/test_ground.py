@@ -1,4 +1,4 @@
-"""The ground is one surface: no gaps, no overlaps, no T-junctions, and tiles that meet."""
+"""The ground is one surface without gaps, overlaps or T-junctions, also across tiles."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ GRASS = materials()["grass"].code
 
 
 def blobs(seed, count=12):
-    """Stars, some with holes, some hanging out of the extent, on no grid."""
+    """Stars at arbitrary coordinates, some with holes, some partly outside the extent."""
     rng = np.random.default_rng(seed)
     out = []
     for _ in range(count):
@@ -50,13 +50,13 @@ def layers_of(polygons, rng):
 
 
 def edge_counts(faces):
-    """Undirected edges (k, 2) and in how many faces each is."""
+    """Undirected edges (k, 2) and the number of faces of each."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     return np.unique(edges, axis=0, return_counts=True)
 
 
 def welded(mesh):
-    """Vertices of equal coordinates made one."""
+    """The mesh with vertices of equal coordinates merged."""
     points, number = np.unique(mesh.vertices, axis=0, return_inverse=True)
     return points, number.reshape(-1)[mesh.faces]
 
@@ -68,7 +68,7 @@ def on_border(points, edges, extent):
 
 
 def assert_one_surface(points, faces, extent):
-    """Every edge has two faces, but one on the border of the extent; nothing is doubled or missing."""
+    """Assert that every edge has two faces, or one at the extent's border, and that areas add up."""
     edges, count = edge_counts(faces)
     border = on_border(points, edges, extent)
     assert (count[~border] == 2).all()
@@ -124,7 +124,7 @@ def test_a_tile_is_independent_of_other_tiles(seed):
 
 
 def test_outlines_on_tile_borders_and_grid_ties_leave_no_gaps():
-    """Edges along a tile's side, corners on it, and crossings half a grid step off it."""
+    """Edges and corners on a tile's side, and crossings half a grid step away from it."""
     half = PRECISION / 2
     polygons = [
         shapely.box(-10, 0, 16, 10),  # ends on a side
@@ -141,7 +141,7 @@ def test_outlines_on_tile_borders_and_grid_ties_leave_no_gaps():
 
 
 def test_vertices_are_exact_in_tile_coordinates():
-    """A power of two as the grid: whole metres off and on again give the same numbers."""
+    """The grid is a power of two, so subtracting and adding whole metres is exact."""
     plan = plan_ground(EXTENT, layers_of(blobs(3), np.random.default_rng(3)), tile_size=25.0)
     mesh = ground_tile(plan, 0, j=0)
     assert (mesh.shifted((-5000, 4000, 0)).shifted((5000, -4000, 0)).vertices == mesh.vertices).all()

@@ -1,4 +1,4 @@
-"""What the map draws becomes ground of the right class, the sea lies right of coasts, water is level."""
+"""Land cover has the right class, the sea lies right of coastlines, and water is level."""
 
 import numpy as np
 import pytest
@@ -172,7 +172,7 @@ def test_a_contradictory_coast_is_reported():
 
 
 def rising(x, y):
-    """A slope to the east, with bumps."""
+    """Height of a bumpy slope that rises to the east."""
     return 50 + 0.2 * np.asarray(x) + np.sin(np.asarray(y) / 7)
 
 
@@ -220,7 +220,7 @@ def test_connected_waters_have_one_level_that_of_the_sea_if_they_touch():
 
 
 def test_a_river_never_flows_uphill_and_is_reversed_if_mapped_so():
-    """The map draws it eastward, up the slope; the water falls to the west."""
+    """The river is mapped eastward, up the slope; its water level falls to the west."""
     stream = way(1, [(-90, 0), (0, 5), (90, 0)], waterway="river")
     layers, _ = cover(stream)
     levels = water_levels(layers, [stream], frame=FRAME, height=rising)

@@ -1,4 +1,4 @@
-"""Heights are the elevation model's, bilinear between its posts, whatever its grid, unit and tiling."""
+"""Heights are interpolated bilinearly between posts, for any CRS, unit and tiling of the elevation model."""
 
 import pickle
 import zipfile
@@ -19,7 +19,7 @@ UTM = "EPSG:32632"  # 9 E is its meridian: easting 500,000
 
 
 def write_dem(path, values, *, corner, step=25.0, crs=UTM, nodata=None, unit=None, dtype="float32"):
-    """A GeoTIFF whose first pixel's outer corner is ``corner``, north up."""
+    """A north-up GeoTIFF with its upper left corner at ``corner``."""
     values = np.asarray(values, dtype)
     with rasterio.open(
         path, "w", driver="GTiff", width=values.shape[1], height=values.shape[0], count=1, dtype=dtype,
@@ -37,7 +37,7 @@ def posts(corner, shape, step=25.0):
 
 
 def around(shape=(60, 60), step=25.0):
-    """A corner such that a raster of that shape is centred on the frame's centre."""
+    """The upper left corner of a raster of this shape centred on the frame's centre."""
     east, north = FRAME.to_crs(0.0, 0.0, crs=UTM)
     return float(east) - shape[1] * step / 2 + 3.7, float(north) + shape[0] * step / 2 - 8.1
 
@@ -47,7 +47,7 @@ def sample(count=500, seed=0):
 
 
 def test_interpolated_heights_of_a_plane_are_exact(tmp_path):
-    """Bilinear interpolation reproduces a plane: to float32's step, only if posts are at pixels' middles."""
+    """Bilinear interpolation reproduces a plane to float32 precision if posts are at pixel centres."""
     corner = around()
     east, north = posts(corner, (60, 60))
     path = write_dem(
@@ -78,7 +78,7 @@ def test_height_between_four_posts_is_bilinear(tmp_path):
 
 
 def test_tiles_of_one_model_equal_one_raster_in_any_order(tmp_path):
-    """No seam: the strip between the last posts of one tile and the first of the next is interpolated too."""
+    """The strip between the last posts of one tile and the first of the next is interpolated, too."""
     corner = around()
     values = np.random.default_rng(1).uniform(0, 50, (60, 60))
     whole = write_dem(tmp_path / "whole.tif", values, corner=corner)
@@ -230,7 +230,7 @@ def test_known_heights_of_real_places(shared_dem, name, lon, lat, metres):
 
 @pytest.mark.shared
 def test_two_srtm_tiles_meet_without_a_seam_at_50_north(shared_dem):
-    """Along a line across the tiles' border steps are as small as anywhere else."""
+    """Height differences along a line are as small across the tiles' border as elsewhere."""
     frame = Frame.at(11.55, 50.0)
     paths = [shared_dem("N49E011.hgt.zip"), shared_dem("N50E011.hgt.zip")]
     terrain = open_terrain(paths, frame, bounds=(-1500, -1500, 1500, 1500))

@@ -1,4 +1,4 @@
-"""Street furniture stands beside the road and faces whom it is for; barriers leave roads open."""
+"""Street furniture stands beside the road and faces the traffic it addresses; barriers leave roads open."""
 
 import manifold3d
 import numpy as np

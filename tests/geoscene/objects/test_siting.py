@@ -1,4 +1,4 @@
-"""No post, pole or trunk stands where vehicles pass."""
+"""No post, pole or trunk stands on a carriageway."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Trees stand where they can, are as high as the map says, and are the same whoever builds which tile."""
+"""Trees have the mapped sizes, avoid roads and buildings, and do not depend on the tiles built."""
 
 import manifold3d
 import numpy as np
@@ -67,7 +67,7 @@ def test_only_crowns_and_hedges_have_a_leaf_area_density():
 
 
 def test_a_sign_faces_its_heading():
-    """The retro-reflecting side looks along the heading."""
+    """The retro-reflecting side faces the heading."""
     sign = expand(place("sign_round", np.zeros((1, 3)), heading=np.radians(120)), list(shapes().values()))
     front = sign.material == materials()["retroreflector"].code
     normal = sign.normals()[front].mean(axis=0)

@@ -1,4 +1,4 @@
-"""Traffic keeps to the side of its country, or to the one the map or the user says."""
+"""The driving side is that of the options, else of the map's tags, else of the country."""
 
 import json
 import zoneinfo

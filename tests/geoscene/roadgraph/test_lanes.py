@@ -1,4 +1,4 @@
-"""Lanes have one place, whoever asks for it: routes, traffic, paint and OpenDRIVE."""
+"""Routes, traffic, lane markings and OpenDRIVE use the same lane positions."""
 
 import xml.etree.ElementTree as ET
 

@@ -1,4 +1,4 @@
-"""Road surfaces cover what roads cover, wide as they are, and what is painted lies on them."""
+"""Road surfaces have the width of their roads, join without gaps, and carry the road markings."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def surfaces_of(places, ways, points=(), **options):
 
 
 def visible(rows, klass):
-    """What is seen of a class when the higher priority wins."""
+    """Visible area of a class where the polygon of higher priority covers others."""
     own = shapely.union_all(rows.polygon[rows.klass == klass])
     over = rows.priority > rows.priority[rows.klass == klass].max(initial=-1)
     return shapely.difference(own, shapely.union_all(rows.polygon[over]))
@@ -198,7 +198,7 @@ def check_rows(rows):
 
 @st.composite
 def networks(draw):
-    """Random streets over few places, some of them the same place."""
+    """Random streets between a few nodes, some of them at the same position."""
     places = {n: (draw(st.integers(-60, 60)), draw(st.integers(-60, 60))) for n in range(8)}
     tags = st.fixed_dictionaries(
         {

@@ -1,4 +1,4 @@
-"""The drivable graph says what the map says, and routes obey it."""
+"""The road graph has the tags and restrictions of the map, and routes obey them."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -37,7 +37,7 @@ LIFT = np.array([0.0, 0.0, 12.3456])
 
 
 def town(places, ways, points=(), relations=()):
-    """A map from node places in scene metres: ``ways`` are (tags, node ids)."""
+    """A map of nodes at positions in scene metres; ``ways`` are (tags, node ids)."""
     lonlat = {n: np.array(FRAME.to_geographic(*xy)) for n, xy in places.items()}
     lost = np.full(2, np.nan)
     return OsmData(
@@ -416,7 +416,7 @@ def test_restriction_on_ways_that_cannot_be_driven_is_reported():
 
 
 def obeys(edges, graph, pairs):
-    """Whether a drive takes permitted turns alone, by looking at every stretch of it."""
+    """Whether a drive takes only permitted turns, checked for every part of it."""
     if any(turn not in pairs for turn in pairwise(edges)):
         return False
     only = {}
@@ -554,7 +554,7 @@ def test_map_without_roads_gives_an_empty_graph_and_a_clear_error():
 
 @st.composite
 def maps(draw):
-    """A random map of streets over few nodes, ids negative too."""
+    """A random map of streets between a few nodes, some with negative ids."""
     ids = draw(st.lists(st.integers(-50, 50), min_size=2, max_size=12, unique=True))
     coordinate = st.integers(-500_000, 500_000).map(lambda mm: mm / 1000)
     places = {n: (draw(coordinate), draw(coordinate)) for n in ids}

@@ -1,4 +1,4 @@
-"""Roads are smooth, bridges clear what they cross, tunnels run under the ground."""
+"""Longitudinal profiles are smooth, bridges have clearance, and tunnels run below the ground."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def graph_of(places, ways):
 
 
 def heights(graph):
-    """Stations of a graph with heights, and their heights."""
+    """Stations of a graph, and their heights."""
     stations = place_stations(graph, spacing=1e9)
     z = np.zeros(len(stations.xy))
     z[stations.row] = np.concatenate([graph.geometry[e][:, 2] for e in np.unique(stations.edge)])
@@ -61,7 +61,7 @@ def clearances(graph):
 
 
 def steps_beyond(graph, ground):
-    """Changes of slope from one station to the next, beyond the ground's own where all three lie on it."""
+    """Changes of gradient between stations, less those of the ground where the road lies on it."""
     stations, z = heights(graph)
     terrain = np.asarray(ground(*stations.xy.T), float)
     a, b, _, edge = stations.segments

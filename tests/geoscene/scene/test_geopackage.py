@@ -1,4 +1,4 @@
-"""Features in the GeoPackage are the features of the scene, and the file depends on them alone."""
+"""The GeoPackage has the features of the scene and depends on nothing else."""
 
 import geopandas
 import numpy as np

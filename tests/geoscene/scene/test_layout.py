@@ -1,4 +1,4 @@
-"""The files of a scene have one home."""
+"""File names of a scene are defined in one module."""
 
 import ast
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The demo extract: there, small, alive, and cut the same again."""
+"""The demo extract: its size and contents, and its reproducible creation."""
 
 import subprocess
 import sys

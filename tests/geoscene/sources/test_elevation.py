@@ -1,4 +1,4 @@
-"""Elevation tiles, asked of a server on the loopback that cuts them from surfaces known everywhere."""
+"""Elevation tiles, served on the loopback interface and sampled from analytic surfaces."""
 
 import io
 import json
@@ -25,13 +25,13 @@ LON, LAT = 7.42, 43.735
 
 
 def encode(metres):
-    """The terrarium colours of heights, as the data set's page on formats defines them."""
+    """Terrarium colours of heights, as documented by the data set."""
     counts = np.round((metres + 32768.0) * 256).astype(np.int64)
     return np.stack([counts >> 16, counts >> 8 & 255, counts & 255], axis=-1).astype(np.uint8)
 
 
 class TileCutter(ThreadingHTTPServer):
-    """Serves tiles of ``surface``, a function of web-Mercator metres."""
+    """Server of tiles of ``surface``, a function of web-Mercator metres."""
 
     daemon_threads = True
 
@@ -63,11 +63,11 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *args):
-        """Quiet."""
+        """Log nothing."""
 
 
 def slope(east, north):
-    """A plane in web-Mercator metres, which bilinear interpolation gives back exactly."""
+    """A plane in web-Mercator metres, which bilinear interpolation reproduces exactly."""
     east0, north0 = HALF * LON / 180, HALF * np.arcsinh(np.tan(np.radians(LAT))) / np.pi
     return 300.0 + 0.125 * (east - east0) - 0.0625 * (north - north0)
 

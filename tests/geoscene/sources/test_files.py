@@ -1,4 +1,4 @@
-"""Extracts become features: every format, every order, every defect."""
+"""Reading extracts: all formats, any order of elements, and defects."""
 
 import bz2
 import gzip
@@ -52,7 +52,7 @@ METRE = 9e-6  # degrees of latitude
 
 
 def square(x: float, y: float, side: float = 20.0) -> list[tuple[float, float]]:
-    """Corners in metres, counter-clockwise."""
+    """Corners of a square in metres, counter-clockwise."""
     return [(x, y), (x + side, y), (x + side, y + side), (x, y + side)]
 
 
@@ -407,7 +407,7 @@ def test_a_file_that_is_not_a_map_is_refused_in_one_line(tmp_path):
 @pytest.mark.shared
 @pytest.mark.parametrize("name", ALL)
 def test_no_building_of_a_real_extract_is_dropped_without_a_problem(shared_osm, name):
-    """Whatever is tagged as a building is an area, or in the report, or bounds a relation's area."""
+    """Every element tagged as a building is an area, a problem, or a member of an area's relation."""
     path = shared_osm(name)
     data = read_osm(path)
     made = {a.osm_id for a in data.areas}
@@ -431,7 +431,7 @@ def test_no_building_of_a_real_extract_is_dropped_without_a_problem(shared_osm, 
 
 @pytest.mark.shared
 def test_number_of_buildings_equals_that_of_libosmium(shared_osm):
-    """Where libosmium can read a file whole (ids positive and sorted, nothing cut) it finds the same."""
+    """Compared for files that libosmium can read completely (positive, sorted ids; no cut features)."""
     for name in ("monaco.osm.pbf", "bayreuth_north.osm.gz", "brumadinho.osm.gz"):
         path = shared_osm(name)
         factory = osmium.geom.WKBFactory()

@@ -1,4 +1,4 @@
-"""Map servers, spoken to over real HTTP: a server on the loopback answers from the demo extract."""
+"""Map servers over HTTP: a server on the loopback interface answers from the demo extract."""
 
 import json
 import re
@@ -27,7 +27,7 @@ KINDS = {"n": "node", "w": "way", "r": "relation"}
 
 
 class Extract:
-    """The demo extract as Overpass would hold it."""
+    """The demo extract as an Overpass database."""
 
     def __init__(self) -> None:
         self.nodes, self.ways, self.relations = {}, {}, {}
@@ -49,7 +49,7 @@ class Extract:
                 }
 
     def answer(self, query: str) -> dict:
-        """What Overpass answers to the query that geoscene sends; any other query is a fault."""
+        """Overpass's answer to the query that geoscene sends; other queries fail."""
         south, west, north, east = map(float, re.search(r"way\(([^)]*)\)", query)[1].split(","))
         box = f"({south:.7f},{west:.7f},{north:.7f},{east:.7f})"
         assert re.sub(r"timeout:\d+", "timeout:20", query) == (
@@ -109,11 +109,11 @@ PLACES = {
 
 
 class MapServer(ThreadingHTTPServer):
-    """Nominatim and Overpass under one address.
+    """Nominatim and Overpass at one address.
 
-    asked   : the requests, as (path, user agent)
-    refuse  : statuses to refuse the next requests for data with, in order
-    status  : the page that says when a query may be sent
+    asked   : requests as (path, user agent)
+    refuse  : HTTP statuses of the next requests for data, in order
+    status  : text of the status page, with the time of the next free slot
     """
 
     def __init__(self, extract: Extract) -> None:
@@ -170,7 +170,7 @@ class Handler(BaseHTTPRequestHandler):
         self._send(200, json.dumps(answer).encode())
 
     def log_message(self, *args: object) -> None:
-        """Quiet."""
+        """Log nothing."""
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +209,7 @@ def servers_at(*servers: MapServer) -> Servers:
 
 
 def nowhere() -> str:
-    """An address at which nobody listens."""
+    """An address without a server."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"http://127.0.0.1:{probe.getsockname()[1]}"

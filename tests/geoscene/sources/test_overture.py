@@ -1,4 +1,4 @@
-"""Buildings of Overture Maps: those of the demo extract in Overture's schema, and odd rows by hand."""
+"""Buildings of Overture Maps: those of the demo extract in Overture's schema, and rows with defects."""
 
 import json
 import sys
@@ -59,7 +59,7 @@ def _whole(row):
 
 
 def _row(area):
-    """A building of OpenStreetMap as Overture's conversion writes it."""
+    """A row in Overture's schema of a building of OpenStreetMap."""
     tags = area.tags
     levels = parse_number(tags.get("building:levels"))
     kind, number = area.osm_id.split("/")

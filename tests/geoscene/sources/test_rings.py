@@ -1,4 +1,4 @@
-"""Boundaries become areas, however they are cut up, turned round and mixed."""
+"""Boundaries become areas for any order, direction and division of their ways."""
 
 from itertools import pairwise
 
@@ -32,7 +32,7 @@ def cities(draw):
 
 
 def chains_of(blocks, rng) -> tuple[list[Chain], np.ndarray]:
-    """The rings cut into pieces at random nodes, each piece turned round or not, all shuffled."""
+    """The rings cut at random nodes into pieces of random direction, shuffled."""
     xy = []
     chains = []
     for outer, holes in blocks:

@@ -1,4 +1,4 @@
-"""Bridges carry roads at their height, tunnels are open from mouth to mouth, and all of them are solids."""
+"""Bridges carry roads at the right height, tunnels are passable, and all structures are closed solids."""
 
 from itertools import pairwise
 
@@ -59,7 +59,7 @@ def town(places, ways, areas=()):
 
 
 class Town:
-    """A map with its structures, as a scene has them."""
+    """A map with its road graph, ground and structures."""
 
     def __init__(self, osm, frame=FRAME, ground=flat):
         graph, _ = build_road_graph(osm, frame)
@@ -77,7 +77,7 @@ class Town:
         return numbered([self.meshes[k] for k in chosen])
 
     def centre_lines(self, kind, step=2.0):
-        """Points (n, 3) on the centre lines of edges of a kind, not nearer than 0.5 m to their ends."""
+        """Points (n, 3) on centre lines of edges of a kind, at least 0.5 m from their ends."""
         once = (self.graph.twin < 0) | (self.graph.twin > np.arange(len(self.graph)))
         points = []
         for edge in np.flatnonzero(getattr(self.graph, kind) & once):
@@ -102,7 +102,7 @@ def moved(points, *offset):
 
 
 def hits(mesh, points):
-    """Heights and faces of the mesh above and below points: (point (h,), z (h,), face (h,))."""
+    """Intersections of vertical lines through points with the mesh: (point (h,), z (h,), face (h,))."""
     corners = mesh.vertices[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lying = np.flatnonzero(np.abs(normal[:, 2]) > 1e-9)
@@ -115,7 +115,7 @@ def hits(mesh, points):
 
 
 def first_below(mesh, points):
-    """Height (n,) and class (n,) of what a ray straight down from the points meets first."""
+    """Height (n,) and class (n,) of the first hit of rays straight down from points."""
     point, z, face = hits(mesh, points)
     under = z <= points[point, 2]
     point, z, face = point[under], z[under], face[under]
@@ -128,14 +128,14 @@ def first_below(mesh, points):
 
 
 def first_above(mesh, points):
-    """Height (n,) of what a ray straight up from the points meets first."""
+    """Height (n,) of the first hit of rays straight up from points."""
     return -first_below(
         Mesh.of(mesh.vertices * [1, 1, -1], mesh.faces, klass=mesh.klass), points * [1, 1, -1]
     )[0]
 
 
 def crosses(mesh, start, end):
-    """Whether the segment from start to end (3,) meets a face (Moeller and Trumbore 1997)."""
+    """Whether the segment from start to end (3,) intersects a face (Moeller and Trumbore 1997)."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     way = np.asarray(end, float) - start
     p = np.cross(way, c - a)
@@ -459,7 +459,7 @@ def lane(town, name, aside=0.0, step=2.0, ends=0.5):
 
 
 def blocked(mesh, points, up=1.0):
-    """How often the way from one point to the next meets a solid."""
+    """Number of segments between consecutive points that intersect a solid."""
     return sum(crosses(mesh, moved(a, 0, 0, up), moved(b, 0, 0, up)) for a, b in pairwise(points))
 
 
@@ -540,7 +540,7 @@ def test_adjacent_carriageways_are_divided_midway():
 
 
 def ground_mesh(town, extent):
-    """The ground of a map's extent, cut along lines 10 m apart, with what its structures ask for."""
+    """The ground of a map, cut along lines 10 m apart, with the openings of its structures."""
     bare = Layers.of([shapely.box(*extent)], klass=Class.GRASS, material=7, priority=1.0)
     layers = Layers.concatenate([bare, opening_layers(town.table, town.openings)])
     plan = plan_ground(extent, layers, lines=10.0)
@@ -600,7 +600,7 @@ def test_a_foot_tunnel_passes_under_a_road_tunnel_of_a_higher_layer_and_joins_on
 
 
 def roofs(made):
-    """Places (n, 3) of the shells' upward faces of class TUNNEL."""
+    """Centres (n, 3) of upward faces of class TUNNEL."""
     mesh = made.mesh()
     corner = mesh.vertices[mesh.faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])

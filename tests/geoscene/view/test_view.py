@@ -1,4 +1,4 @@
-"""The page holds all of the scene, nothing from elsewhere, and the same bytes every time."""
+"""The page contains the whole scene, loads nothing else, and is reproducible."""
 
 import json
 import re
@@ -30,7 +30,7 @@ LOADERS = ("src=", "@import", "url(", "fetch(", "XMLHttpRequest", "WebSocket", "
 
 
 class Page(HTMLParser):
-    """Elements of a page: text of scripts by id, addresses, and what is seen in the credit."""
+    """Parsed page: text of scripts by id, URLs, and the visible attribution."""
 
     def __init__(self, text):
         super().__init__()
@@ -85,7 +85,7 @@ def page(path):
 
 
 def rows(tile):
-    """Faces as sorted rows of whole numbers: corners in steps, then all columns."""
+    """Faces as sorted rows of integers: corners in quantisation steps, then all columns."""
     corners = np.rint((tile.mesh.vertices + tile.origin) / STEP).astype(np.int64)[tile.mesh.faces]
     columns = [getattr(tile.mesh, name).reshape(len(tile.mesh), -1).astype(np.int64) for name in COLUMNS]
     table = np.column_stack([corners.reshape(-1, 9), *columns])
@@ -93,7 +93,7 @@ def rows(tile):
 
 
 def copies(tile):
-    """Copies as rows in scene metres, in order of feature, shape and place."""
+    """Instances as rows in scene metres, sorted by feature, shape and position."""
     moved = tile.instances.transform.copy()
     moved[:, :, 3] += tile.origin
     table = np.column_stack([tile.instances.feature, tile.instances.shape, moved.reshape(-1, 12)])
@@ -102,7 +102,7 @@ def copies(tile):
 
 
 def moved_corners(scene, table):
-    """Corners (k, 8, 3) of the copied shapes' boxes, in scene metres."""
+    """Corners (k, 8, 3) of the bounding boxes of instances in scene metres."""
     boxes = np.array(
         [[mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)] for mesh in scene.shapes().values()]
     )

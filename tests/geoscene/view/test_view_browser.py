@@ -1,4 +1,4 @@
-"""The page in a real browser: it draws, it answers a click, and it asks nothing of the network."""
+"""The page in a browser: drawing, picking, search, controls, and no network requests."""
 
 import os
 from io import BytesIO
@@ -53,7 +53,7 @@ def window(tmp_path_factory):
 
 @pytest.fixture
 def opened(window, page):
-    """The window with the page newly opened; it must neither complain nor ask the network."""
+    """The window with the page newly opened; asserts no console errors and no network requests."""
     window.complaints(), window.requests()
     window.open(page)
     yield window
@@ -67,12 +67,12 @@ def picture(window):
 
 
 def middle(window):
-    """The part of the window that has no boxes over it."""
+    """The part of the window that no panel covers."""
     return picture(window)[100:560, 300:640]
 
 
 def tall_house(scene, window):
-    """(row, feature, columns) of the highest house in the page that is a way."""
+    """(row, feature, columns) of the highest building that is mapped as a way."""
     buildings = scene.features("buildings").columns
     for row in np.argsort(-buildings["height"]):
         feature = int(buildings["feature"][row])
@@ -84,7 +84,7 @@ def tall_house(scene, window):
 
 
 def look_down(window, feature):
-    """Look at a feature from above; the point of the window where its middle is."""
+    """Look at a feature from above; returns the window position of its centre."""
     window.js(
         "const v = geoscene; v.camera.lookAt(v.boxes.middle(arguments[0]), 2.5 * v.boxes.size(arguments[0]));"
         "v.camera.tilt = 1.5; v.redraw();",
@@ -209,7 +209,7 @@ def test_mouse_and_keys_rotate_move_and_zoom(opened):
 
 @pytest.fixture
 def phone(window, page):
-    """The page newly opened on a telephone."""
+    """The page newly opened on a phone."""
     window.phone(390, 844)
     window.open(page)
     yield window
