@@ -85,12 +85,12 @@ def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.i
 
     only = _commands(graph.turn_kind)
     begun = np.array([chain[:2] for chain in graph.chain_edges[_commands(graph.chain_kind)]], np.int32)
-    commanded = np.concatenate(
+    mandatory = np.concatenate(
         [np.column_stack([graph.turn_from[only], graph.turn_to[only]]), begun.reshape(-1, 2)]
     )
     forbidden = _among(graph, before, after=after, first=graph.turn_from[~only], second=graph.turn_to[~only])
-    forbidden |= np.isin(before, commanded[:, 0]) & ~_among(
-        graph, before, after=after, first=commanded[:, 0], second=commanded[:, 1]
+    forbidden |= np.isin(before, mandatory[:, 0]) & ~_among(
+        graph, before, after=after, first=mandatory[:, 0], second=mandatory[:, 1]
     )
     if not u_turns:
         round_ = graph.twin[before] == after
@@ -145,14 +145,14 @@ def turn_states(graph: RoadGraph, *, u_turns: bool = False) -> TurnStates:
     """
     before, after = turn_table(graph, u_turns=u_turns)
     forbidden: set[tuple[int, ...]] = set()
-    commanded: dict[tuple[int, ...], set[int]] = {}
+    mandatory: dict[tuple[int, ...], set[int]] = {}
     prefixes: set[tuple[int, ...]] = set()
     for edges, only in zip(graph.chain_edges, _commands(graph.chain_kind).tolist(), strict=True):
         chain = tuple(edges.tolist())
         prefixes |= {chain[:k] for k in range(2, len(chain))}
         if only:
             for k in range(2, len(chain)):
-                commanded.setdefault(chain[:k], set()).add(chain[k])
+                mandatory.setdefault(chain[:k], set()).add(chain[k])
         else:
             forbidden.add(chain)
     if not prefixes:
@@ -162,16 +162,16 @@ def turn_states(graph: RoadGraph, *, u_turns: bool = False) -> TurnStates:
     number = {prefix: len(graph) + k for k, prefix in enumerate(ordered)}
     first, second = np.array([p[:2] for p in ordered], np.int32).T
     watched = np.flatnonzero(_among(graph, before, after=after, first=first, second=second))
-    onward: dict[int, list[int]] = {}
+    following: dict[int, list[int]] = {}
     for row in np.flatnonzero(np.isin(before, [prefix[-1] for prefix in ordered])).tolist():
-        onward.setdefault(int(before[row]), []).append(int(after[row]))
+        following.setdefault(int(before[row]), []).append(int(after[row]))
     more: list[tuple[int, int]] = []
     for prefix in ordered:
-        for edge in onward.get(prefix[-1], []):
+        for edge in following.get(prefix[-1], []):
             driven = (*prefix, edge)
             if any(driven[k:] in forbidden for k in range(len(prefix) - 1)):
                 continue
-            if any(edge not in commanded.get(prefix[k:], {edge}) for k in range(len(prefix) - 1)):
+            if any(edge not in mandatory.get(prefix[k:], {edge}) for k in range(len(prefix) - 1)):
                 continue
             ends = (driven[k:] for k in range(len(prefix)))
             more.append((number[prefix], next((number[end] for end in ends if end in number), edge)))

@@ -38,11 +38,11 @@ class Lanes:
     max_width : (m,) metres, maximum width of a body on each edge
     side   : 1 where traffic keeps right, -1 where it keeps left
     state  : (s,) the edge of each state of `geoscene.roadgraph.routing.turn_states`
-    after  : permitted next states of each state
+    successors : permitted next states of each state
     leads_on : (s,) bool, the state does not lead into a dead end inside the map
     leave, enter : (m,) headings in which an edge is left and entered, radians
     traffic_weight : (m,) relative density of traffic
-    open   : (m,) bool, `leads_on` for a start on the edge
+    open   : (m,) bool, `leads_on` of the first state of each edge
     exit, entry : (m,) bool, the edge ends, or begins, at the map's edge
     """
 
@@ -52,7 +52,7 @@ class Lanes:
     max_width: Float
     side: int
     state: Ints
-    after: Sequence[Ints]
+    successors: Sequence[Ints]
     leads_on: NDArray[np.bool_]
     leave: Float
     enter: Float
@@ -67,7 +67,7 @@ def lanes_of(
 ) -> Lanes:
     """The lanes of a road graph.
 
-    bounds : (xmin, ymin, xmax, ymax) of the map in scene metres: streets that end near them go on beyond
+    bounds : (xmin, ymin, xmax, ymax) of the map in scene metres; streets that end near them continue outside
     """
     layout = graph_lanes(graph)
     single = layout.count == 1
@@ -77,7 +77,7 @@ def lanes_of(
     before, after, state = states.before, states.after, states.edge.astype(np.int64)
     order = np.argsort(before, kind="stable")
     starts = np.searchsorted(before[order], np.arange(len(states) + 1))
-    follow = [after[order[a:b]].astype(np.int64) for a, b in itertools.pairwise(starts)]
+    successors = [after[order[a:b]].astype(np.int64) for a, b in itertools.pairwise(starts)]
     ends = [polylines.end_headings(line, reach=HEADING_REACH) for line in graph.geometry]
     enter, leave = np.array(ends).reshape(-1, 2).T
     traffic_weight = np.array([_QUIET.get(str(kind), 1.0) for kind in graph.highway])
@@ -92,7 +92,7 @@ def lanes_of(
         max_width,
         1 if side == "right" else -1,
         state,
-        follow,
+        successors,
         leads_on,
         leave,
         enter,
@@ -183,14 +183,14 @@ def random_lanes(
 ) -> tuple[list[int], list[int]]:
     """Edges and lanes of a random drive from an edge, up to ``metres`` or out of the edges ``inside``.
 
-    Who is in the kerb's lane goes straight on or turns towards the kerb, who is in the innermost lane
-    straight on or the other way, where there is such a way. Going straight on is preferred.
+    From the kerb lane, road users go straight on or turn towards the kerb; from the innermost lane straight
+    on or away from it, if possible. Straight on is preferred.
     """
     edges, picked = [edge], [lane]
     far = float(lanes.graph.length[edge])
     state = edge
     while far < metres:
-        states = lanes.after[state]
+        states = lanes.successors[state]
         ways = lanes.state[states]
         fit = (
             (lanes.max_width[ways] >= width)
