@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
@@ -390,6 +390,5 @@ def _by_tile(shapes: NDArray[Any], tile_size: float) -> dict[tuple[int, int], ND
 
 def take_buildings(buildings: Buildings, rows: NDArray[np.int64], *, parts: NDArray[np.int64]) -> Buildings:
     """The table of some buildings (rows below ``count``, ascending) and of their parts (rows)."""
-    keep = np.concatenate([rows, parts])
-    columns = {f.name: getattr(buildings, f.name)[keep] for f in fields(Buildings)}
-    return Buildings(**(columns | {"outline": np.searchsorted(rows, columns["outline"]).astype(np.int32)}))
+    chosen = buildings.take(np.concatenate([rows, parts]))
+    return replace(chosen, outline=np.searchsorted(rows, chosen.outline).astype(np.int32))

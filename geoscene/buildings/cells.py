@@ -35,15 +35,10 @@ class Cells(Columns):
     face: Ints
 
 
-def plain_cells(polygon: Any) -> Cells:
-    """The Delaunay triangles of a polygon, with a field of 0."""
-    xy, _ = triangulate(np.array([polygon], dtype=object))
-    return Cells(xy, np.zeros(xy.shape[:2]), np.zeros(len(xy), np.int64))
-
-
-def with_field(cells: Cells, direction: Float, *, offset: float) -> Cells:
-    """The cells with the field xy . direction - offset."""
-    return replace(cells, field=cells.xy @ direction - offset)
+def sloped_cells(polygon: Any, direction: Float) -> Cells:
+    """The Delaunay triangles of a polygon, all of one face, with the field xy . direction."""
+    xy, owner = triangulate(np.array([polygon], dtype=object))
+    return Cells(xy, xy @ direction, owner)
 
 
 def cut(cells: Cells, level: float) -> Cells:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import shapely
 
 from geoscene.buildings.appearance import choose_appearance, read_roof, read_walls
-from geoscene.buildings.footprints import clean, groups, object_array, project
+from geoscene.buildings.footprints import clean, groups, project
 from geoscene.buildings.heights import read_heights
 from geoscene.buildings.parts import assign, clusters, cut_overlaps, duplicates, remainder
 from geoscene.buildings.resolve import Row, resolve_heights, texts
@@ -48,7 +48,7 @@ def read_buildings(
 
     score = np.array([len(r.tags) + 1000 * ("height" in r.tags) for r in outlines], float)
     repeated, found = duplicates(
-        [r.osm_id for r in outlines], object_array([r.footprint for r in outlines]), score=score
+        [r.osm_id for r in outlines], np.fromiter([r.footprint for r in outlines], object), score=score
     )
     problems += found
     outlines = [r for r, repeats in zip(outlines, repeated, strict=True) if not repeats]
@@ -71,7 +71,7 @@ def _read_rows(
         else:
             chosen.append(area)
     chosen.sort(key=_id_order)
-    raw = project(object_array([a.geometry for a in chosen]), frame)
+    raw = project(np.fromiter([a.geometry for a in chosen], object), frame)
     polygons, repaired = clean(raw)
     before, after = shapely.area(raw), shapely.area(polygons)
     rows = []
@@ -98,12 +98,12 @@ def _assign_parts(
     outlines: list[Row], parts: list[Row], *, osm: OsmData, options: BuildingOptions, problems: list[Problem]
 ) -> list[Row]:
     """Buildings, then parts with the rows of their outlines; the rest of an outline is a part too."""
-    shapes = object_array([p.footprint for p in parts])
+    shapes = np.fromiter([p.footprint for p in parts], object)
     target = assign(
         [p.osm_id for p in parts],
         shapes,
         outline_id=[r.osm_id for r in outlines],
-        outline=object_array([r.footprint for r in outlines]),
+        outline=np.fromiter([r.footprint for r in outlines], object),
         relations=osm.relations,
     )
     buildings = list(outlines)
@@ -111,7 +111,7 @@ def _assign_parts(
     for group in groups(clusters(shapes[orphans])):
         members = orphans[group]
         first = parts[members[np.argmax(shapely.area(shapes[members]))]].osm_id
-        shape = clean(object_array([shapely.union_all(shapes[members])]))[0][0]
+        shape = clean(np.fromiter([shapely.union_all(shapes[members])], object))[0][0]
         target[members] = len(buildings)
         buildings.append(Row(first, {}, shape, "yes"))
         detail = f"{len(members)} parts outside any outline, {shapely.area(shape):.1f} m2, made one building"
@@ -142,7 +142,7 @@ def _table(
     problems: list[Problem],
 ) -> Buildings:
     """The table's columns; ``bounds`` are those of the map in degrees."""
-    footprint = object_array([r.footprint for r in rows])
+    footprint = np.fromiter([r.footprint for r in rows], object)
     is_part = np.array([r.is_part for r in rows], np.bool_)
     outline = np.array([r.outline for r in rows], np.int32)
     tagged = [read_heights(r.tags, options=options) for r in rows]
@@ -215,6 +215,5 @@ def _without_vanished(table: Buildings) -> Buildings:
     alive[table.outline[table.is_part & keep]] = True
     keep &= table.is_part | table.drawn | alive
     number = np.cumsum(keep) - 1
-    columns = {f.name: getattr(table, f.name)[keep] for f in fields(Buildings)}
-    columns["outline"] = number[columns["outline"]].astype(np.int32)
-    return Buildings(**columns)
+    kept = table.take(keep)
+    return replace(kept, outline=number[kept.outline].astype(np.int32))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,13 +22,6 @@ def to_grid(xy: Float) -> Float:
     """Coordinates rounded to the 0.1 mm grid."""
     # like GEOS: division by 1e4 gives the float nearest to the decimal, multiplication by 1e-4 does not
     return np.rint(xy * 1e4) / 1e4
-
-
-def object_array(shapes: Sequence[Any]) -> Polygons:
-    """Shapes as an array of objects (n,)."""
-    out = np.empty(len(shapes), dtype=object)
-    out[:] = shapes
-    return out
 
 
 def groups(number: NDArray[np.integer]) -> list[Ints]:

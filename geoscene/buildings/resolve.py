@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import shapely
 
-from geoscene.buildings.footprints import object_array
 from geoscene.buildings.heights import HIGHEST, SIGMA_PRIOR, Tagged, infer_heights
 from geoscene.buildings.roof_tags import RoofTags, default_roof_height
 from geoscene.buildings.table import BuildingOptions, Texts
@@ -134,7 +133,7 @@ def _resolve_buildings(
     h.sigma[higher] = h.sigma[top[higher]]
 
     whole = np.flatnonzero(~is_part)
-    footprint = object_array([rows[k].footprint for k in whole.tolist()])
+    footprint = np.fromiter([rows[k].footprint for k in whole.tolist()], object)
     inferred, sigma, rule = infer_heights(
         shapely.get_coordinates(shapely.point_on_surface(footprint)),
         texts([rows[k].use for k in whole.tolist()]),

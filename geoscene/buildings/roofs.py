@@ -14,10 +14,9 @@ from geoscene.buildings.cells import (
     cut,
     merged,
     outlines,
-    plain_cells,
     raise_gables,
     skeleton_cells,
-    with_field,
+    sloped_cells,
 )
 from geoscene.buildings.footprints import to_grid
 from geoscene.buildings.shells import Triangles, close, distinct_corners, lift, prisms, triangulate
@@ -175,7 +174,7 @@ def _profile(field: Float, span: float, *, profile: Profile) -> Float:
 
 def _skillion(polygon: Any, spec: RoofSpec) -> Cells:
     """One plane; the field is the share of the roof's height."""
-    cells = with_field(plain_cells(polygon), _slope(polygon, spec), offset=0.0)
+    cells = sloped_cells(polygon, _slope(polygon, spec))
     low, high = cells.field.min(), cells.field.max()
     return replace(cells, field=(cells.field - low) / (high - low))
 
@@ -184,7 +183,7 @@ def _ridged(polygon: Any, spec: RoofSpec) -> Cells:
     """A cross-section extruded along the ridge; the field is the share of the roof's height."""
     up = _slope(polygon, spec)
     profile = SECTIONS[spec.shape]
-    cells = with_field(plain_cells(polygon), up, offset=0.0)
+    cells = sloped_cells(polygon, up)
     low = float(cells.field.min())
     span = float(cells.field.max()) - low
     cells = replace(cells, field=cells.field - low)
@@ -239,18 +238,17 @@ def _from_cells(cells: Cells, spec: RoofSpec) -> Triangles:
     # the highest point has the tagged height even if the footprint excludes the ridge
     share = cells.field / cells.field.max()
     corners = np.concatenate([cells.xy, to_grid(eaves + share * spec.height)[..., None]], axis=2)
-    zeros = np.zeros(len(corners), np.int64)
-    top = Triangles(corners, zeros, np.full(len(corners), ROOF, np.uint8))
-    low = to_grid(np.array([spec.low]))
-    polygons = outlines(cells.xy, zeros)
-    xy = cells.xy if polygons is None else triangulate(polygons)[0]
-    return close(top, _floor(xy, low), underside=low)
+    polygons = outlines(cells.xy, np.zeros(len(corners), np.int64))
+    return _closed(corners, cells.xy if polygons is None else triangulate(polygons)[0], low=spec.low)
 
 
-def _floor(xy: Float, low: Float) -> Triangles:
-    """Floor triangles at height ``low`` (1,) from triangles in plan (m, 3, 2)."""
-    zeros = np.zeros(len(xy), np.int64)
-    return Triangles(lift(xy, low[zeros]), zeros, np.full(len(xy), FLOOR, np.uint8))
+def _closed(corners: Float, xy: Float, *, low: float) -> Triangles:
+    """The shell of roof triangles (m, 3, 3) over a floor at ``low`` of triangles in plan (k, 3, 2)."""
+    bottom = to_grid(np.array([low]))
+    none, zeros = np.zeros(len(corners), np.int64), np.zeros(len(xy), np.int64)
+    top = Triangles(corners, none, np.full(len(corners), ROOF, np.uint8))
+    floor = Triangles(lift(xy, bottom[zeros]), zeros, np.full(len(xy), FLOOR, np.uint8))
+    return close(top, floor, underside=bottom)
 
 
 def _radial(polygon: Any, spec: RoofSpec) -> Triangles:
@@ -270,8 +268,5 @@ def _radial(polygon: Any, spec: RoofSpec) -> Triangles:
         a, b, c, d = lower, np.roll(lower, -1, axis=0), np.roll(upper, -1, axis=0), upper
         triangles += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
     corners = np.concatenate(triangles)
-    corners = corners[distinct_corners(corners)]
-    zeros = np.zeros(len(corners), np.int64)
-    top = Triangles(corners, zeros, np.full(len(corners), ROOF, np.uint8))
-    low = to_grid(np.array([spec.low]))
-    return close(top, _floor(triangulate(np.array([polygon], dtype=object))[0], low), underside=low)
+    floor, _ = triangulate(np.array([polygon], dtype=object))
+    return _closed(corners[distinct_corners(corners)], floor, low=spec.low)

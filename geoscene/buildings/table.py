@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from geoscene.typing import Bools, Float
 
 Texts = NDArray[np.object_]
@@ -41,7 +42,7 @@ class BuildingOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Buildings:
+class Buildings(Columns):
     """One row per building, then one per part; a building's row is its feature number in the layer.
 
     osm_id           : (n,) str
@@ -94,10 +95,6 @@ class Buildings:
     roof_material: NDArray[np.uint8]
     wall_source: Texts
     roof_look_source: Texts
-
-    def __len__(self) -> int:
-        """Number of rows, parts included."""
-        return len(self.osm_id)
 
     @property
     def count(self) -> int:

@@ -14,6 +14,7 @@ from geoscene import polylines
 from geoscene.classes import Class, materials
 from geoscene.ground.layers import PADS, Layers
 from geoscene.structures.heights import surface_heights
+from geoscene.structures.sheets import areal
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
 from geoscene.typing import Float, Height, Ints
 
@@ -37,6 +38,9 @@ _EDGE = 0.05
 
 _HIGH = 1.0
 """Metres over the ground around it at which a deck is over the ground below it as well."""
+
+_TINY = 0.01
+"""Square metres; smaller parts of areas are left out."""
 
 _INTO = 0.1
 """Metres by which the ground reaches into a tunnel's wall beside an opening."""
@@ -87,7 +91,7 @@ def find_low_decks(table: Structures, height: Height | None) -> Structures:
         high = ground > surface_heights(table, k, xy=xy) - table.body[k]
         met = strips[np.bincount(strip[high], minlength=len(strips)) > 0]
         within = table.polygon[k].buffer(-_EDGE, join_style="mitre")
-        low[k] = _areal(shapely.union_all(shapely.buffer(met, 1e-3)).intersection(within))
+        low[k] = areal(shapely.union_all(shapely.buffer(met, 1e-3)).intersection(within), least=_TINY)
     return replace(table, low=low)
 
 
@@ -102,20 +106,13 @@ def _strips(table: Structures, k: int) -> NDArray[np.object_]:
     ]
     rest = table.polygon[k].difference(shapely.union_all(strips))  # beyond the line's ends, as at bends
     across = shapely.intersection(np.array(strips, object), table.polygon[k])
-    return np.append(across, shapely.get_parts(_areal(rest)))
+    return np.append(across, shapely.get_parts(areal(rest, least=_TINY)))
 
 
 def _ground_on(strips: NDArray[np.object_], height: Height | None) -> tuple[Float, Ints, Float]:
     """Points (n, 2) around strips, the strip of each, and the ground's height there."""
     xy, strip = shapely.get_coordinates(shapely.segmentize(strips, _STEP), return_index=True)
     return xy, strip, np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
-
-
-def _areal(shape: shapely.Geometry) -> shapely.MultiPolygon:
-    """The polygons of a shape without tiny ones."""
-    parts = shapely.get_parts(shape)
-    areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0.01)
-    return shapely.MultiPolygon(parts[areal].tolist())
 
 
 def find_openings(table: Structures, height: Height | None) -> NDArray[np.object_]:
@@ -132,7 +129,7 @@ def find_openings(table: Structures, height: Height | None) -> NDArray[np.object
         if open_.any():
             within = table.inner[k].buffer(table.body[k] - _INTO, join_style="mitre")
             shape = shapely.union_all(shapely.buffer(strips[open_], 1e-3)).intersection(table.polygon[k])
-            opening = _areal(shape.intersection(within))
+            opening = areal(shape.intersection(within), least=_TINY)
             openings[k] = None if opening.is_empty else opening
     return openings
 

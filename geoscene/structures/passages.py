@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import shapely
@@ -99,20 +99,18 @@ def _divided(
         for k in np.unique(buildings.outline[row[over_what == what]]).tolist()
     ]
     extra = np.array(source, np.int64)
-    added = {f.name: getattr(buildings, f.name)[extra] for f in fields(Buildings)}
-    added["footprint"] = np.array(shape, object) if shape else np.empty(0, object)
-    added |= {
-        "is_part": np.ones(len(extra), np.bool_),
-        "outline": buildings.outline[extra],
-        "min_height": np.array(new_low, float),
-        "min_height_source": np.array(cause, object),
-        "roof_shape": np.full(len(extra), "flat", object),
-        "roof_height": np.zeros(len(extra)),
-        "roof_source": np.full(len(extra), "none", object),
-    }
+    added = replace(
+        buildings.take(extra),
+        footprint=np.fromiter(shape, object),
+        is_part=np.ones(len(extra), np.bool_),
+        min_height=np.array(new_low, float),
+        min_height_source=np.array(cause, object),
+        roof_shape=np.full(len(extra), "flat", object),
+        roof_height=np.zeros(len(extra)),
+        roof_source=np.full(len(extra), "none", object),
+    )
     kept = replace(buildings, footprint=footprint, min_height=underside)
-    columns = {f.name: np.concatenate([getattr(kept, f.name), added[f.name]]) for f in fields(Buildings)}
-    return Buildings(**columns), problems
+    return Buildings.concatenate([kept, added]), problems
 
 
 def _polygons(shape: shapely.Geometry) -> shapely.Geometry:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.frames import Frame
+from geoscene.polylines import unit
 from geoscene.report import Problem
 from geoscene.roadgraph import find_obstacles
 from geoscene.roadgraph.graph import RoadGraph
@@ -176,9 +177,7 @@ def _ground(xy: Float, height: Height | None) -> Float:
 
 def _onward(xy: Float, width: float) -> shapely.Geometry:
     """The area of the way's first metres before the start of its line."""
-    step = xy[1] - xy[0]
-    step /= max(float(np.hypot(*step)), 1e-9)
-    band = shapely.LineString([xy[0], xy[0] - 3.0 * step]).buffer(width, cap_style="flat")
+    band = shapely.LineString([xy[0], xy[0] - 3.0 * unit(xy[1] - xy[0])]).buffer(width, cap_style="flat")
     return band.union(shapely.Point(xy[0]).buffer(width / 2))
 
 

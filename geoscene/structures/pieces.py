@@ -16,7 +16,7 @@ from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.structures.heights import PARTED, SHEET, nearest_on_line
 from geoscene.structures.layered import PRECISION
 from geoscene.structures.members import Members
-from geoscene.structures.sheets import Sheets, find_sheets, part_outlines, where_same
+from geoscene.structures.sheets import Sheets, areal, find_sheets, part_outlines, where_same
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
 from geoscene.typing import Float, Ints
 
@@ -119,16 +119,9 @@ def _outlines(
                 wedges = [shapely.Point(p[:2]).buffer(half[m] + 1.0) for p in (part[0], part[-1])]
                 outline = outline.intersection(shapely.union_all([reach, *discs, *wedges]))
             rows.append((m, outline, part, polylines.cut(line, start - _AROUND, end=end + _AROUND), half[m]))
-    columns: NDArray[np.object_] = np.empty((3, len(rows)), object)
-    for k, row in enumerate(rows):
-        columns[0, k], columns[1, k], columns[2, k] = row[1:4]
-    return (
-        np.array([r[0] for r in rows], np.int64),
-        columns[0],
-        columns[1],
-        columns[2],
-        np.array([r[4] for r in rows], float),
-    )
+    member, *shapes, width = zip(*rows, strict=True) if rows else ((),) * 5
+    outlines, parts, around = (np.fromiter(column, object) for column in shapes)
+    return np.array(member, np.int64), outlines, parts, around, np.array(width, float)
 
 
 def _wholes(
@@ -180,7 +173,7 @@ def _without_near_vertices(line: Float) -> Float:
 def _half(outline: shapely.Geometry, line: shapely.LineString) -> float:
     """Metres from the line to the outside, midway along it."""
     a, b = (shapely.get_coordinates(line.interpolate(s, normalized=True))[0] for s in (0.499, 0.501))
-    along = (b - a) / max(float(np.hypot(*(b - a))), 1e-9)
+    along = polylines.unit(b - a)
     across = np.array([-along[1], along[0]]) * _SIDE
     ray = shapely.LineString([(a + b) / 2 - across, (a + b) / 2 + across])
     parts = shapely.get_parts(outline.intersection(ray))
@@ -255,9 +248,7 @@ def within_extent(table: Structures, extent: tuple[float, float, float, float]) 
 def _clean(shape: shapely.Geometry) -> shapely.MultiPolygon:
     """A shape on the grid, morphologically opened to remove hairline connections."""
     opened = shape.buffer(-0.005, join_style="mitre").buffer(0.005, join_style="mitre")
-    parts = shapely.get_parts(shapely.set_precision(opened, PRECISION))
-    areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > _CRUMB)
-    return shapely.MultiPolygon(parts[areal].tolist())
+    return areal(shapely.set_precision(opened, PRECISION), least=_CRUMB)
 
 
 def _union(polygons: Sequence[object] | NDArray[np.object_]) -> shapely.Geometry:

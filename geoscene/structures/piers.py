@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.classes import Class
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.structures.heights import nearest_on_line
@@ -108,8 +109,7 @@ def _piers(table: Structures, k: int, *, flat: shapely.LineString, at: Float) ->
         shapely.get_coordinates(shapely.line_interpolate_point(flat, np.clip(at + s, 0.0, flat.length)))
         for s in (-0.5, 0.5)
     )
-    way = there - here
-    way /= np.maximum(np.hypot(*way.T), 1e-9)[:, None]
+    way = polylines.unit(there - here)
     across = np.column_stack([-way[:, 1], way[:, 0]]) * wide / 2
     middle = (here + there) / 2
     lines = shapely.linestrings(np.stack([middle - across, middle + across], axis=1))

@@ -72,10 +72,8 @@ def find_sheets(polygon: NDArray[np.object_], around: NDArray[np.object_], *, tu
     least, most = np.empty((2, len(one)))
     for row, (p, q) in enumerate(zip(one.tolist(), two.tolist(), strict=True)):
         places = shapely.get_coordinates([common[row], common[row].representative_point()])
-        (z, _, beside), (other_z, _, other_beside) = (
-            nearest_on_line(around[p], places),
-            nearest_on_line(around[q], places),
-        )
+        z, _, beside = nearest_on_line(around[p], places)
+        other_z, _, other_beside = nearest_on_line(around[q], places)
         apart = np.abs(z - other_z)
         least[row] = apart.min()
         # Beyond its end a line is extended level: a line that continues it is not another surface.
@@ -88,8 +86,7 @@ def find_sheets(polygon: NDArray[np.object_], around: NDArray[np.object_], *, tu
     one, two = np.concatenate([one[same], two[same]]), np.concatenate([two[same], one[same]])
     order = np.lexsort([two, one])
     ends = np.searchsorted(one[order], np.arange(len(polygon) + 1))
-    near = np.empty(len(polygon), object)
-    near[:] = [two[order[a:b]] for a, b in pairwise(ends)]
+    near = np.fromiter((two[order[a:b]] for a, b in pairwise(ends)), object)
     return Sheets(near, over, parted)
 
 
@@ -126,27 +123,22 @@ def part_outlines(
     keep = one < two
     common = shapely.intersection(polygon[one[keep]], polygon[two[keep]])
     for p, q, meeting in zip(one[keep].tolist(), two[keep].tolist(), common, strict=True):
-        shared = _areal(meeting)
+        shared = areal(meeting)
         if shared.area < _SCANT:
             continue
         least = PARTED if tunnel[p] == tunnel[q] else 0.0
         strips = [
-            *_in_conflict(
-                around[p],
-                around[q],
+            strip
+            for a, b in ((p, q), (q, p))
+            for strip in _in_conflict(
+                around[a],
+                around[b],
                 reach=half[p] + half[q],
-                needs=(free[q] + body[p], free[p] + body[q]),
+                needs=(free[b] + body[a], free[a] + body[b]),
                 least=least,
-            ),
-            *_in_conflict(
-                around[q],
-                around[p],
-                reach=half[p] + half[q],
-                needs=(free[p] + body[q], free[q] + body[p]),
-                least=least,
-            ),
+            )
         ]
-        where = _areal(shapely.union_all(strips).intersection(shared))
+        where = areal(shapely.union_all(strips).intersection(shared))
         if where.area < _SCANT:
             continue
         theirs = _nearer(where, around[q], half=float(half[q]), other=around[p], other_half=float(half[p]))
@@ -158,10 +150,11 @@ def part_outlines(
     return out
 
 
-def _areal(shape: shapely.Geometry) -> shapely.Geometry:
-    """The polygons of a shape."""
+def areal(shape: shapely.Geometry, *, least: float = 0.0) -> shapely.MultiPolygon:
+    """The polygons of a shape that have more than ``least`` square metres."""
     parts = shapely.get_parts(shape)
-    return shapely.MultiPolygon(parts[shapely.get_type_id(parts) == shapely.GeometryType.POLYGON].tolist())
+    kept = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > least)
+    return shapely.MultiPolygon(parts[kept].tolist())
 
 
 def _in_conflict(

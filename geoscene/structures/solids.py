@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.classes import Class, materials
 from geoscene.mesh import FLOOR, OTHER, ROOF, WALL, Mesh
 from geoscene.structures.ground_contact import tunnel_roof
@@ -116,17 +117,13 @@ def _linework(table: Structures, k: int, *, openings: NDArray[np.object_] | None
         if sloped:  # level up to the middle of lanes, sloping from there to the next carriageway
             lines.append(flat.buffer(float(table.half[piece]) / 2, cap_style="flat").boundary)
         lines += list(_ribs(line, float(table.half[piece]) + 1.0))
-    out = np.empty(len(lines), object)
-    out[:] = lines
-    return out
+    return np.fromiter(lines, object)
 
 
 def _ribs(line: Float, reach: float) -> NDArray[np.object_]:
     """Straight lines across a centre line at vertices where it bends or changes its gradient."""
-    step = np.diff(line[:, :2], axis=0)
-    way = step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
-    at = way[:-1] + way[1:]
-    at /= np.maximum(np.hypot(*at.T), 1e-9)[:, None]
+    way = polylines.unit(np.diff(line[:, :2], axis=0))
+    at = polylines.unit(way[:-1] + way[1:])
     across = np.column_stack([-at[:, 1], at[:, 0]]) * reach
     ribs: NDArray[np.object_] = shapely.linestrings(
         np.stack([line[1:-1, :2] - across, line[1:-1, :2] + across], axis=1)

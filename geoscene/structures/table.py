@@ -105,6 +105,5 @@ class Structures:
         number = np.full(len(self), -1, np.int64)
         number[keep] = np.arange(int(keep.sum()))
         columns = {f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name != "surfaces"}
-        near = np.empty(len(columns["near"]), object)
-        near[:] = [number[others[keep[others]]] for others in columns["near"]]
+        near = np.fromiter((number[others[keep[others]]] for others in columns["near"]), object)
         return Structures(**(columns | {"near": near}), surfaces=self.surfaces)

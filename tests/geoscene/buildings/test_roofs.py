@@ -7,7 +7,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from shapely import affinity
 
-from geoscene.buildings.cells import cut, plain_cells, skeleton_cells, with_field
+from geoscene.buildings.cells import cut, skeleton_cells, sloped_cells
 from geoscene.buildings.footprints import clean
 from geoscene.buildings.roofs import RoofSpec, roof_shell
 from geoscene.buildings.shells import sound
@@ -225,7 +225,7 @@ def test_a_replaced_roof_shape_is_reported():
 
 
 def test_a_cut_splits_cells_at_the_level_and_keeps_their_area():
-    cells = with_field(plain_cells(turned(L_SHAPE, 12.0)), np.array([0.6, 0.8]), offset=1.0)
+    cells = sloped_cells(turned(L_SHAPE, 12.0), np.array([0.6, 0.8]))
     level = float(cells.field.mean())
     parts = cut(cells, level)
     assert triangle_areas(parts.xy).sum() == pytest.approx(triangle_areas(cells.xy).sum(), rel=1e-5)
