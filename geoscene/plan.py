@@ -31,7 +31,7 @@ from geoscene.ground import (
     plan_ground,
     water_levels,
 )
-from geoscene.ground.terrain import Terrain, base_heights, flat_terrain, open_terrain
+from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.ground.urban import paved_fabric
 from geoscene.objects.barriers import Barriers, read_barriers
 from geoscene.objects.furniture import Furniture, read_furniture
@@ -136,7 +136,7 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
     built = osm if "buildings" in options.only else replace(osm, areas=[], relations=[])
     buildings = _collect(problems, read_buildings(built, frame))
     extent = _extent(frame, osm.bounds, buildings=buildings)
-    terrain = flat_terrain(frame)
+    terrain = Terrain(frame)
     if options.dem:
         gaps = cast("Literal['error', 'nearest']", options.dem_gaps)
         terrain = open_terrain(options.dem, frame, bounds=extent, outside=gaps)

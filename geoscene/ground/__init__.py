@@ -11,16 +11,11 @@ from geoscene.ground.drape import drape as drape
 from geoscene.ground.drape import ground_tile as ground_tile
 from geoscene.ground.drape import water_levels as water_levels
 from geoscene.ground.landcover import landcover as landcover
-from geoscene.ground.layers import LANDCOVER as LANDCOVER
-from geoscene.ground.layers import PADS as PADS
-from geoscene.ground.layers import ROADS as ROADS
 from geoscene.ground.layers import Layers as Layers
 from geoscene.ground.layers import building_pads as building_pads
 from geoscene.ground.partition import GroundPlan as GroundPlan
-from geoscene.ground.partition import Partition as Partition
 from geoscene.ground.partition import partition as partition
 from geoscene.ground.partition import partition_tile as partition_tile
 from geoscene.ground.partition import plan_ground as plan_ground
 from geoscene.ground.partition import tile_place as tile_place
-from geoscene.ground.triangulate import Triangles as Triangles
 from geoscene.ground.triangulate import triangulate as triangulate

@@ -72,8 +72,7 @@ def _priority(tier: NDArray[np.integer], polygons: NDArray[np.object_]) -> Float
 def _areas(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
     """Land cover drawn as areas that reach into the extent."""
     found = [(area, kind) for area in osm.areas if (kind := area_kind(area.tags)) is not None]
-    polygons = np.empty(len(found), object)
-    polygons[:] = [area.geometry for area, _ in found]
+    polygons = np.fromiter((area.geometry for area, _ in found), object)
     polygons = shapely.transform(polygons, lambda lonlat: _to_scene(frame, lonlat))
     near = shapely.intersects(shapely.box(*extent), shapely.envelope(polygons))
     found = [pair for pair, keep in zip(found, near, strict=True) if keep]

@@ -63,8 +63,7 @@ class Layers(Columns):
         feature: ArrayLike = -1,
     ) -> Layers:
         """Layers of polygons; every other column is broadcast over them."""
-        column = np.empty(len(polygon), object)
-        column[:] = list(polygon)
+        column = np.fromiter(polygon, object)
         n = (len(column),)
         return cls(
             column,
@@ -90,10 +89,8 @@ def building_pads(
 
     Footprints that are None, empty or without area make an empty row, so rows stay aligned with buildings.
     """
-    polygon = np.empty(len(footprints), object)
-    polygon[:] = [shapely.Polygon() if f is None else f for f in footprints]
     return Layers.of(
-        polygon,
+        [shapely.Polygon() if f is None else f for f in footprints],
         klass=Class.BUILDING_PAD,
         material=materials()["concrete"].code,
         priority=PADS,

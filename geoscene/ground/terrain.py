@@ -58,7 +58,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Terrain:
-    """The height of the ground as a function of place.
+    """The height of the ground as a function of place; level at 0 by default.
 
     frame    : the scene frame that x and y are in
     grids    : finest first; a place takes its height from the first that covers it; none for flat ground
@@ -109,11 +109,6 @@ class Terrain:
     @functools.cached_property
     def _transformers(self) -> list[Transformer]:
         return [Transformer.from_crs(self.frame.crs, CRS.from_wkt(g.crs), always_xy=True) for g in self.grids]
-
-
-def flat_terrain(frame: Frame) -> Terrain:
-    """Level ground at z = 0."""
-    return Terrain(frame)
 
 
 def open_terrain(
@@ -190,8 +185,7 @@ def base_heights(footprints: Sequence[object] | NDArray[np.object_], height: Hei
     ``height`` (z of the ground at x, y) is asked at the outline's vertices and at most 2 m apart between
     them. NaN for a footprint that is None or empty.
     """
-    outlines = np.empty(len(footprints), object)
-    outlines[:] = list(footprints)
+    outlines = np.fromiter(footprints, object)
     lowest = np.full(len(outlines), np.inf)
     for first in range(0, len(outlines), _AT_ONCE):
         fine = shapely.segmentize(shapely.boundary(outlines[first : first + _AT_ONCE]), 2.0)

@@ -263,26 +263,19 @@ def _with_openings(polygons: NDArray[np.object_], plan: GroundPlan) -> tuple[NDA
             rest = shapely.difference(out[k], blocked)
             opened[k] |= road and rest.area < out[k].area - 0.01
             out[k] = rest
-    return _polygonal(out), opened
+    return np.fromiter(map(_polygonal, out), object), opened
 
 
-def _polygonal(geometries: NDArray[np.object_]) -> NDArray[np.object_]:
-    """The polygons among geometries' parts, without those of negligible area."""
-    out = np.empty(len(geometries), object)
-    for k, geometry in enumerate(geometries):
-        parts = shapely.get_parts(geometry)
-        parts = parts[
-            (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0.01)
-        ]
-        out[k] = shapely.multipolygons(parts)
-    return out
+def _polygonal(geometry: Any) -> Any:
+    """The polygons among a geometry's parts, without those of negligible area."""
+    parts = shapely.get_parts(geometry)
+    areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0.01)
+    return shapely.multipolygons(parts[areal])
 
 
 def _table(rows: list[tuple[object, Kind, str, float, str, str, str]]) -> Barriers:
-    polygon = np.empty(len(rows), object)
-    polygon[:] = [row[0] for row in rows]
     return Barriers(
-        polygon,
+        np.fromiter((row[0] for row in rows), object),
         np.array([row[1].klass for row in rows], np.uint8),
         np.array([materials()[row[2]].code for row in rows], np.uint8),
         np.array([row[3] for row in rows], float),

@@ -115,7 +115,7 @@ def shapes() -> dict[str, Mesh]:
         "sign_round": _sign(circle(0.6, 12), 2.5),
         "sign_triangle": _sign(circle(0.9, 3) @ _QUARTER, 2.5),
         "sign_give_way": _sign(circle(0.9, 3) @ -_QUARTER, 2.5),
-        "sign_stop": _sign(circle(0.75, 8) @ _eighth(), 2.5),
+        "sign_stop": _sign(circle(0.75, 8) @ _SIXTEENTH, 2.5),
         "sign_rectangle": _sign(rectangle(0.6, 0.6), 2.5),
         "bollard": solid(prism(circle(0.12), -0.2, top=0.9), klass=Class.BOLLARD, material="metal"),
         "bench": _bench(),
@@ -127,19 +127,12 @@ def shapes() -> dict[str, Mesh]:
     }
 
 
-def shape_numbers() -> dict[str, int]:
-    """Number of each shape by name."""
-    return {name: k for k, name in enumerate(shapes())}
-
-
 _QUARTER = np.array([[0.0, 1.0], [-1.0, 0.0]])
 """Rotates row vectors by 90 degrees, counter-clockwise: a triangle's corner from the right to the top."""
 
-
-def _eighth() -> Float:
-    """Matrix that rotates row vectors by 22.5 degrees, so that an octagon stands on an edge."""
-    c, s = np.cos(np.pi / 8), np.sin(np.pi / 8)
-    return np.array([[c, s], [-s, c]])
+_COS, _SIN = np.cos(np.pi / 8), np.sin(np.pi / 8)
+_SIXTEENTH = np.array([[_COS, _SIN], [-_SIN, _COS]])
+"""Rotates row vectors by 22.5 degrees, so that an octagon stands on an edge."""
 
 
 def _street_lamp() -> Mesh:
@@ -220,7 +213,8 @@ def place(
     transform = np.concatenate([turn * size[:, None, :], np.reshape(position, (k, 3, 1))], axis=2)
     names = np.broadcast_to(np.asarray(name, np.str_), (k,))
     known, which = np.unique(names, return_inverse=True)
-    number = np.array([shape_numbers()[str(n)] for n in known], np.int32)[which.reshape(-1)]
+    library = list(shapes())
+    number = np.array([library.index(str(n)) for n in known], np.int32)[which.reshape(-1)]
     return Instances(
         number.astype(np.int32), transform, np.broadcast_to(np.asarray(feature, np.int32), (k,)).copy()
     )

@@ -127,7 +127,7 @@ def read_trees(osm: OsmData, frame: Frame, *, spacing: float = 8.0) -> tuple[Tre
         np.zeros(len(ids)),
         np.array(ids, np.str_),
         np.full(len(ids), -1, np.int32),
-    ), _each_once(problems)
+    ), list(dict.fromkeys(problems))  # the tags of a row are read once per tree
 
 
 def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
@@ -155,7 +155,7 @@ def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
         for osm_id, b in zip(trees.osm_id[blocked], built[blocked], strict=True)
     ]
     placed = replace(trees, xy=xy, place_source=source, moved=np.hypot(*(xy - trees.xy).T))
-    return placed.take(~blocked), _each_once(problems)
+    return placed.take(~blocked), list(dict.fromkeys(problems))  # the tags of a row are read once per tree
 
 
 def needle_shares(plan: GroundPlan, osm: OsmData) -> Float:
@@ -182,17 +182,14 @@ def forest_trees(
     """
     side = 1.0 / np.sqrt(density)
     xmin, ymin, xmax, ymax = tile_box(plan, i, j=j)
-    if not (
-        plan.layers.klass[rows_near(plan, xmin, ymin=ymin, xmax=xmax, ymax=ymax)] == Class.FOREST_FLOOR
-    ).any():
-        return _none()
-    column, row = (
-        grid.ravel()
-        for grid in np.meshgrid(
-            np.arange(np.floor(xmin / side), np.ceil(xmax / side)).astype(np.int64),
-            np.arange(np.floor(ymin / side), np.ceil(ymax / side)).astype(np.int64),
-        )
+    columns, rows = (
+        np.arange(np.floor(low / side), np.ceil(high / side)).astype(np.int64)
+        for low, high in ((xmin, xmax), (ymin, ymax))
     )
+    near = rows_near(plan, xmin, ymin=ymin, xmax=xmax, ymax=ymax)
+    if not (plan.layers.klass[near] == Class.FOREST_FLOOR).any():
+        rows = rows[:0]
+    column, row = (grid.ravel() for grid in np.meshgrid(columns, rows))
     draw = _uniform(seed, column, row=row, count=4)
     x, y = (column + 0.1 + 0.8 * draw[0]) * side, (row + 0.1 + 0.8 * draw[1]) * side
     owner = rows_at(plan, np.column_stack([x, y]))
@@ -227,25 +224,6 @@ def forest_trees(
         np.zeros(n),
         plan.layers.osm_id[owner],
         plan.layers.feature[owner],
-    )
-
-
-def _none() -> Trees:
-    """No trees."""
-    text, number = np.empty(0, np.str_), np.empty(0)
-    return Trees(
-        np.empty((0, 2)),
-        number,
-        number,
-        number,
-        text,
-        text,
-        text,
-        text,
-        text,
-        number,
-        text,
-        np.empty(0, np.int32),
     )
 
 
@@ -343,8 +321,3 @@ def _girth(tags: Tags, osm_id: str, *, problems: list[Problem]) -> float:
     detail = f"circumference={tags['circumference']!r} read as centimetres"
     problems.append(Problem(osm_id, "tree", "repaired", "circumference-in-centimetres", detail))
     return number / 100.0
-
-
-def _each_once(problems: list[Problem]) -> list[Problem]:
-    """Problems without duplicates, in order: the tags of a row are read once per tree."""
-    return list(dict.fromkeys(problems))

@@ -2,7 +2,6 @@
 
 from geoscene.roadgraph.build import RoadOptions as RoadOptions
 from geoscene.roadgraph.build import build_road_graph as build_road_graph
-from geoscene.roadgraph.components import Components as Components
 from geoscene.roadgraph.components import find_components as find_components
 from geoscene.roadgraph.components import main_network as main_network
 from geoscene.roadgraph.grading import find_obstacles as find_obstacles
@@ -10,6 +9,5 @@ from geoscene.roadgraph.grading import graded_ground as graded_ground
 from geoscene.roadgraph.graph import RoadGraph as RoadGraph
 from geoscene.roadgraph.graphml import read_graphml as read_graphml
 from geoscene.roadgraph.graphml import write_graphml as write_graphml
-from geoscene.roadgraph.longitudinal_profile import Obstacles as Obstacles
 from geoscene.roadgraph.longitudinal_profile import ProfileOptions as ProfileOptions
 from geoscene.roadgraph.longitudinal_profile import profile as profile

@@ -49,11 +49,6 @@ def _descriptive(tags: Tags) -> Tags:
     return {key: value for key, value in tags.items() if key not in NOISE and key != "type"}
 
 
-def _common(tables: list[Tags]) -> Tags:
-    """The tags that are the same in all tables."""
-    return {k: v for k, v in tables[0].items() if all(t.get(k) == v for t in tables[1:])} if tables else {}
-
-
 @dataclass(frozen=True, slots=True)
 class Claims:
     """Ways that belong to multipolygon relations.
@@ -100,7 +95,8 @@ def _boundary(
     ways = [(row_of.get(i, -1), role == "inner") for kind, i, role in members if kind == "way"]
     own = _descriptive(tags)
     outer = sorted({row for row, inner in ways if row >= 0 and not inner})
-    common = _common([m for row in outer if _is_tagged_area(m := _descriptive(elements.way_tags[row]))])
+    tables = [m for row in outer if _is_tagged_area(m := _descriptive(elements.way_tags[row]))]
+    common = {k: v for k, v in tables[0].items() if all(t.get(k) == v for t in tables)} if tables else {}
     old_style = not _is_tagged_area(own) and _is_tagged_area(common)
     if old_style:
         own = {**common, **own}

@@ -47,20 +47,17 @@ def _extent(elements: Elements) -> Bounds:
 
 def _near(elements: Elements, bounds: Bounds | None) -> Bools:
     """(w,) bool, whether each way's bounding box intersects the bounds; false for ways without nodes."""
-    ways = np.repeat(np.arange(len(elements.way_id)), np.diff(elements.way_start))
-    here = elements.ref >= 0
-    near = np.zeros(len(elements.way_id), bool)
+    count = len(elements.way_id)
     if bounds is None:
-        near[:] = True
-        return near
-    low = np.full((len(near), 2), np.inf)
-    high = np.full((len(near), 2), -np.inf)
+        return np.ones(count, np.bool_)
+    ways = np.repeat(np.arange(count), np.diff(elements.way_start))
+    here = elements.ref >= 0
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     xy = elements.lonlat(elements.ref[here])
     np.minimum.at(low, ways[here], xy)
     np.maximum.at(high, ways[here], xy)
     west, south, east, north = bounds
-    near[:] = (low <= (east, north)).all(axis=1) & (high >= (west, south)).all(axis=1)
-    return near
+    return np.asarray((low <= (east, north)).all(axis=1) & (high >= (west, south)).all(axis=1), np.bool_)
 
 
 def _lines(elements: Elements, rows: list[int]) -> tuple[list[Way], list[Problem]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.mesh import Instances, Mesh
+from geoscene.mesh import Mesh
 from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
 from geoscene.typing import Bools, Float, Ints
@@ -147,13 +147,6 @@ def _upright(transform: Float, step: float) -> Ints | None:
     return None if whole.max(initial=0) > 65_535 else whole.astype(np.int64)
 
 
-def _transforms(columns: NDArray[np.uint16], step: float) -> Float:
-    """Transforms (k, 3, 4) of the columns of upright copies."""
-    x, y, z, turn, along, lift = columns.astype(np.int64)
-    place = np.column_stack([np.cumsum(x) % 65_536, y, z]) * step
-    return np.dstack([_turned(along * SCALE, lift * SCALE, turn=turn * TURN), place[:, :, None]])
-
-
 def _turned(along: Float, lift: Float, *, turn: Float) -> Float:
     """Matrices (k, 3, 3) that scale horizontally and vertically and rotate about the vertical."""
     matrix = np.zeros((len(turn), 3, 3))
@@ -162,38 +155,6 @@ def _turned(along: Float, lift: Float, *, turn: Float) -> Float:
     matrix[:, 0, 1] = -matrix[:, 1, 0]
     matrix[:, 2, 2] = lift
     return matrix
-
-
-def unpack_tile(header: dict[str, Any], data: bytes) -> Tile:
-    """The tile that `pack_tile` made, its faces in the page's order; ``closed`` is not kept."""
-    raw = zlib.decompress(data, 31)
-    at = 0
-
-    def column(kind: str, *shape: int) -> NDArray[Any]:
-        nonlocal at
-        count = int(np.prod(shape))
-        values = np.frombuffer(raw, kind, count, at).reshape(shape)
-        at += values.nbytes
-        return values
-
-    n, m, k = header["vertices"], header["ends"][-1], sum(run[2] for run in header["runs"])
-    faces, feature = column("<u4", m, 3), column("<i4", m)
-    copied = column("<i4", k)
-    vertices = column("<u2", n, 3) * header["step"]
-    klass, material, surface, color = column("u1", m), column("u1", m), column("u1", m), column("u1", m, 3)
-    columns, size, kind = (6, 2, "<u2") if header["upright"] else (12, 4, "<f4")
-    planes = np.moveaxis(column("u1", columns, size, k), 1, 2)
-    places = np.ascontiguousarray(planes).view(kind).reshape(columns, k)
-    transform = (
-        _transforms(places, header["step"]) if header["upright"] else places.T.reshape(k, 3, 4).astype(float)
-    )
-    mesh = Mesh.of(
-        vertices, faces, feature=feature, klass=klass, material=material, surface=surface, color=color
-    )
-    shape = np.repeat(
-        np.array([run[1] for run in header["runs"]], np.int32), [run[2] for run in header["runs"]]
-    ).astype(np.int32)
-    return Tile(np.array(header["base"]) * header["step"], mesh, Instances(shape, transform, copied))
 
 
 def pack_shapes(shapes: list[Mesh]) -> tuple[list[list[int]], bytes]:

@@ -11,7 +11,7 @@ from rasterio.transform import Affine
 
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.frames import Frame
-from geoscene.ground.terrain import base_heights, flat_terrain, open_terrain
+from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 
 FRAME = Frame.at(9.0, 50.0)
 BOUNDS = (-200.0, -200.0, 200.0, 200.0)
@@ -193,7 +193,7 @@ def test_a_terrain_can_be_pickled(tmp_path):
 
 
 def test_flat_terrain_has_height_zero():
-    terrain = flat_terrain(FRAME)
+    terrain = Terrain(FRAME)
     assert (terrain.height(np.zeros((2, 3)), 7.0) == np.zeros((2, 3))).all()
     assert terrain.vertical == "flat"
     assert terrain.lines == 0.0

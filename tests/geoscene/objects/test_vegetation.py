@@ -10,7 +10,7 @@ from geoscene.export.objects import expand
 from geoscene.frames import Frame
 from geoscene.ground import Layers, building_pads, plan_ground
 from geoscene.mesh import Mesh
-from geoscene.objects.shapes import LEAF_AREA_DENSITY, place, shape_numbers, shapes
+from geoscene.objects.shapes import LEAF_AREA_DENSITY, place, shapes
 from geoscene.objects.vegetation import clear_of, forest_trees, read_trees, tree_instances
 from geoscene.sources.data import OsmData, Point, Way
 
@@ -114,7 +114,7 @@ def test_the_genus_decides_the_form():
     assert trees.form.tolist() == ["needleleaved", "palm", "needleleaved", "broadleaved"]
     crowns = tree_instances(trees).shape[4:]
     names = ["crown_needleleaved", "crown_palm", "crown_needleleaved", "crown_broadleaved"]
-    assert crowns.tolist() == [shape_numbers()[name] for name in names]
+    assert crowns.tolist() == [list(shapes()).index(name) for name in names]
 
 
 def test_tree_row_has_trees_at_both_ends_and_none_on_a_crossing_road():

@@ -9,6 +9,7 @@ from zlib import decompress
 
 import numpy as np
 import pytest
+from helpers.view_tiles import unpack_tile
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,7 +23,7 @@ from geoscene.scene.tile_files import Tile
 from geoscene.sources import demo_path, read_osm
 from geoscene.view import view_scene
 from geoscene.view.lonlat import ACCURACY, lonlat_grid
-from geoscene.view.tiles import STEP, Groups, groups_of, pack_tile, unpack_tile
+from geoscene.view.tiles import STEP, Groups, groups_of, pack_tile
 
 BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 COLUMNS = ("feature", "klass", "material", "surface", "color")
