@@ -183,7 +183,7 @@ def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:
         polygons = polygons_of(xy, rings)
         turned = ~shapely.is_ccw(shapely.get_exterior_ring(polygons))
         crossed = np.flatnonzero(turned | ~shapely.is_valid(polygons))
-        found = _pinch(xy, rings[crossed[0]]) if len(crossed) else None
+        found = _nearest_touch(xy, rings[crossed[0]]) if len(crossed) else None
         if found is None:
             break
         node, start, stop = found
@@ -197,7 +197,7 @@ def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:
     return rings
 
 
-def _pinch(xy: Float, ring: list[int]) -> tuple[int, int, int] | None:
+def _nearest_touch(xy: Float, ring: list[int]) -> tuple[int, int, int] | None:
     """The node of a ring that is nearest to an arc not ending in it, and the arc's ends, if within 2 mm."""
     start, stop = np.array(ring), np.array([*ring[1:], *ring[:1]])
     line = shapely.linestrings(np.stack([xy[start], xy[stop]], axis=1))

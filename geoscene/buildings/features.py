@@ -55,7 +55,7 @@ def read_buildings(
 
     rows = _assign_parts(outlines, parts, osm=osm, options=options, problems=problems)
     table = _table(rows, osm.bounds, frame=frame, options=options, problems=problems)
-    return _without_vanished(table), sorted(problems)
+    return _without_empty(table), sorted(problems)
 
 
 def _read_rows(
@@ -208,7 +208,7 @@ def _table(
     )
 
 
-def _without_vanished(table: Buildings) -> Buildings:
+def _without_empty(table: Buildings) -> Buildings:
     """The table without rows whose footprint has become empty; outlines are renumbered."""
     keep = ~shapely.is_empty(table.footprint)
     alive = np.zeros(len(table), np.bool_)

@@ -53,7 +53,7 @@ def clean(polygons: Polygons) -> tuple[Polygons, Bools]:
     if bad.any():
         valid = shapely.make_valid(out[bad], method="structure", keep_collapsed=False)
         snapped[bad] = _polygonal(shapely.set_precision(valid, GRID))
-    pinched = _pinched(snapped)
+    pinched = _rings_touch(snapped)
     for row in np.flatnonzero(pinched):
         snapped[row] = _separate_rings(snapped[row])
     return shapely.orient_polygons(snapped), bad | pinched
@@ -79,7 +79,7 @@ def _flatten(parts: Polygons, row: NDArray[np.integer]) -> tuple[Polygons, NDArr
     return inner[keep], row[keep]
 
 
-def _pinched(polygons: Polygons) -> Bools:
+def _rings_touch(polygons: Polygons) -> Bools:
     """(n,) bool, whether rings of the polygon touch."""
     return np.asarray(~shapely.is_simple(shapely.boundary(polygons)), np.bool_)
 

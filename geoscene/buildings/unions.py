@@ -38,7 +38,7 @@ def unite(shells: Triangles) -> tuple[Triangles, str] | None:
             if body.status() != m3.Error.NoError or body.is_empty():
                 return None
             corners, run = _triangles(body, first)
-            seams = _crowded_edges(corners)
+            seams = _non_manifold_edges(corners)
             if not len(seams):
                 known = (run >= 0) & (run < 4 * len(pieces))
                 piece = pieces[np.where(known, run // 4, 0)]
@@ -91,7 +91,7 @@ def repair(points: Float, faces: Ints, *, run: Ints) -> tuple[Float, Ints]:
         flat = np.flatnonzero(degenerate_faces(points, faces))
         if not len(flat):
             break
-        faces, run = _cancel(*_flip(points, faces, run=run, flat=int(flat[0])))
+        faces, run = _cancel(*_split_flat_face(points, faces, run=run, flat=int(flat[0])))
     return points[faces], run
 
 
@@ -105,7 +105,7 @@ def _cancel(faces: Ints, run: Ints) -> tuple[Ints, Ints]:
     return faces[keep], run[keep]
 
 
-def _flip(points: Float, faces: Ints, *, run: Ints, flat: int) -> tuple[Ints, Ints]:
+def _split_flat_face(points: Float, faces: Ints, *, run: Ints, flat: int) -> tuple[Ints, Ints]:
     """Faces without the collinear face ``flat``: its middle corner splits the face at its longest edge."""
     corners = faces[flat]
     length = np.linalg.norm(points[np.roll(corners, -1)] - points[corners], axis=1)
@@ -123,7 +123,7 @@ def _flip(points: Float, faces: Ints, *, run: Ints, flat: int) -> tuple[Ints, In
     return out, runs
 
 
-def _crowded_edges(corners: Float) -> Float:
+def _non_manifold_edges(corners: Float) -> Float:
     """Edges (k, 2, 3) shared by more than two triangles."""
     flat = corners.reshape(-1, 3)
     ids, where = weld(flat, np.zeros(len(flat), np.int64))

@@ -108,7 +108,7 @@ def pieces(mesh: Mesh) -> list[Piece]:
     ]
 
 
-def wanted_rows(scene: Scene, feature: NDArray[np.int32], *, layers: Collection[str] | None) -> Bools:
+def rows_in_layers(scene: Scene, feature: NDArray[np.int32], *, layers: Collection[str] | None) -> Bools:
     """Whether faces or instances (m,) belong to one of the layers; all of them for None."""
     if layers is None:
         return np.ones(len(feature), np.bool_)
@@ -144,8 +144,8 @@ def parts(
         tile = scene.tile(i, j)
         mesh, copies = tile.mesh, tile.instances
         if layers is not None:
-            mesh = mesh.take(wanted_rows(scene, mesh.feature, layers=layers))
-            keep = wanted_rows(scene, copies.feature, layers=layers)
+            mesh = mesh.take(rows_in_layers(scene, mesh.feature, layers=layers))
+            keep = rows_in_layers(scene, copies.feature, layers=layers)
             copies = copies.take(keep)
         yield Part((i, j), tile.origin, mesh, copies)
 

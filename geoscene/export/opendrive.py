@@ -197,7 +197,7 @@ def _lanes(graph: RoadGraph, net: RoadNet, *, k: int, left_hand: bool) -> Iterat
     middle = "solid" if road.twin >= 0 and not road.shared else "none"
     if sides[1]:
         yield from ("<left>\n", *reversed(sides[1]), "</left>\n")
-    yield f'<center><lane id="0" type="none" level="false"><link/>{_mark(middle)}</lane></center>\n'
+    yield f'<center><lane id="0" type="none" level="false"><link/>{_road_mark(middle)}</lane></center>\n'
     if sides[-1]:
         yield from ("<right>\n", *sides[-1], "</right>\n")
 
@@ -214,11 +214,11 @@ def _lane(
     limit = "" if speed is None else f'<speed sOffset="0" max="{_n(round(speed, 4))}" unit="m/s"/>'
     return (
         f'<lane id="{number}" type="{kind}" level="false"><link>{links}</link>'
-        f'<width sOffset="0" a="{_n(width)}" b="0" c="0" d="0"/>{_mark(mark)}{limit}</lane>\n'
+        f'<width sOffset="0" a="{_n(width)}" b="0" c="0" d="0"/>{_road_mark(mark)}{limit}</lane>\n'
     )
 
 
-def _mark(kind: str) -> str:
+def _road_mark(kind: str) -> str:
     width = "" if kind == "none" else ' width="0.12"'
     return (
         f'<roadMark sOffset="0" type="{kind}" weight="standard" color="standard"{width} laneChange="none"/>'
@@ -280,14 +280,14 @@ def _connecting_road(
         f'</planView>\n<elevationProfile><elevation s="0" a="{_n(a)}" b="{_n(b)}" c="{cc:.12g}" '
         f'd="{d:.12g}"/></elevationProfile>\n<lateralProfile/>\n<lanes>\n<laneSection s="0">\n'
     )
-    middle = f'<center><lane id="0" type="none" level="false"><link/>{_mark("none")}</lane></center>\n'
+    middle = f'<center><lane id="0" type="none" level="false"><link/>{_road_mark("none")}</lane></center>\n'
     lanes = []
     growth = (c.widths[1] - c.widths[0]) / max(curve.length, 1e-3)
     for k, (before, after) in enumerate(c.lanes.tolist()):
         lanes.append(
             f'<lane id="{sign * (k + 1)}" type="driving" level="false"><link><predecessor id="{before}"/>'
             f'<successor id="{after}"/></link><width sOffset="0" a="{_n(c.widths[0])}" b="{_n(growth)}" '
-            f'c="0" d="0"/>{_mark("none")}<speed sOffset="0" max="{_n(round(speed, 4))}" unit="m/s"/>'
+            f'c="0" d="0"/>{_road_mark("none")}<speed sOffset="0" max="{_n(round(speed, 4))}" unit="m/s"/>'
             "</lane>\n"
         )
     if left_hand:

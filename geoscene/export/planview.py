@@ -78,7 +78,7 @@ def plan_view(points: Float, *, reach: float = REACH) -> PlanView:
     ends = np.concatenate([[0.0], s[1::2] + arc / 2, [s[-1] + columns[3, -1]]])
     keep = columns[3] > 1e-6
     x, y, angle, length, curvature = columns[:, keep]
-    # Pieces left out are shorter than a micrometre: lengths are summed anew so that s has no gap.
+    # Pieces left out are shorter than a micrometre: lengths are summed again so that s has no gap.
     return PlanView(np.cumsum(length) - length, x, y, angle, length, curvature, ends)
 
 

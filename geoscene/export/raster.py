@@ -25,7 +25,7 @@ from geoscene.typing import Float
 Model = Literal["surface", "terrain", "classes"]
 
 MOST_CELLS = 4_000_000_000
-"""Cells of a raster at most: what is asked for beyond is taken for a slip of the resolution."""
+"""Maximum number of cells of a raster; larger ones are refused as mistakes in the resolution."""
 
 _BLOCK = 512
 

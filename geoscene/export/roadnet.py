@@ -135,7 +135,7 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
     return RoadNet(roads, road_of, junctions, connections, joints)
 
 
-def _leaving(graph: RoadGraph, edge: int, *, end: int) -> float:
+def _leaving_heading(graph: RoadGraph, edge: int, *, end: int) -> float:
     """Heading (radians) in which a road leaves the node at one of its ends."""
     line = graph.geometry[edge]
     return polylines.end_headings(line if end == START else line[::-1], reach=1e-3)[0]
@@ -160,7 +160,7 @@ def _joints(
             continue
         (a, end_a), (b, end_b) = meeting
         edge_a, edge_b = firsts[a], firsts[b]
-        away = _angle(_leaving(graph, edge_a, end=end_a), _leaving(graph, edge_b, end=end_b))
+        away = _angle(_leaving_heading(graph, edge_a, end=end_a), _leaving_heading(graph, edge_b, end=end_b))
         if np.pi - away > _STRAIGHT:
             continue
         turned = end_a == end_b  # one runs against the other
@@ -190,7 +190,7 @@ def _gaps(
     for node, arms in ends.items():
         if not junctions[node]:
             continue
-        heading = [_leaving(graph, firsts[k], end=end) for k, end in arms]
+        heading = [_leaving_heading(graph, firsts[k], end=end) for k, end in arms]
         half = [graph.width[firsts[k]] / 2 for k, _ in arms]
         for i, (k, end) in enumerate(arms):
             need = _LEAST_GAP

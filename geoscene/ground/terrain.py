@@ -69,7 +69,7 @@ class Terrain:
     voids    : posts among them that held no height and were filled from their neighbours
     uncovered : share of the scene that no raster covers, which took the nearest height
     sources  : names of the files
-    credits  : attribution that each file asks for, empty if none
+    credits  : required attribution of each file, empty if none
     """
 
     frame: Frame
@@ -182,7 +182,7 @@ def open_terrain(
 def base_heights(footprints: Sequence[object] | NDArray[np.object_], height: Height) -> Float:
     """The lowest ground (n,) along each footprint's outline, metres: where a building on a slope stands.
 
-    ``height`` (z of the ground at x, y) is asked at the outline's vertices and at most 2 m apart between
+    ``height`` (z of the ground at x, y) is sampled at the outline's vertices and at most 2 m apart between
     them. NaN for a footprint that is None or empty.
     """
     outlines = np.fromiter(footprints, object)

@@ -252,7 +252,7 @@ def _gates(osm: OsmData) -> dict[int, float]:
 
 
 def _with_openings(polygons: NDArray[np.object_], plan: GroundPlan) -> tuple[NDArray[np.object_], Bools]:
-    """Polygons less roads, tracks, buildings and what is outside the extent; which crossed a road."""
+    """Polygons without roads, tracks, buildings and areas outside the extent; which crossed a road."""
     out = shapely.intersection(polygons, shapely.box(*plan.extent))
     opened = np.zeros(len(polygons), bool)
     for klasses, road in ((_PASSABLE, True), ((Class.BUILDING_PAD,), False)):

@@ -347,10 +347,10 @@ def _roadside_stands(point: Point, shape: str, *, xy: Float, roads: _Roads, fram
 
 
 def _beside_roads(table: Furniture, sites: Sites, *, left_hand: bool) -> tuple[Furniture, NDArray[np.str_]]:
-    """The table with its roadside posts moved off the road, and the ids that found no place.
+    """The table with its roadside posts moved off the road, and the ids without a clear point.
 
-    A post goes to the nearest clear place between straight aside, on the side on which the traffic it faces
-    drives, and straight back: amid a junction that is the near corner.
+    A post is placed at the nearest clear point between straight to the driving side of the traffic it faces
+    and straight back; in a junction this is the near corner.
     """
     moved = np.flatnonzero(table.place_source == "roadside")
     side = 1.0 if left_hand else -1.0

@@ -28,11 +28,11 @@ _CLEAR = {
 
 def find_obstacles(osm: OsmData, frame: Frame) -> Obstacles:
     """Railways and waterways on the ground that bridges must clear."""
-    ways, lines = way_lines([way for way in osm.ways if _clear(way.tags) is not None], frame)
-    return Obstacles(lines, np.array([_clear(way.tags) for way in ways], float))
+    ways, lines = way_lines([way for way in osm.ways if _required_clearance(way.tags) is not None], frame)
+    return Obstacles(lines, np.array([_required_clearance(way.tags) for way in ways], float))
 
 
-def _clear(tags: Tags) -> float | None:
+def _required_clearance(tags: Tags) -> float | None:
     layer, source = read_layer(tags, [])
     if place_of(layer, source, bridge=is_bridge(tags), tunnel=is_tunnel(tags)) != 0:
         return None

@@ -62,7 +62,7 @@ class LaneLayout(Columns):
     def offsets(self, lane: ArrayLike = 0, *, body_width: float, clearance: float) -> Float:
         """Offset (m,) of the middle of a lane, or of a body that keeps clear of the kerbs where it can.
 
-        Whoever is alone on a single shared lane keeps to its own half.
+        On a single shared lane, each direction keeps to its half.
 
         lane       : number of the lane, from the kerb
         body_width : metres

@@ -119,14 +119,14 @@ def _trips(
     """
     graph, ways = streets.graph, streets.ways
     best: dict[tuple[int, int], tuple[float, tuple[int, ...]]] = {}
-    begun: list[tuple[tuple[int, ...], set[str], float]] = []
+    unfinished: list[tuple[tuple[int, ...], set[str], float]] = []
     for source in sources:
         for edge in streets.of_way.get(source, []):
             rest = set(ways[edge][len(ways[edge]) - ways[edge][::-1].index(source) :])
             if rest <= via:
-                begun.append(((edge,), rest, 0.0))
-    while begun:
-        trip, used, metres = begun.pop()
+                unfinished.append(((edge,), rest, 0.0))
+    while unfinished:
+        trip, used, metres = unfinished.pop()
         last = trip[-1]
         passed = {int(graph.head[edge]) for edge in trip}
         for edge in streets.leaving.get(int(graph.head[last]), []):
@@ -138,7 +138,7 @@ def _trips(
                 key = (trip[0], edge)
                 best[key] = min(best.get(key, (np.inf, ())), (metres, (*trip, edge)))
             if set(names) <= via and int(graph.head[edge]) not in passed:
-                begun.append(((*trip, edge), used | set(names), metres + float(graph.length[edge])))
+                unfinished.append(((*trip, edge), used | set(names), metres + float(graph.length[edge])))
     return [trip for _, trip in best.values()]
 
 

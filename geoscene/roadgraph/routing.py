@@ -83,10 +83,11 @@ def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.i
     rank = np.arange(len(before)) - np.repeat(np.cumsum(count) - count, count)
     after = order[start[graph.head[before]] + rank]
 
-    only = _commands(graph.turn_kind)
-    begun = np.array([chain[:2] for chain in graph.chain_edges[_commands(graph.chain_kind)]], np.int32)
+    only = _is_mandatory(graph.turn_kind)
+    chains = graph.chain_edges[_is_mandatory(graph.chain_kind)]
+    first = np.array([chain[:2] for chain in chains], np.int32)
     mandatory = np.concatenate(
-        [np.column_stack([graph.turn_from[only], graph.turn_to[only]]), begun.reshape(-1, 2)]
+        [np.column_stack([graph.turn_from[only], graph.turn_to[only]]), first.reshape(-1, 2)]
     )
     forbidden = _among(graph, before, after=after, first=graph.turn_from[~only], second=graph.turn_to[~only])
     forbidden |= np.isin(before, mandatory[:, 0]) & ~_among(
@@ -99,7 +100,7 @@ def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.i
     return before[~forbidden], after[~forbidden]
 
 
-def _commands(kind: NDArray[np.str_]) -> Bools:
+def _is_mandatory(kind: NDArray[np.str_]) -> Bools:
     """Whether restrictions (r,) are ``only_*``."""
     return np.char.startswith(kind, "only_") if len(kind) else np.empty(0, np.bool_)
 
@@ -147,7 +148,7 @@ def turn_states(graph: RoadGraph, *, u_turns: bool = False) -> TurnStates:
     forbidden: set[tuple[int, ...]] = set()
     mandatory: dict[tuple[int, ...], set[int]] = {}
     prefixes: set[tuple[int, ...]] = set()
-    for edges, only in zip(graph.chain_edges, _commands(graph.chain_kind).tolist(), strict=True):
+    for edges, only in zip(graph.chain_edges, _is_mandatory(graph.chain_kind).tolist(), strict=True):
         chain = tuple(edges.tolist())
         prefixes |= {chain[:k] for k in range(2, len(chain))}
         if only:

@@ -240,10 +240,10 @@ def _width(tags: Tags, direction: int, *, counted: tuple[float, str], unread: li
     width = lanes * _LANE_WIDTH.get(highway.removesuffix("_link"), 3.5)
     if direction and lanes_source == "default":
         width = max(width, _ONEWAY_AT_LEAST)
-    return width + _beside_lanes(tags), lanes_source
+    return width + _cycle_and_parking_width(tags), lanes_source
 
 
-def _beside_lanes(tags: Tags) -> float:
+def _cycle_and_parking_width(tags: Tags) -> float:
     """Metres of the carriageway that mapped cycle lanes and rows of parked cars take up."""
     extra = 0.0
     for side in ("left", "right"):

@@ -57,7 +57,7 @@ class SceneFiles:
 
     @property
     def tile_reports(self) -> Path:
-        """What each tile holds, with digests of what the tiles depend on."""
+        """Reports of the tiles, with digests of their inputs."""
         return self.folder / "tiles.json"
 
     @property

@@ -45,7 +45,7 @@ def _extent(elements: Elements) -> Bounds:
     return float(west), float(south), float(east), float(north)
 
 
-def _near(elements: Elements, bounds: Bounds | None) -> Bools:
+def _intersect(elements: Elements, bounds: Bounds | None) -> Bools:
     """(w,) bool, whether each way's bounding box intersects the bounds; false for ways without nodes."""
     count = len(elements.way_id)
     if bounds is None:
@@ -136,7 +136,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
         )
     extent = _extent(elements)
     places = Places.of(elements)
-    near = _near(elements, bounds)
+    near = _intersect(elements, bounds)
 
     def wanted(rows: Ints) -> bool:
         return bool(near[rows].any())

@@ -105,7 +105,7 @@ class OsmData:
     source      : file or place it was read from, for messages
     timestamp   : newest edit or replication time, ISO 8601, or "" if unknown
     kind        : name of the source in `geoscene.sources.registry.SOURCES`
-    attribution : of these data, where it says more than the registry's
+    attribution : of these data, if more specific than the registry's
     added       : credits of other sources from which features were merged in
     """
 

@@ -15,7 +15,7 @@ class RefusedError(Exception):
     """An answer that is not the data.
 
     status      : HTTP status
-    retry_after : seconds after which to ask again (header ``Retry-After``), infinite if not stated
+    retry_after : seconds to wait before a retry (header ``Retry-After``), infinite if not stated
     """
 
     def __init__(self, status: int, reason: str, *, retry_after: float = math.inf) -> None:

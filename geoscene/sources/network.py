@@ -81,7 +81,7 @@ def _cached(cache_dir: Path | None, request: str, *, make: Callable[[], Any]) ->
 
 
 def _first_answer(what: str, urls: Sequence[str], *, ask: Callable[[Any, str], Any], servers: Servers) -> Any:
-    """The answer of the first server that gives one; busy servers are asked `Servers.rounds` times.
+    """The first answer of the servers, tried in turn; busy servers are tried `Servers.rounds` times.
 
     what : head of the error message
     ask  : returns the answer of one server, given a session and the server's address

@@ -22,7 +22,7 @@ class Source:
     suffixes    : of its files; empty for a source that is only fetched over the network
     reader      : ``module:function`` here; for files ``(path, *, bounds, progress) -> OsmData``
     licence     : SPDX identifier, or in words
-    attribution : text that the licence or the provider asks to be shown with the data
+    attribution : text that the licence or the provider requires with the data
     """
 
     name: str

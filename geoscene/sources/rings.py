@@ -18,7 +18,7 @@ class Chain:
     """One member of an area's boundary.
 
     nodes : (k,) node indices, none missing
-    inner : whether its role says that it bounds a hole
+    inner : its role is that of a hole's boundary
     """
 
     nodes: Ints
@@ -43,7 +43,7 @@ def segments_of(nodes: Ints) -> Ints:
     return distinct
 
 
-def _odd_ends(segments: Ints) -> Ints:
+def _open_nodes(segments: Ints) -> Ints:
     """The nodes where an odd number of segments end, so that the boundary is open."""
     nodes, count = np.unique(segments, return_counts=True)
     odd: Ints = nodes[count % 2 == 1]
@@ -51,7 +51,7 @@ def _odd_ends(segments: Ints) -> Ints:
 
 
 def _prune(segments: Ints) -> Ints:
-    """The segments without those that lead to a dead end."""
+    """The segments without dead ends."""
     while len(segments):
         _, inverse, count = np.unique(segments, return_inverse=True, return_counts=True)
         alive = (count[inverse.reshape(segments.shape)] > 1).all(axis=1)
@@ -84,7 +84,7 @@ def enclosed(segments: Ints, xy: Float) -> tuple[Any, bool]:
     lines = shapely.get_parts(shapely.union_all(shapely.linestrings(ends)))
     crossing = len(lines) != len(segments)
     faces = shapely.get_parts(shapely.polygonize(lines))
-    if len(faces) > 1 and len(_odd_ends(segments)) == 0:
+    if len(faces) > 1 and len(_open_nodes(segments)) == 0:
         points = shapely.get_coordinates(shapely.point_on_surface(faces))
         faces = faces[_inside(points, ends[:, 0], b=ends[:, 1])]
     if len(faces) == 0:
@@ -165,7 +165,7 @@ def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> As
         return Assembly(None, "open-ring")
     every, count = np.unique(np.concatenate(parts), axis=0, return_counts=True)
     odd = every[count % 2 == 1]
-    is_open = len(_odd_ends(odd)) > 0
+    is_open = len(_open_nodes(odd)) > 0
     defects = (("open-ring", is_open), ("duplicate-way", len(unique) < len(chains)), ("spike", spikes))
     reason = next((name for name, found in defects if found), "")
     crossing = False

@@ -89,9 +89,9 @@ def find_low_decks(table: Structures, height: Height | None) -> Structures:
         strips = _strips(table, k)
         xy, strip, ground = _ground_on(strips, height)
         high = ground > surface_heights(table, k, xy=xy) - table.body[k]
-        met = strips[np.bincount(strip[high], minlength=len(strips)) > 0]
+        intersected = strips[np.bincount(strip[high], minlength=len(strips)) > 0]
         within = table.polygon[k].buffer(-_EDGE, join_style="mitre")
-        low[k] = areal(shapely.union_all(shapely.buffer(met, 1e-3)).intersection(within), least=_TINY)
+        low[k] = areal(shapely.union_all(shapely.buffer(intersected, 1e-3)).intersection(within), least=_TINY)
     return replace(table, low=low)
 
 

@@ -138,7 +138,7 @@ def path_members(
     track = np.array([(raised.klass[r] == Class.RAIL).all() for r in rows], np.bool_)
     net = _network(lines, [way.nodes for way in ways], slope=np.where(track, _TRACK_SLOPE, _SLOPE))
     foot_only = ~track & np.array([(raised.klass[r] != Class.ROAD).all() for r in rows], np.bool_)
-    sunk = tunnel & _sunk(osm, ways)
+    sunk = tunnel & _is_below_ground(osm, ways)
     joined = _joined(osm, ways)
     ends = _ends(net, sunk, joined=joined)
     free = np.where(foot_only, options.passage, options.headroom)
@@ -160,7 +160,7 @@ def path_members(
         width[k] = _BED if track[k] else max(area / max(lines[k].length, 1.0), 0.5)
         landed[k] = ends[station[[0, -1]]]
         approach[k] = shapely.union_all(
-            [_onward(line[k][:: 1 - 2 * e, :2], width[k]) for e in (0, 1) if landed[k, e]]
+            [_area_before_start(line[k][:: 1 - 2 * e, :2], width[k]) for e in (0, 1) if landed[k, e]]
         )
         gap = z[station[[0, -1]]] - _ground(net.xy[station[[0, -1]]], height)
         worst = float(np.abs(gap[landed[k]]).max(initial=0.0))
@@ -175,7 +175,7 @@ def _ground(xy: Float, height: Height | None) -> Float:
     return np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
 
 
-def _onward(xy: Float, width: float) -> shapely.Geometry:
+def _area_before_start(xy: Float, width: float) -> shapely.Geometry:
     """The area of the way's first metres before the start of its line."""
     band = shapely.LineString([xy[0], xy[0] - 3.0 * unit(xy[1] - xy[0])]).buffer(width, cap_style="flat")
     return band.union(shapely.Point(xy[0]).buffer(width / 2))
@@ -221,7 +221,7 @@ def _network(lines: NDArray[np.object_], nodes: list[Ints], *, slope: Float) -> 
     return _Net(np.array(places), rows, np.concatenate(a), np.concatenate(b), np.concatenate(metres), steep)
 
 
-def _sunk(osm: OsmData, ways: list[Way]) -> Bools:
+def _is_below_ground(osm: OsmData, ways: list[Way]) -> Bools:
     """Whether tunnels (n,) are below the ground: by layer; by default if less than half is in buildings."""
     houses = np.array([area.geometry for area in osm.areas if "building" in area.tags], object)
     tree = shapely.STRtree(houses)
@@ -285,7 +285,7 @@ def _heights(net: _Net, paths: _Paths, *, ends: Bools, depth: Float, crossed: _C
     on_road = _on_road_bridges(net, paths, graph=crossed.graph)
     fixed = np.where(np.isnan(on_road), fixed, on_road)
     z = _even(net, fixed, ground=ground)
-    least, most = _needs(net, paths, crossed=crossed)
+    least, most = _height_limits(net, paths, crossed=crossed)
     # Crossings take precedence over cover: below a path a tunnel may have less cover, but stays underground.
     under = np.where(np.isnan(depth), np.inf, ground - np.maximum(depth - _SPARE, 0.0))
     least = np.minimum(least, under)
@@ -331,7 +331,7 @@ def _even(net: _Net, fixed: Float, *, ground: Float) -> Float:
     return z
 
 
-def _needs(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Float, Float]:
+def _height_limits(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Float, Float]:
     """Least and greatest height (v,) of stations at crossings; NaN where there is no limit."""
     graph, options = crossed.graph, crossed.options
     obstacles = find_obstacles(crossed.osm, crossed.frame)

@@ -16,7 +16,7 @@ from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.structures.heights import PARTED, SHEET, nearest_on_line
 from geoscene.structures.layered import PRECISION
 from geoscene.structures.members import Members
-from geoscene.structures.sheets import Sheets, areal, find_sheets, part_outlines, where_same
+from geoscene.structures.sheets import Sheets, areal, find_sheets, part_outlines, strips_of_equal_height
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
 from geoscene.typing import Float, Ints
 
@@ -203,7 +203,7 @@ def _inner(
                 continue
             shape = polygon[q]
             if (min(k, q), max(k, q)) in sheets.parted:
-                shape = shape.intersection(where_same(around[k], around[q], within=PARTED))
+                shape = shape.intersection(strips_of_equal_height(around[k], around[q], within=PARTED))
             shapes.append(shape)
         whole = _union([*shapes, *approach[np.r_[k, others].astype(np.int64)]])
         closed = whole.buffer(0.05, join_style="mitre").buffer(-0.05 - rim[k], join_style="mitre")
@@ -228,7 +228,7 @@ def _territories(
         for earlier in others[rank[others] < rank[k]].tolist():
             taken = polygon[earlier].buffer(-_OVERLAP, join_style="mitre")
             if (min(earlier, k), max(earlier, k)) in sheets.over:
-                taken = taken.intersection(where_same(around[k], around[earlier], within=SHEET))
+                taken = taken.intersection(strips_of_equal_height(around[k], around[earlier], within=SHEET))
             rest = rest.difference(taken)
         out[k] = _clean(rest)
     return out

@@ -57,7 +57,7 @@ def place_piers(
         at = (np.arange(count) + 0.5) * spacing[k]
         tries = np.add.outer(at, [s for s in _SHIFTS if abs(s) < spacing[k] / 2])
         shapes = _piers(table, k, flat=flat, at=tries.ravel())
-        free = _stands_out(table, k, flat=flat, at=tries.ravel(), height=height) & ~shapely.is_empty(shapes)
+        free = _above_ground(table, k, flat=flat, at=tries.ravel(), height=height) & ~shapely.is_empty(shapes)
         hit, found = below.query(shapes, predicate="dwithin", distance=_FREE)
         free[hit] = False
         hit, found = below.query(shapes, predicate="dwithin", distance=_RAIL_FREE)
@@ -97,7 +97,7 @@ def _abutments(
     """
     at = np.array([_END, flat.length - _END])[ends[k]]
     shapes = _piers(table, k, flat=flat, at=at)
-    free = _stands_out(table, k, flat=flat, at=at, height=height) & ~shapely.is_empty(shapes)
+    free = _above_ground(table, k, flat=flat, at=at, height=height) & ~shapely.is_empty(shapes)
     free[np.unique(ways.query(shapes, predicate="dwithin", distance=_FREE)[0])] = False
     return list(shapes[free])
 
@@ -121,7 +121,7 @@ def _piers(table: Structures, k: int, *, flat: shapely.LineString, at: Float) ->
     return shapes
 
 
-def _stands_out(
+def _above_ground(
     table: Structures, k: int, *, flat: shapely.LineString, at: Float, height: Height | None
 ) -> Bools:
     """Whether the bridge is well above the ground at metres along it."""

@@ -1,4 +1,4 @@
-"""Carriageways that share a surface, those that lie over each other, and where they part."""
+"""Carriageways that share a surface, carriageways above each other, and the boundaries between them."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def find_sheets(polygon: NDArray[np.object_], around: NDArray[np.object_], *, tu
     return Sheets(near, over, parted)
 
 
-def where_same(line: Float, other: Float, *, within: float) -> shapely.Geometry:
+def strips_of_equal_height(line: Float, other: Float, *, within: float) -> shapely.Geometry:
     """Strips along a line where its height differs by less than ``within`` metres from another line's."""
     cuts, middle = _strip_cuts(line)
     z, _, beside = nearest_on_line(other, middle[:, :2])

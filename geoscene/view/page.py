@@ -140,15 +140,15 @@ def _tiles_within(scene: Scene, bounds_deg: Degrees | None) -> Ints:
     x, y = scene.frame.from_geographic([west, west, east, east], [south, north, south, north])
     low = indices * scene.tile_size
     high = low + scene.tile_size
-    meets = (low[:, 0] < x.max()) & (high[:, 0] > x.min()) & (low[:, 1] < y.max()) & (high[:, 1] > y.min())
-    if not meets.any():
+    inside = (low[:, 0] < x.max()) & (high[:, 0] > x.min()) & (low[:, 1] < y.max()) & (high[:, 1] > y.min())
+    if not inside.any():
         xmin, ymin, xmax, ymax = scene.bounds
         lon, lat = scene.frame.to_geographic([xmin, xmax], [ymin, ymax])
         raise InputError(
             f"bounds {bounds_deg}: the scene has nothing there; it covers "
             f"{lon[0]:.5f},{lat[0]:.5f},{lon[1]:.5f},{lat[1]:.5f}"
         )
-    chosen: Ints = indices[meets]
+    chosen: Ints = indices[inside]
     return chosen
 
 
