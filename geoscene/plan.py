@@ -328,27 +328,20 @@ def _surfaces(
 
 def _objects(
     osm: OsmData, frame: Frame, *, ground: GroundPlan, only: Collection[str], side: Side
-) -> tuple[tuple[Trees, Furniture, Barriers], list[Problem]]:
+) -> tuple[list[Any], list[Problem]]:
     """Trees, furniture and barriers, moved off carriageways; empty tables for kinds not in ``only``."""
-    trees, in_trees = read_trees(osm, frame)
+    trees, problems = read_trees(osm, frame)
     trees, moved = clear_of(ground, trees)
-    furniture, in_furniture = read_furniture(osm, frame, plan=ground, left_hand=side == "left")
-    barriers, in_barriers = read_barriers(osm, frame, plan=ground)
+    found: dict[str, tuple[Any, list[Problem]]] = {
+        "trees": (trees, problems + moved),
+        "furniture": read_furniture(osm, frame, plan=ground, left_hand=side == "left"),
+        "barriers": read_barriers(osm, frame, plan=ground),
+    }
     none = np.empty(0, np.int64)
-    problems: list[Problem] = []
-    if "trees" in only:
-        problems += [*in_trees, *moved]
-    else:
-        trees = trees.take(none)
-    if "furniture" in only:
-        problems += in_furniture
-    else:
-        furniture = furniture.take(none)
-    if "barriers" in only:
-        problems += in_barriers
-    else:
-        barriers = barriers.take(none)
-    return (trees, furniture, barriers), problems
+    return (
+        [table if kind in only else table.take(none) for kind, (table, _) in found.items()],
+        [problem for kind, (_, problems) in found.items() if kind in only for problem in problems],
+    )
 
 
 def _graded_tiles(graph: RoadGraph, tile_size: float, *, level: bool) -> set[tuple[int, int]]:

@@ -24,23 +24,9 @@ _FEET_INCHES = re.compile(rf"^({_NUMBER})\s*(?:'|ft\.?|feet|foot)\s*({_NUMBER})\
 _PLAIN = re.compile(rf"^({_NUMBER})$")
 
 _COMPASS = (
-    "n",
-    "nne",
-    "ne",
-    "ene",
-    "e",
-    "ese",
-    "se",
-    "sse",
-    "s",
-    "ssw",
-    "sw",
-    "wsw",
-    "w",
-    "wnw",
-    "nw",
-    "nnw",
-)
+    "n", "nne", "ne", "ene", "e", "ese", "se", "sse",
+    "s", "ssw", "sw", "wsw", "w", "wnw", "nw", "nnw",
+)  # fmt: skip
 _POINTS = {"north": "n", "east": "e", "south": "s", "west": "w"}
 
 

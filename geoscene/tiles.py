@@ -113,7 +113,8 @@ def build_tile(
     solids, problems = make_solids(plan, tile, lod=lod)
     if former is not None:
         old = read_tile(former)
-        rest = old.mesh.take(~_is_building(old.mesh, plan)).shifted(old.origin)
+        is_building = old.mesh.closed & (old.mesh.feature < plan.buildings.count)
+        rest = old.mesh.take(~is_building).shifted(old.origin)
         transform = old.instances.transform.copy()
         transform[:, :, 3] += old.origin
         copies = replace(old.instances, transform=transform)
@@ -139,10 +140,6 @@ def build_tile(
         _plan_area(rest.take(~rest.closed)),
         tuple(problems),
     )
-
-
-def _is_building(mesh: Mesh, plan: Plan) -> Any:
-    return mesh.closed & (mesh.feature < plan.buildings.count)
 
 
 def _plan_area(mesh: Mesh) -> float:

@@ -51,19 +51,8 @@ def main() -> None:
         run(*pip, "--no-deps", "--no-index", wheel, cwd=away)
         run(binaries / "geoscene", "build", "--demo", "-o", "scene", "-q", cwd=away)
         run(binaries / "geoscene", "validate", "scene", cwd=away)
-        run(
-            binaries / "lidar",
-            "drive",
-            "scene",
-            "--route",
-            "random",
-            "--duration",
-            "1",
-            "-o",
-            "drive",
-            "-q",
-            cwd=away,
-        )
+        words = ("scene", "--route=random", "--duration=1", "-o", "drive", "-q")
+        run(binaries / "lidar", "drive", *words, cwd=away)
         run(binaries / "python", "-m", "geoscene", "info", "scene", cwd=away)
         run(binaries / "python", "-m", "lidar", "map", "drive", "-o", "map.laz", "-q", cwd=away)
 

@@ -41,19 +41,7 @@ def test_valid_scene_passes_validate(scene):
 
 
 def test_drive_resumes_and_its_map_is_written(scene, tmp_path):
-    words = [
-        "--route",
-        "random",
-        "--duration",
-        "2",
-        "--rig",
-        "vlp16",
-        "--format",
-        "pcd,laz",
-        "--seed",
-        "5",
-        "--json",
-    ]
+    words = ["--route=random", "--duration=2", "--rig=vlp16", "--format=pcd,laz", "--seed=5", "--json"]
     done = run_program("lidar", "drive", scene, *words, "-o", tmp_path / "drive")
     assert done.returncode == 0, done.stderr
     first = json.loads(done.stdout)
