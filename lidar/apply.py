@@ -63,7 +63,7 @@ def apply_stages(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> ApplySummary:
-    """Write recorded data after stages to ``out``, with truth files of what they did.
+    """Write recorded data after stages to ``out``, with truth files of the changes.
 
     A dataset of this program is written whole. Of other folders the point clouds are written, at the same
     relative paths: KITTI's ``*.bin`` in a folder ``velodyne*`` or in ``source`` itself, with SemanticKITTI's

@@ -317,7 +317,7 @@ def sensors(*, json: JsonFlag = False) -> int:
 
 @app.command
 def settings(*, json: JsonFlag = False) -> int:
-    """List the fidelity settings: their values at each level, and what they do.
+    """List the fidelity settings: their values at each level and their effect.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""Everything lidar raises on purpose; messages name parameters as in `geoscene.errors`."""
+"""Errors of lidar; messages name parameters as in `geoscene.errors`."""
 
 from __future__ import annotations
 
 
 class LidarError(Exception):
-    """Root of what this package raises on purpose; the command line shows it as one line, exit code 1."""
+    """Base class of this package's errors; the command line shows one line and exits with code 1."""
 
 
 class InputError(LidarError, ValueError):
@@ -18,8 +18,8 @@ class RouteError(InputError):
 class BlockedError(RouteError):
     """A route that bends too tightly for the vehicle, or on which its body would touch an obstacle.
 
-    turns : pairs of edges of the road graph that a detour must not take one after the other; an edge twice,
-            if it must not be taken at all
+    turns : pairs of successive edges of the road graph that a detour must avoid; an edge twice if it must
+            avoid the edge itself
     """
 
     def __init__(self, message: str, turns: list[tuple[int, int]]) -> None:
@@ -28,11 +28,11 @@ class BlockedError(RouteError):
 
 
 class RigError(InputError):
-    """A rig or sensor description with a mistake in it."""
+    """A rig or sensor description with an error."""
 
 
 class FormatError(InputError):
-    """A file that is not what its name says."""
+    """A file that cannot be read as the format of its name."""
 
 
 class DatasetError(InputError):

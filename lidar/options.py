@@ -223,7 +223,7 @@ class DriveOptions:
     [[stage]]; repeat for more. lidar stages lists them."""
 
     workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2
-    """Threads, a frame each, no more than there are cores; the bytes do not depend on it."""
+    """Threads, at most one per core; each records one frame at a time. The bytes do not depend on it."""
 
     def __post_init__(self) -> None:
         """Validate the options."""

@@ -1,4 +1,4 @@
-"""The plan of a drive: what is known before the first frame is recorded."""
+"""The plan of a drive: everything that is fixed before the first frame is recorded."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
         start=options.start or solar_start(scene),
         trajectory=trajectory,
         actors=actors,
-        scanning_ns=motion.on if isinstance(motion, Flight) else None,
+        scanning_ns=motion.scanning_ns if isinstance(motion, Flight) else None,
         geo=Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact),
         jobs=tuple(jobs),
     )
@@ -224,7 +224,7 @@ def plan_motion(
             side=options.side_in(scene),
             bounds=scene.bounds,
             duration=travel.duration,
-            under_way=travel.under_way,
+            at_speed=travel.at_speed,
         )
         if travel.duration is not None:  # what cannot pull up within a short time is recorded until then
             trajectory = trajectory.until(round(travel.duration * 1e9))
@@ -279,7 +279,7 @@ def _with_traffic(
             seed=seed,
             options=traffic,
             duration=motion.plan.duration,
-            under_way=motion.plan.under_way,
+            at_speed=motion.plan.at_speed,
         )
     if isinstance(traffic, SumoOptions):
         raise InputError("`traffic`: SUMO needs a drive along a route on roads")

@@ -81,7 +81,7 @@ def depth_to_counts(depth: NDArray[np.floating]) -> NDArray[np.uint16]:
 
 
 def counts_to_depth(counts: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Depth in metres, inf where there is no data: what `depth_to_counts` took, to half a count (2 mm)."""
+    """Depth in metres, inf without data: the inverse of `depth_to_counts` within half a count (2 mm)."""
     return np.where(counts > 0, counts / np.float32(DEPTH_SCALE), np.inf).astype(np.float32)
 
 

@@ -19,12 +19,12 @@ from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.camera_model import project
 from lidar.rig.specs import CameraSpec
-from lidar.world.actors import Actors, States, alive, poses_of, rotations, states
+from lidar.world.actors import Actors, States, existing_actors, poses_of, rotations, states
 
 
 def actors_near(actors: Actors, ego: Trajectory, *, time_ns: int, radius: float) -> Ints:
     """Indices (k,) of the actors present at a time within ``radius`` true metres of the ego vehicle."""
-    rows = alive(actors, time_ns, end_ns=time_ns)
+    rows = existing_actors(actors, time_ns, end_ns=time_ns)
     away = states(actors, rows, time_ns=time_ns).position - ego.at([time_ns]).position
     near: Ints = rows[np.hypot(*away[:, :2].T) <= radius * actors.scale]
     return near
@@ -128,7 +128,7 @@ def image_boxes(
     The pixels without occlusion are those that the actor's projected triangles cover, except triangles that
     extend behind the camera.
     """
-    rows = alive(actors, time_ns, end_ns=time_ns)
+    rows = existing_actors(actors, time_ns, end_ns=time_ns)
     at = states(actors, rows, time_ns=time_ns)
     away = ((at.position - pose.position) / pose.scale) @ pose.rotation[0]
     size = np.linalg.norm(actors.size[rows], axis=1)

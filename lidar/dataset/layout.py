@@ -1,14 +1,14 @@
-"""A dataset on disk: what a drive writes and everything later reads.
+"""A dataset on disk: names and reading of its files.
 
 DATASET/
   dataset.json            schema, scene, rig, options, seed, frames, licence; updated last
   poses.csv               the vehicle at each frame's start
-  trajectory.csv          the vehicle at 100 Hz: what points are placed with
+  trajectory.csv          the vehicle at 100 Hz; points are placed with it
   calibration.json        mounts and intrinsics of every sensor
   gnss.csv, imu.csv       measured, by the receivers' and units' names
   boxes.csv               road users in 3D, at the frames of the first scanner
   <sensor>/<format>/<frame>.<ext>
-  <sensor>/truth/<frame>.npz  what stages did; only with stages
+  <sensor>/truth/<frame>.npz  changes by stages; only with stages
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a drive records: the options of its files, and what every frame is recorded from."""
+"""Contents of a dataset, and the inputs that every frame is recorded from."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ class Recording:
         return {kind: path for kind, path, _ in self._files(sensor, frame)}
 
     def is_done(self, sensor: Scanner | Camera, frame: int) -> bool:
-        """Whether all files of a frame are there, and none is empty that has a header."""
+        """Whether all files of a frame exist, and those of formats with a header are not empty."""
         return all(
             path.exists() and (not header or path.stat().st_size > 0)
             for _, path, header in self._files(sensor, frame)

@@ -26,11 +26,11 @@ _LEAD_NS = 1_000_000_000  # nanoseconds before and after a strip for which scann
 class Flight:
     """A planned flight.
 
-    on : (k, 2) int64 nanoseconds from and to which scanners work; None for always
+    scanning_ns : (k, 2) int64 nanoseconds from and to which scanners work; None for always
     """
 
     trajectory: Trajectory
-    on: NDArray[np.int64] | None = None
+    scanning_ns: NDArray[np.int64] | None = None
 
 
 def waypoint_flight(points: ArrayLike, *, ground: Ground | None = None, limit: float = np.inf) -> Route:
@@ -111,11 +111,11 @@ def survey_lines(area: Any, *, spacing: float, heading_deg: float = 90.0) -> Flo
     return ends @ back
 
 
-def times_on_lines(trajectory: Trajectory, lines: Float, *, beside: float) -> NDArray[np.int64]:
+def times_on_lines(trajectory: Trajectory, lines: Float, *, max_offset: float) -> NDArray[np.int64]:
     """Intervals (k, 2) in nanoseconds in which an aircraft is on a line, plus a second at both ends.
 
     lines  : (n, 2, 2) scene metres, from and to
-    beside : scene metres across within which it is on one
+    max_offset : maximum distance to the line across it, scene metres
     """
     xy, course = trajectory.position[:, :2], trajectory.velocity[:, :2]
     course = course / np.maximum(np.hypot(*course.T), 1e-9)[:, None]
@@ -124,7 +124,7 @@ def times_on_lines(trajectory: Trajectory, lines: Float, *, beside: float) -> ND
         length = float(np.hypot(*(end - begin)))
         ahead = (end - begin) / max(length, 1e-9)
         along, aside = (xy - begin) @ ahead, (xy - begin) @ [-ahead[1], ahead[0]]
-        on |= (along >= 0) & (along <= length) & (np.abs(aside) <= beside) & (course @ ahead >= _ALONG)
+        on |= (along >= 0) & (along <= length) & (np.abs(aside) <= max_offset) & (course @ ahead >= _ALONG)
     change = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
     first, last = change[::2], change[1::2] - 1
     time = trajectory.time_ns

@@ -82,7 +82,7 @@ def plan_flight(
     """
     survey, altitude, duration = options.survey, options.altitude, options.duration
     usual = ALTITUDES["slow" if vehicle.max_speed < 30.0 else "fast"]
-    below = _Below(scene)
+    below = _SceneBelow(scene)
     if survey:
         height = usual if altitude is None else altitude
         route, lines, spacing = _strips(
@@ -105,23 +105,23 @@ def plan_flight(
             duration=duration,
             below=below,
         )
-    under_way = spec == "random" and not survey and not options.from_rest
-    trajectory = drive_path(plan_path(route, vehicle, frame=scene.frame), vehicle, under_way=under_way)
+    at_speed = spec == "random" and not survey and not options.from_rest
+    trajectory = drive_path(plan_path(route, vehicle, frame=scene.frame), vehicle, at_speed=at_speed)
     if duration is not None:
         trajectory = trajectory.until(round(duration * 1e9))
     _refuse_collisions(trajectory, below, scene=scene)
     if not survey or options.turns:
         return Flight(trajectory)
-    on = times_on_lines(trajectory, lines, beside=spacing / 2)
-    if not len(on):
+    scanning_ns = times_on_lines(trajectory, lines, max_offset=spacing / 2)
+    if not len(scanning_ns):
         raise RouteError(
             f"the record of {trajectory.duration_ns / 1e9:.1f} s ends before the first line of the survey;"
             " record longer, or scan on the way there too (`turns`)"
         )
-    return Flight(trajectory, on)
+    return Flight(trajectory, scanning_ns)
 
 
-class _Below:
+class _SceneBelow:
     """Heights of the scene below points, with the tiles around them loaded on demand."""
 
     def __init__(self, scene: Scene) -> None:
@@ -178,7 +178,7 @@ def _along(
     usual: float,
     seed: int,
     duration: float | None,
-    below: _Below,
+    below: _SceneBelow,
 ) -> Route:
     """The route along waypoints or streets."""
     if isinstance(spec, str) and spec == "random":
@@ -222,7 +222,7 @@ def _strips(
     sensors: Sequence[Scanner | Camera],
     height: float,
     overlap: float,
-    below: _Below,
+    below: _SceneBelow,
 ) -> tuple[Route, Float, float]:
     """The route in strips along an area's longer side, the strips (k, 2, 2), and their spacing."""
     area = survey_area(scene, survey)
@@ -315,7 +315,7 @@ def _swath(sensor: Scanner | Camera, height: float) -> float:
     return 2.0 * float(min(left, right, furthest))
 
 
-def _refuse_collisions(trajectory: Trajectory, below: _Below, *, scene: Scene) -> None:
+def _refuse_collisions(trajectory: Trajectory, below: _SceneBelow, *, scene: Scene) -> None:
     """Raise RouteError where the clearance above the scene is too small."""
     xyz = trajectory.position[::10]
     top = below.top(xyz[:, 0], xyz[:, 1])

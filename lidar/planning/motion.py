@@ -48,19 +48,19 @@ def drive_path(
     *,
     rate_hz: float = 100.0,
     duration: float | None = None,
-    under_way: bool = False,
+    at_speed: bool = False,
 ) -> Trajectory:
     """The trajectory of a vehicle along a path, from rest to rest, in the scene frame.
 
     rate_hz   : poses per second
     duration  : maximum seconds; on a longer path the vehicle stops in time
-    under_way : the vehicle is at speed at the start, and after ``duration``; it still stops at the path's end
+    at_speed : the vehicle is at speed at the start, and after ``duration``; it still stops at the path's end
 
     The speed stays within speed limits and the vehicle's lateral acceleration, acceleration, deceleration and
     jerk. The body's x axis is along the path at the rear axle, apart from roll and pitch under acceleration.
     Raises InputError for a duration or rate that is not positive.
     """
-    motion = motion_along(path, vehicle, rate_hz=rate_hz, duration=duration, under_way=under_way)
+    motion = motion_along(path, vehicle, rate_hz=rate_hz, duration=duration, at_speed=at_speed)
     return poses_along(path, vehicle, motion=motion)
 
 
@@ -70,7 +70,7 @@ def motion_along(
     *,
     rate_hz: float = 100.0,
     duration: float | None = None,
-    under_way: bool = False,
+    at_speed: bool = False,
 ) -> Motion:
     """The fastest speed profile along a path within all limits; arguments as for `drive_path`."""
     if not (rate_hz > 0 and (duration is None or duration > 0)):
@@ -78,9 +78,9 @@ def motion_along(
     limit = speed_limits(path, vehicle)
     fine = math.ceil(100.0 / rate_hz)
     dt = 1.0 / (rate_hz * fine)
-    s, v, leg = _all_legs(path, limit, vehicle=vehicle, dt=dt, under_way=under_way)
+    s, v, leg = _all_legs(path, limit, vehicle=vehicle, dt=dt, at_speed=at_speed)
     if duration is not None and len(s) * dt > duration:
-        if under_way:
+        if at_speed:
             count = max(round(duration / dt), fine) + 1
             s, v, leg = s[:count], v[:count], leg[:count]
         else:
@@ -142,18 +142,18 @@ def legs_of(path: Path) -> list[tuple[int, int]]:
 
 
 def _all_legs(
-    path: Path, limit: Float, *, vehicle: Vehicle, dt: float, under_way: bool = False
+    path: Path, limit: Float, *, vehicle: Vehicle, dt: float, at_speed: bool = False
 ) -> tuple[Float, Float, NDArray[np.int32]]:
     """Distance, speed and leg at every ``dt`` of the whole path, with a rest between legs.
 
-    under_way : it is at speed at the start
+    at_speed : it is at speed at the start
     """
     s: list[Float] = []
     v: list[Float] = []
     leg: list[NDArray[np.int32]] = []
     rest = round(DWELL_S / dt)
     for first, last in legs_of(path):
-        at_rest = (not vehicle.cruise and not (under_way and not first), not vehicle.cruise)
+        at_rest = (not vehicle.cruise and not (at_speed and not first), not vehicle.cruise)
         ds, dv = _time_law(
             path.s[first:last] - path.s[first], limit[first:last], vehicle=vehicle, dt=dt, rest=at_rest
         )
@@ -196,7 +196,7 @@ def _within(
 def _time_law(
     s: Float, limit: Float, *, vehicle: Vehicle, dt: float, rest: tuple[bool, bool]
 ) -> tuple[Float, Float]:
-    """Distance and speed at every ``dt`` of a leg, from rest and to rest where ``rest`` says so.
+    """Distance and speed at every ``dt`` of a leg; ``rest``: whether it starts and ends at rest.
 
     The fastest profile under the limits and the accelerations (a forward and a backward pass) is averaged
     over a window in time. An average of speeds keeps the bounds of their accelerations, and its acceleration

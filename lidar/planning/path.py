@@ -177,14 +177,14 @@ def _clear_track(line: Line, setting: Setting, *, pose: Pose | None) -> Track:
         pushed = base + shift[:, None] * left
         xy = relaxed(pushed, cap / scale, reach=reach)
         track = follow(xy, vehicle, scale=scale, pose=pose, step=setting.step)
-        lost = _lost(track, line, xy=pushed, vehicle=vehicle)
-        if len(lost):
-            x, y = base[lost[0]]
+        departure = _departure(track, line, xy=pushed, vehicle=vehicle)
+        if len(departure):
+            x, y = base[departure[0]]
             raise BlockedError(
                 f"the {vehicle.name} cannot follow the route near scene x {x:.1f}, y {y:.1f} (edge"
-                f" {line.edge[lost[0]]}): it bends too tightly for a turning radius of"
+                f" {line.edge[departure[0]]}): it bends too tightly for a turning radius of"
                 f" {vehicle.turning_radius} m",
-                turns_at(line, lost),
+                turns_at(line, departure),
             )
         push, at = pushes(track, line, setting=setting)
         if not len(at):
@@ -208,7 +208,7 @@ def _clear_track(line: Line, setting: Setting, *, pose: Pose | None) -> Track:
     )
 
 
-def _lost(track: Track, line: Line, *, xy: Float, vehicle: Vehicle) -> NDArray[np.int64]:
+def _departure(track: Track, line: Line, *, xy: Float, vehicle: Vehicle) -> NDArray[np.int64]:
     """The row of the line, pushed to ``xy`` (n, 2), where the track leaves it; none if it does not."""
     if track.row[-1] < len(line.edge) - 1:
         return track.row[-1:]

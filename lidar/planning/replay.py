@@ -66,7 +66,7 @@ def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
     except (ValueError, TypeError) as error:
         raise FormatError(f"{path}: a row that cannot be read ({error})") from error
     if (np.diff(time) <= 0).any():
-        raise FormatError(f"{path}: its times do not rise")
+        raise FormatError(f"{path}: its times do not increase")
     x, y = frame.from_geographic(lon, lat)
     seconds = time * 1e-9
     at = np.append(np.arange(0, time[-1], _STEP_NS), time[-1])

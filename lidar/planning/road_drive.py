@@ -36,14 +36,14 @@ class RoadPlan:
     graph     : road graph of the scene
     path      : along the route; its edges are those of ``graph``
     duration  : seconds to record, None for the whole route
-    under_way : whether the vehicle is at speed at the start and at the end of the record
+    at_speed : whether the vehicle is at speed at the start and at the end of the record
     """
 
     graph: RoadGraph
     route: Route
     path: Path
     duration: float | None
-    under_way: bool = False
+    at_speed: bool = False
 
 
 def graph_on_tiles(graph: RoadGraph, scene: Scene) -> RoadGraph:
@@ -127,7 +127,7 @@ def plan_road_drive(
     obstacles = ground_footprints(scene)
     progress("planning", 0, total=0)
     seconds = duration if duration is not None or spec != "random" else _RANDOM_SECONDS
-    under_way = spec == "random" and not from_rest
+    at_speed = spec == "random" and not from_rest
     route, path = plan_route_and_path(
         graph,
         scene.frame,
@@ -135,11 +135,11 @@ def plan_road_drive(
         vehicle=body,
         options=RouteOptions(
             seed=seed,
-            duration=None if seconds is None else seconds + (ROUTE_MARGIN_S if under_way else 0.0),
+            duration=None if seconds is None else seconds + (ROUTE_MARGIN_S if at_speed else 0.0),
             side=cast("Side", side),
         ),
         obstacles=obstacles,
         ground=road_surface(scene),
     )
     path = replace(path, edge=np.where(path.edge >= 0, np.flatnonzero(kept)[path.edge], -1).astype(np.int32))
-    return RoadPlan(whole, route, path, seconds, under_way)
+    return RoadPlan(whole, route, path, seconds, at_speed)

@@ -114,7 +114,7 @@ def plan_route(
         ends = (_SET_OUT * float(graph.length[edges[0]]), 0.75 * float(graph.length[edges[-1]]))
         return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
 
-    from lidar.planning.waypoints import match_track, read_track, through  # noqa: PLC0415  (they import this module)
+    from lidar.planning.waypoints import match_track, read_track, route_through  # noqa: PLC0415  (they import this module)
 
     if isinstance(spec, str | Path):
         track = read_track(Path(spec), frame)
@@ -128,7 +128,7 @@ def plan_route(
     else:
         points = [(float(lat), float(lon)) for lat, lon in spec]
     _need_streets(graph)
-    edges, ends = through(graph, frame, points=points, tolerance=tolerance, avoid=avoid)
+    edges, ends = route_through(graph, frame, points=points, tolerance=tolerance, avoid=avoid)
     return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
 
 
@@ -254,7 +254,7 @@ def _cut(line: Float, begin: float, *, end: float) -> Float:
     return polylines.cut(line, begin * total, end=end * total)
 
 
-def _meet(a: Float, b: Float, *, reach: float, change: float) -> tuple[Float, Float]:
+def _joined_lanes(a: Float, b: Float, *, reach: float, change: float) -> tuple[Float, Float]:
     """Two lanes that follow each other, joined within ``reach``.
 
     Straight on, a lane that lies ``change`` metres further out than the other is left over five times that
@@ -315,7 +315,7 @@ def lane_route(
         if not rounds[k]:
             reach = 2.0 * max(abs(float(offset[order[k]])), abs(float(offset[order[k + 1]])), 1.0)
             change = float(offset[order[k + 1]] - offset[order[k]])
-            lanes[k], lanes[k + 1] = _meet(lanes[k], lanes[k + 1], reach=reach, change=change)
+            lanes[k], lanes[k + 1] = _joined_lanes(lanes[k], lanes[k + 1], reach=reach, change=change)
     sizes = np.array([len(lane) for lane in lanes])
     last = np.cumsum(sizes) - 1
     turns = last[rounds].tolist()

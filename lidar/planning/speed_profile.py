@@ -49,13 +49,13 @@ def motion_within(
     time_s: Float,
     max_distance: Float,
     rate_hz: float = 100.0,
-    under_way: bool = False,
+    at_speed: bool = False,
 ) -> Motion:
     """The speed profile along a path, from rest to rest, that never exceeds given distances.
 
     time_s    : (k,) rising seconds from 0
     max_distance : (k,) metres along the path at these times, not decreasing
-    under_way : the vehicle is at speed at the start and at the last time
+    at_speed : the vehicle is at speed at the start and at the last time
 
     It ends at the last time or at the end of the path. Raises InputError for decreasing distances.
     """
@@ -73,11 +73,11 @@ def motion_within(
         needed = _TAIL_S + 1.5 * float((np.diff(path.s[first:last]) / limit[first : last - 1]).sum())
         until = max(float(time_s[there[0]]) - begin, 0.0) + needed if len(there) else math.inf
         t = STEP_S * np.arange(max(math.floor(min(total - begin, until) / STEP_S), 2) + 1)
-        rolls = under_way and not parts
+        rolls = at_speed and not parts
         # each step is bounded by the distance allowed one step before, so all times in between are too
         late = STEP_S * np.minimum(t / _SETTLING_S, 1.0) if rolls else STEP_S
         bounds = np.interp(begin + t - late, time_s, allowed)
-        still = (not rolls, not under_way or until < total - begin)
+        still = (not rolls, not at_speed or until < total - begin)
         knots = _best(
             path.s[first:last] - origin, limit[first:last], vehicle=vehicle, allowed=bounds, rest=still
         )
@@ -127,7 +127,7 @@ def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tup
     place = np.arange(0.0, s[-1] + gap, gap)
     strict = np.interp(place, s, limit)
     cautious = _braked(place, minimum_filter1d(strict, 2 * round(_AROUND / gap) + 1), vehicle=vehicle)
-    allowed = _paced(
+    allowed = _reachable(
         allowed, place, limit=cautious, vehicle=vehicle, speed=0.0 if rest[0] else float(cautious[0])
     )
     cap = np.interp(allowed, place, cautious)
@@ -142,7 +142,7 @@ def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tup
     return _Knots(knots.s, knots.v / late, knots.a / late**2, knots.dt * late)
 
 
-def _paced(allowed: Float, place: Float, *, limit: Float, vehicle: Vehicle, speed: float) -> Float:
+def _reachable(allowed: Float, place: Float, *, limit: Float, vehicle: Vehicle, speed: float) -> Float:
     """Distances (k,) behind those allowed that are reached under speed limits and the vehicle's acceleration.
 
     speed : m/s at the first of them

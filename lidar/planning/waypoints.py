@@ -69,10 +69,10 @@ def read_track(path: Path, frame: Frame) -> Track:
     return Track(list(zip(lat.tolist(), lon.tolist(), strict=True)), xyz, dense)
 
 
-# ----------------------------------------------------------------------------------------- through places
+# ------------------------------------------------------------------------------------------- waypoints
 
 
-def through(
+def route_through(
     graph: RoadGraph,
     frame: Frame,
     *,
@@ -256,10 +256,10 @@ class _Search:
 
     def _round_trip(self, edge: int, far: Float) -> float:
         """Cost from an edge's tail round to its tail again."""
-        column = self._into(edge)
+        column = self._incoming(edge)
         return float((far[column[0]] + column[1]).min()) if len(column[0]) else np.inf
 
-    def _into(self, edge: int) -> tuple[NDArray[Any], Float]:
+    def _incoming(self, edge: int) -> tuple[NDArray[Any], Float]:
         coo = self.links.tocoo()
         rows = coo.col == edge
         return coo.row[rows], coo.data[rows]
@@ -300,7 +300,7 @@ class _Search:
         far, previous = self._dijkstra(a[0], np.inf)
         walk = [b[0]]
         if a[0] == b[0]:
-            before, cost = self._into(b[0])
+            before, cost = self._incoming(b[0])
             walk.append(int(before[np.argmin(far[before] + cost)]))
         while walk[-1] != a[0]:
             walk.append(int(previous[walk[-1]]))

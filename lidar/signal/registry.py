@@ -1,4 +1,4 @@
-"""The stages that there are, and reading them from text, TOML files and recipes."""
+"""Registry of stages; reads stages from text, TOML files and recipes."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Stages:
         return any(self.at(seam, sensor) for seam, of in SEAMS.items() if of == kind)
 
     def check(self, sensors: Mapping[str, str]) -> None:
-        """Raise InputError for a stage that acts on none of the sensors, whose kinds are given by name."""
+        """Raise InputError for a stage that acts on none of the sensors; ``sensors``: kind by name."""
         for named in self.stages:
             if named.sensor and named.sensor not in sensors:
                 raise InputError(

@@ -1,4 +1,4 @@
-"""Runs stages on a frame, and keeps the ground truth of what they did."""
+"""Runs stages on a frame and records the ground truth of their changes."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _FALSE_KINDS = 3  # kinds of false echoes, each at most one per pulse
 class Altered:
     """A frame after its stages.
 
-    cloud    : what is recorded
-    original : what would be recorded without stages
+    cloud    : the recorded cloud
+    original : the cloud without stages
     """
 
     cloud: TracedCloud

@@ -35,16 +35,16 @@ def drive_with_signals(
     side: str = "right",
     bounds: tuple[float, float, float, float] | None = None,
     duration: float | None = None,
-    under_way: bool = False,
+    at_speed: bool = False,
 ) -> Trajectory:
     """The trajectory of a vehicle that drives a path alone and stops at red signals and stop signs.
 
     seed     : of the signals, as for `junction_plan`
     side     : of the road that is driven on
     bounds   : of the map in scene metres
-    duration, under_way : as for `drive_path`
+    duration, at_speed : as for `drive_path`
     """
-    alone = drive_path(path, vehicle, duration=duration, under_way=under_way)
+    alone = drive_path(path, vehicle, duration=duration, at_speed=at_speed)
     plan = junction_plan(graph, lanes_of(graph, side=side, bounds=bounds), seed=seed)
     if not has_traffic_control(ego_trip(path, vehicle), graph, plan=plan):
         return alone
@@ -57,7 +57,7 @@ def drive_with_signals(
         alone=alone,
         duration=duration,
         radius=np.inf,
-        under_way=under_way,
+        at_speed=at_speed,
     )
 
 
@@ -71,12 +71,12 @@ def drive_in_traffic(
     seed: int,
     options: TrafficOptions | None = None,
     duration: float | None = None,
-    under_way: bool = False,
+    at_speed: bool = False,
 ) -> tuple[Trajectory, Actors]:
     """The trajectory of a vehicle along a path in simulated traffic, and the other road users.
 
     first    : its trajectory without other road users, such as `drive_with_signals` gives
-    duration, under_way : as for `drive_path`
+    duration, at_speed : as for `drive_path`
 
     The ego is simulated together with the others. Its motion is then smoothed to its limits of acceleration
     and jerk, never ahead of the simulated one, and the others are simulated again around it.
@@ -96,7 +96,7 @@ def drive_in_traffic(
             alone=first,
             duration=duration,
             radius=radius,
-            under_way=under_way,
+            at_speed=at_speed,
         )
         if _apart(before, ego) < _SAME * setup.scale:
             break
@@ -115,18 +115,18 @@ def _driven(
     alone: Trajectory,
     duration: float | None,
     radius: float,
-    under_way: bool,
+    at_speed: bool,
 ) -> Trajectory:
     """The trajectory of the ego simulated with trips; ``alone`` is that without them."""
     factor, more = _LONGER
     seconds = duration if duration is not None else factor * alone.duration_ns * 1e-9 + more
-    if duration is not None and under_way:
+    if duration is not None and at_speed:
         seconds += _ON_S
-    trip = ego_trip(path, vehicle, under_way=under_way)
+    trip = ego_trip(path, vehicle, at_speed=at_speed)
     travelled = simulate_ego(trip, trips, graph=graph, plan=plan, seconds=seconds, radius=radius)
     time_s: Float = STEP_S * np.arange(len(travelled), dtype=float)
     motion = motion_within(
-        path, vehicle, time_s=time_s, max_distance=travelled.clip(max=path.length), under_way=under_way
+        path, vehicle, time_s=time_s, max_distance=travelled.clip(max=path.length), at_speed=at_speed
     )
     trajectory = poses_along(path, vehicle, motion=motion)
     return trajectory if duration is None else trajectory.until(round(duration * 1e9))

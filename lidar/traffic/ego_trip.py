@@ -25,7 +25,7 @@ _HEADWAY_S, _GAP = 1.4, 2.0
 class EgoTrip:
     """The ego's trip, with the columns of `lidar.traffic.trips.Trip`.
 
-    xy, heading : (n, 2) and (n,) of the box's middle at each station
+    xy, heading : (n, 2) and (n,) of the box's centre at each station
     """
 
     path: ActorPath
@@ -42,14 +42,14 @@ class EgoTrip:
     crossing: Sequence[tuple[int, int, int]] = ()
 
     def body(self) -> tuple[Float, Float]:
-        """Middle and heading at each station."""
+        """Centre and heading of the box at each station."""
         return self.xy, self.heading
 
 
-def ego_trip(path: Path, vehicle: Vehicle, *, under_way: bool = False) -> EgoTrip:
+def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False) -> EgoTrip:
     """The ego's trip along its path, from rest or at speed; stations are `STEP` metres apart."""
     at = np.arange(0.0, path.length + STEP, STEP)
-    # where the vehicle turns round the position stands twice
+    # `s` repeats where the vehicle turns round
     s = path.s + 1e-9 * np.arange(len(path))
     scale = float(path.scale.mean())
     heading = np.interp(at, s, path.heading)
@@ -69,7 +69,7 @@ def ego_trip(path: Path, vehicle: Vehicle, *, under_way: bool = False) -> EgoTri
     deceleration, acceleration = _BRAKE * vehicle.deceleration, _PULL * vehicle.acceleration
     driver = Driver(vehicle.turning_radius, vehicle.max_speed, _HEADWAY_S, acceleration, deceleration, _GAP)
     desired = np.interp(at, s, desired_speed(path, vehicle))
-    if not under_way:
+    if not at_speed:
         desired = np.minimum(desired, np.sqrt(2 * acceleration * (at + 0.2)))
     return EgoTrip(
         actor_path, driver, desired, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading

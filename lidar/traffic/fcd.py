@@ -63,12 +63,12 @@ class TrafficFile:
     """Traffic from a file of SUMO, with parked vehicles.
 
     path   : floating car data, ``.xml`` or ``.xml.gz``
-    net    : SUMO's network, of which its coordinates are; by default the one that the file names, and none is
-             needed for longitudes and latitudes (``--fcd-output.geo``)
+    net    : SUMO network that the coordinates refer to; by default the one that the file names. Not needed
+             for longitudes and latitudes (``--fcd-output.geo``)
     begin  : SUMO's time in seconds at which the drive starts; the first in the file by default
-    parked : share of the places along kerbs and in parking lots that are taken
-    radius  : true metres from the ego vehicle within which there are road users
-    side   : side of the road that traffic keeps to
+    parked : share of the spaces along kerbs and in parking lots that are occupied
+    radius : true metres from the ego vehicle within which there are road users
+    side   : driving side
     """
 
     path: Path
@@ -95,7 +95,7 @@ class Fcd:
     length   : (n,) metres
     time     : (k,) seconds
     lon, lat : (k,) degrees, WGS 84, middle of the front bumper
-    ahead    : (k, 2) longitude and latitude of a place about a metre ahead of it
+    ahead    : (k, 2) longitude and latitude of a point about a metre ahead of it
     speed    : (k,) m/s, NaN where the file has none
     """
 
@@ -128,13 +128,13 @@ def read_fcd(path: Path, *, net: Path | None = None) -> Fcd:
     Raises FormatError for a file that is missing, damaged or no floating car data, and if the position of
     its network on Earth is unknown.
     """
-    noted = _noted(path)
+    sumo_options = _sumo_options(path)
     rows, names, kinds = _rows(path)
     if not len(rows):
         raise FormatError(f"{path}: no vehicles and no persons in it; write it with sumo --fcd-output")
     number, time, x, y, angle, speed = rows.T
-    geo = noted.get("fcd-output.geo") == "true"
-    net = net or _beside(path, noted.get("net-file", ""))
+    geo = sumo_options.get("fcd-output.geo") == "true"
+    net = net or _linked_file(path, sumo_options.get("net-file", ""))
     if not geo and net is None and (np.abs(x) <= 180).all() and (np.abs(y) <= 90).all():
         geo = True
     c, s = np.sin(np.radians(angle)), np.cos(np.radians(angle))  # east and north from degrees clockwise
@@ -149,12 +149,12 @@ def read_fcd(path: Path, *, net: Path | None = None) -> Fcd:
         )
     else:
         projection = network_projection(net)
-        if noted.get("fcd-output.utm") == "true":
+        if sumo_options.get("fcd-output.utm") == "true":
             projection = replace(projection, offset=np.zeros(2))
         at = np.column_stack([x, y])
         lon, lat = projection.to_geographic(at)
         ahead = np.column_stack(projection.to_geographic(at + np.column_stack([c, s])))
-    known = _types(path, noted)
+    known = _types(path, sumo_options)
     classes = [known.get(kind, ("", None)) for kind in kinds]
     vclass = [given or _class_of(kind) for (given, _), kind in zip(classes, kinds, strict=True)]
     length = [
@@ -178,7 +178,7 @@ def read_fcd(path: Path, *, net: Path | None = None) -> Fcd:
 
 
 def _class_of(kind: str) -> str:
-    """SUMO's class of a type by its name; "" for what is left out."""
+    """SUMO's class of a type by its name; "" for classes that are left out."""
     name = kind.lower()
     return next((c for word, c in _WORDS if word in name), "passenger")
 
@@ -196,10 +196,10 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
     except (OSError, EOFError) as error:
         raise FormatError(f"{path}: cannot be read: {error}") from None
     except ET.ParseError as error:
-        raise FormatError(f"{path}: broken XML ({error}); had sumo ended when it was copied?") from None
+        raise FormatError(f"{path}: broken XML ({error}); was sumo still writing it?") from None
 
 
-def _noted(path: Path) -> dict[str, str]:
+def _sumo_options(path: Path) -> dict[str, str]:
     """SUMO's options in the comment at the file's start."""
     with _opened(path) as file:
         head = file.read(_HEAD).decode("utf-8", "replace")
@@ -207,8 +207,8 @@ def _noted(path: Path) -> dict[str, str]:
     return dict(_OPTION.findall(head))
 
 
-def _beside(path: Path, named: str) -> Path | None:
-    """A file named in another one, in the same folder or at the path given; None if it does not exist."""
+def _linked_file(path: Path, named: str) -> Path | None:
+    """A file that another one names, in its folder or at the given path; None if it does not exist."""
     found = [p for p in (path.parent / named, Path(named)) if named and p.is_file()]
     return found[0] if found else None
 
@@ -265,8 +265,8 @@ def _number(path: Path, element: ET.Element, *, attribute: str, where: str) -> f
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        said = "is missing" if text is None else f"= {text!r} is no number"
-        raise FormatError(f"{path}: {where}: {attribute} {said}")
+        fault = "is missing" if text is None else f"= {text!r} is no number"
+        raise FormatError(f"{path}: {where}: {attribute} {fault}")
     return value
 
 
@@ -312,12 +312,12 @@ def network_projection(net: Path) -> NetworkProjection:
         raise FormatError(f"{net}: projParameter = {proj!r}: {error}") from None
 
 
-def _types(path: Path, noted: dict[str, str]) -> dict[str, tuple[str, float | None]]:
+def _types(path: Path, sumo_options: dict[str, str]) -> dict[str, tuple[str, float | None]]:
     """Class and length of the vehicle types in the route files that exist."""
     out: dict[str, tuple[str, float | None]] = {}
-    named = f"{noted.get('route-files', '')},{noted.get('additional-files', '')}"
+    named = f"{sumo_options.get('route-files', '')},{sumo_options.get('additional-files', '')}"
     for name in named.split(","):
-        source = _beside(path, name.strip())
+        source = _linked_file(path, name.strip())
         if source is None:
             continue
         with _opened(source) as file:

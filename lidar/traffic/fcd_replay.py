@@ -26,7 +26,7 @@ from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import Tracks, actors_on_ground
 from lidar.traffic.trips import VEHICLE_SHARES, random_shape, random_stretch
 from lidar.world.actor_shapes import Shape
-from lidar.world.actors import Actors, alive, joined, states
+from lidar.world.actors import Actors, existing_actors, joined, states
 
 _KINDS: dict[str, tuple[str, ...]] = {
     "passenger": ("sedan", "hatchback", "suv"),
@@ -66,8 +66,8 @@ def replay(
     """The road users of a file of SUMO around the ego vehicle, and parked vehicles clear of their paths.
 
     Between SUMO's steps positions are cubic, never backwards, and headings linear; instantaneous lane changes
-    are spread over three seconds. Road users that the ego would touch are left out, as they do not react to
-    it. Bodies depend on the seed and SUMO's ids.
+    are spread over three seconds. Road users that would collide with the ego are left out, as they do not
+    react to it. Bodies depend on the seed and SUMO's ids.
 
     Raises FormatError for an invalid file, InputError if no road user of it comes near the ego.
     """
@@ -90,7 +90,7 @@ def replay_fcd(
     begin: float,
     options: TrafficOptions,
 ) -> Actors:
-    """As `replay`, of floating car data that have been read; densities of moving road users do not count.
+    """As `replay`, for floating car data in memory; ignores the densities of moving road users.
 
     begin : SUMO's time in seconds at which the drive starts
     """
@@ -118,7 +118,7 @@ def _moving(
     scale = setup.scale
     front, heading = scene_positions(fcd, scene)
     shapes, stretch, parts = [], [], []
-    anybody = False
+    any_in_scene = False
     for k, name in enumerate(fcd.name):
         rows = slice(fcd.first[k], fcd.first[k + 1])
         rng = generator(seed, "traffic", "fcd", name)
@@ -129,13 +129,13 @@ def _moving(
             yaw = np.unwrap(heading[rows][run])
             middle = front[rows][run] - back * np.column_stack([np.cos(yaw), np.sin(yaw)])
             track = _sampled(time[run], middle, yaw=yaw, until=ego.duration_ns * 1e-9)
-            anybody |= len(track) > 0 and bool(_inside(track[:, 1:3], scene.bounds).any())
-            for part in _about(track, scene, ego=ego, radius=setup.area.radius * scale):
+            any_in_scene |= len(track) > 0 and bool(_inside(track[:, 1:3], scene.bounds).any())
+            for part in _parts_near_ego(track, scene, ego=ego, radius=setup.area.radius * scale):
                 shapes.append(shape)
                 stretch.append(grow)
                 parts.append(part)
     if not parts:
-        raise InputError(_nobody(fcd, begin, anybody=anybody))
+        raise InputError(_no_road_users(fcd, begin, any_in_scene=any_in_scene))
     knots = np.array([len(part) for part in parts], np.int64)
     step, x, y, yaw, travelled = np.concatenate(parts).T
     speed = np.concatenate([_monotone(np.diff(part[:, 4]) / STEP_S) for part in parts]) / scale
@@ -156,17 +156,17 @@ def _moving(
     return _without(actors, _touched(actors, ego, vehicle=vehicle))
 
 
-def _nobody(fcd: Fcd, begin: float, *, anybody: bool) -> str:
+def _no_road_users(fcd: Fcd, begin: float, *, any_in_scene: bool) -> str:
     """Error message for a file without road users near the ego."""
-    if anybody:
-        return "traffic: nobody of the file comes near the ego vehicle; raise radius or choose another route"
+    if any_in_scene:
+        return "traffic: no road user of the file comes near the ego; raise radius or choose another route"
     first, last = float(fcd.time.min()), float(fcd.time.max())
     if begin >= last or begin < first - 86_400:
         return f"traffic: begin={begin:g}: the file has seconds {first:g} to {last:g}"
     lat, lon = float(np.median(fcd.lat)), float(np.median(fcd.lon))
     return (
-        f"traffic: nobody of the {len(fcd.name)} in the file is in the scene during the drive; they are about"
-        f" {lat:.4f},{lon:.4f}: is the network one of this place?"
+        f"traffic: none of the {len(fcd.name)} road users in the file is in the scene during the drive;"
+        f" they are near {lat:.4f},{lon:.4f}: is the network one of this place?"
     )
 
 
@@ -261,7 +261,7 @@ def _inside(xy: Float, bounds: tuple[float, float, float, float]) -> NDArray[np.
     return np.asarray(((xy >= bounds[:2]) & (xy <= bounds[2:])).all(axis=1), np.bool_)
 
 
-def _about(track: Float, scene: Scene, *, ego: Trajectory, radius: float) -> list[Float]:
+def _parts_near_ego(track: Float, scene: Scene, *, ego: Trajectory, radius: float) -> list[Float]:
     """Parts of a track that are on the map and within ``radius`` of the ego."""
     if not len(track):
         return []
@@ -281,7 +281,7 @@ def _about(track: Float, scene: Scene, *, ego: Trajectory, radius: float) -> lis
 def _hints(graph: RoadGraph, xy: Float, *, yaw: Float, foot: NDArray[np.bool_]) -> Float:
     """Height (n,) of the nearest road in the direction of each position, NaN where there is none.
 
-    foot : who goes in any direction
+    foot : (n,) bool, pedestrian: roads in all directions count
     """
     lines = edge_lines(graph)
     points = shapely.points(xy)
@@ -310,7 +310,7 @@ def _touched(actors: Actors, ego: Trajectory, *, vehicle: Vehicle) -> Ints:
     for t in range(0, ego.duration_ns + 1, round(STEP_S * 1e9)):
         pose = ego.at([t])
         forward = pose.rotation[0, :2, 0]
-        rows = alive(actors, t, end_ns=t)
+        rows = existing_actors(actors, t, end_ns=t)
         at = states(actors, rows, time_ns=t)
         near = (
             np.hypot(*(at.position[:, :2] - pose.position[0, :2]).T) < (actors.size[rows, 0] + 10.0) * scale

@@ -66,9 +66,9 @@ def zones_of(graph: RoadGraph) -> Zones:
         none = np.empty(0, object)
         return Zones(none, shapely.STRtree(none), [])
     circles = shapely.buffer(shapely.points(graph.node_xyz[node, :2]), half[node] + _ROUND, quad_segs=4)
-    lit = shapely.union_all(shapely.buffer(circles[graph.signals[node]], _TOGETHER / 2, quad_segs=4))
-    lit = shapely.buffer(lit, -_TOGETHER / 2, quad_segs=4)
-    polygon = shapely.get_parts(shapely.union_all([*circles, lit]))
+    signalised = shapely.union_all(shapely.buffer(circles[graph.signals[node]], _TOGETHER / 2, quad_segs=4))
+    signalised = shapely.buffer(signalised, -_TOGETHER / 2, quad_segs=4)
+    polygon = shapely.get_parts(shapely.union_all([*circles, signalised]))
     tree = shapely.STRtree(polygon)
     point, zone = tree.query(shapely.points(graph.node_xyz[node, :2]), predicate="intersects")
     return Zones(polygon, tree, [node[point[zone == z]] for z in range(len(polygon))])
@@ -96,12 +96,12 @@ class JunctionPlan:
 
     zones  : the junctions
     axis   : (z,) heading in radians along which the first of a junction's two groups of streets runs
-    lit    : (z,) bool, has signals
+    signalised : (z,) bool, has signals
     """
 
     zones: Zones
     axis: Float
-    lit: NDArray[np.bool_]
+    signalised: NDArray[np.bool_]
     signals: Signals
 
 
@@ -109,19 +109,19 @@ def junction_plan(graph: RoadGraph, lanes: Lanes, *, seed: int, cycle: float = 6
     """Junctions with fixed-time signals of two groups where the map has signals."""
     zones = zones_of(graph)
     n = len(zones.polygon)
-    axis, lit = np.zeros(n), np.zeros(n, bool)
+    axis, signalised = np.zeros(n), np.zeros(n, bool)
     for z, nodes in enumerate(zones.nodes):
         into = np.isin(graph.head, nodes) & ~np.isin(graph.tail, nodes)
         into = into if into.any() else np.isin(graph.head, nodes)
         axis[z] = np.angle(np.exp(4j * lanes.leave[into]).sum()) / 4
-        lit[z] = bool(graph.signals[nodes].any())
+        signalised[z] = bool(graph.signals[nodes].any())
     shift = generator(seed, "traffic", "signals").uniform(0, cycle, n)
-    return JunctionPlan(zones, axis, lit, Signals(np.full(n, cycle), shift, np.empty((0, 4))))
+    return JunctionPlan(zones, axis, signalised, Signals(np.full(n, cycle), shift, np.empty((0, 4))))
 
 
 def signal_group(plan: JunctionPlan, zone: int, *, heading: float) -> int:
     """Signal group of a junction for traffic of a heading, -1 without signals."""
-    if not plan.lit[zone]:
+    if not plan.signalised[zone]:
         return -1
     return 0 if abs(np.cos(heading - plan.axis[zone])) >= abs(np.sin(heading - plan.axis[zone])) else 1
 

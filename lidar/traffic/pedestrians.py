@@ -158,7 +158,7 @@ def _stroll(
 ) -> tuple[list[Float], list[tuple[int, int]]]:
     """Consecutive lines that a pedestrian walks, and pairs of a line and the crossing after it.
 
-    They go to the end of a stretch of sidewalk and back, or over a crossing on the path, and so on.
+    It walks to the end of a sidewalk and back, or over a crossing on the way, until it has walked ``metres``.
     """
     parts: list[Float] = []
     over: list[tuple[int, int]] = []

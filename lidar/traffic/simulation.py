@@ -173,7 +173,7 @@ def green_windows(plan: JunctionPlan, ego: EgoMotion) -> Float:
     cuts = np.flatnonzero(np.diff(np.concatenate([[-2], zone, [-2]])))
     for a, b in itertools.pairwise(cuts.tolist()):
         z = int(zone[a])
-        if z >= 0 and plan.lit[z]:
+        if z >= 0 and plan.signalised[z]:
             rows.append(
                 (z, signal_group(plan, z, heading=float(ego.heading[a])), a * STEP_S - 8.0, b * STEP_S)
             )

@@ -166,7 +166,7 @@ def run(
     radius: float,
     ego_row: int,
 ) -> Any:
-    """Rows (k, 4) of road user, step, metres along the path and speed; and who (n,) bool hits the ego.
+    """Rows (k, 4) of road user, step, metres along the path and speed; whether each (n,) hits the ego.
 
     ego      : its motion; filled in step by step if the ego is simulated
     ego_row  : row of a simulated ego, -1 if the ego's motion is fixed

@@ -92,12 +92,12 @@ def drive_in_sumo(
     seed: int,
     options: TrafficOptions,
     duration: float | None = None,
-    under_way: bool = False,
+    at_speed: bool = False,
 ) -> tuple[Trajectory, Actors]:
     """The trajectory of a vehicle along a path in SUMO's traffic, and the other road users.
 
     first : its trajectory without other road users
-    duration, under_way : as for `lidar.planning.motion.drive_path`
+    duration, at_speed : as for `lidar.planning.motion.drive_path`
 
     The ego is a vehicle of SUMO with the same route, so SUMO's vehicles react to it. Its trajectory follows
     its own path, smoothly and never ahead of SUMO's ego vehicle. Road users that would touch it all the same
@@ -114,14 +114,14 @@ def drive_in_sumo(
         net = _network(home, scene, folder=folder)
         lanes = _lanes(net, scene)
         demand = _trips(lanes, seed=seed, seconds=_WARM_UP_S + seconds, options=options)
-        own = _ego(lanes, path, vehicle=vehicle, under_way=under_way)
+        own = _ego(lanes, path, vehicle=vehicle, at_speed=at_speed)
         (folder / "trips.rou.xml").write_text(f"<routes>\n{''.join(demand)}{own}</routes>\n", "utf-8")
         _simulate(home, folder, net=net, seed=seed, seconds=seconds, radius=options.radius + LEFT)
         fcd = read_fcd(folder / "fcd.xml", net=net)
     time_s, allowed = _ego_progress(fcd, scene, path=path, vehicle=vehicle)
     until = len(time_s) if duration is None else int(np.searchsorted(time_s, seconds)) + 1
     motion = motion_within(
-        path, vehicle, time_s=time_s[:until], max_distance=allowed[:until], under_way=under_way
+        path, vehicle, time_s=time_s[:until], max_distance=allowed[:until], at_speed=at_speed
     )
     ego = poses_along(path, vehicle, motion=motion)
     if duration is not None:
@@ -230,7 +230,7 @@ def _places(lanes: _Lanes, rows: Ints, *, metres: float, rng: np.random.Generato
     return chosen[: 2 + int(np.searchsorted(away, metres))]
 
 
-def _ego(lanes: _Lanes, path: VehiclePath, *, vehicle: Vehicle, under_way: bool) -> str:
+def _ego(lanes: _Lanes, path: VehiclePath, *, vehicle: Vehicle, at_speed: bool) -> str:
     """The ego vehicle's type and trip: along the lanes nearest to its path, with a stop at its end."""
     at = np.arange(0.0, path.length, _SPACING)
     xy = np.column_stack([np.interp(at, path.s, path.position[:, c]) for c in (0, 1)])
@@ -253,7 +253,7 @@ def _ego(lanes: _Lanes, path: VehiclePath, *, vehicle: Vehicle, under_way: bool)
     edges = edges[np.append(True, edges[1:] != edges[:-1])]
     first, last = nearest[0], nearest[-1]
     start = float(np.clip(along[first] + vehicle.front - at[point[first]], 0.0, line[first].length - 0.1))
-    speed = "desired" if under_way else "0"
+    speed = "desired" if at_speed else "0"
     stop = lanes.name[roads[lane[last]]]
     return (
         f'<vType id="{_EGO}" vClass="passenger" length="{vehicle.length}" width="{vehicle.width}" tau="1.4" '

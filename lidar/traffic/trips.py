@@ -78,7 +78,7 @@ class Trip:
 
     shape         : body
     stretch       : scale factors of the body along x, y and z
-    path           : path, n stations
+    path          : path, n stations
     driver        : driver model
     desired_speed : (n,) m/s at each station
     begin         : station of the start

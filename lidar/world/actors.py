@@ -43,7 +43,7 @@ class Actors(Columns):
     position : (k, 3) scene metres, centre of the bounding box, on the ground
     angles   : (k, 3) radians: yaw from the x axis (unwrapped), pitch (nose down positive), roll
     velocity : (k, 3) scene metres per second
-    travelled     : (k,) metres covered
+    travelled : (k,) metres covered
     scale    : scene metres per true metre
     """
 
@@ -73,7 +73,7 @@ class States(Columns):
     position : (k, 3) scene metres, centre of the bounding box, on the ground
     angles   : (k, 3) yaw, pitch, roll in radians
     velocity : (k, 3) scene metres per second
-    travelled     : (k,) metres covered
+    travelled : (k,) metres covered
     """
 
     position: Float
@@ -82,7 +82,7 @@ class States(Columns):
     travelled: Float
 
 
-def alive(actors: Actors, start_ns: int, *, end_ns: int) -> NDArray[np.int64]:
+def existing_actors(actors: Actors, start_ns: int, *, end_ns: int) -> NDArray[np.int64]:
     """Actors (k,) that exist at some time of a span."""
     begin = actors.time_ns[actors.first[:-1]]
     end = actors.time_ns[actors.first[1:] - 1]
@@ -165,7 +165,7 @@ def actor_transforms(
     which   : those that ever move, those that never do, or all
     moments : poses within the span; a car that turns at 0.5 rad/s is off by 0.1 mm between three in 0.1 s
     """
-    rows = alive(actors, start_ns, end_ns=end_ns)
+    rows = existing_actors(actors, start_ns, end_ns=end_ns)
     if which != "all":
         rows = rows[actors.parked[rows] == (which == "parked")]
     times = np.linspace(start_ns, end_ns, moments).astype(np.int64)

@@ -259,7 +259,7 @@ def test_a_random_drive_starts_and_ends_at_speed_by_default(scene):
             )
             trajectory = drive_with_signals(
                 travel.path, load_vehicle("car"), graph=scene.road_graph(), seed=seed, bounds=scene.bounds,
-                duration=3.0, under_way=travel.under_way,
+                duration=3.0, at_speed=travel.at_speed,
             )  # fmt: skip
             speeds[from_rest] = np.linalg.norm(trajectory.velocity, axis=1)
         assert speeds[False][0] > 2.0

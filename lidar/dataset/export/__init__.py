@@ -1,4 +1,4 @@
-"""Exporters: whole datasets in the layouts of others, one module each and one row each in `EXPORTERS`.
+"""Exporters of datasets to other layouts, one module and one row in `EXPORTERS` each.
 
 Modules are imported when a dataset is exported, so that a list of the exporters costs nothing.
 """

@@ -44,7 +44,7 @@ def test_scanners_are_off_between_survey_lines_by_default(scene, tmp_path):
     whole = planned(scene, options, kit)
     xy = whole.trajectory.position[:, :2]
     since = whole.trajectory.time_ns[:, None]
-    on = ((since >= whole.on[:, 0]) & (since <= whole.on[:, 1])).any(axis=1)
+    on = ((since >= whole.scanning_ns[:, 0]) & (since <= whole.scanning_ns[:, 1])).any(axis=1)
     track = shapely.linestrings(xy[on])
     half = swath(scanners(kit), 90.0) / 2
     area = survey_area(scene, "all")
@@ -53,11 +53,11 @@ def test_scanners_are_off_between_survey_lines_by_default(scene, tmp_path):
     turning = np.abs(np.gradient(np.unwrap(course), 0.01)) > 0.2
     assert not on[turning & (np.hypot(*whole.trajectory.velocity[:, :2].T) > 1.0)].any()
     assert 0.2 < on.mean() < 0.95
-    assert planned(scene, replace(options, turns=True), kit).on is None
+    assert planned(scene, replace(options, turns=True), kit).scanning_ns is None
     with pytest.raises(RouteError, match="before the first line"):
         planned(scene, replace(options, duration=0.5), kit)
 
-    first = int(whole.on[0, 0]) / 1e9
+    first = int(whole.scanning_ns[0, 0]) / 1e9
     summary = drive(scene, tmp_path / "x", options=replace(options, duration=first + 1.35))
     files = sorted((tmp_path / "x").glob("*/pcd/*.pcd"))
     assert len(files) == summary.frames

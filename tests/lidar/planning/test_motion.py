@@ -77,27 +77,27 @@ def test_a_drive_that_starts_at_speed_is_gentle_too(seed, name, duration):
     vehicle = load_vehicle(name)
     route = plan_route(grid(4, 4), FRAME, spec="random", options=RouteOptions(seed=seed, length=600.0))
     path = plan_path(route, vehicle, frame=FRAME)
-    trajectory = drive_path(path, vehicle, duration=duration, under_way=True)
+    trajectory = drive_path(path, vehicle, duration=duration, at_speed=True)
     assert_gentle(trajectory, vehicle, rests=False)
-    motion = motion_along(path, vehicle, duration=duration, under_way=True)
+    motion = motion_along(path, vehicle, duration=duration, at_speed=True)
     assert (motion.speed <= np.interp(motion.s, path.s, speed_limits(path, vehicle)) + 1e-6).all()
     assert motion.time_ns[-1] == pytest.approx(duration * 1e9, abs=5.1e6)
 
 
 def test_a_drive_from_speed_to_speed_stays_at_the_speed_limit():
     path = plan_path(straight(1000.0), CAR, frame=FRAME)
-    trajectory = drive_path(path, CAR, duration=30.0, under_way=True)
+    trajectory = drive_path(path, CAR, duration=30.0, at_speed=True)
     speed = np.linalg.norm(trajectory.velocity, axis=1)
     np.testing.assert_allclose(speed, 13.9, rtol=3e-3)
     assert np.ptp(trajectory.position[:, 0]) == pytest.approx(30.0 * 13.9, rel=3e-3)
-    whole = drive_path(path, CAR, under_way=True)  # but where the path ends it stops
+    whole = drive_path(path, CAR, at_speed=True)  # but where the path ends it stops
     assert whole.velocity[-1] == pytest.approx(0.0)
     assert whole.position[-1, 0] == pytest.approx(1000.0, abs=1e-3)
 
 
 def test_a_drive_that_starts_at_speed_before_a_bend_is_slow_enough_for_it():
     corner = free_route([[0.0, 0, 0], [12.0, 0, 0], [12.0, 100.0, 0]], limit=13.9)
-    trajectory = drive_path(plan_path(corner, CAR, frame=FRAME), CAR, under_way=True)
+    trajectory = drive_path(plan_path(corner, CAR, frame=FRAME), CAR, at_speed=True)
     assert 2.0 < np.linalg.norm(trajectory.velocity[0]) < 8.0
     bent = slice(0, len(trajectory.time_ns) // 2)
     yaw = np.unwrap(euler_from_quat(trajectory.quat_xyzw)[:, 2])

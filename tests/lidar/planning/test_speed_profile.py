@@ -95,12 +95,12 @@ def test_decreasing_distances_are_refused():
 @given(stops=st.lists(st.tuples(st.floats(30.0, 280.0), st.floats(3.0, 30.0)), max_size=3))
 def test_a_drive_that_starts_at_speed_ends_at_speed_behind_its_bound(stops):
     time_s = np.arange(0.0, 18.0, 0.1)
-    free = motion_along(PATH, CAR, under_way=True)
+    free = motion_along(PATH, CAR, at_speed=True)
     reach = np.interp(time_s, free.time_ns * 1e-9, free.s - free.s[0])
     for place, until in stops:
         reach = np.minimum(reach, np.where(time_s < until, place, np.inf))
     reach = np.maximum.accumulate(reach)
-    motion = motion_within(PATH, CAR, time_s=time_s, max_distance=reach, under_way=True)
+    motion = motion_within(PATH, CAR, time_s=time_s, max_distance=reach, at_speed=True)
     at = motion.time_ns * 1e-9
     assert (motion.s <= np.interp(at, time_s, reach) + 0.1).all()
     assert (np.diff(motion.s) >= -1e-9).all()

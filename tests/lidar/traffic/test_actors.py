@@ -21,7 +21,7 @@ from lidar.sensors.scan import scan
 from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.populate import TrafficOptions, populate
 from lidar.traffic.sweep import rectangles
-from lidar.world.actors import actor_shapes, actor_transforms, alive, rotations, states, velocities
+from lidar.world.actors import actor_shapes, actor_transforms, existing_actors, rotations, states, velocities
 from lidar.world.world import World
 
 CAR = load_vehicle("car")
@@ -33,7 +33,7 @@ def ego(scene):
     travel = plan_road_drive(scene, "random", vehicle="car", seed=2, duration=15.0)
     return drive_with_signals(
         travel.path, load_vehicle("car"), graph=scene.road_graph(), seed=2, bounds=scene.bounds,
-        duration=15.0, under_way=travel.under_way,
+        duration=15.0, at_speed=travel.at_speed,
     )  # fmt: skip
 
 
@@ -61,7 +61,7 @@ def test_there_are_road_users_of_every_kind(actors):
 
 def test_no_road_user_touches_another_or_the_ego(actors, ego):
     for t in range(0, ego.duration_ns, 300_000_000):
-        rows = alive(actors, t, end_ns=t)
+        rows = existing_actors(actors, t, end_ns=t)
         boxes = outlines(actors, rows, t)
         a, b = shapely.STRtree(boxes).query(boxes, predicate="intersects")
         assert not (a < b).any()
@@ -78,14 +78,14 @@ def test_no_road_user_stands_in_a_building(actors, scene):
     layer = scene.features("buildings")
     walls = shapely.STRtree(layer.geometry[np.asarray(layer.columns["min_height"], float) < 2.5])
     for t in (0, 7_000_000_000):
-        rows = alive(actors, t, end_ns=t)
+        rows = existing_actors(actors, t, end_ns=t)
         assert not len(walls.query(outlines(actors, rows, t), predicate="intersects")[0])
 
 
 def test_vehicles_stand_on_the_ground(actors, scene):
     """Rays cast up from below the tyres hit the road under the vehicle."""
     world = World.load(scene)
-    rows = alive(actors, 0, end_ns=0)
+    rows = existing_actors(actors, 0, end_ns=0)
     at = states(actors, rows, time_ns=0)
     start = at.position + np.array([0.0, 0.0, 1.0])
     hits = world.caster.cast(start, np.tile([0.0, 0.0, -1.0], (len(rows), 1)))
@@ -121,7 +121,7 @@ def test_an_empty_scene_has_no_road_users(scene, ego):
 @settings(max_examples=20, deadline=None)
 @given(t=st.integers(100_000_000, 14_000_000_000), dt=st.integers(1_000_000, 50_000_000))
 def test_velocities_are_the_derivatives_of_positions(actors, t, dt):
-    rows = alive(actors, t, end_ns=t + dt)
+    rows = existing_actors(actors, t, end_ns=t + dt)
     born = actors.time_ns[actors.first[rows]] <= t
     lasts = actors.time_ns[actors.first[rows + 1] - 1] >= t + dt
     rows = rows[(born & lasts) | actors.parked[rows]]

@@ -24,9 +24,9 @@ from lidar.traffic.trips import vehicle_trips
 BOUNDS = (-30.0, -30.0, 300.0, 300.0)
 
 
-def city(*, lit, **columns):
+def city(*, signalised, **columns):
     graph = grid(4, 4, 90.0, speed=13.9)
-    return replace(graph, signals=np.full(len(graph.node_id), lit), **columns)
+    return replace(graph, signals=np.full(len(graph.node_id), signalised), **columns)
 
 
 def path_on(graph, seed, seconds):
@@ -55,13 +55,13 @@ def check_gentle(ego):
     assert np.abs(np.diff(change)).max() * 100.0 <= CAR.jerk + 1e-2
 
 
-@pytest.mark.parametrize("under_way", [False, True])
+@pytest.mark.parametrize("at_speed", [False, True])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_ego_enters_no_junction_on_red(seed, under_way):
-    graph = city(lit=True)
+def test_the_ego_enters_no_junction_on_red(seed, at_speed):
+    graph = city(signalised=True)
     path = path_on(graph, seed, 95.0)
-    ego = drive_with_signals(path, CAR, graph=graph, seed=seed, duration=80.0, under_way=under_way)
-    assert (speed_of(ego)[0] > 1.0) == under_way
+    ego = drive_with_signals(path, CAR, graph=graph, seed=seed, duration=80.0, at_speed=at_speed)
+    assert (speed_of(ego)[0] > 1.0) == at_speed
     plan = junction_plan(graph, lanes_of(graph), seed=seed)
     times = np.arange(0.0, 80.0, STEP_S)
     middle, heading = middle_of(ego, times)
@@ -78,7 +78,7 @@ def test_the_ego_enters_no_junction_on_red(seed, under_way):
 
 
 def test_the_ego_stops_at_stop_signs_and_continues():
-    graph = city(lit=False)
+    graph = city(signalised=False)
     edges = np.arange(len(graph), dtype=np.int32)
     signs = replace(
         graph,
@@ -132,9 +132,9 @@ def test_the_ego_keeps_its_distance_from_a_slow_leader():
     assert speed_of(ego)[4000:5000].mean() == pytest.approx(4.0, abs=1.0)
 
 
-@pytest.mark.parametrize(("seed", "lit"), [(1, True), (2, False), (3, True)])
-def test_in_traffic_the_ego_touches_no_road_user_and_none_is_removed(seed, lit):
-    graph = city(lit=lit)
+@pytest.mark.parametrize(("seed", "signalised"), [(1, True), (2, False), (3, True)])
+def test_in_traffic_the_ego_touches_no_road_user_and_none_is_removed(seed, signalised):
+    graph = city(signalised=signalised)
     lanes = lanes_of(graph, bounds=BOUNDS)
     plan = junction_plan(graph, lanes, seed=seed)
     path = path_on(graph, seed, 60.0)

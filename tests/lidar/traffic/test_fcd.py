@@ -18,7 +18,7 @@ from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.fcd import TrafficFile, read_fcd
 from lidar.traffic.fcd_replay import replay
 from lidar.traffic.ground import ground_heights
-from lidar.world.actors import alive, rotations, states
+from lidar.world.actors import existing_actors, rotations, states
 
 CAR = load_vehicle("car")
 UTM = "+proj=utm +zone=35 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
@@ -147,7 +147,9 @@ def test_road_users_exist_for_their_time_in_the_file_shifted_by_begin(scene, gra
 
     def there(t, **options):
         return len(
-            alive(played(scene, graph, path, ego, net=net, **options), int(t * 1e9), end_ns=int(t * 1e9))
+            existing_actors(
+                played(scene, graph, path, ego, net=net, **options), int(t * 1e9), end_ns=int(t * 1e9)
+            )
         )
 
     assert [there(t) for t in (0.0, 4.9, 5.5, 6.1, 8.9, 9.2)] == [1, 1, 0, 1, 1, 0]
@@ -240,7 +242,7 @@ def test_road_users_that_would_touch_the_ego_are_removed(scene, graph, street, t
     assert (~met.parked).sum() == 1
     assert free.parked.sum() > 3
     for t in range(0, 8_000_000_000, 500_000_000):
-        rows = alive(free, t, end_ns=t)
+        rows = existing_actors(free, t, end_ns=t)
         at = states(free, rows, time_ns=t)
         half = shapely.points(at.position[:, :2])
         for k in np.flatnonzero(~free.parked[rows]):

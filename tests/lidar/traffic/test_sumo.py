@@ -16,7 +16,7 @@ from lidar.planning.road_drive import plan_road_drive
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.sumo import SumoOptions, drive_in_sumo
 from lidar.traffic.sweep import rectangles
-from lidar.world.actors import alive, states
+from lidar.world.actors import existing_actors, states
 
 CAR = load_vehicle("car")
 SECONDS = 8.0
@@ -39,7 +39,7 @@ def simulated(scene, path, seed=2):
     options = SumoOptions(vehicles=20.0, cyclists=3.0, pedestrians=20.0, parked=0.3, radius=150.0)
     return drive_in_sumo(
         scene, scene.road_graph(), path=path, vehicle=CAR, seed=seed, options=options, duration=SECONDS,
-        first=drive_path(path, CAR, duration=SECONDS, under_way=True), under_way=True,
+        first=drive_path(path, CAR, duration=SECONDS, at_speed=True), at_speed=True,
     )  # fmt: skip
 
 
@@ -56,7 +56,7 @@ def test_the_ego_vehicle_follows_its_path_and_touches_no_road_user(drive, path):
     assert shapely.distance(line, shapely.points(ego.position[:, :2])).max() < 0.05
     assert {"adult", "hatchback"} <= set(actors.kind[~actors.parked])
     for t in range(0, ego.duration_ns, 500_000_000):
-        rows = alive(actors, t, end_ns=t)
+        rows = existing_actors(actors, t, end_ns=t)
         at = states(actors, rows, time_ns=t)
         length, width, _ = actors.size[rows].T
         boxes = rectangles(at.position[:, :2], at.angles[:, 0], length=length, width=width)

@@ -37,9 +37,9 @@ def driving(graph, seed, seconds):
     return drive_path(plan_path(route, CAR, frame=Plane()), CAR).until(int(seconds * 1e9))
 
 
-def city(*, lit, lanes=1.0, width=7.0):
+def city(*, signalised, lanes=1.0, width=7.0):
     graph = grid(4, 4, 90.0, lanes=lanes, width=width, speed=13.9)
-    return replace(graph, signals=np.full(len(graph.node_id), lit))
+    return replace(graph, signals=np.full(len(graph.node_id), signalised))
 
 
 def flow_on(graph, ego, *, seed, density=25.0, radius=400.0, shares=None):
@@ -76,9 +76,9 @@ def overlaps(boxes):
 
 
 @settings(max_examples=4, deadline=None)
-@given(seed=st.integers(0, 10_000), lit=st.booleans(), lanes=st.sampled_from([1.0, 2.0]))
-def test_vehicles_do_not_collide_or_jump(seed, lit, lanes):
-    graph = city(lit=lit, lanes=lanes, width=7.0 * lanes)
+@given(seed=st.integers(0, 10_000), signalised=st.booleans(), lanes=st.sampled_from([1.0, 2.0]))
+def test_vehicles_do_not_collide_or_jump(seed, signalised, lanes):
+    graph = city(signalised=signalised, lanes=lanes, width=7.0 * lanes)
     trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 65.0), seed=seed, density=12.0, radius=600.0)
     assert len(np.unique(flow.trip)) > 15
     assert flow.step.max() * STEP_S > 60
@@ -91,7 +91,7 @@ def test_vehicles_do_not_collide_or_jump(seed, lit, lanes):
 
 def test_reckless_drivers_do_not_collide():
     """A driver without gap and headway still stops within the cells it has reserved."""
-    graph = city(lit=False)
+    graph = city(signalised=False)
     ego = standing((400.0, 400.0), 45.0)
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
     trips = vehicle_trips(lanes, surroundings_of(lanes, ego, radius=600.0, scale=1.0), seed=9, density=30.0)
@@ -112,7 +112,7 @@ def test_reckless_drivers_do_not_collide():
 
 
 def test_speed_changes_within_the_limits_of_the_vehicle():
-    trips, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=3, radius=600.0)
+    trips, flow, _ = flow_on(city(signalised=True), standing((400.0, 400.0), 60.0), seed=3, radius=600.0)
     for k in np.unique(flow.trip):
         speed = flow.speed[flow.trip == k]
         change = np.diff(speed) / STEP_S
@@ -124,7 +124,7 @@ def test_speed_changes_within_the_limits_of_the_vehicle():
 
 
 def test_braking_is_mild_almost_always():
-    _, flow, _ = flow_on(city(lit=True), standing((400.0, 400.0), 60.0), seed=5, radius=600.0)
+    _, flow, _ = flow_on(city(signalised=True), standing((400.0, 400.0), 60.0), seed=5, radius=600.0)
     same = np.diff(flow.trip) == 0
     change = np.diff(flow.speed)[same] / STEP_S
     assert (change < -4.0).mean() < 0.01
@@ -132,9 +132,9 @@ def test_braking_is_mild_almost_always():
 
 
 @settings(max_examples=3, deadline=None)
-@given(seed=st.integers(0, 1000), lit=st.booleans())
-def test_the_ego_is_never_touched(seed, lit):
-    graph = city(lit=lit)
+@given(seed=st.integers(0, 1000), signalised=st.booleans())
+def test_the_ego_is_never_touched(seed, signalised):
+    graph = city(signalised=signalised)
     ego = driving(graph, seed, 30.0)
     trips, flow, _ = flow_on(graph, ego, seed=seed, radius=300.0)
     poses = tracks(trips, flow)
@@ -186,7 +186,7 @@ def test_the_gap_to_a_leader_grows_with_speed():
 
 
 def test_no_road_user_enters_a_junction_on_red():
-    graph = city(lit=True)
+    graph = city(signalised=True)
     trips, flow, plan = flow_on(graph, standing((400.0, 400.0), 70.0), seed=4, radius=600.0)
     poses = tracks(trips, flow)
     entered = 0
@@ -210,7 +210,7 @@ def test_no_road_user_enters_a_junction_on_red():
 
 
 def test_both_groups_of_signals_have_green_but_never_together():
-    graph = city(lit=True)
+    graph = city(signalised=True)
     plan = junction_plan(graph, lanes_of(graph), seed=1)
     times = np.arange(0.0, 120.0, 0.25)
     for z in range(len(plan.zones.polygon)):
@@ -220,7 +220,7 @@ def test_both_groups_of_signals_have_green_but_never_together():
 
 
 def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
-    graph = city(lit=False, lanes=2.0, width=14.0)
+    graph = city(signalised=False, lanes=2.0, width=14.0)
     road = shapely.union_all([shapely.LineString(line[:, :2]).buffer(7.3) for line in graph.geometry])
     for side, sign in (("right", 1), ("left", -1)):
         lanes = lanes_of(graph, side=side, bounds=(-30.0, -30.0, 300.0, 300.0))
@@ -243,7 +243,7 @@ def test_lanes_lie_side_by_side():
 
 
 def test_the_same_seed_gives_the_same_traffic():
-    graph = city(lit=True)
+    graph = city(signalised=True)
     ego = driving(graph, 1, 20.0)
     first, second, other = (flow_on(graph, ego, seed=s, radius=200.0)[1] for s in (7, 7, 8))
     for name in ("trip", "step", "travelled", "speed"):
@@ -252,7 +252,7 @@ def test_the_same_seed_gives_the_same_traffic():
 
 
 def test_higher_density_gives_more_traffic():
-    graph = city(lit=False)
+    graph = city(signalised=False)
     ego = standing((135.0, 135.0), 5.0)
     few, many = (len(flow_on(graph, ego, seed=1, density=d)[0]) for d in (5.0, 20.0))
     assert many > 2.5 * few
@@ -260,7 +260,7 @@ def test_higher_density_gives_more_traffic():
 
 
 def test_signals_are_green_for_the_ego_when_it_comes():
-    graph = city(lit=True)
+    graph = city(signalised=True)
     ego = driving(graph, 3, 40.0)
     lanes = lanes_of(graph)
     plan = junction_plan(graph, lanes, seed=11)
