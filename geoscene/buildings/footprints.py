@@ -53,7 +53,7 @@ def clean(polygons: Polygons) -> tuple[Polygons, Bools]:
     if bad.any():
         valid = shapely.make_valid(out[bad], method="structure", keep_collapsed=False)
         snapped[bad] = _polygonal(shapely.set_precision(valid, GRID))
-    pinched = _rings_touch(snapped)
+    pinched = ~shapely.is_simple(shapely.boundary(snapped))  # rings touch
     for row in np.flatnonzero(pinched):
         snapped[row] = _separate_rings(snapped[row])
     return shapely.orient_polygons(snapped), bad | pinched
@@ -62,26 +62,14 @@ def clean(polygons: Polygons) -> tuple[Polygons, Bools]:
 def _polygonal(geometry: Polygons) -> Polygons:
     """The polygonal parts of geometries (n,); lines and points are dropped."""
     parts, row = shapely.get_parts(geometry, return_index=True)
-    parts, row = _flatten(parts, row)
+    parts, index = shapely.get_parts(parts, return_index=True)
+    keep = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & ~shapely.is_empty(parts)
+    parts, row = parts[keep], row[index[keep]]
     out = np.full(len(geometry), shapely.Polygon(), dtype=object)
     for members in groups(row):
         k, mine = row[members[0]], parts[members]
         out[k] = mine[0] if len(mine) == 1 else shapely.multipolygons(mine)
     return out
-
-
-def _flatten(parts: Polygons, row: NDArray[np.integer]) -> tuple[Polygons, NDArray[np.integer]]:
-    """Single polygons of parts that may be MultiPolygons, with their rows."""
-    inner, index = shapely.get_parts(parts, return_index=True)
-    row = row[index]
-    area = shapely.get_type_id(inner) == shapely.GeometryType.POLYGON
-    keep = area & ~shapely.is_empty(inner)
-    return inner[keep], row[keep]
-
-
-def _rings_touch(polygons: Polygons) -> Bools:
-    """(n,) bool, whether rings of the polygon touch."""
-    return np.asarray(~shapely.is_simple(shapely.boundary(polygons)), np.bool_)
 
 
 def _separate_rings(polygon: Any) -> Any:

@@ -44,8 +44,7 @@ def side_at(lon: float, lat: float) -> Side:
 
 def driving_side(osm: OsmData) -> tuple[Side, str]:
     """Driving side of a map extract and its source: ``tag`` (most frequent ``driving_side``) or ``place``."""
-    tags = [item.tags for item in osm.ways] + [item.tags for item in osm.areas]
-    tags += [item.tags for item in osm.relations]
+    tags = [item.tags for items in (osm.ways, osm.areas, osm.relations) for item in items]
     tagged = Counter(side for tag in tags if (side := tag.get("driving_side")) in ("left", "right"))
     if tagged:
         return cast("Side", max(sorted(tagged), key=tagged.__getitem__)), "tag"

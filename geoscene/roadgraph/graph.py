@@ -11,18 +11,6 @@ from numpy.typing import NDArray
 from geoscene.typing import Bools, Float, Ints
 
 
-def _no_rows() -> NDArray[np.int32]:
-    return np.empty(0, np.int32)
-
-
-def _no_objects() -> NDArray[np.object_]:
-    return np.empty(0, object)
-
-
-def _no_text() -> NDArray[np.str_]:
-    return np.empty(0, np.str_)
-
-
 @dataclass(frozen=True, slots=True)
 class RoadGraph:
     """Directed drivable graph; one row an edge, two-way streets are two edges.
@@ -95,15 +83,15 @@ class RoadGraph:
     signals: Bools
     stop: Bools
     give_way: Bools
-    turn_from: NDArray[np.int32] = field(default_factory=_no_rows)
-    turn_via: NDArray[np.int32] = field(default_factory=_no_rows)
-    turn_to: NDArray[np.int32] = field(default_factory=_no_rows)
-    turn_kind: NDArray[np.str_] = field(default_factory=_no_text)
-    chain_edges: NDArray[np.object_] = field(default_factory=_no_objects)
-    chain_kind: NDArray[np.str_] = field(default_factory=_no_text)
-    control_edge: NDArray[np.int32] = field(default_factory=_no_rows)
+    turn_from: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    turn_via: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    turn_to: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    turn_kind: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, np.str_))
+    chain_edges: NDArray[np.object_] = field(default_factory=lambda: np.empty(0, object))
+    chain_kind: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, np.str_))
+    control_edge: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     control_offset: Float = field(default_factory=lambda: np.empty(0))
-    control_kind: NDArray[np.str_] = field(default_factory=_no_text)
+    control_kind: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, np.str_))
 
     def __len__(self) -> int:
         """Number of edges."""

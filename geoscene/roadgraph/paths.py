@@ -27,6 +27,7 @@ _PATHS = {
     "bridleway": (2.0, "soil"),
     "steps": (2.0, "concrete"),
 }
+_PRIORITIES = {"sidewalk": "footway", "cycleway": "cycleway"}  # of other kinds: path
 _SQUARES = frozenset({"pedestrian", "footway", "cycleway", "path", "platform"})
 _YARDS = frozenset({"service", "unclassified", "residential", "living_street", "rest_area", "services"})
 # Railways whose rails lie on the ground; ballast and track beds are land cover.
@@ -71,15 +72,11 @@ def path_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
         bands,
         klass=[Class.SIDEWALK if m in PAVED | {"wood", "metal"} else Class.TERRAIN for m in material],
         material=material,
-        priority=[_path_priority(name) for name in kind],
+        priority=[PRIORITY[_PRIORITIES.get(name, "path")] for name in kind],
         osm_id=[way.osm_id for way in ways],
         source=source,
         **_place_and_level([way.tags for way in ways]),
     )
-
-
-def _path_priority(kind: str) -> float:
-    return PRIORITY["footway" if kind == "sidewalk" else kind if kind == "cycleway" else "path"]
 
 
 def _is_path(tags: Tags) -> bool:
@@ -108,7 +105,10 @@ def _place_and_level(tags: Sequence[Tags]) -> dict[str, Any]:
 def square_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
     """Squares, footpaths, platforms and yards mapped as areas."""
     areas = [a for a in osm.areas if _square_class(a) is not None and a.tags.get("indoor", "no") == "no"]
-    shapes = np.fromiter((shapely.transform(area.geometry, _projector(frame)) for area in areas), object)
+    shapes = shapely.transform(
+        np.fromiter((area.geometry for area in areas), object),
+        lambda lonlat: np.stack(frame.from_geographic(*lonlat.T), axis=1),
+    )
     yard = [_square_class(area) == Class.ROAD for area in areas]
     made_of = [
         surface_material(area.tags, "asphalt" if y else "paving") for area, y in zip(areas, yard, strict=True)
@@ -129,10 +129,6 @@ def _square_class(area: Area) -> Class | None:
     if highway in _SQUARES:
         return Class.SIDEWALK
     return Class.ROAD if highway in _YARDS else None
-
-
-def _projector(frame: Frame) -> Any:
-    return lambda lonlat: np.stack(frame.from_geographic(lonlat[:, 0], lonlat[:, 1]), axis=1)
 
 
 def rail_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:

@@ -50,7 +50,8 @@ def view_scene(
     """
     _check(out, overwrite=overwrite)
     bounds_deg, layers, max_mb = options.bounds_deg, options.layers, options.max_mb
-    indices = _outwards(_tiles_within(scene, bounds_deg))
+    indices = _tiles_within(scene, bounds_deg)
+    indices = indices[np.lexsort([indices[:, 1], indices[:, 0], _rings(indices)])]  # from the middle outwards
     groups = groups_of(scene)
     kept = _kept(groups, layers)
     shapes, shape_bytes = pack_shapes(list(scene.shapes().values()))
@@ -161,11 +162,6 @@ def _rings(indices: Ints) -> Ints:
     """Chebyshev distance of each tile (n, 2) from the middle one, in tiles."""
     rings: Ints = np.abs(indices - _middle(indices)).max(axis=1)
     return rings
-
-
-def _outwards(indices: Ints) -> Ints:
-    """Tiles in loading order: from the middle outwards."""
-    return indices[np.lexsort([indices[:, 1], indices[:, 0], _rings(indices)])]
 
 
 def _too_large(scene: Scene, indices: Ints, *, sizes: Sequence[int], size: int, max_mb: float) -> str:
