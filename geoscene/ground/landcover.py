@@ -15,7 +15,7 @@ from geoscene.ground.coast import sea
 from geoscene.ground.kinds import SEA, SURFACES, Kind, area_kind, line_kind
 from geoscene.ground.layers import Layers
 from geoscene.report import Problem
-from geoscene.sources.data import OsmData, Tags, Way
+from geoscene.sources.data import Area, OsmData, Tags, Way
 from geoscene.tags import parse_length
 from geoscene.typing import Float
 
@@ -63,10 +63,24 @@ def _material(tags: Tags, kind: Kind) -> tuple[str, str]:
     return named, "surface"
 
 
-def _priority(tier: NDArray[np.integer], polygons: NDArray[np.object_]) -> Float:
-    """Tiers, and within one the smaller polygon above the larger."""
-    priority: Float = tier + 0.99 / (1.0 + shapely.area(polygons) / 100.0)
-    return priority
+def _layers(
+    found: Sequence[tuple[Area | Way, Kind]], polygons: NDArray[np.object_], *, source: Sequence[str] = ()
+) -> Layers:
+    """Rows of features and their kinds; within a tier the smaller polygon lies above the larger.
+
+    source : of each row; by default that of its material
+    """
+    looks = [_material(feature.tags, kind) for feature, kind in found]
+    tier = np.array([kind.tier for _, kind in found], int)
+    return Layers.of(
+        polygons,
+        klass=[kind.klass for _, kind in found],
+        material=[materials()[name].code for name, _ in looks],
+        priority=tier + 0.99 / (1.0 + shapely.area(polygons) / 100.0),
+        osm_id=[feature.osm_id for feature, _ in found],
+        source=source or [name for _, name in looks],
+        body=[kind.body for _, kind in found],
+    )
 
 
 def _areas(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
@@ -82,16 +96,7 @@ def _areas(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Laye
         reason = shapely.is_valid_reason(polygons[k])
         polygons[k] = shapely.make_valid(polygons[k], method="structure", keep_collapsed=False)
         problems.append(Problem(found[k][0].osm_id, "area", "repaired", "invalid-after-projection", reason))
-    looks = [_material(area.tags, kind) for area, kind in found]
-    return Layers.of(
-        polygons,
-        klass=[kind.klass for _, kind in found],
-        material=[materials()[name].code for name, _ in looks],
-        priority=_priority(np.array([kind.tier for _, kind in found], int), polygons),
-        osm_id=[area.osm_id for area, _ in found],
-        source=[source for _, source in looks],
-        body=[kind.body for _, kind in found],
-    ), problems
+    return _layers(found, polygons), problems
 
 
 def _lines(ways: Sequence[Way], frame: Frame) -> tuple[Layers, list[Problem]]:
@@ -108,16 +113,7 @@ def _lines(ways: Sequence[Way], frame: Frame) -> tuple[Layers, list[Problem]]:
     xy = _to_scene(frame, np.concatenate([way.lonlat for way, _ in found]))
     line = np.repeat(np.arange(len(found)), [len(way.lonlat) for way, _ in found])
     strips = shapely.buffer(shapely.linestrings(xy, indices=line), np.array(width) / 2, quad_segs=2)
-    looks = [_material(way.tags, kind) for way, kind in found]
-    return Layers.of(
-        strips,
-        klass=[kind.klass for _, kind in found],
-        material=[materials()[name].code for name, _ in looks],
-        priority=_priority(np.array([kind.tier for _, kind in found], int), strips),
-        osm_id=[way.osm_id for way, _ in found],
-        source=source,
-        body=[kind.body for _, kind in found],
-    ), problems
+    return _layers(found, strips, source=source), problems
 
 
 def _width(way: Way, kind: Kind) -> tuple[float, list[Problem]]:
