@@ -150,27 +150,18 @@ def render(
     if random is not None and np.isfinite(options.full_well):
         electrons = random.standard_normal((h, w, 3), np.float32)
     middle = samples // 2
+    look = functools.partial(_view, poses=poses, world=world, times=times)
 
     def band(edges: tuple[int, int]) -> None:
         first, last = edges
-        view = _view(camera, poses, world=world, sample=middle, first=first, last=last, times=times)
+        view = look(camera, sample=middle, first=first, last=last)
         surfaces, distance = view.surfaces, view.hits.range
         if coloured:
             total = np.zeros(((last - first) * w, 3), np.float32)
             for sample in range(samples):
+                seen = view
                 if k > 1 or sample != middle:
-                    seen = _view(
-                        fine,
-                        poses,
-                        world=world,
-                        sample=sample,
-                        first=first * k,
-                        last=last * k,
-                        times=times,
-                        rows=h,
-                    )
-                else:
-                    seen = view
+                    seen = look(fine, sample=sample, first=first * k, last=last * k, rows=h)
                 part = radiance(
                     world, seen, light=light, walls=walls, blur=0.0, angle=1 / fine.fx, options=options
                 )

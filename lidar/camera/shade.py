@@ -23,28 +23,13 @@ _BUILDING = int(Class.BUILDING)
 compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 
 _KINDS = {
-    "asphalt": texture.SPECKLED,
-    "asphalt_fresh": texture.SPECKLED,
-    "gravel": texture.SPECKLED,
-    "soil": texture.SPECKLED,
-    "sand": texture.SPECKLED,
-    "ballast": texture.SPECKLED,
-    "tar_roof": texture.SPECKLED,
-    "paving": texture.SLABS,
-    "concrete": texture.SLABS,
-    "brick": texture.BRICK,
-    "plaster": texture.WEATHERED,
-    "stone": texture.WEATHERED,
-    "copper": texture.WEATHERED,
-    "bark": texture.WEATHERED,
-    "wood": texture.WEATHERED,
-    "grass": texture.LEAFY,
-    "dry_grass": texture.LEAFY,
-    "foliage": texture.LEAFY,
-    "conifer": texture.LEAFY,
-    "water": texture.LIQUID,
-    "roof_tile": texture.SHINGLED,
-    "slate": texture.SHINGLED,
+    texture.SPECKLED: ("asphalt", "asphalt_fresh", "gravel", "soil", "sand", "ballast", "tar_roof"),
+    texture.SLABS: ("paving", "concrete"),
+    texture.BRICK: ("brick",),
+    texture.WEATHERED: ("plaster", "stone", "copper", "bark", "wood"),
+    texture.LEAFY: ("grass", "dry_grass", "foliage", "conifer"),
+    texture.LIQUID: ("water",),
+    texture.SHINGLED: ("roof_tile", "slate"),
 }
 # Specular reflectance at normal incidence: Fresnel for n = 1.33 and 1.5 (two panes for a window), aluminium.
 _MIRROR = {"water": 0.02, "glass": 0.08, "car_paint": 0.04, "metal": 0.15, "rail_steel": 0.3}
@@ -54,8 +39,9 @@ _MIRROR = {"water": 0.02, "glass": 0.08, "car_paint": 0.04, "metal": 0.15, "rail
 def material_tables() -> tuple[NDArray[np.uint8], Float, NDArray[np.uint8]]:
     """Detail kind (256,), specular reflectance at normal incidence (256,) and colour (256, 3) by material."""
     kind, mirror, plain = np.zeros(256, np.uint8), np.zeros(256), np.zeros((256, 3), np.uint8)
+    kinds = {name: kind for kind, names in _KINDS.items() for name in names}
     for name, material in materials().items():
-        kind[material.code] = _KINDS.get(name, texture.PLAIN)
+        kind[material.code] = kinds.get(name, texture.PLAIN)
         mirror[material.code] = _MIRROR.get(name, 0.0)
         plain[material.code] = material.color
     return kind, mirror, plain

@@ -48,7 +48,6 @@ def pose_columns(
     poses = trajectory.at(time_ns)
     x, y, z = poses.position.T
     quat = quat_from_matrix(poses.rotation)
-    alpha, beta, gamma = np.moveaxis(euler_from_quat(quat), -1, 0)
     lon, lat = frame.to_geographic(x, y)
     return {
         "timestamp": iso_times(start, time_ns),
@@ -56,13 +55,8 @@ def pose_columns(
         "x": x,
         "y": y,
         "z": z,
-        "alpha": alpha,
-        "beta": beta,
-        "gamma": gamma,
-        "qx": quat[:, 0],
-        "qy": quat[:, 1],
-        "qz": quat[:, 2],
-        "qw": quat[:, 3],
+        **dict(zip(("alpha", "beta", "gamma"), euler_from_quat(quat).T, strict=True)),
+        **dict(zip(("qx", "qy", "qz", "qw"), quat.T, strict=True)),
         "lon": lon,
         "lat": lat,
         "h": z,

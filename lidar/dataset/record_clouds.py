@@ -19,7 +19,7 @@ from lidar.random_streams import generator
 from lidar.rig.devices import Scanner
 from lidar.sensors.cloud import Cloud, TracedCloud, no_returns
 from lidar.sensors.doppler import radial_velocity, surface_velocity
-from lidar.sensors.scan import cast, scan
+from lidar.sensors.scan import Sweep, cast, measured
 from lidar.signal.run import Altered, altered_sweep, cloud_truth, unaltered, write_truth
 from lidar.world.world import World
 
@@ -47,15 +47,7 @@ def _scanned(recording: Recording, scanner: Scanner, *, frame: int, world: World
     if not _works(recording, scanner, frame=frame):
         return no_returns(scanner.sensor.window_ns(frame)[0])
     with recording.watch.stage("scan"):
-        cloud = scan(
-            scanner.sensor,
-            scanner.spec.mount,
-            trajectory=recording.trajectory,
-            world=world,
-            frame=frame,
-            seed=recording.contents.seed,
-            settings=recording.contents.scanner,
-        )
+        cloud = measured(_swept(recording, scanner, frame=frame, world=world))
     return cloud if recording.scanning_ns is None else cloud.where(_while_on(recording, cloud))
 
 
@@ -64,17 +56,22 @@ def _altered(recording: Recording, scanner: Scanner, *, frame: int, world: World
     if not _works(recording, scanner, frame=frame):
         return unaltered(no_returns(scanner.sensor.window_ns(frame)[0]))
     with recording.watch.stage("scan"):
-        sweep = cast(
-            scanner.sensor,
-            scanner.spec.mount,
-            trajectory=recording.trajectory,
-            world=world,
-            frame=frame,
-            seed=recording.contents.seed,
-            settings=recording.contents.scanner,
-        )
+        sweep = _swept(recording, scanner, frame=frame, world=world)
         altered = altered_sweep(sweep, recording.contents.stages)
     return altered if recording.scanning_ns is None else altered.where(partial(_while_on, recording))
+
+
+def _swept(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> Sweep:
+    """The pulses and echoes of a frame."""
+    return cast(
+        scanner.sensor,
+        scanner.spec.mount,
+        trajectory=recording.trajectory,
+        world=world,
+        frame=frame,
+        seed=recording.contents.seed,
+        settings=recording.contents.scanner,
+    )
 
 
 def _works(recording: Recording, scanner: Scanner, *, frame: int) -> bool:

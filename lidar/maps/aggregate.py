@@ -160,9 +160,7 @@ class _Source:
         placed, time_ns = placed_returns(table, self._trajectory, start_ns=start, vehicle_from_sensor=mount)
         world = self.geo.points(placed)
         return {
-            "x": world[:, 0],
-            "y": world[:, 1],
-            "z": world[:, 2],
+            **dict(zip("xyz", world.T, strict=True)),
             "intensity": table["intensity"],
             "gps_time": gps_seconds(self.dataset.start, time_ns),
             "ring": table["ring"],

@@ -54,9 +54,9 @@ def walker(
     planes: Sequence[float],
     first_deg: Sequence[float],
     radius: float,
-    each: int,
     epoch: datetime,
-    source: str,
+    source: str = "",
+    each: int = 8,
 ) -> Constellation:
     """A constellation with evenly spaced satellites in each plane.
 
@@ -101,9 +101,7 @@ def _beidou() -> Constellation:
         planes=(0.0, 120.0, 240.0),
         first_deg=(0.0, 15.0, 30.0),
         radius=27906.1e3,
-        each=8,
         epoch=epoch,
-        source="",
     )
     # Geostationary satellites stay above a longitude. The inclined geosynchronous ones cross the equator at
     # one longitude, a third of a day apart.
@@ -133,7 +131,6 @@ def constellations() -> dict[str, Constellation]:
             planes=(0.0, 120.0, 240.0),
             first_deg=(0.0, 15.0, 30.0),
             radius=25510.0e3,
-            each=8,
             epoch=datetime(2008, 1, 1, tzinfo=UTC),
             source="GLONASS Interface Control Document, edition 5.1: 24 in three planes 120 degrees apart,"
             " 64.8 degrees, 45 degrees along a plane and 15 between planes, 19,100 km; first node assumed",
@@ -144,7 +141,6 @@ def constellations() -> dict[str, Constellation]:
             planes=(317.632, 77.632, 197.632),
             first_deg=(225.153, 240.153, 255.153),
             radius=29599.801e3,
-            each=8,
             epoch=datetime(2016, 11, 21, tzinfo=UTC),
             source="Galileo Open Service Service Definition Document: Walker 24/3/1, 56 degrees,"
             " 29,599.801 km, reference slots; the drift of the nodes since their epoch left out",

@@ -270,19 +270,13 @@ def gnss_columns(fixes: Fixes) -> dict[str, NDArray[Any]]:
     """Columns of ``gnss.csv``: measurements, and ground truth prefixed ``true_``; degrees, metres, m/s."""
     return {
         "time_ns": fixes.time_ns,
-        "lon": fixes.lonlath[:, 0],
-        "lat": fixes.lonlath[:, 1],
-        "h": fixes.lonlath[:, 2],
+        **dict(zip(("lon", "lat", "h"), fixes.lonlath.T, strict=True)),
         "speed": fixes.speed,
         "course_deg": np.degrees(fixes.course),
         "quality": fixes.quality,
         "satellites": fixes.satellites,
         "hdop": fixes.dop[:, 0],
         "vdop": fixes.dop[:, 1],
-        "true_lon": fixes.true_lonlath[:, 0],
-        "true_lat": fixes.true_lonlath[:, 1],
-        "true_h": fixes.true_lonlath[:, 2],
-        "true_east": fixes.true_velocity[:, 0],
-        "true_north": fixes.true_velocity[:, 1],
-        "true_up": fixes.true_velocity[:, 2],
+        **dict(zip(("true_lon", "true_lat", "true_h"), fixes.true_lonlath.T, strict=True)),
+        **dict(zip(("true_east", "true_north", "true_up"), fixes.true_velocity.T, strict=True)),
     }

@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.classes import Class
 from geoscene.typing import Float
-from lidar.physics.echoes import Echoes, EchoesT, Origin
+from lidar.physics.echoes import Echoes, EchoesT, Origin, artificial_echoes
 from lidar.physics.link import amplitude, apparent_of, daylight_noise, false_alarm_probability
 from lidar.physics.range_error import quantised, signal_sigma, stretch_sigma, walk
 from lidar.physics.reflect import RETRO
@@ -27,14 +26,14 @@ _BLOOM_POWER = 0.01  # of the retro-reflector's power, assumed
 _OVERLAP = 5e-5  # probability that a pulse of another scanner is received, typical value (1e-5 to 1e-4)
 
 
-def received(sensor: Sensor, echoes: Echoes, *, settings: ScannerSettings) -> Float:
+def received(sensor: Sensor, echoes: Echoes, *, extinction: float) -> Float:
     """Power (m,) of each echo over the detection threshold."""
     return amplitude(
         echoes.apparent,
         echoes.range + sensor.pattern.range_offset,
         reference_reflectance=sensor.reference_reflectance,
         reference_range=sensor.reference_range,
-        extinction=settings.extinction,
+        extinction=extinction,
     )
 
 
@@ -44,7 +43,7 @@ def detected(sensor: Sensor, echoes: EchoesT, *, settings: ScannerSettings, devi
     With ``detection``, noise is added to the power before it is compared with the threshold, which gives the
     probability of `lidar.physics.link.detection_probability`; the measured reflectance includes that noise.
     """
-    power = received(sensor, echoes, settings=settings)
+    power = received(sensor, echoes, extinction=settings.extinction)
     measured = power
     if settings.detection:
         noise = daylight_noise(sensor.noise_ratio, settings.daylight_lux)
@@ -81,21 +80,6 @@ def false_echoes(
     return found
 
 
-def _without_surface(pulse: NDArray[np.integer], distance: Float, *, apparent: Float) -> Echoes:
-    """Echoes of no surface, with true range 0."""
-    n = len(pulse)
-    return Echoes(
-        pulse.astype(np.int32),
-        distance,
-        apparent,
-        np.full(n, -1, np.int32),
-        np.full(n, Class.NOISE, np.uint8),
-        np.ones(n),
-        np.zeros(n),
-        np.zeros(n, bool),
-    )
-
-
 def _anywhere(
     sensor: Sensor, pulse: NDArray[np.integer], *, power: Float, rng: np.random.Generator
 ) -> Echoes:
@@ -107,7 +91,7 @@ def _anywhere(
         reference_reflectance=sensor.reference_reflectance,
         reference_range=sensor.reference_range,
     )
-    return _without_surface(pulse, distance - sensor.pattern.range_offset, apparent=apparent)
+    return artificial_echoes(pulse, distance - sensor.pattern.range_offset, apparent=apparent)
 
 
 def _blooming(pulses: Firings, echoes: Echoes, *, rng: np.random.Generator) -> Echoes:
@@ -116,7 +100,7 @@ def _blooming(pulses: Firings, echoes: Echoes, *, rng: np.random.Generator) -> E
 
     bright = echoes.take(echoes.apparent > RETRO)
     if not len(bright):
-        return _without_surface(np.empty(0, np.int32), np.empty(0), apparent=np.empty(0))
+        return artificial_echoes(np.empty(0, np.int32), np.empty(0), apparent=np.empty(0))
     distance, nearest = cKDTree(pulses.direction[bright.pulse]).query(
         pulses.direction, distance_upper_bound=2 * np.sin(_BLOOM_ANGLE / 2)
     )
@@ -124,7 +108,7 @@ def _blooming(pulses: Firings, echoes: Echoes, *, rng: np.random.Generator) -> E
     is_close[bright.pulse] = False
     pulse = np.flatnonzero(is_close & (rng.random(len(pulses)) < _BLOOM_CHANCE))
     source = nearest[pulse]
-    return _without_surface(pulse, bright.range[source], apparent=_BLOOM_POWER * bright.apparent[source])
+    return artificial_echoes(pulse, bright.range[source], apparent=_BLOOM_POWER * bright.apparent[source])
 
 
 def measured_range(
@@ -143,7 +127,7 @@ def measured_range(
         error = generator(seed, sensor.name, "bias").normal(0, sensor.bias_sigma, lasers)
         distance = distance + error[pulses.channel[echoes.pulse]]
     if settings.walk or settings.range_noise == "signal":
-        power = np.maximum(received(sensor, echoes, settings=settings), 1.0)
+        power = np.maximum(received(sensor, echoes, extinction=settings.extinction), 1.0)
         if settings.walk:
             distance = distance + walk(power)
     if settings.range_noise != "none":

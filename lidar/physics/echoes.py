@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.classes import Class
 from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.raycast.memory import inlined
@@ -70,6 +71,23 @@ def traced(echoes: Echoes, origin: Origin, *, source: NDArray[np.integer]) -> Tr
     """Echoes with an origin and their sources (m,)."""
     added: list[Any] = [np.full(len(echoes), origin, np.uint8), source.astype(np.int32)]
     return TracedEchoes(*echoes.columns().values(), *added)
+
+
+def artificial_echoes(
+    pulse: NDArray[np.integer],
+    distance: Float,
+    *,
+    apparent: Float,
+    klass: Class = Class.NOISE,
+    feature: int = -1,
+) -> Echoes:
+    """Echoes (k,) of no surface of the scene, with true range 0."""
+    n = len(pulse)
+    features, classes = np.full(n, feature, np.int32), np.full(n, klass, np.uint8)
+    beside = np.zeros(n, bool)
+    return Echoes(
+        pulse.astype(np.int32), distance, apparent, features, classes, np.ones(n), np.zeros(n), beside
+    )
 
 
 EchoesT = TypeVar("EchoesT", bound=Echoes)

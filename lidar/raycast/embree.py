@@ -13,35 +13,17 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast import kernels
+from lidar.raycast import library as rtc
 from lidar.raycast.columns import COPIES, Rays, Target
 from lidar.raycast.geometry import Geometry, Instances
 from lidar.raycast.hits import Hits
-from lidar.raycast.library import (
-    COHERENT,
-    DYNAMIC,
-    FLOAT3,
-    FLOAT3X4_ROW_MAJOR,
-    INDEX,
-    INSTANCE_ARRAY,
-    INVALID,
-    LOW,
-    MEDIUM,
-    ROBUST,
-    TRANSFORM,
-    TRIANGLE,
-    UINT,
-    UINT3,
-    VERTEX,
-    fill,
-    library,
-)
 from lidar.raycast.rays import share
 
 
 def _arguments(flags: int = 0) -> NDArray[np.int64]:
     """An RTCIntersectArguments or RTCOccludedArguments: flags, feature mask, context, filter, intersect."""
     words = np.zeros(8, np.int64)
-    words.view(np.uint32)[:2] = flags, INVALID
+    words.view(np.uint32)[:2] = flags, rtc.INVALID
     return words
 
 
@@ -68,18 +50,18 @@ class EmbreeScene:
 
     def __init__(self, origin: Float, *, dynamic: bool = False) -> None:
         self.origin = origin
-        self._lib = library()
+        self._lib = rtc.library()
         self.address: int = self._lib.call("rtcNewScene", self._lib.device)
         weakref.finalize(self, self._lib.embree.rtcReleaseScene, self.address)
-        self._lib.call("rtcSetSceneFlags", self.address, ROBUST | (DYNAMIC if dynamic else 0))
+        self._lib.call("rtcSetSceneFlags", self.address, rtc.ROBUST | (rtc.DYNAMIC if dynamic else 0))
         if dynamic:
             # Embree keeps a tree per geometry only in low-quality scenes; the trees have medium quality.
-            self._lib.call("rtcSetSceneBuildQuality", self.address, LOW)
+            self._lib.call("rtcSetSceneBuildQuality", self.address, rtc.LOW)
         self.parts: dict[int, Geometry] = {}
         self._copies: list[NDArray[np.intp]] = []
         self._groups: list[_Group] = []
         self._own: tuple[list[Geometry], NDArray[np.int64]] = [], np.empty((0, 5), np.int64)
-        self._packet, self._single = _arguments(COHERENT), _arguments()
+        self._packet, self._single = _arguments(rtc.COHERENT), _arguments()
         self.target: Target
 
     def _attach(self, geometry: int, number: int) -> None:
@@ -92,11 +74,12 @@ class EmbreeScene:
         self.parts[number] = part
         if len(part) == 0:
             return
-        geometry = self._lib.call("rtcNewGeometry", self._lib.device, TRIANGLE)
-        fill(self._lib, geometry, kind=VERTEX, slot=0, form=FLOAT3, rows=part.vertices.astype(np.float32))
-        fill(self._lib, geometry, kind=INDEX, slot=0, form=UINT3, rows=part.faces.astype(np.uint32))
+        geometry = self._lib.call("rtcNewGeometry", self._lib.device, rtc.TRIANGLE)
+        vertices, faces = part.vertices.astype(np.float32), part.faces.astype(np.uint32)
+        rtc.fill(self._lib, geometry, kind=rtc.VERTEX, slot=0, form=rtc.FLOAT3, rows=vertices)
+        rtc.fill(self._lib, geometry, kind=rtc.INDEX, slot=0, form=rtc.UINT3, rows=faces)
         self._lib.call("rtcSetGeometryMask", geometry, part.mask)
-        self._lib.call("rtcSetGeometryBuildQuality", geometry, MEDIUM)
+        self._lib.call("rtcSetGeometryBuildQuality", geometry, rtc.MEDIUM)
         self._attach(geometry, COPIES + number)
 
     def detach(self, number: int) -> None:
@@ -122,7 +105,7 @@ class EmbreeScene:
             origins = np.array([shape.origin for shape in shapes]).reshape(-1, 3)[group.shape]
             placed = moments.copy()
             placed[..., 3] += np.einsum("ksij,kj->ksi", moments[..., :3], origins) - self.origin
-            mask = np.full(len(group), INVALID, np.uint32) if group.mask is None else group.mask
+            mask = np.full(len(group), rtc.INVALID, np.uint32) if group.mask is None else group.mask
             masks = np.unique(mask)
             if len(self._copies) + len(masks) > COPIES:
                 raise InputError(f"instances have more than {COPIES} different masks")
@@ -143,15 +126,15 @@ class EmbreeScene:
         lib = self._lib
         if len(shape) == 1:  # for a single instance Embree ignores the shape index and takes the first
             shapes, shape = [shapes[int(shape[0])]], np.zeros(1, np.int32)
-        copies: int = lib.call("rtcNewGeometry", lib.device, INSTANCE_ARRAY)
+        copies: int = lib.call("rtcNewGeometry", lib.device, rtc.INSTANCE_ARRAY)
         addresses = (c.c_void_p * len(shapes))(*(one.address for one in shapes))
         lib.call("rtcSetGeometryInstancedScenes", copies, addresses, len(shapes))
         steps = placed.shape[1]
         lib.call("rtcSetGeometryTimeStepCount", copies, steps)
         for step in range(steps):
             matrices = np.ascontiguousarray(placed[:, step], np.float32)
-            fill(lib, copies, kind=TRANSFORM, slot=step, form=FLOAT3X4_ROW_MAJOR, rows=matrices)
-        fill(lib, copies, kind=INDEX, slot=0, form=UINT, rows=shape.astype(np.uint32))
+            rtc.fill(lib, copies, kind=rtc.TRANSFORM, slot=step, form=rtc.FLOAT3X4_ROW_MAJOR, rows=matrices)
+        rtc.fill(lib, copies, kind=rtc.INDEX, slot=0, form=rtc.UINT, rows=shape.astype(np.uint32))
         lib.call("rtcSetGeometryMask", copies, mask)
         return copies
 

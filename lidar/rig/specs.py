@@ -234,6 +234,11 @@ def _gnss(table: Table) -> GnssSpec:
     )
 
 
+_NOISES = tuple(
+    f"{sensor}_{kind}" for sensor in ("gyro", "accel") for kind in ("noise", "walk", "instability")
+)
+
+
 def _imu(table: Table) -> ImuSpec:
     preset = PRESETS[table.text("model", "adis16448", among=tuple(PRESETS))]
     return ImuSpec(
@@ -241,12 +246,7 @@ def _imu(table: Table) -> ImuSpec:
         mount=_mount(table),
         rate_hz=table.number("rate_hz", 100.0, above=0.0, high=1e5),
         time_offset_ns=table.integer("time_offset_ns", 0, low=0),
-        gyro_noise=table.number("gyro_noise", preset.gyro_noise, low=0.0),
-        gyro_walk=table.number("gyro_walk", preset.gyro_walk, low=0.0),
-        accel_noise=table.number("accel_noise", preset.accel_noise, low=0.0),
-        accel_walk=table.number("accel_walk", preset.accel_walk, low=0.0),
-        gyro_instability=table.number("gyro_instability", preset.gyro_instability, low=0.0),
-        accel_instability=table.number("accel_instability", preset.accel_instability, low=0.0),
+        **{name: table.number(name, getattr(preset, name), low=0.0) for name in _NOISES},
     )
 
 

@@ -87,6 +87,11 @@ def scan(
         settings=settings,
         threads=threads,
     )
+    return measured(sweep)
+
+
+def measured(sweep: Sweep) -> Cloud:
+    """The point cloud of a sweep without stages."""
     return report(sweep, detect(sweep, sweep.echoes, deviates=deviates_of(sweep)))
 
 
@@ -153,7 +158,7 @@ def detect(sweep: Sweep, echoes: Echoes, *, deviates: Deviates) -> Detection:
         echoes = joined(echoes, traced(found, origin, source=first + found.pulse) if is_traced else found)
     number, count = numbered(echoes)
     if settings.rays > 1 or settings.mirrors or false or is_traced:
-        power = received(sensor, echoes, settings=settings)
+        power = received(sensor, echoes, extinction=settings.extinction)
         rows = reported(
             echoes, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
         )

@@ -14,8 +14,9 @@ from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.camera.render import Frame
 from lidar.errors import InputError
-from lidar.physics.echoes import Echoes, Origin, TracedEchoes, traced
-from lidar.physics.link import amplitude, apparent_of
+from lidar.physics.detector import received
+from lidar.physics.echoes import Echoes, Origin, TracedEchoes, artificial_echoes, traced
+from lidar.physics.link import apparent_of
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
 from lidar.sensors.cloud import TracedCloud
@@ -92,13 +93,7 @@ class Pulses(Columns):
 
     def received(self, echoes: Echoes) -> Float:
         """Power (m,) of echoes over the detection threshold."""
-        return amplitude(
-            echoes.apparent,
-            echoes.range + self.sensor.pattern.range_offset,
-            reference_reflectance=self.sensor.reference_reflectance,
-            reference_range=self.sensor.reference_range,
-            extinction=self.extinction,
-        )
+        return received(self.sensor, echoes, extinction=self.extinction)
 
     def apparent(self, power: Float, distance: Float) -> Float:
         """Apparent reflectance (m,) of echoes that arrive with a power over the detection threshold.
@@ -136,18 +131,8 @@ def added_echoes(
     distance : (k,) metres from the beam's start
     apparent : (k,) apparent reflectance, such as from `Pulses.apparent`
     """
-    n = len(pulse)
-    echoes = Echoes(
-        pulse.astype(np.int32),
-        distance,
-        apparent,
-        np.full(n, feature, np.int32),
-        np.full(n, klass, np.uint8),
-        np.ones(n),
-        np.zeros(n),
-        np.zeros(n, bool),
-    )
-    return traced(echoes, origin, source=np.full(n, -1))
+    found = artificial_echoes(pulse, distance, apparent=apparent, klass=klass, feature=feature)
+    return traced(found, origin, source=np.full(len(found), -1))
 
 
 class EchoStage(Protocol):

@@ -249,11 +249,9 @@ def _rows(path: Path) -> tuple[Float, list[str], list[str]]:
                     numbers[key] = len(numbers)
                     kinds.append(mover.get("type", "") if mover.tag == "vehicle" else "pedestrian")
                 x, y, angle = (_number(path, mover, attribute=a, where=where) for a in ("x", "y", "angle"))
-                speed = (
-                    _number(path, mover, attribute="speed", where=where)
-                    if "speed" in mover.attrib
-                    else np.nan
-                )
+                speed = np.nan
+                if "speed" in mover.attrib:
+                    speed = _number(path, mover, attribute="speed", where=where)
                 rows.append((numbers[key], time, x, y, angle, speed))
     return np.array(rows, float).reshape(-1, 6), [name for _, name in numbers], kinds
 
@@ -327,10 +325,8 @@ def _types(path: Path, sumo_options: dict[str, str]) -> dict[str, tuple[str, flo
                 vclass = element.get("vClass", "passenger")
                 vclass = _OTHER.get(vclass, vclass)
                 where = f"vType {element.get('id')!r}"
-                length = (
-                    _number(source, element, attribute="length", where=where)
-                    if "length" in element.attrib
-                    else None
-                )
+                length = None
+                if "length" in element.attrib:
+                    length = _number(source, element, attribute="length", where=where)
                 out[element.get("id", "")] = vclass if vclass in _LENGTHS else "left out", length
     return out

@@ -23,16 +23,8 @@ _FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}
 _WALK = Driver(min_radius=0.4, max_speed=2.5, headway=0.5, acceleration=0.8, deceleration=1.2, gap=0.3)
 _LANE = 0.6  # metres from a sidewalk's centre line to the path, on the driving side
 _EDGE = 0.15  # metres, minimum distance of a path from the edge of the sidewalk
-_OUT = (
-    2.4,
-    2.1,
-    1.8,
-    1.5,
-    1.3,
-    1.1,
-    0.95,
-    0.8,
-)  # metres beyond the carriageway's edge where the line may run, best first
+_OUT = (2.4, 2.1, 1.8, 1.5, 1.3, 1.1, 0.95, 0.8)
+"""Metres beyond the carriageway's edge where the line may run, best first."""
 _ROOM = 1.0  # metres, minimum distance of a sidewalk's line from obstacles
 _PIECE = 12.0  # metres, minimum length of a stretch of sidewalk
 
@@ -189,10 +181,8 @@ def _crossings(lanes: Lanes, walks: Sidewalks) -> dict[int, list[tuple[int, floa
     Each is the stretch opposite, metres along the one and the other, and the crossing's number.
     """
     g = lanes.graph
-    edge, offset = (
-        g.control_edge[g.control_kind == "crossing"],
-        g.control_offset[g.control_kind == "crossing"],
-    )
+    rows = g.control_kind == "crossing"
+    edge, offset = g.control_edge[rows], g.control_offset[rows]
     other = (g.twin[edge] >= 0) & (g.twin[edge] < edge)
     offset = np.where(other, g.length[edge] - offset, offset)
     edge = np.where(other, g.twin[edge], edge)

@@ -182,59 +182,36 @@ def green_windows(plan: JunctionPlan, ego: EgoMotion) -> Float:
 
 def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: JunctionPlan) -> Movers:
     """The tables of the simulation."""
-    station, cell, blocks = [0], [0], [0]
-    columns: dict[str, list[NDArray[Any]]] = {
-        name: [] for name in ("desired_speed", "x", "y", "heading", "cell", "first", "last", "leave", "block")
-    }
     routes: dict[tuple[int, ...], int] = {}
     covered = graph.bridge | graph.tunnel
+    parts: list[dict[str, NDArray[Any]]] = []
     for trip in trips:
         path = trip.path
         xy, heading = trip.body()
         level = np.where(path.edge >= 0, covered[path.edge], False).astype(np.int64)
         swept = sweep(xy, heading, length=trip.length, width=trip.width, level=level, scale=path.scale)
-        found = _blocks(trip, graph, plan=plan, routes=routes)
-        columns["desired_speed"].append(trip.desired_speed)
-        columns["x"].append(xy[:, 0])
-        columns["y"].append(xy[:, 1])
-        columns["heading"].append(heading)
-        for name in ("cell", "first", "last", "leave"):
-            columns[name].append(getattr(swept, name))
-        columns["block"].append(found)
-        station.append(station[-1] + len(path))
-        cell.append(cell[-1] + len(swept.cell))
-        blocks.append(blocks[-1] + len(found))
-    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
-    b = whole["block"]
-
-    def of(name: str) -> Float:
-        return np.array([getattr(t.driver, name) for t in trips])
-
-    names = ("block_from", "block_to", "block_stop", "block_zone", "block_group", "block_route")
+        own = {"desired_speed": trip.desired_speed, "x": xy[:, 0], "y": xy[:, 1], "heading": heading}
+        passages = {"block": _blocks(trip, graph, plan=plan, routes=routes)}
+        parts.append(own | swept.columns() | passages)
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    b = columns.pop("block")
+    columns |= {
+        f"{name}_start": np.cumsum([0, *(len(part[column]) for part in parts)])
+        for name, column in (("station", "x"), ("cell", "cell"), ("block", "block"))
+    }
+    numbers = ("block_from", "block_to", "block_stop", "block_zone", "block_group", "block_route")
+    columns |= {name: b[:, c].astype(np.int64) for c, name in enumerate(numbers)}
+    drivers = ("headway", "acceleration", "deceleration", "gap")
     return Movers(
-        station_start=np.array(station),
-        desired_speed=whole["desired_speed"],
-        x=whole["x"],
-        y=whole["y"],
-        heading=whole["heading"],
-        cell_start=np.array(cell),
-        cell=whole["cell"],
-        first=whole["first"],
-        last=whole["last"],
-        leave=whole["leave"],
-        block_start=np.array(blocks),
-        **{name: b[:, c].astype(np.int64) for c, name in enumerate(names)},
+        **columns,
         block_rank=b[:, 6].copy(),
         block_stop_sign=b[:, 7] > 0,
-        headway=of("headway"),
-        acceleration=of("acceleration"),
-        deceleration=of("deceleration"),
-        gap=of("gap"),
-        length=np.array([t.length for t in trips]),
-        width=np.array([t.width for t in trips]),
+        **{name: np.array([getattr(t.driver, name) for t in trips]) for name in drivers},
+        **{
+            name: np.array([getattr(t, name) for t in trips])
+            for name in ("length", "width", "begin", "leaves")
+        },
         appear=np.array([int(t.appear_s / STEP_S) for t in trips]),
-        begin=np.array([t.begin for t in trips]),
-        leaves=np.array([t.leaves for t in trips]),
         whole_block=np.array([t.on_foot for t in trips]),
     )
 

@@ -11,6 +11,7 @@ import shapely
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.traffic.lanes import STEP, ActorPath
 
@@ -22,7 +23,7 @@ _SPARE = 0.05 + CELL * math.sqrt(0.5)
 
 
 @dataclass(frozen=True, slots=True)
-class Sweep:
+class Sweep(Columns):
     """Cells that a body covers along its path, in the order of ``first``.
 
     cell : (q,) int64, the cell's row, column and level as one number

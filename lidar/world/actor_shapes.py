@@ -82,6 +82,12 @@ CLOTHES: dict[str, tuple[Rgb, Rgb]] = {
 """Jackets and trousers of people."""
 
 
+_seat = functools.partial(box, material="clothing", color=DARK)
+_pane = functools.partial(box, material="glass", color=GLASS)
+_lamp = functools.partial(box, material="glass", color=WHITE)
+_reflector = functools.partial(box, material="retroreflector", color=RED)
+
+
 def _car(size: tuple[float, float, float], *, profile: str, paint: Rgb) -> list[Mesh]:
     """A car: body, cabin, wheels, seats, lamps, plates and mirrors."""
     length, width, height = size
@@ -133,40 +139,12 @@ def _car(size: tuple[float, float, float], *, profile: str, paint: Rgb) -> list[
     parts = [shell, glass]
     for x in (-base, base):
         parts += mirrored(wheel(x, w - 0.10, radius=radius, width=0.21))
-    parts += [
-        box(
-            (-0.62 * half, -0.8 * w, 0.3),
-            (-0.4 * half, 0.8 * w, height - 0.35),
-            material="clothing",
-            color=DARK,
-        )
-    ]
-    parts += mirrored(
-        box(
-            (-0.12 * half, 0.12 * w, 0.3),
-            (0.02 * half, 0.75 * w, height - 0.32),
-            material="clothing",
-            color=DARK,
-        )
-    )
+    parts += [_seat((-0.62 * half, -0.8 * w, 0.3), (-0.4 * half, 0.8 * w, height - 0.35))]
+    parts += mirrored(_seat((-0.12 * half, 0.12 * w, 0.3), (0.02 * half, 0.75 * w, height - 0.32)))
     lamp = nose - 0.14
-    parts += mirrored(
-        box(
-            (0.955 * half, 0.50 * w, lamp),
-            (half + 0.002, 0.78 * w, lamp + 0.12),
-            material="glass",
-            color=WHITE,
-        )
-    )
+    parts += mirrored(_lamp((0.955 * half, 0.50 * w, lamp), (half + 0.002, 0.78 * w, lamp + 0.12)))
     rear = tail - 0.22
-    parts += mirrored(
-        box(
-            (-half - 0.002, 0.55 * w, rear),
-            (-0.955 * half, 0.84 * w, rear + 0.12),
-            material="retroreflector",
-            color=RED,
-        )
-    )
+    parts += mirrored(_reflector((-half - 0.002, 0.55 * w, rear), (-0.955 * half, 0.84 * w, rear + 0.12)))
     parts += [_plate(half - 0.012, 0.36), _plate(-half + 0.012, 0.52)]
     parts += mirrored(box((0.26 * half, w - 0.06, belt), (0.31 * half, w + 0.01, belt + 0.13), color=paint))
     return parts
@@ -182,22 +160,8 @@ def _plate(x: float, z: float, *, y: float = 0.0) -> Mesh:
 def _lamps(front: float, rear: float, *, w: float, z: float) -> list[Mesh]:
     """Lamps in front, reflecting lamps behind."""
     return [
-        *mirrored(
-            box(
-                (front - 0.05, 0.62 * w, z),
-                (front + 0.012, 0.92 * w, z + 0.16),
-                material="glass",
-                color=WHITE,
-            )
-        ),
-        *mirrored(
-            box(
-                (rear - 0.012, 0.70 * w, z),
-                (rear + 0.05, 0.93 * w, z + 0.16),
-                material="retroreflector",
-                color=RED,
-            )
-        ),
+        *mirrored(_lamp((front - 0.05, 0.62 * w, z), (front + 0.012, 0.92 * w, z + 0.16))),
+        *mirrored(_reflector((rear - 0.012, 0.70 * w, z), (rear + 0.05, 0.93 * w, z + 0.16))),
     ]
 
 
@@ -227,7 +191,7 @@ def _van(size: tuple[float, float, float], paint: Rgb) -> list[Mesh]:
     shell = repainted(shell, side == 7, material="tyre", color=DARK)
     parts = [
         shell,
-        box((0.12 * half, -0.8 * w, 0.5), (0.24 * half, 0.8 * w, 1.6), material="clothing", color=DARK),
+        _seat((0.12 * half, -0.8 * w, 0.5), (0.24 * half, 0.8 * w, 1.6)),
     ]
     for x in (-0.29 * length, 0.31 * length):
         parts += mirrored(wheel(x, w - 0.11, radius=0.34, width=0.23))
@@ -259,11 +223,7 @@ def _truck(size: tuple[float, float, float], paint: Rgb) -> list[Mesh]:
     )
     for x in (-0.26 * length, 0.36 * length):
         parts += mirrored(wheel(x, w - 0.15, radius=0.48, width=0.29))
-    parts += [
-        box(
-            (-half - 0.004, -w * 0.9, 1.0), (-half + 0.02, w * 0.9, 1.1), material="retroreflector", color=RED
-        )
-    ]
+    parts += [_reflector((-half - 0.004, -w * 0.9, 1.0), (-half + 0.02, w * 0.9, 1.1))]
     parts += _lamps(half, -half, w=w, z=0.75)
     return [*parts, _plate(half - 0.01, 0.58), _plate(-half, 0.62)]
 
@@ -285,20 +245,10 @@ def _bus(size: tuple[float, float, float], paint: Rgb) -> list[Mesh]:
     shell = repainted(shell, side == 7, material="tyre", color=DARK)
     parts = [
         shell,
-        box(
-            (half - 0.02, -0.88 * w, 1.0),
-            (half + 0.01, 0.88 * w, height - 0.45),
-            material="glass",
-            color=GLASS,
-        ),
-        box(
-            (-half - 0.01, -0.80 * w, 1.5),
-            (-half + 0.02, 0.80 * w, height - 0.6),
-            material="glass",
-            color=GLASS,
-        ),
-        box((-0.8 * half, -0.85 * w, 0.5), (0.75 * half, -0.25 * w, 1.35), material="clothing", color=DARK),
-        box((-0.8 * half, 0.25 * w, 0.5), (0.75 * half, 0.85 * w, 1.35), material="clothing", color=DARK),
+        _pane((half - 0.02, -0.88 * w, 1.0), (half + 0.01, 0.88 * w, height - 0.45)),
+        _pane((-half - 0.01, -0.80 * w, 1.5), (-half + 0.02, 0.80 * w, height - 0.6)),
+        _seat((-0.8 * half, -0.85 * w, 0.5), (0.75 * half, -0.25 * w, 1.35)),
+        _seat((-0.8 * half, 0.25 * w, 0.5), (0.75 * half, 0.85 * w, 1.35)),
     ]
     for x in (-0.24 * length, 0.27 * length):
         parts += mirrored(wheel(x, w - 0.14, radius=0.48, width=0.28))
@@ -319,7 +269,7 @@ def _bicycle(paint: Rgb) -> list[Mesh]:
         limb((0.33, -0.29, 1.02), (0.33, 0.29, 1.02), thick=(0.03, 0.03), material="metal", corners=4),
         box((-0.36, -0.08, 0.88), (-0.12, 0.08, 0.94), material="tyre", color=DARK),
         *mirrored(box((-0.17, 0.09, 0.24), (-0.07, 0.18, 0.27), material="tyre", color=DARK)),
-        box((-0.62, -0.04, 0.66), (-0.60, 0.04, 0.72), material="retroreflector", color=RED),
+        _reflector((-0.62, -0.04, 0.66), (-0.60, 0.04, 0.72)),
         box((0.40, -0.03, 0.84), (0.42, 0.03, 0.90), material="retroreflector", color=WHITE),
     ]
     return parts
@@ -347,8 +297,8 @@ def _motorcycle(paint: Rgb) -> list[Mesh]:
         *mirrored(limb((x, 0.09, r), (0.44, 0.09, 0.92), thick=(0.05, 0.05), material="metal", corners=4)),
         limb((0.40, -0.36, 0.98), (0.40, 0.36, 0.98), thick=(0.035, 0.035), material="metal", corners=4),
         limb((-x, 0.0, r), (-0.2, 0.0, 0.36), thick=(0.08, 0.08), material="metal", color=DARK, corners=4),
-        box((0.52, -0.09, 0.76), (0.58, 0.09, 0.92), material="glass", color=WHITE),
-        box((-0.90, -0.07, 0.70), (-0.86, 0.07, 0.78), material="retroreflector", color=RED),
+        _lamp((0.52, -0.09, 0.76), (0.58, 0.09, 0.92)),
+        _reflector((-0.90, -0.07, 0.70), (-0.86, 0.07, 0.78)),
         box((-0.93, -0.09, 0.46), (-0.91, 0.09, 0.60), material="retroreflector", color=WHITE),
     ]
     return [

@@ -41,9 +41,7 @@ Table = dict[str, NDArray[Any]]
 def cloud_table(cloud: Cloud) -> Table:
     """The table of a cloud, in the sensor frame, with the types of files."""
     return {
-        "x": cloud.xyz[:, 0],
-        "y": cloud.xyz[:, 1],
-        "z": cloud.xyz[:, 2],
+        **dict(zip("xyz", cloud.xyz.T, strict=True)),
         "intensity": cloud.intensity,
         "time_ns": cloud.time_ns.astype(np.uint32),
         "ring": cloud.ring,

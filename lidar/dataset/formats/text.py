@@ -14,16 +14,8 @@ from geoscene.files import write_atomically
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
 
-_DECIMALS = {
-    "x": 4,
-    "y": 4,
-    "z": 4,
-    "range": 4,
-    "true_range": 4,
-    "intensity": 2,
-    "incidence": 5,
-    "velocity": 4,
-}
+_METRES = ("x", "y", "z", "range", "true_range", "velocity")
+_DECIMALS = dict.fromkeys(_METRES, 4) | {"intensity": 2, "incidence": 5}
 _TYPES: dict[str, Any] = {
     "intensity": np.float32,
     "time_ns": np.int64,
@@ -31,11 +23,7 @@ _TYPES: dict[str, Any] = {
     "column": np.uint32,
     "label": np.uint16,
     "instance": np.int32,
-    "echo": np.uint8,
-    "echoes": np.uint8,
-    "red": np.uint8,
-    "green": np.uint8,
-    "blue": np.uint8,
+    **dict.fromkeys(("echo", "echoes", "red", "green", "blue"), np.uint8),
 }
 
 

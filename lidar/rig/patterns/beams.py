@@ -37,6 +37,20 @@ class Firings(Columns):
     order: NDArray[np.int32]
 
 
+def from_origin(
+    time_ns: NDArray[np.int64], direction: Float, *, column: NDArray[np.int32], channel: NDArray[np.uint16]
+) -> Firings:
+    """Pulses (n,) that start at the sensor's origin, fired in order of direction; channels are rings."""
+    order = np.arange(len(time_ns), dtype=np.int32)
+    return Firings(time_ns, direction, np.zeros_like(direction), channel, column, channel, order)
+
+
+def unit_vectors(azimuth: Float, elevation: Float) -> Float:
+    """Unit vectors (..., 3) of angles in radians, counter-clockwise from forward, and up."""
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+
+
 class Pattern(Protocol):
     """Firing pattern of a scanner."""
 

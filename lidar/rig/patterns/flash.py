@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.rig.patterns.beams import Firings, blocks, frame_ns, frozen
+from lidar.rig.patterns.beams import Firings, blocks, frame_ns, frozen, unit_vectors
 from lidar.rig.toml_table import Table
 
 
@@ -30,11 +30,7 @@ class Flash:
     rectilinear: bool
     row_ns: int
     range_offset: float = 0.0
-
-    @property
-    def tail_ns(self) -> int:
-        """Maximum delay of the last pulse after the end of its frame, nanoseconds."""
-        return 0
+    tail_ns: int = 0
 
     @functools.cached_property
     def _grid(self) -> tuple[Float, Float, NDArray[np.uint16], NDArray[np.int32], NDArray[np.uint16]]:
@@ -48,10 +44,7 @@ class Flash:
             direction /= np.linalg.norm(direction, axis=2, keepdims=True)
         else:
             azimuth, elevation = np.meshgrid(-u * self.width / 2, -v * self.height / 2)
-            level = np.cos(elevation)
-            direction = np.stack(
-                [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=2
-            )
+            direction = unit_vectors(azimuth, elevation)
         n = self.rows * self.columns
         ring = np.repeat(np.arange(self.rows, dtype=np.uint16)[::-1], self.columns)
         column = np.tile(np.arange(self.columns, dtype=np.int32), self.rows)

@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 
 from geoscene.typing import Float
-from lidar.rig.patterns.beams import Firings, blocks
+from lidar.rig.patterns.beams import Firings, blocks, from_origin
 from lidar.rig.toml_table import Table
 
 LAWS = ("polygon", "zigzag", "sine", "conical")
@@ -47,16 +47,8 @@ class Line:
         swing = self.line_hz * seconds
         direction = self._directions(swing)
         fired = np.flatnonzero(-direction[:, 2] >= np.cos(self.half_angle) - 1e-12).astype(np.int32)
-        zero = np.zeros(len(fired), np.uint16)
-        return Firings(
-            block.time_ns[fired],
-            direction[fired],
-            np.zeros((len(fired), 3)),
-            zero,
-            fired,
-            zero,
-            np.arange(len(fired), dtype=np.int32),
-        )
+        channel = np.zeros(len(fired), np.uint16)
+        return from_origin(block.time_ns[fired], direction[fired], column=fired, channel=channel)
 
     def _directions(self, swing: Float) -> Float:
         """Unit vectors (n, 3) after ``swing`` (n,) lines."""

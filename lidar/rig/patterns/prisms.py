@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from geoscene.typing import Float
-from lidar.rig.patterns.beams import Firings, blocks, numbers
+from lidar.rig.patterns.beams import Firings, blocks, from_origin, numbers
 from lidar.rig.toml_table import Table
 
 
@@ -43,15 +43,7 @@ class Prisms:
         faces = np.stack([np.sin(self.wedge), np.cos(self.wedge), self.index], axis=1)
         _steer(self.incident, faces, np.sin(phase), np.cos(phase), direction)
         column, channel = numbers(len(block), beams)
-        return Firings(
-            np.repeat(block.time_ns, beams),
-            direction,
-            np.zeros_like(direction),
-            channel,
-            column,
-            channel,
-            np.arange(len(direction), dtype=np.int32),
-        )
+        return from_origin(np.repeat(block.time_ns, beams), direction, column=column, channel=channel)
 
 
 @njit(cache=True, nogil=True)

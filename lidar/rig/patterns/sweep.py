@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.rig.patterns.beams import Firings, blocks, frame_ns, numbers
+from lidar.rig.patterns.beams import Firings, blocks, frame_ns, from_origin, numbers, unit_vectors
 from lidar.rig.toml_table import Table
 
 
@@ -44,7 +44,8 @@ class Sweep:
         elevation = (self.low + self.high) / 2 + (self.high - self.low) / 2 * triangle
         azimuth = 2 * np.pi * np.mod(self.azimuth_hz * seconds, 1.0)
         column, _ = numbers(len(block), 1)
-        return _pulses(block.time_ns, azimuth, elevation=elevation, column=column, channel=line)
+        direction = unit_vectors(azimuth, elevation)
+        return from_origin(block.time_ns, direction, column=column, channel=line)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,27 +72,8 @@ class Listed:
         rows = np.flatnonzero((time >= first) & (time < stop))
         entry = rows % len(self.after_ns)
         column, channel = numbers(len(rows), 1)
-        return _pulses(
-            start_ns + time[rows],
-            self.azimuth[entry],
-            elevation=self.elevation[entry],
-            column=column,
-            channel=channel,
-        )
-
-
-def _pulses(
-    time: NDArray[np.int64],
-    azimuth: Float,
-    *,
-    elevation: Float,
-    column: NDArray[np.int32],
-    channel: NDArray[np.uint16],
-) -> Firings:
-    level = np.cos(elevation)
-    direction = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
-    order = np.arange(len(time), dtype=np.int32)
-    return Firings(time, direction, np.zeros_like(direction), channel, column, channel, order)
+        direction = unit_vectors(self.azimuth[entry], self.elevation[entry])
+        return from_origin(start_ns + time[rows], direction, column=column, channel=channel)
 
 
 def read_sweep(table: Table) -> Sweep:
