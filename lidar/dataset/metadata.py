@@ -71,6 +71,9 @@ def _mounted(mount: Mount) -> dict[str, Any]:
     }
 
 
+_SCANNER = ("wavelength_nm", "min_range", "max_range", "range_quantum", "return_mode", "fmcw")
+
+
 def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]:
     """The document ``calibration.json``: mounts, rates and intrinsics."""
     out: dict[str, Any] = {}
@@ -86,12 +89,7 @@ def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]
                 "model": f"{s.maker} {s.model}",
                 "rate_hz": s.rate_hz,
                 "time_offset_ns": s.start_ns,
-                "wavelength_nm": s.wavelength_nm,
-                "min_range": s.min_range,
-                "max_range": s.max_range,
-                "range_quantum": s.range_quantum,
-                "return_mode": s.return_mode,
-                "fmcw": s.fmcw,
+                **{name: getattr(s, name) for name in _SCANNER},
                 **_mounted(sensor.spec.mount),
             }
         else:

@@ -144,16 +144,6 @@ def _flicker(count: int, dt: float, *, seed: int, name: str) -> Float:
     return total
 
 
-def allan_deviation(rate: Float, rate_hz: float, *, windows: NDArray[np.integer]) -> Float:
-    """Overlapping Allan deviation (w, k) of readings (n, k) for averaging windows (w,), in readings."""
-    total = np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(rate, axis=0)]) / rate_hz
-    out = np.empty((len(windows), rate.shape[1]))
-    for row, m in enumerate(windows):
-        second = total[2 * m :] - 2 * total[m:-m] + total[: -2 * m]
-        out[row] = np.sqrt((second**2).mean(axis=0) / 2) * rate_hz / m
-    return out
-
-
 def imu_columns(rows: Inertial) -> dict[str, NDArray[Any]]:
     """Columns of ``imu.csv``: measurements, and ground truth prefixed ``true_``; rad/s and m/s^2."""
     out: dict[str, NDArray[Any]] = {"time_ns": rows.time_ns}

@@ -196,9 +196,7 @@ def dilution(azimuth: Float, elevation: Float, *, used: Bools, names: NDArray[np
     clocks = np.zeros((len(names), len(systems)))
     for column, rows in enumerate(systems):
         clocks[rows, column] = 1.0
-    toward = np.stack(
-        [np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], axis=-1
-    )
+    toward = grid_directions(azimuth, elevation, convergence=np.zeros(1))
     h = np.concatenate([toward, np.broadcast_to(clocks, (*azimuth.shape, len(systems)))], axis=-1)
     normal = np.einsum("nki,nkj,nk->nij", h, h, used.astype(float))
     clock_rows = 3 + np.arange(len(systems))

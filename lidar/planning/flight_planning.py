@@ -80,31 +80,16 @@ def plan_flight(
 
     Raises RouteError for a flight that the aircraft cannot fly or that would collide with the scene.
     """
-    survey, altitude, duration = options.survey, options.altitude, options.duration
-    usual = ALTITUDES["slow" if vehicle.max_speed < 30.0 else "fast"]
+    survey, above, duration = options.survey, options.altitude, options.duration
+    if above is None:
+        above = ALTITUDES["slow" if vehicle.max_speed < 30.0 else "fast"]
     below = _SceneBelow(scene)
     if survey:
-        height = usual if altitude is None else altitude
         route, lines, spacing = _strips(
-            scene,
-            survey,
-            vehicle=vehicle,
-            sensors=sensors,
-            height=height,
-            overlap=options.overlap,
-            below=below,
+            scene, vehicle, sensors=sensors, options=options, height=above, below=below
         )
     else:
-        route = _along(
-            scene,
-            spec,
-            vehicle=vehicle,
-            altitude=altitude,
-            usual=usual,
-            seed=options.seed,
-            duration=duration,
-            below=below,
-        )
+        route = _along(scene, spec, vehicle=vehicle, options=options, above=above, below=below)
     at_speed = spec == "random" and not survey and not options.from_rest
     trajectory = drive_path(plan_path(route, vehicle, frame=scene.frame), vehicle, at_speed=at_speed)
     if duration is not None:
@@ -126,7 +111,7 @@ class _SceneBelow:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._world: World | None = None
+        self._world = World(scene)
 
     def _load(self, x: Float, y: Float) -> World:
         xmin, ymin, xmax, ymax = self._scene.bounds
@@ -136,10 +121,7 @@ class _SceneBelow:
             float(np.clip(x.max(), xmin, xmax)),
             float(np.clip(y.max(), ymin, ymax)),
         )
-        if self._world is None:
-            self._world = World.load(self._scene, region=region)
-        else:
-            self._world.follow(region)
+        self._world.follow(region)
         return self._world
 
     def top(self, x: Float, y: Float) -> Float:
@@ -174,23 +156,22 @@ def _along(
     spec: Spec,
     *,
     vehicle: Vehicle,
-    altitude: float | None,
-    usual: float,
-    seed: int,
-    duration: float | None,
+    options: FlightOptions,
+    above: float,
     below: _SceneBelow,
 ) -> Route:
-    """The route along waypoints or streets."""
+    """The route along waypoints or streets, ``above`` metres over the ground."""
     if isinstance(spec, str) and spec == "random":
         if vehicle.turning_radius > _STREET_RADIUS:
             raise RouteError(
                 f"a craft that turns within {vehicle.turning_radius:.0f} m cannot follow streets; give"
                 " `survey` all, `survey` FILE or waypoints"
             )
-        length = vehicle.max_speed * ((60.0 if duration is None else duration) + ROUTE_MARGIN_S)
+        seconds = 60.0 if options.duration is None else options.duration
+        length = vehicle.max_speed * (seconds + ROUTE_MARGIN_S)
         graph = graph_on_tiles(scene.road_graph(), scene)
         line = plan_route(
-            graph, scene.frame, spec="random", options=RouteOptions(seed=seed, length=length)
+            graph, scene.frame, spec="random", options=RouteOptions(seed=options.seed, length=length)
         ).line
         xyz, given = np.array(line), False
     elif isinstance(spec, str | Path):
@@ -200,10 +181,9 @@ def _along(
         lat, lon = np.array(spec, float).T
         x, y = scene.frame.from_geographic(lon, lat)
         xyz, given = np.column_stack([x, y, np.zeros(len(x))]), False
-    if altitude is None and given:
+    if options.altitude is None and given:
         return waypoint_flight(xyz, limit=vehicle.max_speed)
     xy = _dense(xyz[:, :2])
-    above = usual if altitude is None else altitude
     level = np.column_stack([xy, np.full(len(xy), above)])
     return waypoint_flight(level, ground=below.ground, limit=vehicle.max_speed)
 
@@ -216,16 +196,15 @@ def _dense(xy: Float) -> Float:
 
 def _strips(
     scene: Scene,
-    survey: str,
-    *,
     vehicle: Vehicle,
+    *,
     sensors: Sequence[Scanner | Camera],
+    options: FlightOptions,
     height: float,
-    overlap: float,
     below: _SceneBelow,
 ) -> tuple[Route, Float, float]:
     """The route in strips along an area's longer side, the strips (k, 2, 2), and their spacing."""
-    area = survey_area(scene, survey)
+    area, overlap = survey_area(scene, options.survey), options.overlap
     if not 0.0 <= overlap < 1.0:
         raise InputError(f"`overlap` {overlap:g}: a share from 0 to less than 1")
     scale = float(np.asarray(scene.frame.scale_at(area.centroid.x, area.centroid.y)))
@@ -261,9 +240,8 @@ def survey_area(scene: Scene, text: str) -> Any:
         area = shapely.box(west, south, east, north)
     except ValueError:
         area = _polygon(Path(text))
-    area = shapely.segmentize(
-        area, 1e-3
-    )  # degrees: sides stay straight on the map where they are in the file
+    # degrees: sides stay straight on the map where they are in the file
+    area = shapely.segmentize(area, 1e-3)
     area = shapely.transform(area, lambda p: np.column_stack(scene.frame.from_geographic(*p.T)))
     if not shapely.intersects(area, whole):
         raise RouteError(f"`survey` {text}: the area does not touch the scene")

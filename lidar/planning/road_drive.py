@@ -84,15 +84,10 @@ def ground_footprints(scene: Scene) -> NDArray[np.object_]:
 
 def road_surface(scene: Scene) -> Surface:
     """Heights of the ground or bridge surface near given heights; the given ones where there is none."""
-    world: World | None = None
+    world = World(scene)
 
     def surface(x: Float, y: Float, z: Float) -> Float:  # noqa: PLR0917 - a Surface
-        nonlocal world
-        region = (float(x.min()) - 1, float(y.min()) - 1, float(x.max()) + 1, float(y.max()) + 1)
-        if world is None:
-            world = World.load(scene, region=region)
-        else:
-            world.follow(region)
+        world.follow((float(x.min()) - 1, float(y.min()) - 1, float(x.max()) + 1, float(y.max()) + 1))
         origins = np.column_stack([x, y, z + _SEARCH_M])
         hits = world.caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape), far=2 * _SEARCH_M)
         on_road = np.isfinite(hits.range) & np.isin(world.lookup(hits).klass, _DRIVEN)

@@ -71,15 +71,6 @@ class Vehicle:
         return self.length - self.rear_overhang
 
 
-def rear_axle_radius(turning_circle: float, wheelbase: float, *, track: float) -> float:
-    """Minimum turning radius in metres of a car's rear axle centre, from its kerb-to-kerb turning circle.
-
-    turning_circle : diameter in metres of the outer front wheel's path; the wheels turn about a point on the
-                     line of the rear axle (Ackermann)
-    """
-    return float(np.sqrt((turning_circle / 2) ** 2 - wheelbase**2) - track / 2)
-
-
 def vehicle_names() -> list[str]:
     """Names of the built-in vehicles."""
     folder = resources.files("lidar.rig").joinpath("vehicles")

@@ -23,13 +23,10 @@ def person(stature: float, clothes: Clothes, *, phase: float | None) -> list[Mes
     jacket, trousers = clothes
     h = stature
     swing = 0.0 if phase is None else _SWING * np.sin(phase)
-    lift = 0.0 if phase is None else max(np.cos(phase), 0.0)
+    left, right = (0.0, 0.0) if phase is None else (max(sign * np.cos(phase), 0.0) for sign in (1, -1))
     parts = _trunk((0.0, _HIP * h), (0.0, _SHOULDER * h), h=h, jacket=jacket)
     parts += _head((0.0, _CHIN * h), h)
-    for side, angle, bend in (
-        (1, swing, lift),
-        (-1, -swing, 0.0 if phase is None else max(-np.cos(phase), 0.0)),
-    ):
+    for side, angle, bend in ((1, swing, left), (-1, -swing, right)):
         hip = np.array([0.0, side * 0.052 * h, _LEG * h + 0.05 * h])
         knee = hip + 0.25 * h * np.array([np.sin(angle + 0.35 * bend), 0.0, -np.cos(angle + 0.35 * bend)])
         shin = angle - 0.5 * bend
@@ -37,13 +34,7 @@ def person(stature: float, clothes: Clothes, *, phase: float | None) -> list[Mes
         parts += [
             limb(hip, knee, thick=(0.105 * h, 0.075 * h), color=trousers),
             limb(knee, ankle, thick=(0.075 * h, 0.05 * h), color=trousers),
-            limb(
-                ankle - np.array([0.03 * h, 0, 0.015 * h]),
-                ankle + np.array([0.10 * h, 0, -0.02 * h]),
-                thick=(0.05 * h, 0.04 * h),
-                material="tyre",
-                color=DARK,
-            ),
+            _shoe(ankle, (0.03 * h, 0.015 * h), toe=(0.10 * h, 0.02 * h), thick=(0.05 * h, 0.04 * h)),
         ]
         parts += _arm(
             np.array([0.0, side * 0.125 * h, 0.80 * h]), -0.8 * angle, bend=0.25, h=h, jacket=jacket
@@ -81,13 +72,7 @@ def rider(
         parts += [
             limb(hip, knee, thick=(0.10 * h, 0.075 * h), color=trousers),
             limb(knee, ankle, thick=(0.075 * h, 0.05 * h), color=trousers),
-            limb(
-                ankle - np.array([0.05, 0, 0.03]),
-                ankle + np.array([0.16, 0, -0.03]),
-                thick=(0.08, 0.06),
-                material="tyre",
-                color=DARK,
-            ),
+            _shoe(ankle, (0.05, 0.03), toe=(0.16, 0.03), thick=(0.08, 0.06)),
         ]
         shoulder = np.array([top[0], side * 0.115 * h, top[1] - 0.02 * h])
         hand = np.array([grip[0], side * 0.24, grip[1]])
@@ -97,6 +82,14 @@ def rider(
             limb(elbow, hand, thick=(0.045 * h, 0.035 * h), color=jacket),
         ]
     return parts
+
+
+def _shoe(
+    ankle: Float, heel: tuple[float, float], *, toe: tuple[float, float], thick: tuple[float, float]
+) -> Mesh:
+    """A shoe; heel and toe are metres behind and before the ankle, and below it."""
+    back, front = np.array([heel[0], 0.0, heel[1]]), np.array([toe[0], 0.0, -toe[1]])
+    return limb(ankle - back, ankle + front, thick=thick, material="tyre", color=DARK)
 
 
 def _trunk(low: tuple[float, float], high: tuple[float, float], *, h: float, jacket: Rgb) -> list[Mesh]:
@@ -121,21 +114,10 @@ def _head(chin: tuple[float, float], h: float, *, helmet: Rgb | None = None) -> 
         (x + 0.005, 0.0, z + 0.062 * h), (0.115 * h, 0.09 * h, 0.125 * h), material="skin", color=_SKIN
     )
     if helmet is not None:
-        return [
-            face,
-            ball(
-                (x, 0.0, z + 0.075 * h), (0.15 * h, 0.135 * h, 0.13 * h), material="car_paint", color=helmet
-            ),
-        ]
-    return [
-        face,
-        ball(
-            (x - 0.012 * h, 0.0, z + 0.078 * h),
-            (0.112 * h, 0.098 * h, 0.104 * h),
-            material="clothing",
-            color=_HAIR,
-        ),
-    ]
+        middle, size = (x, 0.0, z + 0.075 * h), (0.15 * h, 0.135 * h, 0.13 * h)
+        return [face, ball(middle, size, material="car_paint", color=helmet)]
+    middle, size = (x - 0.012 * h, 0.0, z + 0.078 * h), (0.112 * h, 0.098 * h, 0.104 * h)
+    return [face, ball(middle, size, material="clothing", color=_HAIR)]
 
 
 def _arm(shoulder: Float, angle: float, *, bend: float, h: float, jacket: Rgb) -> list[Mesh]:

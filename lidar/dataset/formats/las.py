@@ -298,10 +298,3 @@ def _table(points: Any) -> Table:
         if name in points.array.dtype.names:
             table[name] = np.asarray(points[name])
     return table
-
-
-def read_crs(path: Path) -> CRS | None:
-    """The CRS of a LAS or LAZ file, None if the file has none."""
-    with _opened(path) as reader:
-        crs: CRS | None = reader.header.parse_crs()
-        return crs

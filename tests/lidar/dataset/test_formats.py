@@ -17,7 +17,7 @@ from pyproj import CRS
 
 from geoscene.classes import Class
 from lidar.dataset.formats import FORMATS, LABELS, las, pcd, pcd_ascii, ply, read_cloud, read_table, text
-from lidar.dataset.formats.las import LasInfo, gps_seconds, open_las, read_chunks, read_crs
+from lidar.dataset.formats.las import LasInfo, gps_seconds, open_las, read_chunks
 from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
 from lidar.errors import FormatError, InputError
 
@@ -242,7 +242,7 @@ def test_laspy_reads_world_coordinates_crs_classes_and_time(tmp_path, suffix):
     assert [len(t["x"]) for t in back] == [700, 700, 600]
     np.testing.assert_array_equal(np.concatenate([t["label"] for t in back]), cloud["label"])
     assert np.abs(np.concatenate([t["intensity"] for t in back]) - cloud["intensity"]).max() < 0.002
-    assert read_crs(path).to_epsg() == 32618
+    assert file.header.parse_crs().to_epsg() == 32618
 
 
 def test_an_uncompressed_file_written_in_parts_equals_that_of_laspy(tmp_path):

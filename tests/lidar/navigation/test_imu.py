@@ -10,7 +10,6 @@ from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.navigation.imu import (
     EARTH_RATE,
-    allan_deviation,
     imu_columns,
     inertial_noise,
     normal_gravity,
@@ -24,6 +23,16 @@ FRAME = Frame.at(13.377704, 52.516275)
 PHI = np.radians(52.516275)
 TIMES = np.arange(0, 10_000_000_000, 10_000_000)
 SILENT = {"gyro_noise": 0.0, "gyro_walk": 0.0, "accel_noise": 0.0, "accel_walk": 0.0}
+
+
+def allan_deviation(rate, rate_hz, *, windows):
+    """Overlapping Allan deviation (w, k) of readings (n, k) for averaging windows (w,), in readings."""
+    total = np.concatenate([np.zeros((1, rate.shape[1])), np.cumsum(rate, axis=0)]) / rate_hz
+    out = np.empty((len(windows), rate.shape[1]))
+    for row, m in enumerate(windows):
+        second = total[2 * m :] - 2 * total[m:-m] + total[: -2 * m]
+        out[row] = np.sqrt((second**2).mean(axis=0) / 2) * rate_hz / m
+    return out
 
 
 def track(position, velocity, quat):

@@ -11,7 +11,7 @@ from lidar.planning.flight import survey_flight, waypoint_flight
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
 from lidar.planning.route import free_route
-from lidar.rig.vehicle import load_vehicle, rear_axle_radius, vehicle_names
+from lidar.rig.vehicle import load_vehicle, vehicle_names
 
 FRAME = Frame.at(-76.3, 36.88)
 AREA = shapely.Polygon([(0, 0), (900, 100), (800, 700), (100, 500)])
@@ -95,9 +95,9 @@ def test_every_built_in_vehicle_loads_and_an_error_lists_every_fault(tmp_path):
     for name in vehicle_names():
         assert load_vehicle(name).name == name
         assert len(load_vehicle(name).source) > 20
-    assert rear_axle_radius(11.4, 2.71, track=1.55) == pytest.approx(
-        load_vehicle("car").turning_radius, abs=0.01
-    )
+    # the wheels turn about a point on the line of the rear axle (Ackermann); turning circle, wheelbase, track
+    radius = np.sqrt((11.4 / 2) ** 2 - 2.71**2) - 1.55 / 2
+    assert load_vehicle("car").turning_radius == pytest.approx(radius, abs=0.01)
     with pytest.raises(InputError, match="unknown vehicle tank"):
         load_vehicle("tank")
     path = tmp_path / "mine.toml"
