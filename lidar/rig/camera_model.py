@@ -111,6 +111,36 @@ def _first_root(*coefficients: float) -> float:
     return float(real.min()) if len(real) else float("inf")
 
 
+def _radial(t: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
+    """Distorted radius t (1 + k1 t^2 + k2 t^4 + ...) and its derivative, at radii or angles t."""
+    powers = range(len(k), 0, -1)
+    value = np.polyval([*(k[i - 1] for i in powers), 1.0], t * t)
+    slope = np.polyval([*((2 * i + 1) * k[i - 1] for i in powers), 1.0], t * t)
+    return np.asarray(t * value, float), np.asarray(slope, float)
+
+
+def _undistorted_radius(radius: Float, k: tuple[float, ...], *, limit: float) -> Float:
+    """Undistorted radii below a limit of distorted ones; the limit for those beyond its range."""
+    low, high = np.zeros_like(radius), np.full_like(radius, limit)
+    if np.isinf(limit):
+        high = np.maximum(radius, 1.0)
+        while (short := _radial(high, k)[0] < radius).any():
+            high = np.where(short, 2 * high, high)
+    edge, _ = _radial(high, k)
+    # The distorted radius increases from 0 to the edge, so the root is bracketed: take Newton's step, or
+    # bisect where the step leaves the bracket.
+    t = np.minimum(radius, 0.5 * high)
+    for _ in range(60):
+        value, slope = _radial(t, k)
+        low, high = np.where(value < radius, t, low), np.where(value < radius, high, t)
+        step = (value - radius) / np.where(slope > 1e-6, slope, 1e-6)
+        newton = t - step
+        t = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
+        if np.abs(step[radius < edge]).max(initial=0.0) < _TOLERANCE:
+            break
+    return t
+
+
 def _distort(points: Float, k: tuple[float, ...]) -> Float:
     z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
     x, y = points[:, 0] / z, points[:, 1] / z
@@ -137,9 +167,10 @@ def _undistort(distorted: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
     x, y = xd.copy(), yd.copy()
     limit = _squared_limit(k)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        # Newton's method diverges from a start beyond the one-to-one region, so start inside it.
-        far = x * x + y * y >= limit
-        shrink = np.where(far, 0.9 * np.sqrt(limit / np.where(far, x * x + y * y, 1.0)), 1.0)
+        # Without a start near the root, here that of the radial part, Newton's method may diverge.
+        radius = np.hypot(xd, yd)
+        start = _undistorted_radius(radius, (k[0], k[1], k[4]), limit=np.sqrt(limit))
+        shrink = np.minimum(start, 0.999 * np.sqrt(limit)) / np.where(radius > 0, radius, 1.0)
         x *= shrink
         y *= shrink
         for _ in range(_STEPS):
@@ -160,15 +191,6 @@ def _undistort(distorted: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
 # Fisheye: Kannala and Brandt (IEEE PAMI 28, 2006) in the form of OpenCV; equidistant if all are zero.
 
 
-def _fisheye_radius(theta: Float, k: tuple[float, ...]) -> tuple[Float, Float]:
-    """Distorted angle and its derivative at angles theta from the optical axis."""
-    k1, k2, k3, k4 = k
-    t2 = theta * theta
-    radius = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-    slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-    return radius, slope
-
-
 def _fisheye_limit(k: tuple[float, ...]) -> float:
     """Angle from the optical axis up to which the distorted angle increases, at most pi."""
     k1, k2, k3, k4 = k
@@ -178,7 +200,7 @@ def _fisheye_limit(k: tuple[float, ...]) -> float:
 def _fisheye_distort(points: Float, k: tuple[float, ...]) -> Float:
     flat = np.hypot(points[:, 0], points[:, 1])
     theta = np.arctan2(flat, points[:, 2])
-    radius, _ = _fisheye_radius(theta, k)
+    radius, _ = _radial(theta, k)
     seen = (theta < _fisheye_limit(k)) & ((flat > 0) | (points[:, 2] > 0))
     factor = np.where(seen, radius / np.where(flat > 0, flat, 1.0), np.nan)
     return points[:, :2] * factor[:, None]
@@ -187,20 +209,8 @@ def _fisheye_distort(points: Float, k: tuple[float, ...]) -> Float:
 def _fisheye_rays(distorted: Float, k: tuple[float, ...]) -> Float:
     radius = np.hypot(distorted[:, 0], distorted[:, 1])
     limit = _fisheye_limit(k)
-    edge, _ = _fisheye_radius(np.array(limit), k)
-    # The distorted angle increases from 0 to the edge, so the root is bracketed: take Newton's step, or
-    # bisect where the step leaves the bracket.
-    low, high = np.zeros_like(radius), np.full_like(radius, limit)
-    theta = np.minimum(radius, 0.5 * limit)
-    for _ in range(60):
-        value, slope = _fisheye_radius(theta, k)
-        low, high = np.where(value < radius, theta, low), np.where(value < radius, high, theta)
-        step = (value - radius) / np.where(slope > 1e-6, slope, 1e-6)
-        newton = theta - step
-        inside = (newton >= low) & (newton <= high)
-        theta = np.where(inside, newton, 0.5 * (low + high))
-        if np.abs(step[radius < edge]).max(initial=0.0) < _TOLERANCE:
-            break
+    edge, _ = _radial(np.array(limit), k)
+    theta = _undistorted_radius(radius, k, limit=limit)
     scale = np.where(radius < edge, np.sin(theta) / np.where(radius > 0, radius, 1.0), np.nan)
     z = np.where(radius < edge, np.cos(theta), np.nan)
     return np.concatenate([distorted * scale[:, None], z[:, None]], axis=1)

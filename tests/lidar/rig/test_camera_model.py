@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -111,6 +111,7 @@ def test_projecting_a_pixels_ray_gives_the_pixel(k1, k2, p1, p2, k3):
     np.testing.assert_allclose(pixels, np.stack([u.ravel(), v.ravel()], 1)[seen], atol=1e-6)
 
 
+@example(seed=108541, k1=0.375, k2=-0.05859375)  # Newton's method from the distorted point diverges
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), k1=st.floats(-0.4, 0.4), k2=st.floats(-0.1, 0.1))
 def test_the_ray_of_a_points_pixel_passes_through_the_point(seed, k1, k2):
