@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
@@ -71,11 +72,15 @@ def _waypoint(word: str) -> tuple[float, float] | None:
 
 def _time(_: object, tokens: Sequence[Token]) -> datetime:
     text = tokens[0].value
+    if re.search(r":\d\d:60", text):
+        raise ValueError(
+            f"{text}: a drive cannot start within a leap second; give the second before or after"
+        )
     try:
         when = datetime.fromisoformat(text)
-    except ValueError:
+        return when.replace(tzinfo=UTC) if when.tzinfo is None else when.astimezone(UTC)
+    except (ValueError, OverflowError):
         raise ValueError(f"{text}: not an ISO 8601 time such as 2026-06-21T08:00:00") from None
-    return when.replace(tzinfo=UTC) if when.tzinfo is None else when.astimezone(UTC)
 
 
 def _lower(_: object, tokens: Sequence[Token]) -> str:
@@ -188,8 +193,8 @@ class DriveOptions:
     """Seed of the random number generators (non-negative integer)."""
 
     start: Annotated[datetime | None, Parameter(converter=_time)] = None
-    """UTC time of the drive's start, ISO 8601 (2026-06-21T08:00:00); it sets the sun and the time stamps. By
-    default 10:00 local solar time on 21 June 2026."""
+    """UTC time of the drive's start, ISO 8601 (2026-06-21T08:00:00), from 1980-01-06 to the end of 2261; it
+    sets the sun and the time stamps. By default 10:00 local solar time on 21 June 2026."""
 
     crs: Annotated[str, Parameter(group=OUTPUT)] = "utm"
     """CRS of LAZ files: utm, scene, or an EPSG code."""

@@ -23,6 +23,7 @@ from lidar.planning.road_drive import RoadPlan, plan_road_drive
 from lidar.rig.devices import Camera, Scanner, cameras, scanners
 from lidar.rig.specs import Rig, load_rig
 from lidar.rig.vehicle import Vehicle, load_vehicle
+from lidar.time_scales import check_start
 from lidar.traffic.ego_drive import drive_in_traffic, drive_with_signals
 from lidar.traffic.fcd import TrafficFile
 from lidar.traffic.fcd_replay import replay
@@ -123,11 +124,14 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
 
     Raises InputError (also as RouteError, RigError) for what cannot be driven.
     """
+    start = options.start or solar_start(scene)
+    check_start(start, 0)
     rig = load_rig(options.rig)
     sensors = _sensors(rig, options)
     vehicle = load_vehicle(options.vehicle or rig.vehicle)
     motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
     trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)
+    check_start(start, trajectory.duration_ns)
     jobs = schedule(sensors, trajectory.duration_ns)
     if sensors and not jobs:
         raise InputError(f"the drive lasts {trajectory.duration_ns / 1e9:.2f} s, less than one frame")
@@ -136,7 +140,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
         options,
         rig,
         sensors,
-        start=options.start or solar_start(scene),
+        start=start,
         trajectory=trajectory,
         actors=actors,
         scanning_ns=motion.scanning_ns if isinstance(motion, Flight) else None,

@@ -12,7 +12,6 @@ from geoscene.files import write_columns
 from geoscene.typing import Float
 from lidar.dataset.boxes import box_rows, count_points
 from lidar.dataset.deskew import MOMENTS, deskewed
-from lidar.dataset.formats.las import gps_seconds
 from lidar.dataset.formats.table import Table, cloud_table, point_labels
 from lidar.dataset.recording import Recording
 from lidar.random_streams import generator
@@ -21,6 +20,7 @@ from lidar.sensors.cloud import Cloud, TracedCloud, no_returns
 from lidar.sensors.doppler import radial_velocity, surface_velocity
 from lidar.sensors.scan import Sweep, cast, measured
 from lidar.signal.run import Altered, altered_sweep, cloud_truth, unaltered, write_truth
+from lidar.time_scales import gps_seconds
 from lidar.world.world import World
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, class_codes
 from geoscene.progress import Progress, silent
 from lidar.dataset.formats import FORMATS, Format, format_of, map_suffixes, read_table
-from lidar.dataset.formats.las import LasInfo, gps_seconds, read_chunks
+from lidar.dataset.formats.las import LasInfo, read_chunks
 from lidar.dataset.formats.table import Table, placed_returns, records, rows
 from lidar.dataset.layout import Dataset
 from lidar.errors import DatasetError, InputError
@@ -24,6 +24,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.maps.colors import distinct, ramp
 from lidar.options import MapOptions
 from lidar.rig.patterns.beams import frame_ns
+from lidar.time_scales import gps_seconds
 
 _COLUMNS = ("x", "y", "z", "intensity", "gps_time", "ring", "label", "instance", "source")
 _BUCKET = 64.0  # metres: side of the squares into which points are sorted before they are thinned

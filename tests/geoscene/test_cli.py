@@ -100,6 +100,8 @@ def test_invalid_input_gives_one_line_and_exit_code_two(tmp_path, name, words, m
         (["--route", "random", "--rig", "none"], "none"),
         (["--route", "random", "--format", "doc"], "doc"),
         (["--route", "random", "--start", "noon"], "noon"),
+        (["--route", "random", "--start", "2016-12-31T23:59:60"], "leap second"),
+        (["--route", "random", "--start", "2999-01-01"], "end of 2261"),
         (["--route", "random", "--crs", "EPSG:1"], "EPSG:1"),
     ],
 )

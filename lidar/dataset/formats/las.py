@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,6 @@ INTENSITY_UNIT = 257.0
 _FULL = 2**20
 """Bytes of free space below which the disk counts as full: the compressor writes in large pieces."""
 
-GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
-LEAP_SECONDS = 18
-"""GPS minus UTC since 2017-01-01 (IERS Bulletin C 52); none has been announced since."""
-
 _EXTRA = {
     "ring": ("uint16", "beam, 0 = lowest elevation"),
     "label": ("uint8", "geoscene class"),
@@ -46,12 +42,6 @@ _EXTRA = {
     "true_range": ("float32", "metres, without noise"),
     "velocity": ("float32", "m/s along the beam, + away"),
 }
-
-
-def gps_seconds(start: datetime, time_ns: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Adjusted standard GPS time (seconds since 1980-01-06 minus 1e9) of nanoseconds after a UTC start."""
-    base = (start - GPS_EPOCH).total_seconds() + LEAP_SECONDS - 1e9
-    return base + np.asarray(time_ns, np.float64) * 1e-9
 
 
 @dataclass(frozen=True, slots=True)

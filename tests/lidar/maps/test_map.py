@@ -17,7 +17,7 @@ from geoscene.classes import Class, class_codes
 from geoscene.files import write_json
 from geoscene.frames import Frame
 from lidar.dataset.formats import las, pcd
-from lidar.dataset.formats.las import LasInfo, gps_seconds
+from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
@@ -25,6 +25,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
 from lidar.maps.aggregate import aggregate
 from lidar.options import MapOptions
+from lidar.time_scales import gps_seconds
 
 START = datetime(2026, 6, 21, 8, tzinfo=UTC)
 FRAME = Frame.at(24.945, 60.167)
