@@ -31,6 +31,7 @@ from geoscene.ground import (
     plan_ground,
     water_levels,
 )
+from geoscene.ground.foundations import foundation_heights
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.ground.urban import paved_fabric
 from geoscene.objects.barriers import Barriers, read_barriers
@@ -77,6 +78,7 @@ class Plan:
     height    : z of the ground at x, y, graded to roads; None if it is 0 everywhere
     buildings : table of buildings and building parts
     base      : (count,) z of each building's base
+    foot      : (count,) z of the lower end of each building's walls
     rows      : rows of each tile by kind (``buildings``, ``trees``, ``furniture``, ``barriers``,
                 ``structures``): features whose bounding box has its centre in the tile; ``parts`` are in the
                 tiles of their buildings
@@ -96,6 +98,7 @@ class Plan:
     height: Height | None
     buildings: Buildings
     base: Float
+    foot: Float
     rows: dict[str, dict[tuple[int, int], NDArray[np.int64]]]
     graph: RoadGraph
     side: tuple[Side, str]
@@ -146,14 +149,21 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
     roads = _plan_roads(osm, frame, options=options, terrain=terrain, extent=extent, problems=problems)
     footprints = buildings.footprint[: buildings.count]
     base = base_heights(footprints, roads.height or terrain.height)
-    buildings = _collect(problems, buildings_over(buildings, base, table=roads.structures))
 
     progress("ground", 0, total=0)
     cover, surfaces, pads = _collect(
         problems, _surfaces(osm, frame, extent=extent, buildings=buildings, roads=roads, only=options.only)
     )
+    openings = opening_layers(roads.structures, roads.openings)
+    covers = Layers.concatenate([cover, surfaces, pads, openings])
+    levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
+    foot = foundation_heights(
+        footprints, base, height=roads.height or terrain.height, layers=covers, levels=levels
+    )
+    buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=roads.structures))
     cover, surfaces = _numbered([cover, surfaces], len(buildings))
-    ground = _plan_ground([cover, surfaces, pads], roads, extent=extent, terrain=terrain, options=options)
+    covers = Layers.concatenate([cover, surfaces, pads, openings])
+    ground = _plan_ground(covers, roads, extent=extent, terrain=terrain, options=options)
     objects = _collect(problems, _objects(osm, frame, ground=ground, only=options.only, side=roads.side))
     first = len(buildings) + len(cover) + len(surfaces) + len(roads.graph)
     trees, furniture, barriers, structures = _numbered([*objects, roads.structures], first)
@@ -184,11 +194,12 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
         height=roads.height,
         buildings=buildings,
         base=base,
+        foot=foot,
         rows=rows,
         graph=roads.graph,
         side=(roads.side, roads.side_source),
         ground=ground,
-        levels=water_levels(ground.layers, osm.ways, frame=frame, height=terrain.height),
+        levels=levels,
         trees=trees,
         needles=needle_shares(ground, osm),
         furniture=furniture,
@@ -264,12 +275,12 @@ def _plan_roads(
 
 
 def _plan_ground(
-    layers: list[Layers], roads: _Roads, *, extent: Bounds, terrain: Terrain, options: BuildOptions
+    layers: Layers, roads: _Roads, *, extent: Bounds, terrain: Terrain, options: BuildOptions
 ) -> GroundPlan:
     size = options.tile_size
     return plan_ground(
         extent,
-        Layers.concatenate([*layers, opening_layers(roads.structures, roads.openings)]),
+        layers,
         tile_size=size,
         lines=_ROAD_LINES if roads.uneven else 0.0,
         ruled=_graded_tiles(roads.graph, size, level=not terrain.grids),

@@ -73,7 +73,7 @@ def make_solids(plan: Plan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, l
     if not len(rows):
         return Mesh.empty(), []
     chosen = take_buildings(plan.buildings, rows, parts=plan.of_tile("parts", i, j=j))
-    mesh, problems = build_solids(chosen, base=plan.base[rows], lod=lod)
+    mesh, problems = build_solids(chosen, base=plan.base[rows], foot=plan.foot[rows], lod=lod)
     return replace(mesh, feature=rows[mesh.feature].astype(np.int32)), problems
 
 

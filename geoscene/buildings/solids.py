@@ -35,7 +35,9 @@ class _Pieces(Columns):
     flat: Bools
 
 
-def build_solids(buildings: Buildings, *, base: Float, lod: int = 2) -> tuple[Mesh, list[Problem]]:
+def build_solids(
+    buildings: Buildings, *, base: Float, foot: Float | None = None, lod: int = 2
+) -> tuple[Mesh, list[Problem]]:
     """One closed, oriented body of positive volume per building, and what was simplified or dropped.
 
     Vertices lie on the 0.1 mm grid. Faces have the building's row as feature, class BUILDING, and surface,
@@ -45,15 +47,19 @@ def build_solids(buildings: Buildings, *, base: Float, lod: int = 2) -> tuple[Me
 
     base : (count,) or (n,) z in metres of each building's base, in the order of the table; a part stands on
            its building's base
+    foot : z in metres of the lower end of each building's walls, in the same order; parts that stand on the
+           ground reach down to it. The base by default.
 
     Raises InputError for another level of detail or a base of the wrong length.
     """
     if lod not in (0, 1, 2):
         raise InputError(f"level of detail {lod}: there are 0 (blocks), 1 (parts, flat roofs) and 2 (roofs)")
     base = np.asarray(base, float)
-    if len(base) not in (buildings.count, len(buildings)):
-        raise InputError(f"{len(base)} bases for {buildings.count} buildings")
-    pieces = _pieces(buildings, base, lod=lod)
+    for what, z in (("bases", base), ("feet", base if foot is None else foot)):
+        if len(z) not in (buildings.count, len(buildings)):
+            raise InputError(f"{len(z)} {what} for {buildings.count} buildings")
+    foot = base if foot is None else np.asarray(foot, float)
+    pieces = _pieces(buildings, base, foot=foot, lod=lod)
     problems: list[Problem] = []
 
     done = [Triangles(np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty(0, np.uint8))]
@@ -83,7 +89,7 @@ def _problem(buildings: Buildings, row: int, *, action: Any, reason: str, detail
     return Problem(str(buildings.osm_id[row]), "building", action, reason, detail)
 
 
-def _pieces(buildings: Buildings, base: Float, *, lod: int) -> _Pieces:
+def _pieces(buildings: Buildings, base: Float, *, foot: Float, lod: int) -> _Pieces:
     """The polygons to extrude, sorted by building."""
     chosen = np.flatnonzero(~buildings.is_part if lod == 0 else buildings.drawn)
     polygon, index = shapely.get_parts(buildings.footprint[chosen], return_index=True)
@@ -97,7 +103,10 @@ def _pieces(buildings: Buildings, base: Float, *, lod: int) -> _Pieces:
     flat = (
         np.full(len(row), lod < 2) | (buildings.roof_shape[row] == "flat") | (buildings.roof_height[row] <= 0)
     )
-    return _Pieces(polygon, row, building, base[building] + low, base[building] + high, flat)
+    underside = base[building] + low
+    grounded = (low <= 0) & ~np.isin(buildings.min_height_source[row], ("tunnel", "bridge"))
+    underside[grounded] = np.minimum(underside, foot[building])[grounded]
+    return _Pieces(polygon, row, building, underside, base[building] + high, flat)
 
 
 def _mean_heights(buildings: Buildings) -> Float:

@@ -27,7 +27,12 @@ equally high do not leave a stair of micrometres, which the grid of solids would
 
 
 def buildings_over(
-    buildings: Buildings, base: Float, *, table: Structures, options: StructureOptions | None = None
+    buildings: Buildings,
+    base: Float,
+    *,
+    foot: Float,
+    table: Structures,
+    options: StructureOptions | None = None,
 ) -> tuple[Buildings, list[Problem]]:
     """The buildings, those on a tunnel or a road bridge with a passage, and the rows of those.
 
@@ -36,6 +41,7 @@ def buildings_over(
     within the building, not where its edge touches it; footbridges do not count, they lead into buildings.
 
     base : (count,) z in metres of each building's base
+    foot : (count,) z in metres of the lower end of its walls
     """
     options = options or StructureOptions()
     rows = np.flatnonzero(buildings.drawn)
@@ -54,7 +60,9 @@ def buildings_over(
     middle = np.array([shapely.LineString(line[:, :2]) for line in table.line[road]], object)
     within = shapely.length(shapely.intersection(buildings.footprint[row], middle)) > _SCANT
     hit = (shapely.area(common) > _SCANT) & (tunnel | within)
-    hit &= (high > stands + buildings.min_height[row]) & (low < stands + buildings.height[row])
+    grounded = buildings.min_height[row] <= 0
+    under = np.where(grounded, foot[buildings.outline[row]], stands + buildings.min_height[row])
+    hit &= (high > under) & (low < stands + buildings.height[row])
     if not hit.any():
         return buildings, []
     corridor = table.polygon[road[hit]]
@@ -67,6 +75,7 @@ def _divided(
 ) -> tuple[Buildings, list[Problem]]:
     """Rows (k,) divided along corridors (k,); the parts within start ``clear`` (k,) metres over the base."""
     footprint, underside = buildings.footprint.copy(), buildings.min_height.copy()
+    why = buildings.min_height_source.copy()
     source: list[int] = []
     shape: list[shapely.Geometry] = []
     new_low: list[float] = []
@@ -85,7 +94,8 @@ def _divided(
                 cause.append(str(over_what[there]))
         if buildings.is_part[k]:
             if rest.is_empty:  # entirely over tunnels
-                rest, underside[k] = footprint[k], max(clear[row == k].max(), underside[k])
+                over = int(np.flatnonzero(row == k)[np.argmax(clear[row == k])])
+                rest, underside[k], why[k] = footprint[k], clear[over], over_what[over]
                 del source[first:], shape[first:], new_low[first:], cause[first:]
             footprint[k] = rest
         elif not rest.is_empty:
@@ -109,7 +119,7 @@ def _divided(
         roof_height=np.zeros(len(extra)),
         roof_source=np.full(len(extra), "none", object),
     )
-    kept = replace(buildings, footprint=footprint, min_height=underside)
+    kept = replace(buildings, footprint=footprint, min_height=underside, min_height_source=why)
     return Buildings.concatenate([kept, added]), problems
 
 

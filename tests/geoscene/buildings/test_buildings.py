@@ -381,6 +381,19 @@ def test_the_base_lifts_a_building_with_all_its_parts():
         assert (z.min(), z.max()) == (low, high)
 
 
+@pytest.mark.parametrize("lod", [0, 1, 2])
+def test_what_stands_on_the_ground_reaches_down_to_the_foot(lod):
+    areas = (house(1, box(0, 0, 20, 10)), part(2, box(0, 0, 15, 10), height="6"),
+             part(3, box(15, 0, 5, 10), height="9", min_height="3"))  # fmt: skip
+    table, _ = read_buildings(osm(*areas), FRAME)
+    mesh, _ = build_solids(table, base=np.array([100.0]), foot=np.array([97.5]), lod=lod)
+    assert validate_mesh(mesh).ok.all()
+    raised = mesh.vertices[:, 0] > mesh.vertices[:, 0].max() - 4.0
+    assert mesh.vertices[:, 2].min() == 97.5
+    assert mesh.vertices[raised, 2].min() == (97.5 if lod == 0 else 103.0)
+    assert mesh.vertices[:, 2].max() == pytest.approx(106.75 if lod == 0 else 109.0)
+
+
 def test_a_roof_direction_is_from_true_north():
     frame = Frame.at(8.7, 49.4, crs="EPSG:32633")  # a zone too far east: grid north is well off true north
     lon, lat = 8.7, 49.4

@@ -311,7 +311,7 @@ def test_building_is_raised_over_a_tunnel_that_crosses_it(tunnel):
     )
     buildings, _ = read_buildings(town(PLACES, UNDER, [house]), FRAME)
     base = np.full(buildings.count, -4.0)
-    over, problems = buildings_over(buildings, base, table=tunnel.table)
+    over, problems = buildings_over(buildings, base, foot=base, table=tunnel.table)
     assert [p.reason for p in problems] == ["over-tunnel"]
     solid, _ = build_solids(over, base=base)
     assert validate_mesh(solid).ok.all()
@@ -321,6 +321,24 @@ def test_building_is_raised_over_a_tunnel_that_crosses_it(tunnel):
         assert not crosses(solid, moved(a, 0, 0, 1), moved(b, 0, 0, 1))
     assert crosses(build_solids(buildings, base=base)[0], points[0] + [-5, 0, 1], points[0] + [10, 0, 1])
     assert solid.vertices[:, 2].max() == pytest.approx(base[0] + buildings.height[0], abs=1e-3)
+
+
+def test_foundation_of_a_building_above_a_tunnel_stays_out_of_the_tunnel(tunnel):
+    outline = lonlat([(-58, -15), (-40, -15), (-40, 15), (-58, 15)])
+    house = Area("way/900", {"building": "yes", "height": "9"}, shapely.Polygon(outline), np.empty(0, int))
+    buildings, _ = read_buildings(town(PLACES, UNDER, [house]), FRAME)
+    points = tunnel.centre_lines("tunnel")
+    base = np.full(1, points[:, 2].max() + 20.0)
+    assert buildings_over(buildings, base, foot=base, table=tunnel.table)[1] == []
+    foot = np.full(1, points[:, 2].min() - 1.0)
+    over, problems = buildings_over(buildings, base, foot=foot, table=tunnel.table)
+    assert [p.reason for p in problems] == ["over-tunnel"]
+    solid, _ = build_solids(over, base=base, foot=foot)
+    assert validate_mesh(solid).ok.all()
+    assert solid.vertices[:, 2].min() == pytest.approx(foot[0], abs=1e-3)
+    inside = points[(points[:, 0] > -57) & (points[:, 0] < -41)]
+    for a, b in pairwise(inside):
+        assert not crosses(solid, moved(a, 0, 0, 1), moved(b, 0, 0, 1))
 
 
 def test_building_over_two_crossing_tunnels_is_raised_over_the_upper_one():
@@ -344,7 +362,7 @@ def test_building_over_two_crossing_tunnels_is_raised_over_the_upper_one():
     house = Area("way/900", {"building": "yes", "height": "40"}, shapely.Polygon(outline), np.empty(0, int))
     buildings, _ = read_buildings(town(places, ways, [house]), FRAME)
     base = np.full(1, near[:, 2].min() - 1)
-    solid, _ = build_solids(buildings_over(buildings, base, table=both.table)[0], base=base)
+    solid, _ = build_solids(buildings_over(buildings, base, foot=base, table=both.table)[0], base=base)
     assert validate_mesh(solid).ok.all()
     for along in (near[np.abs(near[:, 0]) < 0.1], near[np.abs(near[:, 1]) < 0.1]):
         for up in (0.3, 4.5):
@@ -363,7 +381,7 @@ def test_building_over_a_road_bridge_leaves_headroom_and_one_beside_it_is_unchan
             "way/900", {"building": "yes", "height": "20"}, shapely.Polygon(outline), np.empty(0, int)
         )
         buildings, _ = read_buildings(town(PLACES, OVER, [house]), FRAME)
-        over, problems = buildings_over(buildings, base, table=bridge.table)
+        over, problems = buildings_over(buildings, base, foot=base, table=bridge.table)
         assert [p.reason for p in problems] == (["over-bridge"] if through else [])
         solid, _ = build_solids(over, base=base)
         assert validate_mesh(solid).ok.all()
@@ -654,7 +672,7 @@ def test_building_undersides_over_a_tunnel_are_rounded_to_equal_heights():
     line = Town(town(places, ways))
     buildings, _ = read_buildings(town(places, ways, station), FRAME)
     base = np.full(buildings.count, line.centre_lines("tunnel")[:, 2].min() - 1.0)
-    over, problems = buildings_over(buildings, base, table=line.table)
+    over, problems = buildings_over(buildings, base, foot=base, table=line.table)
     assert [p.reason for p in problems] == ["over-tunnel"]
     steps = over.min_height[over.min_height_source == "tunnel"] / 0.05
     assert len(steps) >= 5
