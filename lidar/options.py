@@ -152,7 +152,8 @@ class DriveOptions:
     poses.csv of an earlier drive, whose trajectory is then repeated."""
 
     duration: float | None = None
-    """Seconds to record; by default all of a given route, or 60 seconds of a random one."""
+    """Seconds to record; by default all of a given route and a second at rest at its end, or 60 seconds of a
+    random one."""
 
     from_rest: bool = False
     """Start and end a random drive at rest, as drives along a given route do; by default the vehicle is under

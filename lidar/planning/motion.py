@@ -17,7 +17,8 @@ from lidar.planning.path import Path
 from lidar.rig.vehicle import Vehicle
 
 DWELL_S = 1.0
-"""Seconds at rest at every stop between legs, for steering and gear changes."""
+"""Seconds at rest at every stop between legs, for steering and gear changes, and at the end of a route."""
+_AT_REST = 0.01  # m/s, below which a vehicle has come to rest
 _SLOWEST = 0.3  # m/s, minimum of the speed limit that bends impose
 _SPARE = 0.98  # share of the acceleration limits used, a margin for sampling
 _BRIEF_S = 0.3  # seconds of the second moving average, which smooths the jerk
@@ -93,6 +94,21 @@ def motion_along(
     last = np.searchsorted(path.leg, leg, side="right") - 1
     row = np.clip(np.searchsorted(path.s, s, side="right") - 1, first, last)
     return Motion(time_ns, s, v, acceleration, row)
+
+
+def ended_at_rest(motion: Motion) -> Motion:
+    """A speed profile that ends `DWELL_S` after the vehicle has come to rest for the last time."""
+    step = int(motion.time_ns[1] - motion.time_ns[0])
+    moving = np.flatnonzero(motion.speed > _AT_REST)
+    count = (int(moving[-1]) if len(moving) else 0) + 1 + round(DWELL_S * 1e9 / step)
+    more = max(count - len(motion.s), 0)
+    return Motion(
+        np.arange(count) * step,
+        np.append(motion.s[:count], np.full(more, motion.s[-1])),
+        np.append(motion.speed[:count], np.zeros(more)),
+        np.append(motion.acceleration[:count], np.zeros(more)),
+        np.append(motion.row[:count], np.full(more, motion.row[-1])),
+    )
 
 
 def speed_limits(path: Path, vehicle: Vehicle) -> Float:

@@ -8,7 +8,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.geometry.poses import Trajectory
-from lidar.planning.motion import drive_path, poses_along
+from lidar.planning.motion import ended_at_rest, motion_along, poses_along
 from lidar.planning.path import Path
 from lidar.planning.speed_profile import motion_within
 from lidar.rig.vehicle import Vehicle
@@ -42,9 +42,10 @@ def drive_with_signals(
     seed     : of the signals, as for `junction_plan`
     side     : of the road that is driven on
     bounds   : of the map in scene metres
-    duration, at_speed : as for `drive_path`
+    duration, at_speed : as for `drive_path`; a drive without a duration ends `DWELL_S` after its arrival
     """
-    alone = drive_path(path, vehicle, duration=duration, at_speed=at_speed)
+    motion = motion_along(path, vehicle, duration=duration, at_speed=at_speed)
+    alone = poses_along(path, vehicle, motion=motion if duration is not None else ended_at_rest(motion))
     plan = junction_plan(graph, lanes_of(graph, side=side, bounds=bounds), seed=seed)
     if not has_traffic_control(ego_trip(path, vehicle), graph, plan=plan):
         return alone
@@ -76,7 +77,7 @@ def drive_in_traffic(
     """The trajectory of a vehicle along a path in simulated traffic, and the other road users.
 
     first    : its trajectory without other road users, such as `drive_with_signals` gives
-    duration, at_speed : as for `drive_path`
+    duration, at_speed : as for `drive_with_signals`
 
     The ego is simulated together with the others. Its motion is then smoothed to its limits of acceleration
     and jerk, never ahead of the simulated one, and the others are simulated again around it.
@@ -128,8 +129,9 @@ def _driven(
     motion = motion_within(
         path, vehicle, time_s=time_s, max_distance=travelled.clip(max=path.length), at_speed=at_speed
     )
-    trajectory = poses_along(path, vehicle, motion=motion)
-    return trajectory if duration is None else trajectory.until(round(duration * 1e9))
+    if duration is None:
+        return poses_along(path, vehicle, motion=ended_at_rest(motion))
+    return poses_along(path, vehicle, motion=motion).until(round(duration * 1e9))
 
 
 def _apart(one: Trajectory, other: Trajectory) -> float:

@@ -19,6 +19,8 @@ _ROOM = (0.4, 0.2)
 _BRAKE = 0.7  # share of its braking that the driver uses for what is ahead, and
 _PULL = 0.8  # of its acceleration
 _HEADWAY_S, _GAP = 1.4, 2.0
+_BEYOND = 2.0
+"""Metres of stations at the path's end, all there: a simulated vehicle stops short of its last station."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,7 @@ class EgoTrip:
 
 def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False) -> EgoTrip:
     """The ego's trip along its path, from rest or at speed; stations are `STEP` metres apart."""
-    at = np.arange(0.0, path.length + STEP, STEP)
+    at = np.arange(0.0, path.length + _BEYOND, STEP)
     # `s` repeats where the vehicle turns round
     s = path.s + 1e-9 * np.arange(len(path))
     scale = float(path.scale.mean())

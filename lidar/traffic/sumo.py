@@ -29,7 +29,7 @@ from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
 from lidar.errors import LidarError, RouteError
 from lidar.geometry.poses import Trajectory
-from lidar.planning.motion import poses_along
+from lidar.planning.motion import ended_at_rest, poses_along
 from lidar.planning.path import Path as VehiclePath
 from lidar.planning.speed_profile import motion_within
 from lidar.random_streams import generator
@@ -97,7 +97,7 @@ def drive_in_sumo(
     """The trajectory of a vehicle along a path in SUMO's traffic, and the other road users.
 
     first : its trajectory without other road users
-    duration, at_speed : as for `lidar.planning.motion.drive_path`
+    duration, at_speed : as for `lidar.traffic.ego_drive.drive_with_signals`
 
     The ego is a vehicle of SUMO with the same route, so SUMO's vehicles react to it. Its trajectory follows
     its own path, smoothly and never ahead of SUMO's ego vehicle. Road users that would touch it all the same
@@ -123,9 +123,10 @@ def drive_in_sumo(
     motion = motion_within(
         path, vehicle, time_s=time_s[:until], max_distance=allowed[:until], at_speed=at_speed
     )
-    ego = poses_along(path, vehicle, motion=motion)
-    if duration is not None:
-        ego = ego.until(round(duration * 1e9))
+    if duration is None:
+        ego = poses_along(path, vehicle, motion=ended_at_rest(motion))
+    else:
+        ego = poses_along(path, vehicle, motion=motion).until(round(duration * 1e9))
     begin = float(fcd.time[fcd.first[fcd.name.index(_EGO)]])
     actors = replay_fcd(
         fcd.without(_EGO),

@@ -157,3 +157,15 @@ def test_in_traffic_the_ego_touches_no_road_user_and_none_is_removed(seed, signa
             assert not shapely.intersects(mine, boxes_at(trips, moment)).any()
     assert travelled[-1] > 80.0  # it makes progress
     assert STEP < travelled[-1] <= path.length + STEP
+
+
+@pytest.mark.parametrize("signalised", [False, True])
+def test_a_drive_without_a_duration_ends_a_second_after_its_arrival(signalised):
+    graph = city(signalised=signalised)
+    for seed in (1, 2, 3):
+        path = path_on(graph, seed, 40.0)
+        ego = drive_with_signals(path, CAR, graph=graph, seed=seed)
+        standing = np.flatnonzero(speed_of(ego) > 0.01)[-1]
+        assert (ego.duration_ns - ego.time_ns[standing]) * 1e-9 == pytest.approx(1.0, abs=0.02)
+        assert np.hypot(*(ego.position[-1] - path.position[-1])[:2]) < 0.2
+        check_gentle(ego)
