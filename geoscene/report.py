@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
+
+import numpy as np
+
+from geoscene.typing import Ints
 
 Action = Literal["repaired", "dropped"]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -26,6 +31,40 @@ class Problem:
     action: Action
     reason: str
     detail: str = ""
+
+
+def make_without_failures(
+    make: Callable[[Ints], T], rows: Ints, *, failed: Callable[[int, Exception], None]
+) -> list[T]:
+    """What ``make`` returns for all rows together, or for as many runs of them as there are failures.
+
+    One feature must not end a build: rows for which ``make`` raises an exception are halved until the one
+    that causes it is alone; that row goes to ``failed`` and is left out.
+
+    rows : (n,) ascending; without rows nothing is made
+    """
+    if not len(rows):
+        return []
+    try:
+        return [make(rows)]
+    except MemoryError:
+        raise
+    except Exception as error:  # noqa: BLE001 - whatever the reason, the other features are wanted
+        if len(rows) == 1:
+            failed(int(rows[0]), error)
+            return []
+    halves = np.array_split(rows, 2)
+    return [made for half in halves for made in make_without_failures(make, half, failed=failed)]
+
+
+def described(error: Exception) -> str:
+    """The kind and the message of an exception on one line."""
+    return ": ".join(filter(None, (type(error).__name__, " ".join(str(error).split()))))
+
+
+def unexpected(osm_id: str, error: Exception, *, kind: str) -> Problem:
+    """The problem of a feature that is dropped because of an unforeseen exception."""
+    return Problem(osm_id, kind, "dropped", "unexpected-error", described(error))
 
 
 def summarise(problems: Iterable[Problem]) -> dict[str, dict[str, dict[str, int]]]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 _NUMBER = r"[+-]?(?:\d+(?:[.,]\d+)*|[.,]\d+)"
 _ABOUT = re.compile(r"^(?:~|≈|ca\.?|c\.|approx\.?|about|around)\s*")
@@ -30,14 +32,15 @@ _COMPASS = (
 _POINTS = {"north": "n", "east": "e", "south": "s", "west": "w"}
 
 
-def _first(text: str) -> str:
-    """The first of a list of values separated by semicolons, in lower case."""
-    return text.split(";", 1)[0].translate(_QUOTES).replace("''", '"').strip().lower()
+def first_value(text: str) -> str:
+    """The first of a list of values separated by semicolons that is not blank, in lower case, else ""."""
+    values = (value.strip() for value in text.translate(_QUOTES).replace("''", '"').lower().split(";"))
+    return next(filter(None, values), "")
 
 
 def _first_quantity(text: str) -> str:
     """The first of a list of values, in lower case, without words for "about"."""
-    return _ABOUT.sub("", _first(text))
+    return _ABOUT.sub("", first_value(text))
 
 
 def _float(digits: str) -> float | None:
@@ -108,7 +111,7 @@ def parse_color(text: str | None) -> tuple[int, int, int] | None:
         return None
     from PIL import ImageColor  # noqa: PLC0415 (Pillow is needed for colours only)
 
-    value = re.sub(r"[\s_-]", "", _first(text))
+    value = re.sub(r"[\s_-]", "", first_value(text))
     if re.fullmatch(r"[0-9a-f]{6}|[0-9a-f]{3}", value):
         value = "#" + value
     try:
@@ -118,3 +121,33 @@ def parse_color(text: str | None) -> tuple[int, int, int] | None:
     if max(red, green, blue) > 255 or min(red, green, blue) < 0:
         return None
     return int(red), int(green), int(blue)
+
+
+@dataclass(frozen=True, slots=True)
+class Quantities:
+    """Reads quantities from the tags of one feature.
+
+    refused : tags that were read and could not be used, with the reasons
+    """
+
+    tags: Mapping[str, str]
+    refused: list[str] = field(default_factory=list)
+
+    def first(
+        self,
+        *keys: str,
+        parse: Callable[[str], float | None],
+        low: float = -math.inf,
+        high: float = math.inf,
+    ) -> float:
+        """The first value of the keys that ``parse`` can read and that lies from low to high; NaN if none."""
+        for key in keys:
+            text = " ".join(self.tags.get(key, "").split())
+            if not text:
+                continue
+            value = parse(text)
+            if value is not None and low <= value <= high:
+                return value
+            why = "unreadable" if value is None else f"not from {low:g} to {high:g}"
+            self.refused.append(f"{key}={text[:40]} is {why}")
+        return math.nan

@@ -27,10 +27,11 @@ from geoscene.objects.barriers import barrier_meshes
 from geoscene.objects.furniture import furniture_instances
 from geoscene.objects.vegetation import forest_trees, tree_instances
 from geoscene.plan import Plan, take_buildings
-from geoscene.report import Problem
+from geoscene.report import Problem, described, make_without_failures
 from geoscene.scene import SceneFiles
 from geoscene.scene.tile_files import Tile, read_tile, write_tile
 from geoscene.structures import structure_meshes
+from geoscene.typing import Ints
 from geoscene.watertight import validate_mesh
 
 
@@ -69,12 +70,22 @@ class Keys:
 def make_solids(plan: Plan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, list[Problem]]:
     """Mesh of the buildings of tile (i, j) in scene metres, and their problems."""
     i, j = tile
-    rows = plan.of_tile("buildings", i, j=j)
-    if not len(rows):
-        return Mesh.empty(), []
-    chosen = take_buildings(plan.buildings, rows, parts=plan.of_tile("parts", i, j=j))
-    mesh, problems = build_solids(chosen, base=plan.base[rows], foot=plan.foot[rows], lod=lod)
-    return replace(mesh, feature=rows[mesh.feature].astype(np.int32)), problems
+    parts = plan.of_tile("parts", i, j=j)
+    of_parts = plan.buildings.outline[parts]
+    problems: list[Problem] = []
+
+    def solids(rows: Ints) -> tuple[Mesh, list[Problem]]:
+        chosen = take_buildings(plan.buildings, rows, parts=parts[np.isin(of_parts, rows)])
+        mesh, found = build_solids(chosen, base=plan.base[rows], foot=plan.foot[rows], lod=lod)
+        return replace(mesh, feature=rows[mesh.feature].astype(np.int32)), found
+
+    def failed(row: int, error: Exception) -> None:
+        name = str(plan.buildings.osm_id[row])
+        problems.append(Problem(name, "building", "dropped", "no-solid", described(error)))
+
+    made = make_without_failures(solids, plan.of_tile("buildings", i, j=j), failed=failed)
+    problems += [problem for _, found in made for problem in found]
+    return concatenate([mesh for mesh, _ in made]), problems
 
 
 def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances]:

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import shapely
+from shapely.errors import GEOSException
 
 from geoscene.buildings.appearance import choose_appearance, read_roof, read_walls
 from geoscene.buildings.footprints import clean, groups, project
 from geoscene.buildings.heights import read_heights
 from geoscene.buildings.parts import assign, clusters, cut_overlaps, duplicates, remainder
-from geoscene.buildings.resolve import Row, resolve_heights, texts
+from geoscene.buildings.resolve import Heights, Row, resolve_heights, texts
 from geoscene.buildings.roof_tags import read_roof_tags
 from geoscene.buildings.table import BuildingOptions, Buildings
 from geoscene.frames import Frame
-from geoscene.report import Problem
+from geoscene.report import Problem, described, make_without_failures, unexpected
 from geoscene.sources.data import Area, OsmData, Tags
+from geoscene.tags import first_value
 
 _NEGATIVE = ("no", "none", "false", "")
 
@@ -42,9 +45,8 @@ def read_buildings(
     """
     options = options or BuildingOptions()
     problems: list[Problem] = []
-    outlines = _read_rows(osm.areas, frame, problems=problems, parts=False, min_area=options.min_area)
-    # parts may be as small as masts and columns
-    parts = _read_rows(osm.areas, frame, problems=problems, parts=True, min_area=options.min_area / 100)
+    outlines = _read_rows(osm.areas, frame, problems=problems, parts=False, options=options)
+    parts = _read_rows(osm.areas, frame, problems=problems, parts=True, options=options)
 
     score = np.array([len(r.tags) + 1000 * ("height" in r.tags) for r in outlines], float)
     repeated, found = duplicates(
@@ -59,7 +61,7 @@ def read_buildings(
 
 
 def _read_rows(
-    areas: Sequence[Area], frame: Frame, *, problems: list[Problem], parts: bool, min_area: float
+    areas: Sequence[Area], frame: Frame, *, problems: list[Problem], parts: bool, options: BuildingOptions
 ) -> list[Row]:
     """Rows of the buildings, or of the parts, in order of id, with clean footprints in scene metres."""
     chosen = []
@@ -71,11 +73,26 @@ def _read_rows(
         else:
             chosen.append(area)
     chosen.sort(key=_id_order)
-    raw = project(np.fromiter([a.geometry for a in chosen], object), frame)
+    made = make_without_failures(
+        lambda some: _rows([chosen[k] for k in some.tolist()], frame, parts=parts, options=options),
+        np.arange(len(chosen)),
+        failed=lambda k, error: problems.append(unexpected(chosen[k].osm_id, error, kind="building")),
+    )
+    for _, found in made:
+        problems += found
+    return [row for rows, _ in made for row in rows]
+
+
+def _rows(
+    areas: Sequence[Area], frame: Frame, *, parts: bool, options: BuildingOptions
+) -> tuple[list[Row], list[Problem]]:
+    """Rows of areas that are large enough, and the problems."""
+    raw = project(np.fromiter([a.geometry for a in areas], object), frame)
     polygons, repaired = clean(raw)
     before, after = shapely.area(raw), shapely.area(polygons)
-    rows = []
-    for k, area in enumerate(chosen):
+    min_area = options.min_area / (100 if parts else 1)  # parts may be as small as masts and columns
+    rows, problems = [], []
+    for k, area in enumerate(areas):
         if not after[k] >= min_area:
             detail = f"{after[k]:.3f} m2, least is {min_area:g} m2"
             problems.append(Problem(area.osm_id, "building", "dropped", "too-small", detail))
@@ -83,9 +100,24 @@ def _read_rows(
         if repaired[k]:
             detail = f"area {before[k]:.2f} to {after[k]:.2f} m2"
             problems.append(Problem(area.osm_id, "building", "repaired", "invalid-footprint", detail))
-        use = area.tags["building:part" if parts else "building"].split(";")[0].strip().lower()
-        rows.append(Row(area.osm_id, area.tags, polygons[k], use, is_part=parts))
-    return rows
+        use = first_value(area.tags["building:part" if parts else "building"])
+        rows.append(_row(area.osm_id, area.tags, footprint=polygons[k], use=use, options=options, part=parts))
+    return rows, problems
+
+
+def _row(
+    osm_id: str, tags: Tags, *, footprint: Any, use: str, options: BuildingOptions, part: bool = False
+) -> Row:
+    return Row(
+        osm_id,
+        tags,
+        footprint,
+        use,
+        tagged=read_heights(tags, options=options),
+        roof=read_roof_tags(tags),
+        looks=(read_walls(tags), read_roof(tags)),
+        is_part=part,
+    )
 
 
 def _id_order(area: Area) -> tuple[str, int]:
@@ -113,7 +145,7 @@ def _assign_parts(
         first = parts[members[np.argmax(shapely.area(shapes[members]))]].osm_id
         shape = clean(np.fromiter([shapely.union_all(shapes[members])], object))[0][0]
         target[members] = len(buildings)
-        buildings.append(Row(first, {}, shape, "yes"))
+        buildings.append(_row(first, {}, footprint=shape, use="yes", options=options))
         detail = f"{len(members)} parts outside any outline, {shapely.area(shape):.1f} m2, made one building"
         problems.append(Problem(first, "building", "repaired", "parts-without-outline", detail))
 
@@ -121,7 +153,12 @@ def _assign_parts(
     for members in groups(target):
         row = int(target[members[0]])
         whole = buildings[row]
-        rest, share = remainder(whole.footprint, shapes[members], covered=options.covered)
+        try:
+            rest, share = remainder(whole.footprint, shapes[members], covered=options.covered)
+        except GEOSException as error:
+            detail = f"no part made of what the parts leave of the outline, {described(error)}"
+            problems.append(Problem(whole.osm_id, "building", "repaired", "unexpected-error", detail))
+            continue
         if shapely.area(rest) >= options.min_area:
             remainders.append(replace(whole, footprint=rest, outline=row, is_part=True, is_remainder=True))
             detail = f"parts cover {share:.0%}; {shapely.area(rest):.1f} m2 of the outline stay as a part"
@@ -145,15 +182,9 @@ def _table(
     footprint = np.fromiter([r.footprint for r in rows], object)
     is_part = np.array([r.is_part for r in rows], np.bool_)
     outline = np.array([r.outline for r in rows], np.int32)
-    tagged = [read_heights(r.tags, options=options) for r in rows]
-    roofs = [read_roof_tags(r.tags) for r in rows]
-    for r, roof in zip(rows, roofs, strict=True):
-        if roof.unknown:
-            detail = f"roof:shape={roof.unknown} made flat"
-            problems.append(Problem(r.osm_id, "building", "repaired", "unknown-roof-shape", detail))
-
-    heights, found = resolve_heights(rows, tagged, roofs=roofs, options=options)
+    heights, found = resolve_heights(rows, options=options)
     problems += found
+    problems += _ignored_tags(rows, heights)
     ids = texts([r.osm_id for r in rows])
     drawn = np.ones(len(rows), np.bool_)
     drawn[outline[is_part]] = False
@@ -169,17 +200,16 @@ def _table(
     # convert from true to grid north; one convergence is precise enough for the whole scene
     west, south, east, north = bounds
     turn = float(frame.convergence((west + east) / 2, (south + north) / 2)) if rows else 0.0
-    azimuth = np.radians(np.array([r.direction_deg for r in roofs], float)) - turn
+    azimuth = np.radians(np.array([r.roof.direction_deg for r in rows], float)) - turn
 
-    appearances = [(read_walls(r.tags), read_roof(r.tags)) for r in rows]
-    of_outline = [appearances[r.outline] if r.is_part else (None, None) for r in rows]
+    of_outline = [rows[r.outline].looks if r.is_part else (None, None) for r in rows]
     walls = [
-        choose_appearance(own[0], up[0], default="plaster")
-        for own, up in zip(appearances, of_outline, strict=True)
+        choose_appearance(r.looks[0], up[0], default="plaster")
+        for r, up in zip(rows, of_outline, strict=True)
     ]
     tops = [
-        choose_appearance(own[1], up[1], default="roof_tile" if roof > 0 else "tar_roof")
-        for own, up, roof in zip(appearances, of_outline, heights.roof, strict=True)
+        choose_appearance(r.looks[1], up[1], default="roof_tile" if roof > 0 else "tar_roof")
+        for r, up, roof in zip(rows, of_outline, heights.roof, strict=True)
     ]
     return Buildings(
         osm_id=ids,
@@ -189,14 +219,14 @@ def _table(
         min_height=heights.low,
         height=heights.high,
         roof_height=heights.roof,
-        roof_shape=texts([f.shape for f in roofs]),
+        roof_shape=texts([r.roof.shape for r in rows]),
         roof_direction=np.pi / 2 - azimuth,
-        roof_across=np.array([f.across for f in roofs], np.bool_),
+        roof_across=np.array([r.roof.across for r in rows], np.bool_),
         height_source=heights.source,
         height_sigma=heights.sigma,
         min_height_source=heights.low_source,
         roof_source=heights.roof_source,
-        levels=np.array([t.levels for t in tagged], float),
+        levels=np.array([r.tagged.levels for r in rows], float),
         use=texts([r.use for r in rows]),
         name=texts([r.tags.get("name", "") for r in rows]),
         wall_color=np.array([w.color for w in walls], np.uint8).reshape(-1, 3),
@@ -206,6 +236,22 @@ def _table(
         wall_source=texts([w.source for w in walls]),
         roof_look_source=texts([t.source for t in tops]),
     )
+
+
+def _ignored_tags(rows: Sequence[Row], heights: Heights) -> list[Problem]:
+    """A problem for each row with tags that cannot be used, which names what was made instead."""
+    problems = []
+    for k, row in enumerate(rows):
+        if row.is_remainder:  # has the tags of its outline, which is a row itself
+            continue
+        if row.roof.unknown:
+            detail = f"roof:shape={row.roof.unknown} made flat"
+            problems.append(Problem(row.osm_id, "building", "repaired", "unknown-roof-shape", detail))
+        if ignored := row.tagged.ignored + row.roof.ignored:
+            made = f"from {heights.low[k]:.4g} to {heights.high[k]:.4g} m ({heights.source[k]})"
+            detail = f"{', '.join(ignored)}; built {made}"
+            problems.append(Problem(row.osm_id, "building", "repaired", "ignored-tags", detail))
+    return problems
 
 
 def _without_empty(table: Buildings) -> Buildings:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely.errors import GEOSException
 
 from geoscene.buildings.table import GRID
 from geoscene.frames import Frame
@@ -48,7 +49,7 @@ def clean(polygons: Polygons) -> tuple[Polygons, Bools]:
     out = np.array(polygons, dtype=object)
     finite = np.isfinite(shapely.bounds(out)).all(axis=1) & ~shapely.is_empty(out)
     out[~finite] = shapely.Polygon()
-    snapped = shapely.remove_repeated_points(shapely.transform(out, to_grid), 0.0)
+    snapped = _without_repeated_points(shapely.transform(out, to_grid))
     bad = ~shapely.is_valid(snapped)
     if bad.any():
         valid = shapely.make_valid(out[bad], method="structure", keep_collapsed=False)
@@ -57,6 +58,16 @@ def clean(polygons: Polygons) -> tuple[Polygons, Bools]:
     for row in np.flatnonzero(pinched):
         snapped[row] = _separate_rings(snapped[row])
     return shapely.orient_polygons(snapped), bad | pinched
+
+
+def _without_repeated_points(polygons: Polygons) -> Polygons:
+    """Polygons (n,) without repeated points; one with a ring that has shrunk to a point stays, invalid."""
+    try:
+        return np.asarray(shapely.remove_repeated_points(polygons, 0.0), object)
+    except GEOSException:
+        if len(polygons) == 1:
+            return polygons
+        return np.concatenate([_without_repeated_points(polygons[k : k + 1]) for k in range(len(polygons))])
 
 
 def _polygonal(geometry: Polygons) -> Polygons:

@@ -9,11 +9,19 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.table import BuildingOptions
 from geoscene.sources.data import Tags
-from geoscene.tags import parse_length, parse_number
+from geoscene.tags import Quantities, parse_length, parse_number
 from geoscene.typing import Float
 
-HIGHEST = 1000.0
-"""Greater heights are treated as typing errors, metres; the tallest building has 828 m."""
+HIGHEST, LOWEST = 1000.0, -50.0
+"""Tops above and undersides below are treated as typing errors, metres; the tallest building has 828 m, the
+depth is assumed."""
+
+THINNEST = 0.01
+"""Least metres between underside and top; a thinner body is tagged by mistake."""
+
+_MOST_LEVELS, _MOST_ROOF_LEVELS, _HIGHEST_ROOF = 200.0, 20.0, 300.0
+"""Greater numbers of storeys and heights of roofs are treated as typing errors. The tallest building has 163
+storeys below a spire of 244 m; storeys in a roof are assumed."""
 
 _TYPICAL: dict[str, tuple[float, float]] = {
     # height in metres of a building of 200 m2, and how it grows: the exponent of area / 200 m2
@@ -68,6 +76,7 @@ class Tagged:
     roof     : height of the roof
     roof_source : tag, levels or ""
     levels   : storeys above ground, without those in the roof
+    ignored  : tags whose values cannot be used, with the reasons
     """
 
     height: float
@@ -78,29 +87,23 @@ class Tagged:
     roof: float
     roof_source: str
     levels: float
-
-
-def _value(value: float | None, low: float, *, high: float) -> float:
-    return value if value is not None and low <= value <= high else np.nan
+    ignored: tuple[str, ...]
 
 
 def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
     """Tagged heights: ``height``, else ``building:height``, ``est_height`` or ``building:levels``.
 
     A height by storeys is storeys x level height, plus the roof's height or storeys (Simple 3D Buildings:
-    building:levels leaves out the storeys of the roof). Values of 0 or less, or over 1,000 m, are ignored.
+    building:levels leaves out the storeys of the roof). Ignored are values that are no lengths or numbers,
+    tops below 1 cm or above 1,000 m, undersides below -50 m, more than 200 storeys, and roofs of more than
+    300 m or 20 storeys.
     """
-    levels = _value(parse_number(tags.get("building:levels") or tags.get("levels")), 0, high=300)
-    roof_levels = _value(parse_number(tags.get("roof:levels")), 0, high=50)
-    roof = _value(parse_length(tags.get("roof:height") or tags.get("building:roof:height")), 0, high=HIGHEST)
+    read = Quantities(tags)
+    levels = read.first("building:levels", "levels", parse=parse_number, low=0, high=_MOST_LEVELS)
+    roof_levels = read.first("roof:levels", parse=parse_number, low=0, high=_MOST_ROOF_LEVELS)
+    roof = read.first("roof:height", "building:roof:height", parse=parse_length, low=0, high=_HIGHEST_ROOF)
     roof_source = "tag" if np.isfinite(roof) else ""
-    height, source, sigma = np.nan, "", np.nan
-    for key in ("height", "building:height", "est_height"):
-        height = _value(parse_length(tags.get(key)), 0.01, high=HIGHEST)
-        if np.isfinite(height):
-            source = "est_height" if key == "est_height" else "tag"
-            sigma = SIGMA_EST * height if source == "est_height" else SIGMA_TAG
-            break
+    height, source, sigma = _tagged_height(read)
 
     step = options.level_height
     storeys = levels + (roof_levels if np.isfinite(roof_levels) else 0.0)
@@ -111,18 +114,31 @@ def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
     if not np.isfinite(height) and (levels > 0 or roof_levels > 0):
         height = (levels if np.isfinite(levels) else 0.0) * step + (roof if np.isfinite(roof) else 0.0)
         source, sigma = "levels", max(SIGMA_STOREYS * height, 1.0)
+    elif not np.isfinite(height) and levels == 0:
+        read.refused.append("building:levels=0 gives no height")
 
-    minimum = _value(
-        parse_length(tags.get("min_height") or tags.get("building:min_height")), -HIGHEST, high=HIGHEST
+    minimum = read.first(
+        "min_height", "building:min_height", parse=parse_length, low=LOWEST, high=HIGHEST - THINNEST
     )
     minimum_source = "tag" if np.isfinite(minimum) else ""
     if not minimum_source:
-        skipped = _value(parse_number(tags.get("building:min_level") or tags.get("min_level")), 0, high=300)
+        skipped = read.first("building:min_level", "min_level", parse=parse_number, low=0, high=_MOST_LEVELS)
         if np.isfinite(skipped):
             minimum, minimum_source = skipped * step, "levels"
             if source == "levels" and levels <= skipped:  # levels are counted from the part's underside
                 height += minimum
-    return Tagged(height, source, sigma, minimum, minimum_source, roof, roof_source, levels)
+    return Tagged(
+        height, source, sigma, minimum, minimum_source, roof, roof_source, levels, tuple(read.refused)
+    )
+
+
+def _tagged_height(read: Quantities) -> tuple[float, str, float]:
+    """Height in metres, source and standard deviation from a tagged height; NaN and "" if there is none."""
+    height = read.first("height", "building:height", parse=parse_length, low=THINNEST, high=HIGHEST)
+    if np.isfinite(height):
+        return height, "tag", SIGMA_TAG
+    height = read.first("est_height", parse=parse_length, low=THINNEST, high=HIGHEST)
+    return height, "est_height" if np.isfinite(height) else "", SIGMA_EST * height
 
 
 def typical_height(use: NDArray[np.object_], area: Float) -> Float:

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import shapely
+from shapely.errors import GEOSException
 
 from geoscene.buildings.footprints import Polygons, clean, groups, subtract
 from geoscene.buildings.table import GRID, Texts
-from geoscene.report import Problem
+from geoscene.report import Problem, unexpected
 from geoscene.sources.data import Relation
 from geoscene.typing import Bools, Float, Ints
 
@@ -130,7 +131,12 @@ def cut_overlaps(
     for mine in sorted(groups(loser), key=lambda g: area[loser[g[0]]]):
         row = loser[mine[0]]
         cutters = out[winner[mine]]
-        out[row] = subtract(out[row], shapely.union_all(cutters, grid_size=GRID))
+        try:
+            out[row] = subtract(out[row], shapely.union_all(cutters, grid_size=GRID))
+        except GEOSException as error:
+            out[row] = shapely.Polygon()
+            problems.append(unexpected(osm_id[row], error, kind="building"))
+            continue
         winners = ", ".join(sorted({osm_id[w] for w in winner[mine]}))
         lost = area[row] - shapely.area(out[row])
         detail = f"lost {lost:.2f} of {area[row]:.1f} m2 to {winners}"

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from geoscene.buildings.heights import HIGHEST, SIGMA_PRIOR, Tagged, infer_heights
+from geoscene.buildings.appearance import Appearance
+from geoscene.buildings.heights import HIGHEST, SIGMA_PRIOR, THINNEST, Tagged, infer_heights
 from geoscene.buildings.roof_tags import RoofTags, default_roof_height
 from geoscene.buildings.table import BuildingOptions, Texts
 from geoscene.report import Problem
@@ -24,11 +25,17 @@ _HALLS = (
 
 _OPEN_BELOW = ("roof", "carport", "canopy")
 
+_SIGMA_ROOF = {"default": 0.5, "angle": 0.2}
+"""Assumed standard deviation of a roof's height as a share of it, by its source."""
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
     """A building or a part before it enters the table.
 
+    tagged       : heights
+    roof         : shape, direction and pitch of the roof
+    looks        : appearance of the walls and of the roof
     outline      : row of its building; its own row for a building
     is_remainder : whether it is what parts leave of an outline
     """
@@ -37,6 +44,9 @@ class Row:
     tags: Tags
     footprint: Any
     use: str
+    tagged: Tagged
+    roof: RoofTags
+    looks: tuple[Appearance, Appearance]
     outline: int = -1
     is_part: bool = False
     is_remainder: bool = False
@@ -60,11 +70,10 @@ def texts(values: Sequence[str]) -> Texts:
     return np.array(values, dtype=object)
 
 
-def resolve_heights(
-    rows: Sequence[Row], tagged: Sequence[Tagged], *, roofs: Sequence[RoofTags], options: BuildingOptions
-) -> tuple[Heights, list[Problem]]:
+def resolve_heights(rows: Sequence[Row], *, options: BuildingOptions) -> tuple[Heights, list[Problem]]:
     """Underside, top and roof height of every row (buildings first, then parts), and what was repaired."""
     problems: list[Problem] = []
+    tagged = [r.tagged for r in rows]
     h = Heights(
         np.nan_to_num([t.minimum for t in tagged]),
         np.array([t.height for t in tagged], float),
@@ -78,7 +87,7 @@ def resolve_heights(
     # a single storey of a hall is as high as the hall, not 3 m
     hall = np.isin(use, _HALLS) & (h.source == "levels") & (np.array([t.levels for t in tagged]) <= 1)
     h.high[hall], h.sigma[hall], h.source[hall] = np.nan, np.nan, ""
-    _resolve_roofs(rows, roofs, h=h)
+    _resolve_roofs(rows, h=h, options=options)
     is_part = np.array([r.is_part for r in rows], np.bool_)
     outline = np.array([r.outline for r in rows], np.int64)
     _resolve_buildings(rows, is_part, outline=outline, h=h, options=options)
@@ -90,11 +99,7 @@ def resolve_heights(
     h.sigma[lacking] = np.maximum(h.sigma[outline[lacking]], SIGMA_PRIOR * h.high[lacking] / 2)
     np.minimum(h.high, HIGHEST, out=h.high)
 
-    for k in np.flatnonzero(h.high - h.low < 0.01).tolist():
-        detail = f"underside at {h.low[k]:g} m, top at {h.high[k]:g} m; underside put at 0"
-        problems.append(Problem(rows[k].osm_id, "building", "repaired", "underside-over-top", detail))
-        h.low[k], h.low_source[k] = 0.0, "default"
-
+    _repair_undersides(rows, h, problems=problems)
     lifted = h.high - np.minimum(h.roof, h.high) - options.canopy
     open_below = np.isin(use, _OPEN_BELOW) & (h.low_source == "default") & (lifted > 0.5)
     h.low[open_below], h.low_source[open_below] = lifted[open_below], "canopy"
@@ -108,15 +113,33 @@ def resolve_heights(
     return h, problems
 
 
-def _resolve_roofs(rows: Sequence[Row], roofs: Sequence[RoofTags], *, h: Heights) -> None:
+def _repair_undersides(rows: Sequence[Row], h: Heights, *, problems: list[Problem]) -> None:
+    """Put undersides above the top at 0 and those just below it 1 cm below it, in place."""
+    for k in np.flatnonzero(h.high - h.low < THINNEST - 1e-9).tolist():
+        tags = f"underside at {h.low[k]:g} m, top at {h.high[k]:g} m"
+        if h.low[k] > h.high[k]:
+            reason, detail = "underside-over-top", f"{tags}; underside put at 0"
+            h.low[k], h.low_source[k] = 0.0, "default"
+        else:
+            reason, detail = "too-thin", f"{tags}; made {THINNEST:g} m thick"
+            h.low[k] = h.high[k] - THINNEST
+        problems.append(Problem(rows[k].osm_id, "building", "repaired", reason, detail))
+
+
+def _resolve_roofs(rows: Sequence[Row], *, h: Heights, options: BuildingOptions) -> None:
     """Set missing roof heights, in place."""
-    for k, roof in enumerate(roofs):
-        if roof.shape == "flat":
+    for k, row in enumerate(rows):
+        if row.roof.shape == "flat":
             h.roof[k], h.roof_source[k] = 0.0, "none"
         elif not np.isfinite(h.roof[k]):
-            h.roof[k], h.roof_source[k] = default_roof_height(roof, rows[k].footprint)
-            if h.source[k] == "levels":  # building:levels excludes the roof
+            by_storeys = h.source[k] == "levels"
+            walls = h.high[k] if by_storeys else np.inf
+            h.roof[k], h.roof_source[k] = default_roof_height(
+                row.roof, row.footprint, walls=walls, storey=options.level_height
+            )
+            if by_storeys:  # building:levels excludes the roof
                 h.high[k] += h.roof[k]
+                h.sigma[k] = np.hypot(h.sigma[k], _SIGMA_ROOF[h.roof_source[k]] * h.roof[k])
 
 
 def _resolve_buildings(

@@ -18,7 +18,7 @@ from geoscene.classes import Class
 from geoscene.columns import Columns
 from geoscene.errors import InputError
 from geoscene.mesh import ROOF, Mesh
-from geoscene.report import Problem
+from geoscene.report import Problem, described
 from geoscene.typing import Bools, Float, Ints
 from geoscene.watertight import weld
 
@@ -143,7 +143,13 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
             direction=float(buildings.roof_direction[row]),
             across=bool(buildings.roof_across[row]),
         )
-        shell, fallback = roof_shell(pieces.polygon[k], spec)
+        try:
+            shell, fallback = roof_shell(pieces.polygon[k], spec)
+        except Exception as error:  # noqa: BLE001 - one roof must not end a build
+            shell = prisms(
+                pieces.polygon[k : k + 1], np.zeros(1, np.int64), low=pieces.low[[k]], high=pieces.high[[k]]
+            )
+            fallback = f"{spec.shape} roof made flat, {described(error)}"
         if fallback:
             notes.append(_problem(buildings, row, action="repaired", reason="roof-fallback", detail=fallback))
         groups.append(replace(shell, piece=np.full(len(shell), k, np.int64)))

@@ -236,6 +236,25 @@ def test_failed_build_leaves_no_files(osm, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_building_that_fails_in_a_tile_is_dropped_alone(osm, scene, tmp_path, monkeypatch):
+    whole = geoscene.tiles.build_solids
+    victim = str(scene.features("buildings").columns["osm_id"][7])
+
+    def failing(buildings, **options):
+        if victim in buildings.osm_id:
+            raise ZeroDivisionError
+        return whole(buildings, **options)
+
+    monkeypatch.setattr(geoscene.tiles, "build_solids", failing)
+    counts = build(osm, tmp_path / "s", options=BuildOptions(name="demo"), workers=1).manifest["counts"]
+    rows = (tmp_path / "s" / "problems.csv").read_text("utf-8").splitlines()
+    assert [row for row in rows if victim in row and "no-solid" in row] == [
+        f"{victim},building,dropped,no-solid,ZeroDivisionError"
+    ]
+    before = scene.manifest["counts"]
+    assert (counts["buildings"], counts["solids"]) == (before["buildings"], before["solids"] - 1)
+
+
 def test_map_without_features_is_refused(tmp_path):
     with pytest.raises(SourceNotFoundError, match="no features"):
         build(OsmData((24.9, 60.1, 24.91, 60.11), [], [], [], []), tmp_path / "x")

@@ -1,5 +1,6 @@
 """Buildings become closed solids without losses or overlaps, and all assumptions and repairs are recorded."""
 
+import importlib
 import random
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import affinity
+from shapely.errors import GEOSException
 
 from geoscene.buildings import BuildingOptions, build_solids, read_buildings
 from geoscene.buildings.heights import infer_heights
@@ -272,6 +274,80 @@ def test_footprints_without_area_are_dropped_and_reported(shape):
     assert reasons(problems) == {("way/1", "dropped", "too-small")}
 
 
+def test_a_self_crossing_footprint_with_an_edge_through_its_own_corner_is_split():
+    lat = [48.2002413, 48.2004413, 48.2003413, 48.2007413, 48.2003413]
+    lon = [16.3701767, 16.3704767, 16.3707767, 16.3710767, 16.3702767]
+    # the repair leaves a part of some nanometres, which vanishes on the 0.1 mm grid
+    shape = shapely.make_valid(shapely.Polygon(np.column_stack([lon, lat])), method="structure")
+    assert shapely.area(shapely.get_parts(shape)).min() < 1e-15
+    way = Area("way/1", {"building": "yes"}, shape, np.empty(0, np.int64))
+    frame = Frame.at((lon[0] + lon[3]) / 2, (lat[0] + lat[3]) / 2)
+    table, problems = read_buildings(OsmData(shape.bounds, [], [way], [], []), frame)
+    assert table.osm_id.tolist() == ["way/1"]
+    assert shapely.get_num_geometries(table.footprint[0]) == 2
+    assert shapely.area(table.footprint[0]) == pytest.approx(661, abs=1)
+    assert reasons(problems) == {("way/1", "repaired", "invalid-footprint")}
+
+
+@pytest.mark.parametrize(
+    ("value", "shape", "reported"),
+    [(";gabled", "gabled", False), ("gabled;;", "gabled", False), (";", "flat", True), (" ", "flat", True)],
+)
+def test_blank_roof_shapes_do_not_end_the_build(value, shape, reported):
+    table, _, _, problems = built(house(1, box(0, 0, 10, 8), height="9", roof__shape=value))
+    assert table.roof_shape.tolist() == [shape]
+    assert reasons(problems) == ({("way/1", "repaired", "unknown-roof-shape")} if reported else set())
+
+
+def fails_for(monkeypatch, place, chosen):
+    """Make a function raise when ``chosen`` says so of its first argument."""
+    module, name = place.rsplit(".", 1)
+    whole = getattr(importlib.import_module(module), name)
+
+    def failing(first, *args, **kwargs):
+        if chosen(first):
+            raise ZeroDivisionError("no\nway")
+        return whole(first, *args, **kwargs)
+
+    monkeypatch.setattr(place, failing)
+
+
+def test_a_building_that_cannot_be_read_is_dropped_alone(monkeypatch):
+    fails_for(
+        monkeypatch, "geoscene.buildings.features.read_roof_tags", lambda tags: tags.get("name") == "odd"
+    )
+    areas = [
+        house(n, box(20 * n, 0, 10, 10), height="9", name="odd" if n in (2, 5) else "") for n in range(7)
+    ]
+    table, _, _, problems = built(*areas)
+    assert table.osm_id.tolist() == [f"way/{n}" for n in (0, 1, 3, 4, 6)]
+    assert reasons(problems) == {(f"way/{n}", "dropped", "unexpected-error") for n in (2, 5)}
+    assert problems[0].detail == "ZeroDivisionError: no way"
+
+
+def test_a_roof_that_cannot_be_built_is_made_flat(monkeypatch):
+    fails_for(monkeypatch, "geoscene.buildings.solids.roof_shell", lambda polygon: polygon.bounds[0] < 5)
+    areas = [house(n, box(20 * n, 0, 10, 8), height="9", roof__shape="gabled") for n in range(2)]
+    _, _, verdict, problems = built(*areas)
+    assert verdict.volume[0] == pytest.approx(720)
+    assert verdict.volume[1] < 650
+    assert reasons(problems) == {("way/0", "repaired", "roof-fallback")}
+
+
+def test_an_overlap_that_cannot_be_cut_drops_only_the_larger_building(monkeypatch):
+    def failing(*_):
+        raise GEOSException("TopologyException")
+
+    monkeypatch.setattr("geoscene.buildings.parts.subtract", failing)
+    table, _, _, problems = built(
+        house(1, box(0, 0, 10, 10), height="9"),
+        house(2, box(8, 0, 20, 10), height="9"),
+        house(3, box(50, 0, 9, 9)),
+    )
+    assert table.osm_id.tolist() == ["way/1", "way/3"]
+    assert reasons(problems) == {("way/2", "dropped", "unexpected-error")}
+
+
 def test_of_duplicates_the_one_with_more_tags_is_kept():
     shape = box(0, 0, 10, 10)
     table, _, _, problems = built(
@@ -353,6 +429,70 @@ def test_the_order_of_the_map_does_not_matter():
     assert first == second
     np.testing.assert_array_equal(one.vertices, other.vertices)
     np.testing.assert_array_equal(one.faces, other.faces)
+
+
+@pytest.mark.parametrize(
+    ("tags", "top", "source", "ignored"),
+    [
+        ({"height": "9999"}, None, "inferred-type", "height=9999 is not from 0.01 to 1000"),
+        ({"height": "-5", "building:levels": "3"}, 9.0, "levels", "height=-5 is not from 0.01 to 1000"),
+        ({"height": "1e-3", "est_height": "8"}, 8.0, "est_height", "height=1e-3 is unreadable"),
+        ({"height": "nan", "building:height": "7"}, 7.0, "tag", "height=nan is unreadable"),
+        ({"building:levels": "1000000", "levels": "2"}, 6.0, "levels", "levels=1000000 is not from 0 to 200"),
+        ({"building:levels": "0"}, None, "inferred-type", "building:levels=0 gives no height"),
+        ({"height": "9", "min_height": "-1000"}, 9.0, "tag", "min_height=-1000 is not from -50"),
+        ({"height": "9", "building:min_level": "x"}, 9.0, "tag", "building:min_level=x is unreadable"),
+        ({"height": "9", "roof:height": "900"}, 9.0, "tag", "roof:height=900 is not from 0 to 300"),
+        ({"height": "9", "roof:levels": "90"}, 9.0, "tag", "roof:levels=90 is not from 0 to 20"),
+        ({"height": "9", "roof:angle": "89.9"}, 9.0, "tag", "roof:angle=89.9 is not from 0.1 to 80"),
+        ({"height": "9", "roof:direction": "up"}, 9.0, "tag", "roof:direction=up is unreadable"),
+    ],
+)
+def test_every_ignored_tag_is_reported_with_what_was_built_instead(tags, top, source, ignored):
+    table, mesh, _, problems = built(house(1, box(0, 0, 10, 10), **tags))
+    assert table.height_source.tolist() == [source]
+    assert table.height[0] == pytest.approx(top) if top else 5 < table.height[0] < 20
+    assert mesh.vertices[:, 2].min() == 0
+    assert reasons(problems) == {("way/1", "repaired", "ignored-tags")}
+    assert ignored in problems[0].detail
+    assert problems[0].detail.endswith(f"; built from 0 to {table.height[0]:.4g} m ({source})")
+
+
+@pytest.mark.parametrize(("low", "underside"), [("4.999", 4.99), ("5", 4.99), ("4.98", 4.98), ("5.5", 0)])
+def test_a_thin_body_stays_thin(low, underside):
+    table, _, verdict, problems = built(house(1, box(0, 0, 10, 10), height="5", min_height=low))
+    assert table.min_height[0] == pytest.approx(underside)
+    assert verdict.volume[0] == pytest.approx(100 * (5 - underside))
+    reason = {"4.98": set(), "5.5": {"underside-over-top"}}.get(low, {"too-thin"})
+    assert {p.reason for p in problems} == reason
+
+
+@pytest.mark.parametrize(
+    ("storeys", "shape", "width", "roof"),
+    [
+        ("2", "gabled", 40, 3.0),
+        ("1", "hipped", 40, 3.0),
+        ("4", "gabled", 40, 6.0),
+        ("2", "dome", 40, 6.0),
+        ("9", "gabled", 40, 8.0),
+        ("2", "gabled", 8, 4 * 3**-0.5),
+    ],
+)
+def test_a_guessed_roof_is_bounded_by_the_storeys_below(storeys, shape, width, roof):
+    tags = {"building:levels": storeys, "roof:shape": shape}
+    table, *_ = built(house(1, box(0, 0, width, width), **tags))
+    walls = 3.0 * int(storeys)
+    assert table.roof_height[0] == pytest.approx(roof, rel=0.02)
+    assert table.height[0] == pytest.approx(walls + roof, rel=0.01)
+    # the guess adds half its height to the uncertainty of the storeys
+    assert table.height_sigma[0] == pytest.approx(np.hypot(max(0.15 * walls, 1.0), roof / 2), rel=0.02)
+
+
+def test_a_steep_angle_over_a_large_footprint_gives_no_giant_roof():
+    tags = {"building:levels": "2", "roof:shape": "hipped", "roof:angle": "75"}
+    table, *_ = built(house(1, box(0, 0, 40, 40), **tags))
+    assert table.roof_source.tolist() == ["angle"]
+    assert table.height[0] == pytest.approx(6 + 18)
 
 
 def test_higher_levels_of_detail_add_parts_and_roofs():
