@@ -22,18 +22,21 @@ from lidar.rig.specs import CameraSpec
 from lidar.world.actors import Actors, States, existing_actors, poses_of, rotations, states
 
 
-def actors_near(actors: Actors, ego: Trajectory, *, time_ns: int, radius: float) -> Ints:
-    """Indices (k,) of the actors present at a time within ``radius`` true metres of the ego vehicle."""
-    rows = existing_actors(actors, time_ns, end_ns=time_ns)
-    away = states(actors, rows, time_ns=time_ns).position - ego.at([time_ns]).position
-    near: Ints = rows[np.hypot(*away[:, :2].T) <= radius * actors.scale]
-    return near
-
-
 def box_rows(
-    actors: Actors, ego: Trajectory, *, time_ns: int, frame: int, radius: float = np.inf
+    actors: Actors,
+    ego: Trajectory,
+    *,
+    time_ns: int,
+    end_ns: int = 0,
+    frame: int,
+    radius: float = np.inf,
+    feature: NDArray[np.integer] | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Columns of the 3D boxes at a time, one row per actor within ``radius`` true metres, ordered by id.
+    """Columns of the 3D boxes at a time, one row per actor, ordered by id.
+
+    The actors are those that exist at some time of a frame from ``time_ns`` to ``end_ns`` and are within
+    ``radius`` true metres of the ego vehicle or among a cloud's column of feature numbers. Of an actor that
+    appears after ``time_ns``, as a frame's rays meet it, the box is where it appears.
 
     frame, time_ns  : as given
     id, instance    : number among the actors; feature number in points and pixels
@@ -46,7 +49,10 @@ def box_rows(
     ego_vx, ego_vy, ego_vz : the velocity along the ego vehicle's axes, not relative to the ego's own
     moving          : whether it moves at any time of the drive
     """
-    rows = actors_near(actors, ego, time_ns=time_ns, radius=radius)
+    rows = existing_actors(actors, time_ns, end_ns=max(end_ns, time_ns))
+    away = states(actors, rows, time_ns=time_ns).position - ego.at([time_ns]).position
+    seen = np.zeros(len(rows), bool) if feature is None else count_points(actors, rows, feature=feature) > 0
+    rows = rows[(np.hypot(*away[:, :2].T) <= radius * actors.scale) | seen]
     at = states(actors, rows, time_ns=time_ns)
     turn = rotations(at.angles)
     centre = _centres(actors, rows, at=at)
@@ -118,23 +124,33 @@ class ImageBoxes:
 
 
 def image_boxes(
-    actors: Actors, camera: CameraSpec, *, pose: Poses, time_ns: int, instance: NDArray[np.integer]
+    actors: Actors,
+    camera: CameraSpec,
+    *,
+    pose: Poses,
+    time_ns: int,
+    instance: NDArray[np.integer],
+    span_ns: tuple[int, int] | None = None,
 ) -> ImageBoxes:
     """2D boxes of the actors in an image.
 
     pose     : the camera's one pose at the time of the image
     instance : (h, w) feature numbers of the image
+    span_ns  : first and last time of the exposure
 
     The pixels without occlusion are those that the actor's projected triangles cover, except triangles that
-    extend behind the camera.
+    extend behind the camera. An actor without such triangles in the image, but with pixels, has their box
+    and a visibility of 1.
     """
-    rows = existing_actors(actors, time_ns, end_ns=time_ns)
+    first, last = span_ns or (time_ns, time_ns)
+    rows = existing_actors(actors, first, end_ns=last)
     at = states(actors, rows, time_ns=time_ns)
     away = ((at.position - pose.position) / pose.scale) @ pose.rotation[0]
     size = np.linalg.norm(actors.size[rows], axis=1)
     ahead = (np.linalg.norm(away, axis=1) < camera.far + size) & (
         (away[:, 2] > -size) | np.full(len(rows), camera.model == "fisheye")
     )
+    ahead |= count_points(actors, rows, feature=instance) > 0
     found: list[tuple[int, tuple[float, ...], tuple[float, ...], int, float]] = []
     body = poses_of(actors, rows, at=at)
     for k in np.flatnonzero(ahead).tolist():
@@ -144,14 +160,14 @@ def image_boxes(
         points = at.position[k] + (mesh.vertices * actors.stretch[row]) @ turn.T * pose.scale[0]
         pixels, _ = project(camera, ((points - pose.position) / pose.scale) @ pose.rotation[0])
         box, whole = outline(pixels[mesh.faces], camera.width, height=camera.height)
-        if not np.isfinite(box[0]):
-            continue
-        u0, v0 = (max(int(side) - 1, 0) for side in box[:2])
-        part = instance[v0 : int(box[3]) + 3, u0 : int(box[2]) + 3]
+        inside = bool(np.isfinite(box[0]))
+        u0, v0 = (max(int(side) - 1, 0) if inside else 0 for side in box[:2])
+        part = instance[v0 : int(box[3]) + 3, u0 : int(box[2]) + 3] if inside else instance
         v, u = np.nonzero(part == actors.feature[row])
         v, u = v + v0, u + u0
         seen = (u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5) if len(u) else (np.nan,) * 4
-        found.append((row, box, seen, len(u), min(len(u) / max(whole, 1), 1.0)))
+        if inside or len(u):
+            found.append((row, box if inside else seen, seen, len(u), min(len(u) / max(whole, 1), 1.0)))
     return ImageBoxes(
         np.array([f[0] for f in found], np.int64),
         np.array([f[1] for f in found], float).reshape(-1, 4),
@@ -165,7 +181,8 @@ def merge_box_files(out: Path) -> None:
     """Write the boxes of all frames of each sensor as one file, and ``boxes.csv`` of the dataset.
 
     The dataset's file holds the boxes of the first scanner, with a column ``points_<scanner>`` for each
-    scanner: its points on the box in frames that start between the row's time and the next row's.
+    scanner: its points on the box in frames that start between the row's time and the next row's. A box
+    that only another scanner has in that time is added as of that scanner's frame.
     """
     paths = Paths(out)
     calibration = json.loads(paths.calibration.read_text("utf-8"))["sensors"]
@@ -180,12 +197,17 @@ def merge_box_files(out: Path) -> None:
     first_ns = calibration[scanners[0]]["time_offset_ns"]
     counts = [_points_by_step(lines[name], first_ns, step_ns=step_ns) for name in scanners]
     names = header.split(",")
-    frame, number = names.index("frame"), names.index("id")
+    frame, number, time = names.index("frame"), names.index("id"), names.index("time_ns")
+    keyed = {(int(c[frame]), int(c[number])): row for row in rows for c in [row.split(",")]}
+    for name, count in zip(scanners[1:], counts[1:], strict=True):
+        for row in lines[name][1:]:
+            cells = row.split(",")
+            key = _step(int(cells[time]), first_ns, step_ns=step_ns), int(cells[number])
+            if key not in keyed and count[key]:
+                cells[frame] = str(key[0])
+                keyed[key] = ",".join(cells)
     merged = [",".join([header, *(f"points_{name}" for name in scanners)])]
-    for row in rows:
-        cells = row.split(",")
-        key = int(cells[frame]), int(cells[number])
-        merged.append(",".join([row, *(str(count.get(key, 0)) for count in counts)]))
+    merged += [",".join([keyed[k], *(str(count.get(k, 0)) for count in counts)]) for k in sorted(keyed)]
     write_atomically(paths.boxes, ("\n".join(merged) + "\n").encode("utf-8"))
 
 
@@ -200,6 +222,11 @@ def _merged(paths: Paths, name: str) -> list[str]:
     return lines
 
 
+def _step(time_ns: int, first_ns: int, *, step_ns: float) -> int:
+    """Number of the step that holds a frame's start; 1 ns is added because starts are rounded down."""
+    return int((time_ns - first_ns + 1) // step_ns)
+
+
 def _points_by_step(lines: list[str], first_ns: int, *, step_ns: float) -> dict[tuple[int, int], int]:
     """Sums of points by (step, road user's id); step k starts ``k * step_ns`` after ``first_ns``."""
     if not lines:
@@ -209,7 +236,6 @@ def _points_by_step(lines: list[str], first_ns: int, *, step_ns: float) -> dict[
     total: dict[tuple[int, int], int] = {}
     for line in lines[1:]:
         cells = line.split(",")
-        # 1 ns is added because frame starts are rounded down
-        key = int((int(cells[time]) - first_ns + 1) // step_ns), int(cells[number])
+        key = _step(int(cells[time]), first_ns, step_ns=step_ns), int(cells[number])
         total[key] = total.get(key, 0) + int(cells[points])
     return total

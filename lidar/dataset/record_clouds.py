@@ -175,8 +175,16 @@ def _write_boxes(
     actors, visibility = recording.actors, recording.visibility
     assert actors is not None  # noqa: S101
     assert visibility is not None  # noqa: S101
-    begin, mount = scanner.frame_start_ns(frame), scanner.spec.mount
-    columns = box_rows(actors, recording.trajectory, time_ns=begin, frame=frame, radius=recording.max_range)
+    (begin, end), mount = scanner.sensor.window_ns(frame), scanner.spec.mount
+    columns = box_rows(
+        actors,
+        recording.trajectory,
+        time_ns=begin,
+        end_ns=end,
+        frame=frame,
+        radius=recording.max_range,
+        feature=cloud.feature,
+    )
     points = count_points(actors, columns["id"], feature=cloud.feature)
     origin = recording.trajectory.at([begin]).mounted(mount.translation, mount.rotation).position[0]
     share = visibility.seen_from(origin, world, rows=columns["id"], time_ns=begin)

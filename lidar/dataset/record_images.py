@@ -18,7 +18,7 @@ from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, w
 from lidar.camera.render import Frame as Image
 from lidar.camera.render import exposure_times, optical_flow, render
 from lidar.camera.sun import sun_direction
-from lidar.dataset.boxes import image_boxes
+from lidar.dataset.boxes import ImageBoxes, image_boxes
 from lidar.dataset.recording import Recording
 from lidar.geometry.poses import Poses
 from lidar.random_streams import generator
@@ -43,9 +43,15 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
         with watch.stage("boxes"):
             middle = int(times[first + rows // 2])
             pose = _poses(recording, camera, times=times[[first + rows // 2]])
-            columns = _box_columns(
-                recording.actors, camera, frame=frame, pose=pose, time_ns=middle, image=image
+            found = image_boxes(
+                recording.actors,
+                camera.spec,
+                pose=pose,
+                time_ns=middle,
+                instance=image.feature,
+                span_ns=(camera.frame_start_ns(frame), int(times[-1])),
             )
+            columns = _box_columns(recording.actors, found, frame=frame, time_ns=middle)
             write_columns(paths["boxes"], columns)
     if recording.has_stages(camera):
         original, stages = image, recording.contents.stages
@@ -91,11 +97,8 @@ def _write_image(path: Path, image: Image, *, kind: str) -> None:
         write_png(path, feature_to_image(image.feature))
 
 
-def _box_columns(
-    actors: Actors, camera: Camera, *, frame: int, pose: Poses, time_ns: int, image: Image
-) -> dict[str, Any]:
+def _box_columns(actors: Actors, found: ImageBoxes, *, frame: int, time_ns: int) -> dict[str, Any]:
     """Columns of the 2D boxes of an image."""
-    found = image_boxes(actors, camera.spec, pose=pose, time_ns=time_ns, instance=image.feature)
     sides = ("left", "top", "right", "bottom")
     return {
         "frame": np.full(len(found.row), frame),

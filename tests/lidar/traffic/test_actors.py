@@ -1,6 +1,7 @@
 """Road users in a real place: positions, visibility, bounding boxes, no collisions."""
 
 import itertools
+import json
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from hypothesis import strategies as st
 
 from geoscene.classes import Class
 from lidar.camera.render import RenderOptions, render
-from lidar.dataset.boxes import COLUMNS, box_rows, count_points, image_boxes
+from lidar.dataset.boxes import COLUMNS, box_rows, count_points, image_boxes, merge_box_files
+from lidar.dataset.layout import Paths
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.planning.road_drive import plan_road_drive
@@ -212,6 +214,51 @@ def test_boxes_are_the_same_in_the_scene_and_about_the_ego(actors, ego):
     assert (speed[~rows["moving"]] == 0).all()
     quat = np.stack([rows[c] for c in ("qx", "qy", "qz", "qw")], axis=1)
     np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0)
+
+
+def test_a_road_user_that_appears_during_a_frame_or_beyond_the_radius_has_a_box(actors, ego):
+    begin = actors.time_ns[actors.first[:-1]]
+    late = int(np.flatnonzero(~actors.parked & (begin > 0) & (begin < ego.duration_ns))[0])
+    feature = actors.feature[[late]]
+    start, end = int(begin[late]) - 40_000_000, int(begin[late]) + 60_000_000
+    assert late not in box_rows(actors, ego, time_ns=start, frame=0)["id"]
+    rows = box_rows(actors, ego, time_ns=start, end_ns=end, frame=0, radius=0.1, feature=feature)
+    assert late in rows["id"]
+    first = actors.position[actors.first[late]]
+    k = rows["id"].tolist().index(late)
+    np.testing.assert_allclose([rows["x"][k], rows["y"][k]], first[:2], atol=1e-6)
+    assert len(box_rows(actors, ego, time_ns=start, end_ns=end, frame=0, radius=0.1)["id"]) == 0
+
+
+def test_boxes_of_a_dataset_include_those_that_only_its_second_scanner_has(tmp_path):
+    sensors = {
+        name: {"kind": "lidar", "rate_hz": 10.0, "time_offset_ns": late}
+        for name, late in (("a", 0), ("b", 90_000_000))
+    }
+    (tmp_path / "calibration.json").write_text(json.dumps({"sensors": sensors}))
+    rows = {"a": ["0,0,5,7", "0,0,6,0"], "b": ["0,90000000,5,3", "0,90000000,8,2", "0,90000000,9,0"]}
+    for name, lines in rows.items():
+        path = Paths(tmp_path).frame_boxes(name, 0)
+        path.parent.mkdir(parents=True)
+        path.write_text("\n".join(["frame,time_ns,id,points", *lines]) + "\n")
+    merge_box_files(tmp_path)
+    assert Paths(tmp_path).boxes.read_text().split() == [
+        "frame,time_ns,id,points,points_a,points_b",
+        *("0,0,5,7,7,3", "0,0,6,0,0,0", "0,90000000,8,2,0,2"),
+    ]
+
+
+def test_every_road_user_in_an_image_has_a_box(actors, ego):
+    k = int(np.flatnonzero(actors.parked)[0])
+    camera = CameraSpec("c", Mount(), 40, 24, 30.0, 30.0, 19.5, 11.5, near=0.1, far=np.inf)
+    away = states(actors, [k], time_ns=0).position + np.array([500.0, 0.0, 0.0])
+    pose = type(ego.at([0]))(away, np.eye(3)[None], np.ones((1, 3)))
+    instance = np.full((24, 40), -1)
+    instance[3:5, 7:11] = actors.feature[k]
+    boxes = image_boxes(actors, camera, pose=pose, time_ns=0, instance=instance)
+    row = boxes.row.tolist().index(k)
+    assert boxes.box[row].tolist() == boxes.seen[row].tolist() == [6.5, 2.5, 10.5, 4.5]
+    assert (boxes.pixels[row], boxes.visibility[row]) == (8, 1.0)
 
 
 def test_image_boxes_give_the_visible_share(actors, scene, ego):
