@@ -48,7 +48,8 @@ def _bounds(corners: Any, right: float, bottom: float, out: Any) -> None:
             out[0], out[1] = min(out[0], low_x), min(out[1], low_y)
             out[2], out[3] = max(out[2], high_x), max(out[3], high_y)
             continue
-        here[:3] = corners[t]
+        for k in range(3):
+            here[k, 0], here[k, 1] = corners[t, k, 0], corners[t, k, 1]
         count = 3
         for side in range(4):
             axis, sign = side % 2, 1.0 if side < 2 else -1.0
@@ -57,10 +58,12 @@ def _bounds(corners: Any, right: float, bottom: float, out: Any) -> None:
                 a, b = here[k], here[(k + 1) % count]
                 in_a, in_b = sign * (a[axis] - limit[side]), sign * (b[axis] - limit[side])
                 if in_a >= 0:
-                    there[kept] = a
+                    there[kept, 0], there[kept, 1] = a[0], a[1]
                     kept += 1
                 if (in_a >= 0) != (in_b >= 0):
-                    there[kept] = a + in_a / (in_a - in_b) * (b - a)
+                    share = in_a / (in_a - in_b)
+                    for r in range(2):
+                        there[kept, r] = a[r] + share * (b[r] - a[r])
                     kept += 1
             here, there = there, here
             count = kept

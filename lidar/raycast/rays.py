@@ -21,6 +21,8 @@ def _rows(values: ArrayLike, name: str) -> Float:
     rows = np.ascontiguousarray(values, np.float64)
     if rows.ndim != 2 or rows.shape[1] != 3:
         raise InputError(f"{name} have the shape {rows.shape}, rays need (n, 3)")
+    rows = rows.view()
+    rows.flags.writeable = False  # kernels are compiled once, and not again for read-only arrays
     return rows
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
@@ -19,9 +18,18 @@ from lidar.geometry.poses import Trajectory
 from lidar.traffic.ego_trip import EgoTrip
 from lidar.traffic.junctions import JunctionPlan, road_rank, signal_group, zone_at
 from lidar.traffic.lanes import STEP, ActorPath
-from lidar.traffic.simulation_kernel import EgoMotion, Movers, run
+from lidar.traffic.simulation_kernel import (
+    BLOCK,
+    CELL,
+    MOTION,
+    STATION,
+    USER,
+    EgoMotion,
+    Movers,
+    simulated,
+)
 from lidar.traffic.surroundings import LEFT
-from lidar.traffic.sweep import CELL, cells_under, sweep
+from lidar.traffic.sweep import CELL_SIZE, Sweep, cells_under, sweep
 from lidar.traffic.trips import Trip
 
 STEP_S = 0.1
@@ -68,14 +76,20 @@ def simulate_trips(
     if not trips:
         none = np.empty(0, np.int64)
         return SimulatedTrips(none, none, np.empty(0), np.empty(0))
-    movers = _movers(trips, graph, plan=plan)
     known = ego_motion(ego, ego_box, graph=graph)
-    movers, known, cells = _number_cells(movers, known)
+    movers, known, cells = _tables(trips, known, graph=graph, plan=plan)
     signals = plan.signals if obeys_signals else plan.signals._replace(window=green_windows(plan, known))
     excluded = np.zeros(len(trips), bool)
     for _ in range(_ROUNDS):
-        log, hit_ego = run(
-            movers, known, signals, excluded, cells, STEP_S, len(known.x), _HORIZON, radius + LEFT, -1
+        log, hit_ego = simulated(
+            movers,
+            known,
+            signals=signals,
+            excluded=excluded,
+            cells=cells,
+            dt=STEP_S,
+            horizon=_HORIZON,
+            radius=radius + LEFT,
         )
         if not hit_ego.any():
             break
@@ -98,14 +112,22 @@ def simulate_ego(
 
     It follows, gives way and obeys signals and signs like the other road users, and they react to it.
     """
-    movers = _movers([ego, *trips], graph, plan=plan)
     steps = int(np.ceil(seconds / STEP_S)) + 1
-    x, y, heading, speed = np.zeros((4, steps))
-    none = np.empty(0, np.int64)
-    known = EgoMotion(x, y, heading, speed, np.full(2, -np.inf), np.zeros(steps + 1, np.int64), none)
-    movers, known, cells = _number_cells(movers, known)
+    starts = np.zeros(steps + 1, np.int64)
+    known = EgoMotion(np.zeros(steps, MOTION), np.full(2, -np.inf), starts, np.empty(0, np.int64))
+    movers, known, cells = _tables([ego, *trips], known, graph=graph, plan=plan)
     excluded = np.zeros(len(trips) + 1, bool)
-    log, _ = run(movers, known, plan.signals, excluded, cells, STEP_S, steps, _HORIZON, radius + LEFT, 0)
+    log, _ = simulated(
+        movers,
+        known,
+        signals=plan.signals,
+        excluded=excluded,
+        cells=cells,
+        dt=STEP_S,
+        horizon=_HORIZON,
+        radius=radius + LEFT,
+        ego_row=0,
+    )
     mine = log[:, 0] == 0
     travelled = np.zeros(steps)
     travelled[log[mine, 1].astype(int)] = log[mine, 2]
@@ -132,14 +154,15 @@ def ego_motion(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadG
     grown = np.column_stack(
         [length / 2 + _KEEP[0] + speed * STEP_S / 2, np.full(steps, width / 2 + _KEEP[1])]
     )
-    under = np.empty(int(4 * np.prod(grown.max(axis=0) / CELL + 2)), np.int64)
+    under = np.empty(int(4 * np.prod(grown.max(axis=0) / CELL_SIZE + 2)), np.int64)
     events = []
     for k in range(steps):
         n = cells_under(middle[k, 0], middle[k, 1], heading[k], grown[k], level[k], under)
         events.append(under[:n].copy())
     start = np.concatenate([[0], np.cumsum([len(e) for e in events])])
     half = np.array([length / 2 + 0.2, width / 2 + 0.1])
-    return EgoMotion(middle[:, 0], middle[:, 1], heading, speed, half, start, np.concatenate(events))
+    motion = _records(MOTION, x=middle[:, 0], y=middle[:, 1], heading=heading, speed=speed)
+    return EgoMotion(motion, half, start, np.concatenate(events))
 
 
 def _levels(xyz: Float, graph: RoadGraph) -> Ints:
@@ -159,67 +182,74 @@ def _levels(xyz: Float, graph: RoadGraph) -> Ints:
     return out
 
 
-def _number_cells(movers: Movers, ego: EgoMotion) -> tuple[Movers, EgoMotion, int]:
-    """The tables with cells numbered from 0, and the number of cells."""
-    used, number = np.unique(np.concatenate([movers.cell, ego.event_cell]), return_inverse=True)
-    mine, its = np.split(number.astype(np.int32), [len(movers.cell)])
-    return movers._replace(cell=mine), ego._replace(event_cell=its), len(used)
-
-
 def green_windows(plan: JunctionPlan, ego: EgoMotion) -> Float:
     """Windows (w, 4) in which signals are green for the ego: from 8 s before it reaches a junction."""
-    zone = zone_at(plan.zones, np.column_stack([ego.x, ego.y]))
+    zone = zone_at(plan.zones, np.column_stack([ego.motion["x"], ego.motion["y"]]))
     rows = []
     cuts = np.flatnonzero(np.diff(np.concatenate([[-2], zone, [-2]])))
     for a, b in itertools.pairwise(cuts.tolist()):
         z = int(zone[a])
         if z >= 0 and plan.signalised[z]:
             rows.append(
-                (z, signal_group(plan, z, heading=float(ego.heading[a])), a * STEP_S - 8.0, b * STEP_S)
+                (
+                    z,
+                    signal_group(plan, z, heading=float(ego.motion["heading"][a])),
+                    a * STEP_S - 8.0,
+                    b * STEP_S,
+                )
             )
     return np.array(rows, float).reshape(-1, 4)
 
 
-def _movers(trips: Sequence[Trip | EgoTrip], graph: RoadGraph, *, plan: JunctionPlan) -> Movers:
-    """The tables of the simulation."""
+def _tables(
+    trips: Sequence[Trip | EgoTrip], ego: EgoMotion, *, graph: RoadGraph, plan: JunctionPlan
+) -> tuple[Movers, EgoMotion, int]:
+    """The tables of the simulation with cells numbered from 0, and the number of cells."""
     routes: dict[tuple[int, ...], int] = {}
     covered = graph.bridge | graph.tunnel
-    parts: list[dict[str, NDArray[Any]]] = []
+    stations, sweeps, passages = [], [], []
     for trip in trips:
         path = trip.path
         xy, heading = trip.body()
         level = np.where(path.edge >= 0, covered[path.edge], False).astype(np.int64)
         swept = sweep(xy, heading, length=trip.length, width=trip.width, level=level, scale=path.scale)
-        own = {"desired_speed": trip.desired_speed, "x": xy[:, 0], "y": xy[:, 1], "heading": heading}
-        passages = {"block": _blocks(trip, graph, plan=plan, routes=routes)}
-        parts.append(own | swept.columns() | passages)
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    b = columns.pop("block")
-    columns |= {
-        f"{name}_start": np.cumsum([0, *(len(part[column]) for part in parts)])
-        for name, column in (("station", "x"), ("cell", "cell"), ("block", "block"))
-    }
-    numbers = ("block_from", "block_to", "block_stop", "block_zone", "block_group", "block_route")
-    columns |= {name: b[:, c].astype(np.int64) for c, name in enumerate(numbers)}
+        own = _records(STATION, desired_speed=trip.desired_speed, x=xy[:, 0], y=xy[:, 1], heading=heading)
+        stations.append(own)
+        sweeps.append(swept)
+        passages.append(_blocks(trip, graph, plan=plan, routes=routes))
+    blocks = np.concatenate(passages)
+    columns = Sweep.concatenate(sweeps)
+    used, number = np.unique(np.concatenate([columns.cell, ego.event_cell]), return_inverse=True)
+    mine, its = np.split(number.astype(np.int32), [len(columns)])
+    tables = (("station_start", stations), ("cell_start", sweeps), ("block_start", passages))
+    starts = {name: np.cumsum([0, *(len(part) for part in parts)]) for name, parts in tables}
     drivers = ("headway", "acceleration", "deceleration", "gap")
-    return Movers(
-        **columns,
-        block_rank=b[:, 6].copy(),
-        block_stop_sign=b[:, 7] > 0,
-        **{name: np.array([getattr(t.driver, name) for t in trips]) for name in drivers},
-        **{
-            name: np.array([getattr(t, name) for t in trips])
-            for name in ("length", "width", "begin", "leaves")
-        },
-        appear=np.array([int(t.appear_s / STEP_S) for t in trips]),
-        whole_block=np.array([t.on_foot for t in trips]),
+    user = {name: [getattr(t.driver, name) for t in trips] for name in drivers}
+    user |= {name: [getattr(t, name) for t in trips] for name in ("length", "width", "begin", "leaves")}
+    user["appear"] = [int(t.appear_s / STEP_S) for t in trips]
+    user["whole_block"] = [t.on_foot for t in trips]
+    end = {name: [*values, 0] for name, values in user.items()}
+    movers = Movers(
+        _records(USER, **starts, **end),
+        np.concatenate(stations),
+        _records(CELL, number=mine, first=columns.first, last=columns.last, leave=columns.leave),
+        _records(BLOCK, **dict(zip(BLOCK.names or (), blocks.T, strict=True))),
     )
+    return movers, ego._replace(event_cell=its), len(used)
+
+
+def _records(dtype: np.dtype[np.void], **columns: ArrayLike) -> NDArray[np.void]:
+    """A table of records from its columns."""
+    table = np.empty(np.size(next(iter(columns.values()))), dtype)
+    for name, values in columns.items():
+        table[name] = values
+    return table
 
 
 def _blocks(
     trip: Trip | EgoTrip, graph: RoadGraph, *, plan: JunctionPlan, routes: dict[tuple[int, ...], int]
 ) -> Float:
-    """Passages through junctions (b, 8): from, to, stop, zone, group, route, rank, sign; see `Movers`."""
+    """Passages through junctions (b, 8): from, to, stop, zone, group, route, rank, sign; see `BLOCK`."""
     path = trip.path
     zone = zone_at(plan.zones, path.xyz[:, :2])
     half = int(np.ceil((trip.length / 2 + 0.5) / STEP))

@@ -15,11 +15,11 @@ from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.traffic.lanes import STEP, ActorPath
 
-CELL = 0.3
+CELL_SIZE = 0.3
 """Side of a cell in metres. Bodies that share no cell do not touch: a body covers all cells whose centre is
 within half a diagonal of it."""
 _MANY = 1 << 30  # cells along a side of the grid: 322,000 km
-_SPARE = 0.05 + CELL * math.sqrt(0.5)
+_SPARE = 0.05 + CELL_SIZE * math.sqrt(0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ def sweep(
     """
     # a body between two stations lies within both, grown by half a step
     half = np.array([length / 2 + STEP / 2, width / 2]) * scale + _SPARE
-    most = int(math.ceil(2 * half[0] / CELL) + 2) * int(math.ceil(2 * half[1] / CELL) + 2)
+    most = int(math.ceil(2 * half[0] / CELL_SIZE) + 2) * int(math.ceil(2 * half[1] / CELL_SIZE) + 2)
     cell, first, last, count = _cover(xy, heading, half, level, most)
     cell, first, last = cell[:count], first[:count], last[:count]
     return Sweep(cell, first, last, np.argsort(last, kind="stable").astype(np.int32))
@@ -87,9 +87,9 @@ def cells_under(x: float, y: float, heading: float, half: Any, level: int, out: 
     c, s, hl, hw = math.cos(heading), math.sin(heading), half[0], half[1]
     ex, ey = abs(c) * hl + abs(s) * hw, abs(s) * hl + abs(c) * hw
     n = 0
-    for j in range(math.ceil((y - ey) / CELL - 0.5), math.floor((y + ey) / CELL - 0.5) + 1):
-        for i in range(math.ceil((x - ex) / CELL - 0.5), math.floor((x + ex) / CELL - 0.5) + 1):
-            dx, dy = (i + 0.5) * CELL - x, (j + 0.5) * CELL - y
+    for j in range(math.ceil((y - ey) / CELL_SIZE - 0.5), math.floor((y + ey) / CELL_SIZE - 0.5) + 1):
+        for i in range(math.ceil((x - ex) / CELL_SIZE - 0.5), math.floor((x + ex) / CELL_SIZE - 0.5) + 1):
+            dx, dy = (i + 0.5) * CELL_SIZE - x, (j + 0.5) * CELL_SIZE - y
             if abs(dx * c + dy * s) <= hl and abs(dy * c - dx * s) <= hw:
                 out[n] = (level * _MANY + j + _MANY // 2) * _MANY + i + _MANY // 2
                 n += 1
