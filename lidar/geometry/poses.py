@@ -99,12 +99,14 @@ class Trajectory(Columns):
 
     def at(self, time_ns: ArrayLike) -> Poses:
         """Poses at times (k,) in nanoseconds, clamped to the first and last pose."""
-        t = np.asarray(time_ns, np.int64).reshape(-1)
-        k = len(t)
-        out = Poses(np.empty((k, 3)), np.empty((k, 3, 3)), np.ones((k, 3)))
+        knot = self.time_ns
+        t = np.clip(np.asarray(time_ns, np.int64).reshape(-1), knot[0], knot[-1])
+        row = np.minimum(np.searchsorted(knot, t, side="right") - 1, len(knot) - 2)
+        share = (t - knot[row]) / (knot[row + 1] - knot[row])
+        out = Poses(np.empty((len(t), 3)), np.empty((len(t), 3, 3)), np.ones((len(t), 3)))
         _interpolate(
-            t,
-            self.time_ns,
+            row,
+            share,
             self.position,
             self.quat_xyzw,
             self.scale,
@@ -140,20 +142,24 @@ class Trajectory(Columns):
 
 
 @njit(cache=True, nogil=True)
-def _interpolate(time: Any, knot: Any, place: Any, quat: Any, scale: Any, out: Any) -> None:
-    """Fill ``out``: position, rotation and scale at each time; slerp takes the shorter arc."""
+def _dot(a: Any, b: Any) -> float:
+    """Inner product of two quaternions; that of whole arrays takes long to compile."""
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3])
+
+
+@njit(cache=True, nogil=True)
+def _interpolate(row: Any, share: Any, place: Any, quat: Any, scale: Any, out: Any) -> None:
+    """Fill ``out``: position, rotation and scale between rows and the next; slerp takes the shorter arc."""
     position, rotation, factor = out
-    last = len(knot) - 2
-    for i in range(len(time)):
-        t = min(max(time[i], knot[0]), knot[-1])
-        k = min(np.searchsorted(knot, t, side="right") - 1, last)
-        w = (t - knot[k]) / (knot[k + 1] - knot[k])
+    for i in range(len(row)):
+        k, w = row[i], share[i]
         for r in range(3):
             position[i, r] = place[k, r] + w * (place[k + 1, r] - place[k, r])
         factor[i, 0] = factor[i, 1] = scale[k] + w * (scale[k + 1] - scale[k])
         a, b = quat[k], quat[k + 1]
-        size = np.sqrt((a * a).sum() * (b * b).sum())
-        along = (a * b).sum() / size
+        size_a, size_b = np.sqrt(_dot(a, a)), np.sqrt(_dot(b, b))
+        size = np.sqrt(_dot(a, a) * _dot(b, b))
+        along = _dot(a, b) / size
         # atan2 of sine and cosine: near 1 the cosine alone is too coarse.
         cross = np.sqrt(
             (a[3] * b[0] - a[0] * b[3] - a[1] * b[2] + a[2] * b[1]) ** 2
@@ -166,7 +172,7 @@ def _interpolate(time: Any, knot: Any, place: Any, quat: Any, scale: Any, out: A
             u, v = np.sin(u * angle) / np.sin(angle), np.sin(w * angle) / np.sin(angle)
         if along < 0.0:
             v = -v
-        u, v = u / np.sqrt((a * a).sum()), v / np.sqrt((b * b).sum())
+        u, v = u / size_a, v / size_b
         x, y, z, s = u * a[0] + v * b[0], u * a[1] + v * b[1], u * a[2] + v * b[2], u * a[3] + v * b[3]
         n = 2.0 / (x * x + y * y + z * z + s * s)
         m = rotation[i]
