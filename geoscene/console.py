@@ -172,7 +172,7 @@ def print_json(document: Mapping[str, Any]) -> None:
 def progress_bar(*, quiet: bool = False) -> Iterator[Progress]:
     """Yield a `Progress` that draws bars on standard error, or a silent one if that is not a terminal.
 
-    A bar appears once its stage has taken about a second.
+    A bar appears once its stage has taken about a second, at once if its length is unknown.
     """
     if quiet or not sys.stderr.isatty():
         yield silent
@@ -193,7 +193,7 @@ def _bar_callback(bars: Any) -> Progress:
     def update(stage: str, done: int, *, total: int) -> None:
         now = time.monotonic()
         if stage not in tasks:
-            if now - started.setdefault(stage, now) < 1.0:
+            if total and now - started.setdefault(stage, now) < 1.0:
                 return
             tasks[stage] = bars.add_task(stage, total=total or None)
         bars.update(tasks[stage], completed=done, total=total or None)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numba.core.event import Event, Listener, install_listener
 
 from geoscene.errors import GeosceneError
 from geoscene.files import write_json
@@ -70,6 +71,29 @@ def drive(
     Raises InputError (also as RouteError, RigError, DatasetError) for what cannot be driven or written.
     """
     began = time.perf_counter()
+    with install_listener("numba:compile", _CompilationProgress(progress)):
+        return _driven(scene, out, options=options, overwrite=overwrite, progress=progress, began=began)
+
+
+class _CompilationProgress(Listener):
+    """Reports the compilation of kernels, which takes seconds when a drive first needs them."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress, self._compiled = progress, 0
+
+    def on_start(self, event: Event) -> None:  # noqa: ARG002
+        """A function begins to compile."""
+        self._progress("compiling, once", self._compiled, total=0)
+
+    def on_end(self, event: Event) -> None:  # noqa: ARG002
+        """A function is compiled."""
+        self._compiled += 1
+
+
+def _driven(
+    scene: Scene, out: Path, *, options: DriveOptions, overwrite: bool, progress: Progress, began: float
+) -> DriveSummary:
+    """Plan and record; ``began`` is the time of the start, seconds."""
     plan = plan_drive(scene, options, progress=progress)
     manifest = plan.manifest()
     prepare(out, manifest["recipe"], overwrite=overwrite)
