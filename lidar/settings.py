@@ -59,17 +59,19 @@ def settings_of(
         raise InputError(f"`fidelity` {level}: one of {', '.join(levels())}")
     scanner, camera = scanner_settings.LEVELS[level], camera_settings.LEVELS[level]
     of_scanner, of_camera = ({f.name for f in fields(kind)} for kind in (ScannerSettings, CameraSettings))
+    scanner_changes: dict[str, Any] = {}
+    camera_changes: dict[str, Any] = {}
     for name, text in changes:
         if name in of_scanner:
-            scanner = replace(scanner, **_parsed(name, text, former=getattr(scanner, name)))
+            scanner_changes |= _parsed(name, text, former=getattr(scanner, name))
         elif name in of_camera:
-            camera = replace(camera, **_parsed(name, text, former=getattr(camera, name)))
+            camera_changes |= _parsed(name, text, former=getattr(camera, name))
         else:
             known = sorted(of_scanner | of_camera)
             near = get_close_matches(name, known, 3, 0.5)
             hint = f"; is {' or '.join(near)} meant?" if near else ";"
             raise InputError(f"`settings` {name}: unknown{hint} lidar settings lists all {len(known)}")
-    return scanner, camera
+    return replace(scanner, **scanner_changes), replace(camera, **camera_changes)
 
 
 def list_settings() -> list[Setting]:

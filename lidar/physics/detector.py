@@ -26,14 +26,13 @@ _BLOOM_POWER = 0.01  # of the retro-reflector's power, assumed
 _OVERLAP = 5e-5  # probability that a pulse of another scanner is received, typical value (1e-5 to 1e-4)
 
 
-def received(sensor: Sensor, echoes: Echoes, *, extinction: float) -> Float:
+def received(sensor: Sensor, echoes: Echoes) -> Float:
     """Power (m,) of each echo over the detection threshold."""
     return amplitude(
         echoes.apparent,
         echoes.range + sensor.pattern.range_offset,
         reference_reflectance=sensor.reference_reflectance,
         reference_range=sensor.reference_range,
-        extinction=extinction,
     )
 
 
@@ -43,7 +42,7 @@ def detected(sensor: Sensor, echoes: EchoesT, *, settings: ScannerSettings, devi
     With ``detection``, noise is added to the power before it is compared with the threshold, which gives the
     probability of `lidar.physics.link.detection_probability`; the measured reflectance includes that noise.
     """
-    power = received(sensor, echoes, extinction=settings.extinction)
+    power = received(sensor, echoes)
     measured = power
     if settings.detection:
         noise = daylight_noise(sensor.noise_ratio, settings.daylight_lux)
@@ -127,7 +126,7 @@ def measured_range(
         error = generator(seed, sensor.name, "bias").normal(0, sensor.bias_sigma, lasers)
         distance = distance + error[pulses.channel[echoes.pulse]]
     if settings.walk or settings.range_noise == "signal":
-        power = np.maximum(received(sensor, echoes, extinction=settings.extinction), 1.0)
+        power = np.maximum(received(sensor, echoes), 1.0)
         if settings.walk:
             distance = distance + walk(power)
     if settings.range_noise != "none":

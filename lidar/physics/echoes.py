@@ -27,7 +27,7 @@ class Echoes(Columns):
     pulse    : (m,) int32, row of the pulse
     range    : (m,) float64, metres from the beam's start, along the beam's axis
     apparent : (m,) float64, apparent reflectance: that of the Lambertian target at normal incidence, as large
-               as the beam, that returns the same power
+               as the beam, that returns the same power in clear air
     feature, klass, cosine : (m,) of the surface, as in `lidar.sensors.cloud.Cloud`; cosine of the incidence
     true_range : (m,) float64, metres to the surface that feature and class are of
     axis       : (m,) bool, the axis of the beam intersects that surface

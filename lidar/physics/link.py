@@ -21,21 +21,25 @@ def amplitude(
     *,
     reference_reflectance: float,
     reference_range: float,
-    extinction: float = 0.0,
 ) -> Float:
     """Received power over the detection threshold of extended targets.
 
-    The link equation (rho / rho_ref) (R_ref / R)^2 exp(-2 alpha R), scaled so that the power of the data
-    sheet's target, rho_ref at R_ref, is the threshold. The maximum range is proportional to sqrt(rho).
+    The link equation (rho / rho_ref) (R_ref / R)^2, scaled so that the power of the data sheet's target,
+    rho_ref at R_ref, is the threshold. The maximum range is proportional to sqrt(rho).
 
-    apparent   : reflectance times the law of incidence
-    distance   : metres
-    extinction : 1/m, one way
+    apparent : reflectance times the law of incidence and `transmission`
+    distance : metres
     """
     r = np.maximum(np.asarray(distance, float), 1e-3)
     scale = np.asarray(apparent, float) / reference_reflectance
-    received: Float = scale * (reference_range / r) ** 2 * np.exp(-2 * extinction * r)
+    received: Float = scale * (reference_range / r) ** 2
     return received
+
+
+def transmission(distance: ArrayLike, extinction: float) -> Float:
+    """Share of the power that the air lets pass to a target and back; metres, and 1/m one way."""
+    share: Float = np.exp(-2 * extinction * np.asarray(distance, float))
+    return share
 
 
 def apparent_of(

@@ -24,8 +24,9 @@ class ScannerSettings:
     spread       : spread of the reflectance from object to object, as the deviation of its logarithm
     link         : lose echoes below the detection threshold
     detection    : lose echoes near the threshold with a probability; includes ``link``
-    daylight_lux : illuminance of the scene, which raises the receiver's noise
-    extinction   : extinction coefficient of the air, 1/m, one way
+    daylight_lux : illuminance of the scene, which raises the receiver's noise; with ``detection`` or
+                   ``false_alarms``
+    extinction   : extinction coefficient of the air, 1/m, one way; also dims intensity, which assumes clear air
     rays         : rays per pulse, of `FOOTPRINTS`: a beam with a size, mixed pixels, several echoes
     mirrors      : glass transmits and reflects, water reflects
     foliage      : tree crowns and hedges let rays pass between their leaves
@@ -75,6 +76,12 @@ class ScannerSettings:
             for name, value in amounts.items()
             if not (isfinite(value) and value >= 0)
         ]
+        if self.daylight_lux and not (self.detection or self.false_alarms):
+            faults.append(
+                f"daylight_lux={self.daylight_lux:g}: has no effect without detection or false_alarms"
+            )
+        if self.stretch and self.rays > 1:
+            faults.append(f"stretch: has no effect with rays={self.rays}, which trace the surface")
         if faults:
             raise InputError("; ".join(faults))
 

@@ -15,6 +15,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.physics.detector import Deviates, detected, false_echoes, measured_range, received
 from lidar.physics.echoes import Echoes, TracedEchoes, joined, numbered, reported, traced
 from lidar.physics.intensity import reflectivity_code
+from lidar.physics.link import transmission
 from lidar.physics.settings import PLAIN, ScannerSettings
 from lidar.random_streams import generator
 from lidar.rig.patterns.beams import Firings
@@ -125,6 +126,9 @@ def cast(
         leaf_seed=int(generator(seed, sensor.name, frame, "foliage").integers(2**63)),
         threads=threads,
     )
+    if settings.extinction:
+        away = echoes.range + sensor.pattern.range_offset
+        echoes = replace(echoes, apparent=echoes.apparent * transmission(away, settings.extinction))
     return Sweep(sensor, frame, seed, settings, firings, sent, echoes)
 
 
@@ -158,7 +162,7 @@ def detect(sweep: Sweep, echoes: Echoes, *, deviates: Deviates) -> Detection:
         echoes = joined(echoes, traced(found, origin, source=first + found.pulse) if is_traced else found)
     number, count = numbered(echoes)
     if settings.rays > 1 or settings.mirrors or false or is_traced:
-        power = received(sensor, echoes, extinction=settings.extinction)
+        power = received(sensor, echoes)
         rows = reported(
             echoes, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
         )

@@ -65,7 +65,7 @@ def altered_sweep(sweep: Sweep, stages: Stages) -> Altered:
     original = report(sweep, first)
     before = stages.at("echoes", sensor.name)
     if before:
-        pulses = pulses_of(sensor, sweep.sent, extinction=sweep.settings.extinction)
+        pulses = pulses_of(sensor, sweep.sent)
         echoes = altered_echoes(pulses, echoes, stages=stages, frame=sweep.frame)
         last = detect(sweep, echoes, deviates=noise.again)
     reported, unaltered = cast("TracedEchoes", last.echoes), cast("TracedEchoes", first.echoes)

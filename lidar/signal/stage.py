@@ -78,7 +78,6 @@ class Pulses(Columns):
     column     : (n,) int32, firing block within the frame
     channel    : (n,) uint16, number of the laser
     power      : (n,) transmitted power over that of the sensor's nominal pulse
-    extinction : 1/m, one way, of the air, which `received` includes
     """
 
     sensor: Sensor
@@ -89,31 +88,28 @@ class Pulses(Columns):
     column: NDArray[np.int32]
     channel: NDArray[np.uint16]
     power: Float
-    extinction: float = 0.0
 
     def received(self, echoes: Echoes) -> Float:
         """Power (m,) of echoes over the detection threshold."""
-        return received(self.sensor, echoes, extinction=self.extinction)
+        return received(self.sensor, echoes)
 
     def apparent(self, power: Float, distance: Float) -> Float:
         """Apparent reflectance (m,) of echoes that arrive with a power over the detection threshold.
 
         distance : (m,) metres from the beam's start
         """
-        away = distance + self.sensor.pattern.range_offset
-        clear = power * np.exp(2 * self.extinction * away)
         return apparent_of(
-            clear,
-            away,
+            power,
+            distance + self.sensor.pattern.range_offset,
             reference_reflectance=self.sensor.reference_reflectance,
             reference_range=self.sensor.reference_range,
         )
 
 
-def pulses_of(sensor: Sensor, sent: Firings, *, extinction: float = 0.0) -> Pulses:
+def pulses_of(sensor: Sensor, sent: Firings) -> Pulses:
     """The pulses that a sensor sends, all with its nominal power."""
     columns = (sent.time_ns, sent.direction, sent.origin, sent.ring, sent.column, sent.channel)
-    return Pulses(sensor, *columns, np.ones(len(sent)), extinction)
+    return Pulses(sensor, *columns, np.ones(len(sent)))
 
 
 def added_echoes(

@@ -43,6 +43,11 @@ def test_each_listed_value_can_be_set():
         assert settings_of("standard", pairs) == settings_of(level)
 
 
+def test_settings_that_need_each_other_may_come_in_any_order():
+    pairs = [("daylight_lux", "20000"), ("detection", "on")]
+    assert settings_of("standard", pairs) == settings_of("standard", pairs[::-1])
+
+
 @pytest.mark.parametrize(
     ("level", "given", "says"),
     [
@@ -52,6 +57,8 @@ def test_each_listed_value_can_be_set():
         ("standard", [("rays", "many")], "whole number"),
         ("standard", [("shadows", "perhaps")], "on or off"),
         ("standard", [("supersample", "99")], "supersample=99"),
+        ("standard", [("daylight_lux", "20000")], "no effect without detection or false_alarms"),
+        ("survey", [("stretch", "on")], "no effect with rays=19"),
         ("best", [], "draft, standard, survey"),
     ],
 )

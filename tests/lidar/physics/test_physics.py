@@ -17,6 +17,7 @@ from lidar.physics.link import (
     daylight_noise,
     detection_probability,
     false_alarm_probability,
+    transmission,
 )
 from lidar.physics.range_error import quantised, signal_sigma, stretch_sigma, walk
 from lidar.physics.reflect import apparent, reflectance_table
@@ -84,8 +85,7 @@ def test_maximum_range_is_proportional_to_the_root_of_reflectance():
 
 
 def test_air_attenuates_out_and_back():
-    clear = amplitude(0.5, 30.0, **OS0)
-    assert amplitude(0.5, 30.0, extinction=0.01, **OS0) == pytest.approx(clear * np.exp(-0.6))
+    assert transmission(30.0, 0.01) == pytest.approx(np.exp(-0.6))
 
 
 @given(st.floats(1e-3, 1e3), st.floats(0.1, 500.0))

@@ -273,6 +273,25 @@ def test_reflectance_spread_is_constant_for_each_object():
     assert np.std(np.log([r[0] for r in each])) == pytest.approx(0.2, rel=0.4)
 
 
+def test_the_air_dims_intensity():
+    """A scanner that assumes clear air codes a target of 40 % at 50 m, with 0.01 1/m, as 40 exp(-1) = 14.7."""
+    clear, hazy = (
+        seen("vlp16", wall(50.0, material="brick"), ScannerSettings(extinction=a)) for a in (0, 0.01)
+    )
+    assert np.array_equal(clear.range, hazy.range)
+    np.testing.assert_allclose(hazy.intensity, clear.intensity * np.exp(-0.02 * clear.range), rtol=1e-5)
+
+
+def test_false_alarms_are_not_dimmed_by_the_air():
+    nothing = world(box((500, 500, 500), (501, 501, 501)))
+    clear, hazy = (
+        seen("vlp16", nothing, ScannerSettings(false_alarms=True, daylight_lux=30_000, extinction=a))
+        for a in (0, 0.05)
+    )
+    assert len(clear) > 100
+    assert np.array_equal(clear.intensity, hazy.intensity)
+
+
 def test_fog_attenuates_distant_surfaces_more():
     clear, foggy = (seen("vlp16", wall(40.0), ScannerSettings(link=True, extinction=a)) for a in (0.0, 0.02))
     assert len(foggy) < len(clear)
