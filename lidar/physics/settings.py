@@ -26,7 +26,7 @@ class ScannerSettings:
     detection    : lose echoes near the threshold with a probability; includes ``link``
     daylight_lux : illuminance of the scene, which raises the receiver's noise; with ``detection`` or
                    ``false_alarms``
-    extinction   : extinction coefficient of the air, 1/m, one way; also dims intensity, which assumes clear air
+    extinction   : extinction coefficient of the air, 1/m one way; dims intensity too, which assumes clear air
     rays         : rays per pulse, of `FOOTPRINTS`: a beam with a size, mixed pixels, several echoes
     mirrors      : glass transmits and reflects, water reflects
     foliage      : tree crowns and hedges let rays pass between their leaves

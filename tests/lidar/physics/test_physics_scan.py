@@ -274,7 +274,7 @@ def test_reflectance_spread_is_constant_for_each_object():
 
 
 def test_the_air_dims_intensity():
-    """A scanner that assumes clear air codes a target of 40 % at 50 m, with 0.01 1/m, as 40 exp(-1) = 14.7."""
+    """A scanner that assumes clear air codes 40 % at 50 m, with 0.01 1/m, as 40 exp(-1) = 14.7."""
     clear, hazy = (
         seen("vlp16", wall(50.0, material="brick"), ScannerSettings(extinction=a)) for a in (0, 0.01)
     )
