@@ -120,12 +120,14 @@ def build(
         Number of processes, by default one per core. The scene does not depend on it.
     """
     from geoscene.pipeline import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
+    from geoscene.scene.writer import check_target  # noqa: PLC0415
 
     started = time.perf_counter()
     if workers is not None and not 1 <= workers <= 256:
         raise InputError(f"`workers` {workers}: give 1 to 256")
     if source.dem_server and options.dem != ("tiles",):
         raise InputError("`dem_server` needs --dem tiles")
+    check_target(out, overwrite=report.overwrite)
     with progress_bar(quiet=report.quiet) as progress:
         progress("reading the map", 0, total=0)
         data = _read_map(source)

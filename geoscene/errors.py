@@ -7,6 +7,8 @@ Messages name parameters in backquotes (`tile_size`); the command line shows the
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 
 
@@ -40,6 +42,30 @@ class SolidError(GeosceneError):
 
 class MissingExtraError(InputError, ImportError):
     """An optional dependency that is not installed."""
+
+
+class WorkersLostError(GeosceneError):
+    """All worker processes were killed."""
+
+
+@contextmanager
+def reading(
+    path: object, error: type[Exception], *, remedy: str, known: type[Exception] = GeosceneError
+) -> Iterator[None]:
+    """Raise what goes wrong in the block, which reads a file, as an ``error`` that names the file.
+
+    remedy : what to do about a missing or damaged file, such as "build the scene again"
+    known  : base class of errors that name their cause; they pass, as do those of access and memory
+    """
+    try:
+        yield
+    except (known, MemoryError, PermissionError, IsADirectoryError):
+        raise
+    except FileNotFoundError as cause:
+        raise error(f"{path}: is missing; {remedy}") from cause
+    except Exception as cause:
+        text = " ".join(str(cause).split())[:200]
+        raise error(f"{path}: damaged ({type(cause).__name__}: {text}); {remedy}") from cause
 
 
 def need(module: str, extra: str) -> ModuleType:

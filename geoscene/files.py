@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import csv
+import errno
+import hashlib
+import importlib
 import io
 import json
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,13 +22,15 @@ from numpy.typing import NDArray
 
 from geoscene.errors import InputError
 
+fcntl = None if sys.platform == "win32" else importlib.import_module("fcntl")
+
 
 @contextmanager
 def atomic_path(path: Path, *, keep_suffix: bool = False) -> Iterator[Path]:
     """Yield a temporary path in the same folder; the file written there is renamed to ``path`` afterwards.
 
     If the block raises, the temporary file is deleted and ``path`` is left unchanged. If the block writes
-    no file, an existing ``path`` is deleted.
+    no file, an existing ``path`` is deleted. An OSError without a file name (disk full) gets ``path``.
 
     keep_suffix : give the temporary file the suffix of ``path``, for libraries that choose the format by it,
                   instead of ``.part``
@@ -39,6 +45,10 @@ def atomic_path(path: Path, *, keep_suffix: bool = False) -> Iterator[Path]:
             part.replace(path)
         else:
             path.unlink(missing_ok=True)
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
     finally:
         part.unlink(missing_ok=True)
 
@@ -70,6 +80,47 @@ def atomic_folder(path: Path, *, mark: str) -> Iterator[Path]:
         part.rename(path)
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+@contextmanager
+def exclusive(path: Path) -> Iterator[None]:
+    """Hold the right to write a directory against other processes; ``<path>.lock`` exists meanwhile.
+
+    Raises InputError if another process holds it. It ends with its process, however that ends.
+    """
+    lock = path.with_name(f"{path.name}.lock")
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with lock.open("ab") as file:
+        if (
+            not _locked(file)
+            or not lock.exists()
+            or not os.path.samestat(lock.stat(), os.fstat(file.fileno()))
+        ):
+            raise InputError(f"{path}: another process is writing it; wait for it, or give another directory")
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+
+
+def _locked(file: IO[bytes]) -> bool:
+    """Lock a file; whether that succeeded. Systems without such locks count as success."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno not in (errno.EACCES, errno.EAGAIN)
+    return True
+
+
+def digest_of(path: Path) -> str:
+    """Digest of a file's bytes; empty if the file cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()[:20]
+    except OSError:
+        return ""
 
 
 def write_atomically(path: Path, data: bytes) -> None:

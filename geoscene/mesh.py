@@ -131,6 +131,12 @@ class Instances(Columns):
     transform: Float
     feature: NDArray[np.int32]
 
+    def shifted(self, offset: Sequence[float] | Float) -> Instances:
+        """The instances moved by ``offset`` (3,), metres."""
+        moved = self.transform.copy()
+        moved[:, :, 3] += np.asarray(offset, float)
+        return replace(self, transform=moved)
+
     @classmethod
     def empty(cls) -> Instances:
         """No instances."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import itertools
 import json
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import shapely
 
 from geoscene import __version__
 from geoscene.errors import SourceNotFoundError
+from geoscene.files import digest_of
 from geoscene.manifest import scene_manifest
 from geoscene.objects.shapes import shapes
 from geoscene.options import BuildOptions
@@ -28,6 +30,12 @@ from geoscene.tiles import Keys, TileReport, build_tiles, tiles_document
 
 _OFFSET = 15.0
 """Metres, maximum distance of a sensor from the centre line of its road."""
+
+_NOT_IN_TILES = frozenset({"name", "along", "reach"})
+"""Options on which no tile depends; some select the tiles to build."""
+
+_NOT_IN_GROUND = frozenset({"lod"})
+"""Options on which only the solids of buildings depend."""
 
 _CROWN, _ARM = 5.0, 10.0
 """Metres, maximum horizontal extent of forest trees and of lamps and signals from their position."""
@@ -114,20 +122,24 @@ def _tiles_along(plan: Plan, options: BuildOptions) -> list[tuple[int, int]]:
 
 
 def _keys(osm: OsmData, options: BuildOptions) -> Keys:
-    """Digests of all inputs of the ground and of the solids of tiles."""
-    dem = [(str(p), Path(p).stat().st_size, Path(p).stat().st_mtime_ns) for p in options.dem]
-    common = [
-        __version__,
-        osm.source,
-        osm.digest,
-        list(osm.bounds),
-        options.crs,
-        dem,
-        options.dem_gaps,
-        sorted(options.only),
-        options.tile_size,
-    ]
-    return Keys(ground=_digest(common), solids=_digest([*common, options.lod]))
+    """Digests of all inputs of the ground and of the solids of tiles: program, map and options."""
+    chosen = {f.name: getattr(options, f.name) for f in fields(options) if f.name not in _NOT_IN_TILES}
+    dem = [digest_of(path) for name in options.dem for path in _with_companions(Path(name))]
+    common = {
+        "version": __version__,
+        "map": osm.digest,
+        "bounds": osm.bounds,
+        **{name: value for name, value in chosen.items() if name not in _NOT_IN_GROUND},
+        "dem": dem,
+        "only": sorted(options.only),
+    }
+    rest = {name: chosen[name] for name in _NOT_IN_GROUND}
+    return Keys(ground=_digest(common), solids=_digest(common | rest))
+
+
+def _with_companions(path: Path) -> list[Path]:
+    """A raster, and the files beside it from which GDAL may read its place (``.tfw``, ``.aux.xml``)."""
+    return [path, *sorted(set(path.parent.glob(f"{glob.escape(path.stem)}.*")) - {path})]
 
 
 def _digest(value: object) -> str:

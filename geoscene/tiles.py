@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import io
 import json
-import multiprocessing
-import os
 import pickle
-import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +16,14 @@ import shapely
 
 from geoscene.buildings import build_solids
 from geoscene.classes import Class
-from geoscene.files import write_atomically
+from geoscene.files import digest_of, write_atomically
 from geoscene.ground import ground_tile, tile_place
 from geoscene.mesh import Instances, Mesh, concatenate
 from geoscene.objects.barriers import barrier_meshes
 from geoscene.objects.furniture import furniture_instances
 from geoscene.objects.vegetation import forest_trees, tree_instances
 from geoscene.plan import Plan, take_buildings
+from geoscene.processes import run_tasks
 from geoscene.report import Problem, described, make_without_failures
 from geoscene.scene import SceneFiles
 from geoscene.scene.tile_files import Tile, read_tile, write_tile
@@ -45,6 +42,7 @@ class TileReport:
     faces      : number of faces
     instances  : number of instances of shapes
     area       : plan area of the ground in square metres
+    digest     : digest of the tile's file
     problems   : buildings that were simplified or dropped
     """
 
@@ -56,6 +54,7 @@ class TileReport:
     faces: int
     instances: int
     area: float
+    digest: str
     problems: tuple[Problem, ...]
 
 
@@ -125,20 +124,15 @@ def build_tile(
     if former is not None:
         old = read_tile(former)
         is_building = old.mesh.closed & (old.mesh.feature < plan.buildings.count)
-        rest = old.mesh.take(~is_building).shifted(old.origin)
-        transform = old.instances.transform.copy()
-        transform[:, :, 3] += old.origin
-        copies = replace(old.instances, transform=transform)
+        origin, rest, copies = old.origin, old.mesh.take(~is_building), old.instances
     else:
-        rest, copies = make_ground(plan, tile)
-    mesh = concatenate([solids, rest])
-    low = float(np.floor(mesh.vertices[:, 2].min(initial=0.0)))
-    origin = np.array([tile[0] * size, tile[1] * size, low])
-    moved = copies.transform.copy()
-    moved[:, :, 3] -= origin
-    write_tile(
-        SceneFiles(folder).tile(*tile), Tile(origin, mesh.shifted(-origin), replace(copies, transform=moved))
-    )
+        ground, copies = make_ground(plan, tile)
+        low = float(np.floor(ground.vertices[:, 2].min(initial=0.0)))
+        origin = np.array([tile[0] * size, tile[1] * size, low])
+        rest = ground.take(np.arange(len(ground))).shifted(-origin)
+        copies = copies.shifted(-origin)
+    mesh = concatenate([solids.shifted(-origin), rest])
+    digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies))
     verdict = validate_mesh(mesh)
     built = verdict.feature < plan.buildings.count
     return TileReport(
@@ -149,6 +143,7 @@ def build_tile(
         len(mesh),
         len(copies),
         _plan_area(rest.take(~rest.closed)),
+        digest,
         tuple(problems),
     )
 
@@ -171,67 +166,63 @@ def build_tiles(
 ) -> Iterator[TileReport]:
     """Build all tiles that are not in ``folder`` yet; yields reports of all tiles, in no particular order.
 
-    Workers are processes started with the current method (`multiprocessing.set_start_method`). Forked workers
-    share the memory of the plan; spawned ones get a copy each and need an importable main module. Each tile
-    is entered in a journal in ``folder`` once written, so an interrupted build can resume. Tiles of the
-    ``former`` scene with the same keys are copied, or their ground is reused.
+    Each tile is entered in a journal in ``folder`` once written, so an interrupted build can resume. Tiles of
+    the ``former`` scene with the same keys are copied, or their ground is reused. Tiles whose files are
+    damaged are built again.
     """
     files = SceneFiles(folder)
     files.tiles.mkdir(parents=True, exist_ok=True)
-    journal = _read_journal(folder, keys)
-    finished = {tile: journal[tile] for tile in tiles if tile in journal}
+    journalled = _read_journal(folder, keys)
+    finished = {tile: journalled[tile] for tile in tiles if tile in journalled}
     kept = {files.tile(*tile) for tile in finished}
     for path in files.tiles.iterdir():
-        if path not in kept:  # of a build with other options, or partly written
+        if path not in kept:  # of a build with other options, damaged or partly written
             path.unlink()
     yield from finished.values()
     remaining = [tile for tile in tiles if tile not in finished]
-    source = _Former.of(former, keys)
-    if workers > 1 and len(remaining) > 1:
-        with ProcessPoolExecutor(
-            workers,
-            mp_context=multiprocessing.get_context(),
-            initializer=_start_worker,
-            initargs=(_Job(plan, folder, lod, source),),
-        ) as pool:
-            for task in as_completed([pool.submit(_build_in_worker, tile) for tile in remaining]):
-                yield _journalled(folder, keys, report=task.result())
-    else:
-        for tile in remaining:
-            yield _journalled(folder, keys, report=source.build(plan, folder, tile=tile, lod=lod))
+    job = _Job(plan, folder, lod, _Former.of(former, keys))
+    several = workers > 1 and len(remaining) > 1
+    for report in run_tasks(job, remaining, workers=workers) if several else map(job, remaining):
+        with files.tile_journal.open("a", encoding="utf-8") as journal:
+            journal.write(json.dumps({"keys": asdict(keys), **asdict(report)}) + "\n")
+        yield report
 
 
 @dataclass(frozen=True, slots=True)
 class _Former:
-    """The scene of an earlier build, and which parts of its tiles can be reused."""
+    """The scene of an earlier build, and which parts of its tiles can be reused.
 
-    folder: Path | None
-    tiles: frozenset[tuple[int, int]]
-    ground: bool
-    all: bool
+    reports : of the tiles whose ground can be reused
+    all     : the solids can be reused, too
+    """
+
+    files: SceneFiles
     reports: dict[tuple[int, int], TileReport]
+    all: bool
 
     @classmethod
     def of(cls, folder: Path | None, keys: Keys) -> _Former:
-        path = None if folder is None else SceneFiles(folder).tile_reports
-        if folder is None or path is None or not path.exists():
-            return cls(None, frozenset(), ground=False, all=False, reports={})
-        document = json.loads(path.read_text("utf-8"))
-        reports = {(r.i, r.j): r for r in map(_report, document["tiles"])}
-        ground = document["keys"]["ground"] == keys.ground
-        both = ground and document["keys"]["solids"] == keys.solids
-        return cls(folder, frozenset(reports), ground=ground, all=both, reports=reports)
+        files = SceneFiles(folder or Path())
+        document: Any = {"keys": {}}
+        if folder is not None:
+            with suppress(OSError, ValueError):
+                document = json.loads(files.tile_reports.read_text("utf-8"))
+        try:
+            same = document["keys"].get("ground") == keys.ground
+            reports = {(r.i, r.j): r for r in map(_report, document["tiles"])} if same else {}
+            return cls(files, reports, all=document["keys"].get("solids") == keys.solids)
+        except (LookupError, TypeError, AttributeError):  # damaged
+            return cls(files, {}, all=False)
 
     def build(self, plan: Plan, folder: Path, *, tile: tuple[int, int], lod: int) -> TileReport:
-        old = None
-        if self.folder is not None and self.ground and tile in self.tiles:
-            old = SceneFiles(self.folder).tile(*tile)
-            if self.all and old.exists():
-                write_atomically(SceneFiles(folder).tile(*tile), old.read_bytes())
-                return self.reports[tile]
-        return build_tile(
-            plan, folder, tile=tile, lod=lod, former=old if old is not None and old.exists() else None
-        )
+        """Copy or build a tile; see `build_tile`."""
+        former = self.files.tile(*tile)
+        if tile not in self.reports or digest_of(former) != self.reports[tile].digest:
+            return build_tile(plan, folder, tile=tile, lod=lod, former=None)
+        if self.all:
+            write_atomically(SceneFiles(folder).tile(*tile), former.read_bytes())
+            return self.reports[tile]
+        return build_tile(plan, folder, tile=tile, lod=lod, former=former)
 
 
 @dataclass(frozen=True)
@@ -242,6 +233,10 @@ class _Job:
     folder: Path
     lod: int
     source: _Former
+
+    def __call__(self, tile: tuple[int, int]) -> TileReport:
+        """Build tile (i, j), or copy it from the former scene."""
+        return self.source.build(self.plan, self.folder, tile=tile, lod=self.lod)
 
     def __reduce__(self) -> tuple[Any, ...]:
         buffer = io.BytesIO()
@@ -265,52 +260,24 @@ def _unpickled_job(data: bytes) -> _Job:
     return _Job(*pickle.loads(data))  # noqa: S301  (from the parent process)
 
 
-_job: _Job
-"""The job of a worker process."""
-
-
-def _start_worker(job: _Job) -> None:
-    """Store the job, and exit when the parent process ends."""
-    global _job  # noqa: PLW0603  (of this process alone)
-    _job = job
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    def watch(sentinel: int) -> None:
-        wait([sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
-
-
-def _build_in_worker(tile: tuple[int, int]) -> TileReport:
-    return _job.source.build(_job.plan, _job.folder, tile=tile, lod=_job.lod)
-
-
 def _report(document: dict[str, Any]) -> TileReport:
     return TileReport(**(document | {"problems": tuple(Problem(**p) for p in document["problems"])}))
 
 
-def _journalled(folder: Path, keys: Keys, *, report: TileReport) -> TileReport:
-    """Append a report to the journal in the folder, and return it."""
-    with SceneFiles(folder).tile_journal.open("a", encoding="utf-8") as journal:
-        journal.write(json.dumps({"keys": asdict(keys), **asdict(report)}) + "\n")
-    return report
-
-
 def _read_journal(folder: Path, keys: Keys) -> dict[tuple[int, int], TileReport]:
-    """Reports by tile of an interrupted build with the same keys in the folder."""
+    """Reports by tile of an interrupted build with the same keys in the folder, of undamaged tiles."""
     files = SceneFiles(folder)
     path = files.tile_journal
     reports: dict[tuple[int, int], TileReport] = {}
-    for line in path.read_text("utf-8").splitlines() if path.exists() else ():
+    for line in path.read_text("utf-8", errors="replace").splitlines() if path.exists() else ():
         try:
             document = json.loads(line)
-        except ValueError:  # the incomplete last line of an interrupted build
+            same = document.pop("keys") == asdict(keys)
+            report = _report(document)
+        except (ValueError, LookupError, TypeError, AttributeError):  # the incomplete or a damaged line
             continue
-        if document.pop("keys") == asdict(keys) and files.tile(document["i"], document["j"]).exists():
-            reports[document["i"], document["j"]] = _report(document)
+        if same and digest_of(files.tile(report.i, report.j)) == report.digest:
+            reports[report.i, report.j] = report
     return reports
 
 

@@ -27,7 +27,7 @@ SLOW = frozenset(
     (
         "test_actors", "test_build", "test_cli", "test_drive",
         "test_ego_drive", "test_elevation", "test_fcd", "test_files",
-        "test_flight_planning", "test_network", "test_outputs", "test_overture",
+        "test_flight_planning", "test_interruptions", "test_network", "test_outputs", "test_overture",
         "test_raycast", "test_real", "test_render", "test_roofs",
         "test_scale", "test_sensors", "test_siting", "test_structures",
         "test_sumo", "test_traffic", "test_view", "test_view_browser",

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from geoscene.errors import SceneFormatError
+from geoscene.errors import GeosceneError, SceneFormatError, reading
+from geoscene.files import digest_of
 from geoscene.frames import Frame
 from geoscene.mesh import Mesh
 from geoscene.roadgraph import RoadGraph, read_graphml
@@ -17,6 +21,8 @@ from geoscene.scene.tile_files import Tile, read_shapes, read_tile
 
 SCHEMA = 1
 """Version of the scene directory; a reader refuses others."""
+
+_REMEDY = "build the scene again with `overwrite`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +74,21 @@ class SceneFiles:
     def tile(self, i: int, j: int) -> Path:
         """Tile (i, j)."""
         return self.tiles / f"{i}_{j}.npz"
+
+    def owns(self, path: Path) -> bool:
+        """Whether a path in the directory, or in its folder of tiles, is named as a file of a scene."""
+        if path.parent == self.tiles:
+            return re.fullmatch(r"-?\d+_-?\d+\.npz", path.name) is not None
+        # SQLite has files beside a GeoPackage that another program opens.
+        return path.name in _NAMES or path.name.startswith(f"{self.features.name}-")
+
+
+_NAMES = frozenset(
+    getattr(SceneFiles(Path()), name).name
+    for name, value in vars(SceneFiles).items()
+    if isinstance(value, property)
+)
+"""Names of the files and folders in a scene directory."""
 
 
 @dataclass(frozen=True)
@@ -164,13 +185,51 @@ def open_scene(path: str | Path) -> Scene:
         raise SceneFormatError(
             f"{folder}: no {manifest_file.name} in it: not a scene, or its build did not finish"
         )
-    try:
+    with reading(manifest_file, SceneFormatError, remedy=_REMEDY):
         manifest = json.loads(manifest_file.read_text("utf-8"))
         schema = manifest["schema"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise SceneFormatError(f"{manifest_file}: damaged ({error}); build the scene again") from error
-    if schema != SCHEMA:
-        raise SceneFormatError(
-            f"{folder}: schema version {schema}, this program reads {SCHEMA}; build the scene again"
-        )
-    return Scene(folder, manifest, Frame.from_json(manifest["frame"]))
+        if schema != SCHEMA:
+            raise SceneFormatError(
+                f"{folder}: schema version {schema}, this program reads {SCHEMA}; build the scene again"
+            )
+        if manifest.get("digest") not in (None, manifest_digest(manifest)):
+            raise SceneFormatError(f"{manifest_file}: differs from what the build wrote; {_REMEDY}")
+        scene = Scene(folder, manifest, Frame.from_json(manifest["frame"]))
+        _ = scene.frame.crs, scene.bounds, scene.tile_size, scene.tile_indices, scene.layers
+    return scene
+
+
+def manifest_digest(manifest: Mapping[str, Any]) -> str:
+    """Digest of a manifest but for its own entry of it."""
+    rest = {key: value for key, value in manifest.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()[:20]
+
+
+def changed_files(scene: Scene) -> list[Path]:
+    """Files of a scene that are missing or differ from what the build wrote."""
+    stated = {scene.path / name: digest for name, digest in scene.manifest.get("files", {}).items()}
+    with suppress(OSError, ValueError, LookupError, TypeError):
+        reports = json.loads(scene.files.tile_reports.read_text("utf-8"))["tiles"]
+        stated |= {scene.files.tile(int(r["i"]), int(r["j"])): r["digest"] for r in reports}
+    return [path for path, digest in stated.items() if digest_of(path) != digest]
+
+
+@contextmanager
+def using(scene: Scene, *, known: type[Exception] = GeosceneError) -> Iterator[Scene]:
+    """Yield a scene; raise an unexpected error of the block as that of a damaged file, if there is one.
+
+    known : base class of errors that name their cause; they pass
+
+    Raises SceneFormatError that names the file.
+    """
+    try:
+        yield scene
+    except (GeosceneError, known, OSError, MemoryError):
+        raise
+    except Exception as error:
+        if changed := changed_files(scene):
+            cause = f"{type(error).__name__}: {error}"
+            raise SceneFormatError(
+                f"{changed[0]}: differs from what the build wrote ({cause}); {_REMEDY}"
+            ) from error
+        raise

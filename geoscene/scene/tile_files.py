@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.errors import SceneFormatError
-from geoscene.files import write_atomically
+from geoscene.errors import SceneFormatError, reading
+from geoscene.files import digest_of, write_atomically
 from geoscene.mesh import Instances, Mesh
 from geoscene.typing import Float
+
+_REMEDY = "build the scene again with `overwrite`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +51,11 @@ def _mesh_arrays(mesh: Mesh) -> dict[str, NDArray[Any]]:
     return {f.name: getattr(mesh, f.name) for f in fields(Mesh)}
 
 
-def write_tile(path: Path, tile: Tile) -> None:
-    """Write one tile as .npz."""
+def write_tile(path: Path, tile: Tile) -> str:
+    """Write one tile as .npz and return the digest of the file."""
     instances = {f"instance_{f.name}": getattr(tile.instances, f.name) for f in fields(Instances)}
     write_atomically(path, pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances}))
+    return digest_of(path)
 
 
 def read_tile(path: Path) -> Tile:
@@ -60,13 +63,25 @@ def read_tile(path: Path) -> Tile:
 
     Raises SceneFormatError if the file is missing or damaged.
     """
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            mesh = Mesh(**{f.name: archive[f.name] for f in fields(Mesh)})
-            instances = Instances(**{f.name: archive[f"instance_{f.name}"] for f in fields(Instances)})
-            return Tile(archive["origin"], mesh, instances)
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise SceneFormatError(f"{path}: not a readable tile ({error}); build the scene again") from error
+    with reading(path, SceneFormatError, remedy=_REMEDY):
+        arrays = _unpacked(path)
+        instances = {f.name: arrays[f"instance_{f.name}"] for f in fields(Instances)}
+        return Tile(arrays["origin"], _mesh(arrays), Instances(**instances))
+
+
+def _unpacked(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of a file of `pack`; zipfile verifies their checksums before their headers are trusted."""
+    with zipfile.ZipFile(path) as archive:
+        return {
+            name.removesuffix(".npy"): np.lib.format.read_array(
+                BytesIO(archive.read(name)), allow_pickle=False
+            )
+            for name in archive.namelist()
+        }
+
+
+def _mesh(arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Mesh:
+    return Mesh(**{f.name: arrays[prefix + f.name] for f in fields(Mesh)})
 
 
 def write_shapes(path: Path, shapes: Mapping[str, Mesh]) -> None:
@@ -81,15 +96,6 @@ def read_shapes(path: Path) -> dict[str, Mesh]:
     """The shapes that `write_shapes` wrote, in order; empty if there is no such file."""
     if not path.exists():
         return {}
-    try:
-        return _shapes(path)
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise SceneFormatError(f"{path}: damaged ({error}); build the scene again") from error
-
-
-def _shapes(path: Path) -> dict[str, Mesh]:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-        return {
-            str(name): Mesh(**{f.name: archive[f"{name}/{f.name}"] for f in fields(Mesh)})
-            for name in archive["names"]
-        }
+    with reading(path, SceneFormatError, remedy=_REMEDY):
+        arrays = _unpacked(path)
+        return {str(name): _mesh(arrays, f"{name}/") for name in arrays["names"]}

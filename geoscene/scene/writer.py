@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
@@ -12,42 +14,92 @@ from typing import Any, Self
 import numpy as np
 
 from geoscene.classes import Class, materials
-from geoscene.errors import SceneFormatError
-from geoscene.files import write_columns, write_json
+from geoscene.errors import SceneFormatError, WorkersLostError
+from geoscene.files import digest_of, exclusive, write_columns, write_json
 from geoscene.frames import Frame
 from geoscene.mesh import Mesh
 from geoscene.report import Problem
 from geoscene.roadgraph import RoadGraph, write_graphml
 from geoscene.scene.geopackage import Layer, write_geopackage
-from geoscene.scene.layout import SCHEMA, SceneFiles
+from geoscene.scene.layout import SCHEMA, SceneFiles, manifest_digest
 from geoscene.scene.tile_files import write_shapes
+
+log = logging.getLogger(__name__)
+
+_RESUMABLE = (OSError, MemoryError, WorkersLostError)
+"""Errors after which the same command may succeed, with more space, memory or patience."""
+
+
+def check_target(path: Path, *, overwrite: bool = False) -> bool:
+    """Whether a directory holds a scene, which the writer of another may replace.
+
+    Raises SceneFormatError if the directory exists and may not be replaced.
+    """
+    path = path.resolve()
+    if path.is_mount() or path in (Path.cwd(), *Path.cwd().parents):
+        kind = "the root of a disk" if path.is_mount() else "the current directory or holds it"
+        raise SceneFormatError(f"{path}: is {kind} and cannot be replaced; give a directory in it")
+    if not path.exists():
+        return False
+    ours = path.is_dir() and any(SceneFiles(path).owns(entry) for entry in path.iterdir())
+    if not path.is_dir() or (any(path.iterdir()) and not ours):
+        raise SceneFormatError(f"{path}: exists and is not a scene; give another directory")
+    if ours and not overwrite:
+        raise SceneFormatError(f"{path}: holds a scene; set `overwrite` to replace it")
+    return ours
 
 
 class SceneWriter:
     """Writer of a scene directory, which appears under its name when `finish` is called.
 
-    Until then its files are in a folder beside it, which is removed if the build fails, and kept if it is
-    killed or interrupted, so that the next build can resume.
+    Until then its files are in a folder beside it, ``<name>.part``. It is kept if the build is killed or
+    interrupted, or ends for want of space or memory, so that the next build can resume; else it is removed.
+    Files of others in a scene that is replaced are kept. A second writer of the same directory is refused.
 
     Raises SceneFormatError if the path exists and may not be replaced.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
-        self.former: Path | None = None
-        if path.exists():
-            ours = SceneFiles(path).manifest.exists()
-            if not path.is_dir() or (any(path.iterdir()) and not ours):
-                raise SceneFormatError(f"{path}: exists and is not a scene; give another directory")
-            if ours and not overwrite:
-                raise SceneFormatError(f"{path}: holds a scene; set `overwrite` to replace it")
-            self.former = path if ours else None
-        self.path = path
-        self.folder = path.with_name(f"{path.name}.part")
-        self.folder.mkdir(parents=True, exist_ok=True)
+        check_target(path, overwrite=overwrite)
+        self.path = path.resolve()  # the directory that a link leads to
+        self.folder = self.path.with_name(f"{self.path.name}.part")
         self.files = SceneFiles(self.folder)
+        self.former: Path | None = None
+        self._replaced = self.path.with_name(f"{self.path.name}.old")
+        self._overwrite = overwrite
+        self._lock = ExitStack()
+
+    def __enter__(self) -> Self:
+        self._lock.enter_context(exclusive(self.path))
+        self._complete_replacement()
+        self.former = self.path if check_target(self.path, overwrite=self._overwrite) else None
+        self.folder.mkdir(exist_ok=True)
         for left in self.folder.iterdir():
             if left not in (self.files.tiles, self.files.tile_journal):  # a build resumes from tiles only
                 left.unlink()
+        return self
+
+    def _complete_replacement(self) -> None:
+        """Complete the replacement of a scene in which an earlier build was killed."""
+        if self._replaced.exists() and not self.path.exists():
+            self._replaced.rename(self.path)
+        elif self._replaced.exists():
+            self._keep_foreign()
+
+    def _keep_foreign(self) -> None:
+        """Move the files of others from the replaced scene to the new one, and delete the rest."""
+        old = SceneFiles(self._replaced)
+        foreign = [entry for entry in self._replaced.iterdir() if not old.owns(entry)]
+        if old.tiles.is_dir():
+            foreign += [entry for entry in old.tiles.iterdir() if not old.owns(entry)]
+        for entry in sorted(foreign):
+            name = entry.relative_to(self._replaced)
+            target = self.path / name
+            target.parent.mkdir(exist_ok=True)
+            if not target.exists():
+                entry.rename(target)
+                log.warning("%s: kept, though not of the scene", target)
+        shutil.rmtree(self._replaced)
 
     def finish(
         self,
@@ -82,6 +134,7 @@ class SceneWriter:
         write_json(self.files.tile_reports, tiles, indent=1)
         self.files.tile_journal.unlink(missing_ok=True)
         ranges = {layer.name: [a, b] for layer, a, b in zip(layers, starts[:-1], starts[1:], strict=True)}
+        tables = (self.files.features, self.files.road_graph, self.files.shapes, self.files.problems)
         document = {
             "schema": SCHEMA,
             **manifest,
@@ -89,17 +142,22 @@ class SceneWriter:
             "layers": ranges,
             "classes": {c.name.lower(): int(c) for c in Class},
             "materials": {name: m.code for name, m in materials().items()},
+            "files": {file.name: digest_of(file) for file in tables if file.exists()},
         }
-        write_json(self.files.manifest, document, indent=1)
+        write_json(self.files.manifest, document | {"digest": manifest_digest(document)}, indent=1)
         if self.path.exists():
-            shutil.rmtree(self.path)
+            self.path.rename(self._replaced)
         self.folder.rename(self.path)
-
-    def __enter__(self) -> Self:
-        return self
+        if self._replaced.exists():
+            self._keep_foreign()
 
     def __exit__(  # noqa: PLR0917 - the protocol of context managers
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None or issubclass(kind, Exception):
-            shutil.rmtree(self.folder, ignore_errors=True)
+        resumable = kind is not None and (
+            not issubclass(kind, Exception)
+            or (issubclass(kind, _RESUMABLE) and self.files.tile_journal.exists())
+        )
+        with self._lock:
+            if not resumable:
+                shutil.rmtree(self.folder, ignore_errors=True)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import shapely
 from helpers import DEMO_BOX
+from helpers.scenes import same_files
 
 import geoscene.tiles
 from geoscene.classes import Class
@@ -120,13 +121,6 @@ def test_every_building_height_has_a_source(scene):
         assert layer.height_sigma[guessed].min() > layer.height_sigma[layer.height_source == "tag"].max()
 
 
-def same_files(a, b):
-    names = sorted(p.relative_to(a) for p in a.rglob("*") if p.is_file())
-    assert names == sorted(p.relative_to(b) for p in b.rglob("*") if p.is_file())
-    for name in names:
-        assert (a / name).read_bytes() == (b / name).read_bytes(), name
-
-
 @pytest.mark.parametrize("workers", [1, 2])
 def test_number_of_workers_does_not_change_the_bytes(osm, scene, tmp_path, workers):
     again = build(osm, tmp_path / "again", options=BuildOptions(name="demo"), workers=workers)
@@ -135,7 +129,7 @@ def test_number_of_workers_does_not_change_the_bytes(osm, scene, tmp_path, worke
 
 def test_spawned_workers_give_the_same_bytes(tmp_path, monkeypatch):
     spawn = multiprocessing.get_context("spawn")
-    monkeypatch.setattr("geoscene.tiles.multiprocessing.get_context", lambda: spawn)
+    monkeypatch.setattr("geoscene.processes.multiprocessing.get_context", lambda: spawn)
     # With a bridge, the height function of the ground must be pickled for the workers.
     slope = np.linspace(60.1655, 60.1690, 4)
     lonlat = {n: (24.9405 + 0.002 * k, lat) for k in range(2) for n, lat in enumerate(slope, start=4 * k)}

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from helpers.programs import ENVIRONMENT, command
+from helpers.programs import ENVIRONMENT, alive, command
 
 from geoscene.classes import Class
 from geoscene.ground import Layers, partition_tile, plan_ground
@@ -88,20 +88,6 @@ def test_partition_of_a_tile_ignores_distant_polygons(monkeypatch):
 def build_words(town, out):
     words = command("geoscene", "build", "--osm", town, "--out", out)
     return [*words, "--tile-size", "100", "--lod", "1", "--workers", "2", "--quiet"]
-
-
-def alive(group):
-    """Running processes of a process group."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                state, _, mine = (entry / "stat").read_text().rsplit(")", 1)[1].split()[:3]
-            except OSError:
-                continue
-            if int(mine) == group and state != "Z":
-                found.append(int(entry.name))
-    return found
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")

@@ -20,3 +20,17 @@ def run_program(name, *words, **options):
     return subprocess.run(
         command(name, *words), env=ENVIRONMENT, capture_output=True, text=True, check=False, **options
     )
+
+
+def alive(group):
+    """Running processes of a process group."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                state, _, mine = (entry / "stat").read_text().rsplit(")", 1)[1].split()[:3]
+            except OSError:
+                continue
+            if int(mine) == group and state != "Z":
+                found.append(int(entry.name))
+    return found

@@ -1,0 +1,127 @@
+"""Runs tasks in worker processes, which stop at once when interrupted and of which some may be killed."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, Generic, TypeVar, cast
+
+from geoscene.errors import WorkersLostError
+
+log = logging.getLogger(__name__)
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+@dataclass(slots=True)
+class _Worker(Generic[Task]):
+    """A process, and the task that it works on; None while it is idle."""
+
+    process: BaseProcess
+    task: Task | None = None
+
+    def end(self) -> str:
+        """How the process ended, in words."""
+        self.process.join()
+        code = self.process.exitcode or 0
+        cause = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        return f"a worker process {cause}" + "; the system may be out of memory" * (-code == signal.SIGKILL)
+
+
+def run_tasks(work: Callable[[Task], Result], tasks: Sequence[Task], *, workers: int) -> Iterator[Result]:
+    """Yields the results of ``work`` for all tasks, in the order of their completion.
+
+    Workers are processes started with the current method (`multiprocessing.set_start_method`): forked ones
+    share the memory of ``work``, spawned ones get a pickled copy each and need an importable main module.
+    They are killed when the iterator is closed or raises, and end when this process ends. The task of a
+    worker that was killed goes to another one.
+
+    Raises the errors of ``work``, and WorkersLostError if all workers were killed.
+    """
+    waiting = deque(tasks)
+    team: dict[Any, _Worker[Task]] = {}
+    try:
+        for _ in range(min(workers, len(waiting))):
+            _add_worker(team, work)
+        while busy := _assigned(team, waiting):
+            for connection in cast("list[Connection]", wait(busy)):
+                worker = team[connection]
+                try:
+                    error, result = connection.recv()
+                except (EOFError, OSError):
+                    waiting.extendleft([worker.task] if worker.task is not None else [])
+                    del team[connection]
+                    if not team:
+                        raise WorkersLostError(
+                            f"{worker.end()}, and so did all others; the finished part is kept:"
+                            " repeat the command with fewer `workers`"
+                        ) from None
+                    log.warning("%s; its task goes to the other %d", worker.end(), len(team))
+                    continue
+                if error is not None:
+                    raise error
+                worker.task = None
+                yield cast("Result", result)
+    finally:
+        for worker in team.values():
+            worker.process.kill()
+        for worker in team.values():
+            worker.process.join()
+
+
+def _add_worker(team: dict[Any, _Worker[Task]], work: Callable[[Task], Result]) -> None:
+    """Start a process and add it to the team, with interruptions blocked: they are for this process."""
+    context = multiprocessing.get_context()
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve, args=(theirs, work), daemon=True)
+    masks = hasattr(signal, "pthread_sigmask")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else None
+    try:
+        process.start()
+        team[ours] = _Worker(process)
+    finally:
+        if before is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    theirs.close()
+
+
+def _assigned(team: dict[Any, _Worker[Task]], waiting: deque[Task]) -> list[Any]:
+    """Give each idle worker a task; returns the connections of the busy ones."""
+    for connection, worker in team.items():
+        if worker.task is None and waiting:
+            worker.task = waiting.popleft()
+            with suppress(OSError):  # if the process has ended, reading from it tells so
+                connection.send(worker.task)
+    return [connection for connection, worker in team.items() if worker.task is not None]
+
+
+def _serve(connection: Connection, work: Callable[[Task], Result]) -> None:
+    """Work on the tasks that arrive, in a worker process; exit when the parent process ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    while True:
+        task = connection.recv()
+        answer: tuple[Exception | None, Result | None]
+        try:
+            answer = None, work(task)
+        except Exception as error:  # noqa: BLE001  (raised again in the parent process)
+            error.add_note(traceback.format_exc())
+            answer = error, None
+        connection.send(answer)
+
+
+def _exit_with_parent() -> None:
+    if (parent := multiprocessing.parent_process()) is not None:
+        wait([parent.sentinel])
+        os._exit(1)

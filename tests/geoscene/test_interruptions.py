@@ -1,0 +1,295 @@
+"""Builds that are interrupted, killed, repeated with other options or meet damaged or foreign files."""
+
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from helpers.programs import ENVIRONMENT, alive, command, run_program
+from helpers.scenes import same_files
+
+import geoscene.tiles
+from geoscene.errors import SceneFormatError, WorkersLostError
+from geoscene.options import BuildOptions
+from geoscene.pipeline import build
+from geoscene.processes import run_tasks
+from geoscene.scene import SceneFiles
+from geoscene.sources import demo_path, read_osm
+
+BOX = (24.9425, 60.1665, 24.9465, 60.1690)
+OPTIONS = BuildOptions(name="demo", tile_size=100.0)
+IN_PROC = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
+
+
+@pytest.fixture(scope="module")
+def osm():
+    return read_osm(demo_path(), bounds=BOX)
+
+
+@pytest.fixture(scope="module")
+def whole(osm, tmp_path_factory):
+    return build(osm, tmp_path_factory.mktemp("whole") / "scene", options=OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def raster(tmp_path_factory):
+    path = tmp_path_factory.mktemp("dem") / "hill.tif"
+    west, south, east, north = BOX
+    rows = np.add.outer(np.arange(40.0), np.arange(40.0)).astype(np.float32)
+    across, down = (east - west + 0.02) / 40, (north - south + 0.02) / 40
+    transform = rasterio.Affine(across, 0.0, west - 0.01, 0.0, -down, north + 0.01)
+    profile = {"driver": "GTiff", "width": 40, "height": 40, "count": 1, "dtype": "float32"}
+    with rasterio.open(path, "w", **profile, crs="EPSG:4326", transform=transform) as out:
+        out.write(rows, 1)
+    return path
+
+
+@pytest.fixture(scope="module")
+def route(tmp_path_factory):
+    path = tmp_path_factory.mktemp("route") / "route.csv"
+    path.write_text("lat,lon\n60.1671,24.9432\n60.1682,24.9440\n")
+    return path
+
+
+CHANGES = {
+    "crs": "utm",
+    "lod": 1,
+    "dem": "a file",
+    "dem_gaps": "nearest",
+    "only": ("buildings", "roads"),
+    "along": "a file",
+    "reach": 30.0,
+    "driving_side": "left",
+    "tile_size": 150.0,
+    "name": "other",
+}
+
+
+def test_every_option_has_a_change():
+    assert set(CHANGES) == {f.name for f in fields(BuildOptions)}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_rebuild_with_another_option_has_the_bytes_of_a_fresh_build(
+    name, osm, whole, raster, route, tmp_path
+):
+    change = {name: CHANGES[name]} | {"dem": {"dem": (str(raster),)}}.get(name, {})
+    if name in ("along", "reach"):
+        change["along"] = (str(route),)
+    options = replace(OPTIONS, **change)
+    shutil.copytree(whole.path, tmp_path / "scene")
+    again = build(osm, tmp_path / "scene", options=options, overwrite=True)
+    same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
+
+
+def test_elevation_file_with_other_heights_is_noticed(osm, raster, tmp_path):
+    dem = tmp_path / "dem.tif"
+    shutil.copy(raster, dem)
+    options = replace(OPTIONS, dem=(str(dem),))
+    build(osm, tmp_path / "scene", options=options)
+    before = dem.stat()
+    dem.write_bytes(dem.read_bytes()[:-4] + bytes(4))  # another height of the last post
+    os.utime(dem, ns=(before.st_atime_ns, before.st_mtime_ns))
+    again = build(osm, tmp_path / "scene", options=options, overwrite=True)
+    same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
+
+
+@pytest.mark.parametrize("lod", [1, 2])
+def test_damaged_tile_is_built_again(lod, osm, whole, tmp_path):
+    shutil.copytree(whole.path, tmp_path / "scene")
+    path = next((tmp_path / "scene" / "tiles").iterdir())
+    path.write_bytes(path.read_bytes()[:-200] + bytes(200))
+    options = replace(OPTIONS, lod=lod)
+    again = build(osm, tmp_path / "scene", options=options, overwrite=True)
+    same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", "{}", '{"keys": 1, "tiles": 2}', '{"keys": {}, "tiles": [1]}']
+)
+def test_damaged_table_of_tiles_is_ignored(text, osm, whole, tmp_path):
+    shutil.copytree(whole.path, tmp_path / "scene")
+    (tmp_path / "scene" / "tiles.json").write_text(text)
+    same_files(whole.path, build(osm, tmp_path / "scene", options=OPTIONS, overwrite=True).path)
+
+
+def ended_by(error, osm, path, monkeypatch):
+    """A build that an error ends after three tiles."""
+    made = []
+    build_tile = geoscene.tiles.build_tile
+
+    def dying(*args, **options):
+        if len(made) == 3:
+            raise error
+        made.append(args)
+        return build_tile(*args, **options)
+
+    monkeypatch.setattr(geoscene.tiles, "build_tile", dying)
+    with pytest.raises(type(error)):
+        build(osm, path, options=OPTIONS)
+    monkeypatch.setattr(geoscene.tiles, "build_tile", build_tile)
+
+
+def test_resumed_build_replaces_damaged_tiles_and_skips_damaged_lines(osm, whole, tmp_path, monkeypatch):
+    ended_by(KeyboardInterrupt(), osm, tmp_path / "scene", monkeypatch)
+    files = SceneFiles(tmp_path / "scene.part")
+    tiles = sorted(files.tiles.iterdir())
+    tiles[0].write_bytes(tiles[1].read_bytes())
+    with files.tile_journal.open("ab") as journal:
+        journal.write(b'[]\n{"keys": {}}\n\xff\xfe\n{"i": 1')
+    same_files(whole.path, build(osm, tmp_path / "scene", options=OPTIONS).path)
+
+
+def build_words(out, *more):
+    box = "--bbox=" + ",".join(map(str, BOX))
+    words = command("geoscene", "build", "--demo", box, "-o", out, "--quiet", "--name", "demo")
+    return [*words, "--tile-size", "50", "--workers", "2", *more]
+
+
+def started(out, tiles, *more):
+    """A build in a process group of its own that has finished some tiles."""
+    process = subprocess.Popen(
+        build_words(out, *more), env=ENVIRONMENT, start_new_session=True, stderr=subprocess.PIPE, text=True
+    )
+    folder = out.with_name(f"{out.name}.part") / "tiles"
+    while process.poll() is None and len(list(folder.glob("*.npz"))) < tiles:
+        time.sleep(0.01)
+    assert process.poll() is None
+    return process
+
+
+@IN_PROC
+def test_interruption_stops_all_processes_at_once_and_keeps_the_journal(tmp_path):
+    process = started(tmp_path / "scene", 3)
+    asked = time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    _, errors = process.communicate(timeout=20)
+    assert time.monotonic() - asked < 2
+    assert (process.returncode, errors) == (130, "geoscene: interrupted; repeat the command to resume\n")
+    assert alive(process.pid) == []
+    assert len((tmp_path / "scene.part" / "tiles.jsonl").read_text().splitlines()) >= 2
+
+
+@IN_PROC
+def test_build_goes_on_without_a_killed_worker(tmp_path):
+    process = started(tmp_path / "scene", 3)
+    os.kill(max(set(alive(process.pid)) - {process.pid}), signal.SIGKILL)
+    _, errors = process.communicate(timeout=100)
+    assert process.returncode == 0
+    assert errors.count("\n") == 1
+    assert "killed by signal 9; the system may be out of memory" in errors
+    subprocess.run(build_words(tmp_path / "again"), env=ENVIRONMENT, check=True, stdout=subprocess.DEVNULL)
+    same_files(tmp_path / "again", tmp_path / "scene")
+
+
+@IN_PROC
+def test_finished_tiles_are_kept_when_all_workers_are_killed(tmp_path):
+    process = started(tmp_path / "scene", 3)
+    for worker in set(alive(process.pid)) - {process.pid}:
+        os.kill(worker, signal.SIGKILL)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 1
+    assert "--workers" in errors.splitlines()[-1]
+    assert "Traceback" not in errors
+    assert (tmp_path / "scene.part" / "tiles.jsonl").exists()
+
+
+def test_error_of_a_task_reaches_the_caller():
+    with pytest.raises(ZeroDivisionError) as raised:
+        list(run_tasks(lambda task: 1 / task, [1, 0, 2], workers=2))
+    assert "1 / task" in raised.value.__notes__[0]
+
+
+def test_task_that_kills_every_worker_ends_the_run():
+    with pytest.raises(WorkersLostError, match="exit code 3"):
+        list(run_tasks(os._exit, [3, 3], workers=2))
+
+
+def test_second_build_into_the_same_directory_is_refused(tmp_path):
+    process = started(tmp_path / "scene", 1)
+    done = subprocess.run(
+        build_words(tmp_path / "scene"), env=ENVIRONMENT, capture_output=True, text=True, check=False
+    )
+    process.communicate(timeout=100)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "another process is writing it" in done.stderr
+    assert process.returncode == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), MemoryError()])
+def test_tiles_are_kept_when_space_or_memory_ends(error, osm, whole, tmp_path, monkeypatch):
+    ended_by(error, osm, tmp_path / "scene", monkeypatch)
+    assert len(list((tmp_path / "scene.part" / "tiles").iterdir())) == 3
+    same_files(whole.path, build(osm, tmp_path / "scene", options=OPTIONS).path)
+
+
+def test_files_of_others_are_kept_and_named(osm, whole, tmp_path, caplog):
+    scene = tmp_path / "scene"
+    shutil.copytree(whole.path, scene)
+    (scene / "drive").mkdir()
+    (scene / "drive" / "dataset.json").write_text("{}")
+    (scene / "notes.txt").write_text("mine")
+    (scene / "tiles" / "map.png").write_bytes(b"png")
+    (scene / "tiles" / "99_99.npz").write_bytes(b"of another build")
+    (scene / "features.gpkg-wal").write_bytes(b"of an open GeoPackage")
+    with caplog.at_level(logging.WARNING):
+        build(osm, scene, options=OPTIONS, overwrite=True)
+    assert (scene / "drive" / "dataset.json").read_text() == "{}"
+    assert (scene / "notes.txt").read_text() == "mine"
+    assert (scene / "tiles" / "map.png").read_bytes() == b"png"
+    assert sum("kept" in line for line in caplog.messages) == 3
+    for name in ("drive", "notes.txt", "tiles/map.png"):
+        assert f"{name}: kept" in caplog.text
+        shutil.rmtree(scene / name) if name == "drive" else (scene / name).unlink()
+    same_files(whole.path, scene)
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+@pytest.mark.parametrize("renamed", [False, True])
+def test_replacement_that_was_killed_is_completed(renamed, osm, whole, tmp_path):
+    """Killed after the old scene was set aside, before or after the new one got its name."""
+    old = tmp_path / "scene.old"
+    shutil.copytree(whole.path, old)
+    (old / "notes.txt").write_text("mine")
+    if renamed:
+        shutil.copytree(whole.path, tmp_path / "scene")
+    build(osm, tmp_path / "scene", options=OPTIONS, overwrite=True)
+    assert (tmp_path / "scene" / "notes.txt").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+def test_scene_without_its_manifest_can_be_replaced(osm, whole, tmp_path):
+    shutil.copytree(whole.path, tmp_path / "scene")
+    (tmp_path / "scene" / "scene.json").unlink()
+    with pytest.raises(SceneFormatError, match="`overwrite`"):
+        build(osm, tmp_path / "scene", options=OPTIONS)
+    same_files(whole.path, build(osm, tmp_path / "scene", options=OPTIONS, overwrite=True).path)
+
+
+def test_scene_behind_a_link_is_replaced(osm, whole, tmp_path):
+    shutil.copytree(whole.path, tmp_path / "scene")
+    (tmp_path / "link").symlink_to("scene")
+    build(osm, tmp_path / "link", options=OPTIONS, overwrite=True)
+    assert (tmp_path / "link").is_symlink()
+    same_files(whole.path, tmp_path / "scene")
+
+
+@pytest.mark.parametrize("out", [".", "..", "/"])
+def test_current_directory_is_refused_before_the_work(out, tmp_path):
+    (tmp_path / "inner").mkdir()
+    done = run_program("geoscene", "build", "--demo", "-o", out, cwd=tmp_path / "inner")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "cannot be replaced" in done.stderr
+
+
+def test_target_is_checked_before_the_map_is_read(whole):
+    done = run_program("geoscene", "build", "--osm", "nowhere.osm", "-o", whole.path)
+    assert "--overwrite" in done.stderr
