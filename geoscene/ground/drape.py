@@ -37,7 +37,7 @@ _FINE = 2.0
 _CUT = 3.0
 """Metres that a river may lie below the terrain; more is a fault of the elevation model or the map."""
 
-_AROUND = 2.0**-9
+_AROUND = 2.0**-6
 _DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False) + 0.1
 
 

@@ -1,7 +1,7 @@
 """One partition of the plane: cells without gaps and overlaps, made tile by tile.
 
 Every polygon's outline is put on a grid of `PRECISION`; in a tile, the outlines that come within a
-millimetre of it, the tile's own sides and the terrain's lines are noded together by snap rounding (Hobby
+centimetre of it, the tile's own sides and the terrain's lines are noded together by snap rounding (Hobby
 1999; Guibas and Marimont 1998, as implemented in GEOS). Snap rounding is local: whether a segment bends
 at a point depends only on the segments that pass that very point. As both tiles beside a border node the
 same whole segments there, they find the same vertices on it, whichever other tiles are built.
@@ -22,8 +22,8 @@ from geoscene.errors import GeosceneError, InputError
 from geoscene.ground.layers import Layers
 from geoscene.typing import Bools, Float, Ints
 
-PRECISION = 2.0**-13
-"""Side of the grid that ground vertices lie on, 0.12 mm.
+PRECISION = 2.0**-9
+"""Side of the grid that ground vertices lie on, 2 mm: twice the distance at which common tools merge them.
 
 A power of two, so that moving a vertex by whole metres is exact in floating point."""
 
@@ -33,12 +33,12 @@ SLIVER = 0.02
 Narrower than the narrowest surface (a kerb or a line of 0.1 m), wider than the gaps that mappers leave
 between areas meant to touch."""
 
-BEND = 0.01
+BEND = 0.03
 """Vertices that bend the border between two cells by less than this squared, m2 of triangle, are left out.
 
 They are what noding leaves on straight borders that hidden outlines cross; tiles' sides keep all."""
 
-_REACH = 1e-3
+_REACH = 1e-2
 """How far beyond a tile's side outlines take part in its noding, metres: several times `PRECISION`."""
 
 

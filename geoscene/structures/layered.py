@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Bools, Float, Ints
 
-PRECISION = 1e-3
-"""Metres: the grid that plans are cut on, ten times that on which solids are checked."""
+PRECISION = 2.0**-9
+"""Metres: the grid that plans are cut on, 2 mm, as that of the ground."""
 
 SIDE = -1
 """Level of a face that stands upright."""
@@ -56,7 +56,7 @@ class Shell:
 def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
     """The triangles of an area (Polygon or MultiPolygon), none of which crosses one of the lines.
 
-    Lines are shapely geometries; parts outside the area are ignored. All is snap-rounded to a grid of 1 mm.
+    Lines are shapely geometries; parts outside the area are ignored. All is snap-rounded to a grid of 2 mm.
     """
     near = lines[shapely.intersects(lines, area)] if len(lines) else lines
     within = shapely.intersection(near, area)

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import shapely
+import shapely.affinity
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
@@ -20,6 +22,7 @@ from geoscene.ground import (
 )
 from geoscene.ground.partition import PRECISION, SLIVER, tile_box
 from geoscene.mesh import concatenate
+from geoscene.watertight import degenerate_faces
 
 EXTENT = (-30.0, -20.0, 30.0, 45.0)
 GRASS = materials()["grass"].code
@@ -87,6 +90,18 @@ def test_the_ground_is_one_surface_across_tiles(seed, lines, size):
     plan = plan_ground(EXTENT, layers_of(blobs(seed), rng), tile_size=size, lines=lines)
     mesh = concatenate([ground_tile(plan, i, j=j) for i, j in plan.tiles])
     assert_one_surface(*welded(mesh), EXTENT)
+
+
+@given(st.integers(0, 2**32), st.sampled_from([0.0, 7.0]))
+@settings(max_examples=15, deadline=None)
+def test_no_two_vertices_of_the_ground_are_within_a_millimetre_and_no_face_is_a_line(seed, lines):
+    rng = np.random.default_rng(seed)
+    jittered = [shapely.affinity.translate(b, *rng.normal(0, 3e-4, 2)) for b in blobs(seed)]
+    layers = layers_of([*blobs(seed), *jittered], rng)  # as mapped twice, almost alike
+    plan = plan_ground(EXTENT, layers, tile_size=25.0, lines=lines)
+    points, faces = welded(concatenate([ground_tile(plan, i, j=j) for i, j in plan.tiles]))
+    assert not cKDTree(points).query_pairs(1.5e-3)
+    assert not degenerate_faces(points, faces).any()
 
 
 @given(st.integers(0, 2**32))

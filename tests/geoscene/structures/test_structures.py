@@ -7,6 +7,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.classes import Class
@@ -439,6 +440,21 @@ def test_a_footway_on_a_road_bridge_is_as_high_as_the_road():
     z, klass = first_below(both.mesh(), moved(road, 0, 6.0, 2))
     np.testing.assert_allclose(z, road[:, 2], atol=0.05)
     assert (klass == Class.SIDEWALK).mean() > 0.9
+
+
+@pytest.mark.parametrize("angle_deg", [3, 19, 31])
+def test_no_two_vertices_of_a_structure_are_within_a_millimetre(angle_deg):
+    turn = np.radians(angle_deg)
+    turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    places = {node: tuple(np.array(xy) @ turned) for node, xy in PLACES.items()}
+    fork = {7: tuple(np.array([0.0, 0.4]) @ turned), 8: tuple(np.array([60.0, 25.0]) @ turned)}
+    for ways in (
+        [(ROAD, [1, 2]), (BRIDGE, [2, 7, 3]), (BRIDGE, [7, 8]), (ROAD, [3, 4]), (ROAD, [5, 6])],
+        [(ROAD, [1, 2]), (TUNNEL, [2, 7, 3]), (TUNNEL, [7, 8]), (ROAD, [3, 4])],
+    ):
+        for mesh in Town(town(places | fork, ways)).meshes:
+            assert validate_mesh(mesh).ok.all()
+            assert not cKDTree(mesh.vertices).query_pairs(1.5e-3)
 
 
 def test_pieces_of_a_long_bridge_join_without_gaps():
