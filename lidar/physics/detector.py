@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, EchoesT, Origin, artificial_echoes
-from lidar.physics.link import amplitude, apparent_of, daylight_noise, false_alarm_probability
+from lidar.physics.link import amplitude, apparent_of, daylight_noise, false_alarm_probability, noise_of
 from lidar.physics.range_error import quantised, signal_sigma, stretch_sigma, walk
 from lidar.physics.reflect import RETRO
 from lidar.physics.settings import ScannerSettings
@@ -33,6 +33,7 @@ def received(sensor: Sensor, echoes: Echoes) -> Float:
         echoes.range + sensor.pattern.range_offset,
         reference_reflectance=sensor.reference_reflectance,
         reference_range=sensor.reference_range,
+        falloff=sensor.falloff,
     )
 
 
@@ -46,7 +47,8 @@ def detected(sensor: Sensor, echoes: EchoesT, *, settings: ScannerSettings, devi
     measured = power
     if settings.detection:
         noise = daylight_noise(sensor.noise_ratio, settings.daylight_lux)
-        measured = power + noise * deviates("detection", echoes)
+        sigma = noise_of(power, noise, signal_noise=sensor.signal_noise)
+        measured = power + sigma * deviates("detection", echoes)
     seen = measured > 1
     apparent = echoes.apparent * measured / np.maximum(power, 1e-300)
     return replace(echoes, apparent=apparent).take(seen)
@@ -89,6 +91,7 @@ def _anywhere(
         distance,
         reference_reflectance=sensor.reference_reflectance,
         reference_range=sensor.reference_range,
+        falloff=sensor.falloff,
     )
     return artificial_echoes(pulse, distance - sensor.pattern.range_offset, apparent=apparent)
 
@@ -132,7 +135,7 @@ def measured_range(
     if settings.range_noise != "none":
         sigma: Float = np.full(len(echoes), sensor.range_sigma)
         if settings.range_noise == "signal":
-            sigma = np.hypot(sigma, signal_sigma(power))
+            sigma = np.hypot(sigma, signal_sigma(power, sensor.weak_sigma))
         distance = distance + sigma * deviates("range noise", echoes)
     if settings.stretch and settings.rays == 1:
         width = stretch_sigma(echoes.range, echoes.cosine, divergence=sensor.divergence[1])

@@ -21,18 +21,20 @@ def amplitude(
     *,
     reference_reflectance: float,
     reference_range: float,
+    falloff: float = 2.0,
 ) -> Float:
     """Received power over the detection threshold of extended targets.
 
-    The link equation (rho / rho_ref) (R_ref / R)^2, scaled so that the power of the data sheet's target,
-    rho_ref at R_ref, is the threshold. The maximum range is proportional to sqrt(rho).
+    The link equation (rho / rho_ref) (R_ref / R)^f, scaled so that the power of the data sheet's target,
+    rho_ref at R_ref, is the threshold. With f = 2 the maximum range is proportional to sqrt(rho).
 
     apparent : reflectance times the law of incidence and `transmission`
     distance : metres
+    falloff  : f; 2 but for receivers whose data sheet says otherwise
     """
     r = np.maximum(np.asarray(distance, float), 1e-3)
     scale = np.asarray(apparent, float) / reference_reflectance
-    received: Float = scale * (reference_range / r) ** 2
+    received: Float = scale * (reference_range / r) ** falloff
     return received
 
 
@@ -43,13 +45,18 @@ def transmission(distance: ArrayLike, extinction: float) -> Float:
 
 
 def apparent_of(
-    received: ArrayLike, distance: ArrayLike, *, reference_reflectance: float, reference_range: float
+    received: ArrayLike,
+    distance: ArrayLike,
+    *,
+    reference_reflectance: float,
+    reference_range: float,
+    falloff: float = 2.0,
 ) -> Float:
     """Reflectance that a scanner derives from received power over threshold and distance in metres.
 
     The inverse of `amplitude` in clear air, as instruments assume.
     """
-    return np.asarray(received) * reference_reflectance * (np.asarray(distance) / reference_range) ** 2
+    return np.asarray(received) * reference_reflectance * (np.asarray(distance) / reference_range) ** falloff
 
 
 def daylight_noise(noise_ratio: float, lux: float) -> float:
@@ -57,11 +64,18 @@ def daylight_noise(noise_ratio: float, lux: float) -> float:
     return float(noise_ratio * np.sqrt(1 + lux / _DAYLIGHT))
 
 
-def detection_probability(received: ArrayLike, noise_ratio: float) -> Float:
-    """Probability that an echo passes the threshold, with Gaussian noise of ``noise_ratio`` thresholds."""
+def noise_of(received: ArrayLike, noise_ratio: float, *, signal_noise: float = 0.0) -> Float:
+    """Noise over threshold of echoes: ``noise_ratio``, and ``signal_noise`` times the power, independent."""
+    sigma: Float = np.hypot(noise_ratio, signal_noise * np.asarray(received, float))
+    return sigma
+
+
+def detection_probability(received: ArrayLike, noise_ratio: float, *, signal_noise: float = 0.0) -> Float:
+    """Probability that an echo passes the threshold, with the Gaussian noise `noise_of`."""
     from scipy.special import erfc  # noqa: PLC0415  (0.2 s)
 
-    probability: Float = 0.5 * erfc((1 - np.asarray(received, float)) / (np.sqrt(2) * noise_ratio))
+    sigma = noise_of(received, noise_ratio, signal_noise=signal_noise)
+    probability: Float = 0.5 * erfc((1 - np.asarray(received, float)) / (np.sqrt(2) * sigma))
     return probability
 
 

@@ -7,18 +7,20 @@ from numpy.typing import ArrayLike
 
 from geoscene.typing import Float
 
-RESOLUTION = 0.09
-"""Metres, range resolution in `signal_sigma`: the default of LISA (Kilic et al. 2021)."""
-
 _WALK = 0.005  # metres nearer per decade of amplitude, typical value
 
 
-def signal_sigma(received: ArrayLike, resolution: float = RESOLUTION) -> Float:
-    """Standard deviation in metres of ranges, by received power over threshold.
+def signal_sigma(received: ArrayLike, weak_sigma: tuple[float, float]) -> Float:
+    """Standard deviation in metres that noise adds to ranges, by received power A over threshold.
 
-    dR / sqrt(2 SNR), as in LISA (Kilic et al. 2021).
+    sqrt(s^2 / A + b^2 / A^2): noise of the signal's own photons, and of background and receiver. With b = 0
+    it is dR / sqrt(2 SNR) of LISA (Kilic et al. 2021), of which dR = 0.09 m is the default.
+
+    weak_sigma : (s, b) metres, both at the threshold
     """
-    sigma: Float = resolution / np.sqrt(2 * np.asarray(received, float))
+    power = np.asarray(received, float)
+    own, background = weak_sigma
+    sigma: Float = np.hypot(own / np.sqrt(power), background / power)
     return sigma
 
 

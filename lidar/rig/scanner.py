@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import resources
@@ -25,6 +26,9 @@ RETURN_MODES = ("strongest", "last", "first", "dual", "all")
 KINDS = ("spinning", "prism", "sweep", "table", "flash", "scan2d", "line")
 """Kinds of scanner; a preset describes its pattern in a table of this name."""
 
+WEAK_SIGMA = (0.09 / math.sqrt(2), 0.0)
+"""Default of `Sensor.weak_sigma`: dR / sqrt(2) of LISA (Kilic et al. 2021), with its dR of 0.09 m."""
+
 _FWHM = 1.699
 """Ratio of the 1/e^2 full angle of a Gaussian beam to its full width at half maximum, sqrt(2 / ln 2)."""
 
@@ -46,6 +50,10 @@ class Sensor:
     reference_range, reference_reflectance : range in metres at which a Lambertian target of that reflectance,
                     normal to the beam and larger than it, is detected with probability 1/2 (dark, clear air)
     noise_ratio   : ratio of the standard deviation of the receiver's noise to its threshold
+    signal_noise  : standard deviation of the noise in proportion to the received power, over that power
+    falloff       : exponent with which received power falls with range, 2 for most
+    weak_sigma    : (2,) metres, standard deviation of a range at the detection threshold: of the signal's own
+                    noise, which falls with the root of the power, and of the receiver's, which falls with it
     divergence    : (2,) radians, full angles, horizontal and vertical, at which power has fallen to 1/e^2
     aperture      : (2,) metres, width and height of the beam at its start
     pulse_ns      : nanoseconds, the pulse's full width at half maximum
@@ -88,6 +96,9 @@ class Sensor:
     fmcw: bool
     pattern: Pattern
     velocity_sigma: float = 0.0
+    signal_noise: float = 0.0
+    falloff: float = 2.0
+    weak_sigma: tuple[float, float] = WEAK_SIGMA
     note: str = ""
     source: dict[str, str] = field(default_factory=dict)
 
@@ -168,6 +179,9 @@ def _read(table: Table, name: str, *, rate_hz: float, return_mode: str, start_ns
     widening = _FWHM if table.text("divergence_at", "1/e2", among=("1/e2", "fwhm")) == "fwhm" else 1.0
     across, along = (widening * b / 1000 for b in table.numbers("divergence_mrad", count=2, spread=True))
     wide, high = (a / 1000 for a in table.numbers("aperture_mm", 0.0, count=2, spread=True))
+    own, background = table.numbers("weak_sigma", WEAK_SIGMA, count=2)
+    if min(own, background) < 0:
+        raise table.error("weak_sigma", f"{min(own, background):g} is under 0")
     sensor = Sensor(
         name=name,
         kind=kind,
@@ -195,6 +209,9 @@ def _read(table: Table, name: str, *, rate_hz: float, return_mode: str, start_ns
         diffuse_code=table.number("diffuse_code", 100.0, above=0.0, high=255.0),
         fmcw=table.flag("fmcw", False),
         velocity_sigma=table.number("velocity_sigma", 0.0, low=0.0),
+        signal_noise=table.number("signal_noise", 0.0, low=0.0, high=1.0),
+        falloff=table.number("falloff", 2.0, low=1.0, high=4.0),
+        weak_sigma=(own, background),
         pattern=_READERS[kind](table.table(kind), rate, rates),
         note=table.text("note", ""),
         source={key: table.table("source").text(key) for key in table.table("source", {}).data},

@@ -103,6 +103,7 @@ class Pulses(Columns):
             distance + self.sensor.pattern.range_offset,
             reference_reflectance=self.sensor.reference_reflectance,
             reference_range=self.sensor.reference_range,
+            falloff=self.sensor.falloff,
         )
 
 

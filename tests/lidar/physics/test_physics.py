@@ -23,6 +23,7 @@ from lidar.physics.range_error import quantised, signal_sigma, stretch_sigma, wa
 from lidar.physics.reflect import apparent, reflectance_table
 from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.random_streams import generator, normal_of
+from lidar.rig.scanner import WEAK_SIGMA, load_sensor
 from lidar.settings import settings_of
 
 OS0 = {"reference_reflectance": 0.8, "reference_range": 50.0}
@@ -93,10 +94,26 @@ def test_apparent_reflectance_in_clear_air_is_the_true_one(rho, distance):
     assert apparent_of(amplitude(rho, distance, **OS0), distance, **OS0) == pytest.approx(rho)
 
 
-def test_detection_follows_the_data_sheet_of_the_os0():
-    """80 % target: 90 % at 45 m and 50 % at 50 m, with noise of 0.183 thresholds."""
-    assert detection_probability(amplitude(0.8, 45.0, **OS0), 0.183) == pytest.approx(0.90, abs=0.001)
-    assert detection_probability(amplitude(0.8, 50.0, **OS0), 0.183) == pytest.approx(0.5)
+@pytest.mark.parametrize(("rho", "half", "most"), [(0.8, 50.0, 45.0), (0.1, 20.0, 15.0)])
+def test_detection_follows_the_data_sheet_of_the_os0(rho, half, most):
+    """Ranges of 50 % and 90 % detection, given in steps of 5 m, of targets of 80 % and 10 %."""
+    os0 = load_sensor("os0_128")
+    link = {name: getattr(os0, name) for name in ("reference_reflectance", "reference_range", "falloff")}
+
+    def seen(distance):
+        power = amplitude(rho, distance, **link)
+        return detection_probability(power, os0.noise_ratio, signal_noise=os0.signal_noise)
+
+    assert seen(half) == pytest.approx(0.5, abs=0.01)
+    distance = np.arange(1.0, 60.0, 0.05)
+    assert distance[np.argmin(np.abs(seen(distance) - 0.9))] == pytest.approx(most, abs=3.0)
+
+
+@pytest.mark.parametrize(("snr", "centimetres"), [(12, 10.0), (100, 3.0), (1e6, 1.5)])
+def test_range_noise_follows_the_data_sheet_of_the_os1(snr, centimetres):
+    os1 = load_sensor("os1_128")
+    sigma = np.hypot(os1.range_sigma, signal_sigma(snr / 12, os1.weak_sigma))
+    assert 100 * sigma == pytest.approx(centimetres, rel=0.02)
 
 
 def test_false_alarms_are_as_rare_as_computed():
@@ -109,7 +126,7 @@ def test_false_alarms_are_as_rare_as_computed():
 
 @pytest.mark.parametrize(("snr", "millimetres"), [(1, 63.6), (10, 20.1), (100, 6.4)])
 def test_range_noise_falls_with_signal(snr, millimetres):
-    assert signal_sigma(snr) * 1000 == pytest.approx(millimetres, abs=0.05)
+    assert signal_sigma(snr, WEAK_SIGMA) * 1000 == pytest.approx(millimetres, abs=0.05)
 
 
 def test_a_slanted_surface_stretches_the_pulse():

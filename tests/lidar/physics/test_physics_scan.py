@@ -9,6 +9,7 @@ from helpers.sensor_worlds import box, driven, plate, world
 from geoscene.classes import Class, materials
 from lidar.geometry.mounts import Mount
 from lidar.physics.fresnel import pane_reflection
+from lidar.physics.link import detection_probability
 from lidar.physics.settings import ScannerSettings
 from lidar.rig.scanner import firings, load_sensor
 from lidar.sensors.scan import scan
@@ -46,11 +47,15 @@ def test_the_detection_range_follows_the_root_of_reflectance():
 
 
 def test_detection_follows_the_data_sheet_in_a_scan():
-    """The OS0's 80 % target: detected with probability 0.5 at 50 m and 0.9 at 45 m; here as brick."""
+    """The OS0 detects an 80 % target with probability 0.5 at 50 m and a 10 % one at 20 m; here brick."""
     sensor = load_sensor("os0_128")
     reflectance = np.interp(865, (905, 1064, 1550), materials()["brick"].reflectance)
-    for share, at in ((0.5, 1.0), (0.9, 0.9)):
-        scene = world(plate(at * 50 * np.sqrt(reflectance / 0.8), half=1.5, material="brick"))
+    half = 50 * (reflectance / 0.8) ** (1 / sensor.falloff)
+    for share, at in (
+        (0.5, 1.0),
+        (detection_probability(0.9**-sensor.falloff, 0.183, signal_noise=0.14), 0.9),
+    ):
+        scene = world(plate(at * half, half=1.5, material="brick"))
         plain, kept = (
             sum(
                 len(
