@@ -21,6 +21,7 @@ from geoscene.frames import Frame
 from geoscene.report import Problem, described, make_without_failures, unexpected
 from geoscene.sources.data import Area, OsmData, Tags
 from geoscene.tags import first_value
+from geoscene.typing import Ints
 
 _NEGATIVE = ("no", "none", "false", "")
 
@@ -48,7 +49,7 @@ def read_buildings(
     outlines = _read_rows(osm.areas, frame, problems=problems, parts=False, options=options)
     parts = _read_rows(osm.areas, frame, problems=problems, parts=True, options=options)
 
-    score = np.array([len(r.tags) + 1000 * ("height" in r.tags) for r in outlines], float)
+    score = np.array([len(r.tags) + 1000 * bool(r.tagged.source) for r in outlines], float)
     repeated, found = duplicates(
         [r.osm_id for r in outlines], np.fromiter([r.footprint for r in outlines], object), score=score
     )
@@ -154,7 +155,7 @@ def _assign_parts(
         row = int(target[members[0]])
         whole = buildings[row]
         try:
-            rest, share = remainder(whole.footprint, shapes[members], covered=options.covered)
+            rest, share, left_out = remainder(whole.footprint, shapes[members], strip=options.strip)
         except GEOSException as error:
             detail = f"no part made of what the parts leave of the outline, {described(error)}"
             problems.append(Problem(whole.osm_id, "building", "repaired", "unexpected-error", detail))
@@ -163,6 +164,13 @@ def _assign_parts(
             remainders.append(replace(whole, footprint=rest, outline=row, is_part=True, is_remainder=True))
             detail = f"parts cover {share:.0%}; {shapely.area(rest):.1f} m2 of the outline stay as a part"
             problems.append(Problem(whole.osm_id, "building", "repaired", "partly-covered", detail))
+        else:
+            left_out += shapely.area(rest)
+        if left_out >= options.min_area:
+            detail = (
+                f"{left_out:.1f} m2 of the outline that no part covers, narrower than {options.strip:g} m"
+            )
+            problems.append(Problem(whole.osm_id, "building", "repaired", "uncovered-strips", detail))
     return [
         *(replace(r, outline=i) for i, r in enumerate(buildings)),
         *(replace(p, outline=int(target[i])) for i, p in enumerate(parts)),
@@ -192,6 +200,7 @@ def _table(
         ids[drawn],
         footprint[drawn],
         owner=outline[drawn].astype(np.int64),
+        rank=_ranks(rows, heights)[drawn],
         low=heights.low[drawn],
         high=heights.high[drawn],
     )
@@ -236,6 +245,15 @@ def _table(
         wall_source=texts([w.source for w in walls]),
         roof_look_source=texts([t.source for t in tops]),
     )
+
+
+def _ranks(rows: Sequence[Row], heights: Heights) -> Ints:
+    """How well each row is described (n,): 2 if the height of its building is known, 1 if only its name."""
+    outline = [r.outline for r in rows]
+    known = np.isin(heights.source, ("tag", "est_height", "levels", "parts"))
+    known |= known[outline]
+    named = np.array(["name" in rows[k].tags for k in outline], np.bool_)
+    return np.where(known, 2, named).astype(np.int64)
 
 
 def _ignored_tags(rows: Sequence[Row], heights: Heights) -> list[Problem]:

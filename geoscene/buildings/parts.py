@@ -100,35 +100,54 @@ def clusters(polygons: Polygons) -> Rows:
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
-def remainder(outline: Any, parts: Polygons, *, covered: float) -> tuple[Any, float]:
-    """The uncovered rest of an outline (empty from a share of ``covered`` on), and the covered share."""
+def remainder(outline: Any, parts: Polygons, *, strip: float) -> tuple[Any, float, float]:
+    """What parts leave of an outline: its pieces that are anywhere wider than ``strip`` metres.
+
+    Also returns the share of the outline that the parts cover, and the area in square metres that neither
+    they nor the pieces do.
+    """
     union = shapely.union_all(parts, grid_size=GRID)
-    share = shapely.area(shapely.intersection(outline, union)) / shapely.area(outline)
-    if share >= covered:
-        return shapely.Polygon(), float(share)
-    return subtract(outline, union), float(share)
+    covered = shapely.area(shapely.intersection(outline, union))
+    pieces = shapely.get_parts(subtract(outline, union))
+    wide = ~shapely.is_empty(shapely.buffer(pieces, -strip / 2, join_style="mitre"))
+    kept = pieces[wide]
+    rest = kept[0] if len(kept) == 1 else shapely.multipolygons(kept)
+    left_out = shapely.area(outline) - covered - shapely.area(rest)
+    return rest, float(covered / shapely.area(outline)), float(left_out)
 
 
 def cut_overlaps(
-    osm_id: Sequence[str] | Texts, footprint: Polygons, *, owner: Rows, low: Float, high: Float
+    osm_id: Sequence[str] | Texts,
+    footprint: Polygons,
+    *,
+    owner: Rows,
+    rank: Ints,
+    low: Float,
+    high: Float,
 ) -> tuple[Polygons, list[Problem]]:
     """Footprints (n,) without the overlaps between buildings, and the problems.
 
-    Of two pieces of different buildings that overlap in plan and in height, the smaller keeps its shape. A
-    piece that keeps less than a tenth of its area is dropped (its footprint becomes empty).
+    Of two pieces of different buildings that overlap in plan and in height, the one of higher rank keeps its
+    shape; the smaller one does if the ranks are equal or if it rises above the other. A piece that keeps less
+    than a tenth of its area is dropped (its footprint becomes empty).
 
+    rank      : (n,) how well each piece is described
     low, high : metres above the base; pieces above one another do not overlap
     """
     area = shapely.area(footprint)
     a, b, shared = overlapping(footprint, footprint)
     overlap = (a < b) & (owner[a] != owner[b]) & (np.minimum(high[a], high[b]) > np.maximum(low[a], low[b]))
     a, b, shared = a[overlap], b[overlap], shared[overlap]
-    b_larger = (area[b] > area[a]) | ((area[b] == area[a]) & (b > a))
-    loser, winner = np.where(b_larger, b, a), np.where(b_larger, a, b)
+    b_smaller = area[b] < area[a]  # of equal ones a comes first
+    small, large = np.where(b_smaller, (b, a), (a, b))
+    small_wins = (rank[small] >= rank[large]) | (high[small] > high[large])
+    loser, winner = np.where(small_wins, (large, small), (small, large))
+    place = np.empty(len(area), np.int64)
+    place[np.lexsort((area, -rank))] = np.arange(len(area))
     out = footprint.copy()
     problems = []
-    # in ascending order of area, so that a piece has its final shape before it cuts others
-    for mine in sorted(groups(loser), key=lambda g: area[loser[g[0]]]):
+    # in order of rank and size, so that most pieces have their final shapes before they cut others
+    for mine in sorted(groups(loser), key=lambda g: place[loser[g[0]]]):
         row = loser[mine[0]]
         cutters = out[winner[mine]]
         try:

@@ -29,14 +29,14 @@ class BuildingOptions:
 
     level_height  : metres per storey where only storeys are tagged
     min_area      : square metres; smaller buildings are dropped (parts: a hundredth of it)
-    covered       : share of an outline that its parts must cover to replace it whole
+    strip         : metres; uncovered pieces of an outline with parts are left out where they are narrower
     reach         : metres within which known heights are used to infer a missing one
     canopy        : metres, thickness of roofs without walls (``building=roof``)
     """
 
     level_height: float = 3.0
     min_area: float = 0.5
-    covered: float = 0.9
+    strip: float = 1.0
     reach: float = 400.0
     canopy: float = 0.4
 

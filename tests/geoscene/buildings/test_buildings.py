@@ -177,6 +177,21 @@ def test_uncovered_part_of_an_outline_keeps_its_height():
     assert reasons(problems) == {("way/1", "repaired", "partly-covered")}
 
 
+def test_an_uncovered_tenth_of_an_outline_stays_unless_it_is_a_strip():
+    _, _, verdict, problems = built(
+        house(1, box(0, 0, 50, 20), height="12"),
+        part(2, box(0, 0, 46, 19.2), height="20"),
+        house(3, box(0, 40, 50, 20), height="12"),
+        part(4, box(0.5, 40.5, 49, 19), height="20"),
+    )
+    assert verdict.volume[0] == pytest.approx(46 * 19.2 * 20 + (1000 - 46 * 19.2) * 12, rel=1e-6)
+    assert verdict.volume[1] == pytest.approx(49 * 19 * 20, rel=1e-6)
+    assert [(p.osm_id, p.reason, p.detail) for p in problems] == [
+        ("way/1", "partly-covered", "parts cover 88%; 116.8 m2 of the outline stay as a part"),
+        ("way/3", "uncovered-strips", "69.0 m2 of the outline that no part covers, narrower than 1 m"),
+    ]
+
+
 def test_parts_inherit_missing_height_and_colour_from_their_building():
     table, *_ = built(
         house(1, box(0, 0, 20, 10), height="21", building__colour="red"),
@@ -220,7 +235,7 @@ def test_any_stack_of_parts_is_one_solid_with_the_volume_of_the_union(seed):
         areas.append(part(number, box(x, y, w, d), height=str(low + tall), min_height=str(low)))
         bodies.append(m3.Manifold.cube((w, d, tall)).translate((float(x), float(y), float(low))))
     _, mesh, verdict, _ = built(
-        house(99, box(0, 0, 9, 9), height="3"), *areas, options=BuildingOptions(covered=0.0)
+        house(99, box(0, 0, 9, 9), height="3"), *areas, options=BuildingOptions(strip=1e3)
     )
     union = m3.Manifold.batch_boolean(bodies, m3.OpType.Add).volume()
     # a groove of some millimetres along an edge takes less than a litre
@@ -233,7 +248,7 @@ def test_bodies_that_share_an_edge_are_separated_and_reported():
         house(1, box(0, 0, 20, 20), height="5"),
         part(2, box(0, 0, 10, 10), height="5"),
         part(3, box(10, 10, 10, 10), height="5"),
-        options=BuildingOptions(covered=0.4),
+        options=BuildingOptions(strip=1e3),
     )
     assert verdict.volume[0] == pytest.approx(500 + 500, rel=1e-6)
     assert ("way/1", "repaired", "touching-bodies") in reasons(problems)
@@ -374,6 +389,41 @@ def test_overlapping_buildings_share_no_volume_and_leave_no_hole(seed):
     for i in range(len(table)):
         for j in range(i):
             assert shapely.intersection(table.footprint[i], table.footprint[j]).area < 1e-2
+
+
+def test_of_overlapping_buildings_the_one_with_a_known_height_keeps_its_shape():
+    table, _, _, problems = built(
+        house(1, box(0, 0, 30, 20), **{"building:levels": "12"}, layer="1"),
+        house(2, box(0, 0, 12, 12)),
+        house(3, box(13, 0, 14, 19), name="Villa"),
+        house(4, box(0, 15, 10, 20)),
+        # of two without a height the named one, else the smaller
+        house(5, box(60, 0, 30, 20), name="Palace"),
+        house(6, box(70, 5, 5, 30)),
+        house(7, box(100, 0, 30, 20)),
+        house(8, box(110, 5, 5, 30)),
+        # a tower stands out of a low hall with a known height
+        house(9, box(140, 0, 30, 20), height="3"),
+        house(10, box(150, 5, 5, 5), building="tower"),
+    )
+    names = [f"way/{n}" for n in (1, 4, 5, 6, 7, 8, 9, 10)]
+    assert table.osm_id.tolist() == names
+    area = dict(zip(names, shapely.area(table.footprint), strict=True))
+    assert area == pytest.approx(
+        dict(zip(names, (600, 150, 600, 75, 525, 150, 575, 25), strict=True)), rel=1e-6
+    )
+    assert reasons(problems) == {
+        *((f"way/{n}", "dropped", "inside-another") for n in (2, 3)),
+        *((f"way/{n}", "repaired", "overlap") for n in (4, 6, 7, 9)),
+    }
+
+
+def test_of_duplicates_the_one_with_storeys_is_kept():
+    table, *_ = built(
+        house(1, box(0, 0, 10, 10), name="a", source="b", height="high", note="c"),
+        house(2, box(0, 0, 10, 10), **{"building:levels": "5"}),
+    )
+    assert table.osm_id.tolist() == ["way/2"]
 
 
 def test_building_raised_above_another_keeps_its_footprint():
@@ -586,13 +636,36 @@ def test_bodies_that_share_an_edge_with_a_narrow_gap_are_joined():
     assert body.corners[..., 2].max() < 9.01
 
 
+def test_one_atypical_height_does_not_set_those_of_a_whole_centre():
+    rng = np.random.default_rng(1)
+    xy = np.vstack([[0.0, 0.0], rng.uniform(-120, 120, (55, 2))])
+    area_ = np.append(120.0, rng.uniform(80, 900, 55))
+    use, height = np.full(56, "yes", dtype=object), np.append(38.0, np.full(55, np.nan))
+    inferred, sigma, _ = infer_heights(xy, use, area=area_, height=height)
+    alone, *_ = infer_heights(xy, use, area=area_, height=np.full(56, np.nan))
+    assert (inferred[1:] < 35).all()
+    assert (inferred[1:] < 2.3 * alone[1:]).all()
+    assert np.median(sigma[1:] / inferred[1:]) > 0.6
+    use[0] = "bell_tower"
+    np.testing.assert_array_equal(infer_heights(xy, use, area=area_, height=height)[0][1:], alone[1:])
+
+
+def test_inferred_heights_suit_their_footprints():
+    n = 30
+    xy = np.column_stack([np.arange(n) * 15.0, np.zeros(n)])
+    use, area_ = np.full(n, "yes", dtype=object), np.append(np.full(n - 1, 900.0), 20.0)
+    height = np.append(np.full(n - 1, 100.0), np.nan)
+    inferred, *_ = infer_heights(xy, use, area=area_, height=height)
+    assert inferred[-1] == pytest.approx(3 * 20**0.5)
+
+
 def test_inferred_height_excludes_the_building_itself():
     xy = np.array([[0.0, 0.0], [10.0, 0.0]])
-    use, area_ = np.array(["yes", "yes"], dtype=object), np.array([100.0, 100.0])
+    use, area_ = np.array(["yes", "yes"], dtype=object), np.array([400.0, 400.0])
     first, _, _ = infer_heights(xy, use, area=area_, height=np.array([30.0, np.nan]))
     again, _, _ = infer_heights(xy, use, area=area_, height=np.array([60.0, np.nan]))
     assert first[0] == again[0]
-    assert again[1] > 1.5 * first[1]
+    assert again[1] == pytest.approx(first[1] * 2**0.5, rel=0.03)  # one neighbour counts half
 
 
 def test_an_empty_map_has_no_buildings():
