@@ -89,7 +89,9 @@ def degrees(names: str) -> Parameter:
             raise ValueError(f"{text}: give {count} numbers in degrees as {names}")
         if names == "W,S,E,N":
             west, south, east, north = values
-            if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
+            east += 360 if east < west - 270 else 0  # across 180°
+            rising = west < east <= max(180, west + 90) and south < north
+            if not (rising and abs(west) <= 180 and south >= -90 and north <= 90):
                 raise ValueError(f"{text}: W,S,E,N must rise from west to east and south to north")
         elif not (abs(values[0]) <= 90 and abs(values[1]) <= 180):
             raise ValueError(f"{text}: not a latitude and longitude in degrees")

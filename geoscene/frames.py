@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike
 from pyproj import CRS, Proj, Transformer
 from pyproj.crs import ProjectedCRS
@@ -31,13 +33,13 @@ def _local_wkt(lon_deg: float, lat_deg: float) -> str:
 
 
 def utm_crs(lon_deg: float, lat_deg: float) -> str:
-    """EPSG code (``EPSG:326xx`` or ``EPSG:327xx``) of the WGS 84 UTM zone of a point.
+    """EPSG code (``EPSG:326xx`` or ``EPSG:327xx``) of the WGS 84 UTM zone of a point, or of UPS.
 
-    Includes the exceptions of south-west Norway (32V) and Svalbard (31X, 33X, 35X, 37X). Raises FrameError
-    outside 80° S to 84° N, where UTM is not defined.
+    Includes the exceptions of south-west Norway (32V) and Svalbard (31X, 33X, 35X, 37X). Beyond 84° N and
+    80° S, where UTM ends, the universal polar stereographic CRS (``EPSG:5041``, ``EPSG:5042``).
     """
     if not -80.0 <= lat_deg <= 84.0:
-        raise FrameError(f"no UTM zone at {lat_deg:.4f}, {lon_deg:.4f}; use the local frame (`crs` local)")
+        return "EPSG:5041" if lat_deg > 0 else "EPSG:5042"
     lon = (lon_deg + 180.0) % 360.0 - 180.0
     zone = int((lon + 180.0) // 6.0) + 1
     if 56.0 <= lat_deg < 64.0 and 3.0 <= lon < 12.0:
@@ -45,6 +47,30 @@ def utm_crs(lon_deg: float, lat_deg: float) -> str:
     elif lat_deg >= 72.0 and 0.0 <= lon < 42.0:
         zone = 31 + 2 * int((lon + 3.0) // 12.0)
     return f"EPSG:{32600 + zone if lat_deg >= 0 else 32700 + zone}"
+
+
+def wrapped(lon_deg: float) -> float:
+    """The longitude within ±180°."""
+    return lon_deg if -180 <= lon_deg <= 180 else (lon_deg + 180) % 360 - 180
+
+
+def beside(lon: ArrayLike, middle: float, *, turn: float = 360.0) -> Float:
+    """Longitudes (any shape) moved by whole turns (none if infinite) to within half a turn of ``middle``."""
+    if np.isinf(turn):
+        return np.asarray(lon, float)
+    moved: Float = np.asarray(lon, float) - turn * np.round((np.asarray(lon, float) - middle) / turn)
+    return moved
+
+
+def rim_of(bounds: Sequence[float], *, step: float) -> Float:
+    """Longitudes and latitudes (2, n) along the edge of a box in degrees, at most ``step`` apart.
+
+    bounds : (west, south, east, north); sides of no length become 1 cm long
+    """
+    west, south, east, north = bounds
+    box = shapely.box(west, south, max(east, west + 1e-7), max(north, south + 1e-7))
+    edge: Float = shapely.get_coordinates(shapely.segmentize(box, step)).T
+    return edge
 
 
 @dataclass(frozen=True)
@@ -65,8 +91,8 @@ class Frame:
     def at(cls, lon_deg: float, lat_deg: float, *, crs: str = "local", vertical: str = "flat") -> Frame:
         """The frame of a scene centred on a point.
 
-        crs : ``local`` (transverse Mercator with scale 1 at the centre), ``utm`` (the zone of the centre),
-              or any projected CRS in metres that pyproj reads (``EPSG:32618``)
+        crs : ``local`` (transverse Mercator with scale 1 at the centre), ``utm`` (the zone of the centre;
+              near the poles UPS), or any projected CRS in metres that pyproj reads (``EPSG:32618``)
 
         Raises FrameError if the CRS is unknown, not projected, not in metres, or distorts lengths
         by over 10 %.

@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 
 from geoscene import __version__
+from geoscene.frames import wrapped
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.plan import Plan
 from geoscene.report import Problem, summarise
@@ -33,6 +34,7 @@ def scene_manifest(
 ) -> dict[str, Any]:
     """The JSON object: sources, options, counts, sources of heights, repaired and dropped features."""
     xmin, ymin, xmax, ymax = plan.extent
+    west, south, east, north = osm.bounds
     terrain = plan.terrain
     sources = _sources(osm, plan)
     return {
@@ -41,7 +43,7 @@ def scene_manifest(
         "attribution": "; ".join(dict.fromkeys(s["attribution"] for s in sources if "attribution" in s)),
         "fingerprint": fingerprint,
         "sources": sources,
-        "geographic_bounds": list(osm.bounds),
+        "geographic_bounds": [west, south, wrapped(east), north],
         "bounds": [xmin, ymin, xmax, ymax],
         "tile_size": options["tile_size"],
         "tiles": sorted((r.i, r.j) for r in reports),

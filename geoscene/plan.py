@@ -21,7 +21,7 @@ from geoscene.features import (
     structure_layer,
     tree_layer,
 )
-from geoscene.frames import Frame
+from geoscene.frames import Frame, rim_of, wrapped
 from geoscene.ground import (
     GroundPlan,
     Layers,
@@ -66,6 +66,7 @@ LARGEST_KM2 = 4000.0
 
 _ROAD_LINES = 10.0  # metres between the lines at which ground graded to roads can bend
 _ROAD_REACH = 25.0  # metres, maximum distance from a centre line of ground that is graded to the road
+_MARGIN = 10.0  # metres of ground added on both sides of maps narrower than twice that
 _RAISED = 1.0  # metres, minimum height of an underside for a building to have no pad
 
 
@@ -227,7 +228,7 @@ def _checked_centre(osm: OsmData) -> tuple[float, float]:
             f"{osm.source}: {area:,.0f} km2, more than the maximum of {LARGEST_KM2:,.0f} km2 for a scene;"
             " select a part of it with `bbox`"
         )
-    return (west + east) / 2, (south + north) / 2
+    return wrapped((west + east) / 2), (south + north) / 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,14 +293,16 @@ def _extent(frame: Frame, bounds: Bounds, *, buildings: Buildings) -> Bounds:
     """Rectangle of the ground in whole metres: contains the bounds of the map and all buildings."""
     west, south, east, north = bounds
     step = max((east - west) / 8, (north - south) / 8, 1e-6)
-    rim = shapely.segmentize(shapely.box(west, south, east, north), step)
-    x, y = frame.from_geographic(*shapely.get_coordinates(rim).T)
+    x, y = frame.from_geographic(*rim_of(bounds, step=step))
     boxes = shapely.bounds(buildings.footprint[: buildings.count])
     xs = np.concatenate([x, boxes[:, 0] - 2, boxes[:, 2] + 2])
     ys = np.concatenate([y, boxes[:, 1] - 2, boxes[:, 3] + 2])
-    xmin, ymin = float(np.floor(xs.min())), float(np.floor(ys.min()))
-    xmax, ymax = float(np.ceil(xs.max())), float(np.ceil(ys.max()))
-    return xmin, ymin, max(xmax, xmin + 10), max(ymax, ymin + 10)
+    low = np.floor([xs.min(), ys.min()])
+    high = np.ceil([xs.max(), ys.max()])
+    thin = high - low < 2 * _MARGIN
+    low[thin] -= _MARGIN
+    high[thin] += _MARGIN
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
 def _surfaces(

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
 
 from geoscene.errors import InputError, SourceNotFoundError
-from geoscene.frames import Frame
+from geoscene.frames import Frame, beside
 from geoscene.typing import Bools, Float, Height
 
 Vertical = Literal["flat", "orthometric", "ellipsoidal"]
@@ -98,7 +98,9 @@ class Terrain:
         open_ = np.full(x.shape, bool(self.grids))
         for k, transformer in enumerate(self._transformers):
             grid, last = self.grids[k], k == len(self.grids) - 1
-            column, row = _posts(grid, transformer, frame=self.frame, x=x[open_], y=y[open_])
+            place = np.stack(transformer.transform(*self.frame.to_projected(x[open_], y[open_])))
+            place[0] = beside(place[0], float(grid.origin[0]), turn=self._turns[k])
+            column, row = np.linalg.solve(grid.step, place - grid.origin[:, None])
             value, covered = _bilinear(grid, column, row=row)
             take = np.zeros(x.shape, bool)
             take[open_] = True if last else covered
@@ -109,6 +111,10 @@ class Terrain:
     @functools.cached_property
     def _transformers(self) -> list[Transformer]:
         return [Transformer.from_crs(self.frame.crs, CRS.from_wkt(g.crs), always_xy=True) for g in self.grids]
+
+    @functools.cached_property
+    def _turns(self) -> list[float]:
+        return [_turn(CRS.from_wkt(g.crs)) for g in self.grids]
 
 
 def open_terrain(
@@ -209,6 +215,11 @@ class _Raster:
     vertical: Literal["orthometric", "ellipsoidal"]
     datum: str
     credit: str
+    turn: float
+
+    def origin_beside(self, other: _Raster) -> Float:
+        """The origin, on the same side of 180° of longitude as that of another raster."""
+        return np.array([beside(self.origin[0], other.origin[0], turn=self.turn), self.origin[1]])
 
 
 def _gdal_name(path: Path) -> str:
@@ -259,6 +270,7 @@ def _open(path: Path, *, unit: str | None, vertical: Literal["orthometric", "ell
                 vertical or kind or "orthometric",
                 tags.get("VERTICAL_DATUM", datum) if vertical is None else f"{vertical}, as told",
                 tags.get("TIFFTAG_COPYRIGHT", ""),
+                _turn(crs),
             )
     except RasterioIOError as error:
         raise InputError(f"{path}: not a raster that GDAL reads ({error})") from error
@@ -311,7 +323,7 @@ def _shares_lattice(one: _Raster, other: _Raster) -> bool:
     """Whether both share one lattice: the same CRS and steps, a whole number of steps apart."""
     if one.crs != other.crs or not np.allclose(one.step, other.step, rtol=1e-7, atol=0):
         return False
-    apart = np.linalg.solve(one.step, other.origin - one.origin)
+    apart = np.linalg.solve(one.step, other.origin_beside(one) - one.origin)
     return bool(np.abs(apart - np.round(apart)).max() < 1e-2)
 
 
@@ -326,13 +338,16 @@ def _read(
     side = max(float(np.diff(bounds[::2])[0]), 1.0)
     edge = shapely.get_coordinates(shapely.segmentize(shapely.box(*bounds), side / 32))
     place = np.column_stack(frame.to_crs(edge[:, 0], edge[:, 1], crs=first.crs))
+    centre = first.origin + first.step @ np.array(first.shape[::-1]) / 2
+    near = float(beside(place[0, 0], float(centre[0]), turn=first.turn))
+    place[:, 0] = beside(place[:, 0], near, turn=first.turn)
     post = np.linalg.solve(first.step, (place - first.origin).T)
     low = np.floor(post.min(axis=1)).astype(int) - _MARGIN
     high = np.ceil(post.max(axis=1)).astype(int) + _MARGIN + 1
     values = np.full((high[1] - low[1], high[0] - low[0]), np.nan)
     known = np.zeros(values.shape, bool)
     for raster in group:
-        shift = np.round(np.linalg.solve(first.step, raster.origin - first.origin)).astype(int)
+        shift = np.round(np.linalg.solve(first.step, raster.origin_beside(first) - first.origin)).astype(int)
         begin = np.maximum(low - shift, 0)
         end = np.minimum(high - shift, raster.shape[::-1])
         if (begin >= end).any():
@@ -384,11 +399,11 @@ def _filled(values: Float, known: Bools) -> Float:
     return filled
 
 
-def _posts(grid: Grid, transformer: Transformer, *, frame: Frame, x: Float, y: Float) -> tuple[Float, Float]:
-    """Column and row (n,), fractional, of scene coordinates (n,)."""
-    place = np.stack(transformer.transform(*frame.to_projected(x, y)))
-    column, row = np.linalg.solve(grid.step, place - grid.origin[:, None])
-    return column, row
+def _turn(crs: CRS) -> float:
+    """Units of a CRS's first axis around the globe; infinite where the axis does not go round."""
+    if crs.is_geographic:
+        return 2 * np.pi / float(crs.axis_info[0].unit_conversion_factor)
+    return 2 * np.pi * 6378137.0 if crs.to_epsg() == 3857 else np.inf
 
 
 def _bilinear(grid: Grid, column: Float, *, row: Float) -> tuple[Float, Bools]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Literal, cast
 
+from geoscene.frames import wrapped
 from geoscene.sources.data import OsmData
 
 Side = Literal["left", "right"]
@@ -49,4 +50,4 @@ def driving_side(osm: OsmData) -> tuple[Side, str]:
     if tagged:
         return cast("Side", max(sorted(tagged), key=tagged.__getitem__)), "tag"
     west, south, east, north = osm.bounds
-    return side_at((west + east) / 2, (south + north) / 2), "place"
+    return side_at(wrapped((west + east) / 2), (south + north) / 2), "place"

@@ -5,44 +5,14 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.errors import SourceNotFoundError
 from geoscene.report import Action, Problem
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
 from geoscene.sources.data import Bounds, OsmData, Point, Relation, Way
-from geoscene.sources.elements import UNITS, Elements
+from geoscene.sources.elements import Elements
+from geoscene.sources.extent import checked_bounds, located, near_extent
 from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
 from geoscene.typing import Bools, Ints
-
-
-def checked_bounds(bounds: Bounds) -> Bounds:
-    """``bounds`` as floats. Raises one InputError that lists all faults."""
-    try:
-        west, south, east, north = (float(v) for v in bounds)
-    except (TypeError, ValueError):
-        raise InputError(f"bounds {bounds!r}: give west, south, east, north in degrees") from None
-    faults = []
-    if not np.isfinite([west, south, east, north]).all():
-        faults.append("not finite")
-    elif abs(west) > 180 or abs(east) > 180 or abs(south) > 90 or abs(north) > 90:
-        faults.append(
-            "outside ±180 (longitude) or ±90 (latitude) degrees; the order is west, south, east, north"
-        )
-    else:
-        if west >= east:
-            faults.append("west is not less than east (areas across 180° are not supported)")
-        if south >= north:
-            faults.append("south is not less than north")
-    if faults:
-        raise InputError(f"bounds {west:g},{south:g},{east:g},{north:g}: {'; '.join(faults)}")
-    return west, south, east, north
-
-
-def _extent(elements: Elements) -> Bounds:
-    """The bounds that the source states, else the extent of its nodes."""
-    if elements.bounds is not None:
-        return elements.bounds
-    (west, south), (east, north) = elements.node_xy.min(axis=0) / UNITS, elements.node_xy.max(axis=0) / UNITS
-    return float(west), float(south), float(east), float(north)
 
 
 def _intersect(elements: Elements, bounds: Bounds | None) -> Bools:
@@ -134,7 +104,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
         raise SourceNotFoundError(
             f"{source}: holds no nodes with coordinates; is it a whole OpenStreetMap extract?"
         )
-    extent = _extent(elements)
+    elements, extent, far = located(elements, bounds)
     places = Places.of(elements)
     near = _intersect(elements, bounds)
 
@@ -145,10 +115,13 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
         Problem(f"node/{i}", "node", "dropped", "bad-coordinates", "missing or out of range")
         for i in elements.misplaced.tolist()
     ]
+    problems += far
     areas, found, claims = multipolygon_areas(elements, places, extent=extent, wanted=wanted)
     problems += found
     rows = [row for row in np.flatnonzero(near).tolist() if has_meaning(elements.way_tags[row])]
     more, found, meant = way_areas(elements, places, extent=extent, rows=rows, claims=claims)
+    problems += found
+    areas, found = near_extent(more + areas, extent)
     problems += found
     lines = [
         row
@@ -160,7 +133,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
     data = OsmData(
         bounds=bounds or extent,
         ways=ways,
-        areas=more + areas,
+        areas=areas,
         points=_points(elements),
         relations=[
             Relation(f"relation/{i}", tags, members)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from geoscene import __version__
 from geoscene.errors import InputError, NetworkError
 from geoscene.files import write_atomically
-from geoscene.frames import Frame
+from geoscene.frames import Frame, beside, rim_of, wrapped
 from geoscene.progress import Progress, silent
 from geoscene.sources.data import Bounds, OsmData
 from geoscene.sources.http import BUSY, RefusedError, cause, open_session
@@ -105,8 +105,8 @@ def fetch_elevation(
     z = zoom_at((south + north) / 2, deepest=server.deepest) if zoom is None else zoom
     (left, top), (right, bottom) = _pixels(np.array([[west, north], [east, south]]), z)
     limit = 2**z - 1
-    x0, y0 = (int(np.clip((v - _AROUND) // _SIDE, 0, limit)) for v in (left, top))
-    x1, y1 = (int(np.clip((v + _AROUND) // _SIDE, 0, limit)) for v in (right, bottom))
+    x0, x1 = int((left - _AROUND) // _SIDE), int((right + _AROUND) // _SIDE)
+    y0, y1 = (int(np.clip(v // _SIDE, 0, limit)) for v in (top - _AROUND, bottom + _AROUND))
     names = [(x, y) for y in range(y0, y1 + 1) for x in range(x0, x1 + 1)]
     if len(names) > server.most:
         raise InputError(
@@ -122,7 +122,12 @@ def fetch_elevation(
         return path
     heights = np.empty(((y1 - y0 + 1) * _SIDE, (x1 - x0 + 1) * _SIDE))
     for done, ((x, y), tile) in enumerate(
-        zip(names, _tiles(names, z, cache_dir=cache_dir, server=server), strict=True), 1
+        zip(
+            names,
+            _tiles([(x % 2**z, y) for x, y in names], z, cache_dir=cache_dir, server=server),
+            strict=True,
+        ),
+        1,
     ):
         row, column = (y - y0) * _SIDE, (x - x0) * _SIDE
         heights[row : row + _SIDE, column : column + _SIDE] = tile
@@ -143,13 +148,15 @@ def _scene_box(osm: OsmData, crs: str) -> Bounds:
     east, north = np.nanmax(boxes[:, 2:], axis=0)
     if max(abs(south), abs(north)) > _LAST_LATITUDE:
         raise InputError(f"elevation tiles end at 85° of latitude; the map spans {south:.2f} to {north:.2f}")
-    frame = Frame.at((west + east) / 2, (south + north) / 2, crs=crs)
-    rim = shapely.segmentize(shapely.box(west, south, east, north), max(east - west, north - south) / 8)
-    xy = np.column_stack(frame.from_geographic(*shapely.get_coordinates(rim).T))
+    middle = wrapped((west + east) / 2)
+    frame = Frame.at(middle, (south + north) / 2, crs=crs)
+    side = max(east - west, north - south, 1e-6) / 8
+    xy = np.column_stack(frame.from_geographic(*rim_of((west, south, east, north), step=side)))
     (xmin, ymin), (xmax, ymax) = xy.min(axis=0), xy.max(axis=0)
-    side = max(xmax - xmin, ymax - ymin) / 8
-    square = shapely.get_coordinates(shapely.segmentize(shapely.box(xmin, ymin, xmax, ymax), side))
-    lon, lat = frame.to_geographic(*square.T)
+    side = max(xmax - xmin, ymax - ymin, 1.0) / 8
+    square = rim_of((xmin, ymin, xmax, ymax), step=side)
+    lon, lat = frame.to_geographic(*square)
+    lon = beside(lon, middle)
     return float(lon.min()), float(lat.min()), float(lon.max()), float(lat.max())
 
 
@@ -166,7 +173,8 @@ def _tiles(names: list[tuple[int, int]], z: int, *, cache_dir: Path, server: Til
     folder = cache_dir / "tiles" / hashlib.sha256(server.template.encode()).hexdigest()[:16] / str(z)
     folder.mkdir(parents=True, exist_ok=True)
     with open_session(server.user_agent) as session:
-        for x, y in names:
+        for column, y in names:
+            x = column % 2**z  # columns run on across 180°
             path = folder / f"{x}_{y}.png"
             heights_of_tile = _heights(path.read_bytes()) if path.exists() else None
             if heights_of_tile is None:

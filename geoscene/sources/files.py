@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.errors import InputError, SourceNotFoundError
-from geoscene.sources.assemble import checked_bounds, features
+from geoscene.sources.assemble import features
 from geoscene.sources.data import Bounds, OsmData, Progress
 from geoscene.sources.elements import Collector
+from geoscene.sources.extent import checked_bounds
 from geoscene.sources.overpass import collect_answer
 from geoscene.sources.plain_xml import collect_xml
 

@@ -20,9 +20,10 @@ import numpy as np
 from geoscene import __version__
 from geoscene.errors import InputError, NetworkError, SourceNotFoundError
 from geoscene.files import write_atomically
-from geoscene.sources.assemble import checked_bounds, features
+from geoscene.sources.assemble import features
 from geoscene.sources.data import METRES_PER_DEGREE, Bounds, OsmData, Progress
 from geoscene.sources.elements import Collector
+from geoscene.sources.extent import checked_bounds
 from geoscene.sources.http import BUSY, RefusedError, cause, open_session
 from geoscene.sources.overpass import collect_answer, query_for
 
@@ -155,8 +156,13 @@ def _seconds_to_free_slot(session: Any, url: str, *, timeout: float) -> float:
 
 
 def _parts(bounds: Bounds, largest_km2: float) -> list[Bounds]:
-    """The box cut into equal boxes of at most ``largest_km2``, each about square."""
+    """The box cut at 180° of longitude, then into equal, about square boxes of at most ``largest_km2``."""
     west, south, east, north = bounds
+    if east > 180:
+        return [
+            *_parts((west, south, 180.0, north), largest_km2),
+            *_parts((-180.0, south, east - 360, north), largest_km2),
+        ]
     width = (east - west) * METRES_PER_DEGREE * math.cos(math.radians((south + north) / 2)) / 1000
     height = (north - south) * METRES_PER_DEGREE / 1000
     side = math.sqrt(largest_km2)

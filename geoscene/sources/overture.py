@@ -13,9 +13,10 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from geoscene.errors import InputError, SourceNotFoundError, need
+from geoscene.frames import beside
 from geoscene.report import Problem
-from geoscene.sources.assemble import checked_bounds
 from geoscene.sources.data import Area, Bounds, OsmData, Progress, Tags
+from geoscene.sources.extent import checked_bounds, close_together
 from geoscene.sources.registry import SOURCES
 from geoscene.sources.rings import polygons_of
 
@@ -53,14 +54,19 @@ def read_overture(path: str | Path, *, bounds: Bounds | None = None, progress: P
     (within the bounds), InputError for a file that is damaged or of another schema or CRS.
     """
     path = Path(path)
-    rows = _read_rows(path, bounds if bounds is None else checked_bounds(bounds))
+    bounds = None if bounds is None else checked_bounds(bounds)
+    rows = _read_rows(path, bounds)
     shapes = shapely.force_2d(shapely.from_wkb([row["geometry"] for row in rows], on_invalid="ignore"))
     areas: list[Area] = []
     problems: list[Problem] = []
     origins: list[dict[str, Any]] = []
+    middle = None if bounds is None else (bounds[0] + bounds[2]) / 2
     for row, shape in zip(progress(rows), shapes, strict=True):
         name = f"overture:{row['id']}"
         geometry, problem = _footprint(name, shape)
+        if geometry is not None:
+            middle = middle if middle is not None else float(shapely.bounds(geometry)[0])
+            geometry = _turned(geometry, middle)
         if bounds is not None and geometry is not None and not shapely.box(*bounds).intersects(geometry):
             continue
         if problem is not None:
@@ -70,9 +76,10 @@ def read_overture(path: str | Path, *, bounds: Bounds | None = None, progress: P
             origins += row.get("sources") or ()
     if not areas:
         raise SourceNotFoundError(f"{path}: no buildings in it" + (" within the bounds" if bounds else ""))
-    west, south, east, north = shapely.total_bounds([area.geometry for area in areas]).tolist()
+    areas, extent, far = close_together(areas) if bounds is None else (areas, bounds, [])
+    problems += far
     return OsmData(
-        bounds=bounds or (west, south, east, north),
+        bounds=extent,
         ways=[],
         areas=sorted(areas, key=lambda area: area.osm_id),
         points=[],
@@ -101,7 +108,10 @@ def _read_rows(path: Path, bounds: Bounds | None) -> list[dict[str, Any]]:
         if bounds is not None and "bbox" in table.schema.names:
             xmin, ymin, xmax, ymax = (arrow.field("bbox", edge) for edge in ("xmin", "ymin", "xmax", "ymax"))
             west, south, east, north = bounds
-            near = (xmin <= east) & (xmax >= west) & (ymin <= north) & (ymax >= south) | ~xmin.is_valid()
+            across = (xmin <= east) & (xmax >= west)
+            if east > 180:
+                across |= xmin <= east - 360
+            near = across & (ymin <= north) & (ymax >= south) | ~xmin.is_valid()
         rows: list[dict[str, Any]] = table.to_table(columns=columns, filter=near).to_pylist()
     except InputError:
         raise
@@ -135,6 +145,13 @@ def _footprint(name: str, shape: Any) -> tuple[Any, Problem | None]:
         return geometry, None
     reason = str(shapely.is_valid_reason(shape)).partition("[")[0].lower()
     return geometry, Problem(name, "building", "repaired", "self-crossing", reason)
+
+
+def _turned(geometry: Any, middle_deg: float) -> Any:
+    """The geometry moved by a whole turn of longitude if that brings it nearer to ``middle_deg``."""
+    lon = float(shapely.bounds(geometry)[0])
+    turn = round(float(beside(lon, middle_deg)) - lon)
+    return shapely.transform(geometry, lambda lonlat: np.add(lonlat, (turn, 0))) if turn else geometry
 
 
 def _tags(row: dict[str, Any]) -> Tags:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import rasterio
 import shapely
+from pyproj import Transformer
 from rasterio.transform import Affine
 
 from geoscene.errors import InputError, SourceNotFoundError
@@ -117,6 +118,25 @@ def test_voids_are_filled_from_their_surroundings_and_counted(tmp_path):
     x, y = sample(2000)
     expected = 0.1 * (FRAME.to_crs(x, y, crs=UTM)[0] - 500000) + 300
     assert np.abs(terrain.height(x, y) - expected).max() < 5.0
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857"])
+def test_rasters_on_both_sides_of_180_degrees_meet(crs, tmp_path):
+    frame = Frame.at(180.0, -16.8)
+    west = Transformer.from_crs(4326, crs, always_xy=True)
+    step = 0.0005 if crs == "EPSG:4326" else 60.0
+    paths = []
+    for name, lon in (("west", 180.0 - 0.02), ("east", -180.0)):
+        left, top = west.transform(lon, -16.79)
+        columns = round((west.transform(180.0, 0)[0] - west.transform(179.98, 0)[0]) / step)
+        offset = 0 if name == "west" else columns
+        left = left if name == "east" else west.transform(180.0, 0)[0] - columns * step
+        values = np.tile(np.arange(columns) + offset, (60, 1))
+        paths.append(write_dem(tmp_path / f"{name}.tif", values, corner=(left, top), step=step, crs=crs))
+    terrain = open_terrain(paths, frame, bounds=BOUNDS)
+    assert max(grid.values.size for grid in terrain.grids) < 5000
+    x = np.linspace(-200, 200, 81)
+    np.testing.assert_allclose(np.diff(terrain.height(x, 0 * x)), 5 / terrain.spacing, rtol=1e-3)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("ft", 0.3048), ("us-ft", 1200 / 3937), ("m", 1.0)])

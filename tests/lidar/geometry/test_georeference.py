@@ -79,6 +79,16 @@ def test_an_unsuitable_crs_is_refused(crs):
         Frame.at(-73.99, 60.72, crs=crs)
 
 
-def test_utm_is_refused_at_the_poles():
-    with pytest.raises(FrameError, match="local"):
-        utm_crs(10.0, 87.0)
+@pytest.mark.parametrize(("lat", "crs"), [(87.0, "EPSG:5041"), (84.5, "EPSG:5041"), (-80.5, "EPSG:5042")])
+def test_near_the_poles_utm_is_ups(lat, crs):
+    assert utm_crs(10.0, lat) == crs
+    frame = Frame.at(10.0, lat, crs="utm")
+    east, north = frame.to_projected(0.0, 0.0)
+    # Snyder (1987), (21-33): rho of the polar stereographic with k0 = 0.994 and false origin 2,000 km.
+    e = np.sqrt(2 / 298.257223563 - 298.257223563**-2)
+    phi = np.radians(abs(lat))
+    t = np.tan(np.pi / 4 - phi / 2) / ((1 - e * np.sin(phi)) / (1 + e * np.sin(phi))) ** (e / 2)
+    rho = 2 * 6378137 * 0.994 * t / np.sqrt((1 + e) ** (1 + e) * (1 - e) ** (1 - e))
+    sign = -1 if lat > 0 else 1
+    assert east == pytest.approx(2e6 + rho * np.sin(np.radians(10)), abs=1)
+    assert north == pytest.approx(2e6 + sign * rho * np.cos(np.radians(10)), abs=1)
