@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from pyproj import CRS, Proj, Transformer
 from pyproj.crs import ProjectedCRS
 from pyproj.crs.coordinate_operation import TransverseMercatorConversion
-from pyproj.exceptions import CRSError
+from pyproj.exceptions import CRSError, ProjError
 
 from geoscene.errors import FrameError
 from geoscene.typing import Float
@@ -195,6 +195,13 @@ class Frame:
 
     @classmethod
     def from_json(cls, document: dict[str, Any]) -> Frame:
-        """The frame of a JSON object of `to_json`."""
-        east, north = document["origin"]
-        return cls(document["wkt"], (float(east), float(north)), document["vertical"])
+        """The frame of a JSON object of `to_json`; raises FrameError for another object."""
+        try:
+            east, north = (float(v) for v in document["origin"])
+            frame = cls(str(document["wkt"]), (east, north), str(document["vertical"]))
+            known = bool(np.isfinite(frame.to_geographic(0.0, 0.0)).all())
+        except (KeyError, TypeError, ValueError, ProjError) as error:
+            raise FrameError(f"not a coordinate frame ({type(error).__name__}: {error})") from error
+        if not known:
+            raise FrameError("a coordinate frame whose origin is nowhere on Earth")
+        return frame

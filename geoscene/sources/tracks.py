@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -13,33 +14,41 @@ from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.typing import Float
 
 _Point = tuple[float, float, float]
+_HIGHEST_M = 1e5
 
 
 def read_track(path: Path) -> Float:
     """Points (n, 3) of a file in order: longitude and latitude in degrees, height in metres or 0.
 
     Of a GPX file these are its tracks, else its routes, else its waypoints; of a GeoJSON file its lines and
-    points.
+    points. GPX may be in any encoding that its XML declaration names, GeoJSON in UTF-8, UTF-16 or UTF-32.
 
     Raises SourceNotFoundError for a missing file and InputError for one that cannot be read.
     """
     if not path.exists():
         raise SourceNotFoundError(f"{path} does not exist")
-    try:
-        text = path.read_text("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: neither GPX (XML) nor GeoJSON (JSON)") from error
-    points = np.array(_gpx(path, text) if text.lstrip().startswith("<") else _geojson(path, text), float)
-    lon, lat = points.reshape(-1, 3)[:, :2].T
-    if not (np.isfinite(lon).all() and (np.abs(lat) <= 90).all() and (np.abs(lon) <= 180).all()):
+    data = path.read_bytes()
+    read = _gpx if _is_xml(data) else _geojson
+    points = np.array(read(path, data), float).reshape(-1, 3)
+    lon, lat, height = points.T
+    if not (np.isfinite(points).all() and (np.abs(lat) <= 90).all() and (np.abs(lon) <= 180).all()):
         raise InputError(f"{path}: coordinates are not longitudes and latitudes in degrees")
-    return points.reshape(-1, 3)
+    if (np.abs(height) > _HIGHEST_M).any():
+        raise InputError(f"{path}: heights exceed {_HIGHEST_M:g} m")
+    return points
 
 
-def _gpx(path: Path, text: str) -> list[_Point]:
+def _is_xml(data: bytes) -> bool:
+    """Whether a file's first character, in any encoding, is that of XML."""
+    for mark in (codecs.BOM_UTF8, codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        data = data.removeprefix(mark)
+    return data.lstrip(b"\x00 \t\r\n").startswith(b"<")
+
+
+def _gpx(path: Path, data: bytes) -> list[_Point]:
     try:
-        root = ET.fromstring(text)  # noqa: S314  (expat bounds the growth of entities)
-    except ET.ParseError as error:
+        root = ET.fromstring(data)  # noqa: S314  (expat bounds the growth of entities)
+    except (ET.ParseError, ValueError, LookupError) as error:  # of an encoding that is unknown or not kept to
         raise InputError(f"{path}: not readable as GPX: {error}") from error
     for tag in ("trkpt", "rtept", "wpt"):
         found = [e for e in root.iter() if e.tag.rsplit("}", 1)[-1] == tag]
@@ -58,17 +67,11 @@ def _elevation(element: ET.Element) -> float:
     return 0.0
 
 
-def _geojson(path: Path, text: str) -> list[_Point]:
-    try:
-        document = json.loads(text)
-    except ValueError as error:
-        raise InputError(f"{path}: neither GPX (XML) nor GeoJSON (JSON)") from error
-    features = document.get("features", [document]) if isinstance(document, dict) else []
-    shapes = [f.get("geometry") or f for f in features if isinstance(f, dict)]
+def _geojson(path: Path, data: bytes) -> list[_Point]:
     lines: list[Any] = []
-    for shape in shapes:
+    for shape in read_geometries(path, data):
         kind, at = shape.get("type"), shape.get("coordinates") or []
-        if kind in {"LineString", "MultiPoint"}:
+        if kind in ("LineString", "MultiPoint"):
             lines.append(at)
         elif kind == "MultiLineString":
             lines.extend(at)
@@ -78,5 +81,24 @@ def _geojson(path: Path, text: str) -> list[_Point]:
         return [
             (float(p[0]), float(p[1]), float(p[2]) if len(p) > 2 else 0.0) for line in lines for p in line
         ]
-    except (TypeError, ValueError, IndexError) as error:
+    except (TypeError, ValueError, LookupError) as error:
         raise InputError(f"{path}: coordinates that are not numbers") from error
+
+
+def read_geometries(path: Path, data: bytes) -> list[dict[str, Any]]:
+    """The geometries, as JSON objects, of a GeoJSON file's contents: of its features, or the file's own.
+
+    Raises InputError for a file that is not JSON or whose features are not a list.
+    """
+    try:
+        document = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: neither GPX (XML) nor GeoJSON (JSON)") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: JSON, but not GeoJSON")
+    features = document.get("features", [document])
+    if not isinstance(features, list):
+        raise InputError(f"{path}: its features are not a list")
+    objects = [feature for feature in features if isinstance(feature, dict)]
+    shapes = [feature.get("geometry") or feature for feature in objects]
+    return [shape for shape in shapes if isinstance(shape, dict)]

@@ -13,6 +13,7 @@ from lidar.geometry.poses import Trajectory
 MANIFEST = "dataset.json"
 """Name of a dataset's manifest; its key ``frame`` is the frame of the trajectory beside it."""
 
+_LARGEST = 1e15  # nanoseconds of eleven days
 _TRAJECTORY = ("time_ns", "x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "scale")
 
 
@@ -29,13 +30,18 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises DatasetError if the file is missing or damaged.
     """
     try:
-        with path.open(encoding="utf-8") as file:
-            names = tuple(file.readline().strip().split(","))
-            values = np.loadtxt(file, delimiter=",", ndmin=2)
+        names, *rows = path.read_text("utf-8").splitlines()
+        values = np.loadtxt(rows, delimiter=",", ndmin=2) if rows else np.empty((0, 0))
     except (OSError, ValueError) as error:
         raise DatasetError(f"{path}: not a readable trajectory ({error})") from error
-    if names != _TRAJECTORY:
-        raise DatasetError(f"{path}: columns {', '.join(names)}; expected {', '.join(_TRAJECTORY)}")
-    return Trajectory(
-        values[:, 0].astype(np.int64), values[:, 1:4], values[:, 4:8], values[:, 8:11], values[:, 11]
-    )
+    if tuple(names.split(",")) != _TRAJECTORY:
+        raise DatasetError(f"{path}: columns {names}; expected {','.join(_TRAJECTORY)}")
+    if values.shape[1:] != (len(_TRAJECTORY),):
+        raise DatasetError(f"{path}: no rows")
+    time, quat, scale = values[:, 0], values[:, 4:8], values[:, 11]
+    if not (np.abs(values) < _LARGEST).all():
+        raise DatasetError(f"{path}: a row holds no pose")
+    unit = np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-3
+    if not (unit & (scale > 0)).all() or (np.diff(time) <= 0).any():
+        raise DatasetError(f"{path}: a row holds no pose, or times do not increase")
+    return Trajectory(time.astype(np.int64), values[:, 1:4], quat, values[:, 8:11], scale)

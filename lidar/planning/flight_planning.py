@@ -14,6 +14,7 @@ import shapely
 
 from geoscene.classes import Class
 from geoscene.scene import Scene
+from geoscene.sources.tracks import read_geometries
 from geoscene.typing import Float
 from lidar.errors import InputError, RouteError
 from lidar.geometry.poses import Trajectory
@@ -240,6 +241,9 @@ def survey_area(scene: Scene, text: str) -> Any:
         area = shapely.box(west, south, east, north)
     except ValueError:
         area = _polygon(Path(text))
+    bounds = np.abs(area.bounds)
+    if not (bounds[::2] <= 180).all() or not (bounds[1::2] <= 90).all():
+        raise RouteError(f"`survey` {text}: coordinates are not longitudes and latitudes in degrees")
     # degrees: sides stay straight on the map where they are in the file
     area = shapely.segmentize(area, 1e-3)
     area = shapely.transform(area, lambda p: np.column_stack(scene.frame.from_geographic(*p.T)))
@@ -252,10 +256,9 @@ def _polygon(path: Path) -> Any:
     if not path.is_file():
         raise RouteError(f"`survey` {path}: neither all, W,S,E,N in degrees, nor a GeoJSON file")
     try:
-        document = json.loads(path.read_text("utf-8-sig"))
-        parts = [f.get("geometry") or f for f in document.get("features", [document])]
+        parts = read_geometries(path, path.read_bytes())
         shapes = [shapely.from_geojson(json.dumps(part)) for part in parts]
-    except (ValueError, AttributeError, shapely.errors.GEOSException) as error:
+    except (ValueError, shapely.errors.GEOSException) as error:
         raise RouteError(f"`survey` {path}: not readable as GeoJSON ({error})") from error
     areas = shapely.union_all([s for s in shapes if s.geom_type in ("Polygon", "MultiPolygon")])
     if areas.is_empty:

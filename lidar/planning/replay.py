@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
-from datetime import datetime
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import FrameError
 from geoscene.frames import Frame
 from geoscene.typing import Float
-from lidar.errors import FormatError, RouteError
+from lidar.errors import DatasetError, FormatError, RouteError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import MANIFEST, read_trajectory
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 
 _STEP_NS = 10_000_000
+_LATEST_NS = 10**15
+_STAMP = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
 _QUAT = ("qx", "qy", "qz", "qw")
 
 
@@ -37,18 +40,26 @@ def read_replay(path: Path, frame: Frame) -> Trajectory:
     """
     if not path.is_file():
         raise RouteError(f"{path} does not exist")
-    with path.open(encoding="utf-8") as file:
-        names = file.readline().strip().split(",")
+    try:
+        with path.open(encoding="utf-8") as file:
+            names = file.readline().strip().split(",")
+    except UnicodeDecodeError as error:
+        raise FormatError(f"{path}: neither a poses.csv nor a trajectory.csv of a dataset") from error
     manifest = path.with_name(MANIFEST)
-    recorded = frame
-    if manifest.is_file():
-        recorded = Frame.from_json(json.loads(manifest.read_text("utf-8"))["frame"])
+    recorded = _recorded_frame(manifest) if manifest.is_file() else frame
     if names[0] == "time_ns":
         found = read_trajectory(path)
         return found if recorded == frame else _moved(found, recorded, frame=frame)
     if not {"timestamp", "lon", "lat", "h", *_QUAT} <= set(names):
         raise FormatError(f"{path}: neither a poses.csv nor a trajectory.csv of a dataset")
     return _from_poses(path, recorded, frame=frame)
+
+
+def _recorded_frame(manifest: Path) -> Frame:
+    try:
+        return Frame.from_json(json.loads(manifest.read_text("utf-8"))["frame"])
+    except (ValueError, KeyError, TypeError, FrameError) as error:
+        raise DatasetError(f"{manifest}: damaged ({type(error).__name__}: {error})") from error
 
 
 def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
@@ -65,9 +76,12 @@ def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
         quat = np.array([[float(row[k]) for k in _QUAT] for row in rows])
     except (ValueError, TypeError) as error:
         raise FormatError(f"{path}: a row that cannot be read ({error})") from error
-    if (np.diff(time) <= 0).any():
-        raise FormatError(f"{path}: its times do not increase")
+    if (np.diff(time) <= 0).any() or time[-1] > _LATEST_NS:
+        raise FormatError(f"{path}: its times do not increase, or span over eleven days")
     x, y = frame.from_geographic(lon, lat)
+    unit = np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-3
+    if not (np.isfinite([x, y, h]).all() and unit.all()):
+        raise FormatError(f"{path}: a row holds no pose")
     seconds = time * 1e-9
     at = np.append(np.arange(0, time[-1], _STEP_NS), time[-1])
     spline = CubicSpline(
@@ -83,7 +97,9 @@ def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
 
 def _nanoseconds(stamps: list[str]) -> NDArray[np.int64]:
     """Nanoseconds of ISO 8601 UTC time stamps after the first."""
-    datetime.fromisoformat(stamps[0][:19])  # numpy's own message is of no help
+    for stamp in stamps:
+        if not _STAMP.fullmatch(stamp):
+            raise ValueError(f"{stamp!r} is not a time stamp such as 2026-06-21T08:00:00.1Z")
     times = np.array([stamp.removesuffix("Z") for stamp in stamps], "datetime64[ns]").astype(np.int64)
     since: NDArray[np.int64] = times - times[0]
     return since

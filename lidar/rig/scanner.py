@@ -170,6 +170,8 @@ def _read(table: Table, name: str, *, rate_hz: float, return_mode: str, start_ns
     if min(rates) <= 0 or not min(rates) <= rate <= max(rates):
         raise table.error("rates_hz", f"{rate:g} Hz is not within {min(rates):g} to {max(rates):g}")
     modes = table.texts("return_modes", ("strongest",), among=RETURN_MODES)
+    if not modes:
+        raise table.error("return_modes", "give one or more")
     mode = return_mode or modes[0]
     if mode not in modes:
         raise table.error("return_modes", f"{mode!r} is not a mode of this sensor: {', '.join(modes)}")

@@ -118,9 +118,15 @@ class Table:
         return value
 
     def numbers(
-        self, key: str, default: Any = ..., *, count: int | Sequence[int] = 0, spread: bool = False
+        self,
+        key: str,
+        default: Any = ...,
+        *,
+        count: int | Sequence[int] = 0,
+        spread: bool = False,
+        within: float = 1e18,
     ) -> tuple[float, ...]:
-        """Finite numbers, ``count`` of them (0: any count); ``spread`` repeats a single number."""
+        """Numbers within ±``within``, ``count`` of them (0: any count); ``spread`` repeats a single one."""
         value = self._take(key, default)
         lengths = (count,) if isinstance(count, int) else tuple(count)
         if spread and isinstance(value, int | float) and not isinstance(value, bool):
@@ -130,6 +136,8 @@ class Table:
         for k, v in enumerate(value):
             if isinstance(v, bool) or not isinstance(v, int | float) or not isfinite(v):
                 raise self.error(key, f"entry {k + 1}, {v!r}, is not a number")
+            if abs(v) > within:
+                raise self.error(key, f"entry {k + 1}, {v:g}, is not within ±{within:g}")
         if lengths != (0,) and len(value) not in lengths:
             wanted = " or ".join(str(n) for n in lengths)
             raise self.error(key, f"{len(value)} numbers where {wanted} are needed")

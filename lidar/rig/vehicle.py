@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import MISSING, dataclass, fields
 from importlib import resources
 from pathlib import Path
+from typing import Any, TypeGuard
 
 import numpy as np
 
 from lidar.errors import InputError
+from lidar.rig.toml_table import read_table
 
 KINDS = ("road", "foot", "air")
 """Where a vehicle moves: on the carriageway, on foot, or through the air."""
@@ -86,16 +87,21 @@ def load_vehicle(name: str | Path) -> Vehicle:
     if path.suffix == ".toml":
         if not path.exists():
             raise InputError(f"{path} does not exist; built-in vehicles are {', '.join(vehicle_names())}")
-        text = path.read_text("utf-8")
+        file: Any = path
     elif str(name) in vehicle_names():
-        text = resources.files("lidar.rig").joinpath("vehicles", f"{name}.toml").read_text("utf-8")
+        file = resources.files("lidar.rig").joinpath("vehicles", f"{name}.toml")
     else:
         raise InputError(f"unknown vehicle {name}; give a .toml file or one of {', '.join(vehicle_names())}")
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{name}: not valid TOML: {error}") from error
-    return _checked(table, str(name))
+    return _checked(read_table(file).data, str(name))
+
+
+def _is_numbers(value: object, count: int) -> TypeGuard[list[float]]:
+    """Whether a value is a list of ``count`` finite numbers of at least 0."""
+    return (
+        isinstance(value, list)
+        and len(value) == count
+        and all(type(v) in (int, float) and 0 <= v < np.inf for v in value)
+    )
 
 
 def _checked(table: dict[str, object], name: str) -> Vehicle:
@@ -113,8 +119,8 @@ def _checked(table: dict[str, object], name: str) -> Vehicle:
             values[key] = float(value)
             if not np.isfinite(float(value)) or (float(value) < 0 and key not in _SIGNED):
                 faults.append(f"{key} = {value} must be a number of at least 0")
-        elif kind.startswith("tuple") and isinstance(value, list) and len(value) == 3:
-            values[key] = tuple(float(v) for v in value)
+        elif kind.startswith("tuple") and _is_numbers(value, 3):
+            values[key] = tuple(value)
         elif (kind, type(value)) in (("str", str), ("bool", bool)):
             values[key] = value
         else:

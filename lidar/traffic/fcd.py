@@ -195,7 +195,7 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
         raise FormatError(f"{path} does not exist") from None
     except (OSError, EOFError) as error:
         raise FormatError(f"{path}: cannot be read: {error}") from None
-    except ET.ParseError as error:
+    except (ET.ParseError, LookupError) as error:  # also of an unknown encoding
         raise FormatError(f"{path}: broken XML ({error}); was sumo still writing it?") from None
 
 

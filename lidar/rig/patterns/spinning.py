@@ -128,7 +128,7 @@ def read_spinning(table: Table) -> Spinning:
         raise table.error("block_us", "is not over 0; give it, or columns for an encoder-locked scanner")
     if columns and block_us:
         raise table.error("block_us", "give block_us or columns, not both")
-    fire_us = np.array(table.numbers("fire_us", 0.0, count=k, spread=True))
+    fire_us = np.array(table.numbers("fire_us", 0.0, count=k, spread=True, within=1e6))
     up = table.numbers("origin_up", 0.0, count=k, spread=True)
     if table.has("focal_offset"):
         if table.has("origin_up"):

@@ -1,0 +1,149 @@
+"""Damaged routes, rigs, vehicles, sensors, stages and traffic files: one clear error, no other exception."""
+
+import json
+from contextlib import suppress
+from importlib import resources
+
+import numpy as np
+import pytest
+from helpers.mutations import mutated
+
+from geoscene.errors import GeosceneError
+from geoscene.frames import Frame
+from geoscene.sources.tracks import read_track
+from lidar.errors import LidarError
+from lidar.geometry.poses import Trajectory
+from lidar.geometry.trajectory_csv import write_trajectory
+from lidar.planning.replay import read_replay
+from lidar.planning.waypoints import read_track as read_route
+from lidar.rig.devices import cameras, scanners
+from lidar.rig.scanner import load_sensor
+from lidar.rig.specs import load_rig, rig_digest
+from lidar.rig.vehicle import load_vehicle
+from lidar.signal.registry import read_stages
+from lidar.traffic.fcd import read_fcd
+
+FRAME = Frame.at(24.945, 60.168)
+ROUNDS = 40
+
+GPX = """<?xml version="1.0" encoding="{}"?>
+<gpx version="1.1" creator="a" xmlns="http://www.topografix.com/GPX/1/1"><trk><name>Mäki</name><trkseg>
+<trkpt lat="60.1670556" lon="24.9476424"><ele>3.5</ele></trkpt>
+<trkpt lat="60.1660556" lon="24.9486424"><ele>3.5</ele></trkpt>
+<trkpt lat="60.1648194" lon="24.9512607"><ele>3.5</ele></trkpt>
+</trkseg></trk></gpx>
+"""
+GEOJSON = """{"type": "FeatureCollection", "features": [
+{"type": "Feature", "properties": {}, "geometry": {"type": "LineString",
+"coordinates": [[24.9476424, 60.1670556], [24.9486, 60.1660, 3.5], [24.9512607, 60.1648194]]}}]}
+"""
+STAGES = """[[stage]]
+name = "dropped_packets"
+loss = 0.1
+burst = 4
+[[stage]]
+name = "cover_glass"
+transmission = 0.7
+sensor = "lidar"
+"""
+FCD = """<?xml version="1.0" encoding="UTF-8"?>
+<fcd-export>
+<timestep time="0.00">
+<vehicle id="a" x="24.947" y="60.167" angle="10.0" type="car" speed="3.0"/>
+<person id="p" x="24.9475" y="60.1671" angle="10.0" speed="1.0"/>
+</timestep>
+<timestep time="1.00">
+<vehicle id="a" x="24.9471" y="60.1671" angle="10.0" type="car" speed="3.0"/>
+</timestep>
+</fcd-export>
+"""
+POSES = """timestamp,frame,x,y,z,qx,qy,qz,qw,lon,lat,h
+2026-06-21T08:20:00.000000000Z,0,147.1,-133.0,0.0,0.0,0.0,0.45,0.893,24.9476,60.1670,0.0
+2026-06-21T08:20:00.100000000Z,1,147.2,-133.0,0.0,0.0,0.0,0.45,0.893,24.9477,60.1670,0.0
+2026-06-21T08:20:00.200000000Z,2,147.4,-133.0,0.0,0.0,0.0,0.45,0.893,24.9478,60.1670,0.0
+"""
+
+
+def load_whole_rig(path):
+    rig = load_rig(path)
+    rig_digest(path)
+    scanners(rig)
+    cameras(rig)
+
+
+def trajectory_text(tmp_path):
+    time_ns = np.arange(5, dtype=np.int64) * 10_000_000
+    still = np.zeros((5, 3))
+    quat = np.tile([0.0, 0.0, 0.0, 1.0], (5, 1))
+    write_trajectory(tmp_path / "t.csv", Trajectory(time_ns, still, quat, still, np.ones(5)))
+    return (tmp_path / "t.csv").read_text()
+
+
+def seeds():
+    inside = resources.files("lidar.rig")
+    for folder, use in (("rigs", load_whole_rig), ("vehicles", load_vehicle), ("sensors", load_sensor)):
+        files = sorted((f for f in inside.joinpath(folder).iterdir() if f.name.endswith(".toml")), key=str)
+        for file in files[:: max(len(files) // 4, 1)]:
+            yield pytest.param(use, file.read_text("utf-8"), ".toml", id=file.name)
+    yield pytest.param(lambda p: read_route(p, FRAME), GPX.format("UTF-8"), ".gpx", id="gpx")
+    yield pytest.param(lambda p: read_route(p, FRAME), GEOJSON, ".geojson", id="geojson")
+    yield pytest.param(lambda p: read_stages([str(p)]), STAGES, ".toml", id="stages")
+    yield pytest.param(read_fcd, FCD, ".xml", id="fcd")
+    yield pytest.param(lambda p: read_replay(p, FRAME), POSES, ".csv", id="poses")
+    yield pytest.param(lambda p: read_replay(p, FRAME), "", ".csv", id="trajectory")
+
+
+@pytest.mark.parametrize(("use", "text", "suffix"), list(seeds()))
+def test_a_damaged_file_is_read_or_refused_with_a_clear_error(use, text, suffix, tmp_path):
+    data = (text or trajectory_text(tmp_path)).encode()
+    path = tmp_path / f"file{suffix}"
+    path.write_bytes(data)
+    use(path)
+    for seed in range(ROUNDS):
+        path.write_bytes(mutated(data, np.random.default_rng(seed)))
+        with suppress(GeosceneError, LidarError):
+            use(path)
+
+
+@pytest.mark.parametrize("frame", ["", "{}", '{"frame": []}', '{"frame": {"origin": [1]}}'])
+def test_a_damaged_manifest_beside_a_trajectory_is_an_error(frame, tmp_path):
+    (tmp_path / "trajectory.csv").write_text(trajectory_text(tmp_path))
+    (tmp_path / "dataset.json").write_text(frame)
+    with pytest.raises(LidarError, match=r"dataset\.json"):
+        read_replay(tmp_path / "trajectory.csv", FRAME)
+
+
+@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "iso-8859-1", "utf-16", "utf-16-le"])
+def test_gpx_is_read_in_the_encoding_that_it_declares(codec, tmp_path):
+    path = tmp_path / "track.gpx"
+    path.write_bytes(GPX.format(codec.removesuffix("-sig").removesuffix("-le")).encode(codec))
+    assert read_track(path) == pytest.approx(
+        np.array(
+            [[24.9476424, 60.1670556, 3.5], [24.9486424, 60.1660556, 3.5], [24.9512607, 60.1648194, 3.5]]
+        )
+    )
+
+
+@pytest.mark.parametrize("codec", ["utf-8", "utf-8-sig", "utf-16", "utf-32"])
+def test_geojson_is_read_in_unicode(codec, tmp_path):
+    path = tmp_path / "track.geojson"
+    path.write_bytes(GEOJSON.encode(codec))
+    assert len(read_track(path)) == 3
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {"type": "FeatureCollection", "features": None},
+        {"type": "FeatureCollection", "features": {"type": "Feature"}},
+        {"type": "LineString", "coordinates": {"a": 1}},
+        {"type": "LineString", "coordinates": [[24.9, 60.1, 1e300], [24.9, 60.2, 0]]},
+        {"type": "LineString", "coordinates": [[24.9, 60.1, float("nan")], [24.9, 60.2, 0]]},
+        [1, 2],
+    ],
+)
+def test_geojson_of_another_structure_is_refused(document, tmp_path):
+    path = tmp_path / "track.geojson"
+    path.write_text(json.dumps(document))
+    with pytest.raises(GeosceneError, match=r"track\.geojson"):
+        read_track(path)
