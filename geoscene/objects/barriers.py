@@ -13,13 +13,12 @@ from geoscene.classes import Class, materials
 from geoscene.columns import Columns
 from geoscene.frames import Frame
 from geoscene.ground.kinds import is_underground
-from geoscene.ground.partition import GroundPlan
+from geoscene.ground.partition import PRECISION, GroundPlan
 from geoscene.mesh import Mesh, concatenate
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
 from geoscene.tags import parse_length
 from geoscene.typing import Bools, Float, Height
-from geoscene.watertight import GRID
 
 _BELOW = 0.3
 """Metres by which a barrier extends below the ground, so that no gap opens on a slope."""
@@ -27,8 +26,8 @@ _BELOW = 0.3
 _STATION = 5.0
 """Metres between samples of the ground's height along a barrier."""
 
-_HIGHEST, _WIDEST = 30.0, 20.0
-"""Metres; larger values are taken for typing errors."""
+_LEAST, _HIGHEST, _WIDEST = 0.01, 30.0, 20.0
+"""Metres; smaller and larger values are taken for typing errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,16 +161,16 @@ def _solid(barriers: Barriers, row: int, *, height: Height | None) -> Mesh:
     """The closed solids of one barrier."""
     material = next(m for m in materials().values() if m.code == barriers.material[row])
     parts = []
-    shape = shapely.set_precision(shapely.segmentize(barriers.polygon[row], _STATION), GRID)
+    shape = shapely.set_precision(shapely.segmentize(barriers.polygon[row], _STATION), PRECISION)
     if _touches_itself(shape):
-        shape = shapely.set_precision(shapely.buffer(shape, -_APART, join_style="mitre"), GRID)
+        shape = shapely.set_precision(shapely.buffer(shape, -_APART, join_style="mitre"), PRECISION)
     for part in shapely.get_parts(shape):
         # In whole steps of the grid, so that what lies on one line does so exactly.
-        steps = shapely.transform(part, lambda c: np.rint(c / GRID))
+        steps = shapely.transform(part, lambda c: np.rint(c / PRECISION))
         triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(steps))
         corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
         grid, faces = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
-        xy = grid * GRID
+        xy = grid * PRECISION
         faces = faces.reshape(-1, 3)
         (ux, uy), (vx, vy) = ((xy[faces[:, k]] - xy[faces[:, 0]]).T for k in (1, 2))
         faces = np.where((ux * vy < uy * vx)[:, None], faces[:, ::-1], faces)
@@ -210,7 +209,7 @@ def _touches_itself(shape: Any) -> bool:
     """Rings of the shape meet in a point, where a solid would have an edge of four faces."""
     rings = shapely.get_rings(shapely.get_parts(shape))
     coordinates = np.concatenate([np.empty((0, 2)), *(shapely.get_coordinates(ring)[:-1] for ring in rings)])
-    return len(np.unique(np.rint(coordinates / GRID), axis=0)) < len(coordinates)
+    return len(np.unique(np.rint(coordinates / PRECISION), axis=0)) < len(coordinates)
 
 
 def _kind(tags: Tags) -> Kind | None:
@@ -233,7 +232,7 @@ def _size(
     if key not in tags:
         return usual, "default"
     metres = parse_length(tags[key])
-    if metres is not None and 0.0 < metres <= most:
+    if metres is not None and _LEAST <= metres <= most:
         return metres, key
     detail = f"{key}={tags[key]!r}; took {usual} m"
     problems.append(Problem(osm_id, "barrier", "repaired", f"unusable-{key}", detail))
