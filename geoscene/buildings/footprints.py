@@ -108,7 +108,8 @@ def _touching(polygon: Any) -> Polygons:
 
 def subtract(polygon: Any, others: Any, *, sliver: float = 0.02) -> Any:
     """The polygon minus others, on the grid, without slivers narrower than twice ``sliver`` metres."""
-    rest = shapely.difference(polygon, others, grid_size=GRID)
+    # pieces thinner than the grid come back as lines, which no further operation takes together with polygons
+    rest = _polygonal(np.array([shapely.difference(polygon, others, grid_size=GRID)], dtype=object))[0]
     opened = shapely.buffer(
         shapely.buffer(rest, -sliver, join_style="mitre"), sliver * 1.5, join_style="mitre"
     )

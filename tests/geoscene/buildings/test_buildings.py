@@ -14,6 +14,7 @@ from shapely import affinity
 from shapely.errors import GEOSException
 
 from geoscene.buildings import BuildingOptions, build_solids, read_buildings
+from geoscene.buildings.footprints import subtract
 from geoscene.buildings.heights import infer_heights
 from geoscene.buildings.shells import prisms, sound
 from geoscene.buildings.unions import unite
@@ -389,6 +390,16 @@ def test_overlapping_buildings_share_no_volume_and_leave_no_hole(seed):
     for i in range(len(table)):
         for j in range(i):
             assert shapely.intersection(table.footprint[i], table.footprint[j]).area < 1e-2
+
+
+def test_a_difference_with_pieces_below_the_grid_is_a_polygon():
+    kite = shapely.Polygon([(1.3333, 0.6667), (1, 0), (0.6667, 0.6667), (1, 0.3333)])
+    wedge = shapely.Polygon([(0, 0), (0, 1), (1.3333, 0.3333)])
+    raw = shapely.difference(kite, wedge, grid_size=1e-4)
+    assert shapely.get_type_id(raw) == shapely.GeometryType.GEOMETRYCOLLECTION  # with a line of 0.1 mm
+    rest = subtract(kite, wedge)
+    assert shapely.get_dimensions(rest) == 2
+    assert shapely.area(rest) == pytest.approx(shapely.area(raw), abs=0.01)
 
 
 def test_of_overlapping_buildings_the_one_with_a_known_height_keeps_its_shape():
