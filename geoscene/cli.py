@@ -14,6 +14,7 @@ from geoscene import __version__
 from geoscene.console import (
     DEFAULTS,
     FAILURE,
+    SEVERAL,
     Report,
     degrees,
     print_json,
@@ -53,8 +54,9 @@ Reporting = Annotated[Report, Parameter(group=_OUTPUT)]
 class MapSource:
     """Sources of the map and its elevation."""
 
-    osm: Path | None = None
-    """OpenStreetMap file: .osm, .osm.gz, .osm.bz2 or .osm.pbf. With --bbox, only that part of it."""
+    osm: Annotated[tuple[Path, ...], SEVERAL] = ()
+    """OpenStreetMap files: .osm, .osm.gz, .osm.bz2, .osm.pbf, or Overpass' .json and .json.gz; several are
+    one map. With --bbox, only that part of it."""
 
     place: str | None = None
     """Name of a place, found by Nominatim and downloaded from Overpass (needs a network; answers
@@ -188,7 +190,7 @@ def _read_map(source: MapSource) -> Any:
     fetched: dict[str, Any] = {"cache_dir": _cache_of(source), "servers": servers}
     data = None
     if local:
-        data = sources.read_source("osm", source.osm or sources.demo_path(), bounds=source.bbox)
+        data = sources.read_osm(source.osm or sources.demo_path(), bounds=source.bbox)
     elif source.place:
         data = sources.fetch_place(source.place, **fetched)
     elif source.point:
@@ -358,6 +360,7 @@ def _extent(manifest: dict[str, Any]) -> dict[str, Any]:
 
 def _print_scene(report: dict[str, Any]) -> None:
     counts, frame = report["counts"], report["frame"]
+    steep = _steep_roads(counts, terrain=frame["vertical"] != "flat")
     xmin, ymin, xmax, ymax = report["bounds"]
     west, south, east, north = report["geographic_bounds"]
     rows = {
@@ -369,7 +372,7 @@ def _print_scene(report: dict[str, Any]) -> None:
         "watertight": f"{counts['watertight']} of {counts['closed_objects']} closed objects",
         "standing": f"{counts['trees']} mapped trees, {counts['furniture']} pieces of furniture,"
         f" {counts['barriers']} barriers",
-        "roads": f"{counts['road_km']:.1f} km in {counts['road_edges']} edges" + _steep_roads(counts),
+        "roads": f"{counts['road_km']:.1f} km in {counts['road_edges']} edges" + steep,
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
     }
@@ -387,10 +390,10 @@ def _print_scene(report: dict[str, Any]) -> None:
     print(f"  {report['attribution']}")
 
 
-def _steep_roads(counts: dict[str, Any]) -> str:
-    if counts["road_km_steep"] < 0.005 * counts["road_km"]:
-        return ""
+def _steep_roads(counts: dict[str, Any], *, terrain: bool) -> str:
     steep = counts["road_km_steep"]
+    if not terrain or steep <= 0.005 * counts["road_km"]:
+        return ""
     return f", {steep:.1f} km steeper than 20 %; the terrain model may be too coarse"
 
 

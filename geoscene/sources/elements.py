@@ -113,6 +113,43 @@ class Collector:
         """Add a relation."""
         self._relations[osm_id] = (tags, members)
 
+    def clashing(self, other: Collector) -> str:
+        """A node or way with a negative id that differs between both, such as ``node/-3``; "" if none does.
+
+        Editors number objects that are not in OpenStreetMap yet by negative ids, each file by itself.
+        """
+        for kind in ("node", "way"):
+            mine, theirs = self._drawn(kind), other._drawn(kind)
+            for osm_id in sorted(mine.keys() & theirs.keys()):
+                if mine[osm_id] != theirs[osm_id]:
+                    return f"{kind}/{osm_id}"
+        return ""
+
+    def _drawn(self, kind: str) -> dict[int, object]:
+        """Positions of nodes or tags of ways with negative ids, by id."""
+        if kind == "way":
+            return {i: tags for i, tags in zip(self._way_id, self._way_tags, strict=True) if i < 0}
+        places = zip(self._node_id, self._node_x, self._node_y, strict=True)
+        return {i: (x, y) for i, x, y in places if i < 0}
+
+    def joined(self, other: Collector) -> Collector:
+        """All objects of both; of objects with the same id those of the other."""
+        boxes = [bounds for bounds in (self.bounds, other.bounds) if bounds is not None]
+        edges = list(zip(*boxes, strict=True))
+        return Collector(
+            (min(edges[0]), min(edges[1]), max(edges[2]), max(edges[3])) if boxes else None,
+            max(self.timestamp, other.timestamp),
+            self._node_id + other._node_id,
+            self._node_x + other._node_x,
+            self._node_y + other._node_y,
+            self._node_tags | other._node_tags,
+            self._way_id + other._way_id,
+            self._way_size + other._way_size,
+            self._way_tags + other._way_tags,
+            self._refs + other._refs,
+            self._relations | other._relations,
+        )
+
     def finish(self) -> Elements:
         """All objects, sorted by id, with node references resolved."""
         ids = np.frombuffer(self._node_id, np.int64) if self._node_id else np.empty(0, np.int64)

@@ -178,7 +178,7 @@ def _beyond(lonlat: Float, bounds: Bounds) -> Float:
 
 
 def _main_part(lonlat: Float) -> Bools:
-    """(n,) bool, points that are not in a small group beyond a wide gap in longitude or latitude."""
+    """(n,) bool, points not in a small group at an end beyond a wide gap in longitude or latitude."""
     kept = np.arange(len(lonlat))
     few = max(_FEW, int(_SHARE * len(lonlat)))
     while True:
@@ -190,8 +190,9 @@ def _main_part(lonlat: Float) -> Bools:
             order = np.argsort(lonlat[kept, axis], kind="stable")
             gaps = np.flatnonzero(np.diff(lonlat[kept[order], axis]) * degree > _WIDE) + 1
             groups = np.split(order, gaps)
-            largest = max(groups, key=len)
-            kept = kept[np.sort(np.concatenate([g for g in groups if g is largest or len(g) > few]))]
+            sizes = [len(group) for group in groups]
+            large = [k for k, size in enumerate(sizes) if size > few or size == max(sizes)]
+            kept = kept[np.sort(np.concatenate(groups[large[0] : large[-1] + 1]))]
         if len(kept) == before:
             break
     main = np.zeros(len(lonlat), np.bool_)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import bz2
 import datetime as dt
+import gzip
 import json
+import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +17,9 @@ from geoscene.sources.data import Bounds, OsmData, Progress
 from geoscene.sources.elements import Collector
 from geoscene.sources.extent import checked_bounds
 from geoscene.sources.overpass import collect_answer
-from geoscene.sources.plain_xml import collect_xml
+from geoscene.sources.plain_xml import OPEN, collect_xml
 
-_HELP = "give an OpenStreetMap extract (.osm, .osm.gz, .osm.bz2, .osm.pbf)"
+_HELP = "give an OpenStreetMap extract (.osm, .osm.gz, .osm.bz2, .osm.pbf) or Overpass JSON"
 
 
 def _format_of(path: Path) -> str:
@@ -27,19 +31,21 @@ def _format_of(path: Path) -> str:
         head = file.read(64)
     if not head:
         raise InputError(f"{path}: the file is empty; {_HELP}")
-    if head[:2] == b"\x1f\x8b":
-        return "osm.gz"
-    if head[:3] == b"BZh":
-        return "osm.bz2"
+    packed = ""
+    for magic, suffix, reader in ((b"\x1f\x8b", ".gz", gzip.open), (b"BZh", ".bz2", bz2.open)):
+        if head.startswith(magic):
+            packed = suffix
+            with reader(path, "rb") as content:
+                head = content.read(64)
     if head[4:6] == b"\x0a\x09" and head[6:15] == b"OSMHeader":
         return "pbf"
     if head[:7] == b"\xff\xe0\x04o5m2":
         return "o5m"
     text = head.lstrip(b"\xef\xbb\xbf \t\r\n")
     if text[:1] == b"<":
-        return "osm"
+        return f"osm{packed}"
     if text[:1] == b"{":
-        return "json"
+        return f"json{packed}"
     raise InputError(f"{path}: not an OpenStreetMap file; {_HELP}")
 
 
@@ -78,8 +84,9 @@ def _collect(path: Path, progress: Progress) -> Collector:
 
     file_format = _format_of(path)
     collector = Collector()
-    if file_format == "json":
-        collect_answer(json.loads(path.read_bytes()), collector)
+    if file_format.startswith("json"):
+        with OPEN[file_format.removeprefix("json")](path, "rb") as content:
+            collect_answer(json.load(content), collector)
         return collector
     file = osmium.io.File(str(path), file_format)
     box = osmium.FileProcessor(file).header.box()
@@ -94,32 +101,8 @@ def _collect(path: Path, progress: Progress) -> Collector:
     return collector
 
 
-def read_osm(path: str | Path, *, bounds: Bounds | None = None, progress: Progress = iter) -> OsmData:
-    """The features of an OpenStreetMap extract: XML (plain, gzip, bzip2), PBF, o5m or Overpass JSON.
-
-    The first bytes tell the format, not the name. Ids may be negative and in any order, and relations may
-    come before ways: the result does not depend on the order in the file. Defects are repaired or dropped by
-    the rules of docs/sources.md and listed in ``problems``.
-
-    Parameters
-    ----------
-    path
-        The file.
-    bounds
-        Keep the features that intersect this box (west, south, east, north in degrees), whole; all if None.
-    progress
-        Wraps the stream of map objects.
-
-    Raises
-    ------
-    SourceNotFoundError
-        The file is missing, or has no features (within the bounds).
-    InputError
-        The file is not an OpenStreetMap file, is truncated or damaged, or the bounds are invalid.
-    """
-    path = Path(path)
-    if bounds is not None:
-        bounds = checked_bounds(bounds)
+def _read(path: Path, progress: Progress) -> Collector:
+    """The objects of a file. Raises SourceNotFoundError or InputError, which name it."""
     if not path.exists():
         raise SourceNotFoundError(f"{path}: no such file; {_HELP}")
     if path.is_dir():
@@ -130,9 +113,48 @@ def read_osm(path: str | Path, *, bounds: Bounds | None = None, progress: Progre
         raise error if str(path) in str(error) else InputError(f"{path}: {error}; {_HELP}") from None
     except PermissionError as error:
         raise InputError(f"{path}: may not be read; give its permissions to this user") from error
-    except (RuntimeError, OSError, ValueError, EOFError) as error:
+    except (RuntimeError, OSError, ValueError, EOFError, zlib.error) as error:
         cause = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: damaged, cut short or no OpenStreetMap file ({cause}); {_HELP}") from error
     if len(collector) == 0:
         raise SourceNotFoundError(f"{path}: holds no map objects; {_HELP}")
-    return features(collector.finish(), bounds=bounds, source=path.name)
+    return collector
+
+
+def read_osm(
+    path: str | Path | Sequence[str | Path], *, bounds: Bounds | None = None, progress: Progress = iter
+) -> OsmData:
+    """The features of OpenStreetMap extracts: XML or Overpass JSON (plain, gzip, bzip2), PBF, or o5m.
+
+    The first bytes tell the format, not the name. Ids may be negative and in any order, and relations may
+    come before ways: the result does not depend on the order in the file. Defects are repaired or dropped by
+    the rules of docs/sources.md and listed in ``problems``.
+
+    Parameters
+    ----------
+    path
+        The file, or several, such as tiles of a map, or its buildings and its roads. Of objects with the
+        same id, that of the last file counts. The bounds are those of all files that state theirs.
+    bounds
+        Keep the features that intersect this box (west, south, east, north in degrees), whole; all if None.
+    progress
+        Wraps the stream of map objects.
+
+    Raises
+    ------
+    SourceNotFoundError
+        A file is missing, or there are no features (within the bounds).
+    InputError
+        A file is not an OpenStreetMap file, is truncated or damaged, the bounds are invalid, or different
+        objects of two files have the same negative id.
+    """
+    paths = [Path(path)] if isinstance(path, (str, Path)) else [Path(p) for p in path]
+    if bounds is not None:
+        bounds = checked_bounds(bounds)
+    collector = Collector()
+    for number, one in enumerate(paths):
+        read = _read(one, progress)
+        if clash := collector.clashing(read):
+            raise InputError(f"{one}: its {clash} is another in a file before; negative ids must be unique")
+        collector = collector.joined(read) if number else read
+    return features(collector.finish(), bounds=bounds, source=", ".join(p.name for p in paths))

@@ -13,7 +13,8 @@ from xml.etree import ElementTree as ET
 from geoscene.sources.data import Progress
 from geoscene.sources.elements import UNITS, UNKNOWN, Collector
 
-_OPEN: dict[str, Callable[..., Any]] = {"osm": open, "osm.gz": gzip.open, "osm.bz2": bz2.open}
+OPEN: dict[str, Callable[..., Any]] = {"": open, ".gz": gzip.open, ".bz2": bz2.open}
+"""How to open a file by the suffix of its compression."""
 
 
 def whole_units(degrees: Any) -> int:
@@ -33,7 +34,7 @@ def collect_xml(path: Path, form: str, *, collector: Collector, progress: Progre
     Raises ValueError or OSError for a damaged file.
     """
     try:
-        with _OPEN[form](path, "rb") as file:
+        with OPEN[form.removeprefix("osm")](path, "rb") as file:
             for _, item in progress(ET.iterparse(file)):  # noqa: S314 - expat limits the expansion of entities
                 if item.tag not in {"node", "way", "relation"}:
                     continue

@@ -52,7 +52,7 @@ SOURCES: dict[str, Source] = {
         Source(
             name="osm",
             gives="map",
-            suffixes=(".osm", ".osm.gz", ".osm.bz2", ".osm.pbf", ".o5m", ".json"),
+            suffixes=(".osm", ".osm.gz", ".osm.bz2", ".osm.pbf", ".o5m", ".json", ".json.gz", ".json.bz2"),
             reader="files:read_osm",
             licence="ODbL-1.0",
             attribution=_OSM,

@@ -7,6 +7,7 @@ import sys
 import pytest
 from helpers.programs import run_program
 
+from geoscene import cli
 from geoscene.sources import demo_path
 
 BOX = "24.9405,60.1655,24.9475,60.1690"
@@ -134,3 +135,10 @@ def test_help_does_not_import_large_libraries():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_steep_roads_are_told_only_of_terrain_that_has_some():
+    none, some = {"road_km": 0.0, "road_km_steep": 0.0}, {"road_km": 2.0, "road_km_steep": 0.1}
+    assert cli._steep_roads(none, terrain=True) == ""
+    assert cli._steep_roads(some, terrain=False) == ""
+    assert "0.1 km steeper" in cli._steep_roads(some, terrain=True)

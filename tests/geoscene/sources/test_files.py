@@ -221,6 +221,50 @@ def test_every_format_gives_the_same_features_under_any_file_name(tmp_path):
         same(expected, read_osm(tmp_path / name))
 
 
+def test_overpass_json_is_read_from_gzip_and_bzip2(tmp_path):
+    places = [(x * METRE, y * METRE) for x, y in square(0, 0)]
+    corners = [{"type": "node", "id": k, "lon": x, "lat": y} for k, (x, y) in enumerate(places, 1)]
+    house = {"type": "way", "id": 9, "nodes": [1, 2, 3, 4, 1], "tags": {"building": "yes"}}
+    text = json.dumps({"elements": [house, *corners]}).encode()
+    read = []
+    for name, pack in (("a.json", bytes), ("b.json.gz", gzip.compress), ("c.json.bz2", bz2.compress)):
+        (tmp_path / name).write_bytes(pack(text))
+        read.append(read_osm(tmp_path / name))
+    same(read[0], read[1])
+    same(read[0], read[2])
+
+
+def test_files_cut_in_any_way_are_one_map(tmp_path):
+    whole = Map((0, 0, 200, 100))
+    for k in range(6):
+        whole.ring(square(30 * k, 20), {"building": "yes"})
+    whole.way(whole.nodes([(0, 5), (200, 5)]), {"highway": "residential"})
+    expected = whole.read(tmp_path)
+    draw = random.Random(0)
+    parts = []
+    for k in range(3):
+        part = Map((0, 0, 200, 100) if k < 2 else None)
+        part.items = [item for item in whole.items if draw.random() < 0.7]
+        parts.append(part)
+    missing = [item for item in whole.items if not any(item in part.items for part in parts)]
+    parts[0].items += missing
+    paths = [tmp_path / f"{k}.osm" for k in range(3)]
+    for path, part in zip(paths, parts, strict=True):
+        path.write_text(part.xml(order=draw))
+    same(read_osm(paths), expected)
+    assert read_osm(paths).source == "0.osm, 1.osm, 2.osm"
+
+
+def test_negative_ids_of_different_objects_are_refused(tmp_path):
+    for name, x in (("a", 0), ("b", 500)):
+        part = Map()
+        part.ring(square(x, 0), {"building": "yes"})
+        (tmp_path / f"{name}.osm").write_text(part.xml(negative=True))
+    with pytest.raises(InputError, match=r"b\.osm: its node/-4"):
+        read_osm([tmp_path / "a.osm", tmp_path / "b.osm"])
+    same(read_osm([tmp_path / "a.osm", tmp_path / "a.osm"]), read_osm(tmp_path / "a.osm"))
+
+
 def test_overpass_json_in_a_file_is_read(tmp_path):
     path = tmp_path / "answer.json"
     corners = [
