@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import KNOT_NS, Poses, Trajectory
@@ -19,30 +18,32 @@ from lidar.rig.patterns.beams import Firings
 
 
 @dataclass(frozen=True, slots=True)
-class Beam(Columns):
-    """Rays that sample the cross-section of a pulse, one row per ray.
+class Beam:
+    """Rays of equal power that sample the cross-section of each pulse.
 
-    spread : (rays, 2) radians, to the left and up, off the beam's axis, which comes first
-    size   : (rays, 2) metres, to the left and up, where the rays start
-    share  : (rays,) share of the pulse's power
+    place  : (rays, 2) on the unit disc, see `lidar.physics.footprint.bundle`; the beam's axis comes first
+    spread : (2,) radians, half angles of the beam to the left and up
+    size   : (2,) metres, half of the beam's width and height where it starts
+    turn   : (n,) radians by which ``place`` is turned for each pulse; empty for one ray
     """
 
+    place: Float
     spread: Float
     size: Float
-    share: Float
+    turn: Float
 
 
 def beam_of(
-    rays: int, *, divergence: tuple[float, float] = (0.0, 0.0), aperture: tuple[float, float] = (0.0, 0.0)
+    rays: int, *, divergence: tuple[float, float], aperture: tuple[float, float], turn: Float
 ) -> Beam:
     """The beam of a scanner.
 
-    rays       : rays per pulse, see `lidar.physics.footprint.bundle`
+    rays       : rays per pulse
     divergence : (2,) radians, full 1/e^2 angles, horizontal and vertical
     aperture   : (2,) metres, size of the beam at its start
+    turn       : (n,) as in `Beam`
     """
-    position, share = bundle(rays)
-    return Beam(position * np.divide(divergence, 2), position * np.divide(aperture, 2), share)
+    return Beam(bundle(rays), np.divide(divergence, 2), np.divide(aperture, 2), turn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +119,7 @@ class MovingSensor:
         part = slice(batch * self._batch, (batch + 1) * self._batch)
         fired, beam = self._firings, self._beam
         work = self._order[part]
-        n = len(work) * len(beam)
+        n = len(work) * len(beam.place)
         out = Rays(self.poses, *_scratch.columns(n))
         _fill(
             fired.time_ns[part],
@@ -127,7 +128,7 @@ class MovingSensor:
             fired.origin[part],
             work - part.start,
             (self._turn, self._shift),
-            (beam.spread, beam.size),
+            (beam.place, beam.spread, beam.size, beam.turn[part]),
             (out.index, out.direction, out.origin, out.order),
         )
         return out
@@ -146,11 +147,12 @@ def _batches(order: Any, size: int, out: Any) -> None:
 
 @njit(cache=True, nogil=True)
 def _fill(
-    time: Any, start: int, directions: Any, origins: Any, work: Any, motion: Any, spread: Any, out: Any
+    time: Any, start: int, directions: Any, origins: Any, work: Any, motion: Any, beam: Any, out: Any
 ) -> None:
     """Fill ``out``: pose, direction, origin and order of every ray."""
     turn, shift = motion
-    angle, size = spread
+    place, spread, size, turned = beam
+    rays = len(place)
     index, direction, origin, order = out
     i = 0
     for pulse in range(len(time)):
@@ -164,15 +166,18 @@ def _fill(
         ox, oy, oz = origins[pulse, 0], origins[pulse, 1], origins[pulse, 2]
         # Axes across the beam: horizontal, to the left (lx, ly), and upwards (ux, uy, uz).
         lx, ly, ux, uy, uz = 0.0, 1.0, 0.0, 0.0, 0.0
-        if len(angle) > 1:
+        c, s = 1.0, 0.0
+        if rays > 1:
+            c, s = np.cos(turned[pulse]), np.sin(turned[pulse])
             level = np.sqrt(x * x + y * y)
             if level > 1e-9:  # else the beam is along the spin axis, and any horizontal axis will do
                 lx, ly = -y / level, x / level
             ux, uy, uz = -z * ly, z * lx, x * ly - y * lx
-        for ray in range(len(angle)):
-            a, b = angle[ray, 0], angle[ray, 1]
+        for ray in range(rays):
+            e, f = c * place[ray, 0] - s * place[ray, 1], s * place[ray, 0] + c * place[ray, 1]
+            a, b = e * spread[0], f * spread[1]
             dx, dy, dz = x + a * lx + b * ux, y + a * ly + b * uy, z + b * uz
-            a, b = size[ray, 0], size[ray, 1]
+            a, b = e * size[0], f * size[1]
             px, py, pz = ox + a * lx + b * ux, oy + a * ly + b * uy, oz + b * uz
             vx = dx + w * (a00 * dx + a01 * dy + a02 * dz)
             vy = dy + w * (a10 * dx + a11 * dy + a12 * dz)
@@ -183,5 +188,5 @@ def _fill(
             origin[i, 1] = py + w * (a10 * px + a11 * py + a12 * pz + sy)
             origin[i, 2] = pz + w * (a20 * px + a21 * py + a22 * pz + sz)
             index[i] = k
-            order[i] = work[pulse] * len(angle) + ray
+            order[i] = work[pulse] * rays + ray
             i += 1

@@ -90,13 +90,13 @@ class SurfaceOptics:
 class EchoCollector:
     """Collects the echoes of consecutive pulses, batch after batch.
 
-    share      : (rays,) share of a pulse's power in each ray
+    rays       : rays of equal power per pulse
     separation : metres; surfaces closer than this give one echo
     pulses     : number of pulses in all
     """
 
-    def __init__(self, optics: SurfaceOptics, share: Float, *, separation: float, pulses: int) -> None:
-        self._optics, self._share, self._separation = optics, share, separation
+    def __init__(self, optics: SurfaceOptics, rays: int, *, separation: float, pulses: int) -> None:
+        self._optics, self._rays, self._separation = optics, rays, separation
         self._columns, self._glossy, self._count = _columns(pulses), np.empty(pulses, np.bool_), 0
 
     def take(self, hits: Hits, first: int) -> NDArray[np.int32]:
@@ -111,7 +111,7 @@ class EchoCollector:
         count, found = _receive(
             (hits.range, hits.face, hits.instance, hits.cosine),
             first,
-            self._share,
+            self._rays,
             self._optics.faces,
             self._optics.tables,
             self._separation,
@@ -126,9 +126,7 @@ class EchoCollector:
                 self._optics.faces.packed[_face_row(self._optics.faces, hits, ray=ray)] & 255
                 == glossy_codes()[1]
             )
-            echoes.apparent[row[wet]] = (
-                glint(echoes.cosine[row[wet]]) * self._share[ray[wet] % len(self._share)]
-            )
+            echoes.apparent[row[wet]] = glint(echoes.cosine[row[wet]]) / self._rays
         rays: NDArray[np.int32] = ray
         return rays
 
@@ -163,7 +161,7 @@ def _face_row(faces: Faces, hits: Hits, *, ray: NDArray[np.int32]) -> NDArray[np
 def _receive(
     hits: Any,
     pulse: Any,
-    share: Any,
+    rays: Any,
     faces: Any,
     tables: Any,
     separation: Any,
@@ -173,7 +171,6 @@ def _receive(
 ) -> Any:
     """Fill ``out`` with echoes; return their number and that of rays that hit glass or water."""
     distance, face, instance, cosine = hits
-    rays = len(share)
     # Fields of a tuple that are read in a loop cost a reference count each time.
     starts, named, packed, own = faces.start, faces.named, faces.packed, len(faces.start) - 1
     reflectance, specular, factor, mirrors = tables.reflectance, tables.specular, tables.factor, tables.glossy
@@ -203,7 +200,7 @@ def _receive(
                 rho = one_off if rho > RETRO else min(one_off, RETRO)
             c = min(abs(np.float64(cosine[i])), 1.0)
             surfaces[k], slant[k], away[k] = surface, c, distance[i]
-            back[k] = sent_back(rho, c, specular[material], law) * share[k]
+            back[k] = sent_back(rho, c, specular[material], law) / rays
             insert(row, size, k, away)
             size += 1
             plain &= not mirrors[material]

@@ -123,7 +123,7 @@ def cast(
         time=_ray_time(sensor, frame, pulses=firings) if _moving(world) else None,
         settings=settings,
         seed=seed,
-        leaf_seed=int(generator(seed, sensor.name, frame, "foliage").integers(2**63)),
+        frame=frame,
         threads=threads,
     )
     if settings.extinction:

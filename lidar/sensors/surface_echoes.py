@@ -12,6 +12,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.physics.echoes import Echoes, by_pulse, joined, merged
 from lidar.physics.fresnel import mirrored, pane_reflection, surface_reflection
 from lidar.physics.settings import ScannerSettings
+from lidar.random_streams import generator
 from lidar.raycast import Hits
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
@@ -35,22 +36,28 @@ def surface_echoes(
     time: NDArray[np.float32] | None,
     settings: ScannerSettings,
     seed: int,
-    leaf_seed: int,
+    frame: int,
     threads: int,
 ) -> Echoes:
     """The echoes of pulses that a moving sensor fires, within its maximum range, sorted by pulse and range.
 
-    time      : (n,) ray times of the pulses; None in a static world
-    leaf_seed : of the leaves that rays hit, if settings include foliage
+    time        : (n,) ray times of the pulses; None in a static world
+    seed, frame : of random reflectances, leaves, and turns of each pulse's rays about its axis
     """
-    beam = beam_of(settings.rays, divergence=sensor.divergence, aperture=sensor.aperture)
+    rays, turn = settings.rays, np.empty(0)
+    if rays > 1:
+        turn = 2 * np.pi * generator(seed, sensor.name, frame, "footprint").random(len(pulses))
+    beam = beam_of(rays, divergence=sensor.divergence, aperture=sensor.aperture, turn=turn)
     far = sensor.max_range - sensor.pattern.range_offset
-    separation, rays = sensor.echo_separation, len(beam)
+    separation = sensor.echo_separation
     batch = max(_BATCH // rays, 1)
     optics = SurfaceOptics(world, sensor.wavelength_nm, settings=settings, seed=seed)
     moving = MovingSensor(pulses, mount, trajectory=trajectory, beam=beam, batch=batch)
-    collector = EchoCollector(optics, beam.share, separation=separation, pulses=len(pulses))
-    foliage = Foliage(world.caster, world.faces, far, leaf_seed) if settings.foliage else None
+    collector = EchoCollector(optics, rays, separation=separation, pulses=len(pulses))
+    foliage = None
+    if settings.foliage:
+        leaf_seed = int(generator(seed, sensor.name, frame, "foliage").integers(2**63))
+        foliage = Foliage(world.caster, world.faces, far, leaf_seed)
     beyond: list[Echoes] = []
     for number, first in enumerate(range(0, len(pulses), batch)):
         cast = moving.rays(number)
@@ -76,7 +83,7 @@ def surface_echoes(
             beyond += _beyond(
                 cast.take(glossy),
                 pulse + np.int32(first),
-                power=beam.share[ray],
+                power=np.full(len(ray), 1 / rays),
                 optics=optics,
                 far=far,
                 time=None if moments is None else moments[glossy],

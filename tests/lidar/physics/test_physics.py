@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from geoscene.classes import materials
 from lidar.errors import InputError
 from lidar.physics.echoes import Echoes, joined, merged, numbered, reported
-from lidar.physics.footprint import bundle, ring_energy
+from lidar.physics.footprint import bundle
 from lidar.physics.fresnel import WATER, fresnel, glint, mirrored, pane_reflection, surface_reflection
 from lidar.physics.intensity import reflectivity_code
 from lidar.physics.link import (
@@ -21,7 +21,7 @@ from lidar.physics.link import (
 )
 from lidar.physics.range_error import quantised, signal_sigma, stretch_sigma, walk
 from lidar.physics.reflect import apparent, reflectance_table
-from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
+from lidar.physics.settings import FOOTPRINTS, LEVELS, PLAIN, ScannerSettings
 from lidar.random_streams import generator, normal_of
 from lidar.rig.scanner import WEAK_SIGMA, load_sensor
 from lidar.settings import settings_of
@@ -190,19 +190,16 @@ def test_codes_are_linear_to_white_and_logarithmic_above():
     assert reflectivity_code(np.array([1.0]), diffuse_code=110.0) == pytest.approx(110)
 
 
-@pytest.mark.parametrize(("rings", "rays"), [(1, 1), (2, 7), (3, 19), (4, 37), (5, 61)])
-def test_bundles_are_centred_and_their_power_adds_up(rings, rays):
-    place, share = bundle(rays)
+@pytest.mark.parametrize("rays", FOOTPRINTS)
+def test_bundles_are_centred_and_as_wide_as_the_beam(rays):
+    place = bundle(rays)
     assert len(place) == rays
-    assert share.sum() == pytest.approx(1.0)
-    assert share @ place == pytest.approx([0, 0], abs=1e-12)
-    assert np.linalg.norm(place, axis=1).max() <= (rings - 1) / (rings - 0.5) + 1e-12
     assert not place[0].any()
-
-
-def test_ring_energies_are_those_of_helios():
-    assert ring_energy(3, waist=2.0) == pytest.approx([0.0198, 0.1449, 0.2287], abs=5e-5)
-    assert ring_energy(3).sum() == pytest.approx(0.8647, abs=1e-4)
+    assert place.mean(axis=0) == pytest.approx([0, 0], abs=1e-12)
+    assert np.linalg.norm(place, axis=1).max() < 1.05
+    if rays > 1:  # mean square radius of a Gaussian beam within its 1/e^2 radius
+        square = 0.5 * (1 - 3 * np.exp(-2)) / (1 - np.exp(-2))
+        assert np.mean(np.sum(place**2, axis=1)) == pytest.approx(square, rel=0.06)
 
 
 def surfaces(rows):

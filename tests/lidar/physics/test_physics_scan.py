@@ -278,6 +278,36 @@ def test_reflectance_spread_is_constant_for_each_object():
     assert np.std(np.log([r[0] for r in each])) == pytest.approx(0.2, rel=0.4)
 
 
+def test_thin_wires_return_their_share_of_the_power_in_many_pulses():
+    """Upright wires of 2 mm in beams 73 mm wide: few rays of a pulse lie in line with them."""
+    wires = []
+    for k, angle in enumerate(2 * np.pi * (np.arange(200) + 0.3) / 200):
+        x, y = 20 * np.cos(angle), 20 * np.sin(angle)
+        wires.append(box((x - 0.001, y - 0.001, -8), (x + 0.001, y + 0.001, 8), feature=k))
+    scene = world(*wires)
+    rho = 100 * materials()["brick"].reflectance[0]
+    share = {rays: seen("vlp16", scene, ScannerSettings(rays=rays)).intensity / rho for rays in (7, 19, 61)}
+    total = [power.sum() for power in share.values()]
+    assert np.ptp(total) < 0.1 * total[-1]
+    assert share[19].max() < 0.25  # three rays in line, and the wire's sides
+    assert share[61].max() < 0.15
+    assert len(share[7]) < 0.5 * len(share[19]) < 0.4 * len(share[61])
+
+
+def test_seven_rays_are_nearer_to_many_than_one_ray():
+    """Posts before a wall: ranges and classes of the strongest echo, against 61 rays."""
+    posts = [box((10, y, -5), (10.05, y + 0.05, 5), klass=Class.POLE) for y in np.arange(-6.0, 6.0, 0.37)]
+    scene = world(*posts, plate(14.0))
+    clouds = [seen("vlp16", scene, ScannerSettings(rays=rays)) for rays in (1, 7, 61)]
+    key = [cloud.column * 16 + cloud.ring.astype(int) for cloud in clouds]
+    both = np.intersect1d(np.intersect1d(key[0], key[1]), key[2])
+    one, seven, many = (c.where(np.isin(k, both)) for c, k in zip(clouds, key, strict=True))
+    off = [np.abs(cloud.range - many.range) for cloud in (one, seven)]
+    assert np.count_nonzero(off[1] > 0.1) < 0.7 * np.count_nonzero(off[0] > 0.1)
+    wrong = [np.count_nonzero(cloud.klass != many.klass) for cloud in (one, seven)]
+    assert wrong[1] < 0.7 * wrong[0]
+
+
 def test_the_air_dims_intensity():
     """A scanner that assumes clear air codes 40 % at 50 m, with 0.01 1/m, as 40 exp(-1) = 14.7."""
     clear, hazy = (
