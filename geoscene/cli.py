@@ -16,7 +16,9 @@ from geoscene.console import (
     FAILURE,
     SEVERAL,
     Report,
+    command_line,
     degrees,
+    note_new_folder,
     print_json,
     progress_bar,
     whole,
@@ -43,6 +45,7 @@ app = App(
 app.register_install_completion_command()
 
 _SOURCE = Group("Source of the map (one of)", sort_key=1)
+_SCENE = Group("Scene", sort_key=2)
 _OUTPUT = Group("Output", sort_key=3)
 
 Out = Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)]
@@ -95,7 +98,7 @@ class MapSource:
 def build(
     *,
     source: Annotated[MapSource, Parameter(group=_SOURCE)] = MapSource(),
-    options: BuildOptions = BuildOptions(),
+    options: Annotated[BuildOptions, Parameter(group=_SCENE)] = BuildOptions(),
     out: Out,
     workers: Annotated[int | None, Parameter(group=_OUTPUT, converter=whole)] = None,
     report: Reporting = Report(),
@@ -130,6 +133,7 @@ def build(
     if source.dem_server and options.dem != ("tiles",):
         raise InputError("`dem_server` needs --dem tiles")
     check_target(out, overwrite=report.overwrite)
+    note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
         progress("reading the map", 0, total=0)
         data = _read_map(source)
@@ -150,9 +154,9 @@ def build(
         print_json(document)
     else:
         _print_scene(document)
-        drive = f"lidar drive {out} --route random -o drive"
-        next_command = drive if document["counts"]["road_edges"] else f"geoscene export {out} -o scene.glb"
-        print(f"\n{document['seconds']:.1f} s; next: {next_command}")
+        drive = ("lidar", "drive", out, "--route", "random", "-o", "drive")
+        words = drive if document["counts"]["road_edges"] else ("geoscene", "export", out, "-o", "scene.glb")
+        print(f"\n{document['seconds']:.1f} s; next: {command_line(*words)}")
     return 0
 
 
@@ -244,10 +248,11 @@ def validate(scene: Path, /, *, json: bool = False) -> int:
     json
         Print the result as JSON.
     """
-    from geoscene.scene.layout import open_scene  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
     from geoscene.scene.validate import check_scene  # noqa: PLC0415
 
-    report = check_scene(open_scene(scene))
+    with using(open_scene(scene)) as opened:
+        report = check_scene(opened)
     if json:
         print_json(report)
     else:
@@ -289,12 +294,11 @@ def export(
         File to write; for 3D Tiles a directory.
     """
     from geoscene.export import export_scene  # noqa: PLC0415
-    from geoscene.scene.layout import open_scene  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
 
-    with progress_bar(quiet=report.quiet) as progress:
-        summary = export_scene(
-            open_scene(scene), out, options=options, overwrite=report.overwrite, progress=progress
-        )
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress, using(open_scene(scene)) as opened:
+        summary = export_scene(opened, out, options=options, overwrite=report.overwrite, progress=progress)
     _print_file(
         summary,
         f"{summary.kind}, {summary.objects} {'cells' if summary.kind == 'geotiff' else 'objects'}",
@@ -328,13 +332,12 @@ def view(
     out
         File to write.
     """
-    from geoscene.scene.layout import open_scene  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
     from geoscene.view import view_scene  # noqa: PLC0415
 
-    with progress_bar(quiet=report.quiet) as progress:
-        summary = view_scene(
-            open_scene(scene), out, options=options, overwrite=report.overwrite, progress=progress
-        )
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress, using(open_scene(scene)) as opened:
+        summary = view_scene(opened, out, options=options, overwrite=report.overwrite, progress=progress)
     _print_file(summary, f"{summary.faces} faces, {summary.objects} objects", json=report.json)
     return 0
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import errno
 import json
 import logging
+import os
 import re
+import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import App, CycloptsError, Parameter, Token
@@ -29,7 +32,7 @@ _HINTS = {
     errno.EPERM: _PERMISSION,
     errno.EROFS: "; give a path that you may write to",
 }
-_INTERRUPTED = 130
+_INTERRUPTED, _BROKEN_PIPE = 130, 141
 _NUMBERS = re.compile(r"-\d+(\.\d*)?(,-?\d+(\.\d*)?)+")
 
 
@@ -120,6 +123,7 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
     try:
         words = _guard_numbers(sys.argv[1:])
         code = app(words, result_action="return_value", exit_on_error=False, print_error=False)
+        sys.stdout.flush()
     except CycloptsError as error:
         message = str(error).rstrip(".")
         _print_error(app, f"{message}; see {app.name[0]} {_command(app)}--help")
@@ -130,12 +134,15 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
     except KeyboardInterrupt:
         _print_error(app, "interrupted; repeat the command to resume")
         sys.exit(_INTERRUPTED)
+    except BrokenPipeError:  # the reader of standard output has ended, as in "| head"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(_BROKEN_PIPE)
     except MemoryError:
         _print_error(app, "out of memory; take a smaller area or fewer workers")
         sys.exit(FAILURE)
     except OSError as error:
         # Files are first written as <name>.<process>.part; the message names the final file.
-        name = re.sub(r"\.\d+\.part(?=$|\.)|\.part$", "", str(error.filename or "the system"))
+        name = re.sub(r"\.\d+\.part(?=$|[./])|\.part(?=$|/)", "", str(error.filename or "the system"))
         hint = _HINTS.get(error.errno or 0, "")
         _print_error(app, f"{name}: {error.strerror or error}{hint}")
         sys.exit(FAILURE)
@@ -165,9 +172,20 @@ def _print_error(app: App, message: object) -> None:
     print(f"{app.name[0]}: {text}", file=sys.stderr)
 
 
+def command_line(*words: object) -> str:
+    """Words as a command to paste into a shell, with quotes where needed."""
+    return shlex.join(map(str, words))
+
+
 def print_json(document: Mapping[str, Any]) -> None:
     """Print a document as JSON on standard output."""
     print(json.dumps(document, indent=2, ensure_ascii=False))
+
+
+def note_new_folder(out: Path) -> None:
+    """Say on standard error which folder is made to hold an output, so that a mistyped path is noticed."""
+    if not (folder := out.absolute().parent).exists():
+        print(f"{folder}: this folder does not exist and is made", file=sys.stderr)
 
 
 @contextmanager

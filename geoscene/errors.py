@@ -28,6 +28,10 @@ class NetworkError(GeosceneError, OSError):
     """A map server that cannot be reached or refuses the request."""
 
 
+class NotWrittenError(GeosceneError, OSError):
+    """A file that a library could not write, as on a full disk."""
+
+
 class FrameError(InputError):
     """An unsuitable coordinate reference system, or coordinates outside its area of use."""
 

@@ -20,7 +20,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.errors import InputError
+from geoscene.errors import InputError, NotWrittenError
 
 fcntl = None if sys.platform == "win32" else importlib.import_module("fcntl")
 
@@ -40,17 +40,31 @@ def atomic_path(path: Path, *, keep_suffix: bool = False) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     part.unlink(missing_ok=True)
     try:
-        yield part
+        with naming(path):
+            yield part
         if part.exists():
             part.replace(path)
         else:
             path.unlink(missing_ok=True)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Give an OSError of the block that names no file, such as of a full disk, the name of ``path``."""
+    try:
+        yield
     except OSError as error:
         if error.filename is None:
             error.filename = str(path)
         raise
-    finally:
-        part.unlink(missing_ok=True)
+
+
+def not_written(path: Path, cause: Exception) -> NotWrittenError:
+    """The error of a file that a library could not write."""
+    text = " ".join(str(cause).split())[:120]
+    return NotWrittenError(f"{path}: cannot be written ({text}); is the disk full?")
 
 
 @contextmanager
@@ -146,7 +160,7 @@ def write_columns(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]
 @contextmanager
 def spool(near: Path) -> Iterator[IO[bytes]]:
     """Yield an unnamed temporary file on the disk of ``near``, for data whose size the header states."""
-    with tempfile.TemporaryFile(dir=near.parent) as file:
+    with naming(near), tempfile.TemporaryFile(dir=near.parent) as file:
         yield file
 
 

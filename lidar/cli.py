@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
-from geoscene.console import DEFAULTS, Report, print_json, progress_bar
+from geoscene.console import DEFAULTS, Report, command_line, note_new_folder, print_json, progress_bar
 from geoscene.console import main as run
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
@@ -67,15 +67,14 @@ def drive(
     out
         Directory to write the dataset to.
     """
-    from geoscene.scene.layout import open_scene  # noqa: PLC0415
+    from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
     from lidar.pipeline import drive as record  # noqa: PLC0415
 
     if options is None or bool(options.route) == bool(options.survey):
         raise InputError("give one of `route` and `survey`, such as `route` random")
-    with progress_bar(quiet=report.quiet) as progress:
-        summary = record(
-            open_scene(scene), out, options=options, overwrite=report.overwrite, progress=progress
-        )
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress, using(open_scene(scene), known=LidarError) as opened:
+        summary = record(opened, out, options=options, overwrite=report.overwrite, progress=progress)
     document: dict[str, Any] = {
         "path": str(summary.path),
         "frames": summary.frames,
@@ -95,7 +94,8 @@ def drive(
         before = f" ({total - summary.written:,} recorded before)" if summary.resumed else ""
         print(
             f"{out}: {summary.duration:.1f} s, {summary.length:.0f} m, {summary.frames} frames,"
-            f" {total:,} points{before} in {summary.wall:.1f} s; next: lidar map {out} -o map.laz"
+            f" {total:,} points{before} in {summary.wall:.1f} s;"
+            f" next: {command_line('lidar', 'map', out, '-o', 'map.laz')}"
         )
     for name in (name for name, points in summary.points.items() if not points):
         print(
@@ -133,6 +133,7 @@ def map_(
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.maps.aggregate import aggregate  # noqa: PLC0415
 
+    note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
         summary = aggregate(
             open_dataset(dataset), out, options=options, overwrite=report.overwrite, progress=progress
@@ -182,6 +183,7 @@ def export(
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
 
+    note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
         summary = exporter(options.to).export(
             open_dataset(dataset), out, overwrite=report.overwrite, progress=progress
@@ -223,6 +225,7 @@ def apply(
     """
     from lidar.apply import apply_stages  # noqa: PLC0415
 
+    note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
         summary = apply_stages(dataset, out, options=options, overwrite=report.overwrite, progress=progress)
     if report.json:

@@ -16,7 +16,7 @@ from geoscene.errors import InputError
 from geoscene.export.files import Summary
 from geoscene.export.objects import attribution, expand, parts
 from geoscene.export.zbuffer import draw_triangles
-from geoscene.files import atomic_path
+from geoscene.files import atomic_path, naming, not_written
 from geoscene.mesh import Mesh, concatenate
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -84,6 +84,8 @@ def write_geotiff(
 
     Raises InputError for an unknown model or an unusable resolution.
     """
+    from rasterio.errors import RasterioError  # noqa: PLC0415
+
     if model not in ("surface", "terrain", "classes"):
         raise InputError(f"`model` {model}: surface, terrain or classes")
     grid = _grid(scene, resolution)
@@ -91,11 +93,9 @@ def write_geotiff(
     faces = 0
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".geoscene-") as folder:
-        shape = (grid.rows, grid.columns)
-        height = np.memmap(Path(folder) / "height", np.float32, "w+", shape=shape)
-        labels = np.memmap(Path(folder) / "labels", np.uint8, "w+", shape=shape)
-        for top in range(0, grid.rows, _BLOCK):
-            height[top : top + _BLOCK] = np.nan
+        with naming(path):
+            height = _cells_on_disk(Path(folder) / "height", grid, value=np.float32(np.nan))
+            labels = _cells_on_disk(Path(folder) / "labels", grid, value=np.uint8(0))
         for part in parts(scene, layers, stage="GeoTIFF", progress=progress):
             mesh = part.mesh
             if model == "terrain":
@@ -105,10 +105,25 @@ def write_geotiff(
             _draw(mesh, part.origin, scene=scene, grid=grid, height=height, labels=labels)
             faces += len(mesh)
         draft = Path(folder) / "draft.tif"
-        _write_draft(draft, scene, grid=grid, cells=labels if model == "classes" else height, model=model)
-        _write_cog(draft, path, model=model)
+        try:
+            _write_draft(draft, scene, grid=grid, cells=labels if model == "classes" else height, model=model)
+            _write_cog(draft, path, model=model)
+        except RasterioError as error:
+            raise not_written(path, error) from error
     count = grid.columns * grid.rows
     return Summary.of(path, "geotiff", objects=count, faces=faces, crs=scene.frame.name)
+
+
+def _cells_on_disk(path: Path, grid: _Grid, *, value: np.generic) -> NDArray[Any]:
+    """Cells (rows, columns) of a value in a file, mapped to memory.
+
+    They are written first: a disk that is full then ends in an OSError, not in a fault of the memory.
+    """
+    block = np.full((_BLOCK, grid.columns), value)
+    with path.open("wb") as file:
+        for top in range(0, grid.rows, _BLOCK):
+            file.write(block[: grid.rows - top].data)
+    return np.memmap(path, value.dtype, "r+", shape=(grid.rows, grid.columns))
 
 
 def _draw(

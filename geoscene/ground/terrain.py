@@ -14,7 +14,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
 
-from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.errors import InputError, SourceNotFoundError, reading
 from geoscene.frames import Frame, beside
 from geoscene.typing import Bools, Float, Height
 
@@ -33,6 +33,8 @@ _LOWEST, _HIGHEST = -500.0, 9000.0
 
 _MARGIN = 3
 """Posts read beyond the scene on each side."""
+
+_REMEDY = "give an elevation file that GDAL reads, such as GeoTIFF or .hgt"
 
 _AT_ONCE = 10_000
 """Footprints whose ground is looked up at once: some 300,000 places, which bounds the memory."""
@@ -241,39 +243,37 @@ def _gdal_name(path: Path) -> str:
 def _open(path: Path, *, unit: str | None, vertical: Literal["orthometric", "ellipsoidal"] | None) -> _Raster:
     """Metadata of a file, completed by the caller's where it has none."""
     import rasterio  # noqa: PLC0415 - slow to import
-    from rasterio.errors import RasterioIOError  # noqa: PLC0415
 
     name = _gdal_name(path)
-    try:
-        with rasterio.Env(GTIFF_REPORT_COMPD_CS="YES"), rasterio.open(name) as source:
-            if source.crs is None:
-                raise InputError(
-                    f"{path}: no CRS in it; assign one, as with: gdal_edit.py -a_srs EPSG:4326 FILE"
-                )
-            crs = CRS.from_wkt(source.crs.to_wkt())
-            stated, kind, datum = _vertical(crs, source.driver)
-            stated = (source.units[0] or stated).strip().lower()
-            factor = _UNITS.get((unit or stated).lower())
-            if factor is None:
-                raise InputError(f"{path}: heights in {unit or stated!r}; say which unit: m, ft or us-ft")
-            a, tags = source.transform, source.tags()
-            step = np.array([[a.a, a.b], [a.d, a.e]])
-            return _Raster(
-                path,
-                name,
-                crs.sub_crs_list[0] if crs.is_compound else crs.to_2d(),
-                np.array([a.c, a.f]) + step @ (0.5, 0.5),
-                step,
-                source.shape,
-                source.nodata,
-                (source.scales[0] * factor, source.offsets[0] * factor),
-                vertical or kind or "orthometric",
-                tags.get("VERTICAL_DATUM", datum) if vertical is None else f"{vertical}, as told",
-                tags.get("TIFFTAG_COPYRIGHT", ""),
-                _turn(crs),
-            )
-    except RasterioIOError as error:
-        raise InputError(f"{path}: not a raster that GDAL reads ({error})") from error
+    with (
+        reading(path, InputError, remedy=_REMEDY),
+        rasterio.Env(GTIFF_REPORT_COMPD_CS="YES"),
+        rasterio.open(name) as source,
+    ):
+        if source.crs is None:
+            raise InputError(f"{path}: no CRS in it; assign one, as with: gdal_edit.py -a_srs EPSG:4326 FILE")
+        crs = CRS.from_wkt(source.crs.to_wkt())
+        stated, kind, datum = _vertical(crs, source.driver)
+        stated = (source.units[0] or stated).strip().lower()
+        factor = _UNITS.get((unit or stated).lower())
+        if factor is None:
+            raise InputError(f"{path}: heights in {unit or stated!r}; say which unit: m, ft or us-ft")
+        a, tags = source.transform, source.tags()
+        step = np.array([[a.a, a.b], [a.d, a.e]])
+        return _Raster(
+            path,
+            name,
+            crs.sub_crs_list[0] if crs.is_compound else crs.to_2d(),
+            np.array([a.c, a.f]) + step @ (0.5, 0.5),
+            step,
+            source.shape,
+            source.nodata,
+            (source.scales[0] * factor, source.offsets[0] * factor),
+            vertical or kind or "orthometric",
+            tags.get("VERTICAL_DATUM", datum) if vertical is None else f"{vertical}, as told",
+            tags.get("TIFFTAG_COPYRIGHT", ""),
+            _turn(crs),
+        )
 
 
 def _vertical(crs: CRS, driver: str) -> tuple[str, Literal["orthometric", "ellipsoidal"] | None, str]:
@@ -352,7 +352,7 @@ def _read(
         end = np.minimum(high - shift, raster.shape[::-1])
         if (begin >= end).any():
             continue
-        with rasterio.open(raster.name) as source:
+        with reading(raster.path, InputError, remedy=_REMEDY), rasterio.open(raster.name) as source:
             found = source.read(1, window=Window(*begin, *(end - begin)))
         void = ~np.isfinite(found)
         if raster.nodata is not None:

@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.errors import SceneFormatError
+from geoscene.errors import SceneFormatError, reading
 from geoscene.files import write_atomically
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
@@ -163,13 +163,9 @@ def read_graphml(path: Path, frame: Frame) -> RoadGraph:
 
     Raises SceneFormatError if the file is missing, damaged or not written by `write_graphml`.
     """
-    try:
+    with reading(path, SceneFormatError, remedy="build the scene again with `overwrite`"):
         nodes, edges = _parse(path)
         return _graph(nodes, edges, frame=frame)
-    except (OSError, ET.ParseError, KeyError, ValueError, shapely.errors.GEOSException) as error:
-        raise SceneFormatError(
-            f"{path}: not a readable road graph ({type(error).__name__}: {error}); build the scene again"
-        ) from error
 
 
 _Row = dict[str, str]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.errors import InputError, SourceNotFoundError, reading
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import nearest_edge, path_line, shortest_path
@@ -61,11 +61,9 @@ def _read_lonlat(path: Path) -> Float:
     if path.suffix.lower() != ".csv":
         points = read_track(path)[:, :2]
     else:
-        try:
+        with reading(path, InputError, remedy="give a CSV file with columns lon and lat"):
             rows = list(csv.DictReader(path.read_text("utf-8", errors="replace").splitlines()))
             points = np.array([(float(row["lon"]), float(row["lat"])) for row in rows])
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path}: not a readable route ({error})") from error
     if not len(points):
         raise InputError(f"{path}: holds no points")
     return points

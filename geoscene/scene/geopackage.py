@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.errors import GeosceneError, SceneFormatError
-from geoscene.files import atomic_path
+from geoscene.errors import SceneFormatError, reading
+from geoscene.files import atomic_path, not_written
 from geoscene.frames import Frame
 
 _DATE = "2000-01-01T00:00:00Z"  # constant, so that the same scene gives the same bytes
@@ -63,7 +63,7 @@ def open_geopackage(path: Path) -> Iterator[Callable[[Layer, str, str], None]]:
     Raises GeosceneError if GDAL cannot write.
     """
     import pyogrio  # noqa: PLC0415  (0.3 s)
-    from pyogrio.errors import DataSourceError  # noqa: PLC0415
+    from pyogrio.errors import DataLayerError, DataSourceError  # noqa: PLC0415
     from pyogrio.raw import write  # noqa: PLC0415
 
     before = {"OGR_CURRENT_DATE": pyogrio.get_gdal_config_option("OGR_CURRENT_DATE")}
@@ -86,8 +86,8 @@ def open_geopackage(path: Path) -> Iterator[Callable[[Layer, str, str], None]]:
                 )
 
             yield append
-    except DataSourceError as error:
-        raise GeosceneError(f"{path}: cannot be written ({error}); is the disk full?") from error
+    except (DataSourceError, DataLayerError) as error:
+        raise not_written(path, error) from error
     finally:
         pyogrio.set_gdal_config_options(before)
 
@@ -123,10 +123,10 @@ def read_schema(path: Path, name: str) -> Schema:
     """The geometry type and the columns of a layer; raises SceneFormatError if there is no such layer."""
     from pyogrio import read_info  # noqa: PLC0415  (0.3 s)
 
-    with _readable(path, name):
+    with _reading(path, name):
         info = read_info(path, layer=name)
-    types = [np.dtype(kind) for kind in info["dtypes"]]
-    return Schema(str(info["geometry_type"]), dict(zip(info["fields"].tolist(), types, strict=True)))
+        types = [np.dtype(kind) for kind in info["dtypes"]]
+        return Schema(str(info["geometry_type"]), dict(zip(info["fields"].tolist(), types, strict=True)))
 
 
 def read_layer(
@@ -148,26 +148,19 @@ def read_layer(
     from pyogrio.raw import read  # noqa: PLC0415
 
     part = {} if rows is None else {"skip_features": rows.start, "max_features": len(rows)}
-    with _readable(path, name):
+    with _reading(path, name):
         meta, _, wkb, values = read(path, layer=name, read_geometry=geometry != "none", **part)
-    columns = dict(zip(meta["fields"].tolist(), values, strict=True))
-    if geometry == "none":
-        return Layer(name, np.full(len(values[0]) if values else 0, None, object), columns)
-    shapes = shapely.from_wkb(wkb)
-    if geometry == "scene":
-        shift = np.array(frame.origin)
-        has_z = bool(shapely.has_z(shapes).any())
-        shift = np.append(shift, 0.0) if has_z else shift
-        shapes = shapely.transform(shapes, lambda c: c - shift, include_z=has_z)
-    return Layer(name, shapes, columns)
+        columns = dict(zip(meta["fields"].tolist(), values, strict=True))
+        if geometry == "none":
+            return Layer(name, np.full(len(values[0]) if values else 0, None, object), columns)
+        shapes = shapely.from_wkb(wkb)
+        if geometry == "scene":
+            shift = np.array(frame.origin)
+            has_z = bool(shapely.has_z(shapes).any())
+            shift = np.append(shift, 0.0) if has_z else shift
+            shapes = shapely.transform(shapes, lambda c: c - shift, include_z=has_z)
+        return Layer(name, shapes, columns)
 
 
-@contextmanager
-def _readable(path: Path, name: str) -> Iterator[None]:
-    """Raise GDAL's errors as SceneFormatError."""
-    from pyogrio.errors import DataLayerError, DataSourceError  # noqa: PLC0415
-
-    try:
-        yield
-    except (DataSourceError, DataLayerError) as error:
-        raise SceneFormatError(f"{path}: no readable layer {name} ({error})") from error
+def _reading(path: Path, name: str) -> AbstractContextManager[None]:
+    return reading(f"{path}, layer {name}", SceneFormatError, remedy="build the scene again with `overwrite`")

@@ -6,7 +6,6 @@ import bz2
 import datetime as dt
 import gzip
 import json
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -113,7 +112,9 @@ def _read(path: Path, progress: Progress) -> Collector:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}; {_HELP}") from None
     except PermissionError as error:
         raise InputError(f"{path}: may not be read; give its permissions to this user") from error
-    except (RuntimeError, OSError, ValueError, EOFError, zlib.error) as error:
+    except MemoryError:
+        raise
+    except Exception as error:
         cause = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: damaged, cut short or no OpenStreetMap file ({cause}); {_HELP}") from error
     if len(collector) == 0:

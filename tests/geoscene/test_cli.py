@@ -1,11 +1,14 @@
 """Both command-line programs: output files, summaries, help, and one-line errors."""
 
 import json
+import os
+import re
+import shlex
 import subprocess
 import sys
 
 import pytest
-from helpers.programs import run_program
+from helpers.programs import ENVIRONMENT, command, run_program
 
 from geoscene import cli
 from geoscene.sources import demo_path
@@ -121,10 +124,65 @@ def test_help_describes_every_command(name, commands):
     assert run_program(name, "--version").stdout.strip() == "0.1.0"
     top = run_program(name, "--help").stdout
     assert "--install-completion" in top
-    for command in commands:
-        assert command in top
-        text = run_program(name, command, "--help").stdout
+    for word in commands:
+        assert word in top
+        text = run_program(name, word, "--help").stdout
         assert len(text.splitlines()) > 8
+
+
+def test_help_lists_sources_of_the_map_first_and_servers_last_among_them():
+    text = run_program("geoscene", "build", "--help").stdout
+    listed = re.findall(r"^│ [* ] *(--[a-z-]+)|^│ (--[a-z-]+)", text, re.MULTILINE)
+    flags = [first or second for first, second in listed]
+    order = [flags.index(flag) for flag in ("--osm", "--demo", "--dem-server", "--crs", "--dem", "--out")]
+    assert order == sorted(order)
+    assert order[0] == 0
+
+
+def closed_pipe():
+    reader, writer = os.pipe()
+    os.close(reader)
+    return writer
+
+
+@pytest.mark.parametrize(("name", "words"), [("geoscene", ["info", "--json"]), ("lidar", ["sensors"])])
+def test_closed_pipe_ends_the_program_without_a_message(scene, name, words):
+    words = [words[0], *([scene] if name == "geoscene" else []), *words[1:]]
+    writer = closed_pipe()
+    done = subprocess.run(
+        command(name, *words), env=ENVIRONMENT, stdout=writer, stderr=subprocess.PIPE, text=True, check=False
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_suggested_commands_quote_paths_and_new_folders_are_named(tmp_path):
+    out = tmp_path / "my scenes" / "it's one"
+    done = run_program("geoscene", "build", "--demo", "--bbox", BOX, "-o", out)
+    assert done.returncode == 0
+    assert done.stderr == f"{out.parent}: this folder does not exist and is made\n"
+    words = shlex.split(done.stdout.splitlines()[-1].partition("next: ")[2])
+    assert words == ["lidar", "drive", str(out), "--route", "random", "-o", "drive"]
+
+
+FORMATS = ["tif", "gpkg", "glb", "city.json", "geojson", "parquet", "obj", "ply", "stl"]
+
+
+@pytest.mark.parametrize("suffix", [*FORMATS, "html"])
+def test_full_disk_gives_one_line_that_names_the_file(scene, tmp_path, suffix):
+    """Files of at most 30 kB stand for a full disk; both fail when bytes are written."""
+    out = tmp_path / f"x.{suffix}"
+    limit = "import resource, runpy, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000));"
+    run = "sys.argv = sys.argv[1:]; runpy.run_module('geoscene.cli', run_name='__main__')"
+    words = ["view" if suffix == "html" else "export", str(scene), "-o", str(out)]
+    done = subprocess.run(
+        [sys.executable, "-c", limit + run, "geoscene", *words],
+        env=ENVIRONMENT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.startswith(f"geoscene: {out}: ")
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_help_does_not_import_large_libraries():

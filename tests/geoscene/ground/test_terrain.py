@@ -182,7 +182,7 @@ def test_unusable_files_are_named_in_the_error(tmp_path):
         open_terrain([tmp_path / "none.tif"], FRAME, bounds=BOUNDS)
     text = tmp_path / "text.tif"
     text.write_text("not a raster")
-    with pytest.raises(InputError, match=r"text\.tif: not a raster"):
+    with pytest.raises(InputError, match=r"text\.tif: damaged"):
         open_terrain([text], FRAME, bounds=BOUNDS)
     bad_zip = tmp_path / "bad.hgt.zip"
     bad_zip.write_text("not an archive")

@@ -1,12 +1,15 @@
-"""File names of a scene are defined in one module."""
+"""File names of a scene are defined in one module; damaged scenes are refused by the name of the file."""
 
 import ast
+import shutil
 from pathlib import Path
 
 import pytest
 from helpers.export_worlds import write_world
 
-from geoscene.scene import SceneFiles, layout
+from geoscene.errors import SceneFormatError
+from geoscene.scene import SceneFiles, layout, open_scene
+from geoscene.scene.layout import changed_files, using
 
 REPOSITORY = Path(__file__).parents[3]
 
@@ -39,3 +42,61 @@ def test_features_are_read_in_scene_or_projected_metres_or_without_geometry(tmp_
         near.columns["feature"][1:3]
     )
     assert len(scene.road_graph()) == len(near)
+
+
+@pytest.fixture
+def copied(scene, tmp_path):
+    shutil.copytree(scene.path, tmp_path / "scene")
+    return tmp_path / "scene"
+
+
+def used(path):
+    """Everything that a scene holds, read."""
+    scene = open_scene(path)
+    list(scene.tiles()), scene.shapes(), scene.road_graph()
+    for layer, (start, stop) in scene.layers.items():
+        if stop > start:
+            scene.features(layer), scene.schema(layer)
+
+
+FILES = ["scene.json", "features.gpkg", "roads.graphml", "shapes.npz", "tiles"]
+
+
+@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("damage", ["empty", "cut", "zeros", "text", "missing"])
+def test_damaged_files_give_one_line_that_names_them(copied, name, damage):
+    path = next((copied / name).iterdir()) if name == "tiles" else copied / name
+    data = path.read_bytes()
+    middle = len(data) // 2
+    path.unlink()
+    if damage != "missing":
+        holed = data[: middle // 2] + bytes(middle) + data[middle // 2 + middle :]
+        changed = {"zeros": holed, "empty": b"", "cut": data[:middle], "text": b"hello"}
+        path.write_bytes(
+            changed.get(damage, data[: middle // 2] + bytes(middle) + data[middle // 2 + middle :])
+        )
+    if (name, damage) == ("features.gpkg", "zeros") or (name, damage) == ("shapes.npz", "missing"):
+        return  # pages without an index are read; a scene without copies has no shapes
+    with pytest.raises(SceneFormatError) as raised:
+        used(copied)
+    text = str(raised.value)
+    assert "\n" not in text
+    assert path.name in text or (name, damage) == ("roads.graphml", "missing")
+
+
+def test_unexpected_error_is_explained_by_a_changed_file(copied):
+    with pytest.raises(ZeroDivisionError), using(open_scene(copied)):
+        _ = 1 / 0
+    tile = next((copied / "tiles").iterdir())
+    tile.write_bytes(b"")
+    assert changed_files(open_scene(copied)) == [tile]
+    message = rf"{tile.name}: differs from what the build wrote"
+    with pytest.raises(SceneFormatError, match=message), using(open_scene(copied)):
+        _ = 1 / 0
+
+
+def test_edited_manifest_is_refused(copied):
+    path = copied / "scene.json"
+    path.write_text(path.read_text().replace('"tile_size": 250', '"tile_size": 251'))
+    with pytest.raises(SceneFormatError, match=r"scene\.json: differs"):
+        open_scene(copied)
