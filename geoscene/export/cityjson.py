@@ -24,8 +24,9 @@ from geoscene.export.objects import (
     pieces,
     read_features,
 )
-from geoscene.export.shells import bodies, shell_numbers
+from geoscene.export.shells import bodies, manifold_patches, shell_numbers
 from geoscene.export.tables import target_crs
+from geoscene.export.vertices import Vertices
 from geoscene.files import append, atomic_file, spool
 from geoscene.frames import Frame, utm_crs
 from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh
@@ -33,11 +34,9 @@ from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
 
-STEP = 1e-4
-"""Metres per unit of the file's integers: the grid of the solids, so that they are exact."""
-
-STEP_ELSEWHERE = 1e-5
-"""The same in a CRS other than the scene's, where neighbours on the old grid must not fall together."""
+STEP = 1e-5
+"""Metres per unit of the file's integers: a tenth of the grid of buildings, so that they are exact, and thin
+triangles of the ground, or of solids in a CRS other than the scene's, do not collapse."""
 
 LOD = {0: "1.1", 1: "1.3", 2: "2.1"}
 """The scene's level of detail in the terms of Biljecki, Ledoux and Stoter, "An improved LOD specification
@@ -94,12 +93,11 @@ class _Palette:
 
 @dataclass(frozen=True, slots=True)
 class _Target:
-    """Quantisation of a file's coordinates: CRS, scale and translation."""
+    """Quantisation of a file's coordinates: CRS and translation."""
 
     frame: Frame
     crs: CRS
     same: bool
-    step: float
     zero: Float
 
     def whole(self, points: Float) -> Ints:
@@ -110,7 +108,7 @@ class _Target:
             else self.frame.to_crs(points[:, 0], points[:, 1], crs=self.crs)
         )
         moved = np.column_stack([x, y, points[:, 2]]) - self.zero
-        return np.rint(moved * (1.0 / self.step)).astype(np.int64)
+        return np.rint(moved * (1.0 / STEP)).astype(np.int64)
 
 
 def _target(scene: Scene, crs: str | None) -> tuple[_Target, tuple[str, ...]]:
@@ -127,7 +125,7 @@ def _target(scene: Scene, crs: str | None) -> tuple[_Target, tuple[str, ...]]:
     same = parsed == scene.frame.crs
     x, y = scene.frame.to_crs(middle[0], middle[1], crs=parsed)
     zero = np.array([np.floor(x), np.floor(y), 0.0])
-    return _Target(scene.frame, parsed, same, STEP if same else STEP_ELSEWHERE, zero), notes
+    return _Target(scene.frame, parsed, same, zero), notes
 
 
 def write_cityjson(
@@ -154,23 +152,22 @@ def write_cityjson(
     library = list(scene.shapes().values())
     palette = _Palette()
     lod = LOD[int(scene.manifest.get("options", {}).get("lod", 2))]
-    objects = solids = faces = count = 0
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    objects = solids = faces = 0
+    numbers = Vertices(scene.tile_size)
     with atomic_file(path) as out, spool(path) as vertices:
         out.write(b'{"type":"CityJSON","version":"2.0","CityObjects":{')
         for part in parts(scene, layers, stage="CityJSON", progress=progress):
-            whole, entries, closed = _tile_objects(
-                part, features, library=library, target=target, palette=palette, lod=lod, first=count
+            before = numbers.count
+            fresh, entries, closed = _tile_objects(
+                part, features, library=library, target=target, palette=palette, lod=lod, numbers=numbers
             )
             for name, entry in entries:
                 out.write(b",\n" if objects else b"\n")
                 out.write(compact_json(name) + b":" + compact_json(entry))
                 objects += 1
-            if len(whole):
-                vertices.write(b",\n" if count else b"\n")
-                vertices.write(compact_json(whole.tolist())[1:-1])
-                low, high = np.minimum(low, whole.min(axis=0)), np.maximum(high, whole.max(axis=0))
-            count += len(whole)
+            if len(fresh):
+                vertices.write(b",\n" if before else b"\n")
+                vertices.write(compact_json(fresh.tolist())[1:-1])
             solids += closed
             faces += len(part.mesh)
         out.write(b'},\n"vertices":[')
@@ -179,10 +176,10 @@ def write_cityjson(
         if library:
             out.write(b'"geometry-templates":' + compact_json(_templates(library, palette)) + b",\n")
         out.write(b'"appearance":' + compact_json(palette.to_json()) + b",\n")
-        extent = np.concatenate([low, high]) * target.step + np.tile(target.zero, 2)
-        transform = {"scale": [target.step] * 3, "translate": target.zero.tolist()}
+        extent = np.concatenate([numbers.low, numbers.high]) * STEP + np.tile(target.zero, 2)
+        transform = {"scale": [STEP] * 3, "translate": target.zero.tolist()}
         out.write(b'"transform":' + compact_json(transform))
-        metadata = _metadata(scene, target, extent=extent if count else None)
+        metadata = _metadata(scene, target, extent=extent if numbers.count else None)
         out.write(b',\n"metadata":' + compact_json(metadata) + b"}\n")
     name = f"EPSG:{target.crs.to_epsg()}"
     return Summary.of(path, "cityjson", objects=objects, solids=solids, faces=faces, crs=name, notes=notes)
@@ -207,19 +204,20 @@ def _tile_objects(
     target: _Target,
     palette: _Palette,
     lod: str,
-    first: int,
+    numbers: Vertices,
 ) -> tuple[Ints, list[tuple[str, dict[str, Any]]], int]:
-    """The tile's quantised vertices, its city objects by name, and the number of solids among them."""
+    """The tile's new quantised vertices, its city objects by name, and the number of solids among them."""
     mesh = part.mesh
     anchors = part.instances.transform[:, :, 3]
     points = np.concatenate([mesh.vertices, anchors]) + part.origin
     whole, ids = np.unique(target.whole(points), axis=0, return_inverse=True)
     ids = ids.ravel()
     corners = ids[mesh.faces].astype(np.int64)
+    number, fresh = numbers.add(whole, column=part.index[0])
     found = pieces(mesh)
     owner = np.zeros(len(mesh), np.int64)
-    for number, piece in enumerate(found):
-        owner[piece.rows] = number
+    for k, piece in enumerate(found):
+        owner[piece.rows] = k
     closed = np.flatnonzero(mesh.closed)
     shell = np.full(len(mesh), -1, np.int64)
     shell[closed] = shell_numbers(corners[closed], owner[closed])
@@ -238,7 +236,7 @@ def _tile_objects(
                 triangles=corners[piece.rows],
                 shell=shell[piece.rows],
                 look=look,
-                first=first,
+                number=number,
                 kind=kind,
             )
             entries += _solid_entries(
@@ -246,12 +244,16 @@ def _tile_objects(
             )
             solids += 1
         else:
-            made = [{"lod": "1", **_surface(piece, corners[piece.rows] + first, look=look, kind=kind)}]
+            triangles = number[corners[piece.rows]]
+            made = [
+                {"lod": "1", **_surface(piece, triangles[rows], look=look[rows], kind=kind)}
+                for rows in _surfaces(triangles, kind=kind)
+            ]
             entries.append((name, {"type": kind, "attributes": attributes, "geometry": made}))
     entries += _copies(
-        part.instances, features, library=library, index=part.index, anchors=ids[len(mesh.vertices) :] + first
+        part.instances, features, library=library, index=part.index, anchors=number[ids[len(mesh.vertices) :]]
     )
-    return whole, entries, solids
+    return fresh, entries, solids
 
 
 def _name(features: Features, piece: Piece, *, index: tuple[int, int]) -> str:
@@ -289,7 +291,15 @@ def _solid_entries(
 
 
 def _solids(
-    mesh: Mesh, piece: Piece, *, whole: Ints, triangles: Ints, shell: Ints, look: Ints, first: int, kind: str
+    mesh: Mesh,
+    piece: Piece,
+    *,
+    whole: Ints,
+    triangles: Ints,
+    shell: Ints,
+    look: Ints,
+    number: Ints,
+    kind: str,
 ) -> list[dict[str, Any]]:
     """A Solid for each body."""
     names, values = np.unique(
@@ -300,7 +310,7 @@ def _solids(
     for body in bodies(whole.astype(float), triangles, shell=shell):
         solid: dict[str, Any] = {
             "type": "Solid",
-            "boundaries": [(triangles[rows][:, None] + first).tolist() for rows in body],
+            "boundaries": [number[triangles[rows]][:, None].tolist() for rows in body],
             "material": {"visual": {"values": [look[rows].tolist() for rows in body]}},
         }
         if kind in _CONSTRUCTIONS:
@@ -320,6 +330,15 @@ def _surface_kinds(mesh: Mesh, piece: Piece, *, whole: Ints, triangles: Ints) ->
         ["RoofSurface", "WallSurface", "GroundSurface", "OuterCeilingSurface"],
         "ClosureSurface",
     )
+
+
+def _surfaces(triangles: Ints, *, kind: str) -> list[Ints]:
+    """Rows of the faces of each surface: terrain is composite surfaces, each of which is one 2-manifold."""
+    if kind != "TINRelief":
+        return [np.arange(len(triangles))]
+    patch = manifold_patches(triangles)
+    order = np.argsort(patch, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(patch[order])) + 1)
 
 
 def _surface(piece: Piece, triangles: Ints, *, look: Ints, kind: str) -> dict[str, Any]:

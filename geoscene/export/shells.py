@@ -1,4 +1,4 @@
-"""Shells of solids: outer shells with the cavities inside them."""
+"""Shells of solids: outer shells with the cavities inside them; and surfaces in connected patches."""
 
 from __future__ import annotations
 
@@ -31,6 +31,44 @@ def shell_numbers(corners: Ints, owner: NDArray[np.integer]) -> Ints:
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
     return rank[numbers]
+
+
+def manifold_patches(corners: Ints) -> Ints:
+    """Patch number (m,) of each face: a patch is connected by edges, and so are its faces at each vertex.
+
+    corners : (m, 3) ids of vertices; no edge has more than two faces
+    """
+    patch = np.full(len(corners), -1, np.int64)
+    while (patch < 0).any():
+        todo = np.flatnonzero(patch < 0)
+        while (extra := _beyond_first_fan(corners[todo])).any():
+            todo = todo[~extra]
+        patch[todo] = patch.max() + 1 + shell_numbers(corners[todo], np.zeros(len(todo), np.int64))
+    return patch
+
+
+def _beyond_first_fan(corners: Ints) -> NDArray[np.bool_]:
+    """Whether a face (m,) is at one of its vertices in another fan of its patch than the largest."""
+    from scipy.sparse import coo_array  # noqa: PLC0415  (slow to import)
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    half = corners.size
+    edge, _, _ = edge_uses(corners)
+    start, stop = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    following = np.arange(half).reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    ends = half + 2 * edge
+    node = np.concatenate([ends + (start > stop), ends + (start < stop)])
+    corner = np.concatenate([np.arange(half), following])
+    size = half + 2 * (int(edge.max()) + 1)
+    links = coo_array((np.ones(len(node), np.int8), (corner, node)), shape=(size, size))
+    fan = connected_components(links, directed=False)[1][:half]
+    patch = np.repeat(shell_numbers(corners, np.zeros(len(corners), np.int64)), 3)
+    order = np.lexsort([fan, -np.bincount(fan)[fan], start, patch])
+    place = patch[order] * (start.max() + 1) + start[order]
+    _, first, which = np.unique(place, return_index=True, return_inverse=True)
+    extra = np.empty(half, np.bool_)
+    extra[order] = fan[order] != fan[order][first][which]
+    return np.asarray(extra.reshape(-1, 3).any(axis=1), np.bool_)
 
 
 def bodies(points: Float, faces: NDArray[np.integer], *, shell: Ints) -> list[list[Ints]]:

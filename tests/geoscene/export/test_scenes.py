@@ -10,6 +10,8 @@ from helpers.export_worlds import SLOPE, TREES, write_world
 from geoscene.errors import InputError
 from geoscene.export import export_scene
 from geoscene.export.cityjson import LOD
+from geoscene.export.shells import manifold_patches
+from geoscene.export.vertices import Vertices
 from geoscene.mesh import Mesh
 from geoscene.objects.shapes import shapes
 from geoscene.options import ExportOptions
@@ -164,6 +166,72 @@ def test_cityjson_tree_is_at_its_position(city, scene):
         found.append([*(anchor[:2] - scene.frame.origin), max(highest)])
     wanted = [[x, y, SLOPE * x + height] for x, y, height in TREES]
     np.testing.assert_allclose(sorted(found), sorted(wanted), atol=2e-4)
+
+
+@pytest.fixture(scope="module")
+def town(demo_scene, tmp_path_factory):
+    """CityJSON of a real place on several tiles."""
+    path = tmp_path_factory.mktemp("out") / "town.city.json"
+    return json.loads(export_scene(demo_scene("local"), path).path.read_text())
+
+
+def test_every_vertex_of_cityjson_is_told_once_also_where_tiles_meet(city, town):
+    for document in (city, town):
+        vertices = np.array(document["vertices"])
+        assert len(np.unique(vertices, axis=0)) == len(vertices)
+    assert len({name.split("@")[1] for name in town["CityObjects"] if "@" in name}) > 1
+
+
+def test_each_composite_surface_of_cityjson_is_one_2_manifold(town):
+    surfaces = [
+        np.array(geometry["boundaries"])[:, 0]
+        for told in town["CityObjects"].values()
+        for geometry in told["geometry"]
+        if geometry["type"] == "CompositeSurface"
+    ]
+    assert len(surfaces) > 10
+    for faces in surfaces:
+        assert not manifold_patches(faces).any()
+
+
+def test_no_face_of_a_surface_of_cityjson_collapses_at_a_millimetre(town):
+    points = np.array(town["vertices"]) * town["transform"]["scale"]
+    for told in town["CityObjects"].values():
+        for geometry in told["geometry"]:
+            if geometry["type"] in ("CompositeSurface", "MultiSurface"):
+                corners = points[np.array(geometry["boundaries"])[:, 0]]
+                sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+                assert sides.min() > 1e-3
+                assert (
+                    np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any(axis=1).all()
+                )
+
+
+def test_patches_are_parted_where_they_touch_in_a_vertex():
+    bow_tie = np.array([[0, 1, 2], [0, 3, 4]])
+    np.testing.assert_array_equal(manifold_patches(bow_tie), [0, 1])
+    strip = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5]])
+    assert not manifold_patches(strip).any()
+    pinched = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5], [4, 5, 0]])  # comes back to vertex 0
+    assert set(manifold_patches(pinched)) == {0, 1}
+    ring = np.array(
+        [[k, (k + 1) % 6, 6 + k] for k in range(6)]
+        + [[6 + k, (k + 1) % 6, 6 + (k + 1) % 6] for k in range(6)]
+    )
+    assert not manifold_patches(ring).any()
+
+
+def test_vertices_of_neighbouring_tiles_share_their_numbers():
+    vertices = Vertices(250.0)
+    one, two = np.array([[0, 0, 0], [0, 1, 0], [5, 5, 5]]), np.array([[0, 1, 0], [9, 9, 9]])
+    number, fresh = vertices.add(one, column=0)
+    assert number.tolist() == [0, 1, 2]
+    assert len(fresh) == 3
+    number, fresh = vertices.add(two, column=1)
+    assert number.tolist() == [1, 3]
+    assert fresh.tolist() == [[9, 9, 9]]
+    assert vertices.count == 4
+    assert (vertices.low.tolist(), vertices.high.tolist()) == ([0, 0, 0], [9, 9, 9])
 
 
 def test_every_vertex_of_cityjson_is_used_and_every_index_exists(city):

@@ -17,7 +17,7 @@ from geoscene.options import ExportOptions
 from geoscene.watertight import validate_mesh
 
 STEPS = {
-    "cityjson": 1e-4,
+    "cityjson": 1e-5,
     "glb": 1e-5,  # float32 at the size of an object
     "3dtiles": 2e-5,  # float32 at the size of a tile
     "obj": 1e-4,
