@@ -144,6 +144,7 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
     if options.dem:
         gaps = cast("Literal['error', 'nearest']", options.dem_gaps)
         terrain = open_terrain(options.dem, frame, bounds=extent, outside=gaps)
+        problems += terrain.problems
     frame = replace(frame, vertical=terrain.vertical)
 
     progress("roads", 0, total=0)

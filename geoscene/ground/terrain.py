@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from pyproj import CRS, Transformer
 
 from geoscene.errors import InputError, SourceNotFoundError, reading
 from geoscene.frames import Frame, beside
+from geoscene.report import Problem
 from geoscene.typing import Bools, Float, Height
 
 Vertical = Literal["flat", "orthometric", "ellipsoidal"]
@@ -30,6 +32,11 @@ _UNITS = {
 
 _LOWEST, _HIGHEST = -500.0, 9000.0
 """Metres of the lowest and highest land, with a margin; other values are unmarked voids."""
+
+_STEP, _STEEPEST, _SPIKE = 100.0, 5.0, 16
+"""Groups of at most 16 posts are spikes if the ground steps by over 100 m and five spacings (79°) all around.
+
+Assumed: rock towers of that slope and height are wider, and single posts that are off are taller."""
 
 _MARGIN = 3
 """Posts read beyond the scene on each side."""
@@ -72,6 +79,7 @@ class Terrain:
     uncovered : share of the scene that no raster covers, which took the nearest height
     sources  : names of the files
     credits  : required attribution of each file, empty if none
+    problems : voids and spikes that were filled, and ground that no raster covers
     """
 
     frame: Frame
@@ -84,6 +92,7 @@ class Terrain:
     uncovered: float = 0.0
     sources: tuple[str, ...] = ()
     credits: tuple[str, ...] = ()
+    problems: tuple[Problem, ...] = ()
 
     @property
     def lines(self) -> float:
@@ -134,7 +143,7 @@ def open_terrain(
 
     Rasters whose posts share one lattice (the tiles of one model) are joined before anything is
     interpolated, so no seam shows between them. Voids (the raster's nodata, not a number, or lower than
-    -500 m or higher than 9,000 m) are filled from around by inverse distances and counted.
+    -500 m or higher than 9,000 m) and spikes are filled from around by inverse distances and listed.
 
     bounds   : (xmin, ymin, xmax, ymax), scene metres; only what lies within is read
     unit     : of heights (``m``, ``ft``, ``us-ft``) where the files do not state it or are wrong
@@ -173,17 +182,22 @@ def open_terrain(
     if not read:
         names = ", ".join(r.path.name for r in rasters)
         raise InputError(f"{names}: no heights within the scene, only voids")
+    beyond = []
+    if uncovered > 1e-9:
+        detail = f"{_percent(uncovered)} of the scene is not covered and takes the nearest height"
+        beyond.append(Problem("", "terrain", "repaired", "uncovered", detail))
     return Terrain(
         frame,
-        tuple(grid for grid, _, _, _ in read),
+        tuple(found[0] for found in read),
         rasters[0].vertical,
         ", ".join(sorted({datum for _, datum in kinds})),
-        min(spacing for _, spacing, _, _ in read),
-        sum(posts for _, _, posts, _ in read),
-        sum(voids for _, _, _, voids in read),
+        min(found[1] for found in read),
+        sum(found[2] for found in read),
+        sum(found[3] for found in read),
         uncovered if uncovered > 1e-9 else 0.0,
         tuple(r.path.name for r in rasters),
         tuple(r.credit for r in rasters),
+        (*beyond, *itertools.chain.from_iterable(found[4] for found in read)),
     )
 
 
@@ -329,8 +343,8 @@ def _shares_lattice(one: _Raster, other: _Raster) -> bool:
 
 def _read(
     group: Sequence[_Raster], frame: Frame, *, bounds: Sequence[float]
-) -> tuple[Grid, float, int, int] | None:
-    """(grid, spacing in metres, posts, voids) of rasters on one lattice; None without a height in bounds."""
+) -> tuple[Grid, float, int, int, tuple[Problem, ...]] | None:
+    """(grid, spacing in metres, posts, voids, problems) of rasters on one lattice; None without a height."""
     import rasterio  # noqa: PLC0415 - slow to import
     from rasterio.windows import Window  # noqa: PLC0415
 
@@ -370,12 +384,68 @@ def _read(
     voids = int((known & np.isnan(values)).sum())
     posts = int(known.sum())
     origin = first.origin + first.step @ low
+    spacing = _spacing(first, frame, bounds=bounds)
+    spikes = _spikes(values, max(_STEP, _STEEPEST * spacing))
+    problems = _repairs(
+        values, spikes=spikes, known=known, names=[r.path.name for r in group], metres=spacing
+    )
+    values[spikes] = np.nan
     grid = Grid(first.crs.to_wkt(), origin, first.step, _filled(values, known), known)
+    return grid, spacing, posts, voids, problems
+
+
+def _spacing(raster: _Raster, frame: Frame, *, bounds: Sequence[float]) -> float:
+    """Metres between neighbouring posts of a row, in the middle of the bounds."""
     middle = np.array([(bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2])
-    east, north = frame.to_crs(middle[0], middle[1], crs=first.crs)
-    steps = np.column_stack([[0.0, 0.0], first.step]) + np.array([[east], [north]])
-    sx, sy = frame.from_crs(steps[0], steps[1], crs=first.crs)
-    return grid, float(np.hypot(np.diff(sx[[0, 1]]), np.diff(sy[[0, 1]]))[0]), posts, voids
+    east, north = frame.to_crs(middle[0], middle[1], crs=raster.crs)
+    steps = np.column_stack([[0.0, 0.0], raster.step]) + np.array([[east], [north]])
+    sx, sy = frame.from_crs(steps[0], steps[1], crs=raster.crs)
+    return float(np.hypot(np.diff(sx[[0, 1]]), np.diff(sy[[0, 1]]))[0])
+
+
+def _spikes(values: Float, step: float) -> Bools:
+    """(rows, columns) bool, posts in groups of at most `_SPIKE` with steps over ``step`` metres all around.
+
+    Groups at voids or at the rim are no spikes: what lies beyond is unknown.
+    """
+    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    number = np.arange(values.size).reshape(values.shape)
+    pairs = [(number[:, :-1], number[:, 1:]), (number[:-1], number[1:])]
+    a, b = (np.concatenate([pair[k].ravel() for pair in pairs]) for k in (0, 1))
+    rise = np.abs(values.ravel()[a] - values.ravel()[b])
+    if not (rise > step).any():
+        return np.zeros(values.shape, np.bool_)
+    joined = ~(rise > step)  # voids join whatever is beside them
+    graph = coo_array((joined[joined], (a[joined], b[joined])), shape=(values.size, values.size))
+    group = connected_components(graph, directed=False)[1].reshape(values.shape)
+    small = np.bincount(group.ravel()) <= _SPIKE
+    small[group[np.isnan(values)]] = False
+    for edge in (group[0], group[-1], group[:, 0], group[:, -1]):
+        small[edge] = False
+    return np.asarray(small[group], np.bool_)
+
+
+def _repairs(
+    values: Float, *, spikes: Bools, known: Bools, names: Sequence[str], metres: float
+) -> tuple[Problem, ...]:
+    """The voids and the spikes of rasters, as problems."""
+    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
+
+    files, end = ", ".join(names), "filled from around"
+    posts = int(known.sum())
+    problems = []
+    void = known & np.isnan(values)
+    if void.any():
+        far = float(distance_transform_edt(np.isnan(values))[void].max()) * metres
+        detail = f"{files}: {int(void.sum())} of {posts} posts, up to {far:.0f} m from a height; {end}"
+        problems.append(Problem("", "terrain", "repaired", "void", detail))
+    if spikes.any():
+        low, high = values[spikes].min(), values[spikes].max()
+        detail = f"{files}: {int(spikes.sum())} of {posts} posts at {low:.0f} to {high:.0f} m; {end}"
+        problems.append(Problem("", "terrain", "repaired", "spike", detail))
+    return tuple(problems)
 
 
 def _filled(values: Float, known: Bools) -> Float:

@@ -120,6 +120,51 @@ def test_voids_are_filled_from_their_surroundings_and_counted(tmp_path):
     assert np.abs(terrain.height(x, y) - expected).max() < 5.0
 
 
+@pytest.mark.parametrize("spike", [8000.0, -400.0])
+@pytest.mark.parametrize("width", [1, 4])
+def test_spikes_are_filled_from_their_surroundings_and_listed(spike, width, tmp_path):
+    corner = around()
+    east, north = posts(corner, (60, 60))
+    values = 300 + 0.1 * (east - 500000) + 20 * np.sin(north / 90)
+    clean = open_terrain([write_dem(tmp_path / "a.tif", values, corner=corner)], FRAME, bounds=BOUNDS)
+    assert clean.problems == ()
+    values[28 : 28 + width, 30 : 30 + width] = spike
+    terrain = open_terrain([write_dem(tmp_path / "b.tif", values, corner=corner)], FRAME, bounds=BOUNDS)
+    x, y = sample()
+    assert np.abs(terrain.height(x, y) - clean.height(x, y)).max() < 20 * width
+    (problem,) = terrain.problems
+    assert (problem.kind, problem.action, problem.reason) == ("terrain", "repaired", "spike")
+    assert problem.detail.startswith(f"b.tif: {width**2} of ")
+
+
+def test_cliffs_and_buttes_are_no_spikes(tmp_path):
+    corner = around()
+    values = np.zeros((60, 60))
+    values[:, 30:] = 900.0  # a wall
+    values[25:30, 20:25] = 400.0  # a butte, 125 m wide
+    terrain = open_terrain([write_dem(tmp_path / "a.tif", values, corner=corner)], FRAME, bounds=BOUNDS)
+    assert terrain.problems == ()
+
+
+def test_voids_and_uncovered_ground_are_listed(tmp_path):
+    corner = around()
+    values = np.full((60, 60), 100.0)
+    values[20:40, 20:40] = -9999.0
+    path = write_dem(tmp_path / "a.tif", values, corner=corner, nodata=-9999.0)
+    terrain = open_terrain([path], FRAME, bounds=BOUNDS)
+    (problem,) = terrain.problems
+    assert problem.reason == "void"
+    assert problem.detail == "a.tif: 400 of 576 posts, up to 250 m from a height; filled from around"
+    values[:] = 100.0
+    terrain = open_terrain(
+        [write_dem(tmp_path / "b.tif", values, corner=(corner[0] + 600, corner[1]))],
+        FRAME,
+        bounds=BOUNDS,
+        outside="nearest",
+    )
+    assert [problem.reason for problem in terrain.problems] == ["uncovered"]
+
+
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857"])
 def test_rasters_on_both_sides_of_180_degrees_meet(crs, tmp_path):
     frame = Frame.at(180.0, -16.8)
