@@ -20,7 +20,7 @@ from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.kitti import read_labels
 from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
-from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows
+from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, remove_dataset
 from lidar.dataset.record_clouds import write_clouds
 from lidar.dataset.recording import Contents, Recording
 from lidar.errors import DatasetError, InputError
@@ -121,8 +121,8 @@ def _apply_to_dataset(
     form = _richest_format(contents) if any(isinstance(s, Scanner) for s, _ in jobs) else None
     written = {path for job in jobs for path in recording.paths(*job).values()}
     if Paths(out).manifest.exists():  # a former dataset, to be replaced
-        shutil.rmtree(out)
-    _copy(dataset.path, out, leave_out=written | {Paths(out).manifest})
+        remove_dataset(out)
+    _copy(dataset.path, out, leave_out=written | {Paths(out).manifest, Paths(out).journal})
     points = dict(dataset.manifest["points"])
     before = sum(points.values())
     points |= dict.fromkeys((s.name for s, _ in jobs if isinstance(s, Scanner)), 0)

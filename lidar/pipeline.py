@@ -16,11 +16,12 @@ import numpy as np
 from numba.core.event import Event, Listener, install_listener
 
 from geoscene.errors import GeosceneError
-from geoscene.files import write_json
+from geoscene.files import exclusive, write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.dataset.boxes import merge_box_files
+from lidar.dataset.journal import Journal, read_journal
 from lidar.dataset.layout import Paths, prepare
 from lidar.dataset.metadata import write_metadata
 from lidar.dataset.record import record_frame
@@ -97,12 +98,17 @@ def _driven(
     plan = plan_drive(scene, options, progress=progress)
     manifest = plan.manifest()
     prepare(out, manifest["recipe"], overwrite=overwrite)
-    with _removed_if_nothing_recorded(out):
-        _write_plan(plan, out, manifest=manifest)
+    with _removed_if_nothing_recorded(out), exclusive(out):
         recording = _recording(plan, out)
-        resumed, points = _recorded_before(plan, recording)
-        written = record_all(recording, plan.jobs, scene=scene, workers=options.workers, progress=progress)
-        points = {name: n + written.get(name, 0) for name, n in points.items()}
+        journal = _verified(recording, plan.jobs, progress=progress)
+        _write_plan(plan, out, manifest=manifest)
+        pending = [job for job in plan.jobs if (job.sensor.name, job.frame) not in journal.entries]
+        resumed, before = len(plan.jobs) - len(pending), _points(plan, journal)
+        record_all(
+            recording, pending, scene=scene, journal=journal, workers=options.workers, progress=progress
+        )
+        points = _points(plan, journal)
+        journal.close()
         if plan.actors is not None:
             merge_box_files(out)
         write_json(Paths(out).manifest, manifest | {"points": points, "frames_done": manifest["frames"]})
@@ -111,7 +117,7 @@ def _driven(
         int(manifest["frames"]),
         resumed,
         points,
-        written=sum(written.values()),
+        written=sum(points.values()) - sum(before.values()),
         duration=plan.trajectory.duration_ns / 1e9,
         length=plan.length,
         wall=time.perf_counter() - began,
@@ -152,14 +158,25 @@ def _recording(plan: DrivePlan, out: Path) -> Recording:
     )
 
 
-def _recorded_before(plan: DrivePlan, recording: Recording) -> tuple[int, dict[str, int]]:
-    """Number of frames that an earlier run has recorded, and their points by scanner."""
+def _verified(recording: Recording, jobs: Sequence[Job], *, progress: Progress) -> Journal:
+    """The journal of the dataset, with only those of the frames whose files are as they were written."""
+    path = Paths(recording.out).journal
+    old, kept = read_journal(path), {}
+    for k, job in enumerate(jobs if old else ()):
+        progress("verifying", k, total=len(jobs))
+        key = job.sensor.name, job.frame
+        if key in old and old[key][1] == recording.digest(job.sensor, job.frame):
+            kept[key] = old[key]
+    return Journal(path, kept)
+
+
+def _points(plan: DrivePlan, journal: Journal) -> dict[str, int]:
+    """Points of the finished frames, by scanner."""
     points = {s.name: 0 for s in plan.sensors if isinstance(s, Scanner)}
-    recorded = [job for job in plan.jobs if recording.is_done(job.sensor, job.frame)]
-    for job in recorded:
-        if job.sensor.name in points:
-            points[job.sensor.name] += recording.count(job.sensor, job.frame)
-    return len(recorded), points
+    for (name, _), (count, _) in journal.entries.items():
+        if name in points:
+            points[name] += count
+    return points
 
 
 @contextmanager
@@ -179,38 +196,43 @@ def record_all(
     jobs: Sequence[Job],
     *,
     scene: Scene,
+    journal: Journal,
     workers: int = 1,
     progress: Progress = silent,
-) -> dict[str, int]:
-    """Record the frames that are not recorded yet; return the points written, by sensor."""
-    pending = [job for job in jobs if not recording.is_done(job.sensor, job.frame)]
-    done = len(jobs) - len(pending)
+) -> None:
+    """Record frames and add them to the journal."""
+    done = 0
     progress("driving", done, total=len(jobs))
     max_range = max((job.sensor.max_range for job in jobs), default=0.0)
     worlds = Worlds(scene, max_range, actors=recording.actors)
-    points: dict[str, int] = {}
     workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
     with ThreadPoolExecutor(workers) as pool:
-        for chunk, region in _chunks(pending, recording.trajectory):
+        for chunk, region in _chunks(jobs, recording.trajectory):
             with recording.watch.stage("load"):
                 worlds.follow(region)
-            running: dict[Future[int], str] = {}
+            running: set[Future[None]] = set()
             for job in chunk:
-                future = pool.submit(record_frame, recording, job.sensor, frame=job.frame, worlds=worlds)
-                running[future] = job.sensor.name
+                running.add(pool.submit(_record, recording, job, worlds=worlds, journal=journal))
                 if len(running) >= 2 * workers:
-                    done += _take(running, points, finished=wait(running, return_when=FIRST_COMPLETED).done)
+                    done += _take(running, finished=wait(running, return_when=FIRST_COMPLETED).done)
                     progress("driving", done, total=len(jobs))
-            done += _take(running, points, finished=wait(running).done)
+            done += _take(running, finished=wait(running).done)
             progress("driving", done, total=len(jobs))
-    return points
 
 
-def _take(running: dict[Future[int], str], points: dict[str, int], *, finished: set[Future[int]]) -> int:
-    """Move finished frames from ``running`` to the sums of points; return how many there were."""
+def _record(recording: Recording, job: Job, *, worlds: Worlds, journal: Journal) -> None:
+    """Record one frame and add it to the journal."""
+    points = record_frame(recording, job.sensor, frame=job.frame, worlds=worlds)
+    with recording.watch.stage("digest"):
+        digest = recording.digest(job.sensor, job.frame)
+    journal.add(job.sensor.name, job.frame, points=points, digest=digest)
+
+
+def _take(running: set[Future[None]], *, finished: set[Future[None]]) -> int:
+    """Remove finished frames from ``running``, raising their errors; return how many there were."""
     for future in finished:
-        name = running.pop(future)
-        points[name] = points.get(name, 0) + future.result()
+        running.remove(future)
+        future.result()
     return len(finished)
 
 

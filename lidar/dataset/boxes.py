@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from geoscene.classes import Class
 from geoscene.files import write_atomically
 from geoscene.typing import Float, Ints
 from lidar.camera.outline import outline
-from lidar.dataset.layout import Paths
+from lidar.dataset.layout import Paths, read_sensors
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.camera_model import project
@@ -185,7 +184,7 @@ def merge_box_files(out: Path) -> None:
     that only another scanner has in that time is added as of that scanner's frame.
     """
     paths = Paths(out)
-    calibration = json.loads(paths.calibration.read_text("utf-8"))["sensors"]
+    calibration = read_sensors(paths)
     lines = {
         name: _merged(paths, name) for name, s in calibration.items() if s["kind"] in ("lidar", "camera")
     }

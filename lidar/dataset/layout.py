@@ -7,6 +7,7 @@ DATASET/
   calibration.json        mounts and intrinsics of every sensor
   gnss.csv, imu.csv       measured, by the receivers' and units' names
   boxes.csv               road users in 3D, at the frames of the first scanner
+  frames.csv              finished frames, with their points and digests of their files
   <sensor>/<format>/<frame>.<ext>
   <sensor>/truth/<frame>.npz  changes by stages; only with stages
 """
@@ -15,8 +16,10 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
-from collections.abc import Iterator, Mapping
+import logging
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -26,11 +29,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
 
+from geoscene.errors import reading
 from geoscene.frames import Frame
 from lidar.dataset.formats import Format
-from lidar.errors import DatasetError
+from lidar.errors import DatasetError, LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import MANIFEST, read_trajectory
+
+log = logging.getLogger(__name__)
 
 SCHEMA = 1
 """Version of the dataset directory; a reader refuses others."""
@@ -46,6 +52,11 @@ class Paths:
     def manifest(self) -> Path:
         """Schema, scene, rig, options, seed, frames and licence; updated last."""
         return self.root / MANIFEST
+
+    @property
+    def journal(self) -> Path:
+        """Finished frames with their points and digests; a drive that is resumed verifies them."""
+        return self.root / "frames.csv"
 
     @property
     def calibration(self) -> Path:
@@ -138,8 +149,7 @@ class Dataset:
 
     def sensors(self, *kinds: str) -> dict[str, dict[str, Any]]:
         """Entries of ``calibration.json`` by name, of sensors of some kinds (lidar, camera, gnss, imu)."""
-        sensors = json.loads(self.paths.calibration.read_text("utf-8"))["sensors"]
-        return {name: sensor for name, sensor in sensors.items() if not kinds or sensor["kind"] in kinds}
+        return read_sensors(self.paths, *kinds)
 
     def sample_times(self, name: str) -> NDArray[np.int64]:
         """Times (n,) of a sensor's measurements or frame starts, nanoseconds since the drive's start.
@@ -147,8 +157,13 @@ class Dataset:
         Raises DatasetError if the drive has not written them.
         """
         frames = self.sensors()[name]["kind"] in ("lidar", "camera")
-        rows = read_rows(self.paths.timestamps(name) if frames else self.paths.measurements(name))
-        return np.array([int(row["time_ns"]) for row in rows], np.int64)
+        path = self.paths.timestamps(name) if frames else self.paths.measurements(name)
+        rows = read_rows(path)
+        with _reading(path):
+            times = np.array([int(row["time_ns"]) for row in rows], np.int64)
+            if (np.diff(times) <= 0).any() or (times < 0).any():
+                raise DatasetError(f"{path}: damaged (times do not increase); drive again with `overwrite`")
+        return times
 
     def trajectory(self) -> Trajectory:
         """The ego vehicle's poses."""
@@ -170,14 +185,22 @@ def open_dataset(path: str | Path) -> Dataset:
     manifest_path = Paths(folder).manifest
     if not manifest_path.exists():
         raise DatasetError(f"{folder}: no dataset.json in it; lidar drive records a dataset")
-    try:
+    with _reading(manifest_path):
         manifest = json.loads(manifest_path.read_text("utf-8"))
-        schema = manifest["schema"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{manifest_path}: damaged ({error})") from error
-    if schema != SCHEMA:
-        raise DatasetError(f"{folder}: schema version {schema}, this program reads {SCHEMA}; drive again")
-    return Dataset(folder, manifest)
+        if manifest["schema"] != SCHEMA:
+            raise DatasetError(
+                f"{folder}: schema version {manifest['schema']}, this program reads {SCHEMA}; drive again"
+            )
+        dataset = Dataset(folder, manifest)
+        _ = dataset.frame, dataset.start, dataset.crs, dataset.frames, int(manifest["frames_done"])
+        if not isinstance(manifest["recipe"], dict):
+            raise DatasetError(f"{manifest_path}: damaged (no recipe); drive again with `overwrite`")
+    return dataset
+
+
+def _reading(path: Path) -> AbstractContextManager[None]:
+    """Errors of the block, which reads a file of a dataset, as a DatasetError that names the file."""
+    return reading(path, DatasetError, remedy="drive again with `overwrite`", known=LidarError)
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
@@ -185,18 +208,39 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 
     Raises DatasetError if it cannot be read.
     """
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
-    except OSError as error:
-        raise DatasetError(f"{path}: {error.strerror}; was the drive finished?") from error
+    remedy = "was the drive finished?"
+    with (
+        reading(path, DatasetError, remedy=remedy, known=LidarError),
+        path.open(newline="", encoding="utf-8") as file,
+    ):
+        return list(csv.DictReader(file, strict=True))
+
+
+def read_sensors(paths: Paths, *kinds: str) -> dict[str, dict[str, Any]]:
+    """Entries of ``calibration.json`` by name, of sensors of some kinds, all by default.
+
+    Raises DatasetError for a file that is missing or damaged.
+    """
+    with _reading(paths.calibration):
+        sensors = json.loads(paths.calibration.read_text("utf-8"))["sensors"]
+        found = {name: sensor for name, sensor in sensors.items() if not kinds or sensor["kind"] in kinds}
+        for sensor in found.values():
+            mount = np.array(sensor["vehicle_from_sensor"], float)
+            turn = mount[:3, :3]
+            if mount.shape != (4, 4) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6):
+                raise ValueError("a mount is no rigid transformation")
+            if not np.isfinite(mount).all():
+                raise ValueError("a mount is not finite")
+            if sensor["kind"] in ("lidar", "camera"):
+                _ = float(sensor["rate_hz"]), int(sensor["time_offset_ns"])
+    return found
 
 
 def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
     """Prepare a directory for a drive made by ``recipe``; return the number of frames that are complete.
 
-    A drive of the same recipe is kept and can be resumed. A drive of another recipe is deleted with
-    ``overwrite``.
+    A drive of the same recipe is kept and can be resumed. With ``overwrite`` any drive is deleted, and files
+    that are not of a dataset are kept.
 
     Raises DatasetError for a drive of another recipe without ``overwrite``, and for a directory that is
     neither empty nor a dataset.
@@ -210,8 +254,7 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
     if not manifest_path.exists():
         raise DatasetError(f"{path}: is not empty and not a dataset; give another directory")
     if overwrite:
-        shutil.rmtree(path)
-        path.mkdir(parents=True)
+        remove_dataset(path)
         return 0
     manifest = open_dataset(path).manifest
     old, new = manifest["recipe"], json.loads(json.dumps(recipe))
@@ -225,6 +268,40 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
     for left in path.rglob("*.part"):  # of a drive that was killed
         left.unlink()
     return int(manifest["frames_done"])
+
+
+def remove_dataset(path: Path) -> None:
+    """Delete the files of a dataset, its manifest last; files of others are kept, with a warning for each."""
+    paths = Paths(path)
+    sensors: set[str] = set()
+    with suppress(DatasetError):
+        sensors = set(read_sensors(paths))
+    top = {paths.calibration, paths.trajectory, paths.poses, paths.boxes, paths.journal, paths.manifest}
+    top |= {paths.measurements(name, suffix) for name in sensors for suffix in (".csv", ".nmea")}
+    folders: list[Path] = []
+    for entry in sorted(path.rglob("*")):
+        place = entry.relative_to(path).parts
+        if entry.is_dir() and not entry.is_symlink():
+            folders += [entry] if place[0] in sensors else []
+        elif entry == paths.manifest:
+            continue
+        elif entry in top or (place[0] in sensors and _of_a_sensor(place[1:])):
+            entry.unlink()
+        else:
+            log.warning("%s: kept, though not of the dataset", entry)
+    for folder in reversed(folders):
+        if not any(folder.iterdir()):
+            folder.rmdir()
+    paths.manifest.unlink()
+
+
+_FRAME_FILE = re.compile(r"\d{6,}[._][\w.]+")
+_SENSOR_FILES = {"timestamps.csv", "boxes.csv", "calib.txt", "times.txt", "poses.txt"}
+
+
+def _of_a_sensor(place: Sequence[str]) -> bool:
+    """Whether names below a sensor's folder are those of a dataset's file."""
+    return place[0] in _SENSOR_FILES if len(place) == 1 else bool(_FRAME_FILE.fullmatch(place[-1]))
 
 
 def _text(value: Any) -> str:

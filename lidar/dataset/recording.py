@@ -20,6 +20,7 @@ from lidar.camera.settings import CameraSettings
 from lidar.dataset.deskew import MOMENTS
 from lidar.dataset.formats import FORMATS, LABELS, Format, LabelFormat
 from lidar.dataset.formats.las import LasInfo
+from lidar.dataset.journal import digest_of_files
 from lidar.dataset.layout import Paths
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference
@@ -144,14 +145,23 @@ class Recording:
 
     def paths(self, sensor: Scanner | Camera, frame: int) -> dict[str, Path]:
         """Files of one frame, by image, format, ``deskewed <format>``, ``labels <format>``, boxes, truth."""
-        return {kind: path for kind, path, _ in self._files(sensor, frame)}
+        name, paths = sensor.name, Paths(self.out)
+        files = {} if self.actors is None else {"boxes": paths.frame_boxes(name, frame)}
+        if self.has_stages(sensor):
+            files["truth"] = paths.truth(name, frame)
+        if isinstance(sensor, Camera):
+            return files | {kind: paths.image(name, frame, kind=kind) for kind in sensor.spec.images}
+        for form in self.contents.cloud_formats:
+            files[form.name] = form.path(paths.sensor(name), frame)
+            if self.contents.deskew and form.frame == "sensor":
+                files[f"deskewed {form.name}"] = paths.deskewed(name, frame, suffix=form.suffix)
+        for row in self.contents.label_formats:
+            files[f"labels {row.name}"] = row.path(paths.sensor(name), frame)
+        return files
 
-    def is_done(self, sensor: Scanner | Camera, frame: int) -> bool:
-        """Whether all files of a frame exist, and those of formats with a header are not empty."""
-        return all(
-            path.exists() and (not header or path.stat().st_size > 0)
-            for _, path, header in self._files(sensor, frame)
-        )
+    def digest(self, sensor: Scanner | Camera, frame: int) -> str:
+        """Digest of the files of a frame; empty if one is missing."""
+        return digest_of_files(self.paths(sensor, frame).values())
 
     def has_stages(self, sensor: Scanner | Camera) -> bool:
         """Whether stages act on a sensor's clouds or colour images."""
@@ -159,26 +169,3 @@ class Recording:
             return False
         kind = "camera" if isinstance(sensor, Camera) else "lidar"
         return self.contents.stages.act_on(sensor.name, kind=kind)
-
-    def count(self, sensor: Scanner | Camera, frame: int) -> int:
-        """Number of points of a frame that is done; 0 for an image."""
-        if isinstance(sensor, Camera):
-            return 0
-        form = self.contents.cloud_formats[0]
-        return form.count(self.paths(sensor, frame)[form.name])
-
-    def _files(self, sensor: Scanner | Camera, frame: int) -> list[tuple[str, Path, bool]]:
-        """(kind, path, whether it has a header) of each file of a frame."""
-        name, paths = sensor.name, Paths(self.out)
-        files = [] if self.actors is None else [("boxes", paths.frame_boxes(name, frame), True)]
-        if self.has_stages(sensor):
-            files.append(("truth", paths.truth(name, frame), True))
-        if isinstance(sensor, Camera):
-            return files + [(kind, paths.image(name, frame, kind=kind), True) for kind in sensor.spec.images]
-        for form in self.contents.cloud_formats:
-            files.append((form.name, form.path(paths.sensor(name), frame), form.header))
-            if self.contents.deskew and form.frame == "sensor":
-                path = paths.deskewed(name, frame, suffix=form.suffix)
-                files.append((f"deskewed {form.name}", path, form.header))
-        labels = self.contents.label_formats
-        return files + [(f"labels {row.name}", row.path(paths.sensor(name), frame), False) for row in labels]

@@ -9,12 +9,14 @@ import signal
 import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 
 import laspy
 import numpy as np
 import pytest
+from helpers.mutations import mutated
 from helpers.programs import ENVIRONMENT, command
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
@@ -23,7 +25,7 @@ from geoscene.classes import Class
 from geoscene.errors import GeosceneError
 from geoscene.scene import open_scene
 from lidar.dataset.formats import read_table
-from lidar.dataset.layout import open_dataset
+from lidar.dataset.layout import open_dataset, prepare
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.geometry.attitude import quat_from_euler
 from lidar.options import DriveOptions
@@ -282,3 +284,44 @@ def test_the_number_of_threads_does_not_exceed_the_cores(scene, tmp_path, monkey
     for workers in (1, 64):
         drive(scene, tmp_path / str(workers), options=replace(OPTIONS, duration=0.2, workers=workers))
     assert sizes == [1, 2]
+
+
+@pytest.mark.parametrize("damage", ["cut", "changed", "removed", "journal"])
+def test_a_resumed_drive_makes_damaged_frames_anew(scene, dataset, damage, tmp_path):
+    shutil.copytree(dataset.path, tmp_path / "again")
+    victim = sorted((tmp_path / "again").glob("*/pcd/*.pcd"))[1]
+    data = victim.read_bytes()
+    if damage == "removed":
+        victim.unlink()
+    elif damage == "journal":
+        (tmp_path / "again" / "frames.csv").write_bytes(b"\xffsensor\n1,2")
+    else:
+        victim.write_bytes(data[:-100] if damage == "cut" else data[:-1] + bytes([data[-1] ^ 1]))
+    drive(scene, tmp_path / "again", options=OPTIONS)
+    assert digest(tmp_path / "again") == digest(dataset.path)
+
+
+def test_a_replaced_dataset_keeps_the_files_of_others(dataset, tmp_path, caplog):
+    copy = tmp_path / "again"
+    shutil.copytree(dataset.path, copy)
+    foreign = [copy / "notes.csv", copy / "thesis" / "000001.pcd", copy / "lidar_top" / "pcd" / "mine.txt"]
+    for path in foreign:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    prepare(copy, {"seed": 5}, overwrite=True)
+    assert sorted(path for path in copy.rglob("*") if path.is_file()) == sorted(foreign)
+    assert all(f"{path}: kept" in caplog.text for path in foreign)
+
+
+@pytest.mark.parametrize("name", ["dataset.json", "calibration.json", "trajectory.csv", "timestamps.csv"])
+def test_a_damaged_dataset_is_refused_with_a_clear_error(dataset, name, tmp_path):
+    shutil.copytree(dataset.path, tmp_path / "again")
+    victim = next((tmp_path / "again").rglob(name))
+    data = victim.read_bytes()
+    for seed in range(25):
+        victim.write_bytes(mutated(data, np.random.default_rng(seed)))
+        with suppress(GeosceneError, LidarError):
+            opened = open_dataset(tmp_path / "again")
+            for sensor in opened.sensors():
+                opened.sample_times(sensor)
+            opened.trajectory()

@@ -35,7 +35,6 @@ class Format:
     frame   : of the points: the sensor's, at each point's own firing time, or the world's (export CRS)
     columns : columns that its files keep
     folder  : of its files, in a sensor's folder; by default its name
-    header  : files start with a header, so that a file without points is not empty
     kitti   : a sensor's folder becomes a KITTI sequence: calib.txt, times.txt and poses.txt are added
     maps    : its module has ``open_map``, which writes aggregated maps
     """
@@ -46,7 +45,6 @@ class Format:
     frame: Literal["sensor", "world"] = "sensor"
     columns: tuple[str, ...] = ALL
     folder: str = ""
-    header: bool = True
     kitti: bool = False
     maps: bool = False
 
@@ -115,8 +113,8 @@ FORMATS = {
         Format("csv", "text", ".csv"),
         Format("laz", "las", ".laz", frame="world", columns=_LAS, maps=True),
         Format("las", "las", ".las", frame="world", columns=_LAS, maps=True),
-        Format("kitti", "kitti", ".bin", columns=ALL[:4], folder="velodyne", header=False, kitti=True),
-        Format("nuscenes", "nuscenes", ".pcd.bin", columns=(*ALL[:4], "ring"), header=False),
+        Format("kitti", "kitti", ".bin", columns=ALL[:4], folder="velodyne", kitti=True),
+        Format("nuscenes", "nuscenes", ".pcd.bin", columns=(*ALL[:4], "ring")),
     )
 }
 """Point-cloud formats by name."""

@@ -32,12 +32,14 @@ def dataset(tmp_path):
     """The metadata files of a drive at constant velocity and yaw rate."""
     paths = Paths(tmp_path / "drive")
     manifest = {"schema": 1, "frame": Frame.at(24.9, 60.2).to_json(), "start_time": START.isoformat()}
+    manifest |= {"export_crs": "EPSG:32635", "frames": 50, "frames_done": 50, "recipe": {}}
     write_json(paths.manifest, manifest)
     sensors = {}
     for name, (kind, translation, rotation) in MOUNTS.items():
         mount = np.eye(4)
         mount[:3, :3], mount[:3, 3] = rotation.as_matrix(), translation
         sensors[name] = {"kind": kind, "vehicle_from_sensor": mount.tolist()}
+        sensors[name] |= {"rate_hz": 10.0, "time_offset_ns": 0}
     write_json(paths.calibration, {"sensors": sensors})
     trajectory = driven(VELOCITY, yaw_rate=YAW_RATE, start=(50.0, -20.0, 3.0), scale=SCALE)
     write_trajectory(paths.trajectory, trajectory)
