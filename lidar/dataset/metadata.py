@@ -19,9 +19,10 @@ from lidar.dataset.recording import Contents
 from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
+from lidar.navigation.geoid import geoid_at
 from lidar.navigation.gnss import antenna_motion, epochs, gnss_columns, observe_gnss
 from lidar.navigation.imu import imu_columns, observe_imu
-from lidar.navigation.nmea import nmea
+from lidar.navigation.nmea import HEIGHTS, height_note, nmea
 from lidar.navigation.satellite_visibility import sky_view
 from lidar.rig.camera_model import intrinsic_matrix
 from lidar.rig.devices import Camera, Scanner
@@ -175,6 +176,16 @@ def _write_fixes(
         systems=spec.constellations,
     )
     fixes = observe_gnss(trajectory, scene.frame, spec=spec, seed=seed, start=start, sky=sky)
+    vertical = scene.frame.vertical
+    geoid = None if vertical == "flat" else geoid_at(*fixes.true_lonlath[:, :2].T)
     stamped: dict[str, Any] = {"timestamp": iso_times(start, fixes.time_ns), **gnss_columns(fixes)}
+    stamped["h_above"] = np.full(len(fixes), HEIGHTS[vertical].split()[-1])
+    if geoid is not None:
+        stamped["geoid"] = geoid.separation
     write_columns(paths.measurements(spec.name), stamped)
-    write_atomically(paths.measurements(spec.name, ".nmea"), "".join(nmea(fixes, start)).encode("ascii"))
+    separation = None if geoid is None else geoid.separation
+    lines = [
+        height_note(vertical, geoid.name if geoid else ""),
+        *nmea(fixes, start, vertical=vertical, separation=separation),
+    ]
+    write_atomically(paths.measurements(spec.name, ".nmea"), "".join(lines).encode("ascii"))

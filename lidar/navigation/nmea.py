@@ -6,8 +6,13 @@ import math
 from collections.abc import Sequence
 from datetime import datetime, timedelta
 
+import numpy as np
+
+from geoscene.typing import Float
 from lidar.navigation.gnss import Fixes
 
+HEIGHTS = {"flat": "an assumed level ground", "orthometric": "the geoid", "ellipsoidal": "the ellipsoid"}
+"""What heights are above, by `geoscene.frames.Frame.vertical`."""
 KNOT = 1852.0 / 3600.0
 """Metres per second in a knot."""
 _SYSTEMS = {"G": ("GP", 1, 0), "R": ("GL", 2, 64), "E": ("GA", 3, 0), "C": ("GB", 4, 0)}
@@ -50,28 +55,46 @@ def _number(value: float, decimals: int) -> str:
     return f"{value:.{decimals}f}" if math.isfinite(value) else ""
 
 
-def nmea(fixes: Fixes, start: datetime, *, geoid: float | None = None) -> list[str]:
+def height_note(vertical: str, geoid: str = "") -> str:
+    """A TXT sentence that says what the heights in GGA are above.
+
+    vertical : as in `geoscene.frames.Frame`
+    geoid    : name of the geoid that `nmea` is given, or empty
+    """
+    text = f"heights above {HEIGHTS[vertical]}"
+    if geoid:
+        text = f"heights above the geoid (separation of {geoid})"
+    return sentence(f"GNTXT,01,01,02,{text}")
+
+
+def nmea(
+    fixes: Fixes, start: datetime, *, vertical: str = "flat", separation: Float | None = None
+) -> list[str]:
     """Sentences for each fix: GGA, RMC, VTG, and a GSA for each system; at most 82 characters each.
 
     The talker is GN for a receiver of several systems, else that of its system. GSA lists at most twelve
     satellites of a system (GLONASS from 65 on) and ends with the number of the system.
 
-    start : UTC of the drive's start; sentences carry UTC
-    geoid : height of the geoid above the ellipsoid, metres. With it, heights of fixes are taken as
-            ellipsoidal and GGA gives height above the geoid and the separation; without it, heights are
-            unchanged and the separation is empty
+    start      : UTC of the drive's start; sentences carry UTC
+    vertical   : reference of the fixes' heights, as in `geoscene.frames.Frame`
+    separation : (n,) heights of the geoid above the ellipsoid, metres, for GGA, whose heights are then above
+                 the geoid. Without it, heights are unchanged and the field is empty
 
     Fields of a missing fix are empty.
     """
     lines: list[str] = []
+    known = np.full(len(fixes), np.nan) if separation is None else separation
     for k in range(len(fixes)):
         when = start + timedelta(microseconds=round(int(fixes.time_ns[k]) / 1000))
-        lines += _epoch(fixes, k, when=when, geoid=geoid)
+        height = fixes.lonlath[k, 2]
+        if vertical == "ellipsoidal" and math.isfinite(known[k]):
+            height -= known[k]
+        lines += _epoch(fixes, k, when=when, height=float(height), separation=float(known[k]))
     return lines
 
 
-def _epoch(fixes: Fixes, k: int, *, when: datetime, geoid: float | None) -> Sequence[str]:
-    lon, lat, h = fixes.lonlath[k].tolist()
+def _epoch(fixes: Fixes, k: int, *, when: datetime, height: float, separation: float) -> Sequence[str]:
+    lon, lat, _ = fixes.lonlath[k].tolist()
     quality, fixed = int(fixes.quality[k]), math.isfinite(lon)
     hundredths = round(when.microsecond / 1e4)
     if hundredths == 100:
@@ -79,8 +102,7 @@ def _epoch(fixes: Fixes, k: int, *, when: datetime, geoid: float | None) -> Sequ
     clock, day = f"{when:%H%M%S}.{hundredths:02d}", f"{when:%d%m%y}"
     place = f"{latitude(lat)},{longitude(lon)}"
     pdop, hdop, vdop = (_dop(fixes.dop[k, i]) for i in (2, 0, 1))
-    height = _number(h - (geoid or 0.0), 3)
-    separation = "" if geoid is None or not fixed else f"{geoid:.1f}"
+    geoid = _number(separation, 1) if fixed else ""
     speed = float(fixes.speed[k]) if fixed else math.nan
     course = _number(math.degrees(fixes.course[k]) % 360.0, 1) if fixed else ""
     course = "0.0" if course == "360.0" else course
@@ -98,7 +120,7 @@ def _epoch(fixes: Fixes, k: int, *, when: datetime, geoid: float | None) -> Sequ
     return [
         sentence(
             f"{talker}GGA,{clock},{place},{quality},{int(fixes.satellites[k]):02d},{hdop},"
-            f"{height},M,{separation},M,,"
+            f"{_number(height, 3)},M,{geoid},M,,"
         ),
         sentence(
             f"{talker}RMC,{clock},{'A' if fixed else 'V'},{place},{_number(speed / KNOT, 3)},"

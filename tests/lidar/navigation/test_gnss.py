@@ -1,9 +1,12 @@
 """Satellite receivers: error statistics, satellite visibility and NMEA sentences."""
 
+import os
+import struct
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
+import pyproj
 import pytest
 import shapely
 from pynmeagps import NMEAReader
@@ -15,6 +18,7 @@ from lidar.geometry.attitude import quat_from_euler
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.navigation.constellations import constellations, satellite_names, satellites
+from lidar.navigation.geoid import geoid_at
 from lidar.navigation.gnss import (
     NAMES,
     STATES,
@@ -24,7 +28,7 @@ from lidar.navigation.gnss import (
     gnss_columns,
     observe_gnss,
 )
-from lidar.navigation.nmea import checksum, latitude, longitude, nmea, sentence
+from lidar.navigation.nmea import checksum, height_note, latitude, longitude, nmea, sentence
 from lidar.navigation.satellite_visibility import Sky, dilution, ecef, enu_axes, look_up, open_sky, sky_view
 from lidar.random_streams import generator
 from lidar.rig.specs import SYSTEMS, GnssSpec
@@ -448,12 +452,48 @@ def test_sentences_without_a_fix_have_empty_fields_and_quality_0():
     assert gsa.navMode == 1
 
 
-def test_sentences_give_the_height_above_the_geoid():
+@pytest.mark.parametrize(
+    ("vertical", "altitude"), [("ellipsoidal", 8.0), ("orthometric", -30.0), ("flat", -30.0)]
+)
+def test_sentences_give_the_geoid_separation(vertical, altitude):
     fixes = observe_gnss(standing(0.5, height=-30.0), FRAME, spec=spec(), seed=0, start=START)
-    gga = read(nmea(fixes, START, geoid=-38.0)[:1])[0]
-    assert gga.alt == pytest.approx(8.0)
+    known = np.full(len(fixes), -38.0)
+    gga = read(nmea(fixes, START, vertical=vertical, separation=known)[:1])[0]
+    assert gga.alt == pytest.approx(altitude)
     assert gga.sep == -38.0
-    assert read(nmea(fixes, START)[:1])[0].sep == ""
+    plain = read(nmea(fixes, START, vertical=vertical)[:1])[0]
+    assert (plain.alt, plain.sep) == (pytest.approx(-30.0), "")
+
+
+@pytest.mark.parametrize(
+    ("vertical", "geoid", "says"),
+    [
+        ("flat", "", "heights above an assumed level ground"),
+        ("ellipsoidal", "", "heights above the ellipsoid"),
+        ("ellipsoidal", "EGM96", "heights above the geoid (separation of EGM96)"),
+    ],
+)
+def test_a_sentence_says_what_heights_are_above(vertical, geoid, says):
+    line = height_note(vertical, geoid)
+    assert len(line) <= 82
+    assert read([line])[0].text == says
+
+
+def test_the_geoid_comes_from_grids_that_proj_finds(tmp_path):
+    """A grid of 20 m in GTX format: south-west corner, steps, rows and columns, then float32, big-endian."""
+    place = np.array([-76.3]), np.array([36.9])
+    assert geoid_at(*place) is None
+    head = struct.pack(">4d2i", -90.0, -180.0, 10.0, 10.0, 19, 36)
+    (tmp_path / "egm96_15.gtx").write_bytes(head + np.full((19, 36), 20.0, ">f4").tobytes())
+    before = pyproj.datadir.get_data_dir()
+    try:
+        pyproj.datadir.set_data_dir(f"{before}{os.pathsep}{tmp_path}")
+        found = geoid_at(*place)
+    finally:
+        pyproj.datadir.set_data_dir(before)
+    assert found is not None
+    assert found.name == "EGM96"
+    assert found.separation == pytest.approx([20.0])
 
 
 def test_columns_have_one_value_per_fix():
