@@ -239,7 +239,10 @@ def info(
 
 @app.command
 def validate(scene: Path, /, *, json: bool = False) -> int:
-    """Check that every solid of a scene is closed, oriented and of positive volume; exit code 1 if not.
+    """Check all solids and surfaces of a scene; exit code 1 if one has a fault.
+
+    A solid is closed, oriented and of positive volume. In a surface, such as a road, no two vertices are
+    within 1 mm, no face is a line and no edge has three faces.
 
     Parameters
     ----------
@@ -260,7 +263,13 @@ def validate(scene: Path, /, *, json: bool = False) -> int:
             print(f"{row['osm_id']} (feature {row['feature']}): {row['fault']}")
         valid = report["solids"] - len(report["broken"])
         print(f"{report['solids']} solids, {valid} closed, oriented and of positive volume")
-    return FAILURE if report["broken"] else 0
+        for row in report["broken_surfaces"]:
+            i, j = row["tile"]
+            of = f" of {row['osm_id']} (feature {row['feature']})" if row["feature"] >= 0 else ""
+            print(f"{row['class']}{of} in tile {i}, {j}: {row['fault']}")
+        valid = report["surfaces"] - len(report["broken_surfaces"])
+        print(f"{report['surfaces']} surfaces, {valid} without faults")
+    return FAILURE if report["broken"] or report["broken_surfaces"] else 0
 
 
 @app.command

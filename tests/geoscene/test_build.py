@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import shutil
+from dataclasses import replace
 
 import geopandas
 import numpy as np
@@ -49,6 +50,29 @@ def test_check_scene_reports_a_broken_solid(scene, tmp_path):
     report = check_scene(broken)
     assert [row["fault"] for row in report["broken"]] == ["not-closed"]
     assert report["broken"][0]["osm_id"].startswith(("way/", "relation/"))
+
+
+def test_check_scene_reports_broken_surfaces(scene, tmp_path):
+    assert check_scene(scene)["broken_surfaces"] == []
+    shutil.copytree(scene.path, tmp_path / "broken")
+    broken = open_scene(tmp_path / "broken")
+    i, j = broken.tile_indices[0]
+    tile = broken.tile(i, j)
+    mesh = tile.mesh
+    row = np.flatnonzero(~mesh.closed & (mesh.klass == Class.ROAD))[0]
+    a, b, c = mesh.vertices[mesh.faces[row]]
+    for corners, fault in (
+        ([a, b, (a + b) / 2], "degenerate-faces"),
+        ([a, b, b + np.array([0.0, 0.0, 4e-4])], "vertices-within-1-mm"),
+        ([a, b, c + np.array([0.0, 0.0, 3.0])], "non-manifold-edges"),
+    ):
+        extra = replace(
+            mesh.take(np.array([row])), vertices=np.array(corners), faces=np.array([[0, 1, 2]], np.int32)
+        )
+        write_tile(broken.files.tile(i, j), replace(tile, mesh=concatenate([mesh, extra])))
+        [told] = check_scene(broken)["broken_surfaces"]
+        assert (told["tile"], told["fault"]) == ([i, j], fault)
+        assert told["feature"] == mesh.feature[row]
 
 
 def test_ground_covers_the_extent_exactly_once(scene):
