@@ -5,11 +5,11 @@ from __future__ import annotations
 import io
 import json
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import shapely
@@ -24,12 +24,16 @@ from geoscene.objects.furniture import furniture_instances
 from geoscene.objects.vegetation import forest_trees, tree_instances
 from geoscene.plan import Plan, take_buildings
 from geoscene.processes import run_tasks
-from geoscene.report import Problem, described, make_without_failures
+from geoscene.report import Problem, described, make_without_failures, unexpected
 from geoscene.scene import SceneFiles
 from geoscene.scene.tile_files import Tile, read_tile, write_tile
 from geoscene.structures import structure_meshes
 from geoscene.typing import Ints
 from geoscene.watertight import validate_mesh
+
+T = TypeVar("T")
+
+_SINGULAR = {"trees": "tree", "furniture": "furniture", "barriers": "barrier", "structures": "structure"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +47,7 @@ class TileReport:
     instances  : number of instances of shapes
     area       : plan area of the ground in square metres
     digest     : digest of the tile's file
-    problems   : buildings that were simplified or dropped
+    problems   : buildings that were simplified, and features that were dropped
     """
 
     i: int
@@ -87,29 +91,47 @@ def make_solids(plan: Plan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, l
     return concatenate([mesh for mesh, _ in made]), problems
 
 
-def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances]:
-    """Mesh (ground, barriers, structures) and instances (trees, furniture) of tile (i, j), scene metres."""
+def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances, list[Problem]]:
+    """Mesh (ground, barriers, structures), instances (trees, furniture) and problems of tile (i, j).
+
+    Mesh and instances are in scene metres.
+    """
     i, j = tile
+    height, problems = plan.height, list[Problem]()
+
+    def made(table: Any, kind: str, *, make: Callable[[Ints], T]) -> list[T]:
+        def failed(row: int, error: Exception) -> None:
+            problems.append(unexpected(str(table.osm_id[row]), error, kind=_SINGULAR[kind]))
+
+        return make_without_failures(make, plan.of_tile(kind, i, j=j), failed=failed)
+
     covered = tile_place(plan.ground, i, j=j) is not None
     meshes = []
     if covered:
-        ground = ground_tile(plan.ground, i, j=j, height=plan.height, levels=plan.levels)
+        ground = ground_tile(plan.ground, i, j=j, height=height, levels=plan.levels)
         kept = ground.klass != Class.TUNNEL  # the ground is open at tunnel mouths
         meshes.append(ground if kept.all() else ground.take(kept))
-    copies = []
-    if len(rows := plan.of_tile("trees", i, j=j)):
-        copies.append(tree_instances(plan.trees.take(rows), height=plan.height))
-    if len(rows := plan.of_tile("furniture", i, j=j)):
-        copies.append(furniture_instances(plan.furniture.take(rows), height=plan.height))
+    trees, furniture, barriers = plan.trees, plan.furniture, plan.barriers
+    copies = [
+        *made(trees, "trees", make=lambda rows: tree_instances(trees.take(rows), height=height)),
+        *made(
+            furniture, "furniture", make=lambda rows: furniture_instances(furniture.take(rows), height=height)
+        ),
+    ]
     if covered and len(plan.needles):
         woods = forest_trees(plan.ground, i, j=j, needles=plan.needles)
         if len(woods):
-            copies.append(tree_instances(woods, height=plan.height))
-    if len(rows := plan.of_tile("barriers", i, j=j)):
-        meshes += barrier_meshes(plan.barriers.take(rows), height=plan.height)
-    if len(rows := plan.of_tile("structures", i, j=j)):
-        meshes += structure_meshes(plan.structures, rows, height=plan.height, openings=plan.openings)
-    return concatenate(meshes), Instances.concatenate([Instances.empty(), *copies])
+            copies.append(tree_instances(woods, height=height))
+    solids = [
+        *made(barriers, "barriers", make=lambda rows: barrier_meshes(barriers.take(rows), height=height)),
+        *made(
+            plan.structures,
+            "structures",
+            make=lambda rows: structure_meshes(plan.structures, rows, height=height, openings=plan.openings),
+        ),
+    ]
+    meshes += [mesh for some in solids for mesh in some]
+    return concatenate(meshes), Instances.concatenate([Instances.empty(), *copies]), problems
 
 
 def build_tile(
@@ -126,7 +148,8 @@ def build_tile(
         is_building = old.mesh.closed & (old.mesh.feature < plan.buildings.count)
         origin, rest, copies = old.origin, old.mesh.take(~is_building), old.instances
     else:
-        ground, copies = make_ground(plan, tile)
+        ground, copies, found = make_ground(plan, tile)
+        problems += found
         low = float(np.floor(ground.vertices[:, 2].min(initial=0.0)))
         origin = np.array([tile[0] * size, tile[1] * size, low])
         rest = ground.take(np.arange(len(ground))).shifted(-origin)

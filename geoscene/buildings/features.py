@@ -268,7 +268,7 @@ def _ignored_tags(rows: Sequence[Row], heights: Heights) -> list[Problem]:
         if ignored := row.tagged.ignored + row.roof.ignored:
             made = f"from {heights.low[k]:.4g} to {heights.high[k]:.4g} m ({heights.source[k]})"
             detail = f"{', '.join(ignored)}; built {made}"
-            problems.append(Problem(row.osm_id, "building", "repaired", "ignored-tags", detail))
+            problems.append(Problem(row.osm_id, "building", "repaired", "unusable-tags", detail))
     return problems
 
 

@@ -18,6 +18,7 @@ from geoscene.errors import InputError, SceneFormatError, SourceNotFoundError
 from geoscene.mesh import concatenate
 from geoscene.options import BuildOptions
 from geoscene.pipeline import build
+from geoscene.plan import make_plan
 from geoscene.scene import open_scene
 from geoscene.scene.tile_files import Tile, write_tile
 from geoscene.scene.validate import check_scene
@@ -29,6 +30,11 @@ from geoscene.watertight import validate_mesh
 @pytest.fixture(scope="module")
 def osm():
     return read_osm(demo_path(), bounds=DEMO_BOX)
+
+
+@pytest.fixture(scope="module")
+def plan(osm):
+    return make_plan(osm, BuildOptions(), progress=lambda *_, **__: None)[0]
 
 
 def test_every_solid_is_closed_oriented_and_of_positive_volume(scene):
@@ -271,6 +277,36 @@ def test_a_building_that_fails_in_a_tile_is_dropped_alone(osm, scene, tmp_path, 
     ]
     before = scene.manifest["counts"]
     assert (counts["buildings"], counts["solids"]) == (before["buildings"], before["solids"] - 1)
+
+
+@pytest.mark.parametrize(
+    ("layer", "kind", "make"),
+    [
+        ("trees", "tree", "tree_instances"),
+        ("furniture", "furniture", "furniture_instances"),
+        ("barriers", "barrier", "barrier_meshes"),
+    ],
+)
+def test_an_object_that_fails_in_a_tile_is_dropped_alone(plan, monkeypatch, layer, kind, make):
+    table = getattr(plan, layer)
+    tile, rows = max(plan.rows[layer].items(), key=lambda item: len(item[1]))
+    victim, whole = str(table.osm_id[rows[-1]]), getattr(geoscene.tiles, make)
+    before, copies_before, _ = geoscene.tiles.make_ground(plan, tile)
+
+    def failing(some, **options):
+        if victim in some.osm_id:
+            raise ZeroDivisionError
+        return whole(some, **options)
+
+    monkeypatch.setattr(geoscene.tiles, make, failing)
+    after, copies_after, problems = geoscene.tiles.make_ground(plan, tile)
+    lost = {(p.osm_id, p.kind, p.action, p.reason, p.detail) for p in problems}
+    assert lost == {(victim, kind, "dropped", "unexpected-error", "ZeroDivisionError")}
+    gone = table.feature[rows[table.osm_id[rows] == victim]]
+    if layer == "barriers":
+        assert set(before.feature) - set(after.feature) == set(gone)
+    else:
+        assert len(copies_after) == len(copies_before) - np.isin(copies_before.feature, gone).sum()
 
 
 def test_map_without_features_is_refused(tmp_path):

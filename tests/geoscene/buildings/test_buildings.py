@@ -514,7 +514,7 @@ def test_every_ignored_tag_is_reported_with_what_was_built_instead(tags, top, so
     assert table.height_source.tolist() == [source]
     assert table.height[0] == pytest.approx(top) if top else 5 < table.height[0] < 20
     assert mesh.vertices[:, 2].min() == 0
-    assert reasons(problems) == {("way/1", "repaired", "ignored-tags")}
+    assert reasons(problems) == {("way/1", "repaired", "unusable-tags")}
     assert ignored in problems[0].detail
     assert problems[0].detail.endswith(f"; built from 0 to {table.height[0]:.4g} m ({source})")
 
