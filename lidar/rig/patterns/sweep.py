@@ -16,11 +16,13 @@ from lidar.rig.toml_table import Table
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Beams that fire in turn: azimuth at a constant rate, elevation as a triangle wave.
+    """Beams that fire in turn: elevation as a triangle wave, azimuth at a constant rate or as such a wave.
 
-    azimuth = 2 pi f_a t, elevation = centre + half range * tri(f_e t + line / lines), tri from -1 to 1.
+    elevation = centre + half range * tri(f_e t + line / lines), tri from -1 to 1; azimuth = 2 pi f_a t, or
+    centre + half range * tri(f_a t).
 
     low, high : radians, elevations
+    sector    : (2,) radians, lowest and highest azimuth, counter-clockwise; empty for full turns
     lines     : number of beams, which fire one after the other
     """
 
@@ -30,6 +32,7 @@ class Sweep:
     high: float
     lines: int
     pulse_hz: Fraction
+    sector: tuple[float, ...] = ()
     range_offset: float = 0.0
     tail_ns: int = 0
 
@@ -39,13 +42,18 @@ class Sweep:
         number = block.first + np.arange(len(block))
         seconds = number / float(self.pulse_hz)
         line = (number % self.lines).astype(np.uint16)
-        turn = np.mod(self.elevation_hz * seconds + line / self.lines, 1.0)
-        triangle = 4 * np.abs(turn - 0.5) - 1
-        elevation = (self.low + self.high) / 2 + (self.high - self.low) / 2 * triangle
+        elevation = _wave(self.elevation_hz * seconds + line / self.lines, self.low, high=self.high)
         azimuth = 2 * np.pi * np.mod(self.azimuth_hz * seconds, 1.0)
+        if self.sector:
+            azimuth = _wave(self.azimuth_hz * seconds, self.sector[0], high=self.sector[1])
         column, _ = numbers(len(block), 1)
         direction = unit_vectors(azimuth, elevation)
         return from_origin(block.time_ns, direction, column=column, channel=line)
+
+
+def _wave(turns: Float, low: float, *, high: float) -> Float:
+    """Triangle wave from ``high`` at whole turns to ``low`` at half ones."""
+    return (low + high) / 2 + (high - low) / 2 * (4 * np.abs(np.mod(turns, 1.0) - 0.5) - 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +92,11 @@ def read_sweep(table: Table) -> Sweep:
     low, high = np.radians(table.numbers("elevation_deg", count=2))
     if not -np.pi / 2 <= low < high <= np.pi / 2:
         raise table.error("elevation_deg", "give the lowest and the highest elevation, within 90 degrees")
+    sector = (
+        tuple(np.radians(table.numbers("azimuth_deg", count=2)).tolist()) if table.has("azimuth_deg") else ()
+    )
+    if sector and not -np.pi <= sector[0] < sector[1] <= np.pi:
+        raise table.error("azimuth_deg", "give the lowest and the highest azimuth, within 180 degrees")
     pattern = Sweep(
         azimuth_hz=table.number("azimuth_hz"),
         elevation_hz=table.number("elevation_hz"),
@@ -91,6 +104,7 @@ def read_sweep(table: Table) -> Sweep:
         high=float(high),
         lines=table.integer("lines", 1, low=1, high=1024),
         pulse_hz=Fraction(str(table.number("pulse_hz", above=0.0, high=1e7))),
+        sector=sector,
     )
     table.close()
     return pattern

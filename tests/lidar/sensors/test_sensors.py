@@ -125,8 +125,14 @@ def test_every_preset_fires_unit_vectors_in_time_order_over_its_frame():
         "xt32": 64_000,
         "rs32": 57_632,
         "helios32": 57_568,
+        "rs16": 28_816,
+        "rs128": 230_400,
+        "bpearl": 57_632,
+        "ot128": 230_400,
+        "hdl64e_s2": 133_312,
         "os1_128": 131_072,
         "mid360": 20_000,
+        "hap": 45_200,
         "avia": 24_000,
         "mid40": 10_000,
     }.items(),
@@ -204,7 +210,7 @@ def covered(sensor, frames):
     return len(np.unique(az * 1000 + el))
 
 
-@pytest.mark.parametrize("name", ["mid360", "avia", "mid40", "mid70"])
+@pytest.mark.parametrize("name", ["mid360", "hap", "avia", "mid40", "mid70"])
 def test_patterns_that_do_not_repeat_cover_more_with_time(name):
     sensor = load_sensor(name)
     once, five, ten = (covered(sensor, n) for n in (1, 5, 10))
@@ -217,6 +223,15 @@ def test_mid360_stays_in_its_field_of_view_and_is_marked_approximate():
     elevation = np.degrees(np.arcsin(firings(sensor, 0).direction[:, 2]))
     assert elevation.min() == pytest.approx(-7, abs=0.1)
     assert elevation.max() == pytest.approx(52, abs=0.1)
+    assert "approximate" in sensor.note
+
+
+def test_hap_stays_in_its_field_of_view_and_is_marked_approximate():
+    sensor = load_sensor("hap")
+    x, y, z = firings(sensor, 0).direction.T
+    azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z))
+    assert [azimuth.min(), azimuth.max()] == pytest.approx([-60, 60], abs=0.1)
+    assert [elevation.min(), elevation.max()] == pytest.approx([-12.5, 12.5], abs=0.1)
     assert "approximate" in sensor.note
 
 
