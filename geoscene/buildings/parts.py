@@ -41,10 +41,21 @@ def duplicates(
     score : (n,) how much is known of each building, in any unit
     """
     area = shapely.area(footprint)
-    a, b, shared = overlapping(footprint, footprint)
+    # Equal outlines first: each overlaps all others.
+    shapes = np.array([shape.wkb for shape in shapely.normalize(footprint)], object)
+    order = np.argsort(-score, kind="stable")
+    _, best, group = np.unique(shapes[order], return_index=True, return_inverse=True)
+    first = np.empty(len(footprint), np.int64)
+    first[order] = order[best][group.ravel()]
+    kept = np.flatnonzero(first == np.arange(len(footprint)))
+    a, b, shared = overlapping(footprint[kept], footprint[kept])
+    a, b = kept[a], kept[b]
     same = (a < b) & (shared > 0.9 * np.maximum(area[a], area[b]))
-    repeated = np.zeros(len(footprint), np.bool_)
-    problems = []
+    repeated = first != np.arange(len(footprint))
+    problems = [
+        Problem(osm_id[i], "building", "dropped", "duplicate", f"the same outline as {osm_id[first[i]]}")
+        for i in np.flatnonzero(repeated).tolist()
+    ]
     for i, j, s in zip(a[same], b[same], shared[same], strict=True):
         if repeated[i] or repeated[j]:
             continue

@@ -12,7 +12,7 @@ import shapely
 from geoscene.report import Problem
 from geoscene.sources.data import Area, Bounds, Tags
 from geoscene.sources.elements import Elements, Members
-from geoscene.sources.rings import Chain, assemble, close_cut_ring, polygons_of
+from geoscene.sources.rings import Chain, assemble, close_cut_ring, polygons_of, tangled
 from geoscene.sources.tags import NOISE, area_tags, is_area, is_building, is_open_area, kind_of
 from geoscene.typing import Float, Ints
 
@@ -255,6 +255,10 @@ def way_areas(
             nodes = nodes[keep]
         if len(nodes) < 4:
             problems.append(Problem(name, kind, "dropped", "no-area", f"{len(nodes)} nodes"))
+            continue
+        if tangled(places.xy[nodes]):
+            detail = f"{len(nodes)} nodes, over 10,000 crossings"
+            problems.append(Problem(name, kind, "dropped", "tangled", detail))
             continue
         if repair:
             problems.append(Problem(name, kind, "repaired", *repair))

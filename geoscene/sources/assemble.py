@@ -14,6 +14,10 @@ from geoscene.sources.extent import checked_bounds, located, near_extent
 from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
 from geoscene.typing import Bools, Ints
 
+_KINDS = ("road", "railway", "waterway", "barrier")
+_CROWD, _CELL = 32, 1e-4
+"""Lines of a kind in one place, and the side of a place in degrees, about 10 m."""
+
 
 def _intersect(elements: Elements, bounds: Bounds | None) -> Bools:
     """(w,) bool, whether each way's bounding box intersects the bounds; false for ways without nodes."""
@@ -60,6 +64,32 @@ def _lines(elements: Elements, rows: list[int]) -> tuple[list[Way], list[Problem
                 Problem(name, kind_of(tags), action, "missing-nodes" if missing else "too-short", detail)
             )
     return ways, problems
+
+
+def _uncrowded(ways: list[Way]) -> tuple[list[Way], list[Problem]]:
+    """The lines without those beyond the first 32 of a kind in one place, by id, and these as problems.
+
+    No place has so many; the time to cut the ground along their borders grows with the square of the number.
+    """
+    kinds = [kind_of(way.tags) for way in ways]
+    rows = np.array([k for k, kind in enumerate(kinds) if kind in _KINDS], np.int64)
+    number_of_kind = np.array([_KINDS.index(kinds[k]) for k in rows], np.int64)
+    if len(rows) <= _CROWD:
+        return ways, []
+    xy = np.concatenate([ways[k].lonlat for k in rows])
+    line = np.repeat(np.arange(len(rows)), [len(ways[k].lonlat) for k in rows])
+    xy, line = shapely.get_coordinates(
+        shapely.segmentize(shapely.linestrings(xy, indices=line), _CELL), return_index=True
+    )
+    cell = np.floor(xy / _CELL).astype(np.int64)
+    where = (cell[:, 1] * len(_KINDS) + number_of_kind[line]) * 2**32 + cell[:, 0]
+    pairs = np.unique(np.stack([where, line], axis=1), axis=0)
+    _, first, number = np.unique(pairs[:, 0], return_index=True, return_inverse=True)
+    beyond = np.arange(len(pairs)) - first[number.ravel()] >= _CROWD
+    dropped = set(rows[np.unique(pairs[beyond, 1])].tolist())
+    detail = f"over {_CROWD} lines within 10 m"
+    problems = [Problem(ways[k].osm_id, kinds[k], "dropped", "crowded", detail) for k in dropped]
+    return [way for k, way in enumerate(ways) if k not in dropped], sorted(problems)
 
 
 def _selected(data: OsmData, bounds: Bounds) -> OsmData:
@@ -129,6 +159,8 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
         if row not in meant or (is_line(elements.way_tags[row]) and is_area(elements.way_tags[row]))
     ]
     ways, found = _lines(elements, lines)
+    problems += found
+    ways, found = _uncrowded(ways)
     problems += found
     data = OsmData(
         bounds=bounds or extent,

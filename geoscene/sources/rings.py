@@ -12,6 +12,9 @@ import shapely
 from geoscene.sources.data import METRES_PER_DEGREE, Bounds
 from geoscene.typing import Bools, Float, Ints
 
+_LONG, _CROSSINGS = 200, 10_000
+"""Points of rings whose crossings are counted, and the number beyond which they are dropped."""
+
 
 @dataclass(frozen=True, slots=True)
 class Chain:
@@ -34,6 +37,33 @@ def polygons_of(geometry: Any) -> Any:
     if len(parts) == 0:
         return None
     return shapely.orient_polygons(parts[0] if len(parts) == 1 else shapely.multipolygons(parts))
+
+
+def tangled(ring: Float) -> bool:
+    """Whether a closed ring (n, 2) crosses itself so often that no area can be meant.
+
+    The number of crossings is estimated from at most 64 segments; making a ring valid takes time by it.
+    """
+    if len(ring) < _LONG:
+        return False
+    a, b = ring[:-1], ring[1:]
+    some = np.linspace(0, len(a) - 1, 64).astype(int)
+    crossings = 0
+    for k in some:
+        p, q = a[k], b[k]
+        across = _side(p, q, points=a) * _side(p, q, points=b) < 0
+        c, d = a[across], b[across]
+        crossings += int((_cross(d - c, p - c) * _cross(d - c, q - c) < 0).sum())
+    return crossings / len(some) * len(a) / 2 > _CROSSINGS
+
+
+def _cross(u: Float, v: Float) -> Float:
+    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+
+
+def _side(p: Float, q: Float, *, points: Float) -> Float:
+    """Positive (n,) for points left of the line from p to q, negative for those right of it."""
+    return _cross(np.broadcast_to(q - p, points.shape), points - p)
 
 
 def segments_of(nodes: Ints) -> Ints:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from shapely import affinity
 from shapely.errors import GEOSException
 
-from geoscene.buildings import BuildingOptions, build_solids, read_buildings
+from geoscene.buildings import BuildingOptions, build_solids, parts, read_buildings
 from geoscene.buildings.footprints import subtract
 from geoscene.buildings.heights import infer_heights
 from geoscene.buildings.shells import prisms, sound
@@ -427,6 +427,25 @@ def test_of_overlapping_buildings_the_one_with_a_known_height_keeps_its_shape():
         *((f"way/{n}", "dropped", "inside-another") for n in (2, 3)),
         *((f"way/{n}", "repaired", "overlap") for n in (4, 6, 7, 9)),
     }
+
+
+def test_thousands_of_equal_outlines_are_compared_once(monkeypatch):
+    compared = []
+    query = parts.overlapping
+
+    def counted(a, b):
+        compared.append(len(a))
+        return query(a, b)
+
+    monkeypatch.setattr(parts, "overlapping", counted)
+    square = shapely.box(0, 0, 10, 20)
+    outlines = np.array([square, square.reverse()] * 1000 + [shapely.box(50, 0, 60, 10)], object)
+    score = np.zeros(2001)
+    score[77] = 3
+    repeated, problems = parts.duplicates([f"way/{k}" for k in range(2001)], outlines, score=score)
+    assert np.flatnonzero(~repeated).tolist() == [77, 2000]
+    assert compared == [2]
+    assert len(problems) == 1999
 
 
 def test_of_duplicates_the_one_with_storeys_is_kept():

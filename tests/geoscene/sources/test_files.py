@@ -234,6 +234,38 @@ def test_overpass_json_is_read_from_gzip_and_bzip2(tmp_path):
     same(read[0], read[2])
 
 
+def test_a_ring_of_random_nodes_is_dropped_at_once(tmp_path):
+    draw = random.Random(0)
+    m = Map()
+    m.ring([(draw.uniform(0, 900), draw.uniform(0, 900)) for _ in range(5000)], {"building": "yes"})
+    m.ring(square(0, 0), {"building": "yes"})
+    data = m.read(tmp_path)
+    assert reasons(data) == [("building", "dropped", "tangled")]
+    assert len(data.areas) == 1
+
+
+def test_a_long_outline_with_few_crossings_is_kept(tmp_path):
+    turn = np.linspace(0, 2 * np.pi, 3000, endpoint=False)
+    m = Map()
+    m.ring(list(zip(500 * np.cos(turn), 500 * np.sin(2 * turn), strict=True)), {"natural": "wood"})
+    data = m.read(tmp_path)
+    assert [action for _, action, _ in reasons(data)] == ["repaired"]
+    assert len(data.areas) == 1
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_of_hundreds_of_roads_in_one_place_32_stay(joined, tmp_path):
+    m = Map()
+    middle = [m.node(0, 0)] if joined else []
+    for a in np.linspace(0, np.pi, 300, endpoint=False):
+        dx, dy = 400 * np.cos(a), 400 * np.sin(a)
+        m.way([m.node(-dx, -dy), *middle, m.node(dx, dy)], {"highway": "residential"})
+    data = m.read(tmp_path)
+    assert 32 <= len(data.ways) <= 4 * 32
+    assert set(reasons(data)) == {("road", "dropped", "crowded")}
+    assert len(data.ways) + len(data.problems) == 300
+
+
 def test_files_cut_in_any_way_are_one_map(tmp_path):
     whole = Map((0, 0, 200, 100))
     for k in range(6):
