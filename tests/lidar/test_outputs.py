@@ -513,6 +513,15 @@ def test_nuscenes_tables_link_samples_to_points_boxes_and_pixels(dataset, tmp_pa
     samples = sorted(tables["sample"].values(), key=lambda s: s["timestamp"])
     assert len(samples) == counts["samples"] == 8  # two a second for four seconds
     assert np.diff([s["timestamp"] for s in samples]).tolist() == [500_000] * 7
+    assert {_resolve(tables, s, "scene_token")["name"] for s in samples} == {"scene-0001"}
+    (drawn,) = tables["map"].values()
+    with Image.open(root / drawn["filename"]) as image:
+        mask = np.asarray(image)
+    ego = np.array([pose["translation"][:2] for pose in tables["ego_pose"].values()])
+    column, row = np.round(ego * [10, -10] + [0, len(mask)]).astype(int).T  # as the development kit does
+    assert min(column.min(), row.min(), mask.shape[1] - column.max(), len(mask) - row.max()) > 600
+    assert (mask[row, column] == 255).mean() > 0.95
+    assert 0.01 < (mask == 255).mean() < 0.5
     data = list(tables["sample_data"].values())
     assert counts["clouds"] + counts["images"] == len(data)
     channels = {d["filename"].split("/")[1] for d in data}

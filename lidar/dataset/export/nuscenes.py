@@ -8,19 +8,23 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import shutil
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 
 from geoscene.classes import Class, class_codes
+from geoscene.errors import GeosceneError
 from geoscene.files import write_atomically
 from geoscene.progress import Progress
+from geoscene.scene import open_scene
 from geoscene.typing import Float
 from lidar.camera.png import write_png
 from lidar.dataset.formats import FORMATS, Format, nuscenes, read_table
@@ -30,6 +34,8 @@ from lidar.errors import DatasetError
 from lidar.geometry.poses import Poses, Trajectory
 
 Row = dict[str, Any]
+
+log = logging.getLogger(__name__)
 
 VERSION = "v1.0-mini"
 """Folder of the tables; the development kit's default."""
@@ -57,6 +63,10 @@ _ATTRIBUTES = (
 _VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
 _MARGIN = 200.0
 """Metres from the drive's bounds to the origin of the tables' frame, so that coordinates are positive."""
+_PIXEL = 0.1
+"""Metres of the map's pixels: the development kit takes all maps to have them."""
+_LARGEST_MASK = 4 * 10**8
+_PAVED = ("flat.driveable_surface", "flat.sidewalk")
 _WALKING, _DRIVING = 0.2, 0.5
 """Speeds in m/s above which pedestrians and vehicles have the attribute ``moving``."""
 
@@ -78,7 +88,7 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     """Write a finished drive as a nuScenes dataset; return the numbers of samples, clouds, images and boxes.
 
     Positions are true metres east and north of a point south-west of the drive, which the scene's description
-    states. There is one scene; the map's mask is empty.
+    states. There is one scene; the map's mask shows the roads and sidewalks of the scene that was driven in.
 
     Raises DatasetError for a drive without labelled clouds in the sensor frame.
     """
@@ -155,7 +165,11 @@ class _Export:
         top = next(s for s in self.streams if s.modality == "lidar")
         keys = _key_frames(top.times)
         samples = [
-            {"token": _token(self.name, "sample", top.frames[k]), "timestamp": self._stamp(top.times[k])}
+            {
+                "token": _token(self.name, "sample", top.frames[k]),
+                "timestamp": self._stamp(top.times[k]),
+                "scene_token": _token(self.name, "scene"),
+            }
             for k in keys
         ]
         _chained(samples)
@@ -319,13 +333,16 @@ class _Export:
     def _describe(self, samples: Sequence[Row]) -> None:
         """Fill the tables that describe the whole drive."""
         manifest = self.dataset.manifest
-        log, place = _token(self.name, "log"), str(manifest["scene"]["name"] or manifest["scene"]["path"])
+        log_token, place = (
+            _token(self.name, "log"),
+            str(manifest["scene"]["name"] or manifest["scene"]["path"]),
+        )
         east, north = (self.zero * self.scale)[:2] + self.dataset.frame.origin
         self.tables["sample"] = list(samples)
         self.tables["scene"] = [
             {
                 "token": _token(self.name, "scene"),
-                "log_token": log,
+                "log_token": log_token,
                 "nbr_samples": len(samples),
                 "first_sample_token": samples[0]["token"],
                 "last_sample_token": samples[-1]["token"],
@@ -337,20 +354,20 @@ class _Export:
         date = self.dataset.start.date().isoformat()
         self.tables["log"] = [
             {
-                "token": log,
+                "token": log_token,
                 "logfile": self.name,
                 "vehicle": manifest["rig"],
                 "date_captured": date,
                 "location": place,
             }
         ]
-        mask = "maps/empty.png"
+        mask = "maps/drivable.png"
         (self.out / "maps").mkdir(parents=True, exist_ok=True)
-        write_png(self.out / mask, np.zeros((1, 1), np.uint8))
+        write_png(self.out / mask, self._map_mask())
         self.tables["map"] = [
             {
                 "token": _token(self.name, "map"),
-                "log_tokens": [log],
+                "log_tokens": [log_token],
                 "category": "semantic_prior",
                 "filename": mask,
             }
@@ -361,6 +378,40 @@ class _Export:
             {"token": str(k + 1), "level": level, "description": f"visibility {level[1:]} %"}
             for k, level in enumerate(_VISIBILITY)
         ]
+
+    def _map_mask(self) -> NDArray[np.uint8]:
+        """The map's mask: 255 on roads and sidewalks, 0 elsewhere; a pixel is `_PIXEL` metres, row 0 north.
+
+        It covers the drive and `_MARGIN` around it. It is 0 all over without the scene, and one pixel for
+        drives over more than `_LARGEST_MASK` pixels.
+        """
+        places = self.trajectory.position[:, :2] / self.scale[:2] - self.zero[:2]
+        width, height = (np.ceil((places.max(axis=0) + _MARGIN) / _PIXEL)).astype(int).tolist()
+        if width * height > _LARGEST_MASK:
+            log.warning("the drive is too long for a map's mask: the development kit cannot draw its map")
+            return np.zeros((1, 1), np.uint8)
+        mask = Image.new("L", (width, height))
+        pen = ImageDraw.Draw(mask)
+        for triangles in _paved(self.dataset):
+            xy = (triangles / self.scale[:2] - self.zero[:2]) / _PIXEL
+            inside = ((xy.max(axis=1) >= 0) & (xy.min(axis=1) <= [width, height])).all(axis=1)
+            for corners in (xy[inside] * [1, -1] + [0, height]).tolist():
+                pen.polygon([tuple(corner) for corner in corners], fill=255)
+        return np.asarray(mask)
+
+
+def _paved(dataset: Dataset) -> Iterator[Float]:
+    """Triangles (n, 3, 2), scene metres, of the roads and sidewalks in each tile of a dataset's scene."""
+    try:
+        scene = open_scene(dataset.manifest["scene"]["path"])
+        tiles = [scene.tile(i, j) for i, j in scene.tile_indices]
+    except GeosceneError as error:
+        log.warning("the map's mask is empty: %s", error)
+        return
+    paved = np.isin(class_codes().nuscenes, [CATEGORIES.index(name) for name in _PAVED])
+    for tile in tiles:
+        xy = (tile.mesh.vertices + tile.origin)[:, :2]
+        yield xy[tile.mesh.faces[paved[tile.mesh.klass]]]
 
 
 _TABLES = (
