@@ -3,8 +3,11 @@
 import manifold3d as m3
 import numpy as np
 import pytest
+import shapely
 
-from geoscene.buildings import build_solids, read_buildings
+from geoscene.buildings import BuildingOptions, build_solids, read_buildings
+from geoscene.buildings.features import is_building, is_building_part
+from geoscene.buildings.footprints import project
 from geoscene.frames import Frame
 from geoscene.sources import read_osm
 from geoscene.watertight import validate_mesh
@@ -40,6 +43,23 @@ def test_every_building_is_a_solid(shared_osm, name):
     whole = m3.Manifold(m3.Mesh64(mesh.vertices, mesh.faces.astype(np.uint64)))
     assert whole.status() == m3.Error.NoError
     assert whole.volume() == pytest.approx(verdict.volume.sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["helsinki_center.osm.pbf", "monaco.osm.pbf", "berlin_neukoelln.osm.gz"])
+def test_no_building_and_no_area_vanishes_without_a_problem(shared_osm, name):
+    osm = read_osm(shared_osm(name))
+    west, south, east, north = osm.bounds
+    frame = Frame.at((west + east) / 2, (south + north) / 2)
+    table, problems = read_buildings(osm, frame)
+    reported = {p.osm_id for p in problems}
+    mapped = [a for a in osm.areas if is_building(a.tags) or is_building_part(a.tags)]
+    assert {a.osm_id for a in mapped} <= reported | set(table.osm_id)
+    quiet = [a for a in mapped if is_building(a.tags) and a.osm_id not in reported]
+    built = table.footprint[table.drawn]
+    tree = shapely.STRtree(built)
+    for footprint in project(np.fromiter([a.geometry for a in quiet], object), frame):
+        union = shapely.union_all(built[tree.query(footprint)])
+        assert shapely.area(shapely.difference(footprint, union)) < BuildingOptions().min_area
 
 
 def test_the_victory_column_is_one_body_of_stacked_parts(shared_osm):
