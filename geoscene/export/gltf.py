@@ -193,7 +193,8 @@ class GlbWriter:
         for column, values in columns.items():
             description, arrays = _encoded(np.asarray(values))
             described[column] = description
-            properties[column] = {role: self._column(data) for role, data in arrays.items()}
+            if arrays["values"]:  # a column without any text is left out: no view may be empty
+                properties[column] = {role: self._column(data) for role, data in arrays.items()}
         self._classes[name] = {"name": name, "properties": described}
         self._tables.append({"name": name, "class": name, "count": count, "properties": properties})
         self._extensions.add("EXT_structural_metadata")
@@ -355,4 +356,4 @@ def _encoded(values: NDArray[Any]) -> tuple[dict[str, Any], dict[str, bytes]]:
     texts = ["" if v is None else str(v) for v in values.tolist()]
     data = [text.encode() for text in texts]
     offsets = np.cumsum([0, *(len(d) for d in data)]).astype("<u4")
-    return {"type": "STRING"}, {"values": b"".join(data) or b"\0", "stringOffsets": offsets.tobytes()}
+    return {"type": "STRING"}, {"values": b"".join(data), "stringOffsets": offsets.tobytes()}

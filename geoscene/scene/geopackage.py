@@ -17,7 +17,7 @@ from geoscene.errors import SceneFormatError, reading
 from geoscene.files import atomic_path, not_written
 from geoscene.frames import Frame
 
-_DATE = "2000-01-01T00:00:00Z"  # constant, so that the same scene gives the same bytes
+_DATE = "2000-01-01T00:00:00.000Z"  # constant, so that the same scene gives the same bytes
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,8 @@
 """Rasters and tables of a scene: positions, heights, classes, attributes and CRS."""
 
 import json
+import sqlite3
+from contextlib import closing
 
 import geopandas
 import numpy as np
@@ -201,3 +203,10 @@ def test_failed_write_keeps_the_old_file(tmp_path):
         out.write(bytes(1 // 0))
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
     assert (tmp_path / "a").read_bytes() == b"old"
+
+
+def test_the_time_in_a_geopackage_has_milliseconds(scene, tmp_path):
+    path = export_scene(scene, tmp_path / "a.gpkg").path
+    with closing(sqlite3.connect(path)) as db:
+        times = [row[0] for row in db.execute("SELECT last_change FROM gpkg_contents")]
+    assert set(times) == {"2000-01-01T00:00:00.000Z"}
