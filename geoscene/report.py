@@ -9,6 +9,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
+from geoscene.errors import GeosceneError
 from geoscene.typing import Ints
 
 Action = Literal["repaired", "dropped"]
@@ -39,7 +40,8 @@ def make_without_failures(
     """What ``make`` returns for all rows together, or for as many runs of them as there are failures.
 
     One feature must not end a build: rows for which ``make`` raises an exception are halved until the one
-    that causes it is alone; that row goes to ``failed`` and is left out.
+    that causes it is alone; that row goes to ``failed`` and is left out. Errors that no feature causes, of
+    options, files or memory, are raised.
 
     rows : (n,) ascending; without rows nothing is made
     """
@@ -47,7 +49,7 @@ def make_without_failures(
         return []
     try:
         return [make(rows)]
-    except MemoryError:
+    except (GeosceneError, ImportError, MemoryError, OSError):  # no feature's fault
         raise
     except Exception as error:  # noqa: BLE001 - whatever the reason, the other features are wanted
         if len(rows) == 1:
