@@ -9,6 +9,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
+import rasterio
 from helpers.programs import run_program
 from hypothesis import given
 from hypothesis import strategies as st
@@ -144,6 +145,22 @@ def test_tiles_join_without_seams(serve, tmp_path):
     assert "NAVD88" in terrain.datum
     assert "U.S. Geological Survey" in terrain.credits[0]
     assert terrain.uncovered == 0.0
+
+
+def test_tiles_on_both_sides_of_180_degrees_join(serve, tmp_path):
+    server = serve(lambda east, north: 4000.0 - 0.125 * (HALF - np.abs(east)) + 0.0 * north)
+    osm = replace(area(), bounds=(180 - 0.02, LAT - 0.02, 180 + 0.02, LAT + 0.02))
+    path = fetch_elevation(osm, cache_dir=tmp_path, server=patient(server))
+    with rasterio.open(path) as file:
+        assert file.width < 2000
+    places = sample(osm)
+    away = np.abs(places[:, 0] - 180) * HALF / 180
+    bounds = (-1000, -1000, 1000, 1000)
+    frame = Frame.at(180.0, LAT)
+    z = open_terrain([path], frame, bounds=bounds).height(*frame.from_geographic(*places.T))
+    near = (away > 20) & (away < 1000)
+    assert near.sum() > 300
+    assert np.abs(z - (4000 - 0.125 * away))[near].max() < 0.1
 
 
 def test_hills_have_the_accuracy_of_ten_metre_posts(serve, tmp_path):

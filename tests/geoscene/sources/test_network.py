@@ -17,7 +17,7 @@ from helpers.programs import run_program
 
 from geoscene.errors import InputError, NetworkError, SourceNotFoundError
 from geoscene.sources import Servers, demo_path, fetch_bbox, fetch_place, fetch_point, read_osm
-from geoscene.sources.network import locate
+from geoscene.sources.network import _parts, locate
 from geoscene.sources.overpass import RELATIONS
 
 BOX = (24.9420, 60.1658, 24.9495, 60.1696)
@@ -250,6 +250,16 @@ def test_large_area_fetched_in_parts_equals_one_request(server):
     data = fetch_bbox(BOX, servers=servers, progress=lambda items: [parts.append(i) or i for i in items])
     assert server.asked_for("/api/interpreter") == len(parts) >= 4
     assert_is_the_box(data)
+
+
+def test_an_area_across_180_degrees_is_fetched_from_both_sides():
+    parts = _parts((179.99, -17.0, 180.01, -16.98), 1.0)
+    assert len(parts) > 4
+    assert min(west for west, *_ in parts) == -180.0
+    assert max(east for _, _, east, _ in parts) == 180.0
+    assert all(west < east for west, _, east, _ in parts)
+    area = sum((east - west) * (north - south) for west, south, east, north in parts)
+    assert area == pytest.approx(0.02 * 0.02)
 
 
 def test_a_point_is_fetched_with_its_surroundings(server):
