@@ -42,7 +42,7 @@ def manifold_patches(corners: Ints) -> Ints:
     while (patch < 0).any():
         todo = np.flatnonzero(patch < 0)
         while (extra := _beyond_first_fan(corners[todo])).any():
-            todo = todo[~extra]
+            todo = todo[:1] if extra.all() else todo[~extra]
         patch[todo] = patch.max() + 1 + shell_numbers(corners[todo], np.zeros(len(todo), np.int64))
     return patch
 

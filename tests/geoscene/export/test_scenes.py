@@ -6,6 +6,8 @@ import struct
 import numpy as np
 import pytest
 from helpers.export_worlds import SLOPE, TREES, write_world
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from geoscene.errors import InputError
 from geoscene.export import export_scene
@@ -219,6 +221,20 @@ def test_patches_are_parted_where_they_touch_in_a_vertex():
         + [[6 + k, (k + 1) % 6, 6 + (k + 1) % 6] for k in range(6)]
     )
     assert not manifold_patches(ring).any()
+
+
+@given(st.integers(1, 6), st.integers(0, 2**32 - 1))
+@settings(max_examples=60, deadline=None)
+def test_patches_of_any_part_of_a_surface_are_connected_2_manifolds(size, seed):
+    rng = np.random.default_rng(seed)
+    corner = np.arange((size + 1) ** 2).reshape(size + 1, size + 1)
+    a, b, c, d = (corner[i : size + i, j : size + j].ravel() for i, j in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    faces = rng.permutation(np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])]))
+    faces = faces[: rng.integers(1, len(faces) + 1)]
+    patch = manifold_patches(faces)
+    assert set(patch) == set(range(patch.max() + 1))
+    for k in range(patch.max() + 1):
+        assert not manifold_patches(faces[patch == k]).any()
 
 
 def test_vertices_of_neighbouring_tiles_share_their_numbers():
