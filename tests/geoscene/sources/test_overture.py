@@ -135,6 +135,29 @@ def test_bounds_keep_intersecting_buildings_whole(demo):
         read_source("overture", demo, bounds=(1.0, 1.0, 2.0, 2.0))
 
 
+def test_a_stray_building_does_not_stretch_the_bounds(tmp_path):
+    rows = [
+        {"id": str(k), "geometry": shapely.box(24.94, 60 + k / 1e3, 24.941, 60.0005 + k / 1e3)}
+        for k in range(9)
+    ]
+    rows.append({"id": "stray", "geometry": shapely.box(0.0, 60.0, 0.001, 60.001)})
+    data = read_source("overture", write(tmp_path / "b.parquet", rows))
+    assert data.bounds == pytest.approx((24.94, 60.0, 24.941, 60.0085))
+    assert len(data.areas) == 9
+    assert [(p.osm_id, p.action, p.reason) for p in data.problems] == [
+        ("overture:stray", "dropped", "far-away")
+    ]
+
+
+@pytest.mark.parametrize("bounds", [None, (179.99, -17.0, -179.99, -16.9)])
+def test_buildings_on_both_sides_of_180_degrees_are_neighbours(bounds, tmp_path):
+    west = {"id": "a", "geometry": shapely.box(179.998, -16.95, 179.999, -16.949)}
+    east = {"id": "b", "geometry": shapely.box(-179.999, -16.95, -179.998, -16.949)}
+    data = read_source("overture", write(tmp_path / "b.parquet", [west, east]), bounds=bounds)
+    assert [area.geometry.bounds[0] for area in data.areas] == pytest.approx([179.998, 180.001])
+    assert data.bounds[2] == pytest.approx(180.01 if bounds else 180.002)
+
+
 def test_all_columns_become_tags(tmp_path):
     row = {
         "id": "a", "geometry": BLOCK, "names": {"primary": "Hall"}, "subtype": "education", "height": 12.5,
