@@ -362,7 +362,7 @@ def kills(options: argparse.Namespace) -> int:
                 code = process.returncode
                 if kill and time.monotonic() - asked > 3:
                     print(f"{kill.name}: ended after {time.monotonic() - asked:.1f} s", flush=True)
-                if b"Traceback" in errors or code not in (0, 130, -9, -15):
+                if b"Traceback" in errors or code not in (0, 130, -2, -9, -15):
                     print(f"exit code {code}: {errors.decode()[-300:]}", flush=True)
             left = sorted(path.name for path in Path(folder).iterdir())
             different += not _same(reference, out) or left != ["reference", "scene"]

@@ -37,6 +37,8 @@ def route_line(words: Sequence[str], graph: RoadGraph, *, frame: Frame) -> Any:
         lat, lon = latlon.T
     except ValueError:
         raise InputError(f"`along` {' '.join(given)}: a file, or two or more LAT,LON") from None
+    if not ((np.abs(lat) <= 90) & (np.abs(lon) <= 180)).all():
+        raise InputError(f"`along` {' '.join(given)}: not latitudes and longitudes in degrees")
     if len(lat) < 2:
         raise InputError(f"`along` {given[0]}: one waypoint is no route; give two or more, or a file")
     xy = np.column_stack(frame.from_geographic(lon, lat))
