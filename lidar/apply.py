@@ -191,6 +191,8 @@ def _apply_to_frame(
         recorded, contents.stages, sensor=scanner.sensor, frame=frame, threshold=threshold
     )
     cloud = altered.cloud
+    if form.kitti:  # recorded without the vehicle's motion: all points are those of the frame's start
+        cloud = replace(cloud, time_ns=np.zeros_like(cloud.time_ns))
     velocity = None
     if "velocity" in table:
         velocity = np.where(cloud.source >= 0, np.append(table["velocity"], 0)[cloud.source], 0)

@@ -113,7 +113,8 @@ def write_clouds(
     table = cloud_table(cloud) | {"time_ns": (time_ns - begin).astype(np.uint32)}
     world_formats = [form for form in contents.cloud_formats if form.frame == "world"]
     placed = np.empty((0, 3))
-    if world_formats or contents.deskew or scanner.sensor.fmcw:
+    compensated = contents.deskew or any(form.kitti for form in contents.cloud_formats)
+    if world_formats or compensated or scanner.sensor.fmcw:
         mount = scanner.spec.mount
         with watch.stage("georeference"):
             placed = recording.trajectory.place(
@@ -124,15 +125,18 @@ def write_clouds(
             if velocity is None:
                 velocity = _velocity(recording, scanner, frame=frame, cloud=cloud, placed=placed)
             table["velocity"] = velocity
+
+    def still_at(time_ns: int) -> Table:
+        still = deskewed(placed, recording.trajectory, mount=scanner.spec.mount, time_ns=time_ns)
+        return table | dict(zip("xyz", still.T, strict=True))
+
     deskewed_table: Table = {}
     if contents.deskew:
-        moment = begin + int(MOMENTS[contents.deskew] * scanner.period_ns)
-        still = deskewed(placed, recording.trajectory, mount=scanner.spec.mount, time_ns=moment)
-        deskewed_table = table | dict(zip("xyz", still.T, strict=True))
+        deskewed_table = still_at(begin + int(MOMENTS[contents.deskew] * scanner.period_ns))
     for form in contents.cloud_formats:
         if form.frame == "sensor":
             with watch.stage(f"write {form.name}"):
-                form.write(paths[form.name], table)
+                form.write(paths[form.name], still_at(begin) if form.kitti else table)
                 if contents.deskew:
                     form.write(paths[f"deskewed {form.name}"], deskewed_table)
     if world_formats:

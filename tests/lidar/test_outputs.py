@@ -24,7 +24,7 @@ from lidar.dataset.export import EXPORTERS
 from lidar.dataset.export.nuscenes import CATEGORIES, VERSION
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.kitti import semantic_kitti_labels
-from lidar.dataset.formats.table import PointLabels
+from lidar.dataset.formats.table import PointLabels, placed_returns
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.recording import Contents
 from lidar.errors import DatasetError, InputError
@@ -293,13 +293,20 @@ def test_labels_are_those_of_semantic_kitti_nuscenes_and_asprs(dataset):
     folder = dataset.path / "top"
     kitti_yaml = {Class.ROAD: 40, Class.SIDEWALK: 48, Class.BUILDING: 50, Class.TREE_CROWN: 70}
     first = max(stop for _, stop in _layers(dataset).values())
-    seen_moving = 0
+    seen_moving, pulled = 0, 0.0
+    trajectory = dataset.trajectory()
+    mount = np.array(dataset.sensors()["top"]["vehicle_from_sensor"])
     moving = {int(r["instance"]) for r in table(dataset.path / "boxes.csv") if r["moving"] == "True"}
     for path in sorted((folder / "pcd").glob("*.pcd"))[::4]:
         cloud = read_table(path)
         labels = np.fromfile(folder / "labels" / f"{path.stem}.label", np.uint32)
         rows = np.fromfile(folder / "velodyne" / f"{path.stem}.bin", np.float32).reshape(-1, 4)
-        np.testing.assert_array_equal(rows[:, :3], np.column_stack([cloud[k] for k in "xyz"]))
+        start_ns = int(dataset.sample_times("top")[int(path.stem)])
+        placed, _ = placed_returns(cloud, trajectory, start_ns=start_ns, vehicle_from_sensor=mount)
+        here = trajectory.at([start_ns]).mounted(mount[:3, 3], mount[:3, :3])
+        still = ((placed - here.position[0]) / here.scale[0]) @ here.rotation[0]
+        np.testing.assert_allclose(rows[:, :3], still, atol=1e-4)
+        pulled = max(pulled, np.abs(rows[:, :3] - np.column_stack([cloud[k] for k in "xyz"])).max())
         assert ((rows[:, 3] >= 0) & (rows[:, 3] <= 1)).all()
         semantic, instance = labels & 0xFFFF, labels >> 16
         for klass, code in kitti_yaml.items():
@@ -318,6 +325,7 @@ def test_labels_are_those_of_semantic_kitti_nuscenes_and_asprs(dataset):
         las = laspy.read(folder / "laz" / f"{path.stem}.laz")
         np.testing.assert_array_equal(las.classification, class_codes().asprs[cloud["label"]])
     assert seen_moving > 50
+    assert pulled > 0.1  # metres: raw points are not those of the frame's start
 
 
 def test_moving_road_users_have_their_own_semantic_kitti_classes():

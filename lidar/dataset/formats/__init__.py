@@ -35,7 +35,8 @@ class Format:
     frame   : of the points: the sensor's, at each point's own firing time, or the world's (export CRS)
     columns : columns that its files keep
     folder  : of its files, in a sensor's folder; by default its name
-    kitti   : a sensor's folder becomes a KITTI sequence: calib.txt, times.txt and poses.txt are added
+    kitti   : a sensor's folder becomes a KITTI sequence: calib.txt, times.txt and poses.txt are added, and
+              clouds are de-skewed to their frame's start, as KITTI's are
     maps    : its module has ``open_map``, which writes aggregated maps
     """
 
