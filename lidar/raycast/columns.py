@@ -32,6 +32,7 @@ class Target(NamedTuple):
     first      : (k,) int64, first row of ``transforms``
     steps      : (k,) int64, rows of ``transforms``; 1 for a static instance
     transforms : (r, 12) float64, from instance to caster, each relative to its own origin
+    margin     : metres by which rays and float32 surfaces are displaced (see `lidar.raycast.hull`)
     """
 
     scene: int
@@ -47,6 +48,7 @@ class Target(NamedTuple):
     first: NDArray[np.int64]
     steps: NDArray[np.int64]
     transforms: Float
+    margin: float
 
 
 class Rays(NamedTuple):

@@ -75,8 +75,8 @@ class EmbreeScene:
         if len(part) == 0:
             return
         geometry = self._lib.call("rtcNewGeometry", self._lib.device, rtc.TRIANGLE)
-        vertices, faces = part.vertices.astype(np.float32), part.faces.astype(np.uint32)
-        rtc.fill(self._lib, geometry, kind=rtc.VERTEX, slot=0, form=rtc.FLOAT3, rows=vertices)
+        faces = part.faces.astype(np.uint32)
+        rtc.fill(self._lib, geometry, kind=rtc.VERTEX, slot=0, form=rtc.FLOAT3, rows=part.hull)
         rtc.fill(self._lib, geometry, kind=rtc.INDEX, slot=0, form=rtc.UINT3, rows=faces)
         self._lib.call("rtcSetGeometryMask", geometry, part.mask)
         self._lib.call("rtcSetGeometryBuildQuality", geometry, rtc.MEDIUM)
@@ -173,6 +173,7 @@ class EmbreeScene:
             np.cumsum(counts) - counts,
             counts,
             np.concatenate(transforms),
+            max((part.margin for own, _ in kept for part in own), default=0.0),
         )
 
     def cast(self, rays: Rays, *, normals: bool, threads: int) -> Hits:

@@ -17,8 +17,11 @@ from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import BackendError
 from lidar.raycast.columns import Rays
+from lidar.raycast.exact import STARTS, circles
 from lidar.raycast.geometry import ALL, Geometry, Instances
 from lidar.raycast.hits import Hits
+from lidar.raycast.lanes import START
+from lidar.raycast.planes import EXACT
 from lidar.raycast.rays import in_scene
 
 _NUDGE = 3e-7
@@ -27,16 +30,18 @@ _GRAZING = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class _Soup(Columns):
-    """Triangles relative to an origin: corners (m, 3, 3), and their face, instance and mask (m,)."""
+    """Triangles relative to an origin: corners and hull (m, 3, 3), and their face, instance and mask (m,)."""
 
     corners: Float
+    hull: Float
     face: NDArray[np.int32]
     instance: NDArray[np.int32]
     mask: NDArray[np.uint32]
 
 
 def _joined(soups: Sequence[_Soup]) -> _Soup:
-    none = _Soup(np.empty((0, 3, 3)), np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.uint32))
+    empty, number = np.empty((0, 3, 3)), np.empty(0, np.int32)
+    none = _Soup(empty, empty, number, number, np.empty(0, np.uint32))
     return _Soup.concatenate([none, *soups])
 
 
@@ -47,7 +52,8 @@ def _mesh(parts: dict[int, Geometry]) -> _Soup:
         m = len(part)
         numbers = part.numbers if len(part.numbers) else np.arange(m, dtype=np.int32)
         face, none = (numbers + part.first).astype(np.int32), np.full(m, -1, np.int32)
-        soups.append(_Soup(part.vertices[part.faces], face, none, np.full(m, part.mask, np.uint32)))
+        corners, hull = part.vertices[part.faces], part.hull[part.faces].astype(np.float64)
+        soups.append(_Soup(corners, hull, face, none, np.full(m, part.mask, np.uint32)))
     return _joined(soups)
 
 
@@ -65,7 +71,7 @@ class _Body:
         self._scene: Any = None
         if len(soup.face):
             self._scene = EmbreeScene()
-            TriangleMesh(self._scene, soup.corners.astype(np.float32))
+            TriangleMesh(self._scene, soup.hull.astype(np.float32))
 
     def visible(self, mask: int) -> _Body:
         """The body without the faces that a mask hides."""
@@ -76,7 +82,9 @@ class _Body:
             self._by_mask[mask] = _Body(self.soup.take(shown))
         return self._by_mask[mask]
 
-    def first_hits(self, o: Float, d: Float, *, near: float, far: Float, turned: bool) -> NDArray[np.int64]:
+    def first_hits(
+        self, o: Float, d: Float, *, near: float | Float, far: Float, turned: bool
+    ) -> NDArray[np.int64]:
         """Rows (n,) of the triangles that rays hit first; -1 for a miss."""
         if self._scene is None:
             return np.full(len(d), -1)
@@ -86,9 +94,56 @@ class _Body:
             unit[np.arange(len(d)), np.argmin(np.abs(unit), axis=1)] += _NUDGE
         # embreex overwrites the bounds with ranges, so they must be a copy; 1e37 is unbounded.
         reach = np.minimum((far - near) * length * (1 + 2.0**-23), 1e37).astype(np.float32)
-        start = (o + near * d).astype(np.float32)
+        start = (o + np.reshape(near, (-1, 1)) * d).astype(np.float32)
         found = self._scene.run(start, unit.astype(np.float32), dists=reach, query="INTERSECT", output=1)
         return np.asarray(found["primID"], np.int64)
+
+    def outside(self, rows: NDArray[np.int64], o: Float, *, d: Float) -> Float:
+        """Metres (n,) by which rays pass outside triangles; see `lidar.raycast.planes.outside`."""
+        corners = self.soup.corners[rows] - o[:, None]
+        edges = np.roll(corners, -1, axis=1) - corners
+        length = np.linalg.norm(edges, axis=2)
+        moment = np.einsum("ij,ikj->ik", d, np.cross(edges, corners))
+        size = length * np.linalg.norm(d, axis=1)[:, None]
+        passed = np.divide(moment, size, out=np.zeros_like(moment), where=size > 0)
+        rounding = EXACT * (np.abs(o).sum(axis=1)[:, None] + np.abs(corners).sum(axis=2) + length)
+        passed[np.abs(passed) <= rounding] = 0.0
+        beside: Float = np.maximum(0.0, np.minimum(-passed.min(axis=1), passed.max(axis=1)))
+        return beside
+
+    def decided(
+        self, rows: NDArray[np.int64], o: Float, *, d: Float, near: float, far: Float, margin: float
+    ) -> NDArray[np.int64]:
+        """The rows of first hits, decided in float64 where rays pass beside the triangle or start on it."""
+        out, hit = rows.copy(), np.flatnonzero(rows >= 0)
+        t, cosine, _ = self.at(rows[hit], o[hit], d=d[hit])
+        starts = ~((t - near) * np.abs(cosine) * np.linalg.norm(d[hit], axis=1) > START)
+        todo = hit[starts | (self.outside(rows[hit], o[hit], d=d[hit]) > 0)]
+        if not len(todo):
+            return out
+        o, d, far = o[todo], d[todo], far[todo]
+        length = np.linalg.norm(d, axis=1)
+        best, closest, range_ = np.full(len(todo), -1), np.full(len(todo), np.inf), np.full(len(todo), np.inf)
+        missed = np.zeros(len(todo), np.bool_)
+        for shift in circles(d / length[:, None], margin):
+            ahead, live = np.full(len(todo), near), np.arange(len(todo))
+            for _ in range(STARTS):
+                found = self.first_hits(
+                    (o + shift)[live], d[live], near=ahead[live], far=far[live], turned=False
+                )
+                missed[live[found < 0]] = True
+                live, found = live[found >= 0], found[found >= 0]
+                t, cosine, _ = self.at(found, o[live], d=d[live])
+                starts = ~((t - near) * np.abs(cosine) * length[live] > START)
+                passed = self.outside(found, o[live], d=d[live])
+                before = (passed < closest[live]) | ((passed == closest[live]) & (t < range_[live]))
+                won = ~starts & (t <= far[live]) & before
+                missed[live[~starts & (t > far[live])]] = True
+                best[live[won]], closest[live[won]], range_[live[won]] = found[won], passed[won], t[won]
+                ahead[live] += margin / (np.maximum(np.abs(cosine), 1e-6) * length[live])
+                live = live[starts]
+        out[todo] = np.where(missed & (closest > 0), -1, best)
+        return out
 
     def at(self, rows: NDArray[np.int64], o: Float, *, d: Float) -> tuple[Float, Float, Float]:
         """Range, cosine and normal (not unit) where rays hit triangles; inf, 0 and 0 for row -1."""
@@ -141,6 +196,7 @@ class EmbreexScene:
         self._groups: list[tuple[Instances, Sequence[EmbreexScene]]] = []
         self._rest = _Body(_joined([]))
         self._movers: list[_Mover] = []
+        self._margin = 0.0
 
     def attach(self, number: int, part: Geometry) -> None:
         """Add a geometry under a free number."""
@@ -168,13 +224,20 @@ class EmbreexScene:
                 mesh = meshes[which]
                 number = np.full(len(mesh.face), start + k, np.int32)
                 if placed.ndim == 2:
-                    corners = mesh.corners @ placed[:, :3].T + placed[:, 3]
-                    soups.append(_Soup(corners, mesh.face, number, mesh.mask & bits))
+                    corners, hull = (
+                        points @ placed[:, :3].T + placed[:, 3] for points in (mesh.corners, mesh.hull)
+                    )
+                    soups.append(_Soup(corners, hull, mesh.face, number, mesh.mask & bits))
                 else:
-                    soup = _Soup(mesh.corners, mesh.face, number, mesh.mask)
+                    soup = _Soup(mesh.corners, mesh.hull, mesh.face, number, mesh.mask)
                     self._movers.append(_Mover(start + k, int(bits), _Body(soup), placed))
             start += len(group)
         self._rest = _Body(_joined(soups))
+        parts = [
+            *self.parts.values(),
+            *(p for _, shapes in self._groups for one in shapes for p in one.parts.values()),
+        ]
+        self._margin = max((part.margin for part in parts), default=0.0)
 
     def _views(self, rays: Rays, o: Float, *, d: Float) -> list[tuple[_Body, Float, Float, Float]]:
         """Bodies visible to rays, each with the rays' origins, directions and normal matrices."""
@@ -201,6 +264,9 @@ class EmbreexScene:
             todo = np.flatnonzero((face < 0) | (cosine < 0)) if turned else np.arange(n)
             for body, local, way, axes in views:
                 rows = body.first_hits(local[todo], way[todo], near=rays.near, far=far[todo], turned=turned)
+                rows = body.decided(
+                    rows, local[todo], d=way[todo], near=rays.near, far=far[todo], margin=self._margin
+                )
                 t, c, m = body.at(rows, local[todo], d=way[todo])
                 m = np.einsum("nij,nj->ni", axes[todo], m)
                 length = np.linalg.norm(m, axis=1) * np.linalg.norm(d[todo], axis=1)

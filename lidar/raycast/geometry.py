@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.raycast.hull import displacements, margin_of
 
 if TYPE_CHECKING:
     from lidar.raycast.caster import Caster
@@ -25,17 +26,23 @@ class Geometry:
     """Triangles with one mask, and their planes.
 
     vertices : (n, 3) float64, metres, relative to the caster's origin
+    hull     : (n, 3) float32, the same, moved outwards (see `lidar.raycast.hull`): for Embree
     faces    : (m, 3) int32
-    planes   : (m, 4) float64: unit normal n and offset d of each face; n @ x = d on it; zeros for zero area
+    planes   : (m, 5) float64: unit normal n and offset d of each face; n @ x = d on it; zeros for zero area;
+               and its margin: a hit whose barycentric coordinates, times the cosine of incidence, are
+               at least this is on the face also in float64
     numbers  : (m,) int32, `Hits.face` of each face minus ``first``; empty: consecutive
     first    : number of the first face
+    margin   : metres, see `lidar.raycast.hull`
     mask     : bits; rays hit the faces if their masks share one
     """
 
     vertices: Float
+    hull: NDArray[np.float32]
     faces: NDArray[np.int32]
     planes: Float
     numbers: NDArray[np.int32]
+    margin: float
     first: int = 0
     mask: int = ALL
 
@@ -66,13 +73,22 @@ def checked(vertices: ArrayLike, faces: ArrayLike) -> tuple[Float, NDArray[np.in
 
 
 def planes(vertices: Float, faces: NDArray[np.int32]) -> Float:
-    """The planes (m, 4) of faces: unit normal and offset; zero for a face without area."""
+    """The planes and margins (m, 5) of faces, for margins of 1 m; see `Geometry.planes`."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     length = np.sqrt(np.einsum("ij,ij->i", normal, normal))[:, None]
-    out = np.zeros((len(faces), 4))
+    out = np.zeros((len(faces), 5))
     np.divide(normal, length, out=out[:, :3], where=length > 0)
     out[:, 3] = np.einsum("ij,ij->i", out[:, :3], a)
+    longest = np.maximum(np.maximum(_squared(b - a), _squared(c - b)), _squared(a - c))
+    out[:, 4] = np.divide(
+        np.sqrt(longest), length[:, 0], out=np.full(len(faces), np.inf), where=length[:, 0] > 0
+    )
+    return out
+
+
+def _squared(vectors: Float) -> Float:
+    out: Float = np.einsum("ij,ij->i", vectors, vectors)
     return out
 
 
@@ -83,17 +99,20 @@ def split(vertices: Float, faces: NDArray[np.int32], *, mask: ArrayLike | None =
     """
     bits = np.broadcast_to(np.asarray(ALL if mask is None else mask, np.uint32), (len(faces),))
     found = np.unique(bits)
+    whole, margin = planes(vertices, faces), margin_of(vertices)
+    moved = displacements(vertices, faces, whole)
+    hull = (vertices + margin * moved).astype(np.float32)
+    # Rounding shifts an edge by one margin at most, in addition to its ends' displacements.
+    whole[:, 4] *= margin * (1 + np.sqrt(_squared(moved))[faces].max(axis=1, initial=0.0))
     if len(found) == 1:
-        whole = planes(vertices, faces)
-        return [Geometry(vertices, faces, whole, np.empty(0, np.int32), mask=int(found[0]))]
+        return [Geometry(vertices, hull, faces, whole, np.empty(0, np.int32), margin, mask=int(found[0]))]
     out = []
     for one in found:
         rows = np.flatnonzero(bits == one)
         used, renumbered = np.unique(faces[rows], return_inverse=True)
-        points: Float = vertices[used]
         corners: NDArray[np.int32] = np.ascontiguousarray(renumbered.reshape(-1, 3), np.int32)
-        own = planes(points, corners)
-        out.append(Geometry(points, corners, own, rows.astype(np.int32), mask=int(one)))
+        numbers = rows.astype(np.int32)
+        out.append(Geometry(vertices[used], hull[used], corners, whole[rows], numbers, margin, mask=int(one)))
     return out
 
 

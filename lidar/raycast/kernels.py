@@ -1,8 +1,12 @@
 """Compiled loops that trace packets of rays with Embree and compute float64 ranges. All release the GIL.
 
 Embree traces in float32 and identifies the face; the range is then computed in float64 from the plane of that
-face. In robust mode no ray passes between two faces at their shared edge, but about 0.3 % of the rays aimed
-exactly at a vertex do. A ray that misses or hits the back of a face is therefore retried with a perturbed
+face. Embree's surfaces enclose those of float64 (`lidar.raycast.hull`). A hit near an edge is therefore
+tested in float64; where the ray passes beside the face, the first hit is decided among the faces around it
+(`lidar.raycast.exact`).
+
+In robust mode no ray passes between two faces at their shared edge, but about 0.3 % of the rays aimed exactly
+at a vertex of Embree's surfaces do. A ray that misses or hits the back of a face is retried with a perturbed
 direction, and a nearer front face is accepted. Rays to retry are buffered until they fill a packet.
 
 Each step processes all lanes of a packet, with vector arithmetic (`lidar.raycast.lanes`).
@@ -18,10 +22,11 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.raycast.columns import CHUNK, Rays, Target
-from lidar.raycast.lanes import GRAZING, cross, move_float64, move_int32, narrow, same
-from lidar.raycast.memory import aligned, float64_at, inlined, int32_at, int64_at
+from lidar.raycast.exact import first_hit
+from lidar.raycast.lanes import GRAZING, START, cross, move_float64, move_int32, narrow, same
+from lidar.raycast.memory import aligned, called, float64_at, inlined, int32_at, int64_at
 from lidar.raycast.packets import alike, first_bad, gather, nudge, trace
-from lidar.raycast.planes import INVALID, intersection, numbered, placed, plane_of
+from lidar.raycast.planes import INVALID, PLANE, intersection, numbered, outside, placed, plane_of, ray_of
 from lidar.raycast.rows import (
     COSINE,
     FAR,
@@ -29,7 +34,10 @@ from lidar.raycast.rows import (
     HIT_FACE,
     HIT_GEOMETRY,
     HIT_INSTANCE,
+    HIT_U,
+    HIT_V,
     INVERSE,
+    MARGIN,
     NX,
     NY,
     NZ,
@@ -76,9 +84,10 @@ def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: 
         planes, numbers, first = int64_at(part, 0), int64_at(part, 3), int64_at(part, 4)
         for k in range(W):
             prim = np.int64(u[HIT_FACE * W + k])
-            plane = planes + 32 * prim
+            plane = planes + PLANE * prim
             work[NX * W + k], work[NY * W + k] = float64_at(plane, 0), float64_at(plane, 1)
             work[NZ * W + k], work[OFFSET * W + k] = float64_at(plane, 2), float64_at(plane, 3)
+            work[MARGIN * W + k] = float64_at(plane, 4)
             faces[k] = first + prim
         if numbers:
             for k in range(W):
@@ -93,16 +102,52 @@ def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: 
             faces[k], instances[k] = -1, -1
         elif inst == INVALID:
             row = np.int64(target.rows[geom])
-            plane = int64_at(target.parts.ctypes.data, 5 * row) + 32 * prim
+            plane = int64_at(target.parts.ctypes.data, 5 * row) + PLANE * prim
             work[NX * W + k], work[NY * W + k] = float64_at(plane, 0), float64_at(plane, 1)
             work[NZ * W + k], work[OFFSET * W + k] = float64_at(plane, 2), float64_at(plane, 3)
+            work[MARGIN * W + k] = float64_at(plane, 4)
             faces[k], instances[k] = numbered(target, row, prim), -1
         else:
             row, instance = placed(target, geom, inst, u[HIT_COPY * W + k])
             x, y, z, d = plane_of(target, row, prim, instance, work[TIME * W + k])
             work[NX * W + k], work[NY * W + k], work[NZ * W + k], work[OFFSET * W + k] = x, y, z, d
             work[SCALE * W + k] /= np.sqrt(x * x + y * y + z * z)
+            work[MARGIN * W + k] = float64_at(int64_at(target.parts.ctypes.data, 5 * row) + PLANE * prim, 4)
             faces[k], instances[k] = numbered(target, row, prim), instance
+
+
+@inlined
+def _starts(t: float, near: float, cosine: float, inverse: float) -> bool:
+    """Whether a face lies nearer than near, or within rounding of it."""
+    return not (t - near) * abs(cosine) > START * inverse
+
+
+@called
+def _keep(
+    target: Target,
+    row: int,
+    prim: int,
+    instance: int,
+    ray: Any,
+    inverse: float,
+    time: float,
+    i: int,
+    ranges: Any,
+    faces: Any,
+    instances: Any,
+    cosines: Any,
+    normals: Any,
+) -> None:
+    """Write a face, or a miss if its row is -1, as the hit of ray i."""
+    if row < 0:
+        ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
+        if normals.size:
+            _normal(normals, i, 0.0, 0.0, 0.0)
+        return
+    t, cosine, x, y, z = intersection(target, row, prim, instance, ray, inverse, time)
+    ranges[i], cosines[i], faces[i], instances[i] = t, cosine, numbered(target, row, prim), instance
+    if normals.size:
+        _normal(normals, i, x, y, z)
 
 
 @inlined
@@ -120,6 +165,8 @@ def _retry(
     instances: Any,
     cosines: Any,
     normals: Any,
+    around: Any,
+    some: Any,
 ) -> None:
     """Retry m rays with perturbed directions and keep nearer hits."""
     W = len(target.lanes)
@@ -140,12 +187,15 @@ def _retry(
         i = ids[k]
         row, instance = placed(target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k])
         prim = np.int64(u[HIT_FACE * W + k])
-        t, cosine, x, y, z = intersection(target, W, k, row, prim, instance, work)
+        ray, inverse, time = ray_of(W, k, work), work[INVERSE * W + k], work[TIME * W + k]
+        t, cosine, _, _, _ = intersection(target, row, prim, instance, ray, inverse, time)
         if t <= work[FAR * W + k] and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
-            ranges[i], cosines[i] = t, cosine
-            faces[i], instances[i] = numbered(target, row, prim), instance
-            if normals.size:
-                _normal(normals, i, x, y, z)
+            if outside(target, row, prim, instance, ray, time) > 0.0 or _starts(t, near, cosine, inverse):
+                far = work[FAR * W + k]
+                row, prim, instance = first_hit(target, near, far, ray, inverse, time, around, some, one)
+            _keep(
+                target, row, prim, instance, ray, inverse, time, i, ranges, faces, instances, cosines, normals
+            )
     for k in range(W):
         valid[k] = -1
 
@@ -170,6 +220,7 @@ def cast(
     packet = aligned(4 * PACKET_ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
     one, valid = aligned(128).view(np.float32), aligned(4 * W).view(np.int32)
+    around, some = aligned(4 * PACKET_ROWS * W).view(np.float32), aligned(4 * W).view(np.int32)
     work, ids = aligned(8 * WORK_ROWS * W).view(np.float64), np.zeros(W, np.int64)
     face, instance = aligned(4 * W).view(np.int32), aligned(4 * W).view(np.int32)
     late, doubtful, waiting = np.zeros(2 * RAY_ROWS * W), np.zeros(2 * W, np.int64), 0
@@ -177,6 +228,7 @@ def cast(
         u[RAY_MASK * W + k] = rays.mask
         u[RAY_ID * W + k] = k
         valid[k] = -1
+        around.view(np.uint32)[RAY_MASK * W + k] = rays.mask
     for at in range(lo, hi, W):
         m = min(W, hi - at)
         if not gather(target, rays, at, m, target.lanes, ids, work, f):
@@ -188,7 +240,7 @@ def cast(
             valid[k] = 0
         trace(target, W, PACKET_ROWS, f, valid, alike(W, work), one)
         _identify(target, W, u, work, face, instance)
-        settled = cross(target.lanes, work.ctypes.data)
+        settled = cross(target.lanes, work.ctypes.data, f.ctypes.data, rays.near)
         if m == W and not rays.order.size:
             exact = work.ctypes.data + 8 * RANGE * W
             move_float64(target.lanes, exact, ranges.ctypes.data + 8 * at)
@@ -206,13 +258,42 @@ def cast(
         for k in range(0 if settled else m):
             i = ids[k]
             hit = u[HIT_GEOMETRY * W + k] != INVALID
-            if hit and not abs(work[COSINE * W + k]) >= GRAZING:
-                row, copy = placed(
-                    target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
-                )
-                prim = np.int64(u[HIT_FACE * W + k])
-                ranges[i], cosines[i], _, _, _ = intersection(target, W, k, row, prim, copy, work)
-            if not (hit and ranges[i] <= work[FAR * W + k]):
+            t, cosine, far = work[RANGE * W + k], work[COSINE * W + k], work[FAR * W + k]
+            if hit:
+                share = min(f[HIT_U * W + k], f[HIT_V * W + k], 1.0 - f[HIT_U * W + k] - f[HIT_V * W + k])
+                grazing = not abs(cosine) >= GRAZING
+                starts = _starts(t, rays.near, cosine, work[INVERSE * W + k])
+                if grazing or starts or not share * abs(cosine) >= work[MARGIN * W + k]:
+                    ray, inverse, time = ray_of(W, k, work), work[INVERSE * W + k], work[TIME * W + k]
+                    row, copy = placed(
+                        target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
+                    )
+                    prim = np.int64(u[HIT_FACE * W + k])
+                    away = starts or outside(target, row, prim, copy, ray, time) > 0.0
+                    if away:
+                        row, prim, copy = first_hit(
+                            target, rays.near, far, ray, inverse, time, around, some, one
+                        )
+                    if away or grazing:
+                        _keep(
+                            target,
+                            row,
+                            prim,
+                            copy,
+                            ray,
+                            inverse,
+                            time,
+                            i,
+                            ranges,
+                            faces,
+                            instances,
+                            cosines,
+                            normals,
+                        )
+                        t = ranges[i]
+                        if away and not t <= far:
+                            continue
+            if not (hit and t <= far):
                 ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
                 if normals.size:
                     _normal(normals, i, 0.0, 0.0, 0.0)
@@ -230,7 +311,23 @@ def cast(
                 for r in range(RAY_ROWS):
                     work[r * W + k] = late[r * 2 * W + min(k, n - 1)]
                 ids[k] = doubtful[min(k, n - 1)]
-            _retry(target, rays.near, n, work, ids, f, valid, one, ranges, faces, instances, cosines, normals)
+            _retry(
+                target,
+                rays.near,
+                n,
+                work,
+                ids,
+                f,
+                valid,
+                one,
+                ranges,
+                faces,
+                instances,
+                cosines,
+                normals,
+                around,
+                some,
+            )
             for k in range(W):
                 doubtful[k] = doubtful[W + k]
                 for r in range(RAY_ROWS):

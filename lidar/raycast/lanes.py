@@ -13,7 +13,27 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from lidar.raycast.rows import COSINE, DX, DY, DZ, FAR, NX, NY, NZ, OFFSET, OX, OY, OZ, RANGE, RAY_DX, SCALE
+from lidar.raycast.rows import (
+    COSINE,
+    DX,
+    DY,
+    DZ,
+    FAR,
+    HIT_U,
+    HIT_V,
+    INVERSE,
+    MARGIN,
+    NX,
+    NY,
+    NZ,
+    OFFSET,
+    OX,
+    OY,
+    OZ,
+    RANGE,
+    RAY_DX,
+    SCALE,
+)
 
 GRAZING = 1e-3
 """Cosine below which a range is clipped to the face's extent along the ray."""
@@ -21,6 +41,8 @@ HUGE = 1e100
 """Rays with squared lengths or coordinates from this on are invalid."""
 UNIT = 1e-12
 """Tolerance of the squared length of a unit vector."""
+START = 1e-9
+"""Metres between the start of a ray and the plane of a face up to which the ray starts on the face."""
 
 _DOUBLE, _FLOAT, _INT = ir.DoubleType(), ir.FloatType(), ir.IntType(32)
 
@@ -52,6 +74,12 @@ class _Row:
             f"llvm.fabs.v{row.count}f64", (), ir.FunctionType(row, [row])
         )
         return _Row(self.builder, self.builder.call(function, [self.value]))
+
+    def double(self) -> _Row:
+        """The numbers as float64."""
+        return _Row(
+            self.builder, self.builder.fpext(self.value, ir.VectorType(_DOUBLE, self.value.type.count))
+        )
 
     def all(self, relation: str, other: _Row) -> Any:
         """Whether the relation holds in every lane; false if a number is NaN."""
@@ -155,21 +183,29 @@ Returns whether all directions have length 1 and all origins are below `HUGE`.""
 
 
 @intrinsic
-def _cross(context: Any, lanes: Any, work: Any) -> Any:  # noqa: ARG001
+def _cross(context: Any, lanes: Any, work: Any, packet: Any, near: Any) -> Any:  # noqa: ARG001
     def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         rows = _Rows(builder, lanes, address=values[1])
+        hits = _Rows(builder, lanes, address=values[2], kind=_FLOAT)
         ox, oy, oz, dx, dy, dz = (rows[r] for r in (OX, OY, OZ, DX, DY, DZ))
         nx, ny, nz, d = (rows[r] for r in (NX, NY, NZ, OFFSET))
         along = nx * dx + ny * dy + nz * dz
         t = (d - nx * ox - ny * oy - nz * oz) / along
         cosine = -along * rows[SCALE]
         rows[RANGE], rows[COSINE] = t, cosine
-        return builder.and_(cosine.all(">=", rows.same(GRAZING)), t.all("<=", rows[FAR]))
+        u, v, margin = hits[HIT_U].double(), hits[HIT_V].double(), rows[MARGIN]
+        settled = builder.and_(cosine.all(">=", rows.same(GRAZING)), t.all("<=", rows[FAR]))
+        started = ((t - rows.same(values[3])) * cosine).all(">", rows.same(START) * rows[INVERSE])
+        settled = builder.and_(settled, started)
+        for share in (u, v, rows.same(1.0) - u - v):
+            settled = builder.and_(settled, (share * cosine).all(">=", margin))
+        return settled
 
-    return types.boolean(lanes, types.int64), build
+    return types.boolean(lanes, types.int64, types.int64, types.float64), build
 
 
 cross: Any = _cross
 """Compute the ranges and cosines at which rays intersect their planes.
 
-Returns whether all ranges are within far and all rays hit the front of a face at no grazing angle."""
+Returns whether all ranges are beyond near and within far, and all rays hit the front of a face, at no grazing
+angle and clearly within its edges."""

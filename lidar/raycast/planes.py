@@ -9,8 +9,12 @@ import numpy as np
 from lidar.raycast.columns import COPIES, Target
 from lidar.raycast.lanes import GRAZING
 from lidar.raycast.memory import called, float64_at, inlined, int32_at, int64_at, vector
-from lidar.raycast.rows import DX, DY, DZ, INVERSE, OX, OY, OZ, TIME
+from lidar.raycast.rows import DX, DY, DZ, OX, OY, OZ
 
+PLANE = 40
+"""Bytes of a row of `lidar.raycast.geometry.Geometry.planes`."""
+EXACT = 4e-15
+"""Rounding of the distance between a ray and an edge, per metre of distance and of coordinates."""
 INVALID = np.uint32(0xFFFFFFFF)
 """Embree's number for no geometry and no instance."""
 
@@ -63,7 +67,7 @@ def numbered(target: Target, row: int, prim: int) -> Any:
 @inlined
 def plane_of(target: Target, row: int, prim: int, instance: int, time: float) -> Any:
     """A face's plane in the caster's axes: normal (a unit vector for the own mesh) and offset."""
-    plane = int64_at(target.parts.ctypes.data, 5 * row) + 32 * prim
+    plane = int64_at(target.parts.ctypes.data, 5 * row) + PLANE * prim
     nx, ny, nz, d = float64_at(plane, 0), float64_at(plane, 1), float64_at(plane, 2), float64_at(plane, 3)
     if instance < 0:
         return nx, ny, nz, d
@@ -81,30 +85,60 @@ def plane_of(target: Target, row: int, prim: int, instance: int, time: float) ->
     return mx, my, mz, offset
 
 
+@inlined
+def _corner(target: Target, row: int, corner: int, instance: int, time: float) -> Any:
+    """A corner of a face in the caster's axes; corners of face f are 3 f to 3 f + 2."""
+    x, y, z = vector(target.parts[row, 1], np.int64(int32_at(target.parts[row, 2], corner)))
+    if instance >= 0:
+        M = transform_of(target, instance, time)
+        x, y, z = (
+            M[0] * x + M[1] * y + M[2] * z + M[3],
+            M[4] * x + M[5] * y + M[6] * z + M[7],
+            M[8] * x + M[9] * y + M[10] * z + M[11],
+        )
+    return x, y, z
+
+
 @called
 def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> Any:
     """Least and greatest ray parameter of a face's corners, measured along the ray."""
     ox, oy, oz, dx, dy, dz = ray
-    vertices, faces = target.parts[row, 1], target.parts[row, 2]
     low, high = np.inf, -np.inf
     for k in range(3):
-        x, y, z = vector(vertices, np.int64(int32_at(faces, 3 * prim + k)))
-        if instance >= 0:
-            M = transform_of(target, instance, time)
-            x, y, z = (
-                M[0] * x + M[1] * y + M[2] * z + M[3],
-                M[4] * x + M[5] * y + M[6] * z + M[7],
-                M[8] * x + M[9] * y + M[10] * z + M[11],
-            )
+        x, y, z = _corner(target, row, 3 * prim + k, instance, time)
         t = ((x - ox) * dx + (y - oy) * dy + (z - oz) * dz) / (dx * dx + dy * dy + dz * dz)
         low, high = min(low, t), max(high, t)
     return low, high
 
 
+@called
+def outside(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> float:
+    """Metres by which a ray passes outside the edges of a face, in float64; 0 if it hits the face.
+
+    Edges belong to both of their faces: what remains of float64 rounding counts as a hit.
+    """
+    ox, oy, oz, dx, dy, dz = ray
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    size = abs(ox) + abs(oy) + abs(oz)
+    low, high = np.inf, -np.inf
+    for k in range(3):
+        ax, ay, az = _corner(target, row, 3 * prim + k, instance, time)
+        bx, by, bz = _corner(target, row, 3 * prim + (k + 1) % 3, instance, time)
+        ax, ay, az, bx, by, bz = ax - ox, ay - oy, az - oz, bx - ox, by - oy, bz - oz
+        ex, ey, ez = bx - ax, by - ay, bz - az
+        edge = np.sqrt(ex * ex + ey * ey + ez * ez)
+        moment = dx * (ey * az - ez * ay) + dy * (ez * ax - ex * az) + dz * (ex * ay - ey * ax)
+        passed = moment / (length * edge) if edge > 0.0 else 0.0
+        rounding = EXACT * (size + abs(ax) + abs(ay) + abs(az) + edge)
+        passed = 0.0 if abs(passed) <= rounding else passed
+        low, high = min(low, passed), max(high, passed)
+    return max(0.0, min(-low, high))
+
+
 @inlined
-def intersection(target: Target, W: int, k: int, row: int, prim: int, instance: int, work: Any) -> Any:
-    """Range, cosine and normal (not unit), in float64, where lane k's ray intersects the plane of a face."""
-    ox, oy, oz, dx, dy, dz = (
+def ray_of(W: int, k: int, work: Any) -> Any:
+    """Origin and direction of lane k."""
+    return (
         work[OX * W + k],
         work[OY * W + k],
         work[OZ * W + k],
@@ -112,14 +146,22 @@ def intersection(target: Target, W: int, k: int, row: int, prim: int, instance: 
         work[DY * W + k],
         work[DZ * W + k],
     )
-    nx, ny, nz, d = plane_of(target, row, prim, instance, work[TIME * W + k])
+
+
+@called
+def intersection(
+    target: Target, row: int, prim: int, instance: int, ray: Any, inverse: float, time: float
+) -> Any:
+    """Range, cosine and normal (not unit), in float64, where a ray intersects the plane of a face."""
+    ox, oy, oz, dx, dy, dz = ray
+    nx, ny, nz, d = plane_of(target, row, prim, instance, time)
     along = nx * dx + ny * dy + nz * dz
     t = (d - nx * ox - ny * oy - nz * oz) / along
-    cosine = -along * work[INVERSE * W + k]
+    cosine = -along * inverse
     if instance >= 0:
         cosine /= np.sqrt(nx * nx + ny * ny + nz * nz)
     if not abs(cosine) >= GRAZING:
-        low, high = _extent(target, row, prim, instance, (ox, oy, oz, dx, dy, dz), work[TIME * W + k])
+        low, high = _extent(target, row, prim, instance, ray, time)
         t = high if t > high else low if not t >= low else t
         cosine = cosine if cosine == cosine else 0.0  # noqa: PLR0124
     return t, cosine, nx, ny, nz

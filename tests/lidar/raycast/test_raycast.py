@@ -152,6 +152,63 @@ def test_no_ray_from_outside_passes_through_the_near_side_of_a_solid():
     assert (hits.cosine > 0).all()
 
 
+def nested_balls():
+    """Vertices and faces of a ball within a ball: what a ray hits that leaks through the outer one."""
+    outer, inner = (trimesh.creation.icosphere(subdivisions=4, radius=radius) for radius in (10.0, 9.5))
+    faces = np.concatenate([outer.faces, inner.faces + len(outer.vertices)])
+    return np.concatenate([outer.vertices, inner.vertices]), faces, len(outer.vertices)
+
+
+@BACKENDS
+@pytest.mark.parametrize("jitter", [0.0, 1e-5])
+def test_no_ray_passes_through_a_vertex_to_a_front_face_behind_it(backend, jitter):
+    vertices, faces, outer = nested_balls()
+    rng = np.random.default_rng(12)
+    n = 200_000 if backend == "embree" else 20_000
+    aim = vertices[rng.integers(0, outer, n)]
+    origins = aim * rng.uniform(1.2, 6, (n, 1)) + rng.uniform(-0.5, 0.5, (n, 3))
+    way = aim + rng.uniform(-jitter, jitter, (n, 3)) - origins
+    hits = Caster(vertices, faces, backend=backend).cast(origins, way)
+    assert (hits.range < 1.0001).all()
+    assert (hits.cosine > 0).all()
+
+
+@pytest.mark.parametrize("distance", [0.0, 1024.0])
+def test_rays_beside_edges_hit_what_they_hit_in_float64(distance):
+    rng = np.random.default_rng(13)
+    box = trimesh.creation.box([3, 4, 5])
+    solids = [box.vertices @ turn.T + rng.uniform(-20, 20, 3) for turn in turns(rng, 30)]
+    vertices = np.concatenate(solids)
+    faces = np.concatenate([box.faces + 8 * k for k in range(30)])
+    corners = vertices[faces]
+    n = 20_000
+    face, k = rng.integers(0, len(faces), n), rng.integers(0, 3, n)
+    start, end = corners[face, k], corners[face, (k + 1) % 3]
+    aim = start + rng.random((n, 1)) * (end - start) + rng.uniform(-1e-4, 1e-4, (n, 3))
+    origins = rng.uniform(-40, 40, (n, 3))
+    way = (aim - origins) / np.linalg.norm(aim - origins, axis=1, keepdims=True)
+    hits = Caster(vertices, faces, origin=[distance, -distance, 0]).cast(origins, way)
+    ranges, _ = first_hits(corners, origins, way)
+    with np.errstate(invalid="ignore"):
+        wrong = ~(np.abs(hits.range - ranges) < 1e-9) & (hits.range != ranges)
+    assert wrong.sum() <= n // 10_000  # where the ray passes an edge within float64 rounding
+
+
+@BACKENDS
+def test_a_ray_that_starts_on_a_face_does_not_hit_it(backend):
+    vertices, faces = sheet([0.3, 0.5, 0.8], np.array([3.0, 4.0, 100.0]))
+    ceiling, roof = sheet([-0.3, -0.5, -0.8], np.array([6.0, 9.0, 108.0]))
+    cast = Caster(np.concatenate([vertices, ceiling]), np.concatenate([faces, roof + 5]), backend=backend)
+    rng = np.random.default_rng(14)
+    down = rng.uniform(-0.2, 0.2, (5000, 3)) - [0.3, 0.5, 0.8]
+    above = rng.uniform([-30, -30, 150], [30, 30, 190], (5000, 3))
+    start = above + cast.cast(above, down).range[:, None] * down
+    again = cast.cast(start, rng.normal(size=(5000, 3)))
+    assert not (again.range < 1e-6).any()
+    through = cast.cast(start, down)
+    assert (through.range > 0.1).all()
+
+
 def test_hits_do_not_depend_on_the_number_of_threads():
     rng = np.random.default_rng(5)
     vertices, faces = soup(rng, 3000)
