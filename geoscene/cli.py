@@ -241,7 +241,8 @@ def info(
 def validate(scene: Path, /, *, json: bool = False) -> int:
     """Check all solids and surfaces of a scene; exit code 1 if one has a fault.
 
-    A solid is closed, oriented and of positive volume. In a surface, such as a road, no two vertices are
+    A solid is closed, oriented and of positive volume, its faces meet in common edges and vertices only, and
+    no two of its vertices are within 1 mm. In a surface, such as a road, no two vertices are
     within 1 mm, no face is a line and no edge has three faces.
 
     Parameters
@@ -262,7 +263,7 @@ def validate(scene: Path, /, *, json: bool = False) -> int:
         for row in report["broken"]:
             print(f"{row['osm_id']} (feature {row['feature']}): {row['fault']}")
         valid = report["solids"] - len(report["broken"])
-        print(f"{report['solids']} solids, {valid} closed, oriented and of positive volume")
+        print(f"{report['solids']} solids, {valid} closed, oriented and free of self-contact")
         for row in report["broken_surfaces"]:
             i, j = row["tile"]
             of = f" of {row['osm_id']} (feature {row['feature']})" if row["feature"] >= 0 else ""

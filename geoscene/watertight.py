@@ -1,4 +1,4 @@
-"""Checks of solids: closed, consistently oriented, of positive volume, without degenerate faces."""
+"""Checks of solids: closed, oriented 2-manifolds of positive volume that do not touch themselves."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.intersections import intersecting_faces
 from geoscene.mesh import Mesh
 from geoscene.typing import Float, Ints
 
 GRID = 1e-4
 """Metres, cell size of the grid on which vertices are welded: those in one cell count as one."""
+
+NEAR = 1e-3
+"""Metres; vertices of a solid that are closer than this merge in programs that snap to a millimetre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +28,9 @@ class Verdict:
     closed     : (n,) bool, every edge has exactly two faces after welding
     oriented   : (n,) bool, adjacent faces run along their common edge in opposite directions
     positive   : (n,) bool, the signed volume is positive
+    fans       : (n,) int64, vertices whose faces are connected only in the vertex itself
+    crossings  : (n,) int64, pairs of faces that cross or touch outside their common vertices and edges
+    near       : (n,) int64, pairs of vertices less than 1 mm apart
     degenerate : (n,) int64, faces without area after welding
     volume     : (n,) float64, cubic metres; NaN where not finite
     """
@@ -34,6 +41,9 @@ class Verdict:
     closed: NDArray[np.bool_]
     oriented: NDArray[np.bool_]
     positive: NDArray[np.bool_]
+    fans: Ints
+    crossings: Ints
+    near: Ints
     degenerate: Ints
     volume: Float
 
@@ -44,7 +54,9 @@ class Verdict:
     @property
     def ok(self) -> NDArray[np.bool_]:
         """(n,) bool, the feature passes all checks."""
-        passed = self.finite & self.closed & self.oriented & self.positive & (self.degenerate == 0)
+        passed = self.finite & self.closed & self.oriented & self.positive
+        for count in (self.degenerate, self.fans, self.crossings, self.near):
+            passed &= count == 0
         return np.asarray(passed, np.bool_)
 
     def fault(self, row: int) -> str:
@@ -55,6 +67,9 @@ class Verdict:
             ("not-closed", self.closed[row]),
             ("not-oriented", self.oriented[row]),
             ("no-volume", self.positive[row]),
+            ("touches-in-a-vertex", self.fans[row] == 0),
+            ("self-intersection", self.crossings[row] == 0),
+            ("vertices-within-1-mm", self.near[row] == 0),
         )
         return next((slug for slug, passed in checks if not passed), "")
 
@@ -73,7 +88,7 @@ def weld(points: Float, owner: NDArray[np.integer], *, grid: float = GRID) -> tu
 
     points : (n, 3) metres, finite, within 1e5 m of the origin
     """
-    cell = np.rint(points * (1.0 / grid)).astype(np.int64)
+    cell = grid_cells(points, grid=grid)
     cell -= cell.min(axis=0, initial=np.iinfo(np.int64).max, keepdims=True) if len(cell) else 0
     ids, _ = _pair_ids(cell[:, 0], cell[:, 1])
     ids, _ = _pair_ids(ids, cell[:, 2])
@@ -95,10 +110,54 @@ def edge_uses(corners: Ints) -> tuple[Ints, Ints, Ints]:
 
 def degenerate_faces(points: Float, faces: NDArray[np.integer], *, grid: float = GRID) -> NDArray[np.bool_]:
     """(m,) bool: the three corners, rounded to the grid, are collinear."""
-    cell = np.rint(points * (1.0 / grid)).astype(np.int64)
+    cell = grid_cells(points, grid=grid)
     a, b, c = (cell[faces[:, k]] for k in range(3))
     # the cross product is exact for differences below 2**31 grid cells (200 km)
     return np.asarray(~np.cross(b - a, c - a).any(axis=1), np.bool_)
+
+
+def vertex_fans(corners: Ints) -> Ints:
+    """Vertices (k,) whose faces form several fans, connected by edges only within each.
+
+    corners : (m, 3) welded vertex ids
+    """
+    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    half = corners.size
+    edge, _, _ = edge_uses(corners)
+    # an edge joins the corners of its faces at its lower end, and those at its upper end
+    start, stop = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    following = np.arange(half).reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    ends = half + 2 * edge
+    node = np.concatenate([ends + (start > stop), ends + (start < stop)])
+    corner = np.concatenate([np.arange(half), following])
+    size = half + 2 * (int(edge.max(initial=-1)) + 1)
+    graph = coo_array((np.ones(len(node), np.int8), (corner, node)), shape=(size, size))
+    fan = connected_components(graph, directed=False)[1][:half]
+    vertex = np.unique(np.stack([start, fan], axis=1), axis=0)[:, 0]
+    found: Ints = np.unique(vertex[1:][np.diff(vertex) == 0])
+    return found
+
+
+def near_vertices(cells: Ints, owner: NDArray[np.integer], *, steps: int) -> Ints:
+    """Pairs (k, 2) of different points of one owner less than ``steps`` grid steps apart.
+
+    cells : (n, 3) whole grid numbers
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
+
+    # owners are set apart in a fourth dimension
+    apart = np.column_stack([cells - cells.min(axis=0, initial=0), owner * (2.0 * steps)])
+    pairs = cKDTree(apart).query_pairs(steps, output_type="ndarray").astype(np.int64)
+    squared = ((cells[pairs[:, 0]] - cells[pairs[:, 1]]) ** 2).sum(axis=1)
+    chosen: Ints = pairs[(squared > 0) & (squared < steps**2)]
+    return chosen
+
+
+def grid_cells(points: Float, *, grid: float = GRID) -> Ints:
+    """Whole grid numbers (n, 3) of points (n, 3)."""
+    return np.rint(points * (1.0 / grid)).astype(np.int64)
 
 
 def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
@@ -107,37 +166,75 @@ def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
     Vertices of a feature in one grid cell count as one, because files with rounded coordinates merge them.
     """
     rows = np.flatnonzero(mesh.closed)
-    faces = mesh.faces[rows].astype(np.int64)
     feature, owner = np.unique(mesh.feature[rows], return_inverse=True)
+    finite_face = np.isfinite(mesh.vertices[mesh.faces[rows]]).all(axis=(1, 2))
     n = len(feature)
-
-    finite_face = np.isfinite(mesh.vertices[faces]).all(axis=(1, 2))
     finite = np.bincount(owner, weights=~finite_face, minlength=n) == 0
     checked = finite[owner]
-    corners, owners = mesh.vertices[faces[checked]].reshape(-1, 3), np.repeat(owner[checked], 3)
-    ids, first = weld(corners, owners, grid=grid)
-    points, triangles = corners[first], ids.reshape(-1, 3)
-    owner_of = owner[checked]
-
-    edge, uses, balance = edge_uses(triangles)
-    edge_owner = np.zeros(len(uses), np.int64)
-    edge_owner[edge] = np.repeat(owner_of, 3)
-    closed = np.bincount(edge_owner, weights=uses != 2, minlength=n) == 0
-    oriented = np.bincount(edge_owner, weights=balance != 0, minlength=n) == 0
-    degenerate = np.bincount(owner_of, weights=degenerate_faces(points, triangles, grid=grid), minlength=n)
-
-    volume = np.full(n, np.nan)
-    volume[finite] = _volumes(points, triangles, owner=owner_of, n=n)[finite]
+    corners = mesh.vertices[mesh.faces[rows[checked]]]
+    found = check_solids(corners, owner[checked].astype(np.int64), n=n, grid=grid)
+    volume = np.where(finite, found.volume, np.nan)
     return Verdict(
         feature.astype(np.int32),
         np.bincount(owner, minlength=n),
         finite,
-        closed & finite,
-        oriented & finite,
+        found.closed & finite,
+        found.oriented & finite,
         volume > 0,
-        degenerate.astype(np.int64),
+        found.fans,
+        found.crossings,
+        found.near,
+        found.degenerate,
         volume,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What `check_solids` finds, one row per solid; columns as in `Verdict`."""
+
+    closed: NDArray[np.bool_]
+    oriented: NDArray[np.bool_]
+    degenerate: Ints
+    fans: Ints
+    crossings: Ints
+    near: Ints
+    volume: Float
+
+    @property
+    def closed_solid(self) -> NDArray[np.bool_]:
+        """(n,) bool, the surface is closed, oriented, without degenerate faces, and of positive volume."""
+        return np.asarray(self.closed & self.oriented & (self.degenerate == 0) & (self.volume > 0), np.bool_)
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """(n,) bool, the solid has no fault."""
+        return np.asarray(self.closed_solid & (self.fans + self.crossings + self.near == 0), np.bool_)
+
+
+def check_solids(corners: Float, owner: Ints, *, n: int, grid: float = GRID) -> Findings:
+    """Checks of n solids, given the corners (m, 3, 3) of their triangles and the solid (m,) of each.
+
+    Solids that are not closed or have degenerate faces are not searched for further faults.
+    """
+    ids, first = weld(corners.reshape(-1, 3), np.repeat(owner, 3), grid=grid)
+    points, triangles = corners.reshape(-1, 3)[first], ids.reshape(-1, 3)
+    edge, uses, balance = edge_uses(triangles)
+    edge_owner = np.zeros(len(uses), np.int64)
+    edge_owner[edge] = np.repeat(owner, 3)
+    closed = np.bincount(edge_owner, weights=uses != 2, minlength=n) == 0
+    oriented = np.bincount(edge_owner, weights=balance != 0, minlength=n) == 0
+    flat = degenerate_faces(points, triangles, grid=grid)
+    degenerate = np.bincount(owner, weights=flat, minlength=n).astype(np.int64)
+
+    whole = (closed & oriented & (degenerate == 0))[owner]
+    cells, of = grid_cells(points, grid=grid), np.repeat(owner, 3)[first]
+    fans = np.bincount(of[vertex_fans(triangles[whole])], minlength=n)
+    crossing = intersecting_faces(cells, triangles[whole], owner=owner[whole])
+    crossings = np.bincount(owner[whole][crossing[:, 0]], minlength=n)
+    near = np.bincount(of[near_vertices(cells, of, steps=round(NEAR / grid))[:, 0]], minlength=n)
+    volume = _volumes(points, triangles, owner=owner, n=n)
+    return Findings(closed, oriented, degenerate, fans, crossings, near, volume)
 
 
 def _volumes(points: Float, triangles: Ints, *, owner: Ints, n: int) -> Float:

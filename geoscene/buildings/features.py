@@ -16,6 +16,7 @@ from geoscene.buildings.heights import read_heights
 from geoscene.buildings.parts import assign, clusters, cut_overlaps, duplicates, remainder
 from geoscene.buildings.resolve import Heights, Row, resolve_heights, texts
 from geoscene.buildings.roof_tags import read_roof_tags
+from geoscene.buildings.stacks import with_support
 from geoscene.buildings.table import BuildingOptions, Buildings
 from geoscene.frames import Frame
 from geoscene.report import Problem, described, make_without_failures, unexpected
@@ -193,6 +194,7 @@ def _table(
     heights, found = resolve_heights(rows, options=options)
     problems += found
     problems += _ignored_tags(rows, heights)
+    problems += with_support(rows, footprint, heights=heights)
     ids = texts([r.osm_id for r in rows])
     drawn = np.ones(len(rows), np.bool_)
     drawn[outline[is_part]] = False

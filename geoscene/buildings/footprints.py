@@ -15,8 +15,9 @@ from geoscene.typing import Bools, Float, Ints
 
 Polygons = NDArray[Any]
 
-NOTCH = 2e-3
-"""Half the diagonal of the notch that separates two rings touching in a point, metres."""
+NOTCHES = (1e-2, 3e-2, 1e-1)
+"""Half the diagonal of the notch that separates two rings touching in a point, metres. The next size is tried
+where the rings diverge so little that the grid closes the notch again (thin wedges)."""
 
 
 def to_grid(xy: Float) -> Float:
@@ -42,7 +43,7 @@ def project(geometry: Polygons, frame: Frame) -> Polygons:
 def clean(polygons: Polygons) -> tuple[Polygons, Bools]:
     """Valid polygons on the grid (n,), and which of them had to be repaired.
 
-    A repaired polygon may be a MultiPolygon, or empty. Rings of the result do not touch: a notch of 2 mm (up
+    A repaired polygon may be a MultiPolygon, or empty. Rings of the result do not touch: a notch of 10 mm (up
     to 100 mm in thin wedges) separates rings that touched in a point, where a wall edge would have four
     faces.
     """
@@ -86,8 +87,7 @@ def _polygonal(geometry: Polygons) -> Polygons:
 def _separate_rings(polygon: Any) -> Any:
     """The polygon with a notch cut wherever a corner of a ring lies on another ring."""
     points, cut = _touching(polygon), polygon
-    # a notch separates the rings only if they diverge by more than the grid: thin wedges need larger ones
-    for reach in (NOTCH, 10 * NOTCH, 50 * NOTCH):
+    for reach in NOTCHES:
         notches = shapely.union_all(shapely.buffer(points, reach, quad_segs=1))
         cut = _polygonal(np.array([shapely.difference(polygon, notches, grid_size=GRID)], dtype=object))[0]
         if not len(_touching(cut)):

@@ -14,7 +14,7 @@ from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.columns import Columns
 from geoscene.mesh import FLOOR, ROOF, WALL
 from geoscene.typing import Bools, Float, Ints
-from geoscene.watertight import degenerate_faces, edge_uses, weld
+from geoscene.watertight import edge_uses, weld
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,21 +114,3 @@ def prisms(polygons: Polygons, piece: Ints, *, low: Float, high: Float) -> Trian
     floor = Triangles(lift(xy, to_grid(low)[owner]), owner, np.full(len(xy), FLOOR, np.uint8))
     shells = close(top, floor, underside=to_grid(low))
     return Triangles(shells.corners, piece[shells.piece], shells.surface)
-
-
-def sound(shells: Triangles, n: int) -> Bools:
-    """(n,) bool, whether each piece is a closed, oriented, non-degenerate surface of positive volume."""
-    ids, first = weld(shells.corners.reshape(-1, 3), np.repeat(shells.piece, 3))
-    faces = ids.reshape(-1, 3)
-    edge, uses, balance = edge_uses(faces)
-    owner = np.zeros(len(uses), np.int64)
-    owner[edge] = np.repeat(shells.piece, 3)
-    bad = np.bincount(owner, weights=(uses != 2) | (balance != 0), minlength=n)
-    flat = degenerate_faces(shells.corners.reshape(-1, 3)[first], faces)
-    bad += np.bincount(shells.piece, weights=flat, minlength=n)
-    anchor = np.zeros((n, 3))
-    anchor[shells.piece] = shells.corners[:, 0]
-    a, b, c = (shells.corners[:, k] - anchor[shells.piece] for k in range(3))
-    volume = np.bincount(shells.piece, weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0, minlength=n)
-    fine: Bools = (bad == 0) & (volume > 0)
-    return fine

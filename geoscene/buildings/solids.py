@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.buildings.footprints import clean
+from geoscene.buildings.footprints import Polygons, clean, groups
 from geoscene.buildings.roofs import RoofSpec, roof_shell
-from geoscene.buildings.shells import Triangles, prisms, sound
+from geoscene.buildings.shells import Triangles, prisms
 from geoscene.buildings.table import Buildings
 from geoscene.buildings.unions import unite
 from geoscene.classes import Class
@@ -20,7 +20,10 @@ from geoscene.errors import InputError
 from geoscene.mesh import ROOF, Mesh
 from geoscene.report import Problem, described
 from geoscene.typing import Bools, Float, Ints
-from geoscene.watertight import weld
+from geoscene.watertight import check_solids, weld
+
+_ALIGNED = 0.02
+"""Metres, grid on which the pieces of a building are put together if they do not unite as they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +46,8 @@ def build_solids(
     Vertices lie on the 0.1 mm grid. Faces have the building's row as feature, class BUILDING, and surface,
     material and colour. LoD 0 extrudes the outline from the ground to the mean height of its parts; LoD 1 has
     parts with their undersides and flat tops at full height; LoD 2 has roofs. A building whose body is not a
-    solid is built again with flat roofs, then with cleaned footprints, and is dropped if that fails too.
+    solid is built again with its parts on a common grid, then with flat roofs, then with cleaned footprints,
+    and is dropped if that fails too.
 
     base : (count,) or (n,) z in metres of each building's base, in the order of the table; a part stands on
            its building's base
@@ -63,10 +67,14 @@ def build_solids(
     problems: list[Problem] = []
 
     done = [Triangles(np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty(0, np.uint8))]
-    for attempt in ("", "flat-roof", "cleaned-footprint"):
+    for attempt in ("", "aligned-parts", "flat-roof", "cleaned-footprint"):
         if not len(pieces.row):
             break
-        if attempt:
+        if attempt == "flat-roof" and pieces.flat.all():
+            continue
+        if attempt == "aligned-parts":
+            pieces = _aligned(pieces)
+        elif attempt:
             pieces = replace(pieces, flat=np.ones(len(pieces.row), np.bool_))
         if attempt == "cleaned-footprint":
             pieces = _simplified(pieces)
@@ -117,12 +125,39 @@ def _mean_heights(buildings: Buildings) -> Float:
     return np.divide(sums, total, out=buildings.height.copy(), where=total > 0)
 
 
+def _aligned(pieces: _Pieces) -> _Pieces:
+    """The pieces of each building on a common grid of 2 cm in plan and 1 cm in height.
+
+    Corners and edges of different pieces then coincide or are at least 1 cm apart (snap rounding).
+    """
+    out = [pieces.take(np.empty(0, np.int64))]
+    for mine in groups(pieces.building):
+        family = pieces.take(mine)
+        lines = shapely.union_all(shapely.boundary(family.polygon), grid_size=_ALIGNED)
+        cells = shapely.get_parts(shapely.polygonize(shapely.get_parts(lines)))
+        inside = shapely.point_on_surface(cells)
+        held = [cells[shapely.contains(polygon, inside)] for polygon in family.polygon]
+        out.append(_cut(family, np.fromiter([shapely.union_all(h) for h in held], object)))
+    aligned = _Pieces.concatenate(out)
+    low, high = np.round(aligned.low, 2), np.round(aligned.high, 2)
+    return replace(aligned, low=low, high=high).take(high > low)
+
+
 def _simplified(pieces: _Pieces) -> _Pieces:
-    """The pieces with footprints opened by 5 mm and rounded to 1 cm, which removes thin necks and spikes."""
-    opened = shapely.buffer(pieces.polygon, -0.005, join_style="mitre")
+    """The pieces with footprints opened by 5 mm and rounded to 1 cm, which removes thin necks and spikes.
+
+    Pieces of a divided building also lose 1 cm all around, so that those side by side do not touch.
+    """
+    alone = np.bincount(pieces.building)[pieces.building] == 1
+    opened = shapely.buffer(pieces.polygon, np.where(alone, -0.005, -0.015), join_style="mitre")
     rounded = shapely.set_precision(shapely.buffer(opened, 0.005, join_style="mitre"), 0.01)
-    polygon, index = shapely.get_parts(clean(rounded)[0], return_index=True)
-    return replace(pieces.take(index), polygon=polygon)
+    return _cut(pieces, rounded)
+
+
+def _cut(pieces: _Pieces, polygons: Polygons) -> _Pieces:
+    """The pieces with other polygons (n,), one piece for each part of these."""
+    polygon, index = shapely.get_parts(clean(polygons)[0], return_index=True)
+    return replace(pieces.take(index), polygon=polygon).take(shapely.area(polygon) > 0)
 
 
 def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, list[Problem]]:
@@ -130,9 +165,7 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
     n = len(pieces.row)
     notes: list[Problem] = []
     flat = np.flatnonzero(pieces.flat)
-    groups = [
-        prisms(pieces.polygon[flat], flat.astype(np.int64), low=pieces.low[flat], high=pieces.high[flat])
-    ]
+    made = [prisms(pieces.polygon[flat], flat.astype(np.int64), low=pieces.low[flat], high=pieces.high[flat])]
     for k in np.flatnonzero(~pieces.flat):
         row = pieces.row[k]
         spec = RoofSpec(
@@ -152,15 +185,14 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
             fallback = f"{spec.shape} roof made flat, {described(error)}"
         if fallback:
             notes.append(_problem(buildings, row, action="repaired", reason="roof-fallback", detail=fallback))
-        groups.append(replace(shell, piece=np.full(len(shell), k, np.int64)))
-    shells = Triangles.concatenate(groups)
-    fine = sound(shells, n)
-    failed = set(np.unique(pieces.building[~fine]).tolist())
+        made.append(replace(shell, piece=np.full(len(shell), k, np.int64)))
+    shells = Triangles.concatenate(made)
+    found = check_solids(shells.corners, shells.piece, n=n)
+    failed = set(np.unique(pieces.building[~found.closed_solid]).tolist())
 
-    several = np.bincount(pieces.building, minlength=len(buildings) + 1)[pieces.building] > 1
-    single = shells.take(~several[shells.piece])
-    out = [single]
-    multiple = shells.take(several[shells.piece])
+    ready = found.ok & (np.bincount(pieces.building, minlength=len(buildings) + 1)[pieces.building] == 1)
+    out = [shells.take(ready[shells.piece])]
+    multiple = shells.take(~ready[shells.piece])
     order = np.argsort(pieces.building[multiple.piece], kind="stable")
     multiple = multiple.take(order)
     owner = pieces.building[multiple.piece]
@@ -178,11 +210,12 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
             notes.append(
                 _problem(buildings, building, action="repaired", reason="touching-bodies", detail=note)
             )
-    result = Triangles.concatenate(out)
-    united_fine = sound(replace(result, piece=pieces.building[result.piece]), len(buildings))
-    failed |= {int(b) for b in np.unique(pieces.building) if not united_fine[b]}
     bad = np.array(sorted(failed), np.int64)
-    return result, bad, [p for p in notes if p.osm_id not in {buildings.osm_id[b] for b in bad}]
+    return (
+        Triangles.concatenate(out),
+        bad,
+        [p for p in notes if p.osm_id not in {buildings.osm_id[b] for b in bad}],
+    )
 
 
 def _mesh(buildings: Buildings, triangles: Triangles) -> Mesh:

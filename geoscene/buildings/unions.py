@@ -1,4 +1,4 @@
-"""Unions of the pieces of a building, on the grid, without edges of four faces."""
+"""Unions of the pieces of a building, on the grid, that nowhere touch themselves."""
 
 from __future__ import annotations
 
@@ -6,21 +6,36 @@ from typing import Any
 
 import manifold3d as m3
 import numpy as np
+import shapely
 
 from geoscene.buildings.footprints import to_grid
 from geoscene.buildings.shells import Triangles
+from geoscene.intersections import intersecting_faces
 from geoscene.mesh import WALL
 from geoscene.typing import Float, Ints
-from geoscene.watertight import degenerate_faces, edge_uses, weld
+from geoscene.watertight import (
+    check_solids,
+    degenerate_faces,
+    edge_uses,
+    grid_cells,
+    near_vertices,
+    vertex_fans,
+    weld,
+)
 
-GROOVES = (2e-3, 2e-2, 1e-1)
-"""Sizes of the groove that separates two bodies of a building which share only an edge, metres. The next size
-is tried where the grid closes the groove again (thin wedges); if none works, beads of these sizes join the
-bodies."""
+SEAMS = (1e-2, 1e-2, 3e-2)
+"""Sizes of the beads that join bodies of a building which only touch each other, metres, one attempt after
+another."""
+
+_TOLERANCE = 2e-3
+"""Metres by which surfaces of a union may move where that removes short edges."""
+
+_MERGE = 15
+"""Grid steps; vertices of a union that are closer are merged, which leaves none within a millimetre."""
 
 
 def unite(shells: Triangles) -> tuple[Triangles, str] | None:
-    """The union of the closed shells of one building, and a note on grooves or beads; None if it fails.
+    """The union of the closed shells of one building, and a note on beads; None if it is no solid.
 
     Faces keep their piece and surface.
     """
@@ -31,24 +46,22 @@ def unite(shells: Triangles) -> tuple[Triangles, str] | None:
     bodies = [_manifold(shells, piece, first=first + 4 * k, origin=origin) for k, piece in enumerate(pieces)]
     if any(body is None for body in bodies):
         return None
-    union = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
-    for operation, what in ((m3.OpType.Subtract, "parted by grooves"), (m3.OpType.Add, "joined by beads")):
-        body, note = union, ""
-        for reach in (*GROOVES, None):
-            if body.status() != m3.Error.NoError or body.is_empty():
-                return None
-            corners, run = _triangles(body, first)
-            seams = _non_manifold_edges(corners)
-            if not len(seams):
+    body, note = m3.Manifold.batch_boolean(bodies, m3.OpType.Add), ""
+    for reach in (*SEAMS, None):
+        if body.status() != m3.Error.NoError or body.is_empty():
+            return None
+        for candidate in (body, body.simplify(_TOLERANCE)):
+            corners, run = _triangles(candidate, first)
+            if check_solids(corners, np.zeros(len(corners), np.int64), n=1).ok[0]:
                 known = (run >= 0) & (run < 4 * len(pieces))
                 piece = pieces[np.where(known, run // 4, 0)]
                 surface = np.where(known, run % 4, WALL).astype(np.uint8)
                 return Triangles(to_grid(corners + origin), piece, surface), note
-            if reach is None:
-                break
-            note = f"{len(seams)} edges where bodies only touched, {what} of {1e3 * reach:.0f} mm"
-            about = [_cutter(a, b, reach=reach) for a, b in seams]
-            body = m3.Manifold.batch_boolean([body, *about], operation)
+        seams = _seams(corners)
+        if reach is None or not seams:
+            return None
+        note = f"{len(seams)} places where bodies only touched, joined by beads of {1e3 * reach:.0f} mm"
+        body = m3.Manifold.batch_boolean([body, *(_bead(s, reach=reach) for s in seams)], m3.OpType.Add)
     return None
 
 
@@ -76,7 +89,24 @@ def _triangles(body: Any, first: int) -> tuple[Float, Ints]:
     run = np.repeat(np.asarray(mesh.run_original_id, np.int64), np.diff(mesh.run_index) // 3) - first
     points = to_grid(mesh.vert_properties[:, :3])
     ids, where = weld(points, np.zeros(len(points), np.int64))
-    return repair(points[where], ids[faces], run=run)
+    points = points[where]
+    return repair(points, merged_vertices(points)[ids[faces]], run=run)
+
+
+def merged_vertices(points: Float) -> Ints:
+    """For each point (n,) the first of those that a chain of steps shorter than 1.5 mm connects with it."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    n = len(points)
+    pairs = near_vertices(grid_cells(points), np.zeros(n, np.int64), steps=_MERGE)
+    if not len(pairs):
+        return np.arange(n)
+    graph = coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(n, n))
+    cluster = connected_components(graph, directed=False)[1]
+    first = np.unique(cluster, return_index=True)[1]
+    out: Ints = first[cluster]
+    return out
 
 
 def repair(points: Float, faces: Ints, *, run: Ints) -> tuple[Float, Ints]:
@@ -123,24 +153,52 @@ def _split_flat_face(points: Float, faces: Ints, *, run: Ints, flat: int) -> tup
     return out, runs
 
 
-def _non_manifold_edges(corners: Float) -> Float:
-    """Edges (k, 2, 3) shared by more than two triangles."""
+def _seams(corners: Float) -> list[Float]:
+    """Points (k, 3) of each place where a surface touches itself.
+
+    These are the ends of edges of more than two triangles and vertices of several fans; if there are no such
+    edges, also what else two faces have in common.
+    """
     flat = corners.reshape(-1, 3)
     ids, where = weld(flat, np.zeros(len(flat), np.int64))
-    faces = ids.reshape(-1, 3)
+    faces, points = ids.reshape(-1, 3), flat[where]
     edge, uses, _ = edge_uses(faces)
     crowded = np.flatnonzero(uses > 2)
     half = np.full(len(uses), -1)
     half[edge[::-1]] = np.arange(len(edge))[::-1]
-    chosen = half[crowded]
-    face, k = chosen // 3, chosen % 3
-    points = flat[where]
-    return np.stack([points[faces[face, k]], points[faces[face, (k + 1) % 3]]], axis=1)
+    face, k = half[crowded] // 3, half[crowded] % 3
+    edges = np.stack([faces[face, k], faces[face, (k + 1) % 3]], axis=1)
+    alone = np.setdiff1d(vertex_fans(faces), edges)
+    if len(edges):
+        return [*points[edges], *points[alone[:, None]]]
+    pair = intersecting_faces(grid_cells(points), faces, owner=np.zeros(len(faces), np.int64))
+    return [*points[alone[:, None]], *_contacts(points[faces[pair[:, 0]]], points[faces[pair[:, 1]]])]
 
 
-def _cutter(a: Float, b: Float, *, reach: float) -> Any:
-    """A convex body around an edge, ``reach`` metres larger on all sides."""
-    # rotated, so that none of its faces is coplanar with one of the building
-    turn = np.array([[0.936, -0.275, 0.218], [0.290, 0.956, -0.036], [-0.199, 0.097, 0.975]])
+def _contacts(first: Float, second: Float) -> list[Float]:
+    """Points (k, 3) that pairs of triangles (n, 3, 3) have in common, or nearly so: corners and piercings."""
+    found = []
+    for one, two in ((first, second), (second, first)):
+        normal = np.cross(two[:, 1] - two[:, 0], two[:, 2] - two[:, 0])
+        axes = np.array([[1, 2], [2, 0], [0, 1]])[np.argmax(np.abs(normal), axis=1)][:, None]
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        away = np.einsum("nij,nj->ni", one - two[:, :1], normal)
+        beyond = np.roll(away, -1, axis=1)
+        crosses = away * beyond < 0
+        share = np.divide(away, away - beyond, out=np.zeros_like(away), where=crosses)
+        piercing = one + share[..., None] * (np.roll(one, -1, axis=1) - one)
+        points = np.concatenate([one, piercing], axis=1)
+        shadow = shapely.polygons(np.take_along_axis(two, axes, axis=2))
+        aside = shapely.distance(shapely.points(np.take_along_axis(points, axes, axis=2)), shadow[:, None])
+        near = np.concatenate([np.abs(away) < _TOLERANCE, crosses], axis=1) & (aside < _TOLERANCE)
+        found.append(np.where(near[..., None], points, np.nan))
+    common = np.concatenate(found, axis=1)
+    return [points[~np.isnan(points[:, 0])] for points in common if not np.isnan(points[:, 0]).all()]
+
+
+def _bead(points: Float, *, reach: float) -> Any:
+    """A convex body around points (k, 3), ``reach`` metres larger on all sides."""
+    # rotated, so that its corners lie well off the planes through the points that walls and floors have
+    turn = np.array([[0.762, -0.323, 0.561], [0.561, 0.762, -0.323], [-0.323, 0.561, 0.762]])
     star = np.vstack([turn, -turn]) * reach
-    return m3.Manifold.hull_points(np.vstack([a + star, b + star]))
+    return m3.Manifold.hull_points((points[:, None] + star).reshape(-1, 3))

@@ -23,6 +23,9 @@ from geoscene.typing import Bools, Float, Height
 _BELOW = 0.3
 """Metres by which a barrier extends below the ground, so that no gap opens on a slope."""
 
+_MERGED = 2e-3
+"""Metres by which outlines may change in plan, so that no two of their vertices lie within a millimetre."""
+
 _STATION = 5.0
 """Metres between samples of the ground's height along a barrier."""
 
@@ -161,7 +164,9 @@ def _solid(barriers: Barriers, row: int, *, height: Height | None) -> Mesh:
     """The closed solids of one barrier."""
     material = next(m for m in materials().values() if m.code == barriers.material[row])
     parts = []
-    shape = shapely.set_precision(shapely.segmentize(barriers.polygon[row], _STATION), PRECISION)
+    shape = shapely.set_precision(
+        shapely.segmentize(shapely.simplify(barriers.polygon[row], _MERGED), _STATION), PRECISION
+    )
     if _touches_itself(shape):
         shape = shapely.set_precision(shapely.buffer(shape, -_APART, join_style="mitre"), PRECISION)
     for part in shapely.get_parts(shape):

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import linprog
 
+from geoscene.intersections import intersecting_faces
 from geoscene.mesh import Mesh, concatenate
 from geoscene.watertight import validate_mesh
 
@@ -72,6 +74,47 @@ def with_a_point_on_an_edge(mesh):
     return Mesh.of(vertices, faces, feature=int(mesh.feature[0]), closed=True)
 
 
+def with_a_twin_at_a_vertex(mesh):
+    return concatenate([mesh, mesh.shifted(np.ptp(mesh.vertices, axis=0))])
+
+
+def with_a_body_that_crosses_it(mesh):
+    return concatenate([mesh, mesh.shifted(np.ptp(mesh.vertices, axis=0) * (0.5, 0.4, 0.3))])
+
+
+def with_a_body_that_stands_on_it(mesh):
+    """A smaller body whose floor lies on the top, without an edge or a vertex in common."""
+    middle, span = mesh.vertices.mean(axis=0), np.ptp(mesh.vertices, axis=0)
+    small = replace(mesh, vertices=middle + (mesh.vertices - middle) * 0.5)
+    return concatenate([mesh, small.shifted(span * (0, 0, 0.75))])
+
+
+def with_a_body_that_pierces_it_by_a_hair(mesh):
+    span = np.ptp(mesh.vertices, axis=0)
+    return concatenate([mesh, mesh.shifted(span * (1, 0.3, 0.3) - (2e-4, 0, 0))])
+
+
+def with_vertices_half_a_millimetre_apart(mesh):
+    """One vertex split in two along an edge."""
+    a, b = mesh.faces[0, 0], mesh.faces[0, 1]
+    start, way = mesh.vertices[a], mesh.vertices[b] - mesh.vertices[a]
+    twin = len(mesh.vertices)
+    faces = []
+    for face in mesh.faces.tolist():
+        following = dict(zip(face, [*face[1:], face[0]], strict=True))
+        if a in face and b in face:
+            other = next(v for v in face if v not in (a, b))
+            faces += (
+                [[a, twin, other], [twin, b, other]]
+                if following[a] == b
+                else [[twin, a, other], [b, twin, other]]
+            )
+        else:
+            faces.append(face)
+    vertices = np.vstack([mesh.vertices, start + way / np.linalg.norm(way) * 5e-4])
+    return Mesh.of(vertices, np.array(faces), feature=int(mesh.feature[0]), closed=True)
+
+
 BROKEN = {
     without_a_face: "not-closed",
     with_a_face_turned: "not-oriented",
@@ -81,12 +124,17 @@ BROKEN = {
     flattened: "degenerate-faces",
     with_a_twin_at_an_edge: "not-closed",
     with_a_point_on_an_edge: "degenerate-faces",
+    with_a_twin_at_a_vertex: "touches-in-a-vertex",
+    with_a_body_that_crosses_it: "self-intersection",
+    with_a_body_that_stands_on_it: "self-intersection",
+    with_a_body_that_pierces_it_by_a_hair: "self-intersection",
+    with_vertices_half_a_millimetre_apart: "vertices-within-1-mm",
 }
 
 
 @given(
     st.tuples(*[st.integers(-(10**7), 10**7)] * 3),
-    st.tuples(*[st.integers(1, 10**6)] * 3),
+    st.tuples(*[st.integers(10, 10**6)] * 3),
     st.booleans(),
 )
 @settings(max_examples=60, deadline=None)
@@ -135,3 +183,37 @@ def test_gaps_are_welded_up_to_the_grid_size():
         vertices = mesh.vertices.copy()
         vertices[0] += crack
         assert validate_mesh(replace(mesh, vertices=vertices)).closed[0] == whole
+
+
+def common_points(first, second, *, shared):
+    """Whether two triangles have a point in common outside shared corners and edges; by linear programs."""
+    cost = np.ones(6)
+    for i, j in shared:
+        cost[i] = cost[3 + j] = 0.0
+    equal = np.zeros((5, 6))
+    equal[:3, :3], equal[:3, 3:] = first.T, -second.T
+    equal[3, :3] = equal[4, 3:] = 1.0
+    found = linprog(-cost, A_eq=equal, b_eq=[0, 0, 0, 1, 1], bounds=[(0, None)] * 6)
+    return bool(found.status == 0 and (not shared or -found.fun > 1e-7))
+
+
+def test_faces_intersect_as_linear_programs_say():
+    rng = np.random.default_rng(5)
+    for _ in range(400):
+        # few grid points, so that corners, edges and planes coincide as often as they can
+        first, second = rng.integers(0, rng.integers(3, 6), (2, 3, 3))
+        if rng.random() < 0.3:
+            first[:, 2] = second[:, 2] = 0
+        common = int(rng.integers(0, 3))
+        second[:common] = first[:common]
+        corners = np.concatenate([first, rng.permutation(second)])
+        points, ids = np.unique(corners, axis=0, return_inverse=True)
+        faces = ids.reshape(2, 3)
+        if any(not np.cross(t[1] - t[0], t[2] - t[0]).any() for t in points[faces]):
+            continue
+        shared = [(i, j) for i in range(3) for j in range(3) if faces[0, i] == faces[1, j]]
+        if len(shared) == 3:
+            continue
+        far = points + rng.integers(-(10**7), 10**7, 3)
+        hit = len(intersecting_faces(far, faces, owner=np.zeros(2, np.int64))) == 1
+        assert hit == common_points(*points[faces].astype(float), shared=shared)

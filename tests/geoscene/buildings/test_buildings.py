@@ -3,6 +3,7 @@
 import importlib
 import random
 from dataclasses import replace
+from itertools import pairwise
 
 import manifold3d as m3
 import numpy as np
@@ -16,7 +17,7 @@ from shapely.errors import GEOSException
 from geoscene.buildings import BuildingOptions, build_solids, parts, read_buildings
 from geoscene.buildings.footprints import subtract
 from geoscene.buildings.heights import infer_heights
-from geoscene.buildings.shells import prisms, sound
+from geoscene.buildings.shells import prisms
 from geoscene.buildings.unions import unite
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
@@ -24,7 +25,7 @@ from geoscene.frames import Frame
 from geoscene.mesh import FLOOR, ROOF, WALL
 from geoscene.report import summarise
 from geoscene.sources.data import Area, OsmData, Relation
-from geoscene.watertight import validate_mesh
+from geoscene.watertight import check_solids, validate_mesh
 
 FRAME = Frame.at(8.7, 49.4)
 
@@ -239,19 +240,19 @@ def test_any_stack_of_parts_is_one_solid_with_the_volume_of_the_union(seed):
         house(99, box(0, 0, 9, 9), height="3"), *areas, options=BuildingOptions(strip=1e3)
     )
     union = m3.Manifold.batch_boolean(bodies, m3.OpType.Add).volume()
-    # a groove of some millimetres along an edge takes less than a litre
-    assert verdict.volume[0] == pytest.approx(union, abs=2e-3)
+    # a bead of a centimetre along an edge adds a tenth of a litre a metre
+    assert verdict.volume[0] == pytest.approx(union, abs=2e-2)
     manifold(mesh, 0)
 
 
-def test_bodies_that_share_an_edge_are_separated_and_reported():
+def test_bodies_that_share_an_edge_are_joined_and_reported():
     _, _, verdict, problems = built(
         house(1, box(0, 0, 20, 20), height="5"),
         part(2, box(0, 0, 10, 10), height="5"),
         part(3, box(10, 10, 10, 10), height="5"),
         options=BuildingOptions(strip=1e3),
     )
-    assert verdict.volume[0] == pytest.approx(500 + 500, rel=1e-6)
+    assert verdict.volume[0] == pytest.approx(500 + 500, rel=1e-5)
     assert ("way/1", "repaired", "touching-bodies") in reasons(problems)
 
 
@@ -584,8 +585,9 @@ def test_higher_levels_of_detail_add_parts_and_roofs():
     )
     volumes = [built(*areas, lod=lod)[2].volume for lod in (0, 1, 2)]
     assert volumes[0].tolist() == pytest.approx([2400, 200 * 9], rel=1e-6)
-    assert volumes[1].tolist() == pytest.approx([2400, 600 + 600], rel=1e-6)
-    assert volumes[2].tolist() == pytest.approx([200 * 10, 600 + 600], rel=1e-6)
+    # a bead joins the two parts along the edge they share
+    assert volumes[1].tolist() == pytest.approx([2400, 600 + 600], rel=1e-5)
+    assert volumes[2].tolist() == pytest.approx([200 * 10, 600 + 600], rel=1e-5)
 
 
 def test_the_base_lifts_a_building_with_all_its_parts():
@@ -612,6 +614,41 @@ def test_what_stands_on_the_ground_reaches_down_to_the_foot(lod):
     assert mesh.vertices[:, 2].min() == 97.5
     assert mesh.vertices[raised, 2].min() == (97.5 if lod == 0 else 103.0)
     assert mesh.vertices[:, 2].max() == pytest.approx(106.75 if lod == 0 else 109.0)
+
+
+def test_a_part_on_top_stands_on_the_outline_and_not_over_a_hole():
+    areas = (house(1, box(0, 0, 20, 10), height="15"),
+             part(2, box(5, 2, 6, 6), height="18", min_height="15"))  # fmt: skip
+    table, _, verdict, problems = built(*areas)
+    assert verdict.volume[0] == pytest.approx(200 * 15 + 36 * 3, rel=1e-6)
+    assert shapely.area(table.footprint[table.drawn]).sum() == pytest.approx(200 + 36, rel=1e-6)
+    assert "touching-bodies" not in {p.reason for p in problems}
+
+
+def test_a_slit_between_stacked_parts_is_closed():
+    areas = (
+        house(1, box(0, 0, 20, 10)),
+        part(2, box(0, 0, 20, 10), height="26"),
+        part(3, box(4, 2, 10, 6), height="29.3", building__levels="9", min_height="26.04"),
+    )
+    _, _, verdict, problems = built(*areas)
+    assert verdict.volume[0] == pytest.approx(200 * 26 + 60 * 3.3, rel=1e-6)
+    assert ("way/3", "repaired", "slit-between-parts") in reasons(problems)
+
+
+def test_parts_that_meet_within_a_millimetre_become_one_clean_solid():
+    # a strip of slices whose corners lie 0.3 to 0.8 mm off one another, at nearly equal heights
+    rng = np.random.default_rng(3)
+    xs = np.linspace(0, 30, 13)
+    slices = []
+    for k, (a, b) in enumerate(pairwise(xs)):
+        (p, q), (r, s) = rng.uniform(-8e-4, 8e-4, (2, 2))
+        ring = [(a + p, -5 + q), (b + r, -5 + s), (b + p, 5 + r), (a + s, 5 + p)]
+        low = str(round(3 + k * 0.05, 2))
+        slices.append(part(k + 2, shapely.Polygon(ring), height="12", min_height=low))
+    _, _, verdict, problems = built(house(1, shapely.box(-1, -9, 31, 9), height="12"), *slices)
+    assert not [p for p in problems if p.reason == "no-solid"]
+    assert verdict.volume[0] == pytest.approx(32 * 18 * 12 - 300 * 3.3, rel=0.01)
 
 
 def test_a_roof_direction_is_from_true_north():
@@ -662,7 +699,7 @@ def test_bodies_that_share_an_edge_with_a_narrow_gap_are_joined():
     shells = prisms(footprints, np.arange(2), low=np.zeros(2), high=np.full(2, 9.0))
     body, told = unite(shells)
     assert "joined by beads of" in told
-    assert sound(replace(body, piece=np.zeros(len(body), np.int64)), 1).all()
+    assert check_solids(body.corners, np.zeros(len(body), np.int64), n=1).ok.all()
     assert body.corners[..., 2].max() < 9.01
 
 
