@@ -29,6 +29,9 @@ KINDS = ("spinning", "prism", "sweep", "table", "flash", "scan2d", "line")
 WEAK_SIGMA = (0.09 / math.sqrt(2), 0.0)
 """Default of `Sensor.weak_sigma`: dR / sqrt(2) of LISA (Kilic et al. 2021), with its dR of 0.09 m."""
 
+_RATES_HZ = (1e-3, 1e4)
+"""Least and greatest rate of a scanner's frames."""
+
 _FWHM = 1.699
 """Ratio of the 1/e^2 full angle of a Gaussian beam to its full width at half maximum, sqrt(2 / ln 2)."""
 
@@ -167,7 +170,9 @@ def _read(table: Table, name: str, *, rate_hz: float, return_mode: str, start_ns
     kind = table.text("kind", among=KINDS)
     rates = table.numbers("rates_hz")
     rate = rate_hz or rates[0]
-    if min(rates) <= 0 or not min(rates) <= rate <= max(rates):
+    if min(rates) < _RATES_HZ[0] or max(rates) > _RATES_HZ[1]:
+        raise table.error("rates_hz", f"rates are {_RATES_HZ[0]:g} to {_RATES_HZ[1]:g} Hz")
+    if not min(rates) <= rate <= max(rates):
         raise table.error("rates_hz", f"{rate:g} Hz is not within {min(rates):g} to {max(rates):g}")
     modes = table.texts("return_modes", ("strongest",), among=RETURN_MODES)
     if not modes:

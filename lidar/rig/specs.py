@@ -81,6 +81,9 @@ class CameraSpec:
 SYSTEMS = ("gps", "glonass", "galileo", "beidou")
 """Names of the satellite systems, in the order in which satellites are numbered."""
 
+SLOWEST_HZ = 1e-3
+"""Least rate of a sensor's frames or measurements."""
+
 IMAGES = ("rgb", "depth", "semantic", "instance", "flow")
 """Kinds of image that a camera can write."""
 
@@ -171,11 +174,14 @@ def _mount(table: Table, *, camera: bool = False) -> Mount:
 
 def _lidar(table: Table, folder: Path) -> LidarSpec:
     preset = table.text("preset")
+    rate_hz = table.number("rate_hz", 0.0, low=0.0, high=1e4)
+    if 0 < rate_hz < SLOWEST_HZ:
+        raise table.error("rate_hz", f"{rate_hz:g} is under {SLOWEST_HZ:g}")
     return LidarSpec(
         name=table.text("name"),
         preset=str(folder / preset) if preset.endswith(".toml") else preset,
         mount=_mount(table),
-        rate_hz=table.number("rate_hz", 0.0, low=0.0, high=1e4),
+        rate_hz=rate_hz,
         time_offset_ns=table.integer("time_offset_ns", 0, low=0),
         return_mode=table.text("return_mode", ""),
     )
@@ -210,7 +216,7 @@ def _camera(table: Table) -> CameraSpec:
         ),
         near=near,
         far=table.number("far", 200.0, above=near),
-        rate_hz=table.number("rate_hz", 10.0, above=0.0, high=1e4),
+        rate_hz=table.number("rate_hz", 10.0, low=SLOWEST_HZ, high=1e4),
         time_offset_ns=table.integer("time_offset_ns", 0, low=0),
         images=table.texts("images", ("rgb", "depth"), among=IMAGES),
         exposure_ns=table.integer("exposure_ns", 0, low=0),
@@ -226,7 +232,7 @@ def _gnss(table: Table) -> GnssSpec:
     return GnssSpec(
         name=table.text("name", "gnss"),
         mount=_mount(table),
-        rate_hz=table.number("rate_hz", 10.0, above=0.0, high=1e3),
+        rate_hz=table.number("rate_hz", 10.0, low=SLOWEST_HZ, high=1e3),
         time_offset_ns=table.integer("time_offset_ns", 0, low=0),
         mode=table.text("mode", "single", among=GNSS_MODES),
         mask_deg=table.number("mask_deg", 10.0, low=0.0, high=90.0),
@@ -244,7 +250,7 @@ def _imu(table: Table) -> ImuSpec:
     return ImuSpec(
         name=table.text("name", "imu"),
         mount=_mount(table),
-        rate_hz=table.number("rate_hz", 100.0, above=0.0, high=1e5),
+        rate_hz=table.number("rate_hz", 100.0, low=SLOWEST_HZ, high=1e5),
         time_offset_ns=table.integer("time_offset_ns", 0, low=0),
         **{name: table.number(name, getattr(preset, name), low=0.0) for name in _NOISES},
     )

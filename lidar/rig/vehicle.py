@@ -20,6 +20,7 @@ _POSITIVE = (
     *("acceleration", "deceleration", "jerk", "lateral_acceleration", "lateral_jerk"),
 )
 
+_LARGEST = 1e4
 _SIGNED = ("roll_gradient", "pitch_gradient")
 
 
@@ -119,6 +120,8 @@ def _checked(table: dict[str, object], name: str) -> Vehicle:
             values[key] = float(value)
             if not np.isfinite(float(value)) or (float(value) < 0 and key not in _SIGNED):
                 faults.append(f"{key} = {value} must be a number of at least 0")
+            elif abs(float(value)) > _LARGEST:
+                faults.append(f"{key} = {value} exceeds {_LARGEST:g}")
         elif kind.startswith("tuple") and _is_numbers(value, 3):
             values[key] = tuple(value)
         elif (kind, type(value)) in (("str", str), ("bool", bool)):

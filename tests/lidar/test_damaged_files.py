@@ -147,3 +147,18 @@ def test_geojson_of_another_structure_is_refused(document, tmp_path):
     path.write_text(json.dumps(document))
     with pytest.raises(GeosceneError, match=r"track\.geojson"):
         read_track(path)
+
+
+@pytest.mark.parametrize(
+    ("folder", "name", "old", "new", "use"),
+    [
+        ("rigs", "vlp16", "[[lidar]]", "[[lidar]]\nrate_hz = 1e-12", load_whole_rig),
+        ("sensors", "vlp16", "rates_hz = [", "rates_hz = [1e18, ", load_sensor),
+        ("vehicles", "car", "turning_radius = ", "turning_radius = 9e9", load_vehicle),
+    ],
+)
+def test_numbers_far_out_of_range_are_refused(folder, name, old, new, use, tmp_path):
+    text = resources.files("lidar.rig").joinpath(folder, f"{name}.toml").read_text("utf-8")
+    (tmp_path / "a.toml").write_text(text.replace(old, new, 1), "utf-8")
+    with pytest.raises(LidarError, match=r"a\.toml"):
+        use(tmp_path / "a.toml")
