@@ -118,6 +118,16 @@ _CODES: dict[Class, tuple[int, int, int, int, tuple[int, int, int]]] = {
 }
 
 
+def class_rows() -> list[dict[str, str | int]]:
+    """Name of each class with its code here, in SemanticKITTI, nuScenes lidarseg, Waymo and LAS."""
+    names = ("semantic_kitti", "nuscenes", "waymo", "asprs")
+    rows: list[dict[str, str | int]] = []
+    for klass in Class:
+        *codes, _ = _CODES[klass]
+        rows.append({"name": klass.name.lower(), "code": int(klass), **dict(zip(names, codes, strict=True))})
+    return rows
+
+
 @functools.cache
 def class_codes() -> ClassCodes:
     """The tables that turn `Class` codes into those of other datasets."""

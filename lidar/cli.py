@@ -30,7 +30,7 @@ app = App(
 
     lidar map drive -o map.laz
 
-    lidar rigs, lidar sensors, lidar settings and lidar stages list the choices.
+    lidar rigs, lidar sensors, lidar settings and lidar stages list the choices, lidar classes the codes.
     """,
 )
 app.register_install_completion_command()
@@ -315,6 +315,27 @@ def sensors(*, json: JsonFlag = False) -> int:
     print(
         "\n--json adds the source of every number; a sensor of your own is a TOML file (see docs/sensors.md)."
     )
+    return 0
+
+
+@app.command
+def classes(*, json: JsonFlag = False) -> int:
+    """List the classes of points and pixels with their codes, also those of other datasets, and materials.
+
+    Parameters
+    ----------
+    json
+        Print them as JSON.
+    """
+    from geoscene.classes import class_rows, materials  # noqa: PLC0415
+    from lidar.rig.catalog import columns  # noqa: PLC0415
+
+    rows, surfaces = class_rows(), {m.name: m.code for m in materials().values()}
+    if json:
+        print_json({"classes": rows, "materials": surfaces})
+        return 0
+    print(columns([list(rows[0]), *([str(value) for value in row.values()] for row in rows)]))
+    print("\nMaterials: " + ", ".join(f"{code} {name}" for name, code in surfaces.items()))
     return 0
 
 

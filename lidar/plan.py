@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from geoscene.classes import Class, materials
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Ints
@@ -112,6 +113,8 @@ class DrivePlan:
             "seed": options.seed,
             "frames": next(iter(frames.values()), 0),
             "sensor_frames": frames,
+            "classes": {klass.name.lower(): int(klass) for klass in Class},
+            "materials": {material.name: material.code for material in materials().values()},
         }
         if self.scanning_ns is not None:
             on = np.clip(self.scanning_ns, 0, self.trajectory.duration_ns)
