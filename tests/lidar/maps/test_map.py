@@ -61,6 +61,7 @@ def dataset(path, *, first=0, frames=6, n=400, kinds=("laz",)):
             "export_crs": CRS_OUT.to_wkt(),
             "start_time": START.isoformat(),
             "frames": frames,
+            "frames_done": frames,
             "recipe": {},
         },
     )
@@ -203,6 +204,17 @@ def test_noise_is_left_out_and_counted_by_default(tmp_path):
     assert (summary.points, summary.noise, summary.points_in) == (793, 7, 800)
     kept = aggregate(data, tmp_path / "n.laz", options=MapOptions(noise=True))
     assert (kept.points, kept.noise) == (800, 0)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
+def test_a_cloud_with_impossible_points_is_refused_by_name(tmp_path, value):
+    data = dataset(tmp_path / "d", frames=2, kinds=("pcd",))
+    path = tmp_path / "d" / "top" / "pcd" / "000001.pcd"
+    table = dict(pcd.read(path))
+    pcd.write(path, table | {"x": np.where(np.arange(400) == 7, np.float32(value), table["x"])})
+    with pytest.raises(DatasetError, match=r"000001\.pcd: damaged"):
+        aggregate(data, tmp_path / "m.laz")
+    assert not (tmp_path / "m.laz").exists()
 
 
 def test_an_existing_map_is_replaced_only_on_request(tmp_path):
