@@ -33,6 +33,8 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from geoscene.scene import SceneFiles
+
 BOX = "--bbox=24.9425,60.1665,24.9445,60.1680"
 WORDS = (
     "nan", "inf", "-inf", "0", "-1", "1e308", "-1e308", "1e-308", "99999999999999999999", "0.1", "2147483648",
@@ -220,7 +222,9 @@ def _cases(kind: str, folder: Path) -> list[Callable[[random.Random], Case]]:
     scene = folder / "scene"
     _program("geoscene", "build", "--demo", BOX, "-o", scene, "--tile-size", "100")
     if kind == "scenes":
-        files = sorted(path for path in scene.rglob("*") if path.is_file() and path.name != "problems.csv")
+        files = sorted(
+            path for path in scene.rglob("*") if path.is_file() and path != SceneFiles(scene).problems
+        )
         exports = [
             ["geoscene", "export", str(scene), "-o", str(folder / f"x.{suffix}"), "--overwrite"]
             for suffix in ("glb", "city.json", "geojson", "gpkg", "tif", "xodr", "obj")

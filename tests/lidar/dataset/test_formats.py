@@ -81,7 +81,6 @@ def test_a_cloud_round_trips_within_the_precision_of_the_format(tmp_path, form, 
         away = np.abs(back[name].astype(float) - written[name].astype(float))
         assert away.max(initial=0) <= tolerance, name
     assert form.count(path) == n
-    assert form.header == (path.stat().st_size > 0) or n
 
 
 def test_the_same_cloud_is_the_same_bytes(tmp_path, form):
@@ -280,7 +279,7 @@ def test_a_failed_writer_leaves_nothing(tmp_path):
 def test_damaged_files_are_named_in_one_line(tmp_path, form, content):
     path = tmp_path / f"bad{form.suffix}"
     path.write_bytes(content)
-    if not content and not form.header:
+    if not content and form.name in ("kitti", "nuscenes"):  # files without a header: empty without points
         assert len(read_table(path)["x"]) == 0
         return
     with pytest.raises(FormatError, match="bad") as error:

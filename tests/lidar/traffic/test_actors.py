@@ -232,7 +232,12 @@ def test_a_road_user_that_appears_during_a_frame_or_beyond_the_radius_has_a_box(
 
 def test_boxes_of_a_dataset_include_those_that_only_its_second_scanner_has(tmp_path):
     sensors = {
-        name: {"kind": "lidar", "rate_hz": 10.0, "time_offset_ns": late}
+        name: {
+            "kind": "lidar",
+            "rate_hz": 10.0,
+            "time_offset_ns": late,
+            "vehicle_from_sensor": np.eye(4).tolist(),
+        }
         for name, late in (("a", 0), ("b", 90_000_000))
     }
     (tmp_path / "calibration.json").write_text(json.dumps({"sensors": sensors}))
