@@ -23,7 +23,7 @@ from geoscene.processes import run_tasks
 from geoscene.scene import SceneFiles
 from geoscene.sources import demo_path, read_osm
 
-BOX = (24.9435, 60.1670, 24.9455, 60.1684)
+BOX = (24.9425, 60.1665, 24.9465, 60.1690)
 OPTIONS = BuildOptions(name="demo", tile_size=100.0)
 IN_PROC = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 
