@@ -209,6 +209,8 @@ def build_tiles(
         with files.tile_journal.open("a", encoding="utf-8") as journal:
             journal.write(json.dumps({"keys": asdict(keys), **asdict(report)}) + "\n")
         yield report
+    for left in files.tiles.glob("*.part"):  # of workers that were killed while writing
+        left.unlink()
 
 
 @dataclass(frozen=True, slots=True)

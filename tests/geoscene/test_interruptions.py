@@ -201,6 +201,17 @@ def test_finished_tiles_are_kept_when_all_workers_are_killed(tmp_path):
     assert (tmp_path / "scene.part" / "tiles.jsonl").exists()
 
 
+def test_partly_written_tiles_of_killed_workers_are_deleted(osm, whole, tmp_path, monkeypatch):
+    build_tile = geoscene.tiles.build_tile
+
+    def leaving(plan, folder, **options):
+        SceneFiles(folder).tile(*options["tile"]).with_suffix(".npz.123.part").write_bytes(b"half")
+        return build_tile(plan, folder, **options)
+
+    monkeypatch.setattr(geoscene.tiles, "build_tile", leaving)
+    same_files(whole.path, build(osm, tmp_path / "scene", options=OPTIONS).path)
+
+
 def test_error_of_a_task_reaches_the_caller():
     with pytest.raises(ZeroDivisionError) as raised:
         list(run_tasks(lambda task: 1 / task, [1, 0, 2], workers=2))
