@@ -40,6 +40,10 @@ class SceneFormatError(InputError):
     """A folder that is not a scene, or one written by another version."""
 
 
+BUILD_AGAIN = "build the scene again with `overwrite`"
+"""What to do about a damaged file of a scene."""
+
+
 class SolidError(GeosceneError):
     """A solid that is not closed, oriented and of positive volume."""
 

@@ -128,6 +128,11 @@ def _locked(file: IO[bytes]) -> bool:
     return True
 
 
+def digest(data: bytes) -> str:
+    """Digest of bytes."""
+    return hashlib.sha256(data).hexdigest()[:20]
+
+
 def digest_of(path: Path) -> str:
     """Digest of a file's bytes; empty if the file cannot be read."""
     try:

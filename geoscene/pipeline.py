@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import hashlib
 import itertools
 import json
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ import shapely
 
 from geoscene import __version__
 from geoscene.errors import SourceNotFoundError
-from geoscene.files import digest_of
+from geoscene.files import digest, digest_of
 from geoscene.manifest import scene_manifest
 from geoscene.objects.shapes import shapes
 from geoscene.options import BuildOptions
@@ -144,4 +143,4 @@ def _with_companions(path: Path) -> list[Path]:
 
 def _digest(value: object) -> str:
     plain = asdict(value) if isinstance(value, Keys) else value
-    return hashlib.sha256(json.dumps(plain).encode()).hexdigest()[:20]
+    return digest(json.dumps(plain).encode())

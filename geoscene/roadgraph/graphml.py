@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.errors import SceneFormatError, reading
+from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
 from geoscene.files import write_atomically
 from geoscene.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
@@ -163,7 +163,7 @@ def read_graphml(path: Path, frame: Frame) -> RoadGraph:
 
     Raises SceneFormatError if the file is missing, damaged or not written by `write_graphml`.
     """
-    with reading(path, SceneFormatError, remedy="build the scene again with `overwrite`"):
+    with reading(path, SceneFormatError, remedy=BUILD_AGAIN):
         nodes, edges = _parse(path)
         return _graph(nodes, edges, frame=frame)
 

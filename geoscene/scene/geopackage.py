@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.errors import SceneFormatError, reading
+from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
 from geoscene.files import atomic_path, not_written
 from geoscene.frames import Frame
 
@@ -163,4 +163,4 @@ def read_layer(
 
 
 def _reading(path: Path, name: str) -> AbstractContextManager[None]:
-    return reading(f"{path}, layer {name}", SceneFormatError, remedy="build the scene again with `overwrite`")
+    return reading(f"{path}, layer {name}", SceneFormatError, remedy=BUILD_AGAIN)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping
@@ -11,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from geoscene.errors import GeosceneError, SceneFormatError, reading
-from geoscene.files import digest_of
+from geoscene.errors import BUILD_AGAIN, GeosceneError, SceneFormatError, reading
+from geoscene.files import digest, digest_of
 from geoscene.frames import Frame
 from geoscene.mesh import Mesh
 from geoscene.roadgraph import RoadGraph, read_graphml
@@ -21,8 +20,6 @@ from geoscene.scene.tile_files import Tile, read_shapes, read_tile
 
 SCHEMA = 1
 """Version of the scene directory; a reader refuses others."""
-
-_REMEDY = "build the scene again with `overwrite`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +182,7 @@ def open_scene(path: str | Path) -> Scene:
         raise SceneFormatError(
             f"{folder}: no {manifest_file.name} in it: not a scene, or its build did not finish"
         )
-    with reading(manifest_file, SceneFormatError, remedy=_REMEDY):
+    with reading(manifest_file, SceneFormatError, remedy=BUILD_AGAIN):
         manifest = json.loads(manifest_file.read_text("utf-8"))
         schema = manifest["schema"]
         if schema != SCHEMA:
@@ -193,7 +190,7 @@ def open_scene(path: str | Path) -> Scene:
                 f"{folder}: schema version {schema}, this program reads {SCHEMA}; build the scene again"
             )
         if manifest.get("digest") not in (None, manifest_digest(manifest)):
-            raise SceneFormatError(f"{manifest_file}: differs from what the build wrote; {_REMEDY}")
+            raise SceneFormatError(f"{manifest_file}: differs from what the build wrote; {BUILD_AGAIN}")
         scene = Scene(folder, manifest, Frame.from_json(manifest["frame"]))
         _ = scene.frame.crs, scene.bounds, scene.tile_size, scene.tile_indices, scene.layers
     return scene
@@ -202,16 +199,16 @@ def open_scene(path: str | Path) -> Scene:
 def manifest_digest(manifest: Mapping[str, Any]) -> str:
     """Digest of a manifest but for its own entry of it."""
     rest = {key: value for key, value in manifest.items() if key != "digest"}
-    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()[:20]
+    return digest(json.dumps(rest, sort_keys=True).encode())
 
 
 def changed_files(scene: Scene) -> list[Path]:
     """Files of a scene that are missing or differ from what the build wrote."""
-    stated = {scene.path / name: digest for name, digest in scene.manifest.get("files", {}).items()}
+    stated = {scene.path / name: value for name, value in scene.manifest.get("files", {}).items()}
     with suppress(OSError, ValueError, LookupError, TypeError):
         reports = json.loads(scene.files.tile_reports.read_text("utf-8"))["tiles"]
         stated |= {scene.files.tile(int(r["i"]), int(r["j"])): r["digest"] for r in reports}
-    return [path for path, digest in stated.items() if digest_of(path) != digest]
+    return [path for path, value in stated.items() if digest_of(path) != value]
 
 
 @contextmanager
@@ -230,6 +227,6 @@ def using(scene: Scene, *, known: type[Exception] = GeosceneError) -> Iterator[S
         if changed := changed_files(scene):
             cause = f"{type(error).__name__}: {error}"
             raise SceneFormatError(
-                f"{changed[0]}: differs from what the build wrote ({cause}); {_REMEDY}"
+                f"{changed[0]}: differs from what the build wrote ({cause}); {BUILD_AGAIN}"
             ) from error
         raise

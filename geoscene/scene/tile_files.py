@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.errors import SceneFormatError, reading
-from geoscene.files import digest_of, write_atomically
+from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
+from geoscene.files import digest, write_atomically
 from geoscene.mesh import Instances, Mesh
 from geoscene.typing import Float
-
-_REMEDY = "build the scene again with `overwrite`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +52,9 @@ def _mesh_arrays(mesh: Mesh) -> dict[str, NDArray[Any]]:
 def write_tile(path: Path, tile: Tile) -> str:
     """Write one tile as .npz and return the digest of the file."""
     instances = {f"instance_{f.name}": getattr(tile.instances, f.name) for f in fields(Instances)}
-    write_atomically(path, pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances}))
-    return digest_of(path)
+    data = pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances})
+    write_atomically(path, data)
+    return digest(data)
 
 
 def read_tile(path: Path) -> Tile:
@@ -63,7 +62,7 @@ def read_tile(path: Path) -> Tile:
 
     Raises SceneFormatError if the file is missing or damaged.
     """
-    with reading(path, SceneFormatError, remedy=_REMEDY):
+    with reading(path, SceneFormatError, remedy=BUILD_AGAIN):
         arrays = _unpacked(path)
         instances = {f.name: arrays[f"instance_{f.name}"] for f in fields(Instances)}
         return Tile(arrays["origin"], _mesh(arrays), Instances(**instances))
@@ -96,6 +95,6 @@ def read_shapes(path: Path) -> dict[str, Mesh]:
     """The shapes that `write_shapes` wrote, in order; empty if there is no such file."""
     if not path.exists():
         return {}
-    with reading(path, SceneFormatError, remedy=_REMEDY):
+    with reading(path, SceneFormatError, remedy=BUILD_AGAIN):
         arrays = _unpacked(path)
         return {str(name): _mesh(arrays, f"{name}/") for name in arrays["names"]}
