@@ -124,7 +124,7 @@ def fetch_elevation(
     for done, ((x, y), tile) in enumerate(
         zip(
             names,
-            _tiles([(x % 2**z, y) for x, y in names], z, cache_dir=cache_dir, server=server),
+            _tiles(names, z, cache_dir=cache_dir, server=server),
             strict=True,
         ),
         1,

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import bz2
 import datetime as dt
-import gzip
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,10 +29,10 @@ def _format_of(path: Path) -> str:
     if not head:
         raise InputError(f"{path}: the file is empty; {_HELP}")
     packed = ""
-    for magic, suffix, reader in ((b"\x1f\x8b", ".gz", gzip.open), (b"BZh", ".bz2", bz2.open)):
+    for magic, suffix in ((b"\x1f\x8b", ".gz"), (b"BZh", ".bz2")):
         if head.startswith(magic):
             packed = suffix
-            with reader(path, "rb") as content:
+            with OPEN[suffix](path, "rb") as content:
                 head = content.read(64)
     if head[4:6] == b"\x0a\x09" and head[6:15] == b"OSMHeader":
         return "pbf"
