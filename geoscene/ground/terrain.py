@@ -8,7 +8,7 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import shapely
@@ -178,7 +178,7 @@ def open_terrain(
         else:
             groups.append([raster])
     read = [found for group in groups if (found := _read(group, frame, bounds=bounds)) is not None]
-    read.sort(key=lambda found: found[1])
+    read.sort(key=lambda found: found.spacing)
     if not read:
         names = ", ".join(r.path.name for r in rasters)
         raise InputError(f"{names}: no heights within the scene, only voids")
@@ -188,16 +188,16 @@ def open_terrain(
         beyond.append(Problem("", "terrain", "repaired", "uncovered", detail))
     return Terrain(
         frame,
-        tuple(found[0] for found in read),
+        tuple(found.grid for found in read),
         rasters[0].vertical,
         ", ".join(sorted({datum for _, datum in kinds})),
-        min(found[1] for found in read),
-        sum(found[2] for found in read),
-        sum(found[3] for found in read),
+        min(found.spacing for found in read),
+        sum(found.posts for found in read),
+        sum(found.voids for found in read),
         uncovered if uncovered > 1e-9 else 0.0,
         tuple(r.path.name for r in rasters),
         tuple(r.credit for r in rasters),
-        (*beyond, *itertools.chain.from_iterable(found[4] for found in read)),
+        (*beyond, *itertools.chain.from_iterable(found.problems for found in read)),
     )
 
 
@@ -341,10 +341,18 @@ def _shares_lattice(one: _Raster, other: _Raster) -> bool:
     return bool(np.abs(apart - np.round(apart)).max() < 1e-2)
 
 
-def _read(
-    group: Sequence[_Raster], frame: Frame, *, bounds: Sequence[float]
-) -> tuple[Grid, float, int, int, tuple[Problem, ...]] | None:
-    """(grid, spacing in metres, posts, voids, problems) of rasters on one lattice; None without a height."""
+class _Found(NamedTuple):
+    """Heights near the scene: spacing in metres, numbers of posts and of voids among them, and repairs."""
+
+    grid: Grid
+    spacing: float
+    posts: int
+    voids: int
+    problems: tuple[Problem, ...]
+
+
+def _read(group: Sequence[_Raster], frame: Frame, *, bounds: Sequence[float]) -> _Found | None:
+    """The heights near the bounds of rasters on one lattice; None if there are none."""
     import rasterio  # noqa: PLC0415 - slow to import
     from rasterio.windows import Window  # noqa: PLC0415
 
@@ -391,7 +399,7 @@ def _read(
     )
     values[spikes] = np.nan
     grid = Grid(first.crs.to_wkt(), origin, first.step, _filled(values, known), known)
-    return grid, spacing, posts, voids, problems
+    return _Found(grid, spacing, posts, voids, problems)
 
 
 def _spacing(raster: _Raster, frame: Frame, *, bounds: Sequence[float]) -> float:
