@@ -80,7 +80,7 @@ WORDS = Parameter(converter=_words, n_tokens=1, metavar="STR,...")
 
 
 def degrees(names: str) -> Parameter:
-    """Parameter of an option that takes comma-separated degrees: W,S,E,N or LAT,LON."""
+    """Parameter of an option that takes comma-separated degrees: LAT,LON, or W,S,E,N as they are given."""
 
     def convert(_: object, tokens: Sequence[Token]) -> tuple[float, ...]:
         text, count = tokens[0].value.strip(), names.count(",") + 1
@@ -90,13 +90,7 @@ def degrees(names: str) -> Parameter:
             values = ()
         if len(values) != count:
             raise ValueError(f"{text}: give {count} numbers in degrees as {names}")
-        if names == "W,S,E,N":
-            west, south, east, north = values
-            east += 360 if east < west - 270 else 0  # across 180°
-            rising = west < east <= max(180, west + 90) and south < north
-            if not (rising and abs(west) <= 180 and south >= -90 and north <= 90):
-                raise ValueError(f"{text}: W,S,E,N must rise from west to east and south to north")
-        elif not (abs(values[0]) <= 90 and abs(values[1]) <= 180):
+        if names == "LAT,LON" and not (abs(values[0]) <= 90 and abs(values[1]) <= 180):
             raise ValueError(f"{text}: not a latitude and longitude in degrees")
         return values
 

@@ -152,6 +152,7 @@ def build_tile(
         problems += found
         low = float(np.floor(ground.vertices[:, 2].min(initial=0.0)))
         origin = np.array([tile[0] * size, tile[1] * size, low])
+        # Without unused vertices, as when the ground is taken from a former scene.
         rest = ground.take(np.arange(len(ground))).shifted(-origin)
         copies = copies.shifted(-origin)
     mesh = concatenate([solids.shifted(-origin), rest])
