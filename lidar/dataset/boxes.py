@@ -49,7 +49,8 @@ def box_rows(
     moving          : whether it moves at any time of the drive
     """
     rows = existing_actors(actors, time_ns, end_ns=max(end_ns, time_ns))
-    away = states(actors, rows, time_ns=time_ns).position - ego.at([time_ns]).position
+    pose = ego.at([time_ns])
+    away = states(actors, rows, time_ns=time_ns).position - pose.position
     seen = np.zeros(len(rows), bool) if feature is None else count_points(actors, rows, feature=feature) > 0
     rows = rows[(np.hypot(*away[:, :2].T) <= radius * actors.scale) | seen]
     at = states(actors, rows, time_ns=time_ns)
@@ -57,7 +58,6 @@ def box_rows(
     centre = _centres(actors, rows, at=at)
     quat = quat_from_matrix(turn)
     velocity = at.velocity / [actors.scale, actors.scale, 1.0]
-    pose = ego.at([time_ns])
     body = pose.rotation[0].T
     local = ((centre - pose.position) / pose.scale) @ body.T
     forward = turn[:, :, 0] @ body.T
