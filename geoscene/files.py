@@ -8,7 +8,9 @@ import hashlib
 import importlib
 import io
 import json
+import logging
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -21,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.errors import InputError, NotWrittenError
+
+log = logging.getLogger(__name__)
 
 fcntl = None if sys.platform == "win32" else importlib.import_module("fcntl")
 
@@ -75,25 +79,47 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
 
 
 @contextmanager
-def atomic_folder(path: Path, *, mark: str) -> Iterator[Path]:
+def atomic_folder(path: Path, *, mark: str, names: str) -> Iterator[Path]:
     """Yield a temporary folder that replaces ``path`` unless the block raises.
 
-    mark : name of a file that marks folders of this kind
+    Files of the replaced folder that are not of its kind are kept, with a warning for each.
+
+    mark  : name of a file that marks folders of this kind
+    names : regular expression of the paths, relative to the folder, of the files in folders of this kind
 
     Raises InputError if ``path`` exists and is neither empty nor a folder with the mark.
     """
     if path.exists() and not (path / mark).is_file() and not (path.is_dir() and not any(path.iterdir())):
         raise InputError(f"{path}: exists and holds no {mark}; give another folder")
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    place = path.resolve()
+    part, old = (place.with_name(f"{place.name}.{os.getpid()}.{end}") for end in ("part", "old"))
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     try:
         yield part
-        if path.exists():
-            shutil.rmtree(path)
-        part.rename(path)
+        if place.exists():
+            place.rename(old)
+        part.rename(place)
+        if old.exists():
+            for entry in _foreign_files(old, names=names):
+                _move(entry, place / entry.relative_to(old))
+                log.warning("%s: kept, though not of the export", path / entry.relative_to(old))
+            shutil.rmtree(old)
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _foreign_files(folder: Path, *, names: str) -> list[Path]:
+    """Files and links below a folder whose relative paths do not match a regular expression."""
+    own = re.compile(names)
+    entries = sorted(entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
+    return [entry for entry in entries if not own.fullmatch(entry.relative_to(folder).as_posix())]
+
+
+def _move(source: Path, target: Path) -> None:
+    """Move a file on its disk, to another folder that is made for it."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    source.rename(target)
 
 
 @contextmanager

@@ -7,11 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.export.files import Summary
-from geoscene.export.gltf import GlbWriter, add_instances, y_up
-from geoscene.export.objects import Features, Part, attribution, klass_name, parts, pieces, read_features
+from geoscene.export.gltf import GlbWriter, Tables, add_instances, y_up
+from geoscene.export.objects import (
+    Features,
+    Part,
+    attribution,
+    klass_name,
+    parts,
+    pieces,
+    read_features,
+)
 from geoscene.files import atomic_file
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -25,9 +32,9 @@ def write_glb(
     Axes as in glTF: x east, y up, z south, metres. The root node's translation is the origin of the scene's
     frame in its CRS, and its ``extras`` contain the CRS; vertices are float32 relative to a whole metre near
     the middle of their object, without loss. Every object is a named node with its attributes in ``extras``;
-    the same attributes are property tables (EXT_structural_metadata), one per layer, whose rows the vertices
-    refer to (EXT_mesh_features). Trees and street furniture are instances (EXT_mesh_gpu_instancing,
-    EXT_instance_features).
+    the same attributes are property tables (EXT_structural_metadata), one per layer, with a row for each
+    feature and class, to which the vertices refer (EXT_mesh_features). Trees and street furniture are
+    instances (EXT_mesh_gpu_instancing, EXT_instance_features).
 
     Raises InputError for more than 4 GiB.
     """
@@ -35,20 +42,15 @@ def write_glb(
     library = scene.shapes()
     objects = solids = faces = 0
     with atomic_file(path) as out, GlbWriter(path) as writer:
-        tables = _tables(writer, features, layers=layers)
+        tables = Tables(features)
         shapes: dict[int, int] = {}
         tiles = []
-
-        def metadata(layer: int, feature: NDArray[np.int32]) -> dict[str, Any]:
-            table, start, count = tables[features.layers[layer]]
-            return {"table": table, "rows": feature - start, "count": count}
-
         for part in parts(scene, layers, stage="GLB", progress=progress):
             first, copies = writer.nodes, part.instances
             solids += _objects(writer, part, features=features, tables=tables)
             objects += writer.nodes - first + len(copies)
             add_instances(
-                writer, copies, features=features, library=library, meshes=shapes, metadata=metadata
+                writer, copies, features=features, library=library, meshes=shapes, metadata=tables.metadata
             )
             faces += len(part.mesh)
             if writer.nodes > first:
@@ -56,6 +58,7 @@ def write_glb(
                 children = list(range(first, writer.nodes))
                 place = y_up(part.origin).tolist()
                 tiles.append(writer.node(name=name, translation=place, children=children))
+        tables.write(writer)
         east, north = scene.frame.origin
         root = writer.node(
             name=str(scene.manifest.get("name", "")) or "scene",
@@ -67,21 +70,7 @@ def write_glb(
     return Summary.of(path, "glb", objects=objects, solids=solids, faces=faces, crs=scene.frame.name)
 
 
-def _tables(
-    writer: GlbWriter, features: Features, *, layers: Collection[str] | None
-) -> dict[str, tuple[int, int, int]]:
-    """Number of each layer's property table, its first feature number and its number of features."""
-    tables = {}
-    for name, columns, first in zip(features.layers, features.columns, features.starts, strict=True):
-        if layers is None or name in layers:
-            count = len(next(iter(columns.values())))
-            tables[name] = (writer.property_table(name, columns, count=count), int(first), count)
-    return tables
-
-
-def _objects(
-    writer: GlbWriter, part: Part, *, features: Features, tables: dict[str, tuple[int, int, int]]
-) -> int:
+def _objects(writer: GlbWriter, part: Part, *, features: Features, tables: Tables) -> int:
     """Add a node for every object of a tile; returns the number of solids among them."""
     solids = 0
     for piece in pieces(part.mesh):
@@ -89,9 +78,9 @@ def _objects(
         middle = np.round((mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2)
         metadata: dict[str, Any] = {}
         if piece.feature >= 0:
-            table, first, count = tables[features.layer(piece.feature)]
-            rows = np.full(len(mesh.vertices), piece.feature - first)
-            metadata = {"table": table, "rows": rows, "count": count}
+            layer = features.layers.index(features.layer(piece.feature))
+            metadata = tables.metadata(layer, np.array([[piece.feature, piece.klass]]))
+            metadata["rows"] = np.repeat(metadata["rows"], len(mesh.vertices))
         number = writer.mesh(mesh, y_up(mesh.vertices - middle).astype("<f4"), **metadata)
         name = features.name(piece.feature)
         writer.node(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from geoscene.classes import materials
 from geoscene.errors import InputError
 from geoscene.export.files import compact_json
-from geoscene.export.objects import Features
+from geoscene.export.objects import Features, table_columns
 from geoscene.files import append, spool
 from geoscene.mesh import Instances, Mesh
 from geoscene.typing import Float
@@ -272,6 +272,26 @@ class GlbWriter:
         out.write(b"}")
 
 
+class Tables:
+    """Rows of the property tables: a table for each layer, a row for each feature and class in it."""
+
+    def __init__(self, features: Features) -> None:
+        self.features = features
+        self._tables: dict[int, tuple[int, dict[tuple[int, int], int]]] = {}
+
+    def metadata(self, layer: int, pairs: NDArray[np.integer]) -> dict[str, Any]:
+        """Number of a layer's table, the rows (n,) of pairs (n, 2) of feature and class, and their number."""
+        number, known = self._tables.setdefault(layer, (len(self._tables), {}))
+        rows = np.array([known.setdefault((f, k), len(known)) for f, k in pairs.tolist()], np.int64)
+        return {"table": number, "rows": rows, "count": len(np.unique(rows))}
+
+    def write(self, writer: GlbWriter) -> None:
+        """Add the tables to a file, in the order of their numbers."""
+        for layer, (_, known) in self._tables.items():
+            columns = table_columns(self.features, layer=layer, pairs=np.array([*known]))
+            writer.property_table(self.features.layers[layer], columns, count=len(known))
+
+
 def add_instances(
     writer: GlbWriter,
     instances: Instances,
@@ -279,13 +299,13 @@ def add_instances(
     features: Features,
     library: Mapping[str, Mesh],
     meshes: dict[int, int],
-    metadata: Callable[[int, NDArray[np.int32]], dict[str, Any]],
+    metadata: Callable[[int, NDArray[np.integer]], dict[str, Any]],
 ) -> list[int]:
     """Add a node for every shape and layer of instances; returns the nodes' numbers.
 
     meshes   : numbers of the meshes of shapes that the file has already; new ones are added
     metadata : the arguments ``table``, ``rows`` and ``count`` of `GlbWriter.copies` for a layer's number and
-               the features of its instances
+               the feature and class (k, 2) of its instances, see `Tables.metadata`
     """
     layer = np.searchsorted(features.starts, instances.feature, side="right") - 1
     keys = np.column_stack([instances.shape, layer])
@@ -293,9 +313,12 @@ def add_instances(
     for number, of_layer in np.unique(keys, axis=0).tolist():
         chosen = (keys == (number, of_layer)).all(axis=1)
         name = names[number]
+        shape = library[name]
         if number not in meshes:
-            meshes[number] = writer.mesh(library[name], y_up(library[name].vertices).astype("<f4"), name=name)
-        ids = metadata(of_layer, instances.feature[chosen]) if of_layer >= 0 else {}
+            meshes[number] = writer.mesh(shape, y_up(shape.vertices).astype("<f4"), name=name)
+        feature = instances.feature[chosen]
+        klass = np.full(len(feature), np.bincount(shape.klass).argmax())  # that of most faces
+        ids = metadata(of_layer, np.column_stack([feature, klass])) if of_layer >= 0 else {}
         transform = instances.transform[chosen]
         origin = np.round(transform[:, :, 3].mean(axis=0))
         nodes.append(writer.copies(meshes[number], transform, name=name, origin=origin, **ids))

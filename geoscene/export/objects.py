@@ -170,6 +170,18 @@ def expand(instances: Instances, library: Sequence[Mesh]) -> Mesh:
     return concatenate(out)
 
 
+def table_columns(features: Features, *, layer: int, pairs: NDArray[np.integer]) -> dict[str, NDArray[Any]]:
+    """``feature``, ``class`` and the attributes of features of a layer.
+
+    pairs : (n, 2) feature number and `Class` code: a building and its pad are one feature of two classes
+    """
+    feature, klass = pairs.T
+    rows = feature - features.starts[layer]
+    names = np.array([klass_name(code) for code in klass.tolist()], object)
+    attributes = {name: values[rows] for name, values in features.columns[layer].items()}
+    return {"feature": feature.astype(np.int32), "class": names, **attributes}
+
+
 def klass_name(code: int) -> str:
     """``building`` for 14."""
     return Class(code).name.lower()

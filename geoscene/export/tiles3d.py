@@ -8,18 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.errors import InputError
 from geoscene.export.files import Summary, compact_json
 from geoscene.export.globe import Globe
-from geoscene.export.gltf import GlbWriter, add_instances, y_up
+from geoscene.export.gltf import GlbWriter, Tables, add_instances, y_up
 from geoscene.export.objects import Features, Part, attribution, expand, parts, pieces, read_features
 from geoscene.files import atomic_file, atomic_folder, write_atomically
 from geoscene.mesh import Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float
+
+_NAMES = r"tileset\.json|content/-?\d+_-?\d+(_copies)?\.glb"
+"""Paths of the files of a tileset's folder, a regular expression."""
 
 _MARGIN = 1e-3
 """Metres that boxes are larger than their content, for what float32 rounds."""
@@ -48,8 +50,8 @@ def write_3dtiles(
     leads to EPSG:4978. Each tile of the scene contains its ground and solids, and has its instances (trees,
     street furniture; EXT_mesh_gpu_instancing) as a child. The geometric error of a tile is the size of what
     its children add: the diagonal of their bounding box for inner nodes, the height of the tallest instance
-    for tiles with instances, else 0. Features have their attributes as property tables
-    (EXT_structural_metadata, EXT_mesh_features).
+    for tiles with instances, else 0. Features have their attributes as property tables with a row for each
+    feature and class (EXT_structural_metadata, EXT_mesh_features).
 
     height_offset : metres from the zero of the scene's heights up from the WGS 84 ellipsoid (for orthometric
                     heights the geoid's undulation)
@@ -61,7 +63,7 @@ def write_3dtiles(
     features = read_features(scene)
     library = scene.shapes()
     objects = solids = faces = 0
-    with atomic_folder(path, mark="tileset.json") as folder:
+    with atomic_folder(path, mark="tileset.json", names=_NAMES) as folder:
         (folder / "content").mkdir()
         nodes: dict[tuple[int, int], _Node] = {}
         for part in parts(scene, layers, stage="3D Tiles", progress=progress):
@@ -166,11 +168,13 @@ def _write_mesh(
     layer = np.searchsorted(features.starts, mesh.feature, side="right")
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     with atomic_file(path) as out, GlbWriter(path) as writer:
-        children = []
+        tables, children = Tables(features), []
         for number in np.unique(layer).tolist():
             rows = np.flatnonzero(layer == number)
-            feature, which = np.unique(mesh.feature[rows], return_inverse=True)
-            # Vertices refer to their feature, so that features cannot share vertices.
+            pair = np.column_stack([mesh.feature[rows], mesh.klass[rows]])
+            pair, which = np.unique(pair, axis=0, return_inverse=True)
+            which = which.ravel()
+            # Vertices refer to their feature and class, so that these cannot share vertices.
             key = which[:, None] * len(mesh.vertices) + mesh.faces[rows].astype(np.int64)
             own, corners = np.unique(key, return_inverse=True)
             points = (local[own % len(mesh.vertices)] - middle).astype(np.float32)
@@ -178,48 +182,32 @@ def _write_mesh(
             high = np.maximum(high, points.max(axis=0) + middle)
             metadata: dict[str, Any] = {}
             if number:
-                table = _table(writer, features, layer=number - 1, feature=feature)
-                metadata = {"table": table, "rows": own // len(mesh.vertices), "count": len(feature)}
+                metadata = tables.metadata(number - 1, pair)
+                metadata["rows"] = metadata["rows"][own // len(mesh.vertices)]
             faces = replace(mesh.take(rows), faces=corners.reshape(-1, 3).astype(np.int32))
             name = features.layers[number - 1] if number else "terrain"
             children.append(
                 writer.node(name=name, mesh=writer.mesh(faces, y_up(points).astype("<f4"), **metadata))
             )
+        tables.write(writer)
         root = writer.node(translation=y_up(middle).tolist(), children=children)
         writer.finish(out, scene_nodes=[root], asset={"copyright": attribution(scene)})
     return low, high
-
-
-def _table(writer: GlbWriter, features: Features, *, layer: int, feature: NDArray[np.integer]) -> int:
-    """Add the attributes of some features of a layer, in their order; returns the table's number."""
-    rows = feature - features.starts[layer]
-    columns = {"feature": feature.astype(np.int32)}
-    columns |= {name: values[rows] for name, values in features.columns[layer].items()}
-    return writer.property_table(features.layers[layer], columns, count=len(feature))
 
 
 def _write_copies(
     path: Path, scene: Scene, *, part: Part, features: Features, globe: Globe, library: dict[str, Mesh]
 ) -> None:
     """Write the instances of a tile, one node per shape and layer."""
-    feature = part.instances.feature
     anchors = part.instances.transform[:, :, 3] + part.origin
     transform = part.instances.transform.copy()
     transform[:, :, :3] = globe.jacobian(anchors) @ transform[:, :, :3]
     transform[:, :, 3] = globe.local(anchors)
     copies = replace(part.instances, transform=transform)
-    layers = np.searchsorted(features.starts, feature, side="right") - 1
     with atomic_file(path) as out, GlbWriter(path) as writer:
-        tables: dict[int, tuple[int, NDArray[np.integer]]] = {}
-
-        def metadata(layer: int, chosen: NDArray[np.int32]) -> dict[str, Any]:
-            if layer not in tables:
-                present = np.unique(feature[layers == layer])
-                tables[layer] = _table(writer, features, layer=layer, feature=present), present
-            table, present = tables[layer]
-            return {"table": table, "rows": np.searchsorted(present, chosen), "count": len(present)}
-
+        tables = Tables(features)
         nodes = add_instances(
-            writer, copies, features=features, library=library, meshes={}, metadata=metadata
+            writer, copies, features=features, library=library, meshes={}, metadata=tables.metadata
         )
+        tables.write(writer)
         writer.finish(out, scene_nodes=nodes, asset={"copyright": attribution(scene)})

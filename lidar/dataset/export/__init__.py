@@ -42,6 +42,7 @@ class Exporter:
     module  : in this folder
     meaning : what is written, one line
     mark    : a file that is always written: a folder is overwritten only if it holds one
+    names   : regular expression of the paths of the files that it writes; others are kept when overwriting
     hint    : how to open the export; ``{path}`` stands for its folder
     """
 
@@ -49,6 +50,7 @@ class Exporter:
     module: str
     meaning: str
     mark: str
+    names: str
     hint: str
 
     def export(
@@ -64,7 +66,7 @@ class Exporter:
         if out.exists() and not overwrite:
             raise InputError(f"{out}: exists already; set `overwrite` to replace it")
         module = importlib.import_module(f"{__name__}.{self.module}")
-        with atomic_folder(out, mark=self.mark) as folder:
+        with atomic_folder(out, mark=self.mark, names=self.names) as folder:
             counts = module.export(dataset, folder, progress=progress)
         return ExportSummary(out, counts, self.hint.format(path=out))
 
@@ -77,6 +79,8 @@ EXPORTERS = {
             "nuscenes",
             "samples and sweeps with all tables of nuScenes, two key frames per second",
             mark="v1.0-mini/sample.json",
+            names=r"v1\.0-mini/[a-z_]+\.json|maps/drivable\.png|lidarseg/v1\.0-mini/[0-9a-f]{32}_lidarseg\.bin"
+            r"|(samples|sweeps)/[^/]+/.+__\d+\.(pcd\.bin|png)",
             hint="open it with NuScenes('v1.0-mini', '{path}')",
         ),
         Exporter(
@@ -84,6 +88,7 @@ EXPORTERS = {
             "tum",
             "trajectories of the vehicle and of every sensor as TUM text files",
             mark="vehicle.tum",
+            names=r"vehicle\.tum|sensors/[^/]+\.tum",
             hint="compare with evo_ape tum {path}/vehicle.tum ESTIMATE",
         ),
     )

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -55,6 +56,15 @@ def _values(document, buffer, number):
     start = view["byteOffset"] + accessor["byteOffset"]
     values = np.frombuffer(buffer, kind, accessor["count"] * width, start)
     return values.reshape(-1, width).astype(float)
+
+
+def _texts(document, buffer, *, table, column):
+    """The texts of a column of a property table."""
+    told = table["properties"][column]
+    views = (document["bufferViews"][told[name]] for name in ("values", "stringOffsets"))
+    data, offsets = (buffer[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in views)
+    cuts = np.frombuffer(offsets, "<u4", table["count"] + 1)
+    return [data[a:b].decode() for a, b in pairwise(cuts)]
 
 
 def _z_up(points):
@@ -277,16 +287,34 @@ def test_a_glb_node_has_its_name_its_attributes_and_its_row(scene, tmp_path):
     primitive = document["meshes"][node["mesh"]]["primitives"][0]
     told = primitive["extensions"]["EXT_mesh_features"]["featureIds"][0]
     rows = _values(document, buffer, primitive["attributes"]["_FEATURE_ID_0"])
-    assert (rows == 0).all()
     metadata = document["extensions"]["EXT_structural_metadata"]
     table = metadata["propertyTables"][told["propertyTable"]]
     assert table["name"] == "buildings"
-    view = document["bufferViews"][table["properties"]["name"]["values"]]
-    assert buffer[view["byteOffset"] :].startswith("Rathaus «Süd»".encode())
+    assert np.ptp(rows) == 0
+    assert _texts(document, buffer, table=table, column="name")[int(rows[0, 0])] == "Rathaus «Süd»"
     root = document["nodes"][document["scenes"][0]["nodes"][0]]
     east, north = scene.frame.origin
     assert root["translation"] == [east, 0, -north]
     assert root["extras"]["crs"] == "EPSG:32633"
+
+
+@pytest.mark.parametrize("kind", ["glb", "3dtiles"])
+def test_buildings_and_their_pads_have_rows_of_their_own_with_their_class(demo_scene, tmp_path, kind):
+    path = export_scene(demo_scene("local"), tmp_path / "out", options=ExportOptions(kind=kind)).path
+    classes = {}
+    for file in [path] if kind == "glb" else sorted(path.rglob("*.glb")):
+        document, buffer = _glb(file)
+        metadata = document.get("extensions", {}).get("EXT_structural_metadata", {"propertyTables": []})
+        for table in metadata["propertyTables"]:
+            klass, osm_id = (
+                _texts(document, buffer, table=table, column=column) for column in ("class", "osm_id")
+            )
+            assert all(klass)
+            if table["name"] == "buildings":
+                for name, own in zip(osm_id, klass, strict=True):
+                    classes.setdefault(name, set()).add(own)
+    both = [name for name, own in classes.items() if own == {"building", "building_pad"}]
+    assert len(both) > 0.8 * len(classes) > 10
 
 
 def test_glb_tree_instances_are_at_tree_positions(scene, tmp_path):
@@ -414,6 +442,20 @@ def test_folder_of_another_kind_is_not_replaced(scene, tmp_path):
     with pytest.raises(InputError, match=r"holds no tileset\.json"):
         export_scene(scene, tmp_path / "mine", overwrite=True, options=ExportOptions(kind="3dtiles"))
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
+
+
+def test_a_replaced_tileset_keeps_and_names_the_files_of_others(scene, tmp_path, caplog):
+    options, out = ExportOptions(kind="3dtiles"), tmp_path / "tiles"
+    export_scene(scene, out, options=options)
+    fresh = {path: path.read_bytes() for path in out.rglob("*.*")}
+    mine = [out / "style.json", out / "content" / "photo.png"]
+    for path in [*mine, out / "content" / "99_-99.glb"]:
+        path.write_text(path.name)
+    export_scene(scene, out, options=options, overwrite=True)
+    assert set(out.rglob("*.*")) == {*fresh, *mine}
+    assert {path: path.read_bytes() for path in fresh} == fresh
+    assert [path.read_text() for path in mine] == [path.name for path in mine]
+    assert all(f"{path}: kept" in caplog.text for path in mine)
 
 
 def test_height_offset_is_added_to_heights(scene, tmp_path, tiles):

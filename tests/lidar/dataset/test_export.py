@@ -98,6 +98,24 @@ def test_an_export_is_replaced_only_on_request_and_nothing_else_is(dataset, tmp_
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "done"
 
 
+def test_a_replaced_export_keeps_and_names_the_files_of_others(dataset, tmp_path, caplog):
+    row, out = EXPORTERS["tum"], tmp_path / "tum"
+    row.export(dataset, out)
+    fresh = {path: path.read_bytes() for path in out.rglob("*.tum")}
+    mine = [out / "thesis.txt", out / "sensors" / "top.tum.bak", out / "notes" / "a.md"]
+    for path in mine:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(path.name)
+    (out / "sensors" / "gone.tum").write_text("of an earlier rig")
+    (out / "sensors" / "top.tum").write_text("damaged")
+    row.export(dataset, out, overwrite=True)
+    assert {path for path in out.rglob("*") if path.is_file()} == {*fresh, *mine}
+    assert {path: path.read_bytes() for path in fresh} == fresh
+    assert [path.read_text() for path in mine] == [path.name for path in mine]
+    assert all(f"{path}: kept" in caplog.text for path in mine)
+    assert {path.name for path in tmp_path.iterdir()} == {"drive", "tum"}
+
+
 def test_a_failed_export_leaves_no_files(dataset, tmp_path):
     dataset.paths.timestamps("front").unlink()
     with pytest.raises(DatasetError, match="was the drive finished"):
