@@ -106,7 +106,7 @@ def drive_in_sumo(
     Raises MissingExtraError without eclipse-sumo, RouteError if SUMO's network does not have the route, and
     LidarError if a program of SUMO fails.
     """
-    home = Path(need("sumo", "sumo").SUMO_HOME)
+    home = _home()
     factor, more = _LONGER
     seconds = factor * first.duration_ns * 1e-9 + more if duration is None else duration + 10.0
     with tempfile.TemporaryDirectory(prefix="lidar-sumo-") as name:
@@ -139,6 +139,18 @@ def drive_in_sumo(
         options=options,
     )
     return ego, actors
+
+
+def _home() -> Path:
+    """Folder of SUMO; raises MissingExtraError without it.
+
+    Importing SUMO points PROJ, and so GDAL, of this process to a database that they refuse; that is undone.
+    """
+    before = {name: os.environ.get(name) for name in ("PROJ_DATA", "PROJ_LIB")}
+    home = Path(need("sumo", "sumo").SUMO_HOME)
+    for name in (name for name, value in before.items() if value is None):
+        os.environ.pop(name, None)
+    return home
 
 
 def _run(home: Path, program: str, *options: str | Path) -> None:

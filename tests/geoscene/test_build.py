@@ -207,31 +207,13 @@ def test_interrupted_build_resumes_with_the_same_bytes(osm, scene, tmp_path, mon
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
 
-@pytest.mark.parametrize(
-    ("change", "grounds"), [({"lod": 1}, 0), ({"name": "other"}, 0), ({"tile_size": 200}, 1)]
-)
-def test_rebuild_reuses_ground_that_the_options_do_not_change(
-    osm, scene, tmp_path, monkeypatch, change, grounds
-):
-    shutil.copytree(scene.path, tmp_path / "scene")
-    made = []
-    whole = geoscene.tiles.ground_tile
-    monkeypatch.setattr(geoscene.tiles, "ground_tile", lambda *a, **o: made.append(a) or whole(*a, **o))
-    options = BuildOptions(**({"name": "demo"} | change))
-    again = build(osm, tmp_path / "scene", options=options, overwrite=True)
-    assert len(made) == grounds * len(again.tile_indices)
-    same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
-
-
-def test_tiles_along_a_route_equal_those_of_the_whole_scene(osm, tmp_path):
-    along = ("60.1665,24.9420", "60.1668,24.9440")
-    options = BuildOptions(name="demo", along=along, reach=20.0, tile_size=100.0)
-    part = build(osm, tmp_path / "part", options=options)
-    whole = build(osm, tmp_path / "whole", options=BuildOptions(name="demo", tile_size=100.0))
-    assert 0 < len(part.tile_indices) < len(whole.tile_indices)
+def test_tiles_along_a_route_equal_those_of_the_whole_scene(osm, scene, tmp_path):
+    along = ("60.1665,24.9420", "60.1668,24.9425")
+    part = build(osm, tmp_path / "part", options=BuildOptions(name="demo", along=along, reach=20.0))
+    assert 0 < len(part.tile_indices) < len(scene.tile_indices)
     for i, j in part.tile_indices:
         name = f"tiles/{i}_{j}.npz"
-        assert (part.path / name).read_bytes() == (whole.path / name).read_bytes()
+        assert (part.path / name).read_bytes() == (scene.path / name).read_bytes()
 
 
 def test_only_selected_kinds_are_built(osm, tmp_path):

@@ -23,14 +23,14 @@ from geoscene.processes import run_tasks
 from geoscene.scene import SceneFiles
 from geoscene.sources import demo_path, read_osm
 
-BOX = (24.9425, 60.1665, 24.9465, 60.1690)
+SMALL, BOX = (24.9430, 60.1669, 24.9455, 60.1684), (24.9425, 60.1665, 24.9465, 60.1690)
 OPTIONS = BuildOptions(name="demo", tile_size=100.0)
 IN_PROC = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 
 
 @pytest.fixture(scope="module")
 def osm():
-    return read_osm(demo_path(), bounds=BOX)
+    return read_osm(demo_path(), bounds=SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -78,14 +78,17 @@ def test_every_option_has_a_change():
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_rebuild_with_another_option_has_the_bytes_of_a_fresh_build(
-    name, osm, whole, raster, route, tmp_path
+    name, osm, whole, raster, route, tmp_path, monkeypatch
 ):
     change = {name: CHANGES[name]} | {"dem": {"dem": (str(raster),)}}.get(name, {})
     if name in ("along", "reach"):
         change["along"] = (str(route),)
     options = replace(OPTIONS, **change)
     shutil.copytree(whole.path, tmp_path / "scene")
+    made, ground_tile = [], geoscene.tiles.ground_tile
+    monkeypatch.setattr(geoscene.tiles, "ground_tile", lambda *a, **o: made.append(a) or ground_tile(*a, **o))
     again = build(osm, tmp_path / "scene", options=options, overwrite=True)
+    assert len(made) == (0 if name in ("lod", "name", "along", "reach") else len(again.tile_indices))
     same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
 
 

@@ -1,9 +1,16 @@
-"""Runs the programs of the checkout under test in processes of their own."""
+"""Runs the programs of the checkout under test, in this process or in one of their own."""
 
+import contextlib
+import io
+import logging
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
+from unittest.mock import patch
+
+import pytest
 
 _ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(_ROOT)}
@@ -15,11 +22,28 @@ def command(name, *words):
     return [sys.executable, "-m", f"{name}.cli", *map(str, words)]
 
 
-def run_program(name, *words, **options):
+def run_process(name, *words, **options):
     """The completed process of the program ``name``, with its output as text; options of `subprocess.run`."""
     return subprocess.run(
         command(name, *words), env=ENVIRONMENT, capture_output=True, text=True, check=False, **options
     )
+
+
+def run_program(name, *words, cwd="."):
+    """What `run_process` returns, without starting a process, which takes a second to import the program."""
+    main = import_module(f"{name}.cli").main
+    arguments = [name, *map(str, words)]
+    out, errors = io.StringIO(), io.StringIO()
+    with (
+        contextlib.chdir(cwd),
+        patch.object(sys, "argv", arguments),
+        patch.object(logging.getLogger(), "handlers", []),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(errors),
+        pytest.raises(SystemExit) as end,
+    ):
+        main()
+    return subprocess.CompletedProcess(arguments, end.value.code, out.getvalue(), errors.getvalue())
 
 
 def alive(group):

@@ -12,7 +12,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from helpers.programs import run_program
+from helpers.programs import run_process, run_program
 from helpers.sensor_worlds import driven, plate, world
 from PIL import Image
 from scipy.spatial import cKDTree
@@ -615,15 +615,11 @@ def test_invalid_contents_are_refused(change, says):
         Contents(**change)
 
 
-def program(*words, **options):
-    return run_program("lidar", *words, **options)
-
-
 def test_a_sensor_without_returns_is_reported(scene, tmp_path):
     text = 'name = "up"\n[[lidar]]\nname = "sky"\npreset = "ust10lx"\ntranslation = [0.0, 0.0, 60.0]\n'
     (tmp_path / "up.toml").write_text(text)
     words = ["--rig", tmp_path / "up.toml", "--route", "random", "--duration", "0.5", "--format", "pcd"]
-    done = program("drive", scene.path, *words, "-o", tmp_path / "d")
+    done = run_program("lidar", "drive", scene.path, *words, "-o", tmp_path / "d")
     assert done.returncode == 0
     assert "sky has no returns" in done.stderr
 
@@ -646,7 +642,7 @@ def test_a_full_disk_ends_the_drive_with_one_line(scene, tmp_path):
         "--format",
         "laz",
     ]
-    done = program(*words, "-o", tmp_path / "d", preexec_fn=limit)
+    done = run_process("lidar", *words, "-o", tmp_path / "d", preexec_fn=limit)
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1, done.stderr
     assert "Traceback" not in done.stderr

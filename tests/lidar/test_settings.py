@@ -18,7 +18,7 @@ from lidar.rig.specs import load_rig, rig_names
 from lidar.settings import levels, list_settings, settings_of
 
 
-def program(*words, cwd=None):
+def program(*words, cwd="."):
     return run_program("lidar", *words, cwd=cwd)
 
 

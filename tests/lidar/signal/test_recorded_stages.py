@@ -9,9 +9,6 @@ import numpy as np
 import pytest
 from helpers.programs import run_program
 
-from geoscene.options import BuildOptions
-from geoscene.pipeline import build
-from geoscene.sources import demo_path, read_osm
 from lidar.apply import apply_stages
 from lidar.camera.png import read_png
 from lidar.dataset.formats import FORMATS, read_cloud
@@ -23,7 +20,6 @@ from lidar.pipeline import drive
 from lidar.signal.registry import read_stages
 from lidar.traffic.populate import TrafficOptions
 
-BOX = (24.9425, 60.1660, 24.9475, 60.1690)
 RIG = """
 name = "small"
 [[lidar]]
@@ -40,12 +36,6 @@ rate_hz = 5.0
 images = ["rgb", "depth", "instance"]
 """
 STAGES = read_stages(["dropped_packets:loss=0.2,burst=3", "lost_rows:loss=0.3,rows=4"]).stages
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scene") / "demo"
-    return build(read_osm(demo_path(), bounds=BOX), folder, options=BuildOptions())
 
 
 @pytest.fixture(scope="module")

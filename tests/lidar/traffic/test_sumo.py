@@ -4,12 +4,11 @@ import tempfile
 
 import numpy as np
 import pytest
+import rasterio
 import shapely
 from cyclopts import CoercionError
 
 from geoscene.errors import MissingExtraError
-from geoscene.pipeline import BuildOptions, build
-from geoscene.sources import demo_path, read_osm
 from lidar.cli import app
 from lidar.planning.motion import drive_path
 from lidar.planning.road_drive import plan_road_drive
@@ -20,14 +19,6 @@ from lidar.world.actors import existing_actors, states
 
 CAR = load_vehicle("car")
 SECONDS = 8.0
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    box = (24.9405, 60.1655, 24.9475, 60.1690)
-    return build(
-        read_osm(demo_path(), bounds=box), tmp_path_factory.mktemp("scene") / "demo", options=BuildOptions()
-    )
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +65,11 @@ def test_the_same_seed_gives_the_same_traffic_and_no_file_remains(drive, scene, 
     assert actors.position.tobytes() == drive[1].position.tobytes()
     assert simulated(scene, path, seed=3)[1].position.tobytes() != actors.position.tobytes()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("drive")
+def test_gdal_finds_its_own_database_of_reference_systems_beside_sumo():
+    assert rasterio.CRS.from_epsg(32635).is_projected
 
 
 def test_without_sumo_the_extra_is_named(scene, path, monkeypatch):
