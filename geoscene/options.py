@@ -106,7 +106,7 @@ class ExportOptions:
 
     layers: Annotated[tuple[str, ...] | None, WORDS] = None
     """Layers to write, separated by commas; all by default. terrain is the bare ground; building_solids, in
-    tables, the surfaces of buildings."""
+    GeoPackage, the table of the volumes of buildings."""
 
     model: str | None = None
     """GeoTIFF: surface (the default), terrain or classes."""

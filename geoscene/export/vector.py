@@ -15,7 +15,15 @@ from pyproj import CRS
 from geoscene.errors import need
 from geoscene.export.files import Summary, compact_json, plain
 from geoscene.export.objects import attribution
-from geoscene.export.tables import SOLIDS, chosen_layers, kinds_of_columns, rows, target_crs
+from geoscene.export.tables import (
+    SOLIDS,
+    chosen_layers,
+    geometry_type,
+    kinds_of_columns,
+    rows,
+    solids,
+    target_crs,
+)
 from geoscene.files import atomic_file
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -27,7 +35,7 @@ def _reading(
     scene: Scene, names: list[str], *, crs: CRS, stage: str, progress: Progress
 ) -> Iterator[tuple[int, Layer]]:
     """The chunks of all layers, with the number of rows before each."""
-    total = sum(np.subtract(*scene.layers[name][::-1]) for name in names if name != SOLIDS)
+    total = sum(np.subtract(*scene.layers[name][::-1]) for name in names)
     done = 0
     for name in names:
         for chunk in rows(scene, name, crs=crs):
@@ -44,28 +52,28 @@ def write_gpkg(
     layers: Collection[str] | None = None,
     progress: Progress = silent,
 ) -> Summary:
-    """Write the features as a GeoPackage: one layer for each kind, and ``building_solids`` as MultiPolygon Z.
+    """Write the features as a GeoPackage: one layer for each kind, and the table ``building_solids``.
 
-    The faces of a MultiPolygon Z bound the building, counter-clockwise seen from outside: GeoPackage has no
-    type for solids, and readers built on GEOS do not support PolyhedralSurface.
+    The table has the faces, heights and volume of each building's solid but no geometry: GeoPackage has no
+    type for solids, and as polygons, which are valid in plan only, their walls would be invalid.
 
     crs    : of the coordinates; default the scene's
     layers : names to write; default all
     """
     target = target_crs(scene, crs)
-    names = chosen_layers(scene, layers, solids=True)
-    objects = solids = faces = 0
+    tables = [SOLIDS] if np.diff(scene.layers.get("buildings", (0, 0)))[0] else []
+    names = chosen_layers(scene, layers, others=tables)
+    layers_in_plan = [name for name in names if name != SOLIDS]
+    objects = count = faces = 0
     with open_geopackage(path) as append:
-        for _, chunk in _reading(scene, names, crs=target, stage="GeoPackage", progress=progress):
-            solid = chunk.name == SOLIDS
-            append(
-                chunk, "MultiPolygon Z" if solid else scene.schema(chunk.name).geometry_type, target.to_wkt()
-            )
+        for _, chunk in _reading(scene, layers_in_plan, crs=target, stage="GeoPackage", progress=progress):
+            append(chunk, geometry_type(scene, chunk.name, crs=target), target.to_wkt())
             objects += len(chunk)
-            if solid:
-                solids += len(chunk)
-                faces += int(shapely.get_num_geometries(chunk.geometry).sum())
-    return Summary.of(path, "gpkg", objects=objects, solids=solids, faces=faces, crs=_named(target))
+        if SOLIDS in names:
+            table = solids(scene)
+            append(table, None, None)
+            count, faces = len(table), int(table.columns["faces"].sum())
+    return Summary.of(path, "gpkg", objects=objects + count, solids=count, faces=faces, crs=_named(target))
 
 
 def _named(crs: CRS) -> str:
@@ -80,9 +88,9 @@ def write_geojson(
 
     One collection of all layers; ``kind`` is the layer of a feature. Unknown values are left out.
 
-    layers : names to write; default all, less ``building_solids``
+    layers : names to write; default all
     """
-    names = chosen_layers(scene, layers, solids=False)
+    names = chosen_layers(scene, layers)
     wgs84 = CRS.from_user_input("OGC:CRS84")
     count = 0
     with atomic_file(path) as out:
@@ -125,14 +133,14 @@ def write_geoparquet(
     """Write the features as one GeoParquet 1.1 table with a ``bbox`` column; ``kind`` is the layer of a row.
 
     crs    : of the coordinates; default the scene's
-    layers : names to write; default all, less ``building_solids``
+    layers : names to write; default all
 
     Raises MissingExtraError without pyarrow.
     """
     pa = need("pyarrow", "gis")
     parquet = need("pyarrow.parquet", "gis")
     target = target_crs(scene, crs)
-    names = chosen_layers(scene, layers, solids=False)
+    names = chosen_layers(scene, layers)
     kinds = _common_kinds(pa, scene, names=names)
     box = pa.struct([(edge, pa.float64()) for edge in ("xmin", "ymin", "xmax", "ymax")])
     fields = [("kind", pa.string()), *kinds.items(), ("bbox", box), ("geometry", pa.binary())]

@@ -55,8 +55,10 @@ def _geometry_type(geometry: NDArray[np.object_]) -> str:
 
 
 @contextmanager
-def open_geopackage(path: Path) -> Iterator[Callable[[Layer, str, str], None]]:
+def open_geopackage(path: Path) -> Iterator[Callable[[Layer, str | None, str | None], None]]:
     """Yield a function that appends rows: a layer, its geometry type and the WKT of its CRS.
+
+    A layer without a geometry type becomes a table of attributes.
 
     The file appears under its name unless the block raises; the same rows give the same bytes.
 
@@ -71,10 +73,10 @@ def open_geopackage(path: Path) -> Iterator[Callable[[Layer, str, str], None]]:
     try:
         with atomic_path(path, keep_suffix=True) as part:
 
-            def append(rows: Layer, kind: str, crs: str) -> None:  # noqa: PLR0917
+            def append(rows: Layer, kind: str | None, crs: str | None) -> None:  # noqa: PLR0917
                 write(
                     str(part),
-                    geometry=shapely.to_wkb(rows.geometry),
+                    geometry=shapely.to_wkb(rows.geometry) if kind else None,
                     field_data=list(rows.columns.values()),
                     fields=list(rows.columns),
                     geometry_type=kind,

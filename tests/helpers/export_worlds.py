@@ -98,9 +98,9 @@ def roads():
     )
 
 
-def write_world(path, crs="utm"):
+def write_world(path, crs="utm", *, at=(13.35, 52.51)):
     """The scene, written to a folder and opened."""
-    frame = Frame.at(13.35, 52.51, crs=crs, vertical="orthometric")
+    frame = Frame.at(*at, crs=crs, vertical="orthometric")
     solids, size = buildings(), 100.0
     first, tree = len(NAMES), len(NAMES) + 1
     graph = roads()

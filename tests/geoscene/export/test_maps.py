@@ -10,7 +10,7 @@ import pyogrio
 import pytest
 import rasterio
 import shapely
-from helpers.export_worlds import NAMES, SLOPE, TREES, write_world
+from helpers.export_worlds import NAMES, SLOPE, SOLID_VOLUMES, TREES, write_world
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
@@ -111,18 +111,29 @@ def test_cell_has_the_height_of_the_highest_triangle_at_its_centre(corners):
 def test_a_geopackage_has_every_layer_with_its_columns(scene, tmp_path):
     path = export_scene(scene, tmp_path / "a.gpkg").path
     assert pyogrio.list_layers(path)[:, 0].tolist() == [*scene.layers, "building_solids"]
-    plan, solids = (geopandas.read_file(path, layer=name) for name in ("buildings", "building_solids"))
-    assert plan.crs.to_epsg() == solids.crs.to_epsg() == 32633
+    plan = geopandas.read_file(path, layer="buildings")
+    assert plan.crs.to_epsg() == 32633
     assert plan["osm_id"].tolist() == list(NAMES)
-    assert dict(zip(solids["osm_id"], solids["height_source"], strict=True)) == dict(
-        zip(plan["osm_id"], plan["height_source"], strict=True)
-    )
     assert plan["name"][0] == "Rathaus «Süd»"
     assert np.isnan(plan["levels"][0])
     moved = geopandas.read_file(
         export_scene(scene, tmp_path / "b.gpkg", options=ExportOptions(crs="EPSG:25833")).path, layer="roads"
     )
     assert moved.crs.to_epsg() == 25833
+
+
+@pytest.mark.parametrize("crs", ["utm", "local"])
+def test_a_geopackage_has_valid_geometry_and_the_volumes_of_solids_without_geometry(crs, tmp_path):
+    scene = write_world(tmp_path / "scene", crs=crs)
+    path = export_scene(scene, tmp_path / "a.gpkg").path
+    for layer, kind in pyogrio.list_layers(path):
+        table = geopandas.read_file(path, layer=layer)
+        assert layer == "building_solids" if kind is None else table.geometry.is_valid.all()
+    assert table["osm_id"].tolist() == list(NAMES)
+    wanted = np.array(SOLID_VOLUMES) / scene.frame.scale(13.35, 52.51) ** 2
+    np.testing.assert_allclose(table["volume"][:3], wanted, rtol=1e-5)
+    assert table["faces"][:3].tolist() == [12, 24, 24]
+    assert table[["bottom", "top"]].to_numpy().tolist() == [[0, 30], [1, 11], [0, 20], [2, 140]]
 
 
 def test_geojson_follows_rfc_7946(scene, tmp_path):
@@ -139,6 +150,34 @@ def test_geojson_follows_rfc_7946(scene, tmp_path):
     assert footprint.exterior.is_ccw
     x, y = scene.frame.from_geographic(*shapely.get_coordinates(footprint).T)
     assert (min(x), max(x), min(y), max(y)) == pytest.approx((0, 20, -30, 0), abs=1e-3)
+
+
+@pytest.mark.parametrize(("crs", "lon"), [("utm", 180.0), ("local", -179.9995), ("local", 179.9999)])
+def test_geometry_in_degrees_is_cut_at_the_antimeridian(crs, lon, tmp_path):
+    """RFC 7946, section 3.1.9; areas and lengths are those of the scene."""
+    scene = write_world(tmp_path / "scene", crs=crs, at=(lon, -16.8))
+    export_scene(scene, tmp_path / "a.geojson")
+    for suffix in ("gpkg", "parquet"):
+        export_scene(scene, tmp_path / f"a.{suffix}", options=ExportOptions(crs="EPSG:4326"))
+    document = json.loads((tmp_path / "a.geojson").read_text())
+    geojson = [shapely.from_geojson(json.dumps(f["geometry"])) for f in document["features"]]
+    layers = [geopandas.read_file(tmp_path / "a.gpkg", layer=name) for name in scene.layers]
+    assert all(len(set(table.geom_type)) == 1 for table in layers)
+    gpkg = [geometry for table in layers for geometry in table.geometry]
+    own = [geometry for name in scene.layers for geometry in scene.features(name).geometry]
+    cut = 0
+    for found in (geojson, gpkg, geopandas.read_parquet(tmp_path / "a.parquet").geometry):
+        for geometry, plan in zip(found, own, strict=True):
+            assert geometry.is_valid
+            assert geometry.has_z == plan.has_z
+            assert np.abs(shapely.get_coordinates(geometry)[:, 0]).max() <= 180
+            for part in shapely.get_parts(geometry):
+                assert np.ptp(shapely.get_coordinates(part)[:, 0]) < 0.01
+            back = shapely.transform(geometry, lambda c: np.column_stack(scene.frame.from_geographic(*c.T)))
+            assert back.area == pytest.approx(plan.area, rel=1e-4)
+            assert plan.area or back.length == pytest.approx(plan.length, rel=1e-4)
+            cut += len(np.unique(np.sign(shapely.get_coordinates(geometry)[:, 0]))) > 1
+    assert cut >= 6
 
 
 def test_a_geoparquet_table_holds_all_layers(scene, tmp_path):
@@ -160,6 +199,8 @@ def test_selected_layer_is_exported_and_unknown_layers_are_refused(scene, tmp_pa
     assert summary.objects == len(TREES)
     with pytest.raises(InputError, match=r"no layer tress; this scene has .*trees"):
         export_scene(scene, tmp_path / "b.geojson", options=ExportOptions(layers=("tress",)))
+    with pytest.raises(InputError, match="no layer building_solids"):
+        export_scene(scene, tmp_path / "b.geojson", options=ExportOptions(layers=("building_solids",)))
     with pytest.raises(InputError, match=r"no layer tress; this scene has .*terrain"):
         export_scene(scene, tmp_path / "b.glb", options=ExportOptions(layers=("tress",)))
 
