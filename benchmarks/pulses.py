@@ -78,7 +78,7 @@ def convert(city: Path, out: Path) -> None:
         "frame": frame.to_json(),
         "bounds": [*low[:2].tolist(), *high[:2].tolist()],
         "tile_size": _TILE,
-        "tiles": indices.tolist(),
+        "tiles": [(i, j, 1) for i, j in indices.tolist()],
         "layers": {"buildings": [0, int(building.max()) + 1]},
     }
     write_json(files.manifest, document)

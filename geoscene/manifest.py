@@ -11,6 +11,7 @@ import shapely
 
 from geoscene import __version__
 from geoscene.frames import wrapped
+from geoscene.ground import tile_span
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.plan import Plan
 from geoscene.report import Problem, summarise
@@ -46,7 +47,7 @@ def scene_manifest(
         "geographic_bounds": [west, south, wrapped(east), north],
         "bounds": [xmin, ymin, xmax, ymax],
         "tile_size": options["tile_size"],
-        "tiles": sorted((r.i, r.j) for r in reports),
+        "tiles": sorted((r.i, r.j, tile_span(plan.ground, r.i, j=r.j)) for r in reports),
         "options": dict(options),
         "terrain": {
             "vertical": terrain.vertical,

@@ -15,6 +15,7 @@ import shapely
 from geoscene import __version__
 from geoscene.errors import SourceNotFoundError
 from geoscene.files import digest, digest_of
+from geoscene.ground import tile_span
 from geoscene.manifest import scene_manifest
 from geoscene.objects.shapes import shapes
 from geoscene.options import BuildOptions
@@ -102,8 +103,9 @@ def _tiles_along(plan: Plan, options: BuildOptions) -> list[tuple[int, int]]:
     line = route_line(options.along, plan.graph, frame=plan.frame)
     shapely.prepare(line)
     reach = options.reach + _OFFSET
-    size = options.tile_size
-    squares = shapely.box(*(np.array(tiles) * size).T, *((np.array(tiles) + 1) * size).T)
+    low = np.array(tiles)
+    high = low + [[tile_span(plan.ground, i, j=j)] for i, j in tiles]
+    squares = shapely.box(*(low * options.tile_size).T, *(high * options.tile_size).T)
     in_range = set(itertools.compress(tiles, shapely.dwithin(line, squares, reach + _CROWN)))
     # Features can extend beyond their tile, long walls and bridges by far.
     buildings = shapely.dwithin(line, plan.buildings.footprint, reach)

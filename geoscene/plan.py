@@ -27,6 +27,8 @@ from geoscene.ground import (
     Layers,
     WaterLevels,
     building_pads,
+    ground_tiles,
+    joined,
     landcover,
     plan_ground,
     water_levels,
@@ -120,8 +122,7 @@ class Plan:
 
     def tiles(self) -> list[tuple[int, int]]:
         """Indices (i, j) of all tiles, sorted."""
-        ground = {(int(i), int(j)) for i, j in self.ground.tiles}
-        return sorted(ground.union(*self.rows.values()))
+        return sorted(set(ground_tiles(self.ground)).union(*self.rows.values()))
 
     def of_tile(self, kind: str, i: int, *, j: int) -> NDArray[np.int64]:
         """Rows of a kind of feature in tile (i, j), ascending."""
@@ -200,7 +201,7 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
         rows=rows,
         graph=roads.graph,
         side=(roads.side, roads.side_source),
-        ground=ground,
+        ground=joined(ground, set().union(*rows.values())),
         levels=levels,
         trees=trees,
         needles=needle_shares(ground, osm),

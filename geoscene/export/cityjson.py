@@ -213,7 +213,7 @@ def _tile_objects(
     whole, ids = np.unique(target.whole(points), axis=0, return_inverse=True)
     ids = ids.ravel()
     corners = ids[mesh.faces].astype(np.int64)
-    number, fresh = numbers.add(whole, column=part.index[0])
+    number, fresh = numbers.add(whole, column=part.index[0], span=part.span)
     found = pieces(mesh)
     owner = np.zeros(len(mesh), np.int64)
     for k, piece in enumerate(found):

@@ -124,6 +124,7 @@ class Part:
     """The chosen layers of a tile, in tile coordinates; see `geoscene.scene.tile_files.Tile`."""
 
     index: tuple[int, int]
+    span: int
     origin: Float
     mesh: Mesh
     instances: Instances
@@ -139,15 +140,16 @@ def parts(
     known = [*scene.layers, BARE]
     if unknown := sorted(set(layers or ()) - set(known)):
         raise InputError(f"no layer {', '.join(unknown)}; this scene has {', '.join(known)}")
-    for done, (i, j) in enumerate(scene.tile_indices):
-        progress(stage, done, total=len(scene.tile_indices))
+    spans = scene.tile_spans.tolist()
+    for done, ((i, j), span) in enumerate(zip(scene.tile_indices, spans, strict=True)):
+        progress(stage, done, total=len(spans))
         tile = scene.tile(i, j)
         mesh, copies = tile.mesh, tile.instances
         if layers is not None:
             mesh = mesh.take(rows_in_layers(scene, mesh.feature, layers=layers))
             keep = rows_in_layers(scene, copies.feature, layers=layers)
             copies = copies.take(keep)
-        yield Part((i, j), tile.origin, mesh, copies)
+        yield Part((i, j), span, tile.origin, mesh, copies)
 
 
 def expand(instances: Instances, library: Sequence[Mesh]) -> Mesh:

@@ -14,11 +14,11 @@ _REACH = 1000.0
 
 @dataclass(frozen=True, slots=True)
 class _Numbered:
-    """Vertices of a tile: whole coordinates (n, 3), their numbers (n,), and the tile's column."""
+    """Vertices of a tile: whole coordinates (n, 3), their numbers (n,), and the tile's last column."""
 
     whole: Ints
     number: Ints
-    column: int
+    last: int
 
 
 class Vertices:
@@ -37,20 +37,21 @@ class Vertices:
         self.low: Float = np.full(3, np.inf)
         self.high: Float = np.full(3, -np.inf)
 
-    def add(self, whole: Ints, *, column: int) -> tuple[Ints, Ints]:
+    def add(self, whole: Ints, *, column: int, span: int = 1) -> tuple[Ints, Ints]:
         """The numbers (n,) of a tile's vertices, and those (m, 3) among them that are new, in their order.
 
         whole  : (n, 3) whole coordinates, each once
         column : the tile's place from west to east; tiles come column by column
+        span   : columns that the tile covers
         """
         number = np.full(len(whole), -1, np.int64)
-        self._near = [tile for tile in self._near if tile.column >= column - self._reach]
+        self._near = [tile for tile in self._near if tile.last >= column - self._reach]
         for tile in self._near:
             _adopt(number, whole, known=tile)
         fresh = number < 0
         number[fresh] = self.count + np.arange(fresh.sum())
         if len(whole):
-            self._near.append(_Numbered(whole, number, column))
+            self._near.append(_Numbered(whole, number, column + span - 1))
             self.low = np.minimum(self.low, whole.min(axis=0))
             self.high = np.maximum(self.high, whole.max(axis=0))
         self.count += int(fresh.sum())

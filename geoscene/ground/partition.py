@@ -56,9 +56,11 @@ class GroundPlan:
     base      : (class, material code) where no polygon lies
     start, end : (m, 2) float64 segments of all outlines, on the grid
     string    : (m,) int64: segments of one outline that follow each other have the same number
-    order, offset : segments by tile: those of tile (i, j) are
-                ``order[offset[k]:offset[k + 1]]``, k the tile's place in `tiles`
-    tiles     : (t, 2) int64, all tiles of the extent, by row
+    order, offset : segments by square: those of square (i, j) are
+                ``order[offset[k]:offset[k + 1]]``, k its place in `tiles`
+    tiles     : (t, 2) int64, all squares of the extent with the tile size, by row; each is a tile unless
+                `geoscene.ground.joined` has joined it to others
+    span      : (t,) int64, squares along a side of the tile that each square is part of: 1, or a power of two
     """
 
     extent: tuple[float, float, float, float]
@@ -75,6 +77,7 @@ class GroundPlan:
     order: Ints
     offset: Ints
     tiles: Ints
+    span: Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,13 +159,15 @@ def plan_ground(
         order,
         offset,
         np.stack([i, j], axis=1) + low,
+        np.ones(len(i), np.int64),
     )
 
 
 def partition_tile(plan: GroundPlan, i: int, *, j: int) -> Partition:
-    """The cells of tile (i, j), which covers [i, i + 1) x [j, j + 1) times the tile size, within the extent.
+    """The cells of tile (i, j), which covers [i, i + n) x [j, j + n) times the tile size, within the extent.
 
-    The result does not depend on which other tiles are made. Raises InputError for a tile outside the extent.
+    n is the tile's `tile_span`. The result does not depend on which other tiles are made. Raises InputError
+    for a tile outside the extent.
     """
     place = tile_place(plan, i, j=j)
     if place is None:
@@ -208,12 +213,18 @@ def partition(
 
 def tile_box(plan: GroundPlan, i: int, *, j: int) -> tuple[float, float, float, float]:
     """(xmin, ymin, xmax, ymax) of a tile's part of the extent, scene metres."""
-    size, (xmin, ymin, xmax, ymax) = plan.tile_size, plan.extent
-    return max(i * size, xmin), max(j * size, ymin), min((i + 1) * size, xmax), min((j + 1) * size, ymax)
+    size, (xmin, ymin, xmax, ymax), n = plan.tile_size, plan.extent, tile_span(plan, i, j=j)
+    return max(i * size, xmin), max(j * size, ymin), min((i + n) * size, xmax), min((j + n) * size, ymax)
+
+
+def tile_span(plan: GroundPlan, i: int, *, j: int) -> int:
+    """The squares along a side of tile (i, j), whose south-west square is (i, j); 1 outside the extent."""
+    place = tile_place(plan, i, j=j)
+    return 1 if place is None else int(plan.span[place])
 
 
 def tile_place(plan: GroundPlan, i: int, *, j: int) -> int | None:
-    """The row of tile (i, j) in the plan's tiles, None where it is not among them."""
+    """The row of square (i, j) in the plan's tiles, None where it is not among them."""
     (west, south), (east, north) = plan.tiles[0].tolist(), plan.tiles[-1].tolist()
     return (j - south) * (east - west + 1) + i - west if west <= i <= east and south <= j <= north else None
 
@@ -325,12 +336,19 @@ def _multiples(low: float, high: float, *spacings: float) -> Float:
 def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float, float]) -> list[object]:
     """The tile's sides, and the terrain's lines across it.
 
-    A side has a vertex at every line of both tiles that share it, so that the two agree.
+    A side has a vertex at every line of both tiles that share it, and at every corner of a square, so that
+    tiles of any span agree.
     """
     xmin, ymin, xmax, ymax = box
-    own = _spacing(plan, i, j=j)
-    bottom, top = (_multiples(xmin, xmax, own, _spacing(plan, i, j=j + k)) for k in (-1, 1))
-    left, right = (_multiples(ymin, ymax, own, _spacing(plan, i + k, j=j)) for k in (-1, 1))
+    own, n = _spacing(plan, i, j=j), tile_span(plan, i, j=j)
+    bottom, top = (
+        _stops(plan, xmin, high=xmax, first=i, beside=[(i + k, row) for k in range(n)], own=own)
+        for row in (j - 1, j + n)
+    )
+    left, right = (
+        _stops(plan, ymin, high=ymax, first=j, beside=[(column, j + k) for k in range(n)], own=own)
+        for column in (i - 1, i + n)
+    )
     ring = [
         (xmin, ymin), *((x, ymin) for x in bottom),
         (xmax, ymin), *((xmax, y) for y in right),
@@ -341,6 +359,23 @@ def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float,
     ruling += [shapely.LineString([(x, ymin), (x, ymax)]) for x in _multiples(xmin, xmax, own)]
     ruling += [shapely.LineString([(xmin, y), (xmax, y)]) for y in _multiples(ymin, ymax, own)]
     return ruling
+
+
+def _stops(
+    plan: GroundPlan, low: float, *, high: float, first: int, beside: Sequence[tuple[int, int]], own: float
+) -> Float:
+    """Coordinates of the vertices along a tile's side from ``low`` to ``high``, both left out, ascending.
+
+    first  : index of the first square along the side
+    beside : the squares beyond the side, in order
+    own    : spacing of the tile's own lines
+    """
+    size, stops = plan.tile_size, [np.empty(0)]
+    for k, (i, j) in enumerate(beside, start=first):
+        start, end = max(k * size, low), min((k + 1) * size, high)
+        if start < end:
+            stops += [np.array([start]), _multiples(start, end, own, _spacing(plan, i, j=j))]
+    return np.concatenate(stops)[1:]
 
 
 def _faces(linework: object, box: tuple[float, float, float, float]) -> NDArray[np.object_]:

@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+import shapely
+
 from geoscene.errors import BUILD_AGAIN, GeosceneError, SceneFormatError, reading
 from geoscene.files import digest, digest_of
 from geoscene.frames import Frame
@@ -17,8 +20,9 @@ from geoscene.mesh import Mesh
 from geoscene.roadgraph import RoadGraph, read_graphml
 from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile
+from geoscene.typing import Float, Ints
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of the scene directory; a reader refuses others."""
 
 
@@ -114,13 +118,32 @@ class Scene:
 
     @property
     def tile_size(self) -> float:
-        """Side of a tile in metres."""
+        """Side of the smallest tiles in metres."""
         return float(self.manifest["tile_size"])
 
     @property
     def tile_indices(self) -> list[tuple[int, int]]:
-        """(i, j) of all tiles; tile (i, j) covers [i, i + 1) x [j, j + 1) times `tile_size`."""
-        return [(int(i), int(j)) for i, j in self.manifest["tiles"]]
+        """(i, j) of all tiles; tile (i, j) of span n covers [i, i + n) x [j, j + n) times `tile_size`."""
+        return [(int(i), int(j)) for i, j, _ in self.manifest["tiles"]]
+
+    @property
+    def tile_spans(self) -> Ints:
+        """Span (t,) of each tile: 1, or a power of two where nothing lies on the ground."""
+        return np.array([n for _, _, n in self.manifest["tiles"]], np.int64)
+
+    @property
+    def tile_boxes(self) -> Float:
+        """(xmin, ymin, xmax, ymax) of each tile (t, 4) in scene metres, not cut at the `bounds`."""
+        low, span = np.array(self.tile_indices, np.int64).reshape(-1, 2), self.tile_spans[:, None]
+        return np.hstack([low, low + span]) * self.tile_size
+
+    def tiles_at(self, xy: Float) -> Ints:
+        """Row (k,) in `tile_indices` of the tile that each point (k, 2) is on, -1 where there is none."""
+        boxes, row = self.tile_boxes, np.full(len(xy), -1, np.int64)
+        point, tile = shapely.STRtree(shapely.box(*boxes.T)).query(shapely.points(xy))
+        on = ((xy[point] >= boxes[tile, :2]) & (xy[point] < boxes[tile, 2:])).all(axis=1)
+        row[point[on]] = tile[on]
+        return row
 
     @property
     def layers(self) -> dict[str, tuple[int, int]]:
@@ -192,7 +215,7 @@ def open_scene(path: str | Path) -> Scene:
         if manifest.get("digest") not in (None, manifest_digest(manifest)):
             raise SceneFormatError(f"{manifest_file}: differs from what the build wrote; {BUILD_AGAIN}")
         scene = Scene(folder, manifest, Frame.from_json(manifest["frame"]))
-        _ = scene.frame.crs, scene.bounds, scene.tile_size, scene.tile_indices, scene.layers
+        _ = scene.frame.crs, scene.bounds, scene.tile_size, scene.tile_boxes, scene.layers
     return scene
 
 

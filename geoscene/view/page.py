@@ -50,8 +50,8 @@ def view_scene(
     """
     _check(out, overwrite=overwrite)
     bounds_deg, layers, max_mb = options.bounds_deg, options.layers, options.max_mb
-    indices = _tiles_within(scene, bounds_deg)
-    indices = indices[np.lexsort([indices[:, 1], indices[:, 0], _rings(indices)])]  # from the middle outwards
+    chosen = _tiles_within(scene, bounds_deg)
+    chosen = chosen[np.lexsort([chosen[:, 1], chosen[:, 0], _rings(chosen)])]  # from the middle outwards
     groups = groups_of(scene)
     kept = _kept(groups, layers)
     shapes, shape_bytes = pack_shapes(list(scene.shapes().values()))
@@ -61,8 +61,8 @@ def view_scene(
     faces = 0
     with atomic_file(out) as file, spool(out) as blobs:
         _blob(blobs, "shapes", data=shape_bytes)
-        for done, (i, j) in enumerate(indices.tolist()):
-            progress("page", done, total=len(indices))
+        for done, (i, j, _) in enumerate(chosen.tolist()):
+            progress("page", done, total=len(chosen))
             tile = only(scene.tile(i, j), groups, kept=kept)
             faces += len(tile.mesh)
             for column in (tile.mesh.feature, tile.instances.feature):
@@ -75,7 +75,7 @@ def view_scene(
                 break
         _blob(blobs, "attributes", data=gzip(compact_json(tables(read_features(scene), present))))
         if blobs.tell() > max_mb * 1e6:
-            raise InputError(_too_large(scene, indices, sizes=ends, size=blobs.tell(), max_mb=max_mb))
+            raise InputError(_too_large(scene, chosen, sizes=ends, size=blobs.tell(), max_mb=max_mb))
         head = _head(scene, tiles, groups=groups, shapes=shapes)
         _join(file, scene, head=head, blobs=blobs)
     notes = []
@@ -131,16 +131,15 @@ def _blob(file: IO[bytes], name: str, *, data: bytes) -> None:
 
 
 def _tiles_within(scene: Scene, bounds_deg: Degrees | None) -> Ints:
-    """(i, j) of the tiles (n, 2) whose squares intersect the bounds."""
-    indices = np.array(scene.tile_indices, np.int64).reshape(-1, 2)
+    """(i, j, span) of the tiles (n, 3) that intersect the bounds."""
+    tiles = np.column_stack([np.array(scene.tile_indices, np.int64).reshape(-1, 2), scene.tile_spans])
     if bounds_deg is None:
-        return indices
+        return tiles
     west, south, east, north = bounds_deg
     if not (west < east and south < north):
         raise InputError(f"bounds {bounds_deg}: give west, south, east, north in degrees, in this order")
     x, y = scene.frame.from_geographic([west, west, east, east], [south, north, south, north])
-    low = indices * scene.tile_size
-    high = low + scene.tile_size
+    low, high = scene.tile_boxes[:, :2], scene.tile_boxes[:, 2:]
     inside = (low[:, 0] < x.max()) & (high[:, 0] > x.min()) & (low[:, 1] < y.max()) & (high[:, 1] > y.min())
     if not inside.any():
         xmin, ymin, xmax, ymax = scene.bounds
@@ -149,31 +148,33 @@ def _tiles_within(scene: Scene, bounds_deg: Degrees | None) -> Ints:
             f"bounds {bounds_deg}: the scene has nothing there; it covers "
             f"{lon[0]:.5f},{lat[0]:.5f},{lon[1]:.5f},{lat[1]:.5f}"
         )
-    chosen: Ints = indices[inside]
+    chosen: Ints = tiles[inside]
     return chosen
 
 
-def _middle(indices: Ints) -> Ints:
-    middle: Ints = (indices.min(axis=0) + indices.max(axis=0)) // 2
+def _middle(tiles: Ints) -> Ints:
+    """The square (2,) in the middle of tiles (n, 3)."""
+    middle: Ints = (tiles[:, :2].min(axis=0) + (tiles[:, :2] + tiles[:, 2:] - 1).max(axis=0)) // 2
     return middle
 
 
-def _rings(indices: Ints) -> Ints:
-    """Chebyshev distance of each tile (n, 2) from the middle one, in tiles."""
-    rings: Ints = np.abs(indices - _middle(indices)).max(axis=1)
+def _rings(tiles: Ints) -> Ints:
+    """Chebyshev distance (n,) of the nearest square of each tile (n, 3) from the middle one, in squares."""
+    low, middle = tiles[:, :2], _middle(tiles)
+    rings: Ints = np.maximum(low - middle, middle - (low + tiles[:, 2:] - 1)).max(axis=1).clip(0)
     return rings
 
 
-def _too_large(scene: Scene, indices: Ints, *, sizes: Sequence[int], size: int, max_mb: float) -> str:
+def _too_large(scene: Scene, tiles: Ints, *, sizes: Sequence[int], size: int, max_mb: float) -> str:
     """Error text: how large the page would be, and the bounds of a part that would fit."""
-    rings, share = _rings(indices), size / sizes[-1]
-    whole = size / len(sizes) * len(indices) / 1e6
+    rings, share = _rings(tiles), size / sizes[-1]
+    whole = size / len(sizes) * len(tiles) / 1e6
     message = f"the page would have about {max(whole, 1.01 * max_mb):.3g} MB and `max_mb` is {max_mb:g}"
-    ends = [int(np.flatnonzero(rings == ring)[-1]) for ring in range(int(rings[len(sizes) - 1]) + 1)]
+    ends = [int((rings <= ring).sum()) - 1 for ring in range(int(rings[len(sizes) - 1]) + 1)]
     fits = [ring for ring, end in enumerate(ends) if end < len(sizes) and sizes[end] * share < max_mb * 1e6]
     if not fits:
         return f"{message}; give more, leave out `layers`, or build the scene with smaller tiles"
-    middle, size_m = _middle(indices), scene.tile_size
+    middle, size_m = _middle(tiles), scene.tile_size
     low = (middle - fits[-1]) * size_m + 1.0
     high = (middle + fits[-1] + 1) * size_m - 1.0
     lon, lat = scene.frame.to_geographic(

@@ -55,17 +55,11 @@ def graph_on_tiles(graph: RoadGraph, scene: Scene) -> RoadGraph:
 def edges_on_tiles(graph: RoadGraph, scene: Scene) -> NDArray[np.bool_]:
     """Whether (m,) each edge of a road graph lies on the scene's tiles; raises RouteError if none does."""
     xmin, ymin, xmax, ymax = scene.bounds
-    size = scene.tile_size
-    tiles = np.array(scene.tile_indices).reshape(-1, 2)
     points = np.concatenate([np.empty((0, 3)), *graph.geometry])[:, :2]
     edge = np.repeat(np.arange(len(graph)), [len(line) for line in graph.geometry])
     low, high = np.array([xmin, ymin]), np.array([xmax, ymax])
     inside = ((points >= low) & (points <= high)).all(axis=1)
-    width = int(tiles[:, 1].max() - tiles[:, 1].min()) + 3
-    base = tiles.min(axis=0) - 1
-    keys = (tiles - base) @ np.array([width, 1])
-    place = np.clip(np.floor(points / size).astype(int) - base, 0, [10**6, width - 1])
-    inside &= np.isin(place @ np.array([width, 1]), keys)
+    inside &= scene.tiles_at(points) >= 0
     kept = np.bincount(edge, ~inside, minlength=len(graph)) == 0
     if not kept.any():
         raise RouteError(f"{scene.path}: no road lies within the tiles of this scene")

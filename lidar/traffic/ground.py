@@ -25,13 +25,10 @@ def ground_heights(scene: Scene, xyz: Float, *, above: float = _ABOVE, below: fl
     z: Float = np.full(len(xyz), np.nan)
     if not len(xyz):
         return z
-    known = set(scene.tile_indices)
-    cell = np.floor(xyz[:, :2] / scene.tile_size).astype(int)
-    for i, j in np.unique(cell, axis=0).tolist():
-        if (i, j) not in known:
-            continue
-        rows = np.flatnonzero((cell == (i, j)).all(axis=1))
-        tile = scene.tile(i, j)
+    on, indices = scene.tiles_at(xyz[:, :2]), scene.tile_indices
+    for row in np.unique(on[on >= 0]).tolist():
+        rows = np.flatnonzero(on == row)
+        tile = scene.tile(*indices[row])
         faces = tile.mesh.faces[np.isin(tile.mesh.klass, _GROUND)]
         if not len(faces):
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Literal
 
@@ -316,12 +317,11 @@ def _obstacles(scene: Scene, area: shapely.Geometry) -> NDArray[np.object_]:
     if buildings is not None:
         low = np.asarray(buildings.columns["min_height"], float)
         parts.append(buildings.geometry[low < _HEADROOM])
-    for i, j in scene.tile_indices:
-        corner = np.array([i, j]) * scene.tile_size
-        if shapely.intersects(area, shapely.box(*corner, *(corner + scene.tile_size))):
-            tile = scene.tile(i, j)
-            posts = tile.instances.transform[:, :2, 3] + tile.origin[:2]
-            parts.append(shapely.buffer(shapely.points(posts), _POST_RADIUS))
+    near = shapely.intersects(area, shapely.box(*scene.tile_boxes.T))
+    for i, j in itertools.compress(scene.tile_indices, near):
+        tile = scene.tile(i, j)
+        posts = tile.instances.transform[:, :2, 3] + tile.origin[:2]
+        parts.append(shapely.buffer(shapely.points(posts), _POST_RADIUS))
     whole = np.concatenate(parts)
     kept: NDArray[np.object_] = whole[shapely.intersects(area, whole)]
     return kept

@@ -278,7 +278,6 @@ def _no_instances(shapes: tuple[Caster, ...]) -> tuple[Instances, NDArray[np.int
 
 def _tiles_intersecting(scene: Scene, region: Region, *, margin: float) -> list[int]:
     """Indices of the scene's tiles that intersect a region grown by a margin."""
-    ij = np.array(scene.tile_indices, float).reshape(-1, 2)
-    low, high = ij * scene.tile_size, (ij + 1) * scene.tile_size
-    near = (low <= np.array(region[2:]) + margin) & (high >= np.array(region[:2]) - margin)
+    boxes = scene.tile_boxes
+    near = (boxes[:, :2] <= np.array(region[2:]) + margin) & (boxes[:, 2:] >= np.array(region[:2]) - margin)
     return [int(k) for k in np.flatnonzero(near.all(axis=1))]

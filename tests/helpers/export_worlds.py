@@ -161,11 +161,12 @@ def write_world(path, crs="utm", *, at=(13.35, 52.51)):
         "name": "world", "attribution": "(c) OpenStreetMap contributors", "fingerprint": "0f" * 10,
         "options": {"lod": 2}, "roads": {"driving_side": "right"},
         "sources": [{"timestamp": "2024-05-06T07:08:09Z"}],
-        "bounds": [-100, -100, 100, 100], "tile_size": size, "tiles": [[-1, -1], [-1, 0], [0, -1], [0, 0]],
+        "bounds": [-100, -100, 100, 100], "tile_size": size,
+        "tiles": [[-1, -1, 1], [-1, 0, 1], [0, -1, 1], [0, 0, 1]],
     }  # fmt: skip
     with SceneWriter(path) as writer:
         writer.files.tiles.mkdir()
-        for i, j in manifest["tiles"]:
+        for i, j, _ in manifest["tiles"]:
             own = [k for k in range(4) if tuple(np.floor(middle[k, :2] / size)) == (i, j)]
             standing = [solids.take(np.isin(solids.feature, own))]
             standing += [hedge(tree + len(TREES))] if (i, j) == (0, -1) else []

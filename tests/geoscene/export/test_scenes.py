@@ -260,6 +260,14 @@ def test_vertices_of_neighbouring_tiles_share_their_numbers():
     assert (vertices.low.tolist(), vertices.high.tolist()) == ([0, 0, 0], [9, 9, 9])
 
 
+def test_vertices_on_the_far_side_of_a_joined_tile_keep_their_numbers():
+    vertices = Vertices(250.0)
+    whole = np.array([[0, 0, 0], [64, 0, 0]])
+    vertices.add(whole, column=0, span=16)
+    vertices.add(np.array([[1, 9, 0]]), column=8)
+    assert vertices.add(whole[1:], column=16)[0].tolist() == [1]
+
+
 def test_every_vertex_of_cityjson_is_used_and_every_index_exists(city):
     used = set()
 

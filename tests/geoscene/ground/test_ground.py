@@ -15,12 +15,14 @@ from geoscene.ground import (
     building_pads,
     drape,
     ground_tile,
+    ground_tiles,
+    joined,
     partition,
     partition_tile,
     plan_ground,
     triangulate,
 )
-from geoscene.ground.partition import PRECISION, SLIVER, tile_box
+from geoscene.ground.partition import PRECISION, SLIVER, tile_box, tile_span
 from geoscene.mesh import concatenate
 from geoscene.watertight import degenerate_faces
 
@@ -90,6 +92,44 @@ def test_the_ground_is_one_surface_across_tiles(seed, lines, size):
     plan = plan_ground(EXTENT, layers_of(blobs(seed), rng), tile_size=size, lines=lines)
     mesh = concatenate([ground_tile(plan, i, j=j) for i, j in plan.tiles])
     assert_one_surface(*welded(mesh), EXTENT)
+
+
+def rolling(x, y):
+    return 4 * np.sin(np.asarray(x) / 9) + np.asarray(y) ** 2 / 900
+
+
+@given(st.integers(0, 2**32), st.sampled_from([0.0, 3.0, 5.0]))
+@settings(max_examples=15, deadline=None)
+def test_the_ground_is_one_surface_across_joined_tiles_and_the_others_do_not_change(seed, lines):
+    rng = np.random.default_rng(seed)
+    polygons = [shapely.affinity.scale(b, 0.2, 0.2) for b in blobs(seed, 4)]
+    ruled = [tuple(square) for square in rng.integers(-4, 6, (3, 2)).tolist()]
+    apart = plan_ground(EXTENT, layers_of(polygons, rng), tile_size=4.0, lines=1.0, ruled=ruled, coarse=lines)
+    plan = joined(apart, {(2, 3)})
+    tiles = ground_tiles(plan)
+    assert len(tiles) < len(apart.tiles)
+    meshes = {tile: ground_tile(plan, tile[0], j=tile[1], height=rolling) for tile in tiles}
+    assert_one_surface(*welded(concatenate(list(meshes.values()))), EXTENT)
+    for i, j in {(2, 3), *ruled}.intersection(map(tuple, apart.tiles.tolist())):
+        assert tile_span(plan, i, j=j) == 1
+    for i, j in tiles:
+        alone = ground_tile(apart, i, j=j, height=rolling)
+        if tile_span(plan, i, j=j) == 1:
+            np.testing.assert_array_equal(meshes[i, j].vertices, alone.vertices)
+            np.testing.assert_array_equal(meshes[i, j].faces, alone.faces)
+        elif lines:  # the same lines, so the same heights at their crossings
+            assert np.isin(alone.vertices[:, :2], meshes[i, j].vertices[:, :2]).all()
+
+
+def test_squares_with_forest_keep_their_size():
+    wood = shapely.box(-1000, -1000, 300, 3000)
+    layers = Layers.of([wood], klass=Class.FOREST_FLOOR, material=GRASS, priority=0)
+    plan = joined(plan_ground((0, 0, 1600, 1600), layers, tile_size=100.0), {(12, 12)})
+    spans = {tile: tile_span(plan, tile[0], j=tile[1]) for tile in ground_tiles(plan)}
+    assert all(spans[i, j] == 1 for i in range(4) for j in range(16))
+    assert spans[8, 0] == 8
+    assert spans[12, 12] == 1
+    assert sum(span**2 for span in spans.values()) == 16 * 16
 
 
 @given(st.integers(0, 2**32), st.sampled_from([0.0, 7.0]))

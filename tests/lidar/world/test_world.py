@@ -10,6 +10,7 @@ from geoscene.classes import Class, materials
 from geoscene.frames import Frame
 from geoscene.mesh import WALL, Instances, Mesh
 from geoscene.scene import SceneFiles, open_scene
+from geoscene.scene.layout import SCHEMA
 from geoscene.scene.tile_files import Tile, write_shapes, write_tile
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
@@ -66,11 +67,11 @@ def scene(tmp_path_factory):
     crown = box([4, 4, 4], [0, 0, 4.0], klass=Class.TREE_CROWN, material=materials()["foliage"].code)
     write_shapes(files.shapes, {"tree": crown})
     manifest = {
-        "schema": 1,
+        "schema": SCHEMA,
         "frame": Frame.at(2.0, 48.0).to_json(),
         "bounds": [-200, 0, 400, 200],
         "tile_size": TILE,
-        "tiles": indices,
+        "tiles": [(i, j, 1) for i, j in indices],
         "layers": {},
     }
     files.manifest.write_text(json.dumps(manifest))
@@ -146,11 +147,11 @@ def test_ranges_stay_exact_over_long_drives(tmp_path):
     files.manifest.write_text(
         json.dumps(
             {
-                "schema": 1,
+                "schema": SCHEMA,
                 "frame": Frame.at(2.0, 48.0).to_json(),
                 "bounds": [0, 0, 40100, 800],
                 "tile_size": TILE,
-                "tiles": indices,
+                "tiles": [(i, j, 1) for i, j in indices],
                 "layers": {},
             }
         )

@@ -1,0 +1,59 @@
+"""Joins tiles on whose ground nothing lies into larger ones."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+
+from geoscene.classes import Class
+from geoscene.ground.partition import GroundPlan, rows_at, values_at
+from geoscene.typing import Bools
+
+_LARGEST = 4096.0
+"""Metres of the longest side of a joined tile."""
+
+_MOST_LINES = 100
+"""Most lines of the terrain along a side of a joined tile, which bounds the number of its faces."""
+
+
+def joined(plan: GroundPlan, occupied: Collection[tuple[int, int]]) -> GroundPlan:
+    """The plan with squares on which nothing lies joined to tiles of 2, 4, 8 ... squares along a side.
+
+    Such a square has no outline, none of the ``occupied`` squares' features, no forest (whose trees are
+    placed tile by tile) and no ground graded to roads. The ground keeps its lines, so it is as close to the
+    terrain as in separate tiles. Tiles that are not joined do not change.
+    """
+    low, high = plan.tiles[0], plan.tiles[-1]
+    columns, rows = (high - low + 1).tolist()
+    span = np.ones((rows, columns), np.int64)
+    whole = _bare(plan, occupied).reshape(rows, columns)
+    lines = plan.coarse if plan.ruled is not None else plan.lines
+    most = min(_LARGEST, _MOST_LINES * lines) if lines else _LARGEST
+    n = 2
+    while n * plan.tile_size <= most and whole.any():
+        # Squares beyond the extent are bare: tiles are cut at its east and north sides.
+        odd = np.pad(whole, [(0, whole.shape[0] % 2), (0, whole.shape[1] % 2)], constant_values=True)
+        whole = odd[::2, ::2] & odd[1::2, ::2] & odd[::2, 1::2] & odd[1::2, 1::2]
+        span[np.repeat(np.repeat(whole, n, axis=0), n, axis=1)[:rows, :columns]] = n
+        n *= 2
+    return replace(plan, span=span.ravel())
+
+
+def ground_tiles(plan: GroundPlan) -> list[tuple[int, int]]:
+    """Indices (i, j) of all tiles of the ground: their south-west squares."""
+    first = ((plan.tiles - plan.tiles[0]) % plan.span[:, None] == 0).all(axis=1)
+    return [(int(i), int(j)) for i, j in plan.tiles[first]]
+
+
+def _bare(plan: GroundPlan, occupied: Collection[tuple[int, int]]) -> Bools:
+    """Whether nothing lies on each square (t,)."""
+    bare: Bools = np.diff(plan.offset) == 0
+    taken = {*occupied, *(plan.ruled or ())}
+    bare &= np.array([tile not in taken for tile in map(tuple, plan.tiles.tolist())])
+    corner = np.maximum(plan.tiles[bare] * plan.tile_size, plan.extent[:2])
+    far = np.minimum((plan.tiles[bare] + 1) * plan.tile_size, plan.extent[2:])
+    klass = values_at(plan.layers.klass, rows_at(plan, (corner + far) / 2), base=plan.base[0])
+    bare[bare] = klass != Class.FOREST_FLOOR
+    return bare
