@@ -24,6 +24,7 @@ from geoscene.progress import Progress, silent
 from geoscene.report import Problem
 from geoscene.roadgraph.route_line import route_line
 from geoscene.scene import Scene, open_scene
+from geoscene.scene.layout import SCHEMA
 from geoscene.scene.writer import SceneWriter
 from geoscene.sources import OsmData
 from geoscene.tiles import Keys, TileReport, build_tiles, tiles_document
@@ -123,11 +124,12 @@ def _tiles_along(plan: Plan, options: BuildOptions) -> list[tuple[int, int]]:
 
 
 def _keys(osm: OsmData, options: BuildOptions) -> Keys:
-    """Digests of all inputs of the ground and of the solids of tiles: program, map and options."""
+    """Digests of all inputs of the ground and of the solids of tiles: program, format, map and options."""
     chosen = {f.name: getattr(options, f.name) for f in fields(options) if f.name not in _NOT_IN_TILES}
     dem = [digest_of(path) for name in options.dem for path in _with_companions(Path(name))]
     common = {
         "version": __version__,
+        "schema": SCHEMA,
         "map": osm.digest,
         "bounds": osm.bounds,
         **{name: value for name, value in chosen.items() if name not in _NOT_IN_GROUND},

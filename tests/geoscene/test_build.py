@@ -207,6 +207,15 @@ def test_interrupted_build_resumes_with_the_same_bytes(osm, scene, tmp_path, mon
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
 
+def test_rebuild_reuses_no_tile_of_another_schema(osm, scene, tmp_path, monkeypatch):
+    shutil.copytree(scene.path, tmp_path / "scene")
+    made, whole = [], geoscene.tiles.build_tile
+    monkeypatch.setattr(geoscene.tiles, "build_tile", lambda *a, **o: made.append(a) or whole(*a, **o))
+    monkeypatch.setattr("geoscene.pipeline.SCHEMA", 99)
+    build(osm, tmp_path / "scene", options=BuildOptions(name="demo"), overwrite=True)
+    assert len(made) == len(scene.tile_indices)
+
+
 def test_tiles_along_a_route_equal_those_of_the_whole_scene(osm, scene, tmp_path):
     along = ("60.1665,24.9420", "60.1668,24.9425")
     part = build(osm, tmp_path / "part", options=BuildOptions(name="demo", along=along, reach=20.0))
