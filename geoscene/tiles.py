@@ -157,13 +157,13 @@ def build_tile(
         copies = copies.shifted(-origin)
     mesh = concatenate([solids.shifted(-origin), rest])
     digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies))
-    verdict = validate_mesh(mesh)
-    built = verdict.feature < plan.buildings.count
+    built = len(np.unique(solids.feature))  # `build_solids` has checked each
+    verdict = validate_mesh(rest)
     return TileReport(
         *tile,
-        len(verdict),
-        int(verdict.ok.sum()),
-        int(built.sum()),
+        built + len(verdict),
+        built + int(verdict.ok.sum()),
+        built,
         len(mesh),
         len(copies),
         _plan_area(rest.take(~rest.closed)),

@@ -41,7 +41,7 @@ class _Pieces(Columns):
 def build_solids(
     buildings: Buildings, *, base: Float, foot: Float | None = None, lod: int = 2
 ) -> tuple[Mesh, list[Problem]]:
-    """One closed, oriented body of positive volume per building, and what was simplified or dropped.
+    """One body without faults (`check_solids`) per building, and what was simplified or dropped.
 
     Vertices lie on the 0.1 mm grid. Faces have the building's row as feature, class BUILDING, and surface,
     material and colour. LoD 0 extrudes the outline from the ground to the mean height of its parts; LoD 1 has

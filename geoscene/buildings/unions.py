@@ -10,7 +10,7 @@ import shapely
 
 from geoscene.buildings.footprints import to_grid
 from geoscene.buildings.shells import Triangles
-from geoscene.intersections import intersecting_faces
+from geoscene.intersections import intersecting_faces, plan_axes
 from geoscene.mesh import WALL
 from geoscene.typing import Float, Ints
 from geoscene.watertight import (
@@ -50,8 +50,8 @@ def unite(shells: Triangles) -> tuple[Triangles, str] | None:
     for reach in (*SEAMS, None):
         if body.status() != m3.Error.NoError or body.is_empty():
             return None
-        for candidate in (body, body.simplify(_TOLERANCE)):
-            corners, run = _triangles(candidate, first)
+        for tolerance in (0.0, _TOLERANCE):
+            corners, run = _triangles(body.simplify(tolerance) if tolerance else body, first)
             if check_solids(corners, np.zeros(len(corners), np.int64), n=1).ok[0]:
                 known = (run >= 0) & (run < 4 * len(pieces))
                 piece = pieces[np.where(known, run // 4, 0)]
@@ -128,10 +128,14 @@ def repair(points: Float, faces: Ints, *, run: Ints) -> tuple[Float, Ints]:
 def _cancel(faces: Ints, run: Ints) -> tuple[Ints, Ints]:
     """Faces without pairs that have the same three vertices in opposite order and so enclose no volume."""
     turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
-    key = {tuple(f): i for i, f in enumerate(turned.tolist())}
-    gone = [i for (a, b, c), i in key.items() if (a, c, b) in key]
+    low, high = np.sort(turned[:, 1:], axis=1).T
+    size = faces.max(initial=0) + 1
+    _, edge = np.unique(low * size + high, return_inverse=True)
+    _, triple = np.unique(edge * size + turned[:, 0], return_inverse=True)
+    sided, last = np.unique((2 * triple + (turned[:, 1] == low))[::-1], return_index=True)
+    opposite = last[np.isin(sided ^ 1, sided)]
     keep = np.ones(len(faces), np.bool_)
-    keep[gone] = False
+    keep[len(faces) - 1 - opposite] = False
     return faces[keep], run[keep]
 
 
@@ -179,8 +183,8 @@ def _contacts(first: Float, second: Float) -> list[Float]:
     """Points (k, 3) that pairs of triangles (n, 3, 3) have in common, or nearly so: corners and piercings."""
     found = []
     for one, two in ((first, second), (second, first)):
+        axes = plan_axes(two)[:, None]
         normal = np.cross(two[:, 1] - two[:, 0], two[:, 2] - two[:, 0])
-        axes = np.array([[1, 2], [2, 0], [0, 1]])[np.argmax(np.abs(normal), axis=1)][:, None]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         away = np.einsum("nij,nj->ni", one - two[:, :1], normal)
         beyond = np.roll(away, -1, axis=1)
