@@ -137,18 +137,19 @@ def _intersect(first: Ints, second: Ints, *, same: Bools) -> Bools:
     shared = same.sum(axis=(0, 1))
     common: tuple[Bools, Bools] = np.any(same, axis=1), np.any(same, axis=0)
     hit: Bools = shared == 3
-    own = np.stack([_sides(second, first[:, k]) for k in range(3)])
-    others = np.stack([_sides(first, second[:, k]) for k in range(3)])
+    own, others = _sides(second, first), _sides(first, second)
     apart = _one_side(own, common[0]) | _one_side(others, common[1])
     rows = np.flatnonzero(~hit & ~apart)
     folded = rows[shared[rows] == 2]
     hit[folded] = _folded(first[folded], second[folded], common=(common[0][:, folded], common[1][:, folded]))
     rows = rows[shared[rows] < 2]
+    edges = []
     for one, two, side, known in ((first, second, own, common[0]), (second, first, others, common[1])):
         for a, b in _EDGES:
-            free = rows[~hit[rows] & ~known[a, rows] & ~known[b, rows]]
-            ends = side[a, free], side[b, free]
-            hit[free] = _pierces(one[free, a], one[free, b], triangle=two[free], ends=ends)
+            free = rows[~known[a, rows] & ~known[b, rows]]
+            edges.append((free, one[free, a], one[free, b], two[free], side[a, free], side[b, free]))
+    row, p, q, triangle, *ends = (np.concatenate(column) for column in zip(*edges, strict=True))
+    hit[row[_pierces(p, q, triangle=triangle, ends=(ends[0], ends[1]))]] = True
     return hit
 
 
@@ -159,18 +160,23 @@ def _one_side(sides: Ints, common: Bools) -> Bools:
     return np.asarray(up | down, np.bool_)
 
 
-def _sides(triangle: Ints, point: Ints) -> Ints:
-    """Side (n,) of planes of triangles (n, 3, 3) on which points (n, 3) lie: 1, 0 or -1."""
-    return _orientation(triangle[:, 0], triangle[:, 1], c=triangle[:, 2], d=point)
+def _sides(triangle: Ints, points: Ints) -> Ints:
+    """Sides (3, n) of planes of triangles (n, 3, 3) on which points (n, 3, 3) lie: 1, 0 or -1."""
+    a, b, c = triangle.transpose(1, 2, 0)
+    return np.stack([_sign(_cross(b - a, c - a), point - a) for point in points.transpose(1, 2, 0)])
 
 
-def _orientation(a: Ints, b: Ints, *, c: Ints, d: Ints) -> Ints:
-    """Sign (n,) of the volume of tetrahedra."""
-    (ux, uy, uz), (vx, vy, vz), (wx, wy, wz) = ((x - a).T for x in (b, c, d))
+def _cross(u: Ints, v: Ints) -> Ints:
+    """Cross products of vectors (3, n)."""
+    return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+
+
+def _sign(normal: Ints, along: Ints) -> Ints:
+    """Signs (n,) of the scalar products of vectors (3, n), of which the first are cross products."""
     high, low = 0, 0
-    for w, normal in ((wx, uy * vz - uz * vy), (wy, uz * vx - ux * vz), (wz, ux * vy - uy * vx)):
-        high = high + w * (normal >> _LOW)
-        low = low + w * (normal & _MASK)
+    for part, w in zip(normal, along, strict=True):
+        high = high + w * (part >> _LOW)
+        low = low + w * (part & _MASK)
     high += low >> _LOW
     return np.asarray(np.where(high != 0, np.sign(high), np.sign(low & _MASK)), np.int64)
 
@@ -182,9 +188,9 @@ def _pierces(p: Ints, q: Ints, *, triangle: Ints, ends: tuple[Ints, Ints]) -> Bo
     rows = np.flatnonzero(level)
     hit[rows] = _meet_in_plane(p[rows], q[rows], triangle=triangle[rows])
     rows = np.flatnonzero(~level & (ends[0] * ends[1] <= 0))
-    turns = np.stack(
-        [_orientation(p[rows], q[rows], c=triangle[rows, a], d=triangle[rows, b]) for a, b in _EDGES]
-    )
+    along = (q[rows] - p[rows]).T
+    corners = (triangle[rows] - p[rows, None]).transpose(1, 2, 0)
+    turns = np.stack([_sign(_cross(along, corners[a]), corners[b]) for a, b in _EDGES])
     hit[rows] = (turns >= 0).all(axis=0) | (turns <= 0).all(axis=0)
     return hit
 
@@ -210,11 +216,11 @@ def _meet_in_plane(p: Ints, q: Ints, *, triangle: Ints) -> Bools:
     inside = np.stack([_turn(corner[a], corner[b], c=p) for a, b in _EDGES])
     hit = (inside >= 0).all(axis=0) | (inside <= 0).all(axis=0)
     for a, b in _EDGES:
-        hit |= _cross(p, q, a=corner[a], b=corner[b])
+        hit |= _segments_cross(p, q, a=corner[a], b=corner[b])
     return np.asarray(hit, np.bool_)
 
 
-def _cross(p: Ints, q: Ints, *, a: Ints, b: Ints) -> Bools:
+def _segments_cross(p: Ints, q: Ints, *, a: Ints, b: Ints) -> Bools:
     """(n,) bool, whether segments p q and a b in the plane have a point in common."""
     turns = (_turn(p, q, c=a) * _turn(p, q, c=b) <= 0) & (_turn(a, b, c=p) * _turn(a, b, c=q) <= 0)
     overlap = (np.maximum(p, q) >= np.minimum(a, b)) & (np.maximum(a, b) >= np.minimum(p, q))
