@@ -67,6 +67,7 @@ def scene_manifest(
         "counts": _counts(plan, reports, problems=problems),
         "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
         "leaf_area_density": LEAF_AREA_DENSITY,
+        "forests": plan.forests.to_json() if plan.forests else None,
         "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),
         "problems": summarise(problems),
     }

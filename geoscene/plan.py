@@ -37,8 +37,9 @@ from geoscene.ground.foundations import foundation_heights
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.ground.urban import paved_fabric
 from geoscene.objects.barriers import Barriers, read_barriers
+from geoscene.objects.forests import Forests
 from geoscene.objects.furniture import Furniture, read_furniture
-from geoscene.objects.vegetation import Trees, clear_of, needle_shares, read_trees
+from geoscene.objects.vegetation import Trees, clear_of, read_trees
 from geoscene.options import BuildOptions
 from geoscene.progress import Progress
 from geoscene.report import Problem
@@ -90,7 +91,7 @@ class Plan:
     ground    : polygons of the ground
     levels    : heights of water surfaces
     trees     : mapped trees
-    needles   : share of needle-leaved trees in each polygon of the ground
+    forests   : what their trees are generated from, None without trees
     structures : bridges and tunnels
     openings  : area of each structure where the ground is left out, None for most
     layers    : feature tables in the order of feature numbers
@@ -108,7 +109,7 @@ class Plan:
     ground: GroundPlan
     levels: WaterLevels
     trees: Trees
-    needles: Float
+    forests: Forests | None
     furniture: Furniture
     barriers: Barriers
     structures: Structures
@@ -204,7 +205,7 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
         ground=joined(ground, set().union(*rows.values())),
         levels=levels,
         trees=trees,
-        needles=needle_shares(ground, osm),
+        forests=Forests.of(ground.layers, osm) if "trees" in options.only else None,
         furniture=furniture,
         barriers=barriers,
         structures=structures,

@@ -17,16 +17,16 @@ import shapely
 from geoscene.buildings import build_solids
 from geoscene.classes import Class
 from geoscene.files import digest_of, write_atomically
-from geoscene.ground import ground_tile, tile_place
+from geoscene.ground import ground_tile, tile_box, tile_place
 from geoscene.mesh import Instances, Mesh, concatenate
 from geoscene.objects.barriers import barrier_meshes
 from geoscene.objects.furniture import furniture_instances
-from geoscene.objects.vegetation import forest_trees, tree_instances
+from geoscene.objects.vegetation import tree_instances
 from geoscene.plan import Plan, take_buildings
 from geoscene.processes import run_tasks
 from geoscene.report import Problem, described, make_without_failures, unexpected
 from geoscene.scene import SceneFiles
-from geoscene.scene.tile_files import Tile, read_tile, write_tile
+from geoscene.scene.tile_files import Tile, read_tile, with_forests, write_tile
 from geoscene.structures import structure_meshes
 from geoscene.typing import Ints
 from geoscene.watertight import validate_mesh
@@ -44,7 +44,7 @@ class TileReport:
     watertight : number of solids that passed the check
     buildings  : number of building solids
     faces      : number of faces
-    instances  : number of instances of shapes
+    instances  : number of instances of shapes, those of forests included
     area       : plan area of the ground in square metres
     digest     : digest of the tile's file
     problems   : buildings that were simplified, and features that were dropped
@@ -118,10 +118,6 @@ def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances, lis
             furniture, "furniture", make=lambda rows: furniture_instances(furniture.take(rows), height=height)
         ),
     ]
-    if covered and len(plan.needles):
-        woods = forest_trees(plan.ground, i, j=j, needles=plan.needles)
-        if len(woods):
-            copies.append(tree_instances(woods, height=height))
     solids = [
         *made(barriers, "barriers", make=lambda rows: barrier_meshes(barriers.take(rows), height=height)),
         *made(
@@ -156,16 +152,19 @@ def build_tile(
         rest = ground.take(np.arange(len(ground))).shifted(-origin)
         copies = copies.shifted(-origin)
     mesh = concatenate([solids.shifted(-origin), rest])
-    digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies))
-    built = len(np.unique(solids.feature))  # `build_solids` has checked each
-    verdict = validate_mesh(rest)
+    made = Tile(origin, mesh, copies)
+    digest = write_tile(SceneFiles(folder).tile(*tile), made)
+    if plan.forests is not None:
+        made = with_forests(made, plan.forests, box=tile_box(plan.ground, tile[0], j=tile[1]))
+    verdict = validate_mesh(mesh)
+    built = verdict.feature < plan.buildings.count
     return TileReport(
         *tile,
-        built + len(verdict),
-        built + int(verdict.ok.sum()),
-        built,
+        len(verdict),
+        int(verdict.ok.sum()),
+        int(built.sum()),
         len(mesh),
-        len(copies),
+        len(made.instances),
         _plan_area(rest.take(~rest.closed)),
         digest,
         tuple(problems),

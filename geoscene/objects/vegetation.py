@@ -1,4 +1,4 @@
-"""Trees: mapped singly, in tree rows, and sampled within woods."""
+"""Trees: mapped singly and in tree rows, and the copies of shapes that trees are drawn as."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.columns import Columns
 from geoscene.frames import Frame
-from geoscene.ground.partition import GroundPlan, rows_at, rows_near, tile_box, values_at
+from geoscene.ground.partition import GroundPlan
 from geoscene.mesh import Instances
 from geoscene.objects.shapes import place
 from geoscene.objects.siting import Sites
 from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
-from geoscene.splitmix import GOLDEN, mix
+from geoscene.splitmix import uniform_at
 from geoscene.tags import parse_length, parse_number
-from geoscene.typing import Float, Height, Ints
+from geoscene.typing import Float, Height
 
 HEIGHT = {"broadleaved": 12.0, "needleleaved": 12.0, "palm": 8.0}
 """Default height in metres.
@@ -64,7 +64,7 @@ class Trees(Columns):
     place_source : (n,) str: ``node`` (where it is mapped), ``moved`` (mapped on a carriageway, moved to the
               nearest clear place), ``row`` (spaced along a tree row) or ``sampled``
     moved   : (n,) float64 metres from where it is mapped
-    osm_id  : (n,) str: the tree's node, or its row's or wood's way or relation
+    osm_id  : (n,) str: the tree's node, or its row's way; "" for a sampled one
     feature : (n,) int32, -1 for none
     """
 
@@ -158,75 +158,6 @@ def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
     return placed.take(~blocked), list(dict.fromkeys(problems))  # the tags of a row are read once per tree
 
 
-def needle_shares(plan: GroundPlan, osm: OsmData) -> Float:
-    """Share (n,) of needle-leaved trees in each row of the plan's layers, by ``leaf_type``; 0 without."""
-    share = {"needleleaved": 1.0, "mixed": 0.5, "coniferous": 1.0}
-    known = {
-        area.osm_id: share[kind]
-        for area in osm.areas
-        if (kind := area.tags.get("leaf_type", area.tags.get("wood", ""))) in share
-    }
-    return np.array([known.get(str(osm_id), 0.0) for osm_id in plan.layers.osm_id], float)
-
-
-def forest_trees(
-    plan: GroundPlan, i: int, *, j: int, density: float = 0.02, seed: int = 0, needles: Float | None = None
-) -> Trees:
-    """Sampled trees of tile (i, j): one per square of 1 / density m2 whose trunk is on forest floor.
-
-    Position, size and form are drawn from (seed, column, row) of a lattice over the plane, so a tree depends
-    neither on tiles nor on other woods. Its feature is that of its wood.
-
-    density : trees per m2; 0.02 (200 to the hectare) is a closed stand of grown trees
-    needles : (rows of the plan's layers,) share of needle-leaved trees, from `needle_shares`; none by default
-    """
-    side = 1.0 / np.sqrt(density)
-    xmin, ymin, xmax, ymax = tile_box(plan, i, j=j)
-    columns, rows = (
-        np.arange(np.floor(low / side), np.ceil(high / side)).astype(np.int64)
-        for low, high in ((xmin, xmax), (ymin, ymax))
-    )
-    near = rows_near(plan, xmin, ymin=ymin, xmax=xmax, ymax=ymax)
-    if not (plan.layers.klass[near] == Class.FOREST_FLOOR).any():
-        rows = rows[:0]
-    column, row = (grid.ravel() for grid in np.meshgrid(columns, rows))
-    draw = _uniform(seed, column, row=row, count=4)
-    x, y = (column + 0.1 + 0.8 * draw[0]) * side, (row + 0.1 + 0.8 * draw[1]) * side
-    owner = rows_at(plan, np.column_stack([x, y]))
-    stands = (x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax)
-    stands &= values_at(plan.layers.klass, owner, base=Class.UNLABELED) == Class.FOREST_FLOOR
-    x, y, draw, owner = x[stands], y[stands], draw[:, stands], owner[stands]
-    # A trunk needs half a metre of forest floor on all sides.
-    dx, dy = np.array([(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)]).T[:, :, None]
-    beside = values_at(
-        plan.layers.klass,
-        rows_at(plan, np.column_stack([(x + dx).ravel(), (y + dy).ravel()])),
-        base=Class.UNLABELED,
-    ).reshape(4, -1)
-    roomy = (beside == Class.FOREST_FLOOR).all(axis=0)
-    x, y, draw, owner = x[roomy], y[roomy], draw[:, roomy], owner[roomy]
-    share = np.zeros(len(plan.layers)) if needles is None else needles
-    form = np.where(draw[3] < share[owner], "needleleaved", "broadleaved")
-    height = np.where(form == "needleleaved", HEIGHT["needleleaved"], HEIGHT["broadleaved"])
-    height = height * (0.8 + 0.4 * draw[2])
-    crown = height * np.where(form == "needleleaved", CROWN["needleleaved"], CROWN["broadleaved"])
-    n = len(x)
-    return Trees(
-        np.column_stack([x, y]),
-        height,
-        np.minimum(crown, 1.2 * side),  # the spacing limits the crown
-        height * TRUNK,
-        form,
-        np.full(n, "sampled"),
-        np.full(n, "height"),
-        np.where(share[owner] > 0, "leaf_type", "default"),
-        np.full(n, "sampled"),
-        np.zeros(n),
-        plan.layers.osm_id[owner],
-        plan.layers.feature[owner],
-    )
-
-
 def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
     """Two copies of shapes a tree, trunk then crown, in scene coordinates, standing on the terrain.
 
@@ -243,7 +174,7 @@ def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
         feature=trees.feature,
     )
     column, row = np.floor(trees.xy.T * 100).astype(np.int64)
-    heading = 2 * np.pi * _uniform(0, column, row=row, count=1)[0]
+    heading = 2 * np.pi * uniform_at(column, row, count=1)[0]
     crowns = place(
         np.char.add("crown_", trees.form),
         np.column_stack([trees.xy, z + base]),
@@ -252,15 +183,6 @@ def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
         feature=trees.feature,
     )
     return Instances.concatenate([trunks, crowns])
-
-
-def _uniform(seed: int, column: Ints, *, row: Ints, count: int) -> Float:
-    """Uniform random numbers (count, n) in [0, 1) determined by (seed, column, row)."""
-    with np.errstate(over="ignore"):
-        state = mix(column.astype(np.uint64) + GOLDEN * np.uint64(seed + 1))
-        state = mix(state ^ (row.astype(np.uint64) * GOLDEN))
-        draws = [mix(state + GOLDEN * np.uint64(k + 1)) >> np.uint64(11) for k in range(count)]
-    return np.stack(draws) * 2.0**-53
 
 
 def _along(line: Float, spacing: float) -> Float:

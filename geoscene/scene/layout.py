@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Iterator, Mapping
@@ -17,9 +18,10 @@ from geoscene.errors import BUILD_AGAIN, GeosceneError, SceneFormatError, readin
 from geoscene.files import digest, digest_of
 from geoscene.frames import Frame
 from geoscene.mesh import Mesh
+from geoscene.objects.forests import Forests
 from geoscene.roadgraph import RoadGraph, read_graphml
 from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
-from geoscene.scene.tile_files import Tile, read_shapes, read_tile
+from geoscene.scene.tile_files import Tile, read_shapes, read_tile, with_forests
 from geoscene.typing import Float, Ints
 
 SCHEMA = 2
@@ -156,8 +158,19 @@ class Scene:
         return bool(self.manifest["roads"]["driving_side"] == "left")
 
     def tile(self, i: int, j: int) -> Tile:
-        """Tile (i, j); raises SceneFormatError if it is missing or damaged."""
-        return read_tile(self.files.tile(i, j))
+        """Tile (i, j) with the trees of its forests; raises SceneFormatError if it is missing or damaged."""
+        tile = read_tile(self.files.tile(i, j))
+        if self._forests is None:
+            return tile
+        box = np.array([i, j, i + 1, j + 1]) * self.tile_size  # no forest is on a larger one
+        low, high = np.maximum(box[:2], self.bounds[:2]), np.minimum(box[2:], self.bounds[2:])
+        return with_forests(tile, self._forests, box=(*low, *high))
+
+    @functools.cached_property
+    def _forests(self) -> Forests | None:
+        """What the trees of forests are generated from, None for a scene without them."""
+        document = self.manifest.get("forests")
+        return None if document is None else Forests.from_json(document)
 
     def tiles(self) -> Iterator[Tile]:
         """All tiles, one at a time."""

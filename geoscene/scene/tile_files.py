@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.classes import Class
 from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
 from geoscene.files import digest, write_atomically
 from geoscene.mesh import Instances, Mesh
+from geoscene.objects.forests import Forests, forest_instances
 from geoscene.typing import Float
 
 
@@ -24,12 +26,20 @@ class Tile:
 
     origin    : (3,) float64, whole metres: tile coordinates + origin = scene coordinates
     mesh      : in tile coordinates
-    instances : in tile coordinates
+    instances : in tile coordinates; trees of forests are not in files (see `with_forests`)
     """
 
     origin: Float
     mesh: Mesh
     instances: Instances = field(default_factory=Instances.empty)
+
+
+def with_forests(tile: Tile, forests: Forests, *, box: Sequence[float]) -> Tile:
+    """The tile with the trees of its forests among its instances; ``box`` is its ground's, scene metres."""
+    if not (tile.mesh.klass == Class.FOREST_FLOOR).any():
+        return tile
+    trees = forest_instances(tile.mesh.shifted(tile.origin), forests, box=box).shifted(-tile.origin)
+    return replace(tile, instances=Instances.concatenate([tile.instances, trees]))
 
 
 def pack(arrays: Mapping[str, NDArray[Any]]) -> bytes:

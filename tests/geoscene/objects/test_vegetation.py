@@ -11,7 +11,7 @@ from geoscene.frames import Frame
 from geoscene.ground import Layers, building_pads, plan_ground
 from geoscene.mesh import Mesh
 from geoscene.objects.shapes import LEAF_AREA_DENSITY, place, shapes
-from geoscene.objects.vegetation import clear_of, forest_trees, read_trees, tree_instances
+from geoscene.objects.vegetation import clear_of, read_trees, tree_instances
 from geoscene.sources.data import OsmData, Point, Way
 
 FRAME = Frame.at(11.0, 50.0)
@@ -135,29 +135,6 @@ def test_a_mapped_tree_in_a_building_is_dropped_and_one_on_a_road_moves_beside_i
     assert left.place_source.tolist() == ["moved", "node"]
     np.testing.assert_allclose(left.moved, [2.5, 0.0], atol=0.26)
     assert [(p.osm_id, p.action, p.reason) for p in problems] == [("node/0", "dropped", "in-building")]
-
-
-def test_forests_have_the_tree_density_and_leave_roads_and_buildings_free():
-    plan = wood_plan(tile_size=400.0)
-    trees = np.vstack([forest_trees(plan, i, j=j, density=0.02).xy for i, j in plan.tiles])
-    x, y = trees.T
-    assert (x < 120).all()
-    assert (y < 80).all()
-    assert (np.abs(y) > 3.5 - 1e-9).all()
-    assert not ((x > 29.6) & (x < 60.4) & (y > 29.6) & (y < 60.4)).any()
-    area = 220 * 180 - 220 * 7 - 31 * 31
-    assert len(trees) == pytest.approx(area * 0.02, rel=0.05)
-
-
-def test_forest_trees_depend_on_the_seed_and_not_on_the_tiles():
-    def all_trees(size, seed=0):
-        plan = wood_plan(tile_size=size)
-        found = [forest_trees(plan, i, j=j, seed=seed) for i, j in plan.tiles]
-        table = np.concatenate([np.column_stack([t.xy, t.height]) for t in found])
-        return table[np.lexsort(table.T)]
-
-    np.testing.assert_array_equal(all_trees(50.0), all_trees(170.0))
-    assert not np.isin(all_trees(50.0, seed=1), all_trees(50.0)).any()
 
 
 def test_expanded_instances_are_transformed_shapes():

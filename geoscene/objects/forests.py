@@ -1,0 +1,166 @@
+"""Trees of forests: stored as the ground they stand on, and placed when a tile is read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+
+from geoscene.classes import Class
+from geoscene.ground.layers import Layers
+from geoscene.mesh import Instances, Mesh
+from geoscene.objects.vegetation import CROWN, HEIGHT, TRUNK, Trees, tree_instances
+from geoscene.sources.data import OsmData
+from geoscene.splitmix import uniform_at
+from geoscene.typing import Bools, Float, Ints
+
+_ROOM = 0.5
+"""Metres of forest floor that a trunk needs on all sides."""
+
+_SHARES = {"needleleaved": 1.0, "coniferous": 1.0, "mixed": 0.5}
+"""Share of needle-leaved trees by ``leaf_type`` or ``wood``; 0 for other values and without."""
+
+
+@dataclass(frozen=True, slots=True)
+class Forests:
+    """What the trees of a scene's forests are generated from, beside their ground.
+
+    feature : (k,) int64, forests with needle-leaved trees, by feature number, ascending
+    needles : (k,) float64, their share of needle-leaved trees
+    density : trees per m2; 0.02 (200 to the hectare) is a closed stand of grown trees
+    seed    : of places, sizes and forms
+    """
+
+    feature: Ints
+    needles: Float
+    density: float = 0.02
+    seed: int = 0
+
+    @classmethod
+    def of(cls, layers: Layers, osm: OsmData) -> Forests:
+        """The forests among the layers of a ground."""
+        kinds = {area.osm_id: area.tags.get("leaf_type", area.tags.get("wood", "")) for area in osm.areas}
+        share = np.array([_SHARES.get(kinds.get(name, ""), 0.0) for name in layers.osm_id.tolist()], float)
+        rows = np.flatnonzero((layers.klass == Class.FOREST_FLOOR) & (share > 0))
+        return cls(layers.feature[rows].astype(np.int64), share[rows])
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any]) -> Forests:
+        """The inverse of `to_json`."""
+        shares = document["needleleaved_share"]
+        feature = np.array([int(name) for name in shares], np.int64)
+        needles = np.array(list(shares.values()), float)
+        return cls(feature, needles, float(document["trees_per_m2"]), int(document["seed"]))
+
+    def to_json(self) -> dict[str, Any]:
+        """The document that a scene's manifest contains."""
+        shares = dict(zip(map(str, self.feature.tolist()), self.needles.tolist(), strict=True))
+        return {"trees_per_m2": self.density, "seed": self.seed, "needleleaved_share": shares}
+
+
+def forest_trees(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> tuple[Trees, Float]:
+    """The trees of forests on a tile's ground, and the height z (n,) of the ground where they stand.
+
+    One in each square of 1 / density m2 where its trunk is on forest floor, half a metre or more from any
+    other ground of the tile. Place, size and form are drawn from (seed, column, row) of a lattice over the
+    plane, so that a tree depends neither on tiles nor on other forests. Its feature is that of its forest.
+
+    ground : faces in scene coordinates; those that are no forest floor are left out
+    box    : (xmin, ymin, xmax, ymax) of the tile, scene metres; trees beyond are left out
+    """
+    floor = ground.take(ground.klass == Class.FOREST_FLOOR)
+    corners = floor.vertices[floor.faces]
+    side = float(1.0 / np.sqrt(forests.density))
+    column, row = _squares(corners, side, box=box)
+    draw = uniform_at(column, row, count=4, seed=forests.seed)
+    xy = np.column_stack([(column + 0.1 + 0.8 * draw[0]) * side, (row + 0.1 + 0.8 * draw[1]) * side])
+    face = _faces_under(corners, xy, box=box)
+    face[_near_an_edge(floor, xy, box=box)] = -1
+    stands = face >= 0
+    xy, draw, face = xy[stands], draw[:, stands], face[stands]
+    feature = floor.feature[face].astype(np.int64)
+    trees = _sampled(xy, draw, feature=feature, share=_needle_shares(forests, feature), widest=1.2 * side)
+    return trees, _heights(corners[face], xy)
+
+
+def forest_instances(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> Instances:
+    """The trees of `forest_trees` as copies of shapes, scene coordinates."""
+    trees, z = forest_trees(ground, forests, box=box)
+    return tree_instances(trees, height=lambda *_: z)
+
+
+def _squares(corners: Float, side: float, *, box: Sequence[float]) -> tuple[Ints, Ints]:
+    """Column and row (n,) of the lattice's squares within the bounds of faces and a box."""
+    low = np.maximum(corners[:, :, :2].min(axis=(0, 1), initial=np.inf), box[:2])
+    high = np.minimum(corners[:, :, :2].max(axis=(0, 1), initial=-np.inf), box[2:])
+    if not (low < high).all():
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    ranges = [np.arange(a, b) for a, b in zip(np.floor(low / side), np.ceil(high / side), strict=True)]
+    column, row = (grid.ravel().astype(np.int64) for grid in np.meshgrid(*ranges))
+    return column, row
+
+
+def _faces_under(corners: Float, xy: Float, *, box: Sequence[float]) -> Ints:
+    """The face (n,) under each point (n, 2) in the box, the first of several; -1 without."""
+    face = np.full(len(xy), -1, np.int64)
+    inside = np.flatnonzero(((xy >= box[:2]) & (xy < box[2:])).all(axis=1))
+    tree = shapely.STRtree(shapely.polygons(corners[:, :, :2]))
+    point, under = tree.query(shapely.points(xy[inside]), predicate="intersects")
+    order = np.lexsort((-under, point))
+    face[inside[point[order]]] = under[order]  # of equal points the last one stays
+    return face
+
+
+def _near_an_edge(floor: Mesh, xy: Float, *, box: Sequence[float]) -> Bools:
+    """Whether points (n, 2) are too near to where the forest floor ends, other than at the tile's sides."""
+    edges = np.sort(floor.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64))
+    _, first, uses = np.unique(edges @ (len(floor.vertices), 1), return_index=True, return_counts=True)
+    ends = floor.vertices[edges[first[uses == 1]], :2]
+    low, high = ((ends == side).all(axis=1).any(axis=1) for side in (np.array(box[:2]), np.array(box[2:])))
+    tree = shapely.STRtree(shapely.linestrings(ends[~(low | high)]))
+    near = np.zeros(len(xy), np.bool_)
+    near[tree.query(shapely.points(xy), predicate="dwithin", distance=_ROOM)[0]] = True
+    return near
+
+
+def _needle_shares(forests: Forests, feature: Ints) -> Float:
+    """Share (n,) of needle-leaved trees in the forests of features (n,)."""
+    known, share = np.append(forests.feature, np.iinfo(np.int64).max), np.append(forests.needles, 0.0)
+    place = np.searchsorted(known, feature)
+    return np.where(known[place] == feature, share[place], 0.0)
+
+
+def _sampled(xy: Float, draw: Float, *, feature: Ints, share: Float, widest: float) -> Trees:
+    """Trees at places (n, 2) with size and form by random numbers (4, n)."""
+    n, needled = len(xy), draw[3] < share
+    height = np.where(needled, HEIGHT["needleleaved"], HEIGHT["broadleaved"]) * (0.8 + 0.4 * draw[2])
+    crown = height * np.where(needled, CROWN["needleleaved"], CROWN["broadleaved"])
+    return Trees(
+        xy,
+        height,
+        np.minimum(crown, widest),  # the spacing limits the crown
+        height * TRUNK,
+        np.where(needled, "needleleaved", "broadleaved"),
+        np.full(n, "sampled"),
+        np.full(n, "height"),
+        np.where(share > 0, "leaf_type", "default"),
+        np.full(n, "sampled"),
+        np.zeros(n),
+        np.full(n, ""),
+        feature.astype(np.int32),
+    )
+
+
+def _heights(corners: Float, xy: Float) -> Float:
+    """Height (n,) of each face (n, 3, 3) at a point (n, 2)."""
+    a = corners[:, 0]
+    u, v = corners[:, 1] - a, corners[:, 2] - a
+    p = xy - a[:, :2]
+    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    along = (p[:, 0] * v[:, 1] - p[:, 1] * v[:, 0]) / area
+    across = (u[:, 0] * p[:, 1] - u[:, 1] * p[:, 0]) / area
+    z: Float = a[:, 2] + along * u[:, 2] + across * v[:, 2]
+    return z
