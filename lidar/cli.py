@@ -174,6 +174,8 @@ def export(
 
     lidar export drive --to nuscenes -o nuscenes
 
+    lidar export drive --to kitti -o kitti
+
     Parameters
     ----------
     dataset

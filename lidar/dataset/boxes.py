@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class
+from geoscene.errors import reading
 from geoscene.files import write_atomically
 from geoscene.typing import Float, Ints
 from lidar.camera.outline import outline
-from lidar.dataset.layout import Paths, read_sensors
+from lidar.dataset.layout import Paths, read_rows, read_sensors
+from lidar.errors import DatasetError, LidarError
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.camera_model import project
@@ -89,6 +92,35 @@ COLUMNS = (
     *("ego_vx", "ego_vy", "ego_vz", "moving"),
 )
 """Columns of `box_rows`, in order."""
+
+_TEXT = ("class", "kind")
+_WHOLE = ("frame", "time_ns", "id", "instance", "points", "pixels")
+
+
+def read_boxes(path: Path, columns: Collection[str]) -> list[dict[str, Any]]:
+    """The rows of a file of boxes: texts, whole numbers, ``moving`` as a boolean, and floats.
+
+    columns : that the file must have
+
+    Raises DatasetError for a missing or damaged file.
+    """
+    rows = read_rows(path)
+    with reading(path, DatasetError, remedy="drive again with `overwrite`", known=LidarError):
+        boxes = [{name: _value(name, text) for name, text in row.items()} for row in rows]
+        for box in boxes:
+            _ = Class[str(box["class"]).upper()], [box[name] for name in columns]
+            if not all(np.isfinite(box[name]) for name in columns if name not in _TEXT):
+                raise ValueError(f"road user {box['id']} of frame {box['frame']} has no finite box")
+    return boxes
+
+
+def _value(name: str, text: str) -> str | int | float | bool:
+    """A value of a file of boxes."""
+    if name in _TEXT:
+        return text
+    if name == "moving":
+        return {"True": True, "False": False}[text]
+    return int(text) if name in _WHOLE else float(text)
 
 
 def _centres(actors: Actors, rows: Ints, *, at: States) -> Float:

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes
 from geoscene.progress import Progress, silent
-from lidar.dataset.formats import FORMATS, Format, format_of, map_suffixes, read_table
+from lidar.dataset.formats import FORMATS, Format, format_of, map_suffixes
 from lidar.dataset.formats.las import LasInfo, read_chunks
 from lidar.dataset.formats.table import Table, placed_returns, records, rows
 from lidar.dataset.layout import Dataset
+from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
@@ -27,7 +28,6 @@ from lidar.rig.patterns.beams import frame_ns
 from lidar.time_scales import gps_seconds
 
 _COLUMNS = ("x", "y", "z", "intensity", "gps_time", "ring", "label", "instance", "source")
-_FAR = 1e6  # metres from a scanner, beyond the range of any
 _BUCKET = 64.0  # metres: side of the squares into which points are sorted before they are thinned
 _SHRINK_AT = 64 * 2**20  # bytes of a square's points beyond which they are thinned
 _SAMPLE = 12  # frames from which the range of heights for the colours is estimated
@@ -151,10 +151,7 @@ class _Source:
                         | {"source": np.full(rows(table), index, np.uint16)},
                     )
             else:
-                table = read_table(path)
-                if not all((np.abs(table[axis]) < _FAR).all() for axis in "xyz"):
-                    raise DatasetError(f"{path}: damaged: points that no scanner measures; record it again")
-                yield frame, self._placed(table, name, index=index, frame=frame)
+                yield frame, self._placed(cloud_points(path), name, index=index, frame=frame)
 
     def _placed(self, table: Table, name: str, *, index: int, frame: int) -> Table:
         if self._trajectory is None:

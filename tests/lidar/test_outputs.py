@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import resource
+import shutil
 import zlib
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -591,6 +592,105 @@ def test_datasets_without_the_files_that_nuscenes_needs_are_refused(dataset, sce
     with pytest.raises(DatasetError, match="`formats` pcd"):
         EXPORTERS["nuscenes"].export(open_dataset(tmp_path / "d"), tmp_path / "m")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "n"]
+
+
+def _calibration(path):
+    """Matrices of a calibration file of KITTI by name."""
+    lines = (line.split(":", 1) for line in path.read_text().splitlines() if line)
+    return {name: np.array(values.split(), float) for name, values in lines if "time" not in name}
+
+
+def test_kitti_sequence_has_one_index_for_clouds_labels_images_and_poses(dataset, tmp_path):
+    """Read as pykitti's odometry class does; the fisheye camera has no place in it."""
+    counts = EXPORTERS["kitti"].export(dataset, tmp_path / "k").counts
+    sequence, recorded = tmp_path / "k" / "sequences" / "00", dataset.path / "top"
+    assert (counts["clouds"], counts["images"]) == (40, 40)
+    assert not any(path.is_symlink() for path in (tmp_path / "k").rglob("*"))
+    for folder in ("velodyne", "labels", "image_2", "label_2", "calib"):
+        assert [int(path.stem) for path in sorted((sequence / folder).iterdir())] == list(range(40)), folder
+    assert {path.name for path in sequence.iterdir() if path.name.startswith("image")} == {"image_2"}
+    times = np.loadtxt(sequence / "times.txt")
+    np.testing.assert_allclose(times, np.arange(40) / 10, atol=1e-8)
+    calibration = _calibration(sequence / "calib.txt")
+    Tr = np.vstack([calibration["Tr"].reshape(3, 4), [0, 0, 0, 1]])
+    sensors, mount = mounts(dataset)
+    np.testing.assert_allclose(Tr, np.linalg.inv(mount["front"]) @ mount["top"], atol=1e-9)
+    np.testing.assert_allclose(calibration["P2"].reshape(3, 4)[:, :3], sensors["front"]["K"], atol=1e-9)
+    poses = np.loadtxt(tmp_path / "k" / "poses" / "00.txt").reshape(-1, 3, 4)
+    at = dataset.trajectory().at(np.arange(40) * 10**8).mounted(mount["front"][:3, 3], mount["front"][:3, :3])
+    np.testing.assert_allclose(poses[:, :, 3], (at.position - at.position[0]) @ at.rotation[0], atol=1e-6)
+    np.testing.assert_allclose(poses[:, :, :3], at.rotation[0].T @ at.rotation, atol=1e-9)
+    for frame in range(0, 40, 7):
+        name = f"{frame:06d}"
+        clouds = (np.fromfile(p / "velodyne" / f"{name}.bin", "<f4") for p in (sequence, recorded))
+        np.testing.assert_allclose(*clouds, atol=1e-4)
+        labels = ((p / "labels" / f"{name}.label").read_bytes() for p in (sequence, recorded))
+        assert next(labels) == next(labels)
+        image = (sequence / "image_2" / f"{name}.png").read_bytes()
+        assert image == (dataset.path / "front" / "rgb" / f"{name}.png").read_bytes()
+
+
+def test_kitti_objects_hold_their_points_and_project_onto_their_2d_boxes(dataset, tmp_path):
+    EXPORTERS["kitti"].export(dataset, tmp_path / "k")
+    sequence = tmp_path / "k" / "sequences" / "00"
+    held, boxes, kinds = 0, 0, set()
+    for path in sorted((sequence / "label_2").iterdir()):
+        calibration = _calibration(sequence / "calib" / path.name)
+        P2, camera_from_lidar = (calibration[name].reshape(3, 4) for name in ("P2", "Tr_velo_to_cam"))
+        points = np.fromfile(sequence / "velodyne" / f"{path.stem}.bin", "<f4").reshape(-1, 4)[:, :3]
+        points = points @ camera_from_lidar[:, :3].T + camera_from_lidar[:, 3]
+        users = np.fromfile(sequence / "labels" / f"{path.stem}.label", "<u4") >> 16
+        for line in path.read_text().splitlines():
+            kind, *values = line.split()
+            truncated, occluded, alpha, *box = map(float, values)
+            left, top, right, bottom, height, width, length, x, y, z, yaw = box
+            assert 0 <= truncated <= 1
+            assert occluded in (0, 1, 2)
+            assert alpha == pytest.approx((yaw - np.arctan2(x, z) + np.pi) % (2 * np.pi) - np.pi, abs=1e-3)
+            assert 0 <= left <= right <= 319
+            assert 0 <= top <= bottom <= 179
+            turn = Rotation.from_euler("y", yaw).as_matrix()  # as KITTI's development kit
+            own = (points - [x, y, z]) @ turn
+            inside = (np.abs(own[:, 0]) < length / 2) & (np.abs(own[:, 2]) < width / 2)
+            inside &= (own[:, 1] < -0.2) & (own[:, 1] > -height)
+            if inside.sum() > 20:
+                found, count = np.unique(users[inside], return_counts=True)
+                assert found[count.argmax()] > 0
+                assert count.max() > 0.9 * inside.sum()
+                held += int(inside.sum())
+            corners = [
+                [a * length / 2, -b * height, c * width / 2] for a in (-1, 1) for b in (0, 1) for c in (-1, 1)
+            ]
+            seen = np.column_stack([np.array(corners) @ turn.T + [x, y, z], np.ones(8)]) @ P2.T
+            if seen[:, 2].min() > 0.5 and truncated == 0:
+                pixels = seen[:, :2] / seen[:, 2:]
+                sides = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+                size = max(right - left, bottom - top)
+                np.testing.assert_allclose([left, top, right, bottom], sides, atol=2.0 + 0.12 * size)
+                boxes += 1
+            kinds.add(kind)
+    assert held > 200
+    assert boxes > 20
+    assert "Car" in kinds
+
+
+def test_kitti_exports_take_clouds_and_labels_of_kitti_as_they_are(dataset, tmp_path):
+    source = tmp_path / "d"
+    shutil.copytree(
+        dataset.path, source, ignore=shutil.ignore_patterns("pcd", "ply", "csv", "front", "side", "ahead")
+    )
+    for kind, name in (
+        ("kitti", "sequences/00/velodyne/000007.bin"),
+        ("kitti-raw", "velodyne_points/data/{:010d}.bin"),
+    ):
+        EXPORTERS[kind].export(open_dataset(source), tmp_path / kind)
+        (copied,) = (tmp_path / kind).rglob(name.format(7))
+        assert copied.read_bytes() == (source / "top" / "velodyne" / "000007.bin").read_bytes()
+    labels = tmp_path / "kitti" / "sequences" / "00" / "labels" / "000007.label"
+    assert labels.read_bytes() == (source / "top" / "labels" / "000007.label").read_bytes()
+    shutil.rmtree(source / "top" / "velodyne")
+    with pytest.raises(DatasetError, match=r"`formats` pcd, .*kitti"):
+        EXPORTERS["kitti"].export(open_dataset(source), tmp_path / "none")
 
 
 def test_a_map_reports_missing_frames(scene, rig, tmp_path):

@@ -75,6 +75,24 @@ EXPORTERS = {
     row.name: row
     for row in (
         Exporter(
+            "kitti",
+            "kitti",
+            "a sequence of KITTI's odometry benchmark, with labels of SemanticKITTI and of objects",
+            mark="sequences/00/calib.txt",
+            names=r"poses/00\.txt|sequences/00/((calib|times|poses)\.txt|velodyne/\d{6}\.bin|labels/\d{6}\.label"
+            r"|image_[0-3]/\d{6}\.png|(label_2|calib)/\d{6}\.txt)",
+            hint="open it with pykitti.odometry('{path}', '00')",
+        ),
+        Exporter(
+            "kitti-raw",
+            "kitti_raw",
+            "a drive of KITTI's raw recordings, with OXTS files of the true motion",
+            mark="dataformat.txt",
+            names=r"dataformat\.txt|\d{4}_\d\d_\d\d/(calib_\w+\.txt|\d{4}_\d\d_\d\d_drive_0001_sync/\w+"
+            r"/(timestamps\w*\.txt|data/\d{10}\.(bin|png|txt)))",
+            hint="open it with pykitti.raw('{path}', DATE, '0001')",
+        ),
+        Exporter(
             "nuscenes",
             "nuscenes",
             "samples and sweeps with all tables of nuScenes, two key frames per second",

@@ -11,8 +11,7 @@ import json
 import logging
 import shutil
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +20,26 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from geoscene.classes import Class, class_codes
-from geoscene.errors import GeosceneError
+from geoscene.errors import GeosceneError, reading
 from geoscene.files import write_atomically
 from geoscene.progress import Progress
 from geoscene.scene import open_scene
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 from lidar.camera.png import write_png
-from lidar.dataset.formats import FORMATS, Format, nuscenes, read_table
-from lidar.dataset.formats.table import PointLabels, placed_returns
-from lidar.dataset.layout import Dataset, read_rows
+from lidar.dataset.boxes import COLUMNS, read_boxes
+from lidar.dataset.formats import nuscenes
+from lidar.dataset.layout import Dataset
+from lidar.dataset.recorded import (
+    Stream,
+    color_images,
+    labelled_clouds,
+    labelled_formats,
+    nearest,
+    recorded_labels,
+    still_points,
+)
 from lidar.errors import DatasetError
-from lidar.geometry.poses import Poses, Trajectory
+from lidar.geometry.poses import Trajectory
 
 Row = dict[str, Any]
 
@@ -71,19 +79,6 @@ _WALKING, _DRIVING = 0.2, 0.5
 """Speeds in m/s above which pedestrians and vehicles have the attribute ``moving``."""
 
 
-@dataclass(frozen=True)
-class _Stream:
-    """A sensor's frames: numbers, times (nanoseconds since the start) and files."""
-
-    name: str
-    channel: str
-    modality: str
-    sensor: Row
-    frames: list[int]
-    times: list[int]
-    files: list[Path]
-
-
 def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, int]:
     """Write a finished drive as a nuScenes dataset; return the numbers of samples, clouds, images and boxes.
 
@@ -95,45 +90,20 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     return _Export(dataset, _streams(dataset), out=folder).write(progress)
 
 
-def _streams(dataset: Dataset) -> list[_Stream]:
-    """Scanners, the first as LIDAR_TOP, and cameras with colour images."""
-    streams: list[_Stream] = []
+def _streams(dataset: Dataset) -> dict[str, Stream]:
+    """Scanners, the first as LIDAR_TOP, and cameras with colour images, by channel."""
+    streams: dict[str, Stream] = {}
     for name, sensor in dataset.sensors("lidar", "camera").items():
-        if sensor["kind"] == "lidar":
-            form = next((f for f in _formats() if any(dataset.files(name, f))), None)
-            found = list(dataset.files(name, form)) if form else []
-        else:
-            images = sorted(dataset.paths.image(name, 0, kind="rgb").parent.glob("*.png"))
-            found = [(int(path.stem), path) for path in images]
-        if not found:
-            continue
         lidar = sensor["kind"] == "lidar"
-        first = lidar and not any(s.modality == "lidar" for s in streams)
-        at = dataset.sample_times(name).tolist()
-        frames = [frame for frame, _ in found]
-        streams.append(
-            _Stream(
-                name,
-                "LIDAR_TOP" if first else name.upper(),
-                sensor["kind"],
-                sensor,
-                frames,
-                [at[frame] for frame in frames],
-                [path for _, path in found],
-            )
-        )
-    if not any(s.modality == "lidar" for s in streams):
-        names = ", ".join(form.name for form in _formats())
+        stream = labelled_clouds(dataset, name) if lidar else color_images(dataset, name)
+        if stream is not None:
+            streams["LIDAR_TOP" if lidar and "LIDAR_TOP" not in streams else name.upper()] = stream
+    if "LIDAR_TOP" not in streams:
+        names = ", ".join(form.name for form in labelled_formats())
         raise DatasetError(
             f"{dataset.path}: holds no labelled clouds in the sensor frame; drive with `formats` {names}"
         )
     return streams
-
-
-def _formats() -> list[Format]:
-    """Formats that keep what samples need: points in the sensor frame with times and labels."""
-    needed = {"time_ns", "label", "ring"}
-    return [form for form in FORMATS.values() if form.frame == "sensor" and needed <= set(form.columns)]
 
 
 def _token(*parts: object) -> str:
@@ -151,7 +121,7 @@ def _chained(rows: Sequence[Row]) -> None:
 class _Export:
     """The tables of one drive, and the folder they are written to."""
 
-    def __init__(self, dataset: Dataset, streams: Sequence[_Stream], *, out: Path) -> None:
+    def __init__(self, dataset: Dataset, streams: Mapping[str, Stream], *, out: Path) -> None:
         self.dataset, self.streams, self.out = dataset, streams, out
         self.trajectory: Trajectory = dataset.trajectory()
         self.scale = np.array([self.trajectory.scale[0], self.trajectory.scale[0], 1.0])
@@ -162,29 +132,27 @@ class _Export:
 
     def write(self, progress: Progress) -> dict[str, int]:
         """Write all files; return the numbers of samples, clouds, images and boxes."""
-        top = next(s for s in self.streams if s.modality == "lidar")
-        keys = _key_frames(top.times)
+        top = self.streams["LIDAR_TOP"]
+        keys = _key_frames(top.time_ns)
         samples = [
             {
-                "token": _token(self.name, "sample", top.frames[k]),
-                "timestamp": self._stamp(top.times[k]),
+                "token": _token(self.name, "sample", int(top.frames[k])),
+                "timestamp": self._stamp(int(top.time_ns[k])),
                 "scene_token": _token(self.name, "scene"),
             }
             for k in keys
         ]
         _chained(samples)
-        key_times = np.array([top.times[k] for k in keys], np.int64)
+        key_times = top.time_ns[keys]
         counts = {"lidar": 0, "camera": 0}
-        total = sum(len(s.files) for s in self.streams)
-        for stream in self.streams:
-            self._add_sensor(stream)
+        total = sum(len(s.files) for s in self.streams.values())
+        for channel, stream in self.streams.items():
+            self._add_sensor(channel, stream)
             rows = []
-            near = _nearest(stream.times, key_times)
-            for k, frame in enumerate(stream.frames):
-                rows.append(
-                    self._sample_data(stream, k, frame=frame, samples=samples, key_times=key_times, near=near)
-                )
-                counts[stream.modality] += 1
+            near = nearest(stream.time_ns, key_times)
+            for k in range(len(stream.files)):
+                rows.append(self._sample_data(channel, k, samples=samples, key_times=key_times, near=near))
+                counts[stream.sensor["kind"]] += 1
                 progress("nuScenes", sum(counts.values()), total=total)
             _chained(rows)
             self.tables["sample_data"] += rows
@@ -209,13 +177,13 @@ class _Export:
         """A position (3,) of the scene in the tables' frame."""
         return [float(v) for v in position / self.scale - self.zero]
 
-    def _add_sensor(self, stream: _Stream) -> None:
-        token = _token("sensor", stream.channel)
-        self.tables["sensor"].append({"token": token, "channel": stream.channel, "modality": stream.modality})
+    def _add_sensor(self, channel: str, stream: Stream) -> None:
+        token, modality = _token("sensor", channel), stream.sensor["kind"]
+        self.tables["sensor"].append({"token": token, "channel": channel, "modality": modality})
         mount = np.array(stream.sensor["vehicle_from_sensor"])
         self.tables["calibrated_sensor"].append(
             {
-                "token": _token(self.name, "calibrated", stream.channel),
+                "token": _token(self.name, "calibrated", channel),
                 "sensor_token": token,
                 "translation": mount[:3, 3].tolist(),
                 "rotation": _wxyz(mount[:3, :3]),
@@ -224,20 +192,14 @@ class _Export:
         )
 
     def _sample_data(
-        self,
-        stream: _Stream,
-        k: int,
-        *,
-        frame: int,
-        samples: Sequence[Row],
-        key_times: NDArray[np.int64],
-        near: NDArray[np.int64],
+        self, channel: str, k: int, *, samples: Sequence[Row], key_times: Ints, near: Ints
     ) -> Row:
         """Write a frame's cloud or image and add its pose; return its row of ``sample_data``."""
-        time, source = stream.times[k], stream.files[k]
-        token = _token(self.name, stream.channel, frame)
+        stream = self.streams[channel]
+        time, source, lidar = int(stream.time_ns[k]), stream.files[k], stream.sensor["kind"] == "lidar"
+        token = _token(self.name, channel, int(stream.frames[k]))
         key = bool((near == k).any())
-        sample = int(np.flatnonzero(near == k)[0]) if key else int(_nearest(key_times.tolist(), [time])[0])
+        sample = np.flatnonzero(near == k)[0] if key else nearest(key_times, stream.time_ns[k : k + 1])[0]
         pose = self.trajectory.at([time])
         self.tables["ego_pose"].append(
             {
@@ -247,62 +209,53 @@ class _Export:
                 "rotation": _wxyz(pose.rotation[0]),
             }
         )
-        suffix = ".pcd.bin" if stream.modality == "lidar" else ".png"
-        folder = "samples" if key else "sweeps"
-        name = f"{folder}/{stream.channel}/{self.name}__{stream.channel}__{self._stamp(time)}{suffix}"
+        suffix, folder = ".pcd.bin" if lidar else ".png", "samples" if key else "sweeps"
+        name = f"{folder}/{channel}/{self.name}__{channel}__{self._stamp(time)}{suffix}"
         path = self.out / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        if stream.modality == "lidar":
-            self._write_cloud(stream, source, time=time, path=path, token=token, labelled=key)
+        if lidar:
+            self._write_cloud(stream, k, path=path, token=token, labelled=key)
         else:
             shutil.copyfile(source, path)
         return {
             "token": token,
             "sample_token": samples[sample]["token"],
             "ego_pose_token": token,
-            "calibrated_sensor_token": _token(self.name, "calibrated", stream.channel),
+            "calibrated_sensor_token": _token(self.name, "calibrated", channel),
             "timestamp": self._stamp(time),
-            "fileformat": "pcd" if stream.modality == "lidar" else "png",
+            "fileformat": "pcd" if lidar else "png",
             "is_key_frame": key,
             "height": stream.sensor.get("height", 0),
             "width": stream.sensor.get("width", 0),
             "filename": name,
         }
 
-    def _write_cloud(
-        self, stream: _Stream, source: Path, *, time: int, path: Path, token: str, labelled: bool
-    ) -> None:
+    def _write_cloud(self, stream: Stream, k: int, *, path: Path, token: str, labelled: bool) -> None:
         """Write a de-skewed cloud, and for a key frame the lidarseg classes of its points."""
-        table = read_table(source)
-        mount = np.array(stream.sensor["vehicle_from_sensor"])
-        placed, _ = placed_returns(table, self.trajectory, start_ns=time, vehicle_from_sensor=mount)
-        here: Poses = self.trajectory.at([time]).mounted(mount[:3, 3], mount[:3, :3])
-        still = ((placed - here.position[0]) / here.scale[0]) @ here.rotation[0]
-        nuscenes.write(path, table | {axis: still[:, k] for k, axis in enumerate("xyz")})
+        table = still_points(stream, self.trajectory, row=k)
+        nuscenes.write(path, table)
         if labelled:
             name = f"lidarseg/{VERSION}/{token}_lidarseg.bin"
             (self.out / name).parent.mkdir(parents=True, exist_ok=True)
-            n = len(placed)
-            labels = PointLabels(table["label"].astype(np.int64), np.zeros(n, np.int64), np.zeros(n, bool))
-            nuscenes.write_labels(self.out / name, labels)
+            nuscenes.write_labels(self.out / name, recorded_labels(table))
             self.tables["lidarseg"].append({"token": token, "sample_data_token": token, "filename": name})
 
-    def _annotate(self, top: _Stream, keys: Sequence[int], *, samples: Sequence[Row]) -> None:
+    def _annotate(self, top: Stream, keys: Ints, *, samples: Sequence[Row]) -> None:
         """Add the boxes of key frames with returns or visibility, and the instances they belong to."""
         path = self.dataset.paths.sensor_boxes(top.name)
         if not path.exists():
             return
-        sample_of = {top.frames[k]: sample for k, sample in zip(keys, samples, strict=True)}
+        sample_of = dict(zip(top.frames[keys].tolist(), samples, strict=True))
         annotations: dict[str, list[Row]] = defaultdict(list)
         category: dict[str, str] = {}
-        for box in read_rows(path):
-            sample = sample_of.get(int(box["frame"]))
-            if sample is None or (int(box["points"]) == 0 and float(box["visibility"]) == 0.0):
+        for box in read_boxes(path, (*COLUMNS, "points", "visibility")):
+            sample = sample_of.get(box["frame"])
+            if sample is None or (box["points"] == 0 and box["visibility"] == 0.0):
                 continue
             kind = CATEGORIES[int(class_codes().nuscenes[Class[box["class"].upper()]])]
             instance = _token(self.name, "instance", box["id"])
             category[instance] = kind
-            seen = int(np.searchsorted([0.4, 0.6, 0.8], float(box["visibility"]), side="right"))
+            seen = int(np.searchsorted([0.4, 0.6, 0.8], box["visibility"], side="right"))
             annotations[instance].append(
                 {
                     "token": _token(self.name, "annotation", box["id"], box["frame"]),
@@ -310,10 +263,10 @@ class _Export:
                     "instance_token": instance,
                     "visibility_token": str(seen + 1),
                     "attribute_tokens": [_token("attribute", name) for name in _attributes(kind, box)],
-                    "translation": self._position(np.array([float(box[k]) for k in "xyz"])),
-                    "size": [float(box[k]) for k in ("width", "length", "height")],
-                    "rotation": [float(box[k]) for k in ("qw", "qx", "qy", "qz")],
-                    "num_lidar_pts": int(box["points"]),
+                    "translation": self._position(np.array([box[k] for k in "xyz"])),
+                    "size": [box[k] for k in ("width", "length", "height")],
+                    "rotation": [box[k] for k in ("qw", "qx", "qy", "qz")],
+                    "num_lidar_pts": box["points"],
                     "num_radar_pts": 0,
                 }
             )
@@ -332,11 +285,11 @@ class _Export:
 
     def _describe(self, samples: Sequence[Row]) -> None:
         """Fill the tables that describe the whole drive."""
-        manifest = self.dataset.manifest
-        log_token, place = (
-            _token(self.name, "log"),
-            str(manifest["scene"]["name"] or manifest["scene"]["path"]),
-        )
+        path, manifest = self.dataset.paths.manifest, self.dataset.manifest
+        with reading(path, DatasetError, remedy="drive again with `overwrite`"):
+            place = str(manifest["scene"]["name"] or manifest["scene"]["path"])
+            attribution, vehicle = str(manifest["attribution"]), str(manifest["rig"])
+        log_token = _token(self.name, "log")
         east, north = (self.zero * self.scale)[:2] + self.dataset.frame.origin
         self.tables["sample"] = list(samples)
         self.tables["scene"] = [
@@ -348,7 +301,7 @@ class _Export:
                 "last_sample_token": samples[-1]["token"],
                 "name": "scene-0001",
                 "description": f"simulated in {place}; zero at {east:.3f}, {north:.3f} of"
-                f" {self.dataset.frame.name}; {manifest['attribution']}",
+                f" {self.dataset.frame.name}; {attribution}",
             }
         ]
         date = self.dataset.start.date().isoformat()
@@ -356,7 +309,7 @@ class _Export:
             {
                 "token": log_token,
                 "logfile": self.name,
-                "vehicle": manifest["rig"],
+                "vehicle": vehicle,
                 "date_captured": date,
                 "location": place,
             }
@@ -434,25 +387,15 @@ def _wxyz(rotation: Float) -> list[float]:
     return [w, x, y, z]
 
 
-def _key_frames(times: Sequence[int]) -> list[int]:
+def _key_frames(time_ns: Ints) -> Ints:
     """Indices of the frames nearest to every `KEY_NS`, without repetition."""
-    wanted = np.arange(times[0], times[-1] + 1, KEY_NS)
-    return sorted({int(k) for k in _nearest(times, wanted)})
+    wanted = np.arange(time_ns[0], time_ns[-1] + 1, KEY_NS)
+    return np.unique(nearest(time_ns, wanted))
 
 
-def _nearest(times: Sequence[int], wanted: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of the nearest of increasing ``times`` to each target; of equally near ones the earlier."""
-    have = np.asarray(times, np.int64)
-    target = np.asarray(wanted, np.int64)
-    after = np.clip(np.searchsorted(have, target), 1, max(len(have) - 1, 1))
-    if len(have) == 1:
-        return np.zeros(len(target), np.int64)
-    return after - (target - have[after - 1] <= have[after] - target)
-
-
-def _attributes(kind: str, box: dict[str, str]) -> list[str]:
+def _attributes(kind: str, box: dict[str, Any]) -> list[str]:
     """NuScenes' attributes of a road user: moving, stopped, parked, ..."""
-    speed = float(np.hypot(float(box["vx"]), float(box["vy"])))
+    speed = float(np.hypot(box["vx"], box["vy"]))
     if kind.startswith("human"):
         return ["pedestrian.moving" if speed > _WALKING else "pedestrian.standing"]
     if kind in ("vehicle.bicycle", "vehicle.motorcycle"):
@@ -460,5 +403,5 @@ def _attributes(kind: str, box: dict[str, str]) -> list[str]:
     if kind.startswith("vehicle"):
         if speed > _DRIVING:
             return ["vehicle.moving"]
-        return ["vehicle.stopped" if box["moving"] == "True" else "vehicle.parked"]
+        return ["vehicle.stopped" if box["moving"] else "vehicle.parked"]
     return []

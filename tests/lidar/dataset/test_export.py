@@ -1,5 +1,6 @@
 """Exported datasets equal the recorded ones, read with independent parsers."""
 
+import json
 from datetime import UTC, datetime
 
 import numpy as np
@@ -10,8 +11,13 @@ from scipy.spatial.transform import Rotation
 from geoscene.errors import InputError as FolderError
 from geoscene.files import write_columns, write_json
 from geoscene.frames import Frame
+from lidar.dataset.boxes import COLUMNS
 from lidar.dataset.export import EXPORTERS, exporter
+from lidar.dataset.export.kitti_drive import KittiDrive
+from lidar.dataset.export.kitti_raw import oxts_columns
+from lidar.dataset.formats import FORMATS
 from lidar.dataset.layout import Paths, open_dataset
+from lidar.dataset.recorded import Stream
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.mounts import OPTICAL
 from lidar.geometry.trajectory_csv import write_trajectory
@@ -33,6 +39,7 @@ def dataset(tmp_path):
     paths = Paths(tmp_path / "drive")
     manifest = {"schema": 1, "frame": Frame.at(24.9, 60.2).to_json(), "start_time": START.isoformat()}
     manifest |= {"export_crs": "EPSG:32635", "frames": 50, "frames_done": 50, "recipe": {}}
+    manifest |= {"scene": {"name": "", "path": "gone"}, "rig": "mine", "attribution": "nobody"}
     write_json(paths.manifest, manifest)
     sensors = {}
     for name, (kind, translation, rotation) in MOUNTS.items():
@@ -40,12 +47,19 @@ def dataset(tmp_path):
         mount[:3, :3], mount[:3, 3] = rotation.as_matrix(), translation
         sensors[name] = {"kind": kind, "vehicle_from_sensor": mount.tolist()}
         sensors[name] |= {"rate_hz": 10.0, "time_offset_ns": 0}
+    sensors["front"] |= {
+        "K": np.eye(3).tolist(),
+        "width": 4,
+        "height": 3,
+        "model": "pinhole",
+        "distortion": [],
+    }
     write_json(paths.calibration, {"sensors": sensors})
     trajectory = driven(VELOCITY, yaw_rate=YAW_RATE, start=(50.0, -20.0, 3.0), scale=SCALE)
     write_trajectory(paths.trajectory, trajectory)
     for name, times in TIMES.items():
         write_columns(paths.timestamps(name), {"frame": np.arange(len(times)), "time_ns": times})
-    write_columns(paths.measurements("gnss"), {"time_ns": [0, 2 * 10**9]})
+    write_columns(paths.measurements("gnss"), {"time_ns": [0, 2 * 10**9], "satellites": [7, 8]})
     return open_dataset(paths.root)
 
 
@@ -85,6 +99,94 @@ def test_tum_trajectories_are_the_true_poses_of_vehicle_and_sensors(dataset, tmp
         assert (turn.inv() * rotation).magnitude().max() < 1e-9, name
 
 
+def test_oxts_values_are_the_true_motion_of_the_inertial_unit(dataset):
+    """30 values as in KITTI's data format, from the equations of the drive; read as pykitti does."""
+    time_ns = np.arange(0, 4 * 10**9, 10**8)
+    stream = Stream("top", dataset.sensors()["top"], np.arange(40), time_ns, ("",) * 40)
+    values = oxts_columns(KittiDrive(dataset, stream, {}))
+    assert len(values) == 30
+    assert {len(column) for column in values.values()} == {40}
+    arm = np.array(MOUNTS["gnss"][1])
+    place, turn = expected_pose("vehicle", time_ns)
+    place, turning = place + turn.apply(arm), np.array([0, 0, YAW_RATE])
+    x, y = dataset.frame.from_geographic(values["lon"], values["lat"])
+    np.testing.assert_allclose(np.column_stack([x, y]) / SCALE, place[:, :2], atol=1e-5)
+    np.testing.assert_allclose(values["alt"], place[:, 2], atol=1e-9)
+    convergence = dataset.frame.convergence(values["lon"], values["lat"])
+    to_true = Rotation.from_euler("z", -convergence[:, None])
+    found = Rotation.from_euler("ZYX", np.column_stack([values[name] for name in ("yaw", "pitch", "roll")]))
+    assert ((to_true * turn).inv() * found).magnitude().max() < 1e-9
+    velocity = to_true.apply(VELOCITY + np.cross(turning, turn.apply(arm)))
+    np.testing.assert_allclose(np.column_stack([values[k] for k in ("ve", "vn", "vu")]), velocity, atol=1e-4)
+    level = Rotation.from_euler("z", -values["yaw"][:, None])
+    np.testing.assert_allclose(
+        np.column_stack([values[k] for k in ("vf", "vl", "vu")]), level.apply(velocity), atol=1e-4
+    )
+    np.testing.assert_allclose(values["wu"][2:-2], YAW_RATE, atol=1e-3)
+    np.testing.assert_allclose(values["wz"], values["wu"], atol=1e-9)
+    np.testing.assert_allclose(values["au"][2:-2], 9.81907, atol=2e-3)  # normal gravity at 60.2 N
+    assert set(values["numsats"]) == {7, 8}
+
+
+def _write_cloud(dataset, frame, **columns):
+    """A cloud of five points of the scanner, but for some columns."""
+    whole = {
+        "time_ns": np.uint32,
+        "ring": np.uint16,
+        "column": np.uint32,
+        "label": np.uint16,
+        "instance": np.int32,
+    }
+    names = FORMATS["pcd"].columns[:-1]
+    table = {name: np.arange(5).astype(whole.get(name, np.float32)) for name in names}
+    path = FORMATS["pcd"].path(dataset.path / "top", frame)
+    path.parent.mkdir(exist_ok=True)
+    FORMATS["pcd"].write(path, table | {name: np.array(v, table[name].dtype) for name, v in columns.items()})
+
+
+@pytest.mark.parametrize("name", ["kitti", "nuscenes"])
+def test_damaged_clouds_and_boxes_are_refused_by_name(dataset, tmp_path, name):
+    row, out, boxes = EXPORTERS[name], tmp_path / "out", dataset.paths.sensor_boxes("top")
+    for columns in (
+        {"label": [1, 2, 3, 4, 999]},
+        {"x": [0, 1, np.nan, 3, 4]},
+        {"intensity": [0, 1e30, 3, 4, 5]},
+    ):
+        _write_cloud(dataset, 0, **columns)
+        with pytest.raises(DatasetError, match=r"000000\.pcd: damaged"):
+            row.export(dataset, out)
+    _write_cloud(dataset, 0)
+    _write_cloud(dataset, 99)
+    with pytest.raises(DatasetError, match=r"timestamps\.csv: has no time of frame 99"):
+        row.export(dataset, out)
+    FORMATS["pcd"].path(dataset.path / "top", 99).unlink()
+    good = dict.fromkeys((*COLUMNS, "points", "visibility"), "0") | {
+        "class": "car",
+        "kind": "suv",
+        "moving": "True",
+    }
+    for column, value in (("class", "cart"), ("x", "nan"), ("points", ""), ("moving", "yes"), ("id", "1.5")):
+        write_columns(boxes, {key: [text] for key, text in (good | {column: value}).items()})
+        with pytest.raises(DatasetError, match=r"boxes\.csv: damaged"):
+            row.export(dataset, out)
+    boxes.unlink()
+    write_json(dataset.paths.manifest, {k: v for k, v in dataset.manifest.items() if k != "attribution"})
+    if name == "nuscenes":
+        with pytest.raises(DatasetError, match=r"dataset\.json: damaged"):
+            row.export(open_dataset(dataset.path), out)
+    assert {path.name for path in tmp_path.iterdir()} == {"drive"}
+
+
+def test_a_camera_without_intrinsics_is_refused(dataset, tmp_path):
+    _write_cloud(dataset, 0)
+    document = json.loads(dataset.paths.calibration.read_text())
+    document["sensors"]["front"]["K"] = [[1, 2]]
+    write_json(dataset.paths.calibration, document)
+    for name in ("kitti", "kitti-raw", "nuscenes"):
+        with pytest.raises(DatasetError, match=r"calibration\.json: damaged"):
+            EXPORTERS[name].export(dataset, tmp_path / name)
+
+
 def test_an_export_is_replaced_only_on_request_and_nothing_else_is(dataset, tmp_path):
     row = EXPORTERS["tum"]
     row.export(dataset, tmp_path / "tum")
@@ -121,5 +223,5 @@ def test_a_failed_export_leaves_no_files(dataset, tmp_path):
     with pytest.raises(DatasetError, match="was the drive finished"):
         EXPORTERS["tum"].export(dataset, tmp_path / "tum")
     assert [path.name for path in tmp_path.iterdir()] == ["drive"]
-    with pytest.raises(InputError, match="`to` kitti: one of nuscenes, tum"):
-        exporter("kitti")
+    with pytest.raises(InputError, match="`to` waymo: one of kitti, kitti-raw, nuscenes, tum"):
+        exporter("waymo")

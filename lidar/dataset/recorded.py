@@ -1,0 +1,152 @@
+"""Frames of a dataset, as exporters and maps read them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.errors import reading
+from geoscene.typing import Ints
+from lidar.dataset.deskew import deskewed
+from lidar.dataset.formats import FORMATS, Format, read_table
+from lidar.dataset.formats.table import PointLabels, Table, placed_returns
+from lidar.dataset.layout import Dataset
+from lidar.errors import DatasetError
+from lidar.geometry.attitude import quat_from_matrix
+from lidar.geometry.mounts import Mount
+from lidar.geometry.poses import Trajectory
+
+_FAR = 1e6
+"""Metres from a scanner, beyond the range of any."""
+
+_CLASSES = [int(klass) for klass in Class]
+
+
+@dataclass(frozen=True)
+class Stream:
+    """The frames of a sensor.
+
+    name    : of the sensor
+    sensor  : its entry of ``calibration.json``
+    frames  : (n,) int64, their numbers, ascending
+    time_ns : (n,) int64, their starts, since the drive's start
+    files   : (n,) of each frame
+    """
+
+    name: str
+    sensor: dict[str, Any]
+    frames: Ints
+    time_ns: Ints
+    files: tuple[Path, ...]
+
+    @property
+    def mount(self) -> Mount:
+        """Extrinsics of the sensor."""
+        return mount_of(self.sensor)
+
+
+def mount_of(sensor: Mapping[str, Any]) -> Mount:
+    """Extrinsics of an entry of ``calibration.json``."""
+    matrix = np.array(sensor["vehicle_from_sensor"], float)
+    return Mount(tuple(matrix[:3, 3].tolist()), tuple(quat_from_matrix(matrix[:3, :3]).tolist()))
+
+
+def labelled_clouds(dataset: Dataset, name: str) -> Stream | None:
+    """A scanner's clouds in the sensor frame with times and labels; None if there are none.
+
+    Raises DatasetError for frames without a time.
+    """
+    streams = (clouds_in(dataset, name, form=form) for form in labelled_formats())
+    return next((stream for stream in streams if stream is not None), None)
+
+
+def clouds_in(dataset: Dataset, name: str, *, form: Format) -> Stream | None:
+    """A scanner's clouds in a format; None if there are none.
+
+    Raises DatasetError for frames without a time.
+    """
+    found = list(dataset.files(name, form))
+    return _stream(dataset, name, found=found) if found else None
+
+
+def color_images(dataset: Dataset, name: str) -> Stream | None:
+    """A camera's colour images; None if there are none.
+
+    Raises DatasetError for frames without a time and a camera without intrinsics.
+    """
+    camera = dataset.sensors()[name]
+    with reading(dataset.paths.calibration, DatasetError, remedy="drive again with `overwrite`"):
+        if not np.isfinite(np.array(camera["K"], float).reshape(3, 3)).all():
+            raise ValueError("intrinsics are not finite")
+        _ = int(camera["width"]), int(camera["height"]), str(camera["model"]), list(camera["distortion"])
+    paths = sorted(dataset.paths.image(name, 0, kind="rgb").parent.glob("*.png"))
+    found = [(int(path.stem), path) for path in paths if path.stem.isdigit()]
+    return _stream(dataset, name, found=found) if found else None
+
+
+def labelled_formats() -> list[Format]:
+    """Formats that keep points in the sensor frame with times and labels."""
+    needed = {"time_ns", "label", "ring"}
+    return [form for form in FORMATS.values() if form.frame == "sensor" and needed <= set(form.columns)]
+
+
+def _stream(dataset: Dataset, name: str, *, found: Iterable[tuple[int, Path]]) -> Stream:
+    numbers, files = zip(*found, strict=True)
+    frames, time_ns = np.array(numbers, np.int64), dataset.sample_times(name)
+    if frames[-1] >= len(time_ns):
+        stamps = dataset.paths.timestamps(name)
+        raise DatasetError(f"{stamps}: has no time of frame {frames[-1]}; drive again with `overwrite`")
+    return Stream(name, dataset.sensors()[name], frames, time_ns[frames], files)
+
+
+def cloud_points(path: Path) -> Table:
+    """The points of a recorded cloud in the sensor frame.
+
+    Raises FormatError or DatasetError for a damaged file.
+    """
+    table = read_table(path)
+    if not all((np.abs(table[name]) < _FAR).all() for name in ("x", "y", "z", "intensity")):
+        raise DatasetError(f"{path}: damaged: points that no scanner measures; record it again")
+    if "label" in table and not np.isin(table["label"], _CLASSES).all():
+        raise DatasetError(f"{path}: damaged: labels of no class; record it again")
+    return table
+
+
+def still_points(clouds: Stream, trajectory: Trajectory, *, row: int) -> Table:
+    """The points of a cloud without the ego vehicle's motion, in the frame of the sensor at its start.
+
+    row : of the stream
+
+    Raises as `cloud_points`.
+    """
+    table, start_ns, mount = cloud_points(clouds.files[row]), int(clouds.time_ns[row]), clouds.mount
+    placed, _ = placed_returns(table, trajectory, start_ns=start_ns, vehicle_from_sensor=mount.matrix)
+    still = deskewed(placed, trajectory, mount=mount, time_ns=start_ns)
+    return table | dict(zip("xyz", still.T, strict=True))
+
+
+def recorded_labels(table: Table, boxes: Iterable[Mapping[str, Any]] = ()) -> PointLabels:
+    """The labels of a recorded cloud's points.
+
+    boxes : rows of the frame's 3D boxes, which give the numbers of road users and whether they move
+    """
+    road_user, moving = np.zeros(len(table["label"]), np.int64), np.zeros(len(table["label"]), bool)
+    for box in boxes:
+        on = table["instance"] == box["instance"]
+        road_user[on], moving[on] = box["id"] + 1, box["moving"]
+    return PointLabels(table["label"].astype(np.int64), road_user, moving)
+
+
+def nearest(times: NDArray[np.int64], wanted: NDArray[np.int64]) -> Ints:
+    """Index of the nearest of increasing ``times`` to each target; of equally near ones the earlier."""
+    after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
+    if len(times) == 1:
+        return np.zeros(len(wanted), np.int64)
+    index: Ints = after - (wanted - times[after - 1] <= times[after] - wanted)
+    return index
