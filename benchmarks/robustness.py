@@ -1,409 +1,241 @@
-"""Damaged inputs and killed builds: tracebacks, crashes, hangs, memory, and differences after resuming.
+"""Damaged inputs: tracebacks, crashes, hangs and memory.
 
-    python benchmarks/robustness.py inputs maps scenes datasets configurations --count 1000 --keep FOLDER
-    python benchmarks/robustness.py kills --count 50
+    python benchmarks/robustness.py --count 100000 --keep FOLDER
+    python benchmarks/robustness.py --kinds maps scenes --count 1000
 
-``inputs`` changes bytes or words of a valid input at random and runs a command on it, ``count`` times per
-kind. One line or success is right; a traceback, a crash (signal), more than --seconds or --gigabytes is not.
-Inputs that went wrong are kept in FOLDER. ``kills`` ends builds of the demo map by SIGKILL, SIGINT or
-SIGTERM at random moments, repeats the command and compares the scene with that of an uninterrupted build.
+Each trial damages a small valid input at random (`mutations.py`) and runs a command on it, in a process
+that runs many. Success or one line on standard error is right; a traceback, a crash (signal), an exit code
+other than 0, 1 and 2, more than --seconds or --gigabytes is not. Inputs that went wrong are kept in FOLDER.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib
 import io
-import json
 import multiprocessing
-import os
 import random
 import resource
-import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 import traceback
+import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
-from geoscene.scene import SceneFiles
+from damaged_inputs import KINDS, Inputs, Words
+from mutations import mutate
 
-BOX = "--bbox=24.9425,60.1665,24.9445,60.1680"
-WORDS = (
-    "nan", "inf", "-inf", "0", "-1", "1e308", "-1e308", "1e-308", "99999999999999999999", "0.1", "2147483648",
-    "yes", "no", ";", ";;", ":", "null", "None", "[]", "{}", "", " ", "é", "\ufffd", "🏠", "\x01", "1;2",
-    "1,5", "1'", "10ft", "--", "a=b", "true", "Infinity",
-)  # fmt: skip
+from geoscene.console import main as main_of
+from geoscene.errors import GeosceneError
+from geoscene.errors import InputError as SceneInputError
+from geoscene.files import digest_of
+from lidar.errors import InputError, LidarError
 
-Case = tuple[Path, list[list[str]]]
-"""A changed file, and the commands that use it."""
-
-
-def changed(data: bytes, rng: random.Random) -> bytes:
-    """Data with one to four changes of bytes, or of words if it is text."""
-    try:
-        text = data.decode()
-    except UnicodeDecodeError:
-        text = ""
-    for _ in range(rng.randint(1, 4)):
-        if text and rng.random() < 0.8:
-            text = _changed_text(text, rng)
-            data = text.encode(errors="replace")
-        else:
-            data = _changed_bytes(data, rng)
-            text = ""
-    return data
+_SHARES = {"maps": 2, "scenes": 4, "datasets": 4, "configurations": 5}
+_USAGE = (InputError, SceneInputError)
 
 
-def _changed_text(text: str, rng: random.Random) -> str:
-    lines = text.split("\n")
-    kind, k = rng.randrange(5), rng.randrange(len(lines))
-    if kind == 0:
-        del lines[k]
-    elif kind == 1:
-        lines.insert(rng.randrange(len(lines)), lines[k])
-    else:  # replace a word between delimiters
-        line = lines[k]
-        cuts = [n for n, letter in enumerate(line) if letter in "\"' ,:;=<>[](){}|"] or [0]
-        start = rng.choice(cuts) + 1
-        stop = min((cut for cut in cuts if cut >= start), default=len(line))
-        lines[k] = line[:start] + rng.choice(WORDS) + line[stop:]
-    return "\n".join(lines)
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A damaged file (None if only the words are), its name, its valid contents, and the command."""
+
+    path: Path | None
+    valid: bytes
+    words: Words
 
 
-def _changed_bytes(data: bytes, rng: random.Random) -> bytes:
-    at, size = rng.randrange(len(data) + 1), rng.randint(1, 64)
-    return rng.choice(
-        [
-            data[:at],
-            data[:at] + rng.randbytes(size) + data[at:],
-            data[:at] + rng.randbytes(size) + data[at + size :],
-            data[:at] + bytes(size) + data[at + size :],
-            data[:at] + data[at + size :],
-            data[:at] + bytes([data[at - 1] ^ 1 << rng.randrange(8)] if at else []) + data[at + 1 :],
-        ]
-    )
+class _Program:
+    """A program that parses equal words once: parsing takes longer than many commands on small inputs."""
+
+    def __init__(self, name: str) -> None:
+        module = importlib.import_module(f"{name}.cli")
+        self._app, self._parsed = module.app, {}
+        self.name = self._app.name
+        self.roots = (LidarError, GeosceneError) if name == "lidar" else (GeosceneError,)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._app, name)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._app[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._app
+
+    def __call__(self, words: Words, **options: Any) -> Any:
+        """Run the command of the words."""
+        if "--stage" in words:  # read while parsing
+            return self._app(words, **options)
+        key = tuple(words)
+        if key not in self._parsed:
+            found = self._app.parse_args(words, exit_on_error=False, print_error=False)
+            self._parsed[key] = found[:2]
+        command, bound = self._parsed[key]
+        return command(*bound.args, **bound.kwargs)
 
 
-def _run(words: list[str]) -> str:
+def _share_shapes() -> None:
+    """Read equal files of shapes once: reading them takes longer than most commands on a small scene."""
+    layout = importlib.import_module("geoscene.scene.layout")
+    read, known = layout.read_shapes, {}
+
+    def read_once(path: Path) -> Any:
+        digest = digest_of(path)
+        if digest not in known:
+            known[digest] = read(path)
+        return known[digest]
+
+    layout.read_shapes = read_once
+
+
+@functools.cache
+def _program(name: str) -> _Program:
+    return _Program(name)
+
+
+def outcome(words: Words) -> str:
     """Run a command in this process; returns what is wrong, or an empty text."""
-    program, *rest = words
-    sys.argv = [program, *rest]
+    sys.argv = words
+    program = _program(words[0])
+    code = 0
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()) as errors:
         try:
-            importlib.import_module(f"{program}.cli").main()
-        except SystemExit:
-            pass
+            main_of(program, program.roots, usage=_USAGE)
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else 0 if end.code is None else -1
         except BaseException as error:  # noqa: BLE001
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            return f"traceback {type(error).__name__} {Path(place.filename).name}:{place.lineno}"
-    return "memory" if "out of memory" in errors.getvalue() else ""
+            frames = traceback.extract_tb(error.__traceback__)
+            ours = [f for f in frames if "/geoscene/" in f.filename or "/lidar/" in f.filename] or frames
+            places = " < ".join(f"{Path(f.filename).name}:{f.lineno}" for f in reversed(ours[-3:]))
+            return f"traceback {type(error).__name__} {places}: {str(error)[:80]}"
+    text = errors.getvalue()
+    if "Traceback" in text or code not in (0, 1, 2) or (code == 2 and not text.strip()):
+        return f"exit code {code}: {text[-200:]}"
+    return "memory: out of memory" if "out of memory" in text else ""
 
 
-def _trials(
-    seed: int, cases: list[Callable[[random.Random], Case]], link: Connection, *, limit: float
-) -> None:
-    """Run trials whose numbers arrive; answers with what was wrong and the largest memory in gigabytes."""
-    resource.setrlimit(resource.RLIMIT_AS, (int(4 * limit * 2**30),) * 2)
+def _serve(link: Connection, folder: Path, options: argparse.Namespace) -> None:
+    """Run the trials whose numbers arrive; tells of each what it is and then what was wrong."""
+    resource.setrlimit(resource.RLIMIT_AS, (int(6 * options.gigabytes * 2**30),) * 2)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**31,) * 2)
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    warnings.simplefilter("ignore")
+    _share_shapes()
+    inputs = Inputs.__new__(Inputs)
+    object.__setattr__(inputs, "folder", folder)
     while True:
-        number = link.recv()
-        rng = random.Random(f"{seed} {number}")
-        path, commands = rng.choice(cases)(rng)
-        data = path.read_bytes()
-        path.write_bytes(changed(data, rng))
-        wrong = ""
+        kind, number = link.recv()
+        rng = random.Random(f"{options.seed} {kind} {number}")
+        path, words = KINDS[kind](inputs, rng)
+        valid = path.read_bytes() if path else b""
+        link.send(Trial(path, valid, words))
+        if path:
+            mutate(path, rng)
+        Path("/proc/self/clear_refs").write_text("5")
+        wrong = outcome(words)
+        peak = int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0]) / 2**20
+        link.send(wrong or (f"memory: {peak:.1f} GB" if peak > options.gigabytes else ""))
+        if link.recv() and path:
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(valid)
+
+
+class _Server:
+    """A process that runs trials and is replaced when it crashes or hangs."""
+
+    def __init__(self, folder: Path, options: argparse.Namespace) -> None:
+        self._start = (folder, options)
+        self._seconds, self.process = options.seconds, None
+        self._link: Connection
+
+    def run(self, kind: str, number: int) -> tuple[str, Trial | None, bytes]:
+        """What was wrong in a trial, the trial, and the damaged file if something was wrong."""
+        if self.process is None:
+            context = multiprocessing.get_context("fork")
+            self._link, theirs = context.Pipe()
+            self.process = context.Process(target=_serve, args=(theirs, *self._start), daemon=True)
+            self.process.start()
+            theirs.close()
+        trial = None
         try:
-            for words in commands:
-                wrong = wrong or _run(words)
-                Path("/proc/self/clear_refs").write_text("5")
-                status = Path("/proc/self/status").read_text()
-                peak = int(status.partition("VmHWM:")[2].split()[0]) / 2**20
-                wrong = wrong or ("memory" if peak > limit else "")
-        finally:
-            bad = path.read_bytes() if wrong and path.exists() else b""
-            path.write_bytes(data)
-        link.send((wrong, bad, path.name, commands))
+            self._link.send((kind, number))
+            trial = self._link.recv()
+            wrong = self._link.recv() if self._link.poll(self._seconds) else f"hang: over {self._seconds:g} s"
+        except EOFError:
+            self.process.join()
+            wrong = f"crash: exit code {self.process.exitcode}"
+        bad = trial.path.read_bytes() if wrong and trial and trial.path and trial.path.exists() else b""
+        if wrong.startswith(("hang", "crash", "memory")):
+            self.stop()
+            if trial and trial.path:
+                trial.path.write_bytes(trial.valid)
+        else:
+            self._link.send(True)
+        return wrong, trial, bad
+
+    def stop(self) -> None:
+        """End the process."""
+        if self.process is not None:
+            self.process.kill()
+            self.process.join()
+            self.process = None
 
 
-def _worker(
-    numbers: Iterator[int],
-    seed: int,
-    *,
-    cases: list[Callable[[random.Random], Case]],
-    options: argparse.Namespace,
-) -> Counter[str]:
-    """Run trials in a process that is replaced when it dies or hangs."""
+def run_trials(options: argparse.Namespace, folder: Path) -> Counter[str]:
+    """Run the trials; returns the number of each kind, and of those with a fault by kind and fault."""
+    for module in ("geoscene.cli", "lidar.cli", "geoscene.pipeline", "lidar.pipeline", "geoscene.view"):
+        importlib.import_module(module)
+    inputs = Inputs(folder / "inputs")
+    server = _Server(inputs.folder, options)
     counts: Counter[str] = Counter()
-    context = multiprocessing.get_context("fork")
-    process = None
+    shares = [_SHARES[kind] for kind in options.kinds]
     stop = time.monotonic() + 60 * options.minutes
-    for number in numbers:
+    for number in range(options.first, options.first + options.count):
+        kind = random.Random(f"{options.seed} {number}").choices(options.kinds, shares)[0]
+        wrong, trial, bad = server.run(kind, number)
+        counts[kind] += 1
+        if wrong and trial:
+            counts[f"{kind}: {wrong.partition(':')[0]}"] += 1
+            print(f"{number} {wrong}\n    {trial.path} | {' '.join(trial.words)}", flush=True)
+            if options.keep and trial.path:
+                options.keep.mkdir(parents=True, exist_ok=True)
+                (options.keep / f"{number}_{trial.path.name}").write_bytes(bad)
+        if (number + 1) % 1000 == 0:
+            print(f"{number + 1}: {dict(counts)}", flush=True)
         if time.monotonic() > stop:
             break
-        if process is None:
-            link, theirs = context.Pipe()
-            process = context.Process(
-                target=_trials, args=(seed, cases, theirs), kwargs={"limit": options.gigabytes}
-            )
-            process.start()
-            theirs.close()
-        link.send(number)
-        bad, name, commands = b"", "?", []
-        try:
-            wrong, bad, name, commands = link.recv() if link.poll(options.seconds) else ("hang", b"", "?", [])
-        except EOFError:
-            process.join()
-            wrong = f"crash {process.exitcode}"
-        if wrong.startswith(("hang", "crash")):
-            process.kill()
-            process.join()
-            process = None
-        counts["inputs"] += 1
-        if wrong:
-            counts[wrong] += 1
-            print(f"{number}: {wrong}: {name} {' '.join(commands[0]) if commands else ''}", flush=True)
-            if options.keep and bad:
-                options.keep.mkdir(parents=True, exist_ok=True)
-                (options.keep / f"{number}_{name}").write_bytes(bad)
-    if process is not None:
-        process.kill()
+    server.stop()
     return counts
 
 
-def _program(*words: object) -> None:
-    subprocess.run(
-        [sys.executable, "-m", f"{words[0]}.cli", *map(str, words[1:])], check=True, stdout=subprocess.DEVNULL
-    )
-
-
-def _small_map(path: Path) -> None:
-    """The part of the demo map in the box, as XML."""
-    import osmium  # noqa: PLC0415
-
-    from geoscene.sources import demo_path  # noqa: PLC0415
-
-    west, south, east, north = map(float, BOX.partition("=")[2].split(","))
-    ways, nodes = [], set()
-    places = {node.id: (node.lon, node.lat) for node in osmium.FileProcessor(demo_path(), osmium.osm.NODE)}
-    for way in osmium.FileProcessor(demo_path(), osmium.osm.WAY):
-        refs = [node.ref for node in way.nodes]
-        if any(west < places[r][0] < east and south < places[r][1] < north for r in refs if r in places):
-            ways.append(way.id)
-            nodes.update(refs)
-    with osmium.SimpleWriter(str(path), overwrite=True) as out:
-        for item in osmium.FileProcessor(demo_path()):
-            if (item.is_node() and item.id in nodes) or (item.is_way() and item.id in ways):
-                out.add(item)
-
-
-def _cases(kind: str, folder: Path) -> list[Callable[[random.Random], Case]]:
-    """Functions that choose a file to change and the commands that use it."""
-    folder.mkdir(parents=True)
-    out = folder / "out"
-    if kind == "maps":
-        maps = [folder / name for name in ("a.osm", "a.osm.pbf", "a.osm.gz")]
-        for path in maps:
-            _small_map(path)
-
-        def of_map(rng: random.Random) -> Case:
-            path = rng.choices(maps, (8, 1, 1))[0]
-            return path, [
-                ["geoscene", "build", "--osm", str(path), "-o", str(out), "--overwrite", "--workers=1"]
-            ]
-
-        return [of_map]
-    scene = folder / "scene"
-    _program("geoscene", "build", "--demo", BOX, "-o", scene, "--tile-size", "100")
-    if kind == "scenes":
-        files = sorted(
-            path for path in scene.rglob("*") if path.is_file() and path != SceneFiles(scene).problems
-        )
-        exports = [
-            ["geoscene", "export", str(scene), "-o", str(folder / f"x.{suffix}"), "--overwrite"]
-            for suffix in ("glb", "city.json", "geojson", "gpkg", "tif", "xodr", "obj")
-        ]
-        exports += [["geoscene", "view", str(scene), "-o", str(folder / "x.html"), "--overwrite"]]
-
-        def of_scene(rng: random.Random) -> Case:
-            path = (
-                rng.choice(files)
-                if rng.random() < 0.5
-                else rng.choice([f for f in files if f.parent == scene])
-            )
-            looks = [["geoscene", "info", str(scene)], ["geoscene", "validate", str(scene)]]
-            return path, [*looks, rng.choice(exports)]
-
-        return [of_scene]
-    drive = ["lidar", "drive", str(scene), "--out", str(folder / "drive"), "--duration=0.3", "--route=random"]
-    if kind == "datasets":
-        _program(*drive, "--rig=vlp16", "--format=pcd")
-        data = folder / "drive"
-        files = sorted(path for path in data.rglob("*") if path.is_file())
-        uses = [
-            ["lidar", "map", str(data), "-o", str(folder / "m.laz"), "--overwrite"],
-            *(
-                ["lidar", "export", str(data), "--to", name, "-o", str(folder / name), "--overwrite"]
-                for name in ("nuscenes", "tum")
-            ),
-            [*drive, "--rig=vlp16", "--format=pcd"],
-        ]
-        return [lambda rng: (rng.choice(files), [rng.choice(uses)])]
-    rigs = Path(__file__).resolve().parents[1] / "lidar" / "rig"
-    own = [shutil.copy(path, folder) for path in sorted((rigs / "rigs").glob("*.toml"))[:6]]
-    routes = [folder / "a.gpx", folder / "a.geojson", folder / "a.csv"]
-    routes[0].write_text(
-        '<gpx>\n<wpt lat="60.1670" lon="24.9430"/>\n<wpt lat="60.1676" lon="24.9440"/>\n</gpx>'
-    )
-    routes[1].write_text('{"type": "LineString",\n "coordinates": [[24.943, 60.167],\n [24.944, 60.1676]]}')
-    routes[2].write_text("lon,lat\n24.943,60.167\n24.944,60.1676\n")
-    along = [
-        "geoscene",
-        "build",
-        "--demo",
-        BOX,
-        "-o",
-        str(out),
-        "--overwrite",
-        "--workers=1",
-        "--only=roads",
-        "--along",
-    ]
-    return [
-        lambda rng: (
-            Path(path := rng.choice(own)),
-            [[*drive, "--overwrite", "--format=pcd", "--rig", str(path)]],
-        ),
-        lambda rng: (path := rng.choice(routes), [[*along, str(path)]]),
-        lambda rng: (
-            path := rng.choice(routes),
-            [[*drive[:-1], "--overwrite", "--rig=vlp16", "--route", str(path)]],
-        ),
-    ]
-
-
-def inputs(options: argparse.Namespace) -> int:
-    """Run the trials of each kind; returns the number of those that went wrong."""
-    total = 0
-    with tempfile.TemporaryDirectory() as folder:
-        for kind in options.kinds:
-            started = time.monotonic()
-            shares = [range(k, options.count, options.workers) for k in range(options.workers)]
-            counts: Counter[str] = Counter()
-            with ThreadPoolExecutor(options.workers) as threads:
-                tasks = [
-                    threads.submit(
-                        _worker,
-                        iter(share),
-                        options.seed,
-                        cases=_cases(kind, Path(folder) / f"{kind}{k}"),
-                        options=options,
-                    )
-                    for k, share in enumerate(shares)
-                ]
-                for task in tasks:
-                    counts.update(task.result())
-            wrong = sum(counts.values()) - counts["inputs"]
-            total += wrong
-            print(
-                kind,
-                json.dumps(dict(counts)),
-                f"wrong {wrong}, {time.monotonic() - started:.0f} s",
-                flush=True,
-            )
-    return total
-
-
-def kills(options: argparse.Namespace) -> int:
-    """Kill builds at random moments, complete them and return the number of scenes that differ."""
-    rng, killed, different = random.Random(options.seed), 0, 0
-    with tempfile.TemporaryDirectory() as folder:
-        out, reference = Path(folder) / "scene", Path(folder) / "reference"
-        words = [
-            sys.executable,
-            "-m",
-            "geoscene.cli",
-            "build",
-            "--demo",
-            BOX,
-            "--tile-size",
-            "50",
-            "--workers",
-            "2",
-        ]
-        words += ["--name", "demo", "--quiet", "--overwrite", "-o"]
-        started = time.monotonic()
-        subprocess.run([*words, str(reference)], check=True, stdout=subprocess.DEVNULL)
-        whole = time.monotonic() - started
-        while killed < options.count:
-            code = None
-            while code != 0:
-                process = subprocess.Popen(
-                    [*words, str(out)],
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.PIPE,
-                    start_new_session=True,
-                )
-                kill = (
-                    rng.choice((signal.SIGKILL, signal.SIGINT, signal.SIGTERM))
-                    if rng.random() < 0.75
-                    else None
-                )
-                if kill and killed < options.count:
-                    time.sleep(rng.uniform(0.2, 0.9) * whole)
-                    asked = time.monotonic()
-                    if process.poll() is None:
-                        killed += 1
-                    with contextlib.suppress(ProcessLookupError):
-                        (os.killpg if kill == signal.SIGINT else os.kill)(process.pid, kill)
-                _, errors = process.communicate(timeout=600)
-                code = process.returncode
-                if kill and time.monotonic() - asked > 3:
-                    print(f"{kill.name}: ended after {time.monotonic() - asked:.1f} s", flush=True)
-                if b"Traceback" in errors or code not in (0, 130, -2, -9, -15):
-                    print(f"exit code {code}: {errors.decode()[-300:]}", flush=True)
-            left = sorted(path.name for path in Path(folder).iterdir())
-            different += not _same(reference, out) or left != ["reference", "scene"]
-            print(f"{killed} kills, {different} differences {'' if len(left) == 2 else left}", flush=True)
-            if rng.random() < 0.8:  # else the next build replaces it
-                shutil.rmtree(out)
-    return different
-
-
-def _same(one: Path, two: Path) -> bool:
-    names = sorted(path.relative_to(one) for path in one.rglob("*") if path.is_file())
-    return names == sorted(path.relative_to(two) for path in two.rglob("*") if path.is_file()) and all(
-        (one / name).read_bytes() == (two / name).read_bytes() for name in names
-    )
-
-
 def main() -> int:
-    """Run the chosen trials; exit code 1 if something went wrong."""
+    """Run the trials; exit code 1 if something went wrong."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    commands = parser.add_subparsers(required=True)
-    damaged = commands.add_parser("inputs")
-    damaged.add_argument("kinds", nargs="+", choices=("maps", "scenes", "datasets", "configurations"))
-    damaged.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    damaged.add_argument("--seconds", type=float, default=60.0)
-    damaged.add_argument("--minutes", type=float, default=1e6, help="at most, for each kind")
-    damaged.add_argument("--gigabytes", type=float, default=2.0)
-    damaged.add_argument("--keep", type=Path)
-    damaged.set_defaults(run=inputs, count=1000)
-    killing = commands.add_parser("kills")
-    killing.set_defaults(run=kills, count=50)
-    for command in (damaged, killing):
-        command.add_argument("--count", type=int)
-        command.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
+    parser.add_argument("--count", type=int, default=1000)
+    parser.add_argument("--first", type=int, default=0, help="number of the first trial")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=60.0, help="limit of a trial")
+    parser.add_argument("--gigabytes", type=float, default=2.0, help="limit of a trial")
+    parser.add_argument("--minutes", type=float, default=1e6, help="at most, in all")
+    parser.add_argument("--keep", type=Path)
     options = parser.parse_args()
-    return int(options.run(options) > 0)
+    memory = Path("/dev/shm")  # noqa: S108  (files in memory, not at a guessable name)
+    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
+        counts = run_trials(options, Path(folder))
+    wrong = sum(n for name, n in counts.items() if name not in KINDS)
+    print(f"{dict(counts)}: {wrong} wrong")
+    return int(wrong > 0)
 
 
 if __name__ == "__main__":

@@ -155,7 +155,7 @@ def with_flags(app: App, text: str) -> str:
     Parameters that the command does not have keep their name.
     """
     flags = {}
-    if command := _command(app).strip():
+    if "`" in text and (command := _command(app).strip()):
         arguments = app[command].assemble_argument_collection()
         flags = {argument.field_info.name: argument.name for argument in arguments}
     return re.sub(r"`(\w+)`", lambda found: flags.get(found[1], found[1]), text)

@@ -32,6 +32,14 @@ def _local_wkt(lon_deg: float, lat_deg: float) -> str:
     )
 
 
+@functools.lru_cache(maxsize=64)
+def _crs_name(wkt: str) -> str:
+    """``EPSG:n`` if the CRS has an EPSG code, else its name; the search takes a tenth of a second."""
+    crs = CRS.from_wkt(wkt)
+    code = crs.to_authority(min_confidence=100)
+    return ":".join(code) if code else str(crs.name)
+
+
 def utm_crs(lon_deg: float, lat_deg: float) -> str:
     """EPSG code (``EPSG:326xx`` or ``EPSG:327xx``) of the WGS 84 UTM zone of a point, or of UPS.
 
@@ -125,11 +133,10 @@ class Frame:
         """The projected CRS."""
         return CRS.from_wkt(self.wkt)
 
-    @functools.cached_property
+    @property
     def name(self) -> str:
         """``EPSG:n`` if the CRS has an EPSG code, else its name."""
-        code = self.crs.to_authority(min_confidence=100)
-        return ":".join(code) if code else str(self.crs.name)
+        return _crs_name(self.wkt)
 
     @functools.cached_property
     def _forward(self) -> Transformer:

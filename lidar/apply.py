@@ -20,8 +20,9 @@ from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.kitti import read_labels
 from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
-from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, remove_dataset
+from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file, remove_dataset
 from lidar.dataset.record_clouds import write_clouds
+from lidar.dataset.recorded import cloud_points
 from lidar.dataset.recording import Contents, Recording
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
@@ -184,7 +185,7 @@ def _apply_to_frame(
     paths = recording.paths(scanner, frame)
     for path in paths.values():
         path.parent.mkdir(parents=True, exist_ok=True)
-    table = form.read(source[form.name])
+    table = cloud_points(source[form.name])
     recorded = _completed(table_cloud(table, start_ns=begin), scanner.sensor, columns=form.columns)
     threshold = contents.scanner.link or contents.scanner.detection
     altered = altered_recording(
@@ -205,7 +206,9 @@ def _apply_to_frame(
         rows = read_rows(boxes)
         columns: dict[str, Any] = {name: [row[name] for row in rows] for name in (rows[0] if rows else ())}
         if rows:
-            hits = [np.count_nonzero(cloud.feature == int(row["instance"])) for row in rows]
+            with reading_file(boxes):
+                instances = [int(row["instance"]) for row in rows]
+            hits = [np.count_nonzero(cloud.feature == instance) for instance in instances]
             write_columns(Paths(recording.out).frame_boxes(scanner.name, frame), columns | {"points": hits})
     write_truth(paths["truth"], cloud_truth(altered, start_ns=begin))
     return len(cloud)
@@ -217,6 +220,8 @@ def _labels(altered: Altered, semantic_kitti: Path | None) -> PointLabels:
     if semantic_kitti is None:
         return PointLabels(altered.cloud.klass, np.zeros(n, np.int64), np.zeros(n, bool))
     road_user, moving = read_labels(semantic_kitti)
+    if len(road_user) != len(altered.original):
+        raise DatasetError(f"{semantic_kitti}: {len(road_user)} labels for {len(altered.original)} points")
     return PointLabels(altered.cloud.klass, np.append(road_user, 0)[source], np.append(moving, False)[source])
 
 

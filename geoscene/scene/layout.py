@@ -225,7 +225,7 @@ def open_scene(path: str | Path) -> Scene:
             raise SceneFormatError(
                 f"{folder}: schema version {schema}, this program reads {SCHEMA}; build the scene again"
             )
-        if manifest.get("digest") not in (None, manifest_digest(manifest)):
+        if manifest.get("digest") != manifest_digest(manifest):
             raise SceneFormatError(f"{manifest_file}: differs from what the build wrote; {BUILD_AGAIN}")
         scene = Scene(folder, manifest, Frame.from_json(manifest["frame"]))
         _ = scene.frame.crs, scene.bounds, scene.tile_size, scene.tile_boxes, scene.layers

@@ -42,16 +42,25 @@ def collect_answer(answer: Any, collector: Collector) -> None:
     collector.timestamp = max(collector.timestamp, str(stamp))
     try:
         for item in answer["elements"]:
-            tags: Tags = item.get("tags") or {}
-            kind, osm_id = item["type"], item["id"]
+            tags, kind, osm_id = _tags(item), item["type"], int(item["id"])
             if kind == "node":
                 collector.node(
                     osm_id, whole_units(item.get("lon")), y=whole_units(item.get("lat")), tags=tags or None
                 )
             elif kind == "way":
-                collector.way(osm_id, item.get("nodes", ()), tags=tags)
+                collector.way(osm_id, [int(ref) for ref in item.get("nodes", ())], tags=tags)
             elif kind == "relation":
-                members = tuple((m["type"], m["ref"], m["role"]) for m in item.get("members", ()))
+                members = tuple(
+                    (str(m["type"]), int(m["ref"]), str(m["role"])) for m in item.get("members", ())
+                )
                 collector.relation(osm_id, tags, members=members)
-    except (KeyError, TypeError, AttributeError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"JSON, but not as Overpass answers with [out:json]: {error!r}") from error
+
+
+def _tags(item: dict[str, Any]) -> Tags:
+    """The tags of an object; raises TypeError for values that are not text."""
+    tags: Tags = item.get("tags") or {}
+    if not all(isinstance(value, str) for value in tags.values()):
+        raise TypeError("tags that are not text")
+    return tags

@@ -17,12 +17,15 @@ from lidar.camera.light import Light, daylight
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast import Hits
-from lidar.rig.camera_model import pixel_rays, project
+from lidar.rig.camera_model import pixel_rays, project, unproject
 from lidar.rig.specs import CameraSpec
 from lidar.world.world import Surfaces, World
 
 _BAND = 1 << 16
 """Rays per batch: small enough for their columns to stay in the processor's cache."""
+
+_SHARED = 1 << 23
+"""Rays of a camera, supersampling included, up to which frames share them; they take 24 bytes each."""
 
 _ROLLS = 5
 """Fixed-point iterations for the row in which a rolling shutter sees a point; each gains some digits."""
@@ -227,7 +230,7 @@ def _view(
     rows : rows of the shutter, where the camera is a finer one
     """
     w = camera.width
-    rays = _scaled_rays(camera)[first * w : last * w]
+    rays = _scaled_rays(camera, first, last=last)
     moments = (rows or camera.height) if camera.row_ns else 1
     if moments == 1:
         row = np.full(len(rays), sample, np.int32)
@@ -250,9 +253,14 @@ def _pinhole_rays(camera: CameraSpec) -> Float:
     return rays / rays[:, 2:]
 
 
-def _scaled_rays(camera: CameraSpec) -> Float:
-    """Directions whose ray parameter is the depth as defined in `Frame`."""
-    return pixel_rays(camera) if camera.model == "fisheye" else _pinhole_rays(camera)
+def _scaled_rays(camera: CameraSpec, first: int, *, last: int) -> Float:
+    """Directions of the rows first to last whose ray parameter is the depth as defined in `Frame`."""
+    w, fisheye = camera.width, camera.model == "fisheye"
+    if w * camera.height <= _SHARED:
+        return (pixel_rays(camera) if fisheye else _pinhole_rays(camera))[first * w : last * w]
+    pixels = np.stack(np.meshgrid(np.arange(w), np.arange(first, last)), axis=-1).reshape(-1, 2)
+    rays = unproject(camera, pixels)
+    return rays if fisheye else rays / rays[:, 2:]
 
 
 def _with_misses(hits: Hits, missed: NDArray[np.bool_]) -> Hits:

@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class
-from geoscene.errors import reading
 from geoscene.files import write_atomically
 from geoscene.typing import Float, Ints
 from lidar.camera.outline import outline
-from lidar.dataset.layout import Paths, read_rows, read_sensors
-from lidar.errors import DatasetError, LidarError
+from lidar.dataset.layout import Paths, read_rows, read_sensors, reading_file
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.camera_model import project
@@ -105,7 +103,7 @@ def read_boxes(path: Path, columns: Collection[str]) -> list[dict[str, Any]]:
     Raises DatasetError for a missing or damaged file.
     """
     rows = read_rows(path)
-    with reading(path, DatasetError, remedy="drive again with `overwrite`", known=LidarError):
+    with reading_file(path):
         boxes = [{name: _value(name, text) for name, text in row.items()} for row in rows]
         for box in boxes:
             _ = Class[str(box["class"]).upper()], [box[name] for name in columns]
@@ -243,10 +241,20 @@ def merge_box_files(out: Path) -> None:
 
 
 def _merged(paths: Paths, name: str) -> list[str]:
-    """Header and rows of all box files of a sensor, written to its ``boxes.csv`` too; empty without files."""
+    """Header and rows of all box files of a sensor, written to its ``boxes.csv`` too; empty without files.
+
+    Raises DatasetError for a damaged file.
+    """
     lines: list[str] = []
     for part in sorted(paths.frame_boxes(name, 0).parent.glob("*.csv")):
-        header, *rows = part.read_text("utf-8").splitlines()
+        with reading_file(part):
+            header, *rows = part.read_text("utf-8").splitlines()
+            names = header.split(",")
+            whole = [names.index(key) for key in ("frame", "time_ns", "id", "points") if key in names]
+            for cells in (row.split(",") for row in rows):
+                if len(cells) != len(names) or header != (lines or [header])[0]:
+                    raise ValueError("rows and columns disagree")
+                _ = [int(cells[column]) for column in whole]
         lines += rows if lines else [header, *rows]
     if lines:
         write_atomically(paths.sensor_boxes(name), ("\n".join(lines) + "\n").encode("utf-8"))

@@ -159,7 +159,7 @@ class Dataset:
         frames = self.sensors()[name]["kind"] in ("lidar", "camera")
         path = self.paths.timestamps(name) if frames else self.paths.measurements(name)
         rows = read_rows(path)
-        with _reading(path):
+        with reading_file(path):
             times = np.array([int(row["time_ns"]) for row in rows], np.int64)
             if (np.diff(times) <= 0).any() or (times < 0).any():
                 raise DatasetError(f"{path}: damaged (times do not increase); drive again with `overwrite`")
@@ -185,7 +185,7 @@ def open_dataset(path: str | Path) -> Dataset:
     manifest_path = Paths(folder).manifest
     if not manifest_path.exists():
         raise DatasetError(f"{folder}: no dataset.json in it; lidar drive records a dataset")
-    with _reading(manifest_path):
+    with reading_file(manifest_path):
         manifest = json.loads(manifest_path.read_text("utf-8"))
         if manifest["schema"] != SCHEMA:
             raise DatasetError(
@@ -198,8 +198,8 @@ def open_dataset(path: str | Path) -> Dataset:
     return dataset
 
 
-def _reading(path: Path) -> AbstractContextManager[None]:
-    """Errors of the block, which reads a file of a dataset, as a DatasetError that names the file."""
+def reading_file(path: Path) -> AbstractContextManager[None]:
+    """Raises errors of the block, which reads a file of a dataset, as DatasetErrors that name the file."""
     return reading(path, DatasetError, remedy="drive again with `overwrite`", known=LidarError)
 
 
@@ -221,7 +221,7 @@ def read_sensors(paths: Paths, *kinds: str) -> dict[str, dict[str, Any]]:
 
     Raises DatasetError for a file that is missing or damaged.
     """
-    with _reading(paths.calibration):
+    with reading_file(paths.calibration):
         sensors = json.loads(paths.calibration.read_text("utf-8"))["sensors"]
         found = {name: sensor for name, sensor in sensors.items() if not kinds or sensor["kind"] in kinds}
         for sensor in found.values():

@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.errors import reading
 from geoscene.typing import Ints
 from lidar.dataset.deskew import deskewed
-from lidar.dataset.formats import FORMATS, Format, read_table
+from lidar.dataset.formats import FORMATS, Format, format_of, read_table
 from lidar.dataset.formats.table import PointLabels, Table, placed_returns
-from lidar.dataset.layout import Dataset
+from lidar.dataset.layout import Dataset, reading_file
 from lidar.errors import DatasetError
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.mounts import Mount
@@ -24,6 +23,12 @@ from lidar.geometry.poses import Trajectory
 
 _FAR = 1e6
 """Metres from a scanner, beyond the range of any."""
+
+_LATEST_NS = 2**32 - 1
+"""Nanoseconds from a frame's start to a point's time, at most."""
+
+_NEEDED = ("x", "y", "z", "intensity", "time_ns", "ring", "label", "instance")
+"""Columns that clouds are used by, in formats that keep them."""
 
 _CLASSES = [int(klass) for klass in Class]
 
@@ -81,7 +86,7 @@ def color_images(dataset: Dataset, name: str) -> Stream | None:
     Raises DatasetError for frames without a time and a camera without intrinsics.
     """
     camera = dataset.sensors()[name]
-    with reading(dataset.paths.calibration, DatasetError, remedy="drive again with `overwrite`"):
+    with reading_file(dataset.paths.calibration):
         if not np.isfinite(np.array(camera["K"], float).reshape(3, 3)).all():
             raise ValueError("intrinsics are not finite")
         _ = int(camera["width"]), int(camera["height"]), str(camera["model"]), list(camera["distortion"])
@@ -110,11 +115,16 @@ def cloud_points(path: Path) -> Table:
 
     Raises FormatError or DatasetError for a damaged file.
     """
-    table = read_table(path)
-    if not all((np.abs(table[name]) < _FAR).all() for name in ("x", "y", "z", "intensity")):
-        raise DatasetError(f"{path}: damaged: points that no scanner measures; record it again")
-    if "label" in table and not np.isin(table["label"], _CLASSES).all():
-        raise DatasetError(f"{path}: damaged: labels of no class; record it again")
+    with reading_file(path):
+        table = read_table(path)
+        if lacks := [name for name in format_of(path).columns if name in _NEEDED and name not in table]:
+            raise ValueError(f"lacks {', '.join(lacks)}")
+        near = all((np.abs(table[name]) < _FAR).all() for name in ("x", "y", "z", "intensity"))
+        time_ns = table.get("time_ns", np.zeros(1))
+        if not (near and ((time_ns >= 0) & (time_ns <= _LATEST_NS)).all()):
+            raise ValueError("points that no scanner measures")
+        if "label" in table and not np.isin(table["label"], _CLASSES).all():
+            raise ValueError("labels of no class")
     return table
 
 

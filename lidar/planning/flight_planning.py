@@ -39,6 +39,8 @@ _LAYERS = 16  # surfaces above the ground that a vertical ray passes at most
 _CLEAR = 2.0  # metres, minimum clearance above the scene
 _STEEPEST = 0.2  # sine of the smallest depression angle of a beam that counts for the swath
 _STEP = 10.0
+_LONGEST_S = 6 * 3600.0  # seconds: few aircraft stay up longer, and plans of longer flights fill the memory
+_FURTHEST = 20_000.0  # metres from the scene to a waypoint; sensors do not range further
 _GROUND = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD]
 
 
@@ -182,6 +184,13 @@ def _along(
         lat, lon = np.array(spec, float).T
         x, y = scene.frame.from_geographic(lon, lat)
         xyz, given = np.column_stack([x, y, np.zeros(len(x))]), False
+    xmin, ymin, xmax, ymax = scene.bounds
+    away = np.abs(xyz[:, :2] - np.clip(xyz[:, :2], [xmin, ymin], [xmax, ymax])).max(axis=1)
+    if not away.max() <= _FURTHEST:
+        k = int(np.argmax(~(away <= _FURTHEST)))
+        raise RouteError(
+            f"`route`: point {k + 1} lies {away[k] / 1000:.0f} km from the scene; give points over the scene"
+        )
     if options.altitude is None and given:
         return waypoint_flight(xyz, limit=vehicle.max_speed)
     xy = _dense(xyz[:, :2])
@@ -213,6 +222,15 @@ def _strips(
     corner = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))
     sides = np.diff(corner[:3], axis=0)
     dx, dy = sides[int(np.argmax(np.hypot(*sides.T)))]
+    strips = 1 + float(np.hypot(*sides.T).min()) / spacing
+    turn = 2 * math.pi * vehicle.turning_radius * scale
+    seconds = (area.area / spacing + strips * turn) / (vehicle.max_speed * scale)
+    if not seconds <= _LONGEST_S:
+        raise RouteError(
+            f"the survey has {strips:.0f} strips {spacing / scale:.3g} m apart and takes over"
+            f" {_LONGEST_S / 3600:.0f} hours; lower the `overlap`, fly higher (`altitude`) or take a smaller"
+            " area"
+        )
     stop = 0.0 if vehicle.cruise else vehicle.max_speed**2 / (2 * vehicle.acceleration)
     heading_deg = math.degrees(math.atan2(dx, dy))
     route = survey_flight(

@@ -84,6 +84,9 @@ SYSTEMS = ("gps", "glonass", "galileo", "beidou")
 SLOWEST_HZ = 1e-3
 """Least rate of a sensor's frames or measurements."""
 
+MOST_PIXELS = 64 * 10**6
+"""Greatest size of an image: a frame takes about 25 bytes of memory for each pixel."""
+
 IMAGES = ("rgb", "depth", "semantic", "instance", "flow")
 """Kinds of image that a camera can write."""
 
@@ -190,6 +193,8 @@ def _lidar(table: Table, folder: Path) -> LidarSpec:
 def _camera(table: Table) -> CameraSpec:
     model = table.text("model", "pinhole", among=("pinhole", "fisheye"))
     width, height = (table.integer(key, low=1, high=65535) for key in ("width", "height"))
+    if width * height > MOST_PIXELS:
+        raise table.error("height", f"{width} x {height} pixels are over {MOST_PIXELS // 10**6} megapixels")
     if table.has("fx"):
         if table.has("fov_deg"):
             raise table.error("fov_deg", "give fx or fov_deg, not both")

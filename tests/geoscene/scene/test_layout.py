@@ -95,8 +95,9 @@ def test_unexpected_error_is_explained_by_a_changed_file(copied):
         _ = 1 / 0
 
 
-def test_edited_manifest_is_refused(copied):
+@pytest.mark.parametrize(("old", "new"), [('"tile_size": 250', '"tile_size": 251'), ('"digest"', '"other"')])
+def test_edited_manifest_is_refused(copied, old, new):
     path = copied / "scene.json"
-    path.write_text(path.read_text().replace('"tile_size": 250', '"tile_size": 251'))
+    path.write_text(path.read_text().replace(old, new))
     with pytest.raises(SceneFormatError, match=r"scene\.json: differs"):
         open_scene(copied)

@@ -308,6 +308,23 @@ def test_overpass_json_in_a_file_is_read(tmp_path):
     assert square_metres(area) == pytest.approx(400, rel=0.02)
 
 
+@pytest.mark.parametrize(
+    "item",
+    [
+        {"type": "node", "id": 1, "lon": 0, "lat": 0, "tags": 1.5},
+        {"type": "node", "id": 1, "lon": 0, "lat": 0, "tags": {"highway": 3}},
+        {"type": "way", "id": 1, "nodes": [{}]},
+        {"type": "way", "id": [], "nodes": []},
+        {"type": "relation", "id": 1, "members": [{"type": "way", "ref": "x", "role": ""}]},
+    ],
+)
+def test_overpass_json_with_other_values_is_refused(tmp_path, item):
+    path = tmp_path / "answer.json"
+    path.write_text(json.dumps({"elements": [item]}))
+    with pytest.raises(InputError, match=r"answer\.json: JSON, but not as Overpass"):
+        read_osm(path)
+
+
 # --- defects
 
 

@@ -71,14 +71,26 @@ def test_depth_is_in_true_metres_where_the_grid_is_not():
     np.testing.assert_allclose(frame.depth, 10.0, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "camera",
-    [
-        CAMERA,
-        replace(CAMERA, distortion=(-0.3, 0.1, 1e-3, -1e-3, 0.0)),
-        replace(CAMERA, model="fisheye", fx=60.0, fy=60.0, distortion=(0.02, 0.0, 0.0, 0.0)),
-    ],
+LENSES = (
+    CAMERA,
+    replace(CAMERA, distortion=(-0.3, 0.1, 1e-3, -1e-3, 0.0)),
+    replace(CAMERA, model="fisheye", fx=60.0, fy=60.0, distortion=(0.02, 0.0, 0.0, 0.0)),
 )
+
+
+@pytest.mark.parametrize("camera", LENSES)
+def test_frames_are_the_same_if_their_rays_are_too_many_to_keep(camera, monkeypatch):
+    options = RenderOptions(supersample=2)
+    frames = []
+    for shared in (1 << 23, 0):
+        monkeypatch.setattr("lidar.camera.render._SHARED", shared)
+        frames.append(render(camera, looking((0, 0, 1.5)), world=street(), sun=NOON, options=options))
+    np.testing.assert_allclose(frames[0].depth, frames[1].depth, rtol=1e-6)
+    np.testing.assert_array_equal(frames[0].feature, frames[1].feature)
+    np.testing.assert_allclose(frames[0].rgb.astype(int), frames[1].rgb, atol=1)
+
+
+@pytest.mark.parametrize("camera", LENSES)
 def test_points_of_a_scanner_lie_in_the_depth_image(camera):
     town = street()
     poses = looking((0, 0, 1.5), yaw=0.3)

@@ -206,12 +206,15 @@ def test_noise_is_left_out_and_counted_by_default(tmp_path):
     assert (kept.points, kept.noise) == (800, 0)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
-def test_a_cloud_with_impossible_points_is_refused_by_name(tmp_path, value):
+@pytest.mark.parametrize(
+    ("column", "value"), [("x", np.nan), ("y", np.inf), ("z", 1e30), ("label", 37603), ("label", 254)]
+)
+def test_a_cloud_with_impossible_points_is_refused_by_name(tmp_path, column, value):
     data = dataset(tmp_path / "d", frames=2, kinds=("pcd",))
     path = tmp_path / "d" / "top" / "pcd" / "000001.pcd"
     table = dict(pcd.read(path))
-    pcd.write(path, table | {"x": np.where(np.arange(400) == 7, np.float32(value), table["x"])})
+    values = np.where(np.arange(400) == 7, table[column].dtype.type(value), table[column])
+    pcd.write(path, table | {column: values})
     with pytest.raises(DatasetError, match=r"000001\.pcd: damaged"):
         aggregate(data, tmp_path / "m.laz")
     assert not (tmp_path / "m.laz").exists()

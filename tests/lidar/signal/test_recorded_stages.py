@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from lidar.apply import apply_stages
 from lidar.camera.png import read_png
 from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.dataset.layout import open_dataset
-from lidar.errors import DatasetError, InputError
+from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.physics.echoes import Origin
 from lidar.pipeline import drive
@@ -190,6 +191,18 @@ def test_stages_refuse_data_without_clouds_or_matching_sensors(plain, tmp_path):
     with pytest.raises(DatasetError, match="is not empty"):
         apply_stages(plain, tmp_path / "full", options=ApplyOptions(STAGES))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["top/labels/000001.label", "top/boxes/000001.csv", "front/boxes/000000.csv", "top/pcd/000000.pcd"],
+)
+def test_damaged_frames_end_in_one_error_that_names_the_file(plain, name, tmp_path):
+    shutil.copytree(plain, tmp_path / "data")
+    victim = tmp_path / "data" / name
+    victim.write_bytes(victim.read_bytes()[:-9] + (b"\n1,2\n" if victim.suffix == ".csv" else b""))
+    with pytest.raises(LidarError, match=victim.name):
+        apply_stages(tmp_path / "data", tmp_path / "out", options=ApplyOptions(STAGES))
 
 
 @pytest.mark.parametrize("stage", ["rein", "dropped_packets:los=1", "dropped_packets:loss=2", "none.toml"])

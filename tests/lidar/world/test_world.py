@@ -10,7 +10,7 @@ from geoscene.classes import Class, materials
 from geoscene.frames import Frame
 from geoscene.mesh import WALL, Instances, Mesh
 from geoscene.scene import SceneFiles, open_scene
-from geoscene.scene.layout import SCHEMA
+from geoscene.scene.layout import SCHEMA, manifest_digest
 from geoscene.scene.tile_files import Tile, write_shapes, write_tile
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
@@ -74,7 +74,7 @@ def scene(tmp_path_factory):
         "tiles": [(i, j, 1) for i, j in indices],
         "layers": {},
     }
-    files.manifest.write_text(json.dumps(manifest))
+    files.manifest.write_text(json.dumps(manifest | {"digest": manifest_digest(manifest)}))
     return open_scene(folder)
 
 
@@ -144,18 +144,15 @@ def test_ranges_stay_exact_over_long_drives(tmp_path):
     for rank, (i, j) in enumerate(indices):
         write_tile(files.tile(i, j), tile(i, j, rank))
     write_shapes(files.shapes, {"tree": box([4, 4, 4], [0, 0, 4.0])})
-    files.manifest.write_text(
-        json.dumps(
-            {
-                "schema": SCHEMA,
-                "frame": Frame.at(2.0, 48.0).to_json(),
-                "bounds": [0, 0, 40100, 800],
-                "tile_size": TILE,
-                "tiles": [(i, j, 1) for i, j in indices],
-                "layers": {},
-            }
-        )
-    )
+    manifest = {
+        "schema": SCHEMA,
+        "frame": Frame.at(2.0, 48.0).to_json(),
+        "bounds": [0, 0, 40100, 800],
+        "tile_size": TILE,
+        "tiles": [(i, j, 1) for i, j in indices],
+        "layers": {},
+    }
+    files.manifest.write_text(json.dumps(manifest | {"digest": manifest_digest(manifest)}))
     world = World.load(open_scene(tmp_path), region=(50, 50, 50, 50))
     world.follow((40050, 750, 40050, 750))
     hits = world.caster.cast([40070.0, 700, 5], [[0.0, 1.0, 0.0]])
