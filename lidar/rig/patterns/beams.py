@@ -95,10 +95,17 @@ def blocks(frame: int, rate_hz: float, *, block_ns: Fraction, start_ns: int) -> 
     """
     period = frame_ns(rate_hz)
     first, stop = (-(-frame_edge // block_ns) for frame_edge in (frame * period, (frame + 1) * period))
-    number = np.arange(first, stop, dtype=np.int64)
-    whole = block_ns.numerator * number
-    time = start_ns + (2 * whole + block_ns.denominator) // (2 * block_ns.denominator)
+    time = start_ns + _nearest_multiples(block_ns, first, stop=stop)
     return Blocks(first, float((first * block_ns - frame * period) / period), float(block_ns / period), time)
+
+
+def _nearest_multiples(period: Fraction, first: int, *, stop: int) -> NDArray[np.int64]:
+    """The multiples ``first`` to ``stop`` of a period, rounded to whole numbers, halves up."""
+    step, unit = 2 * period.numerator, 2 * period.denominator
+    whole, rest = divmod(step * first + period.denominator, unit)
+    if step * (stop - first) + unit < 1 << 63:
+        return whole + (step * np.arange(stop - first, dtype=np.int64) + rest) // unit
+    return np.array([whole + (step * k + rest) // unit for k in range(stop - first)], np.int64)
 
 
 def ranks(elevation: Float) -> NDArray[np.uint16]:

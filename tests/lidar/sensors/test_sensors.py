@@ -1,10 +1,14 @@
 """Firing times and directions of scanners."""
 
+import math
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from helpers.sensor_worlds import driven, plate, world
 
 from lidar.geometry.mounts import Mount
+from lidar.rig.patterns.beams import blocks
 from lidar.rig.scanner import firings, load_sensor, sensor_names
 from lidar.sensors.doppler import radial_velocity
 from lidar.sensors.scan import scan
@@ -13,6 +17,19 @@ from lidar.sensors.scan import scan
 def azimuth_deg(direction):
     """Azimuth clockwise from forward, as in Velodyne's data."""
     return np.degrees(np.arctan2(-direction[:, 1], direction[:, 0])) % 360
+
+
+@pytest.mark.parametrize("first", [0, 10**6, 10**9])
+@pytest.mark.parametrize(
+    "period_ns", ["55296", "20000/11", "10000000000000000000/5500000000307839", "333333333333/123456789"]
+)
+def test_clocks_of_any_period_are_exact_at_any_time(period_ns, first):
+    period = Fraction(period_ns)
+    frame = math.ceil(first * period / 10**9)
+    block = blocks(frame, 1.0, block_ns=period, start_ns=5)
+    number = block.first + np.array([0, 1, 7, len(block) - 1])
+    exact = [5 + math.floor(int(k) * period + Fraction(1, 2)) for k in number]
+    assert block.time_ns[number - block.first].tolist() == exact
 
 
 def test_vlp16_turns_by_the_published_step():
