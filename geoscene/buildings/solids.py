@@ -26,6 +26,10 @@ _ALIGNED = 0.02
 """Metres, grid on which the pieces of a building are put together if they do not unite as they are."""
 
 
+_STRAIGHT = 2e-3
+"""Metres off a straight wall within which corners are left out; far below what a map resolves (1 cm)."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Pieces(Columns):
     """Single polygons to extrude: one or several per row of the table."""
@@ -114,7 +118,26 @@ def _pieces(buildings: Buildings, base: Float, *, foot: Float, lod: int) -> _Pie
     underside = base[building] + low
     grounded = (low <= 0) & ~np.isin(buildings.min_height_source[row], ("tunnel", "bridge"))
     underside[grounded] = np.minimum(underside, foot[building])[grounded]
-    return _Pieces(polygon, row, building, underside, base[building] + high, flat)
+    return _Pieces(_straightened(polygon, building), row, building, underside, base[building] + high, flat)
+
+
+def _straightened(polygons: Polygons, building: Ints) -> Polygons:
+    """Polygons (n,) without corners in straight walls, unless another piece of the building has them."""
+    simple = shapely.simplify(polygons, _STRAIGHT)
+    longer = np.isin(
+        building, building[shapely.get_num_coordinates(simple) < shapely.get_num_coordinates(polygons)]
+    )
+    rings, of = shapely.get_rings(polygons[longer], return_index=True)
+    corners, ring = shapely.get_coordinates(rings, return_index=True)
+    wanted, polygon = shapely.get_coordinates(simple[longer], return_index=True)
+    owner = building[longer][np.append(of[ring], polygon)]
+    place, _ = weld(np.pad(np.concatenate([corners, wanted]), ((0, 0), (0, 1))), owner)
+    kept = np.isin(place[: len(corners)], place[len(corners) :])
+    kept[:-1] &= np.diff(ring) == 0  # a ring's last point is its first
+    kept[-1:] = False
+    out = polygons.copy()
+    out[longer] = shapely.polygons(shapely.linearrings(corners[kept], indices=ring[kept]), indices=of)
+    return out
 
 
 def _mean_heights(buildings: Buildings) -> Float:

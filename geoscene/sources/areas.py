@@ -159,7 +159,8 @@ def _relation_area(
     ]
     detail = ", ".join(defects) or f"{len(boundary.ways)} member ways"
     if made.geometry is None:
-        return None, Problem(osm_id, kind, "dropped", reason, f"{detail}; no ring closes")
+        why = "the inner rings leave no area" if reason in ("both-roles", "no-area") else "no ring closes"
+        return None, Problem(osm_id, kind, "dropped", reason, f"{detail}; {why}")
     return made.geometry, Problem(osm_id, kind, "repaired", reason, detail)
 
 

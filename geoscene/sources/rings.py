@@ -160,8 +160,8 @@ class Assembly:
     """Result of `assemble`.
 
     geometry : Polygon or MultiPolygon, valid, exteriors counter-clockwise; None if nothing is enclosed
-    reason   : "" if the boundary is valid, else ``open-ring``, ``self-crossing``, ``duplicate-way``
-               or ``spike``
+    reason   : "" if the boundary is valid, else ``open-ring``, ``self-crossing``, ``both-roles``,
+               ``duplicate-way`` or ``spike``
     """
 
     geometry: Any
@@ -173,33 +173,40 @@ def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> As
 
     A valid boundary (an even number of segments at every node, no crossing between nodes) is filled by the
     even-odd rule and needs no roles: segments shared by two rings cancel, so that touching holes
-    become one. Otherwise, or if members are missing (not ``complete``), the closed rings are used: the union
-    of the outer ones minus the union of the inner ones.
+    become one. Otherwise, or if members are missing (not ``complete``) or have both roles, the closed rings
+    are used: the union of the outer ones minus the union of the inner ones.
 
     xy : (n, 2) coordinates of all nodes
     """
-    known: set[bytes] = set()
+    roles: dict[bytes, set[bool]] = {}
     unique: list[Chain] = []
     parts: list[Ints] = []
     spikes = False
     for chain in chains:
         segments = segments_of(chain.nodes)
         distinct = np.unique(segments, axis=0)
-        key = distinct.tobytes()
-        if len(segments) and key not in known:
-            known.add(key)
+        of = roles.setdefault(distinct.tobytes(), set())
+        if len(segments) and chain.inner not in of:
             unique.append(chain)
-            spikes |= len(distinct) < len(segments)
-            parts.append(segments)
+            if not of:
+                spikes |= len(distinct) < len(segments)
+                parts.append(segments)
+            of.add(chain.inner)
     if not parts:
         return Assembly(None, "open-ring")
     every, count = np.unique(np.concatenate(parts), axis=0, return_counts=True)
     odd = every[count % 2 == 1]
     is_open = len(_open_nodes(odd)) > 0
-    defects = (("open-ring", is_open), ("duplicate-way", len(unique) < len(chains)), ("spike", spikes))
+    both_roles = len(parts) < len(unique)
+    defects = (
+        ("both-roles", both_roles),
+        ("open-ring", is_open),
+        ("duplicate-way", len(unique) < len(chains)),
+        ("spike", spikes),
+    )
     reason = next((name for name, found in defects if found), "")
     crossing = False
-    if complete and not is_open and len(odd):
+    if complete and not is_open and not both_roles and len(odd):
         geometry, crossing = enclosed(odd, xy)
         if not crossing:
             return Assembly(geometry, reason)

@@ -636,6 +636,41 @@ def test_a_slit_between_stacked_parts_is_closed():
     assert ("way/3", "repaired", "slit-between-parts") in reasons(problems)
 
 
+def dotted(shape, count):
+    """A rectangle with ``count`` points on each side."""
+    corners = shapely.get_coordinates(shape)
+    return shapely.Polygon([a + (b - a) * k / count for a, b in pairwise(corners) for k in range(count)])
+
+
+@pytest.mark.parametrize("turn", [0.0, 17.3])
+@pytest.mark.parametrize(
+    ("tags", "faces"), [({}, 12), ({"roof__shape": "gabled"}, 22), ({"roof__shape": "hipped"}, 16)]
+)
+def test_points_in_straight_walls_are_left_out(tags, faces, turn):
+    whole = affinity.rotate(box(0, 0, 40, 30), turn, origin=(0, 0))
+    _, mesh, verdict, _ = built(house(1, dotted(whole, 400), height="10", **tags))
+    _, same, expected, _ = built(house(1, whole, height="10", **tags))
+    assert len(mesh) == len(same) == faces
+    assert verdict.volume[0] == pytest.approx(expected.volume[0], rel=1e-4)
+
+
+def test_points_in_straight_walls_stay_where_another_part_has_a_corner():
+    # the small part ends in the middle of the walls of its neighbours, 0.1 to 1 mm off their straight lines
+    left = shapely.Polygon([(0, 0), (10, 0), (10.0002, 8), (9.9990, 12), (10, 20), (0, 20)])
+    right = shapely.Polygon([(10, 0), (20, 0), (20, 20), (10, 20), (9.9990, 12), (10.0002, 8)])
+    _, mesh, verdict, problems = built(
+        house(1, box(0, 0, 20, 20), height="3"),
+        part(2, dotted(left, 50), height="6"),
+        part(3, right, height="9"),
+        part(
+            4, shapely.Polygon([(10.0002, 8), (20, 8), (20, 12), (9.9990, 12)]), height="12", min_height="9"
+        ),
+    )
+    assert not [p for p in problems if p.reason != "partly-covered"]
+    assert verdict.volume[0] == pytest.approx(200 * 6 + 200 * 9 + 40 * 3, rel=1e-3)
+    assert len(mesh) < 60
+
+
 def test_parts_that_meet_within_a_millimetre_become_one_clean_solid():
     # a strip of slices whose corners lie 0.3 to 0.8 mm off one another, at nearly equal heights
     rng = np.random.default_rng(3)

@@ -436,6 +436,19 @@ def test_closed_rings_of_a_broken_multipolygon_are_kept(tmp_path):
     ]
 
 
+def test_a_building_whose_inner_ring_is_its_outer_ring_is_dropped(tmp_path):
+    town = Map()
+    ring, again = town.ring(square(0, 0, 50)), town.ring(square(0, 0, 50)[::-1])
+    tags = {"type": "multipolygon", "building": "yes"}
+    town.relation([(ring, "outer"), (ring, "inner")], tags)
+    town.relation([(ring, "outer"), (again, "inner")], tags)
+    town.ring(square(100, 0), {"building": "yes"})
+    data = town.read(tmp_path)
+    assert [round(square_metres(a)) for a in data.areas] == [400]
+    assert reasons(data) == [("building", "dropped", "both-roles")] * 2
+    assert {p.detail for p in data.problems} == {"2 member ways; the inner rings leave no area"}
+
+
 # --- bounds and errors
 
 

@@ -8,7 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.sources.rings import Chain, assemble, close_cut_ring
+from geoscene.sources.rings import Assembly, Chain, assemble, close_cut_ring
 
 
 @st.composite
@@ -80,6 +80,16 @@ def test_a_member_listed_twice_counts_once(city):
     made = assemble([*chains, chains[0]], xy)
     assert made.reason == "duplicate-way"
     assert shapely.equals(made.geometry, area_of(blocks))
+
+
+def test_an_inner_ring_that_equals_its_outer_ring_leaves_no_area():
+    xy = np.array([(0, 0), (4, 0), (4, 4), (0, 4), (9, 9), (10, 9), (10, 10)], float)
+    outer = Chain(np.array([0, 1, 2, 3, 0]), inner=False)
+    same = Chain(np.array([2, 1, 0, 3, 2]), inner=True)
+    island = Chain(np.array([4, 5, 6, 4]), inner=False)
+    assert assemble([outer, same], xy) == assemble([same, outer], xy) == Assembly(None, "both-roles")
+    made = assemble([outer, same, island], xy)
+    assert (made.geometry.area, made.reason) == (0.5, "both-roles")
 
 
 @given(cities())
