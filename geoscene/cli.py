@@ -396,7 +396,8 @@ def _print_scene(report: dict[str, Any]) -> None:
         )
     print(report["name"] or report["path"])
     for title, text in rows.items():
-        print(f"  {title:<10} {text}")
+        if text:
+            print(f"  {title:<10} {text}")
     for action, kinds in report["problems"].items():
         for kind, reasons in kinds.items():
             print(f"  {action:<10} {kind}: {_listed(reasons)}")
