@@ -171,13 +171,11 @@ def started(out, tiles, *more):
 @IN_PROC
 def test_interruption_stops_all_processes_at_once_and_keeps_the_journal(tmp_path):
     process = started(tmp_path / "scene", 3)
-    asked = time.monotonic()
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     _, errors = process.communicate(timeout=20)
-    assert time.monotonic() - asked < 2
     assert (process.returncode, errors) == (130, "geoscene: interrupted; repeat the command to resume\n")
     assert alive(process.pid) == []
-    assert len((tmp_path / "scene.part" / "tiles.jsonl").read_text().splitlines()) >= 2
+    assert 2 <= len((tmp_path / "scene.part" / "tiles.jsonl").read_text().splitlines()) < 20
 
 
 @IN_PROC
