@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import reduce
+
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.typing import Bools, Ints
+from geoscene.typing import Bools, Float, Ints
 
-_AT_ONCE = 400_000
+_AT_ONCE = 50_000
 """Pairs of faces tested at once, which bounds the memory."""
+
+_CLEAR = 1e-3
+"""Grid steps; far more than rounding moves a point that lies within 2**27 steps of a plane."""
 
 _LOW = 25
 """Bits of the lower part into which products are split, so that sums of products stay within 64 bits."""
@@ -29,24 +35,98 @@ def intersecting_faces(cells: Ints, faces: Ints, *, owner: NDArray[np.integer]) 
     faces : (m, 3) vertices of each face, none degenerate
     owner : (m,) number of the solid that each face belongs to
     """
+    if not len(faces):
+        return np.empty((0, 2), np.int64)
     corners = cells[faces]
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    boxes = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
+    i, j = _near_pairs(corners, owner)
+    planes = _Planes.of(corners, faces)
     found = [np.empty((0, 2), np.int64)]
-    tree = shapely.STRtree(boxes)
-    for first in range(0, len(faces), 20_000):
-        i, j = tree.query(boxes[first : first + 20_000])
-        i = i.astype(np.int64) + first
-        j = j.astype(np.int64)
-        near = (i < j) & (owner[i] == owner[j])
-        i, j = i[near], j[near]
-        near = (low[i, 2] <= high[j, 2]) & (low[j, 2] <= high[i, 2])
-        i, j = i[near], j[near]
-        for start in range(0, len(i), _AT_ONCE):
-            a, b = i[start : start + _AT_ONCE], j[start : start + _AT_ONCE]
-            hit = _intersect(corners[a], corners[b], same=faces[a].T[:, None] == faces[b].T[None])
-            found.append(np.stack([a[hit], b[hit]], axis=1))
+    for first in range(0, len(i), _AT_ONCE):
+        a, b = planes.not_apart(i[first : first + _AT_ONCE], j[first : first + _AT_ONCE])
+        hit = _intersect(corners[a], corners[b], same=faces[a].T[:, None] == faces[b].T[None])
+        found.append(np.stack([a[hit], b[hit]], axis=1))
     return np.concatenate(found)
+
+
+def _near_pairs(corners: Ints, owner: NDArray[np.integer]) -> tuple[Ints, Ints]:
+    """Pairs i < j of triangles (m, 3, 3) of one owner whose boxes overlap."""
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    # owners stand apart, so that triangles find only those of their own
+    apart = owner * float(high[:, 0].max() - low[:, 0].min() + 1)
+    boxes = shapely.box(low[:, 0] + apart, low[:, 1], high[:, 0] + apart, high[:, 1])
+    tree = shapely.STRtree(boxes)
+    bottom, top = low[:, 2].copy(), high[:, 2].copy()
+    found = []
+    for first in range(0, len(boxes), 20_000):
+        i, j = tree.query(boxes[first : first + 20_000])
+        i += first
+        above = i < j
+        i, j = i[above], j[above]
+        near = (bottom[i] <= top[j]) & (bottom[j] <= top[i])
+        found.append(np.stack([i[near], j[near]]))
+    i, j = np.concatenate(found, axis=1)
+    return i, j
+
+
+@dataclass(frozen=True, slots=True)
+class _Planes:
+    """Planes of triangles and of their edges, rounded, which tell most pairs of triangles apart.
+
+    vertices : (3, m) numbers of the corners
+    points   : (3, 3, m) grid steps: corner, axis, triangle
+    normal   : (4, 3, m) unit vectors: of the triangle, and in its plane out of each edge
+    offset   : (4, m) normal . x of the points x of each plane
+    """
+
+    vertices: NDArray[np.int32]
+    points: Float
+    normal: Float
+    offset: Float
+
+    @classmethod
+    def of(cls, corners: Ints, faces: Ints) -> _Planes:
+        """The planes of triangles (m, 3, 3)."""
+        points = np.ascontiguousarray((corners - corners[0, 0]).transpose(1, 2, 0))
+        along = np.roll(points, -1, axis=0) - points
+        upright = np.cross(along[0], along[1], axis=0).astype(float)  # of whole numbers, so it is exact
+        normal = np.stack([upright, *(np.cross(edge, upright, axis=0) for edge in along)])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1.0)
+        offset = (normal * points[[0, 0, 1, 2]]).sum(axis=1)
+        return cls(np.ascontiguousarray(faces.T, np.int32), points.astype(float), normal, offset)
+
+    def not_apart(self, a: Ints, b: Ints) -> tuple[Ints, Ints]:
+        """The pairs of triangles a and b (n,) that no plane of either clearly separates."""
+        for separated in (self._by_face, self._by_edges):
+            for _ in range(2):
+                rest = ~separated(a, b)
+                a, b = b[rest], a[rest]
+        return a, b
+
+    def _by_face(self, a: Ints, b: Ints) -> Bools:
+        """(n,) bool, the plane of a has all corners of b on one side, except for common corners."""
+        above, below = self._sides(0, a, b=b, common=(0, 1, 2))
+        return above | below
+
+    def _by_edges(self, a: Ints, b: Ints) -> Bools:
+        """(n,) bool, b lies outside an edge of a, except for common ends of the edge."""
+        outside = [self._sides(k + 1, a, b=b, common=ends)[0] for k, ends in enumerate(_EDGES)]
+        return np.asarray(np.any(outside, axis=0), np.bool_)
+
+    def _sides(self, plane: int, a: Ints, *, b: Ints, common: tuple[int, ...]) -> tuple[Bools, Bools]:
+        """(n,) bool, whether the corners of b are clearly above a plane of a, or clearly below it.
+
+        common : corners of a that b may have
+        """
+        normal, offset = self.normal[plane][:, a], self.offset[plane][a]
+        own = self.vertices[list(common)][:, a]
+        above, below = np.ones((2, len(a)), np.bool_)
+        for corner, number in zip(self.points, self.vertices, strict=True):
+            x, y, z = corner[:, b]
+            away = normal[0] * x + normal[1] * y + normal[2] * z - offset
+            known = reduce(np.logical_or, own == number[b])
+            above &= known | (away > _CLEAR)
+            below &= known | (away < -_CLEAR)
+        return above, below
 
 
 def _intersect(first: Ints, second: Ints, *, same: Bools) -> Bools:
@@ -57,18 +137,19 @@ def _intersect(first: Ints, second: Ints, *, same: Bools) -> Bools:
     shared = same.sum(axis=(0, 1))
     common: tuple[Bools, Bools] = np.any(same, axis=1), np.any(same, axis=0)
     hit: Bools = shared == 3
-    own = np.stack([_sides(second, first[:, k]) for k in range(3)])
-    others = np.stack([_sides(first, second[:, k]) for k in range(3)])
+    own, others = _sides(second, first), _sides(first, second)
     apart = _one_side(own, common[0]) | _one_side(others, common[1])
     rows = np.flatnonzero(~hit & ~apart)
     folded = rows[shared[rows] == 2]
     hit[folded] = _folded(first[folded], second[folded], common=(common[0][:, folded], common[1][:, folded]))
     rows = rows[shared[rows] < 2]
+    edges = []
     for one, two, side, known in ((first, second, own, common[0]), (second, first, others, common[1])):
         for a, b in _EDGES:
-            free = rows[~hit[rows] & ~known[a, rows] & ~known[b, rows]]
-            ends = side[a, free], side[b, free]
-            hit[free] = _pierces(one[free, a], one[free, b], triangle=two[free], ends=ends)
+            free = rows[~known[a, rows] & ~known[b, rows]]
+            edges.append((free, one[free, a], one[free, b], two[free], side[a, free], side[b, free]))
+    row, p, q, triangle, *ends = (np.concatenate(column) for column in zip(*edges, strict=True))
+    hit[row[_pierces(p, q, triangle=triangle, ends=(ends[0], ends[1]))]] = True
     return hit
 
 
@@ -79,18 +160,23 @@ def _one_side(sides: Ints, common: Bools) -> Bools:
     return np.asarray(up | down, np.bool_)
 
 
-def _sides(triangle: Ints, point: Ints) -> Ints:
-    """Side (n,) of planes of triangles (n, 3, 3) on which points (n, 3) lie: 1, 0 or -1."""
-    return _orientation(triangle[:, 0], triangle[:, 1], c=triangle[:, 2], d=point)
+def _sides(triangle: Ints, points: Ints) -> Ints:
+    """Sides (3, n) of planes of triangles (n, 3, 3) on which points (n, 3, 3) lie: 1, 0 or -1."""
+    a, b, c = triangle.transpose(1, 2, 0)
+    return np.stack([_sign(_cross(b - a, c - a), point - a) for point in points.transpose(1, 2, 0)])
 
 
-def _orientation(a: Ints, b: Ints, *, c: Ints, d: Ints) -> Ints:
-    """Sign (n,) of the volume of tetrahedra."""
-    (ux, uy, uz), (vx, vy, vz), (wx, wy, wz) = ((x - a).T for x in (b, c, d))
+def _cross(u: Ints, v: Ints) -> Ints:
+    """Cross products of vectors (3, n)."""
+    return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+
+
+def _sign(normal: Ints, along: Ints) -> Ints:
+    """Signs (n,) of the scalar products of vectors (3, n), of which the first are cross products."""
     high, low = 0, 0
-    for w, normal in ((wx, uy * vz - uz * vy), (wy, uz * vx - ux * vz), (wz, ux * vy - uy * vx)):
-        high = high + w * (normal >> _LOW)
-        low = low + w * (normal & _MASK)
+    for part, w in zip(normal, along, strict=True):
+        high = high + w * (part >> _LOW)
+        low = low + w * (part & _MASK)
     high += low >> _LOW
     return np.asarray(np.where(high != 0, np.sign(high), np.sign(low & _MASK)), np.int64)
 
@@ -102,16 +188,16 @@ def _pierces(p: Ints, q: Ints, *, triangle: Ints, ends: tuple[Ints, Ints]) -> Bo
     rows = np.flatnonzero(level)
     hit[rows] = _meet_in_plane(p[rows], q[rows], triangle=triangle[rows])
     rows = np.flatnonzero(~level & (ends[0] * ends[1] <= 0))
-    turns = np.stack(
-        [_orientation(p[rows], q[rows], c=triangle[rows, a], d=triangle[rows, b]) for a, b in _EDGES]
-    )
+    along = (q[rows] - p[rows]).T
+    corners = (triangle[rows] - p[rows, None]).transpose(1, 2, 0)
+    turns = np.stack([_sign(_cross(along, corners[a]), corners[b]) for a, b in _EDGES])
     hit[rows] = (turns >= 0).all(axis=0) | (turns <= 0).all(axis=0)
     return hit
 
 
-def _plan(triangle: Ints) -> Ints:
+def plan_axes(triangles: Ints | Float) -> Ints:
     """The two axes (n, 2) onto which triangles (n, 3, 3) project with the greatest area."""
-    normal = np.abs(np.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]))
+    normal = np.abs(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
     axes: Ints = np.array([[1, 2], [2, 0], [0, 1]])[np.argmax(normal, axis=1)]
     return axes
 
@@ -124,17 +210,17 @@ def _turn(a: Ints, b: Ints, *, c: Ints) -> Ints:
 
 def _meet_in_plane(p: Ints, q: Ints, *, triangle: Ints) -> Bools:
     """(n,) bool, whether segments in the planes of triangles (n, 3, 3) meet them."""
-    axes = _plan(triangle)
+    axes = plan_axes(triangle)
     p, q = np.take_along_axis(p, axes, axis=1), np.take_along_axis(q, axes, axis=1)
     corner = [np.take_along_axis(triangle[:, k], axes, axis=1) for k in range(3)]
     inside = np.stack([_turn(corner[a], corner[b], c=p) for a, b in _EDGES])
     hit = (inside >= 0).all(axis=0) | (inside <= 0).all(axis=0)
     for a, b in _EDGES:
-        hit |= _cross(p, q, a=corner[a], b=corner[b])
+        hit |= _segments_cross(p, q, a=corner[a], b=corner[b])
     return np.asarray(hit, np.bool_)
 
 
-def _cross(p: Ints, q: Ints, *, a: Ints, b: Ints) -> Bools:
+def _segments_cross(p: Ints, q: Ints, *, a: Ints, b: Ints) -> Bools:
     """(n,) bool, whether segments p q and a b in the plane have a point in common."""
     turns = (_turn(p, q, c=a) * _turn(p, q, c=b) <= 0) & (_turn(a, b, c=p) * _turn(a, b, c=q) <= 0)
     overlap = (np.maximum(p, q) >= np.minimum(a, b)) & (np.maximum(a, b) >= np.minimum(p, q))
@@ -147,7 +233,7 @@ def _folded(first: Ints, second: Ints, *, common: tuple[Bools, Bools]) -> Bools:
     common : which corners (3, n) of the first and of the second are those of the edge
     """
     n, tips = np.arange(len(first)), [np.argmin(known, axis=0) for known in common]
-    axes = _plan(first)
+    axes = plan_axes(first)
     tip, a, b, other = (
         np.take_along_axis(x, axes, axis=1)
         for x in (*(first[n, (tips[0] + k) % 3] for k in range(3)), second[n, tips[1]])

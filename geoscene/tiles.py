@@ -156,13 +156,13 @@ def build_tile(
     digest = write_tile(SceneFiles(folder).tile(*tile), made)
     if plan.forests is not None:
         made = with_forests(made, plan.forests, box=tile_box(plan.ground, tile[0], j=tile[1]))
-    verdict = validate_mesh(mesh)
-    built = verdict.feature < plan.buildings.count
+    built = len(np.unique(solids.feature))  # `build_solids` has checked each
+    verdict = validate_mesh(rest)
     return TileReport(
         *tile,
-        len(verdict),
-        int(verdict.ok.sum()),
-        int(built.sum()),
+        built + len(verdict),
+        built + int(verdict.ok.sum()),
+        built,
         len(mesh),
         len(made.instances),
         _plan_area(rest.take(~rest.closed)),

@@ -9,55 +9,70 @@ from numpy.typing import NDArray
 
 from geoscene.intersections import intersecting_faces
 from geoscene.mesh import Mesh
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 
 GRID = 1e-4
 """Metres, cell size of the grid on which vertices are welded: those in one cell count as one."""
 
 NEAR = 1e-3
-"""Metres; vertices of a solid that are closer than this merge in programs that snap to a millimetre."""
+"""Metres; vertices of a feature that are closer than this merge in programs that snap to a millimetre."""
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """Result of the checks, one row per feature with closed faces, in order of feature number.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Findings:
+    """What `check_solids` finds, one row per solid.
 
-    feature    : (n,) int32
-    faces      : (n,) int64, number of faces
-    finite     : (n,) bool, no vertex is NaN or infinite
     closed     : (n,) bool, every edge has exactly two faces after welding
     oriented   : (n,) bool, adjacent faces run along their common edge in opposite directions
-    positive   : (n,) bool, the signed volume is positive
+    degenerate : (n,) int64, faces without area after welding
     fans       : (n,) int64, vertices whose faces are connected only in the vertex itself
     crossings  : (n,) int64, pairs of faces that cross or touch outside their common vertices and edges
     near       : (n,) int64, pairs of vertices less than 1 mm apart
-    degenerate : (n,) int64, faces without area after welding
-    volume     : (n,) float64, cubic metres; NaN where not finite
+    volume     : (n,) float64, signed, cubic metres
+    """
+
+    closed: Bools
+    oriented: Bools
+    degenerate: Ints
+    fans: Ints
+    crossings: Ints
+    near: Ints
+    volume: Float
+
+    @property
+    def positive(self) -> Bools:
+        """(n,) bool, the signed volume is positive."""
+        return np.asarray(self.volume > 0, np.bool_)
+
+    @property
+    def closed_solid(self) -> Bools:
+        """(n,) bool, the surface is closed, oriented, without degenerate faces, and of positive volume."""
+        return np.asarray(self.closed & self.oriented & (self.degenerate == 0) & self.positive, np.bool_)
+
+    @property
+    def ok(self) -> Bools:
+        """(n,) bool, the solid has no fault."""
+        return np.asarray(self.closed_solid & (self.fans + self.crossings + self.near == 0), np.bool_)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict(Findings):
+    """Result of the checks of a mesh, one row per feature with closed faces, in order of feature number.
+
+    A feature with a vertex that is not finite is not closed, and its volume is NaN.
+
+    feature : (n,) int32
+    faces   : (n,) int64, number of faces
+    finite  : (n,) bool, no vertex is NaN or infinite
     """
 
     feature: NDArray[np.int32]
     faces: Ints
-    finite: NDArray[np.bool_]
-    closed: NDArray[np.bool_]
-    oriented: NDArray[np.bool_]
-    positive: NDArray[np.bool_]
-    fans: Ints
-    crossings: Ints
-    near: Ints
-    degenerate: Ints
-    volume: Float
+    finite: Bools
 
     def __len__(self) -> int:
         """Number of features."""
         return len(self.feature)
-
-    @property
-    def ok(self) -> NDArray[np.bool_]:
-        """(n,) bool, the feature passes all checks."""
-        passed = self.finite & self.closed & self.oriented & self.positive
-        for count in (self.degenerate, self.fans, self.crossings, self.near):
-            passed &= count == 0
-        return np.asarray(passed, np.bool_)
 
     def fault(self, row: int) -> str:
         """The first failed check of a feature as a slug, "" if it passes all."""
@@ -108,7 +123,7 @@ def edge_uses(corners: Ints) -> tuple[Ints, Ints, Ints]:
     return edge, uses, balance
 
 
-def degenerate_faces(points: Float, faces: NDArray[np.integer], *, grid: float = GRID) -> NDArray[np.bool_]:
+def degenerate_faces(points: Float, faces: NDArray[np.integer], *, grid: float = GRID) -> Bools:
     """(m,) bool: the three corners, rounded to the grid, are collinear."""
     cell = grid_cells(points, grid=grid)
     a, b, c = (cell[faces[:, k]] for k in range(3))
@@ -116,27 +131,36 @@ def degenerate_faces(points: Float, faces: NDArray[np.integer], *, grid: float =
     return np.asarray(~np.cross(b - a, c - a).any(axis=1), np.bool_)
 
 
-def vertex_fans(corners: Ints) -> Ints:
-    """Vertices (k,) whose faces form several fans, connected by edges only within each.
+def corner_fans(corners: Ints) -> Ints:
+    """Fan (3 m,) of each corner of each face: faces around a vertex that edges connect form a fan.
 
     corners : (m, 3) welded vertex ids
     """
     from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
-    half = corners.size
     edge, _, _ = edge_uses(corners)
-    # an edge joins the corners of its faces at its lower end, and those at its upper end
+    size = len(edge)
+    # the corners at the lower and at the upper end of each half-edge
     start, stop = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    following = np.arange(half).reshape(-1, 3)[:, [1, 2, 0]].ravel()
-    ends = half + 2 * edge
-    node = np.concatenate([ends + (start > stop), ends + (start < stop)])
-    corner = np.concatenate([np.arange(half), following])
-    size = half + 2 * (int(edge.max(initial=-1)) + 1)
-    graph = coo_array((np.ones(len(node), np.int8), (corner, node)), shape=(size, size))
-    fan = connected_components(graph, directed=False)[1][:half]
-    vertex = np.unique(np.stack([start, fan], axis=1), axis=0)[:, 0]
-    found: Ints = np.unique(vertex[1:][np.diff(vertex) == 0])
+    ends = np.stack([np.arange(size), np.arange(size).reshape(-1, 3)[:, [1, 2, 0]].ravel()])
+    ends = np.where(start < stop, ends, ends[::-1])
+    # an edge joins its faces at both ends
+    order = np.argsort(edge, kind="stable")
+    same = np.diff(edge[order]) == 0
+    a, b = ends[:, order[:-1][same]].ravel(), ends[:, order[1:][same]].ravel()
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(size, size))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def vertex_fans(corners: Ints) -> Ints:
+    """Vertices (k,) whose faces form several fans, connected by edges only within each.
+
+    corners : (m, 3) welded vertex ids
+    """
+    _, first = np.unique(corner_fans(corners), return_index=True)
+    vertex, fans = np.unique(corners.ravel()[first], return_counts=True)
+    found: Ints = vertex[fans > 1]
     return found
 
 
@@ -173,43 +197,18 @@ def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
     checked = finite[owner]
     corners = mesh.vertices[mesh.faces[rows[checked]]]
     found = check_solids(corners, owner[checked].astype(np.int64), n=n, grid=grid)
-    volume = np.where(finite, found.volume, np.nan)
     return Verdict(
-        feature.astype(np.int32),
-        np.bincount(owner, minlength=n),
-        finite,
-        found.closed & finite,
-        found.oriented & finite,
-        volume > 0,
-        found.fans,
-        found.crossings,
-        found.near,
-        found.degenerate,
-        volume,
+        feature=feature.astype(np.int32),
+        faces=np.bincount(owner, minlength=n),
+        finite=finite,
+        closed=found.closed & finite,
+        oriented=found.oriented & finite,
+        degenerate=found.degenerate,
+        fans=found.fans,
+        crossings=found.crossings,
+        near=found.near,
+        volume=np.where(finite, found.volume, np.nan),
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Findings:
-    """What `check_solids` finds, one row per solid; columns as in `Verdict`."""
-
-    closed: NDArray[np.bool_]
-    oriented: NDArray[np.bool_]
-    degenerate: Ints
-    fans: Ints
-    crossings: Ints
-    near: Ints
-    volume: Float
-
-    @property
-    def closed_solid(self) -> NDArray[np.bool_]:
-        """(n,) bool, the surface is closed, oriented, without degenerate faces, and of positive volume."""
-        return np.asarray(self.closed & self.oriented & (self.degenerate == 0) & (self.volume > 0), np.bool_)
-
-    @property
-    def ok(self) -> NDArray[np.bool_]:
-        """(n,) bool, the solid has no fault."""
-        return np.asarray(self.closed_solid & (self.fans + self.crossings + self.near == 0), np.bool_)
 
 
 def check_solids(corners: Float, owner: Ints, *, n: int, grid: float = GRID) -> Findings:
@@ -234,7 +233,15 @@ def check_solids(corners: Float, owner: Ints, *, n: int, grid: float = GRID) -> 
     crossings = np.bincount(owner[whole][crossing[:, 0]], minlength=n)
     near = np.bincount(of[near_vertices(cells, of, steps=round(NEAR / grid))[:, 0]], minlength=n)
     volume = _volumes(points, triangles, owner=owner, n=n)
-    return Findings(closed, oriented, degenerate, fans, crossings, near, volume)
+    return Findings(
+        closed=closed,
+        oriented=oriented,
+        degenerate=degenerate,
+        fans=fans,
+        crossings=crossings,
+        near=near,
+        volume=volume,
+    )
 
 
 def _volumes(points: Float, triangles: Ints, *, owner: Ints, n: int) -> Float:

@@ -52,7 +52,7 @@ def drive(
 
     lidar drive scene --route random --duration 30 --seed 1 -o drive
 
-    lidar drive scene --route 60.1699,24.9384 60.1755,24.9414 --rig vlp16 --format pcd,laz -o drive
+    lidar drive scene --route 60.1662,24.9413 60.1655,24.9405 --rig vlp16 --format pcd,laz -o drive
 
     lidar drive scene --route track.gpx --rig my_rig.toml -o drive
 
@@ -170,7 +170,7 @@ def export(
 
     For example:
 
-    lidar drive scene --rig nuscenes --traffic on --format pcd -o drive
+    lidar drive scene --route random --rig nuscenes --traffic on --format pcd -o drive
 
     lidar export drive --to nuscenes -o nuscenes
 

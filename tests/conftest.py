@@ -25,7 +25,7 @@ FUZZ_FACTOR = 10
 
 SLOW = frozenset(
     (
-        "test_actors", "test_build", "test_cli", "test_drive",
+        "test_actors", "test_build", "test_cli", "test_documented_commands", "test_drive",
         "test_ego_drive", "test_elevation", "test_fcd", "test_files",
         "test_flight_planning", "test_interruptions", "test_network", "test_outputs", "test_overture",
         "test_raycast", "test_real", "test_render", "test_roofs",

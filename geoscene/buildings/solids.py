@@ -45,7 +45,7 @@ class _Pieces(Columns):
 def build_solids(
     buildings: Buildings, *, base: Float, foot: Float | None = None, lod: int = 2
 ) -> tuple[Mesh, list[Problem]]:
-    """One closed, oriented body of positive volume per building, and what was simplified or dropped.
+    """One body without faults (`check_solids`) per building, and what was simplified or dropped.
 
     Vertices lie on the 0.1 mm grid. Faces have the building's row as feature, class BUILDING, and surface,
     material and colour. LoD 0 extrudes the outline from the ground to the mean height of its parts; LoD 1 has
@@ -185,8 +185,32 @@ def _cut(pieces: _Pieces, polygons: Polygons) -> _Pieces:
 
 def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, list[Problem]]:
     """Triangles of all bodies, the buildings that failed, and the replaced roofs and separated bodies."""
-    n = len(pieces.row)
-    notes: list[Problem] = []
+    shells, notes = _shells(buildings, pieces)
+    found = check_solids(shells.corners, shells.piece, n=len(pieces.row))
+    bad = np.unique(pieces.building[~found.closed_solid])
+    alone = np.bincount(pieces.building, minlength=len(buildings) + 1)[pieces.building] == 1
+    ready = found.ok & alone
+    out = [shells.take(ready[shells.piece])]
+    rest = shells.take((~ready & ~np.isin(pieces.building, bad))[shells.piece])
+    owner = pieces.building[rest.piece]
+    families = [rest.take(rows) for rows in groups(owner)]
+    for building, united in zip(np.unique(owner).tolist(), unite(families), strict=True):
+        if united is None:
+            bad = np.append(bad, building)
+            continue
+        body, note = united
+        out.append(body)
+        if note:
+            notes.append(
+                _problem(buildings, building, action="repaired", reason="touching-bodies", detail=note)
+            )
+    failed = {buildings.osm_id[b] for b in bad}
+    return Triangles.concatenate(out), bad, [p for p in notes if p.osm_id not in failed]
+
+
+def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, list[Problem]]:
+    """The closed shell of each piece, and the replaced roofs."""
+    notes = []
     flat = np.flatnonzero(pieces.flat)
     made = [prisms(pieces.polygon[flat], flat.astype(np.int64), low=pieces.low[flat], high=pieces.high[flat])]
     for k in np.flatnonzero(~pieces.flat):
@@ -209,36 +233,7 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
         if fallback:
             notes.append(_problem(buildings, row, action="repaired", reason="roof-fallback", detail=fallback))
         made.append(replace(shell, piece=np.full(len(shell), k, np.int64)))
-    shells = Triangles.concatenate(made)
-    found = check_solids(shells.corners, shells.piece, n=n)
-    failed = set(np.unique(pieces.building[~found.closed_solid]).tolist())
-
-    ready = found.ok & (np.bincount(pieces.building, minlength=len(buildings) + 1)[pieces.building] == 1)
-    out = [shells.take(ready[shells.piece])]
-    multiple = shells.take(~ready[shells.piece])
-    order = np.argsort(pieces.building[multiple.piece], kind="stable")
-    multiple = multiple.take(order)
-    owner = pieces.building[multiple.piece]
-    owners, starts = np.unique(owner, return_index=True)
-    for building, start, stop in zip(owners.tolist(), starts, np.append(starts, len(owner))[1:], strict=True):
-        if building in failed:
-            continue
-        united = unite(multiple.take(np.arange(start, stop)))
-        if united is None:
-            failed.add(building)
-            continue
-        body, note = united
-        out.append(body)
-        if note:
-            notes.append(
-                _problem(buildings, building, action="repaired", reason="touching-bodies", detail=note)
-            )
-    bad = np.array(sorted(failed), np.int64)
-    return (
-        Triangles.concatenate(out),
-        bad,
-        [p for p in notes if p.osm_id not in {buildings.osm_id[b] for b in bad}],
-    )
+    return Triangles.concatenate(made), notes
 
 
 def _mesh(buildings: Buildings, triangles: Triangles) -> Mesh:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import manifold3d as m3
@@ -10,7 +12,7 @@ import shapely
 
 from geoscene.buildings.footprints import to_grid
 from geoscene.buildings.shells import Triangles
-from geoscene.intersections import intersecting_faces
+from geoscene.intersections import intersecting_faces, plan_axes
 from geoscene.mesh import WALL
 from geoscene.typing import Float, Ints
 from geoscene.watertight import (
@@ -34,35 +36,109 @@ _MERGE = 15
 """Grid steps; vertices of a union that are closer are merged, which leaves none within a millimetre."""
 
 
-def unite(shells: Triangles) -> tuple[Triangles, str] | None:
-    """The union of the closed shells of one building, and a note on beads; None if it is no solid.
+def unite(buildings: Sequence[Triangles]) -> list[tuple[Triangles, str] | None]:
+    """Of the closed shells of each building their union, and a note on beads; None if it is no solid.
 
     Faces keep their piece and surface.
     """
-    pieces = np.unique(shells.piece)
-    first = m3.Manifold.reserve_ids(4 * len(pieces))
-    # boolean operations lose digits far from the origin, so coordinates are relative to a corner
-    origin = to_grid(shells.corners.reshape(-1, 3).min(axis=0))
-    bodies = [_manifold(shells, piece, first=first + 4 * k, origin=origin) for k, piece in enumerate(pieces)]
-    if any(body is None for body in bodies):
-        return None
-    body, note = m3.Manifold.batch_boolean(bodies, m3.OpType.Add), ""
-    for reach in (*SEAMS, None):
-        if body.status() != m3.Error.NoError or body.is_empty():
+    unions = [_Union.of(shells) for shells in buildings]
+    drafts = [(union, *union.triangles()) for union in unions if union is not None]
+    owner = np.repeat(np.arange(len(drafts)), [len(corners) for _, corners, _ in drafts])
+    corners = np.concatenate([np.empty((0, 3, 3)), *(corners for _, corners, _ in drafts)])
+    fine = check_solids(corners, owner, n=len(drafts)).ok
+    made = (
+        (union.result(corners, run), "") if ok else _mended(union)
+        for (union, corners, run), ok in zip(drafts, fine, strict=True)
+    )
+    return [None if union is None else next(made) for union in unions]
+
+
+@dataclass(frozen=True, slots=True)
+class _Union:
+    """The union of the pieces of a building.
+
+    body   : manifold relative to the origin
+    pieces : (k,) their numbers
+    first  : id of the first piece's first surface; each piece has 4
+    origin : (3,) metres
+    """
+
+    body: Any
+    pieces: Ints
+    first: int
+    origin: Float
+
+    @classmethod
+    def of(cls, shells: Triangles) -> _Union | None:
+        """The union of closed shells; None if one of them or the union is no manifold."""
+        pieces = np.unique(shells.piece)
+        first = m3.Manifold.reserve_ids(4 * len(pieces))
+        # boolean operations lose digits far from the origin, so coordinates are relative to a corner
+        origin = to_grid(shells.corners.reshape(-1, 3).min(axis=0))
+        bodies = [
+            _manifold(shells, piece, first=first + 4 * k, origin=origin) for k, piece in enumerate(pieces)
+        ]
+        if any(body is None for body in bodies):
             return None
-        for candidate in (body, body.simplify(_TOLERANCE)):
-            corners, run = _triangles(candidate, first)
-            if check_solids(corners, np.zeros(len(corners), np.int64), n=1).ok[0]:
-                known = (run >= 0) & (run < 4 * len(pieces))
-                piece = pieces[np.where(known, run // 4, 0)]
-                surface = np.where(known, run % 4, WALL).astype(np.uint8)
-                return Triangles(to_grid(corners + origin), piece, surface), note
+        body = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
+        return cls(body, pieces, first, origin) if _is_solid(body) else None
+
+    def joined(self, beads: Sequence[Any]) -> _Union | None:
+        """The union with further bodies; None if it is no manifold."""
+        body = m3.Manifold.batch_boolean([self.body, *beads], m3.OpType.Add)
+        return replace(self, body=body) if _is_solid(body) else None
+
+    def triangles(self, *, tolerance: float = 0.0) -> tuple[Float, Ints]:
+        """Corners (m, 3, 3) of the body's triangles, repaired on the grid, and their ids minus ``first``.
+
+        tolerance : metres by which surfaces may move where that removes short edges
+        """
+        body = self.body.simplify(tolerance) if tolerance else self.body
+        mesh = body.to_mesh64()
+        faces = mesh.tri_verts.astype(np.int64)
+        run = np.repeat(np.asarray(mesh.run_original_id, np.int64), np.diff(mesh.run_index) // 3) - self.first
+        points = to_grid(mesh.vert_properties[:, :3])
+        ids, where = weld(points, np.zeros(len(points), np.int64))
+        points = points[where]
+        return repair(points, merged_vertices(points)[ids[faces]], run=run)
+
+    def result(self, corners: Float, run: Ints) -> Triangles:
+        """Triangles with their pieces and surfaces; those of beads are walls of the first piece."""
+        known = (run >= 0) & (run < 4 * len(self.pieces))
+        piece = self.pieces[np.where(known, run // 4, 0)]
+        return Triangles(
+            to_grid(corners + self.origin), piece, np.where(known, run % 4, WALL).astype(np.uint8)
+        )
+
+
+def _mended(union: _Union) -> tuple[Triangles, str] | None:
+    """A union with a fault, simplified or with beads where it touches itself; None if that does not help."""
+    note = ""
+    for reach in (*SEAMS, None):
+        corners, run = union.triangles(tolerance=_TOLERANCE)
+        if _is_fine(corners):
+            return union.result(corners, run), note
         seams = _seams(corners)
         if reach is None or not seams:
-            return None
+            break
+        joined = union.joined([_bead(points, reach=reach) for points in seams])
+        if joined is None:
+            break
+        union = joined
         note = f"{len(seams)} places where bodies only touched, joined by beads of {1e3 * reach:.0f} mm"
-        body = m3.Manifold.batch_boolean([body, *(_bead(s, reach=reach) for s in seams)], m3.OpType.Add)
+        corners, run = union.triangles()
+        if _is_fine(corners):
+            return union.result(corners, run), note
     return None
+
+
+def _is_solid(body: Any) -> bool:
+    return body.status() == m3.Error.NoError and not body.is_empty()
+
+
+def _is_fine(corners: Float) -> bool:
+    """Whether triangles (m, 3, 3) bound a solid without faults."""
+    return bool(check_solids(corners, np.zeros(len(corners), np.int64), n=1).ok[0])
 
 
 def _manifold(shells: Triangles, piece: int, *, first: int, origin: Float) -> Any:
@@ -79,18 +155,7 @@ def _manifold(shells: Triangles, piece: int, *, first: int, origin: Float) -> An
         run_original_id=first + kinds.astype(np.uint32),
     )
     body = m3.Manifold(mesh)
-    return body if body.status() == m3.Error.NoError and not body.is_empty() else None
-
-
-def _triangles(body: Any, first: int) -> tuple[Float, Ints]:
-    """Corners (m, 3, 3) of a body's triangles, repaired on the grid, and their ids minus ``first``."""
-    mesh = body.to_mesh64()
-    faces = mesh.tri_verts.astype(np.int64)
-    run = np.repeat(np.asarray(mesh.run_original_id, np.int64), np.diff(mesh.run_index) // 3) - first
-    points = to_grid(mesh.vert_properties[:, :3])
-    ids, where = weld(points, np.zeros(len(points), np.int64))
-    points = points[where]
-    return repair(points, merged_vertices(points)[ids[faces]], run=run)
+    return body if _is_solid(body) else None
 
 
 def merged_vertices(points: Float) -> Ints:
@@ -128,10 +193,14 @@ def repair(points: Float, faces: Ints, *, run: Ints) -> tuple[Float, Ints]:
 def _cancel(faces: Ints, run: Ints) -> tuple[Ints, Ints]:
     """Faces without pairs that have the same three vertices in opposite order and so enclose no volume."""
     turned = np.take_along_axis(faces, (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3, axis=1)
-    key = {tuple(f): i for i, f in enumerate(turned.tolist())}
-    gone = [i for (a, b, c), i in key.items() if (a, c, b) in key]
+    low, high = np.sort(turned[:, 1:], axis=1).T
+    size = faces.max(initial=0) + 1
+    _, edge = np.unique(low * size + high, return_inverse=True)
+    _, triple = np.unique(edge * size + turned[:, 0], return_inverse=True)
+    sided, last = np.unique((2 * triple + (turned[:, 1] == low))[::-1], return_index=True)
+    opposite = last[np.isin(sided ^ 1, sided)]
     keep = np.ones(len(faces), np.bool_)
-    keep[gone] = False
+    keep[len(faces) - 1 - opposite] = False
     return faces[keep], run[keep]
 
 
@@ -179,8 +248,8 @@ def _contacts(first: Float, second: Float) -> list[Float]:
     """Points (k, 3) that pairs of triangles (n, 3, 3) have in common, or nearly so: corners and piercings."""
     found = []
     for one, two in ((first, second), (second, first)):
+        axes = plan_axes(two)[:, None]
         normal = np.cross(two[:, 1] - two[:, 0], two[:, 2] - two[:, 0])
-        axes = np.array([[1, 2], [2, 0], [0, 1]])[np.argmax(np.abs(normal), axis=1)][:, None]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         away = np.einsum("nij,nj->ni", one - two[:, :1], normal)
         beyond = np.roll(away, -1, axis=1)

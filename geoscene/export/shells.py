@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.typing import Float, Ints
-from geoscene.watertight import edge_uses
+from geoscene.typing import Bools, Float, Ints
+from geoscene.watertight import corner_fans, edge_uses
 
 
 def shell_numbers(corners: Ints, owner: NDArray[np.integer]) -> Ints:
@@ -47,26 +47,14 @@ def manifold_patches(corners: Ints) -> Ints:
     return patch
 
 
-def _beyond_first_fan(corners: Ints) -> NDArray[np.bool_]:
+def _beyond_first_fan(corners: Ints) -> Bools:
     """Whether a face (m,) is at one of its vertices in another fan of its patch than the largest."""
-    from scipy.sparse import coo_array  # noqa: PLC0415  (slow to import)
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
-    half = corners.size
-    edge, _, _ = edge_uses(corners)
-    start, stop = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    following = np.arange(half).reshape(-1, 3)[:, [1, 2, 0]].ravel()
-    ends = half + 2 * edge
-    node = np.concatenate([ends + (start > stop), ends + (start < stop)])
-    corner = np.concatenate([np.arange(half), following])
-    size = half + 2 * (int(edge.max()) + 1)
-    links = coo_array((np.ones(len(node), np.int8), (corner, node)), shape=(size, size))
-    fan = connected_components(links, directed=False)[1][:half]
+    vertex, fan = corners.ravel(), corner_fans(corners)
     patch = np.repeat(shell_numbers(corners, np.zeros(len(corners), np.int64)), 3)
-    order = np.lexsort([fan, -np.bincount(fan)[fan], start, patch])
-    place = patch[order] * (start.max() + 1) + start[order]
+    order = np.lexsort([fan, -np.bincount(fan)[fan], vertex, patch])
+    place = patch[order] * (vertex.max() + 1) + vertex[order]
     _, first, which = np.unique(place, return_index=True, return_inverse=True)
-    extra = np.empty(half, np.bool_)
+    extra = np.empty(len(fan), np.bool_)
     extra[order] = fan[order] != fan[order][first][which]
     return np.asarray(extra.reshape(-1, 3).any(axis=1), np.bool_)
 

@@ -9,10 +9,7 @@ from numpy.typing import NDArray
 
 from geoscene.mesh import Mesh
 from geoscene.typing import Ints
-from geoscene.watertight import degenerate_faces, edge_uses, weld
-
-NEAR = 1e-3
-"""Metres: other programs merge vertices of a surface that are closer than this."""
+from geoscene.watertight import NEAR, degenerate_faces, edge_uses, grid_cells, near_vertices, weld
 
 _STEP = 1e-5
 """Metres: the finest step of the formats with whole coordinates."""
@@ -72,6 +69,8 @@ def check_surfaces(mesh: Mesh) -> SurfaceFaults:
     corners, owner = corners[whole], owner[whole]
     ids, first = weld(corners.reshape(-1, 3), np.repeat(owner, 3), grid=_STEP)
     points, faces = corners.reshape(-1, 3)[first], ids.reshape(-1, 3)
+    cells, of = grid_cells(points, grid=_STEP), np.repeat(owner, 3)[first]
+    near = near_vertices(cells, of, steps=round(NEAR / _STEP))[:, 0]
     lines = degenerate_faces(points, faces, grid=_STEP)
     edge, uses, balance = edge_uses(faces)
     edge_owner = np.zeros(len(uses), np.int64)
@@ -81,18 +80,7 @@ def check_surfaces(mesh: Mesh) -> SurfaceFaults:
         names[:, 0].astype(np.int32),
         names[:, 1].astype(np.uint8),
         finite,
-        np.bincount(_near_pairs(points, np.repeat(owner, 3)[first]), minlength=n),
+        np.bincount(of[near], minlength=n),
         np.bincount(owner[lines], minlength=n),
         np.bincount(edge_owner[bad_edge], minlength=n),
     )
-
-
-def _near_pairs(points: NDArray[np.float64], owner: Ints) -> Ints:
-    """The owner (k,) of each pair of its points that are less than `NEAR` apart."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
-
-    if not len(points):
-        return np.empty(0, np.int64)
-    pairs = cKDTree(points).query_pairs(NEAR, output_type="ndarray")
-    same = owner[pairs[:, 0]] == owner[pairs[:, 1]]
-    return np.asarray(owner[pairs[same, 0]], np.int64)

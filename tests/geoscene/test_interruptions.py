@@ -9,10 +9,9 @@ import time
 from dataclasses import fields, replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-import rasterio
 from helpers.programs import ENVIRONMENT, alive, command, run_program
+from helpers.rasters import write_slope
 from helpers.scenes import same_files
 
 import geoscene.tiles
@@ -40,15 +39,7 @@ def whole(osm, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def raster(tmp_path_factory):
-    path = tmp_path_factory.mktemp("dem") / "hill.tif"
-    west, south, east, north = BOX
-    rows = np.add.outer(np.arange(40.0), np.arange(40.0)).astype(np.float32)
-    across, down = (east - west + 0.02) / 40, (north - south + 0.02) / 40
-    transform = rasterio.Affine(across, 0.0, west - 0.01, 0.0, -down, north + 0.01)
-    profile = {"driver": "GTiff", "width": 40, "height": 40, "count": 1, "dtype": "float32"}
-    with rasterio.open(path, "w", **profile, crs="EPSG:4326", transform=transform) as out:
-        out.write(rows, 1)
-    return path
+    return write_slope(tmp_path_factory.mktemp("dem") / "hill.tif", BOX)
 
 
 @pytest.fixture(scope="module")

@@ -732,7 +732,7 @@ def test_bodies_that_share_an_edge_with_a_narrow_gap_are_joined():
     lower = shapely.Polygon([(0, 0), (-10, -0.0005), (-10, -10), (10, -10), (10, -0.0005)])
     footprints = shapely.set_precision(np.array([upper, lower]), 1e-4)
     shells = prisms(footprints, np.arange(2), low=np.zeros(2), high=np.full(2, 9.0))
-    body, told = unite(shells)
+    [(body, told)] = unite([shells])
     assert "joined by beads of" in told
     assert check_solids(body.corners, np.zeros(len(body), np.int64), n=1).ok.all()
     assert body.corners[..., 2].max() < 9.01

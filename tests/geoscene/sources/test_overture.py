@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import shapely
+from helpers.overture import overture_row, write_overture
 from helpers.programs import run_program
 from pyarrow import parquet
 from pyproj import CRS
@@ -17,66 +18,8 @@ from geoscene.frames import Frame
 from geoscene.sources import SOURCES, credits_of, demo_path, merged, read_osm, read_source
 from geoscene.sources.registry import reader_of
 from geoscene.sources.tags import is_building
-from geoscene.tags import parse_length, parse_number
-
-SOURCE = pa.struct(
-    [(name, pa.string()) for name in ("property", "dataset", "license", "record_id", "update_time")]
-)
-SCHEMA = pa.schema(
-    [
-        ("id", pa.string()),
-        ("geometry", pa.binary()),
-        ("bbox", pa.struct([(edge, pa.float32()) for edge in ("xmin", "xmax", "ymin", "ymax")])),
-        ("sources", pa.list_(SOURCE)),
-        ("names", pa.struct([("primary", pa.string())])),
-        *[(name, pa.string()) for name in ("subtype", "class")],
-        *[(name, pa.float64()) for name in ("height", "min_height", "roof_height", "roof_direction")],
-        *[(name, pa.int32()) for name in ("num_floors", "min_floor")],
-        *[(name, pa.string()) for name in ("facade_color", "facade_material", "roof_color")],
-        *[(name, pa.string()) for name in ("roof_shape", "roof_material", "roof_orientation")],
-        *[(name, pa.bool_()) for name in ("is_underground", "has_parts")],
-    ]
-)
-"""Columns of theme buildings, type building (Overture schema 1.18)."""
 
 BLOCK = "POLYGON ((24.940 60.166, 24.941 60.166, 24.941 60.167, 24.940 60.167, 24.940 60.166))"
-
-
-def write(path, rows, *, geo=None):
-    table = pa.Table.from_pylist([_whole(row) for row in rows], SCHEMA)
-    geo = {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": geo or {}}}
-    parquet.write_table(table.replace_schema_metadata({"geo": json.dumps(geo)}), path, row_group_size=50)
-    return path
-
-
-def _whole(row):
-    shape = row.get("geometry")
-    shape = shapely.from_wkt(shape) if isinstance(shape, str) else shape
-    if isinstance(shape, shapely.Geometry):
-        edges = zip(("xmin", "ymin", "xmax", "ymax"), shape.bounds, strict=True)
-        row = {"bbox": dict(edges)} | row | {"geometry": shapely.to_wkb(shape, include_srid=True)}
-    return row
-
-
-def _row(area):
-    """A row in Overture's schema of a building of OpenStreetMap."""
-    tags = area.tags
-    levels = parse_number(tags.get("building:levels"))
-    kind, number = area.osm_id.split("/")
-    return {
-        "id": f"id-of-{kind}-{number}",
-        "geometry": area.geometry,
-        "sources": [{"dataset": "OpenStreetMap", "record_id": f"{kind[0]}{number}@1", "license": "ODbL-1.0",
-                     "update_time": "2024-04-26T23:55:01Z"}],
-        "names": {"primary": tags["name"]} if "name" in tags else None,
-        "class": tags["building"] if tags["building"] != "yes" else None,
-        "height": parse_length(tags.get("height")),
-        "num_floors": None if levels is None else int(levels),
-        "facade_color": tags.get("building:colour"),
-        "facade_material": tags.get("building:material"),
-        "roof_shape": tags.get("roof:shape", "").replace("half-hipped", "half_hipped") or None,
-        "roof_material": tags.get("roof:material"),
-    }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +29,8 @@ def osm():
 
 @pytest.fixture(scope="module")
 def demo(osm, tmp_path_factory):
-    rows = [_row(a) for a in osm.areas if a.tags.get("building", "no") != "no"]
-    return write(tmp_path_factory.mktemp("overture") / "demo.parquet", rows)
+    rows = [overture_row(a) for a in osm.areas if a.tags.get("building", "no") != "no"]
+    return write_overture(tmp_path_factory.mktemp("overture") / "demo.parquet", rows)
 
 
 def test_real_buildings_are_read_as_from_openstreetmap(osm, demo):
@@ -141,7 +84,7 @@ def test_a_stray_building_does_not_stretch_the_bounds(tmp_path):
         for k in range(9)
     ]
     rows.append({"id": "stray", "geometry": shapely.box(0.0, 60.0, 0.001, 60.001)})
-    data = read_source("overture", write(tmp_path / "b.parquet", rows))
+    data = read_source("overture", write_overture(tmp_path / "b.parquet", rows))
     assert data.bounds == pytest.approx((24.94, 60.0, 24.941, 60.0085))
     assert len(data.areas) == 9
     assert [(p.osm_id, p.action, p.reason) for p in data.problems] == [
@@ -153,7 +96,7 @@ def test_a_stray_building_does_not_stretch_the_bounds(tmp_path):
 def test_buildings_on_both_sides_of_180_degrees_are_neighbours(bounds, tmp_path):
     west = {"id": "a", "geometry": shapely.box(179.998, -16.95, 179.999, -16.949)}
     east = {"id": "b", "geometry": shapely.box(-179.999, -16.95, -179.998, -16.949)}
-    data = read_source("overture", write(tmp_path / "b.parquet", [west, east]), bounds=bounds)
+    data = read_source("overture", write_overture(tmp_path / "b.parquet", [west, east]), bounds=bounds)
     assert [area.geometry.bounds[0] for area in data.areas] == pytest.approx([179.998, 180.001])
     assert data.bounds[2] == pytest.approx(180.01 if bounds else 180.002)
 
@@ -166,7 +109,7 @@ def test_all_columns_become_tags(tmp_path):
         "roof_shape": "half_hipped", "roof_material": "slate", "roof_orientation": "across",
         "is_underground": True,
     }  # fmt: skip
-    (area,) = read_source("overture", write(tmp_path / "a.parquet", [row])).areas
+    (area,) = read_source("overture", write_overture(tmp_path / "a.parquet", [row])).areas
     assert area.tags == {
         "building": "education", "name": "Hall", "height": "12.5", "building:levels": "3",
         "min_height": "2.0", "building:min_level": "1", "roof:height": "3.25", "roof:direction": "90.0",
@@ -192,7 +135,7 @@ def test_odd_rows_are_repaired_or_dropped_and_listed(tmp_path):
         {"id": "line", "geometry": "LINESTRING (0 0, 1 1)"},
         {"id": "metres", "geometry": "POLYGON ((500000 0, 500010 0, 500010 10, 500000 0))"},
     ]
-    data = read_source("overture", write(tmp_path / "a.parquet", rows))
+    data = read_source("overture", write_overture(tmp_path / "a.parquet", rows))
     areas = {a.osm_id.removeprefix("overture:"): a for a in data.areas}
     assert sorted(areas) == ["bow", "multi", "plain", "z"]
     assert areas["plain"].tags == {"building": "zeppelin"}
@@ -219,7 +162,7 @@ def test_the_attribution_names_the_datasets(tmp_path):
         {"id": "b", "sources": [{"dataset": "Esri", "license": "CC-BY-4.0", "update_time": "2024-01-02"}]},
     ]
     rows = [row | {"geometry": BLOCK} for row in rows]
-    data = read_source("overture", write(tmp_path / "a.parquet", rows))
+    data = read_source("overture", write_overture(tmp_path / "a.parquet", rows))
     (credit,) = credits_of(data)
     assert credit.licence == "ODbL-1.0"
     assert credit.timestamp == "2024-01-02"
@@ -245,7 +188,7 @@ def test_files_of_another_kind_are_refused_in_one_line(tmp_path, monkeypatch):
         (CRS(3067).to_json_dict(), True),
         (CRS(4326).to_json_dict(), False),
     ):
-        path = write(tmp_path / "crs.parquet", [row], geo={"crs": crs})
+        path = write_overture(tmp_path / "crs.parquet", [row], geo={"crs": crs})
         if refused:
             with pytest.raises(InputError, match=r"longitude and latitude|damaged"):
                 read_source("overture", path)

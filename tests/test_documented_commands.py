@@ -1,0 +1,146 @@
+"""The commands in the README, the documentation and the help texts do what they say.
+
+They run one after the other in a folder with the files that they name. Those for map servers are only parsed.
+The bundled map is replaced by a part of it, drives end after 0.2 s, and surveys record 20 frames.
+"""
+
+import shlex
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import osmium
+import pytest
+from helpers.overture import overture_row, write_overture
+from helpers.programs import run_program
+from helpers.rasters import write_slope
+
+import geoscene.cli
+import geoscene.sources
+import lidar.cli
+import lidar.pipeline
+from geoscene.pipeline import build
+from geoscene.sources import demo_path, read_osm
+from lidar.options import DriveOptions
+
+ROOT = Path(__file__).resolve().parents[1]
+APPS = {"geoscene": geoscene.cli.app, "lidar": lidar.cli.app}
+NETWORK = {"--place", "--point", "tiles"}
+BOX = (24.9400, 60.1653, 24.9420, 60.1666)
+RIG = """
+name = "mine"
+[[lidar]]
+name = "top"
+preset = "vlp16"
+translation = [1.2, 0.0, 1.9]
+"""
+ROUTE = """<?xml version="1.0"?><gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>
+<trkpt lat="60.1662" lon="24.9413"/><trkpt lat="60.1655" lon="24.9405"/></trkseg></trk></gpx>"""
+CAR = '<vehicle id="a" x="24.9413" y="60.1662" angle="0" type="car" lane="1_0" pos="1"/>'
+SECONDS = "".join(f'<timestep time="{second}">{CAR}</timestep>' for second in (300, 301))
+TRAFFIC = f"<fcd-export>{SECONDS}</fcd-export>"
+
+
+def commands(text):
+    """Commands (words) in a text, one to a line or separated by semicolons, without comments."""
+    for line in text.splitlines():
+        lexer = shlex.shlex(line.strip(), posix=True, punctuation_chars=";")
+        lexer.whitespace_split = True
+        words = []
+        if line.strip().startswith(("geoscene ", "lidar ")):
+            words = list(lexer)
+        while words:
+            end = words.index(";") if ";" in words else len(words)
+            if words[1] in APPS[words[0]]:
+                yield words[:end]
+            words = words[end + 1 :]
+
+
+def in_page(name):
+    """The commands in the blocks of code of a page; lines with brackets show a syntax."""
+    blocks = (ROOT / name).read_text("utf-8").split("```")[1::2]
+    return [words for block in blocks for words in commands(block) if "[" not in " ".join(words)]
+
+
+def in_help(name):
+    """The commands in the help texts of a program: paragraphs of their own."""
+    texts = [APPS[name].help, *(APPS[name][word].help for word in APPS[name] if not word.startswith("-"))]
+    paragraphs = [part.strip() for text in texts for part in (text or "").split("\n\n")]
+    return [words for text in paragraphs for words in commands(text)]
+
+
+PAGES = [str(path.relative_to(ROOT)) for path in sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])]
+SOURCES = [page for page in PAGES if in_page(page)] + ["geoscene --help", "lidar --help"]
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """A folder with the input files of all examples."""
+    folder = tmp_path_factory.mktemp("inputs")
+    city = folder / "city.osm.pbf"
+    with osmium.BackReferenceWriter(str(city), str(demo_path()), overwrite=True) as writer:
+        for item in osmium.FileProcessor(demo_path()).with_locations():
+            if item.is_way() and any(inside(BOX, node) for node in item.nodes):
+                writer.add(item)
+    osm = read_osm(city, bounds=BOX)
+    rows = [overture_row(area) for area in osm.areas if "building" in area.tags]
+    write_overture(folder / "buildings.parquet", rows)
+    write_slope(folder / "heights.tif", BOX, rise=0.3)
+    stages = (ROOT / "docs" / "stages.md").read_text("utf-8").split("```toml")[1].split("```")[0]
+    texts = {"track.gpx": ROUTE, "my_rig.toml": RIG, "fcd.xml": TRAFFIC, "stages.toml": stages}
+    for name, text in texts.items():
+        (folder / name).write_text(text, "utf-8")
+    for name in ("scene", "city"):
+        scene = build(osm, folder / name)
+    options = DriveOptions(rig=str(folder / "my_rig.toml"), duration=0.2, formats=("kitti",))
+    recorded = lidar.pipeline.drive(scene, folder / "recorded", options=options).path / "top"
+    shutil.copytree(recorded, folder / "kitti" / "sequences" / "00")
+    return folder
+
+
+@pytest.fixture
+def folder(inputs, tmp_path, monkeypatch):
+    """A folder with copies of the input files; drives that are run here are short."""
+    folder = tmp_path / "work"
+    shutil.copytree(inputs, folder)
+    monkeypatch.setattr(geoscene.sources, "demo_path", lambda: folder / "city.osm.pbf")
+    drive, record_all = lidar.pipeline.drive, lidar.pipeline.record_all
+
+    def short(scene, out, *, options, **more):
+        options = options if options.survey else replace(options, duration=0.2)
+        return drive(scene, out, options=options, **more)
+
+    def first(recording, jobs, **more):
+        record_all(recording, jobs[:20], **more)
+
+    monkeypatch.setattr(lidar.pipeline, "drive", short)
+    monkeypatch.setattr(lidar.pipeline, "record_all", first)
+    return folder
+
+
+def inside(box, node):
+    return node.location.valid() and box[0] < node.lon < box[2] and box[1] < node.lat < box[3]
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_documented_commands_succeed(source, folder):
+    found = in_help(source.split()[0]) if source.endswith("--help") else in_page(source)
+    for program, *words in found:
+        if NETWORK & set(words) or "sumo" in " ".join(words):
+            APPS[program].parse_args(words, exit_on_error=False, print_error=False)
+            continue
+        if words[0] in ("build", "drive"):
+            shutil.rmtree(folder / words[words.index("-o") + 1], ignore_errors=True)
+        (folder / "map.laz").unlink(missing_ok=True)
+        done = run_program(program, *words, cwd=folder)
+        assert done.returncode == 0, (program, words, done.stderr)
+
+
+def test_example_in_python_succeeds(folder, monkeypatch):
+    (example,) = (ROOT / "README.md").read_text("utf-8").split("```python")[1:]
+    shutil.rmtree(folder / "scene")
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(geoscene, "demo_path", geoscene.sources.demo_path)
+    monkeypatch.setattr(lidar, "drive", lidar.pipeline.drive)
+    exec(example.split("```")[0], {})  # noqa: S102
+    assert (folder / "drive" / "dataset.json").is_file()
