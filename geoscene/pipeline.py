@@ -44,7 +44,7 @@ _CROWN, _ARM = 5.0, 10.0
 
 def build(
     osm: OsmData,
-    out: Path,
+    out: str | Path,
     *,
     options: BuildOptions = BuildOptions(),
     overwrite: bool = False,
@@ -61,7 +61,7 @@ def build(
     """
     if not (osm.areas or osm.ways):
         raise SourceNotFoundError(f"{osm.source or 'the extract'}: has no features to build a scene from")
-    with SceneWriter(out, overwrite=overwrite) as writer:
+    with SceneWriter(Path(out), overwrite=overwrite) as writer:
         plan, problems = make_plan(osm, options, progress=progress)
         keys = _keys(osm, options)
         tiles = _tiles_along(plan, options)

@@ -57,8 +57,8 @@ class ApplySummary:
 
 
 def apply_stages(
-    source: Path,
-    out: Path,
+    source: str | Path,
+    out: str | Path,
     *,
     options: ApplyOptions,
     overwrite: bool = False,
@@ -74,6 +74,7 @@ def apply_stages(
 
     Raises InputError for stages that cannot act on the data, and DatasetError for data that cannot be read.
     """
+    source, out = Path(source), Path(out)
     here, there = source.resolve(), out.resolve()
     if here == there or here in there.parents or there in here.parents:
         raise InputError(f"{out}: give a directory outside of {source}")

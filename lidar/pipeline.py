@@ -65,7 +65,12 @@ class DriveSummary:
 
 
 def drive(
-    scene: Scene, out: Path, *, options: DriveOptions, overwrite: bool = False, progress: Progress = silent
+    scene: Scene,
+    out: str | Path,
+    *,
+    options: DriveOptions,
+    overwrite: bool = False,
+    progress: Progress = silent,
 ) -> DriveSummary:
     """Drive a route through a scene and write the dataset; an unfinished one of the same options is finished.
 
@@ -73,7 +78,7 @@ def drive(
     """
     began = time.perf_counter()
     with install_listener("numba:compile", _CompilationProgress(progress)):
-        return _driven(scene, out, options=options, overwrite=overwrite, progress=progress, began=began)
+        return _driven(scene, Path(out), options=options, overwrite=overwrite, progress=progress, began=began)
 
 
 class _CompilationProgress(Listener):

@@ -68,7 +68,7 @@ def kind_of(out: Path) -> str:
 
 def export_scene(
     scene: Scene,
-    out: Path,
+    out: str | Path,
     *,
     options: ExportOptions = ExportOptions(),
     overwrite: bool = False,
@@ -79,6 +79,7 @@ def export_scene(
     Raises InputError for an unknown kind, for an option that the kind does not take, and if ``out`` exists
     and may not be overwritten; MissingExtraError where an optional package is needed.
     """
+    out = Path(out)
     name = kind_of(out) if options.kind is None else options.kind
     if name not in KINDS:
         raise InputError(f"`kind` {name}: there are {', '.join(KINDS)}")

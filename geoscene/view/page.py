@@ -34,7 +34,7 @@ _COPYRIGHT = "https://www.openstreetmap.org/copyright"
 
 def view_scene(
     scene: Scene,
-    out: Path,
+    out: str | Path,
     *,
     options: ViewOptions = ViewOptions(),
     overwrite: bool = False,
@@ -48,6 +48,7 @@ def view_scene(
     Raises InputError for an existing file, bounds without a tile, an unknown layer, and a page that would be
     too large; the message then gives the bounds of a part that would fit.
     """
+    out = Path(out)
     _check(out, overwrite=overwrite)
     bounds_deg, layers, max_mb = options.bounds_deg, options.layers, options.max_mb
     chosen = _tiles_within(scene, bounds_deg)

@@ -62,7 +62,7 @@ class MapSummary:
 
 def aggregate(
     dataset: Dataset,
-    out: Path,
+    out: str | Path,
     *,
     options: MapOptions = MapOptions(),
     overwrite: bool = False,
@@ -77,6 +77,7 @@ def aggregate(
 
     Raises InputError for an unknown scanner or suffix, and DatasetError for a dataset without clouds.
     """
+    out = Path(out)
     if out.suffix.lower() not in map_suffixes():
         raise InputError(f"{out}: maps are written as {', '.join(map_suffixes())}")
     if out.exists() and not overwrite:

@@ -161,7 +161,7 @@ def read_table(path: Path, format: str = "") -> Table:  # noqa: A002 - the word 
     return format_of(path, format).read(path)
 
 
-def read_cloud(path: Path, format: str = "", *, start_ns: int = 0) -> Cloud:  # noqa: A002
+def read_cloud(path: str | Path, format: str = "", *, start_ns: int = 0) -> Cloud:  # noqa: A002
     """The cloud of one frame, from a file in the sensor frame, to the precision of its format.
 
     format   : name in `FORMATS`; by default from the file's suffix
@@ -173,6 +173,7 @@ def read_cloud(path: Path, format: str = "", *, start_ns: int = 0) -> Cloud:  # 
     """
     from lidar.dataset.formats.table import table_cloud  # noqa: PLC0415
 
+    path = Path(path)
     row = format_of(path, format)
     if row.frame == "world":
         raise InputError(f"{path}: {row.name} files hold points in the world frame; use read_table")
