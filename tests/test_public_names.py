@@ -28,7 +28,7 @@ def test_paths_may_be_text(scene, tmp_path):
     options = lidar.DriveOptions(route="random", rig="vlp16", duration=0.1, formats=("pcd",))
     drive = lidar.drive(scene, f"{tmp_path}/drive", options=options).path
     lidar.aggregate(lidar.open_dataset(str(drive)), f"{tmp_path}/map.laz")
-    assert len(lidar.read_cloud(f"{drive}/vlp16/pcd/000000.pcd")) > 1000
+    assert len(lidar.read_cloud(f"{drive}/lidar_top/pcd/000000.pcd")) > 1000
     apply_stages(
         str(drive),
         f"{tmp_path}/lossy",
