@@ -123,17 +123,17 @@ class Scene:
         """Side of the smallest tiles in metres."""
         return float(self.manifest["tile_size"])
 
-    @property
+    @functools.cached_property
     def tile_indices(self) -> list[tuple[int, int]]:
         """(i, j) of all tiles; tile (i, j) of span n covers [i, i + n) x [j, j + n) times `tile_size`."""
         return [(int(i), int(j)) for i, j, _ in self.manifest["tiles"]]
 
-    @property
+    @functools.cached_property
     def tile_spans(self) -> Ints:
         """Span (t,) of each tile: 1, or a power of two where nothing lies on the ground."""
         return np.array([n for _, _, n in self.manifest["tiles"]], np.int64)
 
-    @property
+    @functools.cached_property
     def tile_boxes(self) -> Float:
         """(xmin, ymin, xmax, ymax) of each tile (t, 4) in scene metres, not cut at the `bounds`."""
         low, span = np.array(self.tile_indices, np.int64).reshape(-1, 2), self.tile_spans[:, None]
@@ -157,20 +157,20 @@ class Scene:
         """Whether traffic keeps left."""
         return bool(self.manifest["roads"]["driving_side"] == "left")
 
-    def tile(self, i: int, j: int) -> Tile:
-        """Tile (i, j) with the trees of its forests; raises SceneFormatError if it is missing or damaged."""
-        tile = read_tile(self.files.tile(i, j))
-        if self._forests is None:
-            return tile
-        box = np.array([i, j, i + 1, j + 1]) * self.tile_size  # no forest is on a larger one
-        low, high = np.maximum(box[:2], self.bounds[:2]), np.minimum(box[2:], self.bounds[2:])
-        return with_forests(tile, self._forests, box=(*low, *high))
-
     @functools.cached_property
-    def _forests(self) -> Forests | None:
+    def forests(self) -> Forests | None:
         """What the trees of forests are generated from, None for a scene without them."""
         document = self.manifest.get("forests")
         return None if document is None else Forests.from_json(document)
+
+    def tile(self, i: int, j: int) -> Tile:
+        """Tile (i, j) with the trees of its forests; raises SceneFormatError if it is missing or damaged."""
+        tile = read_tile(self.files.tile(i, j))
+        if self.forests is None:
+            return tile
+        box = np.array([i, j, i + 1, j + 1]) * self.tile_size  # no forest is on a larger one
+        low, high = np.maximum(box[:2], self.bounds[:2]), np.minimum(box[2:], self.bounds[2:])
+        return with_forests(tile, self.forests, box=(*low, *high))
 
     def tiles(self) -> Iterator[Tile]:
         """All tiles, one at a time."""
@@ -228,7 +228,7 @@ def open_scene(path: str | Path) -> Scene:
         if manifest.get("digest") != manifest_digest(manifest):
             raise SceneFormatError(f"{manifest_file}: differs from what the build wrote; {BUILD_AGAIN}")
         scene = Scene(folder, manifest, Frame.from_json(manifest["frame"]))
-        _ = scene.frame.crs, scene.bounds, scene.tile_size, scene.tile_boxes, scene.layers
+        _ = scene.frame.crs, scene.bounds, scene.tile_boxes, scene.layers, scene.forests
     return scene
 
 
