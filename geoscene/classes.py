@@ -52,6 +52,7 @@ class Class(IntEnum):
     BICYCLE = 45
     CYCLIST = 46
     PEDESTRIAN = 47
+    MOTORCYCLIST = 48
     NOISE = 60
     SKY = 61
 
@@ -113,6 +114,7 @@ _CODES: dict[Class, tuple[int, int, int, int, tuple[int, int, int]]] = {
     Class.BICYCLE: (11, 14, 12, 72, (119, 11, 32)),
     Class.CYCLIST: (31, 14, 6, 72, (255, 0, 0)),
     Class.PEDESTRIAN: (30, 2, 7, 73, (220, 20, 60)),
+    Class.MOTORCYCLIST: (32, 21, 5, 72, (255, 60, 140)),
     Class.NOISE: (1, 0, 0, 7, (255, 0, 255)),
     Class.SKY: (0, 0, 0, 1, (135, 190, 240)),
 }

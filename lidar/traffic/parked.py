@@ -20,8 +20,10 @@ from lidar.traffic.tracks import actor_table, poses_on_ground
 from lidar.traffic.trips import random_shape
 from lidar.world.actors import Actors
 
-CARS = {"hatchback": 0.38, "sedan": 0.30, "suv": 0.22, "van": 0.10}
-"""Shares of the kinds of parked vehicles: assumed."""
+PARKED = {"hatchback": 0.37, "sedan": 0.29, "suv": 0.21, "van": 0.09, "parked_motorcycle": 0.04}
+"""Shares of the kinds of vehicles in parking spaces: assumed."""
+_BICYCLES = 0.2  # bicycles on the sidewalk per occupied parking space: assumed
+_ASIDE = 0.5  # metres from the kerb to a bicycle on the sidewalk
 _FREE = 1.3  # metres beside the lane centre that stay free: half a car and a margin
 _OVER = 0.35  # metres that a car's centre may be beyond the kerb in narrow streets
 _ROOM, _BETWEEN = 0.2, 0.4  # metres to obstacles, and to each other
@@ -39,17 +41,23 @@ class ParkingSpaces(Columns):
     xy      : (n, 2) scene metres, the middle of the box
     heading : (n,) radians
     hint    : (n,) metres, height near which the ground is; NaN for the topmost
+    narrow  : (n,) whether there is room for a bicycle only
     """
 
     xy: Float
     heading: Float
     hint: Float
+    narrow: NDArray[np.bool_]
+
+
+NO_SPACES = ParkingSpaces(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0, np.bool_))
+"""No parking spaces."""
 
 
 def kerb_spaces(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: float) -> ParkingSpaces:
-    """A random share of the spaces along kerbs of the edges ``near``."""
+    """A random share of the spaces along kerbs of the edges ``near``, and for bicycles beside them."""
     g = lanes.graph
-    xy, heading, hint = [], [], []
+    found: list[ParkingSpaces] = []
     for e in np.flatnonzero(near).tolist():
         kind = str(g.highway[e])
         slow = g.speed[e] < _FAST and not (g.bridge[e] or g.tunnel[e])
@@ -65,22 +73,27 @@ def kerb_spaces(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: floa
             out = max(float(g.width[e]) / 2 - 0.92 - 0.15, inner + _FREE + 0.92)
             if out > float(g.width[e]) / 2 + (_OVER if kind in _QUIET else -0.9):
                 continue
-            line = polylines.parallel(g.geometry[e], -side * out)
-            along = polylines.stations(line)
-            at = np.arange(4.0 + rng.uniform(0, 2.0), along[-1] - 4.0, 5.9)
-            at = at + rng.uniform(-0.25, 0.25, len(at))
-            at = at[rng.random(len(at)) < share]
-            d = polylines.points_at(line, at + 0.5, along=along) - polylines.points_at(
-                line, at - 0.5, along=along
-            )
             turned = np.pi if side != lanes.side else 0.0
-            spots = polylines.points_at(line, at, along=along)
-            xy.append(spots[:, :2])
-            heading.append(np.arctan2(d[:, 1], d[:, 0]) + turned + rng.normal(0.0, 0.012, len(at)))
-            hint.append(spots[:, 2])
-    if not xy:
-        return ParkingSpaces(np.empty((0, 2)), np.empty(0), np.empty(0))
-    return ParkingSpaces(np.concatenate(xy), np.concatenate(heading), np.concatenate(hint))
+            beside = float(g.width[e]) / 2 + _ASIDE
+            for aside, chance in ((out, share), (beside, share * _BICYCLES)):
+                line = polylines.parallel(g.geometry[e], -side * aside)
+                row = _row(line, turned, share=chance, narrow=aside == beside, rng=rng)
+                found.append(row)
+    return ParkingSpaces.concatenate(found) if found else NO_SPACES
+
+
+def _row(
+    line: Float, turned: float, *, share: float, narrow: bool, rng: np.random.Generator
+) -> ParkingSpaces:
+    """A random share of the spaces along a line; ``turned`` is the angle from the line to the vehicles."""
+    along = polylines.stations(line)
+    at = np.arange(4.0 + rng.uniform(0, 2.0), along[-1] - 4.0, 5.9)
+    at = at + rng.uniform(-0.25, 0.25, len(at))
+    at = at[rng.random(len(at)) < share]
+    d = polylines.points_at(line, at + 0.5, along=along) - polylines.points_at(line, at - 0.5, along=along)
+    spots = polylines.points_at(line, at, along=along)
+    heading = np.arctan2(d[:, 1], d[:, 0]) + turned + rng.normal(0.0, 0.012, len(at))
+    return ParkingSpaces(spots[:, :2], heading, spots[:, 2], np.full(len(at), narrow))
 
 
 def lot_spaces(lots: NDArray[np.object_], *, seed: int, share: float) -> ParkingSpaces:
@@ -115,29 +128,28 @@ def lot_spaces(lots: NDArray[np.object_], *, seed: int, share: float) -> Parking
             xy.append(points[fits])
             heading.append((angle + backwards + rng.normal(0.0, 0.02, len(at)))[fits])
     if not xy:
-        return ParkingSpaces(np.empty((0, 2)), np.empty(0), np.empty(0))
+        return NO_SPACES
     whole = np.concatenate(xy)
-    return ParkingSpaces(whole, np.concatenate(heading), np.full(len(whole), np.nan))
+    n = len(whole)
+    return ParkingSpaces(whole, np.concatenate(heading), np.full(n, np.nan), np.zeros(n, np.bool_))
 
 
 def parked_actors(
     spots: ParkingSpaces,
     scene: Scene,
     *,
-    kinds: dict[str, float],
     trees: Sequence[shapely.STRtree],
     seed: int,
     scale: float,
 ) -> Actors:
     """Vehicles on the spaces where all wheels have ground and the body touches no obstacle or other vehicle.
 
-    kinds : shares of the kinds of vehicles
     trees : obstacles and areas that must stay free, polygons in plan
     """
     n = len(spots.xy)
-    rng = generator(seed, "parked", *kinds)
-    names, chance = list(kinds), np.array(list(kinds.values()))
-    shapes = [random_shape(names[k], rng) for k in rng.choice(len(names), size=n, p=chance / chance.sum())]
+    rng = generator(seed, "parked", *PARKED)
+    kinds = np.where(spots.narrow, "bicycle", rng.choice(list(PARKED), size=n, p=list(PARKED.values())))
+    shapes = [random_shape(kind, rng) for kind in kinds.tolist()]
     grow = 1 + rng.uniform(-0.03, 0.03, (n, 3))
     size = np.array([[s.length, s.width, s.base] for s in shapes]).reshape(-1, 3)
     length, width, base = size[:, 0] * grow[:, 0], size[:, 1] * grow[:, 1], size[:, 2] * grow[:, 0]

@@ -20,7 +20,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import Lanes, lane_shift, lanes_of
-from lidar.traffic.parked import CARS, ParkingSpaces, kerb_spaces, lot_spaces, parked_actors
+from lidar.traffic.parked import ParkingSpaces, kerb_spaces, lot_spaces, parked_actors
 from lidar.traffic.pedestrians import pedestrian_trips, sidewalks_around
 from lidar.traffic.simulation import simulate_trips
 from lidar.traffic.surroundings import Surroundings, ego_line, surroundings_of
@@ -203,7 +203,7 @@ def parked_vehicles(
     seed: int,
     share: float,
 ) -> Actors:
-    """Parked vehicles along kerbs and in parking lots.
+    """Parked vehicles along kerbs and in parking lots, and bicycles on sidewalks.
 
     swept : areas swept by moving road users, polygons in plan
     share : share of the spaces that are occupied
@@ -227,7 +227,7 @@ def parked_vehicles(
             lot_spaces(lots, seed=seed, share=share),
         ]
     )
-    return parked_actors(spots, scene, kinds=CARS, trees=trees, seed=seed, scale=setup.scale)
+    return parked_actors(spots, scene, trees=trees, seed=seed, scale=setup.scale)
 
 
 def _passable(

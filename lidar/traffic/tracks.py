@@ -23,7 +23,7 @@ _STRIDE = {"cyclist": 5.6, "adult": 1.45, "small_adult": 1.35, "child": 1.05}
 """Metres in a stride of two steps, and in a turn of a bicycle's pedals: typical."""
 
 _UPRIGHT = ("adult", "small_adult", "child")
-_LEANING = ("cyclist", "motorcycle", "bicycle")
+_LEANING = ("cyclist", "motorcycle")
 _TRACK = 0.8  # track width over body width
 _SKY = 1e4  # metres above and below zero within which the ground is searched
 _STEP_UP = 0.5  # metres, maximum height difference between a wheel and the centre

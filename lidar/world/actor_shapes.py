@@ -54,10 +54,21 @@ class Shape:
 
 
 KINDS = (
-    *("sedan", "hatchback", "suv", "van", "truck", "bus", "motorcycle", "bicycle", "cyclist"),
+    *(
+        "sedan",
+        "hatchback",
+        "suv",
+        "van",
+        "truck",
+        "bus",
+        "motorcycle",
+        "parked_motorcycle",
+        "bicycle",
+        "cyclist",
+    ),
     *("adult", "small_adult", "child"),
 )
-"""Kinds of bodies."""
+"""Kinds of bodies. A motorcycle has its rider, a parked one and a bicycle have none."""
 
 PAINTS: dict[str, tuple[Rgb, float]] = {
     "white": ((232, 232, 228), 0.29),
@@ -276,7 +287,7 @@ def _bicycle(paint: Rgb) -> list[Mesh]:
 
 
 def _motorcycle(paint: Rgb) -> list[Mesh]:
-    """A motorcycle 2.1 m long with its rider."""
+    """A motorcycle 2.1 m long, without a rider."""
     r, x = 0.31, 0.70
     stations = (
         (-0.85, 0.05, 0.72, 0.86),
@@ -301,17 +312,14 @@ def _motorcycle(paint: Rgb) -> list[Mesh]:
         _reflector((-0.90, -0.07, 0.70), (-0.86, 0.07, 0.78)),
         box((-0.93, -0.09, 0.46), (-0.91, 0.09, 0.60), material="retroreflector", color=WHITE),
     ]
-    return [
-        *parts,
-        *rider(
-            (-0.22, 0.84),
-            (0.38, 1.0),
-            foot=(0.05, 0.34),
-            stature=1.78,
-            clothes=((40, 40, 46), (30, 30, 34)),
-            helmet=paint,
-        ),
-    ]
+    return parts
+
+
+def _motorcyclist(paint: Rgb) -> list[Mesh]:
+    """A motorcycle with its rider."""
+    clothes = (40, 40, 46), (30, 30, 34)
+    on = rider((-0.22, 0.84), (0.38, 1.0), foot=(0.05, 0.34), stature=1.78, clothes=clothes, helmet=paint)
+    return [*_motorcycle(paint), *on]
 
 
 _SIZES: dict[str, tuple[float, float, float, float]] = {
@@ -333,11 +341,13 @@ _FLEET: dict[str, dict[str, Rgb]] = {
     "truck": {"blue": (30, 62, 120), "red": (140, 30, 28)},
     "bus": {"red": (170, 30, 34), "blue": (24, 78, 140)},
     "motorcycle": {"black": (24, 24, 26), "red": (150, 24, 28)},
+    "parked_motorcycle": {"black": (24, 24, 26), "red": (150, 24, 28)},
     "bicycle": {"black": (26, 26, 28), "blue": (40, 82, 140)},
 }
 
 _CLASS = {
-    "van": Class.VAN, "truck": Class.TRUCK, "bus": Class.BUS, "motorcycle": Class.MOTORCYCLE,
+    "van": Class.VAN, "truck": Class.TRUCK, "bus": Class.BUS, "motorcycle": Class.MOTORCYCLIST,
+    "parked_motorcycle": Class.MOTORCYCLE,
     "bicycle": Class.BICYCLE, "cyclist": Class.CYCLIST, "adult": Class.PEDESTRIAN,
     "small_adult": Class.PEDESTRIAN, "child": Class.PEDESTRIAN,
 }  # fmt: skip
@@ -351,7 +361,7 @@ def _parts(kind: str, paint: Rgb) -> list[Mesh]:
         return _car(_SIZES[kind][:3], profile=kind, paint=paint)
     if kind in ("van", "truck", "bus"):
         return {"van": _van, "truck": _truck, "bus": _bus}[kind](_SIZES[kind][:3], paint)
-    return _motorcycle(paint) if kind == "motorcycle" else _bicycle(paint)
+    return {"motorcycle": _motorcyclist, "parked_motorcycle": _motorcycle, "bicycle": _bicycle}[kind](paint)
 
 
 @functools.cache

@@ -331,13 +331,63 @@ def test_labels_are_those_of_semantic_kitti_nuscenes_and_asprs(dataset):
 
 def test_moving_road_users_have_their_own_semantic_kitti_classes():
     klass = np.array(
-        [Class.CAR, Class.CAR, Class.PEDESTRIAN, Class.CYCLIST, Class.BUS, Class.TRUCK, Class.ROAD]
+        [
+            *(Class.CAR, Class.CAR, Class.PEDESTRIAN, Class.CYCLIST, Class.BUS, Class.TRUCK, Class.ROAD),
+            *(Class.MOTORCYCLE, Class.MOTORCYCLIST, Class.MOTORCYCLIST, Class.BICYCLE),
+        ]
     )
-    thing = np.array([7, 8, 9, 10, 11, 70_000, 0])
-    moves = np.array([False, True, True, True, True, True, False])
+    thing = np.array([7, 8, 9, 10, 11, 70_000, 0, 12, 13, 14, 15])
+    moves = np.array([False, True, True, True, True, True, False, False, False, True, False])
     labels = semantic_kitti_labels(PointLabels(klass, thing, moves))
-    assert (labels & 0xFFFF).tolist() == [10, 252, 254, 253, 257, 258, 40]
-    assert (labels >> 16).tolist() == [7, 8, 9, 10, 11, 0, 0]
+    assert (labels & 0xFFFF).tolist() == [10, 252, 254, 253, 257, 258, 40, 15, 32, 255, 11]
+    assert (labels >> 16).tolist() == [7, 8, 9, 10, 11, 0, 0, 12, 13, 14, 15]
+
+
+# learning_map of semantic-kitti-api
+TRAINING = {
+    0: 0,
+    1: 0,
+    10: 1,
+    11: 2,
+    13: 5,
+    15: 3,
+    16: 5,
+    18: 4,
+    20: 5,
+    30: 6,
+    31: 7,
+    32: 8,
+    40: 9,
+    44: 10,
+    48: 11,
+    49: 12,
+    50: 13,
+    51: 14,
+    52: 0,
+    60: 9,
+    70: 15,
+    71: 16,
+    72: 17,
+    80: 18,
+    81: 19,
+    99: 0,
+    252: 1,
+    253: 7,
+    254: 6,
+    255: 8,
+    256: 5,
+    257: 5,
+    258: 4,
+    259: 5,
+}
+
+
+def test_the_classes_have_all_training_classes_of_semantic_kitti():
+    klass = np.array(Class)
+    for moves in (False, True):
+        labels = PointLabels(klass, np.arange(len(klass)), np.full(len(klass), moves))
+        codes = (semantic_kitti_labels(labels) & 0xFFFF).tolist()
+        assert {TRAINING[code] for code in codes} >= set(range(1, 20))
 
 
 def test_a_scanners_folder_is_a_kitti_sequence(dataset):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.errors import reading
 from geoscene.files import write_atomically
 from geoscene.progress import Progress
 from geoscene.typing import Float
@@ -21,6 +22,7 @@ from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset, read_rows
 from lidar.dataset.metadata import iso_times
 from lidar.dataset.recorded import nearest
+from lidar.errors import DatasetError
 from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
 from lidar.navigation.gnss import antenna_motion
 from lidar.navigation.imu import true_inertial
@@ -137,11 +139,14 @@ def _applied(rotation: Float, vectors: Float) -> Float:
 
 
 def _satellites(drive: KittiDrive) -> NDArray[np.int64]:
-    """Satellites (n,) that the first receiver used at the fix nearest to each frame; 0 without one."""
+    """Satellites (n,) that the first receiver used at the epoch nearest to each frame; 0 without one."""
     for name in drive.dataset.sensors("gnss"):
-        rows = read_rows(drive.dataset.paths.measurements(name))
-        used = np.array([int(row["satellites"]) for row in rows], np.int64)
-        return used[nearest(drive.dataset.sample_times(name), drive.clouds.time_ns)]
+        path, times = drive.dataset.paths.measurements(name), drive.dataset.sample_times(name)
+        rows = read_rows(path)
+        with reading(path, DatasetError, remedy="drive again with `overwrite`"):
+            used = np.array([int(row["satellites"]) for row in rows], np.int64)
+        if len(used):
+            return used[nearest(times, drive.clouds.time_ns)]
     return np.zeros(len(drive), np.int64)
 
 

@@ -65,8 +65,8 @@ CATEGORIES = (
 """Categories of nuScenes-lidarseg, in order of their codes."""
 
 _ATTRIBUTES = (
-    "vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "pedestrian.moving",
-    "pedestrian.standing",
+    "vehicle.moving", "vehicle.stopped", "vehicle.parked", "cycle.with_rider", "cycle.without_rider",
+    "pedestrian.moving", "pedestrian.standing",
 )  # fmt: skip
 _VISIBILITY = ("v0-40", "v40-60", "v60-80", "v80-100")
 _MARGIN = 200.0
@@ -399,7 +399,7 @@ def _attributes(kind: str, box: dict[str, Any]) -> list[str]:
     if kind.startswith("human"):
         return ["pedestrian.moving" if speed > _WALKING else "pedestrian.standing"]
     if kind in ("vehicle.bicycle", "vehicle.motorcycle"):
-        return ["cycle.with_rider"]
+        return ["cycle.with_rider" if box["class"] in ("cyclist", "motorcyclist") else "cycle.without_rider"]
     if kind.startswith("vehicle"):
         if speed > _DRIVING:
             return ["vehicle.moving"]

@@ -16,8 +16,7 @@ from geoscene.files import write_atomically
 from lidar.dataset.formats.table import PointLabels, Table, read_rows
 
 # Moving road users have codes of their own: car, bicyclist, person, motorcyclist, bus, truck, other vehicle.
-# A moving bicycle or motorcycle has a rider.
-_MOVING = {10: 252, 11: 253, 31: 253, 30: 254, 15: 255, 13: 257, 18: 258, 20: 259}
+_MOVING = {10: 252, 31: 253, 30: 254, 32: 255, 13: 257, 18: 258, 20: 259}
 
 
 def write(path: Path, table: Table) -> None:

@@ -126,6 +126,11 @@ def test_oxts_values_are_the_true_motion_of_the_inertial_unit(dataset):
     np.testing.assert_allclose(values["wz"], values["wu"], atol=1e-9)
     np.testing.assert_allclose(values["au"][2:-2], 9.81907, atol=2e-3)  # normal gravity at 60.2 N
     assert set(values["numsats"]) == {7, 8}
+    write_columns(dataset.paths.measurements("gnss"), {"time_ns": [], "satellites": []})
+    assert not oxts_columns(KittiDrive(dataset, stream, {}))["numsats"].any()
+    write_columns(dataset.paths.measurements("gnss"), {"time_ns": [0], "satellites": ["many"]})
+    with pytest.raises(DatasetError, match=r"gnss\.csv: damaged"):
+        oxts_columns(KittiDrive(dataset, stream, {}))
 
 
 def _write_cloud(dataset, frame, **columns):

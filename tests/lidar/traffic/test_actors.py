@@ -56,6 +56,9 @@ def test_there_are_road_users_of_every_kind(actors):
     assert {"cyclist", "adult"} <= moving
     assert moving & {"sedan", "hatchback", "suv"}
     assert actors.parked.sum() > 5
+    assert "bicycle" in actors.kind[actors.parked]
+    assert not {"cyclist", "motorcycle"} & set(actors.kind[actors.parked])
+    assert not {"bicycle", "parked_motorcycle"} & moving
     v = np.hypot(*actors.velocity[:, :2].T)
     assert 3.0 < v.max() < 20.0
     assert not v[np.repeat(actors.parked, np.diff(actors.first))].any()
