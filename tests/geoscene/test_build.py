@@ -151,9 +151,8 @@ def test_every_building_height_has_a_source(scene):
         assert layer.height_sigma[guessed].min() > layer.height_sigma[layer.height_source == "tag"].max()
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_number_of_workers_does_not_change_the_bytes(osm, scene, tmp_path, workers):
-    again = build(osm, tmp_path / "again", options=BuildOptions(name="demo"), workers=workers)
+def test_number_of_workers_does_not_change_the_bytes(osm, scene, tmp_path):
+    again = build(osm, tmp_path / "again", options=BuildOptions(name="demo"), workers=2)
     same_files(scene.path, again.path)
 
 
