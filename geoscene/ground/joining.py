@@ -48,12 +48,16 @@ def ground_tiles(plan: GroundPlan) -> list[tuple[int, int]]:
 
 
 def _bare(plan: GroundPlan, occupied: Collection[tuple[int, int]]) -> Bools:
-    """Whether nothing lies on each square (t,)."""
-    bare: Bools = np.diff(plan.offset) == 0
+    """Whether nothing lies on each square (t,), outlines along the border of the extent aside."""
+    low, high = np.array(plan.extent[:2]), np.array(plan.extent[2:])
+    on_border = (plan.start == plan.end) & ((plan.start == low) | (plan.start == high))
+    square = np.repeat(np.arange(len(plan.tiles)), np.diff(plan.offset))
+    within = square[~on_border.any(axis=1)[plan.order]]
+    bare: Bools = np.bincount(within, minlength=len(plan.tiles)) == 0
     taken = {*occupied, *(plan.ruled or ())}
     bare &= np.array([tile not in taken for tile in map(tuple, plan.tiles.tolist())])
-    corner = np.maximum(plan.tiles[bare] * plan.tile_size, plan.extent[:2])
-    far = np.minimum((plan.tiles[bare] + 1) * plan.tile_size, plan.extent[2:])
+    corner = np.maximum(plan.tiles[bare] * plan.tile_size, low)
+    far = np.minimum((plan.tiles[bare] + 1) * plan.tile_size, high)
     klass = values_at(plan.layers.klass, rows_at(plan, (corner + far) / 2), base=plan.base[0])
     bare[bare] = klass != Class.FOREST_FLOOR
     return bare

@@ -121,6 +121,16 @@ def test_the_ground_is_one_surface_across_joined_tiles_and_the_others_do_not_cha
             assert np.isin(alone.vertices[:, :2], meshes[i, j].vertices[:, :2]).all()
 
 
+def test_outlines_along_the_border_of_the_extent_do_not_keep_squares_apart():
+    sea = shapely.box(0, 0, 1500, 1600) - shapely.box(500, 500, 520, 520)
+    layers = Layers.of([sea], klass=Class.WATER, material=GRASS, priority=0)
+    plan = joined(plan_ground((0, 0, 1500, 1600), layers, tile_size=100.0), set())
+    spans = {tile: tile_span(plan, tile[0], j=tile[1]) for tile in ground_tiles(plan)}
+    assert sorted(spans.values()) == [1] * 4 + [2] * 3 + [4] * 3 + [8] * 3
+    mesh = concatenate([ground_tile(plan, i, j=j) for i, j in spans])
+    assert_one_surface(*welded(mesh), plan.extent)
+
+
 def test_squares_with_forest_keep_their_size():
     wood = shapely.box(-1000, -1000, 300, 3000)
     layers = Layers.of([wood], klass=Class.FOREST_FLOOR, material=GRASS, priority=0)
