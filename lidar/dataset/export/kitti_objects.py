@@ -60,7 +60,7 @@ def object_lines(
         corners = bottom + (_CORNERS * size) @ turn.T
         side = np.array([sensor["width"], sensor["height"]] * 2) - 1
         values = [
-            _truncation(corners, drive.projections[number], sides=side[:2]),
+            truncation(corners, drive.projections[number], sides=side[:2]),
             int(np.searchsorted(_VISIBLE, flat["visibility"], side="right")),
             _wrapped(yaw - np.arctan2(bottom[0], bottom[2])),
             *np.clip([flat[k] for k in ("left", "top", "right", "bottom")], 0, side),
@@ -74,17 +74,19 @@ def object_lines(
     return lines
 
 
-def _truncation(corners: Float, projection: Float, *, sides: Float) -> float:
-    """Share of the rectangle around a box's projection that is outside the image.
+def truncation(corners: Float, projection: Float, *, sides: Float) -> float:
+    """Share of the rectangle around a box's projection that is outside the image; 1 behind the camera.
 
-    corners : (8, 3), the reference camera's frame
+    corners : (8, 3), the reference camera's frame; bits of their numbers tell the sides x, y and z
     sides   : (2,) greatest pixel coordinates of the image
     """
     points = np.column_stack([corners, np.ones(8)]) @ projection.T
     ends = points[_EDGES]
     depth = ends[..., 2]
-    whole = (depth > _NEAR).any(axis=1)
-    ends, depth = ends[whole], depth[whole]
+    before = (depth > _NEAR).any(axis=1)
+    if not before.any():
+        return 1.0
+    ends, depth = ends[before], depth[before]
     across = np.clip((_NEAR - depth) / np.where(depth[:, ::-1] == depth, 1.0, depth[:, ::-1] - depth), 0, 1)
     ends = ends + (ends[:, ::-1] - ends) * across[..., None]
     pixels = (ends[..., :2] / ends[..., 2:]).reshape(-1, 2)

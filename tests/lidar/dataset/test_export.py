@@ -14,6 +14,7 @@ from geoscene.frames import Frame
 from lidar.dataset.boxes import COLUMNS
 from lidar.dataset.export import EXPORTERS, exporter
 from lidar.dataset.export.kitti_drive import KittiDrive
+from lidar.dataset.export.kitti_objects import truncation
 from lidar.dataset.export.kitti_raw import oxts_columns
 from lidar.dataset.formats import FORMATS
 from lidar.dataset.layout import Paths, open_dataset
@@ -131,6 +132,16 @@ def test_oxts_values_are_the_true_motion_of_the_inertial_unit(dataset):
     write_columns(dataset.paths.measurements("gnss"), {"time_ns": [0], "satellites": ["many"]})
     with pytest.raises(DatasetError, match=r"gnss\.csv: damaged"):
         oxts_columns(KittiDrive(dataset, stream, {}))
+
+
+def test_truncation_is_the_share_of_the_projection_outside_the_image():
+    camera, sides = np.array([[100.0, 0, 50, 0], [0, 100, 50, 0], [0, 0, 1, 0]]), np.array([100.0, 100.0])
+    cube = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    plate = cube * [1, 1, 0]  # 25 pixels wide at 8 m
+    cases = [((0, 0, 8), 0.0), ((4, 0, 8), 0.5), ((4, 4, 8), 0.75), ((9, 0, 8), 1.0), ((0, 0, -8), 1.0)]
+    for place, share in cases:
+        assert truncation(plate + place, camera, sides=sides) == pytest.approx(share, abs=1e-9)
+    assert 0.9 < truncation(cube + np.array([0.0, 0.5, 0.0]), camera, sides=sides) < 1  # around the camera
 
 
 def _write_cloud(dataset, frame, **columns):
