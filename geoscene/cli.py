@@ -383,16 +383,16 @@ def _print_scene(report: dict[str, Any]) -> None:
         "buildings": f"{counts['buildings']} in the map, {counts['dropped']} dropped,"
         f" {counts['solids']} solids",
         "watertight": f"{counts['watertight']} of {counts['closed_objects']} closed objects",
-        "standing": f"{counts['trees']} mapped trees, {counts['furniture']} pieces of furniture,"
-        f" {counts['barriers']} barriers",
+        "standing": f"{counts['trees']} mapped trees, {counts['forest_trees']} in forests,"
+        f" {counts['furniture']} pieces of furniture, {counts['barriers']} barriers",
         "roads": f"{counts['road_km']:.1f} km in {counts['road_edges']} edges" + steep,
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
     }
     if report["options"]["along"]:
         rows["along"] = (
-            f"{len(report['tiles'])} tiles are built, those in range of the route; solids and watertight"
-            " count these tiles, all other figures the whole map"
+            f"{len(report['tiles'])} tiles are built, those in range of the route; solids, watertight"
+            " and trees in forests count these tiles, all other figures the whole map"
         )
     print(report["name"] or report["path"])
     for title, text in rows.items():

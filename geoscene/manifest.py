@@ -130,6 +130,7 @@ def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Pro
         "road_components": int(components.strong.max(initial=-1)) + 1,
         "road_largest_component_share": round(components.largest_strong_share, 4),
         "trees": len(plan.trees),
+        "forest_trees": sum(r.forest_trees for r in reports),
         "furniture": len(plan.furniture),
         "barriers": len(plan.barriers),
         "bridge_pieces": int((~plan.structures.tunnel).sum()),

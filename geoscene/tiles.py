@@ -45,6 +45,7 @@ class TileReport:
     buildings  : number of building solids
     faces      : number of faces
     instances  : number of instances of shapes, those of forests included
+    forest_trees : number of trees of forests
     area       : plan area of the ground in square metres
     digest     : digest of the tile's file
     problems   : buildings that were simplified, and features that were dropped
@@ -57,6 +58,7 @@ class TileReport:
     buildings: int
     faces: int
     instances: int
+    forest_trees: int
     area: float
     digest: str
     problems: tuple[Problem, ...]
@@ -165,6 +167,7 @@ def build_tile(
         built,
         len(mesh),
         len(made.instances),
+        (len(made.instances) - len(copies)) // 2,  # a trunk and a crown each
         _plan_area(rest.take(~rest.closed)),
         digest,
         tuple(problems),

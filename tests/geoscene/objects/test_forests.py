@@ -125,7 +125,7 @@ def rows(instances, origin=(0, 0, 0)):
 def test_files_of_tiles_have_no_forest_trees_and_readers_place_them(scene):
     assert all(len(read_tile(scene.files.tile(*index)).instances) == 0 for index in scene.tile_indices)
     placed = sum(len(tile.instances) for tile in scene.tiles())
-    assert placed == scene.manifest["counts"]["instances"]
+    assert placed == scene.manifest["counts"]["instances"] == 2 * scene.manifest["counts"]["forest_trees"]
     xmin, ymin, xmax, ymax = scene.bounds
     assert placed / 2 == pytest.approx(0.02 * (xmax - xmin) * (ymax - ymin), rel=0.15)
 
