@@ -21,16 +21,18 @@ class Kind:
     writer   : ``module:function`` within this package
     suffixes : of file names, the usual one first; none for a folder
     options  : fields of `ExportOptions` that it uses
+    beside   : suffix of a second file that is written beside the first
     """
 
     title: str
     writer: str
     suffixes: tuple[str, ...]
     options: frozenset[str]
+    beside: str = ""
 
 
-def _kind(title: str, writer: str, *, suffixes: str, options: str = "") -> Kind:
-    return Kind(title, writer, tuple(suffixes.split()), frozenset(options.split()))
+def _kind(title: str, writer: str, *, suffixes: str, options: str = "", beside: str = "") -> Kind:
+    return Kind(title, writer, tuple(suffixes.split()), frozenset(options.split()), beside)
 
 
 KINDS: dict[str, Kind] = {
@@ -39,7 +41,9 @@ KINDS: dict[str, Kind] = {
     ),
     "glb": _kind("binary glTF 2.0", "glb:write_glb", suffixes=".glb", options="layers"),
     "3dtiles": _kind("3D Tiles 1.1", "tiles3d:write_3dtiles", suffixes="", options="layers height_offset"),
-    "obj": _kind("Wavefront OBJ and MTL", "triangles:write_obj", suffixes=".obj", options="layers"),
+    "obj": _kind(
+        "Wavefront OBJ and MTL", "triangles:write_obj", suffixes=".obj", options="layers", beside=".mtl"
+    ),
     "ply": _kind("PLY", "triangles:write_ply", suffixes=".ply", options="layers"),
     "stl": _kind("STL, solids only", "triangles:write_stl", suffixes=".stl", options="layers"),
     "gpkg": _kind("GeoPackage", "vector:write_gpkg", suffixes=".gpkg", options="crs layers"),
@@ -76,7 +80,7 @@ def export_scene(
 ) -> Summary:
     """Write a scene to a file, or to a folder for 3D Tiles, and return a summary.
 
-    Raises InputError for an unknown kind, for an option that the kind does not take, and if ``out`` exists
+    Raises InputError for an unknown kind, for an option that the kind does not take, and if a file exists
     and may not be overwritten; MissingExtraError where an optional package is needed.
     """
     out = Path(out)
@@ -90,8 +94,9 @@ def export_scene(
         names = ", ".join(f"`{key}`" for key in foreign)
         takes = ", ".join(f"`{key}`" for key in sorted(kind.options)) or "none"
         raise InputError(f"{names} does not go with {kind.title}, which takes {takes}")
-    if out.exists() and not overwrite:
-        raise InputError(f"{out}: exists; set `overwrite` to replace it")
+    for path in (out, out.with_suffix(kind.beside)) if kind.beside else (out,):
+        if path.exists() and not overwrite:
+            raise InputError(f"{path}: exists; set `overwrite` to replace it")
     if out.is_dir() and kind.suffixes:
         raise InputError(f"{out}: is a folder; {kind.title} needs a file name")
     module, function = kind.writer.split(":")

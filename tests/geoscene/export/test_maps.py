@@ -232,6 +232,14 @@ def test_invalid_options_are_refused_before_writing(scene, tmp_path):
     assert export_scene(scene, tmp_path / "a.ply", overwrite=True).bytes > 1000
 
 
+def test_the_library_of_materials_of_another_mesh_is_not_replaced_unasked(scene, tmp_path):
+    (tmp_path / "a.mtl").write_text("mine")
+    with pytest.raises(InputError, match=r"a\.mtl: exists; set `overwrite`"):
+        export_scene(scene, tmp_path / "a.obj")
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+    assert export_scene(scene, tmp_path / "a.obj", overwrite=True).files == 2
+
+
 def test_missing_sumo_error_names_the_extra(scene, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "sumo", None)
     with pytest.raises(MissingExtraError, match=r"geoscene\[sumo\]"):
