@@ -13,6 +13,9 @@ from geoscene.typing import Bools, Float, Ints
 PRECISION = 2.0**-9
 """Metres: the grid that plans are cut on, 2 mm, as that of the ground."""
 
+_THIN = PRECISION / 4
+"""Metres, width of the thinnest triangle at the border of a plan."""
+
 SIDE = -1
 """Level of a face that stands upright."""
 
@@ -74,7 +77,24 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
     u, v = grid[faces[:, 1]] - grid[faces[:, 0]], grid[faces[:, 2]] - grid[faces[:, 0]]
     twice = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
     faces = np.where((twice < 0)[:, None], faces[:, ::-1], faces)
-    return Plan(grid * PRECISION, faces[twice != 0].astype(np.int64))
+    return _without_slivers(Plan(grid * PRECISION, faces[twice != 0].astype(np.int64)))
+
+
+def _without_slivers(plan: Plan) -> Plan:
+    """The plan without triangles at its border that are thinner than `_THIN`.
+
+    Their sides would be walls so near to each other that rounding makes them cross.
+    """
+    xy, faces = plan.xy, plan.faces
+    while True:
+        sides = xy[faces[:, [1, 2, 0]]] - xy[faces]
+        twice = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
+        thin = np.abs(twice) < _THIN * np.hypot(*sides.T).max(axis=0)
+        _, _, own, other = half_edges(Plan(xy, faces))
+        thin[thin] = np.isin(np.flatnonzero(thin), own[other < 0])
+        if not thin.any():
+            return Plan(xy, faces)
+        faces = faces[~thin]
 
 
 def raise_shell(plan: Plan, levels: Float, *, solid: Bools) -> Shell:

@@ -30,7 +30,7 @@ from geoscene.structures import (
     structure_meshes,
     within_extent,
 )
-from geoscene.structures.layered import Plan, cut_plan, raise_shell
+from geoscene.structures.layered import PRECISION, Plan, cut_plan, raise_shell
 from geoscene.watertight import validate_mesh
 
 FRAME = Frame.at(10.0, 50.0)
@@ -182,6 +182,16 @@ def test_random_parts_above_and_below_a_slab_form_one_closed_solid(size, seed):
     solid = np.column_stack([rng.random(len(slab)) < 0.4, slab, rng.random(len(slab)) < 0.4])
     levels = np.cumsum(rng.uniform(0.2, 1.0, (len(plan.xy), 4)), axis=1)
     shell = raise_shell(plan, levels, solid=solid)
+    verdict = validate_mesh(Mesh.of(shell.vertices, shell.faces, feature=0, closed=True))
+    assert verdict.ok.all(), verdict.fault(0)
+
+
+@pytest.mark.parametrize("offset", range(5))
+def test_a_corner_that_is_no_thicker_than_rounding_makes_no_walls_that_cross(offset):
+    ring = (np.array([(0, 0), (1, -1), (29, -28), (1614, 1640)]) + offset) * PRECISION
+    plan = cut_plan(shapely.Polygon(ring), np.empty(0, object))
+    deck = 1.8 - 0.005 * np.hypot(*(plan.xy - plan.xy[0]).T)
+    shell = raise_shell(plan, np.column_stack([deck - 0.8, deck]), solid=np.ones((len(plan.faces), 1), bool))
     verdict = validate_mesh(Mesh.of(shell.vertices, shell.faces, feature=0, closed=True))
     assert verdict.ok.all(), verdict.fault(0)
 
