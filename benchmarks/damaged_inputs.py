@@ -19,6 +19,8 @@ Line = list[tuple[float, float]]
 Case = tuple[Path | None, Words]
 """A file to damage, and the command that uses it; without a file, the command's own words are damaged."""
 
+_RIG_FOLDER = Path(__file__).resolve().parents[1] / "lidar" / "rig"
+
 PLACE = 24.944, 60.167
 """Longitude and latitude of the small map, in the bundled country."""
 
@@ -125,16 +127,16 @@ class Inputs:
         files = [path for path in sorted(scene.rglob("*")) if path.is_file() and path.suffix != ".lock"]
         path = rng.choice([file for file in files if file.parent == scene or rng.random() < 0.5])
         kind = rng.randrange(20)
-        if kind < 6:
+        if kind < 12:
             return path, ["geoscene", "info", str(scene)]
-        if kind < 14:
+        if kind < 17:
             return path, ["geoscene", "validate", str(scene)]
-        if kind < 15:
+        if kind < 18:
             return path, ["geoscene", "view", str(scene), "-o", f"{f}/x.html", "--overwrite"]
-        if kind < 16:
+        if kind < 19 and rng.random() < 0.5:
             words = ["geoscene", "build", "--osm", f"{f}/a.osm", "-o", str(scene)]
             return path, [*words, "--overwrite", "--workers=1"]
-        if kind < 17:
+        if kind < 19:
             return path, [*self.drive("out"), "--overwrite", "--rig", f"{f}/rig0.toml", "--traffic=on"]
         suffix = rng.choice(
             ("glb", "city.json", "geojson", "gpkg", "tif", "xodr", "obj", "ply", "stl", "parquet")
@@ -146,7 +148,7 @@ class Inputs:
         """A file of a dataset, and a command that reads it."""
         f = self.folder
         kind = rng.randrange(20)
-        name = rng.choice([name for name in _DATASETS if kind >= 14 or name not in ("kitti", "nuscenes")])
+        name = rng.choice([name for name in _DATASETS if kind >= 16 or name not in ("kitti", "nuscenes")])
         data = f / f"data-{name}"
         files = [path for path in sorted(data.rglob("*")) if path.is_file()]
         path = rng.choice(
@@ -156,13 +158,13 @@ class Inputs:
             end = rng.choice((".laz", ".ply", ".pcd"))
             more = rng.choice(([], ["--voxel=0.2"], ["--color=intensity", "--noise"]))
             return path, ["lidar", "map", str(data), "-o", f"{f}/m{end}", "--overwrite", *more]
-        if kind < 14:
+        if kind < 16:
             to = rng.choice(_EXPORTS)
             return path, ["lidar", "export", str(data), "--to", to, "-o", f"{f}/to-{to}", "--overwrite"]
-        if kind < 15:
+        if kind < 17:
             rig = ["--rig", f"{f}/rig0.toml", "--traffic=on"]
             return path, [*self.drive(data.name), f"--format={name}", *_DATASETS[name], *rig]
-        if kind < 17:
+        if kind < 18:
             path = data / rng.choice(("poses.csv", "trajectory.csv", "dataset.json"))
             route = data / "trajectory.csv" if path.suffix == ".json" else path
             words = [word for word in self.drive("out") if word != "--route=random"]
@@ -173,37 +175,33 @@ class Inputs:
     def damaged_configuration(self, rng: random.Random) -> Case:
         """A rig, sensor, vehicle, stage, route or traffic file, or the words of a command."""
         f = self.folder
-        drive = [*self.drive("out"), "--overwrite", "--format=pcd"]
-        kind = rng.randrange(10)
-        if kind < 3:
-            k = rng.randrange(len(list(f.glob("rig*.toml"))))
-            rig = f / f"rig{k}.toml"
-            own = f / f"sensor{k}.toml"
-            return (own if own.exists() and rng.random() < 0.7 else rig), [*drive, "--rig", str(rig)]
+        drive = [*self.drive("out")[:-2], "--workers=1", "--overwrite", "--format=pcd"]
+        # most are planned no further than the route, which the scene does not have
+        way = ["--route=random"] if rng.random() < 0.3 else ["--route", "9,9", "9,9.1"]
+        kind = rng.randrange(20)
+        if kind < 8:
+            k = rng.randrange(_SENSORS)
+            rig, own = f / f"rig{k}.toml", f / f"sensor{k}.toml"
+            return (own if k and rng.random() < 0.7 else rig), [*drive, "--rig", str(rig), *way]
         drive += ["--rig", f"{f}/rig0.toml"]
-        if kind == 3:
-            return (path := f / rng.choice(("car.toml", "drone.toml"))), [*drive, "--vehicle", str(path)]
-        if kind == 4:
-            return f / "stages.toml", [*drive, "--stage", f"{f}/stages.toml"]
-        drive = [word for word in drive if word != "--route=random"]
-        route = f / rng.choice(("a.gpx", "a.geojson", "a.csv"))
-        if kind == 5:
-            return route, [*drive, "--route", str(route), *rng.choice(([], ["--vehicle=drone"]))]
-        if kind == 6:
-            words = [
-                "geoscene",
-                "build",
-                "--osm",
-                f"{f}/a.osm",
-                "-o",
-                f"{f}/built",
-                "--overwrite",
-                "--workers=1",
+        if kind < 10:
+            return (path := f / rng.choice(("car.toml", "drone.toml"))), [
+                *drive,
+                "--vehicle",
+                str(path),
+                *way,
             ]
-            return route, [*words, "--only=roads", "--along", str(route)]
-        if kind == 7:
+        if kind < 12:
+            return f / "stages.toml", [*drive, "--stage", f"{f}/stages.toml", *way]
+        route = f / rng.choice(("a.gpx", "a.geojson", "a.csv"))
+        if kind < 15:
+            return route, [*drive, "--route", str(route), *rng.choice(([], ["--vehicle=drone"]))]
+        if kind < 16:
+            words = ["geoscene", "build", "--osm", f"{f}/a.osm", "-o", f"{f}/built"]
+            return route, [*words, "--overwrite", "--workers=1", "--only=roads", "--along", str(route)]
+        if kind < 17:
             return (path := f / "fcd.xml"), [*drive, "--route=random", "--traffic", str(path)]
-        if kind == 8:
+        if kind < 19:
             path = f / "field.geojson"
             return path, [*drive, "--vehicle=drone", "--altitude=30", "--survey", str(path)]
         return None, self._damaged_words(rng)
@@ -264,6 +262,9 @@ _DATASETS = {
     "pcd-ascii": ["--fidelity=survey"],
 }
 """Formats of the datasets, with more options of their drives."""
+
+_SENSORS = 1 + len(list(_RIG_FOLDER.glob("sensors/*.toml")))
+"""Number of rigs: one with cameras, and one for each built-in scanner."""
 
 _EXPORTS = ("nuscenes", "tum")
 
@@ -465,13 +466,12 @@ def _write_overture(path: Path) -> None:
 
 
 def _write_configurations(folder: Path) -> None:
-    own = Path(__file__).resolve().parents[1] / "lidar" / "rig"
     (folder / "rig0.toml").write_text(_RIG.format("utm30lx"))
-    for k, path in enumerate(sorted((own / "sensors").glob("*.toml")), 1):
+    for k, path in enumerate(sorted(_RIG_FOLDER.glob("sensors/*.toml")), 1):
         shutil.copy(path, folder / f"sensor{k}.toml")
         (folder / f"rig{k}.toml").write_text(_RIG.format(f"sensor{k}.toml").partition("[[camera]]")[0])
     for name in ("car", "drone"):
-        shutil.copy(own / "vehicles" / f"{name}.toml", folder)
+        shutil.copy(_RIG_FOLDER / "vehicles" / f"{name}.toml", folder)
     (folder / "stages.toml").write_text(_STAGES)
     (a, b), (c, d), (e, g) = (_degrees(*place) for place in ((-40, -7), (0, -8), (40, -7)))
     track = "".join(f'<trkpt lat="{y}" lon="{x}"><ele>3</ele></trkpt>\n' for x, y in ((a, b), (c, d), (e, g)))

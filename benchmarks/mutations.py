@@ -9,7 +9,6 @@ import json
 import random
 import re
 import sqlite3
-import tempfile
 import xml.etree.ElementTree as ET
 import zipfile
 from contextlib import closing, suppress
@@ -290,30 +289,30 @@ def _ends(dtype: np.dtype[Any]) -> list[float]:
 
 def _of_database(data: bytes, rng: random.Random) -> bytes:
     """Another value in a table of an SQLite file, or one table or row less."""
-    with tempfile.NamedTemporaryFile(suffix=".gpkg") as file:
-        Path(file.name).write_bytes(data)
-        with closing(sqlite3.connect(file.name)) as base:
-            triggers = base.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall()
-            for (name,) in triggers:
-                base.execute(f'DROP TRIGGER "{name}"')
-            names = [row[0] for row in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-            table = rng.choice([name for name in names if not name.startswith(("rtree_", "sqlite_"))])
-            columns = [row[1] for row in base.execute(f'PRAGMA table_info("{table}")')]
-            column, kind = rng.choice(columns), rng.randrange(8)
-            if kind == 0:
-                base.execute(f'DROP TABLE "{table}"')
-            elif kind == 1 and len(columns) > 1:
-                base.execute(f'ALTER TABLE "{table}" RENAME COLUMN "{column}" TO "x{column}"')
+    with closing(sqlite3.connect(":memory:")) as base:
+        base.deserialize(data)
+        triggers = base.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall()
+        for (name,) in triggers:
+            base.execute(f'DROP TRIGGER "{name}"')
+        names = [row[0] for row in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        table = rng.choice([name for name in names if not name.startswith(("rtree_", "sqlite_"))])
+        columns = [row[1] for row in base.execute(f'PRAGMA table_info("{table}")')]
+        column, kind = rng.choice(columns), rng.randrange(8)
+        if kind == 0:
+            base.execute(f'DROP TABLE "{table}"')
+        elif kind == 1 and len(columns) > 1:
+            base.execute(f'ALTER TABLE "{table}" RENAME COLUMN "{column}" TO "x{column}"')
+        else:
+            row, old = rng.choice(base.execute(f'SELECT rowid, "{column}" FROM "{table}"').fetchall())  # noqa: S608
+            if kind == 2:
+                base.execute(f'DELETE FROM "{table}" WHERE rowid = ?', (row,))  # noqa: S608
             else:
-                row, old = rng.choice(base.execute(f'SELECT rowid, "{column}" FROM "{table}"').fetchall())  # noqa: S608
-                if kind == 2:
-                    base.execute(f'DELETE FROM "{table}" WHERE rowid = ?', (row,))  # noqa: S608
-                else:
-                    others = (None, 0, -1, 1e308, 2**40, _value(str(old), rng))
-                    new = _of_bytes(old, rng) if isinstance(old, bytes) else rng.choice(others)
-                    base.execute(f'UPDATE OR IGNORE "{table}" SET "{column}" = ? WHERE rowid = ?', (new, row))  # noqa: S608
-            base.commit()
-        return Path(file.name).read_bytes()
+                others = (None, 0, -1, 1e308, 2**40, _value(str(old), rng))
+                new = _of_bytes(old, rng) if isinstance(old, bytes) else rng.choice(others)
+                words = f'UPDATE OR IGNORE "{table}" SET "{column}" = ? WHERE rowid = ?'  # noqa: S608
+                base.execute(words, (new, row))
+        base.commit()
+        return base.serialize()
 
 
 def _of_toml(data: bytes, rng: random.Random) -> bytes:

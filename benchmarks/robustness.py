@@ -39,7 +39,7 @@ from geoscene.errors import InputError as SceneInputError
 from geoscene.files import digest_of
 from lidar.errors import InputError, LidarError
 
-_SHARES = {"maps": 2, "scenes": 4, "datasets": 4, "configurations": 5}
+_SHARES = {"maps": 1, "scenes": 3, "datasets": 2, "configurations": 8}
 _USAGE = (InputError, SceneInputError)
 
 

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 from cyclopts import App, CycloptsError, Parameter, Token
 
@@ -126,8 +126,11 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
         _print_error(app, error)
         sys.exit(USAGE if isinstance(error, usage) else FAILURE)
     except KeyboardInterrupt:
-        _print_error(app, "interrupted; repeat the command to resume")
-        sys.exit(_INTERRUPTED)
+        _exit_interrupted(app)
+    except SystemError as error:
+        if not isinstance(error.__cause__, KeyboardInterrupt):  # which compiled code returns as a SystemError
+            raise
+        _exit_interrupted(app)
     except BrokenPipeError:  # the reader of standard output has ended, as in "| head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(_BROKEN_PIPE)
@@ -141,6 +144,13 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
         _print_error(app, f"{name}: {error.strerror or error}{hint}")
         sys.exit(FAILURE)
     sys.exit(code if isinstance(code, int) else DONE)
+
+
+def _exit_interrupted(app: App) -> NoReturn:
+    """End at once, without waiting for other threads; files appear when they are complete."""
+    _print_error(app, "interrupted; repeat the command to resume")
+    sys.stderr.flush()
+    os._exit(_INTERRUPTED)
 
 
 def _command(app: App) -> str:

@@ -211,7 +211,7 @@ def record_all(
     max_range = max((job.sensor.max_range for job in jobs), default=0.0)
     worlds = Worlds(scene, max_range, actors=recording.actors)
     workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
-    with ThreadPoolExecutor(workers) as pool:
+    with _pool(workers) as pool:
         for chunk, region in _chunks(jobs, recording.trajectory):
             with recording.watch.stage("load"):
                 worlds.follow(region)
@@ -223,6 +223,18 @@ def record_all(
                     progress("driving", done, total=len(jobs))
             done += _take(running, finished=wait(running).done)
             progress("driving", done, total=len(jobs))
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[ThreadPoolExecutor]:
+    """Threads; an error drops waiting tasks, and an interruption does not wait for running ones either."""
+    pool = ThreadPoolExecutor(workers)
+    try:
+        yield pool
+    except BaseException as error:
+        pool.shutdown(wait=isinstance(error, Exception), cancel_futures=True)
+        raise
+    pool.shutdown()
 
 
 def _record(recording: Recording, job: Job, *, worlds: Worlds, journal: Journal) -> None:

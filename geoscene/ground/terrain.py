@@ -309,7 +309,10 @@ def _outline(raster: _Raster, frame: Frame) -> Any:
     rows, columns = raster.shape
     edge = shapely.segmentize(shapely.box(-0.5, -0.5, columns - 0.5, rows - 0.5), max(rows, columns) / 32)
     xy = raster.origin + shapely.get_coordinates(edge) @ raster.step.T
-    outline = shapely.Polygon(np.column_stack(frame.from_crs(xy[:, 0], xy[:, 1], crs=raster.crs)))
+    corners = np.column_stack(frame.from_crs(xy[:, 0], xy[:, 1], crs=raster.crs))
+    if not np.isfinite(corners).all():
+        raise InputError(f"{raster.path}: has pixels outside the area of its CRS or of the scene's CRS")
+    outline = shapely.Polygon(corners)
     # Neighbouring tiles' edges agree to the rounding of their headers and of the projection between vertices.
     return shapely.make_valid(outline).buffer(0.01, join_style="mitre")
 

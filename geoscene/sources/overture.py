@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,9 @@ _TAGS = {
 """Columns of Overture's schema and the OpenStreetMap keys of the same meaning; values need no translation."""
 
 _OTHERS = ("id", "geometry", "class", "subtype", "is_underground", "sources")
+_LONGEST_KM = 10.0
+"""The longest buildings have about 3 km."""
+
 _NO_NODES = np.empty(0, np.int64)
 
 
@@ -138,6 +142,10 @@ def _footprint(name: str, shape: Any) -> tuple[Any, Problem | None]:
         return None, Problem(name, "building", "dropped", "no-area", "geometry is null or no WKB")
     if not (np.abs(shapely.get_coordinates(shape)) <= (180, 90)).all():
         return None, Problem(name, "building", "dropped", "bad-coordinates", "missing or out of range")
+    west, south, east, north = np.radians(shapely.bounds(shape)).tolist()
+    km = 6371 * math.hypot((east - west) * math.cos((south + north) / 2), north - south)
+    if km > _LONGEST_KM:
+        return None, Problem(name, "building", "dropped", "bad-coordinates", f"{km:,.0f} km long")
     geometry = polygons_of(shape)
     if geometry is None:
         return None, Problem(name, "building", "dropped", "no-area", shape.geom_type)

@@ -3,7 +3,8 @@
 Signals, queues and other traffic give an upper bound of the distance driven at each time. The profile
 maximises the sum of distances below it, within the limits of speed, acceleration and jerk: a linear programme
 over even time steps, whose unknowns are the accelerations at the steps, linear in between. Speed limits
-depend on the position; they are looked up at the last solution, and the programme is solved again.
+depend on the position; they are looked up at the last solution, and the programme is solved again. Windows
+of time are solved one after another.
 """
 
 from __future__ import annotations
@@ -24,7 +25,12 @@ STEP_S = 0.2
 """Seconds between the knots of a motion."""
 _SPARE = 0.98  # share of the acceleration limits used, a margin for sampling
 _COMFORT = 0.8  # share of the deceleration used before lower speed limits
-_AGAIN = 8  # maximum number of solutions
+_AGAIN = 8  # maximum number of solutions of a window
+_WINDOW, _KEPT, _BEYOND = 200, 50, 35
+"""Steps of a window, those that are kept, and those behind them in which limits hold too: time to brake."""
+_GAP = 0.25  # metres between the places at which limits are looked up
+_FAST_COST = 1e3  # metres that a m/s above the limit costs in a step
+_AT_REST = 1e-3  # m/s
 _SLACK = 0.005  # share of a speed limit by which a solution may exceed it
 _TAIL_S = 10.0  # seconds that a leg may take longer than on an empty road
 _SETTLING_S = 10.0  # seconds over which a profile that starts at speed falls behind by one step
@@ -116,53 +122,113 @@ def _braked(s: Float, limit: Float, *, vehicle: Vehicle) -> Float:
     return np.sqrt(np.maximum(square, 0.0))
 
 
+@dataclass(frozen=True, slots=True)
+class _Limits:
+    """Speed limits in m/s every `_GAP` metres of a leg: as they are, and with comfortable braking before."""
+
+    strict: Float
+    cautious: Float
+
+    def at(self, s: Float) -> Float:
+        """Cautious limits (n,) at distances (n,)."""
+        return np.interp(s, _GAP * np.arange(len(self.cautious)), self.cautious)
+
+    def excess(self, s: Float, *, v: Float) -> float:
+        """Largest ratio of speeds (n,) to the limits at distances (n,)."""
+        return float((v / np.interp(s, _GAP * np.arange(len(self.strict)), self.strict)).max())
+
+
+def _limits(s: Float, limit: Float, *, vehicle: Vehicle) -> _Limits:
+    from scipy.ndimage import minimum_filter1d  # noqa: PLC0415
+
+    place = np.arange(0.0, s[-1] + _GAP, _GAP)
+    strict = np.interp(place, s, limit)
+    around = 2 * round(_AROUND / _GAP) + 1
+    return _Limits(strict, _braked(place, minimum_filter1d(strict, around), vehicle=vehicle))
+
+
 def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tuple[bool, bool]) -> _Knots:
     """The best profile along a leg that never exceeds ``allowed`` (k,) metres.
 
     rest : whether the vehicle is at rest at the start, and at the end
-    """
-    from scipy.ndimage import minimum_filter1d  # noqa: PLC0415
 
-    gap = 0.25
-    place = np.arange(0.0, s[-1] + gap, gap)
-    strict = np.interp(place, s, limit)
-    cautious = _braked(place, minimum_filter1d(strict, 2 * round(_AROUND / gap) + 1), vehicle=vehicle)
-    allowed = _reachable(
-        allowed, place, limit=cautious, vehicle=vehicle, speed=0.0 if rest[0] else float(cautious[0])
-    )
-    cap = np.interp(allowed, place, cautious)
+    It is solved in windows of time, each from a state within the one before: the limits at a place can be
+    looked up only where the time of arrival there is known.
+    """
+    limits, n = _limits(s, limit, vehicle=vehicle), len(allowed)
+    knots, excess, first = np.zeros((3, n)), 1.0, 0
+    start: tuple[float, ...] = (0.0, 0.0, 0.0) if rest[0] else (0.0,)
+    while first < n - 1:
+        ends = first + _WINDOW >= n - 1
+        part, over = _in_window(
+            limits,
+            allowed[first : first + _WINDOW + 1],
+            vehicle=vehicle,
+            start=start,
+            ends=ends,
+            rests=ends and rest[1],
+        )
+        kept = part if ends else part[:, : _KEPT + 1]
+        knots[:, first : first + kept.shape[1]] = kept
+        excess, first = max(excess, over), first + kept.shape[1] - 1
+        start = tuple(knots[:, first].tolist())
+        if rest[1] and start[0] > s[-1] - _NEAR and start[1] < _AT_REST:
+            knots[0, first:] = start[0]
+            break
+    # stretch time by the remaining excess, so that all limits hold
+    return _Knots(knots[0], knots[1] / excess, knots[2] / excess**2, STEP_S * excess)
+
+
+def _in_window(
+    limits: _Limits, allowed: Float, *, vehicle: Vehicle, start: tuple[float, ...], ends: bool, rests: bool
+) -> tuple[Float, float]:
+    """Distances, speeds and accelerations (3, k) of the best profile in a window, and its excess of speed.
+
+    start : distance, or distance, speed and acceleration at the first knot
+    ends  : the window is the last, so that all of it counts
+    rests : the vehicle is at rest at its end
+    """
+    counts = len(allowed) if ends else _KEPT + _BEYOND
+    speed = start[1] if len(start) > 1 else float(limits.at(np.array(start[:1]))[0])
+    near = _reachable(allowed, limits, vehicle=vehicle, start=(start[0], speed))
+    if len(start) == 1:  # any state that follows ``near``
+        allowed = near
+    cap = limits.at(near)
     for _ in range(_AGAIN):
-        knots = _solved(vehicle, allowed, cap=cap, rest=rest)
-        excess = float((knots.v / np.interp(knots.s, place, strict)).max())
+        s, v, a = _solved(vehicle, allowed, cap=cap, start=start, rests=rests)
+        excess = limits.excess(s[:counts], v=v[:counts])
         if excess <= 1.0 + _SLACK:
             break
-        cap = np.interp(knots.s, place, cautious)
-    # stretch time by the remaining excess, so that all limits hold
-    late = max(excess, 1.0)
-    return _Knots(knots.s, knots.v / late, knots.a / late**2, knots.dt * late)
+        cap = limits.at(s)
+    return np.stack([s, v, a]), excess
 
 
-def _reachable(allowed: Float, place: Float, *, limit: Float, vehicle: Vehicle, speed: float) -> Float:
+def _reachable(allowed: Float, limits: _Limits, *, vehicle: Vehicle, start: tuple[float, float]) -> Float:
     """Distances (k,) behind those allowed that are reached under speed limits and the vehicle's acceleration.
 
-    speed : m/s at the first of them
+    start : metres and m/s at the first of them
 
     They are near the solution, so that the limits found there are about those of the solution.
     """
     out = np.empty_like(allowed)
-    s, v, gap = 0.0, speed, float(place[1])
-    table, most = limit.tolist(), len(limit) - 1
-    for k, bound in enumerate(allowed.tolist()):
-        v = min(v + _SPARE * vehicle.acceleration * STEP_S, table[min(int(s / gap), most)])
-        ahead = min(s + v * STEP_S, bound) if k else min(s, bound)
-        v = (ahead - s) / STEP_S if k else speed
-        s = max(ahead, s)
+    s, v = start
+    table, most = limits.cautious.tolist(), len(limits.cautious) - 1
+    out[0] = s
+    for k, bound in enumerate(allowed[1:].tolist(), 1):
+        v = min(v + _SPARE * vehicle.acceleration * STEP_S, table[min(int(s / _GAP), most)])
+        ahead = max(min(s + v * STEP_S, bound), s)
+        s, v = ahead, (ahead - s) / STEP_S
         out[k] = s
     return out
 
 
-def _solved(vehicle: Vehicle, allowed: Float, *, cap: Float, rest: tuple[bool, bool]) -> _Knots:
-    """The linear programme: greatest sum of distances under those allowed and caps (k,) on speed."""
+def _solved(
+    vehicle: Vehicle, allowed: Float, *, cap: Float, start: tuple[float, ...], rests: bool
+) -> list[Float]:
+    """The linear programme: greatest sum of distances under those allowed and caps (k,) on speed.
+
+    Speeds above the caps cost much more than they gain: caps may be out of reach of the state at the start.
+    """
     from scipy.optimize import linprog  # noqa: PLC0415
     from scipy.sparse import csr_array, diags_array, hstack, vstack  # noqa: PLC0415
 
@@ -170,23 +236,27 @@ def _solved(vehicle: Vehicle, allowed: Float, *, cap: Float, rest: tuple[bool, b
     m = n - 1
     here = diags_array([np.ones(m)], offsets=[0], shape=(m, n))
     change = diags_array([-np.ones(m), np.ones(m)], offsets=[0, 1], shape=(m, n))
+    each = diags_array([np.ones(n)], offsets=[0], shape=(n, n))
     following = here + change
-    none = csr_array((m, n))
+    none, nothing = csr_array((m, n)), csr_array((n, n))
     # acceleration is linear in a step: speed and distance follow from it
-    speeds = hstack([none, change, -dt / 2 * (here + following)])
-    places = hstack([change, -dt * here, -(dt**2) * (here / 3 + following / 6)])
-    jerks = hstack([none, none, change])
+    speeds = hstack([none, change, -dt / 2 * (here + following), none])
+    places = hstack([change, -dt * here, -(dt**2) * (here / 3 + following / 6), none])
+    jerks = hstack([none, none, change, none])
     # and speed, a parabola in a step, is not below the third of its control values: never backwards
-    forwards = hstack([none, here, dt / 2 * here])
+    forwards = hstack([none, here, dt / 2 * here, none])
+    caps = hstack([nothing, each, nothing, -each])
     up, down, jerk = (_SPARE * v for v in (vehicle.acceleration, vehicle.deceleration, vehicle.jerk))
-    low = np.concatenate([np.zeros(2 * n), np.full(n, -down)])
-    high = np.concatenate([np.maximum(allowed, 0.0), cap, np.full(n, up)])
-    ends = [0, *((n, 2 * n) if rest[0] else ()), *((2 * n - 1, 3 * n - 1) if rest[1] else ())]
-    low[ends] = high[ends] = 0.0
+    low = np.concatenate([np.zeros(2 * n), np.full(n, -down), np.zeros(n)])
+    high = np.concatenate([np.maximum(allowed, 0.0), np.full(n, np.inf), np.full(n, up), np.full(n, np.inf)])
+    first = np.arange(len(start)) * n
+    low[first] = high[first] = start
+    if rests:
+        low[[2 * n - 1, 3 * n - 1]] = high[[2 * n - 1, 3 * n - 1]] = 0.0
     found = linprog(
-        np.concatenate([-np.ones(n), np.zeros(2 * n)]),
-        A_ub=vstack([jerks, -jerks, -forwards]),
-        b_ub=np.concatenate([np.full(2 * m, jerk * dt), np.zeros(m)]),
+        np.concatenate([-np.ones(n), np.zeros(2 * n), np.full(n, _FAST_COST)]),
+        A_ub=vstack([jerks, -jerks, -forwards, caps]),
+        b_ub=np.concatenate([np.full(2 * m, jerk * dt), np.zeros(m), cap]),
         A_eq=vstack([speeds, places]),
         b_eq=np.zeros(2 * m),
         bounds=np.column_stack([low, high]),
@@ -194,14 +264,14 @@ def _solved(vehicle: Vehicle, allowed: Float, *, cap: Float, rest: tuple[bool, b
     )
     if found.status != 0:
         raise InputError(f"no speed profile satisfies the maximum distances: {found.message}")
-    s, v, a = np.split(found.x, 3)
-    return _Knots(s, np.maximum(v, 0.0), a, dt)
+    s, v, a, _ = np.split(found.x, 4)
+    return [s, np.maximum(v, 0.0), a]
 
 
 def _sampled(knots: _Knots, end: float, *, dt: float) -> tuple[Float, Float]:
     """Distance and speed at every ``dt`` until the knots end, or the vehicle rests at the end of its leg."""
     last = len(knots.s) - 1
-    resting = np.flatnonzero((knots.s > end - _NEAR) & (knots.v < 1e-3))
+    resting = np.flatnonzero((knots.s > end - _NEAR) & (knots.v < _AT_REST))
     if len(resting):
         last = int(resting[0])
     t = np.arange(0.0, last * knots.dt + 1e-9, dt)

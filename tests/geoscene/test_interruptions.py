@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from dataclasses import fields, replace
 from pathlib import Path
@@ -157,6 +158,30 @@ def started(out, tiles, *more):
         time.sleep(0.01)
     assert process.poll() is None
     return process
+
+
+@pytest.mark.parametrize(
+    "raised", ["KeyboardInterrupt", "SystemError('in compiled code') from KeyboardInterrupt()"]
+)
+def test_interruption_ends_the_program_without_waiting_for_its_threads(raised):
+    program = (
+        "import threading, time, cyclopts, geoscene.console as console\n"
+        "app = cyclopts.App(name='geoscene', suppress_keyboard_interrupt=False)\n"
+        "@app.default\n"
+        "def run():\n"
+        "    threading.Thread(target=time.sleep, args=(60,)).start()\n"
+        f"    raise {raised}\n"
+        "console.main(app, (), usage=())\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (130, "geoscene: interrupted; repeat the command to resume\n")
 
 
 @IN_PROC

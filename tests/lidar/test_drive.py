@@ -29,7 +29,7 @@ from lidar.dataset.layout import open_dataset, prepare
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.geometry.attitude import quat_from_euler
 from lidar.options import DriveOptions
-from lidar.pipeline import drive
+from lidar.pipeline import _pool, drive
 from lidar.planning.road_drive import plan_road_drive
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.ego_drive import drive_with_signals
@@ -284,6 +284,17 @@ def test_the_number_of_threads_does_not_exceed_the_cores(scene, tmp_path, monkey
     for workers in (1, 64):
         drive(scene, tmp_path / str(workers), options=replace(OPTIONS, duration=0.2, workers=workers))
     assert sizes == [1, 2]
+
+
+def test_an_interruption_waits_for_no_frame_and_an_error_for_the_running_ones():
+    for error, waits in ((KeyboardInterrupt, False), (OSError, True)):
+        done, began = [], time.monotonic()
+        with pytest.raises(error), _pool(1) as pool:  # noqa: PT012
+            for _ in range(3):
+                pool.submit(lambda done=done: done.append(time.sleep(0.5)))
+            raise error
+        assert len(done) == waits
+        assert time.monotonic() - began < 1.4
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "removed", "journal"])

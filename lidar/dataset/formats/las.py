@@ -7,6 +7,7 @@ import functools
 import io
 import os
 import shutil
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -29,6 +30,9 @@ SCALE = 0.001
 
 INTENSITY_UNIT = 257.0
 """LAS intensity (16 bits) per unit of calibrated reflectivity (0 to 255)."""
+
+_RATIO = 10**5
+"""Greatest compression of LAZ that is read: clouds are compressed to a tenth, equal points by a thousand."""
 
 _FULL = 2**20
 """Bytes of free space below which the disk counts as full: the compressor writes in large pieces."""
@@ -248,11 +252,43 @@ def count(path: Path) -> int:
         return int.from_bytes(file.read(8), "little")
 
 
+def _states_what_it_holds(path: Path) -> bool:
+    """Whether records and points that a file's header and chunk table state fit into the file.
+
+    Readers trust these numbers: they run out of memory or read for hours. Byte offsets as in LAS 1.4 R15.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(375).ljust(375, b"\0")
+        header, start, records = struct.unpack_from("<HII", head, 94)
+        kind, length, points = struct.unpack_from("<BHI", head, 104)
+        more, extended = 0, 0
+        if head[25] >= 4:
+            more, extended, points = struct.unpack_from("<QIQ", head, 235)
+        if not header + 54 * records <= start <= size or (extended and more + 60 * extended > size):
+            return False
+        if kind < 128:
+            return bool(start + length * points <= size)
+        if points == 0:
+            return True
+        file.seek(start)
+        table = int.from_bytes(file.read(8), "little", signed=True)
+        if table == -1:  # written without going back: stated at the end
+            file.seek(-8, os.SEEK_END)
+            table = int.from_bytes(file.read(8), "little", signed=True)
+        if not start <= table <= size - 8:
+            return False
+        file.seek(table + 4)
+        return bool(int.from_bytes(file.read(4), "little") <= size and length * points <= _RATIO * size)
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     import laspy  # noqa: PLC0415
     import lazrs  # noqa: PLC0415
 
+    if path.is_file() and not _states_what_it_holds(path):
+        raise FormatError(f"{path}: not a readable LAS or LAZ file (its header states more than it holds)")
     try:
         with laspy.open(path) as reader:
             yield reader

@@ -78,6 +78,18 @@ def test_bounds_keep_intersecting_buildings_whole(demo):
         read_source("overture", demo, bounds=(1.0, 1.0, 2.0, 2.0))
 
 
+def test_a_building_of_impossible_length_is_dropped(tmp_path):
+    rows = [
+        {"id": "a", "geometry": shapely.box(24.94, 60.0, 24.941, 60.0005)},
+        {"id": "b", "geometry": shapely.Polygon([(24.95, 60.0), (24.951, 0.0), (24.951, 60.0005)])},
+    ]
+    data = read_source("overture", write_overture(tmp_path / "b.parquet", rows))
+    assert data.bounds == pytest.approx((24.94, 60.0, 24.941, 60.0005))
+    assert [(p.osm_id, p.action, p.reason, p.detail) for p in data.problems] == [
+        ("overture:b", "dropped", "bad-coordinates", "6,672 km long")
+    ]
+
+
 def test_a_stray_building_does_not_stretch_the_bounds(tmp_path):
     rows = [
         {"id": str(k), "geometry": shapely.box(24.94, 60 + k / 1e3, 24.941, 60.0005 + k / 1e3)}

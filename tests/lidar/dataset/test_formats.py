@@ -287,6 +287,27 @@ def test_damaged_files_are_named_in_one_line(tmp_path, form, content):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize(("at", "size"), [(94, 2), (96, 4), (100, 4), (247, 8), (235, 12)])
+def test_counts_that_a_file_cannot_hold_are_refused(tmp_path, suffix, at, size):
+    path = tmp_path / f"a{suffix}"
+    las.write(path, table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:at] + b"\xf0" * size + whole[at + size :])
+    with pytest.raises(FormatError, match="states more than it holds"):
+        read_table(path)
+
+
+def test_a_chunk_table_that_a_file_cannot_hold_is_refused(tmp_path):
+    path = tmp_path / "a.laz"
+    las.write(path, table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
+    whole = path.read_bytes()
+    at = int.from_bytes(whole[(start := int.from_bytes(whole[96:100], "little")) : start + 8], "little") + 4
+    path.write_bytes(whole[:at] + b"\xf0" * 4 + whole[at + 4 :])
+    with pytest.raises(FormatError, match="states more than it holds"):
+        read_table(path)
+
+
 def test_a_truncated_laz_is_named(tmp_path):
     las.write(tmp_path / "a.laz", table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
     whole = (tmp_path / "a.laz").read_bytes()

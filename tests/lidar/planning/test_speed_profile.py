@@ -76,6 +76,28 @@ def test_without_hold_ups_the_drive_is_about_as_fast_as_on_an_empty_road():
     assert motion.time_ns[-1] < 1.05 * free.time_ns[-1]
 
 
+def test_a_long_drive_through_many_bends_is_about_as_fast_as_on_an_empty_road():
+    turns = np.cumsum(np.tile([70.0, -70.0, -50.0, 50.0], 12))
+    steps = np.column_stack([np.cos(np.radians(turns)), np.sin(np.radians(turns)), np.zeros(len(turns))])
+    line = np.concatenate([np.zeros((1, 3)), np.cumsum(60.0 * steps, axis=0)])
+    n = len(line)
+    route = Route(
+        line,
+        np.full(n, -1, np.int32),
+        np.full(n, 13.9),
+        np.zeros(n, bool),
+        np.empty(0, np.int64),
+        np.empty(0, np.int32),
+    )
+    path = plan_path(route, CAR, frame=Plane())
+    free = motion_along(path, CAR)
+    time_s = np.arange(0.0, 2.0 * free.time_ns[-1] * 1e-9, 0.1)
+    reach = np.interp(time_s, free.time_ns * 1e-9, free.s)
+    motion = motion_within(path, CAR, time_s=time_s, max_distance=reach)
+    assert motion.time_ns[-1] < 1.1 * free.time_ns[-1]
+    assert motion.s[-1] == pytest.approx(path.length, abs=0.1)
+
+
 def test_speed_and_velocity_are_the_derivatives_of_distance_and_position():
     time_s = np.arange(0.0, 60.0, 0.1)
     motion = motion_within(PATH, CAR, time_s=time_s, max_distance=np.clip(6.0 * (time_s - 2.0), 0.0, 120.0))
