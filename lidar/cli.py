@@ -174,7 +174,7 @@ def export(
 
     lidar export drive --to nuscenes -o nuscenes
 
-    lidar export drive --to kitti -o kitti
+    lidar export drive --to kitti -o odometry
 
     Parameters
     ----------
