@@ -94,24 +94,28 @@ def apply_stages(
 def _apply_to_dataset(
     dataset: Dataset, out: Path, *, stages: tuple[NamedStage, ...], progress: Progress
 ) -> ApplySummary:
-    recipe, seed = dataset.manifest["recipe"], int(dataset.manifest["seed"])
+    recipe = dataset.manifest["recipe"]
     if dataset.manifest["frames_done"] != dataset.frames:
         raise DatasetError(f"{dataset.path}: the drive was not finished; finish it first")
     if {"stages", "applied_stages"} & recipe.keys():
         raise DatasetError(f"{dataset.path}: has stages already; apply all to the original")
-    sensors = _sensors(recipe["rig"])
-    chosen = Stages(stages, seed)
-    chosen.check({s.name: "lidar" if isinstance(s, Scanner) else "camera" for s in sensors})
-    settings = settings_of(recipe["fidelity"], [(name, text) for name, text in recipe["settings"]])
-    contents = Contents(
-        tuple(recipe["formats"]), tuple(recipe["labels"]), recipe["deskew"], seed, *settings, chosen
-    )
+    with reading_file(dataset.paths.manifest):
+        seed = int(dataset.manifest["seed"])
+        sensors = _sensors(recipe["rig"])
+        chosen = Stages(stages, seed)
+        chosen.check({s.name: "lidar" if isinstance(s, Scanner) else "camera" for s in sensors})
+        settings = settings_of(recipe["fidelity"], [(name, text) for name, text in recipe["settings"]])
+        contents = Contents(
+            tuple(recipe["formats"]), tuple(recipe["labels"]), recipe["deskew"], seed, *settings, chosen
+        )
+        crs = export_crs(dataset.frame, recipe["crs"])
+        points = dict(dataset.manifest["points"])
     recording = Recording(
         out,
         dataset.frame,
         trajectory=dataset.trajectory(),
         start=dataset.start,
-        geo=Georeference(dataset.frame, export_crs(dataset.frame, recipe["crs"]), exact=recipe["exact"]),
+        geo=Georeference(dataset.frame, crs, exact=bool(recipe.get("exact"))),
         contents=contents,
     )
     jobs = [
@@ -125,7 +129,6 @@ def _apply_to_dataset(
     if Paths(out).manifest.exists():  # a former dataset, to be replaced
         remove_dataset(out)
     _copy(dataset.path, out, leave_out=written | {Paths(out).manifest, Paths(out).journal})
-    points = dict(dataset.manifest["points"])
     before = sum(points.values())
     points |= dict.fromkeys((s.name for s, _ in jobs if isinstance(s, Scanner)), 0)
     for done, (device, frame) in enumerate(jobs):

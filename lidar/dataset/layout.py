@@ -195,6 +195,9 @@ def open_dataset(path: str | Path) -> Dataset:
         _ = dataset.frame, dataset.start, dataset.crs, dataset.frames, int(manifest["frames_done"])
         if not isinstance(manifest["recipe"], dict):
             raise DatasetError(f"{manifest_path}: damaged (no recipe); drive again with `overwrite`")
+        for counts in (manifest.get(name, {}) for name in ("sensor_frames", "points")):
+            if not all(isinstance(count, int) for count in counts.values()):
+                raise ValueError("counts that are no whole numbers")
     return dataset
 
 

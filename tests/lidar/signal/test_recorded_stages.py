@@ -205,6 +205,18 @@ def test_damaged_frames_end_in_one_error_that_names_the_file(plain, name, tmp_pa
         apply_stages(tmp_path / "data", tmp_path / "out", options=ApplyOptions(STAGES))
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("sensor_frames", [1]), ("points", {"top": "x"}), ("seed", None), ("recipe", {"rig": 1})],
+)
+def test_a_damaged_manifest_ends_in_one_error_that_names_it(plain, key, value, tmp_path):
+    shutil.copytree(plain, tmp_path / "data")
+    path = tmp_path / "data" / "dataset.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
+    with pytest.raises(LidarError, match=r"dataset\.json"):
+        apply_stages(tmp_path / "data", tmp_path / "out", options=ApplyOptions(STAGES))
+
+
 @pytest.mark.parametrize("stage", ["rein", "dropped_packets:los=1", "dropped_packets:loss=2", "none.toml"])
 def test_faulty_stages_end_in_one_line_with_nothing_written(scene, plain, tmp_path, stage):
     route = ("--route", "random", "--duration", "0.5")
