@@ -26,6 +26,11 @@ _ALIGNED = 0.02
 """Metres, grid on which the pieces of a building are put together if they do not unite as they are."""
 
 
+_OVERLAP = 0.01
+"""Metres by which pieces with roofs grow if they do not unite as they are.
+
+The corners of a roof on a wall are rounded, and so lie off the plane of the wall beside it."""
+
 _STRAIGHT = 2e-3
 """Metres off a straight wall within which corners are left out; far below what a map resolves (1 cm)."""
 
@@ -50,8 +55,8 @@ def build_solids(
     Vertices lie on the 0.1 mm grid. Faces have the building's row as feature, class BUILDING, and surface,
     material and colour. LoD 0 extrudes the outline from the ground to the mean height of its parts; LoD 1 has
     parts with their undersides and flat tops at full height; LoD 2 has roofs. A building whose body is not a
-    solid is built again with its parts on a common grid, then with flat roofs, then with cleaned footprints,
-    and is dropped if that fails too.
+    solid is built again with its parts on a common grid, then with parts that have roofs overlapping others,
+    then with flat roofs, then with cleaned footprints, and is dropped if that fails too.
 
     base : (count,) or (n,) z in metres of each building's base, in the order of the table; a part stands on
            its building's base
@@ -71,22 +76,22 @@ def build_solids(
     problems: list[Problem] = []
 
     done = [Triangles(np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty(0, np.uint8))]
-    for attempt in ("", "aligned-parts", "flat-roof", "cleaned-footprint"):
+    for attempt in ("", "aligned-parts", "overlapping-roofs", "flat-roof", "cleaned-footprint"):
         if not len(pieces.row):
             break
-        if attempt == "flat-roof" and pieces.flat.all():
+        if attempt in ("overlapping-roofs", "flat-roof") and pieces.flat.all():
             continue
         if attempt == "aligned-parts":
             pieces = _aligned(pieces)
-        elif attempt:
+        elif attempt in ("flat-roof", "cleaned-footprint"):
             pieces = replace(pieces, flat=np.ones(len(pieces.row), np.bool_))
         if attempt == "cleaned-footprint":
             pieces = _simplified(pieces)
-        shells, failed, notes = _bodies(buildings, pieces)
+        tried = _overlapping(pieces) if attempt == "overlapping-roofs" else pieces
+        shells, failed, notes = _bodies(buildings, tried)
         problems += notes
-        fine = ~np.isin(shells.piece, np.flatnonzero(np.isin(pieces.building, failed)))
-        good = shells.take(fine)
-        done.append(replace(good, piece=pieces.row[good.piece]))
+        good = shells.take(~np.isin(tried.building[shells.piece], failed))
+        done.append(replace(good, piece=tried.row[good.piece]))
         if attempt:
             made = np.setdiff1d(pieces.building, failed)
             problems += [_problem(buildings, b, action="repaired", reason=attempt) for b in made]
@@ -164,6 +169,19 @@ def _aligned(pieces: _Pieces) -> _Pieces:
     aligned = _Pieces.concatenate(out)
     low, high = np.round(aligned.low, 2), np.round(aligned.high, 2)
     return replace(aligned, low=low, high=high).take(high > low)
+
+
+def _overlapping(pieces: _Pieces) -> _Pieces:
+    """The pieces, those with roofs enlarged by 1 cm, 2 cm ...: those that meet by different amounts."""
+    near = 10 * _OVERLAP
+    i, j = shapely.STRtree(pieces.polygon).query(pieces.polygon, predicate="dwithin", distance=near)
+    same = pieces.building[i] == pieces.building[j]
+    i, j = i[same], j[same]
+    rank = np.zeros(len(pieces.row), np.int64)
+    for k in np.flatnonzero(~pieces.flat).tolist():
+        taken = rank[j[i == k]]
+        rank[k] = np.setdiff1d(np.arange(1, len(taken) + 2), taken)[0]
+    return _cut(pieces, shapely.buffer(pieces.polygon, _OVERLAP * rank, join_style="mitre"))
 
 
 def _simplified(pieces: _Pieces) -> _Pieces:

@@ -686,6 +686,29 @@ def test_parts_that_meet_within_a_millimetre_become_one_clean_solid():
     assert verdict.volume[0] == pytest.approx(32 * 18 * 12 - 300 * 3.3, rel=0.01)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_parts_side_by_side_keep_their_roofs(seed):
+    # a church: corners of the roofs on common walls lie a rounding error off these walls' planes
+    rng = np.random.default_rng(seed)
+    turn, long, wide = rng.uniform(0, 90), rng.uniform(20, 40), rng.uniform(8, 14)
+
+    def piece(number, x, y, to_x, to_y, height, roof):
+        shape = affinity.rotate(shapely.box(x, y, to_x, to_y), turn, origin=(0, 0))
+        return part(number, shape, height=str(height), roof__shape=roof, roof__height="4")
+
+    nave = piece(2, 0, 0, long, wide, 15, "gabled")
+    tower = piece(3, -5, wide / 4, 0, wide * 3 / 4, 12, "pyramidal")
+    chapels = [
+        piece(4 + k, k * long / 4, -4, (k + 1) * long / 4, 0, 8, roof)
+        for k, roof in enumerate(("round", "hipped", "gambrel", "skillion"))
+    ]
+    whole = affinity.rotate(shapely.box(-5, -4, long, wide), turn, origin=(0, 0))
+    _, mesh, _, problems = built(house(1, whole, height="3"), nave, tower, *chapels)
+    assert not {"flat-roof", "no-solid", "roof-fallback"} & {p.reason for p in problems}
+    steep = (mesh.surface == ROOF) & (np.abs(mesh.normals()[:, 2]) < 0.98)
+    assert np.count_nonzero(steep) > 20
+
+
 def test_a_roof_direction_is_from_true_north():
     frame = Frame.at(8.7, 49.4, crs="EPSG:32633")  # a zone too far east: grid north is well off true north
     lon, lat = 8.7, 49.4
