@@ -106,6 +106,8 @@ def atomic_folder(path: Path, *, mark: str, names: str) -> Iterator[Path]:
                 log.warning("%s: kept, though not of the export", path / entry.relative_to(old))
             shutil.rmtree(old)
     finally:
+        if old.exists() and not place.exists():
+            old.rename(place)
         shutil.rmtree(part, ignore_errors=True)
 
 

@@ -3,6 +3,7 @@
 import json
 import struct
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -464,6 +465,23 @@ def test_a_replaced_tileset_keeps_and_names_the_files_of_others(scene, tmp_path,
     assert {path: path.read_bytes() for path in fresh} == fresh
     assert [path.read_text() for path in mine] == [path.name for path in mine]
     assert all(f"{path}: kept" in caplog.text for path in mine)
+
+
+def test_a_tileset_that_cannot_be_replaced_stays(scene, tmp_path, monkeypatch):
+    options, out, rename = ExportOptions(kind="3dtiles"), tmp_path / "tiles", Path.rename
+    export_scene(scene, out, options=options)
+    before = {path: path.read_bytes() for path in out.rglob("*.*")}
+
+    def interrupted(path, target):
+        if Path(target) == out and path.name.endswith(".part"):
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        export_scene(scene, out, options=options, overwrite=True)
+    assert {path: path.read_bytes() for path in out.rglob("*.*")} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["tiles"]
 
 
 def test_height_offset_is_added_to_heights(scene, tmp_path, tiles):
