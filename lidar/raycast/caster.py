@@ -15,11 +15,11 @@ from geoscene.typing import Float
 from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast.embree import EmbreeScene
-from lidar.raycast.fallback import EmbreexScene
 from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split
 from lidar.raycast.hits import Hits
 from lidar.raycast.library import library
 from lidar.raycast.rays import free_rays, limited, posed_rays
+from lidar.raycast.scene import Float64Scene
 
 log = logging.getLogger(__name__)
 
@@ -29,17 +29,17 @@ _NUMBERS: Mapping[int, int] = {}
 
 @functools.cache
 def _uses_embree(backend: str) -> bool:
-    """Whether to call Embree directly; logs one warning if ``auto`` falls back to embreex."""
-    if backend not in ("auto", "embree", "embreex"):
-        raise InputError(f"backend {backend!r}: choose one of auto, embree, embreex")
-    if backend == "embreex":
+    """Whether to call Embree directly; logs one warning if ``auto`` falls back to float64."""
+    if backend not in ("auto", "embree", "float64"):
+        raise InputError(f"backend {backend!r}: choose one of auto, embree, float64")
+    if backend == "float64":
         return False
     try:
         library()
     except BackendError as error:
         if backend == "embree":
             raise
-        log.warning("casting rays with plain embreex, several times slower: %s", error)
+        log.warning("casting rays in float64, several times slower: %s", error)
         return False
     return True
 
@@ -56,8 +56,8 @@ class Caster:
     origin          : (3,) metres, origin of the float32 coordinates, within a few kilometres of all vertices
                       and rays; the middle of the vertices by default
     dynamic         : whether `update` will exchange parts of the mesh
-    backend         : ``embree``; ``embreex``, the package's Python interface with the same results at a fifth
-                      of the speed; or ``auto``: Embree if it is available, else embreex
+    backend         : ``embree``; ``float64``, the same hits without Embree, 10 to 50 times slower; or
+                      ``auto``: Embree if it is available, else float64
 
     Raises InputError for an invalid mesh and BackendError if Embree is not available.
     """
@@ -75,8 +75,9 @@ class Caster:
     ) -> None:
         v, f = checked(vertices, faces)
         self.origin: Float = middle(v) if origin is None else np.array(origin, np.float64)
-        scene = EmbreeScene if _uses_embree(backend) else EmbreexScene
-        self.scene = scene(self.origin, dynamic=dynamic)
+        self.scene: Float64Scene = (
+            EmbreeScene(self.origin, dynamic=dynamic) if _uses_embree(backend) else Float64Scene(self.origin)
+        )
         self.instances: tuple[Instances, ...] = ()
         self.update(attach=dict(enumerate(split(v - self.origin, f, mask=mask))), instances=instances)
 

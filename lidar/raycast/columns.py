@@ -23,16 +23,19 @@ class Target(NamedTuple):
     scene, packet, single : addresses of the Embree scene and of the arguments for packets and for single rays
     lanes      : as many zeros as rays in a packet: their number is a compile-time constant
     origin     : (3,) float64, subtracted from scene coordinates
-    parts      : (p, 5) int64, addresses of a geometry's planes, vertices, faces and face numbers (0:
-                 consecutive) and the first number
+    parts      : (p, 9) int64, one row per geometry (see `lidar.raycast.rows.PART`): own ones, then those of
+                 shapes
     rows       : (g,) int32, row of ``parts`` of Embree's geometry g, if it holds triangles
     starts     : (g,) int64, start in ``numbers`` of Embree's geometry g, if it holds instances
     numbers    : (k,) int32, instance numbers in Embree's order
     shape      : (k,) int32, first row of ``parts`` of the instance's shape
+    sizes      : (k,) int32, number of rows of ``parts`` of the instance's shape
+    masks      : (k,) uint32, of the instance
     first      : (k,) int64, first row of ``transforms``
     steps      : (k,) int64, rows of ``transforms``; 1 for a static instance
     transforms : (r, 12) float64, from instance to caster, each relative to its own origin
-    margin     : metres by which rays and float32 surfaces are displaced (see `lidar.raycast.hull`)
+    groups     : (g, 4) int64, trees (see `lidar.raycast.tree`) of the own parts and of groups of instances:
+                 addresses of nodes and order, number of items, number of the first instance (-1: parts)
     """
 
     scene: int
@@ -45,10 +48,12 @@ class Target(NamedTuple):
     starts: NDArray[np.int64]
     numbers: NDArray[np.int32]
     shape: NDArray[np.int32]
+    sizes: NDArray[np.int32]
+    masks: NDArray[np.uint32]
     first: NDArray[np.int64]
     steps: NDArray[np.int64]
     transforms: Float
-    margin: float
+    groups: NDArray[np.int64]
 
 
 class Rays(NamedTuple):

@@ -1,146 +1,186 @@
-"""Rays near edges: the first hit decided in float64 among the faces around them."""
+"""The first hit of a ray in float64, found in trees of all parts and instances."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from geoscene.typing import Float
 from lidar.raycast.columns import Target
-from lidar.raycast.lanes import START
-from lidar.raycast.memory import called, inlined
-from lidar.raycast.packets import trace
-from lidar.raycast.planes import INVALID, intersection, outside, placed
-from lidar.raycast.rows import (
-    HIT_COPY,
-    HIT_FACE,
-    HIT_GEOMETRY,
-    HIT_INSTANCE,
-    PACKET_ROWS,
-    RAY_DX,
-    RAY_DY,
-    RAY_DZ,
-    RAY_FAR,
-    RAY_NEAR,
-    RAY_OX,
-    RAY_OY,
-    RAY_OZ,
-    RAY_TIME,
-)
+from lidar.raycast.lanes import GRAZING, START
+from lidar.raycast.memory import called, float32_at, float64_at, inlined, int32_at, int64_at, vector
+from lidar.raycast.planes import PLANE, beside, transform_of
+from lidar.raycast.rows import CORNERS, COUNT, MASK, NODES, ORDER, PART, PLANES, VERTICES
+from lidar.raycast.tree import DEPTH, FIRST, LEAF, NODE, RIGHT
 
-AROUND = 16
-"""Number of parallel rays around a ray: one on it, and two circles beyond the displacement of edges."""
-_INNER, _CIRCLES = 6, (3.0, 8.0)  # rays of the inner circle with the one on the ray; radii in margins
-_GOLDEN = 2.399963229728653  # radians between successive rays
-STARTS = 4
-"""Faces at the start of a ray that it passes."""
-_BEYOND = 1.0 + 2.0**-21  # factor of a float32 range to the range beyond it
+STACK = 2 * DEPTH
+"""Numbers of the array ``stack`` that `first_hit` needs."""
 
 
 @inlined
-def _aim(f: Any, valid: Any, W: int, first: int, ray: Any, inverse: float, margin: float) -> None:
-    """Write parallel rays first to first + W around a ray to Embree's packet."""
+def _slopes(ray: Any) -> Any:
+    """A ray's origin and the inverse of its direction, huge where that is zero."""
     ox, oy, oz, dx, dy, dz = ray
-    dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
-    if abs(dz) < 0.7:
-        length = 1.0 / np.sqrt(dx * dx + dy * dy)
-        ux, uy, uz = dy * length, -dx * length, 0.0
-    else:
-        length = 1.0 / np.sqrt(dx * dx + dz * dz)
-        ux, uy, uz = dz * length, 0.0, -dx * length
-    vx, vy, vz = dy * uz - dz * uy, dz * ux - dx * uz, dx * uy - dy * ux
-    for k in range(W):
-        number = first + k
-        radius = 0.0 if number == 0 else _CIRCLES[0] if number < _INNER else _CIRCLES[1]
-        a, b = margin * radius * np.cos(_GOLDEN * number), margin * radius * np.sin(_GOLDEN * number)
-        f[RAY_OX * W + k] = ox + a * ux + b * vx
-        f[RAY_OY * W + k] = oy + a * uy + b * vy
-        f[RAY_OZ * W + k] = oz + a * uz + b * vz
-        f[RAY_DX * W + k], f[RAY_DY * W + k], f[RAY_DZ * W + k] = dx, dy, dz
-        valid[k] = -1 if number < AROUND else 0
-
-
-def circles(directions: Float, margin: float) -> Iterator[Float]:
-    """Offsets (n, 3) of the parallel rays around rays with unit directions (n, 3)."""
-    steep = np.abs(directions[:, 2:]) < 0.7
-    u = np.cross(directions, np.where(steep, [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(directions, u)
-    for k in range(AROUND):
-        radius = margin * (0.0 if k == 0 else _CIRCLES[0] if k < _INNER else _CIRCLES[1])
-        yield radius * (np.cos(_GOLDEN * k) * u + np.sin(_GOLDEN * k) * v)
+    return (
+        ox,
+        oy,
+        oz,
+        1.0 / dx if abs(dx) > 1e-100 else 1e100,
+        1.0 / dy if abs(dy) > 1e-100 else 1e100,
+        1.0 / dz if abs(dz) > 1e-100 else 1e100,
+    )
 
 
 @inlined
-def _known(u: Any, W: int, k: int) -> bool:
-    """Whether an earlier lane has the same face as lane k."""
-    found = False
-    for j in range(k):
-        found |= (
-            (u[HIT_FACE * W + j] == u[HIT_FACE * W + k])
-            & (u[HIT_GEOMETRY * W + j] == u[HIT_GEOMETRY * W + k])
-            & (u[HIT_INSTANCE * W + j] == u[HIT_INSTANCE * W + k])
-            & (u[HIT_COPY * W + j] == u[HIT_COPY * W + k])
-        )
-    return found
+def _enters(node: int, slopes: Any, near: float, far: float) -> float:
+    """The ray parameter at which a ray enters the box of a node; inf if it does not."""
+    ox, oy, oz, ix, iy, iz = slopes
+    a, b = (float32_at(node, 0) - ox) * ix, (float32_at(node, 3) - ox) * ix
+    near, far = max(near, min(a, b)), min(far, max(a, b))
+    a, b = (float32_at(node, 1) - oy) * iy, (float32_at(node, 4) - oy) * iy
+    near, far = max(near, min(a, b)), min(far, max(a, b))
+    a, b = (float32_at(node, 2) - oz) * iz, (float32_at(node, 5) - oz) * iz
+    near, far = max(near, min(a, b)), min(far, max(a, b))
+    return near if near <= far else np.inf
 
 
 @called
-def first_hit(
-    target: Target,
-    near: float,
-    far: float,
-    ray: Any,
-    inverse: float,
-    time: float,
-    f: Any,
-    valid: Any,
-    one: Any,
-) -> Any:
-    """The first face that a ray hits in float64: row of ``parts``, number in it, instance; row -1 for a miss.
-
-    The faces are those that parallel rays around it hit in float32. If it hits none of them and all parallel
-    rays hit something, the face is the one that it passes at the least distance.
-    """
-    W = len(target.lanes)
-    u = f.view(np.uint32)
-    best, closest, t_best = (np.int64(-1), np.int64(-1), np.int64(-1)), np.inf, np.inf
-    missed = False
-    for first in range(0, AROUND, W):
-        _aim(f, valid, W, first, ray, inverse, target.margin)
-        for k in range(W):
-            f[RAY_NEAR * W + k], f[RAY_TIME * W + k] = near / inverse, time
-        for _ in range(STARTS):
-            for k in range(W):
-                f[RAY_FAR * W + k] = np.inf
-                u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k] = INVALID, INVALID
-            trace(target, W, PACKET_ROWS, f, valid, W > 1, one)
-            again = False
-            for k in range(W):
-                if valid[k] == 0:
-                    continue
-                valid[k] = 0
-                if u[HIT_GEOMETRY * W + k] == INVALID:
-                    missed = True
-                    continue
-                row, instance = placed(
-                    target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
-                )
-                prim = np.int64(u[HIT_FACE * W + k])
-                t, cosine, _, _, _ = intersection(target, row, prim, instance, ray, inverse, time)
-                if not (t - near) * abs(cosine) > START * inverse:
-                    f[RAY_NEAR * W + k] = f[RAY_FAR * W + k] * _BEYOND + np.float32(1e-6)
-                    valid[k], again = -1, True
-                elif t > far:
-                    missed = True
-                elif not _known(u, W, k):
-                    passed = outside(target, row, prim, instance, ray, time)
-                    if passed < closest or (passed == closest and t < t_best):
-                        best, closest, t_best = (row, prim, instance), passed, t
-            if not again:
+def _next_leaf(nodes: int, slopes: Any, near: float, far: float, stack: Any, bottom: int, top: int) -> Any:
+    """The first item of the next leaf that a ray enters before ``far``, or -1, and the stack's new top."""
+    while top > bottom:
+        top -= 1
+        node = stack[top]
+        if not _enters(nodes + NODE * node, slopes, near, far) < np.inf:
+            continue
+        while True:
+            place = nodes + NODE * node
+            right = np.int64(int32_at(place, RIGHT))
+            if right == 0:
+                return np.int64(int32_at(place, FIRST)), top
+            one = _enters(place + NODE, slopes, near, far)
+            two = _enters(nodes + NODE * right, slopes, near, far)
+            if not min(one, two) < np.inf:
                 break
-    if missed and closest > 0.0:
-        best = (np.int64(-1), np.int64(-1), np.int64(-1))
+            stack[top] = right if one <= two else node + 1
+            top += max(one, two) < np.inf
+            node = node + 1 if one <= two else right
+    return np.int64(-1), top
+
+
+@called
+def _within(target: Target, instance: int, ray: Any, time: float) -> Any:
+    """A ray in the frame of an instance."""
+    ox, oy, oz, dx, dy, dz = ray
+    a, b, c, x, e, f, g, y, h, i, j, z = transform_of(target, instance, time)
+    ux, uy, uz = f * j - g * i, g * h - e * j, e * i - f * h
+    vx, vy, vz = c * i - b * j, a * j - c * h, b * h - a * i
+    wx, wy, wz = b * g - c * f, c * e - a * g, a * f - b * e
+    scale = 1.0 / (a * ux + b * uy + c * uz)
+    ox, oy, oz = (ox - x) * scale, (oy - y) * scale, (oz - z) * scale
+    dx, dy, dz = dx * scale, dy * scale, dz * scale
+    return (
+        ux * ox + vx * oy + wx * oz,
+        uy * ox + vy * oy + wy * oz,
+        uz * ox + vz * oy + wz * oz,
+        ux * dx + vx * dy + wx * dz,
+        uy * dx + vy * dy + wy * dz,
+        uz * dx + vz * dy + wz * dz,
+    )
+
+
+@inlined
+def _relative(part: int, corner: int, ray: Any) -> Any:
+    """A corner of a part's faces, relative to the origin of a ray."""
+    x, y, z = vector(int64_at(part, VERTICES), np.int64(int32_at(int64_at(part, CORNERS), corner)))
+    return x - ray[0], y - ray[1], z - ray[2]
+
+
+@called
+def _range(part: int, prim: int, ray: Any, near: float, far: float) -> float:
+    """The ray parameter at which a ray hits a face after near, not at its start, and before far; else inf."""
+    ox, oy, oz, dx, dy, dz = ray
+    plane = int64_at(part, PLANES) + PLANE * prim
+    nx, ny, nz = float64_at(plane, 0), float64_at(plane, 1), float64_at(plane, 2)
+    along = nx * dx + ny * dy + nz * dz
+    height = float64_at(plane, 3) - nx * ox - ny * oy - nz * oz
+    squared = dx * dx + dy * dy + dz * dz
+    grazing = along * along < GRAZING * GRAZING * squared
+    t = height / along
+    if not grazing and not (t < far and (t - near) * abs(along) > START):
+        return np.inf
+    a, b, c = (
+        _relative(part, 3 * prim, ray),
+        _relative(part, 3 * prim + 1, ray),
+        _relative(part, 3 * prim + 2, ray),
+    )
+    if (nx == 0.0 and ny == 0.0 and nz == 0.0) or beside(ray, a, b, c) > 0.0:
+        return np.inf
+    if grazing:
+        low, high = np.inf, -np.inf
+        for x, y, z in (a, b, c):
+            place = (x * dx + y * dy + z * dz) / squared
+            low, high = min(low, place), max(high, place)
+        t = high if t > high else low if not t >= low else t
+        if not (t < far and (t - near) * abs(along) > START):
+            return np.inf
+    return t
+
+
+@called
+def _first_of_part(part: int, ray: Any, slopes: Any, near: float, far: float, stack: Any) -> Any:
+    """The first face of a part that a ray hits before ``far``, or -1, and its ray parameter.
+
+    part : address of the row of ``parts``
+    """
+    nodes, order, count = int64_at(part, NODES), int64_at(part, ORDER), int64_at(part, COUNT)
+    best, top = np.int64(-1), DEPTH
+    if count:
+        stack[top] = 0
+        top += 1
+    while True:
+        first, top = _next_leaf(nodes, slopes, near, far, stack, DEPTH, top)
+        if first < 0:
+            return best, far
+        for k in range(first, min(first + LEAF, count)):
+            prim = np.int64(int32_at(order, k))
+            t = _range(part, prim, ray, near, far)
+            if t < far:
+                best, far = prim, t
+
+
+@called
+def first_hit(target: Target, near: float, far: float, mask: int, ray: Any, time: float, stack: Any) -> Any:
+    """The first face that a ray hits: row of ``parts``, number in it, instance; row -1 for a miss.
+
+    stack : (`STACK`,) int64, overwritten
+    """
+    best: Any = (np.int64(-1), np.int64(-1), np.int64(-1))
+    parts, slopes = target.parts.ctypes.data, _slopes(ray)
+    far *= 1.0 + 1e-15  # hits at far count
+    for group in range(len(target.groups)):
+        nodes, order, count, start = target.groups[group]
+        top = np.int64(0)
+        if count:
+            stack[top] = 0
+            top += 1
+        while True:
+            first, top = _next_leaf(nodes, slopes, near, far, stack, 0, top)
+            if first < 0:
+                break
+            for k in range(first, min(first + LEAF, count)):
+                item = np.int64(int32_at(order, k))
+                row, last, instance, local = item, item + 1, np.int64(-1), ray
+                if start >= 0:
+                    instance = start + item
+                    if not np.int64(target.masks[instance]) & mask:
+                        continue
+                    local = _within(target, instance, ray, time)
+                    row = np.int64(target.shape[instance])
+                    last = row + np.int64(target.sizes[instance])
+                for one in range(row, last):
+                    part = parts + 8 * PART * one
+                    if int64_at(part, MASK) & mask:
+                        prim, far = _first_of_part(part, local, _slopes(local), near, far, stack)
+                        if prim >= 0:
+                            best = (one, prim, instance)
     return best

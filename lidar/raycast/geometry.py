@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.raycast.hull import displacements, margin_of
+from lidar.raycast.hull import displacements, margins_of
+from lidar.raycast.tree import Tree, tree_of
 
 if TYPE_CHECKING:
     from lidar.raycast.caster import Caster
@@ -33,7 +34,7 @@ class Geometry:
                at least this is on the face also in float64
     numbers  : (m,) int32, `Hits.face` of each face minus ``first``; empty: consecutive
     first    : number of the first face
-    margin   : metres, see `lidar.raycast.hull`
+    tree     : of the faces' boxes
     mask     : bits; rays hit the faces if their masks share one
     """
 
@@ -42,7 +43,7 @@ class Geometry:
     faces: NDArray[np.int32]
     planes: Float
     numbers: NDArray[np.int32]
-    margin: float
+    tree: Tree
     first: int = 0
     mask: int = ALL
 
@@ -99,21 +100,28 @@ def split(vertices: Float, faces: NDArray[np.int32], *, mask: ArrayLike | None =
     """
     bits = np.broadcast_to(np.asarray(ALL if mask is None else mask, np.uint32), (len(faces),))
     found = np.unique(bits)
-    whole, margin = planes(vertices, faces), margin_of(vertices)
+    whole, margins = planes(vertices, faces), margins_of(vertices)
     moved = displacements(vertices, faces, whole)
-    hull = (vertices + margin * moved).astype(np.float32)
+    hull = (vertices + margins[:, None] * moved).astype(np.float32)
     # Rounding shifts an edge by one margin at most, in addition to its ends' displacements.
-    whole[:, 4] *= margin * (1 + np.sqrt(_squared(moved))[faces].max(axis=1, initial=0.0))
+    whole[:, 4] *= (margins * (1 + np.sqrt(_squared(moved))))[faces].max(axis=1, initial=0.0)
     if len(found) == 1:
-        return [Geometry(vertices, hull, faces, whole, np.empty(0, np.int32), margin, mask=int(found[0]))]
+        none = np.empty(0, np.int32)
+        return [Geometry(vertices, hull, faces, whole, none, _tree(vertices, faces), mask=int(found[0]))]
     out = []
     for one in found:
         rows = np.flatnonzero(bits == one)
         used, renumbered = np.unique(faces[rows], return_inverse=True)
         corners: NDArray[np.int32] = np.ascontiguousarray(renumbered.reshape(-1, 3), np.int32)
+        tree = _tree(vertices[used], corners)
         numbers = rows.astype(np.int32)
-        out.append(Geometry(vertices[used], hull[used], corners, whole[rows], numbers, margin, mask=int(one)))
+        out.append(Geometry(vertices[used], hull[used], corners, whole[rows], numbers, tree, mask=int(one)))
     return out
+
+
+def _tree(vertices: Float, faces: NDArray[np.int32]) -> Tree:
+    corners = vertices[faces]
+    return tree_of(corners.min(axis=1), corners.max(axis=1))
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,12 +2,12 @@
 
 Embree traces in float32 and identifies the face; the range is then computed in float64 from the plane of that
 face. Embree's surfaces enclose those of float64 (`lidar.raycast.hull`). A hit near an edge is therefore
-tested in float64; where the ray passes beside the face, the first hit is decided among the faces around it
-(`lidar.raycast.exact`).
+tested in float64. Where the ray passes beside the face, at grazing incidence and on the back of a face, the
+first hit is found in float64 among all faces (`lidar.raycast.exact`).
 
-In robust mode no ray passes between two faces at their shared edge, but about 0.3 % of the rays aimed exactly
-at a vertex of Embree's surfaces do. A ray that misses or hits the back of a face is retried with a perturbed
-direction, and a nearer front face is accepted. Rays to retry are buffered until they fill a packet.
+In robust mode no ray passes between two faces at their shared edge, but some of the rays aimed exactly at a
+vertex of Embree's surfaces do. A ray that misses is retried with a perturbed direction. Rays to retry are
+buffered until they fill a packet.
 
 Each step processes all lanes of a packet, with vector arithmetic (`lidar.raycast.lanes`).
 """
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.raycast.columns import CHUNK, Rays, Target
-from lidar.raycast.exact import first_hit
+from lidar.raycast.exact import STACK, first_hit
 from lidar.raycast.lanes import GRAZING, START, cross, move_float64, move_int32, narrow, same
 from lidar.raycast.memory import aligned, called, float64_at, inlined, int32_at, int64_at
 from lidar.raycast.packets import alike, first_bad, gather, nudge, trace
@@ -38,6 +38,7 @@ from lidar.raycast.rows import (
     HIT_V,
     INVERSE,
     MARGIN,
+    NUMBERS,
     NX,
     NY,
     NZ,
@@ -47,6 +48,7 @@ from lidar.raycast.rows import (
     OZ,
     PACKET_RAY_ROWS,
     PACKET_ROWS,
+    PART,
     RANGE,
     RAY_FAR,
     RAY_ID,
@@ -58,6 +60,7 @@ from lidar.raycast.rows import (
     RAY_ROWS,
     RAY_TIME,
     SCALE,
+    START_NUMBER,
     TIME,
     WORK_ROWS,
 )
@@ -80,8 +83,8 @@ def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: 
     own = u[HIT_GEOMETRY * W] != INVALID and u[HIT_INSTANCE * W] == INVALID
     if own and same(target.lanes, geometry) and same(target.lanes, copies):
         # The common case, all lanes on one mesh: look up the mesh once.
-        part = target.parts.ctypes.data + 40 * np.int64(target.rows[u[HIT_GEOMETRY * W]])
-        planes, numbers, first = int64_at(part, 0), int64_at(part, 3), int64_at(part, 4)
+        part = target.parts.ctypes.data + 8 * PART * np.int64(target.rows[u[HIT_GEOMETRY * W]])
+        planes, numbers, first = int64_at(part, 0), int64_at(part, NUMBERS), int64_at(part, START_NUMBER)
         for k in range(W):
             prim = np.int64(u[HIT_FACE * W + k])
             plane = planes + PLANE * prim
@@ -102,7 +105,7 @@ def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: 
             faces[k], instances[k] = -1, -1
         elif inst == INVALID:
             row = np.int64(target.rows[geom])
-            plane = int64_at(target.parts.ctypes.data, 5 * row) + PLANE * prim
+            plane = int64_at(target.parts.ctypes.data, PART * row) + PLANE * prim
             work[NX * W + k], work[NY * W + k] = float64_at(plane, 0), float64_at(plane, 1)
             work[NZ * W + k], work[OFFSET * W + k] = float64_at(plane, 2), float64_at(plane, 3)
             work[MARGIN * W + k] = float64_at(plane, 4)
@@ -112,7 +115,9 @@ def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: 
             x, y, z, d = plane_of(target, row, prim, instance, work[TIME * W + k])
             work[NX * W + k], work[NY * W + k], work[NZ * W + k], work[OFFSET * W + k] = x, y, z, d
             work[SCALE * W + k] /= np.sqrt(x * x + y * y + z * z)
-            work[MARGIN * W + k] = float64_at(int64_at(target.parts.ctypes.data, 5 * row) + PLANE * prim, 4)
+            work[MARGIN * W + k] = float64_at(
+                int64_at(target.parts.ctypes.data, PART * row) + PLANE * prim, 4
+            )
             faces[k], instances[k] = numbered(target, row, prim), instance
 
 
@@ -154,6 +159,7 @@ def _keep(
 def _retry(
     target: Target,
     near: float,
+    mask: int,
     m: int,
     work: Any,
     ids: Any,
@@ -165,10 +171,9 @@ def _retry(
     instances: Any,
     cosines: Any,
     normals: Any,
-    around: Any,
-    some: Any,
+    stack: Any,
 ) -> None:
-    """Retry m rays with perturbed directions and keep nearer hits."""
+    """Retry m rays that hit nothing, with perturbed directions."""
     W = len(target.lanes)
     u = f.view(np.uint32)
     for k in range(W):
@@ -176,25 +181,34 @@ def _retry(
         f[RAY_OY * W + k] = work[OY * W + k]
         f[RAY_OZ * W + k] = work[OZ * W + k]
         f[RAY_NEAR * W + k], f[RAY_TIME * W + k] = near / work[INVERSE * W + k], work[TIME * W + k]
-        nudge(W, k, work, f, min(work[FAR * W + k], ranges[ids[k]]))
+        nudge(W, k, work, f, work[FAR * W + k])
         valid[k] = -1 if k < m else 0
         u[HIT_GEOMETRY * W + k] = INVALID
         u[HIT_INSTANCE * W + k] = INVALID
     trace(target, W, PACKET_ROWS, f, valid, alike(W, work), one)
     for k in range(m):
-        if u[HIT_GEOMETRY * W + k] == INVALID:
-            continue
-        i = ids[k]
-        row, instance = placed(target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k])
-        prim = np.int64(u[HIT_FACE * W + k])
-        ray, inverse, time = ray_of(W, k, work), work[INVERSE * W + k], work[TIME * W + k]
-        t, cosine, _, _, _ = intersection(target, row, prim, instance, ray, inverse, time)
-        if t <= work[FAR * W + k] and t < ranges[i] and (faces[i] < 0 or cosine > 0.0):
-            if outside(target, row, prim, instance, ray, time) > 0.0 or _starts(t, near, cosine, inverse):
-                far = work[FAR * W + k]
-                row, prim, instance = first_hit(target, near, far, ray, inverse, time, around, some, one)
+        if u[HIT_GEOMETRY * W + k] != INVALID:
+            ray, inverse, time, far = (
+                ray_of(W, k, work),
+                work[INVERSE * W + k],
+                work[TIME * W + k],
+                work[FAR * W + k],
+            )
+            row, prim, copy = first_hit(target, near, far, mask, ray, time, stack)
             _keep(
-                target, row, prim, instance, ray, inverse, time, i, ranges, faces, instances, cosines, normals
+                target,
+                row,
+                prim,
+                copy,
+                ray,
+                inverse,
+                time,
+                ids[k],
+                ranges,
+                faces,
+                instances,
+                cosines,
+                normals,
             )
     for k in range(W):
         valid[k] = -1
@@ -220,15 +234,14 @@ def cast(
     packet = aligned(4 * PACKET_ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
     one, valid = aligned(128).view(np.float32), aligned(4 * W).view(np.int32)
-    around, some = aligned(4 * PACKET_ROWS * W).view(np.float32), aligned(4 * W).view(np.int32)
     work, ids = aligned(8 * WORK_ROWS * W).view(np.float64), np.zeros(W, np.int64)
     face, instance = aligned(4 * W).view(np.int32), aligned(4 * W).view(np.int32)
+    stack = np.zeros(STACK, np.int64)
     late, doubtful, waiting = np.zeros(2 * RAY_ROWS * W), np.zeros(2 * W, np.int64), 0
     for k in range(W):
         u[RAY_MASK * W + k] = rays.mask
         u[RAY_ID * W + k] = k
         valid[k] = -1
-        around.view(np.uint32)[RAY_MASK * W + k] = rays.mask
     for at in range(lo, hi, W):
         m = min(W, hi - at)
         if not gather(target, rays, at, m, target.lanes, ids, work, f):
@@ -261,20 +274,15 @@ def cast(
             t, cosine, far = work[RANGE * W + k], work[COSINE * W + k], work[FAR * W + k]
             if hit:
                 share = min(f[HIT_U * W + k], f[HIT_V * W + k], 1.0 - f[HIT_U * W + k] - f[HIT_V * W + k])
-                grazing = not abs(cosine) >= GRAZING
                 starts = _starts(t, rays.near, cosine, work[INVERSE * W + k])
-                if grazing or starts or not share * abs(cosine) >= work[MARGIN * W + k]:
+                if starts or not share * cosine >= work[MARGIN * W + k] or not cosine >= GRAZING:
                     ray, inverse, time = ray_of(W, k, work), work[INVERSE * W + k], work[TIME * W + k]
                     row, copy = placed(
                         target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
                     )
                     prim = np.int64(u[HIT_FACE * W + k])
-                    away = starts or outside(target, row, prim, copy, ray, time) > 0.0
-                    if away:
-                        row, prim, copy = first_hit(
-                            target, rays.near, far, ray, inverse, time, around, some, one
-                        )
-                    if away or grazing:
+                    if starts or not cosine >= GRAZING or outside(target, row, prim, copy, ray, time) > 0.0:
+                        row, prim, copy = first_hit(target, rays.near, far, rays.mask, ray, time, stack)
                         _keep(
                             target,
                             row,
@@ -290,15 +298,12 @@ def cast(
                             cosines,
                             normals,
                         )
-                        t = ranges[i]
-                        if away and not t <= far:
-                            continue
-            if not (hit and t <= far):
-                ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
-                if normals.size:
-                    _normal(normals, i, 0.0, 0.0, 0.0)
-            elif cosines[i] >= 0.0:
-                continue
+                        continue
+                if t <= far:
+                    continue
+            ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
+            if normals.size:
+                _normal(normals, i, 0.0, 0.0, 0.0)
             for r in range(RAY_ROWS):
                 late[r * 2 * W + waiting] = work[r * W + k]
             doubtful[waiting] = i
@@ -314,6 +319,7 @@ def cast(
             _retry(
                 target,
                 rays.near,
+                rays.mask,
                 n,
                 work,
                 ids,
@@ -325,14 +331,37 @@ def cast(
                 instances,
                 cosines,
                 normals,
-                around,
-                some,
+                stack,
             )
             for k in range(W):
                 doubtful[k] = doubtful[W + k]
                 for r in range(RAY_ROWS):
                     late[r * 2 * W + k] = late[r * 2 * W + W + k]
             waiting -= n
+    return -1
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def cast_float64(
+    target: Target,
+    rays: Rays,
+    lo: int,
+    hi: int,
+    ranges: Float,
+    faces: NDArray[np.int32],
+    instances: NDArray[np.int32],
+    cosines: NDArray[np.float32],
+    normals: Float,
+) -> Any:
+    """The same as `cast`, entirely in float64, without Embree."""
+    work, ids, stack = np.zeros(WORK_ROWS), np.zeros(1, np.int64), np.zeros(STACK, np.int64)
+    f = np.zeros(PACKET_ROWS, np.float32)
+    for at in range(lo, hi):
+        if not gather(target, rays, at, 1, target.lanes, ids, work, f):
+            return first_bad(1, ids, work)
+        ray, inverse, time = ray_of(1, 0, work), work[INVERSE], work[TIME]
+        row, prim, copy = first_hit(target, rays.near, work[FAR], rays.mask, ray, time, stack)
+        _keep(target, row, prim, copy, ray, inverse, time, ids[0], ranges, faces, instances, cosines, normals)
     return -1
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from lidar.raycast.columns import COPIES, Target
 from lidar.raycast.lanes import GRAZING
 from lidar.raycast.memory import called, float64_at, inlined, int32_at, int64_at, vector
-from lidar.raycast.rows import DX, DY, DZ, OX, OY, OZ
+from lidar.raycast.rows import CORNERS, DX, DY, DZ, NUMBERS, OX, OY, OZ, PART, START_NUMBER, VERTICES
 
 PLANE = 40
 """Bytes of a row of `lidar.raycast.geometry.Geometry.planes`."""
@@ -59,15 +59,15 @@ def placed(target: Target, geom: Any, inst: Any, place: Any) -> Any:
 @inlined
 def numbered(target: Target, row: int, prim: int) -> Any:
     """The number of a face."""
-    part = target.parts.ctypes.data + 40 * row
-    numbers = int64_at(part, 3)
-    return int64_at(part, 4) + (prim if numbers == 0 else np.int64(int32_at(numbers, prim)))
+    part = target.parts.ctypes.data + 8 * PART * row
+    numbers = int64_at(part, NUMBERS)
+    return int64_at(part, START_NUMBER) + (prim if numbers == 0 else np.int64(int32_at(numbers, prim)))
 
 
 @inlined
 def plane_of(target: Target, row: int, prim: int, instance: int, time: float) -> Any:
     """A face's plane in the caster's axes: normal (a unit vector for the own mesh) and offset."""
-    plane = int64_at(target.parts.ctypes.data, 5 * row) + PLANE * prim
+    plane = int64_at(target.parts.ctypes.data, PART * row) + PLANE * prim
     nx, ny, nz, d = float64_at(plane, 0), float64_at(plane, 1), float64_at(plane, 2), float64_at(plane, 3)
     if instance < 0:
         return nx, ny, nz, d
@@ -88,7 +88,7 @@ def plane_of(target: Target, row: int, prim: int, instance: int, time: float) ->
 @inlined
 def _corner(target: Target, row: int, corner: int, instance: int, time: float) -> Any:
     """A corner of a face in the caster's axes; corners of face f are 3 f to 3 f + 2."""
-    x, y, z = vector(target.parts[row, 1], np.int64(int32_at(target.parts[row, 2], corner)))
+    x, y, z = vector(target.parts[row, VERTICES], np.int64(int32_at(target.parts[row, CORNERS], corner)))
     if instance >= 0:
         M = transform_of(target, instance, time)
         x, y, z = (
@@ -111,20 +111,19 @@ def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: 
     return low, high
 
 
-@called
-def outside(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> float:
-    """Metres by which a ray passes outside the edges of a face, in float64; 0 if it hits the face.
+@inlined
+def beside(ray: Any, a: Any, b: Any, c: Any) -> float:
+    """Metres by which a ray passes outside the edges of a triangle, in float64; 0 if it hits the triangle.
 
     Edges belong to both of their faces: what remains of float64 rounding counts as a hit.
+
+    a, b, c : corners, relative to the ray's origin
     """
     ox, oy, oz, dx, dy, dz = ray
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
     size = abs(ox) + abs(oy) + abs(oz)
     low, high = np.inf, -np.inf
-    for k in range(3):
-        ax, ay, az = _corner(target, row, 3 * prim + k, instance, time)
-        bx, by, bz = _corner(target, row, 3 * prim + (k + 1) % 3, instance, time)
-        ax, ay, az, bx, by, bz = ax - ox, ay - oy, az - oz, bx - ox, by - oy, bz - oz
+    for (ax, ay, az), (bx, by, bz) in ((a, b), (b, c), (c, a)):
         ex, ey, ez = bx - ax, by - ay, bz - az
         edge = np.sqrt(ex * ex + ey * ey + ez * ez)
         moment = dx * (ey * az - ez * ay) + dy * (ez * ax - ex * az) + dz * (ex * ay - ey * ax)
@@ -133,6 +132,16 @@ def outside(target: Target, row: int, prim: int, instance: int, ray: Any, time: 
         passed = 0.0 if abs(passed) <= rounding else passed
         low, high = min(low, passed), max(high, passed)
     return max(0.0, min(-low, high))
+
+
+@called
+def outside(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> float:
+    """Metres by which a ray passes outside a face, as in `beside`."""
+    ox, oy, oz, _, _, _ = ray
+    ax, ay, az = _corner(target, row, 3 * prim, instance, time)
+    bx, by, bz = _corner(target, row, 3 * prim + 1, instance, time)
+    cx, cy, cz = _corner(target, row, 3 * prim + 2, instance, time)
+    return beside(ray, (ax - ox, ay - oy, az - oz), (bx - ox, by - oy, bz - oz), (cx - ox, cy - oy, cz - oz))
 
 
 @inlined

@@ -1,4 +1,4 @@
-"""Rows of the kernels' arrays: in a packet of W lanes, the value of row R and lane k is element R * W + k."""
+"""Rows and columns of the kernels' arrays: in a packet of W lanes, row R of lane k is element R * W + k."""
 
 OX, OY, OZ, DX, DY, DZ = range(6)
 INVERSE, FAR, TIME = 6, 7, 8
@@ -19,3 +19,9 @@ copy within it."""
 
 PACKET_RAY_ROWS, PACKET_ROWS = 12, 21
 """Number of rows of RTCRayN and of RTCRayHitN."""
+
+PLANES, VERTICES, CORNERS, NUMBERS, START_NUMBER, NODES, ORDER, COUNT, MASK = range(9)
+"""Columns of `lidar.raycast.columns.Target.parts`: addresses of a geometry's planes, vertices, faces, face
+numbers (0: consecutive), nodes and order of its tree; its first number, number of faces and mask."""
+PART = 9
+"""Number of columns of a part."""
