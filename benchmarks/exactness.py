@@ -82,11 +82,18 @@ def tree_of(corners: Float) -> Tree:
     return Tree(np.array(bounds), *columns, np.ascontiguousarray(corners[np.concatenate(order)]))
 
 
+@njit(inline="always")
+def _cross(a: Float, b: Float, c: Float, d: Float) -> Any:
+    """The cross product of b - a and d - c."""
+    x, y, z, p, q, r = b[0] - a[0], b[1] - a[1], b[2] - a[2], d[0] - c[0], d[1] - c[1], d[2] - c[2]
+    return y * r - z * q, z * p - x * r, x * q - y * p
+
+
 @njit(parallel=True, cache=True, error_model="numpy")
-def first_hits(tree: Tree, origins: Float, way: Float) -> Any:
+def first_hits(tree: Tree, origins: Float, way: Float, reach: Float) -> Any:
     """Ranges (n,) of the first hit for certain and of the first possible one, and their cosines (n, 2).
 
-    Cosines are negative where a ray hits the back of a face.
+    Cosines are negative where a ray hits the back of a face. Ranges beyond ``reach`` (n,) are infinite.
     """
     n = len(way)
     sure, possible, cosines = np.full(n, np.inf), np.full(n, np.inf), np.ones((n, 2))
@@ -95,7 +102,7 @@ def first_hits(tree: Tree, origins: Float, way: Float) -> Any:
         length = np.sqrt((d * d).sum())
         box = 0
         while box < len(tree.bounds):
-            enter, leave = 0.0, sure[i]
+            enter, leave = 0.0, min(sure[i], reach[i])
             for k in range(3):
                 a, b = (
                     (tree.bounds[box, k] - 1e-6 - o[k]) / d[k],
@@ -105,22 +112,25 @@ def first_hits(tree: Tree, origins: Float, way: Float) -> Any:
                     enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
                 elif a > 0 or b < 0:
                     leave = -1.0
-            if enter > leave:
+            if not enter <= leave:
                 box = tree.skip[box]
                 continue
             for face in range(tree.first[box], tree.first[box] + tree.count[box]):
-                p = tree.corners[face] - o
-                normal = np.cross(p[1] - p[0], p[2] - p[0])
-                t = np.dot(normal, p[0]) / np.dot(normal, d)
-                if not 0.0 < t < np.inf:
+                p = tree.corners[face]
+                nx, ny, nz = _cross(p[0], p[1], p[0], p[2])
+                along = nx * d[0] + ny * d[1] + nz * d[2]
+                t = (nx * (p[0, 0] - o[0]) + ny * (p[0, 1] - o[1]) + nz * (p[0, 2] - o[2])) / along
+                if not 0.0 < t < sure[i]:
                     continue
                 low, high = np.inf, -np.inf
                 for k in range(3):
-                    edge = p[(k + 1) % 3] - p[k]
-                    passed = np.dot(d, np.cross(edge, p[k])) / (length * np.sqrt((edge * edge).sum()))
+                    a, b = p[k], p[(k + 1) % 3]
+                    x, y, z = _cross(o, b, o, a)
+                    size = np.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2)
+                    passed = (d[0] * x + d[1] * y + d[2] * z) / (length * size)
                     low, high = min(low, passed), max(high, passed)
                 passed = min(-low, high)
-                cosine = -np.dot(normal, d) / (length * np.sqrt((normal * normal).sum()))
+                cosine = -along / (length * np.sqrt(nx * nx + ny * ny + nz * nz))
                 if passed < -TOLERANCE and t < sure[i]:
                     sure[i], cosines[i, 0] = t, cosine
                 if passed < TOLERANCE and t < possible[i]:
@@ -270,7 +280,7 @@ def main() -> None:
                     hits = caster.cast(origins, way)
                     far = np.linalg.norm(aim - origins, axis=1)
                     aimed = np.where(facing & (jitter == 0.0), far, np.inf)
-                    found = first_hits(tree, origins, way)
+                    found = first_hits(tree, origins, way, hits.range + 1e-3)
                     worst = worst_range(hits, corners, origins, way)
                     total = added(total, compared(hits, *found, aimed=aimed, limit=limit, worst=worst))
                 print(

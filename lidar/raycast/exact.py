@@ -96,7 +96,7 @@ def _relative(part: int, corner: int, ray: Any) -> Any:
 
 
 @called
-def _range(part: int, prim: int, ray: Any, near: float, far: float) -> float:
+def _range(part: int, prim: int, ray: Any, near: float, far: float) -> Any:
     """The ray parameter at which a ray hits a face after near, not at its start, and before far; else inf."""
     ox, oy, oz, dx, dy, dz = ray
     plane = int64_at(part, PLANES) + PLANE * prim

@@ -141,7 +141,10 @@ def outside(target: Target, row: int, prim: int, instance: int, ray: Any, time: 
     ax, ay, az = _corner(target, row, 3 * prim, instance, time)
     bx, by, bz = _corner(target, row, 3 * prim + 1, instance, time)
     cx, cy, cz = _corner(target, row, 3 * prim + 2, instance, time)
-    return beside(ray, (ax - ox, ay - oy, az - oz), (bx - ox, by - oy, bz - oz), (cx - ox, cy - oy, cz - oz))
+    passed: float = beside(
+        ray, (ax - ox, ay - oy, az - oz), (bx - ox, by - oy, bz - oz), (cx - ox, cy - oy, cz - oz)
+    )
+    return passed
 
 
 @inlined
