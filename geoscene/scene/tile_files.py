@@ -72,7 +72,7 @@ def read_tile(path: Path) -> Tile:
 
     Raises SceneFormatError if the file is missing or damaged.
     """
-    with reading(path, SceneFormatError, remedy=BUILD_AGAIN):
+    with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
         arrays = _unpacked(path)
         instances = {f.name: arrays[f"instance_{f.name}"] for f in fields(Instances)}
         return Tile(arrays["origin"], _mesh(arrays), Instances(**instances))
@@ -105,6 +105,6 @@ def read_shapes(path: Path) -> dict[str, Mesh]:
     """The shapes that `write_shapes` wrote, in order; empty if there is no such file."""
     if not path.exists():
         return {}
-    with reading(path, SceneFormatError, remedy=BUILD_AGAIN):
+    with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
         arrays = _unpacked(path)
         return {str(name): _mesh(arrays, f"{name}/") for name in arrays["names"]}

@@ -4,6 +4,7 @@ import ast
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.export_worlds import write_world
 
@@ -82,6 +83,17 @@ def test_damaged_files_give_one_line_that_names_them(copied, name, damage):
     text = str(raised.value)
     assert "\n" not in text
     assert path.name in text or (name, damage) == ("roads.graphml", "missing")
+
+
+@pytest.mark.parametrize("name", ["shapes.npz", "tiles"])
+def test_columns_that_do_not_fit_their_mesh_name_the_file(copied, name):
+    path = next((copied / name).iterdir()) if name == "tiles" else copied / name
+    with np.load(path) as file:
+        arrays = dict(file)
+    column = next(key for key in arrays if key.endswith("surface"))
+    np.savez(path, **(arrays | {column: np.tile(arrays[column], 2)}))
+    with pytest.raises(SceneFormatError, match=path.name):
+        used(copied)
 
 
 def test_unexpected_error_is_explained_by_a_changed_file(copied):
