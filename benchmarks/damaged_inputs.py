@@ -14,6 +14,8 @@ from typing import Any
 
 from mutations import WORDS
 
+from lidar.dataset.export import EXPORTERS
+
 Words = list[str]
 Line = list[tuple[float, float]]
 Case = tuple[Path | None, Words]
@@ -37,7 +39,7 @@ translation = [1.6, 0.0, 1.5]
 width = 32
 height = 24
 fov_deg = 90.0
-distortion = [0.01, 0.0, 0.0, 0.0, 0.0]
+distortion = [0.0, 0.0, 0.0, 0.0, 0.0]
 far = 100.0
 rate_hz = 10.0
 images = ["rgb", "depth", "semantic", "instance", "flow"]
@@ -49,6 +51,7 @@ model = "fisheye"
 width = 24
 height = 24
 fov_deg = 180.0
+distortion = [0.01, 0.0, 0.0, 0.0]
 [[gnss]]
 name = "gnss"
 translation = [0.6, 0.0, 1.6]
@@ -159,7 +162,7 @@ class Inputs:
             more = rng.choice(([], ["--voxel=0.2"], ["--color=intensity", "--noise"]))
             return path, ["lidar", "map", str(data), "-o", f"{f}/m{end}", "--overwrite", *more]
         if kind < 16:
-            to = rng.choice(_EXPORTS)
+            to = rng.choice(list(EXPORTERS))
             return path, ["lidar", "export", str(data), "--to", to, "-o", f"{f}/to-{to}", "--overwrite"]
         if kind < 17:
             rig = ["--rig", f"{f}/rig0.toml", "--traffic=on"]
@@ -266,7 +269,6 @@ _DATASETS = {
 _SENSORS = 1 + len(list(_RIG_FOLDER.glob("sensors/*.toml")))
 """Number of rigs: one with cameras, and one for each built-in scanner."""
 
-_EXPORTS = ("nuscenes", "tum")
 
 _SEVERAL = ("--route", "--along")
 """Options that take several values."""
