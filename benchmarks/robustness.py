@@ -1,11 +1,12 @@
 """Damaged inputs: tracebacks, crashes, hangs and memory.
 
-    python benchmarks/robustness.py --count 100000 --keep FOLDER
+    python benchmarks/robustness.py --count 100000 --reading 0.8 --keep FOLDER
     python benchmarks/robustness.py --kinds maps scenes --count 1000
 
 Each trial damages a small valid input at random (`mutations.py`) and runs a command on it, in a process
-that runs many. Success or one line on standard error is right; a traceback, a crash (signal), an exit code
-other than 0, 1 and 2, more than --seconds or --gigabytes is not. Inputs that went wrong are kept in FOLDER.
+that runs many; a share of them only reads the file by the function for it (`readers.py`). Success or one
+line on standard error is right; a traceback, a crash (signal), an exit code other than 0, 1 and 2, more
+than --seconds or --gigabytes is not. Inputs that went wrong are kept in FOLDER.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from typing import Any
 
 from damaged_inputs import KINDS, Inputs, Words
 from mutations import mutate
+from readers import readable, reader_of
 
 from geoscene.console import main as main_of
 from geoscene.errors import GeosceneError
@@ -101,6 +103,28 @@ def _program(name: str) -> _Program:
     return _Program(name)
 
 
+def reading(kind: str, path: Path) -> str:
+    """Read a file by its own function; returns what is wrong, or an empty text."""
+    read = reader_of(kind, path)
+    try:
+        if read:
+            read(path)
+    except (GeosceneError, LidarError, OSError):
+        return ""
+    except MemoryError:
+        return "memory: out of memory"
+    except BaseException as error:  # noqa: BLE001
+        return _described(error)
+    return ""
+
+
+def _described(error: BaseException) -> str:
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [f for f in frames if "/geoscene/" in f.filename or "/lidar/" in f.filename] or frames
+    places = " < ".join(f"{Path(f.filename).name}:{f.lineno}" for f in reversed(ours[-3:]))
+    return f"traceback {type(error).__name__} {places}: {str(error)[:80]}"
+
+
 def outcome(words: Words) -> str:
     """Run a command in this process; returns what is wrong, or an empty text."""
     sys.argv = words
@@ -112,10 +136,7 @@ def outcome(words: Words) -> str:
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else 0 if end.code is None else -1
         except BaseException as error:  # noqa: BLE001
-            frames = traceback.extract_tb(error.__traceback__)
-            ours = [f for f in frames if "/geoscene/" in f.filename or "/lidar/" in f.filename] or frames
-            places = " < ".join(f"{Path(f.filename).name}:{f.lineno}" for f in reversed(ours[-3:]))
-            return f"traceback {type(error).__name__} {places}: {str(error)[:80]}"
+            return _described(error)
     text = errors.getvalue()
     if "Traceback" in text or code not in (0, 1, 2) or (code == 2 and not text.strip()):
         return f"exit code {code}: {text[-200:]}"
@@ -134,13 +155,17 @@ def _serve(link: Connection, folder: Path, options: argparse.Namespace) -> None:
     while True:
         kind, number = link.recv()
         rng = random.Random(f"{options.seed} {kind} {number}")
-        path, words = KINDS[kind](inputs, rng)
+        if only_read := rng.random() < options.reading:
+            path: Path | None = rng.choice(readable(kind, folder))
+            words = ["read", str(path)]
+        else:
+            path, words = KINDS[kind](inputs, rng)
         valid = path.read_bytes() if path else b""
         link.send(Trial(path, valid, words))
         if path:
             mutate(path, rng)
         Path("/proc/self/clear_refs").write_text("5")
-        wrong = outcome(words)
+        wrong = reading(kind, path) if only_read and path else outcome(words)
         peak = int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0]) / 2**20
         link.send(wrong or (f"memory: {peak:.1f} GB" if peak > options.gigabytes else ""))
         if link.recv() and path:
@@ -224,6 +249,7 @@ def main() -> int:
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
     parser.add_argument("--count", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0, help="number of the first trial")
+    parser.add_argument("--reading", type=float, default=0.0, help="share of trials that only read a file")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=60.0, help="limit of a trial")
     parser.add_argument("--gigabytes", type=float, default=2.0, help="limit of a trial")
