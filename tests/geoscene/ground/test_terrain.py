@@ -244,6 +244,9 @@ def test_unusable_files_are_named_in_the_error(tmp_path):
     odd = write_dem(tmp_path / "odd.tif", np.zeros((60, 60)), corner=around(), unit="fathom")
     with pytest.raises(InputError, match="fathom"):
         open_terrain([odd], FRAME, bounds=BOUNDS)
+    wide = write_dem(tmp_path / "wide.tif", np.zeros((60, 60)), corner=(9.0, 50.0), step=1e9, crs="EPSG:4326")
+    with pytest.raises(InputError, match=r"wide\.tif: has pixels outside"):
+        open_terrain([wide], FRAME, bounds=BOUNDS)
     void = write_dem(tmp_path / "void.tif", np.full((60, 60), -1.0), corner=around(), nodata=-1)
     with pytest.raises(InputError, match="only voids"):
         open_terrain([void], FRAME, bounds=BOUNDS)
