@@ -294,6 +294,10 @@ def _opened(path: Path) -> Iterator[Any]:
             yield reader
     except (laspy.errors.LaspyException, lazrs.LazrsError, OSError, ValueError) as error:
         raise FormatError(f"{path}: not a readable LAS or LAZ file ({error})") from error
+    except BaseException as error:
+        if type(error).__name__ != "PanicException":  # of the decompressor; no Exception, and not importable
+            raise
+        raise FormatError(f"{path}: not a readable LAS or LAZ file (the decompressor failed)") from error
 
 
 def read(path: Path) -> Table:

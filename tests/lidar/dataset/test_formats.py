@@ -308,6 +308,19 @@ def test_a_chunk_table_that_a_file_cannot_hold_is_refused(tmp_path):
         read_table(path)
 
 
+def test_a_panic_of_the_decompressor_names_the_file(tmp_path, monkeypatch):
+    class PanicException(BaseException):
+        """As pyo3 raises it."""
+
+    def fails(path):
+        raise PanicException(path)
+
+    las.write(tmp_path / "a.laz", table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
+    monkeypatch.setattr(laspy, "open", fails)
+    with pytest.raises(FormatError, match=r"a\.laz: not a readable"):
+        read_table(tmp_path / "a.laz")
+
+
 def test_a_truncated_laz_is_named(tmp_path):
     las.write(tmp_path / "a.laz", table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
     whole = (tmp_path / "a.laz").read_bytes()
