@@ -34,7 +34,6 @@ def margins_of(vertices: Float) -> Float:
     return margins
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
 def displacements(vertices: Float, faces: NDArray[np.int32], planes: Float) -> Float:
     """Displacements (n, 3) of vertices, in margins.
 
@@ -43,63 +42,73 @@ def displacements(vertices: Float, faces: NDArray[np.int32], planes: Float) -> F
     border of the surface move alike. The few that no displacement up to `_LONGEST` serves move, too.
     """
     n = len(vertices)
-    out, mean, balance, flattest = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, np.uint64), np.ones(n)
+    mean, balance, flattest = np.zeros((n, 3)), np.zeros(n, np.uint64), np.ones(n)
+    _normals(faces, planes, mean, balance, flattest)
+    border = balance != 0
+    lacking = ~border & (flattest <= _PLANE)
+    outwards = np.where(lacking, 1.0, 0.0)
+    sharp = lacking & (flattest > 0) & (flattest < _SHARP)
+    outwards[sharp] = (1.0 + _SIDEWAYS) / flattest[sharp]  # encloses all faces, whatever the way sideways
+    out = _SIDEWAYS * _sideways(vertices, faces, mean) + outwards[:, None] * mean
+    out[border] = _BORDER
+    rows = np.flatnonzero(lacking[faces].any(axis=1))
+    for _ in range(_ROUNDS):
+        if not len(rows):
+            break
+        still = np.zeros(n, np.bool_)
+        _correct(out, faces, planes, rows, lacking, still)
+        rows, lacking = rows[still[faces[rows]].any(axis=1)], still
+    length = np.sqrt((out * out).sum(axis=1))
+    far = length > _LONGEST
+    out[far] *= (_LONGEST / length[far])[:, None]
+    return out
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _normals(
+    faces: NDArray[np.int32], planes: Float, mean: Float, balance: NDArray[np.uint64], flattest: Float
+) -> None:
+    """Write mean normals, cosines of the faces to them, and a balance that is 0 at surrounded vertices."""
     for f in range(len(faces)):
         for k in range(3):
             v = faces[f, k]
             balance[v] += _scrambled(faces[f, (k + 1) % 3]) - _scrambled(faces[f, (k + 2) % 3])
             for c in range(3):
                 mean[v, c] += planes[f, c]
-    for v in range(n):
+    for v in range(len(mean)):
         length = np.sqrt(mean[v, 0] ** 2 + mean[v, 1] ** 2 + mean[v, 2] ** 2)
         for c in range(3):
             mean[v, c] = mean[v, c] / length if length > 0.0 else 0.0
     for f in range(len(faces)):
-        if not planes[f, 0] == planes[f, 1] == planes[f, 2] == 0.0:
+        if planes[f, 0] != 0.0 or planes[f, 1] != 0.0 or planes[f, 2] != 0.0:
             for k in range(3):
                 flattest[faces[f, k]] = min(flattest[faces[f, k]], _along(mean, faces[f, k], planes, f))
-    sideways = _sideways(vertices, faces, mean)
-    lacking = np.zeros(n, np.bool_)
-    for v in range(n):
-        lacking[v] = balance[v] == 0 and flattest[v] <= _PLANE
-        outwards = 1.0 if lacking[v] else 0.0
-        if lacking[v] and 0.0 < flattest[v] < _SHARP:
-            outwards = (1.0 + _SIDEWAYS) / flattest[v]  # encloses all faces, whatever the way sideways
-        for c in range(3):
-            along = _SIDEWAYS * sideways[v, c] + outwards * mean[v, c]
-            out[v, c] = _BORDER[c] if balance[v] != 0 else along
-    rows = np.arange(len(faces))
-    for _ in range(_ROUNDS):
-        rows, lacking = _corrected(out, faces, planes, rows, lacking)
-    for v in range(n):
-        length = np.sqrt(out[v, 0] ** 2 + out[v, 1] ** 2 + out[v, 2] ** 2)
-        if length > _LONGEST:
-            for c in range(3):
-                out[v, c] *= _LONGEST / length
-    return out
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
 def _sideways(vertices: Float, faces: NDArray[np.int32], mean: Float) -> Float:
     """Unit vectors (n, 3) along the surface at vertices with mean normals (n, 3), away from all edges.
 
     Embree misses some rays at a vertex and along the edges of narrow faces. The rays aimed at the vertex or
     the edges of float64 pass these by. Of some directions, the one farthest from the line of any edge.
     """
-    n = len(vertices)
-    cosine, sine = np.cos(np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS), np.empty(_DIRECTIONS)
-    sine[:] = np.sin(np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS)
-    u, w, clear, side = np.empty((n, 3)), np.empty((n, 3)), np.ones((n, _DIRECTIONS)), np.empty((n, 3))
-    for v in range(n):
-        x, y, z = mean[v]
-        if abs(z) < 0.7:
-            length = max(np.sqrt(x * x + y * y), 1e-9)
-            u[v, 0], u[v, 1], u[v, 2] = -y / length, x / length, 0.0
-        else:
-            length = np.sqrt(x * x + z * z)
-            u[v, 0], u[v, 1], u[v, 2] = z / length, 0.0, -x / length
-        for c in range(3):
-            w[v, c] = mean[v, (c + 1) % 3] * u[v, (c + 2) % 3] - mean[v, (c + 2) % 3] * u[v, (c + 1) % 3]
+    x, y, z = mean.T
+    level = np.abs(z) < 0.7
+    u = np.where(level[:, None], np.stack([-y, x, 0 * z], axis=1), np.stack([z, 0 * z, -x], axis=1))
+    u /= np.maximum(np.sqrt((u * u).sum(axis=1)), 1e-9)[:, None]
+    w = np.cross(mean, u)
+    angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
+    clear = np.ones((len(vertices), _DIRECTIONS))
+    _clear(vertices, faces, u, w, np.cos(angle), np.sin(angle), clear)
+    best = angle[clear.argmax(axis=1), None]
+    sideways: Float = np.cos(best) * u + np.sin(best) * w
+    return sideways
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _clear(
+    vertices: Float, faces: NDArray[np.int32], u: Float, w: Float, cosine: Float, sine: Float, clear: Float
+) -> None:
+    """Lower the sines (n, d) of the angles between directions along the axes u and w and the nearest edge."""
     for f in range(len(faces)):
         for k in range(3):
             v, end = faces[f, k], faces[f, (k + 1) % 3]
@@ -108,36 +117,30 @@ def _sideways(vertices: Float, faces: NDArray[np.int32], mean: Float) -> Float:
                 p += (vertices[end, c] - vertices[v, c]) * u[v, c]
                 q += (vertices[end, c] - vertices[v, c]) * w[v, c]
             length = np.sqrt(p * p + q * q)
-            for i in range(_DIRECTIONS if length > 0.0 else 0):
-                clear[v, i] = min(clear[v, i], abs(p * sine[i] - q * cosine[i]) / length)
-    for v in range(n):
-        best = np.argmax(clear[v])
-        for c in range(3):
-            side[v, c] = cosine[best] * u[v, c] + sine[best] * w[v, c]
-    return side
+            if length > 0.0:
+                for i in range(len(cosine)):
+                    clear[v, i] = min(clear[v, i], abs(p * sine[i] - q * cosine[i]) / length)
 
 
 @njit(nogil=True, cache=True)
-def _corrected(
-    out: Float, faces: NDArray[np.int32], planes: Float, rows: NDArray[np.int64], lacking: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Move the vertices that are still lacking along the normals of the faces in ``rows``.
-
-    Returns the faces of vertices that lacked more than `_SHORT` along one of the normals, and these vertices.
-    """
-    still, kept = np.zeros(len(lacking), np.bool_), np.zeros(len(rows), np.bool_)
+def _correct(
+    out: Float,
+    faces: NDArray[np.int32],
+    planes: Float,
+    rows: NDArray[np.int64],
+    lacking: NDArray[np.bool_],
+    still: NDArray[np.bool_],
+) -> None:
+    """Move the lacking vertices along the normals of the faces in ``rows``; mark those that lacked much."""
     for f in rows:
         for k in range(3):
             v = faces[f, k]
             short = 1.0 - _along(out, v, planes, f)
-            if lacking[v] and short > 0.0 and not (planes[f, 0] == planes[f, 1] == planes[f, 2] == 0.0):
-                still[v] |= short > _SHORT
+            if lacking[v] and short > 0.0:
+                if planes[f, 0] != 0.0 or planes[f, 1] != 0.0 or planes[f, 2] != 0.0:
+                    still[v] |= short > _SHORT
                 for c in range(3):
                     out[v, c] += short * planes[f, c]
-    for i in range(len(rows)):
-        for k in range(3):
-            kept[i] |= still[faces[rows[i], k]]
-    return rows[kept], still
 
 
 @njit(nogil=True, cache=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
@@ -36,60 +35,45 @@ class Tree(NamedTuple):
 
 def tree_of(low: Float, high: Float) -> Tree:
     """The tree of boxes with corners ``low`` and ``high`` (n, 3), in metres."""
-    if not len(low):
+    n = len(low)
+    if not n:
         return Tree(np.empty((0, 8), np.float32), np.empty(0, np.int32))
+    order = np.argsort(_curve(low + high)).astype(np.int32)
+    starts = np.arange(0, n, LEAF)
     margin = _ROUNDING * max(1.0, float(np.abs(low).max()), float(np.abs(high).max()))
-    order = np.argsort(_curve(low, high)).astype(np.int32)
-    return Tree(_nodes(low, high, order, margin), order)
+    least = np.minimum.reduceat(low[order], starts) - margin
+    greatest = np.maximum.reduceat(high[order], starts) + margin
+    nodes = np.empty((2 * len(starts) - 1, 8), np.float32)
+    links, levels = nodes.view(np.int32), []
+    node, first, last = (
+        np.array([0]),
+        np.array([0]),
+        np.array([len(starts)]),
+    )  # halves of the leaves, by level
+    while len(node):
+        half, inner = (first + last) // 2, last - first > 1
+        right = node + 2 * (half - first)
+        links[node, RIGHT], links[node, FIRST] = np.where(inner, right, 0), first * LEAF
+        levels.append((node[inner], right[inner]))
+        leaf, k = node[~inner], first[~inner]
+        nodes[leaf, :3], nodes[leaf, 3:6] = least[k], greatest[k]
+        node, first, last = (
+            np.concatenate([node[inner] + 1, right[inner]]),
+            np.concatenate([first[inner], half[inner]]),
+            np.concatenate([half[inner], last[inner]]),
+        )
+    for node, right in reversed(levels):
+        nodes[node, :3] = np.minimum(nodes[node + 1, :3], nodes[right, :3])
+        nodes[node, 3:6] = np.maximum(nodes[node + 1, 3:6], nodes[right, 3:6])
+    return Tree(nodes, order)
 
 
-@njit(nogil=True, cache=True)
-def _curve(low: Float, high: Float) -> NDArray[np.int64]:
-    """Positions (n,) of the boxes' centres along a Morton curve."""
-    out, least, extent = np.empty(len(low), np.int64), np.empty(3), 1e-9
-    for c in range(3):
-        least[c] = (low[:, c] + high[:, c]).min()
-        extent = max(extent, (low[:, c] + high[:, c]).max() - least[c])
-    for i in range(len(low)):
-        place = 0
-        for c in range(3):
-            x = int((low[i, c] + high[i, c] - least[c]) / extent * (_CELLS - 1.0))
-            x = (x | x << 16) & 0x0000FF0000FF
-            x = (x | x << 8) & 0x00F00F00F00F
-            x = (x | x << 4) & 0x0C30C30C30C3
-            x = (x | x << 2) & 0x249249249249
-            place |= x << c
-        out[i] = place
+def _curve(places: Float) -> NDArray[np.int64]:
+    """Positions (n,) of places (n, 3) along a Morton curve."""
+    least = places.min(axis=0)
+    extent = max(1e-9, float((places.max(axis=0) - least).max()))
+    x = ((places - least) * ((_CELLS - 1.0) / extent)).astype(np.int64)
+    for shift, kept in ((16, 0x0000FF0000FF), (8, 0x00F00F00F00F), (4, 0x0C30C30C30C3), (2, 0x249249249249)):
+        x = (x | x << shift) & kept
+    out: NDArray[np.int64] = x[:, 0] | x[:, 1] << 1 | x[:, 2] << 2
     return out
-
-
-@njit(nogil=True, cache=True)
-def _nodes(low: Float, high: Float, order: NDArray[np.int32], margin: float) -> NDArray[np.float32]:
-    """The nodes of a tree, halves of the order."""
-    leaves = (len(order) + LEAF - 1) // LEAF
-    nodes = np.empty((2 * leaves - 1, 8), np.float32)
-    links = nodes.view(np.int32)
-    waiting, count = np.empty((DEPTH, 3), np.int64), 1
-    waiting[0] = 0, 0, leaves
-    while count:
-        count -= 1
-        node, first, last = waiting[count]
-        links[node, FIRST], links[node, RIGHT] = first * LEAF, 0
-        if last - first > 1:
-            half = (first + last) // 2
-            links[node, RIGHT] = node + 2 * (half - first)
-            waiting[count] = node + 2 * (half - first), half, last
-            waiting[count + 1] = node + 1, first, half
-            count += 2
-    for node in range(len(nodes) - 1, -1, -1):
-        right, start = links[node, RIGHT], links[node, FIRST]
-        for c in range(3):
-            if right:
-                nodes[node, c] = min(nodes[node + 1, c], nodes[right, c])
-                nodes[node, c + 3] = max(nodes[node + 1, c + 3], nodes[right, c + 3])
-            else:
-                least, greatest = np.inf, -np.inf
-                for k in range(start, min(start + LEAF, len(order))):
-                    least, greatest = min(least, low[order[k], c]), max(greatest, high[order[k], c])
-                nodes[node, c], nodes[node, c + 3] = least - margin, greatest + margin
-    return nodes
