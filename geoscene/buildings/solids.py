@@ -121,9 +121,13 @@ def _pieces(buildings: Buildings, base: Float, *, foot: Float, lod: int) -> _Pie
         np.full(len(row), lod < 2) | (buildings.roof_shape[row] == "flat") | (buildings.roof_height[row] <= 0)
     )
     underside = base[building] + low
-    grounded = (low <= 0) & ~np.isin(buildings.min_height_source[row], ("tunnel", "bridge"))
+    over_road = np.isin(buildings.min_height_source[row], ("tunnel", "bridge"))
+    grounded = (low <= 0) & ~over_road
     underside[grounded] = np.minimum(underside, foot[building])[grounded]
-    return _Pieces(_straightened(polygon, building), row, building, underside, base[building] + high, flat)
+    # walls beside a passage have rounded corners where it cuts them, without which they would nearly coincide
+    uncut = ~np.isin(building, building[over_road])
+    polygon[uncut] = _straightened(polygon[uncut], building[uncut])
+    return _Pieces(polygon, row, building, underside, base[building] + high, flat)
 
 
 def _straightened(polygons: Polygons, building: Ints) -> Polygons:

@@ -654,6 +654,13 @@ def test_points_in_straight_walls_are_left_out(tags, faces, turn):
     assert verdict.volume[0] == pytest.approx(expected.volume[0], rel=1e-4)
 
 
+def test_points_in_walls_of_buildings_with_passages_stay():
+    table, _ = read_buildings(osm(house(1, dotted(box(0, 0, 40, 30), 100), height="10")), FRAME)
+    over_road = replace(table, min_height_source=np.array(["tunnel"], object))
+    sizes = [len(build_solids(some, base=np.zeros(1))[0]) for some in (table, over_road)]
+    assert sizes == [12, 4 * 400 - 4]
+
+
 def test_points_in_straight_walls_stay_where_another_part_has_a_corner():
     # the small part ends in the middle of the walls of its neighbours, 0.1 to 1 mm off their straight lines
     left = shapely.Polygon([(0, 0), (10, 0), (10.0002, 8), (9.9990, 12), (10, 20), (0, 20)])
