@@ -13,7 +13,7 @@ from geoscene.typing import Bools, Float, Ints
 PRECISION = 2.0**-9
 """Metres: the grid that plans are cut on, 2 mm, as that of the ground."""
 
-_THIN = PRECISION / 4
+_THIN = PRECISION / 2
 """Metres, width of the thinnest triangle at the border of a plan."""
 
 SIDE = -1
@@ -81,20 +81,20 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
 
 
 def _without_slivers(plan: Plan) -> Plan:
-    """The plan without triangles at its border that are thinner than `_THIN`.
+    """The plan without triangles at its border that are thinner than `_THIN`, and connected at each vertex.
 
     Their sides would be walls so near to each other that rounding makes them cross.
     """
-    xy, faces = plan.xy, plan.faces
     while True:
-        sides = xy[faces[:, [1, 2, 0]]] - xy[faces]
+        start, _, own, other = half_edges(plan)
+        sides = plan.xy[plan.faces[:, [1, 2, 0]]] - plan.xy[plan.faces]
         twice = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
         thin = np.abs(twice) < _THIN * np.hypot(*sides.T).max(axis=0)
-        _, _, own, other = half_edges(Plan(xy, faces))
         thin[thin] = np.isin(np.flatnonzero(thin), own[other < 0])
-        if not thin.any():
-            return Plan(xy, faces)
-        faces = faces[~thin]
+        kept = _unpinched(plan, ~thin, start=start, own=own, other=other) if thin.any() else ~thin
+        if kept.all():
+            return plan
+        plan = Plan(plan.xy, plan.faces[kept])
 
 
 def raise_shell(plan: Plan, levels: Float, *, solid: Bools) -> Shell:
