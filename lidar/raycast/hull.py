@@ -19,8 +19,7 @@ ROUNDING = 2.0**-22
 REACH = 256.0
 """Metres from the origin within which the margin is constant: 0.06 mm."""
 _PLANE = 0.9995  # cosine to the mean normal from which all faces at a vertex form a plane
-_LONGEST = 250.0  # margins by which a vertex moves at most
-_SHARP = 0.05  # cosine to the mean normal of a face at a tip
+_LONGEST = 30.0  # margins by which a vertex moves at most
 _SIDEWAYS = 1.5  # margins along the surface
 _DIRECTIONS = 12  # along the surface, of which the best is taken
 _BORDER = (0.9, 1.2, 0.0)  # margins, the same in all tiles that share the vertex
@@ -46,10 +45,7 @@ def displacements(vertices: Float, faces: NDArray[np.int32], planes: Float) -> F
     _normals(faces, planes, mean, balance, flattest)
     border = balance != 0
     lacking = ~border & (flattest <= _PLANE)
-    outwards = np.where(lacking, 1.0, 0.0)
-    sharp = lacking & (flattest > 0) & (flattest < _SHARP)
-    outwards[sharp] = (1.0 + _SIDEWAYS) / flattest[sharp]  # encloses all faces, whatever the way sideways
-    out = _SIDEWAYS * _sideways(vertices, faces, mean) + outwards[:, None] * mean
+    out = _SIDEWAYS * _sideways(vertices, faces, mean) + np.where(lacking[:, None], mean, 0.0)
     out[border] = _BORDER
     rows = np.flatnonzero(lacking[faces].any(axis=1))
     for _ in range(_ROUNDS):

@@ -173,14 +173,6 @@ def test_no_ray_passes_through_a_vertex_to_a_front_face_behind_it(backend, jitte
     assert (hits.cosine > 0).all()
 
 
-def spire(rng):
-    """A sharp spire and a smaller one inside; a ray at the tip comes from above."""
-    solid = trimesh.creation.cone(radius=rng.uniform(0.1, 0.3), height=9.0, sections=int(rng.integers(3, 9)))
-    vertices = solid.vertices @ Rotation.from_euler("z", rng.uniform(0, 6)).as_matrix().T
-    order = np.argsort(-vertices[:, 2], kind="stable")
-    return vertices[order], np.argsort(order)[solid.faces], vertices[order] * 0.9
-
-
 def fan(rng):
     """Faces around a point, each with vertices of its own, as those of tiles have; and a floor."""
     azimuth = (np.arange(6) + rng.uniform(-0.3, 0.3, 6)) * np.pi / 3
@@ -198,8 +190,8 @@ def narrow(rng):
     return vertices, np.array([[1, 3, 0], [3, 4, 0], [4, 1, 0], [1, 2, 3]]), vertices - [0, 0, 1.5]
 
 
-@pytest.mark.parametrize(("body", "spread"), [(spire, 0.003), (fan, 1.0), (narrow, 1.0)])
-def test_no_ray_passes_through_the_first_vertex_of_a_body_to_a_face_behind(body, spread):
+@pytest.mark.parametrize("body", [fan, narrow])
+def test_no_ray_passes_through_the_first_vertex_of_a_body_to_a_face_behind(body):
     rng = np.random.default_rng(17)
     vertices, faces, targets, count = [], [], [], 0
     for k in range(400):
@@ -211,7 +203,7 @@ def test_no_ray_passes_through_the_first_vertex_of_a_body_to_a_face_behind(body,
         count += 2 * len(corners)
     n = 400_000
     aim = np.array(targets)[rng.integers(0, 400, n)]
-    towards = rng.uniform([-spread, -spread, 0.4], [spread, spread, 1], (n, 3))
+    towards = rng.uniform([-1, -1, 0.4], [1, 1, 1], (n, 3))
     origins = aim + towards * rng.uniform(1, 60, (n, 1))
     hits = Caster(np.concatenate(vertices), np.concatenate(faces)).cast(origins, aim - origins)
     assert (hits.range < 1.0001).all()
