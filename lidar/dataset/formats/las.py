@@ -292,7 +292,7 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with laspy.open(path) as reader:
             yield reader
-    except (laspy.errors.LaspyException, lazrs.LazrsError, OSError, ValueError) as error:
+    except (laspy.errors.LaspyException, lazrs.LazrsError, OSError, ValueError, ArithmeticError) as error:
         raise FormatError(f"{path}: not a readable LAS or LAZ file ({error})") from error
     except BaseException as error:
         if type(error).__name__ != "PanicException":  # of the decompressor; no Exception, and not importable

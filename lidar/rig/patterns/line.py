@@ -79,7 +79,7 @@ def read_line(table: Table) -> Line:
         half_angle=float(np.radians(half)),
         turn=float(np.radians(turn)),
         line_hz=table.number("line_hz", above=0.0, high=1e5),
-        pulse_hz=Fraction(str(table.number("pulse_hz", above=0.0, high=1e7))),
+        pulse_hz=Fraction(str(table.number("pulse_hz", low=1e-3, high=1e7))),
     )
     table.close()
     return pattern

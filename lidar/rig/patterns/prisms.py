@@ -94,7 +94,7 @@ def read_prisms(table: Table) -> Prisms:
         wedge=wedge,
         index=np.array(table.numbers("index", count=k, spread=True)),
         turn_hz=np.array(table.numbers("turn_hz", count=k)),
-        pulse_hz=Fraction(str(table.number("pulse_hz", above=0.0, high=1e7))),
+        pulse_hz=Fraction(str(table.number("pulse_hz", low=1e-3, high=1e7))),
     )
     if (pattern.index < 1).any():
         raise table.error("index", "indices of refraction are 1 or more")

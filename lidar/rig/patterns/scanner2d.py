@@ -62,7 +62,7 @@ def read_scan2d(table: Table, rate_hz: float, *, rates_hz: tuple[float, ...]) ->
         known = ", ".join(f"{r:g}" for r in rates_hz)
         raise table.error("step_deg", f"no step is given for {rate_hz:g} Hz; rates are {known}")
     chosen = step[rates_hz.index(rate_hz)] if rate_hz in rates_hz else step[0]
-    steps = round(360 / chosen) if chosen > 0 else 0
+    steps = round(360 / chosen) if chosen > 1e-6 else 0
     if not steps or abs(steps * chosen - 360) > 0.01:
         raise table.error("step_deg", f"{chosen} does not divide 360 degrees")
     table.close()

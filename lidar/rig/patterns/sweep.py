@@ -103,7 +103,7 @@ def read_sweep(table: Table) -> Sweep:
         low=float(low),
         high=float(high),
         lines=table.integer("lines", 1, low=1, high=1024),
-        pulse_hz=Fraction(str(table.number("pulse_hz", above=0.0, high=1e7))),
+        pulse_hz=Fraction(str(table.number("pulse_hz", low=1e-3, high=1e7))),
         sector=sector,
     )
     table.close()
