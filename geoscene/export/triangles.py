@@ -191,5 +191,5 @@ def _in_single_precision(mesh: Mesh) -> tuple[Mesh, int]:
     rounded = replace(mesh, vertices=points)
     rounded = rounded.take(~degenerate_faces(points, mesh.faces))
     verdict = validate_mesh(rounded)
-    bad = verdict.feature[~verdict.ok]
+    bad = verdict.feature[~verdict.closed_solid]
     return rounded.take(~np.isin(rounded.feature, bad)), len(bad)

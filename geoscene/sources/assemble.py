@@ -9,7 +9,7 @@ from geoscene.errors import SourceNotFoundError
 from geoscene.report import Action, Problem
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
 from geoscene.sources.data import Bounds, OsmData, Point, Relation, Way
-from geoscene.sources.elements import Elements
+from geoscene.sources.elements import UNITS, Elements
 from geoscene.sources.extent import checked_bounds, located, near_extent
 from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
 from geoscene.typing import Bools, Ints
@@ -178,10 +178,12 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
     )
     if bounds is not None:
         data = _selected(data, bounds)
+        lonlat = elements.node_xy / UNITS
+        covered = (*lonlat.min(axis=0), *lonlat.max(axis=0))
         if not (data.ways or data.areas or data.points):
             raise SourceNotFoundError(
                 f"{source}: nothing within {','.join(f'{v:g}' for v in bounds)};"
-                f" it covers {','.join(f'{v:.7g}' for v in extent)} (west, south, east, north)"
+                f" it covers {','.join(f'{v:.7g}' for v in covered)} (west, south, east, north)"
             )
     return data
 

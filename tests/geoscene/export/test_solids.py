@@ -225,6 +225,14 @@ def test_every_solid_of_a_real_place_is_still_closed_after_ply(demo_scene, tmp_p
     assert len(verdict) >= scene.manifest["counts"]["solids"] > 20
 
 
+def test_an_stl_has_every_tree(demo_scene, tmp_path):
+    scene = demo_scene("local")
+    summary = export_scene(scene, tmp_path / "a.stl", options=ExportOptions(layers=("trees",)))
+    first, end = scene.layers["trees"]
+    assert summary.solids == end - first > 10
+    assert summary.notes == ()
+
+
 def test_every_solid_of_a_real_place_is_still_closed_after_cityjson(demo_scene, tmp_path):
     scene = demo_scene("local")
     document = json.loads(export_scene(scene, tmp_path / "a.city.json").path.read_text())
