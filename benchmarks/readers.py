@@ -11,7 +11,7 @@ from damaged_inputs import PLACE
 from geoscene.frames import Frame
 from geoscene.roadgraph import read_graphml
 from geoscene.scene.geopackage import read_layer
-from geoscene.scene.layout import open_scene
+from geoscene.scene.layout import SceneFiles, open_scene
 from geoscene.scene.tile_files import read_shapes, read_tile
 from geoscene.sources import read_osm, read_source
 from lidar.dataset.boxes import read_boxes
@@ -48,12 +48,13 @@ _MAPS: dict[str, Callable[[Path], object]] = {
     "a.json": read_osm,
     "*.parquet": functools.partial(read_source, "overture"),
 }
+_FILES = SceneFiles(Path())
 _SCENES: dict[str, Callable[[Path], object]] = {
-    "scene.json": lambda path: open_scene(path.parent),
+    _FILES.manifest.name: lambda path: open_scene(path.parent),
     "*_*.npz": read_tile,
-    "shapes.npz": read_shapes,
-    "features.gpkg": _layers,
-    "roads.graphml": lambda path: read_graphml(path, _FRAME),
+    _FILES.shapes.name: read_shapes,
+    _FILES.features.name: _layers,
+    _FILES.road_graph.name: lambda path: read_graphml(path, _FRAME),
 }
 _DATASETS: dict[str, Callable[[Path], object]] = {
     "dataset.json": lambda path: open_dataset(path.parent),

@@ -282,6 +282,29 @@ def _states_what_it_holds(path: Path) -> bool:
         return bool(int.from_bytes(file.read(4), "little") <= size and length * points <= _RATIO * size)
 
 
+def _check_layers(path: Path, header: Any) -> None:
+    """Raise ValueError if layers of a chunk of a LAZ file do not fit into it: the decompressor trusts them.
+
+    A chunk of point formats 6 to 10 holds its first point as it is, the number of its points, the sizes of
+    its layers, and the layers: nine of the point, one each of colour, infrared, wave packets and extra bytes.
+    """
+    import lazrs  # noqa: PLC0415
+
+    compressed, point = header.vlrs.get("LasZipVlr"), header.point_format
+    if not compressed or point.id < 6:
+        return
+    layers = 9 + {6: 0, 7: 1, 8: 2, 9: 1, 10: 3}[point.id] + point.num_extra_bytes
+    with path.open("rb") as file:
+        file.seek(header.offset_to_point_data)
+        for _, size in lazrs.read_chunk_table(file, lazrs.LazVlr(compressed[0].record_data)):
+            start = file.tell()
+            file.seek(start + point.size)
+            sizes = np.frombuffer(file.read(4 + 4 * layers), "<u4")[1:]
+            if sizes.sum(dtype=np.int64) > size:
+                raise ValueError("layers larger than their chunk")
+            file.seek(start + size)
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     import laspy  # noqa: PLC0415
@@ -291,6 +314,7 @@ def _opened(path: Path) -> Iterator[Any]:
         raise FormatError(f"{path}: not a readable LAS or LAZ file (its header states more than it holds)")
     try:
         with laspy.open(path) as reader:
+            _check_layers(path, reader.header)
             yield reader
     except (laspy.errors.LaspyException, lazrs.LazrsError, OSError, ValueError, ArithmeticError) as error:
         raise FormatError(f"{path}: not a readable LAS or LAZ file ({error})") from error

@@ -144,7 +144,7 @@ def test_odd_rows_are_repaired_or_dropped_and_listed(tmp_path):
         {"id": "null", "geometry": None},
         {"id": "noise", "geometry": b"no wkb"},
         {"id": "empty", "geometry": "POLYGON EMPTY", "bbox": None},
-        {"id": "line", "geometry": "LINESTRING (0 0, 1 1)"},
+        {"id": "line", "geometry": "LINESTRING (0 0, 1e-3 1e-3)"},
         {"id": "metres", "geometry": "POLYGON ((500000 0, 500010 0, 500010 10, 500000 0))"},
     ]
     data = read_source("overture", write_overture(tmp_path / "a.parquet", rows))

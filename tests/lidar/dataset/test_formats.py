@@ -308,6 +308,18 @@ def test_a_chunk_table_that_a_file_cannot_hold_is_refused(tmp_path):
         read_table(path)
 
 
+def test_layers_that_a_chunk_cannot_hold_are_refused(tmp_path):
+    path = tmp_path / "a.laz"
+    las.write(path, table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
+    assert len(read_table(path)["x"]) == 500
+    whole = path.read_bytes()
+    length, start = int.from_bytes(whole[105:107], "little"), int.from_bytes(whole[96:100], "little")
+    sizes = start + 8 + length + 4  # after the place of the chunk table, the first point and their number
+    path.write_bytes(whole[:sizes] + b"\xf0" * 4 + whole[sizes + 4 :])
+    with pytest.raises(FormatError, match="layers larger than their chunk"):
+        read_table(path)
+
+
 def test_a_panic_of_the_decompressor_names_the_file(tmp_path, monkeypatch):
     class PanicException(BaseException):
         """As pyo3 raises it."""
