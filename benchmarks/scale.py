@@ -31,7 +31,7 @@ from make_osm import make_city, write_city
 
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.frames import Frame
-from geoscene.ground.terrain import base_heights, flat_terrain, open_terrain
+from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.plan import take_buildings
 from geoscene.scene import open_scene
 from geoscene.sources import read_osm
@@ -140,7 +140,7 @@ def stages(given: argparse.Namespace) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"extract": path.name, "buildings": count, "parse_s": round(parse, 2)}
         row["read_s"] = round(read - parsed, 2)
         _solids(table, np.zeros(count), 2, _tiles(table)[:1])  # imports, not counted
-        terrains = {"level": flat_terrain(frame)}
+        terrains = {"level": Terrain(frame)}
         if given.dem:
             bounds = tuple(shapely.total_bounds(footprints).tolist())
             terrains["dem"] = open_terrain(given.dem, frame, bounds=bounds, outside="nearest")
