@@ -128,6 +128,12 @@ class Dataset:
         return Frame.from_json(self.manifest["frame"])
 
     @property
+    def scene_path(self) -> Path:
+        """The scene's folder as it was given for the drive; if it is not there, from the dataset's parent."""
+        given = Path(self.manifest["scene"]["path"])
+        return given if given.exists() else self.path.resolve().parent / given
+
+    @property
     def start(self) -> datetime:
         """UTC time of the drive's start."""
         return datetime.fromisoformat(self.manifest["start_time"])

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class, class_codes
+from geoscene.scene import open_scene
 from lidar.dataset.deskew import MOMENTS, deskewed
 from lidar.dataset.export import EXPORTERS
 from lidar.dataset.export.nuscenes import CATEGORIES, VERSION
@@ -741,6 +742,17 @@ def test_kitti_exports_take_clouds_and_labels_of_kitti_as_they_are(dataset, tmp_
     shutil.rmtree(source / "top" / "velodyne")
     with pytest.raises(DatasetError, match=r"`formats` pcd, .*kitti"):
         EXPORTERS["kitti"].export(open_dataset(source), tmp_path / "none")
+
+
+def test_a_dataset_finds_its_scene_beside_it_from_any_directory(scene, tmp_path, monkeypatch):
+    for name in ("work", "elsewhere"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "work" / "scene").symlink_to(scene.path)
+    monkeypatch.chdir(tmp_path / "work")
+    options = DriveOptions(route="random", rig="vlp16", duration=0.1, formats=("pcd",))
+    drive(open_scene("scene"), "drive", options=options)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert open_dataset("../work/drive").scene_path.samefile(scene.path)
 
 
 def test_a_map_reports_missing_frames(scene, rig, tmp_path):

@@ -356,15 +356,14 @@ class _Export:
 def _paved(dataset: Dataset) -> Iterator[Float]:
     """Triangles (n, 3, 2), scene metres, of the roads and sidewalks in each tile of a dataset's scene."""
     try:
-        scene = open_scene(dataset.manifest["scene"]["path"])
-        tiles = [scene.tile(i, j) for i, j in scene.tile_indices]
+        scene = open_scene(dataset.scene_path)
+        paved = np.isin(class_codes().nuscenes, [CATEGORIES.index(name) for name in _PAVED])
+        for i, j in scene.tile_indices:
+            tile = scene.tile(i, j)
+            xy = (tile.mesh.vertices + tile.origin)[:, :2]
+            yield xy[tile.mesh.faces[paved[tile.mesh.klass]]]
     except GeosceneError as error:
-        log.warning("the map's mask is empty: %s", error)
-        return
-    paved = np.isin(class_codes().nuscenes, [CATEGORIES.index(name) for name in _PAVED])
-    for tile in tiles:
-        xy = (tile.mesh.vertices + tile.origin)[:, :2]
-        yield xy[tile.mesh.faces[paved[tile.mesh.klass]]]
+        log.warning("the map's mask is not complete: %s", error)
 
 
 _TABLES = (
