@@ -83,18 +83,35 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
 def _without_slivers(plan: Plan) -> Plan:
     """The plan without triangles at its border that are thinner than `_THIN`, and connected at each vertex.
 
-    Their sides would be walls so near to each other that rounding makes them cross.
+    Their sides would be walls so near to each other that rounding makes them cross. One with only its
+    shortest side at the border is closed by merging that side's ends; others are left out.
     """
     while True:
-        start, _, own, other = half_edges(plan)
-        sides = plan.xy[plan.faces[:, [1, 2, 0]]] - plan.xy[plan.faces]
-        twice = sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]
-        thin = np.abs(twice) < _THIN * np.hypot(*sides.T).max(axis=0)
-        thin[thin] = np.isin(np.flatnonzero(thin), own[other < 0])
-        kept = _unpinched(plan, ~thin, start=start, own=own, other=other) if thin.any() else ~thin
-        if kept.all():
+        start, end, own, other = half_edges(plan)
+        length = np.hypot(*(plan.xy[end] - plan.xy[start]).T).reshape(-1, 3)
+        border = other.reshape(-1, 3) < 0
+        thin = border.any(axis=1) & (_twice_areas(plan) < _THIN * length.max(axis=1))
+        if not thin.any():
             return plan
-        plan = Plan(plan.xy, plan.faces[kept])
+        needle = thin & (border.sum(axis=1) == 1) & (border.argmax(axis=1) == length.argmin(axis=1))
+        for triangle in np.flatnonzero(needle):
+            side = 3 * triangle + border[triangle].argmax()
+            faces = np.where(plan.faces == end[side], start[side], plan.faces)
+            merged = Plan(plan.xy, faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
+            if (_twice_areas(merged) > 0).all():
+                break
+        else:
+            kept = _unpinched(plan, ~thin, start=start, own=own, other=other)
+            merged = Plan(plan.xy, plan.faces[kept])
+        plan = merged
+
+
+def _twice_areas(plan: Plan) -> Float:
+    """Twice the area (m,) of each triangle; negative if clockwise."""
+    a, b, c = (plan.xy[plan.faces[:, k]] for k in range(3))
+    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
+    twice: Float = ux * vy - uy * vx
+    return twice
 
 
 def raise_shell(plan: Plan, levels: Float, *, solid: Bools) -> Shell:
@@ -136,8 +153,7 @@ def raise_shell(plan: Plan, levels: Float, *, solid: Bools) -> Shell:
 
 def _unpinched(plan: Plan, solid: Bools, *, start: Ints, own: Ints, other: Ints) -> Bools:
     """The layer (m,) reduced so that the solid around each vertex is connected."""
-    (ux, uy), (vx, vy) = (plan.xy[plan.faces[:, k]].T - plan.xy[plan.faces[:, 0]].T for k in (1, 2))
-    area = np.repeat(ux * vy - uy * vx, 3)
+    area = np.repeat(_twice_areas(plan), 3)
     solid = solid.copy()
     while True:
         # Each sector of solid about a vertex has one side that begins there with the empty on its right.
