@@ -77,10 +77,10 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
     u, v = grid[faces[:, 1]] - grid[faces[:, 0]], grid[faces[:, 2]] - grid[faces[:, 0]]
     twice = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
     faces = np.where((twice < 0)[:, None], faces[:, ::-1], faces)
-    return _without_slivers(Plan(grid * PRECISION, faces[twice != 0].astype(np.int64)))
+    return without_slivers(Plan(grid * PRECISION, faces[twice != 0].astype(np.int64)))
 
 
-def _without_slivers(plan: Plan) -> Plan:
+def without_slivers(plan: Plan) -> Plan:
     """The plan without triangles at its border that are thinner than `_THIN`, and connected at each vertex.
 
     Their sides would be walls so near to each other that rounding makes them cross. One with only its
