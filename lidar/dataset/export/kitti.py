@@ -6,7 +6,6 @@ Geiger et al. 2012, Behley et al. 2019. With ``calib/`` and ``label_2/``, ``sequ
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -42,10 +41,8 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
         name = f"{row:06d}"
         labels = sequence / "labels" / f"{name}.label"
         drive.write_cloud(sequence / "velodyne" / f"{name}.bin", row=row, labels=labels)
-        for number, stream in drive.cameras.items():
-            path = sequence / f"image_{number}" / f"{name}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(stream.files[drive.images[number][row]], path)
+        for number in drive.cameras:
+            drive.write_image(sequence / f"image_{number}" / f"{name}.png", number=number, row=row)
         progress("KITTI", row + 1, total=len(drive))
     objects = _write_objects(drive, sequence) if _OBJECTS in drive.cameras and drive.boxes else 0
     return {"clouds": len(drive), "images": len(drive) * len(drive.cameras), "objects": objects}
@@ -69,8 +66,7 @@ def _write_objects(drive: KittiDrive, sequence: Path) -> int:
 
 def _object_calibration(drive: KittiDrive) -> list[str]:
     """Lines of a calibration file of the object benchmark; its inertial unit is the vehicle's."""
-    lidar_from_imu = np.linalg.inv(drive.clouds.mount.matrix) @ drive.inertial_unit.matrix
     named = {f"P{k}": matrix for k, matrix in enumerate(drive.projections)}
     named |= {"R0_rect": np.eye(3), "Tr_velo_to_cam": drive.camera_from_lidar[:3]}
-    named |= {"Tr_imu_to_velo": lidar_from_imu[:3]}
+    named |= {"Tr_imu_to_velo": drive.lidar_from_imu[:3]}
     return [f"{name}: {numbers(matrix)}" for name, matrix in named.items()]

@@ -86,6 +86,11 @@ class KittiDrive:
         """Transformation (4, 4) from the scanner's frame to the reference camera's."""
         return np.asarray(np.linalg.inv(self.reference.matrix) @ self.clouds.mount.matrix, float)
 
+    @property
+    def lidar_from_imu(self) -> Float:
+        """Transformation (4, 4) from the inertial unit's frame to the scanner's."""
+        return np.asarray(np.linalg.inv(self.clouds.mount.matrix) @ self.inertial_unit.matrix, float)
+
     @functools.cached_property
     def projections(self) -> list[Float]:
         """Projections (3, 4) of cameras 0 to 3 from the reference camera's frame; else those of the first."""
@@ -131,6 +136,11 @@ class KittiDrive:
             found = recorded_labels(table, self.boxes.get(int(self.clouds.frames[row]), {}).values())
             labels.parent.mkdir(parents=True, exist_ok=True)
             kitti.write_labels(labels, found)
+
+    def write_image(self, path: Path, *, number: int, row: int) -> None:
+        """Write the image of a frame from a camera."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(self.cameras[number].files[self.images[number][row]], path)
 
 
 def read_drive(dataset: Dataset) -> KittiDrive:

@@ -61,14 +61,13 @@ def object_lines(
         side = np.array([sensor["width"], sensor["height"]] * 2) - 1
         values = [
             truncation(corners, drive.projections[number], sides=side[:2]),
-            int(np.searchsorted(_VISIBLE, flat["visibility"], side="right")),
+            len(_VISIBLE) - int(np.searchsorted(_VISIBLE, flat["visibility"], side="right")),
             _wrapped(yaw - np.arctan2(bottom[0], bottom[2])),
             *np.clip([flat[k] for k in ("left", "top", "right", "bottom")], 0, side),
             *size[[2, 1, 0]],
             *bottom,
             yaw,
         ]
-        values[1] = 2 - values[1]
         kind = TYPES.get(Class[box["class"].upper()], "Misc")
         lines.append(" ".join([kind, *(str(v) if isinstance(v, int) else f"{v:.4f}" for v in values)]))
     return lines

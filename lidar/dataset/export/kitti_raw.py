@@ -6,23 +6,20 @@ dataset have the measurements.
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.errors import reading
 from geoscene.files import write_atomically
 from geoscene.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.export.kitti_drive import CAMERAS, KittiDrive, read_drive
 from lidar.dataset.kitti_sequence import numbers
-from lidar.dataset.layout import Dataset, read_rows
+from lidar.dataset.layout import Dataset, read_rows, reading_file
 from lidar.dataset.metadata import iso_times
 from lidar.dataset.recorded import nearest
-from lidar.errors import DatasetError
 from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
 from lidar.navigation.gnss import antenna_motion
 from lidar.navigation.imu import true_inertial
@@ -91,10 +88,10 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
         text = " ".join(str(value) for value in values) + "\n"
         write_atomically(out / "oxts" / "data" / f"{row:010d}.txt", text.encode("ascii"))
         drive.write_cloud(out / "velodyne_points" / "data" / f"{row:010d}.bin", row=row)
-        for number, stream in drive.cameras.items():
-            path = out / f"image_{number:02d}" / "data" / f"{row:010d}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(stream.files[drive.images[number][row]], path)
+        for number in drive.cameras:
+            drive.write_image(
+                out / f"image_{number:02d}" / "data" / f"{row:010d}.png", number=number, row=row
+            )
         progress("KITTI raw", row + 1, total=len(drive))
     return {"clouds": len(drive), "images": len(drive) * len(drive.cameras), "poses": len(drive)}
 
@@ -143,7 +140,7 @@ def _satellites(drive: KittiDrive) -> NDArray[np.int64]:
     for name in drive.dataset.sensors("gnss"):
         path, times = drive.dataset.paths.measurements(name), drive.dataset.sample_times(name)
         rows = read_rows(path)
-        with reading(path, DatasetError, remedy="drive again with `overwrite`"):
+        with reading_file(path):
             used = np.array([int(row["satellites"]) for row in rows], np.int64)
         if len(used):
             return used[nearest(times, drive.clouds.time_ns)]
@@ -159,8 +156,7 @@ def _write_times(path: Path, dataset: Dataset, *, times: NDArray[np.int64]) -> N
 def _write_calibrations(drive: KittiDrive, folder: Path) -> None:
     """Write ``calib_imu_to_velo.txt``, ``calib_velo_to_cam.txt`` and ``calib_cam_to_cam.txt``."""
     stamp = drive.dataset.start.strftime("%d-%b-%Y %H:%M:%S")
-    lidar_from_imu = np.linalg.inv(drive.clouds.mount.matrix) @ drive.inertial_unit.matrix
-    _write_calibration(folder / "calib_imu_to_velo.txt", stamp, values=_rigid(lidar_from_imu))
+    _write_calibration(folder / "calib_imu_to_velo.txt", stamp, values=_rigid(drive.lidar_from_imu))
     pixels = {"delta_f": np.zeros(2), "delta_c": np.zeros(2)}
     _write_calibration(
         folder / "calib_velo_to_cam.txt", stamp, values=_rigid(drive.camera_from_lidar) | pixels

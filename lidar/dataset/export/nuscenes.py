@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from geoscene.classes import Class, class_codes
-from geoscene.errors import GeosceneError, reading
+from geoscene.errors import GeosceneError
 from geoscene.files import write_atomically
 from geoscene.progress import Progress
 from geoscene.scene import open_scene
@@ -28,7 +28,7 @@ from geoscene.typing import Float, Ints
 from lidar.camera.png import write_png
 from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.formats import nuscenes
-from lidar.dataset.layout import Dataset
+from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.recorded import (
     Stream,
     color_images,
@@ -286,7 +286,7 @@ class _Export:
     def _describe(self, samples: Sequence[Row]) -> None:
         """Fill the tables that describe the whole drive."""
         path, manifest = self.dataset.paths.manifest, self.dataset.manifest
-        with reading(path, DatasetError, remedy="drive again with `overwrite`"):
+        with reading_file(path):
             place = str(manifest["scene"]["name"] or manifest["scene"]["path"])
             attribution, vehicle = str(manifest["attribution"]), str(manifest["rig"])
         log_token = _token(self.name, "log")
