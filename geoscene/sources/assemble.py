@@ -178,9 +178,9 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
     )
     if bounds is not None:
         data = _selected(data, bounds)
-        lonlat = elements.node_xy / UNITS
-        covered = (*lonlat.min(axis=0), *lonlat.max(axis=0))
         if not (data.ways or data.areas or data.points):
+            lonlat = elements.node_xy / UNITS
+            covered = (*lonlat.min(axis=0), *lonlat.max(axis=0))
             raise SourceNotFoundError(
                 f"{source}: nothing within {','.join(f'{v:g}' for v in bounds)};"
                 f" it covers {','.join(f'{v:.7g}' for v in covered)} (west, south, east, north)"
