@@ -121,14 +121,8 @@ def fetch_elevation(
     if path.exists():
         return path
     heights = np.empty(((y1 - y0 + 1) * _SIDE, (x1 - x0 + 1) * _SIDE))
-    for done, ((x, y), tile) in enumerate(
-        zip(
-            names,
-            _tiles(names, z, cache_dir=cache_dir, server=server),
-            strict=True,
-        ),
-        1,
-    ):
+    tiles = zip(names, _tiles(names, z, cache_dir=cache_dir, server=server), strict=True)
+    for done, ((x, y), tile) in enumerate(tiles, 1):
         row, column = (y - y0) * _SIDE, (x - x0) * _SIDE
         heights[row : row + _SIDE, column : column + _SIDE] = tile
         progress("elevation tiles", done, total=len(names))

@@ -74,10 +74,10 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
         np.rint(corners.reshape(-1, 2) / PRECISION).astype(np.int64), axis=0, return_inverse=True
     )
     faces = faces.reshape(-1, 3)
-    u, v = grid[faces[:, 1]] - grid[faces[:, 0]], grid[faces[:, 2]] - grid[faces[:, 0]]
-    twice = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    faces = np.where((twice < 0)[:, None], faces[:, ::-1], faces)
-    return without_slivers(Plan(grid * PRECISION, faces[twice != 0].astype(np.int64)))
+    plan = Plan(grid * PRECISION, faces.astype(np.int64))
+    twice = _twice_areas(plan)  # of multiples of the grid, so it is exact
+    faces = np.where((twice < 0)[:, None], plan.faces[:, ::-1], plan.faces)
+    return without_slivers(Plan(plan.xy, faces[twice != 0]))
 
 
 def without_slivers(plan: Plan) -> Plan:

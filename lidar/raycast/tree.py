@@ -45,11 +45,7 @@ def tree_of(low: Float, high: Float) -> Tree:
     greatest = np.maximum.reduceat(high[order], starts) + margin
     nodes = np.empty((2 * len(starts) - 1, 8), np.float32)
     links, levels = nodes.view(np.int32), []
-    node, first, last = (
-        np.array([0]),
-        np.array([0]),
-        np.array([len(starts)]),
-    )  # halves of the leaves, by level
+    node, first, last = (np.array([k]) for k in (0, 0, len(starts)))  # halves of the leaves, by level
     while len(node):
         half, inner = (first + last) // 2, last - first > 1
         right = node + 2 * (half - first)

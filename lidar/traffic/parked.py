@@ -75,10 +75,9 @@ def kerb_spaces(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: floa
                 continue
             turned = np.pi if side != lanes.side else 0.0
             beside = float(g.width[e]) / 2 + _ASIDE
-            for aside, chance in ((out, share), (beside, share * _BICYCLES)):
+            for aside, chance, narrow in ((out, share, False), (beside, share * _BICYCLES, True)):
                 line = polylines.parallel(g.geometry[e], -side * aside)
-                row = _row(line, turned, share=chance, narrow=aside == beside, rng=rng)
-                found.append(row)
+                found.append(_row(line, turned, share=chance, narrow=narrow, rng=rng))
     return ParkingSpaces.concatenate(found) if found else NO_SPACES
 
 

@@ -148,8 +148,9 @@ def _home() -> Path:
     """
     before = {name: os.environ.get(name) for name in ("PROJ_DATA", "PROJ_LIB")}
     home = Path(need("sumo", "sumo").SUMO_HOME)
-    for name in (name for name, value in before.items() if value is None):
-        os.environ.pop(name, None)
+    for name, value in before.items():
+        if value is None:
+            os.environ.pop(name, None)
     return home
 
 

@@ -54,18 +54,8 @@ class Shape:
 
 
 KINDS = (
-    *(
-        "sedan",
-        "hatchback",
-        "suv",
-        "van",
-        "truck",
-        "bus",
-        "motorcycle",
-        "parked_motorcycle",
-        "bicycle",
-        "cyclist",
-    ),
+    *("sedan", "hatchback", "suv", "van", "truck", "bus"),
+    *("motorcycle", "parked_motorcycle", "bicycle", "cyclist"),
     *("adult", "small_adult", "child"),
 )
 """Kinds of bodies. A motorcycle has its rider, a parked one and a bicycle have none."""
