@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar.errors import RigError
-from lidar.rig.patterns.beams import Firings, Pattern, frame_ns
+from lidar.rig.patterns.beams import Firings, Pattern, frame_ns, frame_window_ns
 from lidar.rig.patterns.flash import read_flash
 from lidar.rig.patterns.line import read_line
 from lidar.rig.patterns.prisms import read_prisms
@@ -107,11 +107,14 @@ class Sensor:
 
     def frame_start_ns(self, frame: int) -> int:
         """Start of a frame, nanoseconds since the drive's start."""
-        return self.start_ns + int(frame * frame_ns(self.rate_hz))
+        return self.window_ns(frame)[0]
 
     def window_ns(self, frame: int) -> tuple[int, int]:
-        """Interval in which all pulses of a frame are fired, nanoseconds since the drive's start."""
-        return self.frame_start_ns(frame), self.frame_start_ns(frame + 1) + self.pattern.tail_ns
+        """Start of a frame and of the next one, nanoseconds since the drive's start.
+
+        The pulses of the frame are fired from the first to before the second.
+        """
+        return frame_window_ns(frame, self.rate_hz, start_ns=self.start_ns)
 
     def footprint(self, distance: float) -> tuple[float, float]:
         """Width and height in metres of the beam at a distance in metres."""

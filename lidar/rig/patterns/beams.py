@@ -58,20 +58,16 @@ class Pattern(Protocol):
     def range_offset(self) -> float:
         """Metres that the sensor adds to the distance from the beam's start."""
 
-    @property
-    def tail_ns(self) -> int:
-        """Maximum delay of the last pulse after the end of its frame, nanoseconds."""
-
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
-        """The pulses of frame ``frame``; frame 0 starts at ``start_ns``."""
+        """The pulses that are fired within `frame_window_ns` of frame ``frame``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Blocks(Columns):
-    """The firing blocks that start within one frame.
+    """Successive firing blocks.
 
     first   : number of the first block, counted from the start of frame 0
-    phase   : time from the frame's start to that block, in frames (0 to 1)
+    phase   : time from the frame's start to that block, in frames; negative if it starts before the frame
     step    : time from block to block, in frames
     time_ns : (n,) int64, start of each block
     """
@@ -87,15 +83,30 @@ def frame_ns(rate_hz: float) -> Fraction:
     return 10**9 / Fraction(rate_hz).limit_denominator(10**6)
 
 
-def blocks(frame: int, rate_hz: float, *, block_ns: Fraction, start_ns: int) -> Blocks:
-    """The blocks within one frame of a clock with the period ``block_ns``.
+def frame_window_ns(frame: int, rate_hz: float, *, start_ns: int) -> tuple[int, int]:
+    """Start of a frame and of the next one in whole nanoseconds; frame 0 starts at ``start_ns``."""
+    period = frame_ns(rate_hz)
+    return start_ns + int(frame * period), start_ns + int((frame + 1) * period)
+
+
+def blocks(
+    frame: int, rate_hz: float, *, block_ns: Fraction, start_ns: int, delays_ns: tuple[int, int] = (0, 0)
+) -> Blocks:
+    """The blocks of a clock with the period ``block_ns`` that have a pulse within one frame.
+
+    delays_ns : of the first and of the last pulse of a block after the block's start
 
     The clock runs on across frames, as in real instruments: if a frame is not a multiple of a block, the
     phase of the blocks shifts from frame to frame, and some frames have one block more.
     """
     period = frame_ns(rate_hz)
-    first, stop = (-(-frame_edge // block_ns) for frame_edge in (frame * period, (frame + 1) * period))
-    time = start_ns + _nearest_multiples(block_ns, first, stop=stop)
+    start, stop = frame_window_ns(frame, rate_hz, start_ns=0)
+    half = Fraction(1, 2)  # a time within half a nanosecond of the frame's start is rounded to it
+    first, end = (
+        -(-(edge - delay - half) // block_ns)
+        for edge, delay in zip((start, stop), delays_ns[::-1], strict=True)
+    )
+    time = start_ns + _nearest_multiples(block_ns, first, stop=end)
     return Blocks(first, float((first * block_ns - frame * period) / period), float(block_ns / period), time)
 
 

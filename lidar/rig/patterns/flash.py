@@ -30,7 +30,6 @@ class Flash:
     rectilinear: bool
     row_ns: int
     range_offset: float = 0.0
-    tail_ns: int = 0
 
     @functools.cached_property
     def _grid(self) -> tuple[Float, Float, NDArray[np.uint16], NDArray[np.int32], NDArray[np.uint16]]:

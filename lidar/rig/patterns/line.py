@@ -38,7 +38,6 @@ class Line:
     line_hz: float
     pulse_hz: Fraction
     range_offset: float = 0.0
-    tail_ns: int = 0
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of frame ``frame``; the mirror's motion continues across frames."""

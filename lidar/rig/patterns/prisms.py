@@ -31,7 +31,6 @@ class Prisms:
     turn_hz: Float
     pulse_hz: Fraction
     range_offset: float = 0.0
-    tail_ns: int = 0
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of frame ``frame``; the prisms' rotation continues across frames."""

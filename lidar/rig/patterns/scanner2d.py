@@ -25,7 +25,6 @@ class Scan2d:
     first: float
     last: float
     range_offset: float = 0.0
-    tail_ns: int = 0
 
     @functools.cached_property
     def _beams(self) -> tuple[Float, Float, NDArray[np.int32], NDArray[np.uint16]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.rig.patterns.beams import Firings, blocks, frame_ns, frozen, ranks
+from lidar.rig.patterns.beams import Firings, blocks, frame_ns, frame_window_ns, frozen, ranks
 from lidar.rig.toml_table import Table
 
 
@@ -48,11 +48,6 @@ class Spinning:
     range_offset: float
 
     @functools.cached_property
-    def tail_ns(self) -> int:
-        """Maximum delay of the last pulse after the end of its frame, nanoseconds."""
-        return int(self.fire_ns.max())
-
-    @functools.cached_property
     def _central(self) -> bool:
         """Whether all beams start on the axis."""
         return not (self.forward.any() or self.left.any())
@@ -67,13 +62,17 @@ class Spinning:
         return origin.reshape(-1, 3)
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
-        """The pulses of revolution ``frame``; azimuths repeat only if encoder-locked."""
+        """The pulses of revolution ``frame``; azimuths repeat only if encoder-locked.
+
+        Pulses of one block before and after the end of a frame belong to different frames.
+        """
         period = frame_ns(rate_hz)
         block = blocks(
             frame,
             rate_hz,
             block_ns=period / self.columns if self.columns else self.block_ns,
             start_ns=start_ns,
+            delays_ns=(int(self.fire_ns.min()), int(self.fire_ns.max())),
         )
         turned = block.phase + block.step * np.arange(len(block), dtype=np.float64)
         encoder = self.start + self.turn * 2 * np.pi * turned
@@ -86,7 +85,10 @@ class Spinning:
         ring, column, channel, order, up = _labels(self, len(block))
         origin = up if self._central else self._origins(encoder, late, ahead=ahead)
         time = (block.time_ns[:, None] + self.fire_ns).ravel()
-        return Firings(time, direction.reshape(-1, 3), origin, ring, column, channel, order)
+        pulses = Firings(time, direction.reshape(-1, 3), origin, ring, column, channel, order)
+        start, stop = frame_window_ns(frame, rate_hz, start_ns=start_ns)
+        during = (time >= start) & (time < stop)
+        return pulses if during.all() else _chosen(pulses, during)
 
 
 @functools.lru_cache(maxsize=64)
@@ -104,6 +106,13 @@ def _labels(
         frozen(number[:, np.argsort(rank)].T.ravel()),
         frozen(np.tile(np.stack([0 * pattern.up, 0 * pattern.up, pattern.up], axis=1), (count, 1))),
     )
+
+
+def _chosen(pulses: Firings, chosen: NDArray[np.bool_]) -> Firings:
+    """Some of the pulses, in the same order."""
+    kept, order = pulses.take(chosen), pulses.order[chosen[pulses.order]]
+    rank = np.cumsum(chosen, dtype=np.int32) - 1
+    return replace(kept, order=rank[order])
 
 
 def _rotate(angle: Any, x: Any, *, y: Any, out: Float) -> None:

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.rig.patterns.beams import Firings, blocks, frame_ns, from_origin, numbers, unit_vectors
+from lidar.rig.patterns.beams import (
+    Firings,
+    blocks,
+    frame_window_ns,
+    from_origin,
+    numbers,
+    unit_vectors,
+)
 from lidar.rig.toml_table import Table
 
 
@@ -34,7 +41,6 @@ class Sweep:
     pulse_hz: Fraction
     sector: tuple[float, ...] = ()
     range_offset: float = 0.0
-    tail_ns: int = 0
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of frame ``frame``; the pattern continues across frames."""
@@ -70,11 +76,10 @@ class Listed:
     elevation: Float
     period_ns: int
     range_offset: float = 0.0
-    tail_ns: int = 0
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses of frame ``frame``; the list continues across frames."""
-        first, stop = (-(-k * frame_ns(rate_hz) // 1) for k in (frame, frame + 1))
+        first, stop = frame_window_ns(frame, rate_hz, start_ns=0)
         rounds = np.arange(first // self.period_ns, stop // self.period_ns + 1, dtype=np.int64)
         time = (rounds[:, None] * self.period_ns + self.after_ns).ravel()
         rows = np.flatnonzero((time >= first) & (time < stop))
