@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
@@ -18,6 +18,9 @@ from lidar.dataset.export import exporter
 from lidar.dataset.formats import map_suffixes
 from lidar.errors import InputError, LidarError
 from lidar.options import OUTPUT, ApplyOptions, DriveOptions, ExportOptions, MapOptions
+
+if TYPE_CHECKING:
+    from lidar.maps.aggregate import MapSummary
 
 app = App(
     name="lidar",
@@ -125,6 +128,8 @@ def map_(
 
     lidar map drive -o map.ply --voxel 0.1 --color height
 
+    lidar map drive -o empty.laz --without vehicles,pedestrian
+
     Parameters
     ----------
     dataset
@@ -140,13 +145,19 @@ def map_(
         )
     if report.json:
         counts: dict[str, Any] = {"points_in": summary.points_in, "points": summary.points}
-        counts["noise_left_out"] = summary.noise
+        counts |= {f"{name}_left_out": n for name, n in _left_out(summary).items()}
         counts |= {"frames": summary.frames, "missing_frames": summary.missing}
         print_json({"path": str(out), **counts})
     else:
-        noise = f"; {summary.noise:,} of noise left out (--noise keeps them)" if summary.noise else ""
+        what = {
+            "noise": "noise (--noise keeps them)",
+            "moving": "moving road users (--moving keeps them)",
+            "classes": "--without",
+        }
+        left = [f"{n:,} of {what[name]}" for name, n in _left_out(summary).items() if n]
         print(
-            f"{out}: {summary.points:,} of {summary.points_in:,} points from {summary.frames} frames{noise}"
+            f"{out}: {summary.points:,} of {summary.points_in:,} points from {summary.frames} frames"
+            + (f"; left out: {', '.join(left)}" if left else "")
         )
     if summary.missing:
         lost = ", ".join(f"{count} of {name}" for name, count in summary.missing.items())
@@ -155,6 +166,11 @@ def map_(
             file=sys.stderr,
         )
     return 0
+
+
+def _left_out(summary: MapSummary) -> dict[str, int]:
+    """Numbers of returns that a map leaves out, by what they are of."""
+    return {"noise": summary.noise, "moving": summary.moving, "classes": summary.without}
 
 
 @app.command

@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from cyclopts import Group, Parameter, Token
 
+from geoscene.classes import Class
 from geoscene.console import SEVERAL, WORDS, whole
 from lidar.dataset.export import EXPORTERS
 from lidar.dataset.formats import FORMATS, LABELS
@@ -301,12 +303,20 @@ class MapOptions:
     noise: bool = False
     """Keep returns of class noise: false alarms and mirror images."""
 
+    moving: bool = False
+    """Keep returns of road users that move during the drive; they leave trails."""
+
+    without: Annotated[tuple[str, ...], WORDS] = ()
+    """Classes of returns to leave out, separated by commas: names that lidar classes lists, or vehicles,
+    which are all of them, parked ones too."""
+
     def __post_init__(self) -> None:
         """Validate the options."""
         if self.color not in COLORS:
             raise InputError(f"`color` {self.color}: one of {', '.join(COLORS)}")
         if self.voxel is not None and not 0 < self.voxel < math.inf:
             raise InputError(f"`voxel` {self.voxel}: give a positive number of metres")
+        classes_of(self.without)
 
 
 @Parameter(name="*")
@@ -333,6 +343,20 @@ class ApplyOptions:
         """Validate the options."""
         if not self.stages:
             raise InputError("`stages`: give one or more")
+
+
+def classes_of(names: Iterable[str]) -> list[int]:
+    """Codes of classes by name; ``vehicles`` stands for all of them, with and without riders.
+
+    Raises InputError for an unknown name.
+    """
+    vehicles = [k for k in Class if Class.CAR <= k <= Class.MOTORCYCLIST and k != Class.PEDESTRIAN]
+    known = {k.name.lower(): [k] for k in Class} | {"vehicles": vehicles}
+    if unknown := [name for name in names if name not in known]:
+        near = get_close_matches(unknown[0], known, 3, 0.6)
+        hint = f"is {' or '.join(near)} meant? " if near else ""
+        raise InputError(f"`without` {unknown[0]}: {hint}lidar classes lists all names; vehicles is one, too")
+    return [int(code) for name in names for code in known[name]]
 
 
 def _digested(name: str | Path) -> str:

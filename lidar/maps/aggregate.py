@@ -17,13 +17,13 @@ from geoscene.progress import Progress, silent
 from lidar.dataset.formats import FORMATS, Format, format_of, map_suffixes
 from lidar.dataset.formats.las import LasInfo, read_chunks
 from lidar.dataset.formats.table import Table, placed_returns, records, rows
-from lidar.dataset.layout import Dataset
+from lidar.dataset.layout import Dataset, Paths, read_rows, reading_file
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
 from lidar.maps.colors import distinct, ramp
-from lidar.options import MapOptions
+from lidar.options import MapOptions, classes_of
 from lidar.rig.patterns.beams import frame_ns
 from lidar.time_scales import gps_seconds
 
@@ -47,6 +47,8 @@ class MapSummary:
     points_in : returns read
     points    : points written
     noise     : returns of class NOISE that were left out
+    moving    : returns of road users that move during the drive, left out
+    without   : returns of the classes to leave out
     frames    : frames read
     missing   : number of missing frames, by scanner
     path      : the file
@@ -55,6 +57,8 @@ class MapSummary:
     points_in: int
     points: int
     noise: int
+    moving: int
+    without: int
     frames: int
     missing: dict[str, int]
     path: Path
@@ -89,26 +93,34 @@ def aggregate(
     source = _Source(dataset, chosen)
     limits = source.height_range() if options.color == "height" else (0.0, 0.0)
 
-    read = dropped = 0
+    read = 0
+    dropped = Counter[str]()
+    unwanted = classes_of(options.without)
     frames: set[int] = set()
 
     def tables() -> Iterator[Table]:
-        nonlocal read, dropped
-        for k, (frame, table) in enumerate(source.tables()):
+        nonlocal read
+        for k, (frame, name, table) in enumerate(source.tables()):
             read += rows(table)
             frames.add(frame)
             progress("reading clouds", k + 1, total=len(source))
-            real = table["label"] != Class.NOISE
-            if not options.noise and not real.all():
-                dropped += int(np.count_nonzero(~real))
-                table = {name: column[real] for name, column in table.items()}  # noqa: PLW2901
-            yield table
+            left = {
+                "without": np.isin(table["label"], unwanted),
+                "noise": (table["label"] == Class.NOISE) & (not options.noise),
+                "moving": np.isin(table["instance"], [] if options.moving else source.moving(name, frame)),
+            }
+            keep = np.ones(rows(table), bool)
+            for reason, rows_left in left.items():
+                dropped[reason] += int(np.count_nonzero(keep & rows_left))
+                keep &= ~rows_left
+            yield table if keep.all() else {column: values[keep] for column, values in table.items()}
 
     stream = tables()
     if options.voxel is not None:
         stream = _voxels(stream, options.voxel, out=out, offset=source.geo.offset)
     written = _write(out, (_colored(t, options.color, limits=limits) for t in stream), source=source)
-    return MapSummary(read, written, dropped, len(frames), source.missing(), out)
+    reasons = dropped["noise"], dropped["moving"], dropped["without"]
+    return MapSummary(read, written, *reasons, len(frames), source.missing(), out)
 
 
 class _Source:
@@ -141,18 +153,28 @@ class _Source:
         missing = {name: expected.get(name, 0) - found[name] for name in self._names}
         return {name: count for name, count in missing.items() if count > 0}
 
-    def tables(self, every: int = 1) -> Iterator[tuple[int, Table]]:
-        """Frame number and table of every n-th file."""
+    def moving(self, name: str, frame: int) -> list[int]:
+        """Instances of the road users near a frame of a scanner that move during the drive."""
+        path = Paths(self.dataset.path).frame_boxes(name, frame)
+        if not path.exists():  # without road users
+            return []
+        boxes = read_rows(path)
+        with reading_file(path):
+            return [int(row["instance"]) for row in boxes if {"True": True, "False": False}[row["moving"]]]
+
+    def tables(self, every: int = 1) -> Iterator[tuple[int, str, Table]]:
+        """Frame number, scanner and table of every n-th file; several tables for large files."""
         for frame, name, index, path in self._files[::every]:
             if format_of(path).frame == "world":
                 for table in read_chunks(path):
                     yield (
                         frame,
+                        name,
                         {k: table[k] for k in _COLUMNS if k in table and k != "source"}
                         | {"source": np.full(rows(table), index, np.uint16)},
                     )
             else:
-                yield frame, self._placed(cloud_points(path), name, index=index, frame=frame)
+                yield frame, name, self._placed(cloud_points(path), name, index=index, frame=frame)
 
     def _placed(self, table: Table, name: str, *, index: int, frame: int) -> Table:
         if self._trajectory is None:
@@ -175,7 +197,7 @@ class _Source:
     def height_range(self) -> tuple[float, float]:
         """1st and 99th percentile of the heights of about `_SAMPLE` frames."""
         every = max(1, len(self) // _SAMPLE)
-        z = np.concatenate([table["z"] for _, table in self.tables(every)] or [np.zeros(1)])
+        z = np.concatenate([table["z"] for _, _, table in self.tables(every)] or [np.zeros(1)])
         low, high = np.percentile(z, (1, 99)) if len(z) else (0.0, 1.0)
         return float(low), float(high)
 

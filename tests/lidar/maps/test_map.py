@@ -187,6 +187,7 @@ def test_the_same_dataset_gives_the_same_bytes(tmp_path):
         ("m.laz", {"voxel": 0.0}, "`voxel`"),
         ("m.laz", {"voxel": float("nan")}, "`voxel`"),
         ("m.laz", {"color": "mood"}, "`color` mood"),
+        ("m.laz", {"without": ("carr",)}, "`without` carr: is car meant"),
         ("m.laz", {"sensors": ("bottom",)}, "no scanner bottom"),
     ],
 )
@@ -204,6 +205,31 @@ def test_noise_is_left_out_and_counted_by_default(tmp_path):
     assert (summary.points, summary.noise, summary.points_in) == (793, 7, 800)
     kept = aggregate(data, tmp_path / "n.laz", options=MapOptions(noise=True))
     assert (kept.points, kept.noise) == (800, 0)
+
+
+def test_moving_road_users_are_left_out_by_default_and_classes_on_request(tmp_path):
+    data = dataset(tmp_path / "d", frames=2, kinds=("pcd",))
+    path = tmp_path / "d" / "top" / "pcd" / "000001.pcd"
+    table = dict(pcd.read(path))
+    row = np.arange(400)
+    klass = np.select([row < 5, row < 11, row < 14], [Class.CAR, Class.PEDESTRIAN, Class.VAN], table["label"])
+    instance = np.select([row < 5, row < 11, row < 14], [7000, 7001, 7002], -1)
+    pcd.write(path, table | {"label": klass.astype(np.uint16), "instance": instance.astype(np.int32)})
+    boxes = tmp_path / "d" / "top" / "boxes" / "000001.csv"
+    boxes.parent.mkdir()
+    boxes.write_text("instance,moving\n7000,True\n7001,True\n7002,False\n")
+
+    def counts(**options):
+        made = aggregate(data, tmp_path / "m.laz", options=MapOptions(**options), overwrite=True)
+        return made.points, made.moving, made.without
+
+    assert counts() == (789, 11, 0)
+    assert counts(moving=True) == (800, 0, 0)
+    assert counts(without=("vehicles",)) == (786, 6, 8)
+    assert counts(without=("vehicles", "pedestrian"), moving=True) == (786, 0, 14)
+    boxes.write_text("instance,moving\n7000,perhaps\n")
+    with pytest.raises(DatasetError, match=r"000001\.csv"):
+        counts()
 
 
 @pytest.mark.parametrize(
