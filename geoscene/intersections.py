@@ -14,8 +14,11 @@ from geoscene.typing import Bools, Float, Ints
 _AT_ONCE = 50_000
 """Pairs of faces tested at once, which bounds the memory."""
 
-_CLEAR = 1e-3
-"""Grid steps; far more than rounding moves a point that lies within 2**27 steps of a plane."""
+CLEARANCE = 0.2
+"""Grid steps: 0.02 mm; faces closer than this may cross in a CityJSON file, whose coordinates are rounded to
+0.01 mm, and so move by up to 0.0087 mm each.
+
+Far more than the rounding of distances from planes, for points within 2**27 steps."""
 
 _LOW = 25
 """Bits of the lower part into which products are split, so that sums of products stay within 64 bits."""
@@ -29,23 +32,36 @@ _EDGES = ((0, 1), (1, 2), (2, 0))
 def intersecting_faces(cells: Ints, faces: Ints, *, owner: NDArray[np.integer]) -> Ints:
     """Pairs (k, 2) of faces of one owner that have more in common than the vertices and edges they share.
 
-    Faces that only touch, as a corner that lies on another face, are among them.
+    Faces that only touch, as a corner that lies on another face, are among them. For the arguments see
+    `close_faces`.
+    """
+    pairs, crossing = close_faces(cells, faces, owner=owner)
+    return pairs[crossing]
+
+
+def close_faces(cells: Ints, faces: Ints, *, owner: NDArray[np.integer]) -> tuple[Ints, Bools]:
+    """Pairs (k, 2) of faces of one owner that are closer than `CLEARANCE`, and whether they cross or touch.
+
+    The vertices and edges that two faces share do not count.
 
     cells : (n, 3) whole grid numbers of the vertices, each place once per owner; all within 2**27 of another
     faces : (m, 3) vertices of each face, none degenerate
     owner : (m,) number of the solid that each face belongs to
     """
     if not len(faces):
-        return np.empty((0, 2), np.int64)
+        return np.empty((0, 2), np.int64), np.empty(0, np.bool_)
     corners = cells[faces]
     i, j = _near_pairs(corners, owner)
     planes = _Planes.of(corners, faces)
-    found = [np.empty((0, 2), np.int64)]
+    found, crossing = [np.empty((0, 2), np.int64)], [np.empty(0, np.bool_)]
     for first in range(0, len(i), _AT_ONCE):
         a, b = planes.not_apart(i[first : first + _AT_ONCE], j[first : first + _AT_ONCE])
-        hit = _intersect(corners[a], corners[b], same=faces[a].T[:, None] == faces[b].T[None])
-        found.append(np.stack([a[hit], b[hit]], axis=1))
-    return np.concatenate(found)
+        same = common_corners(faces[a], faces[b])
+        hit = _intersect(corners[a], corners[b], same=same)
+        near = hit | (distances(corners[a], corners[b], same=same) < CLEARANCE)
+        found.append(np.stack([a, b], axis=1)[near])
+        crossing.append(hit[near])
+    return np.concatenate(found), np.concatenate(crossing)
 
 
 def _near_pairs(corners: Ints, owner: NDArray[np.integer]) -> tuple[Ints, Ints]:
@@ -124,9 +140,60 @@ class _Planes:
             x, y, z = corner[:, b]
             away = normal[0] * x + normal[1] * y + normal[2] * z - offset
             known = reduce(np.logical_or, own == number[b])
-            above &= known | (away > _CLEAR)
-            below &= known | (away < -_CLEAR)
+            above &= known | (away > CLEARANCE)
+            below &= known | (away < -CLEARANCE)
         return above, below
+
+
+def common_corners(first: Ints, second: Ints) -> Bools:
+    """(3, 3, n) bool, corner i of the first faces (n, 3) is corner j of the second."""
+    return np.asarray(first.T[:, None] == second.T[None], np.bool_)
+
+
+def distances(first: Ints, second: Ints, *, same: Bools) -> Float:
+    """Grid steps (n,) between those corners, edges and faces of triangles (n, 3, 3) that share no corner.
+
+    same : (3, 3, n) bool, corner i of the first is corner j of the second
+    """
+    least = np.full(len(first), np.inf)
+    for one, two, common in ((first, second, same), (second, first, same.transpose(1, 0, 2))):
+        for k in range(3):
+            away = _from_triangles(one[:, k], two)
+            least = np.where(common[k].any(axis=0), least, np.minimum(least, away))
+    for a, b in _EDGES:
+        for c, d in _EDGES:
+            known = same[a, c] | same[a, d] | same[b, c] | same[b, d]
+            away = _between(first[:, a], first[:, b], c=second[:, c], d=second[:, d])
+            least = np.where(known, least, np.minimum(least, away))
+    return least
+
+
+def _from_triangles(points: Ints, triangles: Ints) -> Float:
+    """Distance (n,) of points (n, 3) from triangles (n, 3, 3)."""
+    a, b, c = triangles.transpose(1, 0, 2).astype(float)
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    sides = [(end - start, points - start) for start, end in ((a, b), (b, c), (c, a))]
+    over = np.all([np.vecdot(np.cross(side, away), normal) >= 0 for side, away in sides], axis=0)
+    beside = np.min([_from_edges(away, side) for side, away in sides], axis=0)
+    return np.asarray(np.where(over, np.abs(np.vecdot(points - a, normal)), beside), float)
+
+
+def _from_edges(away: Float, edge: Float) -> Float:
+    """Distance (n,) of points from edges; both (n, 3) from the start of each edge."""
+    share = np.clip(np.vecdot(away, edge) / np.vecdot(edge, edge), 0, 1)
+    return np.asarray(np.linalg.norm(away - share[:, None] * edge, axis=1), float)
+
+
+def _between(a: Ints, b: Ints, *, c: Ints, d: Ints) -> Float:
+    """Distance (n,) of segments a b and c d, each (n, 3) (Ericson 2005, section 5.1.9)."""
+    u, v, w = (b - a).astype(float), (d - c).astype(float), (a - c).astype(float)
+    uu, vv, uv, uw, vw = (np.vecdot(x, y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
+    spread = uu * vv - uv * uv
+    s = np.divide(uv * vw - uw * vv, spread, out=np.zeros_like(uu), where=spread > 1e-12 * uu * vv)
+    t = np.clip((uv * np.clip(s, 0, 1) + vw) / vv, 0, 1)
+    s = np.clip((uv * t - uw) / uu, 0, 1)
+    return np.asarray(np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1), float)
 
 
 def _intersect(first: Ints, second: Ints, *, same: Bools) -> Bools:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.intersections import intersecting_faces
+from geoscene.intersections import close_faces
 from geoscene.mesh import Mesh
 from geoscene.typing import Bools, Float, Ints
 
@@ -28,6 +28,7 @@ class Findings:
     fans       : (n,) int64, vertices whose faces are connected only in the vertex itself
     crossings  : (n,) int64, pairs of faces that cross or touch outside their common vertices and edges
     near       : (n,) int64, pairs of vertices less than 1 mm apart
+    close      : (n,) int64, pairs of faces that may cross once their coordinates are rounded (`CLEARANCE`)
     volume     : (n,) float64, signed, cubic metres
     """
 
@@ -37,6 +38,7 @@ class Findings:
     fans: Ints
     crossings: Ints
     near: Ints
+    close: Ints
     volume: Float
 
     @property
@@ -50,9 +52,14 @@ class Findings:
         return np.asarray(self.closed & self.oriented & (self.degenerate == 0) & self.positive, np.bool_)
 
     @property
+    def valid(self) -> Bools:
+        """(n,) bool, the solid has no fault but, perhaps, close faces."""
+        return np.asarray(self.closed_solid & (self.fans + self.crossings + self.near == 0), np.bool_)
+
+    @property
     def ok(self) -> Bools:
         """(n,) bool, the solid has no fault."""
-        return np.asarray(self.closed_solid & (self.fans + self.crossings + self.near == 0), np.bool_)
+        return np.asarray(self.valid & (self.close == 0), np.bool_)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +92,7 @@ class Verdict(Findings):
             ("touches-in-a-vertex", self.fans[row] == 0),
             ("self-intersection", self.crossings[row] == 0),
             ("vertices-within-1-mm", self.near[row] == 0),
+            ("faces-within-0.02-mm", self.close[row] == 0),
         )
         return next((slug for slug, passed in checks if not passed), "")
 
@@ -207,6 +215,7 @@ def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
         fans=found.fans,
         crossings=found.crossings,
         near=found.near,
+        close=found.close,
         volume=np.where(finite, found.volume, np.nan),
     )
 
@@ -225,6 +234,7 @@ def check_solids(corners: Float, owner: Ints, *, n: int, grid: float = GRID) -> 
             fans=none,
             crossings=none,
             near=none,
+            close=none,
             volume=np.zeros(n),
         )
     ids, first = weld(corners.reshape(-1, 3), np.repeat(owner, 3), grid=grid)
@@ -240,8 +250,8 @@ def check_solids(corners: Float, owner: Ints, *, n: int, grid: float = GRID) -> 
     whole = (closed & oriented & (degenerate == 0))[owner]
     cells, of = grid_cells(points, grid=grid), np.repeat(owner, 3)[first]
     fans = np.bincount(of[vertex_fans(triangles[whole])], minlength=n)
-    crossing = intersecting_faces(cells, triangles[whole], owner=owner[whole])
-    crossings = np.bincount(owner[whole][crossing[:, 0]], minlength=n)
+    pairs, crossing = close_faces(cells, triangles[whole], owner=owner[whole])
+    of_pair = owner[whole][pairs[:, 0]]
     near = np.bincount(of[near_vertices(cells, of, steps=round(NEAR / grid))[:, 0]], minlength=n)
     volume = _volumes(points, triangles, owner=owner, n=n)
     return Findings(
@@ -249,8 +259,9 @@ def check_solids(corners: Float, owner: Ints, *, n: int, grid: float = GRID) -> 
         oriented=oriented,
         degenerate=degenerate,
         fans=fans,
-        crossings=crossings,
+        crossings=np.bincount(of_pair[crossing], minlength=n),
         near=near,
+        close=np.bincount(of_pair[~crossing], minlength=n),
         volume=volume,
     )
 

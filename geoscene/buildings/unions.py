@@ -10,6 +10,7 @@ import manifold3d as m3
 import numpy as np
 import shapely
 
+from geoscene.buildings.clearance import parted
 from geoscene.buildings.footprints import to_grid
 from geoscene.buildings.shells import Triangles
 from geoscene.intersections import intersecting_faces, plan_axes
@@ -100,7 +101,7 @@ class _Union:
         points = to_grid(mesh.vert_properties[:, :3])
         ids, where = weld(points, np.zeros(len(points), np.int64))
         points = points[where]
-        return repair(points, merged_vertices(points)[ids[faces]], run=run)
+        return _without_slivers(*repair(points, merged_vertices(points)[ids[faces]], run=run))
 
     def result(self, corners: Float, run: Ints) -> Triangles:
         """Triangles with their pieces and surfaces; those of beads are walls of the first piece."""
@@ -111,13 +112,39 @@ class _Union:
         )
 
 
+def _without_slivers(corners: Float, run: Ints) -> tuple[Float, Ints]:
+    """Triangles (m, 3, 3) and their ids without shells that are thinner than surfaces may move.
+
+    Rounding leaves such shells, bodies and cavities, where walls of pieces nearly coincide.
+    """
+    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
+    ids, _ = weld(corners.reshape(-1, 3), np.zeros(3 * len(corners), np.int64))
+    faces = ids.reshape(-1, 3)
+    n = ids.max(initial=-1) + 1
+    links = np.concatenate([faces[:, :2], faces[:, 1:]]).T
+    graph = coo_array((np.ones(links.shape[1], np.int8), links), shape=(n, n))
+    shell = connected_components(graph, directed=False)[1][faces[:, 0]]
+    a, b, c = corners.transpose(1, 0, 2)
+    volume = np.bincount(shell, weights=np.vecdot(a, np.cross(b, c)) / 6)
+    area = np.bincount(shell, weights=np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+    thick = (np.abs(volume) > _TOLERANCE * area / 2)[shell]
+    return corners[thick], run[thick]
+
+
 def _mended(union: _Union) -> tuple[Triangles, str] | None:
-    """A union with a fault, simplified or with beads where it touches itself; None if that does not help."""
+    """A union with a fault, its faces parted, simplified, or with beads where it touches itself.
+
+    None if that does not help.
+    """
     note = ""
     for reach in (*SEAMS, None):
-        corners, run = union.triangles(tolerance=_TOLERANCE)
-        if _is_fine(corners):
-            return union.result(corners, run), note
+        for tolerance in (0.0, _TOLERANCE):
+            corners, run = union.triangles(tolerance=tolerance)
+            fine = _without_faults(corners)
+            if fine is not None:
+                return union.result(fine, run), note
         seams = _seams(corners)
         if reach is None or not seams:
             break
@@ -126,9 +153,6 @@ def _mended(union: _Union) -> tuple[Triangles, str] | None:
             break
         union = joined
         note = f"{len(seams)} places where bodies only touched, joined by beads of {1e3 * reach:.0f} mm"
-        corners, run = union.triangles()
-        if _is_fine(corners):
-            return union.result(corners, run), note
     return None
 
 
@@ -136,9 +160,14 @@ def _is_solid(body: Any) -> bool:
     return body.status() == m3.Error.NoError and not body.is_empty()
 
 
-def _is_fine(corners: Float) -> bool:
-    """Whether triangles (m, 3, 3) bound a solid without faults."""
-    return bool(check_solids(corners, np.zeros(len(corners), np.int64), n=1).ok[0])
+def _without_faults(corners: Float) -> Float | None:
+    """Triangles (m, 3, 3), with close faces parted, if they bound a solid without faults, else None."""
+    owner = np.zeros(len(corners), np.int64)
+    found = check_solids(corners, owner, n=1)
+    if found.valid[0] and not found.ok[0]:
+        corners = parted(corners)
+        found = check_solids(corners, owner, n=1)
+    return corners if found.ok[0] else None
 
 
 def _manifold(shells: Triangles, piece: int, *, first: int, origin: Float) -> Any:

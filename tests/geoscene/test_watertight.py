@@ -115,6 +115,21 @@ def with_vertices_half_a_millimetre_apart(mesh):
     return Mesh.of(vertices, np.array(faces), feature=int(mesh.feature[0]), closed=True)
 
 
+def upright(triangle, at):
+    """A triangle (3, 2), extruded by 5 m."""
+    vertices = np.column_stack([np.tile(triangle, (2, 1)), np.repeat([0.0, 5.0], 3)]) + at
+    faces = np.array([[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]])
+    return Mesh.of(vertices, faces, feature=7, closed=True)
+
+
+def with_a_body_a_hair_from_another(mesh):
+    """Two more bodies, an edge of one 0.01 mm from a wall of the other, which runs 1 m in 10 m."""
+    at = mesh.vertices.max(axis=0) + 1
+    return concatenate(
+        [mesh, upright([(0, 0), (10, 0), (10, 1)], at), upright([(4.9999, 0.5), (5.5, 2), (4.5, 2)], at)]
+    )
+
+
 BROKEN = {
     without_a_face: "not-closed",
     with_a_face_turned: "not-oriented",
@@ -129,6 +144,7 @@ BROKEN = {
     with_a_body_that_stands_on_it: "self-intersection",
     with_a_body_that_pierces_it_by_a_hair: "self-intersection",
     with_vertices_half_a_millimetre_apart: "vertices-within-1-mm",
+    with_a_body_a_hair_from_another: "faces-within-0.02-mm",
 }
 
 

@@ -768,6 +768,38 @@ def test_bodies_that_share_an_edge_with_a_narrow_gap_are_joined():
     assert body.corners[..., 2].max() < 9.01
 
 
+def test_cavities_thinner_than_surfaces_may_move_are_filled():
+    whole = shapely.box(0, 0, 10, 8)
+    split = whole.difference(shapely.box(2, 4, 7, 4.0016))
+    shells = prisms(
+        np.array([split, whole, whole]), np.arange(3), low=np.array([0, 0, 7.0]), high=np.array([8.0, 1, 8])
+    )
+    [(body, told)] = unite([shells])
+    assert told == ""
+    found = check_solids(body.corners, np.zeros(len(body), np.int64), n=1)
+    assert found.ok.all()
+    assert found.volume == pytest.approx(whole.area * 8, rel=1e-9)
+
+
+def test_faces_that_nearly_touch_are_parted():
+    wall = shapely.Polygon([(0, 0), (10, 0), (10, 1)])
+    edges = [
+        shapely.Polygon([(x, y), (x + 0.5, y + 2), (x - 0.5, y + 2)])
+        for x, y in ((2.9999, 0.3), (6.9999, 0.7))
+    ]
+    shells = prisms(np.array([wall, *edges]), np.arange(3), low=np.zeros(3), high=np.array([9.0, 8.0, 7.0]))
+    one = np.zeros(len(shells), np.int64)
+    assert check_solids(shells.corners, one, n=1).valid.all()
+    assert not check_solids(shells.corners, one, n=1).ok.any()
+    [(body, told)] = unite([shells])
+    assert told == ""
+    assert check_solids(body.corners, np.zeros(len(body), np.int64), n=1).ok.all()
+    before, after = (
+        shapely.multipoints(np.unique(c.reshape(-1, 3), axis=0)) for c in (shells.corners, body.corners)
+    )
+    assert shapely.hausdorff_distance(before, after) < 2e-4
+
+
 def test_one_atypical_height_does_not_set_those_of_a_whole_centre():
     rng = np.random.default_rng(1)
     xy = np.vstack([[0.0, 0.0], rng.uniform(-120, 120, (55, 2))])
