@@ -301,7 +301,7 @@ def mesh_of(path: str, radius: float) -> tuple[Float, NDArray[np.int32], NDArray
         place = (np.array([i, j]) + 0.5) * scene.tile_size - middle[:2]
         if np.abs(place).max() > radius:
             continue
-        tile = scene.tile(i, j)
+        tile = scene.tile(i, j, forests=False)
         vertices.append(tile.mesh.vertices + tile.origin - middle)
         faces.append(tile.mesh.faces + np.int32(count))
         count += len(tile.mesh.vertices)

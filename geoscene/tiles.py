@@ -20,13 +20,14 @@ from geoscene.files import digest_of, write_atomically
 from geoscene.ground import ground_tile, tile_box, tile_place
 from geoscene.mesh import Instances, Mesh, concatenate
 from geoscene.objects.barriers import barrier_meshes
+from geoscene.objects.forests import forest_tree_count
 from geoscene.objects.furniture import furniture_instances
 from geoscene.objects.vegetation import tree_instances
 from geoscene.plan import Plan, take_buildings
 from geoscene.processes import run_tasks
 from geoscene.report import Problem, described, make_without_failures, unexpected
 from geoscene.scene import SceneFiles
-from geoscene.scene.tile_files import Tile, read_tile, with_forests, write_tile
+from geoscene.scene.tile_files import Tile, read_tile, write_tile
 from geoscene.structures import structure_meshes
 from geoscene.typing import Ints
 from geoscene.watertight import validate_mesh
@@ -154,10 +155,11 @@ def build_tile(
         rest = ground.take(np.arange(len(ground))).shifted(-origin)
         copies = copies.shifted(-origin)
     mesh = concatenate([solids.shifted(-origin), rest])
-    made = Tile(origin, mesh, copies)
-    digest = write_tile(SceneFiles(folder).tile(*tile), made)
+    digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies))
+    forest_trees = 0
     if plan.forests is not None:
-        made = with_forests(made, plan.forests, box=tile_box(plan.ground, tile[0], j=tile[1]))
+        box = tile_box(plan.ground, tile[0], j=tile[1])
+        forest_trees = forest_tree_count(mesh.shifted(origin), plan.forests, box=box)
     built = len(np.unique(solids.feature))  # `build_solids` has checked each
     verdict = validate_mesh(rest)
     return TileReport(
@@ -166,8 +168,8 @@ def build_tile(
         built + int(verdict.ok.sum()),
         built,
         len(mesh),
-        len(made.instances),
-        (len(made.instances) - len(copies)) // 2,  # a trunk and a crown each
+        len(copies) + 2 * forest_trees,  # a trunk and a crown each
+        forest_trees,
         _plan_area(rest.take(~rest.closed)),
         digest,
         tuple(problems),

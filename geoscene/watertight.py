@@ -253,7 +253,7 @@ def check_solids(corners: Float, owner: Ints, *, n: int, grid: float = GRID) -> 
     pairs, crossing = close_faces(cells, triangles[whole], owner=owner[whole])
     of_pair = owner[whole][pairs[:, 0]]
     near = np.bincount(of[near_vertices(cells, of, steps=round(NEAR / grid))[:, 0]], minlength=n)
-    volume = _volumes(points, triangles, owner=owner, n=n)
+    volume = volumes(points[triangles], owner=owner, n=n)
     return Findings(
         closed=closed,
         oriented=oriented,
@@ -266,12 +266,12 @@ def check_solids(corners: Float, owner: Ints, *, n: int, grid: float = GRID) -> 
     )
 
 
-def _volumes(points: Float, triangles: Ints, *, owner: Ints, n: int) -> Float:
-    """Signed volume (n,) of each owner's triangles, summed about its first vertex for precision."""
-    if not len(triangles):
+def volumes(corners: Float, *, owner: NDArray[np.integer], n: int) -> Float:
+    """Signed volume (n,) of each owner's closed triangles (m, 3, 3), about its first corner for precision."""
+    if not len(corners):
         return np.zeros(n)
     anchor = np.zeros((n, 3))
-    anchor[owner[::-1]] = points[triangles[::-1, 0]]
-    a, b, c = (points[triangles[:, k]] - anchor[owner] for k in range(3))
+    anchor[owner[::-1]] = corners[::-1, 0]
+    a, b, c = np.moveaxis(corners - anchor[owner, None], 1, 0)
     sixfold = np.bincount(owner, weights=np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=n)
     return np.asarray(sixfold / 6.0, float)

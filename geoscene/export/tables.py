@@ -16,6 +16,7 @@ from geoscene.errors import InputError
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer
 from geoscene.typing import Float
+from geoscene.watertight import volumes
 
 SOLIDS = "building_solids"
 """Name of the table of the solids of buildings in GeoPackages."""
@@ -148,7 +149,7 @@ def solids(scene: Scene) -> Layer:
     count = stop - first
     faces, volume = np.zeros(count, np.int32), np.zeros(count)
     bottom, top = np.full(count, np.inf), np.full(count, -np.inf)
-    for tile in scene.tiles():
+    for tile in scene.tiles(forests=False):
         mesh = tile.mesh
         keep = mesh.closed & (mesh.feature >= first) & (mesh.feature < stop) & (mesh.klass == Class.BUILDING)
         row, corners = mesh.feature[keep] - first, mesh.vertices[mesh.faces[keep]]
@@ -157,7 +158,7 @@ def solids(scene: Scene) -> Layer:
         np.maximum.at(top, row, heights.max(axis=1))
         np.add.at(faces, row, 1)
         scale = float(scene.frame.scale_at(*(tile.origin[:2] + scene.tile_size / 2).tolist()))
-        np.add.at(volume, row, _volumes(corners) / scale**2)
+        volume += volumes(corners, owner=row, n=count) / scale**2
     columns: dict[str, NDArray[Any]] = {
         "feature": np.arange(first, stop, dtype=np.int32),
         "osm_id": scene.features("buildings", geometry="none").columns["osm_id"],
@@ -168,10 +169,3 @@ def solids(scene: Scene) -> Layer:
     }
     rows = np.flatnonzero(faces)
     return Layer(SOLIDS, np.full(len(rows), None), {name: values[rows] for name, values in columns.items()})
-
-
-def _volumes(corners: Float) -> Float:
-    """Signed volumes (m,) of the tetrahedra of triangles (m, 3, 3) and the first corner of all."""
-    a, b, c = np.moveaxis(corners - corners[:1, :1], 1, 0)
-    volumes: Float = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
-    return volumes

@@ -72,24 +72,40 @@ def forest_trees(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> tup
     box    : (xmin, ymin, xmax, ymax) of the tile, scene metres; trees beyond are left out
     """
     floor = ground.take(ground.klass == Class.FOREST_FLOOR)
-    corners = floor.vertices[floor.faces]
-    side = float(1.0 / np.sqrt(forests.density))
-    column, row = _squares(corners, side, box=box)
-    draw = uniform_at(column, row, count=4, seed=forests.seed)
-    xy = np.column_stack([(column + 0.1 + 0.8 * draw[0]) * side, (row + 0.1 + 0.8 * draw[1]) * side])
-    face = _faces_under(corners, xy, box=box)
-    face[_near_an_edge(floor, xy, box=box)] = -1
-    stands = face >= 0
-    xy, draw, face = xy[stands], draw[:, stands], face[stands]
+    xy, draw, face = _places(floor, forests, box=box)
     feature = floor.feature[face].astype(np.int64)
-    trees = _sampled(xy, draw, feature=feature, share=_needle_shares(forests, feature), widest=1.2 * side)
-    return trees, _heights(corners[face], xy)
+    share, widest = _needle_shares(forests, feature), 1.2 * _spacing(forests)
+    trees = _sampled(xy, draw, feature=feature, share=share, widest=widest)
+    return trees, _heights(floor.vertices[floor.faces[face]], xy)
+
+
+def forest_tree_count(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> int:
+    """The number of `forest_trees`, which are not made."""
+    floor = ground.take(ground.klass == Class.FOREST_FLOOR)
+    return len(_places(floor, forests, box=box)[0])
 
 
 def forest_instances(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> Instances:
     """The trees of `forest_trees` as copies of shapes, scene coordinates."""
     trees, z = forest_trees(ground, forests, box=box)
     return tree_instances(trees, height=lambda *_: z)
+
+
+def _spacing(forests: Forests) -> float:
+    """Side in metres of the squares with one tree each."""
+    return float(1.0 / np.sqrt(forests.density))
+
+
+def _places(floor: Mesh, forests: Forests, *, box: Sequence[float]) -> tuple[Float, Float, Ints]:
+    """Places (n, 2) of trees, random numbers (4, n) of each, and the face of the floor (n,) below."""
+    side, corners = _spacing(forests), floor.vertices[floor.faces]
+    column, row = _squares(corners, side, box=box)
+    draw = uniform_at(column, row, count=4, seed=forests.seed)
+    xy = np.column_stack([(column + 0.1 + 0.8 * draw[0]) * side, (row + 0.1 + 0.8 * draw[1]) * side])
+    face = _faces_under(corners, xy, box=box)
+    face[_near_an_edge(floor, xy, box=box)] = -1
+    stands = face >= 0
+    return xy[stands], draw[:, stands], face[stands]
 
 
 def _squares(corners: Float, side: float, *, box: Sequence[float]) -> tuple[Ints, Ints]:

@@ -163,19 +163,22 @@ class Scene:
         document = self.manifest.get("forests")
         return None if document is None else Forests.from_json(document)
 
-    def tile(self, i: int, j: int) -> Tile:
-        """Tile (i, j) with the trees of its forests; raises SceneFormatError if it is missing or damaged."""
+    def tile(self, i: int, j: int, *, forests: bool = True) -> Tile:
+        """Tile (i, j) with the trees of its forests, or without them for a reader of the mesh alone.
+
+        Raises SceneFormatError if it is missing or damaged.
+        """
         tile = read_tile(self.files.tile(i, j))
-        if self.forests is None:
+        if self.forests is None or not forests:
             return tile
         box = np.array([i, j, i + 1, j + 1]) * self.tile_size  # no forest is on a larger one
         low, high = np.maximum(box[:2], self.bounds[:2]), np.minimum(box[2:], self.bounds[2:])
         return with_forests(tile, self.forests, box=(*low, *high))
 
-    def tiles(self) -> Iterator[Tile]:
+    def tiles(self, *, forests: bool = True) -> Iterator[Tile]:
         """All tiles, one at a time."""
         for i, j in self.tile_indices:
-            yield self.tile(i, j)
+            yield self.tile(i, j, forests=forests)
 
     def shapes(self) -> dict[str, Mesh]:
         """The meshes that the tiles' instances copy, by name."""

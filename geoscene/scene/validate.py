@@ -23,7 +23,7 @@ def check_scene(scene: Scene) -> dict[str, Any]:
     faults: dict[int, str] = {}
     broken_surfaces: list[dict[str, Any]] = []
     for index in scene.tile_indices:
-        tile = scene.tile(*index)
+        tile = scene.tile(*index, forests=False)
         verdict = validate_mesh(tile.mesh)
         solids += len(verdict)
         volume += float(verdict.volume[verdict.ok].sum())

@@ -28,7 +28,7 @@ def ground_heights(scene: Scene, xyz: Float, *, above: float = _ABOVE, below: fl
     on, indices = scene.tiles_at(xyz[:, :2]), scene.tile_indices
     for row in np.unique(on[on >= 0]).tolist():
         rows = np.flatnonzero(on == row)
-        tile = scene.tile(*indices[row])
+        tile = scene.tile(*indices[row], forests=False)
         faces = tile.mesh.faces[np.isin(tile.mesh.klass, _GROUND)]
         if not len(faces):
             continue

@@ -359,7 +359,7 @@ def _paved(dataset: Dataset) -> Iterator[Float]:
         scene = open_scene(dataset.scene_path)
         paved = np.isin(class_codes().nuscenes, [CATEGORIES.index(name) for name in _PAVED])
         for i, j in scene.tile_indices:
-            tile = scene.tile(i, j)
+            tile = scene.tile(i, j, forests=False)
             xy = (tile.mesh.vertices + tile.origin)[:, :2]
             yield xy[tile.mesh.faces[paved[tile.mesh.klass]]]
     except GeosceneError as error:

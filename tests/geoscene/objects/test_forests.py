@@ -10,16 +10,19 @@ import shapely
 
 from geoscene.classes import Class
 from geoscene.export import export_scene
+from geoscene.export.tables import solids
 from geoscene.ground import Layers, building_pads, ground_tile, plan_ground, tile_box
 from geoscene.mesh import Mesh
-from geoscene.objects.forests import Forests, forest_instances, forest_trees
+from geoscene.objects.forests import Forests, forest_instances, forest_tree_count, forest_trees
 from geoscene.objects.shapes import shapes
 from geoscene.options import BuildOptions, ExportOptions
 from geoscene.pipeline import build
 from geoscene.scene.tile_files import read_tile
+from geoscene.scene.validate import check_scene
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData
 from geoscene.view import view_scene
+from lidar.traffic.ground import ground_heights
 from lidar.world.world import World
 
 NONE = Forests(np.empty(0, np.int64), np.empty(0))
@@ -46,6 +49,7 @@ def all_trees(size, forests=NONE):
     for i, j in plan.tiles.tolist():
         ground = ground_tile(plan, i, j=j, height=hill)
         trees, z = forest_trees(ground, forests, box=tile_box(plan, i, j=j))
+        assert forest_tree_count(ground, forests, box=tile_box(plan, i, j=j)) == len(z)
         parts.append(
             np.column_stack([trees.xy, z, trees.height, trees.form == "needleleaved", trees.feature])
         )
@@ -85,6 +89,7 @@ def test_the_leaf_type_of_a_forest_decides_the_forms_of_its_trees():
 
 def test_a_tile_without_forest_has_no_trees():
     assert len(forest_instances(Mesh.empty(), NONE, box=(0, 0, 100, 100))) == 0
+    assert forest_tree_count(Mesh.empty(), NONE, box=(0, 0, 100, 100)) == 0
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +133,22 @@ def test_files_of_tiles_have_no_forest_trees_and_readers_place_them(scene):
     assert placed == scene.manifest["counts"]["instances"] == 2 * scene.manifest["counts"]["forest_trees"]
     xmin, ymin, xmax, ymax = scene.bounds
     assert placed / 2 == pytest.approx(0.02 * (xmax - xmin) * (ymax - ymin), rel=0.15)
+
+
+def test_trees_of_forests_are_not_made_where_only_the_ground_is_read(osm, scene, tmp_path, monkeypatch):
+    def refuse(*_args, **_options):
+        raise AssertionError("trees are made")
+
+    for name in ("forest_instances", "forest_trees"):
+        monkeypatch.setattr(f"geoscene.objects.forests.{name}", refuse)
+    monkeypatch.setattr("geoscene.scene.tile_files.forest_instances", refuse)
+    again = build(osm, tmp_path / "again", options=BuildOptions(tile_size=100.0))
+    assert again.manifest["counts"] == scene.manifest["counts"]
+    assert check_scene(scene)["broken"] == []
+    assert len(solids(scene).columns["volume"]) == 1
+    assert np.isfinite(ground_heights(scene, np.array([[-100.0, -100.0, 0.0]]))).all()
+    with pytest.raises(AssertionError, match="trees are made"):
+        next(scene.tiles())
 
 
 def test_rays_views_and_exports_meet_the_same_trees(scene, tmp_path):
