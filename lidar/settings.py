@@ -21,7 +21,6 @@ _SWITCH |= {"off": False, "no": False, "false": False, "0": False}
 
 _CHOICES: dict[str, Iterable[object]] = {
     "law": INCIDENCE_LAWS,
-    "rays": scanner_settings.FOOTPRINTS,
     "range_noise": scanner_settings.NOISES,
 }
 

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.columns import Columns
 from geoscene.typing import Float
+from lidar.physics.footprint import AXIS_ONLY, Gap
 from lidar.raycast.memory import inlined
 
 _MODES = ("strongest", "first", "last", "dual", "all")
 _STRONGEST, _FIRST, _LAST, _DUAL, _ALL = range(5)
+_GRAZING = 1e-3  # least cosine of incidence at which surfaces count as slanted
 _FAINT = 1e-3  # share of the brightest surface's power below which a surface is negligible
 
 
@@ -108,20 +110,22 @@ def by_pulse(first: EchoesT, other: EchoesT) -> EchoesT:
     return both.take(np.argsort(both.pulse, kind="stable"))
 
 
-def merged(surfaces: EchoesT, separation: float) -> EchoesT:
+def merged(surfaces: EchoesT, separation: float, *, gap: Gap = AXIS_ONLY) -> EchoesT:
     """The echoes of pulses that hit these surfaces.
 
     Consecutive surfaces of a pulse within ``separation`` metres give one echo, with the sum of their power at
-    their mean range, weighted by received power. Its other columns are those of the surface on the beam's
-    axis, if that is among them and returns power (water and panes may not), else of the surface that returns
-    most.
+    their mean range, weighted by received power. Slanted surfaces may be further apart: by the depth of both
+    within the ``gap`` between neighbouring rays, as one surface, or by half that of the more slanted one, as
+    ground that ends at a wall. Its other columns are those of the surface on the beam's axis, if that is
+    among them and returns power (water and panes may not), else of the surface that returns most.
     """
     if not len(surfaces):
         return surfaces
     starts = np.flatnonzero(np.diff(surfaces.pulse, prepend=-1, append=-1)).astype(np.int64)
     m = len(surfaces)
     bearer, place, power = np.empty(m, np.int64), np.empty(m), np.empty(m)
-    count = _merge(starts, surfaces.range, surfaces.apparent, surfaces.axis, separation, bearer, place, power)
+    columns = surfaces.range, surfaces.apparent, surfaces.axis, surfaces.cosine
+    count = _merge(starts, columns, separation, gap, bearer, place, power)
     return replace(surfaces.take(bearer[:count]), range=place[:count], apparent=power[:count])
 
 
@@ -136,12 +140,22 @@ def insert(row: Any, size: Any, new: Any, distance: Any) -> None:
 
 
 @inlined
+def depth_of(distance: Any, cosine: Any, gap: Any) -> Any:
+    """Metres along the beam between neighbouring rays on a surface at this distance and cosine of incidence.
+
+    gap : (2,) as `lidar.physics.footprint.Gap`
+    """
+    return (gap[0] + gap[1] * distance) * np.sqrt(1 - cosine * cosine) / max(cosine, _GRAZING)
+
+
+@inlined
 def gather(
     row: Any,
     size: Any,
     distance: Any,
     apparent: Any,
     axis: Any,
+    depth: Any,
     separation: Any,
     count: Any,
     bearer: Any,
@@ -151,7 +165,7 @@ def gather(
     """Append the echoes of a pulse to ``bearer``, ``place`` and ``power``; return the new number of echoes.
 
     row      : numbers of its ``size`` surfaces, sorted by range
-    distance, apparent, axis : of surfaces, by number
+    distance, apparent, axis, depth : of surfaces, by number; depth as of `depth_of`
     count    : number of echoes so far
     bearer   : number of the surface that describes each echo
     place, power : range and apparent reflectance of each echo
@@ -168,7 +182,12 @@ def gather(
             middle, central = s, received
         total += received
         moment += received * distance[s]
-        if i == size - 1 or distance[row[i + 1]] - distance[s] > separation:
+        ends = i == size - 1
+        if not ends:
+            here, next_ = depth[s], depth[row[i + 1]]
+            between = max(min(here, next_), 0.5 * max(here, next_))
+            ends = distance[row[i + 1]] - distance[s] > separation + between
+        if ends:
             bearer[count] = middle if central > _FAINT * most else best
             if i == first or not total > 0.0:
                 place[count], power[count] = distance[best], apparent[best]
@@ -183,17 +202,12 @@ def gather(
 
 
 @njit(cache=True, nogil=True)
-def _merge(
-    starts: Any,
-    distance: Any,
-    apparent: Any,
-    axis: Any,
-    separation: Any,
-    bearer: Any,
-    place: Any,
-    power: Any,
-) -> Any:
+def _merge(starts: Any, columns: Any, separation: Any, gap: Any, bearer: Any, place: Any, power: Any) -> Any:
     """Fill the columns of the echoes and return their number."""
+    distance, apparent, axis, cosine = columns
+    depth = np.empty(len(distance))
+    for i in range(len(distance)):
+        depth[i] = depth_of(distance[i], cosine[i], gap)
     count = 0
     row = np.empty(256, np.int64)
     for p in range(len(starts) - 1):
@@ -202,7 +216,7 @@ def _merge(
             row = np.empty(2 * size, np.int64)
         for i in range(size):
             insert(row, i, first + i, distance)
-        count = gather(row, size, distance, apparent, axis, separation, count, bearer, place, power)
+        count = gather(row, size, distance, apparent, axis, depth, separation, count, bearer, place, power)
     return count
 
 

@@ -11,8 +11,8 @@ from lidar.physics.reflect import INCIDENCE_LAWS
 NOISES = ("none", "constant", "signal")
 """Models of range noise."""
 
-FOOTPRINTS = (1, 7, 19, 37, 61)
-"""Numbers of rays per pulse that can be chosen."""
+MOST_RAYS = 999
+"""Maximum number of rays per pulse."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ScannerSettings:
     daylight_lux : illuminance of the scene, which raises the receiver's noise; with ``detection`` or
                    ``false_alarms``
     extinction   : extinction coefficient of the air, 1/m one way; dims intensity too, which assumes clear air
-    rays         : rays per pulse, of `FOOTPRINTS`: a beam with a size, mixed pixels, several echoes
+    rays         : rays per pulse, 1 to 999; more than 1: a beam with a size, mixed pixels, several echoes
     mirrors      : glass transmits and reflects, water reflects
     foliage      : tree crowns and hedges let rays pass between their leaves
     blooming     : pulses that pass close to a retro-reflector may return its range
@@ -68,8 +68,8 @@ class ScannerSettings:
             faults.append(f"law={self.law}: known are {', '.join(INCIDENCE_LAWS)}")
         if self.range_noise not in NOISES:
             faults.append(f"range_noise={self.range_noise}: known are {', '.join(NOISES)}")
-        if self.rays not in FOOTPRINTS:
-            faults.append(f"rays={self.rays}: known are {', '.join(map(str, FOOTPRINTS))}")
+        if not 1 <= self.rays <= MOST_RAYS:
+            faults.append(f"rays={self.rays}: give 1 to {MOST_RAYS}")
         amounts = {n: getattr(self, n) for n in ("spread", "daylight_lux", "extinction", "interference")}
         faults += [
             f"{name}={value}: give 0 or more"

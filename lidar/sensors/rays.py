@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import KNOT_NS, Poses, Trajectory
-from lidar.physics.footprint import bundle
+from lidar.physics.footprint import Gap, bundle, widest_gap
 from lidar.rig.patterns.beams import Firings
 
 
@@ -31,6 +31,12 @@ class Beam:
     spread: Float
     size: Float
     turn: Float
+
+    @property
+    def gap(self) -> Gap:
+        """Widest gap between neighbouring rays, in the wider direction of the beam."""
+        share = widest_gap(len(self.place))
+        return Gap(share * float(self.size.max()), share * float(self.spread.max()))
 
 
 def beam_of(

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from geoscene.classes import materials
 from geoscene.typing import Float
-from lidar.physics.echoes import Echoes, gather, insert
+from lidar.physics.echoes import Echoes, depth_of, gather, insert
+from lidar.physics.footprint import Gap
 from lidar.physics.fresnel import glint
 from lidar.physics.reflect import INCIDENCE_LAWS, RETRO, apparent, reflectance_table, sent_back
 from lidar.physics.settings import ScannerSettings
@@ -92,11 +93,12 @@ class EchoCollector:
 
     rays       : rays of equal power per pulse
     separation : metres; surfaces closer than this give one echo
+    gap        : between neighbouring rays
     pulses     : number of pulses in all
     """
 
-    def __init__(self, optics: SurfaceOptics, rays: int, *, separation: float, pulses: int) -> None:
-        self._optics, self._rays, self._separation = optics, rays, separation
+    def __init__(self, optics: SurfaceOptics, rays: int, *, separation: float, gap: Gap, pulses: int) -> None:
+        self._optics, self._rays, self._separation, self._gap = optics, rays, separation, gap
         self._columns, self._glossy, self._count = _columns(pulses), np.empty(pulses, np.bool_), 0
 
     def take(self, hits: Hits, first: int) -> NDArray[np.int32]:
@@ -115,6 +117,7 @@ class EchoCollector:
             self._optics.faces,
             self._optics.tables,
             self._separation,
+            self._gap,
             tuple(echoes.columns().values()),
             self._glossy[start : start + n],
             glossy,
@@ -165,6 +168,7 @@ def _receive(
     faces: Any,
     tables: Any,
     separation: Any,
+    gap: Any,
     out: Any,
     apart: Any,
     glossy: Any,
@@ -176,7 +180,7 @@ def _receive(
     reflectance, specular, factor, mirrors = tables.reflectance, tables.specular, tables.factor, tables.glossy
     low, law, spread = tables.low, tables.law, len(tables.factor) > 0
     numbers, ranges, apparents, features, classes, cosines, trues, axes = out
-    back, away, slant = np.empty(rays), np.empty(rays), np.empty(rays)
+    back, away, slant, depth = np.empty(rays), np.empty(rays), np.empty(rays), np.empty(rays)
     axis = np.zeros(rays, np.bool_)
     axis[0] = True
     surfaces = np.empty(rays, np.int64)
@@ -200,6 +204,7 @@ def _receive(
                 rho = one_off if rho > RETRO else min(one_off, RETRO)
             c = min(abs(np.float64(cosine[i])), 1.0)
             surfaces[k], slant[k], away[k] = surface, c, distance[i]
+            depth[k] = depth_of(distance[i], c, gap)
             back[k] = sent_back(rho, c, specular[material], law) / rays
             insert(row, size, k, away)
             size += 1
@@ -207,7 +212,7 @@ def _receive(
         if size == 0:
             continue
         if plain:
-            echoes = gather(row, size, away, back, axis, separation, 0, bearer, place, power)
+            echoes = gather(row, size, away, back, axis, depth, separation, 0, bearer, place, power)
         else:
             echoes = size
             for j in range(size):

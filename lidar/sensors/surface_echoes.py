@@ -53,7 +53,8 @@ def surface_echoes(
     batch = max(_BATCH // rays, 1)
     optics = SurfaceOptics(world, sensor.wavelength_nm, settings=settings, seed=seed)
     moving = MovingSensor(pulses, mount, trajectory=trajectory, beam=beam, batch=batch)
-    collector = EchoCollector(optics, rays, separation=separation, pulses=len(pulses))
+    gap = beam.gap
+    collector = EchoCollector(optics, rays, separation=separation, gap=gap, pulses=len(pulses))
     foliage = None
     if settings.foliage:
         leaf_seed = int(generator(seed, sensor.name, frame, "foliage").integers(2**63))
@@ -92,7 +93,7 @@ def surface_echoes(
     echoes, surfaces = collector.echoes()
     if not len(surfaces):
         return echoes
-    return by_pulse(echoes, merged(joined(surfaces, *beyond), separation))
+    return by_pulse(echoes, merged(joined(surfaces, *beyond), separation, gap=gap))
 
 
 def _beyond(

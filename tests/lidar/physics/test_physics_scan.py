@@ -331,3 +331,26 @@ def test_fog_attenuates_distant_surfaces_more():
     clear, foggy = (seen("vlp16", wall(40.0), ScannerSettings(link=True, extinction=a)) for a in (0.0, 0.02))
     assert len(foggy) < len(clear)
     assert foggy.range.max() < clear.range.max()
+
+
+def test_a_long_footprint_on_level_ground_is_one_echo_with_few_rays():
+    """Beams of 3.4 mrad cover 5 to 16 m of ground at 50 to 90 m; rays of two echoes would be 1 m apart."""
+    ground = world(box((-200, -200, -3), (200, 200, -1.73)))
+    few, many = (
+        seen("hdl64e_s3", ground, ScannerSettings(rays=rays), return_mode="dual") for rays in (7, 217)
+    )
+    assert few.echoes.max() == many.echoes.max() == 1
+    key = [cloud.column * 64 + cloud.ring.astype(int) for cloud in (few, many)]
+    _, a, b = np.intersect1d(*key, return_indices=True)
+    far = (many.range[b] > 50) & (many.range[b] < 90)
+    assert np.count_nonzero(far) > 1000
+    assert np.abs(few.range[a] - many.range[b])[far].max() < 0.05
+
+
+def test_a_wall_at_the_end_of_slanted_ground_keeps_its_echo():
+    """Neighbouring rays on the ground are 1 m apart along the beam; a wall 5 m on is an echo of its own."""
+    scene = world(box((-60, -60, -3), (25, 60, -1.73), feature=1), box((32, -60, -3), (33, 60, 5), feature=2))
+    cloud = seen("hdl64e_s3", scene, ScannerSettings(rays=61), return_mode="dual")
+    pairs = cloud.echoes == 2
+    assert pairs.any()
+    assert set(cloud.feature[pairs & (cloud.echo == 2)]) == {2}
