@@ -199,6 +199,7 @@ def open_dataset(path: str | Path) -> Dataset:
             )
         dataset = Dataset(folder, manifest)
         _ = dataset.frame, dataset.start, dataset.crs, dataset.frames, int(manifest["frames_done"])
+        _ = dataset.scene_path
         if not isinstance(manifest["recipe"], dict):
             raise DatasetError(f"{manifest_path}: damaged (no recipe); drive again with `overwrite`")
         for counts in (manifest.get(name, {}) for name in ("sensor_frames", "points")):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import MISSING, dataclass, fields
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, cast
 
 import numpy as np
 
@@ -21,6 +21,7 @@ _POSITIVE = (
 )
 
 _LARGEST = 1e4
+_SMALLEST_TURN = 0.1  # metres; paths are sampled at a part of the turning radius
 _SIGNED = ("roll_gradient", "pitch_gradient")
 
 
@@ -131,6 +132,8 @@ def _checked(table: dict[str, object], name: str) -> Vehicle:
     if values.get("kind", "road") not in KINDS:
         faults.append(f"kind = {values['kind']!r} must be one of {', '.join(KINDS)}")
     faults += [f"{key} must be above 0" for key in _POSITIVE if values.get(key) == 0.0]
+    if 0.0 < cast("float", values.get("turning_radius", _SMALLEST_TURN)) < _SMALLEST_TURN:
+        faults.append(f"turning_radius = {values['turning_radius']} is below {_SMALLEST_TURN:g} m")
     if faults:
         raise InputError(f"vehicle {name}: " + "; ".join(faults))
     return Vehicle(**values)  # type: ignore[arg-type]

@@ -155,6 +155,7 @@ def test_geojson_of_another_structure_is_refused(document, tmp_path):
         ("rigs", "vlp16", "[[lidar]]", "[[lidar]]\nrate_hz = 1e-12", load_whole_rig),
         ("sensors", "vlp16", "rates_hz = [", "rates_hz = [1e18, ", load_sensor),
         ("vehicles", "car", "turning_radius = ", "turning_radius = 9e9", load_vehicle),
+        ("vehicles", "car", "turning_radius = ", "turning_radius = 0.006", load_vehicle),
         ("sensors", "mid40", "pulse_hz = ", "pulse_hz = 1e-308 # ", load_sensor),
         ("sensors", "ust10lx", "step_deg = ", "step_deg = 1e-308 # ", load_sensor),
         ("rigs", "seed", "height = 720", "height = 65535", load_whole_rig),

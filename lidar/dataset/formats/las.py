@@ -34,6 +34,9 @@ INTENSITY_UNIT = 257.0
 _RATIO = 10**5
 """Greatest compression of LAZ that is read: clouds are compressed to a tenth, equal points by a thousand."""
 
+_CHUNK_POINTS = 10**6
+"""Points per chunk of LAZ that are read even if the file holds fewer; writers state 50,000."""
+
 _FULL = 2**20
 """Bytes of free space below which the disk counts as full: the compressor writes in large pieces."""
 
@@ -283,7 +286,7 @@ def _states_what_it_holds(path: Path) -> bool:
 
 
 def _check_layers(path: Path, header: Any) -> None:
-    """Raise ValueError if layers of a chunk of a LAZ file do not fit into it: the decompressor trusts them.
+    """Raise ValueError for sizes of chunks and of their layers that cannot be: the decompressor trusts them.
 
     A chunk of point formats 6 to 10 holds its first point as it is, the number of its points, the sizes of
     its layers, and the layers: nine of the point, one each of colour, infrared, wave packets and extra bytes.
@@ -296,7 +299,9 @@ def _check_layers(path: Path, header: Any) -> None:
     layers = 9 + {6: 0, 7: 1, 8: 2, 9: 1, 10: 3}[point.id] + point.num_extra_bytes
     with path.open("rb") as file:
         file.seek(header.offset_to_point_data)
-        for _, size in lazrs.read_chunk_table(file, lazrs.LazVlr(compressed[0].record_data)):
+        for count, size in lazrs.read_chunk_table(file, lazrs.LazVlr(compressed[0].record_data)):
+            if count > max(header.point_count, _CHUNK_POINTS):
+                raise ValueError(f"a chunk of {count} points")
             start = file.tell()
             file.seek(start + point.size)
             sizes = np.frombuffer(file.read(4 + 4 * layers), "<u4")[1:]

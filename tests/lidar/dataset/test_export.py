@@ -193,6 +193,12 @@ def test_damaged_clouds_and_boxes_are_refused_by_name(dataset, tmp_path, name):
     assert {path.name for path in tmp_path.iterdir()} == {"drive"}
 
 
+def test_a_scene_path_that_is_no_text_is_refused(dataset):
+    write_json(dataset.paths.manifest, dataset.manifest | {"scene": {"name": "", "path": 0}})
+    with pytest.raises(DatasetError, match=r"dataset\.json: damaged"):
+        open_dataset(dataset.path)
+
+
 def test_a_camera_without_intrinsics_is_refused(dataset, tmp_path):
     _write_cloud(dataset, 0)
     document = json.loads(dataset.paths.calibration.read_text())

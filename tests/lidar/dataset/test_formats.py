@@ -320,6 +320,17 @@ def test_layers_that_a_chunk_cannot_hold_are_refused(tmp_path):
         read_table(path)
 
 
+def test_chunks_of_more_points_than_a_file_can_hold_are_refused(tmp_path):
+    """The decompressor allocates memory for all points that a chunk may have."""
+    path = tmp_path / "a.laz"
+    las.write(path, table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
+    whole = path.read_bytes()
+    at = whole.index((50_000).to_bytes(4, "little"))
+    path.write_bytes(whole[:at] + (1_879_088_695).to_bytes(4, "little") + whole[at + 4 :])
+    with pytest.raises(FormatError, match="a chunk of 1879088695 points"):
+        read_table(path)
+
+
 def test_a_panic_of_the_decompressor_names_the_file(tmp_path, monkeypatch):
     class PanicException(BaseException):
         """As pyo3 raises it."""
