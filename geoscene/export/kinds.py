@@ -80,14 +80,19 @@ def export_scene(
 ) -> Summary:
     """Write a scene to a file, or to a folder for 3D Tiles, and return a summary.
 
-    Raises InputError for an unknown kind, for an option that the kind does not take, and if a file exists
-    and may not be overwritten; MissingExtraError where an optional package is needed.
+    Raises InputError for an unknown kind, a suffix of another kind, an option that the kind does not take,
+    layers without contents, and if a file exists and may not be overwritten; MissingExtraError where an
+    optional package is needed.
     """
     out = Path(out)
     name = kind_of(out) if options.kind is None else options.kind
     if name not in KINDS:
         raise InputError(f"`kind` {name}: there are {', '.join(KINDS)}")
     kind = KINDS[name]
+    others = [suffix for other in KINDS.values() for suffix in other.suffixes if suffix not in kind.suffixes]
+    if out.name.lower().endswith(tuple(others)):
+        known = " or ".join(kind.suffixes) or "a folder"
+        raise InputError(f"{out}: the suffix is of another format than `kind` {name}, which is {known}")
     given = {key: value for key, value in asdict(options).items() if key != "kind" and value is not None}
     foreign = sorted(set(given) - kind.options)
     if foreign:

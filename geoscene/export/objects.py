@@ -135,8 +135,9 @@ def parts(
 ) -> Iterator[Part]:
     """The tiles of a scene one at a time, restricted to the chosen layers.
 
-    Raises InputError for unknown names of layers.
+    Raises InputError for unknown names of layers, and after the last tile if the layers have no faces.
     """
+    found = layers is None
     known = [*scene.layers, BARE]
     if unknown := sorted(set(layers or ()) - set(known)):
         raise InputError(f"no layer {', '.join(unknown)}; this scene has {', '.join(known)}")
@@ -149,7 +150,11 @@ def parts(
             mesh = mesh.take(rows_in_layers(scene, mesh.feature, layers=layers))
             keep = rows_in_layers(scene, copies.feature, layers=layers)
             copies = copies.take(keep)
+        found = found or len(mesh) + len(copies) > 0
         yield Part((i, j), span, tile.origin, mesh, copies)
+    if not found:
+        names = ", ".join(layers or ())
+        raise InputError(f"`layers` {names}: no faces in this scene; they are attributes alone, or empty")
 
 
 def expand(instances: Instances, library: Sequence[Mesh]) -> Mesh:

@@ -82,7 +82,7 @@ def write_geotiff(
                  ground alone, under buildings and trees too) or ``classes`` (`Class` code of the highest)
     resolution : metres, side of a cell; the grid is aligned to multiples of it
 
-    Raises InputError for an unknown model or an unusable resolution.
+    Raises InputError for an unknown model, an unusable resolution, and layers that the model does not show.
     """
     from rasterio.errors import RasterioError  # noqa: PLC0415
 
@@ -104,6 +104,10 @@ def write_geotiff(
                 mesh = concatenate([mesh, expand(part.instances, library)])
             _draw(mesh, part.origin, scene=scene, grid=grid, height=height, labels=labels)
             faces += len(mesh)
+        if not faces:
+            raise InputError(
+                f"`layers` {', '.join(layers or ())}: no faces of the {model} model in this scene"
+            )
         draft = Path(folder) / "draft.tif"
         try:
             _write_draft(draft, scene, grid=grid, cells=labels if model == "classes" else height, model=model)

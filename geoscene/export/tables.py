@@ -44,7 +44,7 @@ def chosen_layers(scene: Scene, layers: Collection[str] | None, *, others: Colle
 
     others : names of tables that the format has besides the scene's layers
 
-    Raises InputError for an unknown name.
+    Raises InputError for an unknown name, and if none of the layers to write has features.
     """
     known = [name for name, (a, b) in sorted(scene.layers.items(), key=lambda item: item[1]) if b > a]
     if layers is None:
@@ -52,7 +52,10 @@ def chosen_layers(scene: Scene, layers: Collection[str] | None, *, others: Colle
     if unknown := sorted(set(layers) - {*scene.layers, *others}):
         names = ", ".join([*scene.layers, *others])
         raise InputError(f"no layer {', '.join(unknown)}; this scene has {names}")
-    return [name for name in [*known, *others] if name in layers]
+    chosen = [name for name in [*known, *others] if name in layers]
+    if not chosen:
+        raise InputError(f"`layers` {', '.join(layers)}: no features in this scene")
+    return chosen
 
 
 def kinds_of_columns(scene: Scene, layer: str) -> dict[str, np.dtype[Any]]:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.errors import InputError
 from geoscene.export.files import Summary, compact_json
 from geoscene.export.globe import Globe
 from geoscene.export.gltf import GlbWriter, Tables, add_instances, y_up
@@ -56,7 +55,7 @@ def write_3dtiles(
     height_offset : metres from the zero of the scene's heights up from the WGS 84 ellipsoid (for orthometric
                     heights the geoid's undulation)
 
-    Raises InputError if the folder is not a tileset, and if the chosen layers are empty.
+    Raises InputError if the folder is not a tileset, and if the layers have no faces.
     """
     xmin, ymin, xmax, ymax = scene.bounds
     globe = Globe.at(scene.frame, (xmin + xmax) / 2, y=(ymin + ymax) / 2, lift=height_offset)
@@ -74,8 +73,6 @@ def write_3dtiles(
             objects += len(found) + len(part.instances)
             solids += sum(piece.solid for piece in found)
             faces += len(part.mesh)
-        if not nodes:
-            raise InputError(f"{scene.path}: the chosen layers are empty")
         root = _quadtree(nodes)
         diagonal = float(np.linalg.norm(root.high - root.low))
         document = {

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import materials
+from geoscene.errors import InputError
 from geoscene.export.files import Summary, size_of
 from geoscene.export.objects import attribution, expand, klass_name, parts, pieces, read_features
 from geoscene.files import append, atomic_file, spool
@@ -159,6 +160,8 @@ def write_stl(
 
     STL has no objects, no colours and float32 coordinates. Faces that rounding makes degenerate are left out,
     as are solids that would no longer be closed; the notes count these.
+
+    Raises InputError if there is no solid.
     """
     xmin, ymin, xmax, ymax = scene.bounds
     middle = np.array([np.round((xmin + xmax) / 2), np.round((ymin + ymax) / 2), 0.0])
@@ -177,6 +180,9 @@ def write_stl(
             facets += len(mesh)
             solids += len(np.unique(mesh.feature))
             broken += lost
+        if not facets:
+            chosen = "the scene" if layers is None else f"`layers` {', '.join(layers)}"
+            raise InputError(f"{path}: {chosen} has no solids, and STL has nothing else")
         out.seek(80)
         out.write(np.array(facets, "<u4").tobytes())
     notes = (f"{broken} solids left out: float32 coordinates would not leave them closed",) if broken else ()

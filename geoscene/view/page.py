@@ -45,8 +45,8 @@ def view_scene(
     The page loads nothing: data, style and viewer (WebGL 2) are in it. Its bytes depend on the scene, the
     bounds and the layers alone.
 
-    Raises InputError for an existing file, bounds without a tile, an unknown layer, and a page that would be
-    too large; the message then gives the bounds of a part that would fit.
+    Raises InputError for a file that exists or is not named as a page, bounds without a tile, an unknown
+    layer, and a page that would be too large; the message then gives the bounds of a part that would fit.
     """
     out = Path(out)
     _check(out, overwrite=overwrite)
@@ -96,6 +96,8 @@ def view_scene(
 def _check(out: Path, *, overwrite: bool) -> None:
     if out.is_dir():
         raise InputError(f"{out}: is a folder; name a file such as page.html")
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{out}: unknown suffix; a page is a file such as {out.with_suffix('.html').name}")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
 

@@ -1,8 +1,10 @@
 """Rasters and tables of a scene: positions, heights, classes, attributes and CRS."""
 
 import json
+import re
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 
 import geopandas
 import numpy as np
@@ -211,6 +213,31 @@ def test_selected_layer_is_exported_and_unknown_layers_are_refused(scene, tmp_pa
 )
 def test_suffix_selects_the_format(tmp_path, name, kind):
     assert kind_of(tmp_path / name) == kind
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        *((f"a{KINDS[kind].suffixes[0]}", {"layers": ("roads",)}, "`layers` roads: no faces")
+          for kind in ("cityjson", "glb", "obj", "ply", "stl", "geotiff")),
+        ("tiles", {"kind": "3dtiles", "layers": ("roads",)}, "`layers` roads: no faces"),
+        ("a.stl", {"layers": ("roads", "terrain")}, "`layers` roads, terrain has no solids"),
+        ("a.tif", {"layers": ("buildings",), "model": "terrain"}, "no faces of the terrain model"),
+        ("a.gpkg", {"layers": ("structures",)}, "`layers` structures: no features"),
+        ("a.geojson", {"layers": ("structures",)}, "`layers` structures: no features"),
+        ("a.obj", {"kind": "stl"}, "another format than `kind` stl, which is .stl"),
+        ("a.glb", {"kind": "3dtiles"}, "another format than `kind` 3dtiles, which is a folder"),
+    ],
+)  # fmt: skip
+def test_exports_without_contents_or_with_the_name_of_others_are_refused(
+    scene, tmp_path, name, options, words
+):
+    stop = max(stop for _, stop in scene.layers.values())
+    layers = {name: list(rows) for name, rows in scene.layers.items()} | {"structures": [stop, stop]}
+    scene = replace(scene, manifest=scene.manifest | {"layers": layers})
+    with pytest.raises(InputError, match=re.escape(words)):
+        export_scene(scene, tmp_path / name, options=ExportOptions(**options))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_invalid_options_are_refused_before_writing(scene, tmp_path):

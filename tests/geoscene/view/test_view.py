@@ -245,6 +245,13 @@ def test_a_page_that_is_too_large_is_refused_with_the_bounds_of_a_part_that_fits
         view_scene(scene, tmp_path / "none.html", options=ViewOptions(max_mb=0.01))
 
 
+def test_a_page_must_be_named_as_one(scene, tmp_path):
+    for name in ("page.txt", "page", "page.glb"):
+        with pytest.raises(InputError, match=r"unknown suffix; a page is a file such as page\.html"):
+            view_scene(scene, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
