@@ -130,14 +130,22 @@ def _traffic(_: object, tokens: Sequence[Token]) -> Any:
 
 
 def _values(text: str, words: Sequence[str], *, known: dict[str, Any]) -> dict[str, Any]:
-    """Values by name of words NAME=VALUE."""
-    pairs = [_pair(word) if "=" in word else (word, "") for word in words]
-    if unknown := [name for name, _ in pairs if name not in known]:
-        raise ValueError(f"{', '.join(unknown)} is none of on, off, sumo, {', '.join(known)}")
-    try:
-        return {name: known[name](value) for name, value in pairs}
-    except ValueError as error:
-        raise ValueError(f"{text}: {error}") from None
+    """Values by name of words NAME=VALUE of an option's text."""
+    values: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = (part.strip() for part in word.partition("="))
+        if name not in known:
+            raise ValueError(f"{text}: {name or 'nothing'} is none of on, off, sumo, {', '.join(known)}")
+        if not equals or not value:
+            raise ValueError(f"{text}: give a value for {name}, as in {name}={_EXAMPLES[known[name]]}")
+        try:
+            values[name] = known[name](value)
+        except ValueError:
+            raise ValueError(f"{text}: {name} = {value} is not a number") from None
+    return values
+
+
+_EXAMPLES = {float: "0.5", Path: "map.net.xml"}
 
 
 @Parameter(name="*")

@@ -5,6 +5,7 @@ import re
 from dataclasses import fields
 
 import pytest
+from cyclopts import CoercionError
 from helpers.programs import run_program
 
 from geoscene.errors import SceneFormatError
@@ -104,6 +105,25 @@ def test_a_bad_rig_or_sensor_is_named_with_line_and_key(tmp_path):
     (tmp_path / "s.toml").write_text('kind = "flash"\nrates_hz = [10.0]\nmin_range = "near"\n')
     with pytest.raises(InputError, match=r"s.toml, line 3: min_range: 'near' is not a number"):
         load_sensor(tmp_path / "s.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("vehicles=abc", "vehicles=abc: vehicles = abc is not a number"),
+        ("vehicles", "vehicles: give a value for vehicles, as in vehicles=0.5"),
+        ("parked=0.5,radius=", "parked=0.5,radius=: give a value for radius"),
+        ("cars=3", "cars=3: cars is none of on, off, sumo, vehicles"),
+        ("vehicles=3,", "vehicles=3,: nothing is none of on"),
+        ("sumo,pedestrians=x", "sumo,pedestrians=x: pedestrians = x is not a number"),
+        ("fcd.xml,net=", "fcd.xml,net=: give a value for net, as in net=map.net.xml"),
+        ("fcd.xml,begin=soon", "fcd.xml,begin=soon: begin = soon is not a number"),
+    ],
+)
+def test_values_of_traffic_are_named_with_what_is_expected(text, said, tmp_path):
+    words = ["drive", str(tmp_path), "--route", "random", "-o", str(tmp_path / "d"), "--traffic", text]
+    with pytest.raises(CoercionError, match=re.escape(said)):
+        app(words, exit_on_error=False, result_action="return_value")
 
 
 def test_options_are_read_where_pydantic_is_imported(tmp_path):
