@@ -3,8 +3,11 @@
 import json
 import re
 import sqlite3
+import subprocess
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import geopandas
 import numpy as np
@@ -265,6 +268,27 @@ def test_the_library_of_materials_of_another_mesh_is_not_replaced_unasked(scene,
         export_scene(scene, tmp_path / "a.obj")
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
     assert export_scene(scene, tmp_path / "a.obj", overwrite=True).files == 2
+
+
+def test_warnings_of_netconvert_are_notes_one_of_each_kind(monkeypatch, scene, tmp_path):
+    warnings = [
+        "Warning: Edge '-1' has a grade of 16.77%.",
+        "Warning: Found sharp turn with radius 8.94 at the start of edge '-108'.",
+        "Warning: Edge '20' has a grade of 31.00%.",
+        "Success.",
+    ]
+
+    def convert(command, **_options):
+        Path(command[command.index("--output-file") + 1]).write_text("<net/>")
+        return subprocess.CompletedProcess(command, 0, "", "\n".join(warnings))
+
+    monkeypatch.setattr("geoscene.export.sumo.need", lambda *_: SimpleNamespace(SUMO_HOME="/none"))
+    monkeypatch.setattr("geoscene.export.sumo.subprocess.run", convert)
+    summary = export_scene(scene, tmp_path / "a.net.xml")
+    assert summary.notes[-2:] == (
+        "netconvert: Edge '-1' has a grade of 16.77%. (2 warnings of this kind)",
+        "netconvert: Found sharp turn with radius 8.94 at the start of edge '-108'.",
+    )
 
 
 def test_missing_sumo_error_names_the_extra(scene, tmp_path, monkeypatch):
