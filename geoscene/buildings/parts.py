@@ -17,6 +17,9 @@ from geoscene.typing import Bools, Float, Ints
 
 Rows = Ints
 
+_LEAST_SHOWN = 0.01
+"""Square metres that problems name at least."""
+
 
 def overlapping(a: Polygons, b: Polygons, *, least: float = 1e-4) -> tuple[Rows, Rows, Float]:
     """Pairs of rows of a and b that share more than ``least`` square metres, and the shared areas."""
@@ -168,8 +171,9 @@ def cut_overlaps(
             problems.append(unexpected(osm_id[row], error, kind="building"))
             continue
         winners = ", ".join(sorted({osm_id[w] for w in winner[mine]}))
-        lost = area[row] - shapely.area(out[row])
-        detail = f"lost {lost:.2f} of {area[row]:.1f} m2 to {winners}"
+        lost = area[row] - shapely.area(out[row])  # under 0 where rounding to the grid adds more
+        amount = f"{lost:.2f}" if lost >= _LEAST_SHOWN else f"under {_LEAST_SHOWN}"
+        detail = f"lost {amount} m2 of {area[row]:.1f} m2 to {winners}"
         if shapely.area(out[row]) < 0.1 * area[row]:
             out[row] = shapely.Polygon()
             problems.append(Problem(osm_id[row], "building", "dropped", "inside-another", detail))

@@ -45,7 +45,7 @@ def with_support(rows: Sequence[Row], footprint: Polygons, *, heights: Heights) 
             below = below[shapely.area(shapely.intersection(footprint[below], footprint[k])) > _SUPPORT]
             if len(below):
                 top = float(high[below].max())
-                detail = f"underside at {low[k]:.2f} m put on the part below, at {top:.2f} m"
+                detail = f"underside at {low[k]:z.2f} m put on the part below, at {top:z.2f} m"
                 problems.append(Problem(rows[k].osm_id, "building", "repaired", "slit-between-parts", detail))
                 low[k] = top
     return problems

@@ -39,7 +39,7 @@ def _head(scene: Scene) -> list[str]:
     return [
         "made by geoscene; x east, y north, z up, metres",
         ascii_only,
-        f"add {east:.0f} to x and {north:.0f} to y for coordinates in {scene.frame.name}",
+        f"add {east:z.0f} to x and {north:z.0f} to y for coordinates in {scene.frame.name}",
         f"heights: {scene.frame.vertical}",
         f"crs {wkt}",
     ]
@@ -168,7 +168,7 @@ def write_stl(
     east, north = scene.frame.origin
     facets = solids = broken = 0
     row = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
-    head = f"geoscene; add {middle[0] + east:.0f} {middle[1] + north:.0f} 0; {scene.frame.name}"
+    head = f"geoscene; add {middle[0] + east:z.0f} {middle[1] + north:z.0f} 0; {scene.frame.name}"
     with atomic_file(path) as out:
         out.write(head.encode("ascii", "replace")[:80].ljust(80, b" ") + bytes(4))
         for _, mesh in meshes_of(scene, layers, stage="STL", progress=progress):

@@ -47,7 +47,7 @@ def sea(
     for face, w, d in zip(faces, wet, dry, strict=True):
         if min(w, d) > 0.01 * max(w, d):
             at = face.representative_point()
-            detail = f"sea by {w:.0f} m of shore, land by {d:.0f} m, at ({at.x:.0f}, {at.y:.0f})"
+            detail = f"sea by {w:.0f} m of shore, land by {d:.0f} m, at ({at.x:z.0f}, {at.y:z.0f})"
             problems.append(Problem("", "coastline", "repaired", "conflict", detail))
     return faces[wet > dry], problems
 

@@ -454,7 +454,7 @@ def _repairs(
         problems.append(Problem("", "terrain", "repaired", "void", detail))
     if spikes.any():
         low, high = values[spikes].min(), values[spikes].max()
-        detail = f"{files}: {int(spikes.sum())} of {posts} posts at {low:.0f} to {high:.0f} m; {end}"
+        detail = f"{files}: {int(spikes.sum())} of {posts} posts at {low:z.0f} to {high:z.0f} m; {end}"
         problems.append(Problem("", "terrain", "repaired", "spike", detail))
     return tuple(problems)
 

@@ -53,7 +53,7 @@ def triangulate(partition: Partition) -> Triangles:
         where = partition.polygon[np.argmax(amiss)].representative_point()
         raise GeosceneError(
             f"{int(amiss.sum())} ground cells not fully triangulated, {int((area == 0).sum())} triangles "
-            f"have no area; look at ({where.x:.3f}, {where.y:.3f})"
+            f"have no area; look at ({where.x:z.3f}, {where.y:z.3f})"
         )
     return Triangles(points, faces.astype(np.int32), cell.astype(np.int32))
 

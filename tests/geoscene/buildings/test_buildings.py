@@ -351,6 +351,25 @@ def test_a_roof_that_cannot_be_built_is_made_flat(monkeypatch):
     assert reasons(problems) == {("way/0", "repaired", "roof-fallback")}
 
 
+def test_an_overlap_of_less_than_the_grid_is_no_negative_loss():
+    """Subtraction on the grid may add more area than the overlap had."""
+    details = []
+    for angle in np.linspace(1, 40, 30).tolist():
+        wide, narrow = affinity.rotate(box(0, 0, 40, 20), angle), box(39.999985, 2, 20, 15)
+        narrow = affinity.rotate(narrow, angle, origin=(20, 10))
+        _, problems = parts.cut_overlaps(
+            ["way/1", "way/2"],
+            np.array([wide, narrow]),
+            owner=np.arange(2),
+            rank=np.zeros(2, np.int64),
+            low=np.zeros(2),
+            high=np.full(2, 5.0),
+        )
+        details += [problem.detail for problem in problems]
+    assert len(details) == 30
+    assert set(details) == {"lost under 0.01 m2 of 800.0 m2 to way/2"}
+
+
 def test_an_overlap_that_cannot_be_cut_drops_only_the_larger_building(monkeypatch):
     def failing(*_):
         raise GEOSException("TopologyException")
