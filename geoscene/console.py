@@ -8,10 +8,11 @@ import logging
 import os
 import re
 import shlex
+import signal
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -32,7 +33,14 @@ _HINTS = {
     errno.EPERM: _PERMISSION,
     errno.EROFS: "; give a path that you may write to",
 }
-_INTERRUPTED, _BROKEN_PIPE = 130, 141
+_BROKEN_PIPE = 141
+
+_INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM)
+"""Signals of Ctrl-C, and of ``timeout``, ``kill`` and batch systems; the exit code is 128 plus the number."""
+
+_GRACE = 1.5
+"""Seconds to clear up in after an interruption, which may also get lost in callbacks of compiled code."""
+
 _NUMBERS = re.compile(r"-\d+(\.\d*)?(,-?\d+(\.\d*)?)+")
 
 
@@ -115,9 +123,10 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
         level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
     try:
-        words = _guard_numbers(sys.argv[1:])
-        code = app(words, result_action="return_value", exit_on_error=False, print_error=False)
-        sys.stdout.flush()
+        with _ended_by_interruptions(app):
+            words = _guard_numbers(sys.argv[1:])
+            code = app(words, result_action="return_value", exit_on_error=False, print_error=False)
+            sys.stdout.flush()
     except CycloptsError as error:
         message = str(error).rstrip(".")
         _print_error(app, f"{message}; see {app.name[0]} {_command(app)}--help")
@@ -125,12 +134,6 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
     except roots as error:
         _print_error(app, error)
         sys.exit(USAGE if isinstance(error, usage) else FAILURE)
-    except KeyboardInterrupt:
-        _exit_interrupted(app)
-    except SystemError as error:
-        if not isinstance(error.__cause__, KeyboardInterrupt):  # which compiled code returns as a SystemError
-            raise
-        _exit_interrupted(app)
     except BrokenPipeError:  # the reader of standard output has ended, as in "| head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(_BROKEN_PIPE)
@@ -146,11 +149,44 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
     sys.exit(code if isinstance(code, int) else DONE)
 
 
-def _exit_interrupted(app: App) -> NoReturn:
+@contextmanager
+def _ended_by_interruptions(app: App) -> Iterator[None]:
+    """Let the first interruption of the block raise KeyboardInterrupt, and end the program soon after.
+
+    What the block raises then counts as that: compiled code turns a KeyboardInterrupt into other errors.
+    """
+    arrived: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        arrived.append(number)
+        if hasattr(signal, "setitimer"):
+            for interruption in _INTERRUPTIONS:  # ``timeout`` sends two
+                signal.signal(interruption, signal.SIG_IGN)
+            signal.signal(signal.SIGALRM, lambda *_: _exit_interrupted(app, number))
+            signal.setitimer(signal.ITIMER_REAL, _GRACE)
+        raise KeyboardInterrupt
+
+    for interruption in _INTERRUPTIONS:
+        if signal.getsignal(interruption) != signal.SIG_IGN:  # as of SIGINT in the background of a script
+            signal.signal(interruption, interrupt)
+    try:
+        yield
+    except BaseException:
+        if arrived:
+            _exit_interrupted(app, arrived[0])
+        raise
+
+
+def _exit_interrupted(app: App, number: int) -> NoReturn:
     """End at once, without waiting for other threads; files appear when they are complete."""
-    _print_error(app, "interrupted; repeat the command to resume")
-    sys.stderr.flush()
-    os._exit(_INTERRUPTED)
+    from multiprocessing import active_children  # noqa: PLC0415 - slow to import
+
+    for child in active_children():
+        child.kill()
+    with suppress(RuntimeError):  # if it was interrupted in writing to standard error
+        _print_error(app, "interrupted; repeat the command to resume")
+        sys.stderr.flush()
+    os._exit(128 + number)
 
 
 def _command(app: App) -> str:

@@ -20,6 +20,9 @@ from geoscene.errors import WorkersLostError
 
 log = logging.getLogger(__name__)
 
+_INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that a terminal or ``timeout`` sends to all processes; they are for the parent process."""
+
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -81,12 +84,12 @@ def run_tasks(work: Callable[[Task], Result], tasks: Sequence[Task], *, workers:
 
 
 def _add_worker(team: dict[Any, _Worker[Task]], work: Callable[[Task], Result]) -> None:
-    """Start a process and add it to the team, with interruptions blocked: they are for this process."""
+    """Start a process and add it to the team, with interruptions blocked."""
     context = multiprocessing.get_context()
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs, work), daemon=True)
     masks = hasattr(signal, "pthread_sigmask")
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else None
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTIONS) if masks else None
     try:
         process.start()
         team[ours] = _Worker(process)
@@ -108,7 +111,8 @@ def _assigned(team: dict[Any, _Worker[Task]], waiting: deque[Task]) -> list[Any]
 
 def _serve(connection: Connection, work: Callable[[Task], Result]) -> None:
     """Work on the tasks that arrive, in a worker process; exit when the parent process ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for interruption in _INTERRUPTIONS:
+        signal.signal(interruption, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     while True:
         task = connection.recv()

@@ -160,17 +160,18 @@ def started(out, tiles, *more):
     return process
 
 
-@pytest.mark.parametrize(
-    "raised", ["KeyboardInterrupt", "SystemError('in compiled code') from KeyboardInterrupt()"]
-)
-def test_interruption_ends_the_program_without_waiting_for_its_threads(raised):
+@pytest.mark.parametrize("error", ["KeyboardInterrupt", "SystemError('in compiled code')"])
+def test_interruption_ends_the_program_without_waiting_for_its_threads(error):
     program = (
-        "import threading, time, cyclopts, geoscene.console as console\n"
+        "import signal, threading, time, cyclopts, geoscene.console as console\n"
         "app = cyclopts.App(name='geoscene', suppress_keyboard_interrupt=False)\n"
         "@app.default\n"
         "def run():\n"
         "    threading.Thread(target=time.sleep, args=(60,)).start()\n"
-        f"    raise {raised}\n"
+        "    try:\n"
+        "        signal.raise_signal(signal.SIGINT)\n"
+        "    except KeyboardInterrupt:\n"
+        f"        raise {error}\n"
         "console.main(app, (), usage=())\n"
     )
     done = subprocess.run(
@@ -184,14 +185,43 @@ def test_interruption_ends_the_program_without_waiting_for_its_threads(raised):
     assert (done.returncode, done.stderr) == (130, "geoscene: interrupted; repeat the command to resume\n")
 
 
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interruption_that_is_lost_ends_the_program_soon(number, code):
+    """As in callbacks of compiled code, whose exceptions are ignored."""
+    program = (
+        "import contextlib, time, cyclopts, geoscene.console as console\n"
+        "app = cyclopts.App(name='geoscene', suppress_keyboard_interrupt=False)\n"
+        "@app.default\n"
+        "def run():\n"
+        "    for _ in range(2):\n"
+        "        with contextlib.suppress(KeyboardInterrupt):\n"
+        "            print('ready', flush=True)\n"
+        "            time.sleep(60)\n"
+        "console.main(app, (), usage=())\n"
+    )
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        [sys.executable, "-c", program], env=ENVIRONMENT, stdout=pipe, stderr=pipe, text=True
+    ) as process:
+        process.stdout.readline()
+        process.send_signal(number)
+        process.stdout.readline()
+        process.send_signal(number)  # as `timeout` does
+        _, errors = process.communicate(timeout=20)
+    assert (process.returncode, errors) == (code, "geoscene: interrupted; repeat the command to resume\n")
+
+
 @IN_PROC
-def test_interruption_stops_all_processes_at_once_and_keeps_the_journal(tmp_path):
+@pytest.mark.parametrize("send", [os.kill, os.killpg])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interruption_stops_all_processes_at_once_and_keeps_the_journal(send, number, code, tmp_path):
     process = started(tmp_path / "scene", 3)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    send(process.pid, number)
     _, errors = process.communicate(timeout=20)
-    assert (process.returncode, errors) == (130, "geoscene: interrupted; repeat the command to resume\n")
+    assert (process.returncode, errors) == (code, "geoscene: interrupted; repeat the command to resume\n")
     assert alive(process.pid) == []
-    assert 2 <= len((tmp_path / "scene.part" / "tiles.jsonl").read_text().splitlines()) < 20
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.part"]
+    assert 1 <= len((tmp_path / "scene.part" / "tiles.jsonl").read_text().splitlines()) < 20
 
 
 @IN_PROC
