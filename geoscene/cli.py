@@ -372,7 +372,8 @@ def _extent(manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def _print_scene(report: dict[str, Any]) -> None:
-    counts, frame = report["counts"], report["frame"]
+    counts, frame, ground = report["counts"], report["frame"], report["ground"]
+    water = ground.get("water_area", 0.0) / 1e6
     steep = _steep_roads(counts, terrain=frame["vertical"] != "flat")
     xmin, ymin, xmax, ymax = report["bounds"]
     west, south, east, north = report["geographic_bounds"]
@@ -385,14 +386,16 @@ def _print_scene(report: dict[str, Any]) -> None:
         "watertight": f"{counts['watertight']} of {counts['closed_objects']} closed objects",
         "standing": f"{counts['trees']} mapped trees, {counts['forest_trees']} in forests,"
         f" {counts['furniture']} pieces of furniture, {counts['barriers']} barriers",
-        "roads": f"{counts['road_km']:.1f} km in {counts['road_edges']} edges" + steep,
+        "ground": f"{ground['area'] / 1e6:.2f} km2" + (f", {water:.3g} km2 of it water" if water else ""),
+        "roads": f"{counts['road_km']:.1f} km of carriageway in the extent; {counts['road_edges']} edges by"
+        f" direction{steep}",
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
     }
     if report["options"]["along"]:
         rows["along"] = (
-            f"{len(report['tiles'])} tiles are built, those in range of the route; solids, watertight"
-            " and trees in forests count these tiles, all other figures the whole map"
+            f"{len(report['tiles'])} tiles are built, those in range of the route; solids, watertight,"
+            " trees in forests and ground count these tiles, all other figures the whole map"
         )
     print(report["name"] or report["path"])
     for title, text in rows.items():

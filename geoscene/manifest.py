@@ -60,6 +60,7 @@ def scene_manifest(
         },
         "ground": {
             "area": sum(r.area for r in sorted(reports, key=lambda r: (r.i, r.j))),
+            "water_area": sum(r.water for r in sorted(reports, key=lambda r: (r.i, r.j))),
             "extent_area": (xmax - xmin) * (ymax - ymin),
             "open_area": _open_area(plan),
         },
@@ -101,13 +102,23 @@ def _open_area(plan: Plan) -> float:
     return float(shapely.intersection(shapely.union_all(openings), shapely.box(*plan.extent)).area)
 
 
-def steep_metres(graph: RoadGraph) -> float:
-    """Length in metres of road segments with a gradient above `STEEP`."""
-    total = 0.0
-    for line in graph.geometry:
-        metres = np.hypot(*np.diff(line[:, :2], axis=0).T)
-        total += float(metres[np.abs(np.diff(line[:, 2])) > STEEP * metres].sum())
-    return total
+def road_metres(graph: RoadGraph, extent: Sequence[float]) -> tuple[float, float]:
+    """True metres of the roads' centre lines within an extent, and of those with a gradient above `STEEP`.
+
+    A carriageway of two directions counts once.
+    """
+    once = np.flatnonzero((graph.twin < 0) | (np.arange(len(graph)) < graph.twin))
+    if not len(once):
+        return 0.0, 0.0
+    lines = graph.geometry[once]
+    segments = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
+    edge = np.repeat(once, [len(line) - 1 for line in lines])
+    plan = np.hypot(*(segments[:, 1, :2] - segments[:, 0, :2]).T)
+    steep = np.abs(segments[:, 1, 2] - segments[:, 0, 2]) > STEEP * plan
+    inside = shapely.length(shapely.clip_by_rect(shapely.linestrings(segments[:, :, :2]), *extent))
+    whole = np.bincount(edge, plan, minlength=len(graph))[edge]
+    metres = inside * graph.length[edge] / np.where(whole > 0, whole, 1.0)
+    return float(metres.sum()), float(metres[steep].sum())
 
 
 def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Problem]) -> dict[str, Any]:
@@ -115,6 +126,7 @@ def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Pro
     summary = summarise(problems)
     dropped = summary["dropped"].get("building", {})
     components = find_components(plan.graph)
+    metres, steep = road_metres(plan.graph, plan.extent)
     return {
         "buildings": count + sum(dropped.values()) - dropped.get("no-solid", 0),
         "solids": sum(r.buildings for r in reports),
@@ -125,8 +137,8 @@ def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Pro
         "watertight": sum(r.watertight for r in reports),
         "faces": sum(r.faces for r in reports),
         "road_edges": len(plan.graph),
-        "road_km": round(float(plan.graph.length.sum()) / 1000, 3),
-        "road_km_steep": round(steep_metres(plan.graph) / 1000, 3),
+        "road_km": round(metres / 1000, 3),
+        "road_km_steep": round(steep / 1000, 3),
         "road_components": int(components.strong.max(initial=-1)) + 1,
         "road_largest_component_share": round(components.largest_strong_share, 4),
         "trees": len(plan.trees),

@@ -48,6 +48,7 @@ class TileReport:
     instances  : number of instances of shapes, those of forests included
     forest_trees : number of trees of forests
     area       : plan area of the ground in square metres
+    water      : plan area of the water on it
     digest     : digest of the tile's file
     problems   : buildings that were simplified, and features that were dropped
     """
@@ -61,6 +62,7 @@ class TileReport:
     instances: int
     forest_trees: int
     area: float
+    water: float
     digest: str
     problems: tuple[Problem, ...]
 
@@ -171,6 +173,7 @@ def build_tile(
         len(copies) + 2 * forest_trees,  # a trunk and a crown each
         forest_trees,
         _plan_area(rest.take(~rest.closed)),
+        _plan_area(rest.take(~rest.closed & (rest.klass == Class.WATER))),
         digest,
         tuple(problems),
     )

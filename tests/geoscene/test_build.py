@@ -83,13 +83,16 @@ def test_check_scene_reports_broken_surfaces(scene, tmp_path):
 
 def test_ground_covers_the_extent_exactly_once(scene):
     xmin, ymin, xmax, ymax = scene.bounds
-    area = 0.0
+    area = water = 0.0
     for tile in scene.tiles():
         ground = ~tile.mesh.closed
         a, b, c = (tile.mesh.vertices[tile.mesh.faces[ground, k]][:, :2] for k in range(3))
         u, v = b - a, c - a
-        area += float((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / 2)
+        parts = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2
+        area += float(parts.sum())
+        water += float(parts[tile.mesh.klass[ground] == Class.WATER].sum())
     open_area = scene.manifest["ground"]["open_area"]
+    assert scene.manifest["ground"]["water_area"] == pytest.approx(water, abs=1e-6)
     assert area + open_area == pytest.approx((xmax - xmin) * (ymax - ymin), rel=1e-6)
 
 

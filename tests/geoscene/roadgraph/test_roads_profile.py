@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_array, diags_array
 
 from geoscene.frames import Frame
 from geoscene.ground.terrain import open_terrain
-from geoscene.manifest import steep_metres
+from geoscene.manifest import road_metres
 from geoscene.roadgraph import ProfileOptions, build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.quadratic import Bounds, interior_point
 from geoscene.roadgraph.stations import find_crossings, place_stations
@@ -205,8 +206,21 @@ def test_steep_metres_are_counted():
         return np.where(x > 0, 0.3 * x, 0.1 * x) + 0 * y
 
     graph = profile(graph_of(OVER, [(ROAD | {"oneway": "yes"}, [1, 4])]), cliff)
-    assert steep_metres(graph) == pytest.approx(400, abs=25)
-    assert steep_metres(profile(graph, lambda x, y: 0.15 * x + 0 * y)) == 0
+    everywhere = (-1e4, -1e4, 1e4, 1e4)
+    assert road_metres(graph, everywhere)[1] == pytest.approx(400, abs=25)
+    assert road_metres(graph, (-1e4, -1e4, 100, 1e4))[1] == pytest.approx(100, abs=25)
+    assert road_metres(profile(graph, lambda x, y: 0.15 * x + 0 * y), everywhere)[1] == 0
+
+
+def test_a_carriageway_of_two_directions_counts_once_and_within_the_extent_only():
+    streets = [graph_of(OVER, [(ROAD | {"oneway": way}, [1, 4])]) for way in ("yes", "no")]
+    xmin, ymin, xmax, ymax = shapely.total_bounds(shapely.linestrings(streets[0].geometry[0][:, :2]))
+    for graph in streets:
+        whole = float(graph.length[0])
+        assert road_metres(graph, (-1e4, -1e4, 1e4, 1e4))[0] == pytest.approx(whole, rel=1e-9)
+        half = (xmin - 1, ymin - 1, (xmin + xmax) / 2, ymax + 1)
+        assert road_metres(graph, half)[0] == pytest.approx(whole / 2, rel=0.01)
+        assert road_metres(graph, (xmax + 1, ymin, xmax + 2, ymax)) == (0.0, 0.0)
 
 
 def test_both_edges_of_a_street_have_the_same_heights():
