@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _STEP_NS = 10_000_000
 _LATEST_NS = 10**15
+_FASTEST = 1000.0  # m/s
 _STAMP = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
 _QUAT = ("qx", "qy", "qz", "qw")
 
@@ -49,6 +50,7 @@ def read_replay(path: Path, frame: Frame) -> Trajectory:
     recorded = _recorded_frame(manifest) if manifest.is_file() else frame
     if names[0] == "time_ns":
         found = read_trajectory(path)
+        _check_speed(path, found.time_ns, position=found.position)
         return found if recorded == frame else _moved(found, recorded, frame=frame)
     if not {"timestamp", "lon", "lat", "h", *_QUAT} <= set(names):
         raise FormatError(f"{path}: neither a poses.csv nor a trajectory.csv of a dataset")
@@ -82,6 +84,7 @@ def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
     unit = np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-3
     if not (np.isfinite([x, y, h]).all() and unit.all()):
         raise FormatError(f"{path}: a row holds no pose")
+    _check_speed(path, time, position=np.column_stack([x, y, h]))
     seconds = time * 1e-9
     at = np.append(np.arange(0, time[-1], _STEP_NS), time[-1])
     spline = CubicSpline(
@@ -95,6 +98,17 @@ def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
     return Trajectory(at, position, Slerp(seconds, turn)(at * 1e-9).as_quat(), velocity, scale)
 
 
+def _check_speed(path: Path, time_ns: NDArray[np.int64], *, position: Float) -> None:
+    """Raise FormatError if rows of a trajectory are too far apart for their times."""
+    speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / (np.diff(time_ns) * 1e-9)
+    fastest = int(speed.argmax())
+    if speed[fastest] > _FASTEST:
+        raise FormatError(
+            f"{path}: row {fastest + 2} is {speed[fastest]:.3g} m/s from the row before; repeats are of up to"
+            f" {_FASTEST:g} m/s"
+        )
+
+
 def _nanoseconds(stamps: list[str]) -> NDArray[np.int64]:
     """Nanoseconds of ISO 8601 UTC time stamps after the first."""
     for stamp in stamps:
@@ -106,12 +120,18 @@ def _nanoseconds(stamps: list[str]) -> NDArray[np.int64]:
 
 
 def _turn(recorded: Frame, frame: Frame, *, lon: Float, lat: Float) -> Rotation:
-    """Turns (n,) about the vertical from the axes of one frame to those of another."""
+    """Turns (n,) about the vertical from the axes of one frame to those of another.
+
+    Raises FormatError for places where the axes of either are not known.
+    """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
     angle = np.zeros((len(lon), 3))
     if recorded != frame:
-        angle[:, 2] = frame.convergence(lon, lat) - recorded.convergence(lon, lat)
+        with np.errstate(invalid="ignore"):
+            angle[:, 2] = frame.convergence(lon, lat) - recorded.convergence(lon, lat)
+        if not np.isfinite(angle).all():
+            raise FormatError(f"the drive to repeat is not within the area of {recorded.name} and {frame.name}")
     return Rotation.from_rotvec(angle)
 
 

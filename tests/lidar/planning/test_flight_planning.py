@@ -14,7 +14,7 @@ from helpers.programs import run_program
 from geoscene.scene import SceneFiles
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
-from lidar.errors import InputError, RouteError
+from lidar.errors import FormatError, InputError, RouteError
 from lidar.geometry.trajectory_csv import read_trajectory
 from lidar.options import DriveOptions
 from lidar.pipeline import drive
@@ -166,6 +166,19 @@ def test_replayed_poses_agree_within_centimetres(scene, driven):
     span = again.time_ns[again.time_ns < 5_800_000_000]
     np.testing.assert_allclose(again.at(span).position, first.at(span).position, atol=0.02)
     np.testing.assert_allclose(again.at(span).rotation, first.at(span).rotation, atol=0.01)
+
+
+@pytest.mark.parametrize(("rows", "word"), [(1, "row 2 is"), (None, "area")])
+def test_a_damaged_trajectory_is_refused(scene_utm, driven, tmp_path, rows, word):
+    """A single place far away needs an impossible speed; where all are, the axes are not known."""
+    shutil.copy(driven / "dataset.json", tmp_path)
+    first, *lines = (driven / "trajectory.csv").read_text().splitlines()
+    for k, line in enumerate(lines[:rows]):
+        time, _, *rest = line.split(",")
+        lines[k] = ",".join([time, "1e12", *rest])
+    (tmp_path / "trajectory.csv").write_text("\n".join([first, *lines]))
+    with pytest.raises(FormatError, match=word):
+        read_replay(tmp_path / "trajectory.csv", scene_utm.frame)
 
 
 @pytest.mark.parametrize("name", ["trajectory.csv", "poses.csv"])
