@@ -74,7 +74,7 @@ def read_tile(path: Path) -> Tile:
     """
     with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
         arrays = _unpacked(path)
-        instances = {f.name: arrays[f"instance_{f.name}"] for f in fields(Instances)}
+        instances = {f.name: _column(arrays, f"instance_{f.name}") for f in fields(Instances)}
         return Tile(arrays["origin"], _mesh(arrays), Instances(**instances))
 
 
@@ -90,7 +90,19 @@ def _unpacked(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _mesh(arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Mesh:
-    return Mesh(**{f.name: arrays[prefix + f.name] for f in fields(Mesh)})
+    return Mesh(**{f.name: _column(arrays, prefix + f.name) for f in fields(Mesh)})
+
+
+_ROWS = {"vertices": (3,), "faces": (3,), "color": (3,), "instance_transform": (3, 4)}
+"""Shape of a row of a column; of all others a number."""
+
+
+def _column(arrays: Mapping[str, NDArray[Any]], name: str) -> NDArray[Any]:
+    """A column of a table, of any length; raises ValueError if its rows have another shape."""
+    array, row = arrays[name], _ROWS.get(name.rpartition("/")[2], ())
+    if not array.ndim or array.shape[1:] != row:
+        raise ValueError(f"{name} has the shape {array.shape}")
+    return array
 
 
 def write_shapes(path: Path, shapes: Mapping[str, Mesh]) -> None:

@@ -91,9 +91,10 @@ def test_columns_that_do_not_fit_their_mesh_name_the_file(copied, name):
     with np.load(path) as file:
         arrays = dict(file)
     column = next(key for key in arrays if key.endswith("surface"))
-    np.savez(path, **(arrays | {column: np.tile(arrays[column], 2)}))
-    with pytest.raises(SceneFormatError, match=path.name):
-        used(copied)
+    for damaged in (np.tile(arrays[column], 2), arrays[column][:, None], arrays[column][0]):
+        np.savez(path, **(arrays | {column: damaged}))
+        with pytest.raises(SceneFormatError, match=path.name):
+            used(copied)
 
 
 def test_unexpected_error_is_explained_by_a_changed_file(copied):
