@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
 
 from geoscene.errors import InputError, SourceNotFoundError, reading
 from geoscene.frames import Frame, beside
@@ -309,7 +310,10 @@ def _outline(raster: _Raster, frame: Frame) -> Any:
     rows, columns = raster.shape
     edge = shapely.segmentize(shapely.box(-0.5, -0.5, columns - 0.5, rows - 0.5), max(rows, columns) / 32)
     xy = raster.origin + shapely.get_coordinates(edge) @ raster.step.T
-    corners = np.column_stack(frame.from_crs(xy[:, 0], xy[:, 1], crs=raster.crs))
+    try:
+        corners = np.column_stack(frame.from_crs(xy[:, 0], xy[:, 1], crs=raster.crs))
+    except ProjError as error:
+        raise InputError(f"{raster.path}: its CRS cannot be transformed to the scene's ({error})") from error
     if not np.isfinite(corners).all():
         raise InputError(f"{raster.path}: has pixels outside the area of its CRS or of the scene's CRS")
     outline = shapely.Polygon(corners)

@@ -244,6 +244,10 @@ def test_unusable_files_are_named_in_the_error(tmp_path):
     odd = write_dem(tmp_path / "odd.tif", np.zeros((60, 60)), corner=around(), unit="fathom")
     with pytest.raises(InputError, match="fathom"):
         open_terrain([odd], FRAME, bounds=BOUNDS)
+    site = 'LOCAL_CS["site",UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+    local = write_dem(tmp_path / "local.tif", np.zeros((60, 60)), corner=around(), crs=site)
+    with pytest.raises(InputError, match=r"local\.tif: its CRS cannot be transformed"):
+        open_terrain([local], FRAME, bounds=BOUNDS)
     wide = write_dem(tmp_path / "wide.tif", np.zeros((60, 60)), corner=(9.0, 50.0), step=1e9, crs="EPSG:4326")
     with pytest.raises(InputError, match=r"wide\.tif: has pixels outside"):
         open_terrain([wide], FRAME, bounds=BOUNDS)
