@@ -100,7 +100,8 @@ def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
 
 def _check_speed(path: Path, time_ns: NDArray[np.int64], *, position: Float) -> None:
     """Raise FormatError if rows of a trajectory are too far apart for their times."""
-    speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / (np.diff(time_ns) * 1e-9)
+    with np.errstate(over="ignore"):
+        speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / (np.diff(time_ns) * 1e-9)
     fastest = int(speed.argmax())
     if speed[fastest] > _FASTEST:
         raise FormatError(
@@ -131,7 +132,9 @@ def _turn(recorded: Frame, frame: Frame, *, lon: Float, lat: Float) -> Rotation:
         with np.errstate(invalid="ignore"):
             angle[:, 2] = frame.convergence(lon, lat) - recorded.convergence(lon, lat)
         if not np.isfinite(angle).all():
-            raise FormatError(f"the drive to repeat is not within the area of {recorded.name} and {frame.name}")
+            raise FormatError(
+                f"the drive to repeat is not within the area of {recorded.name} and {frame.name}"
+            )
     return Rotation.from_rotvec(angle)
 
 
