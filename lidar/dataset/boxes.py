@@ -221,20 +221,21 @@ def merge_box_files(out: Path) -> None:
     scanners = [name for name in lines if calibration[name]["kind"] == "lidar"]
     if not scanners or not lines[scanners[0]]:
         return
-    header, *rows = lines[scanners[0]]
-    step_ns = 10**9 / calibration[scanners[0]]["rate_hz"]
-    first_ns = calibration[scanners[0]]["time_offset_ns"]
-    counts = [_points_by_step(lines[name], first_ns, step_ns=step_ns) for name in scanners]
-    names = header.split(",")
-    frame, number, time = names.index("frame"), names.index("id"), names.index("time_ns")
-    keyed = {(int(c[frame]), int(c[number])): row for row in rows for c in [row.split(",")]}
-    for name, count in zip(scanners[1:], counts[1:], strict=True):
-        for row in lines[name][1:]:
-            cells = row.split(",")
-            key = _step(int(cells[time]), first_ns, step_ns=step_ns), int(cells[number])
-            if key not in keyed and count[key]:
-                cells[frame] = str(key[0])
-                keyed[key] = ",".join(cells)
+    with reading_file(paths.calibration):  # its kinds of sensors and their box files may disagree
+        header, *rows = lines[scanners[0]]
+        step_ns = 10**9 / calibration[scanners[0]]["rate_hz"]
+        first_ns = calibration[scanners[0]]["time_offset_ns"]
+        counts = [_points_by_step(lines[name], first_ns, step_ns=step_ns) for name in scanners]
+        names = header.split(",")
+        frame, number, time = names.index("frame"), names.index("id"), names.index("time_ns")
+        keyed = {(int(c[frame]), int(c[number])): row for row in rows for c in [row.split(",")]}
+        for name, count in zip(scanners[1:], counts[1:], strict=True):
+            for row in lines[name][1:]:
+                cells = row.split(",")
+                key = _step(int(cells[time]), first_ns, step_ns=step_ns), int(cells[number])
+                if key not in keyed and count[key]:
+                    cells[frame] = str(key[0])
+                    keyed[key] = ",".join(cells)
     merged = [",".join([header, *(f"points_{name}" for name in scanners)])]
     merged += [",".join([keyed[k], *(str(count.get(k, 0)) for count in counts)]) for k in sorted(keyed)]
     write_atomically(paths.boxes, ("\n".join(merged) + "\n").encode("utf-8"))

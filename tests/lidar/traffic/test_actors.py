@@ -13,7 +13,7 @@ from geoscene.classes import Class
 from lidar.camera.render import RenderOptions, render
 from lidar.dataset.boxes import COLUMNS, box_rows, count_points, image_boxes, merge_box_files
 from lidar.dataset.layout import Paths
-from lidar.errors import InputError
+from lidar.errors import DatasetError, InputError
 from lidar.geometry.mounts import Mount
 from lidar.planning.road_drive import plan_road_drive
 from lidar.rig.scanner import load_sensor
@@ -254,6 +254,9 @@ def test_boxes_of_a_dataset_include_those_that_only_its_second_scanner_has(tmp_p
         "frame,time_ns,id,points,points_a,points_b",
         *("0,0,5,7,7,3", "0,0,6,0,0,0", "0,90000000,8,2,0,2"),
     ]
+    Paths(tmp_path).frame_boxes("b", 0).write_text("frame,time_ns,id,pixels\n0,0,5,7\n")  # of a camera
+    with pytest.raises(DatasetError, match=r"calibration\.json: damaged"):
+        merge_box_files(tmp_path)
 
 
 def test_every_road_user_in_an_image_has_a_box(actors, ego):
