@@ -139,33 +139,22 @@ def first_hits(tree: Tree, origins: Float, way: Float, reach: Float) -> Any:
     return sure, possible, cosines
 
 
-class Count(NamedTuple):
-    """Numbers of rays, and the worst difference in metres of the rays that are none of the others."""
-
-    rays: int
-    leaks: int
-    others: int
-    inside: int
-    close: int
-    worst: float
+LEAK, OTHER, INSIDE, CLOSE = 1, 2, 3, 4
+"""Verdicts on rays; 0 if a ray hits what it hits in float64."""
 
 
-def compared(
-    hits: Hits, sure: Float, possible: Float, cosines: Float, *, aimed: Float, limit: float, worst: float
-) -> Count:
-    """Ranges against the reference; ``aimed`` (n,) is where rays have to hit at the latest, or inf."""
+def verdicts(
+    hits: Hits, sure: Float, possible: Float, cosines: Float, *, aimed: Float, limit: float
+) -> NDArray[np.int64]:
+    """Verdicts (n,) on rays; ``aimed`` (n,) is where rays have to hit at the latest, or inf."""
     latest = np.minimum(sure, aimed)
     steepest = np.minimum(np.abs(hits.cosine), np.abs(cosines).min(axis=1))
     with np.errstate(invalid="ignore"):
         apart = np.maximum(np.maximum(possible - hits.range, hits.range - latest), 0.0)
         apart[np.isinf(hits.range) & np.isinf(latest)] = 0.0
         close = (apart * steepest <= limit) | (possible * np.abs(cosines[:, 1]) <= limit)
-    wrong = apart > DIFFERENT
-    inside = wrong & ~close & (cosines[:, 1] < 0)
-    leaks = wrong & ~close & ~inside & (hits.range > aimed)
-    others = wrong & ~close & ~inside & ~leaks
-    counts = (int(found.sum()) for found in (leaks, others, inside, wrong & close))
-    return Count(len(hits), *counts, worst)
+    inside, leaks = cosines[:, 1] < 0, hits.range > aimed
+    return np.select([apart <= DIFFERENT, close, inside, leaks], [0, CLOSE, INSIDE, LEAK], OTHER)
 
 
 def worst_range(hits: Hits, corners: Float, origins: Float, way: Float) -> float:
@@ -175,11 +164,6 @@ def worst_range(hits: Hits, corners: Float, origins: Float, way: Float) -> float
     normal = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     ranges = (normal * p[:, 0]).sum(axis=1) / (normal * way[rows]).sum(axis=1)
     return float(np.abs(ranges - hits.range[rows]).max(initial=0.0))
-
-
-def added(a: Count, b: Count) -> Count:
-    """The counts of both."""
-    return Count(*(x + y for x, y in zip(a[:5], b[:5], strict=True)), max(a.worst, b.worst))
 
 
 class Targets(NamedTuple):
@@ -253,6 +237,7 @@ def main() -> None:
         "--radius", type=float, default=250.0, help="metres around the scene's middle to load"
     )
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", help="CSV file of the rays counted as leaks and others, to write")
     options = parser.parse_args()
     vertices, faces, joined = mesh_of(options.scene, options.radius)
     corners = vertices[faces]
@@ -262,15 +247,17 @@ def main() -> None:
     normal /= np.where(length > 0, length, 1.0)[:, None]
     print(f"{options.scene}: {len(faces):,} faces")
     print(
-        f"{'origin m':>9} {'target':8} {'jitter':>8} {'rays':>10} leaks others inside  close limit   worst m"
+        f"{'origin m':>9} {'target':8} {'jitter':>8} {'rays':>10} {'facing':>10}"
+        f" leaks others inside  close limit   worst m"
     )
+    kept = []
     for distance in options.distances:
         origin = np.array([-0.8, 0.6, 0.0]) * distance
         caster = Caster(vertices, faces, origin=np.round(origin))
         limit = 3 * float(margins_of(vertices - caster.origin).max())
         for name, targets in (("vertices", vertices_of), ("edges", edges_of)):
             for jitter, rays in ((0.0, options.rays), (JITTER, options.jittered)):
-                rng, total = np.random.default_rng(options.seed), Count(0, 0, 0, 0, 0, 0.0)
+                rng, total, facing_rays, worst = np.random.default_rng(options.seed), np.zeros(5, int), 0, 0.0
                 places = targets(vertices, joined, normal)
                 for done in range(0, rays, _BATCH):
                     count = min(_BATCH, rays - done)
@@ -281,14 +268,21 @@ def main() -> None:
                     far = np.linalg.norm(aim - origins, axis=1)
                     aimed = np.where(facing & (jitter == 0.0), far, np.inf)
                     found = first_hits(tree, origins, way, hits.range + 1e-3)
-                    worst = worst_range(hits, corners, origins, way)
-                    total = added(total, compared(hits, *found, aimed=aimed, limit=limit, worst=worst))
+                    verdict = verdicts(hits, *found, aimed=aimed, limit=limit)
+                    total += np.bincount(verdict, minlength=5)
+                    facing_rays += int(facing.sum())
+                    worst = max(worst, worst_range(hits, corners, origins, way))
+                    columns = distance + 0 * far, verdict, origins, way, far, hits.range, hits.face
+                    kept.append(np.column_stack(columns)[(verdict == LEAK) | (verdict == OTHER)])
                 print(
-                    f"{distance:9.0f} {name:8} {jitter:8.0e} {total.rays:10,} {total.leaks:5}"
-                    f" {total.others:6} {total.inside:6} {total.close:6} {1000 * limit:5.2f}"
-                    f" {total.worst:9.1e}",
+                    f"{distance:9.0f} {name:8} {jitter:8.0e} {total.sum():10,} {facing_rays:10,}"
+                    f" {total[LEAK]:5} {total[OTHER]:6} {total[INSIDE]:6} {total[CLOSE]:6}"
+                    f" {1000 * limit:5.2f} {worst:9.1e}",
                     flush=True,
                 )
+    if options.keep:
+        head = "distance,verdict,ox,oy,oz,dx,dy,dz,aim,range,face"
+        np.savetxt(options.keep, np.concatenate(kept), "%.17g", ",", header=head, comments="")
 
 
 def mesh_of(path: str, radius: float) -> tuple[Float, NDArray[np.int32], NDArray[np.int32]]:
