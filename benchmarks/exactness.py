@@ -91,12 +91,13 @@ def _cross(a: Float, b: Float, c: Float, d: Float) -> Any:
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def first_hits(tree: Tree, origins: Float, way: Float, reach: Float) -> Any:
-    """Ranges (n,) of the first hit for certain and of the first possible one, and their cosines (n, 2).
+    """Ranges (n,) of the first hit for certain and of the first possible one, and cosines (n, 3).
 
-    Cosines are negative where a ray hits the back of a face. Ranges beyond ``reach`` (n,) are infinite.
+    Cosines of both, negative where a ray hits the back of a face, and the least one of all faces that may
+    be hit at the first possible range. Ranges beyond ``reach`` (n,) are infinite.
     """
     n = len(way)
-    sure, possible, cosines = np.full(n, np.inf), np.full(n, np.inf), np.ones((n, 2))
+    sure, possible, cosines = np.full(n, np.inf), np.full(n, np.inf), np.ones((n, 3))
     for i in prange(n):
         o, d = origins[i], way[i]
         length = np.sqrt((d * d).sum())
@@ -133,8 +134,11 @@ def first_hits(tree: Tree, origins: Float, way: Float, reach: Float) -> Any:
                 cosine = -along / (length * np.sqrt(nx * nx + ny * ny + nz * nz))
                 if passed < -TOLERANCE and t < sure[i]:
                     sure[i], cosines[i, 0] = t, cosine
-                if passed < TOLERANCE and t < possible[i]:
-                    possible[i], cosines[i, 1] = t, cosine
+                if passed < TOLERANCE and t < possible[i] + DIFFERENT:
+                    same = t > possible[i] - DIFFERENT
+                    cosines[i, 2] = min(cosines[i, 2], abs(cosine)) if same else abs(cosine)
+                    if t < possible[i]:
+                        possible[i], cosines[i, 1] = t, cosine
             box += 1
     return sure, possible, cosines
 
@@ -148,12 +152,12 @@ def verdicts(
 ) -> NDArray[np.int64]:
     """Verdicts (n,) on rays; ``aimed`` (n,) is where rays have to hit at the latest, or inf."""
     latest = np.minimum(sure, aimed)
-    steepest = np.minimum(np.abs(hits.cosine), np.abs(cosines).min(axis=1))
+    steepest = np.minimum(np.abs(hits.cosine), np.abs(cosines[:, :2]).min(axis=1))
     with np.errstate(invalid="ignore"):
         apart = np.maximum(np.maximum(possible - hits.range, hits.range - latest), 0.0)
         apart[np.isinf(hits.range) & np.isinf(latest)] = 0.0
-        close = (apart * steepest <= limit) | (possible * np.abs(cosines[:, 1]) <= limit)
-    inside, leaks = cosines[:, 1] < 0, hits.range > aimed
+        close = (apart * steepest <= limit) | (possible * cosines[:, 2] <= limit)
+    inside, leaks = cosines[:, 1] < 0, hits.range > aimed + DIFFERENT
     return np.select([apart <= DIFFERENT, close, inside, leaks], [0, CLOSE, INSIDE, LEAK], OTHER)
 
 

@@ -64,7 +64,8 @@ class EmbreeScene(Float64Scene):
         if len(part) == 0:
             return
         geometry = self._lib.call("rtcNewGeometry", self._lib.device, rtc.TRIANGLE)
-        faces = part.faces.astype(np.uint32)
+        patches = np.arange(len(part.vertices), len(part.hull)).reshape(-1, 3)
+        faces = np.concatenate([part.faces, patches]).astype(np.uint32)
         rtc.fill(self._lib, geometry, kind=rtc.VERTEX, slot=0, form=rtc.FLOAT3, rows=part.hull)
         rtc.fill(self._lib, geometry, kind=rtc.INDEX, slot=0, form=rtc.UINT3, rows=faces)
         self._lib.call("rtcSetGeometryMask", geometry, part.mask)

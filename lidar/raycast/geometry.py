@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.raycast.hull import displacements, margins_of
+from lidar.raycast.hull import LONG, NARROW, displacements, margins_of, patches
 from lidar.raycast.tree import Tree, tree_of
 
 if TYPE_CHECKING:
@@ -27,12 +27,14 @@ class Geometry:
     """Triangles with one mask, and their planes.
 
     vertices : (n, 3) float64, metres, relative to the caster's origin
-    hull     : (n, 3) float32, the same, moved outwards (see `lidar.raycast.hull`): for Embree
+    hull     : (n + 3 p, 3) float32, the same, moved outwards, and corners of p patches (see
+               `lidar.raycast.hull`): for Embree
     faces    : (m, 3) int32
-    planes   : (m, 5) float64: unit normal n and offset d of each face; n @ x = d on it; zeros for zero area;
-               and its margin: a hit whose barycentric coordinates, times the cosine of incidence, are
-               at least this is on the face also in float64
-    numbers  : (m,) int32, `Hits.face` of each face minus ``first``; empty: consecutive
+    planes   : (m + p, 5) float64: unit normal n and offset d of each face; n @ x = d on it; zeros for zero
+               area and patches; and its margin: a hit whose barycentric coordinates, times the cosine of
+               incidence, are at least this is on the face also in float64; inf where float64 decides all
+               hits
+    numbers  : (m + p,) int32, `Hits.face` of each face minus ``first``, 0 for patches; empty: consecutive
     first    : number of the first face
     tree     : of the faces' boxes
     mask     : bits; rays hit the faces if their masks share one
@@ -102,21 +104,36 @@ def split(vertices: Float, faces: NDArray[np.int32], *, mask: ArrayLike | None =
     found = np.unique(bits)
     whole, margins = planes(vertices, faces), margins_of(vertices)
     moved = displacements(vertices, faces, whole)
-    hull = (vertices + margins[:, None] * moved).astype(np.float32)
-    # Rounding shifts an edge by one margin at most, in addition to its ends' displacements.
-    whole[:, 4] *= (margins * (1 + np.sqrt(_squared(moved))))[faces].max(axis=1, initial=0.0)
     if len(found) == 1:
-        none = np.empty(0, np.int32)
-        return [Geometry(vertices, hull, faces, whole, none, _tree(vertices, faces), mask=int(found[0]))]
+        return [_geometry(vertices, faces, whole, margins=margins, moved=moved, mask=int(found[0]))]
     out = []
     for one in found:
         rows = np.flatnonzero(bits == one)
         used, renumbered = np.unique(faces[rows], return_inverse=True)
         corners: NDArray[np.int32] = np.ascontiguousarray(renumbered.reshape(-1, 3), np.int32)
-        tree = _tree(vertices[used], corners)
-        numbers = rows.astype(np.int32)
-        out.append(Geometry(vertices[used], hull[used], corners, whole[rows], numbers, tree, mask=int(one)))
+        part = _geometry(
+            vertices[used], corners, whole[rows], margins=margins[used], moved=moved[used], mask=int(one)
+        )
+        numbers = np.zeros(len(part.planes), np.int32)
+        numbers[: len(rows)] = rows
+        out.append(replace(part, numbers=numbers))
     return out
+
+
+def _geometry(
+    vertices: Float, faces: NDArray[np.int32], whole: Float, *, margins: Float, moved: Float, mask: int
+) -> Geometry:
+    """The geometry of faces with planes (m, 5) for margins of 1 m, and of displacements (n, 3) in margins."""
+    length = np.sqrt(_squared(moved))
+    # Rounding shifts an edge by one margin at most, in addition to its ends' displacements.
+    share = whole[:, 4] * (margins * (1 + length))[faces].max(axis=1, initial=0.0)
+    places = vertices + margins[:, None] * moved
+    extra = patches(places, faces[(share > NARROW) & (share < np.inf)], margins=margins, moved=moved)
+    share[(length > LONG)[faces].any(axis=1)] = np.inf
+    rows = np.zeros((len(faces) + len(extra), 5))
+    rows[: len(faces)] = np.column_stack([whole[:, :4], share])
+    hull = np.concatenate([places, extra.reshape(-1, 3)]).astype(np.float32)
+    return Geometry(vertices, hull, faces, rows, np.empty(0, np.int32), _tree(vertices, faces), mask=mask)
 
 
 def _tree(vertices: Float, faces: NDArray[np.int32]) -> Tree:

@@ -3,7 +3,8 @@
 Each vertex is moved by a few units of float32 rounding: outwards, by a margin along the normal of each of its
 faces, and sideways, as Embree misses some rays that are aimed exactly at one of its vertices.
 A ray that hits the float64 surface then also hits the float32 one, and float64 decides
-(`lidar.raycast.exact`). Faces keep sharing vertices, so that no ray passes between them.
+(`lidar.raycast.exact`). Faces keep sharing vertices, so that no ray passes between them. Patches cover the
+moved vertices, which rays along their displacements meet, and narrow faces.
 """
 
 from __future__ import annotations
@@ -18,7 +19,11 @@ ROUNDING = 2.0**-22
 """Margin per metre of distance from the origin: four times the rounding of a float32 coordinate."""
 REACH = 256.0
 """Metres from the origin within which the margin is constant: 0.06 mm."""
-_PLANE = 0.9995  # cosine to the mean normal from which all faces at a vertex form a plane
+LONG = 2.5
+"""Margins by which vertices move at most, except sharp ones: float64 decides all hits on faces there."""
+NARROW = 0.05
+"""Margin (`lidar.raycast.geometry.Geometry.planes`) from which a face is narrow."""
+_PLANE = 1.0 - 5e-7  # cosine to the mean normal (1 mrad) from which all faces at a vertex form a plane
 _LONGEST = 30.0  # margins by which a vertex moves at most
 _SIDEWAYS = 1.5  # margins along the surface
 _DIRECTIONS = 12  # along the surface, of which the best is taken
@@ -87,17 +92,50 @@ def _sideways(vertices: Float, faces: NDArray[np.int32], mean: Float) -> Float:
     Embree misses some rays at a vertex and along the edges of narrow faces. The rays aimed at the vertex or
     the edges of float64 pass these by. Of some directions, the one farthest from the line of any edge.
     """
-    x, y, z = mean.T
-    level = np.abs(z) < 0.7
-    u = np.where(level[:, None], np.stack([-y, x, 0 * z], axis=1), np.stack([z, 0 * z, -x], axis=1))
-    u /= np.maximum(np.sqrt((u * u).sum(axis=1)), 1e-9)[:, None]
-    w = np.cross(mean, u)
+    u, w = _across(mean)
     angle = np.arange(_DIRECTIONS) * np.pi / _DIRECTIONS
     clear = np.ones((len(vertices), _DIRECTIONS))
     _clear(vertices, faces, u, w, np.cos(angle), np.sin(angle), clear)
     best = angle[clear.argmax(axis=1), None]
     sideways: Float = np.cos(best) * u + np.sin(best) * w
     return sideways
+
+
+def _across(normals: Float) -> tuple[Float, Float]:
+    """Two directions (n, 3) at right angles to unit vectors (n, 3) and to each other."""
+    x, y, z = normals.T
+    level = np.abs(z) < 0.7
+    u = np.where(level[:, None], np.stack([-y, x, 0 * z], axis=1), np.stack([z, 0 * z, -x], axis=1))
+    u /= np.maximum(np.sqrt((u * u).sum(axis=1)), 1e-9)[:, None]
+    return u, np.cross(normals, u)
+
+
+def patches(places: Float, narrow: NDArray[np.int32], *, margins: Float, moved: Float) -> Float:
+    """Corners (p, 3, 3) of triangles over vertices that moved outwards, and over narrow faces (k, 3).
+
+    A ray aimed at a vertex also meets the moved one if it is parallel to the displacement, and Embree may
+    lose it there: the triangle over a vertex lies across its displacement. A narrow face is covered with its
+    edges.
+
+    places  : (n, 3), moved vertices
+    margins : (n,) metres
+    moved   : (n, 3), displacements in margins
+    """
+    length = np.sqrt((moved * moved).sum(axis=1))
+    rows = np.flatnonzero(length > _SIDEWAYS + _SHORT)
+    u, w = _across(moved[rows] / length[rows, None])
+    turned = [u, -0.5 * u + np.sqrt(0.75) * w, -0.5 * u - np.sqrt(0.75) * w]
+    over = places[rows, None] + margins[rows, None, None] * np.stack(turned, axis=1)
+    corners = places[narrow]
+    one, other = (_unit(np.roll(corners, -k, axis=1) - corners) for k in (1, 2))
+    sine = np.maximum(np.linalg.norm(one - other, axis=2) / 2, 1 / _LONGEST)  # of half the angle
+    size = margins[narrow].max(axis=1, initial=0.0)[:, None] / sine
+    return np.concatenate([over, corners - size[:, :, None] * _unit(one + other)])
+
+
+def _unit(vectors: Float) -> Float:
+    out: Float = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+    return out
 
 
 @njit(nogil=True, cache=True, error_model="numpy")

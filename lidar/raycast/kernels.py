@@ -2,8 +2,8 @@
 
 Embree traces in float32 and identifies the face; the range is then computed in float64 from the plane of that
 face. Embree's surfaces enclose those of float64 (`lidar.raycast.hull`). A hit near an edge is therefore
-tested in float64. Where the ray passes beside the face, at grazing incidence and on the back of a face, the
-first hit is found in float64 among all faces (`lidar.raycast.exact`).
+tested in float64. Where the ray passes beside the face, at grazing incidence, on the back of a face, on
+patches and at sharp vertices, the first hit is found in float64 among all faces (`lidar.raycast.exact`).
 
 In robust mode no ray passes between two faces at their shared edge, but some of the rays aimed exactly at a
 vertex of Embree's surfaces do. A ray that misses is retried with a perturbed direction. Rays to retry are
@@ -281,7 +281,8 @@ def cast(
                         target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
                     )
                     prim = np.int64(u[HIT_FACE * W + k])
-                    if starts or not cosine >= GRAZING or outside(target, row, prim, copy, ray, time) > 0.0:
+                    trusted = cosine >= GRAZING and work[MARGIN * W + k] < np.inf and not starts
+                    if not trusted or outside(target, row, prim, copy, ray, time) > 0.0:
                         row, prim, copy = first_hit(target, rays.near, far, rays.mask, ray, time, stack)
                         _keep(
                             target,

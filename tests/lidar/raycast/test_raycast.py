@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast import ALL, Caster, Instances, caster, library
+from lidar.raycast.geometry import planes
+from lidar.raycast.hull import displacements
 
 FAR_AWAY = st.sampled_from([(0.0, 0.0, 0.0), (500_000.37, 4_080_000.61, 0.0), (-3e6, 9.9e6, 2500.25)])
 BACKENDS = pytest.mark.parametrize("backend", ["embree", "float64"])
@@ -208,6 +210,40 @@ def test_no_ray_passes_through_the_first_vertex_of_a_body_to_a_face_behind(body)
     hits = Caster(np.concatenate(vertices), np.concatenate(faces)).cast(origins, aim - origins)
     assert (hits.range < 1.0001).all()
     assert (hits.cosine > 0).all()
+
+
+def pyramid(rng):
+    """Vertices and faces of the sides of a pyramid, apex first, and of a floor."""
+    sides = int(rng.integers(3, 9))
+    angle = np.sort(rng.uniform(0, 2 * np.pi, sides))
+    ring = np.column_stack([np.cos(angle), np.sin(angle), -rng.uniform(0.1, 0.6, sides)])
+    floor = np.array([[-50, -50, -8], [50, -50, -8], [0, 50, -8]])
+    vertices = np.concatenate([np.zeros((1, 3)), ring * rng.uniform(1, 5), floor])
+    side = np.arange(sides)
+    faces = np.column_stack([0 * side, 1 + side, 1 + (side + 1) % sides])
+    return vertices, np.concatenate([faces, [sides + 1 + np.arange(3)]]).astype(np.int32)
+
+
+def test_no_ray_passes_through_a_vertex_along_its_displacement():
+    rng = np.random.default_rng(19)
+    for _ in range(50):
+        vertices, faces = pyramid(rng)
+        vertices += rng.uniform(-100, 100, 3)
+        moved = displacements(vertices, faces, planes(vertices, faces))[0]
+        towards = moved / np.linalg.norm(moved) + rng.normal(size=(2000, 3)) * 1e-9
+        far = rng.uniform(1, 60, 2000)
+        hits = Caster(vertices, faces).cast(vertices[0] + far[:, None] * towards, -towards)
+        assert (hits.range < far + 1e-6).all()
+
+
+def test_a_sharp_vertex_hides_no_surface_in_front_of_it():
+    wedge = [[0, 0, 0], [0, 5, 0], [0, 5, -0.5], [5, 0, 0], [5, 0, -0.5]]
+    screen = [[-5e-4, -9, -9], [-5e-4, 0, 9], [-5e-4, 9, -9]]
+    faces = [[0, 3, 1], [0, 2, 4], [0, 1, 2], [0, 4, 3], [1, 3, 4], [1, 4, 2], [5, 6, 7]]
+    y = np.random.default_rng(20).uniform(0.01, 1, 1000)
+    origins = np.column_stack([y * 0 - 5, y, -0.05 * y])
+    hits = Caster(wedge + screen, faces).cast(origins, np.tile([1.0, 0, 0], (1000, 1)))
+    assert (hits.face == 6).all()
 
 
 @pytest.mark.parametrize("distance", [0.0, 1024.0])
