@@ -32,8 +32,8 @@ class Geometry:
     faces    : (m, 3) int32
     planes   : (m + p, 5) float64: unit normal n and offset d of each face; n @ x = d on it; zeros for zero
                area and patches; and its margin: a hit whose barycentric coordinates, times the cosine of
-               incidence, are at least this is on the face also in float64; inf where float64 decides all
-               hits
+               incidence, are at least this is on the face also in float64; inf where a corner moved far along
+               n
     numbers  : (m + p,) int32, `Hits.face` of each face minus ``first``, 0 for patches; empty: consecutive
     first    : number of the first face
     tree     : of the faces' boxes
@@ -129,7 +129,8 @@ def _geometry(
     share = whole[:, 4] * (margins * (1 + length))[faces].max(axis=1, initial=0.0)
     places = vertices + margins[:, None] * moved
     extra = patches(places, faces[(share > NARROW) & (share < np.inf)], margins=margins, moved=moved)
-    share[(length > LONG)[faces].any(axis=1)] = np.inf
+    outwards = [np.einsum("ij,ij->i", moved[faces[:, k]], whole[:, :3]) for k in range(3)]
+    share[np.max(outwards, axis=0) > LONG] = np.inf
     rows = np.zeros((len(faces) + len(extra), 5))
     rows[: len(faces)] = np.column_stack([whole[:, :4], share])
     hull = np.concatenate([places, extra.reshape(-1, 3)]).astype(np.float32)

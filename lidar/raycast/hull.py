@@ -20,7 +20,7 @@ ROUNDING = 2.0**-22
 REACH = 256.0
 """Metres from the origin within which the margin is constant: 0.06 mm."""
 LONG = 2.5
-"""Margins by which vertices move at most, except sharp ones: float64 decides all hits on faces there."""
+"""Margins by which a float32 face may lie before its face; float64 decides hits that lie farther before."""
 NARROW = 0.05
 """Margin (`lidar.raycast.geometry.Geometry.planes`) from which a face is narrow."""
 _PLANE = 1.0 - 5e-7  # cosine to the mean normal (1 mrad) from which all faces at a vertex form a plane

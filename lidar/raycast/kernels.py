@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.raycast.columns import CHUNK, Rays, Target
 from lidar.raycast.exact import STACK, first_hit
+from lidar.raycast.hull import LONG, REACH, ROUNDING
 from lidar.raycast.lanes import GRAZING, START, cross, move_float64, move_int32, narrow, same
 from lidar.raycast.memory import aligned, called, float64_at, inlined, int32_at, int64_at
 from lidar.raycast.packets import alike, first_bad, gather, nudge, trace
@@ -119,6 +120,13 @@ def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: 
                 int64_at(target.parts.ctypes.data, PART * row) + PLANE * prim, 4
             )
             faces[k], instances[k] = numbered(target, row, prim), instance
+
+
+@inlined
+def _margin(ray: Any, t: float) -> float:
+    """The margin (`lidar.raycast.hull.margins_of`) of the point at ray parameter t."""
+    ox, oy, oz, dx, dy, dz = ray
+    return ROUNDING * max(REACH, abs(ox + t * dx), abs(oy + t * dy), abs(oz + t * dz))
 
 
 @inlined
@@ -281,7 +289,10 @@ def cast(
                         target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
                     )
                     prim = np.int64(u[HIT_FACE * W + k])
-                    trusted = cosine >= GRAZING and work[MARGIN * W + k] < np.inf and not starts
+                    trusted = cosine >= GRAZING and not starts
+                    if not work[MARGIN * W + k] < np.inf:
+                        before = (t / inverse - f[RAY_FAR * W + k]) * cosine
+                        trusted &= copy < 0 and before <= LONG * _margin(ray, t)
                     if not trusted or outside(target, row, prim, copy, ray, time) > 0.0:
                         row, prim, copy = first_hit(target, rays.near, far, rays.mask, ray, time, stack)
                         _keep(
