@@ -25,6 +25,7 @@ NARROW = 0.05
 """Margin (`lidar.raycast.geometry.Geometry.planes`) from which a face is narrow."""
 _PLANE = 1.0 - 5e-7  # cosine to the mean normal (1 mrad) from which all faces at a vertex form a plane
 _LONGEST = 30.0  # margins by which a vertex moves at most
+_TIP = 5.0  # margins by which the patch of a narrow face extends beyond a corner at most
 _SIDEWAYS = 1.5  # margins along the surface
 _DIRECTIONS = 12  # along the surface, of which the best is taken
 _BORDER = (0.9, 1.2, 0.0)  # margins, the same in all tiles that share the vertex
@@ -128,7 +129,7 @@ def patches(places: Float, narrow: NDArray[np.int32], *, margins: Float, moved: 
     over = places[rows, None] + margins[rows, None, None] * np.stack(turned, axis=1)
     corners = places[narrow]
     one, other = (_unit(np.roll(corners, -k, axis=1) - corners) for k in (1, 2))
-    sine = np.maximum(np.linalg.norm(one - other, axis=2) / 2, 1 / _LONGEST)  # of half the angle
+    sine = np.maximum(np.linalg.norm(one - other, axis=2) / 2, 1 / _TIP)  # of half the angle
     size = margins[narrow].max(axis=1, initial=0.0)[:, None] / sine
     return np.concatenate([over, corners - size[:, :, None] * _unit(one + other)])
 
