@@ -28,7 +28,7 @@ _LONGEST = 30.0  # margins by which a vertex moves at most
 _TIP = 5.0  # margins by which the patch of a narrow face extends beyond a corner at most
 _SIDEWAYS = 1.5  # margins along the surface
 _DIRECTIONS = 12  # along the surface, of which the best is taken
-_BORDER = (0.9, 1.2, 0.0)  # margins, the same in all tiles that share the vertex
+_BORDER = (0.4, 0.5, 1.5)  # margins, upwards like ground, the same in all tiles that share the vertex
 _ROUNDS = 1000  # of corrections: enough for sharp corners; most vertices need less than ten
 _SHORT = 0.05  # margins that a displacement along a normal may lack
 
