@@ -200,7 +200,7 @@ _CACHE: weakref.WeakKeyDictionary[
 
 def _numbers(part: Geometry) -> NDArray[np.int32]:
     """Face numbers in hits of a part's faces."""
-    own = part.numbers if len(part.numbers) else np.arange(len(part), dtype=np.int32)
+    own = part.numbers[: len(part)] if len(part.numbers) else np.arange(len(part), dtype=np.int32)
     return own + np.int32(part.first)
 
 
@@ -210,7 +210,7 @@ def _of_part(world: World, part: Geometry) -> Facades:
     surfaces = world.lookup(Hits(ones, _numbers(part), own, ones.astype(np.float32), np.empty((0, 3))))
     corners = part.vertices[part.faces] + world.caster.origin
     wall = (surfaces.klass == Class.BUILDING) & (surfaces.surface == WALL)
-    return facades(corners, part.planes[:, :3], feature=surfaces.feature, wall=wall)
+    return facades(corners, part.planes[:m, :3], feature=surfaces.feature, wall=wall)
 
 
 def _concatenated(parts: list[Facades], numbers: list[NDArray[np.int32]]) -> Facades:
