@@ -126,7 +126,7 @@ def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: 
 def _margin(ray: Any, t: float) -> float:
     """The margin (`lidar.raycast.hull.margins_of`) of the point at ray parameter t."""
     ox, oy, oz, dx, dy, dz = ray
-    return ROUNDING * max(REACH, abs(ox + t * dx), abs(oy + t * dy), abs(oz + t * dz))
+    return float(ROUNDING * max(REACH, abs(ox + t * dx), abs(oy + t * dy), abs(oz + t * dz)))
 
 
 @inlined
