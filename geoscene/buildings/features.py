@@ -225,6 +225,7 @@ def _table(
     return Buildings(
         osm_id=ids,
         footprint=footprint,
+        passages=np.fromiter([() for _ in rows], object),
         is_part=is_part,
         outline=outline,
         min_height=heights.low,

@@ -17,7 +17,7 @@ from geoscene.buildings.unions import unite
 from geoscene.classes import Class
 from geoscene.columns import Columns
 from geoscene.errors import InputError
-from geoscene.mesh import ROOF, Mesh
+from geoscene.mesh import FLOOR, ROOF, Mesh
 from geoscene.report import Problem, described
 from geoscene.typing import Bools, Float, Ints
 from geoscene.watertight import check_solids, weld
@@ -42,6 +42,7 @@ class _Pieces(Columns):
     polygon: NDArray[Any]
     row: Ints
     building: Ints
+    base: Float
     low: Float
     high: Float
     flat: Bools
@@ -121,13 +122,10 @@ def _pieces(buildings: Buildings, base: Float, *, foot: Float, lod: int) -> _Pie
         np.full(len(row), lod < 2) | (buildings.roof_shape[row] == "flat") | (buildings.roof_height[row] <= 0)
     )
     underside = base[building] + low
-    over_road = np.isin(buildings.min_height_source[row], ("tunnel", "bridge"))
-    grounded = (low <= 0) & ~over_road
+    grounded = low <= 0
     underside[grounded] = np.minimum(underside, foot[building])[grounded]
-    # walls beside a passage have rounded corners where it cuts them, without which they would nearly coincide
-    uncut = ~np.isin(building, building[over_road])
-    polygon[uncut] = _straightened(polygon[uncut], building[uncut])
-    return _Pieces(polygon, row, building, underside, base[building] + high, flat)
+    polygon = _straightened(polygon, building)
+    return _Pieces(polygon, row, building, base[building], underside, base[building] + high, flat)
 
 
 def _straightened(polygons: Polygons, building: Ints) -> Polygons:
@@ -211,12 +209,14 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
     found = check_solids(shells.corners, shells.piece, n=len(pieces.row))
     bad = np.unique(pieces.building[~found.closed_solid])
     alone = np.bincount(pieces.building, minlength=len(buildings) + 1)[pieces.building] == 1
-    ready = found.ok & alone
+    cut = np.array([len(cuts) > 0 for cuts in buildings.passages[pieces.building]], np.bool_)
+    ready = found.ok & alone & ~cut
     out = [shells.take(ready[shells.piece])]
     rest = shells.take((~ready & ~np.isin(pieces.building, bad))[shells.piece])
     owner = pieces.building[rest.piece]
     families = [rest.take(rows) for rows in groups(owner)]
-    for building, united in zip(np.unique(owner).tolist(), unite(families), strict=True):
+    cuts = [_cuts(buildings, pieces, chosen=np.unique(family.piece)) for family in families]
+    for building, united in zip(np.unique(owner).tolist(), unite(families, cuts), strict=True):
         if united is None:
             bad = np.append(bad, building)
             continue
@@ -228,6 +228,27 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
             )
     failed = {buildings.osm_id[b] for b in bad}
     return Triangles.concatenate(out), bad, [p for p in notes if p.osm_id not in failed]
+
+
+def _cuts(buildings: Buildings, pieces: _Pieces, *, chosen: Ints) -> list[Triangles]:
+    """Closed shells of the passages through a building, given its pieces (numbers).
+
+    Their faces, which become those of the passages, have the number of the piece of which they cut most.
+    """
+    low, base = pieces.low[chosen].min() - 1.0, pieces.base[chosen[0]]
+    out = []
+    for polygons, top in buildings.passages[pieces.building[chosen[0]]]:
+        for polygon in shapely.get_parts(polygons):
+            common = shapely.area(shapely.intersection(pieces.polygon[chosen], polygon))
+            shell = prisms(
+                np.array([polygon]),
+                chosen[[np.argmax(common)]],
+                low=np.array([low]),
+                high=np.array([base + top]),
+            )
+            # tops of passages are undersides of what is above them
+            out.append(replace(shell, surface=np.where(shell.surface == ROOF, FLOOR, shell.surface)))
+    return out
 
 
 def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, list[Problem]]:

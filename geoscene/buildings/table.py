@@ -48,6 +48,8 @@ class Buildings(Columns):
     osm_id           : (n,) str
     footprint        : (n,) valid shapely Polygon or MultiPolygon on the 0.1 mm grid, scene metres, exteriors
                        counter-clockwise, overlaps with other buildings removed
+    passages         : (n,) tuple of pairs: a polygon, and the metres above the building's base up to which
+                       it is cut out of the body with all its parts; empty for parts
     is_part          : (n,) bool
     outline          : (n,) int32, row of the building that a part belongs to; a building's own row
     min_height       : (n,) metres from the building's base to the underside
@@ -74,6 +76,7 @@ class Buildings(Columns):
 
     osm_id: Texts
     footprint: NDArray[Any]
+    passages: NDArray[Any]
     is_part: Bools
     outline: NDArray[np.int32]
     min_height: Float

@@ -37,12 +37,16 @@ _MERGE = 15
 """Grid steps; vertices of a union that are closer are merged, which leaves none within a millimetre."""
 
 
-def unite(buildings: Sequence[Triangles]) -> list[tuple[Triangles, str] | None]:
+def unite(
+    buildings: Sequence[Triangles], cuts: Sequence[Sequence[Triangles]]
+) -> list[tuple[Triangles, str] | None]:
     """Of the closed shells of each building their union, and a note on beads; None if it is no solid.
 
     Faces keep their piece and surface.
+
+    cuts : for each building the closed shells that are cut out of it, each with the piece of its faces
     """
-    unions = [_Union.of(shells) for shells in buildings]
+    unions = [_Union.of(*each) for each in zip(buildings, cuts, strict=True)]
     drafts = [(union, *union.triangles()) for union in unions if union is not None]
     owner = np.repeat(np.arange(len(drafts)), [len(corners) for _, corners, _ in drafts])
     corners = np.concatenate([np.empty((0, 3, 3)), *(corners for _, corners, _ in drafts)])
@@ -70,18 +74,24 @@ class _Union:
     origin: Float
 
     @classmethod
-    def of(cls, shells: Triangles) -> _Union | None:
-        """The union of closed shells; None if one of them or the union is no manifold."""
+    def of(cls, shells: Triangles, cuts: Sequence[Triangles]) -> _Union | None:
+        """The union of closed shells, less what is cut out; None if one or the result is no manifold."""
         pieces = np.unique(shells.piece)
         first = m3.Manifold.reserve_ids(4 * len(pieces))
         # boolean operations lose digits far from the origin, so coordinates are relative to a corner
         origin = to_grid(shells.corners.reshape(-1, 3).min(axis=0))
-        bodies = [
-            _manifold(shells, piece, first=first + 4 * k, origin=origin) for k, piece in enumerate(pieces)
-        ]
-        if any(body is None for body in bodies):
+        bodies, hollows = (
+            [
+                _manifold(one, first=first + 4 * int(np.searchsorted(pieces, one.piece[0])), origin=origin)
+                for one in some
+            ]
+            for some in ([shells.take(shells.piece == piece) for piece in pieces], cuts)
+        )
+        if any(body is None for body in (*bodies, *hollows)):
             return None
         body = m3.Manifold.batch_boolean(bodies, m3.OpType.Add)
+        if hollows:
+            body = m3.Manifold.batch_boolean([body, *hollows], m3.OpType.Subtract)
         return cls(body, pieces, first, origin) if _is_solid(body) else None
 
     def joined(self, beads: Sequence[Any]) -> _Union | None:
@@ -170,11 +180,10 @@ def _without_faults(corners: Float) -> Float | None:
     return corners if found.ok[0] else None
 
 
-def _manifold(shells: Triangles, piece: int, *, first: int, origin: Float) -> Any:
-    """One piece as a manifold whose faces have the id ``first`` plus surface; None if it is not a solid."""
-    mine = shells.take(shells.piece == piece)
-    order = np.argsort(mine.surface, kind="stable")
-    corners, surface = mine.corners[order].reshape(-1, 3) - origin, mine.surface[order]
+def _manifold(shell: Triangles, *, first: int, origin: Float) -> Any:
+    """A closed shell as a manifold whose faces have the id ``first`` plus surface; None if it is no solid."""
+    order = np.argsort(shell.surface, kind="stable")
+    corners, surface = shell.corners[order].reshape(-1, 3) - origin, shell.surface[order]
     ids, where = weld(corners, np.zeros(len(corners), np.int64))
     kinds, starts = np.unique(surface, return_index=True)
     mesh = m3.Mesh64(

@@ -21,6 +21,12 @@ _SCANT = 1.0
 _OVER = 0.1
 """Metres from a tunnel's roof, or a bridge's free height, to the underside of what stands over it."""
 
+_GAP = 0.01
+"""Metres; narrower gaps between corridors are closed."""
+
+_LEAST = 0.05
+"""Square metres; a building of which passages leave less has none."""
+
 _STEP = 0.05
 """Metres: undersides are whole multiples of this over the base, so that pieces of road that are all but
 equally high do not leave a stair of micrometres, which the grid of solids would crush."""
@@ -36,9 +42,9 @@ def buildings_over(
 ) -> tuple[Buildings, list[Problem]]:
     """The buildings, those on a tunnel or a road bridge with a passage, and the rows of those.
 
-    The part over the road gets its underside above the tunnel's roof or the bridge's free height; the rest
-    reaches down as before. Divided buildings have flat roofs. A bridge counts where its centre line lies
-    within the building, not where its edge touches it; footbridges do not count, they lead into buildings.
+    Passages reach from below a building up to the tunnel's roof or the bridge's free height, but leave parts
+    that end below the road. A bridge counts where its centre line lies within the building, not where its
+    edge touches it; footbridges do not count, they lead into buildings.
 
     base : (count,) z in metres of each building's base
     foot : (count,) z in metres of the lower end of its walls
@@ -62,70 +68,49 @@ def buildings_over(
     hit = (shapely.area(common) > _SCANT) & (tunnel | within)
     grounded = buildings.min_height[row] <= 0
     under = np.where(grounded, foot[buildings.outline[row]], stands + buildings.min_height[row])
-    hit &= (high > under) & (low < stands + buildings.height[row])
+    top = stands + buildings.height[row]
+    hit &= (high > under) & (low < top)
     if not hit.any():
         return buildings, []
-    corridor = table.polygon[road[hit]]
+    corridor = table.polygon[road]
+    for k in np.flatnonzero((high > under) & (low >= top)).tolist():  # below the road
+        same = (road == road[k]) & (buildings.outline[row] == buildings.outline[row[k]])
+        corridor[same] = shapely.difference(corridor[same], buildings.footprint[row[k]])
+    corridor = corridor[hit]
     clear = np.ceil((high - stands)[hit] / _STEP - 1e-3) * _STEP
-    return _divided(buildings, row[hit], corridor=corridor, clear=clear, tunnel=tunnel[hit])
+    return _with_passages(buildings, row[hit], corridor=corridor, clear=clear, tunnel=tunnel[hit])
 
 
-def _divided(
+def _with_passages(
     buildings: Buildings, row: Ints, *, corridor: NDArray[np.object_], clear: Float, tunnel: Bools
 ) -> tuple[Buildings, list[Problem]]:
-    """Rows (k,) divided along corridors (k,); the parts within start ``clear`` (k,) metres over the base."""
-    footprint, underside = buildings.footprint.copy(), buildings.min_height.copy()
-    why = buildings.min_height_source.copy()
-    source: list[int] = []
-    shape: list[shapely.Geometry] = []
-    new_low: list[float] = []
-    over_what = np.where(tunnel, "tunnel", "bridge")
-    cause: list[str] = []
-    for k in np.unique(row).tolist():
-        rest, first = footprint[k], len(source)
-        # Highest first: where roads cross, the building stands over the upper one.
-        for there in sorted(np.flatnonzero(row == k).tolist(), key=lambda c: -clear[c]):
-            over = _polygons(shapely.intersection(rest, corridor[there]))
-            rest = _polygons(shapely.difference(rest, corridor[there]))
-            if not over.is_empty and clear[there] < buildings.height[k] - _OVER:
-                source.append(k)
-                shape.append(over)
-                new_low.append(clear[there])
-                cause.append(str(over_what[there]))
-        if buildings.is_part[k]:
-            if rest.is_empty:  # entirely over tunnels
-                over = int(np.flatnonzero(row == k)[np.argmax(clear[row == k])])
-                rest, underside[k], why[k] = footprint[k], clear[over], over_what[over]
-                del source[first:], shape[first:], new_low[first:], cause[first:]
-            footprint[k] = rest
-        elif not rest.is_empty:
-            source.append(k)
-            shape.append(rest)
-            new_low.append(buildings.min_height[k])
-            cause.append(str(buildings.min_height_source[k]))
+    """Buildings with passages in rows (k,): corridors (k,) up to ``clear`` (k,) metres over the base."""
+    passages = buildings.passages.copy()
+    # what would be too thin over a road is left out
+    height = buildings.height[row]
+    clear = np.where(clear < height - _OVER, clear, np.maximum(clear, height + _OVER))
+    of = buildings.outline[row]
+    for k in np.unique(of).tolist():
+        there = np.flatnonzero(of == k)
+        levels = np.unique(clear[there])[::-1]
+        cuts = [(_closed(corridor[there][clear[there] >= level]), float(level)) for level in levels]
+        mine = np.flatnonzero(buildings.drawn & (buildings.outline == k))
+        gone = [
+            shapely.union_all([p for p, top in cuts if top >= height]) for height in buildings.height[mine]
+        ]
+        if shapely.area(shapely.difference(buildings.footprint[mine], gone)).max() > _LEAST:
+            passages[k] = tuple(cuts)
     problems = [
         Problem(str(buildings.osm_id[k]), "building", "repaired", f"over-{what}", f"stands over a {what}")
         for what in ("tunnel", "bridge")
-        for k in np.unique(buildings.outline[row[over_what == what]]).tolist()
+        for k in np.unique(of[tunnel == (what == "tunnel")]).tolist()
     ]
-    extra = np.array(source, np.int64)
-    added = replace(
-        buildings.take(extra),
-        footprint=np.fromiter(shape, object),
-        is_part=np.ones(len(extra), np.bool_),
-        min_height=np.array(new_low, float),
-        min_height_source=np.array(cause, object),
-        roof_shape=np.full(len(extra), "flat", object),
-        roof_height=np.zeros(len(extra)),
-        roof_source=np.full(len(extra), "none", object),
+    return replace(buildings, passages=passages), problems
+
+
+def _closed(corridors: NDArray[np.object_]) -> shapely.Geometry:
+    """The union of corridors on the grid of buildings, without the gaps that rounding leaves between them."""
+    wide = shapely.buffer(
+        shapely.union_all(shapely.buffer(corridors, _GAP, join_style="mitre")), -_GAP, join_style="mitre"
     )
-    kept = replace(buildings, footprint=footprint, min_height=underside, min_height_source=why)
-    return Buildings.concatenate([kept, added]), problems
-
-
-def _polygons(shape: shapely.Geometry) -> shapely.Geometry:
-    """The polygons of a shape, on the grid of buildings, without tiny ones."""
-    parts = shapely.get_parts(shapely.set_precision(shape, GRID))
-    areal = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0.05)
-    parts = shapely.orient_polygons(shapely.set_precision(parts[areal], 0.0))
-    return parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts.tolist())
+    return shapely.set_precision(shapely.simplify(wide, _GAP), GRID)

@@ -15,7 +15,7 @@ from geoscene.frames import Frame
 from geoscene.ground import ground_tile, plan_ground
 from geoscene.ground.layers import Layers
 from geoscene.ground.terrain import open_terrain
-from geoscene.mesh import Mesh, concatenate
+from geoscene.mesh import FLOOR, ROOF, Mesh, concatenate
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.surfaces import road_surfaces
 from geoscene.sources import read_osm
@@ -342,6 +342,25 @@ def test_building_is_raised_over_a_tunnel_that_crosses_it(tunnel):
         assert not crosses(solid, moved(a, 0, 0, 1), moved(b, 0, 0, 1))
     assert crosses(build_solids(buildings, base=base)[0], points[0] + [-5, 0, 1], points[0] + [10, 0, 1])
     assert solid.vertices[:, 2].max() == pytest.approx(base[0] + buildings.height[0], abs=1e-3)
+
+
+def test_building_over_a_tunnel_keeps_its_roof(tunnel):
+    outline = shapely.Polygon(lonlat([(-58, -15), (-40, -15), (-40, 15), (-58, 15)]))
+    house = Area(
+        "way/900", {"building": "yes", "height": "15", "roof:shape": "gabled"}, outline, np.empty(0, int)
+    )
+    buildings, _ = read_buildings(town(PLACES, UNDER, [house]), FRAME)
+    base = np.full(1, -4.0)
+    over, _ = buildings_over(buildings, base, foot=base, table=tunnel.table)
+    [(solid, problems), (whole, _)] = [build_solids(table, base=base) for table in (over, buildings)]
+    assert problems == []
+    assert validate_mesh(solid).ok.all()
+    assert validate_mesh(solid).volume < validate_mesh(whole).volume - 500
+    roofs = [mesh.take(mesh.surface == ROOF) for mesh in (solid, whole)]
+    assert {tuple(n) for n in np.round(roofs[0].normals(), 3)} == {
+        tuple(n) for n in np.round(roofs[1].normals(), 3)
+    }
+    assert (solid.surface == FLOOR).sum() > 2
 
 
 def test_foundation_of_a_building_above_a_tunnel_stays_out_of_the_tunnel(tunnel):
@@ -710,8 +729,8 @@ def test_building_undersides_over_a_tunnel_are_rounded_to_equal_heights():
     base = np.full(buildings.count, line.centre_lines("tunnel")[:, 2].min() - 1.0)
     over, problems = buildings_over(buildings, base, foot=base, table=line.table)
     assert [p.reason for p in problems] == ["over-tunnel"]
-    steps = over.min_height[over.min_height_source == "tunnel"] / 0.05
-    assert len(steps) >= 5
+    steps = np.array([top for _, top in over.passages[0]]) / 0.05
+    assert len(steps) >= 4
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
     solid, _ = build_solids(over, base=base)
     assert validate_mesh(solid).ok.all()
