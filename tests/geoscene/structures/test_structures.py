@@ -344,6 +344,29 @@ def test_building_is_raised_over_a_tunnel_that_crosses_it(tunnel):
     assert solid.vertices[:, 2].max() == pytest.approx(base[0] + buildings.height[0], abs=1e-3)
 
 
+PART = {"building:part": "yes"}
+
+
+def test_part_below_a_bridge_stays_where_another_part_stands_over_it(bridge):
+    points = bridge.centre_lines("bridge")
+    x = float(points[points[:, 2] > 4.0][0, 0])
+    low, high = ([(x + a, -15), (x + a + 6, -15), (x + a + 6, 15), (x + a, 15)] for a in (0, 6))
+    whole = [low[0], high[1], high[2], low[3]]
+    areas = [
+        Area(f"way/90{k}", tags | {"height": height}, shapely.Polygon(lonlat(corners)), np.empty(0, int))
+        for k, (corners, tags, height) in enumerate(
+            [(whole, {"building": "yes"}, "20"), (low, PART, "1"), (high, PART, "20")]
+        )
+    ]
+    buildings, _ = read_buildings(town(PLACES, OVER, areas), FRAME)
+    over, _ = buildings_over(buildings, np.zeros(1), foot=np.zeros(1), table=bridge.table)
+    solid, _ = build_solids(over, base=np.zeros(1))
+    assert validate_mesh(solid).ok.all()
+    below, beside = np.array([x + 3.1, 0.2, 0.5]), np.array([x + 9.1, 0.2, 0.5])
+    assert crosses(solid, below, moved(below, 0, 0, 1))
+    assert not crosses(solid, beside, moved(beside, 0, 0, 4))
+
+
 def test_building_over_a_tunnel_keeps_its_roof(tunnel):
     outline = shapely.Polygon(lonlat([(-58, -15), (-40, -15), (-40, 15), (-58, 15)]))
     house = Area(
