@@ -18,7 +18,6 @@ from geoscene.roadgraph.lanes import graph_lanes
 from geoscene.roadgraph.routing import TurnStates, edge_lines, turn_states
 from geoscene.typing import Float
 from lidar.errors import RouteError
-from lidar.random_streams import generator
 
 Side = Literal["right", "left"]
 Spec = str | Path | Sequence[tuple[float, float]]
@@ -31,7 +30,6 @@ U_TURN_S = 30.0
 """Cost in seconds of a U-turn at a dead end in the search for the fastest route."""
 U_TURN = np.radians(150.0)
 """Smallest change of direction at a node, in radians, that needs a U-turn."""
-_SET_OUT = 0.25  # share of its first street at which a random route starts
 _STEP = 0.3  # metres between the lanes of two streets from which on a change of lane is drawn out
 _STRAIGHT = 0.5  # cosine of the turn up to which a junction is gone straight over
 _KEEP = 0.2  # metres between the body and the kerb where the carriageway is narrow
@@ -110,8 +108,9 @@ def plan_route(
         seconds = np.inf if options.duration is None else options.duration
         if options.length is None and options.duration is None:
             seconds = 600.0
-        edges = random_edges(graph, seed=options.seed, seconds=seconds, metres=metres, avoid=avoid)
-        ends = (_SET_OUT * float(graph.length[edges[0]]), 0.75 * float(graph.length[edges[-1]]))
+        from lidar.planning.random_route import random_edges  # noqa: PLC0415  (it imports this module)
+
+        edges, ends = random_edges(graph, seed=options.seed, seconds=seconds, metres=metres, avoid=avoid)
         return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
 
     from lidar.planning.waypoints import match_track, read_track, route_through  # noqa: PLC0415  (they import this module)
@@ -159,90 +158,6 @@ def permitted_turns(graph: RoadGraph, avoid: Collection[tuple[int, int]]) -> Tur
         np.isin(key, shut[:, 0] * len(graph) + shut[:, 1]) | np.isin(before, closed) | np.isin(after, closed)
     )
     return replace(states, before=states.before[~bad], after=states.after[~bad])
-
-
-# ---------------------------------------------------------------------------------------------- random
-
-
-def _components(
-    graph: RoadGraph, states: TurnStates, *, turns: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], Float]:
-    """Strongly connected component of each state (s,) by some of the turns (t,), and its metres of street."""
-    from scipy.sparse import csr_array  # noqa: PLC0415
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
-    before, after = states.before[turns], states.after[turns]
-    links = csr_array((np.ones(len(before)), (before, after)), shape=(len(states), len(states)))
-    count, label = connected_components(links, directed=True, connection="strong")
-    size = np.bincount(label, minlength=count)
-    part, edge = np.unique(np.column_stack([label, states.edge]), axis=0).T
-    metres = np.bincount(part, weights=graph.length[edge], minlength=count)
-    loops = np.zeros(count, bool)
-    loops[label[before[before == after]]] = True
-    metres[(size == 1) & ~loops] = 0.0  # a single state that cannot be reached again
-    return np.asarray(label, np.int64), np.asarray(metres, float)
-
-
-def random_edges(
-    graph: RoadGraph,
-    *,
-    seed: int,
-    seconds: float = np.inf,
-    metres: float = np.inf,
-    avoid: Collection[tuple[int, int]] = (),
-) -> NDArray[np.int32]:
-    """Edges of a random route that lasts ``seconds`` at the speed limits or ``metres``, whichever is shorter.
-
-    It starts at the share `_SET_OUT` of the first edge, stays in the largest strongly connected part of the
-    graph, and prefers streets that it has not driven. U-turns at dead ends are used only if the connected
-    part without them is less than a fifth of that with them.
-    """
-    rng = generator(seed, "route")
-    states = permitted_turns(graph, avoid)
-    edges = states.edge
-    use = ~turns_back(graph, edges[states.before], after=edges[states.after])
-    label, size = _components(graph, states, turns=use)
-    label_back, size_back = _components(graph, states, turns=np.ones(len(use), bool))
-    if not (size.max(initial=0.0) >= 0.2 * size_back.max(initial=0.0) and size.max(initial=0.0) > 0):
-        use[:], label, size = True, label_back, size_back
-    # without a connected part, one-way streets lead out of the map: drive to their end
-    round_trip = size.max(initial=0.0) > 0
-    inside = label == int(np.argmax(size)) if round_trip else np.ones(len(states), bool)
-    use &= inside[states.before] & inside[states.after]
-    before, after = states.before[use], states.after[use]
-    order = np.argsort(before, kind="stable")
-    after = after[order]
-    first = np.searchsorted(before[order], np.arange(len(states) + 1))
-
-    liking = np.where(np.isin(graph.highway, ("service", "track")), 0.1, 1.0)
-    start = graph.length[edges] * liking[edges] * inside
-    start = start / start.sum()
-    best: list[int] = []
-    for _ in range(1 if round_trip else 32):
-        state = int(rng.choice(len(states), p=start))
-        edge = int(edges[state])
-        far = -_SET_OUT * graph.length[edge]
-        walk, time = [edge], far / graph.speed[edge]
-        visits = np.zeros(len(graph))
-        # streets of zero length must not make the loop endless
-        while far < metres and time < seconds and len(walk) < 1_000_000:
-            time, far = time + graph.length[edge] / graph.speed[edge], far + graph.length[edge]
-            visits[edge] += 1
-            if graph.twin[edge] >= 0:
-                visits[graph.twin[edge]] += 1
-            following = after[first[state] : first[state + 1]]
-            if not len(following):
-                break
-            ways = edges[following]
-            weight = liking[ways] / (1.0 + visits[ways]) ** 4
-            state = int(
-                following[np.searchsorted(np.cumsum(weight), rng.random() * weight.sum(), side="right")]
-            )
-            edge = int(edges[state])
-            walk.append(edge)
-        if len(walk) > len(best):
-            best = walk
-    return np.array(best, np.int32)
 
 
 # ------------------------------------------------------------------------------------------------ lanes

@@ -16,7 +16,8 @@ from geoscene.roadgraph import build_road_graph
 from geoscene.roadgraph.routing import turn_table
 from geoscene.sources import read_osm
 from lidar.errors import RouteError
-from lidar.planning.route import RouteOptions, lane_route, plan_route, random_edges, turns_back
+from lidar.planning.random_route import random_edges
+from lidar.planning.route import RouteOptions, lane_route, plan_route, turns_back
 
 FRAME = Frame.at(-76.3, 36.88)
 
@@ -36,24 +37,58 @@ def follows(graph, edges):
 @settings(max_examples=25, deadline=None)
 def test_a_random_drive_follows_streets_without_needless_turns_back(seed, columns, rows):
     graph = grid(columns, rows)
-    edges = random_edges(graph, seed=seed, seconds=300.0)
+    edges, _ = random_edges(graph, seed=seed, seconds=300.0)
     assert follows(graph, edges)
     assert not turns_back(graph, edges[:-1], after=edges[1:]).any()
     assert graph.travel_time[edges].sum() >= 300.0
-    assert np.array_equal(edges, random_edges(graph, seed=seed, seconds=300.0))
+    assert np.array_equal(edges, random_edges(graph, seed=seed, seconds=300.0)[0])
 
 
 def test_other_seeds_give_other_routes():
     graph = grid(5, 5)
-    drives = {tuple(random_edges(graph, seed=seed, metres=2000.0).tolist()) for seed in range(10)}
+    drives = {tuple(random_edges(graph, seed=seed, metres=2000.0)[0].tolist()) for seed in range(10)}
     assert len(drives) == 10
+
+
+def test_seeds_start_anywhere_on_the_streets_and_end_anywhere():
+    """Starts are uniform by length on all streets that lead on: also on the spur, from its end."""
+    nodes = [(0, 0), (100, 0), (100, 100), (0, 100), (100, 200)]
+    graph = road_graph(nodes, [(0, 1), (1, 2), (2, 3), (3, 0), (2, 4)])
+    drives = [random_edges(graph, seed=seed, metres=300.0) for seed in range(2000)]
+    first = np.array([edges[0] for edges, _ in drives])
+    start, stop = np.array([ends for _, ends in drives]).T
+    into_spur = (graph.tail == 2) & (graph.head == 4)  # without turning round it leads nowhere
+    count = np.bincount(first, minlength=len(graph))
+    assert count[into_spur].sum() == 0
+    expected = 2000 / np.count_nonzero(~into_spur)
+    assert ((count[~into_spur] - expected) ** 2 / expected).sum() < 30  # chi-square, 8 degrees: p = 0.0002
+    quarters = np.histogram(start, bins=4, range=(0, 90))[0]
+    assert ((quarters - 500) ** 2 / 500).sum() < 20
+    assert stop.min() < 15
+    assert stop.max() > 95
+    for edges, (begin, end) in drives:
+        assert follows(graph, edges)
+        assert graph.length[edges].sum() - begin - (graph.length[edges[-1]] - end) >= 300.0
+
+
+def test_a_random_drive_starts_where_the_map_is_left_after_it():
+    """Two kilometres of one-way street, of which the route needs one."""
+    nodes = [(100 * k, 0) for k in range(21)]
+    graph = road_graph(nodes, [(k, k + 1) for k in range(20)], twoway=False)
+    starts = []
+    for seed in range(200):
+        edges, (begin, end) = random_edges(graph, seed=seed, metres=1000.0)
+        starts.append(100 * int(edges[0]) + begin)
+        assert 100 * int(edges[-1]) + end - starts[-1] >= 1000.0
+    assert min(starts) < 50
+    assert 950 < max(starts) <= 1000
 
 
 def test_a_random_drive_prefers_new_streets():
     graph = grid(5, 5)
     seen = []
     for seed in range(20):
-        edges = random_edges(graph, seed=seed, metres=2500.0)
+        edges, _ = random_edges(graph, seed=seed, metres=2500.0)
         streets = np.minimum(edges, graph.twin[edges])
         seen.append(len(set(streets.tolist())) / len(streets))
     assert np.mean(seen) > 0.83  # a walk that prefers nothing sees 0.78
@@ -69,7 +104,7 @@ def test_a_village_of_one_dead_end_street_is_driven_up_and_down():
 
 def test_one_way_streets_that_lead_out_of_the_map_are_driven_to_their_end():
     graph = road_graph([(0, 0), (100, 0), (200, 0)], [(0, 1), (1, 2)], twoway=False)
-    assert random_edges(graph, seed=0, seconds=600.0).tolist() == [0, 1]
+    assert random_edges(graph, seed=0, seconds=600.0)[0].tolist() == [0, 1]
 
 
 def test_a_map_without_streets_has_no_route():
@@ -152,12 +187,12 @@ def drives_along(edges, chain):
 
 def test_random_drives_take_no_turn_that_is_forbidden_via_a_way():
     graph = grid(3, 3)
-    drives = [random_edges(graph, seed=seed, metres=3000.0) for seed in range(6)]
+    drives = [random_edges(graph, seed=seed, metres=3000.0)[0] for seed in range(6)]
     chains = [drive[k : k + 3] for drive in drives for k in (1, 9)]
     assert all(any(drives_along(drive, chain) for drive in drives) for chain in chains)
     bound = chained(graph, *chains)
     for seed in range(6):
-        drive = random_edges(bound, seed=seed, metres=3000.0)
+        drive, _ = random_edges(bound, seed=seed, metres=3000.0)
         assert follows(bound, drive)
         assert graph.length[drive].sum() >= 2900.0
         assert not any(drives_along(drive, chain) for chain in chains)
@@ -258,7 +293,7 @@ def test_a_random_drive_through_a_real_city_is_lawful(shared_osm, name):
     west, south, east, north = osm.bounds
     graph, _ = build_road_graph(osm, Frame.at((west + east) / 2, (south + north) / 2))
     for seed in range(5):
-        edges = random_edges(graph, seed=seed, seconds=900.0)
+        edges, _ = random_edges(graph, seed=seed, seconds=900.0)
         assert follows(graph, edges)
         assert graph.travel_time[edges].sum() >= 900.0
         assert not turns_back(graph, edges[:-1], after=edges[1:]).any()
