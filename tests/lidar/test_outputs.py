@@ -39,7 +39,7 @@ from lidar.rig.scanner import load_sensor
 from lidar.sensors.scan import scan
 from lidar.traffic.populate import TrafficOptions
 
-ROADS = (Class.CAR, Class.VAN, Class.TRUCK, Class.BUS, Class.CYCLIST, Class.PEDESTRIAN, Class.MOTORCYCLE)
+ROADS = [k for k in Class if Class.CAR <= k <= Class.MOTORCYCLIST]
 
 SENSOR = """
 kind = "flash"
@@ -717,7 +717,8 @@ def test_kitti_objects_hold_their_points_and_project_onto_their_2d_boxes(dataset
                 pixels = seen[:, :2] / seen[:, 2:]
                 sides = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
                 size = max(right - left, bottom - top)
-                np.testing.assert_allclose([left, top, right, bottom], sides, atol=2.0 + 0.12 * size)
+                room = 2.0 + (0.3 if kind == "Misc" else 0.12) * size  # bicycles do not reach their corners
+                np.testing.assert_allclose([left, top, right, bottom], sides, atol=room)
                 boxes += 1
             kinds.add(kind)
     assert held > 200
