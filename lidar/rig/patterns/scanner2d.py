@@ -30,6 +30,7 @@ class Scan2d:
     def _beams(self) -> tuple[Float, Float, NDArray[np.int32], NDArray[np.uint16]]:
         """Direction, origin, column and zeros of the sector."""
         count = int(np.floor((self.last - self.first) / (2 * np.pi) * self.steps + 1e-6)) + 1
+        count = min(count, self.steps)  # of a full circle the last is the next revolution's first
         angle = self.first + np.arange(count) * (2 * np.pi / self.steps)
         direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
         return (

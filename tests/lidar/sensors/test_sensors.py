@@ -11,6 +11,7 @@ from helpers.sensor_worlds import driven, plate, world
 
 from lidar.geometry.mounts import Mount
 from lidar.rig.patterns.beams import blocks, frame_window_ns
+from lidar.rig.patterns.scanner2d import Scan2d
 from lidar.rig.scanner import firings, load_sensor, sensor_names
 from lidar.sensors.doppler import radial_velocity
 from lidar.sensors.scan import scan
@@ -112,6 +113,13 @@ def test_2d_scanners_sweep_their_sector_counter_clockwise(name, beams, step_deg,
     assert f.time_ns[0] == 2 * period_ns
     # The blind sector shortens the part of the revolution with returns.
     assert f.time_ns[-1] - f.time_ns[0] == pytest.approx(period_ns * (beams - 1) * step_deg / 360, abs=1)
+
+
+def test_a_2d_scanner_of_a_full_circle_fires_each_direction_once():
+    f = Scan2d(720, -np.pi, np.pi).fire(1, 25.0, start_ns=0)
+    assert len(f.time_ns) == len(f.direction) == len(f.column) == 720
+    assert 40_000_000 <= f.time_ns.min() <= f.time_ns.max() < 80_000_000
+    assert len(np.unique(np.round(f.direction, 9), axis=0)) == 720
 
 
 def test_the_sick_scanner_halves_its_step_at_half_the_rate():
