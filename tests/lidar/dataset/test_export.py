@@ -38,7 +38,12 @@ TIMES = {"top": np.arange(0, 5 * 10**9, 10**8), "front": np.arange(3, 5 * 10**9,
 def dataset(tmp_path):
     """The metadata files of a drive at constant velocity and yaw rate."""
     paths = Paths(tmp_path / "drive")
-    manifest = {"schema": 1, "frame": Frame.at(24.9, 60.2).to_json(), "start_time": START.isoformat()}
+    manifest = {
+        "schema": 1,
+        "scene": {"path": "scene"},
+        "frame": Frame.at(24.9, 60.2).to_json(),
+        "start_time": START.isoformat(),
+    }
     manifest |= {"export_crs": "EPSG:32635", "frames": 50, "frames_done": 50, "recipe": {}}
     manifest |= {"scene": {"name": "", "path": "gone"}, "rig": "mine", "attribution": "nobody"}
     write_json(paths.manifest, manifest)

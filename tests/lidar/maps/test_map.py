@@ -57,6 +57,7 @@ def dataset(path, *, first=0, frames=6, n=400, kinds=("laz",)):
         path / "dataset.json",
         {
             "schema": 1,
+            "scene": {"path": "scene"},
             "frame": FRAME.to_json(),
             "export_crs": CRS_OUT.to_wkt(),
             "start_time": START.isoformat(),
