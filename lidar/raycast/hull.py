@@ -28,7 +28,7 @@ _LONGEST = 30.0  # margins by which a vertex moves at most
 _TIP = 5.0  # margins by which the patch of a narrow face extends beyond a corner at most
 _SIDEWAYS = 1.5  # margins along the surface
 _DIRECTIONS = 12  # along the surface, of which the best is taken
-_BORDER = (0.4, 0.5, 1.5)  # margins, upwards like ground, the same in all tiles that share the vertex
+_BORDER = (0.9, 1.2, 0.0)  # margins, the same in all tiles that share the vertex
 _ROUNDS = 1000  # of corrections: enough for sharp corners; most vertices need less than ten
 _SHORT = 0.05  # margins that a displacement along a normal may lack
 
@@ -112,7 +112,7 @@ def _across(normals: Float) -> tuple[Float, Float]:
 
 
 def patches(places: Float, narrow: NDArray[np.int32], *, margins: Float, moved: Float) -> Float:
-    """Corners (p, 3, 3) of triangles over vertices that moved outwards, and over narrow faces (k, 3).
+    """Corners (p, 3, 3) of triangles over vertices that moved, and over narrow faces (k, 3).
 
     A ray aimed at a vertex also meets the moved one if it is parallel to the displacement, and Embree may
     lose it there: the triangle over a vertex lies across its displacement. A narrow face is covered with its
@@ -123,7 +123,7 @@ def patches(places: Float, narrow: NDArray[np.int32], *, margins: Float, moved: 
     moved   : (n, 3), displacements in margins
     """
     length = np.sqrt((moved * moved).sum(axis=1))
-    rows = np.flatnonzero(length > _SIDEWAYS + _SHORT)
+    rows = np.flatnonzero(length > 0)
     u, w = _across(moved[rows] / length[rows, None])
     turned = [u, -0.5 * u + np.sqrt(0.75) * w, -0.5 * u - np.sqrt(0.75) * w]
     over = places[rows, None] + margins[rows, None, None] * np.stack(turned, axis=1)
