@@ -20,6 +20,8 @@ _FIRST_END = 0.1
 """Share of a street from which on a route ends."""
 _SHORTEST = 0.75
 """Share of the longest route that is left at the start, where no route is as long as is wanted."""
+_MINOR = 0.1
+"""Weight of service roads and tracks in random choices; of other streets 1."""
 _MOST_STREETS = 1_000_000
 """Streets of zero length must not make a route endless."""
 
@@ -59,11 +61,11 @@ def random_edges(
 
     Also the true metres from the first edge's tail to the start, and from the last one's tail to the end.
 
-    The start is drawn uniformly by length from all places from which so long a route is possible: into a
-    connected part of the graph that has as much street, or the largest, or out of the map. Without such a
-    place it is one from which three quarters of the longest route are left. The route prefers streets that
-    it has not driven, then ends on the next street, anywhere. It turns round at dead ends only if five times
-    as many starts are possible with such turns.
+    The start is drawn by length, service roads and tracks counting a tenth, from all places from which so
+    long a route is possible: into a connected part of the graph that has as much street, or the largest, or
+    out of the map. Without such a place it is one from which three quarters of the longest route are left.
+    The route prefers streets that it has not driven, then ends on the next street, anywhere. It turns round
+    at dead ends only if five times as many starts are possible with such turns.
     """
     rng = generator(seed, "route")
     states = permitted_turns(graph, avoid)
@@ -73,13 +75,11 @@ def random_edges(
     if streets.starts(1.0) @ graph.length < 0.2 * (turning.starts(1.0) @ graph.length):
         streets = turning
     need = 1.0 if streets.starts(1.0).any() else _SHORTEST * float(streets.left.max())
-    share = streets.starts(need)
-    weight = np.cumsum(share * graph.length)
-    place = rng.random() * weight[-1]
-    state = int(np.searchsorted(weight, place, side="right"))
-    start = float(share[state] * graph.length[state] - (weight[state] - place))
-
-    liking = np.where(np.isin(graph.highway, ("service", "track")), 0.1, 1.0)
+    liking = np.where(np.isin(graph.highway, ("service", "track")), _MINOR, 1.0)
+    reach = streets.starts(need) * graph.length
+    weight = np.cumsum(reach * liking)
+    state = int(np.searchsorted(weight, rng.random() * weight[-1], side="right"))
+    start = float(reach[state] * rng.random())
     visits = np.zeros(len(graph))
     done = -start / float(graph.length[state]) * float(cost[state])
     walk, end = [state], 1.0

@@ -71,6 +71,15 @@ def test_seeds_start_anywhere_on_the_streets_and_end_anywhere():
         assert graph.length[edges].sum() - begin - (graph.length[edges[-1]] - end) >= 300.0
 
 
+def test_service_roads_are_a_tenth_as_likely_to_start_on():
+    nodes = [(0, 0), (100, 0), (100, 100), (0, 100)]
+    kinds = np.repeat(["service", "residential"], [2, 6])
+    graph = dataclasses.replace(road_graph(nodes, [(0, 1), (1, 2), (2, 3), (3, 0)]), highway=kinds)
+    first = [int(random_edges(graph, seed=seed, metres=150.0)[0][0]) for seed in range(2000)]
+    minor = (graph.highway[first] == "service").mean()
+    assert minor == pytest.approx(0.2 / 6.2, abs=0.015)  # 4 sigma
+
+
 def test_a_random_drive_starts_where_the_map_is_left_after_it():
     """Two kilometres of one-way street, of which the route needs one."""
     nodes = [(100 * k, 0) for k in range(21)]
