@@ -15,6 +15,8 @@ _GROUND = (
 )
 _ABOVE, _BELOW = 1.5, 6.0
 """Metres above and below the expected height within which the ground is looked for."""
+_BORDER = 1e-3
+"""Metres from the border of a tile's ground, where rays may miss it, at which heights are taken."""
 
 
 def ground_heights(scene: Scene, xyz: Float, *, above: float = _ABOVE, below: float = _BELOW) -> Float:
@@ -34,6 +36,8 @@ def ground_heights(scene: Scene, xyz: Float, *, above: float = _ABOVE, below: fl
             continue
         caster = Caster(tile.mesh.vertices, faces)
         start = xyz[rows] - tile.origin + [0.0, 0.0, above]
+        low, high = scene.tile_boxes[row].reshape(2, 2) - tile.origin[:2]
+        start[:, :2] = np.clip(start[:, :2], low + _BORDER, high - _BORDER)
         down = np.broadcast_to([0.0, 0.0, -1.0], start.shape)
         hits = caster.cast(start, down, far=above + below)
         found = np.isfinite(hits.range)
