@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -253,16 +254,19 @@ def _solved(
     low[first] = high[first] = start
     if rests:
         low[[2 * n - 1, 3 * n - 1]] = high[[2 * n - 1, 3 * n - 1]] = 0.0
-    found = linprog(
-        np.concatenate([-np.ones(n), np.zeros(2 * n), np.full(n, _FAST_COST)]),
-        A_ub=vstack([jerks, -jerks, -forwards, caps]),
-        b_ub=np.concatenate([np.full(2 * m, jerk * dt), np.zeros(m), cap]),
-        A_eq=vstack([speeds, places]),
-        b_eq=np.zeros(2 * m),
-        bounds=np.column_stack([low, high]),
-        method="highs-ds",
-    )
-    if found.status != 0:
+    programme: dict[str, Any] = {
+        "c": np.concatenate([-np.ones(n), np.zeros(2 * n), np.full(n, _FAST_COST)]),
+        "A_ub": vstack([jerks, -jerks, -forwards, caps]),
+        "b_ub": np.concatenate([np.full(2 * m, jerk * dt), np.zeros(m), cap]),
+        "A_eq": vstack([speeds, places]),
+        "b_eq": np.zeros(2 * m),
+        "bounds": np.column_stack([low, high]),
+    }
+    for presolve in (True, False):  # it is faster, and fails in rare cases near rest
+        found = linprog(**programme, method="highs-ds", options={"presolve": presolve})
+        if found.status == 0:
+            break
+    else:
         raise InputError(f"no speed profile satisfies the maximum distances: {found.message}")
     s, v, a, _ = np.split(found.x, 4)
     return [s, np.maximum(v, 0.0), a]
