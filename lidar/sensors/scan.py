@@ -105,12 +105,18 @@ def cast(
     frame: int,
     seed: int = 0,
     settings: ScannerSettings = PLAIN,
+    pulses: NDArray[np.integer] | None = None,
     threads: int = 1,
 ) -> Sweep:
-    """The pulses of a frame and their echoes, before the detector; parameters as of `scan`."""
+    """The pulses of a frame and their echoes, before the detector; other parameters as of `scan`.
+
+    pulses : (k,) ascending rows of the frame's pulses to send; all by default
+    """
     firings = fire(sensor, frame)
     if not settings.motion:
         firings = replace(firings, time_ns=np.full_like(firings.time_ns, firings.time_ns[0]))
+    if pulses is not None:
+        firings = _only(firings, pulses)
     sent = firings
     if settings.angle_noise:
         sent = _with_angle_noise(firings, sensor, rng=generator(seed, sensor.name, frame, "angle"))
@@ -130,6 +136,12 @@ def cast(
         away = echoes.range + sensor.pattern.range_offset
         echoes = replace(echoes, apparent=echoes.apparent * transmission(away, settings.extinction))
     return Sweep(sensor, frame, seed, settings, firings, sent, echoes)
+
+
+def _only(firings: Firings, rows: NDArray[np.integer]) -> Firings:
+    """Some rows (k,) of firings, ascending, with the order among them."""
+    order = firings.order[np.isin(firings.order, rows)]
+    return replace(firings.take(rows), order=np.searchsorted(rows, order).astype(np.int32))
 
 
 def deviates_of(sweep: Sweep) -> Deviates:

@@ -100,8 +100,8 @@ def _bits(material: NDArray[np.uint8]) -> NDArray[np.uint32]:
     return table[material]
 
 
-def _shape(mesh: Mesh) -> Caster:
-    return Caster(mesh.vertices, mesh.faces, mask=_bits(mesh.material))
+def _shape(mesh: Mesh, *, backend: str) -> Caster:
+    return Caster(mesh.vertices, mesh.faces, mask=_bits(mesh.material), backend=backend)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,9 +124,12 @@ class World:
     scene  : the scene
     margin : metres around every region: the maximum range of the sensors
     actors : bodies of actors (see `place_actors`), closed, in their own frames
+    backend : of the ray caster, see `lidar.raycast.Caster`
     """
 
-    def __init__(self, scene: Scene, *, margin: float = 0.0, actors: Sequence[Mesh] = ()) -> None:
+    def __init__(
+        self, scene: Scene, *, margin: float = 0.0, actors: Sequence[Mesh] = (), backend: str = "auto"
+    ) -> None:
         named = scene.shapes()
         shapes = list(named.values())
         self.scene = scene
@@ -134,27 +137,35 @@ class World:
         self._leaves: Mapping[str, float] = scene.manifest.get("leaf_area_density", LEAF_AREA_DENSITY)
         self.margin = margin
         self.region: Region | None = None
-        self._shapes = tuple(_shape(mesh) for mesh in shapes)
-        self._actors = tuple(_shape(mesh) for mesh in actors)
+        self._backend = backend
+        self._shapes = tuple(_shape(mesh, backend=backend) for mesh in shapes)
+        self._actors = tuple(_shape(mesh, backend=backend) for mesh in actors)
         self._copied = [_surfaces(mesh) for mesh in (*shapes, *actors)]
         self._tiles: dict[int, _Tile] = {}
         self._moving: tuple[Instances, NDArray[np.int32]] = _no_instances(self._actors)
-        self.caster = Caster(origin=np.zeros(3), dynamic=True)
+        self.caster = Caster(origin=np.zeros(3), dynamic=True, backend=backend)
         self._concatenate_tables()
 
     @classmethod
     def load(
-        cls, scene: Scene, *, region: Region | None = None, margin: float = 0.0, actors: Sequence[Mesh] = ()
+        cls,
+        scene: Scene,
+        *,
+        region: Region | None = None,
+        margin: float = 0.0,
+        actors: Sequence[Mesh] = (),
+        backend: str = "auto",
     ) -> World:
         """The world of the tiles that intersect a region.
 
         region : (xmin, ymin, xmax, ymax) in scene metres; the whole scene by default
         margin : metres to add on every side: the maximum range of the sensors
         actors : bodies of actors (see `place_actors`)
+        backend : of the ray caster, see `lidar.raycast.Caster`
 
         Raises InputError if no tile intersects the region.
         """
-        world = cls(scene, margin=margin, actors=actors)
+        world = cls(scene, margin=margin, actors=actors, backend=backend)
         world.follow(scene.bounds if region is None else region)
         return world
 
@@ -173,7 +184,7 @@ class World:
         origin = np.array([(xmin + xmax) / 2, (ymin + ymax) / 2, 0.0])
         origin = np.round(origin / _GRID) * _GRID
         if not np.array_equal(origin, self.caster.origin):
-            self.caster, self._tiles = Caster(origin=origin, dynamic=True), {}
+            self.caster, self._tiles = Caster(origin=origin, dynamic=True, backend=self._backend), {}
         elif ranks == list(self._tiles):
             self.region = region
             return

@@ -11,7 +11,7 @@ from lidar.geometry.mounts import Mount
 from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.rig.scanner import firings, load_sensor
 from lidar.rig.specs import load_rig
-from lidar.sensors.scan import scan
+from lidar.sensors.scan import cast, scan
 
 ROOF = Mount((1.2, 0.0, 1.9))
 ROOM = world(
@@ -176,3 +176,13 @@ def test_the_seed_rig_scans():
     for spec in rig.lidars:
         sensor = load_sensor(spec.preset, name=spec.name, rate_hz=spec.rate_hz)
         assert len(scan(sensor, spec.mount, trajectory=drive, world=ROOM, frame=0)) > 500
+
+
+def test_chosen_pulses_of_a_frame_give_their_own_echoes():
+    sensor, rows = load_sensor("vlp16"), np.arange(5, 20_000, 37)
+    common = {"trajectory": driven((3.0, 0.0, 0.0)), "world": world(plate(10.0)), "frame": 2}
+    whole = cast(sensor, Mount(), **common)
+    part = cast(sensor, Mount(), pulses=rows, **common)
+    chosen = np.isin(whole.echoes.pulse, rows)
+    assert rows[part.echoes.pulse].tolist() == whole.echoes.pulse[chosen].tolist()
+    np.testing.assert_array_equal(part.echoes.range, whole.echoes.range[chosen])

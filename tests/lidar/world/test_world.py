@@ -15,6 +15,7 @@ from geoscene.scene.tile_files import Tile, write_shapes, write_tile
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast import ALL
+from lidar.raycast.embree import EmbreeScene
 from lidar.world.world import FOLIAGE, GLASS, World
 
 TILE = 100.0
@@ -89,6 +90,16 @@ def test_rays_hit_the_faces_of_the_tiles_and_lookup_returns_their_attributes(sce
     assert found.feature.tolist() == [2, 102, 1002, 1000, -1]
     assert found.surface.tolist() == [0, WALL, 0, 0, 0]
     np.testing.assert_allclose(hits.normal, [[0, 0, 1]] * 4 + [[0, 0, 0]])
+
+
+def test_a_world_in_float64_has_the_same_hits(scene):
+    above = np.array([[50.0, 50, 30], [70, 70, 30], [30, 30, 30], [450, 50, 30]])
+    down = np.repeat(DOWN, 4, 0)
+    exact = World.load(scene, backend="float64")
+    assert not isinstance(exact.caster.scene, EmbreeScene)
+    hits, usual = exact.caster.cast(above, down), World.load(scene).caster.cast(above, down)
+    np.testing.assert_allclose(hits.range, usual.range, atol=1e-9)
+    assert exact.lookup(hits).feature.tolist() == [2, 102, 1002, -1]
 
 
 def test_masks_look_through_glass_and_foliage(scene):
