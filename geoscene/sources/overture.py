@@ -98,7 +98,7 @@ def read_overture(path: str | Path, *, bounds: Bounds | None = None, progress: P
 
 def _read_rows(path: Path, bounds: Bounds | None) -> list[dict[str, Any]]:
     """Rows whose ``bbox`` intersects the bounds or is null, with the columns of the schema that exist."""
-    need("pyarrow", "gis")
+    errors = need("pyarrow", "gis").ArrowException
     arrow = need("pyarrow.dataset", "gis")
     if not path.exists():
         raise SourceNotFoundError(f"{path}: no such file; give a GeoParquet file of Overture Maps")
@@ -119,7 +119,7 @@ def _read_rows(path: Path, bounds: Bounds | None) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = table.to_table(columns=columns, filter=near).to_pylist()
     except InputError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, CRSError) as error:
+    except (errors, OSError, ValueError, KeyError, TypeError, CRSError) as error:
         cause = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: damaged, or not Overture's GeoParquet ({cause})") from error
     return rows

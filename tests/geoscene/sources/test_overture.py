@@ -208,6 +208,13 @@ def test_files_of_another_kind_are_refused_in_one_line(tmp_path, monkeypatch):
             assert len(read_source("overture", path).areas) == 1
     with pytest.raises(InputError, match="maps: give one of osm, overture"):
         read_source("maps", path)
+
+    def refuse(*_args, **_options):
+        raise pa.ArrowNotImplementedError("integers of 7 bits")
+
+    monkeypatch.setattr("pyarrow.dataset.dataset", refuse)
+    with pytest.raises(InputError, match="damaged, or not Overture's GeoParquet"):
+        read_source("overture", path)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtraError, match=r"geoscene\[gis\]"):
         read_source("overture", path)
