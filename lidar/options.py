@@ -267,9 +267,9 @@ class DriveOptions:
         from lidar.settings import settings_of  # noqa: PLC0415
         from lidar.signal.registry import Stages  # noqa: PLC0415
 
-        scanner, camera = settings_of(self.fidelity, self.settings)
+        chosen = settings_of(self.fidelity, self.settings)
         stages = Stages(self.stages, self.seed)
-        return Contents(self.formats, self.labels, self.deskew, self.seed, scanner, camera, stages)
+        return Contents(self.formats, self.labels, self.deskew, self.seed, *chosen, stages)
 
     def recipe(self, scene: Scene) -> dict[str, Any]:
         """All that the dataset's bytes depend on, as JSON; files with a digest of their contents."""

@@ -209,7 +209,7 @@ def record_all(
     done = 0
     progress("driving", done, total=len(jobs))
     max_range = max((job.sensor.max_range for job in jobs), default=0.0)
-    worlds = Worlds(scene, max_range, actors=recording.actors)
+    worlds = Worlds(scene, max_range, actors=recording.actors, settings=recording.contents.world)
     workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
     with _pool(workers) as pool:
         for chunk, region in _chunks(jobs, recording.trajectory):

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, NamedTuple
 
 from lidar.camera import settings as camera_settings
 from lidar.camera.settings import CameraSettings
@@ -15,6 +15,8 @@ from lidar.errors import InputError
 from lidar.physics import settings as scanner_settings
 from lidar.physics.reflect import INCIDENCE_LAWS
 from lidar.physics.settings import ScannerSettings
+from lidar.raycast import PRECISIONS
+from lidar.world.settings import ORIGINS, WorldSettings
 
 _SWITCH = {"on": True, "yes": True, "true": True, "1": True}
 _SWITCH |= {"off": False, "no": False, "false": False, "0": False}
@@ -22,6 +24,8 @@ _SWITCH |= {"off": False, "no": False, "false": False, "0": False}
 _CHOICES: dict[str, Iterable[object]] = {
     "law": INCIDENCE_LAWS,
     "range_noise": scanner_settings.NOISES,
+    "precision": PRECISIONS,
+    "origin": ORIGINS,
 }
 
 
@@ -29,8 +33,8 @@ _CHOICES: dict[str, Iterable[object]] = {
 class Setting:
     """One setting as `list_settings` describes it.
 
-    name    : field of `ScannerSettings` or `CameraSettings`
-    of      : lidar or camera
+    name    : field of `ScannerSettings`, `CameraSettings` or `WorldSettings`
+    of      : lidar, camera or world
     values  : as text, at each of `levels`
     meaning : one line
     """
@@ -46,43 +50,48 @@ def levels() -> tuple[str, ...]:
     return tuple(scanner_settings.LEVELS)
 
 
-def settings_of(
-    level: str, changes: Iterable[tuple[str, str]] = ()
-) -> tuple[ScannerSettings, CameraSettings]:
-    """Settings of scanners and of cameras at a level, with single ones changed by name and text.
+class Settings(NamedTuple):
+    """Settings of a drive: of scanners, of cameras, and of the scene around the vehicle."""
 
-    Values are numbers, words, or on/off, yes/no, true/false, 1/0. Raises InputError if a level, a name or a
-    value is unknown.
+    lidar: ScannerSettings
+    camera: CameraSettings
+    world: WorldSettings
+
+
+def settings_of(level: str, changes: Iterable[tuple[str, str]] = ()) -> Settings:
+    """Settings at a level, with single ones changed by name and text.
+
+    A name that both scanners and cameras have changes both. Values are numbers, words, or on/off, yes/no,
+    true/false, 1/0. Raises InputError if a level, a name or a value is unknown.
     """
-    if level not in scanner_settings.LEVELS:
-        raise InputError(f"`fidelity` {level}: one of {', '.join(levels())}")
-    scanner, camera = scanner_settings.LEVELS[level], camera_settings.LEVELS[level]
-    of_scanner, of_camera = ({f.name for f in fields(kind)} for kind in (ScannerSettings, CameraSettings))
-    scanner_changes: dict[str, Any] = {}
-    camera_changes: dict[str, Any] = {}
+    chosen: tuple[Any, ...] = _at(level)
+    known = {f.name for group in chosen for f in fields(group)}
+    changed: tuple[dict[str, Any], ...] = tuple({} for _ in chosen)
     for name, text in changes:
-        if name in of_scanner:
-            scanner_changes |= _parsed(name, text, former=getattr(scanner, name))
-        elif name in of_camera:
-            camera_changes |= _parsed(name, text, former=getattr(camera, name))
-        else:
-            known = sorted(of_scanner | of_camera)
-            near = get_close_matches(name, known, 3, 0.5)
+        if name not in known:
+            near = get_close_matches(name, sorted(known), 3, 0.5)
             hint = f"; is {' or '.join(near)} meant?" if near else ";"
             raise InputError(f"`settings` {name}: unknown{hint} lidar settings lists all {len(known)}")
-    return replace(scanner, **scanner_changes), replace(camera, **camera_changes)
+        for group, values in zip(chosen, changed, strict=True):
+            if hasattr(group, name):
+                values.update(_parsed(name, text, former=getattr(group, name)))
+    return Settings(*(replace(group, **values) for group, values in zip(chosen, changed, strict=True)))
+
+
+def _at(level: str) -> Settings:
+    if level not in levels():
+        raise InputError(f"`fidelity` {level}: one of {', '.join(levels())}")
+    return Settings(scanner_settings.LEVELS[level], camera_settings.LEVELS[level], WorldSettings())
 
 
 def list_settings() -> list[Setting]:
     """All settings, those of scanners first, with their values at each level."""
+    at_levels = [_at(level) for level in levels()]
     found = []
-    for of, kind, by_level in (
-        ("lidar", ScannerSettings, scanner_settings.LEVELS),
-        ("camera", CameraSettings, camera_settings.LEVELS),
-    ):
-        meanings = _meanings(inspect.getdoc(kind) or "")
-        for f in fields(kind):
-            values = tuple(_text(getattr(by_level[level], f.name)) for level in levels())
+    for k, of in enumerate(Settings._fields):
+        meanings = _meanings(inspect.getdoc(type(at_levels[0][k])) or "")
+        for f in fields(at_levels[0][k]):
+            values = tuple(_text(getattr(chosen[k], f.name)) for chosen in at_levels)
             found.append(Setting(f.name, of, values, meanings.get(f.name, "")))
     return found
 

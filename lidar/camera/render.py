@@ -38,6 +38,8 @@ _LIFT = 1e-3
 class RenderOptions:
     """Options of the renderer.
 
+    precision   : of depths, see `lidar.raycast.Caster.cast`
+    retrace     : whether rays that miss are traced a second time
     shadows     : cast shadows
     detail      : draw windows, joints and grain on surfaces of uniform colour
     supersample : rays along each side of a pixel, for colour only; labels and depth are those of its centre
@@ -48,6 +50,8 @@ class RenderOptions:
     threads     : threads to use; the images do not depend on it
     """
 
+    precision: str = "exact"
+    retrace: bool = True
     shadows: bool = True
     detail: bool = True
     supersample: int = 1
@@ -153,7 +157,7 @@ def render(
     if random is not None and np.isfinite(options.full_well):
         electrons = random.standard_normal((h, w, 3), np.float32)
     middle = samples // 2
-    look = functools.partial(_view, poses=poses, world=world, times=times)
+    look = functools.partial(_view, poses=poses, world=world, times=times, options=options)
 
     def band(edges: tuple[int, int]) -> None:
         first, last = edges
@@ -223,6 +227,7 @@ def _view(
     first: int,
     last: int,
     times: Float | None,
+    options: RenderOptions,
     rows: int | None = None,
 ) -> View:
     """Hits and surfaces of the rows first to last of a camera in one sample of the exposure.
@@ -241,7 +246,16 @@ def _view(
     shade.aim(rays, row, poses.rotation, poses.scale, direction, seen)
     time = None if times is None else np.asarray(times, float)[row]
     origin = poses.position[sample] if moments == 1 else poses.position[row]
-    hits = world.caster.cast(origin, direction, near=camera.near, time=time, normals=True)
+    hits = world.caster.cast(
+        origin,
+        direction,
+        near=camera.near,
+        far=world.reach,
+        time=time,
+        normals=True,
+        precision=options.precision,
+        retrace=options.retrace,
+    )
     if not seen.all():
         hits = _with_misses(hits, ~seen)
     return View(poses.position, row, direction, seen, time, hits, world.lookup(hits))
@@ -365,7 +379,16 @@ def optical_flow(
         raise InputError(f"camera {camera.name}: optical flow needs {rows} poses of each frame")
     start = np.zeros(rows) if times is None else np.asarray(times, float)
     end = np.ones(rows) if later_times is None else np.asarray(later_times, float)
-    view = _view(camera, poses, world=world, sample=0, first=0, last=camera.height, times=start)
+    view = _view(
+        camera,
+        poses,
+        world=world,
+        sample=0,
+        first=0,
+        last=camera.height,
+        times=start,
+        options=RenderOptions(),
+    )
     hit = np.isfinite(view.hits.range)
     point = view.origin[view.row] + np.where(hit, view.hits.range, 1.0)[:, None] * view.direction
     body = _on_bodies(point, view.hits, world=world, time=start[view.row])

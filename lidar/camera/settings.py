@@ -8,6 +8,7 @@ import numpy as np
 
 from lidar.camera.render import RenderOptions
 from lidar.errors import InputError
+from lidar.raycast import PRECISIONS
 from lidar.rig.specs import CameraSpec
 
 
@@ -15,6 +16,8 @@ from lidar.rig.specs import CameraSpec
 class CameraSettings:
     """Settings of images. The defaults are a camera without noise and one ray per pixel.
 
+    precision    : of the depths of pixels, of `lidar.raycast.PRECISIONS`
+    retrace      : trace pixels that miss a second time, as rays towards a vertex may pass between faces
     shadows      : the sun casts shadows
     detail       : windows, joints and grain are drawn on surfaces of uniform colour
     supersample  : rays along each side of a pixel, for colour: 1 to 16
@@ -23,6 +26,8 @@ class CameraSettings:
     camera_noise : shot noise and read noise (the camera's ``full_well``, ``read_noise``)
     """
 
+    precision: str = "exact"
+    retrace: bool = True
     shadows: bool = True
     detail: bool = True
     supersample: int = 1
@@ -33,6 +38,8 @@ class CameraSettings:
     def __post_init__(self) -> None:
         """Validate the settings; one InputError names all faults."""
         faults = []
+        if self.precision not in PRECISIONS:
+            faults.append(f"precision={self.precision}: known are {', '.join(PRECISIONS)}")
         if not 1 <= self.supersample <= 16:
             faults.append(f"supersample={self.supersample}: give 1 to 16")
         if not 1 <= self.blur <= 64:
@@ -49,6 +56,8 @@ class CameraSettings:
     def options(self, camera: CameraSpec) -> RenderOptions:
         """The renderer's options for a camera."""
         return RenderOptions(
+            precision=self.precision,
+            retrace=self.retrace,
             shadows=self.shadows,
             detail=self.detail,
             supersample=self.supersample,

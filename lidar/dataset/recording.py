@@ -30,6 +30,8 @@ from lidar.physics.settings import ScannerSettings
 from lidar.rig.devices import Camera, Scanner
 from lidar.signal.registry import NO_STAGES, Stages
 from lidar.world.actors import Actors
+from lidar.world.settings import PLAIN as PLAIN_WORLD
+from lidar.world.settings import WorldSettings
 from lidar.world.visibility import Visibility
 
 
@@ -62,6 +64,7 @@ class Contents:
     seed    : of the random number generators
     scanner : settings of scanners
     camera  : settings of cameras
+    world   : settings of the scene around the vehicle
     stages  : that change echoes, clouds or images, see `lidar.signal`
     """
 
@@ -71,6 +74,7 @@ class Contents:
     seed: int = 0
     scanner: ScannerSettings = PLAIN_SCANNER
     camera: CameraSettings = PLAIN_CAMERA
+    world: WorldSettings = PLAIN_WORLD
     stages: Stages = NO_STAGES
 
     def __post_init__(self) -> None:

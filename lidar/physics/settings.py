@@ -7,6 +7,7 @@ from math import isfinite
 
 from lidar.errors import InputError
 from lidar.physics.reflect import INCIDENCE_LAWS
+from lidar.raycast import PRECISIONS
 
 NOISES = ("none", "constant", "signal")
 """Models of range noise."""
@@ -20,6 +21,8 @@ class ScannerSettings:
     """Settings of the returns. The defaults are a scanner that measures exactly.
 
     motion       : cast each pulse from the sensor's pose at its own time; off: from the frame's first pose
+    precision    : of the ranges of pulses, of `lidar.raycast.PRECISIONS`
+    retrace      : trace pulses that miss a second time, as pulses towards a vertex may pass between faces
     law          : incidence law, of `lidar.physics.reflect.INCIDENCE_LAWS`
     spread       : spread of the reflectance from object to object, as the deviation of its logarithm
     link         : lose echoes below the detection threshold
@@ -42,6 +45,8 @@ class ScannerSettings:
     """
 
     motion: bool = True
+    precision: str = "exact"
+    retrace: bool = True
     law: str = "lambert"
     spread: float = 0.0
     link: bool = False
@@ -64,6 +69,8 @@ class ScannerSettings:
     def __post_init__(self) -> None:
         """Validate the settings; one InputError names all faults."""
         faults = []
+        if self.precision not in PRECISIONS:
+            faults.append(f"precision={self.precision}: known are {', '.join(PRECISIONS)}")
         if self.law not in INCIDENCE_LAWS:
             faults.append(f"law={self.law}: known are {', '.join(INCIDENCE_LAWS)}")
         if self.range_noise not in NOISES:

@@ -120,6 +120,8 @@ class Caster:
         time: ArrayLike | None = None,
         order: NDArray[np.integer] | None = None,
         normals: bool = False,
+        precision: str = "exact",
+        retrace: bool = True,
         threads: int = 1,
     ) -> Hits:
         """The first hit of each ray.
@@ -133,11 +135,26 @@ class Caster:
         order      : (n,) permutation, the order in which rays form packets; fastest where 16 rays in a
                      row are nearly parallel (16 azimuths of one channel, 16 pixels)
         normals    : whether to compute `Hits.normal`
+        precision  : ``exact``; ``refined``: the float64 range on the face that Embree finds in float32, also
+                     near its edges; ``float32``: Embree's range. The latter two may hit faces in which a ray
+                     starts. Without effect on the float64 backend
+        retrace    : whether rays that miss are traced a second time, with a perturbed direction, as rays
+                     towards a vertex may pass between faces. Without effect on the float64 backend
         threads    : threads to use; the result does not depend on it
 
         Raises InputError for rays that are not finite or have a direction of length zero.
         """
-        rays = limited(free_rays(origins, directions), near=near, far=far, mask=mask, time=time, order=order)
+        rays = free_rays(origins, directions)
+        rays = limited(
+            rays,
+            near=near,
+            far=far,
+            mask=mask,
+            time=time,
+            order=order,
+            precision=precision,
+            retrace=retrace,
+        )
         return self.scene.cast(rays, normals=normals, threads=threads)
 
     def cast_posed(
@@ -153,6 +170,8 @@ class Caster:
         time: ArrayLike | None = None,
         order: NDArray[np.integer] | None = None,
         normals: bool = False,
+        precision: str = "exact",
+        retrace: bool = True,
         threads: int = 1,
     ) -> Hits:
         """The first hit of each ray of a moving sensor; ranges are true metres for unit directions.
@@ -165,7 +184,16 @@ class Caster:
         ``near`` and ``far`` are true metres from the start of the beam; other parameters as for `cast`.
         """
         rays = posed_rays(poses, pose_index, directions=directions, offsets=offsets)
-        rays = limited(rays, near=near, far=far, mask=mask, time=time, order=order)
+        rays = limited(
+            rays,
+            near=near,
+            far=far,
+            mask=mask,
+            time=time,
+            order=order,
+            precision=precision,
+            retrace=retrace,
+        )
         return self.scene.cast(rays, normals=normals, threads=threads)
 
     def occluded(

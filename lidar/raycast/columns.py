@@ -13,6 +13,12 @@ COPIES = 256
 """Geometry numbers below this are for instances, numbers from it on for the mesh. Embree's commit visits all
 numbers up to the highest."""
 
+PRECISIONS = ("exact", "refined", "float32")
+"""Precisions of ranges, see `lidar.raycast.Caster.cast`; `Rays.precision` is the index of one."""
+
+EXACT, REFINED, FLOAT32 = range(len(PRECISIONS))
+"""Indices of `PRECISIONS`."""
+
 CHUNK = 8192
 """Rays per unit of work of a thread; a multiple of all packet widths, so that packets never change."""
 
@@ -69,6 +75,8 @@ class Rays(NamedTuple):
     near       : ray parameter
     far        : (n,) float64, ray parameter; (1,) for all rays
     mask       : bits
+    precision  : index of one of `PRECISIONS`
+    retrace    : whether rays that miss are traced a second time
     """
 
     directions: Float
@@ -81,3 +89,5 @@ class Rays(NamedTuple):
     near: float
     far: Float
     mask: int
+    precision: int
+    retrace: bool

@@ -21,7 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.raycast.columns import CHUNK, Rays, Target
+from lidar.raycast.columns import CHUNK, EXACT, FLOAT32, Rays, Target
 from lidar.raycast.exact import STACK, first_hit
 from lidar.raycast.hull import LONG, REACH, ROUNDING
 from lidar.raycast.lanes import GRAZING, START, cross, move_float64, move_int32, narrow, same
@@ -120,6 +120,23 @@ def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: 
                 int64_at(target.parts.ctypes.data, PART * row) + PLANE * prim, 4
             )
             faces[k], instances[k] = numbered(target, row, prim), instance
+
+
+@inlined
+def _approximate(W: int, near: float, precision: int, work: Any, f: Any) -> bool:
+    """Accept Embree's hits, with Embree's ranges for float32; whether all lanes have one that is clear.
+
+    Patches have planes without a normal, so that a hit on one is not clear.
+    """
+    clear = True
+    for k in range(W):
+        cosine = work[COSINE * W + k]
+        if precision == FLOAT32 and abs(cosine) > 0.0:
+            work[RANGE * W + k] = np.float64(f[RAY_FAR * W + k]) * work[INVERSE * W + k]
+        t = work[RANGE * W + k]
+        clear &= (abs(cosine) >= GRAZING) & (t <= work[FAR * W + k])
+        clear &= not _starts(t, near, cosine, work[INVERSE * W + k])
+    return clear
 
 
 @inlined
@@ -246,6 +263,7 @@ def cast(
     face, instance = aligned(4 * W).view(np.int32), aligned(4 * W).view(np.int32)
     stack = np.zeros(STACK, np.int64)
     late, doubtful, waiting = np.zeros(2 * RAY_ROWS * W), np.zeros(2 * W, np.int64), 0
+    precise = rays.precision == EXACT
     for k in range(W):
         u[RAY_MASK * W + k] = rays.mask
         u[RAY_ID * W + k] = k
@@ -262,6 +280,8 @@ def cast(
         trace(target, W, PACKET_ROWS, f, valid, alike(W, work), one)
         _identify(target, W, u, work, face, instance)
         settled = cross(target.lanes, work.ctypes.data, f.ctypes.data, rays.near)
+        if not precise:
+            settled = _approximate(W, rays.near, rays.precision, work, f)
         if m == W and not rays.order.size:
             exact = work.ctypes.data + 8 * RANGE * W
             move_float64(target.lanes, exact, ranges.ctypes.data + 8 * at)
@@ -283,7 +303,11 @@ def cast(
             if hit:
                 share = min(f[HIT_U * W + k], f[HIT_V * W + k], 1.0 - f[HIT_U * W + k] - f[HIT_V * W + k])
                 starts = _starts(t, rays.near, cosine, work[INVERSE * W + k])
-                if starts or not share * cosine >= work[MARGIN * W + k] or not cosine >= GRAZING:
+                if precise:
+                    clear = share * cosine >= work[MARGIN * W + k] and cosine >= GRAZING
+                else:
+                    clear = abs(cosine) >= GRAZING
+                if starts or not clear:
                     ray, inverse, time = ray_of(W, k, work), work[INVERSE * W + k], work[TIME * W + k]
                     row, copy = placed(
                         target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
@@ -316,6 +340,8 @@ def cast(
             ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
             if normals.size:
                 _normal(normals, i, 0.0, 0.0, 0.0)
+            if not rays.retrace:
+                continue
             for r in range(RAY_ROWS):
                 late[r * 2 * W + waiting] = work[r * W + k]
             doubtful[waiting] = i

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
-from lidar.raycast.columns import CHUNK, Rays
+from lidar.raycast.columns import CHUNK, EXACT, PRECISIONS, Rays
 from lidar.raycast.geometry import ALL
 
 
@@ -60,7 +60,7 @@ def posed_rays(
 
 def _plain(d: Float, o: Float, *, pose: NDArray[np.int64], position: Float, matrix: Float) -> Rays:
     none, start = np.empty(0, np.int64), np.empty(0, np.float32)
-    return Rays(d, o, pose, position, matrix, none, start, 0.0, np.array([np.inf]), ALL)
+    return Rays(d, o, pose, position, matrix, none, start, 0.0, np.array([np.inf]), ALL, EXACT, True)
 
 
 def limited(
@@ -71,16 +71,27 @@ def limited(
     mask: int,
     time: ArrayLike | None,
     order: NDArray[np.integer] | None = None,
+    precision: str = PRECISIONS[EXACT],
+    retrace: bool = True,
 ) -> Rays:
-    """The rays with bounds, mask, times and order of work.
+    """The rays with bounds, mask, times, order of work and precision.
 
-    Raises InputError unless 0 <= near <= far, times lie within 0 to 1 and the order is a permutation.
+    Raises InputError unless 0 <= near <= far, times lie within 0 to 1, the order is a permutation and the
+    precision one of `PRECISIONS`.
     """
     n = len(rays.directions)
     reach = np.ascontiguousarray(far, np.float64).reshape(-1)
     if len(reach) not in (1, n) or not (near >= 0 and (reach >= near).all()):
         raise InputError("rays need 0 <= near <= far, far one number or one per ray")
-    limits = rays._replace(near=float(near), far=reach, mask=int(mask) & ALL)
+    if precision not in PRECISIONS:
+        raise InputError(f"precision {precision!r}: choose one of {', '.join(PRECISIONS)}")
+    limits = rays._replace(
+        near=float(near),
+        far=reach,
+        mask=int(mask) & ALL,
+        precision=PRECISIONS.index(precision),
+        retrace=bool(retrace),
+    )
     if time is not None:
         moments = np.ascontiguousarray(time, np.float32)
         if not (moments.shape == (n,) and ((moments >= 0) & (moments <= 1)).all()):

@@ -48,7 +48,7 @@ def surface_echoes(
     if rays > 1:
         turn = 2 * np.pi * generator(seed, sensor.name, frame, "footprint").random(len(pulses))
     beam = beam_of(rays, divergence=sensor.divergence, aperture=sensor.aperture, turn=turn)
-    far = sensor.max_range - sensor.pattern.range_offset
+    far = min(sensor.max_range - sensor.pattern.range_offset, world.reach)
     separation = sensor.echo_separation
     batch = max(_BATCH // rays, 1)
     optics = SurfaceOptics(world, sensor.wavelength_nm, settings=settings, seed=seed)
@@ -71,6 +71,8 @@ def surface_echoes(
             far=far,
             time=moments,
             order=cast.order,
+            precision=settings.precision,
+            retrace=settings.retrace,
             threads=threads,
         )
         pierced = None if foliage is None else foliage.pierce(hits, cast, first=first * rays, time=moments)

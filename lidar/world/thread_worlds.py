@@ -6,20 +6,30 @@ import threading
 
 from geoscene.scene import Scene
 from lidar.world.actors import Actors, actor_shapes, actor_transforms
+from lidar.world.settings import PLAIN, WorldSettings
 from lidar.world.world import Region, World
 
 
 class Worlds:
     """Worlds of the threads of a drive: one for all threads without moving actors, else one per thread.
 
-    scene  : the static scene
-    margin : maximum range of the sensors, metres
-    actors : the road users; none by default
+    scene    : the static scene
+    margin   : maximum range of the sensors, metres
+    actors   : the road users; none by default
+    settings : of the worlds
     """
 
-    def __init__(self, scene: Scene, margin: float, *, actors: Actors | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        margin: float,
+        *,
+        actors: Actors | None = None,
+        settings: WorldSettings = PLAIN,
+    ) -> None:
         self.scene = scene
-        self.margin = margin
+        self.margin = min(margin, settings.reach)
+        self.settings = settings
         self.actors = actors if actors is not None and len(actors) else None
         self._region: Region | None = None
         self._shared: World | None = None
@@ -51,6 +61,8 @@ class Worlds:
     def _loaded(self, world: World | None, region: Region) -> World:
         if world is None:
             shapes = actor_shapes(self.actors) if self.actors is not None else ()
-            return World.load(self.scene, region=region, margin=self.margin, actors=shapes)
+            return World.load(
+                self.scene, region=region, margin=self.margin, actors=shapes, settings=self.settings
+            )
         world.follow(region)
         return world

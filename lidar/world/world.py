@@ -18,6 +18,7 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast import Caster, Geometry, Hits, Instances
 from lidar.raycast.geometry import split
+from lidar.world.settings import PLAIN, WorldSettings
 
 Region = tuple[float, float, float, float]
 
@@ -121,23 +122,31 @@ class World:
     ``world.caster`` casts the rays (see `lidar.raycast.Caster`), `lookup` returns the surfaces of their hits.
     `follow` loads another region and `place_actors` places moving actors, both in place: look up hits first.
 
-    scene  : the scene
-    margin : metres around every region: the maximum range of the sensors
-    actors : bodies of actors (see `place_actors`), closed, in their own frames
-    backend : of the ray caster, see `lidar.raycast.Caster`
+    scene    : the scene
+    margin   : metres around every region: the maximum range of the sensors; at most the reach of the settings
+    actors   : bodies of actors (see `place_actors`), closed, in their own frames
+    settings : what of the scene is loaded
+    backend  : of the caster, see `lidar.raycast.Caster`
     """
 
     def __init__(
-        self, scene: Scene, *, margin: float = 0.0, actors: Sequence[Mesh] = (), backend: str = "auto"
+        self,
+        scene: Scene,
+        *,
+        margin: float = 0.0,
+        actors: Sequence[Mesh] = (),
+        settings: WorldSettings = PLAIN,
+        backend: str = "auto",
     ) -> None:
         named = scene.shapes()
         shapes = list(named.values())
         self.scene = scene
         self._names = tuple(named)
         self._leaves: Mapping[str, float] = scene.manifest.get("leaf_area_density", LEAF_AREA_DENSITY)
-        self.margin = margin
-        self.region: Region | None = None
+        self.margin = min(margin, settings.reach)
+        self.settings = settings
         self._backend = backend
+        self.region: Region | None = None
         self._shapes = tuple(_shape(mesh, backend=backend) for mesh in shapes)
         self._actors = tuple(_shape(mesh, backend=backend) for mesh in actors)
         self._copied = [_surfaces(mesh) for mesh in (*shapes, *actors)]
@@ -154,18 +163,18 @@ class World:
         region: Region | None = None,
         margin: float = 0.0,
         actors: Sequence[Mesh] = (),
+        settings: WorldSettings = PLAIN,
         backend: str = "auto",
     ) -> World:
         """The world of the tiles that intersect a region.
 
         region : (xmin, ymin, xmax, ymax) in scene metres; the whole scene by default
-        margin : metres to add on every side: the maximum range of the sensors
-        actors : bodies of actors (see `place_actors`)
-        backend : of the ray caster, see `lidar.raycast.Caster`
+
+        Other parameters are those of the class.
 
         Raises InputError if no tile intersects the region.
         """
-        world = cls(scene, margin=margin, actors=actors, backend=backend)
+        world = cls(scene, margin=margin, actors=actors, settings=settings, backend=backend)
         world.follow(scene.bounds if region is None else region)
         return world
 
@@ -182,7 +191,7 @@ class World:
             )
         xmin, ymin, xmax, ymax = region
         origin = np.array([(xmin + xmax) / 2, (ymin + ymax) / 2, 0.0])
-        origin = np.round(origin / _GRID) * _GRID
+        origin = np.round(origin / _GRID) * _GRID if self.settings.origin == "near" else np.zeros(3)
         if not np.array_equal(origin, self.caster.origin):
             self.caster, self._tiles = Caster(origin=origin, dynamic=True, backend=self._backend), {}
         elif ranks == list(self._tiles):
@@ -218,6 +227,11 @@ class World:
         copied = np.flatnonzero(hits.instance >= 0)
         found.feature[copied] = self._feature[hits.instance[copied]]
         return found
+
+    @property
+    def reach(self) -> float:
+        """Metres from a sensor beyond which nothing is hit."""
+        return self.settings.reach
 
     @property
     def faces(self) -> Faces:

@@ -26,6 +26,7 @@ class MeshWorld:
     """A world of one mesh."""
 
     mesh: Mesh
+    reach = np.inf
 
     def __post_init__(self):
         self.caster = Caster(self.mesh.vertices, self.mesh.faces)

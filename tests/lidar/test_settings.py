@@ -17,6 +17,7 @@ from lidar.rig.catalog import rig_rows, sensor_rows
 from lidar.rig.scanner import load_sensor, sensor_names
 from lidar.rig.specs import load_rig, rig_names
 from lidar.settings import levels, list_settings, settings_of
+from lidar.world.settings import WorldSettings
 
 
 def program(*words, cwd="."):
@@ -26,7 +27,7 @@ def program(*words, cwd="."):
 def test_every_setting_is_listed_with_its_value_at_each_level_and_a_meaning():
     found = list_settings()
     assert [s.name for s in found] == [
-        f.name for kind in (ScannerSettings, CameraSettings) for f in fields(kind)
+        f.name for kind in (ScannerSettings, CameraSettings, WorldSettings) for f in fields(kind)
     ]
     for setting in found:
         assert len(setting.values) == len(levels()) == 3
@@ -49,6 +50,14 @@ def test_settings_that_need_each_other_may_come_in_any_order():
     assert settings_of("standard", pairs) == settings_of("standard", pairs[::-1])
 
 
+def test_a_setting_that_scanners_and_cameras_share_changes_both():
+    chosen = settings_of("standard", [("precision", "float32"), ("retrace", "off"), ("reach", "40")])
+    assert chosen.lidar.precision == chosen.camera.precision == "float32"
+    assert not chosen.lidar.retrace
+    assert not chosen.camera.retrace
+    assert chosen.world == WorldSettings(reach=40.0)
+
+
 @pytest.mark.parametrize(
     ("level", "given", "says"),
     [
@@ -58,6 +67,10 @@ def test_settings_that_need_each_other_may_come_in_any_order():
         ("standard", [("rays", "many")], "whole number"),
         ("standard", [("shadows", "perhaps")], "on or off"),
         ("standard", [("supersample", "99")], "supersample=99"),
+        ("standard", [("precision", "half")], "known are exact, refined, float32"),
+        ("standard", [("origin", "far")], "known are near, scene"),
+        ("standard", [("reach", "0")], "reach=0: give metres above 0, or inf"),
+        ("standard", [("reach", "nan")], "reach=nan: give metres above 0, or inf"),
         ("standard", [("daylight_lux", "20000")], "no effect without detection or false_alarms"),
         ("survey", [("stretch", "on")], "no effect with rays=19"),
         ("best", [], "draft, standard, survey"),

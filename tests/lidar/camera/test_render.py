@@ -433,6 +433,7 @@ class ActorWorld:
 
     shift: tuple[float, float, float]
     way: tuple[float, float, float]
+    reach = np.inf
 
     def __post_init__(self):
         self.mesh = box((-1, -1, -1), (1, 1, 1), feature=9)

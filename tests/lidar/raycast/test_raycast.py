@@ -282,6 +282,59 @@ def test_a_ray_that_starts_on_a_face_does_not_hit_it(backend):
     assert (through.range > 0.1).all()
 
 
+@pytest.mark.parametrize("origin", [0.0, 2000.0, 10_000.0])
+def test_cheap_ranges_are_as_near_to_exact_ones_as_stated(origin):
+    rng = np.random.default_rng(7)
+    vertices, faces = soup(rng, 2000, spread=30.0)
+    shift = np.array([origin, 0, 0])
+    scene = Caster(vertices + shift, faces, origin=np.zeros(3))
+    start, way = rng.normal(size=(40_000, 3)) * 30 + shift, directions(rng, 40_000)
+    unit = way / np.linalg.norm(way, axis=1)[:, None]
+    exact = scene.cast(start, unit)
+    for precision in ("refined", "float32"):
+        hits = scene.cast(start, unit, precision=precision)
+        same = (hits.face == exact.face) & (exact.face >= 0)
+        assert (hits.face != exact.face).mean() < 2e-3  # beside edges
+        off = np.abs(hits.range[same] - exact.range[same])
+        if precision == "refined":
+            assert not off.any()
+        else:
+            margin = 6e-5 * max(1.0, (origin + 200) / 256)
+            bound = 4 * margin / np.abs(exact.cosine[same]) + 1e-6 * exact.range[same]
+            assert 0 < (off / bound).max() < 1
+        np.testing.assert_array_equal(
+            hits.range, scene.cast(start, unit, precision=precision, threads=2).range
+        )
+
+
+@pytest.mark.parametrize("precision", ["exact", "refined", "float32"])
+def test_the_float64_backend_is_exact_whatever_the_precision(precision):
+    rng = np.random.default_rng(8)
+    scene = Caster(*soup(rng, 50), backend="float64")
+    start, way = rng.normal(size=(500, 3)), directions(rng, 500)
+    exact, hits = scene.cast(start, way), scene.cast(start, way, precision=precision, retrace=False)
+    for name in ("range", "face", "cosine"):
+        np.testing.assert_array_equal(getattr(hits, name), getattr(exact, name))
+
+
+def test_without_a_second_trace_hits_stay_and_few_rays_leak():
+    rng = np.random.default_rng(9)
+    solid = trimesh.creation.icosphere(subdivisions=3, radius=5.0)
+    scene = Caster(solid.vertices[:, :], solid.faces[:, ::-1])
+    aimed = np.concatenate([solid.vertices, solid.vertices[solid.edges_unique].mean(axis=1)])
+    start = rng.uniform(-1, 1, (len(aimed), 3))
+    twice, once = (scene.cast(start, aimed - start, retrace=again) for again in (True, False))
+    hit = once.face >= 0
+    assert (twice.face >= 0).all()
+    assert (~hit).mean() < 0.01
+    np.testing.assert_array_equal(once.range[hit], twice.range[hit])
+
+
+def test_an_unknown_precision_is_refused():
+    with pytest.raises(InputError, match="precision 'half': choose one of exact, refined, float32"):
+        Caster(*sheet([0, 0, 1.0], [0, 0, 0])).cast([0, 0, 1], [[0, 0, -1.0]], precision="half")
+
+
 def test_hits_do_not_depend_on_the_number_of_threads():
     rng = np.random.default_rng(5)
     vertices, faces = soup(rng, 3000)

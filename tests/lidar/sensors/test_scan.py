@@ -4,7 +4,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from helpers.sensor_worlds import box, driven, plate, world
+from helpers.sensor_worlds import MeshWorld, box, driven, plate, world
 
 from geoscene.classes import Class, materials
 from lidar.geometry.mounts import Mount
@@ -186,3 +186,27 @@ def test_chosen_pulses_of_a_frame_give_their_own_echoes():
     chosen = np.isin(whole.echoes.pulse, rows)
     assert rows[part.echoes.pulse].tolist() == whole.echoes.pulse[chosen].tolist()
     np.testing.assert_array_equal(part.echoes.range, whole.echoes.range[chosen])
+
+
+def test_cheap_casts_change_ranges_by_less_than_their_bound():
+    drive = driven((20.0, 3.0, 0.0), yaw_rate=0.8, start=(-20, -10, 0))
+    exact, cheap = (
+        scan(load_sensor("vlp16"), ROOF, trajectory=drive, world=ROOM, frame=3, settings=settings)
+        for settings in (ScannerSettings(), ScannerSettings(precision="float32", retrace=False))
+    )
+    pulses = [cloud.column * np.int64(16) + cloud.ring for cloud in (exact, cheap)]
+    both, one, two = np.intersect1d(*pulses, return_indices=True)
+    assert len(both) >= len(exact) - 2  # beside the faces' edges
+    off = np.abs(cheap.range[two] - exact.range[one]) * np.cos(exact.incidence[one])
+    assert 0 < np.median(off) < off[cheap.feature[two] == exact.feature[one]].max() < 4e-4
+
+
+def test_nothing_beyond_the_reach_of_the_world_returns():
+    near = MeshWorld(ROOM.mesh)
+    near.reach = 8.0
+    whole, part = (
+        scan(load_sensor("vlp16"), ROOF, trajectory=driven(), world=one, frame=0) for one in (ROOM, near)
+    )
+    within = whole.range <= 8.0
+    assert 0 < within.sum() < len(whole)
+    np.testing.assert_array_equal(part.range, whole.range[within])

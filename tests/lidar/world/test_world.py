@@ -16,6 +16,8 @@ from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast import ALL
 from lidar.raycast.embree import EmbreeScene
+from lidar.raycast.scene import Float64Scene
+from lidar.world.settings import WorldSettings
 from lidar.world.world import FOLIAGE, GLASS, World
 
 TILE = 100.0
@@ -148,7 +150,8 @@ def test_following_keeps_only_the_tiles_around(scene):
         assert world.caster.cast([x, 50, 3], DOWN).range == pytest.approx(3)
 
 
-def test_ranges_stay_exact_over_long_drives(tmp_path):
+@pytest.mark.parametrize(("settings", "x"), [({}, 40960.0), ({"origin": "scene"}, 0.0)])
+def test_ranges_stay_exact_over_long_drives(tmp_path, settings, x):
     files = SceneFiles(tmp_path)
     files.tiles.mkdir()
     indices = [(0, 0), (400, 7)]
@@ -164,8 +167,9 @@ def test_ranges_stay_exact_over_long_drives(tmp_path):
         "layers": {},
     }
     files.manifest.write_text(json.dumps(manifest | {"digest": manifest_digest(manifest)}))
-    world = World.load(open_scene(tmp_path), region=(50, 50, 50, 50))
+    world = World.load(open_scene(tmp_path), region=(50, 50, 50, 50), settings=WorldSettings(**settings))
     world.follow((40050, 750, 40050, 750))
+    assert world.caster.origin[0] == x
     hits = world.caster.cast([40070.0, 700, 5], [[0.0, 1.0, 0.0]])
     np.testing.assert_allclose(hits.range, 65, rtol=0, atol=1e-9)
     assert world.lookup(hits).feature.tolist() == [101]
@@ -205,3 +209,28 @@ def test_actors_stay_when_another_region_is_loaded(scene):
         hits = world.caster.cast([150, 50, 10], DOWN)
         assert hits.range == pytest.approx(8.5)
         assert world.lookup(hits).feature.tolist() == [9]
+
+
+def test_the_origin_of_the_scene_and_the_float64_backend_give_the_same_hits(scene):
+    region = (150, 50, 160, 60)
+    rng = np.random.default_rng(3)
+    eye, way = np.array([150.0, 50.0, 5.0]), rng.normal(size=(2000, 3))
+    near = World.load(scene, region=region, margin=100)
+    for options in ({"settings": WorldSettings(origin="scene")}, {"backend": "float64"}):
+        other = World.load(scene, region=region, margin=100, **options)
+        one, two = near.caster.cast(eye, way), other.caster.cast(eye, way)
+        np.testing.assert_allclose(two.range, one.range, atol=1e-9)
+        np.testing.assert_array_equal(other.lookup(two).feature, near.lookup(one).feature)
+    assert type(other.caster.scene) is Float64Scene
+
+
+def test_tiles_beyond_the_reach_are_not_loaded(scene):
+    region = (50.0, 50.0, 50.0, 50.0)
+    whole, part = (
+        World.load(scene, region=region, margin=300, settings=WorldSettings(reach=reach))
+        for reach in (np.inf, 10)
+    )
+    assert (whole.margin, whole.reach, part.margin, part.reach) == (300, np.inf, 10, 10)
+    far = [[250.0, 50, 30]]
+    assert np.isfinite(whole.caster.cast(far[0], DOWN).range).all()
+    assert np.isinf(part.caster.cast(far[0], DOWN).range).all()

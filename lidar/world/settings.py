@@ -1,0 +1,39 @@
+"""Settings of the world: what of the scene rays can reach, and the origin of its float32 coordinates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+
+from lidar.errors import InputError
+
+ORIGINS = ("near", "scene")
+"""Origins of the float32 coordinates of a caster."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorldSettings:
+    """Settings of the world around the vehicle. The defaults are the whole scene within range.
+
+    origin : of Embree's float32 coordinates, of `ORIGINS`: the point of a grid of 2,048 m near the vehicle,
+             or the scene's origin, from which the margins of faces grow with the distance
+    reach  : metres around the vehicle beyond which no tiles are loaded and nothing is hit; inf: the sensors'
+             maximum range
+    """
+
+    origin: str = "near"
+    reach: float = inf
+
+    def __post_init__(self) -> None:
+        """Validate the settings; one InputError names all faults."""
+        faults = []
+        if self.origin not in ORIGINS:
+            faults.append(f"origin={self.origin}: known are {', '.join(ORIGINS)}")
+        if not self.reach > 0:
+            faults.append(f"reach={self.reach:g}: give metres above 0, or inf")
+        if faults:
+            raise InputError("; ".join(faults))
+
+
+PLAIN = WorldSettings()
+"""The whole scene within range."""
