@@ -44,7 +44,7 @@ _GRACE = 1.5
 _NUMBERS = re.compile(r"-\d+(\.\d*)?(,-?\d+(\.\d*)?)+")
 
 
-def _guard_numbers(words: Sequence[str]) -> list[str]:
+def guard_numbers(words: Sequence[str]) -> list[str]:
     """Put a space before ``-30.1,-51.2``, so that it is not parsed as an option; number parsers ignore it."""
     return [f" {word}" if _NUMBERS.fullmatch(word) else word for word in words]
 
@@ -122,9 +122,10 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
     logging.basicConfig(
         level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
+    logging.getLogger("geoscene.cluster").setLevel(logging.INFO)  # it names the page with the progress
     try:
         with _ended_by_interruptions(app):
-            words = _guard_numbers(sys.argv[1:])
+            words = guard_numbers(sys.argv[1:])
             code = app(words, result_action="return_value", exit_on_error=False, print_error=False)
             sys.stdout.flush()
     except CycloptsError as error:

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
-from geoscene.console import DEFAULTS, Report, command_line, note_new_folder, print_json, progress_bar
+from geoscene.console import (
+    DEFAULTS,
+    FAILURE,
+    Report,
+    command_line,
+    note_new_folder,
+    print_json,
+    progress_bar,
+    whole,
+)
 from geoscene.console import main as run
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
@@ -106,6 +115,56 @@ def drive(
             file=sys.stderr,
         )
     return 0
+
+
+@app.command
+def sweep(
+    file: Path,
+    /,
+    *,
+    out: Out,
+    workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2,
+    scheduler: Annotated[str, Parameter(group=OUTPUT, metavar="ADDRESS")] = "",
+    report: Reporting = Report(),
+) -> int:
+    """Record a grid of drives: every combination of scenes, routes, seeds, rigs or other options.
+
+    The same command resumes an interrupted sweep, and repeats only drives that failed. The bytes depend
+    neither on the number of workers nor on where they are.
+
+    For example:
+
+    lidar sweep sweep.toml -o drives
+
+    Parameters
+    ----------
+    file
+        TOML file with the options of all drives in [drive] and lists of values in [grid].
+    out
+        Directory to write to: a dataset for each drive, and the table sweep.json, also as sweep.csv.
+    workers
+        Processes; each records one drive at a time.
+    scheduler
+        Address of the scheduler of a Dask cluster (tcp://HOST:8786), whose workers record the drives instead;
+        they need the scenes and the output folder under the same paths.
+    """
+    from lidar.sweep import sweep as run_sweep  # noqa: PLC0415
+
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = run_sweep(
+            file, out, workers=workers, scheduler=scheduler, overwrite=report.overwrite, progress=progress
+        )
+    failed = summary.failed
+    if report.json:
+        print_json({"path": str(out), "drives": [asdict(row) for row in summary.rows]})
+    else:
+        points, length = (sum(r.points for r in summary.rows), sum(r.metres for r in summary.rows))
+        done = len(summary.rows) - len(failed)
+        print(f"{out}: {done} of {len(summary.rows)} drives, {length:,.0f} m, {points:,} points")
+    for row in failed:
+        print(f"lidar: {row.name}: {row.error}", file=sys.stderr)
+    return FAILURE if failed else 0
 
 
 @app.command(name="map")

@@ -148,10 +148,14 @@ def _values(text: str, words: Sequence[str], *, known: dict[str, Any]) -> dict[s
 _EXAMPLES = {float: "0.5", Path: "map.net.xml"}
 
 
+_NOT_IN_RECIPE = ("stages", "workers", "scheduler")
+"""Options that the recipe states otherwise, or on which no byte depends."""
+
+
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class DriveOptions:
-    """Options of a drive. The dataset stores them all; its bytes depend on all but ``workers``.
+    """Options of a drive. The dataset stores them; its bytes depend on all but ``workers`` and ``scheduler``.
 
     In Python, ``route`` is ``random``, a path or a list of (latitude, longitude) in degrees, ``settings``
     holds (name, text) pairs and ``traffic`` a `TrafficOptions`, `SumoOptions` or `TrafficFile`.
@@ -241,6 +245,10 @@ class DriveOptions:
     workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2
     """Threads, at most one per core; each records one frame at a time. The bytes do not depend on it."""
 
+    scheduler: Annotated[str, Parameter(group=OUTPUT, metavar="ADDRESS")] = ""
+    """Address of the scheduler of a Dask cluster (tcp://HOST:8786), whose workers record the frames; they
+    need the scene's and the output folder under the same paths. The bytes do not depend on it."""
+
     def __post_init__(self) -> None:
         """Validate the options."""
         if self.duration is not None and not 0.1 <= self.duration <= 86400:
@@ -288,7 +296,8 @@ class DriveOptions:
             and {k: _digested(v) if isinstance(v, Path) else v for k, v in traffic.items()},
         }
         recipe = {"scene": scene.manifest.get("fingerprint", scene.path.name)}
-        recipe |= {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("stages", "workers")}
+        names = [f.name for f in fields(self) if f.name not in _NOT_IN_RECIPE]
+        recipe |= {name: getattr(self, name) for name in names}
         if self.stages:
             resolved["stages"] = [stage.to_json() for stage in self.stages]
         return recipe | resolved

@@ -7,7 +7,7 @@ import shutil
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 from numba.core.event import Event, Listener, install_listener
 
+from geoscene.cluster import Cluster, connected
 from geoscene.errors import GeosceneError
 from geoscene.files import exclusive, write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float
+from lidar.cluster import record_on_cluster
 from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.journal import Journal, read_journal
 from lidar.dataset.layout import Paths, prepare
@@ -77,8 +79,19 @@ def drive(
     Raises InputError (also as RouteError, RigError, DatasetError) for what cannot be driven or written.
     """
     began = time.perf_counter()
-    with install_listener("numba:compile", _CompilationProgress(progress)):
-        return _driven(scene, Path(out), options=options, overwrite=overwrite, progress=progress, began=began)
+    with (
+        install_listener("numba:compile", _CompilationProgress(progress)),
+        connected(options.scheduler) if options.scheduler else nullcontext() as cluster,
+    ):
+        return _driven(
+            scene,
+            Path(out),
+            options=options,
+            overwrite=overwrite,
+            cluster=cluster,
+            progress=progress,
+            began=began,
+        )
 
 
 class _CompilationProgress(Listener):
@@ -97,21 +110,34 @@ class _CompilationProgress(Listener):
 
 
 def _driven(
-    scene: Scene, out: Path, *, options: DriveOptions, overwrite: bool, progress: Progress, began: float
+    scene: Scene,
+    out: Path,
+    *,
+    options: DriveOptions,
+    overwrite: bool,
+    cluster: Cluster | None,
+    progress: Progress,
+    began: float,
 ) -> DriveSummary:
     """Plan and record; ``began`` is the time of the start, seconds."""
     plan = plan_drive(scene, options, progress=progress)
     manifest = plan.manifest()
     prepare(out, manifest["recipe"], overwrite=overwrite)
     with _removed_if_nothing_recorded(out), exclusive(out):
-        recording = _recording(plan, out)
+        recording = plan.recording(out)
         journal = _verified(recording, plan.jobs, progress=progress)
         _write_plan(plan, out, manifest=manifest)
         pending = [job for job in plan.jobs if (job.sensor.name, job.frame) not in journal.entries]
         resumed, before = len(plan.jobs) - len(pending), _points(plan, journal)
-        record_all(
-            recording, pending, scene=scene, journal=journal, workers=options.workers, progress=progress
-        )
+        if cluster is None:
+            record_all(
+                recording, pending, scene=scene, journal=journal, workers=options.workers, progress=progress
+            )
+        else:
+            chunks = _chunks(pending, recording.trajectory)
+            record_on_cluster(
+                plan, recording=recording, chunks=chunks, cluster=cluster, journal=journal, progress=progress
+            )
         points = _points(plan, journal)
         journal.close()
         if plan.actors is not None:
@@ -145,21 +171,6 @@ def _write_plan(plan: DrivePlan, out: Path, *, manifest: dict[str, Any]) -> None
         start=plan.start,
         frames=plan.frames,
         contents=plan.options.contents(),
-    )
-
-
-def _recording(plan: DrivePlan, out: Path) -> Recording:
-    """What the frames of a plan are recorded from."""
-    return Recording(
-        out,
-        plan.scene.frame,
-        trajectory=plan.trajectory,
-        start=plan.start,
-        geo=plan.geo,
-        contents=plan.options.contents(),
-        actors=plan.actors,
-        max_range=plan.max_range,
-        scanning_ns=plan.scanning_ns,
     )
 
 

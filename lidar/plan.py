@@ -15,6 +15,7 @@ from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Ints
 from lidar import __version__
+from lidar.dataset.recording import Recording
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.geometry.poses import Trajectory
@@ -92,6 +93,20 @@ class DrivePlan:
             count[job.sensor.name] += 1
         return count
 
+    def recording(self, out: Path) -> Recording:
+        """What the frames are recorded from."""
+        return Recording(
+            out,
+            self.scene.frame,
+            trajectory=self.trajectory,
+            start=self.start,
+            geo=self.geo,
+            contents=self.options.contents(),
+            actors=self.actors,
+            max_range=self.max_range,
+            scanning_ns=self.scanning_ns,
+        )
+
     def manifest(self) -> dict[str, Any]:
         """Contents of ``dataset.json`` but its counts of points and finished frames."""
         scene, options, frames = self.scene, self.options, self.frames
@@ -130,7 +145,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     start = options.start or solar_start(scene)
     check_start(start, 0)
     rig = load_rig(options.rig)
-    sensors = _sensors(rig, options)
+    sensors = sensors_of(rig, options)
     vehicle = load_vehicle(options.vehicle or rig.vehicle)
     motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
     trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)
@@ -159,7 +174,7 @@ def solar_start(scene: Scene) -> datetime:
     return datetime(2026, 6, 21, 10, tzinfo=UTC) - timedelta(minutes=round(float(lon_deg) * 4))
 
 
-def _sensors(rig: Rig, options: DriveOptions) -> tuple[Scanner | Camera, ...]:
+def sensors_of(rig: Rig, options: DriveOptions) -> tuple[Scanner | Camera, ...]:
     """Scanners and cameras of a rig; raises InputError if it has no sensors, or stages on unknown ones."""
     sensors: tuple[Scanner | Camera, ...] = (*scanners(rig), *cameras(rig))
     if not sensors and not rig.gnss:

@@ -25,12 +25,12 @@ FUZZ_FACTOR = 10
 
 SLOW = frozenset(
     (
-        "test_actors", "test_build", "test_cli", "test_documented_commands", "test_drive",
+        "test_actors", "test_build", "test_cli", "test_cluster", "test_documented_commands", "test_drive",
         "test_ego_drive", "test_elevation", "test_fcd", "test_files",
         "test_flight_planning", "test_interruptions", "test_network", "test_outputs", "test_overture",
         "test_raycast", "test_real", "test_render", "test_roofs",
         "test_scale", "test_sensors", "test_siting", "test_structures",
-        "test_sumo", "test_traffic", "test_view", "test_view_browser",
+        "test_sumo", "test_sweep", "test_traffic", "test_view", "test_view_browser",
     )
 )  # fmt: skip
 """Modules that compile most kernels, build scenes or record drives: most of the time, 40 % of the tests."""

@@ -25,7 +25,7 @@ from lidar.options import DriveOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 APPS = {"geoscene": geoscene.cli.app, "lidar": lidar.cli.app}
-NETWORK = {"--place", "--point", "tiles"}
+NETWORK = {"--place", "--point", "--scheduler", "tiles"}
 BOX = (24.9400, 60.1653, 24.9420, 60.1666)
 RIG = """
 name = "mine"
@@ -87,7 +87,10 @@ def inputs(tmp_path_factory):
     write_overture(folder / "buildings.parquet", rows)
     write_slope(folder / "heights.tif", BOX, rise=0.3)
     stages = (ROOT / "docs" / "stages.md").read_text("utf-8").split("```toml")[1].split("```")[0]
+    sweep = (ROOT / "docs" / "sweeps.md").read_text("utf-8").split("```toml")[1].split("```")[0]
+    sweep = sweep.replace("duration = 20", "duration = 0.2").replace("seed = [1, 2, 3]", "seed = [1]")
     texts = {"track.gpx": ROUTE, "my_rig.toml": RIG, "fcd.xml": TRAFFIC, "stages.toml": stages}
+    texts["sweep.toml"] = sweep
     for name, text in texts.items():
         (folder / name).write_text(text, "utf-8")
     for name in ("scene", "city"):

@@ -1,0 +1,215 @@
+"""Description of a sweep: a TOML file with grids of options, each combination of which is a drive."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from cyclopts import App, CycloptsError
+
+from geoscene.console import DEFAULTS, guard_numbers
+from geoscene.errors import GeosceneError, reading
+from geoscene.scene import open_scene
+from geoscene.scene.layout import SceneFiles
+from lidar.errors import InputError, LidarError
+from lidar.options import DriveOptions
+from lidar.plan import sensors_of
+from lidar.rig.specs import load_rig
+from lidar.rig.vehicle import load_vehicle
+from lidar.time_scales import check_start
+from lidar.traffic.fcd import TrafficFile
+
+_REPEATED = ("set", "stage")
+"""Options of which each value is given by a flag of its own."""
+
+_JOINED = ("format", "labels")
+"""Options whose values are separated by commas."""
+
+_OF_THE_SWEEP = ("out", "workers", "scheduler", "overwrite", "json", "quiet")
+"""Options of the command, not of a drive."""
+
+_LONGEST = 32
+"""Characters of a value in the name of a folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class GridDrive:
+    """One drive of a sweep.
+
+    name    : of its folder: the values of the grid's options
+    scene   : directory of the scene
+    values  : options of the grid as text, by name
+    options : of the drive; their paths are absolute, as workers may have another current folder
+    """
+
+    name: str
+    scene: Path
+    values: dict[str, str]
+    options: DriveOptions
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Files that it reads, but those within the scene."""
+        options = self.options
+        named: list[object] = [options.route, options.survey, options.rig, options.vehicle]
+        if isinstance(options.traffic, TrafficFile):
+            named += [options.traffic.path, options.traffic.net]
+        paths = [Path(name) for name in named if isinstance(name, str | Path)]
+        return [SceneFiles(self.scene).manifest, *(path for path in paths if path.is_file())]
+
+
+def read_grid(path: Path) -> list[GridDrive]:
+    """The drives that a file describes, in its order.
+
+    Table ``drive`` holds options of all drives. Table ``grid``, or each table ``[[grid]]``, holds lists,
+    whose combinations are the drives. Names are those of the flags of ``lidar drive``, and ``scene``.
+
+    Raises InputError, which names the drive, for anything that can be known before the drive starts.
+    """
+    with reading(path, InputError, remedy="give a TOML file with a table [grid]", known=InputError):
+        document = tomllib.loads(path.read_text("utf-8"))
+    if unknown := sorted(set(document) - {"drive", "grid"}):
+        raise InputError(f"{path}: unknown {unknown[0]}; there are the tables drive and grid")
+    common, grids = document.get("drive", {}), document.get("grid", {})
+    grids = grids if isinstance(grids, list) else [grids]
+    if not isinstance(common, dict) or not all(isinstance(grid, dict) for grid in grids):
+        raise InputError(f"{path}: drive and grid are tables, as in [grid]")
+    if not grids:
+        raise InputError(f"{path}: no drives; add a table [grid]")
+    drives: dict[str, GridDrive] = {}
+    for grid in grids:
+        _check_keys(path, common, grid=grid)
+        for values in itertools.product(*grid.values()):
+            drive = _drive(path, common, grid=dict(zip(grid, values, strict=True)))
+            if drive.name in drives:
+                raise InputError(f"{path}: drive {drive.name} is in it twice")
+            drives[drive.name] = drive
+    for scene in dict.fromkeys(drive.scene for drive in drives.values()):
+        with _naming(path, "scene"):
+            open_scene(scene)
+    return list(drives.values())
+
+
+def _check_keys(path: Path, common: Mapping[str, Any], *, grid: Mapping[str, Any]) -> None:
+    """Raise InputError for options in the wrong place."""
+    for name, values in grid.items():
+        if not isinstance(values, list) or not values:
+            raise InputError(f"{path}: {name} in the grid: give a list of values, as in {name} = [1, 2]")
+        if name in common:
+            raise InputError(f"{path}: {name} is in both drive and grid; keep one of them")
+    for name in (*common, *grid):
+        if name in _OF_THE_SWEEP:
+            raise InputError(f"{path}: {name} is an option of lidar sweep, not of its drives")
+    if "scene" not in common and "scene" not in grid:
+        raise InputError(f'{path}: no scene; add scene = ["DIRECTORY"] to the grid')
+
+
+def _drive(path: Path, common: Mapping[str, Any], *, grid: Mapping[str, Any]) -> GridDrive:
+    """The drive of one combination of values."""
+    texts = {name: _text(value) for name, value in grid.items()}
+    name = "_".join(f"{key}-{_slug(text)}" if key != "scene" else _slug(text) for key, text in texts.items())
+    name = name or "drive"
+    with _naming(path, f"drive {name}"):
+        values = {**common, **grid}
+        scene = values.pop("scene")
+        if not isinstance(scene, str):
+            raise InputError("scene: give a directory")
+        words = [word for key, value in values.items() for word in _words(key, value)]
+        options = _parsed(words)
+        _check(options)
+        options = _with_absolute_paths(options)
+    return GridDrive(name, Path(scene).absolute(), texts, options)
+
+
+@contextmanager
+def _naming(path: Path, what: str) -> Iterator[None]:
+    """Raise errors of the block as InputErrors that name the file and what in it has the error."""
+    try:
+        yield
+    except (CycloptsError, LidarError, GeosceneError, OSError) as error:
+        raise InputError(f"{path}: {what}: {str(error).rstrip('.')}") from error
+
+
+def _text(value: Any) -> str:
+    """A value of the grid as one text."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _slug(text: str) -> str:
+    """A text as part of a folder's name; with a digest if characters are replaced or cut off."""
+    if not text:
+        return "none"
+    plain = re.sub(r"[^\w.=+-]+", "-", text.rsplit("/", 1)[-1]).lstrip(".")[:_LONGEST]
+    if plain == text:
+        return plain
+    return f"{plain}-{hashlib.blake2b(text.encode(), digest_size=3).hexdigest()}"
+
+
+def _words(key: str, value: Any) -> list[str]:
+    """An option and its value as on the command line of ``lidar drive``."""
+    flag = f"--{key.replace('_', '-')}"
+    if isinstance(value, dict):
+        raise InputError(f"{key}: give a text, a number or a list")
+    if isinstance(value, bool) and key != "traffic":
+        return [flag] * value
+    if not isinstance(value, list):
+        return [flag, _text(value)] if value != "" else []
+    if key in _REPEATED:
+        return [word for item in value for word in (flag, str(item))]
+    if key in _JOINED:
+        return [flag, ",".join(map(str, value))] if value else []
+    return [flag, *map(str, value)]
+
+
+def _parsed(words: list[str]) -> DriveOptions:
+    """Options from words of a command line."""
+    app = App(default_parameter=DEFAULTS, help_flags=(), version_flags=())
+
+    @app.default
+    def options_of(*, options: DriveOptions | None = None) -> DriveOptions:
+        return options or DriveOptions()
+
+    parsed: DriveOptions = app(
+        guard_numbers(words), result_action="return_value", exit_on_error=False, print_error=False
+    )
+    return parsed
+
+
+def _check(options: DriveOptions) -> None:
+    """Raise InputError for what the drive would refuse, but for the route's course."""
+    if bool(options.route) == bool(options.survey):
+        raise InputError("give one of `route` and `survey`, such as `route` random")
+    rig = load_rig(options.rig)
+    sensors_of(rig, options)
+    load_vehicle(options.vehicle or rig.vehicle)
+    if options.start is not None:
+        check_start(options.start, 0)
+    files = [options.route] if isinstance(options.route, Path) else []
+    files += [options.traffic.path] if isinstance(options.traffic, TrafficFile) else []
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"{file}: no such file")
+
+
+def _with_absolute_paths(options: DriveOptions) -> DriveOptions:
+    """Options in which files are named by absolute paths."""
+    changed: dict[str, Any] = {}
+    for name in ("route", "survey", "rig", "vehicle"):
+        value = getattr(options, name)
+        if isinstance(value, str | Path) and str(value) and Path(value).is_file():
+            changed[name] = type(value)(Path(value).absolute())
+    if isinstance(options.traffic, TrafficFile):
+        net = options.traffic.net
+        changed["traffic"] = replace(
+            options.traffic, path=options.traffic.path.absolute(), net=net and net.absolute()
+        )
+    return replace(options, **changed)

@@ -1,0 +1,209 @@
+"""Runs the drives of a sweep, each in a folder of its own, and writes a table of their states."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geoscene.cluster import Cluster, connected
+from geoscene.errors import GeosceneError
+from geoscene.files import digest_of, exclusive, write_columns, write_json
+from geoscene.processes import run_tasks
+from geoscene.progress import Progress, silent
+from geoscene.scene import open_scene
+from geoscene.scene.layout import using
+from lidar import __version__
+from lidar.dataset.journal import read_journal
+from lidar.dataset.layout import Paths
+from lidar.errors import InputError, LidarError
+from lidar.pipeline import drive
+from lidar.sweep.grid import GridDrive, read_grid
+
+log = logging.getLogger(__name__)
+
+_TABLE = "sweep.json"
+_SECONDS = 2.0
+"""Between two updates of the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class DriveRow:
+    """One drive in the table of a sweep.
+
+    name    : of its folder
+    state   : waiting, done or failed
+    error   : why it failed, one line
+    frames  : of all sensors
+    points  : of all scanners
+    seconds : of simulated time
+    metres  : driven
+    digest  : of the journal, hence of all frames
+    """
+
+    name: str
+    state: str = "waiting"
+    error: str = ""
+    frames: int = 0
+    points: int = 0
+    seconds: float = 0.0
+    metres: float = 0.0
+    digest: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepSummary:
+    """A sweep that has ended.
+
+    path : its folder
+    rows : of the drives, in the order of the grid
+    """
+
+    path: Path
+    rows: tuple[DriveRow, ...]
+
+    @property
+    def failed(self) -> list[DriveRow]:
+        """The drives that failed."""
+        return [row for row in self.rows if row.state == "failed"]
+
+
+def sweep(
+    file: str | Path,
+    out: str | Path,
+    *,
+    workers: int = 1,
+    scheduler: str = "",
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> SweepSummary:
+    """Record all drives of a grid; finished ones of the same options are verified and kept.
+
+    Folder ``out`` gets a dataset for each drive, ``sweep.json`` and ``sweep.csv``. A drive that fails is a
+    row with the reason, and the others go on. The bytes depend neither on ``workers`` nor on ``scheduler``.
+
+    file      : TOML file, see `lidar.sweep.grid.read_grid`
+    workers   : processes, each of which records a drive at a time
+    scheduler : address of a Dask scheduler, whose workers record the drives instead
+
+    Raises InputError for a file with an error, before the first drive starts.
+    """
+    if not 1 <= workers <= 256:
+        raise InputError(f"`workers` {workers}: give 1 to 256")
+    folder = Path(out)
+    drives = read_grid(Path(file))
+    if folder.exists() and not (folder.is_dir() and (_is_sweep(folder) or not any(folder.iterdir()))):
+        raise InputError(f"{folder}: is not empty and no sweep; give another directory")
+    with connected(scheduler) if scheduler else nullcontext() as cluster, exclusive(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        threads = 1 if cluster else max(workers // len(drives), 1)
+        tasks = [
+            _Task(row, drive, folder.absolute(), threads, overwrite=overwrite)
+            for row, drive in enumerate(drives)
+        ]
+        if cluster is not None:
+            inputs = dict.fromkeys(path for drive in drives for path in drive.inputs)
+            cluster.check(folder.absolute(), inputs=list(inputs))
+        with _table(folder, Path(file), drives=drives) as table:
+            progress("drives", 0, total=len(tasks))
+            for done, (row, result) in enumerate(_results(tasks, workers=workers, cluster=cluster), 1):
+                table.set(row, result)
+                progress("drives", done, total=len(tasks))
+    return SweepSummary(folder, tuple(table.rows))
+
+
+def _is_sweep(folder: Path) -> bool:
+    return (folder / _TABLE).is_file()
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """One drive to record: its row in the table, the folder of the sweep, and the threads to use."""
+
+    row: int
+    drive: GridDrive
+    folder: Path
+    threads: int
+    overwrite: bool
+
+
+def _results(
+    tasks: Sequence[_Task], *, workers: int, cluster: Cluster | None
+) -> Iterator[tuple[int, DriveRow]]:
+    """Rows of the table as the drives end, with their numbers."""
+    if cluster is not None:
+        return cluster.run_tasks(_recorded, tasks)
+    return run_tasks(_recorded, tasks, workers=workers)
+
+
+def _recorded(task: _Task) -> tuple[int, DriveRow]:
+    """Record a drive; its row of the table. Run by workers."""
+    name, out = task.drive.name, task.folder / task.drive.name
+    options = replace(task.drive.options, workers=task.threads)
+    try:
+        with using(open_scene(task.drive.scene), known=LidarError) as scene:
+            done = drive(scene, out, options=options, overwrite=task.overwrite)
+    except (GeosceneError, LidarError, OSError) as error:
+        return task.row, DriveRow(name, "failed", " ".join(str(error).split()))
+    except Exception as error:  # one drive's defect must not end the others
+        log.exception("drive %s", name)
+        return task.row, DriveRow(name, "failed", " ".join(f"{type(error).__name__}: {error}".split()))
+    return task.row, DriveRow(
+        name,
+        "done",
+        frames=len(read_journal(Paths(out).journal)),
+        points=sum(done.points.values()),
+        seconds=done.duration,
+        metres=round(done.length, 3),
+        digest=digest_of(Paths(out).journal),
+    )
+
+
+class _Table:
+    """The files ``sweep.json`` and ``sweep.csv`` of a sweep."""
+
+    def __init__(self, folder: Path, file: Path, *, drives: Sequence[GridDrive]) -> None:
+        self.rows = [DriveRow(drive.name) for drive in drives]
+        self._folder, self._file, self._drives = folder, file, drives
+        self._written = 0.0
+
+    def set(self, row: int, result: DriveRow) -> None:
+        """Set a row; the files follow within seconds, while rows are set."""
+        self.rows[row] = result
+        if time.monotonic() - self._written > _SECONDS:
+            self.write()
+
+    def write(self) -> None:
+        """Write the files."""
+        documents: list[dict[str, Any]] = [
+            {**asdict(row), "options": drive.values}
+            for row, drive in zip(self.rows, self._drives, strict=True)
+        ]
+        generator = f"geoscene lidar {__version__}"
+        write_json(
+            self._folder / _TABLE,
+            {"schema": 1, "generator": generator, "grid": self._file.name, "drives": documents},
+        )
+        names = list(dict.fromkeys(name for drive in self._drives for name in drive.values))
+        columns = {name: [drive.values.get(name, "") for drive in self._drives] for name in names}
+        figures = {name: [row[name] for row in map(asdict, self.rows)] for name in asdict(self.rows[0])}
+        clash = {f"option {name}" if name in figures else name: values for name, values in columns.items()}
+        write_columns(self._folder / "sweep.csv", {k: np.array(v) for k, v in (figures | clash).items()})
+        self._written = time.monotonic()
+
+
+@contextmanager
+def _table(folder: Path, file: Path, *, drives: Sequence[GridDrive]) -> Iterator[_Table]:
+    """Yield the table of a sweep, written at the start and at the end, however that comes."""
+    table = _Table(folder, file, drives=drives)
+    table.write()
+    try:
+        yield table
+    finally:
+        table.write()

@@ -1,0 +1,139 @@
+"""Sweeps: grids of drives, their table, resuming, and drives that fail."""
+
+import csv
+import json
+
+import pytest
+from helpers.programs import run_program
+from helpers.scenes import same_files
+
+from lidar.dataset.layout import open_dataset
+from lidar.errors import InputError
+from lidar.sweep import sweep
+from lidar.sweep.grid import read_grid
+
+NOWHERE = '["0,0", "0,0.001"]'
+
+
+def written(path, scene, *, grid="seed = [1, 2]", drive="", table="[grid]"):
+    """A file with a grid of short drives through a scene."""
+    common = 'route = "random"' * ("route" not in grid + drive)
+    path.write_text(
+        f'[drive]\nrig = "vlp16"\nduration = 0.3\nformat = ["pcd"]\n{common}\n{drive}\n'
+        f'{table}\nscene = ["{scene.path}"]\n{grid}\n',
+        "utf-8",
+    )
+    return path
+
+
+@pytest.fixture(scope="module")
+def recorded(scene, tmp_path_factory):
+    """A grid of four drives, recorded by one process."""
+    folder = tmp_path_factory.mktemp("sweep")
+    file = written(folder / "grid.toml", scene, grid='seed = [1, 2]\nset = [[], ["rays=3"]]')
+    return file, sweep(file, folder / "out")
+
+
+def test_every_combination_is_a_dataset_with_its_row_in_both_tables(recorded):
+    _, summary = recorded
+    rows = json.loads((summary.path / "sweep.json").read_text())["drives"]
+    with (summary.path / "sweep.csv").open() as file:
+        assert [row["name"] for row in csv.DictReader(file)] == [row["name"] for row in rows]
+    assert [row["options"]["seed"] for row in rows] == ["1", "1", "2", "2"]
+    assert [row["options"]["set"] for row in rows] == ["", "rays=3"] * 2
+    for row in rows:
+        recipe = open_dataset(summary.path / row["name"]).manifest["recipe"]
+        assert (row["state"], row["frames"]) == ("done", 3)
+        assert str(recipe["seed"]) == row["options"]["seed"]
+        assert recipe["settings"] == ([["rays", "3"]] if row["options"]["set"] else [])
+    assert len({row["digest"] for row in rows}) == 4
+
+
+def test_bytes_do_not_depend_on_the_number_of_processes(recorded, tmp_path):
+    file, summary = recorded
+    sweep(file, tmp_path / "out", workers=2)
+    same_files(summary.path, tmp_path / "out")
+
+
+def test_repeated_sweep_keeps_finished_drives_and_mends_the_others(scene, tmp_path):
+    file = written(tmp_path / "grid.toml", scene)
+    first = sweep(file, tmp_path / "out")
+    clouds = sorted((tmp_path / "out").glob("*/*/pcd/*.pcd"))
+    bytes_before = [path.read_bytes() for path in clouds]
+    times = [path.stat().st_mtime_ns for path in clouds]
+    clouds[0].write_bytes(b"")
+    again = sweep(written(file, scene, grid="seed = [1, 2, 3]"), tmp_path / "out")
+    assert again.rows[:2] == first.rows
+    assert [row.state for row in again.rows] == ["done"] * 3
+    assert [path.read_bytes() for path in clouds] == bytes_before
+    assert [path.stat().st_mtime_ns for path in clouds][1:] == times[1:]
+
+
+def test_a_failed_drive_is_a_row_and_the_others_go_on(scene, tmp_path):
+    file = written(tmp_path / "grid.toml", scene, grid=f'route = [{NOWHERE}, "random"]')
+    done = run_program("lidar", "sweep", file, "-o", tmp_path / "out")
+    failed, kept = json.loads((tmp_path / "out" / "sweep.json").read_text())["drives"]
+    assert (failed["state"], kept["state"]) == ("failed", "done")
+    assert failed["error"]
+    assert done.returncode == 1
+    assert f"{failed['name']}: {failed['error']}" in done.stderr
+    assert "1 of 2 drives" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"grid": "seed = [1, -1]"}, "drive .*seed--1.*seed"),
+        ({"grid": "colour = [1]"}, "colour"),
+        ({"grid": 'rig = ["vlp16"]'}, "rig is in both"),
+        ({"grid": "seed = 1"}, "seed in the grid: give a list"),
+        ({"grid": "seed = []"}, "seed in the grid: give a list"),
+        ({"grid": "seed = [1, 1]"}, "seed-1 is in it twice"),
+        ({"grid": 'set = ["beams=3"]'}, "beams"),
+        ({"grid": "workers = [1, 2]"}, "workers is an option of lidar sweep"),
+        ({"grid": 'route = ["absent.gpx"]'}, "absent.gpx: no such file"),
+        ({"grid": "seed = [1", "table": "[grid]"}, "damaged"),
+        ({"grid": "seed = [1]", "table": "[grids]"}, "unknown grids"),
+        ({"grid": 'vehicle = ["spaceship"]'}, "spaceship"),
+        ({"grid": 'stage = ["dropped_packets:sensor=rear"]'}, "rear"),
+    ],
+)
+def test_errors_of_the_grid_are_found_before_the_first_drive(scene, tmp_path, changes, message):
+    file = written(tmp_path / "grid.toml", scene, **changes)
+    with pytest.raises(InputError, match=message):
+        sweep(file, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scene_that_is_not_there_is_found_before_the_first_drive(scene, tmp_path):
+    file = written(tmp_path / "grid.toml", scene)
+    file.write_text(file.read_text().replace("scene = [", f'scene = ["{tmp_path}/absent", '))
+    with pytest.raises(InputError, match="absent"):
+        sweep(file, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_other_files_is_refused(scene, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    file = written(tmp_path / "grid.toml", scene)
+    with pytest.raises(InputError, match="no sweep"):
+        sweep(file, tmp_path)
+    assert not (tmp_path / "sweep.json").exists()
+
+
+def test_names_are_readable_stable_and_differ(scene, tmp_path):
+    grid = 'route = ["random", ["60.1662,24.9413", "60.1655,24.9405"]]\ntraffic = [false, true]'
+    names = [drive.name for drive in read_grid(written(tmp_path / "grid.toml", scene, grid=grid))]
+    assert len(set(names)) == 4
+    assert names[0].endswith("route-random_traffic-off")
+    more = grid.replace('["random",', '["random", ["60.1655,24.9405", "60.1662,24.9413"],')
+    assert set(names) < {d.name for d in read_grid(written(tmp_path / "grid.toml", scene, grid=more))}
+
+
+def test_several_grids_make_one_job(scene, tmp_path):
+    file = written(tmp_path / "grid.toml", scene, table="[[grid]]")
+    text = f'[[grid]]\nscene = ["{scene.path}"]\nfidelity = ["survey"]\n'
+    file.write_text(file.read_text() + text)
+    drives = read_grid(file)
+    assert [drive.options.seed for drive in drives] == [1, 2, 0]
+    assert [drive.options.fidelity for drive in drives] == ["standard", "standard", "survey"]
