@@ -24,6 +24,7 @@ _SWITCH |= {"off": False, "no": False, "false": False, "0": False}
 _CHOICES: dict[str, Iterable[object]] = {
     "law": INCIDENCE_LAWS,
     "range_noise": scanner_settings.NOISES,
+    "poses": scanner_settings.POSES,
     "precision": PRECISIONS,
     "origin": ORIGINS,
 }

@@ -12,6 +12,9 @@ from lidar.raycast import PRECISIONS
 NOISES = ("none", "constant", "signal")
 """Models of range noise."""
 
+POSES = ("firing", "column", "frame")
+"""Pulses that share the sensor's pose: none, those of a column, all of a frame."""
+
 MOST_RAYS = 999
 """Maximum number of rays per pulse."""
 
@@ -20,7 +23,8 @@ MOST_RAYS = 999
 class ScannerSettings:
     """Settings of the returns. The defaults are a scanner that measures exactly.
 
-    motion       : cast each pulse from the sensor's pose at its own time; off: from the frame's first pose
+    poses        : of `POSES`: pulses have the sensor's pose and time at their own ``firing``, at the first
+                   pulse of their ``column`` (block of firings), or at the first of the ``frame``
     precision    : of the ranges of pulses, of `lidar.raycast.PRECISIONS`
     retrace      : trace pulses that miss a second time, as pulses towards a vertex may pass between faces
     law          : incidence law, of `lidar.physics.reflect.INCIDENCE_LAWS`
@@ -44,7 +48,7 @@ class ScannerSettings:
     quantise     : round ranges and intensity codes to the sensor's steps
     """
 
-    motion: bool = True
+    poses: str = "firing"
     precision: str = "exact"
     retrace: bool = True
     law: str = "lambert"
@@ -69,6 +73,8 @@ class ScannerSettings:
     def __post_init__(self) -> None:
         """Validate the settings; one InputError names all faults."""
         faults = []
+        if self.poses not in POSES:
+            faults.append(f"poses={self.poses}: known are {', '.join(POSES)}")
         if self.precision not in PRECISIONS:
             faults.append(f"precision={self.precision}: known are {', '.join(PRECISIONS)}")
         if self.law not in INCIDENCE_LAWS:
@@ -97,7 +103,7 @@ PLAIN = ScannerSettings()
 """Exact ranges, intensity from material and incidence, hard limits of range."""
 
 LEVELS: dict[str, ScannerSettings] = {
-    "draft": ScannerSettings(motion=False),
+    "draft": ScannerSettings(poses="frame"),
     "standard": PLAIN,
     "survey": ScannerSettings(
         law="phong",

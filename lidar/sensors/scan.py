@@ -113,8 +113,8 @@ def cast(
     pulses : (k,) ascending rows of the frame's pulses to send; all by default
     """
     firings = fire(sensor, frame)
-    if not settings.motion:
-        firings = replace(firings, time_ns=np.full_like(firings.time_ns, firings.time_ns[0]))
+    if settings.poses != "firing":
+        firings = replace(firings, time_ns=_pose_times(firings, settings.poses))
     if pulses is not None:
         firings = _only(firings, pulses)
     sent = firings
@@ -136,6 +136,14 @@ def cast(
         away = echoes.range + sensor.pattern.range_offset
         echoes = replace(echoes, apparent=echoes.apparent * transmission(away, settings.extinction))
     return Sweep(sensor, frame, seed, settings, firings, sent, echoes)
+
+
+def _pose_times(firings: Firings, poses: str) -> NDArray[np.int64]:
+    """Times (n,) of the first pulses of the columns or of the frame."""
+    if poses == "frame":
+        return np.full_like(firings.time_ns, firings.time_ns[0])
+    _, first, block = np.unique(firings.column, return_index=True, return_inverse=True)
+    return firings.time_ns[first][block]
 
 
 def _only(firings: Firings, rows: NDArray[np.integer]) -> Firings:

@@ -67,6 +67,7 @@ def test_a_setting_that_scanners_and_cameras_share_changes_both():
         ("standard", [("rays", "many")], "whole number"),
         ("standard", [("shadows", "perhaps")], "on or off"),
         ("standard", [("supersample", "99")], "supersample=99"),
+        ("standard", [("poses", "pulse")], "known are firing, column, frame"),
         ("standard", [("precision", "half")], "known are exact, refined, float32"),
         ("standard", [("origin", "far")], "known are near, scene"),
         ("standard", [("reach", "0")], "reach=0: give metres above 0, or inf"),

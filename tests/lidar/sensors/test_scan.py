@@ -52,11 +52,27 @@ def test_points_of_a_moving_turning_vehicle_lie_on_the_surfaces():
 
 def test_one_pose_per_frame_distorts_the_cloud():
     drive = driven((20.0, 0.0, 0.0), start=(-20, -10, 0))
-    cloud = scan(load_sensor("vlp16"), ROOF, trajectory=drive, world=ROOM, frame=3, settings=LEVELS["draft"])
+    one_pose = ScannerSettings(poses="frame")
+    cloud = scan(load_sensor("vlp16"), ROOF, trajectory=drive, world=ROOM, frame=3, settings=one_pose)
     assert not cloud.time_ns.any()
     late = replace(cloud, time_ns=np.full(len(cloud), 90_000_000, np.int32))
     moved = placed(late, ROOF, drive) - placed(cloud, ROOF, drive)
     assert moved[:, 0] == pytest.approx(1.8, abs=1e-4)
+
+
+def test_one_pose_per_column_is_that_of_its_first_pulse():
+    drive, sensor = driven((20.0, 0.0, 0.0), start=(-20, -10, 0)), load_sensor("vlp16")
+    by_column = ScannerSettings(poses="column")
+    sweep = cast(sensor, ROOF, trajectory=drive, world=ROOM, frame=3, settings=by_column)
+    own, shared = firings(sensor, 3), sweep.firings
+    assert (np.diff(own.column) >= 0).all()
+    late = own.time_ns - shared.time_ns
+    assert 0 == late.min() < late.max() < 55_296
+    assert (np.diff(shared.time_ns)[np.diff(shared.column) == 0] == 0).all()
+    exact = cast(sensor, ROOF, trajectory=drive, world=ROOM, frame=3)
+    _, one, two = np.intersect1d(exact.echoes.pulse, sweep.echoes.pulse, return_indices=True)
+    off = np.abs(exact.echoes.range[one] - sweep.echoes.range[two])
+    assert 0 < np.quantile(off, 0.9) < 20 * 55.296e-6
 
 
 def test_ranges_are_true_metres_where_the_projection_stretches():
@@ -139,7 +155,7 @@ def test_every_setting_changes_the_returns_and_none_is_on_by_default():
         box((3, 3, 0), (3.5, 3.1, 2.5), feature=11, klass=Class.TRAFFIC_SIGN, material="retroreflector"),
     )
     turned = {
-        "motion": False,
+        "poses": "column",
         "law": "oren-nayar",
         "spread": 0.2,
         "link": True,
@@ -159,7 +175,7 @@ def test_every_setting_changes_the_returns_and_none_is_on_by_default():
     assert np.array_equal(plain.range, plain.true_range)
     for name, value in turned.items():
         assert getattr(ScannerSettings(), name) == type(value)() or name in (
-            "motion",
+            "poses",
             "law",
             "rays",
             "range_noise",
