@@ -12,6 +12,7 @@ from cyclopts import App, Parameter
 from geoscene.console import (
     DEFAULTS,
     FAILURE,
+    WORDS,
     Report,
     command_line,
     note_new_folder,
@@ -43,6 +44,8 @@ app = App(
     lidar map drive -o map.laz
 
     lidar rigs, lidar sensors, lidar settings and lidar stages list the choices, lidar classes the codes.
+
+    Accuracy and stability at the extremes on this machine: lidar selftest.
     """,
 )
 app.register_install_completion_command()
@@ -444,6 +447,52 @@ def settings(*, json: JsonFlag = False) -> int:
         "\n--along."
     )
     return 0
+
+
+@app.command
+def selftest(
+    *,
+    only: Annotated[tuple[str, ...], WORDS] = (),
+    full: bool = False,
+    json: JsonFlag = False,
+    markdown: bool = False,
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT)] = False,
+) -> int:
+    """Measure accuracy and stability at the extremes on this machine, against the bounds that must hold.
+
+    Exits with 1 if a bound does not hold.
+
+    For example:
+
+    lidar selftest --only places
+
+    Parameters
+    ----------
+    only
+        Groups of cases: rays, places, footprints, statistics, scale. All by default.
+    full
+        Measure as many samples as in the documentation, up to 100 million a case; takes tens of minutes.
+    json
+        Print the table and the machine as JSON.
+    markdown
+        Print the table as in docs/extremes.md.
+    quiet
+        Show no progress bars.
+    """
+    from lidar.selftest import run as extremes  # noqa: PLC0415
+
+    with progress_bar(quiet=quiet) as progress:
+        done = list(extremes.outcomes(only, full=full, progress=progress))
+    broken = sum(not one.ok for one in done)
+    if json:
+        print_json(extremes.document(done))
+    elif markdown:
+        print(extremes.markdown(done))
+    else:
+        extremes.print_table(done)
+    if broken:
+        print(f"lidar: {broken} of {len(done)} bounds do not hold on this machine", file=sys.stderr)
+    return 1 if broken else 0
 
 
 def main() -> None:

@@ -1,0 +1,18 @@
+"""The table of extremes."""
+
+from __future__ import annotations
+
+from lidar.selftest import footprints, places, rays, scale, statistics
+from lidar.selftest.case import Case
+
+CASES: tuple[Case, ...] = (
+    *rays.CASES,
+    *places.CASES,
+    *footprints.CASES,
+    *statistics.CASES,
+    *scale.CASES,
+)
+"""All cases, by group."""
+
+GROUPS = tuple(dict.fromkeys(case.group for case in CASES))
+"""Names of the groups of cases."""

@@ -1,0 +1,41 @@
+"""Footprints at the extremes: the table's cases, and drawn rings of any kind."""
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidar.selftest.footprints import CASES, built, house
+from lidar.selftest.run import outcome
+
+POINTS = st.tuples(st.floats(-50, 50), st.floats(-50, 50))
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_footprints_stay_within_the_bound(case):
+    done = outcome(case, case.quick)
+    assert done.error == ""
+    assert done.measured <= case.bound
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(POINTS, min_size=3, max_size=9),
+    st.sampled_from(["flat", "gabled", "hipped", "pyramidal", "skillion", "dome"]),
+    st.floats(0, 1e4),
+)
+def test_any_ring_becomes_a_solid_or_is_reported(corners, roof, height):
+    _, verdict, lost = built([house(1, shapely.Polygon(corners), height=f"{height:.6f}", roof__shape=roof)])
+    assert verdict.ok.all()
+    assert lost == 0
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_any_crowd_of_rings_becomes_solids_or_is_reported(seed):
+    rng = np.random.default_rng(seed)
+    rings = rng.uniform(0, 30, (6, 4, 2)).round(int(rng.integers(0, 4)))
+    _, verdict, lost = built([house(k + 1, shapely.Polygon(ring)) for k, ring in enumerate(rings)])
+    assert verdict.ok.all()
+    assert lost == 0

@@ -1,0 +1,33 @@
+"""Places at the extremes: the table's cases, and round trips from anywhere on Earth."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geoscene.frames import Frame, utm_crs
+from lidar.selftest.places import CASES
+from lidar.selftest.run import outcome
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_places_stay_within_the_bound(case):
+    done = outcome(case, case.quick)
+    assert done.error == ""
+    assert done.measured <= case.bound
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.floats(-180, 180), st.floats(-90, 90), st.sampled_from(["local", "utm"]),
+    st.floats(-5e4, 5e4), st.floats(-5e4, 5e4),
+)  # fmt: skip
+def test_points_anywhere_return_to_their_place(lon, lat, crs, x, y):
+    frame = Frame.at(lon, lat, crs=crs)
+    assert np.hypot(*(np.array(frame.from_geographic(*frame.to_geographic(x, y))) - [x, y])) < 1e-6
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(-180, 180), st.floats(-90, 90))
+def test_a_turn_of_longitude_does_not_change_the_zone(lon, lat):
+    assert utm_crs(lon, lat) == utm_crs(lon + 360, lat)
