@@ -3,43 +3,31 @@
 from __future__ import annotations
 
 import glob
-import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
-import numpy as np
-import shapely
-
 from geoscene import __version__
 from geoscene.errors import SourceNotFoundError
 from geoscene.files import digest, digest_of
-from geoscene.ground import tile_span
 from geoscene.manifest import scene_manifest
 from geoscene.objects.shapes import shapes
 from geoscene.options import BuildOptions
-from geoscene.plan import Plan, make_plan
+from geoscene.plan import make_plan
 from geoscene.progress import Progress, silent
 from geoscene.report import Problem
-from geoscene.roadgraph.route_line import route_line
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA
 from geoscene.scene.writer import SceneWriter
 from geoscene.sources import OsmData
 from geoscene.tiles import Keys, TileReport, build_tiles, tiles_document
 
-_OFFSET = 15.0
-"""Metres, maximum distance of a sensor from the centre line of its road."""
-
 _NOT_IN_TILES = frozenset({"name", "along", "reach"})
 """Options on which no tile depends; some select the tiles to build."""
 
 _NOT_IN_GROUND = frozenset({"lod"})
 """Options on which only the solids of buildings depend."""
-
-_CROWN, _ARM = 5.0, 10.0
-"""Metres, maximum horizontal extent of forest trees and of lamps and signals from their position."""
 
 
 def build(
@@ -64,7 +52,7 @@ def build(
     with SceneWriter(Path(out), overwrite=overwrite) as writer:
         plan, problems = make_plan(osm, options, progress=progress)
         keys = _keys(osm, options)
-        tiles = _tiles_along(plan, options)
+        tiles = plan.chosen
         reports: list[TileReport] = []
         for report in build_tiles(
             plan,
@@ -82,6 +70,7 @@ def build(
             frame=plan.frame,
             layers=plan.layers,
             graph=plan.graph,
+            kept=plan.kept,
             shapes=shapes(),
             problems=problems,
             tiles=tiles_document(keys, reports),
@@ -94,33 +83,6 @@ def build(
 
 def _tile_problems(reports: Sequence[TileReport]) -> list[Problem]:
     return [problem for report in sorted(reports, key=lambda r: (r.i, r.j)) for problem in report.problems]
-
-
-def _tiles_along(plan: Plan, options: BuildOptions) -> list[tuple[int, int]]:
-    """Tiles to build: all, or those with a feature or ground within sensor range of the route."""
-    tiles = plan.tiles()
-    if not options.along:
-        return tiles
-    line = route_line(options.along, plan.graph, frame=plan.frame)
-    shapely.prepare(line)
-    reach = options.reach + _OFFSET
-    low = np.array(tiles)
-    high = low + [[tile_span(plan.ground, i, j=j)] for i, j in tiles]
-    squares = shapely.box(*(low * options.tile_size).T, *(high * options.tile_size).T)
-    in_range = set(itertools.compress(tiles, shapely.dwithin(line, squares, reach + _CROWN)))
-    # Features can extend beyond their tile, long walls and bridges by far.
-    buildings = shapely.dwithin(line, plan.buildings.footprint, reach)
-    near = {
-        "buildings": buildings,
-        "parts": buildings,
-        "trees": shapely.dwithin(line, shapely.points(plan.trees.xy), reach + plan.trees.crown / 2),
-        "furniture": shapely.dwithin(line, shapely.points(plan.furniture.xy), reach + _ARM),
-        "barriers": shapely.dwithin(line, plan.barriers.polygon, reach),
-        "structures": shapely.dwithin(line, plan.structures.polygon, reach),
-    }
-    for kind, by_tile in plan.rows.items():
-        in_range |= {tile for tile, rows in by_tile.items() if near[kind][rows].any()}
-    return sorted(in_range)
 
 
 def _keys(osm: OsmData, options: BuildOptions) -> Keys:

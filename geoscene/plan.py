@@ -27,7 +27,6 @@ from geoscene.ground import (
     Layers,
     WaterLevels,
     building_pads,
-    ground_tiles,
     joined,
     landcover,
     plan_ground,
@@ -42,11 +41,13 @@ from geoscene.objects.furniture import Furniture, read_furniture
 from geoscene.objects.vegetation import Trees, clear_of, read_trees
 from geoscene.options import BuildOptions
 from geoscene.progress import Progress
+from geoscene.reach import Reach, all_tiles
 from geoscene.report import Problem
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.driving_side import Side
 from geoscene.roadgraph.driving_side import driving_side as found_side
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, road_surfaces
 from geoscene.scene.geopackage import Layer
 from geoscene.sources import OsmData
@@ -70,6 +71,7 @@ LARGEST_KM2 = 4000.0
 _ROAD_LINES = 10.0  # metres between the lines at which ground graded to roads can bend
 _ROAD_REACH = 25.0  # metres, maximum distance from a centre line of ground that is graded to the road
 _MARGIN = 10.0  # metres of ground added on both sides of maps narrower than twice that
+_ARM = 10.0  # metres, maximum horizontal extent of lamps and signals from their position
 _RAISED = 1.0  # metres, minimum height of an underside for a building to have no pad
 
 
@@ -81,8 +83,8 @@ class Plan:
     terrain   : elevation model, or level ground
     height    : z of the ground at x, y, graded to roads; None if it is 0 everywhere
     buildings : table of buildings and building parts
-    base      : (count,) z of each building's base
-    foot      : (count,) z of the lower end of each building's walls
+    base      : (count,) z of each building's base, NaN for those out of reach of a route
+    foot      : (count,) z of the lower end of each building's walls, as ``base``
     rows      : rows of each tile by kind (``buildings``, ``trees``, ``furniture``, ``barriers``,
                 ``structures``): features whose bounding box has its centre in the tile; ``parts`` are in the
                 tiles of their buildings
@@ -95,6 +97,8 @@ class Plan:
     structures : bridges and tunnels
     openings  : area of each structure where the ground is left out, None for most
     layers    : feature tables in the order of feature numbers
+    chosen    : tiles to build, sorted: all, or those in reach of a route
+    kept      : rows of each of ``layers`` that tables on disk hold, None for all
     """
 
     frame: Frame
@@ -115,15 +119,13 @@ class Plan:
     structures: Structures
     openings: NDArray[np.object_]
     layers: list[Layer]
+    chosen: list[tuple[int, int]]
+    kept: dict[str, NDArray[np.int64]] | None
 
     @property
     def extent(self) -> Bounds:
         """(xmin, ymin, xmax, ymax) of the ground in scene metres."""
         return self.ground.extent
-
-    def tiles(self) -> list[tuple[int, int]]:
-        """Indices (i, j) of all tiles, sorted."""
-        return sorted(set(ground_tiles(self.ground)).union(*self.rows.values()))
 
     def of_tile(self, kind: str, i: int, *, j: int) -> NDArray[np.int64]:
         """Rows of a kind of feature in tile (i, j), ascending."""
@@ -152,7 +154,7 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
     progress("roads", 0, total=0)
     roads = _plan_roads(osm, frame, options=options, terrain=terrain, extent=extent, problems=problems)
     footprints = buildings.footprint[: buildings.count]
-    base = base_heights(footprints, roads.height or terrain.height)
+    reach = Reach.of(options, roads.graph, frame=frame)
 
     progress("ground", 0, total=0)
     cover, surfaces, pads = _collect(
@@ -161,16 +163,45 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
     openings = opening_layers(roads.structures, roads.openings)
     covers = Layers.concatenate([cover, surfaces, pads, openings])
     levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
-    foot = foundation_heights(
-        footprints, base, height=roads.height or terrain.height, layers=covers, levels=levels
-    )
-    buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=roads.structures))
     cover, surfaces = _numbered([cover, surfaces], len(buildings))
     covers = Layers.concatenate([cover, surfaces, pads, openings])
     ground = _plan_ground(covers, roads, extent=extent, terrain=terrain, options=options)
     objects = _collect(problems, _objects(osm, frame, ground=ground, only=options.only, side=roads.side))
     first = len(buildings) + len(cover) + len(surfaces) + len(roads.graph)
     trees, furniture, barriers, structures = _numbered([*objects, roads.structures], first)
+
+    shapes = {
+        "buildings": footprints,
+        "parts": footprints[buildings.outline[buildings.count :]],
+        "trees": shapely.points(trees.xy),
+        "furniture": shapely.points(furniture.xy),
+        "barriers": barriers.polygon,
+        "structures": structures.polygon,
+    }
+    rows = {kind: _by_tile(column, options.tile_size) for kind, column in shapes.items()}
+    rows["parts"] = {tile: buildings.count + parts for tile, parts in rows["parts"].items()}
+    ground = joined(ground, set().union(*rows.values()))
+
+    chosen, kept = all_tiles(ground, rows), None
+    if reach is not None:
+        shapes |= {
+            "buildings": buildings.footprint,
+            "parts": buildings.footprint,
+            "landcover": cover.polygon,
+            "road_surfaces": surfaces.polygon,
+            "roads": edge_lines(roads.graph),
+        }
+        beyond = {"trees": trees.crown / 2, "furniture": _ARM}
+        chosen = reach.tiles(ground, rows=rows, shapes=shapes, beyond=beyond)
+        kept = reach.rows(shapes, tiles=chosen, ground=ground, rows=rows, buildings=buildings)
+    standing = np.arange(buildings.count) if kept is None else kept["buildings"]
+    base, foot = np.full((2, buildings.count), np.nan)
+    z = roads.height or terrain.height
+    base[standing] = base_heights(footprints[standing], z)
+    foot[standing] = foundation_heights(
+        footprints[standing], base[standing], height=z, layers=covers, levels=levels
+    )
+    buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=roads.structures))
 
     layers = [
         *building_layers(buildings, base),
@@ -182,16 +213,6 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
         barrier_layer(barriers),
         structure_layer(structures),
     ]
-    shapes = {
-        "buildings": footprints,
-        "parts": footprints[buildings.outline[buildings.count :]],
-        "trees": shapely.points(trees.xy),
-        "furniture": shapely.points(furniture.xy),
-        "barriers": barriers.polygon,
-        "structures": structures.polygon,
-    }
-    rows = {kind: _by_tile(column, options.tile_size) for kind, column in shapes.items()}
-    rows["parts"] = {tile: buildings.count + parts for tile, parts in rows["parts"].items()}
     plan = Plan(
         frame=frame,
         terrain=terrain,
@@ -202,7 +223,9 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
         rows=rows,
         graph=roads.graph,
         side=(roads.side, roads.side_source),
-        ground=joined(ground, set().union(*rows.values())),
+        ground=ground,
+        chosen=chosen,
+        kept=kept,
         levels=levels,
         trees=trees,
         forests=Forests.of(ground.layers, osm) if "trees" in options.only else None,

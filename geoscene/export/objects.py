@@ -27,14 +27,16 @@ class Features:
 
     starts  : (k,) int64, first feature number of each layer
     layers  : names of the layers, in the same order
-    columns : of each layer, column name to values
-    unique  : (n,) bool, the feature is the only one of its layer with its ``osm_id``
+    numbers : of each layer, (n,) int64 feature numbers, ascending; those of its range, or fewer
+    columns : of each layer, column name to values (n,)
+    unique  : of each layer, (n,) bool, the feature is the only one with its ``osm_id``
     """
 
     starts: Ints
     layers: tuple[str, ...]
+    numbers: tuple[Ints, ...]
     columns: tuple[dict[str, NDArray[Any]], ...]
-    unique: Bools
+    unique: tuple[Bools, ...]
 
     def layer(self, feature: int) -> str:
         """Name of a feature's layer."""
@@ -53,13 +55,13 @@ class Features:
         if feature < 0:
             return BARE
         layer, row = self._row(feature)
-        if self.unique[feature] and self.layers[layer] == "buildings":
+        if self.unique[layer][row] and self.layers[layer] == "buildings":
             return str(self.columns[layer]["osm_id"][row])
         return f"{self.layers[layer]}/{feature}"
 
     def _row(self, feature: int) -> tuple[int, int]:
         layer = int(np.searchsorted(self.starts, feature, side="right")) - 1
-        return layer, feature - int(self.starts[layer])
+        return layer, int(np.searchsorted(self.numbers[layer], feature))
 
 
 def read_features(scene: Scene) -> Features:
@@ -67,15 +69,17 @@ def read_features(scene: Scene) -> Features:
 
     Raises SceneFormatError if the scene lacks a layer that its manifest names.
     """
-    layers = [name for name, (a, b) in sorted(scene.layers.items(), key=lambda item: item[1]) if b > a]
+    ranges = sorted(scene.layers.items(), key=lambda item: item[1])
+    layers = [name for name, _ in ranges if scene.table_length(name)]
     tables = [scene.features(name, geometry="none").columns for name in layers]
     columns = tuple({name: v for name, v in table.items() if name != "feature"} for table in tables)
     starts = np.array([scene.layers[name][0] for name in layers], np.int64)
-    unique = [np.empty(0, np.bool_)]
+    numbers = tuple(table["feature"].astype(np.int64) for table in tables)
+    unique = []
     for layer in columns:
         _, owner, count = np.unique(layer["osm_id"].astype(str), return_inverse=True, return_counts=True)
         unique.append(count[owner] == 1)
-    return Features(starts, tuple(layers), columns, np.concatenate(unique))
+    return Features(starts, tuple(layers), numbers, columns, tuple(unique))
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +187,7 @@ def table_columns(features: Features, *, layer: int, pairs: NDArray[np.integer])
     pairs : (n, 2) feature number and `Class` code: a building and its pad are one feature of two classes
     """
     feature, klass = pairs.T
-    rows = feature - features.starts[layer]
+    rows = np.searchsorted(features.numbers[layer], feature)
     names = np.array([klass_name(code) for code in klass.tolist()], object)
     attributes = {name: values[rows] for name, values in features.columns[layer].items()}
     return {"feature": feature.astype(np.int32), "class": names, **attributes}

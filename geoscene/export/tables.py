@@ -46,7 +46,8 @@ def chosen_layers(scene: Scene, layers: Collection[str] | None, *, others: Colle
 
     Raises InputError for an unknown name, and if none of the layers to write has features.
     """
-    known = [name for name, (a, b) in sorted(scene.layers.items(), key=lambda item: item[1]) if b > a]
+    ranges = sorted(scene.layers.items(), key=lambda item: item[1])
+    known = [name for name, _ in ranges if scene.table_length(name)]
     if layers is None:
         return [*known, *others]
     if unknown := sorted(set(layers) - {*scene.layers, *others}):
@@ -65,10 +66,9 @@ def kinds_of_columns(scene: Scene, layer: str) -> dict[str, np.dtype[Any]]:
 
 def rows(scene: Scene, layer: str, *, crs: CRS) -> Iterator[Layer]:
     """The features of a layer in order, in chunks."""
-    start, stop = scene.layers[layer]
     same = crs == scene.frame.crs
     several = geometry_type(scene, layer, crs=crs) != scene.schema(layer).geometry_type
-    for first in range(0, stop - start, ROWS):
+    for first in range(0, scene.table_length(layer), ROWS):
         some = scene.features(layer, geometry="projected", rows=range(first, first + ROWS))
         geometry = some.geometry if same else _transformed(scene, some.geometry, crs=crs)
         if crs.is_geographic:
@@ -162,9 +162,12 @@ def solids(scene: Scene) -> Layer:
         np.add.at(faces, row, 1)
         scale = float(scene.frame.scale_at(*(tile.origin[:2] + scene.tile_size / 2).tolist()))
         volume += volumes(corners, owner=row, n=count) / scale**2
+    table = scene.features("buildings", geometry="none").columns
+    osm_id = np.full(count, None, object)
+    osm_id[table["feature"] - first] = table["osm_id"]
     columns: dict[str, NDArray[Any]] = {
         "feature": np.arange(first, stop, dtype=np.int32),
-        "osm_id": scene.features("buildings", geometry="none").columns["osm_id"],
+        "osm_id": osm_id,
         "faces": faces,
         "bottom": bottom,
         "top": top,

@@ -35,11 +35,11 @@ def _reading(
     scene: Scene, names: list[str], *, crs: CRS, stage: str, progress: Progress
 ) -> Iterator[tuple[int, Layer]]:
     """The chunks of all layers, with the number of rows before each."""
-    total = sum(np.subtract(*scene.layers[name][::-1]) for name in names)
+    total = sum(map(scene.table_length, names))
     done = 0
     for name in names:
         for chunk in rows(scene, name, crs=crs):
-            progress(stage, min(done, int(total)), total=int(total))
+            progress(stage, min(done, total), total=total)
             yield done, chunk
             done += len(chunk)
 
@@ -61,7 +61,7 @@ def write_gpkg(
     layers : names to write; default all
     """
     target = target_crs(scene, crs)
-    tables = [SOLIDS] if np.diff(scene.layers.get("buildings", (0, 0)))[0] else []
+    tables = [SOLIDS] if scene.table_length("buildings") else []
     names = chosen_layers(scene, layers, others=tables)
     layers_in_plan = [name for name in names if name != SOLIDS]
     objects = count = faces = 0

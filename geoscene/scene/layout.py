@@ -152,6 +152,16 @@ class Scene:
         """Layer name to its range [start, stop) of feature numbers, in the order of the numbers."""
         return {name: (int(a), int(b)) for name, (a, b) in self.manifest["layers"].items()}
 
+    def table_length(self, layer: str) -> int:
+        """Number of rows of a layer's table, which holds the features within reach of a build's route."""
+        start, stop = self.layers.get(layer, (0, 0))
+        return int(self.manifest.get("cut", {"rows": {}})["rows"].get(layer, stop - start))
+
+    @property
+    def cut_nodes(self) -> Ints:
+        """Ids (n,) of the road graph's nodes from which roads lead that a build along a route left out."""
+        return np.array(self.manifest.get("cut", {"nodes": []})["nodes"], np.int64)
+
     @property
     def left_hand(self) -> bool:
         """Whether traffic keeps left."""

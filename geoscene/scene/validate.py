@@ -57,7 +57,7 @@ def check_scene(scene: Scene) -> dict[str, Any]:
 def _osm_ids(scene: Scene, features: set[int]) -> dict[int, str]:
     out: dict[int, str] = {}
     for name, (start, stop) in scene.layers.items():
-        if features & set(range(start, stop)):
+        if scene.table_length(name) and features & set(range(start, stop)):
             layer = scene.features(name, geometry="none")
             out |= dict(zip(layer.columns["feature"].tolist(), layer.columns["osm_id"].tolist(), strict=True))
     return out

@@ -23,6 +23,7 @@ from geoscene.roadgraph import RoadGraph, write_graphml
 from geoscene.scene.geopackage import Layer, write_geopackage
 from geoscene.scene.layout import SCHEMA, SceneFiles, manifest_digest
 from geoscene.scene.tile_files import write_shapes
+from geoscene.typing import Ints
 
 log = logging.getLogger(__name__)
 
@@ -107,6 +108,7 @@ class SceneWriter:
         frame: Frame,
         layers: Sequence[Layer],
         graph: RoadGraph,
+        kept: Mapping[str, Ints] | None = None,
         shapes: Mapping[str, Mesh],
         problems: Iterable[Problem],
         tiles: Mapping[str, Any],
@@ -116,6 +118,7 @@ class SceneWriter:
 
         layers   : features; the number of a feature is its row, counted through all layers in order
         graph    : the drivable road graph; not written if it has no edges
+        kept     : rows of each layer, ascending, that tables and road graph hold; all by default
         tiles    : the document of tile reports
         manifest : the manifest without frame, layers and codes
         """
@@ -124,12 +127,19 @@ class SceneWriter:
             Layer(layer.name, layer.geometry, {"feature": np.arange(a, b, dtype=np.int32), **layer.columns})
             for layer, a, b in zip(layers, starts[:-1], starts[1:], strict=True)
         ]
+        cut: dict[str, Any] = {}
+        if kept is not None:
+            left_out = np.setdiff1d(np.arange(len(graph)), kept["roads"])
+            onward = graph.node_id[np.unique(graph.tail[left_out])]
+            numbered, graph = _only_kept(numbered, graph, kept=kept)
+            rows = {layer.name: len(layer) for layer in numbered}
+            cut = {"cut": {"rows": rows, "nodes": np.intersect1d(onward, graph.node_id).tolist()}}
         write_geopackage(self.files.features, numbered, frame=frame)
         if len(graph):
             write_graphml(graph, frame, path=self.files.road_graph)
         write_shapes(self.files.shapes, shapes)
-        rows = sorted(problems)
-        columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(Problem)}
+        found = sorted(problems)
+        columns = {f.name: [getattr(row, f.name) for row in found] for f in fields(Problem)}
         write_columns(self.files.problems, columns)
         write_json(self.files.tile_reports, tiles, indent=1)
         self.files.tile_journal.unlink(missing_ok=True)
@@ -140,6 +150,7 @@ class SceneWriter:
             **manifest,
             "frame": frame.to_json(),
             "layers": ranges,
+            **cut,
             "classes": {c.name.lower(): int(c) for c in Class},
             "materials": {name: m.code for name, m in materials().items()},
             "files": {file.name: digest_of(file) for file in tables if file.exists()},
@@ -161,3 +172,19 @@ class SceneWriter:
         with self._lock:
             if not resumable:
                 shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _only_kept(
+    layers: Sequence[Layer], graph: RoadGraph, *, kept: Mapping[str, Ints]
+) -> tuple[list[Layer], RoadGraph]:
+    """Layers and road graph with the kept rows; numbers of edges in the layers are those of the new graph."""
+    edge = np.full(len(graph) + 1, -1, np.int32)
+    edge[kept["roads"]] = np.arange(len(kept["roads"]))
+    out = []
+    for layer in layers:
+        rows = kept[layer.name]
+        columns = {name: values[rows] for name, values in layer.columns.items()}
+        if "edge" in columns:
+            columns["edge"] = edge[columns["edge"]]
+        out.append(Layer(layer.name, layer.geometry[rows], columns))
+    return out, graph.take(kept["roads"])

@@ -46,11 +46,11 @@ def buildings_over(
     that end below the road. A bridge counts where its centre line lies within the building, not where its
     edge touches it; footbridges do not count, they lead into buildings.
 
-    base : (count,) z in metres of each building's base
+    base : (count,) z in metres of each building's base, NaN for buildings that are not looked at
     foot : (count,) z in metres of the lower end of its walls
     """
     options = options or StructureOptions()
-    rows = np.flatnonzero(buildings.drawn)
+    rows = np.flatnonzero(buildings.drawn & ~np.isnan(base[buildings.outline]))
     roads = np.flatnonzero(table.tunnel | (table.edge >= 0))
     pair = shapely.STRtree(buildings.footprint[rows]).query(table.polygon[roads], predicate="intersects")
     road, row = roads[pair[0]], rows[pair[1]]

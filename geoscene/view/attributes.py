@@ -24,15 +24,13 @@ def tables(features: Features, present: Bools) -> list[dict[str, Any]]:
     ``words`` and the index of each row's among them (-1 for none).
     """
     out = []
-    for number, (layer, start) in enumerate(zip(features.layers, features.starts.tolist(), strict=True)):
+    for number, layer in enumerate(features.layers):
         columns = features.columns[number]
-        length = len(next(iter(columns.values()), ()))
-        rows = _chosen(
-            layer, columns, own=present[start : start + length], features=features, present=present
-        )
+        own = features.numbers[number]
+        rows = _chosen(layer, columns, own=present[own], features=features, present=present)
         if len(rows):
             encoded = {name: _column(values[rows]) for name, values in columns.items()}
-            out.append({"layer": layer, "feature": (rows + start).tolist(), "columns": encoded})
+            out.append({"layer": layer, "feature": own[rows].tolist(), "columns": encoded})
     return out
 
 
@@ -47,8 +45,7 @@ def _chosen(
     if layer == "roads" and "road_surfaces" in features.layers:
         number = features.layers.index("road_surfaces")
         ids = _text(features.columns[number]["osm_id"])
-        first = int(features.starts[number])
-        known = {way for text in ids[present[first : first + len(ids)]] for way in text.split(";")}
+        known = {way for text in ids[present[features.numbers[number]]] for way in text.split(";")}
         keep |= np.array([not known.isdisjoint(text.split(";")) for text in _text(columns["osm_id"])])
     return np.flatnonzero(keep)
 

@@ -69,7 +69,7 @@ def edges_on_tiles(graph: RoadGraph, scene: Scene) -> NDArray[np.bool_]:
 
 def ground_footprints(scene: Scene) -> NDArray[np.object_]:
     """Footprints (k,) in scene metres of buildings without a passage below."""
-    if "buildings" not in scene.layers or len(set(scene.layers["buildings"])) == 1:
+    if not scene.table_length("buildings"):
         return np.empty(0, object)
     layer = scene.features("buildings")
     low = np.asarray(layer.columns["min_height"], float)

@@ -109,13 +109,15 @@ def junction_plan(graph: RoadGraph, lanes: Lanes, *, seed: int, cycle: float = 6
     """Junctions with fixed-time signals of two groups where the map has signals."""
     zones = zones_of(graph)
     n = len(zones.polygon)
-    axis, signalised = np.zeros(n), np.zeros(n, bool)
+    axis, shift, signalised = np.zeros(n), np.zeros(n), np.zeros(n, bool)
     for z, nodes in enumerate(zones.nodes):
         into = np.isin(graph.head, nodes) & ~np.isin(graph.tail, nodes)
         into = into if into.any() else np.isin(graph.head, nodes)
         axis[z] = np.angle(np.exp(4j * lanes.leave[into]).sum()) / 4
         signalised[z] = bool(graph.signals[nodes].any())
-    shift = generator(seed, "traffic", "signals").uniform(0, cycle, n)
+        if signalised[z]:
+            first = int(graph.node_id[nodes].min())
+            shift[z] = generator(seed, "traffic", "signals", first).uniform(0, cycle)
     return JunctionPlan(zones, axis, signalised, Signals(np.full(n, cycle), shift, np.empty((0, 4))))
 
 

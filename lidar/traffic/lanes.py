@@ -63,11 +63,17 @@ class Lanes:
 
 
 def lanes_of(
-    graph: RoadGraph, *, side: str = "right", bounds: tuple[float, float, float, float] | None = None
+    graph: RoadGraph,
+    *,
+    side: str = "right",
+    bounds: tuple[float, float, float, float] | None = None,
+    cut_nodes: Ints | None = None,
 ) -> Lanes:
     """The lanes of a road graph.
 
-    bounds : (xmin, ymin, xmax, ymax) of the map in scene metres; streets that end near them continue outside
+    bounds    : (xmin, ymin, xmax, ymax) of the map in scene metres; streets that end near them continue
+                outside
+    cut_nodes : ids of nodes from which streets continue that the graph does not have
     """
     layout = graph_lanes(graph)
     single = layout.count == 1
@@ -82,6 +88,8 @@ def lanes_of(
     enter, leave = np.array(ends).reshape(-1, 2).T
     traffic_weight = np.array([_QUIET.get(str(kind), 1.0) for kind in graph.highway])
     leads_out = _at_edge(graph, bounds, end=graph.head, other=graph.tail)
+    if cut_nodes is not None:
+        leads_out |= np.isin(graph.node_id[graph.head], cut_nodes)
     leads_in = _at_edge(graph, bounds, end=graph.tail, other=graph.head)
     straight_on = graph.twin[state[before]] != state[after]
     leads_on = _leading_on(before[straight_on], after[straight_on], leads_out=leads_out[state])
@@ -169,6 +177,12 @@ class ActorPath(Columns):
     lane: Ints
     limit: Float
     scale: float
+
+
+def edge_name(graph: RoadGraph, edge: int) -> str:
+    """Name of an edge that does not depend on the extent of the map, for keys of random numbers."""
+    ends = graph.node_id[[graph.tail[edge], graph.head[edge]]].tolist()
+    return f"{graph.osm_id[edge]} from {ends[0]} to {ends[1]}"
 
 
 def random_lanes(

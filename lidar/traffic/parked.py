@@ -14,7 +14,7 @@ from geoscene.columns import Columns
 from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.random_streams import generator
-from lidar.traffic.lanes import Lanes, lane_shift
+from lidar.traffic.lanes import Lanes, edge_name, lane_shift
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import actor_table, poses_on_ground
 from lidar.traffic.trips import random_shape
@@ -63,7 +63,7 @@ def kerb_spaces(lanes: Lanes, near: NDArray[np.bool_], *, seed: int, share: floa
         slow = g.speed[e] < _FAST and not (g.bridge[e] or g.tunnel[e])
         if not slow or g.length[e] < 15.0 or kind not in (*_QUIET, *_BUSY):
             continue
-        rng = generator(seed, "parked", "kerb", e)
+        rng = generator(seed, "parked", "kerb", edge_name(g, e))
         lane = lane_shift(lanes, e, lane=0, width=1.82)
         # the inner side of a one-way street of several lanes is a median as likely as not
         alone = g.twin[e] < 0 and lanes.count[e] == 1 and kind in _QUIET

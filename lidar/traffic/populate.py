@@ -122,7 +122,7 @@ def traffic_setup(
     scene: Scene, graph: RoadGraph, *, ego: Trajectory, seed: int, options: TrafficOptions
 ) -> TrafficSetup:
     """Trips, junctions and obstacles around an ego trajectory."""
-    lanes = lanes_of(graph, side=options.side, bounds=scene.bounds)
+    lanes = lanes_of(graph, side=options.side, bounds=scene.bounds, cut_nodes=scene.cut_nodes)
     plan = junction_plan(graph, lanes, seed=seed)
     scale = float(np.mean(np.asarray(scene.frame.scale_at(*ego.position[0, :2]), float)))
     area = surroundings_of(lanes, ego, radius=options.radius, scale=scale)

@@ -10,7 +10,7 @@ import shapely
 
 from geoscene.typing import Float
 from lidar.random_streams import generator
-from lidar.traffic.lanes import STEP, ActorPath, Lanes, path_along_lanes, random_lanes
+from lidar.traffic.lanes import STEP, ActorPath, Lanes, edge_name, path_along_lanes, random_lanes
 from lidar.traffic.surroundings import Surroundings, entrances
 from lidar.traffic.sweep import body_poses, rectangles
 from lidar.world.actor_shapes import PAINTS, Shape, catalogue
@@ -137,11 +137,12 @@ def vehicle_trips(
     shares = shares or VEHICLE_SHARES
     graph, weight = lanes.graph, lanes.traffic_weight
     metres = graph.length * lanes.count * area.near * (weight > 0) * np.maximum(weight, 0.05) * lanes.open
-    name = "+".join(shares)
+    used = np.flatnonzero(metres)
+    metres, name = metres[used], "+".join(shares)
     trips: list[Trip | None] = []
     for number in range(round(density * float(metres.sum()) / 1000)):
         rng = generator(seed, "traffic", name, number)
-        edge, at = int(rng.choice(len(metres), p=metres / metres.sum())), rng.random()
+        edge, at = int(rng.choice(used, p=metres / metres.sum())), rng.random()
         where = shapely.line_interpolate_point(area.lines[edge], at, normalized=True)
         spans = area.visits(shapely.get_coordinates(where)[0])
         trips += [
@@ -151,7 +152,7 @@ def vehicle_trips(
     for wave in range(int(area.time[-1] / _WAVE_S)):
         begin = wave * _WAVE_S
         for edge, at in entrances(lanes, area, t=begin):
-            rng = generator(seed, "traffic", name, "wave", wave, edge)
+            rng = generator(seed, "traffic", name, "wave", wave, edge_name(graph, edge))
             rate = (
                 density / 1000 * lanes.count[edge] * max(weight[edge], 0.05) * _MEAN_SPEED * graph.speed[edge]
             )
@@ -191,7 +192,7 @@ def _trip(
     width = shape.width * grow[1]
     if width > lanes.max_width[edge]:
         return None
-    top = min(float(lanes.graph.speed.max()) * 1.1, driver.max_speed)
+    top = min(float(lanes.graph.speed[area.near].max()) * 1.1, driver.max_speed)
     metres = min(top * (span[1] - span[0]), _MAX_LENGTH) + 60.0
     for _ in range(_TRIES):
         edges, picked = random_lanes(

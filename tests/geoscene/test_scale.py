@@ -15,14 +15,18 @@ import shapely
 from helpers.programs import ENVIRONMENT, alive, command
 
 from geoscene.classes import Class
+from geoscene.export import export_scene
 from geoscene.ground import Layers, partition_tile, plan_ground
 from geoscene.options import BuildOptions
-from geoscene.pipeline import _tiles_along, build
+from geoscene.pipeline import build
 from geoscene.plan import make_plan
 from geoscene.progress import silent
+from geoscene.scene.validate import check_scene
 from geoscene.sources import Way, read_osm
+from geoscene.view import view_scene
 from lidar.options import DriveOptions
 from lidar.pipeline import drive
+from lidar.traffic.populate import TrafficOptions
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -136,10 +140,11 @@ def test_long_wall_in_range_adds_its_tile(make_osm, town, tmp_path):
 
 
 def test_bridge_with_an_end_in_range_adds_its_tile(town, tmp_path, monkeypatch):
-    monkeypatch.setattr("geoscene.pipeline._OFFSET", 0.0)
-    monkeypatch.setattr("geoscene.pipeline._CROWN", 0.0)
+    monkeypatch.setattr("geoscene.reach._OFFSET", 0.0)
+    monkeypatch.setattr("geoscene.reach._CROWN", 0.0)
     options = BuildOptions(tile_size=50.0, only=("roads",))
-    plan, _ = make_plan(read_osm(town), options, progress=silent)
+    osm = read_osm(town)
+    plan, _ = make_plan(osm, options, progress=silent)
     found = 0
     for home, rows in plan.rows["structures"].items():
         square = shapely.box(*np.multiply(home, 50.0), *np.add(home, 1) * 50.0)
@@ -149,8 +154,8 @@ def test_bridge_with_an_end_in_range_adds_its_tile(town, tmp_path, monkeypatch):
             end = corners[away.argmax()]
             there = "lon,lat\n{},{}\n".format(*plan.frame.to_geographic(end.x, end.y))
             (tmp_path / "end.csv").write_text(there)
-            options = BuildOptions(tile_size=50.0, along=(str(tmp_path / "end.csv"),), reach=1.0)
-            assert home in _tiles_along(plan, options)
+            along = replace(options, along=(str(tmp_path / "end.csv"),), reach=1.0)
+            assert home in make_plan(osm, along, progress=silent)[0].chosen
             found += 1
     assert found  # a bridge that sticks out of its tile
 
@@ -170,4 +175,70 @@ def test_drive_on_tiles_along_its_route_gives_the_same_bytes(make_osm, town, sce
     drives = [drive(s, tmp_path / s.path.name / "drive", options=words).path for s in (scene, part)]
     clouds = [{p.relative_to(d): p.read_bytes() for p in d.rglob("*.pcd")} for d in drives]
     assert len(clouds[0]) == 20
+    assert clouds[0] == clouds[1]
+
+
+@pytest.fixture(scope="module")
+def part(make_osm, town, tmp_path_factory):
+    lonlat = make_osm.on_globe(np.array([(-300.0, 0.0), (-250.0, 0.0)]))
+    along = tuple(f"{lat},{lon}" for lon, lat in lonlat.tolist())
+    options = BuildOptions(tile_size=100.0, lod=1, along=along, reach=20.0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("geoscene.reach.TABLE_MARGIN", 20.0)
+        return build(read_osm(town), tmp_path_factory.mktemp("part") / "scene", options=options)
+
+
+def test_tables_along_a_route_hold_what_is_in_reach_with_the_numbers_of_the_whole_scene(scene, part):
+    assert part.layers == scene.layers
+    assert sum(p.stat().st_size for p in (part.files.features, part.files.road_graph)) < 0.6 * sum(
+        p.stat().st_size for p in (scene.files.features, scene.files.road_graph)
+    )
+    used = set()
+    for tile in part.tiles():
+        used |= set(tile.mesh.feature.tolist()) | set(tile.instances.feature.tolist())
+    for name, (first, stop) in part.layers.items():
+        if not part.table_length(name):
+            assert used.isdisjoint(range(first, stop))
+            continue
+        whole, some = scene.features(name), part.features(name)
+        rows = some.columns["feature"] - first
+        assert len(rows) == part.table_length(name) <= scene.table_length(name) == stop - first
+        assert set(range(first, stop)) & used <= set(some.columns["feature"].tolist())
+        assert shapely.equals_exact(some.geometry, whole.geometry[rows], tolerance=1e-9).all()
+        for column in set(some.columns) - {"edge"}:
+            np.testing.assert_array_equal(some.columns[column], whole.columns[column][rows])
+    assert part.table_length("buildings") < 0.6 * scene.table_length("buildings")
+
+
+def test_edges_of_structures_along_a_route_are_those_of_its_road_graph(part):
+    structures, graph = part.features("structures"), part.road_graph()
+    roads = part.features("roads")
+    assert len(graph) == len(roads)
+    for osm_id, edge in zip(structures.columns["osm_id"], structures.columns["edge"], strict=True):
+        assert edge < 0 or osm_id in str(graph.osm_id[edge]).split(";")
+
+
+@pytest.mark.parametrize("name", ["a.city.json", "a.glb", "a.gpkg", "a.geojson", "a.ply"])
+def test_scenes_along_a_route_export(part, tmp_path, name):
+    assert export_scene(part, tmp_path / name).objects > 0
+
+
+def test_scenes_along_a_route_have_a_page_and_pass_validation(part, tmp_path):
+    assert view_scene(part, tmp_path / "page.html").objects > 0
+    report = check_scene(part)
+    assert report["solids"] > 0
+    assert not report["broken"]
+
+
+def test_traffic_along_a_route_is_that_of_the_whole_scene(make_osm, town, scene, tmp_path):
+    lonlat = make_osm.on_globe(np.array([(-300.0, 0.0), (-60.0, 0.0)]))
+    along = tuple(f"{lat},{lon}" for lon, lat in lonlat.tolist())
+    options = BuildOptions(tile_size=100.0, lod=1, along=along, reach=100.0)
+    part = build(read_osm(town), tmp_path / "part", options=options)
+    route = tuple((lat, lon) for lon, lat in lonlat.tolist())
+    words = DriveOptions(
+        route=route, rig="vlp16", duration=1.0, formats=("pcd",), traffic=TrafficOptions(radius=100.0)
+    )
+    drives = [drive(s, tmp_path / s.path.name / "drive", options=words).path for s in (scene, part)]
+    clouds = [{p.relative_to(d): p.read_bytes() for p in d.rglob("*.pcd")} for d in drives]
     assert clouds[0] == clouds[1]

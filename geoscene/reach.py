@@ -1,0 +1,117 @@
+"""What a build along a route has: tiles and features within reach of the route."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.buildings import Buildings
+from geoscene.frames import Frame
+from geoscene.ground import GroundPlan, ground_tiles, tile_span
+from geoscene.options import BuildOptions
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.route_line import route_line
+from geoscene.typing import Float, Ints
+
+Tile = tuple[int, int]
+
+TABLE_MARGIN = 250.0
+"""Metres beyond the sensors' reach that tables of features and the road graph hold: the default radius of
+traffic is 200 m."""
+
+_OFFSET = 15.0
+"""Metres, maximum distance of a sensor from the centre line of its road."""
+
+_CROWN = 5.0
+"""Metres, maximum horizontal extent of forest trees from their position."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """Range of the sensors around a route.
+
+    line   : the route as a shapely line or points, scene metres
+    metres : from the line
+    """
+
+    line: Any
+    metres: float
+
+    @classmethod
+    def of(cls, options: BuildOptions, graph: RoadGraph, *, frame: Frame) -> Reach | None:
+        """Reach of the options' route, None without one; raises InputError if the route cannot be used."""
+        if not options.along:
+            return None
+        line = route_line(options.along, graph, frame=frame)
+        shapely.prepare(line)
+        return cls(line, options.reach + _OFFSET)
+
+    def tiles(
+        self,
+        ground: GroundPlan,
+        *,
+        rows: Mapping[str, Mapping[Tile, Ints]],
+        shapes: Mapping[str, NDArray[np.object_]],
+        beyond: Mapping[str, Float | float],
+    ) -> list[Tile]:
+        """Tiles with a feature or ground in reach, sorted.
+
+        rows   : of ``shapes`` in each tile by kind; shapes can extend beyond their tile, long walls and
+                 bridges by far
+        beyond : metres that features extend beyond their shapes, by kind; 0 by default
+        """
+        tiles = all_tiles(ground, rows)
+        boxes = tile_boxes(ground, tiles)
+        chosen = set(itertools.compress(tiles, shapely.dwithin(self.line, boxes, self.metres + _CROWN)))
+        for kind, by_tile in rows.items():
+            near = shapely.dwithin(self.line, shapes[kind], self.metres + beyond.get(kind, 0.0))
+            chosen |= {tile for tile, some in by_tile.items() if near[some].any()}
+        return sorted(chosen)
+
+    def rows(
+        self,
+        shapes: Mapping[str, NDArray[np.object_]],
+        *,
+        tiles: Sequence[Tile],
+        ground: GroundPlan,
+        rows: Mapping[str, Mapping[Tile, Ints]],
+        buildings: Buildings,
+    ) -> dict[str, Ints]:
+        """Rows of each table that are on disk, by layer: near the route, or on the tiles that are built.
+
+        shapes : of all features by kind; those of buildings and parts are rows of ``buildings``
+        """
+        boxes = tile_boxes(ground, tiles)
+        none = np.empty(0, np.int64)
+        kept = {}
+        for kind, geometry in shapes.items():
+            near = shapely.dwithin(self.line, geometry, self.metres + TABLE_MARGIN)
+            near[shapely.STRtree(geometry).query(boxes, predicate="intersects")[1]] = True
+            for tile in tiles:
+                near[rows.get(kind, {}).get(tile, none)] = True
+            kept[kind] = np.flatnonzero(near)
+        outlines = np.unique(buildings.outline[np.concatenate([kept["buildings"], kept.pop("parts")])])
+        of_parts = buildings.outline[buildings.count :]
+        return kept | {
+            "buildings": outlines.astype(np.int64),
+            "building_parts": np.flatnonzero(np.isin(of_parts, outlines)),
+        }
+
+
+def all_tiles(ground: GroundPlan, rows: Mapping[str, Mapping[Tile, Ints]]) -> list[Tile]:
+    """Indices (i, j) of the tiles with ground or features, sorted."""
+    return sorted(set(ground_tiles(ground)).union(*rows.values()))
+
+
+def tile_boxes(ground: GroundPlan, tiles: Sequence[Tile]) -> NDArray[np.object_]:
+    """Squares (t,) of tiles, scene metres."""
+    low = np.array(tiles, float).reshape(-1, 2)
+    high = low + np.array([tile_span(ground, i, j=j) for i, j in tiles])[:, None]
+    boxes: NDArray[np.object_] = shapely.box(*(low * ground.tile_size).T, *(high * ground.tile_size).T)
+    return boxes
