@@ -393,11 +393,11 @@ def _print_scene(report: dict[str, Any]) -> None:
         "roofs": _listed(report["roofs"]),
     }
     if report["options"]["along"]:
-        rows_kept = report["cut"]["rows"]
+        features = max(stop for _, stop in report["layers"].values())
         rows["along"] = (
             f"{len(report['tiles'])} tiles are built, those in range of the route; solids, watertight,"
             " trees in forests and ground count these tiles, all other figures the whole map;"
-            f" tables hold {sum(rows_kept.values())} of {max(b for _, b in report['layers'].values())} features"
+            f" tables hold {sum(report['cut']['rows'].values())} of {features} features"
         )
     print(report["name"] or report["path"])
     for title, text in rows.items():
