@@ -44,7 +44,7 @@ class GridDrive:
     """One drive of a sweep.
 
     name    : of its folder: the values of the grid's options
-    scene   : directory of the scene
+    scene   : directory of a scene, or a map that one is built of
     values  : options of the grid as text, by name
     options : of the drive; their paths are absolute, as workers may have another current folder
     """
@@ -93,7 +93,8 @@ def read_grid(path: Path) -> list[GridDrive]:
             drives[drive.name] = drive
     for scene in dict.fromkeys(drive.scene for drive in drives.values()):
         with _naming(path, "scene"):
-            open_scene(scene)
+            if not scene.is_file():
+                open_scene(scene)
     return list(drives.values())
 
 
@@ -120,7 +121,7 @@ def _drive(path: Path, common: Mapping[str, Any], *, grid: Mapping[str, Any]) ->
         values = {**common, **grid}
         scene = values.pop("scene")
         if not isinstance(scene, str):
-            raise InputError("scene: give a directory")
+            raise InputError("scene: give the directory of a scene, or a map")
         words = [word for key, value in values.items() for word in _words(key, value)]
         options = _parsed(words)
         _check(options)

@@ -13,12 +13,15 @@ from typing import Any
 import numpy as np
 
 from geoscene.cluster import Cluster, connected
-from geoscene.errors import GeosceneError
+from geoscene.errors import GeosceneError, WorkersLostError
 from geoscene.files import digest_of, exclusive, write_columns, write_json
+from geoscene.options import BuildOptions
+from geoscene.pipeline import build
 from geoscene.processes import run_tasks
 from geoscene.progress import Progress, silent
 from geoscene.scene import open_scene
 from geoscene.scene.layout import using
+from geoscene.sources import read_osm
 from lidar import __version__
 from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Paths
@@ -102,20 +105,43 @@ def sweep(
         raise InputError(f"{folder}: is not empty and no sweep; give another directory")
     with connected(scheduler) if scheduler else nullcontext() as cluster, exclusive(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        threads = 1 if cluster else max(workers // len(drives), 1)
-        tasks = [
-            _Task(row, drive, folder.absolute(), threads, overwrite=overwrite)
-            for row, drive in enumerate(drives)
-        ]
         if cluster is not None:
-            inputs = dict.fromkeys(path for drive in drives for path in drive.inputs)
+            inputs = dict.fromkeys(path for planned in drives for path in planned.inputs)
             cluster.check(folder.absolute(), inputs=list(inputs))
         with _table(folder, Path(file), drives=drives) as table:
+            drives = _with_scenes(drives, folder.absolute(), workers=workers, progress=progress)
+            threads = 1 if cluster else max(workers // len(drives), 1)
+            tasks = [
+                _Task(row, planned, folder.absolute(), threads, overwrite=overwrite)
+                for row, planned in enumerate(drives)
+            ]
             progress("drives", 0, total=len(tasks))
             for done, (row, result) in enumerate(_results(tasks, workers=workers, cluster=cluster), 1):
                 table.set(row, result)
                 progress("drives", done, total=len(tasks))
     return SweepSummary(folder, tuple(table.rows))
+
+
+def _with_scenes(
+    drives: Sequence[GridDrive], folder: Path, *, workers: int, progress: Progress
+) -> list[GridDrive]:
+    """The drives with scenes in folder ``scenes`` for those of maps; they are built as needed."""
+    scenes: dict[Path, Path] = {}
+    for file in dict.fromkeys(planned.scene for planned in drives if planned.scene.is_file()):
+        name = file.name.split(".")[0]
+        target = folder / "scenes" / name
+        if target in scenes.values():
+            raise InputError(f"scene: two maps are named {name}; rename one of them")
+        build(
+            read_osm(file),
+            target,
+            options=BuildOptions(name=name),
+            overwrite=target.exists(),  # its unchanged tiles are kept
+            workers=workers,
+            progress=progress,
+        )
+        scenes[file] = target
+    return [replace(planned, scene=scenes.get(planned.scene, planned.scene)) for planned in drives]
 
 
 def _is_sweep(folder: Path) -> bool:
@@ -138,8 +164,21 @@ def _results(
 ) -> Iterator[tuple[int, DriveRow]]:
     """Rows of the table as the drives end, with their numbers."""
     if cluster is not None:
-        return cluster.run_tasks(_recorded, tasks)
-    return run_tasks(_recorded, tasks, workers=workers)
+        yield from cluster.run_tasks(_recorded, tasks)
+        return
+    waiting = {task.row: task for task in tasks}
+    try:
+        for row, result in run_tasks(_recorded, tasks, workers=workers):
+            del waiting[row]
+            yield row, result
+    except (
+        WorkersLostError
+    ):  # one at a time needs the least memory, and shows which drives cannot be recorded
+        for task in waiting.values():
+            try:
+                yield from run_tasks(_recorded, [task], workers=1)
+            except WorkersLostError as error:
+                yield task.row, DriveRow(task.drive.name, "failed", str(error))
 
 
 def _recorded(task: _Task) -> tuple[int, DriveRow]:

@@ -2,11 +2,15 @@
 
 import csv
 import json
+import os
+import signal
 
 import pytest
 from helpers.programs import run_program
 from helpers.scenes import same_files
 
+import lidar.sweep.run
+from geoscene.scene import open_scene
 from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError
 from lidar.sweep import sweep
@@ -137,3 +141,33 @@ def test_several_grids_make_one_job(scene, tmp_path):
     drives = read_grid(file)
     assert [drive.options.seed for drive in drives] == [1, 2, 0]
     assert [drive.options.fidelity for drive in drives] == ["standard", "standard", "survey"]
+
+
+def test_a_map_is_built_into_a_scene_that_is_kept(tmp_path):
+    nodes = "".join(f'<node id="{k}" lat="60.16{k}" lon="24.94"/>' for k in range(1, 6))
+    refs = "".join(f'<nd ref="{k}"/>' for k in range(1, 6))
+    way = f'<way id="9">{refs}<tag k="highway" v="residential"/></way>'
+    (tmp_path / "street.osm").write_text(f'<osm version="0.6">{nodes}{way}</osm>', "utf-8")
+    text = '[drive]\nroute = "random"\nrig = "vlp16"\nduration = 0.2\n[grid]\nscene = ["{}"]\nseed = [1]\n'
+    (tmp_path / "grid.toml").write_text(text.format(tmp_path / "street.osm"), "utf-8")
+    first = sweep(tmp_path / "grid.toml", tmp_path / "out")
+    assert [row.state for row in first.rows] == ["done"], first.rows
+    scene = open_scene(tmp_path / "out" / "scenes" / "street")
+    tile = scene.files.tile(*scene.tile_indices[0])
+    before = tile.read_bytes()
+    assert sweep(tmp_path / "grid.toml", tmp_path / "out").rows == first.rows
+    assert tile.read_bytes() == before
+
+
+def test_a_drive_that_kills_its_process_is_a_row_and_the_others_go_on(scene, tmp_path, monkeypatch):
+    recorded = lidar.sweep.run.drive
+
+    def deadly(scene, out, *, options, **more):
+        if options.seed == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return recorded(scene, out, options=options, **more)
+
+    monkeypatch.setattr(lidar.sweep.run, "drive", deadly)
+    rows = sweep(written(tmp_path / "grid.toml", scene), tmp_path / "out").rows
+    assert [row.state for row in rows] == ["failed", "done"]
+    assert "killed by signal 9" in rows[0].error
