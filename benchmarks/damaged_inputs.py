@@ -304,7 +304,7 @@ _DRIVE = _COMMON | {
     "--format": ("pcd", "pcd,laz,kitti", "csv"),
     "--labels": ("nuscenes", "semantickitti"),
     "--deskew": ("start", "end"),
-    "--fidelity": ("draft", "standard", "survey"),
+    "--fidelity": ("standard", "survey"),
     "--set": ("rays=7", "rays=61", "extinction=0.01", "interference=3", "supersample=2", "haze=1",
               "blur=9", "mirrors=on", "daylight_lux=1e5",
               "spread=nan", "rays=-1", "extinction=1e308", "interference=1e9"),

@@ -24,7 +24,7 @@ from lidar.pipeline import drive
 RIGS = {"VLP-16": "vlp16", "HDL-64E": "hdl64e_s3", "OS1-128": "os1_128", "nuScenes": ""}
 """Sensor preset of each rig of one scanner; the nuScenes rig has a scanner and six cameras."""
 
-LEVELS = ("draft", "standard", "survey")
+LEVELS = ("standard", "survey")
 
 
 def rig_of(sensor: str, folder: Path) -> str:

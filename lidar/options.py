@@ -221,8 +221,8 @@ class DriveOptions:
     """Side of the road to drive on, right or left; the scene's by default."""
 
     fidelity: str = "standard"
-    """Level: draft (one pose per frame, exact ranges, no shadows), standard (one per pulse, exact ranges) or
-    survey (beams with a size, several echoes, noise, lost and false returns; image noise)."""
+    """Level: standard (one pose and one ray per pulse, exact ranges) or survey (beams with a size,
+    several echoes, noise, lost and false returns; image noise)."""
 
     traffic: Annotated[
         Traffic | None, Parameter(converter=_traffic, n_tokens=1, accepts_keys=False, metavar="STR")

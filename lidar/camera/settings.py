@@ -72,7 +72,6 @@ PLAIN = CameraSettings()
 """A sharp, clean image."""
 
 LEVELS: dict[str, CameraSettings] = {
-    "draft": CameraSettings(shadows=False, detail=False, blur=1),
     "standard": PLAIN,
     "survey": CameraSettings(supersample=2, blur=9, camera_noise=True),
 }

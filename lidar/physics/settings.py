@@ -103,7 +103,6 @@ PLAIN = ScannerSettings()
 """Exact ranges, intensity from material and incidence, hard limits of range."""
 
 LEVELS: dict[str, ScannerSettings] = {
-    "draft": ScannerSettings(poses="frame"),
     "standard": PLAIN,
     "survey": ScannerSettings(
         law="phong",
