@@ -6,7 +6,6 @@ import csv
 import errno
 import hashlib
 import importlib
-import io
 import json
 import logging
 import os
@@ -14,7 +13,7 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -25,6 +24,9 @@ from numpy.typing import NDArray
 from geoscene.errors import InputError, NotWrittenError
 
 log = logging.getLogger(__name__)
+
+BLOCK_ROWS = 1 << 16
+"""Rows of a table that are formatted at once."""
 
 fcntl = None if sys.platform == "win32" else importlib.import_module("fcntl")
 
@@ -183,11 +185,25 @@ def write_json(path: Path, document: Mapping[str, Any], *, indent: int = 2) -> N
 
 def write_columns(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> None:
     """Write columns as CSV with a header; floats as the shortest text that reads back the same value."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True))
-    write_atomically(path, text.getvalue().encode("utf-8"))
+    arrays = {name: np.asarray(column) for name, column in columns.items()}
+    most = max((len(array) for array in arrays.values()), default=0)
+    write_blocks(
+        path,
+        (
+            {name: array[first : first + BLOCK_ROWS] for name, array in arrays.items()}
+            for first in range(0, max(most, 1), BLOCK_ROWS)
+        ),
+    )
+
+
+def write_blocks(path: Path, blocks: Iterable[Mapping[str, Sequence[Any] | NDArray[Any]]]) -> None:
+    """Write a table that comes in blocks of rows as CSV, as `write_columns` does; memory holds one block."""
+    with atomic_path(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        for number, columns in enumerate(blocks):
+            if not number:
+                writer.writerow(columns)
+            writer.writerows(zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True))
 
 
 @contextmanager

@@ -78,7 +78,7 @@ def record_on_cluster(
     ]
     done, total = 0, sum(len(task.frames) for task in tasks)
     progress("driving", done, total=total)
-    write_atomically(file, pickle.dumps(replace(plan, scene=scene, jobs=())))
+    write_atomically(file, pickle.dumps(replace(plan, scene=scene, jobs=plan.jobs[:0])))
     try:
         for result in cluster.run_tasks(_recorded, tasks):
             for sensor, frame, points, digest in result.frames:

@@ -39,6 +39,9 @@ from lidar.world.thread_worlds import Worlds
 _CHUNK = 200.0
 """Scene metres along each axis that the vehicle may cover before other tiles are loaded."""
 
+_FORGET = 1024
+"""Frames of a sensor after which the memory of a long trajectory is let go."""
+
 
 @dataclass(frozen=True, slots=True)
 class DriveSummary:
@@ -127,7 +130,7 @@ def _driven(
         recording = plan.recording(out)
         journal = _verified(recording, plan.jobs, progress=progress)
         _write_plan(plan, out, manifest=manifest)
-        pending = [job for job in plan.jobs if (job.sensor.name, job.frame) not in journal.entries]
+        pending = plan.jobs.where(lambda job: (job.sensor.name, job.frame) not in journal.entries)
         resumed, before = len(plan.jobs) - len(pending), _points(plan, journal)
         if cluster is None:
             record_all(
@@ -232,6 +235,8 @@ def record_all(
                 if len(running) >= 2 * workers:
                     done += _take(running, finished=wait(running, return_when=FIRST_COMPLETED).done)
                     progress("driving", done, total=len(jobs))
+                if not job.frame % _FORGET:
+                    recording.trajectory.release()
             done += _take(running, finished=wait(running).done)
             progress("driving", done, total=len(jobs))
 
@@ -266,24 +271,23 @@ def _take(running: set[Future[None]], *, finished: set[Future[None]]) -> int:
 
 def _chunks(
     jobs: Sequence[Job], trajectory: Trajectory
-) -> Iterator[tuple[list[Job], tuple[float, float, float, float]]]:
+) -> Iterator[tuple[Sequence[Job], tuple[float, float, float, float]]]:
     """Runs of jobs during which the vehicle stays within a square of `_CHUNK`, with the box it covers."""
-    chunk: list[Job] = []
+    first = 0
     low = high = np.zeros(2)
-    for job in jobs:
+    for row, job in enumerate(jobs):
         span = np.linspace(job.start_ns, job.start_ns + job.sensor.period_ns, 5).astype(np.int64)
         xy = trajectory.at(span).position[:, :2]
         new_low, new_high = xy.min(axis=0), xy.max(axis=0)
-        if chunk:
+        if row > first:
             new_low, new_high = np.minimum(low, new_low), np.maximum(high, new_high)
             if (new_high - new_low).max() > _CHUNK:
-                yield chunk, _box(low, high)
-                chunk = []
+                yield jobs[first:row], _box(low, high)
+                first = row
                 new_low, new_high = xy.min(axis=0), xy.max(axis=0)
-        chunk.append(job)
         low, high = new_low, new_high
-    if chunk:
-        yield chunk, _box(low, high)
+    if len(jobs):
+        yield jobs[first:], _box(low, high)
 
 
 def _box(low: Float, high: Float) -> tuple[float, float, float, float]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.progress import Progress, silent
@@ -18,7 +19,7 @@ from lidar import __version__
 from lidar.dataset.recording import Recording
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference, export_crs
-from lidar.geometry.poses import Trajectory
+from lidar.geometry.poses import Trajectory, blocks_of
 from lidar.options import DriveOptions
 from lidar.planning.flight import Flight
 from lidar.planning.road_drive import RoadPlan, plan_road_drive
@@ -47,6 +48,41 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
+class Jobs(Sequence[Job]):
+    """Frames of several sensors in order of time; a job is made when it is asked for.
+
+    sensors : the sensors
+    order   : (n,) int16, row of each frame's sensor
+    frame   : (n,) int32, number of each frame
+    """
+
+    sensors: tuple[Scanner | Camera, ...]
+    order: NDArray[np.int16]
+    frame: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.frame)
+
+    @overload
+    def __getitem__(self, row: int) -> Job: ...
+    @overload
+    def __getitem__(self, row: slice) -> Jobs: ...
+    def __getitem__(self, row: int | slice) -> Job | Jobs:
+        """A job, or the jobs of some rows."""
+        if isinstance(row, slice):
+            return Jobs(self.sensors, self.order[row], self.frame[row])
+        order, frame = int(self.order[row]), int(self.frame[row])
+        sensor = self.sensors[order]
+        return Job(sensor.frame_start_ns(frame), order, frame, sensor)
+
+    def where(self, keep: Callable[[Job], bool]) -> Jobs:
+        """The jobs for which ``keep`` is true."""
+        mask = np.fromiter(map(keep, self), bool, len(self))
+        return Jobs(self.sensors, self.order[mask], self.frame[mask])
+
+
+@dataclass(frozen=True, slots=True)
 class DrivePlan:
     """All that `drive` records, fixed before the first frame.
 
@@ -71,7 +107,7 @@ class DrivePlan:
     actors: Actors | None
     scanning_ns: Ints | None
     geo: Georeference
-    jobs: tuple[Job, ...]
+    jobs: Jobs
 
     @property
     def max_range(self) -> float:
@@ -81,17 +117,19 @@ class DrivePlan:
     @property
     def length(self) -> float:
         """True metres that the ego vehicle covers."""
-        steps = np.diff(self.trajectory.position, axis=0)
-        steps[:, :2] /= self.trajectory.scale[1:, None]
-        return float(np.linalg.norm(steps, axis=1).sum())
+        metres = 0.0
+        for rows in blocks_of(len(self.trajectory), overlap=1):
+            steps = np.diff(self.trajectory.position[rows], axis=0)
+            steps[:, :2] /= self.trajectory.scale[rows][1:, None]
+            metres += float(np.linalg.norm(steps, axis=1).sum())
+            self.trajectory.release()
+        return metres
 
     @property
     def frames(self) -> dict[str, int]:
         """Number of frames, by sensor."""
-        count = dict.fromkeys((s.name for s in self.sensors), 0)
-        for job in self.jobs:
-            count[job.sensor.name] += 1
-        return count
+        count = np.bincount(self.jobs.order, minlength=len(self.sensors)).tolist()
+        return dict(zip((s.name for s in self.sensors), count, strict=True))
 
     def recording(self, out: Path) -> Recording:
         """What the frames are recorded from."""
@@ -163,7 +201,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
         actors=actors,
         scanning_ns=motion.scanning_ns if isinstance(motion, Flight) else None,
         geo=Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact),
-        jobs=tuple(jobs),
+        jobs=jobs,
     )
 
 
@@ -184,14 +222,17 @@ def sensors_of(rig: Rig, options: DriveOptions) -> tuple[Scanner | Camera, ...]:
     return sensors
 
 
-def schedule(sensors: Sequence[Scanner | Camera], duration_ns: int) -> list[Job]:
+def schedule(sensors: Sequence[Scanner | Camera], duration_ns: int) -> Jobs:
     """Frames of all sensors that end within ``duration_ns``, in order of time."""
-    jobs = [
-        Job(sensor.frame_start_ns(k), i, k, sensor)
-        for i, sensor in enumerate(sensors)
-        for k in range(sensor.frame_count(duration_ns))
+    counts = [sensor.frame_count(duration_ns) for sensor in sensors]
+    starts = [
+        np.fromiter(map(sensor.frame_start_ns, range(count)), np.int64, count)
+        for sensor, count in zip(sensors, counts, strict=True)
     ]
-    return sorted(jobs, key=lambda job: (job.start_ns, job.order, job.frame))
+    order = np.repeat(np.arange(len(counts), dtype=np.int16), counts)
+    frame = np.concatenate([np.empty(0, np.int32), *(np.arange(n, dtype=np.int32) for n in counts)])
+    rows = np.lexsort((frame, order, np.concatenate([np.empty(0, np.int64), *starts])))
+    return Jobs(tuple(sensors), order[rows], frame[rows])
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import write_atomically, write_columns, write_json
+from geoscene.files import BLOCK_ROWS, write_atomically, write_blocks, write_columns, write_json
 from geoscene.frames import Frame
 from geoscene.scene import Scene
 from lidar.dataset.kitti_sequence import write_sequence
@@ -39,9 +39,9 @@ def iso_times(start: datetime, time_ns: NDArray[np.integer]) -> list[str]:
 
 
 def pose_columns(
-    trajectory: Trajectory, frame: Frame, *, start: datetime, time_ns: NDArray[np.integer]
+    trajectory: Trajectory, frame: Frame, *, start: datetime, time_ns: NDArray[np.integer], first: int = 0
 ) -> dict[str, Any]:
-    """Columns of ``poses.csv``: the vehicle at given times.
+    """Columns of ``poses.csv``: the vehicle at given times, of frames from number ``first`` on.
 
     x, y, z in scene metres; alpha, beta, gamma in radians with R = Rz(gamma) Ry(beta) Rx(alpha), scene axes
     from vehicle axes; lon, lat in degrees (WGS 84) and h in metres as the scene's heights.
@@ -52,7 +52,7 @@ def pose_columns(
     lon, lat = frame.to_geographic(x, y)
     return {
         "timestamp": iso_times(start, time_ns),
-        "frame": np.arange(len(time_ns)),
+        "frame": np.arange(first, first + len(time_ns)),
         "x": x,
         "y": y,
         "z": z,
@@ -141,11 +141,23 @@ def write_metadata(
     seed, paths = contents.seed, Paths(out)
     write_json(paths.calibration, calibration(rig, sensors))
     for k, sensor in enumerate(sensors):
-        times = np.array([sensor.frame_start_ns(f) for f in range(frames[sensor.name])], np.int64)
-        stamps: dict[str, Any] = {"frame": np.arange(len(times)), "time_ns": times}
-        write_columns(paths.timestamps(sensor.name), stamps | {"timestamp": iso_times(start, times)})
+        times = np.fromiter(map(sensor.frame_start_ns, range(frames[sensor.name])), np.int64)
+        number = np.arange(len(times))
+        write_blocks(
+            paths.timestamps(sensor.name),
+            (
+                {"frame": number[rows], "time_ns": times[rows], "timestamp": iso_times(start, times[rows])}
+                for rows in _blocks(len(times))
+            ),
+        )
         if k == 0:
-            write_columns(paths.poses, pose_columns(trajectory, scene.frame, start=start, time_ns=times))
+            write_blocks(
+                paths.poses,
+                (
+                    pose_columns(trajectory, scene.frame, start=start, time_ns=times[rows], first=rows.start)
+                    for rows in _blocks(len(times))
+                ),
+            )
         if contents.kitti and isinstance(sensor, Scanner):
             folder, mount = paths.sensor(sensor.name), sensor.spec.mount
             write_sequence(folder, rig, mount=mount, trajectory=trajectory, time_ns=times)
@@ -153,8 +165,23 @@ def write_metadata(
         _write_fixes(paths, scene, spec=receiver, trajectory=trajectory, start=start, seed=seed)
     for unit in rig.imus:
         rows = observe_imu(trajectory, scene.frame, spec=unit, seed=seed)
-        stamped: dict[str, Any] = {"timestamp": iso_times(start, rows.time_ns), **imu_columns(rows)}
-        write_columns(paths.measurements(unit.name), stamped)
+        columns = imu_columns(rows)
+        write_blocks(
+            paths.measurements(unit.name),
+            (
+                {
+                    "timestamp": iso_times(start, rows.time_ns[block]),
+                    **{name: column[block] for name, column in columns.items()},
+                }
+                for block in _blocks(len(rows.time_ns))
+            ),
+        )
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    """Slices of at most `BLOCK_ROWS` rows that cover ``count`` rows; an empty one for none."""
+    for first in range(0, max(count, 1), BLOCK_ROWS):
+        yield slice(first, first + BLOCK_ROWS)
 
 
 def _write_fixes(
@@ -163,8 +190,11 @@ def _write_fixes(
     times = epochs(spec, trajectory.duration_ns)
     antenna, _ = antenna_motion(trajectory, scene.frame, spec=spec, time_ns=times)
 
+    world = World(scene)
+
     def world_at(region: tuple[float, float, float, float]) -> World:
-        return World.load(scene, region=region)
+        world.follow(region)
+        return world
 
     sky = sky_view(
         scene.frame,

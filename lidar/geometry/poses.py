@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+import mmap
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -18,6 +23,43 @@ KNOT_NS = 200_000
 
 At a yaw rate of 1 rad/s the chord deviates from the arc by (2e-4)^2 / 8 = 5e-9 rad.
 """
+
+
+BLOCK_POSES = 1 << 17
+"""Poses of a trajectory that are worked on at once: 22 minutes at 100 Hz."""
+_IN_MEMORY = 1 << 20
+"""Poses up to which a trajectory is kept in memory: three hours at 100 Hz."""
+_RISING = "a trajectory needs two or more poses at increasing times"
+
+
+def blocks_of(count: int, *, overlap: int = 0) -> Iterator[slice]:
+    """Slices that cover ``count`` rows: `BLOCK_POSES` each, and ``overlap`` rows of the next one."""
+    for first in range(0, count, BLOCK_POSES):
+        yield slice(first, min(first + BLOCK_POSES + overlap, count))
+
+
+def _room(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
+    """An array to fill, in memory, or for a long trajectory in a temporary file: see `_release`."""
+    if shape[0] <= _IN_MEMORY:
+        return np.empty(shape, kind)
+    size = math.prod(shape) * kind.itemsize
+    with tempfile.TemporaryFile() as file:
+        if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and a crash when it is written
+            os.posix_fallocate(file.fileno(), 0, size)
+        else:
+            file.truncate(size)
+        return np.frombuffer(mmap.mmap(file.fileno(), size), kind).reshape(shape)
+
+
+def _release(column: NDArray[Any]) -> None:
+    """Let go of the memory of an array of `_room` in a file, which keeps its values."""
+    base: Any = column
+    while isinstance(base, np.ndarray):
+        base = base.base
+    if isinstance(base, memoryview):
+        base = base.obj
+    if isinstance(base, mmap.mmap) and hasattr(base, "madvise"):
+        base.madvise(mmap.MADV_DONTNEED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,10 +122,46 @@ class Trajectory(Columns):
 
     def __post_init__(self) -> None:
         """Check that the trajectory can be interpolated."""
-        if len(self.time_ns) < 2 or (np.diff(self.time_ns) <= 0).any():
-            raise InputError("a trajectory needs two or more poses at increasing times")
-        if not (np.isfinite(self.position).all() and np.isfinite(self.quat_xyzw).all()):
-            raise InputError("a trajectory has poses that are not finite")
+        for rows in blocks_of(len(self.time_ns), overlap=1):
+            if (np.diff(self.time_ns[rows]) <= 0).any():
+                raise InputError(_RISING)
+            if not (np.isfinite(self.position[rows]).all() and np.isfinite(self.quat_xyzw[rows]).all()):
+                raise InputError("a trajectory has poses that are not finite")
+            self.release()
+        if len(self.time_ns) < 2:
+            raise InputError(_RISING)
+
+    @classmethod
+    def gathered(cls, count: int, blocks: Iterable[Trajectory]) -> Trajectory:
+        """The trajectory of ``count`` poses that comes in blocks of rows; a long one is kept in a file."""
+        kinds = {f.name: (np.dtype(np.int64 if f.name == "time_ns" else float)) for f in fields(cls)}
+        shapes = {"position": (count, 3), "quat_xyzw": (count, 4), "velocity": (count, 3)}
+        out = {name: _room(shapes.get(name, (count,)), kind) for name, kind in kinds.items()}
+        first = 0
+        for block in blocks:
+            last = first + len(block)
+            for name, column in block.columns().items():
+                out[name][first:last] = column
+            for column in out.values():
+                _release(column)
+            first = last
+        return cls(**out)
+
+    def release(self) -> None:
+        """Let go of the memory of a trajectory in a file; its rows are read again when needed."""
+        for column in self.columns().values():
+            _release(column)
+
+    def windows(self, time_ns: NDArray[np.int64], *, margin: int) -> Iterator[tuple[slice, Trajectory]]:
+        """Runs of rising times with the part of the trajectory around each, ``margin`` poses wider."""
+        for rows in blocks_of(len(self.time_ns)):
+            last = len(time_ns)
+            if rows.stop < len(self.time_ns):
+                last = int(np.searchsorted(time_ns, self.time_ns[rows.stop]))
+            begin = int(np.searchsorted(time_ns, self.time_ns[rows.start])) if rows.start else 0
+            if last > begin:
+                yield slice(begin, last), self.take(slice(max(rows.start - margin, 0), rows.stop + margin))
+                self.release()
 
     @property
     def duration_ns(self) -> int:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from geoscene.files import write_columns
+from geoscene.files import write_blocks
 from lidar.errors import DatasetError
-from lidar.geometry.poses import Trajectory
+from lidar.geometry.poses import Trajectory, blocks_of
 
 MANIFEST = "dataset.json"
 """Name of a dataset's manifest; its key ``frame`` is the frame of the trajectory beside it."""
@@ -19,9 +22,22 @@ _TRAJECTORY = ("time_ns", "x", "y", "z", "qx", "qy", "qz", "qw", "vx", "vy", "vz
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory as CSV; `read_trajectory` returns exactly the same numbers."""
-    t = trajectory
-    columns = [t.time_ns, *t.position.T, *t.quat_xyzw.T, *t.velocity.T, t.scale]
-    write_columns(path, dict(zip(_TRAJECTORY, columns, strict=True)))
+    write_blocks(path, _rows(trajectory))
+
+
+def _rows(trajectory: Trajectory) -> Iterator[dict[str, NDArray[Any]]]:
+    """Columns of the file, block by block."""
+    for rows in blocks_of(len(trajectory)):
+        t = trajectory
+        columns = [
+            t.time_ns[rows],
+            *t.position[rows].T,
+            *t.quat_xyzw[rows].T,
+            *t.velocity[rows].T,
+            t.scale[rows],
+        ]
+        yield dict(zip(_TRAJECTORY, columns, strict=True))
+        trajectory.release()
 
 
 def read_trajectory(path: Path) -> Trajectory:

@@ -27,6 +27,8 @@ from lidar.rig.specs import ImuSpec
 _FLICKER_TIMES = 0.1 * np.exp(np.arange(12))
 """Correlation times in seconds of the processes that add up to flicker noise: 0.1 s to 100 minutes."""
 
+_AROUND = 4  # poses around a time that its differences depend on
+
 EARTH_RATE = 7.292115e-5
 """Angular rate of the Earth, rad/s (WGS 84)."""
 
@@ -62,6 +64,16 @@ def true_inertial(
 
     Central differences of the trajectory's attitudes and of the unit's velocity, interpolated linearly.
     """
+    rate, force = np.empty((len(time_ns), 3)), np.empty((len(time_ns), 3))
+    for rows, part in trajectory.windows(time_ns, margin=_AROUND):
+        rate[rows], force[rows] = _true_inertial(part, frame, spec=spec, time_ns=time_ns[rows])
+    return rate, force
+
+
+def _true_inertial(
+    trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, time_ns: NDArray[np.int64]
+) -> tuple[Float, Float]:
+    """Columns of `true_inertial` from the part of the trajectory around some times."""
     seconds = trajectory.time_ns * 1e-9
     R = matrix_from_quat(trajectory.quat_xyzw)
     turn = body_rates(seconds, trajectory.quat_xyzw)

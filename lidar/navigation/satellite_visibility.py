@@ -21,6 +21,7 @@ E2 = F * (2 - F)
 
 _RINGS = 6  # rings of directions that sample the blocked share of the sky
 _SPOKES = 16
+_EPOCHS = 4096  # epochs whose satellites are worked on at once
 _BLOCK_M = 100.0  # metres of the drive whose epochs share one loaded region
 REACH = 400.0
 """Distance in metres within which buildings can block satellites."""
@@ -133,9 +134,15 @@ def open_sky(
     Raises InputError for an unknown system.
     """
     lon, lat = frame.to_geographic(antenna[:, 0], antenna[:, 1])
-    azimuth, elevation = look_up(lon, lat, h=antenna[:, 2], start=start, time_ns=time_ns, systems=systems)
+    names = satellite_names(systems)
+    azimuth, elevation = np.empty((len(antenna), len(names))), np.empty((len(antenna), len(names)))
+    for first in range(0, len(antenna), _EPOCHS):
+        rows = slice(first, first + _EPOCHS)
+        azimuth[rows], elevation[rows] = look_up(
+            lon[rows], lat[rows], h=antenna[rows, 2], start=start, time_ns=time_ns[rows], systems=systems
+        )
     above = elevation > np.radians(mask_deg)
-    return Sky(azimuth, elevation, above, above, np.zeros(len(antenna)), satellite_names(systems))
+    return Sky(azimuth, elevation, above, above, np.zeros(len(antenna)), names)
 
 
 def sky_view(
@@ -192,6 +199,15 @@ def dilution(azimuth: Float, elevation: Float, *, used: Bools, names: NDArray[np
     The unknowns are three coordinates and a clock offset per system in use: four satellites, and one more for
     each further system. ``names`` as in `Sky`.
     """
+    out = np.empty((len(azimuth), 3))
+    for first in range(0, len(azimuth), _EPOCHS):
+        rows = slice(first, first + _EPOCHS)
+        out[rows] = _dilution(azimuth[rows], elevation[rows], used=used[rows], names=names)
+    return out
+
+
+def _dilution(azimuth: Float, elevation: Float, *, used: Bools, names: NDArray[np.str_]) -> Float:
+    """The rows of `dilution` for some epochs."""
     systems = systems_of(names)
     clocks = np.zeros((len(names), len(systems)))
     for column, rows in enumerate(systems):

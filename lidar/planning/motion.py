@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.attitude import quat_from_euler
-from lidar.geometry.poses import Trajectory
+from lidar.geometry.poses import Trajectory, blocks_of
 from lidar.planning.path import Path
 from lidar.rig.vehicle import Vehicle
 
@@ -24,10 +26,11 @@ _SPARE = 0.98  # share of the acceleration limits used, a margin for sampling
 _BRIEF_S = 0.3  # seconds of the second moving average, which smooths the jerk
 _FIT = 40
 _ROWS = 65
+_AROUND = 3  # rows of a path before and after a part of a drive that its poses depend on
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(Columns):
     """A speed profile: progress along a path at an even rate.
 
     time_ns : (n,) int64
@@ -310,6 +313,15 @@ def _fastest(s: Float, limit: Float, *, up: float, down: float, rest: tuple[bool
 
 def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:
     """The trajectory of a speed profile along a path; cubic between rows, so velocity is continuous."""
+    legs = legs_of(path)
+    # the speed of a walker's gait is a difference over time, of all rows at once
+    blocks = [slice(0, len(motion))] if any(vehicle.bob) else blocks_of(len(motion))
+    parts = (_poses(path, vehicle, legs=legs, motion=motion.take(rows)) for rows in blocks)
+    return Trajectory.gathered(len(motion), parts)
+
+
+def _poses(path: Path, vehicle: Vehicle, *, legs: Sequence[tuple[int, int]], motion: Motion) -> Trajectory:
+    """The poses of a part of a speed profile."""
     from scipy.interpolate import CubicHermiteSpline  # noqa: PLC0415  (slow to import)
 
     n = len(motion.s)
@@ -317,11 +329,15 @@ def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:
     columns = {name: np.empty(n) for name in ("slope", "pitch", "bank", "scale", "curvature")}
     gear = path.gear[motion.row].astype(float)
     leg = path.leg[motion.row]
-    for first, last in legs_of(path):
+    for first, last in legs:
         here = leg == path.leg[first]
         if not here.any():
             continue
-        p, s = path.take(slice(first, last)), motion.s[here]
+        s = motion.s[here]
+        ends = np.searchsorted(path.s[first:last], [s.min(), s.max()])
+        p = path.take(
+            slice(first + max(int(ends[0]) - _AROUND, 0), min(first + int(ends[1]) + _AROUND, last))
+        )
         run = np.cos(p.slope) * p.scale * p.gear
         tangent = np.column_stack(
             [run * np.cos(p.heading), run * np.sin(p.heading), np.sin(p.slope) * p.gear]

@@ -44,18 +44,22 @@ def drive_with_signals(
     bounds   : of the map in scene metres
     duration, at_speed : as for `drive_path`; a drive without a duration ends `DWELL_S` after its arrival
     """
-    motion = motion_along(path, vehicle, duration=duration, at_speed=at_speed)
-    alone = poses_along(path, vehicle, motion=motion if duration is not None else ended_at_rest(motion))
     plan = junction_plan(graph, lanes_of(graph, side=side, bounds=bounds), seed=seed)
-    if not has_traffic_control(ego_trip(path, vehicle), graph, plan=plan):
-        return alone
+    controlled = has_traffic_control(ego_trip(path, vehicle), graph, plan=plan)
+    alone_ns = 0
+    if duration is None or not controlled:
+        motion = motion_along(path, vehicle, duration=duration, at_speed=at_speed)
+        motion = motion if duration is not None else ended_at_rest(motion)
+        if not controlled:
+            return poses_along(path, vehicle, motion=motion)
+        alone_ns = int(motion.time_ns[-1])
     return _driven(
         path,
         vehicle,
         graph=graph,
         plan=plan,
         trips=[],
-        alone=alone,
+        alone_ns=alone_ns,
         duration=duration,
         radius=np.inf,
         at_speed=at_speed,
@@ -94,7 +98,7 @@ def drive_in_traffic(
             graph=graph,
             plan=setup.plan,
             trips=setup.trips,
-            alone=first,
+            alone_ns=first.duration_ns,
             duration=duration,
             radius=radius,
             at_speed=at_speed,
@@ -113,14 +117,14 @@ def _driven(
     graph: RoadGraph,
     plan: JunctionPlan,
     trips: list[Trip],
-    alone: Trajectory,
+    alone_ns: int,
     duration: float | None,
     radius: float,
     at_speed: bool,
 ) -> Trajectory:
-    """The trajectory of the ego simulated with trips; ``alone`` is that without them."""
+    """The trajectory of the ego simulated with trips; ``alone_ns`` is its time without them."""
     factor, more = _LONGER
-    seconds = duration if duration is not None else factor * alone.duration_ns * 1e-9 + more
+    seconds = duration if duration is not None else factor * alone_ns * 1e-9 + more
     if duration is not None and at_speed:
         seconds += _ON_S
     trip = ego_trip(path, vehicle, at_speed=at_speed)

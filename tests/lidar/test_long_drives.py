@@ -1,0 +1,112 @@
+"""Long drives are planned and written in blocks of rows, with the bytes of those worked on at once."""
+
+import mmap
+
+import numpy as np
+import pytest
+from helpers.roadgrids import grid
+
+from geoscene import files
+from geoscene.files import write_columns
+from geoscene.frames import Frame
+from lidar.errors import InputError
+from lidar.geometry import poses
+from lidar.geometry.mounts import Mount
+from lidar.geometry.poses import Trajectory
+from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
+from lidar.navigation.gnss import antenna_motion
+from lidar.navigation.imu import true_inertial
+from lidar.plan import schedule
+from lidar.planning.motion import drive_path
+from lidar.planning.path import plan_path
+from lidar.planning.route import RouteOptions, plan_route
+from lidar.rig.devices import scanners
+from lidar.rig.specs import GnssSpec, ImuSpec, load_rig
+from lidar.rig.vehicle import load_vehicle
+
+FRAME = Frame.at(-76.3, 36.88)
+ARM = Mount((1.2, 0.3, 1.5), (0.0, 0.0, 0.0, 1.0))
+
+
+@pytest.fixture(scope="module")
+def path():
+    graph = grid(gap=80.0)
+    route = plan_route(graph, FRAME, spec="random", options=RouteOptions(seed=3, length=600.0))
+    return plan_path(route, load_vehicle("car"), frame=FRAME)
+
+
+def backing(column):
+    while isinstance(column, np.ndarray):
+        column = column.base
+    return column.obj if isinstance(column, memoryview) else column
+
+
+def test_long_trajectory_is_kept_in_a_file_with_the_same_values(path, monkeypatch, tmp_path):
+    whole = drive_path(path, load_vehicle("car"))
+    write_trajectory(tmp_path / "whole.csv", whole)
+    monkeypatch.setattr(poses, "BLOCK_POSES", 257)
+    monkeypatch.setattr(poses, "_IN_MEMORY", 1000)
+    monkeypatch.setattr(files, "BLOCK_ROWS", 100)
+    parts = drive_path(path, load_vehicle("car"))
+    assert len(parts) == len(whole) > 2000
+    for name, column in parts.columns().items():
+        assert isinstance(backing(column), mmap.mmap)
+        assert column.tobytes() == whole.columns()[name].tobytes()
+    parts.release()
+    write_trajectory(tmp_path / "parts.csv", parts)
+    assert (tmp_path / "parts.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
+    again = read_trajectory(tmp_path / "parts.csv")
+    assert all(
+        column.tobytes() == again.columns()[name].tobytes() for name, column in whole.columns().items()
+    )
+
+
+def test_receivers_and_units_measure_the_same_along_parts_of_a_trajectory(path, monkeypatch):
+    whole = drive_path(path, load_vehicle("car"))
+    times = np.arange(0, whole.duration_ns, 33_333_333)
+    specs = GnssSpec("gnss", ARM), ImuSpec("imu", ARM)
+
+    def measured():
+        gnss, imu = specs
+        return [
+            *antenna_motion(whole, FRAME, spec=gnss, time_ns=times),
+            *true_inertial(whole, FRAME, spec=imu, time_ns=times),
+        ]
+
+    expected = measured()
+    monkeypatch.setattr(poses, "BLOCK_POSES", 311)
+    for part, one in zip(measured(), expected, strict=True):
+        # differences over even and over uneven times round differently
+        np.testing.assert_allclose(part, one, rtol=0, atol=1e-9)
+
+
+def test_poses_that_do_not_follow_each_other_are_refused_across_blocks(monkeypatch):
+    monkeypatch.setattr(poses, "BLOCK_POSES", 2)
+    still = np.zeros((4, 3))
+    turn = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
+    with pytest.raises(InputError, match="increasing times"):
+        Trajectory(np.array([0, 2, 2, 3]), still, turn, still, np.ones(4))
+    with pytest.raises(InputError, match="two or more"):
+        Trajectory(np.array([0]), still[:1], turn[:1], still[:1], np.ones(1))
+
+
+def test_jobs_are_in_order_of_time_and_made_on_demand():
+    sensors = scanners(load_rig("seed"))
+    jobs = schedule(sensors, 3_000_000_000)
+    order = [(job.start_ns, job.order, job.frame) for job in jobs]
+    assert order == sorted(order)
+    assert len(jobs) == sum(sensor.frame_count(3_000_000_000) for sensor in sensors)
+    assert [*jobs[5:9]] == [jobs[k] for k in range(5, 9)]
+    assert [job.frame for job in jobs.where(lambda job: job.frame == 7)] == [7] * len(sensors)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 100, 101])
+def test_tables_are_written_in_blocks(rows, monkeypatch, tmp_path):
+    columns = {"k": np.arange(rows), "x": np.arange(rows) / 7, "name": [f"a,{k}" for k in range(rows)]}
+    write_columns(tmp_path / "whole.csv", columns)
+    monkeypatch.setattr(files, "BLOCK_ROWS", 10)
+    write_columns(tmp_path / "parts.csv", columns)
+    text = (tmp_path / "parts.csv").read_bytes()
+    assert text == (tmp_path / "whole.csv").read_bytes()
+    assert text.count(b"\n") == rows + 1
+    assert text.startswith(b"k,x,name\n")
