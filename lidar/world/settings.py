@@ -15,14 +15,22 @@ ORIGINS = ("near", "scene")
 class WorldSettings:
     """Settings of the world around the vehicle. The defaults are the whole scene within range.
 
-    origin : of Embree's float32 coordinates, of `ORIGINS`: the point of a grid of 2,048 m near the vehicle,
-             or the scene's origin, from which the margins of faces grow with the distance
-    reach  : metres around the vehicle beyond which no tiles are loaded and nothing is hit; inf: the sensors'
-             maximum range
+    origin    : of Embree's float32 coordinates, of `ORIGINS`: the point of a grid of 2,048 m near the
+                vehicle, or the scene's origin, from which the margins of faces grow with the distance
+    reach     : metres around the vehicle beyond which no tiles are loaded and nothing is hit; inf: the
+                sensors' maximum range
+    forests   : the trees of forests
+    trees     : single trees and those of rows
+    furniture : poles, lamps, signs, traffic lights, bollards, benches and wires
+    barriers  : walls, fences and hedges
     """
 
     origin: str = "near"
     reach: float = inf
+    forests: bool = True
+    trees: bool = True
+    furniture: bool = True
+    barriers: bool = True
 
     def __post_init__(self) -> None:
         """Validate the settings; one InputError names all faults."""

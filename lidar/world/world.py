@@ -19,6 +19,7 @@ from lidar.errors import InputError
 from lidar.raycast import Caster, Geometry, Hits, Instances
 from lidar.raycast.geometry import split
 from lidar.world.settings import PLAIN, WorldSettings
+from lidar.world.tile_selection import selected_tile
 
 Region = tuple[float, float, float, float]
 
@@ -139,7 +140,7 @@ class World:
         backend: str = "auto",
     ) -> None:
         named = scene.shapes()
-        shapes = list(named.values())
+        self._meshes = shapes = list(named.values())
         self.scene = scene
         self._names = tuple(named)
         self._leaves: Mapping[str, float] = scene.manifest.get("leaf_area_density", LEAF_AREA_DENSITY)
@@ -239,7 +240,7 @@ class World:
         return self._faces
 
     def _read(self, rank: int) -> _Tile:
-        tile = self.scene.tile(*self.scene.tile_indices[rank])
+        tile = selected_tile(self.scene, rank, settings=self.settings, shapes=self._meshes)
         mesh, copies = tile.mesh, tile.instances
         parts = split(
             mesh.vertices + (tile.origin - self.caster.origin), mesh.faces, mask=_bits(mesh.material)

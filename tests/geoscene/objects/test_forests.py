@@ -23,6 +23,7 @@ from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData
 from geoscene.view import view_scene
 from lidar.traffic.ground import ground_heights
+from lidar.world.settings import WorldSettings
 from lidar.world.world import World
 
 NONE = Forests(np.empty(0, np.int64), np.empty(0))
@@ -165,6 +166,18 @@ def test_rays_views_and_exports_meet_the_same_trees(scene, tmp_path):
     glb = export_scene(scene, tmp_path / "a.glb", options=ExportOptions())
     assert glb.objects >= len(table)
     assert view_scene(scene, tmp_path / "a.html").path.stat().st_size > 12 * len(table) / 4
+
+
+@pytest.mark.parametrize("trees", [True, False])
+def test_settings_of_worlds_leave_out_forests_and_keep_them_without_single_trees(scene, trees):
+    single = sum(len(tile.instances) for tile in scene.tiles(forests=False)) if trees else 0
+    forest = sum(len(tile.instances) for tile in scene.tiles()) - sum(
+        len(tile.instances) for tile in scene.tiles(forests=False)
+    )
+    for forests, count in ((True, single + forest), (False, single)):
+        world = World.load(scene, settings=WorldSettings(forests=forests, trees=trees))
+        assert len(world.caster.instances[0]) == count
+    assert forest > 0
 
 
 def test_a_rebuild_with_the_same_ground_places_the_same_trees(osm, scene, tmp_path):

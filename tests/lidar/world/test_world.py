@@ -8,7 +8,7 @@ import trimesh
 
 from geoscene.classes import Class, materials
 from geoscene.frames import Frame
-from geoscene.mesh import WALL, Instances, Mesh
+from geoscene.mesh import WALL, Instances, Mesh, concatenate
 from geoscene.scene import SceneFiles, open_scene
 from geoscene.scene.layout import SCHEMA, manifest_digest
 from geoscene.scene.tile_files import Tile, write_shapes, write_tile
@@ -234,3 +234,29 @@ def test_tiles_beyond_the_reach_are_not_loaded(scene):
     far = [[250.0, 50, 30]]
     assert np.isfinite(whole.caster.cast(far[0], DOWN).range).all()
     assert np.isinf(part.caster.cast(far[0], DOWN).range).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "klass"), [("trees", Class.TREE_CROWN), ("furniture", Class.POLE), ("barriers", Class.WALL)]
+)
+def test_classes_of_settings_are_left_out_of_tiles(tmp_path, name, klass):
+    files = SceneFiles(tmp_path)
+    files.tiles.mkdir()
+    parts = [ground(0), box([1, 1, 6], [30, 30, 3.0], klass=klass, feature=55)]
+    copies = Instances(np.zeros(1, np.int32), np.array([np.eye(3, 4)]), np.array([77], np.int32))
+    write_tile(files.tile(0, 0), Tile(np.full(3, TILE / 2) * [1, 1, 0], concatenate(parts), copies))
+    write_shapes(files.shapes, {"thing": box([4, 4, 4], [0, 0, 4.0], klass=klass)})
+    manifest = {
+        "schema": SCHEMA,
+        "frame": Frame.at(2.0, 48.0).to_json(),
+        "bounds": [0, 0, 100, 100],
+        "tile_size": TILE,
+        "tiles": [(0, 0, 1)],
+        "layers": {},
+    }
+    files.manifest.write_text(json.dumps(manifest | {"digest": manifest_digest(manifest)}))
+    scene = open_scene(tmp_path)
+    above = np.array([[50, 50, 30.0], [80, 80, 30.0]])
+    for chosen, features in (({}, [77, 55]), ({name: False}, [0, 0])):
+        world = World.load(scene, settings=WorldSettings(**chosen))
+        assert world.lookup(world.caster.cast(above, np.repeat(DOWN, 2, 0))).feature.tolist() == features
