@@ -19,6 +19,7 @@ from lidar.rig.vehicle import Vehicle
 ASIDE = 4.0
 """Maximum lateral shift of a line, in metres, to pass an obstacle."""
 _NEAR = 12.0  # metres from a junction within which a collision blocks its turn, not the edge
+_BODIES = 1 << 15  # outlines of the body that are in memory at once
 _SWEEP = 0.5  # metres between the poses that are checked for collisions
 
 
@@ -86,11 +87,16 @@ def touching(
     every = max(round(_SWEEP / track.step), 1)
     rows = np.unique(np.append(np.arange(0, len(track.row), every), len(track.row) - 1))
     rows = rows[~line.free[track.row[rows]]]
-    bodies = body_outlines(
-        track.xy[rows], track.heading[rows], vehicle=setting.vehicle, margin=setting.margin
-    )
-    body, obstacle = setting.tree.query(bodies, predicate="intersects")
-    return rows[body], bodies[body], setting.tree.geometries[obstacle]
+    found: list[tuple[NDArray[np.int64], NDArray[np.object_], NDArray[np.object_]]] = []
+    for first in range(0, max(len(rows), 1), _BODIES):
+        part = rows[first : first + _BODIES]
+        bodies = body_outlines(
+            track.xy[part], track.heading[part], vehicle=setting.vehicle, margin=setting.margin
+        )
+        body, obstacle = setting.tree.query(bodies, predicate="intersects")
+        found.append((part[body], bodies[body], setting.tree.geometries[obstacle]))
+    at, outlines, obstacles = (np.concatenate(column) for column in zip(*found, strict=True))
+    return at, outlines, obstacles
 
 
 def pushes(track: Track, line: Line, *, setting: Setting) -> tuple[Float, NDArray[np.int64]]:

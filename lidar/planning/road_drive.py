@@ -25,6 +25,7 @@ ROUTE_MARGIN_S = 15.0
 """Seconds at the speed limits by which the route of a drive that starts and ends at speed exceeds its record.
 
 It covers the braking distance at any speed that streets allow."""
+_RAYS = 1 << 17  # rays that are cast at once
 _SEARCH_M = 1.5  # metres above and below the road graph within which the road surface is searched
 _DRIVEN = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD or c == Class.BRIDGE]
 
@@ -82,10 +83,16 @@ def road_surface(scene: Scene) -> Surface:
 
     def surface(x: Float, y: Float, z: Float) -> Float:  # noqa: PLR0917 - a Surface
         world.follow((float(x.min()) - 1, float(y.min()) - 1, float(x.max()) + 1, float(y.max()) + 1))
-        origins = np.column_stack([x, y, z + _SEARCH_M])
-        hits = world.caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape), far=2 * _SEARCH_M)
-        on_road = np.isfinite(hits.range) & np.isin(world.lookup(hits).klass, _DRIVEN)
-        return np.where(on_road, z + _SEARCH_M - np.where(on_road, hits.range, 0.0), z)
+        out = np.array(z, float)
+        for first in range(0, len(x), _RAYS):
+            rows = slice(first, first + _RAYS)
+            origins = np.column_stack([x[rows], y[rows], z[rows] + _SEARCH_M])
+            down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
+            hits = world.caster.cast(origins, down, far=2 * _SEARCH_M)
+            on_road = np.isfinite(hits.range) & np.isin(world.lookup(hits).klass, _DRIVEN)
+            low = z[rows] + _SEARCH_M - np.where(on_road, hits.range, 0.0)
+            out[rows] = np.where(on_road, low, z[rows])
+        return out
 
     return surface
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,7 +97,7 @@ def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose
     x, y, th = pose if pose is not None else (lx[0], ly[0], lh[0])
     j = 0 if pose is None else int(np.argmin(np.hypot(xy[:, 0] - x, xy[:, 1] - y)))
     k = 0.0 if pose is not None else max(-most, min(most, lk[0]))
-    out: list[tuple[float, float, float, float, int]] = []
+    out = array("d")
     stride = step * scale
     budget = int(3 * m * gap / stride) + 400
     for _ in range(budget):
@@ -104,7 +105,7 @@ def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose
             j + 1 < m and (x - lx[j + 1]) ** 2 + (y - ly[j + 1]) ** 2 <= (x - lx[j]) ** 2 + (y - ly[j]) ** 2
         ):
             j += 1
-        out.append((x, y, th, k, j))
+        out.extend((x, y, th, k, j))
         c, s = math.cos(lh[j]), math.sin(lh[j])
         along, aside = (x - lx[j]) * c + (y - ly[j]) * s, ((y - ly[j]) * c - (x - lx[j]) * s) / scale
         if j == m - 1 and along >= -0.5 * stride:
@@ -122,5 +123,5 @@ def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose
         chord = stride * (1.0 - half * half / 6.0)  # of an arc; the next term is below 1e-9 m
         x, y = x + chord * math.cos(th + half), y + chord * math.sin(th + half)
         th, k = th + mean * step, new
-    rows = np.array(out)
+    rows = np.array(out).reshape(-1, 5)
     return Track(rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4].astype(np.int64), 1, step)

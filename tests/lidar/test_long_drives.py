@@ -4,6 +4,7 @@ import mmap
 
 import numpy as np
 import pytest
+import shapely
 from helpers.roadgrids import grid
 
 from geoscene import files
@@ -17,9 +18,12 @@ from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
 from lidar.navigation.gnss import antenna_motion
 from lidar.navigation.imu import true_inertial
 from lidar.plan import schedule
+from lidar.planning import clearance
+from lidar.planning.clearance import Line, Setting, touching
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
 from lidar.planning.route import RouteOptions, plan_route
+from lidar.planning.steering import follow
 from lidar.rig.devices import scanners
 from lidar.rig.specs import GnssSpec, ImuSpec, load_rig
 from lidar.rig.vehicle import load_vehicle
@@ -110,3 +114,23 @@ def test_tables_are_written_in_blocks(rows, monkeypatch, tmp_path):
     assert text == (tmp_path / "whole.csv").read_bytes()
     assert text.count(b"\n") == rows + 1
     assert text.startswith(b"k,x,name\n")
+
+
+def test_obstacles_along_a_track_are_found_block_by_block(monkeypatch):
+    xy = np.column_stack([np.arange(0.0, 100.0, 0.25), np.zeros(400)])
+    track = follow(xy, load_vehicle("car"), scale=1.0, step=0.25)
+    n = len(xy)
+    line = Line(
+        np.column_stack([xy, np.zeros(n)]),
+        np.zeros(n, np.int32),
+        np.full(n, 10.0),
+        np.zeros(n, bool),
+        np.zeros(n, bool),
+    )
+    tree = shapely.STRtree([shapely.box(20, 0.5, 25, 3), shapely.box(60, -3, 70, 3)])
+    setting = Setting(load_vehicle("car"), FRAME, tree, margin=0.2, step=0.25, side="right")
+    whole = touching(track, line, setting=setting)
+    monkeypatch.setattr(clearance, "_BODIES", 7)
+    parts = touching(track, line, setting=setting)
+    assert len(whole[0])
+    assert all((one == other).all() for one, other in zip(whole, parts, strict=True))
