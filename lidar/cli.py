@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,7 +28,7 @@ from lidar import __version__
 from lidar.dataset.export import exporter
 from lidar.dataset.formats import map_suffixes
 from lidar.errors import InputError, LidarError
-from lidar.options import OUTPUT, ApplyOptions, DriveOptions, ExportOptions, MapOptions
+from lidar.options import OUTPUT, ApplyOptions, DriveOptions, ExportOptions, MapOptions, TradeoffOptions
 
 if TYPE_CHECKING:
     from lidar.maps.aggregate import MapSummary
@@ -168,6 +169,65 @@ def sweep(
     for row in failed:
         print(f"lidar: {row.name}: {row.error}", file=sys.stderr)
     return FAILURE if failed else 0
+
+
+@app.command
+def tradeoff(
+    scene: Path,
+    /,
+    *,
+    options: DriveOptions | None = None,
+    compared: TradeoffOptions = TradeoffOptions(),
+    others: Annotated[tuple[Path, ...], Parameter(name="--scene", n_tokens=1)] = (),
+    out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
+    report: Reporting = Report(),
+) -> int:
+    """Measure the error and the cost of each setting on a drive, and recommend the cheapest that is enough.
+
+    Errors are differences from an exact reference, pulse by pulse, with 95 % intervals; costs are CPU time
+    per simulated second, peak memory and bytes.
+
+    For example:
+
+    lidar tradeoff scene --route random --duration 10 --rig vlp16 -o tradeoff
+
+    lidar tradeoff scene --route random --duration 10 --settings rays,poses --json
+
+    Parameters
+    ----------
+    scene
+        Directory of the scene.
+    others
+        Another scene of the same place and frame, built with other options, to compare with the first;
+        repeat for more.
+    out
+        Folder to write tradeoff.json, tradeoff.html and a plot of each sensor to.
+    """
+    from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
+    from lidar.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
+    from lidar.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
+
+    if options is None or bool(options.route) == bool(options.survey):
+        raise InputError("give one of `route` and `survey`, such as `route` random")
+    if out is not None:
+        note_new_folder(out)
+        if out.exists() and not report.overwrite:
+            raise InputError(f"{out}: exists already; set `overwrite` to replace it")
+    with (
+        progress_bar(quiet=report.quiet) as progress,
+        ExitStack() as opened,
+    ):
+        first, *rest = [
+            opened.enter_context(using(open_scene(s), known=LidarError)) for s in (scene, *others)
+        ]
+        found = measured(first, options, compared=compared, others=rest, progress=progress)
+    if out is not None:
+        write_report(found, out)
+    if report.json:
+        print_json(document(found))
+    else:
+        print_tables(found)
+    return 0
 
 
 @app.command(name="map")

@@ -305,6 +305,39 @@ class DriveOptions:
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
+class TradeoffOptions:
+    """Options of a comparison of settings."""
+
+    compare: Annotated[tuple[str, ...], Parameter(name="--settings"), WORDS] = ()
+    """Settings to compare, separated by commas: rays, poses, precision, retrace, mirrors, foliage,
+    origin, reach, scene, traffic, georeferencing; all by default."""
+
+    frames: Annotated[int, Parameter(converter=whole)] = 8
+    """Frames to sample, spread over the drive: 2 to 1000."""
+
+    pulses: Annotated[int, Parameter(converter=whole)] = 16_000
+    """Pulses of each scanner to compare, at random over the sampled frames: 100 to 10,000,000."""
+
+    reference_rays: Annotated[int, Parameter(converter=whole)] = 217
+    """Rays per pulse of the reference: 7 to 665."""
+
+    repetitions: Annotated[int, Parameter(converter=whole)] = 3
+    """Repetitions of every timing, interleaved: 3 to 100."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        for name, low, high in (
+            ("frames", 2, 1000),
+            ("pulses", 100, 10**7),
+            ("reference_rays", 7, 665),
+            ("repetitions", 3, 100),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"`{name}` {getattr(self, name)}: give {low} to {high}")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
 class MapOptions:
     """Options of an aggregated map."""
 

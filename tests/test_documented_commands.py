@@ -19,6 +19,7 @@ import geoscene.cli
 import geoscene.sources
 import lidar.cli
 import lidar.pipeline
+import lidar.tradeoff.engine
 from geoscene.pipeline import build
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions
@@ -116,6 +117,13 @@ def folder(inputs, tmp_path, monkeypatch):
     def first(recording, jobs, **more):
         record_all(recording, jobs[:20], **more)
 
+    compare = lidar.tradeoff.engine.tradeoff
+
+    def small(scene, options, *, compared, **more):
+        compared = replace(compared, frames=2, pulses=100, reference_rays=7)
+        return compare(scene, replace(options, duration=0.4), compared=compared, **more)
+
+    monkeypatch.setattr(lidar.tradeoff.engine, "tradeoff", small)
     monkeypatch.setattr(lidar.pipeline, "drive", short)
     monkeypatch.setattr(lidar.pipeline, "record_all", first)
     return folder

@@ -1,0 +1,160 @@
+"""Differences between two simulations of the same pulses, with intervals by resampling frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from geoscene.columns import Columns
+from geoscene.typing import Float
+
+RESAMPLES = 200
+"""Bootstrap samples of an interval."""
+
+
+@dataclass(frozen=True, slots=True)
+class Returns(Columns):
+    """Returns of some pulses of a frame.
+
+    key   : (n,) int64, ascending: 256 times the row of the pulse plus the rank of the return in it
+    range : (n,) metres
+    klass : (n,) uint8
+    xyz   : (n, 3) scene metres
+    """
+
+    key: NDArray[np.int64]
+    range: Float
+    klass: NDArray[np.uint8]
+    xyz: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A figure with the 95 % interval of its repetition."""
+
+    value: float
+    low: float
+    high: float
+
+    def to_json(self) -> dict[str, float | None]:
+        """The figures; None for those that are not finite."""
+        figures = {"value": self.value, "low": self.low, "high": self.high}
+        return {name: float(f"{v:.6g}") if np.isfinite(v) else None for name, v in figures.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class FrameError:
+    """Differences of one frame from the reference.
+
+    range, position : (m,) metres, absolute, of returns that both have: of ranges, and of points in the world
+    there, back     : metres from each point to the nearest one of the reference, and from each of its points
+    missed, extra, changed : numbers of returns that only the reference has, or only this, and of other class
+    returns         : of the reference
+    """
+
+    range: Float
+    position: Float
+    there: Float
+    back: Float
+    missed: int
+    extra: int
+    changed: int
+    returns: int
+
+
+def frame_error(found: Returns, exact: Returns) -> FrameError:
+    """Differences between the returns of the same pulses."""
+    _, a, b = np.intersect1d(found.key, exact.key, assume_unique=True, return_indices=True)
+    position = np.linalg.norm(found.xyz[a] - exact.xyz[b], axis=1)
+    there, back = cloud_distances(found.xyz, exact.xyz)
+    return FrameError(
+        np.abs(found.range[a] - exact.range[b]),
+        position,
+        there,
+        back,
+        missed=len(exact) - len(b),
+        extra=len(found) - len(a),
+        changed=int(np.count_nonzero(found.klass[a] != exact.klass[b])),
+        returns=len(exact),
+    )
+
+
+def cloud_distances(found: Float, exact: Float) -> tuple[Float, Float]:
+    """Distances of the points of either cloud to the nearest of the other; empty if one has no points."""
+    if not len(found) or not len(exact):
+        return np.empty(0), np.empty(0)
+    return cKDTree(exact).query(found)[0], cKDTree(found).query(exact)[0]
+
+
+def rms(values: Float) -> float:
+    """Root mean square; 0 without values."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
+
+
+def percentile(values: Float, share: float) -> float:
+    """The value that a share of all values does not exceed; 0 without values."""
+    return float(np.quantile(values, share, method="higher")) if len(values) else 0.0
+
+
+Statistic = Callable[[Sequence[FrameError]], float]
+
+
+def _of_all(name: str, figure: Callable[[Float], float]) -> Statistic:
+    return lambda frames: figure(np.concatenate([getattr(f, name) for f in frames]))
+
+
+def _share(name: str) -> Statistic:
+    return lambda frames: sum(getattr(f, name) for f in frames) / max(1, sum(f.returns for f in frames))
+
+
+def _chamfer(frames: Sequence[FrameError]) -> float:
+    there, back = (np.concatenate([getattr(f, side) for f in frames]) for side in ("there", "back"))
+    return float(np.mean(there) + np.mean(back)) / 2 if len(there) else 0.0
+
+
+def _hausdorff(share: float) -> Statistic:
+    def distance(frames: Sequence[FrameError]) -> float:
+        sides = (np.concatenate([getattr(f, side) for f in frames]) for side in ("there", "back"))
+        return max(percentile(side, share) for side in sides)
+
+    return distance
+
+
+STATISTICS: dict[str, Statistic] = {
+    "range_rms_m": _of_all("range", rms),
+    "range_99_m": _of_all("range", lambda v: percentile(v, 0.99)),
+    "range_99.9_m": _of_all("range", lambda v: percentile(v, 0.999)),
+    "range_max_m": _of_all("range", lambda v: percentile(v, 1.0)),
+    "missed": _share("missed"),
+    "extra": _share("extra"),
+    "class_changes": _share("changed"),
+    "position_rms_m": _of_all("position", rms),
+    "position_99.9_m": _of_all("position", lambda v: percentile(v, 0.999)),
+    "chamfer_m": _chamfer,
+    "hausdorff_99.9_m": _hausdorff(0.999),
+    "hausdorff_m": _hausdorff(1.0),
+}
+"""Figures of an error, over all sampled frames. Shares are of the reference's returns."""
+
+
+def estimates(frames: Sequence[FrameError], *, seed: int) -> dict[str, Estimate]:
+    """All `STATISTICS` of an error, with intervals by resampling frames."""
+    picks = np.random.default_rng(seed).integers(0, len(frames), (RESAMPLES, len(frames)))
+    found = {}
+    for name, figure in STATISTICS.items():
+        again = [figure([frames[k] for k in pick]) for pick in picks]
+        low, high = np.percentile(again, [2.5, 97.5])
+        found[name] = Estimate(figure(frames), float(low), float(high))
+    return found
+
+
+def median(values: Sequence[float], *, seed: int) -> Estimate:
+    """The median of repetitions with the 95 % interval by resampling them."""
+    data = np.asarray(values, float)
+    picks = np.random.default_rng(seed).integers(0, len(data), (RESAMPLES, len(data)))
+    low, high = np.percentile(np.median(data[picks], axis=1), [2.5, 97.5])
+    return Estimate(float(np.median(data)), float(low), float(high))

@@ -1,0 +1,86 @@
+"""Peak memory of a simulation, measured in a process of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from geoscene.scene import open_scene
+from lidar.dataset.formats.table import cloud_table
+from lidar.geometry.poses import Trajectory
+from lidar.physics.settings import ScannerSettings
+from lidar.rig.devices import Scanner
+from lidar.sensors.scan import scan
+from lidar.world.actors import Actors, actor_shapes, actor_transforms
+from lidar.world.settings import WorldSettings
+from lidar.world.world import Region, World
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One frame of a scanner, from loading the world on.
+
+    region : of the vehicle, scene metres
+    margin : metres around it that are loaded, at most the reach of the settings of the world
+    """
+
+    scene: Path
+    scanner: Scanner
+    settings: ScannerSettings
+    trajectory: Trajectory
+    actors: Actors | None
+    frame: int
+    region: Region
+    margin: float
+    world: WorldSettings
+
+
+def peaks(tasks: list[Task]) -> list[int]:
+    """Bytes by which the peak memory of a new process grows with each task, in the order of the tasks."""
+    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context = multiprocessing.get_context(method)
+    with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
+        return list(pool.map(_growth, tasks))
+
+
+def _growth(task: Task) -> int:
+    before = _peak()
+    actors = task.actors
+    world = World.load(
+        open_scene(task.scene),
+        region=task.region,
+        margin=task.margin,
+        actors=() if actors is None else actor_shapes(actors),
+        settings=task.world,
+    )
+    start, end = task.scanner.sensor.window_ns(task.frame)
+    if actors is not None:
+        x0, y0, x1, y1 = task.region
+        around = (x0 - task.margin, y0 - task.margin, x1 + task.margin, y1 + task.margin)
+        shape, transform, feature = actor_transforms(actors, start, end_ns=end, region=around)
+        world.place_actors(shape, transform, feature=feature)
+    cloud_table(
+        scan(
+            task.scanner.sensor,
+            task.scanner.spec.mount,
+            trajectory=task.trajectory,
+            world=world,
+            frame=task.frame,
+            settings=task.settings,
+        )
+    )
+    return _peak() - before
+
+
+def _peak() -> int:
+    """Peak memory of this process in bytes; Linux's own count, as a parent's may be part of the other."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        line = next(text for text in status.read_text().splitlines() if text.startswith("VmHWM"))
+        return 1024 * int(line.split()[1])
+    unit = 1 if sys.platform == "darwin" else 1024
+    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

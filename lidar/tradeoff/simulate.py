@@ -1,0 +1,164 @@
+"""Frames of a drive as a variant simulates them, in worlds that ray casting of either kind shares."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.scene import Scene
+from lidar.dataset.formats.table import cloud_table, records
+from lidar.physics.settings import ScannerSettings
+from lidar.plan import DrivePlan
+from lidar.rig.devices import Camera, Scanner
+from lidar.sensors.scan import Detection, Sweep, cast, detect, deviates_of, report
+from lidar.tradeoff.errors import Returns
+from lidar.world.actors import actor_shapes, actor_transforms
+from lidar.world.settings import PLAIN as WHOLE
+from lidar.world.settings import WorldSettings
+from lidar.world.world import Region, World
+
+EXACT, FAST = "float64", "auto"
+"""Backends of the reference and of drives."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """What is simulated: frames of a planned drive.
+
+    plan   : the drive
+    scenes : the plan's scene, and others of the same frame
+    frames : numbers of the sampled frames, of each sensor by its name
+    """
+
+    plan: DrivePlan
+    scenes: tuple[Scene, ...]
+    frames: dict[str, tuple[int, ...]]
+    _worlds: dict[tuple[int, str, bool, WorldSettings], World] = field(default_factory=dict, repr=False)
+
+    def world(
+        self,
+        sensor: Scanner | Camera,
+        frame: int,
+        *,
+        backend: str,
+        scene: int = 0,
+        traffic: bool = True,
+        settings: WorldSettings = WHOLE,
+    ) -> World:
+        """A world during a frame, with all that a ray of the sampled frames can reach."""
+        actors = self.plan.actors if traffic else None
+        key = scene, backend, actors is not None, settings
+        if key not in self._worlds:
+            self._worlds[key] = World.load(
+                self.scenes[scene],
+                region=self._region(),
+                margin=self.plan.max_range,
+                actors=() if actors is None else actor_shapes(actors),
+                settings=settings,
+                backend=backend,
+            )
+        world = self._worlds[key]
+        if actors is not None:
+            start = sensor.frame_start_ns(frame)
+            x0, y0, x1, y1 = self._region()
+            reach = self.plan.max_range
+            shape, transform, feature = actor_transforms(
+                actors,
+                start,
+                end_ns=start + sensor.period_ns,
+                region=(x0 - reach, y0 - reach, x1 + reach, y1 + reach),
+            )
+            world.place_actors(shape, transform, feature=feature)
+        return world
+
+    def _region(self) -> Region:
+        """The box that the vehicle covers during the sampled frames."""
+        boxes = []
+        for sensor in self.plan.sensors:
+            for frame in self.frames[sensor.name]:
+                start = sensor.frame_start_ns(frame)
+                times = np.linspace(start, start + sensor.period_ns, 5).astype(np.int64)
+                boxes.append(self.plan.trajectory.at(times).position[:, :2])
+        xy = np.concatenate(boxes)
+        return (float(xy[:, 0].min()), float(xy[:, 1].min()), float(xy[:, 0].max()), float(xy[:, 1].max()))
+
+
+def spread_frames(count: int, frames: int) -> tuple[int, ...]:
+    """Numbers of at most ``frames`` of ``count`` frames, spread evenly, the first and last half steps in."""
+    n = min(count, frames)
+    return tuple(int((k + 0.5) * count / n) for k in range(n))
+
+
+def chosen_pulses(count: int, pulses: int, *, frame: int, seed: int) -> NDArray[np.int64]:
+    """Rows of at most ``pulses`` of the ``count`` pulses of a frame, at random, ascending."""
+    rng = np.random.default_rng([seed, frame])
+    return np.sort(rng.permutation(count)[:pulses]).astype(np.int64)
+
+
+def swept(
+    plan: DrivePlan,
+    scanner: Scanner,
+    *,
+    frame: int,
+    world: World,
+    settings: ScannerSettings,
+    pulses: NDArray[np.int64] | None = None,
+) -> tuple[Sweep, Detection]:
+    """Pulses of a frame and what the scanner detects."""
+    sweep = cast(
+        scanner.sensor,
+        scanner.spec.mount,
+        trajectory=plan.trajectory,
+        world=world,
+        frame=frame,
+        seed=plan.options.seed,
+        settings=settings,
+        pulses=pulses,
+    )
+    return sweep, detect(sweep, sweep.echoes, deviates=deviates_of(sweep))
+
+
+def returns_of(
+    plan: DrivePlan,
+    scanner: Scanner,
+    *,
+    frame: int,
+    world: World,
+    settings: ScannerSettings,
+    pulses: NDArray[np.int64],
+) -> Returns:
+    """Returns of some pulses of a frame, placed in the scene in float64."""
+    sweep, found = swept(plan, scanner, frame=frame, world=world, settings=settings, pulses=pulses)
+    fired, rows = sweep.firings, found.echoes.pulse
+    away = found.range - scanner.sensor.pattern.range_offset
+    xyz = fired.origin[rows] + away[:, None] * fired.direction[rows]
+    mount = scanner.spec.mount
+    placed = plan.trajectory.place(
+        xyz, fired.time_ns[rows], translation=mount.translation, rotation=mount.rotation
+    )
+    first = np.searchsorted(rows, rows)  # rows are sorted by pulse and range
+    key = 256 * pulses[rows] + np.arange(len(rows)) - first
+    return Returns(key, found.range, found.echoes.klass, placed)
+
+
+def frame_cost(
+    plan: DrivePlan, scanner: Scanner, *, frame: int, world: World, settings: ScannerSettings
+) -> tuple[float, int]:
+    """CPU seconds of a whole frame as a drive simulates it, and the bytes of its point table."""
+    began = time.process_time()
+    table = cloud_table(report(*swept(plan, scanner, frame=frame, world=world, settings=settings)))
+    return time.process_time() - began, int(records(table).nbytes)
+
+
+def sampled(plan: DrivePlan, frames: int) -> dict[str, tuple[int, ...]]:
+    """Frames spread over a drive, by sensor."""
+    return {s.name: spread_frames(plan.frames[s.name], frames) for s in plan.sensors}
+
+
+def bench_of(plan: DrivePlan, others: Sequence[Scene] = (), *, frames: int) -> Bench:
+    """The bench of a plan."""
+    return Bench(plan, (plan.scene, *others), sampled(plan, frames))

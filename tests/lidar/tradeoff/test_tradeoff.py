@@ -1,0 +1,196 @@
+"""Errors and costs of settings: known differences, repeatable figures, recommendations, the report."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidar.errors import InputError
+from lidar.options import DriveOptions, TradeoffOptions
+from lidar.physics.settings import LEVELS, PLAIN
+from lidar.tradeoff.engine import Comparison, Row, scene_label, tradeoff
+from lidar.tradeoff.errors import STATISTICS, Estimate, Returns, estimates, frame_error, median
+from lidar.tradeoff.report import document, write_report
+from lidar.tradeoff.simulate import chosen_pulses, spread_frames
+from lidar.tradeoff.variants import next_step, noiseless, reference, scanner_variants
+from lidar.tradeoff.words import metres, pareto, recommendation
+
+DRIVE = DriveOptions(route="random", rig="vlp16", duration=1.0, seed=3)
+FEW = TradeoffOptions(("rays", "poses", "georeferencing"), frames=3, pulses=900, reference_rays=31)
+
+
+@pytest.fixture(scope="module")
+def found(scene):
+    return tradeoff(scene, DRIVE, compared=FEW)
+
+
+def returns(key, distance, klass=None):
+    n = len(key)
+    xyz = np.column_stack([distance, np.zeros(n), np.zeros(n)]).astype(float)
+    kinds = np.ones(n, np.uint8) if klass is None else np.array(klass, np.uint8)
+    return Returns(np.array(key, np.int64), np.array(distance, float), kinds, xyz)
+
+
+def row(label, error, cpu):
+    figures = {name: Estimate(error, error, error) for name in STATISTICS}
+    cost = {name: Estimate(cpu, cpu, cpu) for name in ("cpu_s", "bytes", "memory_bytes")}
+    return Row(label, figures, {}, cost)
+
+
+def comparison(*rows, residual=0.0):
+    gap = {name: Estimate(residual, residual, residual) for name in STATISTICS}
+    return Comparison("top (vlp16)", "exact", gap, rows, 10, 1)
+
+
+def test_differences_of_matched_missed_and_extra_returns():
+    error = frame_error(
+        returns([0, 256, 768], [5.0, 7.5, 9.0], [1, 2, 1]), returns([0, 256, 512], [5.0, 7, 8])
+    )
+    assert error.range.tolist() == [0.0, 0.5]
+    assert (error.missed, error.extra, error.changed, error.returns) == (1, 1, 1, 3)
+    np.testing.assert_allclose(error.there, [0, 0.5, 1.0])
+    np.testing.assert_allclose(error.back, [0, 0.5, 0.5])
+    figures = estimates([error], seed=0)
+    assert figures["range_rms_m"].value == pytest.approx(0.5 / np.sqrt(2))
+    assert figures["chamfer_m"].value == pytest.approx((0.5 + 1 / 3) / 2)
+    assert figures["hausdorff_m"].value == pytest.approx(1.0)
+    assert figures["missed"].value == pytest.approx(1 / 3)
+
+
+def test_a_cloud_equals_itself_and_an_empty_one_has_no_error():
+    cloud, empty = returns([0, 256], [5.0, 7.0]), returns([], [])
+    for one, other in ((cloud, cloud), (empty, empty)):
+        assert all(f.value == 0 for f in estimates([frame_error(one, other)], seed=1).values())
+    assert frame_error(empty, cloud).missed == 2
+
+
+def test_intervals_hold_the_value_and_repeat_by_seed():
+    frames = [
+        frame_error(returns([0, 256], [5.0, 7 + e]), returns([0, 256], [5.0, 7])) for e in (0.1, 0.2, 0.4)
+    ]
+    one, again = estimates(frames, seed=5), estimates(frames, seed=5)
+    assert one == again
+    rms = one["range_rms_m"]
+    assert 0.1 / np.sqrt(2) - 1e-9 <= rms.low < rms.value < rms.high <= 0.4 / np.sqrt(2) + 1e-9
+    spent = median([1.0, 9.0, 2.0], seed=0)
+    assert (spent.value, spent.low, spent.high) == (2.0, 1.0, 9.0)
+
+
+def test_the_reference_is_the_exact_end_without_random_effects():
+    exact = reference(LEVELS["survey"], rays=217)
+    assert (exact.rays, exact.poses, exact.mirrors, exact.foliage, exact.link) == (
+        217,
+        "firing",
+        True,
+        True,
+        True,
+    )
+    assert (exact.range_noise, exact.angle_noise, exact.detection, exact.quantise) == (
+        "none",
+        False,
+        False,
+        False,
+    )
+    assert noiseless(PLAIN) == PLAIN
+    assert [next_step(r) for r in (7, 217, 665, 900)] == [11, 326, 998, 999]
+
+
+def test_variants_change_one_setting_each():
+    rows = scanner_variants(PLAIN, rays=31, compared=("rays", "poses"), scenes=["lod=1"], traffic=True)
+    assert [r.label for r in rows[1:]] == ["rays=7", "rays=19", "poses=column", "poses=frame"]
+    assert rows[0].used == PLAIN
+    assert rows[1].used == replace(PLAIN, rays=7)
+    assert rows[3].alone == replace(PLAIN, rays=31, poses="column")
+    last = [
+        (r.label, r.scene, r.traffic)
+        for r in scanner_variants(PLAIN, rays=31, scenes=["lod=1"], traffic=True)
+    ]
+    assert last[-2:] == [("scene=lod=1", 1, True), ("traffic=off", 0, False)]
+
+
+def test_samples_are_spread_and_repeat():
+    assert spread_frames(100, 4) == (12, 37, 62, 87)
+    assert spread_frames(2, 8) == (0, 1)
+    rows = chosen_pulses(1000, 100, frame=3, seed=1)
+    assert len(np.unique(rows)) == 100
+    assert (np.diff(rows) > 0).all()
+    assert rows.tolist() == chosen_pulses(1000, 100, frame=3, seed=1).tolist()
+
+
+def test_errors_on_a_drive(found):
+    (one,) = found.comparisons
+    asked, *rest = one.rows
+    by_label = {r.label: r for r in rest}
+    assert asked.label == (
+        "as asked (rays=1, poses=firing, precision=exact, retrace=on, mirrors=off, foliage=off, origin=near,"
+        " reach=inf)"
+    )
+    assert list(by_label) == ["rays=7", "rays=19", "poses=column", "poses=frame"]
+    tail = {name: r.error["range_99_m"].value for name, r in by_label.items()}
+    assert tail["rays=19"] <= tail["rays=7"] <= asked.error["range_99_m"].value < tail["poses=frame"]
+    assert by_label["rays=7"].alone["range_rms_m"].value == pytest.approx(
+        by_label["rays=7"].error["range_rms_m"].value, abs=1e-4
+    )
+    assert one.residual["range_99_m"].value <= tail["rays=7"]
+    assert all(r.cost["cpu_s"].value > 0 and r.cost["memory_bytes"].value > 2**20 for r in one.rows)
+    assert (one.frames, one.pulses) == (3, 900)
+
+
+def test_georeferencing_is_within_its_promise(found):
+    assert 0 <= found.georeferencing["99.9_m"] <= found.georeferencing["max_m"] <= 1e-4
+
+
+def test_errors_repeat_by_seed(scene, found):
+    again = tradeoff(scene, DRIVE, compared=FEW)
+    assert [r.error for r in again.comparisons[0].rows] == [r.error for r in found.comparisons[0].rows]
+
+
+def test_the_report_is_written(found, tmp_path):
+    write_report(found, tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"tradeoff.json", "tradeoff.html"} < names
+    assert any(name.startswith("pareto_") for name in names)
+    written = json.loads((tmp_path / "out/tradeoff.json").read_text())
+    assert written == json.loads(json.dumps(document(found)))
+    assert len(written["sensors"][0]["recommendations"]) == 3
+    page = (tmp_path / "out/tradeoff.html").read_text()
+    assert "data:image/png;base64," in page
+    assert "http" not in page
+
+
+def test_the_cheapest_sufficient_setting_is_recommended():
+    rows = (row("as asked (rays=1)", 0.2, 1.0), row("rays=7", 0.3, 4.0), row("rays=19", 0.02, 9.0))
+    several = comparison(*rows, row("rays=61", 0.005, 30.0), residual=0.002)
+    assert [r.label for r in pareto(several)] == ["as asked (rays=1)", "rays=19", "rays=61"]
+    assert "cheapest setting is rays=19; it costs 9 CPU s" in recommendation(several, 0.1)
+    assert "cheapest setting is rays=61" in recommendation(several, 0.01)
+    none = recommendation(several, 0.001)
+    assert "no setting that was compared is enough; rays=61 comes nearest with 5 mm" in none
+    loose = comparison(row("rays=61", 0.0005, 30.0), residual=0.002)
+    assert "certain to 2 mm only" in recommendation(loose, 0.001)
+
+
+def test_lengths_have_fitting_units():
+    assert [metres(v) for v in (0, 3e-8, 2e-6, 0.0015, 0.25, 12.0)] == [
+        "0",
+        "30 nm",
+        "2 µm",
+        "1.5 mm",
+        "25 cm",
+        "12 m",
+    ]
+
+
+def test_scenes_are_named_by_what_differs(scene, scene_utm):
+    assert scene_label(scene, scene_utm).startswith("crs=")
+    assert scene_label(scene, scene) == scene.path.name
+
+
+def test_bad_input_is_one_clear_line(scene, scene_utm):
+    with pytest.raises(InputError, match="`compare` leaves: unknown; there are rays"):
+        tradeoff(scene, DRIVE, compared=TradeoffOptions(("leaves",)))
+    with pytest.raises(InputError, match="another frame"):
+        tradeoff(scene, DRIVE, compared=FEW, others=[scene_utm])
+    with pytest.raises(InputError, match="`frames` 1: give 2 to 1000"):
+        TradeoffOptions(frames=1)
