@@ -214,7 +214,7 @@ def _hipped_ends(cells: Cells, up: Float, *, low: float, span: float) -> Cells:
 def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
     """A profile from the eaves inwards on the straight skeleton; the field is the share of the roof's height.
 
-    None if there is no skeleton. The flag tells whether a hip end was raised to a gable.
+    None if there is no skeleton, or none with a height. The flag tells whether a hip end was raised to a gable.
     """
     skeleton = straight_skeleton(polygon)
     if skeleton is None:
@@ -224,6 +224,8 @@ def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
         skeleton = raise_gables(skeleton, GABLE_SHARE[spec.shape])
     cells = skeleton_cells(skeleton)
     span = float(cells.field.max())
+    if span == 0:  # a footprint so narrow that the ridge merges with its corners
+        return None, False
     profile = INWARD[spec.shape]
     for share, _ in profile[1:-1]:
         cells = cut(cells, share * span)

@@ -271,7 +271,7 @@ CASES = (
         "footprints",
         20,
         1000,
-        _FAULTS,
+        "below 0.5 m² they are dropped and reported as too small",
     ),
     Case(
         "footprints",

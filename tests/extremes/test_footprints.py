@@ -6,6 +6,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from geoscene.buildings.roofs import RoofSpec, roof_shell
 from lidar.selftest.footprints import CASES, built, house
 from lidar.selftest.run import outcome
 
@@ -39,3 +40,12 @@ def test_any_crowd_of_rings_becomes_solids_or_is_reported(seed):
     _, verdict, lost = built([house(k + 1, shapely.Polygon(ring)) for k, ring in enumerate(rings)])
     assert verdict.ok.all()
     assert lost == 0
+
+
+@pytest.mark.parametrize("roof", ["hipped", "gabled", "mansard"])
+def test_a_roof_on_a_footprint_of_a_millimetre_is_flat_and_finite(roof):
+    corners = [(317.6413, 1012.0132), (317.6413, 1052.3341), (317.6403, 1012.0142)]
+    polygon = shapely.orient_polygons(shapely.Polygon(corners))
+    shell, note = roof_shell(polygon, RoofSpec(roof, 0.0, 10.0, 4.0))
+    assert np.isfinite(shell.corners).all()
+    assert note == f"{roof} roof made flat"
