@@ -214,7 +214,7 @@ def _hipped_ends(cells: Cells, up: Float, *, low: float, span: float) -> Cells:
 def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
     """A profile from the eaves inwards on the straight skeleton; the field is the share of the roof's height.
 
-    None if there is no skeleton, or none with a height. The flag tells whether a hip end was raised to a gable.
+    None if there is no skeleton with a height. The flag tells whether a hip end was raised to a gable.
     """
     skeleton = straight_skeleton(polygon)
     if skeleton is None:
