@@ -156,6 +156,8 @@ def build(
         _print_scene(document)
         drive = ("lidar", "drive", out, "--route", "random", "-o", "drive")
         words = drive if document["counts"]["road_edges"] else ("geoscene", "export", out, "-o", "scene.glb")
+        if options.use == "gis":
+            words = ("geoscene", "export", out, "-o", "scene.gpkg")
         print(f"\n{document['seconds']:.1f} s; next: {command_line(*words)}")
     return 0
 
@@ -392,13 +394,16 @@ def _print_scene(report: dict[str, Any]) -> None:
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
     }
-    if report["options"]["along"]:
+    if "cut" in report:
         features = max(stop for _, stop in report["layers"].values())
         rows["along"] = (
             f"{len(report['tiles'])} tiles are built, those in range of the route; solids, watertight,"
             " trees in forests and ground count these tiles, all other figures the whole map;"
             f" tables hold {sum(report['cut']['rows'].values())} of {features} features"
         )
+    if report["options"].get("use") == "gis":
+        left_out = report["left_out"]["tiles"]
+        rows["for gis"] = f"tables and road graph only; {left_out} tiles with all meshes are left out"
     print(report["name"] or report["path"])
     for title, text in rows.items():
         if text:

@@ -49,6 +49,7 @@ def scene_manifest(
         "tile_size": options["tile_size"],
         "tiles": sorted((r.i, r.j, tile_span(plan.ground, r.i, j=r.j)) for r in reports),
         "options": dict(options),
+        "left_out": {"tiles": len(plan.chosen) - len(reports)},
         "terrain": {
             "vertical": terrain.vertical,
             "datum": terrain.datum,

@@ -38,6 +38,10 @@ class BuildOptions:
     only: Annotated[tuple[str, ...], WORDS] = KINDS
     """Kinds of features to build besides the ground, separated by commas."""
 
+    use: Annotated[str, Parameter(name="--for")] = "all"
+    """What the scene is for: all, or gis (tables and road graph, no tiles: it cannot be driven in, shown,
+    validated or exported as meshes)."""
+
     along: Annotated[tuple[str, ...], SEVERAL] = ()
     """Build only the tiles within sensor range of a route: LAT,LON LAT,LON ... or a GPX, GeoJSON or CSV file
     (such as the poses.csv of a dataset)."""
@@ -63,6 +67,8 @@ class BuildOptions:
             raise InputError(f"`dem_gaps` {self.dem_gaps}: error or nearest")
         if unknown := sorted(set(self.only) - set(KINDS)):
             raise InputError(f"`only` {','.join(unknown)}: of {','.join(KINDS)}")
+        if self.use not in ("all", "gis"):
+            raise InputError(f"`use` {self.use}: all or gis")
         if self.driving_side not in ("", "left", "right"):
             raise InputError(f"`driving_side` {self.driving_side}: left or right")
         if not 0 < self.reach < 1e6:

@@ -23,7 +23,7 @@ from geoscene.scene.writer import SceneWriter
 from geoscene.sources import OsmData
 from geoscene.tiles import Keys, TileReport, build_tiles, tiles_document
 
-_NOT_IN_TILES = frozenset({"name", "along", "reach"})
+_NOT_IN_TILES = frozenset({"name", "along", "reach", "use"})
 """Options on which no tile depends; some select the tiles to build."""
 
 _NOT_IN_GROUND = frozenset({"lod"})
@@ -52,7 +52,7 @@ def build(
     with SceneWriter(Path(out), overwrite=overwrite) as writer:
         plan, problems = make_plan(osm, options, progress=progress)
         keys = _keys(osm, options)
-        tiles = plan.chosen
+        tiles = plan.chosen if options.use == "all" else []
         reports: list[TileReport] = []
         for report in build_tiles(
             plan,

@@ -61,7 +61,7 @@ def write_gpkg(
     layers : names to write; default all
     """
     target = target_crs(scene, crs)
-    tables = [SOLIDS] if scene.table_length("buildings") else []
+    tables = [SOLIDS] if scene.table_length("buildings") and scene.has_tiles else []
     names = chosen_layers(scene, layers, others=tables)
     layers_in_plan = [name for name in names if name != SOLIDS]
     objects = count = faces = 0

@@ -123,9 +123,19 @@ class Scene:
         """Side of the smallest tiles in metres."""
         return float(self.manifest["tile_size"])
 
+    @property
+    def has_tiles(self) -> bool:
+        """Whether the scene was built with its tiles."""
+        return self.manifest.get("options", {}).get("use", "all") == "all"
+
     @functools.cached_property
     def tile_indices(self) -> list[tuple[int, int]]:
-        """(i, j) of all tiles; tile (i, j) of span n covers [i, i + n) x [j, j + n) times `tile_size`."""
+        """(i, j) of all tiles; tile (i, j) of span n covers [i, i + n) x [j, j + n) times `tile_size`.
+
+        Raises SceneFormatError if the scene was built without tiles.
+        """
+        if not self.has_tiles:
+            raise SceneFormatError(f"{self.path}: has tables but no tiles (built for gis); build it for all")
         return [(int(i), int(j)) for i, j, _ in self.manifest["tiles"]]
 
     @functools.cached_property
@@ -241,7 +251,8 @@ def open_scene(path: str | Path) -> Scene:
         if manifest.get("digest") != manifest_digest(manifest):
             raise SceneFormatError(f"{manifest_file}: differs from what the build wrote; {BUILD_AGAIN}")
         scene = Scene(folder, manifest, Frame.from_json(manifest["frame"]))
-        _ = scene.frame.crs, scene.bounds, scene.tile_boxes, scene.layers, scene.forests
+        _ = scene.frame.crs, scene.bounds, scene.layers, scene.forests
+        _ = scene.tile_boxes if scene.has_tiles else None
     return scene
 
 

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import shapely
 from helpers import DEMO_BOX
+from helpers.programs import run_program
 from helpers.scenes import same_files
 
 import geoscene.tiles
 from geoscene.classes import Class
 from geoscene.errors import InputError, SceneFormatError, SourceNotFoundError
+from geoscene.export import export_scene
 from geoscene.mesh import concatenate
 from geoscene.options import BuildOptions
 from geoscene.pipeline import build
@@ -225,6 +227,25 @@ def test_tiles_along_a_route_equal_those_of_the_whole_scene(osm, scene, tmp_path
     for i, j in part.tile_indices:
         name = f"tiles/{i}_{j}.npz"
         assert (part.path / name).read_bytes() == (scene.path / name).read_bytes()
+
+
+def test_scene_for_gis_has_the_tables_and_no_tiles(osm, scene, tmp_path):
+    part = build(osm, tmp_path / "gis", options=BuildOptions(name="demo", use="gis"))
+    for name in ("features", "road_graph"):
+        assert getattr(part.files, name).read_bytes() == getattr(scene.files, name).read_bytes()
+    assert part.manifest["left_out"]["tiles"] == len(scene.tile_indices)
+    assert list(part.files.tiles.iterdir()) == []
+    assert export_scene(part, tmp_path / "a.gpkg").objects > 0
+    assert export_scene(part, tmp_path / "a.xodr").objects > 0
+    for name in ("a.glb", "a.city.json", "a.tif"):
+        with pytest.raises(SceneFormatError, match="no tiles"):
+            export_scene(part, tmp_path / name)
+        assert not (tmp_path / name).exists()
+    done = run_program("lidar", "drive", part.path, "--route", "random", "-o", tmp_path / "drive")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "no tiles" in done.stderr
+    assert not (tmp_path / "drive").exists()
 
 
 def test_only_selected_kinds_are_built(osm, tmp_path):
