@@ -59,6 +59,7 @@ CHANGES = {
     "along": "a file",
     "reach": 30.0,
     "driving_side": "left",
+    "use": "gis",
     "tile_size": 150.0,
     "name": "other",
 }
@@ -80,7 +81,8 @@ def test_rebuild_with_another_option_has_the_bytes_of_a_fresh_build(
     made, ground_tile = [], geoscene.tiles.ground_tile
     monkeypatch.setattr(geoscene.tiles, "ground_tile", lambda *a, **o: made.append(a) or ground_tile(*a, **o))
     again = build(osm, tmp_path / "scene", options=options, overwrite=True)
-    assert len(made) == (0 if name in ("lod", "name", "along", "reach") else len(again.tile_indices))
+    kept = ("lod", "name", "along", "reach", "use")  # no option on which the ground depends
+    assert len(made) == (0 if name in kept else len(again.tile_indices))
     same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
 
 
