@@ -126,7 +126,7 @@ class Scene:
     @property
     def has_tiles(self) -> bool:
         """Whether the scene was built with its tiles."""
-        return self.manifest.get("options", {}).get("use", "all") == "all"
+        return bool(self.manifest.get("options", {}).get("use", "all") == "all")
 
     @functools.cached_property
     def tile_indices(self) -> list[tuple[int, int]]:
