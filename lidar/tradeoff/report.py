@@ -157,7 +157,7 @@ def pareto_plot(comparison: Comparison, *, width: int = 1100, height: int = 700)
     rows, best = candidates(comparison), pareto(comparison)
     x = [row.cost["cpu_s"] for row in rows]
     y = [row.error["range_99.9_m"] for row in rows]
-    left, right, top, bottom = 90, width - 150, 50, height - 70
+    left, right, top, bottom = 90, width - 150, 70, height - 70
     across, up = _scale(x, ends=(left, right)), _scale(y, ends=(bottom, top))
     said: dict[str, Any] = {"fill": _INK, "font": font}
     pen.text((left, 16), headline(comparison), **said)
@@ -172,15 +172,27 @@ def pareto_plot(comparison: Comparison, *, width: int = 1100, height: int = 700)
     places = [(across(row.cost["cpu_s"].value), up(row.error["range_99.9_m"].value)) for row in best]
     if len(places) > 1:
         pen.line(places, fill=_CHOICE, width=2)
-    for row in rows:
+    named: list[tuple[float, float, float, float]] = []
+    for row in (*best, *(row for row in rows if row not in best)):
         cost, error = row.cost["cpu_s"], row.error["range_99.9_m"]
         u, v = across(cost.value), up(error.value)
         color = _CHOICE if row in best else _OTHER
         pen.line((across(cost.low), v, across(cost.high), v), fill=color)
         pen.line((u, up(error.low), u, up(error.high)), fill=color)
         pen.ellipse((u - 4, v - 4, u + 4, v + 4), fill=color)
-        pen.text((u + 8, v - 4), row.label, **said, anchor="ls")
+        name = row.label.partition(" (")[0]
+        for x_text, y_text, anchor in ((u + 8, v - 4, "ls"), (u + 8, v + 4, "lt"), (u - 8, v + 4, "rt")):
+            box = pen.textbbox((x_text, y_text), name, font=font, anchor=anchor)
+            if not any(_overlap(box, other) for other in named):  # else without a name: the table has it
+                pen.text((x_text, y_text), name, **said, anchor=anchor)
+                named.append(box)
+                break
     return np.asarray(picture).copy()
+
+
+def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+    """Whether two boxes (left, top, right, bottom) overlap."""
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
 
 
 def _ends(figures: list[Estimate]) -> tuple[float, float]:
