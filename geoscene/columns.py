@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
@@ -38,3 +38,9 @@ class Columns:
         names = tables[0].columns()
         joined = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
         return replace(tables[0], **joined)
+
+
+def row_blocks(count: int, size: int, *, overlap: int = 0) -> Iterator[slice]:
+    """Slices of ``size`` rows, and ``overlap`` of the next, that cover ``count``; an empty one for none."""
+    for first in range(0, max(count, 1), size):
+        yield slice(first, min(first + size + overlap, count))

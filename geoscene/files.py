@@ -21,6 +21,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import row_blocks
 from geoscene.errors import InputError, NotWrittenError
 
 log = logging.getLogger(__name__)
@@ -189,11 +190,13 @@ def write_columns(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]
     most = max((len(array) for array in arrays.values()), default=0)
     write_blocks(
         path,
-        (
-            {name: array[first : first + BLOCK_ROWS] for name, array in arrays.items()}
-            for first in range(0, max(most, 1), BLOCK_ROWS)
-        ),
+        ({name: array[rows] for name, array in arrays.items()} for rows in table_blocks(most)),
     )
+
+
+def table_blocks(count: int) -> Iterator[slice]:
+    """Slices of the rows of a table, of which one at a time is in memory; see `write_blocks`."""
+    return row_blocks(count, BLOCK_ROWS)
 
 
 def write_blocks(path: Path, blocks: Iterable[Mapping[str, Sequence[Any] | NDArray[Any]]]) -> None:

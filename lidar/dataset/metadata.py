@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import BLOCK_ROWS, write_atomically, write_blocks, write_columns, write_json
+from geoscene.files import table_blocks, write_atomically, write_blocks, write_columns, write_json
 from geoscene.frames import Frame
 from geoscene.scene import Scene
 from lidar.dataset.kitti_sequence import write_sequence
@@ -147,7 +147,7 @@ def write_metadata(
             paths.timestamps(sensor.name),
             (
                 {"frame": number[rows], "time_ns": times[rows], "timestamp": iso_times(start, times[rows])}
-                for rows in _blocks(len(times))
+                for rows in table_blocks(len(times))
             ),
         )
         if k == 0:
@@ -155,7 +155,7 @@ def write_metadata(
                 paths.poses,
                 (
                     pose_columns(trajectory, scene.frame, start=start, time_ns=times[rows], first=rows.start)
-                    for rows in _blocks(len(times))
+                    for rows in table_blocks(len(times))
                 ),
             )
         if contents.kitti and isinstance(sensor, Scanner):
@@ -173,15 +173,9 @@ def write_metadata(
                     "timestamp": iso_times(start, rows.time_ns[block]),
                     **{name: column[block] for name, column in columns.items()},
                 }
-                for block in _blocks(len(rows.time_ns))
+                for block in table_blocks(len(rows.time_ns))
             ),
         )
-
-
-def _blocks(count: int) -> Iterator[slice]:
-    """Slices of at most `BLOCK_ROWS` rows that cover ``count`` rows; an empty one for none."""
-    for first in range(0, max(count, 1), BLOCK_ROWS):
-        yield slice(first, first + BLOCK_ROWS)
 
 
 def _write_fixes(

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.columns import Columns
+from geoscene.columns import Columns, row_blocks
 from geoscene.typing import Float
 from lidar.errors import InputError
 
@@ -34,8 +34,7 @@ _RISING = "a trajectory needs two or more poses at increasing times"
 
 def blocks_of(count: int, *, overlap: int = 0) -> Iterator[slice]:
     """Slices that cover ``count`` rows: `BLOCK_POSES` each, and ``overlap`` rows of the next one."""
-    for first in range(0, count, BLOCK_POSES):
-        yield slice(first, min(first + BLOCK_POSES + overlap, count))
+    return row_blocks(count, BLOCK_POSES, overlap=overlap)
 
 
 def _room(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
+from geoscene.columns import Columns, row_blocks
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import BlockedError
@@ -88,8 +88,8 @@ def touching(
     rows = np.unique(np.append(np.arange(0, len(track.row), every), len(track.row) - 1))
     rows = rows[~line.free[track.row[rows]]]
     found: list[tuple[NDArray[np.int64], NDArray[np.object_], NDArray[np.object_]]] = []
-    for first in range(0, max(len(rows), 1), _BODIES):
-        part = rows[first : first + _BODIES]
+    for block in row_blocks(len(rows), _BODIES):
+        part = rows[block]
         bodies = body_outlines(
             track.xy[part], track.heading[part], vehicle=setting.vehicle, margin=setting.margin
         )

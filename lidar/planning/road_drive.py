@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from geoscene.columns import row_blocks
 from geoscene.progress import Progress, silent
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
@@ -84,8 +85,7 @@ def road_surface(scene: Scene) -> Surface:
     def surface(x: Float, y: Float, z: Float) -> Float:  # noqa: PLR0917 - a Surface
         world.follow((float(x.min()) - 1, float(y.min()) - 1, float(x.max()) + 1, float(y.max()) + 1))
         out = np.array(z, float)
-        for first in range(0, len(x), _RAYS):
-            rows = slice(first, first + _RAYS)
+        for rows in row_blocks(len(x), _RAYS):
             origins = np.column_stack([x[rows], y[rows], z[rows] + _SEARCH_M])
             down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
             hits = world.caster.cast(origins, down, far=2 * _SEARCH_M)
