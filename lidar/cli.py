@@ -86,8 +86,8 @@ def drive(
     from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
     from lidar.pipeline import drive as record  # noqa: PLC0415
 
-    if options is None or bool(options.route) == bool(options.survey):
-        raise InputError("give one of `route` and `survey`, such as `route` random")
+    options = options or DriveOptions()
+    options.check_course()
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress, using(open_scene(scene), known=LidarError) as opened:
         summary = record(opened, out, options=options, overwrite=report.overwrite, progress=progress)
@@ -207,8 +207,8 @@ def tradeoff(
     from lidar.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
     from lidar.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
 
-    if options is None or bool(options.route) == bool(options.survey):
-        raise InputError("give one of `route` and `survey`, such as `route` random")
+    options = options or DriveOptions()
+    options.check_course()
     if out is not None:
         note_new_folder(out)
         if out.exists() and not report.overwrite:
@@ -552,7 +552,7 @@ def selftest(
         extremes.print_table(done)
     if broken:
         print(f"lidar: {broken} of {len(done)} bounds do not hold on this machine", file=sys.stderr)
-    return 1 if broken else 0
+    return FAILURE if broken else 0
 
 
 def main() -> None:

@@ -265,6 +265,11 @@ class DriveOptions:
             raise InputError(f"`overlap` {self.overlap:g}: give a share from 0 to less than 1")
         self.contents()
 
+    def check_course(self) -> None:
+        """Raise InputError unless the options name either a route or a survey."""
+        if bool(self.route) == bool(self.survey):
+            raise InputError("give one of `route` and `survey`, such as `route` random")
+
     def side_in(self, scene: Scene) -> Side:
         """Side of the road that the vehicle drives on."""
         return cast("Side", self.side) if self.side else "left" if scene.left_hand else "right"

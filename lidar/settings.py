@@ -92,7 +92,7 @@ def list_settings() -> list[Setting]:
     for k, of in enumerate(Settings._fields):
         meanings = _meanings(inspect.getdoc(type(at_levels[0][k])) or "")
         for f in fields(at_levels[0][k]):
-            values = tuple(_text(getattr(chosen[k], f.name)) for chosen in at_levels)
+            values = tuple(text_of(getattr(chosen[k], f.name)) for chosen in at_levels)
             found.append(Setting(f.name, of, values, meanings.get(f.name, "")))
     return found
 
@@ -108,7 +108,8 @@ def _meanings(docstring: str) -> dict[str, str]:
     return meanings
 
 
-def _text(value: object) -> str:
+def text_of(value: object) -> str:
+    """The text of a setting's value, as `settings_of` reads it."""
     if isinstance(value, bool):
         return "on" if value else "off"
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -187,8 +187,7 @@ def _parsed(words: list[str]) -> DriveOptions:
 
 def _check(options: DriveOptions) -> None:
     """Raise InputError for what the drive would refuse, but for the route's course."""
-    if bool(options.route) == bool(options.survey):
-        raise InputError("give one of `route` and `survey`, such as `route` random")
+    options.check_course()
     rig = load_rig(options.rig)
     sensors_of(rig, options)
     load_vehicle(options.vehicle or rig.vehicle)

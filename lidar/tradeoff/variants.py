@@ -8,6 +8,7 @@ from typing import Any
 
 from lidar.physics.settings import MOST_RAYS, POSES, ScannerSettings
 from lidar.raycast import PRECISIONS
+from lidar.settings import text_of
 from lidar.world.settings import ORIGINS, WorldSettings
 from lidar.world.settings import PLAIN as WHOLE
 
@@ -115,7 +116,7 @@ def scanner_variants(
     used, exact = noiseless(settings), reference(settings, rays=rays)
     values = {name: getattr(used, name) for name in SCANNER_VALUES}
     values |= {name: getattr(world, name) for name in WORLD_VALUES}
-    asked = ", ".join(f"{name}={_text(value)}" for name, value in values.items())
+    asked = ", ".join(f"{name}={text_of(value)}" for name, value in values.items())
     rows = [Variant("", asked, used, used, world=world)]
     for name in SCANNER_VALUES:
         if not compared or name in compared:
@@ -138,7 +139,9 @@ def _of_setting(
     for value in SCANNER_VALUES[name]:
         change: dict[str, Any] = {name: value}
         if value != getattr(used, name) and (name != "rays" or value < exact.rays):
-            yield Variant(name, _text(value), replace(used, **change), replace(exact, **change), world=world)
+            yield Variant(
+                name, text_of(value), replace(used, **change), replace(exact, **change), world=world
+            )
 
 
 def _of_world(
@@ -149,15 +152,9 @@ def _of_world(
         if value != getattr(world, name):
             yield Variant(
                 name,
-                _text(value),
+                text_of(value),
                 used,
                 exact,
                 world=replace(world, **change),
                 alone_world=replace(WHOLE, **change),
             )
-
-
-def _text(value: object) -> str:
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    return f"{value:g}" if isinstance(value, float) else str(value)
