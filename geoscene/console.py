@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import json
 import logging
 import os
@@ -23,6 +24,10 @@ from geoscene.progress import Progress, silent
 
 DONE, FAILURE, USAGE = 0, 1, 2
 """Exit codes: success, failure, unusable input or options."""
+
+_COLLECTED = (100_000, 50, 50)
+"""Thresholds of Python's search for cyclic garbage: with its defaults it takes a tenth of a build, whose many
+objects are kept."""
 
 _NO_SPACE = "; free some space and run the same command again"
 _PERMISSION = "; give a path that you may write to and files that you may read"
@@ -122,6 +127,7 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
     logging.basicConfig(
         level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
+    gc.set_threshold(*_COLLECTED)
     logging.getLogger("geoscene.cluster").setLevel(logging.INFO)  # it names the page with the progress
     try:
         with _ended_by_interruptions(app):

@@ -46,6 +46,33 @@ def cut(line: Float, start: float, *, end: float, gap: float = 0.0, least: float
     return points_at(line, np.concatenate([[start], along[inside], [end]]), along=along)
 
 
+def heads(lines: NDArray[np.object_], end: Float) -> NDArray[np.object_]:
+    """The parts (n,) of shapely lines from their starts to stations (n,), clamped to their ends."""
+    if not len(lines):
+        return lines
+    xy, of = shapely.get_coordinates(lines, return_index=True)
+    first = np.flatnonzero(np.diff(of, prepend=-1))
+    step = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
+    step[first] = 0.0
+    along = np.cumsum(step)
+    along -= along[first][of]
+    last = np.append(first[1:], len(of)) - 1
+    end = np.minimum(end, along[last])
+    # The cut is in the segment that ends in the first vertex beyond it.
+    beyond = first + np.bincount(of, along < end[of], minlength=len(lines)).astype(np.int64)
+    before = np.maximum(beyond - 1, first)
+    run = np.maximum(along[beyond] - along[before], 1e-12)
+    share = np.clip((end - along[before]) / run, 0.0, 1.0)
+    cut_at = xy[before] + share[:, None] * (xy[beyond] - xy[before])
+    kept = (along > 0.0) & (along < end[of])
+    kept[first] = True
+    points = np.concatenate([xy[kept], cut_at])
+    owner = np.concatenate([of[kept], np.arange(len(lines))])
+    order = np.argsort(owner, kind="stable")
+    parts: NDArray[np.object_] = shapely.linestrings(points[order], indices=owner[order])
+    return parts
+
+
 def parallel(line: Float, offset: float) -> Float:
     """The line (k, 3) with every vertex moved ``offset`` to the left, with mitred corners.
 

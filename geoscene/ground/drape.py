@@ -77,8 +77,8 @@ def water_levels(layers: Layers, ways: Sequence[Way], *, frame: Frame, height: H
     stations, heights, turned = _profiles(lines, frame, height=height)
     river = layers.body == "river"
     if river.any():
-        tree = shapely.STRtree(layers.polygon[river])
-        has_line = np.unique(tree.query(shapely.points(stations), predicate="within")[1])
+        tree = shapely.STRtree(shapely.points(stations))
+        has_line = np.unique(tree.query(layers.polygon[river], predicate="contains")[0])
         river[np.flatnonzero(river)[~np.isin(np.arange(river.sum()), has_line)]] = False
     still = np.flatnonzero((layers.body != "") & ~river)
     if len(still):

@@ -187,13 +187,10 @@ def _neighbour(group: Ints) -> Ints:
 
 def _stubs(roads: Carriageways, arms: _Arms, *, length: Float) -> NDArray[np.object_]:
     """Carriageways of the first metres of each arm (a,)."""
-    lines = []
-    for road, end, far in zip(arms.road.tolist(), arms.end.tolist(), length.tolist(), strict=True):
-        xy = shapely.get_coordinates(roads.line[road])
-        lines.append(polylines.cut(xy[::-1] if end else xy, 0.0, end=far))
-    sizes = [len(line) for line in lines]
-    stubs = shapely.linestrings(np.concatenate(lines), indices=np.repeat(np.arange(len(lines)), sizes))
-    return carriageway(stubs, roads.width[arms.road] / 2)
+    lines = roads.line[arms.road].copy()
+    from_end = arms.end == 1
+    lines[from_end] = shapely.reverse(lines[from_end])
+    return carriageway(polylines.heads(lines, length), roads.width[arms.road] / 2)
 
 
 def carriageway(lines: NDArray[np.object_], half: Float) -> NDArray[np.object_]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -53,3 +54,13 @@ def test_end_headings_span_short_segments():
     line = np.array([[0, 0], [0, 0.1], [10, 0], [20, 0], [20, 10.0]])
     first, last = polylines.end_headings(line, reach=5.0)
     assert (first, last) == (0.0, np.pi / 2)
+
+
+def test_heads_of_many_lines_are_those_cut_one_by_one():
+    rng = np.random.default_rng(5)
+    lines = [rng.uniform(0, 30, (n, 2)) for n in (2, 3, 7, 12)] + [np.array([[0, 0], [0, 0], [3, 4.0]])]
+    for end in (0.5, 12.0, 1e3):
+        found = polylines.heads(np.array([shapely.LineString(xy) for xy in lines]), np.full(len(lines), end))
+        expected = [shapely.LineString(polylines.cut(xy, 0.0, end=end)) for xy in lines]
+        assert shapely.hausdorff_distance(found, expected).max() < 1e-9
+        assert np.allclose(shapely.length(found), shapely.length(expected))
