@@ -8,12 +8,15 @@ import os
 import signal
 import threading
 import traceback
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
+from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from geoscene.errors import WorkersLostError
@@ -22,6 +25,9 @@ log = logging.getLogger(__name__)
 
 _INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM)
 """Signals that a terminal or ``timeout`` sends to all processes; they are for the parent process."""
+
+_THREADS = Path("/proc/self/task")
+"""Folder of an entry for each thread of this process, on Linux."""
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -45,18 +51,20 @@ class _Worker(Generic[Task]):
 def run_tasks(work: Callable[[Task], Result], tasks: Sequence[Task], *, workers: int) -> Iterator[Result]:
     """Yields the results of ``work`` for all tasks, in the order of their completion.
 
-    Workers are processes started with the current method (`multiprocessing.set_start_method`): forked ones
-    share the memory of ``work``, spawned ones get a pickled copy each and need an importable main module.
-    They are killed when the iterator is closed or raises, and end when this process ends. The task of a
-    worker that was killed goes to another one.
+    Workers are processes started with the current method (`multiprocessing.set_start_method`), but spawned
+    instead of forked if a library has threads in this process, whose locks and pools a fork would break.
+    Forked ones share the memory of ``work``, spawned ones get a pickled copy each and need an importable main
+    module. They are killed when the iterator is closed or raises, and end when this process ends. The task of
+    a worker that was killed goes to another one.
 
     Raises the errors of ``work``, and WorkersLostError if all workers were killed.
     """
     waiting = deque(tasks)
     team: dict[Any, _Worker[Task]] = {}
+    context = _context()
     try:
         for _ in range(min(workers, len(waiting))):
-            _add_worker(team, work)
+            _add_worker(team, work, context=context)
         while busy := _assigned(team, waiting):
             for connection in cast("list[Connection]", wait(busy)):
                 worker = team[connection]
@@ -83,19 +91,51 @@ def run_tasks(work: Callable[[Task], Result], tasks: Sequence[Task], *, workers:
             worker.process.join()
 
 
-def _add_worker(team: dict[Any, _Worker[Task]], work: Callable[[Task], Result]) -> None:
-    """Start a process and add it to the team, with interruptions blocked."""
+def _context() -> BaseContext:
+    """How processes are started: as is current, but not by a fork while libraries have threads."""
     context = multiprocessing.get_context()
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_serve, args=(theirs, work), daemon=True)
+    forks = context.get_start_method() == "fork"
+    return multiprocessing.get_context("spawn") if forks and threads_of_libraries() else context
+
+
+def threads_of_libraries() -> int:
+    """Number of threads that Python does not know and that are in the way of a fork, 0 without ``/proc``.
+
+    They are those of pools, as of lazrs, Arrow or TBB. Those of OpenBLAS, which it ends before a fork and
+    starts again when needed, do not count.
+    """
+    if not _THREADS.is_dir():
+        return 0
+    with _without_interruptions(), warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of forks with threads, from Python 3.12
+        if not (child := os.fork()):  # so that libraries that care for forks end their threads
+            os._exit(0)
+        os.waitpid(child, 0)
+    known = {thread.native_id for thread in threading.enumerate()}
+    return sum(int(entry.name) not in known for entry in _THREADS.iterdir())
+
+
+@contextmanager
+def _without_interruptions() -> Iterator[None]:
+    """Block interruptions, also in processes that are started in the block."""
     masks = hasattr(signal, "pthread_sigmask")
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _INTERRUPTIONS) if masks else None
     try:
-        process.start()
-        team[ours] = _Worker(process)
+        yield
     finally:
         if before is not None:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _add_worker(
+    team: dict[Any, _Worker[Task]], work: Callable[[Task], Result], *, context: BaseContext
+) -> None:
+    """Start a process and add it to the team, with interruptions blocked."""
+    ours, theirs = context.Pipe()
+    process: BaseProcess = context.Process(target=_serve, args=(theirs, work), daemon=True)  # type: ignore[attr-defined]
+    with _without_interruptions():
+        process.start()
+        team[ours] = _Worker(process)
     theirs.close()
 
 

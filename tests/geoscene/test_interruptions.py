@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -263,8 +264,43 @@ def test_partly_written_tiles_of_killed_workers_are_deleted(osm, whole, tmp_path
 
 def test_error_of_a_task_reaches_the_caller():
     with pytest.raises(ZeroDivisionError) as raised:
-        list(run_tasks(lambda task: 1 / task, [1, 0, 2], workers=2))
-    assert "1 / task" in raised.value.__notes__[0]
+        list(run_tasks(partial(divmod, 1), [1, 0, 2], workers=2))
+    assert "work(task)" in raised.value.__notes__[0]
+
+
+AFTER_THREADS = """
+import io
+import laspy
+import numpy as np
+from geoscene.processes import run_tasks, threads_of_libraries
+
+def compressed(points):
+    las = laspy.LasData(laspy.LasHeader(point_format=6))
+    las.x = las.y = las.z = np.arange(float(points))
+    las.write(file := io.BytesIO(), do_compress=True)
+    return len(file.getvalue())
+
+if __name__ == "__main__":
+    np.ones((600, 600)) @ np.ones((600, 600))  # BLAS, whose threads end before a fork
+    print(threads_of_libraries())
+    expected = compressed(200_000)
+    print(threads_of_libraries() > 0)
+    print(list(run_tasks(compressed, [200_000] * 3, workers=2)) == [expected] * 3)
+"""
+
+
+@IN_PROC
+def test_workers_started_while_a_library_has_threads_do_not_inherit_its_pool(tmp_path):
+    (tmp_path / "main.py").write_text(AFTER_THREADS)
+    done = subprocess.run(
+        [sys.executable, tmp_path / "main.py"],
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert (done.stdout.split(), done.stderr) == (["0", "True", "True"], "")
 
 
 def test_task_that_kills_every_worker_ends_the_run():
