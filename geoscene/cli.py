@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -101,6 +102,7 @@ def build(
     options: Annotated[BuildOptions, Parameter(group=_SCENE)] = BuildOptions(),
     out: Out,
     workers: Annotated[int | None, Parameter(group=_OUTPUT, converter=whole)] = None,
+    scheduler: Annotated[str, Parameter(group=_OUTPUT, metavar="ADDRESS")] = "",
     report: Reporting = Report(),
 ) -> int:
     """Build a scene: solids of all buildings, one ground surface, the drivable road graph.
@@ -123,7 +125,11 @@ def build(
         Directory to write the scene to.
     workers
         Number of processes, by default one per core. The scene does not depend on it.
+    scheduler
+        Address of the scheduler of a Dask cluster (tcp://HOST:8786), whose workers build the tiles instead;
+        they need the output folder under the same path.
     """
+    from geoscene.cluster import connected  # noqa: PLC0415
     from geoscene.pipeline import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
     from geoscene.scene.writer import check_target  # noqa: PLC0415
 
@@ -134,7 +140,10 @@ def build(
         raise InputError("`dem_server` needs --dem tiles")
     check_target(out, overwrite=report.overwrite)
     note_new_folder(out)
-    with progress_bar(quiet=report.quiet) as progress:
+    with (
+        connected(scheduler) if scheduler else nullcontext() as cluster,
+        progress_bar(quiet=report.quiet) as progress,
+    ):
         progress("reading the map", 0, total=0)
         data = _read_map(source)
         if options.dem == ("tiles",):
@@ -147,6 +156,7 @@ def build(
             options=options,
             overwrite=report.overwrite,
             workers=workers or os.cpu_count() or 1,
+            cluster=cluster,
             progress=progress,
         )
     document = scene.manifest | {"path": str(out), "seconds": round(time.perf_counter() - started, 2)}

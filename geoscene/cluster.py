@@ -29,7 +29,7 @@ class Cluster:
         self._client, self._address = client, address
         log.info("the workers' progress: %s", client.dashboard_link)
 
-    def check(self, out: Path, *, inputs: Sequence[Path]) -> None:
+    def check(self, out: Path, *, inputs: Sequence[Path] = ()) -> None:
         """Check that all workers have this version and see what this process sees.
 
         out    : folder to write to

@@ -9,6 +9,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 
 from geoscene import __version__
+from geoscene.cluster import Cluster
 from geoscene.errors import SourceNotFoundError
 from geoscene.files import digest, digest_of
 from geoscene.manifest import scene_manifest
@@ -37,12 +38,16 @@ def build(
     options: BuildOptions = BuildOptions(),
     overwrite: bool = False,
     workers: int = 1,
+    cluster: Cluster | None = None,
     progress: Progress = silent,
 ) -> Scene:
     """Build a scene of a map extract and write it to a directory.
 
     An interrupted build resumes when repeated. A build that overwrites a scene reuses its unchanged tiles.
-    The bytes depend neither on ``workers`` nor on earlier builds.
+    The bytes depend neither on ``workers`` or ``cluster`` nor on earlier builds.
+
+    workers : processes that build tiles
+    cluster : whose workers build the tiles instead, see `geoscene.cluster.connected`
 
     Raises SourceNotFoundError for an empty extract, FrameError for an unsuitable CRS and SceneFormatError for
     a directory that must not be overwritten.
@@ -50,6 +55,8 @@ def build(
     if not (osm.areas or osm.ways):
         raise SourceNotFoundError(f"{osm.source or 'the extract'}: has no features to build a scene from")
     with SceneWriter(Path(out), overwrite=overwrite) as writer:
+        if cluster is not None:
+            cluster.check(writer.folder)
         plan, problems = make_plan(osm, options, progress=progress)
         keys = _keys(osm, options)
         tiles = plan.chosen if options.use == "all" else []
@@ -62,6 +69,7 @@ def build(
             keys=keys,
             workers=workers,
             former=writer.former,
+            cluster=cluster,
         ):
             reports.append(report)
             progress("tiles", len(reports), total=len(tiles))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import pickle
+import secrets
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -16,6 +18,7 @@ import shapely
 
 from geoscene.buildings import build_solids
 from geoscene.classes import Class
+from geoscene.cluster import Cluster
 from geoscene.files import digest_of, write_atomically
 from geoscene.ground import ground_tile, tile_box, tile_place
 from geoscene.mesh import Instances, Mesh, concatenate
@@ -33,6 +36,9 @@ from geoscene.typing import Ints
 from geoscene.watertight import validate_mesh
 
 T = TypeVar("T")
+
+_TILES = 4
+"""Tiles of a task of a cluster: few, so that the tasks of a lost worker are soon repeated."""
 
 _SINGULAR = {"trees": "tree", "furniture": "furniture", "barriers": "barrier", "structures": "structure"}
 
@@ -194,12 +200,13 @@ def build_tiles(
     keys: Keys,
     workers: int,
     former: Path | None,
+    cluster: Cluster | None = None,
 ) -> Iterator[TileReport]:
     """Build all tiles that are not in ``folder`` yet; yields reports of all tiles, in no particular order.
 
     Each tile is entered in a journal in ``folder`` once written, so an interrupted build can resume. Tiles of
     the ``former`` scene with the same keys are copied, or their ground is reused. Tiles whose files are
-    damaged are built again.
+    damaged are built again. Workers of a cluster must see ``folder`` and that scene under the same paths.
     """
     files = SceneFiles(folder)
     files.tiles.mkdir(parents=True, exist_ok=True)
@@ -212,13 +219,43 @@ def build_tiles(
     yield from finished.values()
     remaining = [tile for tile in tiles if tile not in finished]
     job = _Job(plan, folder, lod, _Former.of(former, keys))
-    several = workers > 1 and len(remaining) > 1
-    for report in run_tasks(job, remaining, workers=workers) if several else map(job, remaining):
+    for report in _reports(job, remaining, workers=workers, cluster=cluster):
         with files.tile_journal.open("a", encoding="utf-8") as journal:
             journal.write(json.dumps({"keys": asdict(keys), **asdict(report)}) + "\n")
         yield report
     for left in files.tiles.glob("*.part"):  # of workers that were killed while writing
         left.unlink()
+
+
+def _reports(
+    job: _Job, tiles: Sequence[tuple[int, int]], *, workers: int, cluster: Cluster | None
+) -> Iterator[TileReport]:
+    """Reports of tiles as they are built: here, by processes, or by the workers of a cluster."""
+    if cluster is None:
+        several = workers > 1 and len(tiles) > 1
+        yield from run_tasks(job, tiles, workers=workers) if several else map(job, tiles)
+    elif tiles:
+        file = job.folder / f"plan-{secrets.token_hex(8)}.part"
+        write_atomically(file, pickle.dumps(job))
+        tasks = [(file, tuple(tiles[k : k + _TILES])) for k in range(0, len(tiles), _TILES)]
+        try:
+            for reports in cluster.run_tasks(_built, tasks):
+                yield from reports
+        finally:
+            file.unlink(missing_ok=True)
+
+
+def _built(task: tuple[Path, Sequence[tuple[int, int]]]) -> list[TileReport]:
+    """Build the tiles of a task, whose job is in a file; run by workers of a cluster."""
+    file, tiles = task
+    job = _job_in(file)
+    return [job(tile) for tile in tiles]
+
+
+@functools.lru_cache(maxsize=1)
+def _job_in(file: Path) -> _Job:
+    job: _Job = pickle.loads(file.read_bytes())  # noqa: S301  (of the program that gave the task)
+    return job
 
 
 @dataclass(frozen=True, slots=True)

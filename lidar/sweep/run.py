@@ -109,7 +109,9 @@ def sweep(
             inputs = dict.fromkeys(path for planned in drives for path in planned.inputs)
             cluster.check(folder.absolute(), inputs=list(inputs))
         with _table(folder, Path(file), drives=drives) as table:
-            drives = _with_scenes(drives, folder.absolute(), workers=workers, progress=progress)
+            drives = _with_scenes(
+                drives, folder.absolute(), workers=workers, cluster=cluster, progress=progress
+            )
             threads = 1 if cluster else max(workers // len(drives), 1)
             tasks = [
                 _Task(row, planned, folder.absolute(), threads, overwrite=overwrite)
@@ -123,7 +125,7 @@ def sweep(
 
 
 def _with_scenes(
-    drives: Sequence[GridDrive], folder: Path, *, workers: int, progress: Progress
+    drives: Sequence[GridDrive], folder: Path, *, workers: int, cluster: Cluster | None, progress: Progress
 ) -> list[GridDrive]:
     """The drives with scenes in folder ``scenes`` for those of maps; they are built as needed."""
     scenes: dict[Path, Path] = {}
@@ -138,6 +140,7 @@ def _with_scenes(
             options=BuildOptions(name=name),
             overwrite=target.exists(),  # its unchanged tiles are kept
             workers=workers,
+            cluster=cluster,
             progress=progress,
         )
         scenes[file] = target
