@@ -314,14 +314,22 @@ class TradeoffOptions:
     """Options of a comparison of settings."""
 
     compare: Annotated[tuple[str, ...], Parameter(name="--settings"), WORDS] = ()
-    """Settings to compare, separated by commas: rays, poses, precision, retrace, mirrors, foliage,
-    origin, reach, scene, traffic, georeferencing; all by default."""
+    """Settings to compare, separated by commas: rays, poses, mirrors, foliage of scanners; supersample, blur,
+    shadows, detail, resolution, haze of cameras; precision, retrace of both; origin, reach, forests, trees,
+    furniture, barriers, scene, traffic, georeferencing; all by default. Cheap ones are combined, too."""
+
+    sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
+    """Names of the scanners and cameras to compare; all by default."""
 
     frames: Annotated[int, Parameter(converter=whole)] = 8
     """Frames to sample, spread over the drive: 2 to 1000."""
 
     pulses: Annotated[int, Parameter(converter=whole)] = 16_000
     """Pulses of each scanner to compare, at random over the sampled frames: 100 to 10,000,000."""
+
+    pixels: Annotated[int, Parameter(converter=whole)] = 8192
+    """Pixels of each camera to compare, in blocks of 8 by 8 at random over the sampled frames: 256 to
+    10,000,000."""
 
     reference_rays: Annotated[int, Parameter(converter=whole)] = 217
     """Rays per pulse of the reference: 7 to 665."""
@@ -334,6 +342,7 @@ class TradeoffOptions:
         for name, low, high in (
             ("frames", 2, 1000),
             ("pulses", 100, 10**7),
+            ("pixels", 256, 10**7),
             ("reference_rays", 7, 665),
             ("repetitions", 3, 100),
         ):

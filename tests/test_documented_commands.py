@@ -120,7 +120,7 @@ def folder(inputs, tmp_path, monkeypatch):
     compare = lidar.tradeoff.engine.tradeoff
 
     def small(scene, options, *, compared, **more):
-        compared = replace(compared, frames=2, pulses=100, reference_rays=7)
+        compared = replace(compared, frames=2, pulses=100, pixels=256, reference_rays=7)
         return compare(scene, replace(options, duration=0.4), compared=compared, **more)
 
     monkeypatch.setattr(lidar.tradeoff.engine, "tradeoff", small)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,11 +142,67 @@ STATISTICS: dict[str, Statistic] = {
 """Figures of an error, over all sampled frames. Shares are of the reference's returns."""
 
 
-def estimates(frames: Sequence[FrameError], *, seed: int) -> dict[str, Estimate]:
-    """All `STATISTICS` of an error, with intervals by resampling frames."""
+@dataclass(frozen=True, slots=True)
+class ImageError:
+    """Differences of pixels of one frame of a camera from the reference.
+
+    levels  : (256,) int64, numbers of red, green and blue values by their absolute difference
+    depth   : (m,) metres, absolute, of pixels with a depth in both
+    missing : number of pixels with a depth in one of both only
+    changed : number of pixels of another class
+    pixels  : number of pixels compared
+    """
+
+    levels: NDArray[np.int64]
+    depth: Float
+    missing: int
+    changed: int
+    pixels: int
+
+
+def _rgb(figure: Callable[[NDArray[np.int64]], float]) -> Callable[[Sequence[ImageError]], float]:
+    return lambda frames: figure(np.sum([f.levels for f in frames], axis=0))
+
+
+def _level(share: float) -> Callable[[NDArray[np.int64]], float]:
+    """The difference that a share of all values does not exceed."""
+    return lambda counts: float(np.searchsorted(np.cumsum(counts), share * counts.sum()))
+
+
+def _rms_of_counts(counts: NDArray[np.int64]) -> float:
+    return float(np.sqrt((counts * np.arange(256.0) ** 2).sum() / max(1, counts.sum())))
+
+
+def _of_depth(figure: Callable[[Float], float]) -> Callable[[Sequence[ImageError]], float]:
+    return lambda frames: figure(np.concatenate([f.depth for f in frames]))
+
+
+def _of_pixels(name: str) -> Callable[[Sequence[ImageError]], float]:
+    return lambda frames: sum(getattr(f, name) for f in frames) / max(1, sum(f.pixels for f in frames))
+
+
+IMAGE_STATISTICS: dict[str, Callable[[Sequence[ImageError]], float]] = {
+    "rgb_rms": _rgb(_rms_of_counts),
+    "rgb_99.9": _rgb(_level(0.999)),
+    "rgb_max": _rgb(_level(1.0)),
+    "depth_rms_m": _of_depth(rms),
+    "depth_99.9_m": _of_depth(lambda v: percentile(v, 0.999)),
+    "depth_max_m": _of_depth(lambda v: percentile(v, 1.0)),
+    "depth_missing": _of_pixels("missing"),
+    "class_changes": _of_pixels("changed"),
+}
+"""Figures of an error of images, over all sampled frames: levels of 255, metres, shares of the pixels."""
+
+E = TypeVar("E", FrameError, ImageError)
+
+
+def estimates(
+    frames: Sequence[E], *, seed: int, statistics: Mapping[str, Callable[[Sequence[E]], float]]
+) -> dict[str, Estimate]:
+    """All figures of an error, with intervals by resampling frames."""
     picks = np.random.default_rng(seed).integers(0, len(frames), (RESAMPLES, len(frames)))
     found = {}
-    for name, figure in STATISTICS.items():
+    for name, figure in statistics.items():
         again = [figure([frames[k] for k in pick]) for pick in picks]
         low, high = np.percentile(again, [2.5, 97.5])
         found[name] = Estimate(figure(frames), float(low), float(high))

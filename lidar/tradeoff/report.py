@@ -16,15 +16,26 @@ from rich.console import Console
 from rich.table import Table
 
 from geoscene.files import write_atomically, write_json
-from lidar.tradeoff.engine import Comparison, Row, Tradeoff
+from lidar.tradeoff.comparison import Comparison, Kind, Row
+from lidar.tradeoff.engine import Tradeoff
 from lidar.tradeoff.errors import Estimate
-from lidar.tradeoff.words import candidates, metres, pareto, recommendations, residual_text, share, size
-
-_HEAD = (
-    *("setting", "range rms", "99 %", "99.9 % (95 % interval)", "max", "missed", "extra", "class"),
-    *("Chamfer", "Hausdorff 99.9 %", "alone 99.9 %", "CPU s/s", "memory", "bytes/s", "note"),
+from lidar.tradeoff.words import (
+    candidates,
+    metres,
+    pareto,
+    recommendations,
+    residual_text,
+    share,
+    size,
+    size_of,
 )
+
 _INK, _GREY, _CHOICE, _OTHER = (30, 32, 38), (205, 208, 214), (200, 60, 40), (60, 110, 180)
+
+_RANKED: dict[Kind, str] = {
+    "scanner": "range error at 99.9 %",
+    "camera": "rms difference of colours, levels of 255",
+}
 
 NOISE = (
     "Random effects and the sensor's own imperfections are off in both: the error of a setting is not noise."
@@ -32,22 +43,46 @@ NOISE = (
 )
 
 
-def cells(row: Row) -> list[str]:
+def heads(kind: Kind) -> tuple[str, ...]:
+    """Headings of the table of a kind of sensor."""
+    errors = {
+        "scanner": (
+            *("range rms", "99 %", "99.9 % (95 % interval)", "max", "missed", "extra", "class"),
+            *("Chamfer", "Hausdorff 99.9 %"),
+        ),
+        "camera": (
+            *("RGB rms (95 % interval)", "99.9 %", "max", "depth rms", "99.9 %", "max", "with/without"),
+            "class",
+        ),
+    }
+    alone = {"scanner": "alone 99.9 %", "camera": "alone RGB rms"}
+    return ("setting", *errors[kind], alone[kind], "CPU s/s", "memory", "bytes/s", "note")
+
+
+def cells(row: Row, comparison: Comparison) -> list[str]:
     """Texts of a row of the table."""
-    e, c = row.error, row.cost
-    tail = e["range_99.9_m"]
+    e, c, kind = row.error, row.cost, comparison.kind
+    tail = e[comparison.tail]
+    interval = f"{size_of(tail.value, kind)} ({size_of(tail.low, kind)} to {size_of(tail.high, kind)})"
+    errors = {
+        "scanner": lambda: [
+            *(metres(e[name].value) for name in ("range_rms_m", "range_99_m")),
+            interval,
+            metres(e["range_max_m"].value),
+            *(share(e[name].value) for name in ("missed", "extra", "class_changes")),
+            *(metres(e[name].value) for name in ("chamfer_m", "hausdorff_99.9_m")),
+        ],
+        "camera": lambda: [
+            interval,
+            *(f"{e[name].value:.0f}" for name in ("rgb_99.9", "rgb_max")),
+            *(metres(e[name].value) for name in ("depth_rms_m", "depth_99.9_m", "depth_max_m")),
+            *(share(e[name].value) for name in ("depth_missing", "class_changes")),
+        ],
+    }
     return [
         row.label,
-        metres(e["range_rms_m"].value),
-        metres(e["range_99_m"].value),
-        f"{metres(tail.value)} ({metres(tail.low)} to {metres(tail.high)})",
-        metres(e["range_max_m"].value),
-        share(e["missed"].value),
-        share(e["extra"].value),
-        share(e["class_changes"].value),
-        metres(e["chamfer_m"].value),
-        metres(e["hausdorff_99.9_m"].value),
-        metres(row.alone["range_99.9_m"].value) if row.alone else "",
+        *errors[kind](),
+        size_of(row.alone[comparison.tail].value, kind) if row.alone else "",
         _with_interval(c["cpu_s"]),
         size(c["memory_bytes"].value),
         size(c["bytes"].value),
@@ -61,7 +96,8 @@ def _with_interval(cost: Estimate) -> str:
 
 def headline(comparison: Comparison) -> str:
     """What was compared."""
-    return f"{comparison.sensor}: {comparison.pulses:,} pulses of {comparison.frames} frames"
+    what = "pulses" if comparison.kind == "scanner" else "pixels"
+    return f"{comparison.sensor}: {comparison.samples:,} {what} of {comparison.frames} frames"
 
 
 def georeferencing_text(found: Tradeoff) -> str:
@@ -80,13 +116,13 @@ def print_tables(found: Tradeoff) -> None:
     if not console.is_terminal:
         console = Console(width=240)
     for comparison in found.comparisons:
-        table = Table(*_HEAD, title=headline(comparison))
+        table = Table(*heads(comparison.kind), title=headline(comparison))
         for row in comparison.rows:
-            table.add_row(*cells(row))
+            table.add_row(*cells(row, comparison))
         console.print(table)
         for text in (residual_text(comparison), *recommendations(comparison)):
             console.print(text, highlight=False)
-    for text in (georeferencing_text(found), NOISE):
+    for text in filter(None, (georeferencing_text(found), NOISE)):
         console.print(text, highlight=False)
 
 
@@ -110,7 +146,8 @@ def document(found: Tradeoff) -> dict[str, Any]:
 def _sensor_json(comparison: Comparison) -> dict[str, Any]:
     return {
         "sensor": comparison.sensor,
-        "pulses": comparison.pulses,
+        "kind": comparison.kind,
+        "samples": comparison.samples,
         "frames": comparison.frames,
         "reference": comparison.reference,
         "reference_residual": _json_of(comparison.residual),
@@ -151,30 +188,30 @@ def _png(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def pareto_plot(comparison: Comparison, *, width: int = 1100, height: int = 700) -> NDArray[np.uint8]:
-    """A picture (height, width, 3): range error at 99.9 % against CPU time, both logarithmic."""
+    """A picture (height, width, 3): error against CPU time, both logarithmic."""
     picture = Image.new("RGB", (width, height), (255, 255, 255))
     pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=15)
     rows, best = candidates(comparison), pareto(comparison)
     x = [row.cost["cpu_s"] for row in rows]
-    y = [row.error["range_99.9_m"] for row in rows]
+    y = [row.error[comparison.tail] for row in rows]
     left, right, top, bottom = 90, width - 150, 70, height - 70
     across, up = _scale(x, ends=(left, right)), _scale(y, ends=(bottom, top))
     said: dict[str, Any] = {"fill": _INK, "font": font}
     pen.text((left, 16), headline(comparison), **said)
     pen.text(((left + right) / 2, height - 16), "CPU s per simulated second", **said, anchor="ms")
-    pen.text((12, top - 10), "range error at 99.9 %", **said, anchor="ls")
+    pen.text((12, top - 10), _RANKED[comparison.kind], **said, anchor="ls")
     for value in _decades(x):
         pen.line((across(value), top, across(value), bottom), fill=_GREY)
         pen.text((across(value), bottom + 8), f"{value:g}", **said, anchor="mt")
     for value in _decades(y):
         pen.line((left, up(value), right, up(value)), fill=_GREY)
-        pen.text((left - 8, up(value)), metres(value), **said, anchor="rm")
-    places = [(across(row.cost["cpu_s"].value), up(row.error["range_99.9_m"].value)) for row in best]
+        pen.text((left - 8, up(value)), size_of(value, comparison.kind), **said, anchor="rm")
+    places = [(across(row.cost["cpu_s"].value), up(row.error[comparison.tail].value)) for row in best]
     if len(places) > 1:
         pen.line(places, fill=_CHOICE, width=2)
     named: list[tuple[float, float, float, float]] = []
     for row in (*best, *(row for row in rows if row not in best)):
-        cost, error = row.cost["cpu_s"], row.error["range_99.9_m"]
+        cost, error = row.cost["cpu_s"], row.error[comparison.tail]
         u, v = across(cost.value), up(error.value)
         color = _CHOICE if row in best else _OTHER
         pen.line((across(cost.low), v, across(cost.high), v), fill=color)
@@ -224,9 +261,9 @@ def _page(found: Tradeoff, plots: list[bytes]) -> str:
     """A self-contained HTML page."""
     parts = []
     for comparison, plot in zip(found.comparisons, plots, strict=True):
-        head = "".join(f"<th>{html.escape(text)}</th>" for text in _HEAD)
+        head = "".join(f"<th>{html.escape(text)}</th>" for text in heads(comparison.kind))
         body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in cells(row)) + "</tr>"
+            "<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in cells(row, comparison)) + "</tr>"
             for row in comparison.rows
         )
         said = "".join(f"<li>{html.escape(text)}</li>" for text in recommendations(comparison))

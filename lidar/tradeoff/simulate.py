@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import timedelta
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.scene import Scene
+from geoscene.typing import Float
+from lidar.camera.sun import sun_direction
 from lidar.dataset.formats.table import cloud_table, records
 from lidar.physics.settings import ScannerSettings
 from lidar.plan import DrivePlan
 from lidar.rig.devices import Camera, Scanner
+from lidar.rig.scanner import firings
 from lidar.sensors.scan import Detection, Sweep, cast, detect, deviates_of, report
 from lidar.tradeoff.errors import Returns
+from lidar.tradeoff.images import Shot
+from lidar.tradeoff.variants import noiseless
 from lidar.world.actors import actor_shapes, actor_transforms
 from lidar.world.settings import PLAIN as WHOLE
 from lidar.world.settings import WorldSettings
@@ -38,6 +44,11 @@ class Bench:
     scenes: tuple[Scene, ...]
     frames: dict[str, tuple[int, ...]]
     _worlds: dict[tuple[int, str, bool, WorldSettings], World] = field(default_factory=dict, repr=False)
+
+    def close(self, *, backend: str) -> None:
+        """Let go of the worlds of a backend, which are loaded again when needed."""
+        for key in [key for key in self._worlds if key[1] == backend]:
+            del self._worlds[key]
 
     def world(
         self,
@@ -74,6 +85,17 @@ class Bench:
             )
             world.place_actors(shape, transform, feature=feature)
         return world
+
+    def shot(self, camera: Camera, frame: int) -> Shot:
+        """A frame of a camera, to be rendered."""
+        return Shot(camera, frame, self.plan.trajectory, self.sun(camera.frame_start_ns(frame)))
+
+    def sun(self, time_ns: int) -> Float:
+        """Direction (3,) towards the sun at a time of the drive."""
+        plan = self.plan
+        x, y = plan.trajectory.position[0, :2].tolist()
+        when = plan.start + timedelta(microseconds=time_ns // 1000)
+        return sun_direction(plan.scene.frame, when, at=(x, y))
 
     def _region(self) -> Region:
         """The box that the vehicle covers during the sampled frames."""
@@ -143,6 +165,15 @@ def returns_of(
     first = np.searchsorted(rows, rows)  # rows are sorted by pulse and range
     key = 256 * pulses[rows] + np.arange(len(rows)) - first
     return Returns(key, found.range, found.echoes.klass, placed)
+
+
+def sampled_returns(bench: Bench, scanner: Scanner, *, every: int) -> Iterator[Returns]:
+    """Returns of every n-th pulse of the sampled frames, with one ray per pulse."""
+    settings = replace(noiseless(bench.plan.options.contents().scanner), rays=1)
+    for frame in bench.frames[scanner.name]:
+        pulses = np.arange(0, len(firings(scanner.sensor, frame)), every)
+        world = bench.world(scanner, frame, backend=FAST)
+        yield returns_of(bench.plan, scanner, frame=frame, world=world, settings=settings, pulses=pulses)
 
 
 def frame_cost(

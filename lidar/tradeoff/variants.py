@@ -1,11 +1,12 @@
-"""Settings to compare: the user's with one of them changed, and the exact end."""
+"""Settings to compare: the user's with some of them changed, and the exact end."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Generic, TypeVar
 
+from lidar.camera.settings import CameraSettings
 from lidar.physics.settings import MOST_RAYS, POSES, ScannerSettings
 from lidar.raycast import PRECISIONS
 from lidar.settings import text_of
@@ -25,42 +26,147 @@ SCANNER_VALUES: dict[str, tuple[Any, ...]] = {
 }
 """Values of the scanner's settings that are compared, by setting."""
 
-WORLD_VALUES: dict[str, tuple[Any, ...]] = {"origin": ORIGINS, "reach": (25.0, 50.0, 100.0)}
+CAMERA_VALUES: dict[str, tuple[Any, ...]] = {
+    "supersample": (1, 2, 3, 4),
+    "blur": (1, 5, 9, 17),
+    "shadows": (True, False),
+    "detail": (True, False),
+    "resolution": (1, 2, 4),
+    "precision": PRECISIONS,
+    "retrace": (True, False),
+    "haze": (20_000.0, float("inf")),
+}
+"""Values of the camera's settings that are compared; resolution divides width and height."""
+
+WORLD_VALUES: dict[str, tuple[Any, ...]] = {
+    "origin": ORIGINS,
+    "reach": (25.0, 50.0, 100.0),
+    "forests": (True, False),
+    "trees": (True, False),
+    "furniture": (True, False),
+    "barriers": (True, False),
+}
 """Values of the world's settings that are compared, by setting."""
 
-OF_EMBREE = ("precision", "retrace", "origin")
+KINDS = ("forests", "trees", "furniture", "barriers")
+"""Settings that leave kinds of objects out of the world."""
+
+OF_EMBREE = frozenset({"precision", "retrace", "origin"})
 """Settings that act on Embree's float32 rays only: alone, they are cast by Embree."""
 
-MODELS = ("mirrors", "foliage")
+MODELS = frozenset({"mirrors", "foliage", "haze"})
 """Settings that change what is modelled: the difference that they make is no error."""
+
+CHEAPER: tuple[tuple[tuple[str, Any], ...], ...] = (
+    (("retrace", False), ("precision", "float32")),
+    (("reach", 50.0),),
+    (("forests", False),),
+)
+"""Changes that combinations make to a scanner's number of rays, one after the other."""
+
+CHEAPER_IMAGES: tuple[tuple[tuple[str, Any], ...], ...] = ((("resolution", 2),), (("shadows", False),))
+"""Changes that combinations make to a camera's number of rays, one after the other."""
+
+SAMPLES = 16
+"""Rays along each side of a pixel of the reference; of an exposure with motion blur `BLURRED`."""
+
+BLURRED, MOMENTS = 4, 64
+"""Rays along each side of a pixel, and samples of the exposure, of the reference of a blurred image."""
+
+S = TypeVar("S", ScannerSettings, CameraSettings)
 
 
 @dataclass(frozen=True, slots=True)
-class Variant:
-    """One row of a comparison of scanner settings.
+class Variant(Generic[S]):
+    """One row of a comparison of settings of a scanner or a camera.
 
-    setting : name, such as ``rays``; empty for the user's own settings, unchanged
-    value   : as text; of the user's own settings all that are compared
-    used    : the user's settings with this one changed, without random effects
-    alone   : the reference's settings with this one changed
+    changes : name and value of each setting that is changed; empty for the user's own settings
+    used    : the user's settings with these changed, without random effects
+    alone   : the reference's settings with these changed
+    world, alone_world : settings of the world of either
     scene   : number of the scene, 0 for the first
     traffic : whether other road users are in the world
-    world, alone_world : settings of the world of either
     """
 
-    setting: str
-    value: str
-    used: ScannerSettings
-    alone: ScannerSettings
+    changes: tuple[tuple[str, Any], ...]
+    used: S
+    alone: S
+    world: WorldSettings
+    alone_world: WorldSettings
     scene: int = 0
     traffic: bool = True
-    world: WorldSettings = WHOLE
-    alone_world: WorldSettings = WHOLE
 
     @property
     def label(self) -> str:
-        """Name of the row."""
-        return f"{self.setting}={self.value}" if self.setting else f"as asked ({self.value})"
+        """Names and values of what is changed; empty for the user's own settings."""
+        return " ".join(f"{name}={text_of(value)}" for name, value in self.changes)
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of what is changed."""
+        return frozenset(name for name, _ in self.changes)
+
+    @property
+    def choice(self) -> bool:
+        """Whether a drive in this world may choose it: not another model, scene or traffic."""
+        return not self.names & (MODELS | {"scene", "traffic"})
+
+    @property
+    def resolution(self) -> int:
+        """Pixels of a camera's side that are one pixel of the image."""
+        return int(dict(self.changes).get("resolution", 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Basis(Generic[S]):
+    """What variants are made of.
+
+    used  : the user's settings, without random effects
+    exact : the reference's
+    world : the user's settings of the world
+    """
+
+    used: S
+    exact: S
+    world: WorldSettings = WHOLE
+
+    def variant(
+        self, changes: Iterable[tuple[str, Any]] = (), *, scene: int = 0, traffic: bool = True
+    ) -> Variant[S]:
+        """The variant with some settings changed."""
+        changes = tuple(changes)
+        values = dict(changes)
+        return Variant(
+            changes,
+            _changed(self.used, values),
+            _changed(self.exact, values),
+            world=_changed(self.world, values),
+            alone_world=_changed(WHOLE, values),
+            scene=scene,
+            traffic=traffic,
+        )
+
+    def value(self, name: str) -> Any:
+        """The user's value of a setting of the sensor or of the world."""
+        for group in (self.used, self.world):
+            if hasattr(group, name):
+                return getattr(group, name)
+        return 1  # resolution
+
+    def described(self, values: Mapping[str, Any]) -> str:
+        """The user's values: of the sensor's settings all, of the world's those that leave something out."""
+        shown = [n for n in values if hasattr(self.used, n)]
+        shown += [n for n in WORLD_VALUES if getattr(self.world, n) != getattr(WHOLE, n)]
+        return ", ".join(f"{name}={text_of(self.value(name))}" for name in shown)
+
+
+_Any = TypeVar("_Any", ScannerSettings, CameraSettings, WorldSettings)
+
+
+def _changed(settings: _Any, values: Mapping[str, Any]) -> _Any:
+    """Settings with those values that they have."""
+    own = {f.name for f in fields(settings)}
+    return replace(settings, **{name: value for name, value in values.items() if name in own})
 
 
 def noiseless(settings: ScannerSettings) -> ScannerSettings:
@@ -96,65 +202,112 @@ def next_step(rays: int) -> int:
     return min(rays + rays // 2 + rays % 2, MOST_RAYS)
 
 
+def scanner_basis(
+    settings: ScannerSettings, *, rays: int, world: WorldSettings = WHOLE
+) -> Basis[ScannerSettings]:
+    """The basis of variants of a scanner; ``rays`` are the reference's."""
+    return Basis(noiseless(settings), reference(settings, rays=rays), world)
+
+
 def scanner_variants(
-    settings: ScannerSettings,
+    basis: Basis[ScannerSettings],
     *,
-    rays: int,
-    world: WorldSettings = WHOLE,
     compared: Sequence[str] = (),
     scenes: Sequence[str] = (),
     traffic: bool = False,
-) -> list[Variant]:
-    """The user's settings, and these with one of them changed.
+) -> list[Variant[ScannerSettings]]:
+    """The user's settings, these with one of them changed, and combinations of cheap ones.
 
-    rays     : of the reference
-    world    : the user's settings of the world
     compared : names of settings; all by default
     scenes   : labels of the scenes after the first
     traffic  : whether there are other road users, to be left out in one variant
     """
-    used, exact = noiseless(settings), reference(settings, rays=rays)
-    values = {name: getattr(used, name) for name in SCANNER_VALUES}
-    values |= {name: getattr(world, name) for name in WORLD_VALUES}
-    asked = ", ".join(f"{name}={text_of(value)}" for name, value in values.items())
-    rows = [Variant("", asked, used, used, world=world)]
-    for name in SCANNER_VALUES:
-        if not compared or name in compared:
-            rows += _of_setting(name, used, exact=exact, world=world)
-    for name in WORLD_VALUES:
-        if not compared or name in compared:
-            rows += _of_world(name, world, used=used, exact=exact)
+    rows = _variants(
+        basis, SCANNER_VALUES, compared=compared, scenes=scenes, traffic=traffic, cheaper=CHEAPER
+    )
+    return [row for row in rows if row.used.rays < basis.exact.rays or not row.changes]
+
+
+def camera_basis(
+    settings: CameraSettings, *, exposed: bool, world: WorldSettings = WHOLE
+) -> Basis[CameraSettings]:
+    """The basis of variants of a camera; ``exposed`` is whether its exposure lasts some time."""
+    used = replace(settings, camera_noise=False)
+    exact = replace(used, precision="exact", retrace=True, shadows=True, detail=True)
+    if exposed:
+        return Basis(used, replace(exact, supersample=BLURRED, blur=MOMENTS), world)
+    return Basis(used, replace(exact, supersample=SAMPLES), world)
+
+
+def coarser(settings: CameraSettings) -> CameraSettings:
+    """A reference with about half as many rays per pixel, which shows whether it has converged."""
+    return replace(settings, supersample=round(settings.supersample / 2**0.5))
+
+
+def camera_variants(
+    basis: Basis[CameraSettings],
+    *,
+    compared: Sequence[str] = (),
+    scenes: Sequence[str] = (),
+    traffic: bool = False,
+) -> list[Variant[CameraSettings]]:
+    """As `scanner_variants`, of a camera."""
+    return _variants(
+        basis,
+        CAMERA_VALUES,
+        compared=compared,
+        scenes=scenes,
+        traffic=traffic,
+        cheaper=CHEAPER_IMAGES,
+    )
+
+
+def _variants(
+    basis: Basis[S],
+    values: Mapping[str, Sequence[Any]],
+    *,
+    compared: Sequence[str],
+    scenes: Sequence[str],
+    traffic: bool,
+    cheaper: Sequence[Sequence[tuple[str, Any]]],
+) -> list[Variant[S]]:
+    """Variants of settings of a sensor, whose first one counts its rays, and of the world."""
+    chosen = {n: v for n, v in {**values, **WORLD_VALUES}.items() if not compared or n in compared}
+    rows = [basis.variant()]
+    rows += [
+        basis.variant([(name, value)])
+        for name, known in chosen.items()
+        for value in known
+        if value != basis.value(name)
+    ]
     if not compared or "scene" in compared:
-        rows += [
-            Variant("scene", text, used, exact, scene=k + 1, world=world) for k, text in enumerate(scenes)
-        ]
+        rows += [basis.variant([("scene", text)], scene=k + 1) for k, text in enumerate(scenes)]
     if traffic and (not compared or "traffic" in compared):
-        rows.append(Variant("traffic", "off", used, exact, traffic=False, world=world))
+        rows.append(basis.variant([("traffic", False)], traffic=False))
+    first = next(iter(values))
+    steps = [
+        [(name, value) for name, value in step if name in chosen and value != basis.value(name)]
+        for step in cheaper
+    ]
+    for value in chosen.get(first, ()):
+        changes = [] if value == basis.value(first) else [(first, value)]
+        for step in filter(None, steps):
+            changes = changes + step
+            if len(changes) > 1:
+                rows.append(basis.variant(changes))
     return rows
 
 
-def _of_setting(
-    name: str, used: ScannerSettings, *, exact: ScannerSettings, world: WorldSettings
-) -> Iterator[Variant]:
-    for value in SCANNER_VALUES[name]:
-        change: dict[str, Any] = {name: value}
-        if value != getattr(used, name) and (name != "rays" or value < exact.rays):
-            yield Variant(
-                name, text_of(value), replace(used, **change), replace(exact, **change), world=world
-            )
-
-
-def _of_world(
-    name: str, world: WorldSettings, *, used: ScannerSettings, exact: ScannerSettings
-) -> Iterator[Variant]:
-    for value in WORLD_VALUES[name]:
-        change: dict[str, Any] = {name: value}
-        if value != getattr(world, name):
-            yield Variant(
-                name,
-                text_of(value),
-                used,
-                exact,
-                world=replace(world, **change),
-                alone_world=replace(WHOLE, **change),
-            )
+def without_each(basis: Basis[S], variant: Variant[S]) -> Iterator[tuple[str, Variant[S]]]:
+    """Each change of a variant, as text, and the variant without it."""
+    for k, (name, value) in enumerate(variant.changes):
+        rest = variant.changes[:k] + variant.changes[k + 1 :]
+        left = {n for n, _ in rest}
+        yield (
+            f"{name}={text_of(value)}",
+            basis.variant(
+                rest,
+                scene=variant.scene if "scene" in left else 0,
+                traffic=variant.traffic if "traffic" in left else True,
+            ),
+        )

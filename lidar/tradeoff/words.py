@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from lidar.tradeoff.engine import Comparison, Row
+from math import inf
 
-TARGETS = (0.001, 0.01, 0.1)
-"""Metres at 99.9 % for which a setting is recommended."""
+from lidar.tradeoff.comparison import Comparison, Kind, Row
+
+TARGETS: dict[Kind, tuple[float, ...]] = {"scanner": (0.001, 0.01, 0.1), "camera": (1.0, 3.0, 10.0)}
+"""Errors for which a setting is recommended: metres at 99.9 %, and levels of 255 rms."""
+
+LOST = 0.001
+"""Share of missed and extra returns beyond which a setting does not keep any error at 99.9 %."""
 
 
 def metres(value: float) -> str:
@@ -29,62 +34,83 @@ def size(value: float) -> str:
     return f"{value:.0f} B"
 
 
+def levels(value: float) -> str:
+    """A difference of colours, of 255."""
+    return "0" if value == 0 else f"{value:.3g} levels"
+
+
+def size_of(error: float, kind: Kind) -> str:
+    """An error by which settings are ranked."""
+    return metres(error) if kind == "scanner" else levels(error)
+
+
 def candidates(comparison: Comparison) -> list[Row]:
     """Rows that are choices for a drive in this world: not those of another model, scene or traffic."""
-    return [
-        row
-        for row in comparison.rows
-        if not row.label.startswith(("scene=", "traffic=")) and not row.note.startswith("changes")
-    ]
+    return [row for row in comparison.rows if row.choice]
 
 
 def pareto(comparison: Comparison) -> list[Row]:
-    """Choices of which no other is both cheaper and at least as exact, the cheapest first."""
+    """Choices of which no other is both cheaper and at least as exact, the cheapest first.
+
+    Settings that miss or add more than `LOST` of the returns are left out.
+    """
     best: list[Row] = []
-    for row in sorted(candidates(comparison), key=lambda r: (r.cost["cpu_s"].value, _worst(r))):
-        if not best or _worst(row) < _worst(best[-1]):
+    ranked = [(row.cost["cpu_s"].value, reached(comparison, row), row) for row in candidates(comparison)]
+    for _, error, row in sorted(ranked, key=lambda r: r[:2]):
+        if error < (reached(comparison, best[-1]) if best else inf):
             best.append(row)
     return best
 
 
+def reached(comparison: Comparison, row: Row) -> float:
+    """The error by which a row is ranked; inf if more than `LOST` of the returns are missed or extra."""
+    if "missed" in row.error and row.error["missed"].value + row.error["extra"].value > LOST:
+        return inf
+    return row.error[comparison.tail].value
+
+
 def recommendation(comparison: Comparison, target: float) -> str:
-    """The cheapest setting that reaches a range error in metres at 99.9 %, or that none does."""
-    rows = pareto(comparison)
-    wanted = f"For {metres(target)} at 99.9 %"
-    fit = [row for row in rows if row.error["range_99.9_m"].value <= target]
+    """The cheapest setting that reaches an error (see `TARGETS`), or that none does."""
+    kind, rows = comparison.kind, pareto(comparison)
+    wanted = f"For {size_of(target, kind)} {'at 99.9 %' if kind == 'scanner' else 'rms'}"
+    fit = [row for row in rows if reached(comparison, row) <= target]
     if fit:
         row = fit[0]
-        cost, error = row.cost["cpu_s"], row.error["range_99.9_m"]
+        cost, error = row.cost["cpu_s"], row.error[comparison.tail]
         what = f"the one {row.label}" if row.label.startswith("as asked") else row.label
         text = (
             f"{wanted} the cheapest setting is {what}; it costs {cost.value:.3g} CPU s per simulated second"
-            f" ({cost.low:.3g} to {cost.high:.3g}) and errs by {metres(error.value)}"
-            f" ({metres(error.low)} to {metres(error.high)})."
+            f" ({cost.low:.3g} to {cost.high:.3g}) and errs by {size_of(error.value, kind)}"
+            f" ({size_of(error.low, kind)} to {size_of(error.high, kind)})."
         )
         if comparison.uncertainty > target:
-            text += f" The reference is certain to {metres(comparison.uncertainty)} only."
+            text += f" The reference is certain to {size_of(comparison.uncertainty, kind)} only."
         return text
-    nearest = min(rows, key=_worst)
+    text = f"{wanted} no setting that was compared is enough"
+    if not rows:
+        return f"{text}: all miss or add more than {share(LOST)} of the returns."
+    nearest = rows[-1]
     return (
-        f"{wanted} no setting that was compared is enough; {nearest.label} comes nearest with"
-        f" {metres(_worst(nearest))}, at {nearest.cost['cpu_s'].value:.3g} CPU s per simulated second."
+        f"{text}; {nearest.label} comes nearest with {size_of(reached(comparison, nearest), kind)}, at"
+        f" {nearest.cost['cpu_s'].value:.3g} CPU s per simulated second."
     )
 
 
 def recommendations(comparison: Comparison) -> list[str]:
     """A sentence for each of `TARGETS`."""
-    return [recommendation(comparison, target) for target in TARGETS]
+    return [recommendation(comparison, target) for target in TARGETS[comparison.kind]]
 
 
 def residual_text(comparison: Comparison) -> str:
     """How far the reference has converged."""
     gap = comparison.residual
+    if comparison.kind == "scanner":
+        change = (
+            f"ranges by {metres(gap['range_rms_m'].value)} rms and {metres(comparison.uncertainty)} at 99.9 %"
+        )
+    else:
+        change = f"colours by {levels(comparison.uncertainty)} rms"
     return (
-        f"Reference: {comparison.reference}; half as many rays more change ranges by"
-        f" {metres(gap['range_rms_m'].value)} rms and {metres(comparison.uncertainty)} at 99.9 %: errors"
-        " below that cannot be told from the reference's own."
+        f"Reference: {comparison.reference} change {change}: errors below that cannot be told from the"
+        " reference's own."
     )
-
-
-def _worst(row: Row) -> float:
-    return row.error["range_99.9_m"].value

@@ -9,12 +9,15 @@ import pytest
 from lidar.errors import InputError
 from lidar.options import DriveOptions, TradeoffOptions
 from lidar.physics.settings import LEVELS, PLAIN
-from lidar.tradeoff.engine import Comparison, Row, scene_label, tradeoff
+from lidar.tradeoff.comparison import Comparison, Row
+from lidar.tradeoff.engine import scene_label, tradeoff
 from lidar.tradeoff.errors import STATISTICS, Estimate, Returns, estimates, frame_error, median
 from lidar.tradeoff.report import document, write_report
 from lidar.tradeoff.simulate import chosen_pulses, spread_frames
-from lidar.tradeoff.variants import next_step, noiseless, reference, scanner_variants
+from lidar.tradeoff.variants import next_step, noiseless, reference, scanner_basis, scanner_variants
 from lidar.tradeoff.words import metres, pareto, recommendation
+from lidar.world.settings import PLAIN as WHOLE
+from lidar.world.settings import WorldSettings
 
 DRIVE = DriveOptions(route="random", rig="vlp16", duration=1.0, seed=3)
 FEW = TradeoffOptions(("rays", "poses", "georeferencing"), frames=3, pulses=900, reference_rays=31)
@@ -32,8 +35,9 @@ def returns(key, distance, klass=None):
     return Returns(np.array(key, np.int64), np.array(distance, float), kinds, xyz)
 
 
-def row(label, error, cpu):
+def row(label, error, cpu, *, lost=0.0):
     figures = {name: Estimate(error, error, error) for name in STATISTICS}
+    figures |= {name: Estimate(lost, lost, lost) for name in ("missed", "extra")}
     cost = {name: Estimate(cpu, cpu, cpu) for name in ("cpu_s", "bytes", "memory_bytes")}
     return Row(label, figures, {}, cost)
 
@@ -41,6 +45,10 @@ def row(label, error, cpu):
 def comparison(*rows, residual=0.0):
     gap = {name: Estimate(residual, residual, residual) for name in STATISTICS}
     return Comparison("top (vlp16)", "exact", gap, rows, 10, 1)
+
+
+def statistics_of(error):
+    return estimates([error], seed=1, statistics=STATISTICS)
 
 
 def test_differences_of_matched_missed_and_extra_returns():
@@ -51,7 +59,7 @@ def test_differences_of_matched_missed_and_extra_returns():
     assert (error.missed, error.extra, error.changed, error.returns) == (1, 1, 1, 3)
     np.testing.assert_allclose(error.there, [0, 0.5, 1.0])
     np.testing.assert_allclose(error.back, [0, 0.5, 0.5])
-    figures = estimates([error], seed=0)
+    figures = estimates([error], seed=0, statistics=STATISTICS)
     assert figures["range_rms_m"].value == pytest.approx(0.5 / np.sqrt(2))
     assert figures["chamfer_m"].value == pytest.approx((0.5 + 1 / 3) / 2)
     assert figures["hausdorff_m"].value == pytest.approx(1.0)
@@ -61,7 +69,7 @@ def test_differences_of_matched_missed_and_extra_returns():
 def test_a_cloud_equals_itself_and_an_empty_one_has_no_error():
     cloud, empty = returns([0, 256], [5.0, 7.0]), returns([], [])
     for one, other in ((cloud, cloud), (empty, empty)):
-        assert all(f.value == 0 for f in estimates([frame_error(one, other)], seed=1).values())
+        assert all(f.value == 0 for f in statistics_of(frame_error(one, other)).values())
     assert frame_error(empty, cloud).missed == 2
 
 
@@ -69,7 +77,7 @@ def test_intervals_hold_the_value_and_repeat_by_seed():
     frames = [
         frame_error(returns([0, 256], [5.0, 7 + e]), returns([0, 256], [5.0, 7])) for e in (0.1, 0.2, 0.4)
     ]
-    one, again = estimates(frames, seed=5), estimates(frames, seed=5)
+    one, again = (estimates(frames, seed=5, statistics=STATISTICS) for _ in range(2))
     assert one == again
     rms = one["range_rms_m"]
     assert 0.1 / np.sqrt(2) - 1e-9 <= rms.low < rms.value < rms.high <= 0.4 / np.sqrt(2) + 1e-9
@@ -96,17 +104,37 @@ def test_the_reference_is_the_exact_end_without_random_effects():
     assert [next_step(r) for r in (7, 217, 665, 900)] == [11, 326, 998, 999]
 
 
+def labels(*compared, world=WHOLE, **more):
+    return [
+        r.label
+        for r in scanner_variants(scanner_basis(PLAIN, rays=31, world=world), compared=compared, **more)
+    ]
+
+
 def test_variants_change_one_setting_each():
-    rows = scanner_variants(PLAIN, rays=31, compared=("rays", "poses"), scenes=["lod=1"], traffic=True)
-    assert [r.label for r in rows[1:]] == ["rays=7", "rays=19", "poses=column", "poses=frame"]
+    rows = scanner_variants(scanner_basis(PLAIN, rays=31), compared=("rays", "poses"))
+    assert [r.label for r in rows] == ["", "rays=7", "rays=19", "poses=column", "poses=frame"]
     assert rows[0].used == PLAIN
     assert rows[1].used == replace(PLAIN, rays=7)
     assert rows[3].alone == replace(PLAIN, rays=31, poses="column")
-    last = [
-        (r.label, r.scene, r.traffic)
-        for r in scanner_variants(PLAIN, rays=31, scenes=["lod=1"], traffic=True)
+    (asked, other) = scanner_variants(scanner_basis(PLAIN, rays=31), compared=("scene",), scenes=["lod=1"])
+    assert (other.label, other.scene, other.choice, asked.choice) == ("scene=lod=1", 1, False, True)
+    assert labels("traffic", traffic=True) == ["", "traffic=off"]
+
+
+def test_cheap_settings_are_combined():
+    assert labels("rays", "retrace", "reach", "forests")[-8:] == [
+        "retrace=off reach=50",
+        "retrace=off reach=50 forests=off",
+        "rays=7 retrace=off",
+        "rays=7 retrace=off reach=50",
+        "rays=7 retrace=off reach=50 forests=off",
+        "rays=19 retrace=off",
+        "rays=19 retrace=off reach=50",
+        "rays=19 retrace=off reach=50 forests=off",
     ]
-    assert last[-2:] == [("scene=lod=1", 1, True), ("traffic=off", 0, False)]
+    without = labels("rays", "forests", world=WorldSettings(forests=False))
+    assert without == ["", "rays=7", "rays=19", "forests=on"]
 
 
 def test_samples_are_spread_and_repeat():
@@ -123,8 +151,7 @@ def test_errors_on_a_drive(found):
     asked, *rest = one.rows
     by_label = {r.label: r for r in rest}
     assert asked.label == (
-        "as asked (rays=1, poses=firing, precision=exact, retrace=on, mirrors=off, foliage=off, origin=near,"
-        " reach=inf)"
+        "as asked (rays=1, poses=firing, precision=exact, retrace=on, mirrors=off, foliage=off)"
     )
     assert list(by_label) == ["rays=7", "rays=19", "poses=column", "poses=frame"]
     tail = {name: r.error["range_99_m"].value for name, r in by_label.items()}
@@ -134,7 +161,7 @@ def test_errors_on_a_drive(found):
     )
     assert one.residual["range_99_m"].value <= tail["rays=7"]
     assert all(r.cost["cpu_s"].value > 0 and r.cost["memory_bytes"].value > 2**20 for r in one.rows)
-    assert (one.frames, one.pulses) == (3, 900)
+    assert (one.frames, one.samples) == (3, 900)
 
 
 def test_georeferencing_is_within_its_promise(found):
@@ -171,6 +198,12 @@ def test_the_cheapest_sufficient_setting_is_recommended():
     assert "certain to 2 mm only" in recommendation(loose, 0.001)
 
 
+def test_settings_that_lose_returns_are_not_recommended():
+    rows = (row("as asked (rays=1)", 0.02, 2.0), row("reach=25", 0.02, 1.0, lost=0.1))
+    assert "cheapest setting is the one as asked (rays=1)" in recommendation(comparison(*rows), 0.1)
+    assert "all miss or add more than 0.1 %" in recommendation(comparison(rows[1]), 0.1)
+
+
 def test_lengths_have_fitting_units():
     assert [metres(v) for v in (0, 3e-8, 2e-6, 0.0015, 0.25, 12.0)] == [
         "0",
@@ -188,9 +221,29 @@ def test_scenes_are_named_by_what_differs(scene, scene_utm):
 
 
 def test_bad_input_is_one_clear_line(scene, scene_utm):
-    with pytest.raises(InputError, match="`compare` leaves: unknown; there are rays"):
-        tradeoff(scene, DRIVE, compared=TradeoffOptions(("leaves",)))
+    def refused(*names, match, **more):
+        with pytest.raises(InputError, match=match):
+            tradeoff(scene, DRIVE, compared=TradeoffOptions(names, **more))
+
+    refused("leaves", match="`compare` leaves: unknown; there are rays")
+    refused("rays", "shadows", match="`compare` shadows: a setting of cameras, and none is compared")
+    refused("scene", match="`compare` scene: no other scene is given")
+    refused("traffic", match="`compare` traffic: the drive has none")
+    refused(sensors=("roof",), match="`sensors` roof: not in rig vlp16; there are lidar_top")
     with pytest.raises(InputError, match="another frame"):
         tradeoff(scene, DRIVE, compared=FEW, others=[scene_utm])
     with pytest.raises(InputError, match="`frames` 1: give 2 to 1000"):
         TradeoffOptions(frames=1)
+
+
+def test_kinds_of_objects_that_a_place_lacks_have_no_effect(scene):
+    compared = TradeoffOptions(
+        ("forests", "trees", "barriers", "furniture"), frames=2, pulses=200, reference_rays=7
+    )
+    (one,) = tradeoff(scene, DRIVE, compared=compared).comparisons
+    notes = {r.label: r.note for r in one.rows}
+    assert notes["forests=off"] == "no effect here: there are none within reach"
+    assert notes["trees=off"] == "no effect with the other settings as asked"
+    assert notes["furniture=off"] == ""
+    without = {r.label: r.error for r in one.rows}["furniture=off"]
+    assert without["range_max_m"].value > one.rows[0].error["range_max_m"].value

@@ -1,0 +1,160 @@
+"""Images of a drive's frames, whole or some blocks of their pixels, as settings render them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.typing import Float, Ints
+from lidar.camera.png import depth_to_counts, encode_png, feature_to_image
+from lidar.camera.render import Frame, exposure_times, render
+from lidar.camera.settings import CameraSettings
+from lidar.geometry.poses import Trajectory
+from lidar.rig.devices import Camera
+from lidar.rig.specs import CameraSpec
+from lidar.tradeoff.errors import ImageError
+from lidar.world.world import World
+
+BLOCK = 8
+"""Pixels along each side of the blocks that are compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A frame of a camera.
+
+    sun : (3,) direction towards the sun, scene axes
+    """
+
+    camera: Camera
+    frame: int
+    trajectory: Trajectory
+    sun: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Pixels:
+    """Blocks of a frame: rgb (n, b, b, 3) uint8, depth (n, b, b) metres, klass (n, b, b) uint8."""
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    klass: NDArray[np.uint8]
+
+    def equals(self, other: Pixels) -> bool:
+        """Whether all pixels are the same."""
+        return all(
+            np.array_equal(getattr(self, name), getattr(other, name)) for name in ("rgb", "depth", "klass")
+        )
+
+    def enlarged(self, factor: int) -> Pixels:
+        """Each pixel repeated ``factor`` times along both sides."""
+        return Pixels(
+            self.rgb.repeat(factor, axis=1).repeat(factor, axis=2),
+            self.depth.repeat(factor, axis=1).repeat(factor, axis=2),
+            self.klass.repeat(factor, axis=1).repeat(factor, axis=2),
+        )
+
+    def reduced(self, factor: int) -> Pixels:
+        """Means of colours over squares of pixels; depth and class of the pixel nearest to their centres."""
+        n, b = self.depth.shape[:2]
+        squares = self.rgb.reshape(n, b // factor, factor, b // factor, factor, 3)
+        rgb = np.rint(squares.mean(axis=(2, 4))).astype(np.uint8)
+        middle = slice(factor // 2, None, factor)
+        return Pixels(rgb, self.depth[:, middle, middle], self.klass[:, middle, middle])
+
+
+def coarse(camera: CameraSpec, resolution: int) -> CameraSpec:
+    """The same camera with one pixel for each square of ``resolution`` pixels' side."""
+    return replace(
+        camera,
+        width=camera.width // resolution,
+        height=camera.height // resolution,
+        fx=camera.fx / resolution,
+        fy=camera.fy / resolution,
+        cx=(camera.cx + 0.5) / resolution - 0.5,
+        cy=(camera.cy + 0.5) / resolution - 0.5,
+        row_ns=camera.row_ns * resolution,
+    )
+
+
+def image(shot: Shot, *, world: World, settings: CameraSettings, resolution: int = 1) -> Frame:
+    """The whole frame."""
+    return _rendered(shot, coarse(shot.camera.spec, resolution), world=world, settings=settings)
+
+
+def blocks_of_frame(camera: CameraSpec, count: int, *, frame: int, seed: int) -> Ints:
+    """Columns and rows (n, 2) of the top left pixels of at most ``count`` blocks of a frame, at random."""
+    across, down = camera.width // BLOCK, camera.height // BLOCK
+    chosen = np.sort(np.random.default_rng([seed, frame]).permutation(across * down)[:count])
+    return (BLOCK * np.column_stack([chosen % across, chosen // across])).astype(np.int64)
+
+
+def pixels(
+    shot: Shot, blocks: Ints, *, world: World, settings: CameraSettings, resolution: int = 1
+) -> Pixels:
+    """Blocks of a frame, of its coarse camera: ``BLOCK / resolution`` pixels wide."""
+    spec, size = coarse(shot.camera.spec, resolution), BLOCK // resolution
+    frames = []
+    for left, top in (blocks // resolution).tolist():
+        window = replace(spec, width=size, height=size, cx=spec.cx - left, cy=spec.cy - top)
+        frames.append(_rendered(shot, window, world=world, settings=settings, top=top))
+    black = np.zeros((size, size, 3), np.uint8)
+    return Pixels(
+        np.stack([black if f.rgb is None else f.rgb for f in frames]),
+        np.stack([f.depth for f in frames]),
+        np.stack([f.klass for f in frames]),
+    )
+
+
+def _rendered(shot: Shot, spec: CameraSpec, *, world: World, settings: CameraSettings, top: int = 0) -> Frame:
+    """A frame of a camera, or of the part of it that begins at its row ``top``."""
+    start = shot.camera.frame_start_ns(shot.frame)
+    times = exposure_times(spec, start + top * spec.row_ns, samples=settings.moments(spec))
+    mount = spec.mount
+    return render(
+        spec,
+        shot.trajectory.at(times).mounted(mount.translation, mount.rotation),
+        world=world,
+        sun=shot.sun,
+        times=np.clip((times - start) / shot.camera.period_ns, 0.0, 1.0),
+        options=settings.options(spec),
+    )
+
+
+def image_error(found: Pixels, exact: Pixels) -> ImageError:
+    """Differences between the same pixels."""
+    levels = np.abs(found.rgb.astype(np.int16) - exact.rgb.astype(np.int16)).ravel()
+    here, there = np.isfinite(found.depth), np.isfinite(exact.depth)
+    both = here & there
+    depth = found.depth[both].astype(np.float64) - exact.depth[both]
+    return ImageError(
+        np.bincount(levels, minlength=256),
+        np.abs(depth),
+        missing=int(np.count_nonzero(here != there)),
+        changed=int(np.count_nonzero(found.klass != exact.klass)),
+        pixels=both.size,
+    )
+
+
+def encoded(frame: Frame, camera: Camera) -> int:
+    """Bytes of the images of a frame as PNG, as a drive writes them; optical flow is left out."""
+    images: dict[str, NDArray[np.uint8] | NDArray[np.uint16] | None] = {
+        "rgb": frame.rgb,
+        "depth": depth_to_counts(frame.depth),
+        "semantic": frame.klass,
+        "instance": feature_to_image(frame.feature),
+    }
+    written = (images.get(kind) for kind in camera.spec.images)
+    return sum(len(encode_png(pixels)) for pixels in written if pixels is not None)
+
+
+def image_cost(
+    shot: Shot, *, world: World, settings: CameraSettings, resolution: int = 1
+) -> tuple[float, int]:
+    """CPU seconds of rendering and encoding a whole frame, and the bytes of its images."""
+    began = time.process_time()
+    size = encoded(image(shot, world=world, settings=settings, resolution=resolution), shot.camera)
+    return time.process_time() - began, size
