@@ -35,6 +35,10 @@ class BuildOptions:
     dem_gaps: str = "error"
     """If elevation files do not cover the scene: error, or nearest (use the nearest height and report it)."""
 
+    dem_tolerance: float | None = None
+    """Maximum difference in metres from the terrain's grid, of ground on which nothing lies: more needs fewer
+    triangles. By default 1 % of the distance between heights in the elevation files; 0 keeps the grid."""
+
     only: Annotated[tuple[str, ...], WORDS] = KINDS
     """Kinds of features to build besides the ground, separated by commas."""
 
@@ -65,6 +69,8 @@ class BuildOptions:
             raise InputError(f"`lod` {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
         if self.dem_gaps not in ("error", "nearest"):
             raise InputError(f"`dem_gaps` {self.dem_gaps}: error or nearest")
+        if self.dem_tolerance is not None and not 0 <= self.dem_tolerance <= 1000:
+            raise InputError(f"`dem_tolerance` {self.dem_tolerance:g}: give metres from 0 to 1000")
         if unknown := sorted(set(self.only) - set(KINDS)):
             raise InputError(f"`only` {','.join(unknown)}: of {','.join(KINDS)}")
         if self.use not in ("all", "gis"):

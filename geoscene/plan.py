@@ -33,6 +33,7 @@ from geoscene.ground import (
     water_levels,
 )
 from geoscene.ground.foundations import foundation_heights
+from geoscene.ground.relief import Relief
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.ground.urban import paved_fabric
 from geoscene.objects.barriers import Barriers, read_barriers
@@ -65,9 +66,10 @@ from geoscene.typing import Float, Height
 Bounds = tuple[float, float, float, float]
 T = TypeVar("T")
 
-LARGEST_KM2 = 4000.0
-"""Maximum size of a scene in square kilometres: 64,000 tiles of 250 m."""
+LARGEST_KM2 = 10_500.0
+"""Maximum size of a scene in square kilometres: 100 x 100 km and a margin."""
 
+_TOLERANCE = 0.01  # of the distance between heights: maximum error of bare ground on the terrain's grid
 _ROAD_LINES = 10.0  # metres between the lines at which ground graded to roads can bend
 _ROAD_REACH = 25.0  # metres, maximum distance from a centre line of ground that is graded to the road
 _MARGIN = 10.0  # metres of ground added on both sides of maps narrower than twice that
@@ -304,7 +306,9 @@ def _plan_roads(
 def _plan_ground(
     layers: Layers, roads: _Roads, *, extent: Bounds, terrain: Terrain, options: BuildOptions
 ) -> GroundPlan:
-    size = options.tile_size
+    size, tolerance = options.tile_size, options.dem_tolerance
+    if tolerance is None:
+        tolerance = _TOLERANCE * terrain.spacing
     return plan_ground(
         extent,
         layers,
@@ -312,6 +316,7 @@ def _plan_ground(
         lines=_ROAD_LINES if roads.uneven else 0.0,
         ruled=_graded_tiles(roads.graph, size, level=not terrain.grids),
         coarse=terrain.lines,
+        relief=Relief(terrain.height, tolerance, terrain.lines) if terrain.grids and tolerance else None,
     )
 
 

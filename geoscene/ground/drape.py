@@ -17,13 +17,15 @@ from geoscene.ground.layers import Layers
 from geoscene.ground.partition import (
     GroundPlan,
     Partition,
+    follows_relief,
     partition_tile,
     rows_at,
     rows_near,
     tile_box,
+    tile_lattice,
     values_at,
 )
-from geoscene.ground.triangulate import Triangles, triangulate
+from geoscene.ground.triangulate import Triangles, triangulate, triangulate_relief
 from geoscene.mesh import Mesh
 from geoscene.sources.data import Way
 from geoscene.typing import Bools, Float, Height
@@ -127,7 +129,12 @@ def ground_tile(
 ) -> Mesh:
     """The ground of tile (i, j) in scene coordinates: partition, triangles and heights in one call."""
     cells = partition_tile(plan, i, j=j)
-    return drape(plan, cells, triangles=triangulate(cells), height=height, levels=levels)
+    still = np.isin(values_at(plan.layers.body, cells.row, base=""), ("sea", "standing")).all()
+    if follows_relief(plan, i, j=j) and not still:
+        triangles = triangulate_relief(cells, tile_lattice(plan, i, j=j))
+    else:
+        triangles = triangulate(cells)
+    return drape(plan, cells, triangles=triangles, height=height, levels=levels)
 
 
 def _inside(polygons: NDArray[np.object_]) -> tuple[Float, Float]:

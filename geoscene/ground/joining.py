@@ -14,16 +14,19 @@ from geoscene.typing import Bools
 _LARGEST = 4096.0
 """Metres of the longest side of a joined tile."""
 
+_MOST_STEPS = 128
+"""Most steps of the relief's lattice along a side of a joined tile, which bounds the number of its faces."""
+
 _MOST_LINES = 100
-"""Most lines of the terrain along a side of a joined tile, which bounds the number of its faces."""
+"""The same for lines of the terrain, where the ground follows no relief."""
 
 
 def joined(plan: GroundPlan, occupied: Collection[tuple[int, int]]) -> GroundPlan:
     """The plan with squares on which nothing lies joined to tiles of 2, 4, 8 ... squares along a side.
 
     Such a square has no outline, none of the ``occupied`` squares' features, no forest (whose trees are
-    placed tile by tile) and no ground graded to roads. The ground keeps its lines, so it is as close to the
-    terrain as in separate tiles. Tiles that are not joined do not change.
+    placed tile by tile), no river and no ground graded to roads. The ground follows the plan's relief, or
+    else keeps its lines. Tiles that are not joined only change on sides beside joined ones.
     """
     low, high = plan.tiles[0], plan.tiles[-1]
     columns, rows = (high - low + 1).tolist()
@@ -31,6 +34,8 @@ def joined(plan: GroundPlan, occupied: Collection[tuple[int, int]]) -> GroundPla
     whole = _bare(plan, occupied).reshape(rows, columns)
     lines = plan.coarse if plan.ruled is not None else plan.lines
     most = min(_LARGEST, _MOST_LINES * lines) if lines else _LARGEST
+    if plan.relief is not None:
+        most = min(_LARGEST, _MOST_STEPS * plan.tile_size / plan.relief.steps(plan.tile_size))
     n = 2
     while n * plan.tile_size <= most and whole.any():
         # Squares beyond the extent are bare: tiles are cut at its east and north sides.
@@ -58,6 +63,7 @@ def _bare(plan: GroundPlan, occupied: Collection[tuple[int, int]]) -> Bools:
     bare &= np.array([tile not in taken for tile in map(tuple, plan.tiles.tolist())])
     corner = np.maximum(plan.tiles[bare] * plan.tile_size, low)
     far = np.minimum((plan.tiles[bare] + 1) * plan.tile_size, high)
-    klass = values_at(plan.layers.klass, rows_at(plan, (corner + far) / 2), base=plan.base[0])
-    bare[bare] = klass != Class.FOREST_FLOOR
+    row = rows_at(plan, (corner + far) / 2)
+    is_forest = values_at(plan.layers.klass, row, base=plan.base[0]) == Class.FOREST_FLOOR
+    bare[bare] = ~is_forest & (values_at(plan.layers.body, row, base="") != "river")
     return bare

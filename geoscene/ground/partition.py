@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, materials
 from geoscene.errors import GeosceneError, InputError
 from geoscene.ground.layers import Layers
+from geoscene.ground.relief import Lattice, Relief, lattice
 from geoscene.typing import Bools, Float, Ints
 
 PRECISION = 2.0**-9
@@ -51,6 +52,7 @@ class GroundPlan:
     lines     : spacing of the terrain's lines, metres, 0 for none
     ruled     : tiles that have these lines; None for all
     coarse    : spacing of the lines in the other tiles, 0 for none
+    relief    : heights that joined tiles follow instead of lines, None for none
     layers    : the polygons that compete for the ground
     tree      : STRtree over their polygons
     base      : (class, material code) where no polygon lies
@@ -68,6 +70,7 @@ class GroundPlan:
     lines: float
     ruled: frozenset[tuple[int, int]] | None
     coarse: float
+    relief: Relief | None
     layers: Layers
     tree: shapely.STRtree
     base: tuple[int, int]
@@ -114,6 +117,7 @@ def plan_ground(
     lines: float = 0.0,
     ruled: Iterable[tuple[int, int]] | None = None,
     coarse: float = 0.0,
+    relief: Relief | None = None,
     base: tuple[int, str] = (Class.TERRAIN, "soil"),
 ) -> GroundPlan:
     """The scene's outlines sorted by tile, ready for `partition_tile`.
@@ -123,6 +127,7 @@ def plan_ground(
              that the ground can follow a terrain (still water is not cut); 0 for none
     ruled  : tiles that have such lines; all by default
     coarse : spacing of the lines in other tiles, 0 for none
+    relief : heights that tiles follow, instead of lines, that `geoscene.ground.joined` makes of several
     base   : class and material where no polygon lies
 
     Raises InputError for an extent without area or non-finite, or sizes off the grid.
@@ -150,6 +155,7 @@ def plan_ground(
         lines,
         None if ruled is None else frozenset(ruled),
         coarse,
+        relief,
         layers,
         shapely.STRtree(layers.polygon),
         (int(klass), materials()[material].code),
@@ -227,6 +233,20 @@ def tile_place(plan: GroundPlan, i: int, *, j: int) -> int | None:
     """The row of square (i, j) in the plan's tiles, None where it is not among them."""
     (west, south), (east, north) = plan.tiles[0].tolist(), plan.tiles[-1].tolist()
     return (j - south) * (east - west + 1) + i - west if west <= i <= east and south <= j <= north else None
+
+
+def follows_relief(plan: GroundPlan, i: int, *, j: int) -> bool:
+    """Whether the ground of square (i, j) follows the plan's relief, instead of lines."""
+    return plan.relief is not None and tile_span(plan, i, j=j) > 1
+
+
+def tile_lattice(plan: GroundPlan, i: int, *, j: int) -> Lattice:
+    """The vertices by which tile (i, j) follows the plan's relief; the plan must have one."""
+    if plan.relief is None:
+        raise InputError("the ground's plan has no relief")
+    odd = bool((i + j - plan.tiles[0].sum()) % 2)
+    span = tile_span(plan, i, j=j)
+    return lattice(plan.relief, (i, j), span=span, odd=odd, tile_size=plan.tile_size, extent=plan.extent)
 
 
 def rows_near(plan: GroundPlan, xmin: float, *, ymin: float, xmax: float, ymax: float) -> Ints:
@@ -324,6 +344,8 @@ def _strings(start: Float, end: Float, *, string: Ints) -> NDArray[np.object_]:
 
 def _spacing(plan: GroundPlan, i: int, *, j: int) -> float:
     """Spacing of the terrain's lines in tile (i, j), 0 where it has none."""
+    if follows_relief(plan, i, j=j):
+        return 0.0
     return plan.lines if plan.ruled is None or (i, j) in plan.ruled else plan.coarse
 
 
@@ -336,18 +358,23 @@ def _multiples(low: float, high: float, *spacings: float) -> Float:
 def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float, float]) -> list[object]:
     """The tile's sides, and the terrain's lines across it.
 
-    A side has a vertex at every line of both tiles that share it, and at every corner of a square, so that
-    tiles of any span agree.
+    A side has a vertex at every line and every vertex of the relief of both tiles that share it, and at every
+    corner of a square, so that tiles of any span agree.
     """
     xmin, ymin, xmax, ymax = box
     own, n = _spacing(plan, i, j=j), tile_span(plan, i, j=j)
+    kept = _kept_on_sides(plan, i, j=j)
     bottom, top = (
-        _stops(plan, xmin, high=xmax, first=i, beside=[(i + k, row) for k in range(n)], own=own)
-        for row in (j - 1, j + n)
+        _stops(
+            plan, (i, j), ends=(xmin, xmax), first=i, beside=[(i + k, row) for k in range(n)], kept=of_side
+        )
+        for row, of_side in zip((j - 1, j + n), kept[:2], strict=True)
     )
     left, right = (
-        _stops(plan, ymin, high=ymax, first=j, beside=[(column, j + k) for k in range(n)], own=own)
-        for column in (i - 1, i + n)
+        _stops(
+            plan, (i, j), ends=(ymin, ymax), first=j, beside=[(column, j + k) for k in range(n)], kept=of_side
+        )
+        for column, of_side in zip((i - 1, i + n), kept[2:], strict=True)
     )
     ring = [
         (xmin, ymin), *((x, ymin) for x in bottom),
@@ -361,20 +388,45 @@ def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float,
     return ruling
 
 
+def _kept_on_sides(plan: GroundPlan, i: int, *, j: int) -> list[Float]:
+    """Coordinates of the relief's vertices on a tile's south, north, west and east side.
+
+    None where neither the tile nor one beside it follows the relief.
+    """
+    n = tile_span(plan, i, j=j)
+    near = [(i + dx, j + dy) for k in range(n) for dx, dy in ((k, -1), (k, n), (-1, k), (n, k))]
+    if not any(follows_relief(plan, column, j=row) for column, row in [(i, j), *near]):
+        return [np.empty(0)] * 4
+    points = tile_lattice(plan, i, j=j)
+    x, y, kept = points.x, points.y, points.kept
+    return [x[kept[:, 0]], x[kept[:, -1]], y[kept[0]], y[kept[-1]]]
+
+
 def _stops(
-    plan: GroundPlan, low: float, *, high: float, first: int, beside: Sequence[tuple[int, int]], own: float
+    plan: GroundPlan,
+    tile: tuple[int, int],
+    *,
+    ends: tuple[float, float],
+    first: int,
+    beside: Sequence[tuple[int, int]],
+    kept: Float,
 ) -> Float:
-    """Coordinates of the vertices along a tile's side from ``low`` to ``high``, both left out, ascending.
+    """Coordinates of the vertices along a tile's side between its ends, ascending.
 
     first  : index of the first square along the side
     beside : the squares beyond the side, in order
-    own    : spacing of the tile's own lines
+    kept   : coordinates of the relief's vertices on the side
     """
     size, stops = plan.tile_size, [np.empty(0)]
+    own, follows = _spacing(plan, tile[0], j=tile[1]), follows_relief(plan, tile[0], j=tile[1])
     for k, (i, j) in enumerate(beside, start=first):
-        start, end = max(k * size, low), min((k + 1) * size, high)
+        start, end = max(k * size, ends[0]), min((k + 1) * size, ends[1])
         if start < end:
-            stops += [np.array([start]), _multiples(start, end, own, _spacing(plan, i, j=j))]
+            border = follows and tile_place(plan, i, j=j) is None
+            lines = _multiples(start, end, own, 0.0 if border else _spacing(plan, i, j=j))
+            if follows or follows_relief(plan, i, j=j):
+                lines = np.union1d(lines, kept[(kept > start) & (kept < end)])
+            stops += [np.array([start]), lines]
     return np.concatenate(stops)[1:]
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError
 from geoscene.ground.partition import Partition, distinct
-from geoscene.typing import Float
+from geoscene.ground.relief import Lattice, relief_corners
+from geoscene.typing import Float, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +44,20 @@ def triangulate(partition: Partition) -> Triangles:
     found = shapely.constrained_delaunay_triangles(partition.polygon)
     triangles, cell = shapely.get_parts(found, return_index=True)
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
+    return _checked(partition, corners, cell=cell)
+
+
+def triangulate_relief(partition: Partition, vertices: Lattice) -> Triangles:
+    """The triangles of a tile of bare ground, which is one cell, with the vertices that its relief needs.
+
+    Raises GeosceneError if the triangles do not add up to its area.
+    """
+    corners = relief_corners(vertices, partition.polygon[0])
+    return _checked(partition, corners, cell=np.zeros(len(corners), np.int64))
+
+
+def _checked(partition: Partition, corners: Float, *, cell: Ints) -> Triangles:
+    """Triangles with these corners (m, 3, 2), if they add up to the area of their cells (m,)."""
     points, number = distinct(corners.reshape(-1, 2))
     faces = number.reshape(-1, 3)
     area = _signed_area(points, faces)

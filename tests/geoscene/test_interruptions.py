@@ -56,6 +56,7 @@ CHANGES = {
     "lod": 1,
     "dem": "a file",
     "dem_gaps": "nearest",
+    "dem_tolerance": 1.0,
     "only": ("buildings", "roads"),
     "along": "a file",
     "reach": 30.0,

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import shapely
 import shapely.affinity
+from helpers.surfaces import assert_one_surface, welded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
@@ -52,37 +53,6 @@ def layers_of(polygons, rng):
     return Layers.of(
         polygons, klass=klass, material=GRASS, priority=rng.integers(0, 5, n), feature=np.arange(n)
     )
-
-
-def edge_counts(faces):
-    """Undirected edges (k, 2) and the number of faces of each."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return np.unique(edges, axis=0, return_counts=True)
-
-
-def welded(mesh):
-    """The mesh with vertices of equal coordinates merged."""
-    points, number = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    return points, number.reshape(-1)[mesh.faces]
-
-
-def on_border(points, edges, extent):
-    ends = points[edges][:, :, :2]
-    low, high = np.array(extent[:2]), np.array(extent[2:])
-    return ((ends == low).all(axis=1) | (ends == high).all(axis=1)).any(axis=1)
-
-
-def assert_one_surface(points, faces, extent):
-    """Assert that every edge has two faces, or one at the extent's border, and that areas add up."""
-    edges, count = edge_counts(faces)
-    border = on_border(points, edges, extent)
-    assert (count[~border] == 2).all()
-    assert (count[border] == 1).all()
-    a, b, c = (points[faces[:, k], :2] for k in range(3))
-    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
-    area = (ux * vy - uy * vx) / 2
-    assert (area > 0).all()
-    assert area.sum() == pytest.approx((extent[2] - extent[0]) * (extent[3] - extent[1]), rel=1e-9)
 
 
 @given(st.integers(0, 2**32), st.sampled_from([0.0, 4.0, 7.0]), st.sampled_from([16.0, 25.0, 200.0]))
