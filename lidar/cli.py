@@ -28,7 +28,15 @@ from lidar import __version__
 from lidar.dataset.export import exporter
 from lidar.dataset.formats import map_suffixes
 from lidar.errors import InputError, LidarError
-from lidar.options import OUTPUT, ApplyOptions, DriveOptions, ExportOptions, MapOptions, TradeoffOptions
+from lidar.options import (
+    OUTPUT,
+    AccuracyOptions,
+    ApplyOptions,
+    DriveOptions,
+    ExportOptions,
+    MapOptions,
+    TradeoffOptions,
+)
 
 if TYPE_CHECKING:
     from lidar.maps.aggregate import MapSummary
@@ -58,7 +66,13 @@ JsonFlag = Annotated[bool, Parameter(group=OUTPUT)]
 
 @app.command
 def drive(
-    scene: Path, /, *, options: DriveOptions | None = None, out: Out, report: Reporting = Report()
+    scene: Path,
+    /,
+    *,
+    options: DriveOptions | None = None,
+    wanted: AccuracyOptions = AccuracyOptions(),
+    out: Out,
+    report: Reporting = Report(),
 ) -> int:
     """Drive a route through a scene and record what the rig senses.
 
@@ -76,6 +90,8 @@ def drive(
 
     lidar drive scene --rig drone --survey all --altitude 80 -o flight
 
+    lidar drive scene --route random --rig vlp16 --accuracy 3cm -o drive
+
     Parameters
     ----------
     scene
@@ -84,13 +100,29 @@ def drive(
         Directory to write the dataset to.
     """
     from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
-    from lidar.pipeline import drive as record  # noqa: PLC0415
+    from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415
 
     options = options or DriveOptions()
     options.check_course()
     note_new_folder(out)
-    with progress_bar(quiet=report.quiet) as progress, using(open_scene(scene), known=LidarError) as opened:
-        summary = record(opened, out, options=options, overwrite=report.overwrite, progress=progress)
+    with using(open_scene(scene), known=LidarError) as opened:
+        with progress_bar(quiet=report.quiet) as progress:
+            pick = picked(
+                opened, options, wanted=wanted, out=None if report.overwrite else out, progress=progress
+            )
+        if pick and not report.json:
+            print(pick.to_text(options.workers), flush=True)
+        with progress_bar(quiet=report.quiet) as progress:
+            done = driven(
+                opened,
+                out,
+                options=options,
+                wanted=wanted,
+                pick=pick,
+                overwrite=report.overwrite,
+                progress=progress,
+            )
+    summary = done.summary
     document: dict[str, Any] = {
         "path": str(summary.path),
         "frames": summary.frames,
@@ -103,6 +135,8 @@ def drive(
         "wall_s": round(summary.wall, 2),
         "stages_s": {name: round(seconds, 3) for name, seconds in summary.stages.items()},
     }
+    if pick or done.reached:
+        document["accuracy"] = done.accuracy(options.workers)
     if report.json:
         print_json(document)
     else:
@@ -113,6 +147,10 @@ def drive(
             f" {total:,} points{before} in {summary.wall:.1f} s;"
             f" next: {command_line('lidar', 'map', out, '-o', 'map.laz')}"
         )
+        if done.reached:
+            print(done.reached.to_text())
+    if missed := done.missed():
+        print(f"lidar: {missed}", file=sys.stderr)
     for name in (name for name, points in summary.points.items() if not points):
         print(
             f"lidar: {name} has no returns in the whole drive; check its mount and maximum range",

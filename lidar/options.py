@@ -6,6 +6,7 @@ import hashlib
 import math
 import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from difflib import get_close_matches
@@ -306,6 +307,90 @@ class DriveOptions:
         if self.stages:
             resolved["stages"] = [stage.to_json() for stage in self.stages]
         return recipe | resolved
+
+
+PERCENTS = (50.0, 68.0, 90.0, 95.0, 99.0, 99.9)
+"""Percent of the returns that an accuracy may be asked for."""
+
+_LENGTH = re.compile(r"([\d.]+) ?(um|µm|mm|cm|m)(?:@([\d.]+) ?%?)?")
+_METRES = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """A range error that a share of the returns of each scanner must not exceed.
+
+    text    : as it was asked for
+    metres  : the error
+    percent : the share, of `PERCENTS`
+    """
+
+    text: str
+    metres: float
+    percent: float = 99.9
+
+
+def read_accuracy(text: str) -> Accuracy:
+    """An accuracy of a text such as ``1cm`` or ``5mm@99``; raises InputError for others."""
+    found = _LENGTH.fullmatch(text.strip().lower())
+    metres, percent = 0.0, 99.9
+    with suppress(ValueError):  # of numbers with two points
+        if found:
+            metres, percent = float(found[1]) * _METRES[found[2]], float(found[3] or percent)
+    if not 1e-6 <= metres <= 1000:
+        raise InputError(f"`accuracy` {text}: give a length and its unit, as in 1cm, 5mm@99 or 0.1m")
+    if percent not in PERCENTS:
+        among = ", ".join(f"{p:g}" for p in PERCENTS)
+        raise InputError(f"`accuracy` {text}: after the @ give one of {among} percent of the returns")
+    return Accuracy(text.strip(), metres, percent)
+
+
+def read_budget(text: str) -> float:
+    """Simulated seconds per second, of a text such as ``2x-realtime``; raises InputError for others."""
+    found = re.fullmatch(r"(\d+\.?\d*|\.\d+)x-realtime", text.strip().lower())
+    speed = float(found[1]) if found else 0.0
+    if not 0 < speed < math.inf:
+        raise InputError(f"`budget` {text}: give a speed such as 2x-realtime or 0.5x-realtime")
+    return speed
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class AccuracyOptions:
+    """Options by which the number of rays of scanners is picked, and errors are checked."""
+
+    accuracy: Annotated[str, Parameter(metavar="LENGTH[@PERCENT]")] = ""
+    """Pick the fewest rays per pulse with which the range errors of every scanner are below this: 1cm is at
+    99.9 % of the returns, 5mm@99 at 99 %. By the upper end of the 95 % interval of a measurement, which is
+    made once for a scene, rig and settings."""
+
+    budget: Annotated[str, Parameter(metavar="Nx-realtime")] = ""
+    """Pick the most rays per pulse with which the drive is simulated this much faster than real time, with
+    the workers given: 2x-realtime is two simulated seconds per second. With an accuracy: a limit to it."""
+
+    spot_check: bool = False
+    """Compare a sample of the recorded frames with the exact end afterwards; always done for an accuracy or a
+    budget."""
+
+    profile_cache: Path | None = None
+    """Folder of the measurements that accuracy and budget pick by; ~/.cache/geoscene/profiles by default."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if self.accuracy:
+            read_accuracy(self.accuracy)
+        if self.budget:
+            read_budget(self.budget)
+
+    @property
+    def picks(self) -> bool:
+        """Whether settings are to be picked."""
+        return bool(self.accuracy or self.budget)
+
+    @property
+    def checks(self) -> bool:
+        """Whether a sample of frames is to be checked."""
+        return self.picks or self.spot_check
 
 
 @Parameter(name="*")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -76,8 +76,13 @@ def drive(
     options: DriveOptions,
     overwrite: bool = False,
     progress: Progress = silent,
+    notes: Mapping[str, Any] | None = None,
+    check: Callable[[DrivePlan], Mapping[str, Any]] | None = None,
 ) -> DriveSummary:
     """Drive a route through a scene and write the dataset; an unfinished one of the same options is finished.
+
+    notes : further entries of ``dataset.json``
+    check : called when all frames are recorded; returns entries that replace or join the notes
 
     Raises InputError (also as RouteError, RigError, DatasetError) for what cannot be driven or written.
     """
@@ -93,6 +98,8 @@ def drive(
             overwrite=overwrite,
             cluster=cluster,
             progress=progress,
+            notes=notes or {},
+            check=check,
             began=began,
         )
 
@@ -120,11 +127,13 @@ def _driven(
     overwrite: bool,
     cluster: Cluster | None,
     progress: Progress,
+    notes: Mapping[str, Any],
+    check: Callable[[DrivePlan], Mapping[str, Any]] | None,
     began: float,
 ) -> DriveSummary:
     """Plan and record; ``began`` is the time of the start, seconds."""
     plan = plan_drive(scene, options, progress=progress)
-    manifest = plan.manifest()
+    manifest = plan.manifest() | dict(notes)
     prepare(out, manifest["recipe"], overwrite=overwrite)
     with _removed_if_nothing_recorded(out), exclusive(out):
         recording = plan.recording(out)
@@ -145,7 +154,11 @@ def _driven(
         journal.close()
         if plan.actors is not None:
             merge_box_files(out)
-        write_json(Paths(out).manifest, manifest | {"points": points, "frames_done": manifest["frames"]})
+        manifest |= {"points": points, "frames_done": manifest["frames"]}
+        write_json(Paths(out).manifest, manifest)
+        wall = time.perf_counter() - began
+        if check is not None:
+            write_json(Paths(out).manifest, manifest | dict(check(plan)))
     return DriveSummary(
         out,
         int(manifest["frames"]),
@@ -154,7 +167,7 @@ def _driven(
         written=sum(points.values()) - sum(before.values()),
         duration=plan.trajectory.duration_ns / 1e9,
         length=plan.length,
-        wall=time.perf_counter() - began,
+        wall=wall,
         stages=recording.watch.seconds,
     )
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import osmium
 import pytest
 from helpers.overture import overture_row, write_overture
+from helpers.profiles import measure_little
 from helpers.programs import run_process, run_program
 from helpers.rasters import write_slope
 
@@ -123,6 +124,7 @@ def folder(inputs, tmp_path, monkeypatch):
         compared = replace(compared, frames=2, pulses=100, pixels=256, reference_rays=7)
         return compare(scene, replace(options, duration=0.4), compared=compared, **more)
 
+    measure_little(monkeypatch, folder=tmp_path / "profiles")
     monkeypatch.setattr(lidar.tradeoff.engine, "tradeoff", small)
     monkeypatch.setattr(lidar.pipeline, "drive", short)
     monkeypatch.setattr(lidar.pipeline, "record_all", first)

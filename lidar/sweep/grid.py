@@ -19,7 +19,7 @@ from geoscene.errors import GeosceneError, reading
 from geoscene.scene import open_scene
 from geoscene.scene.layout import SceneFiles
 from lidar.errors import InputError, LidarError
-from lidar.options import DriveOptions
+from lidar.options import AccuracyOptions, DriveOptions
 from lidar.plan import sensors_of
 from lidar.rig.specs import load_rig
 from lidar.rig.vehicle import load_vehicle
@@ -47,12 +47,14 @@ class GridDrive:
     scene   : directory of a scene, or a map that one is built of
     values  : options of the grid as text, by name
     options : of the drive; their paths are absolute, as workers may have another current folder
+    wanted  : accuracy and budget of the drive
     """
 
     name: str
     scene: Path
     values: dict[str, str]
     options: DriveOptions
+    wanted: AccuracyOptions = AccuracyOptions()
 
     @property
     def inputs(self) -> list[Path]:
@@ -123,10 +125,12 @@ def _drive(path: Path, common: Mapping[str, Any], *, grid: Mapping[str, Any]) ->
         if not isinstance(scene, str):
             raise InputError("scene: give the directory of a scene, or a map")
         words = [word for key, value in values.items() for word in _words(key, value)]
-        options = _parsed(words)
+        options, wanted = _parsed(words)
         _check(options)
         options = _with_absolute_paths(options)
-    return GridDrive(name, Path(scene).absolute(), texts, options)
+        if wanted.profile_cache:
+            wanted = replace(wanted, profile_cache=wanted.profile_cache.absolute())
+    return GridDrive(name, Path(scene).absolute(), texts, options, wanted)
 
 
 @contextmanager
@@ -171,15 +175,17 @@ def _words(key: str, value: Any) -> list[str]:
     return [flag, *map(str, value)]
 
 
-def _parsed(words: list[str]) -> DriveOptions:
+def _parsed(words: list[str]) -> tuple[DriveOptions, AccuracyOptions]:
     """Options from words of a command line."""
     app = App(default_parameter=DEFAULTS, help_flags=(), version_flags=())
 
     @app.default
-    def options_of(*, options: DriveOptions | None = None) -> DriveOptions:
-        return options or DriveOptions()
+    def options_of(
+        *, options: DriveOptions | None = None, wanted: AccuracyOptions = AccuracyOptions()
+    ) -> tuple[DriveOptions, AccuracyOptions]:
+        return options or DriveOptions(), wanted
 
-    parsed: DriveOptions = app(
+    parsed: tuple[DriveOptions, AccuracyOptions] = app(
         guard_numbers(words), result_action="return_value", exit_on_error=False, print_error=False
     )
     return parsed

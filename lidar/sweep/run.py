@@ -26,8 +26,8 @@ from lidar import __version__
 from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Paths
 from lidar.errors import InputError, LidarError
-from lidar.pipeline import drive
 from lidar.sweep.grid import GridDrive, read_grid
+from lidar.tradeoff.accuracy import Pick, driven, picked
 
 log = logging.getLogger(__name__)
 
@@ -113,10 +113,15 @@ def sweep(
                 drives, folder.absolute(), workers=workers, cluster=cluster, progress=progress
             )
             threads = 1 if cluster else max(workers // len(drives), 1)
-            tasks = [
-                _Task(row, planned, folder.absolute(), threads, overwrite=overwrite)
-                for row, planned in enumerate(drives)
-            ]
+            tasks, failed = [], []
+            for row, planned in enumerate(drives):
+                task = _Task(row, planned, folder.absolute(), threads, overwrite=overwrite)
+                try:
+                    tasks.append(_with_pick(task, progress=progress))
+                except (GeosceneError, LidarError, OSError) as error:
+                    failed.append((row, DriveRow(planned.name, "failed", " ".join(str(error).split()))))
+            for row, result in failed:
+                table.set(row, result)
             progress("drives", 0, total=len(tasks))
             for done, (row, result) in enumerate(_results(tasks, workers=workers, cluster=cluster), 1):
                 table.set(row, result)
@@ -153,13 +158,26 @@ def _is_sweep(folder: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """One drive to record: its row in the table, the folder of the sweep, and the threads to use."""
+    """One drive to record: its row in the table, the folder of the sweep, the threads, and what is picked."""
 
     row: int
     drive: GridDrive
     folder: Path
     threads: int
     overwrite: bool
+    pick: Pick | None = None
+
+
+def _with_pick(task: _Task, *, progress: Progress) -> _Task:
+    """The task with what is picked for its drive, here, as one profile serves many drives."""
+    planned = task.drive
+    if not planned.wanted.picks:
+        return task
+    options = replace(planned.options, workers=task.threads)
+    out = None if task.overwrite else task.folder / planned.name
+    with using(open_scene(planned.scene), known=LidarError) as scene:
+        pick = picked(scene, options, wanted=planned.wanted, out=out, progress=progress)
+    return replace(task, pick=pick)
 
 
 def _results(
@@ -190,7 +208,14 @@ def _recorded(task: _Task) -> tuple[int, DriveRow]:
     options = replace(task.drive.options, workers=task.threads)
     try:
         with using(open_scene(task.drive.scene), known=LidarError) as scene:
-            done = drive(scene, out, options=options, overwrite=task.overwrite)
+            done = driven(
+                scene,
+                out,
+                options=options,
+                wanted=task.drive.wanted,
+                pick=task.pick,
+                overwrite=task.overwrite,
+            ).summary
     except (GeosceneError, LidarError, OSError) as error:
         return task.row, DriveRow(name, "failed", " ".join(str(error).split()))
     except Exception as error:  # one drive's defect must not end the others

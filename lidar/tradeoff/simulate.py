@@ -129,6 +129,7 @@ def swept(
     world: World,
     settings: ScannerSettings,
     pulses: NDArray[np.int64] | None = None,
+    threads: int = 1,
 ) -> tuple[Sweep, Detection]:
     """Pulses of a frame and what the scanner detects."""
     sweep = cast(
@@ -140,6 +141,7 @@ def swept(
         seed=plan.options.seed,
         settings=settings,
         pulses=pulses,
+        threads=threads,
     )
     return sweep, detect(sweep, sweep.echoes, deviates=deviates_of(sweep))
 
@@ -152,9 +154,12 @@ def returns_of(
     world: World,
     settings: ScannerSettings,
     pulses: NDArray[np.int64],
+    threads: int = 1,
 ) -> Returns:
     """Returns of some pulses of a frame, placed in the scene in float64."""
-    sweep, found = swept(plan, scanner, frame=frame, world=world, settings=settings, pulses=pulses)
+    sweep, found = swept(
+        plan, scanner, frame=frame, world=world, settings=settings, pulses=pulses, threads=threads
+    )
     fired, rows = sweep.firings, found.echoes.pulse
     away = found.range - scanner.sensor.pattern.range_offset
     xyz = fired.origin[rows] + away[:, None] * fired.direction[rows]

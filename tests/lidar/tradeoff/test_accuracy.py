@@ -1,0 +1,341 @@
+"""Drives to an accuracy or within a budget: texts, choice, stored profiles, recipes, spot checks."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.profiles import measure_little
+from helpers.programs import run_program
+from helpers.scenes import same_files
+
+from lidar.dataset.layout import Paths, open_dataset
+from lidar.errors import InputError
+from lidar.options import PERCENTS, AccuracyOptions, DriveOptions, read_accuracy, read_budget
+from lidar.pipeline import drive
+from lidar.sweep import sweep
+from lidar.tradeoff import profile
+from lidar.tradeoff.accuracy import CheckedDrive, choice, driven, picked
+from lidar.tradeoff.errors import Estimate, Returns
+from lidar.tradeoff.profile import Candidate, Profile, profile_of
+from lidar.tradeoff.sampling import RangeError, SampledError, range_error, sampled_error
+from lidar.tradeoff.spot import SpotCheck
+
+DRIVE = DriveOptions(route="random", rig="vlp16", duration=0.5, seed=3, formats=("pcd",))
+
+
+@pytest.mark.parametrize(
+    ("text", "metres", "percent"),
+    [
+        ("1cm", 0.01, 99.9),
+        ("1cm@99.9", 0.01, 99.9),
+        ("5mm@99", 0.005, 99.0),
+        ("0.1m", 0.1, 99.9),
+        ("0.1 m@95%", 0.1, 95.0),
+        (" 200um@50", 0.0002, 50.0),
+        ("2CM", 0.02, 99.9),
+    ],
+)
+def test_accuracies_are_read(text, metres, percent):
+    found = read_accuracy(text)
+    assert (found.metres, found.percent) == (pytest.approx(metres), percent)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "1", "cm", "0cm", "-1cm", "1in", "1cm@", "1cm@100", "1cm@98.7", "1..2cm", "5km", "nan m"]
+)
+def test_other_accuracies_are_refused_in_one_line(text):
+    with pytest.raises(InputError, match="`accuracy`") as error:
+        read_accuracy(text)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "speed"), [("2x-realtime", 2), ("0.5x-realtime", 0.5), (".5X-realtime", 0.5)]
+)
+def test_budgets_are_read(text, speed):
+    assert read_budget(text) == speed
+
+
+@pytest.mark.parametrize(
+    "text", ["", "2", "2x", "0x-realtime", "-1x-realtime", "x-realtime", "1e3x-realtime"]
+)
+def test_other_budgets_are_refused(text):
+    with pytest.raises(InputError, match="`budget`"):
+        read_budget(text)
+
+
+def candidate(rays, cpu, *errors):
+    """A candidate of scanners with these errors, which reach twice as far up; ten times less at 99 %."""
+
+    def of(error):
+        at = {p: Estimate(e, e / 2, 2 * e) for p, e in ((99.0, error / 10), (99.9, error))}
+        nothing = Estimate(0.0, 0.0, 0.0)
+        return RangeError(dict.fromkeys(PERCENTS, nothing) | at, missed=nothing, extra=nothing)
+
+    cost = Estimate(cpu, 0.9 * cpu, 1.1 * cpu)
+    return Candidate(rays, {f"scanner_{k}": of(error) for k, error in enumerate(errors)}, cost)
+
+
+PROFILE = Profile(
+    Path("profile.json"),
+    (candidate(1, 0.1, 0.1, 0.2), candidate(7, 0.4, 0.02, 0.04), candidate(19, 0.9, 0.004, 0.009)),
+    frames=20,
+)
+
+
+@pytest.mark.parametrize(
+    ("accuracy", "budget", "rays"),
+    [
+        ("0.5m", "", 1),
+        ("40cm", "", 1),  # the upper end of the worse scanner
+        ("39cm", "", 7),
+        ("8cm", "", 7),
+        ("5cm", "", 19),  # 7 rays have 4 cm, up to 8 cm
+        ("1cm@99", "", 7),
+        ("", "9x-realtime", 1),
+        ("", "2.2x-realtime", 7),
+        ("", "2.3x-realtime", 1),  # the upper end of the cost
+        ("", "0.1x-realtime", 19),
+        ("40cm", "0.1x-realtime", 1),
+        ("8cm", "2x-realtime", 7),
+    ],
+)
+def test_the_first_that_is_enough_or_the_last_that_is_affordable_is_chosen(accuracy, budget, rays):
+    assert choice(PROFILE, AccuracyOptions(accuracy, budget), workers=1).rays == rays
+
+
+@pytest.mark.parametrize(
+    ("accuracy", "budget", "line"),
+    [
+        ("1cm", "", r"rays=19 errs by 9 mm \(4.5 mm to 1.8 cm\): give 1.8 cm or more"),
+        ("", "10x-realtime", "even rays=1 is simulated at 9.1 x real time with 1 worker"),
+        (
+            "5cm",
+            "2x-realtime",
+            "takes rays=19, simulated at 1 x real time.*allows rays=7, with errors of 4 cm",
+        ),
+    ],
+)
+def test_what_none_reaches_is_one_line_with_the_nearest(accuracy, budget, line):
+    with pytest.raises(InputError, match=line):
+        choice(PROFILE, AccuracyOptions(accuracy, budget), workers=1)
+
+
+def test_more_workers_afford_more(monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 4)
+    wanted = AccuracyOptions(budget="2x-realtime")
+    assert [choice(PROFILE, wanted, workers=w).rays for w in (1, 2, 9)] == [7, 19, 19]
+
+
+def returns(rows, ranges):
+    n = len(rows)
+    return Returns(256 * np.array(rows), np.array(ranges, float), np.ones(n, np.uint8), np.zeros((n, 3)))
+
+
+def test_weighted_errors_of_matched_missed_and_extra_returns():
+    weights = np.array([1.0, 10.0, 1.0, 5.0])
+    error = sampled_error(
+        returns([0, 1, 3], [5.1, 7, 9]), exact=returns([0, 1, 2], [5, 7, 8]), weights=weights
+    )
+    np.testing.assert_allclose(error.range, [0.1, 0])
+    assert (error.weight.tolist(), error.missed, error.extra, error.returns) == ([1, 10], 1, 5, 12)
+    found = range_error([error, error])
+    assert found.range_m[90.0].value == 0
+    assert found.range_m[95.0].value == pytest.approx(0.1)
+    assert found.missed.value == pytest.approx(1 / 12)
+    assert found.extra.value == pytest.approx(5 / 12)
+
+
+def test_a_stratified_sample_has_the_quantiles_of_all():
+    rng = np.random.default_rng(0)
+    every = rng.lognormal(-6, 2, (20, 5000))
+
+    def sampled(errors):
+        seen = errors * rng.uniform(0.8, 1.2, len(errors))  # by the screening
+        hard, easy = np.split(np.argsort(-seen), [120])
+        easy = rng.permutation(easy)[:120]
+        weight = np.r_[np.ones(120), np.full(120, (5000 - 120) / 120)]
+        return SampledError(errors[np.r_[hard, easy]], weight, missed=0.0, extra=0.0, returns=5000.0)
+
+    found = range_error([sampled(errors) for errors in every])
+    for percent, tolerance in ((50.0, 0.2), (90.0, 0.2), (99.0, 0.1), (99.9, 0.01)):
+        true = np.quantile(every, percent / 100)
+        assert found.range_m[percent].value == pytest.approx(true, rel=tolerance)
+        assert found.range_m[percent].low <= found.range_m[percent].value <= found.range_m[percent].high
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick():
+    """Smaller samples, so that a profile takes a second."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(profile, "RAYS", (1, 7, 61))
+        measure_little(patch)
+        yield
+
+
+@pytest.fixture(scope="module")
+def cache(scene, tmp_path_factory):
+    """A folder with the profile of the demo scene."""
+    folder = tmp_path_factory.mktemp("profiles")
+    assert profile_of(scene, DRIVE, folder=folder).made
+    return folder
+
+
+@pytest.fixture
+def measured_before(monkeypatch):
+    """Let a profile that is measured again fail the test."""
+
+    def again(*_args, **_options):
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr(profile, "_measured", again)
+
+
+def accurate(scene, out, *, options=DRIVE, wanted):
+    pick = picked(scene, options, wanted=wanted, out=out)
+    return driven(scene, out, options=options, wanted=wanted, pick=pick)
+
+
+def between(cache, scene):
+    """An accuracy that takes 7 rays, by the profile."""
+    one, seven, _ = profile_of(scene, DRIVE, folder=cache).candidates
+    low, high = (max(e.range_m[99.0].high for e in c.errors.values()) for c in (seven, one))
+    assert low < high
+    return f"{500 * (low + high):.6f}mm@99"
+
+
+def test_more_rays_err_less_and_cost_more(scene, cache):
+    one, _, most = profile_of(scene, DRIVE, folder=cache).candidates
+    for percent in (99.0, 99.9):
+        assert (
+            most.errors["lidar_top"].range_m[percent].value < one.errors["lidar_top"].range_m[percent].value
+        )
+    assert one.cpu_s.value < most.cpu_s.value
+
+
+@pytest.mark.usefixtures("measured_before")
+def test_a_profile_is_kept_for_other_routes_and_made_for_other_settings(scene, cache):
+    for change in ({"seed": 9}, {"duration": 2.0, "from_rest": True}, {"workers": 1}):
+        assert not profile_of(scene, replace(DRIVE, **change), folder=cache).made
+    for change in (
+        {"rig": "drone", "vehicle": "car"},
+        {"fidelity": "survey"},
+        {"settings": (("reach", "50"),)},
+    ):
+        with pytest.raises(AssertionError, match="measured again"):
+            profile_of(scene, replace(DRIVE, **change), folder=cache)
+
+
+def test_errors_are_measured_the_same_again_and_damaged_profiles_are_replaced(scene, cache, tmp_path):
+    first = profile_of(scene, DRIVE, folder=cache)
+    (tmp_path / first.path.name).write_text("{")
+    again = profile_of(scene, DRIVE, folder=tmp_path)
+    assert again.made
+    assert [c.errors for c in again.candidates] == [c.errors for c in first.candidates]
+
+
+@pytest.mark.usefixtures("measured_before")
+def test_a_drive_holds_what_was_asked_picked_expected_and_reached(scene, cache, tmp_path):
+    wanted = AccuracyOptions(between(cache, scene), profile_cache=cache)
+    done = accurate(scene, tmp_path / "a", wanted=wanted)
+    manifest = open_dataset(tmp_path / "a").manifest
+    notes = manifest["accuracy"]
+    assert notes["asked"] == {"accuracy": wanted.accuracy}
+    assert notes["picked"] == {"rays": 7}
+    assert manifest["recipe"]["settings"] == [["rays", "7"]]
+    expected, reached = (notes[f"{name}_error_m"]["lidar_top"] for name in ("expected", "reached"))
+    assert expected["low"] <= expected["value"] <= expected["high"] <= read_accuracy(wanted.accuracy).metres
+    assert 0 < reached["low"] <= reached["value"] <= reached["high"]
+    assert notes["spot_check"]["lidar_top"]["frames"] == 5
+    assert "rays=7" in done.pick.to_text(2)
+    assert done.accuracy(2)["expected_cpu_s"]["value"] > 0
+    assert "cpu" not in json.dumps(notes)
+    drive(scene, tmp_path / "set", options=replace(DRIVE, settings=(("rays", "7"),)))
+    assert Paths(tmp_path / "a").journal.read_bytes() == Paths(tmp_path / "set").journal.read_bytes()
+
+
+@pytest.mark.usefixtures("measured_before")
+def test_a_drive_is_resumed_with_what_was_picked_and_has_the_same_bytes(scene, cache, tmp_path):
+    wanted = AccuracyOptions(between(cache, scene), profile_cache=cache)
+    accurate(scene, tmp_path / "a", wanted=wanted)
+    accurate(scene, tmp_path / "b", options=replace(DRIVE, workers=1), wanted=wanted)
+    same_files(tmp_path / "a", tmp_path / "b")
+    manifest = json.loads(Paths(tmp_path / "b").manifest.read_text())
+    for key in ("reached_error_m", "spot_check"):
+        del manifest["accuracy"][key]
+    Paths(tmp_path / "b").manifest.write_text(json.dumps(manifest | {"frames_done": 0}))
+    next((tmp_path / "b").glob("*/pcd/*")).unlink()
+    elsewhere = replace(wanted, profile_cache=tmp_path / "none")
+    done = accurate(scene, tmp_path / "b", wanted=elsewhere)
+    assert (done.summary.resumed, done.pick.rays) == (4, 7)
+    assert "as picked before" in done.pick.to_text(1)
+    same_files(tmp_path / "a", tmp_path / "b")
+
+
+def test_settings_that_contradict_and_rigs_without_scanners_are_one_line(scene, cache, tmp_path):
+    words = ["drive", scene.path, "--route", "random", "--duration", "0.5", "--profile-cache", cache]
+    for more, line in (
+        (["--accuracy", "1cm", "--set", "rays=3"], "--set rays=3: --accuracy picks it"),
+        (["--budget", "1x-realtime", "--set", "stretch=on"], "--set stretch=on: --budget picks rays"),
+        (["--budget", "1x-realtime", "--scheduler", "tcp://a:1"], "--budget is for this machine"),
+        (["--accuracy", "1cm@42"], "--accuracy 1cm@42: after the @ give one of 50, 68"),
+        (["--budget", "fast"], "--budget fast: give a speed such as 2x-realtime"),
+    ):
+        ended = run_program("lidar", *words, *more, "--rig", "vlp16", "-o", tmp_path / "d")
+        assert ended.returncode == 2
+        assert line in ended.stderr
+        assert ended.stderr.count("\n") == 1
+    assert not (tmp_path / "d").exists()
+    rig = tmp_path / "camera.toml"
+    rig.write_text(
+        'name = "eye"\nvehicle = "car"\n[[camera]]\nname = "front"\nwidth = 64\nheight = 48\nfx = 60.0\n'
+    )
+    ended = run_program("lidar", *words, "--accuracy", "1cm", "--rig", rig, "-o", tmp_path / "d")
+    assert (ended.returncode, "has no scanner" in ended.stderr) == (2, True), ended.stderr
+
+
+@pytest.mark.usefixtures("measured_before")
+def test_the_program_says_what_it_picks_and_what_was_reached(scene, cache, tmp_path):
+    words = ["drive", scene.path, "--route", "random", "--duration", "0.5", "--rig", "vlp16", "--seed", "3"]
+    words += ["--format", "pcd", "--profile-cache", cache]
+    ended = run_program("lidar", *words, "--budget", "0.01x-realtime", "-o", tmp_path / "d")
+    assert ended.returncode == 0, ended.stderr
+    first, _, last = ended.stdout.splitlines()
+    assert first.startswith("picked rays=61: expect range errors at 99.9 % of lidar_top")
+    assert "x real time with" in first
+    assert last.startswith("spot check of 5 frames: range errors at 99.9 % are lidar_top")
+    ended = run_program("lidar", *words, "--spot-check", "--json", "-o", tmp_path / "e")
+    assert json.loads(ended.stdout)["accuracy"]["reached_error_m"]["lidar_top"]["value"] > 0
+    manifest = open_dataset(tmp_path / "e").manifest
+    assert "picked" not in manifest["accuracy"]
+
+
+def test_a_missed_accuracy_is_named():
+    errors = PROFILE.candidates[0].errors
+    reached = SpotCheck(99.9, errors, dict.fromkeys(errors, 5))
+    done = CheckedDrive(None, AccuracyOptions("15cm"), None, reached)
+    assert done.missed() == (
+        "the accuracy of 15cm at 99.9 % is missed on this drive: scanner_1 has 20 cm (10 cm to 40 cm)"
+    )
+    assert not replace(done, wanted=AccuracyOptions("25cm")).missed()
+
+
+@pytest.mark.usefixtures("measured_before")
+def test_drives_of_a_sweep_have_picks_of_their_own(scene, cache, tmp_path):
+    coarse = AccuracyOptions(between(cache, scene)).accuracy
+    (tmp_path / "grid.toml").write_text(
+        f'[drive]\nroute = "random"\nrig = "vlp16"\nduration = 0.5\nformat = ["pcd"]\nseed = 3\n'
+        f'profile-cache = "{cache}"\n'
+        f'[grid]\nscene = ["{scene.path}"]\naccuracy = ["{coarse}", "100m", "1um"]\n'
+    )
+    summary = sweep(tmp_path / "grid.toml", tmp_path / "out")
+    assert [row.state for row in summary.rows] == ["done", "done", "failed"]
+    assert "no number of rays is sure to reach it" in summary.rows[2].error
+    picks = [open_dataset(summary.path / row.name).manifest["accuracy"]["picked"] for row in summary.rows[:2]]
+    assert picks == [{"rays": 7}, {"rays": 1}]
+    shutil.rmtree(summary.path / summary.rows[1].name / "lidar_top")
+    again = sweep(tmp_path / "grid.toml", tmp_path / "out", workers=2)
+    assert [row.digest for row in again.rows] == [row.digest for row in summary.rows]
