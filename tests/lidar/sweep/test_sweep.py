@@ -9,7 +9,7 @@ import pytest
 from helpers.programs import run_program
 from helpers.scenes import same_files
 
-import lidar.sweep.run
+import lidar.pipeline
 from geoscene.scene import open_scene
 from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError
@@ -160,14 +160,14 @@ def test_a_map_is_built_into_a_scene_that_is_kept(tmp_path):
 
 
 def test_a_drive_that_kills_its_process_is_a_row_and_the_others_go_on(scene, tmp_path, monkeypatch):
-    recorded = lidar.sweep.run.drive
+    recorded = lidar.pipeline.drive
 
     def deadly(scene, out, *, options, **more):
         if options.seed == 1:
             os.kill(os.getpid(), signal.SIGKILL)
         return recorded(scene, out, options=options, **more)
 
-    monkeypatch.setattr(lidar.sweep.run, "drive", deadly)
+    monkeypatch.setattr(lidar.pipeline, "drive", deadly)
     rows = sweep(written(tmp_path / "grid.toml", scene), tmp_path / "out").rows
     assert [row.state for row in rows] == ["failed", "done"]
     assert "killed by signal 9" in rows[0].error
