@@ -49,6 +49,8 @@ def scene_manifest(
         "tile_size": options["tile_size"],
         "tiles": sorted((r.i, r.j, tile_span(plan.ground, r.i, j=r.j)) for r in reports),
         "options": dict(options),
+        **({} if plan.area is None else {"area": shapely.to_wkt(plan.area, rounding_precision=3)}),
+        "map": osm.digest,
         "left_out": {"tiles": len(plan.chosen) - len(reports)},
         "terrain": {
             "vertical": terrain.vertical,

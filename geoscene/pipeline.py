@@ -17,6 +17,7 @@ from geoscene.objects.shapes import shapes
 from geoscene.options import BuildOptions
 from geoscene.plan import make_plan
 from geoscene.progress import Progress, silent
+from geoscene.reach import Needed
 from geoscene.report import Problem
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA
@@ -39,6 +40,8 @@ def build(
     overwrite: bool = False,
     workers: int = 1,
     cluster: Cluster | None = None,
+    needed: Needed | None = None,
+    former: Path | None = None,
     progress: Progress = silent,
 ) -> Scene:
     """Build a scene of a map extract and write it to a directory.
@@ -49,6 +52,9 @@ def build(
     workers : processes that build tiles
     cluster : whose workers build the tiles instead, see `geoscene.cluster.connected`
 
+    needed : chooses the area to build, once the roads and buildings of the map are known
+    former : another scene whose unchanged tiles are reused
+
     Raises SourceNotFoundError for an empty extract, FrameError for an unsuitable CRS and SceneFormatError for
     a directory that must not be overwritten.
     """
@@ -57,7 +63,7 @@ def build(
     with SceneWriter(Path(out), overwrite=overwrite) as writer:
         if cluster is not None:
             cluster.check(writer.folder)
-        plan, problems = make_plan(osm, options, progress=progress)
+        plan, problems = make_plan(osm, options, progress=progress, needed=needed)
         keys = _keys(osm, options)
         tiles = plan.chosen if options.use == "all" else []
         reports: list[TileReport] = []
@@ -68,7 +74,7 @@ def build(
             lod=options.lod,
             keys=keys,
             workers=workers,
-            former=writer.former,
+            former=former or writer.former,
             cluster=cluster,
         ):
             reports.append(report)
@@ -96,18 +102,22 @@ def _tile_problems(reports: Sequence[TileReport]) -> list[Problem]:
 def _keys(osm: OsmData, options: BuildOptions) -> Keys:
     """Digests of all inputs of the ground and of the solids of tiles: program, format, map and options."""
     chosen = {f.name: getattr(options, f.name) for f in fields(options) if f.name not in _NOT_IN_TILES}
-    dem = [digest_of(path) for name in options.dem for path in _with_companions(Path(name))]
     common = {
         "version": __version__,
         "schema": SCHEMA,
         "map": osm.digest,
         "bounds": osm.bounds,
         **{name: value for name, value in chosen.items() if name not in _NOT_IN_GROUND},
-        "dem": dem,
+        "dem": elevation_digests(options.dem),
         "only": sorted(options.only),
     }
     rest = {name: chosen[name] for name in _NOT_IN_GROUND}
     return Keys(ground=_digest(common), solids=_digest(common | rest))
+
+
+def elevation_digests(dem: Sequence[str]) -> list[str]:
+    """Digests of the contents of elevation files and of the files beside them."""
+    return [digest_of(path) for name in dem for path in _with_companions(Path(name))]
 
 
 def _with_companions(path: Path) -> list[Path]:

@@ -42,7 +42,7 @@ from geoscene.objects.furniture import Furniture, read_furniture
 from geoscene.objects.vegetation import Trees, clear_of, read_trees
 from geoscene.options import BuildOptions
 from geoscene.progress import Progress
-from geoscene.reach import Reach, all_tiles
+from geoscene.reach import Needed, Reach, RoadMap, all_tiles
 from geoscene.report import Problem
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.driving_side import Side
@@ -101,6 +101,7 @@ class Plan:
     layers    : feature tables in the order of feature numbers
     chosen    : tiles to build, sorted: all, or those in reach of a route
     kept      : rows of each of ``layers`` that tables on disk hold, None for all
+    area      : polygon that the scene is built for, in place of a route; None without
     """
 
     frame: Frame
@@ -123,6 +124,7 @@ class Plan:
     layers: list[Layer]
     chosen: list[tuple[int, int]]
     kept: dict[str, NDArray[np.int64]] | None
+    area: Any | None = None
 
     @property
     def extent(self) -> Bounds:
@@ -134,8 +136,12 @@ class Plan:
         return self.rows[kind].get((i, j), np.empty(0, np.int64))
 
 
-def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tuple[Plan, list[Problem]]:
+def make_plan(
+    osm: OsmData, options: BuildOptions, *, progress: Progress, needed: Needed | None = None
+) -> tuple[Plan, list[Problem]]:
     """The plan of a scene of a map, and the features that were repaired or dropped.
+
+    needed : chooses the area to build; the road graph is then that of the whole map
 
     Raises FrameError or InputError if the CRS or the elevation files cannot be used.
     """
@@ -156,7 +162,20 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
     progress("roads", 0, total=0)
     roads = _plan_roads(osm, frame, options=options, terrain=terrain, extent=extent, problems=problems)
     footprints = buildings.footprint[: buildings.count]
-    reach = Reach.of(options, roads.graph, frame=frame)
+    reach, area = Reach.of(options, roads.graph, frame=frame), None
+    if needed is not None:
+        area = needed(
+            RoadMap(
+                osm.source,
+                frame,
+                extent,
+                roads.graph if len(roads.graph) else None,
+                footprints,
+                buildings.min_height[: buildings.count],
+                left_hand=roads.side == "left",
+            )
+        )
+        reach = Reach.within(area)
 
     progress("ground", 0, total=0)
     cover, surfaces, pads = _collect(
@@ -196,6 +215,8 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
         beyond = {"trees": trees.crown / 2, "furniture": _ARM}
         chosen = reach.tiles(ground, rows=rows, shapes=shapes, beyond=beyond)
         kept = reach.rows(shapes, tiles=chosen, ground=ground, rows=rows, buildings=buildings)
+        if needed is not None:
+            kept["roads"] = np.arange(len(roads.graph))
     standing = np.arange(buildings.count) if kept is None else kept["buildings"]
     base, foot = np.full((2, buildings.count), np.nan)
     z = roads.height or terrain.height
@@ -236,6 +257,7 @@ def make_plan(osm: OsmData, options: BuildOptions, *, progress: Progress) -> tup
         structures=structures,
         openings=roads.openings,
         layers=layers,
+        area=area,
     )
     return plan, problems
 

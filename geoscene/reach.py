@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,10 +33,36 @@ _CROWN = 5.0
 
 
 @dataclass(frozen=True, slots=True)
+class RoadMap:
+    """The roads and buildings of a whole map, on which a drive is planned before anything is built.
+
+    name       : of the map, for messages
+    frame      : frame of the scene
+    bounds     : (xmin, ymin, xmax, ymax) of its ground in scene metres
+    graph      : road graph with heights; None without drivable roads
+    footprints : polygons (k,) of the buildings, scene metres
+    min_height : (k,) metres from the ground to the underside of each
+    left_hand  : traffic keeps left
+    """
+
+    name: str
+    frame: Frame
+    bounds: tuple[float, float, float, float]
+    graph: RoadGraph | None
+    footprints: NDArray[np.object_]
+    min_height: Float
+    left_hand: bool
+
+
+Needed = Callable[[RoadMap], Any]
+"""The area that a scene is built for, as a shapely polygon in scene metres."""
+
+
+@dataclass(frozen=True, slots=True)
 class Reach:
     """Range of the sensors around a route.
 
-    line   : the route as a shapely line or points, scene metres
+    line   : the route as a shapely line or points, scene metres; or an area
     metres : from the line
     """
 
@@ -51,6 +77,12 @@ class Reach:
         line = route_line(options.along, graph, frame=frame)
         shapely.prepare(line)
         return cls(line, options.reach + _OFFSET)
+
+    @classmethod
+    def within(cls, area: Any) -> Reach:
+        """What is in an area, a shapely polygon in scene metres."""
+        shapely.prepare(area)
+        return cls(area, 0.0)
 
     def tiles(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,11 +35,13 @@ from lidar.options import (
     DriveOptions,
     ExportOptions,
     MapOptions,
+    PlaceOptions,
     TradeoffOptions,
 )
 
 if TYPE_CHECKING:
     from lidar.maps.aggregate import MapSummary
+    from lidar.scene_cache import OpenedScene
 
 app = App(
     name="lidar",
@@ -66,21 +68,25 @@ JsonFlag = Annotated[bool, Parameter(group=OUTPUT)]
 
 @app.command
 def drive(
-    scene: Path,
+    scene: Path | None = None,
     /,
     *,
     options: DriveOptions | None = None,
+    place: PlaceOptions = PlaceOptions(),
     wanted: AccuracyOptions = AccuracyOptions(),
     out: Out,
     report: Reporting = Report(),
 ) -> int:
-    """Drive a route through a scene and record what the rig senses.
+    """Drive a route through a scene or a map and record what the rig senses.
 
-    The same command resumes an interrupted drive; the bytes are those of an uninterrupted one.
+    The same command resumes an interrupted drive; the bytes are those of an uninterrupted one. Of a map, what
+    the drive needs is built first and kept for later drives; the bytes are those of a scene of the whole map.
 
     For example:
 
     lidar drive scene --route random --duration 30 --seed 1 -o drive
+
+    lidar drive city.osm.pbf --route random --duration 30 -o drive
 
     lidar drive scene --route 60.1662,24.9413 60.1655,24.9405 --rig vlp16 --format pcd,laz -o drive
 
@@ -95,17 +101,22 @@ def drive(
     Parameters
     ----------
     scene
-        Directory of the scene.
+        Directory of the scene, or a map: .osm, .osm.gz, .osm.bz2, .osm.pbf or Overpass JSON.
     out
         Directory to write the dataset to.
     """
-    from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
+    from geoscene.scene.layout import using  # noqa: PLC0415
+    from lidar.scene_cache import open_scene_or_map  # noqa: PLC0415
     from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415
 
     options = options or DriveOptions()
     options.check_course()
     note_new_folder(out)
-    with using(open_scene(scene), known=LidarError) as opened:
+    with progress_bar(quiet=report.quiet) as progress:
+        found = open_scene_or_map(scene, options, place=place, progress=progress)
+    if not report.json:
+        _print_built(found)
+    with using(found.scene, known=LidarError) as opened:
         with progress_bar(quiet=report.quiet) as progress:
             pick = picked(
                 opened, options, wanted=wanted, out=None if report.overwrite else out, progress=progress
@@ -125,6 +136,8 @@ def drive(
     summary = done.summary
     document: dict[str, Any] = {
         "path": str(summary.path),
+        "scene": str(found.scene.path),
+        **({} if found.built is None else {"tiles_built": found.built}),
         "frames": summary.frames,
         "resumed": summary.resumed,
         "points": sum(summary.points.values()),
@@ -157,6 +170,14 @@ def drive(
             file=sys.stderr,
         )
     return 0
+
+
+def _print_built(found: OpenedScene) -> None:
+    """Say what of a map's scene was built for a drive."""
+    if found.built is not None:
+        tiles = len(found.scene.tile_indices)
+        news = f"{found.built} of {tiles} tiles built" if found.built else f"{tiles} tiles, built before"
+        print(f"scene {found.scene.path}: {news}", flush=True)
 
 
 @app.command
@@ -211,10 +232,11 @@ def sweep(
 
 @app.command
 def tradeoff(
-    scene: Path,
+    scene: Path | None = None,
     /,
     *,
     options: DriveOptions | None = None,
+    place: PlaceOptions = PlaceOptions(),
     compared: TradeoffOptions = TradeoffOptions(),
     others: Annotated[tuple[Path, ...], Parameter(name="--scene", n_tokens=1)] = (),
     out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
@@ -234,7 +256,7 @@ def tradeoff(
     Parameters
     ----------
     scene
-        Directory of the scene.
+        Directory of the scene, or a map, as for lidar drive.
     others
         Another scene of the same place and frame, built with other options, to compare with the first;
         repeat for more.
@@ -242,8 +264,10 @@ def tradeoff(
         Folder to write tradeoff.json, tradeoff.html and a plot of each sensor to.
     """
     from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
+    from lidar.scene_cache import open_scene_or_map  # noqa: PLC0415
     from lidar.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
     from lidar.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
+    from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415
 
     options = options or DriveOptions()
     options.check_course()
@@ -255,9 +279,10 @@ def tradeoff(
         progress_bar(quiet=report.quiet) as progress,
         ExitStack() as opened,
     ):
-        first, *rest = [
-            opened.enter_context(using(open_scene(s), known=LidarError)) for s in (scene, *others)
-        ]
+        needing = replace(options, traffic=options.traffic or TrafficOptions())  # it compares traffic, too
+        found_scene = open_scene_or_map(scene, needing, place=place, progress=progress).scene
+        scenes = [found_scene, *map(open_scene, others)]
+        first, *rest = [opened.enter_context(using(s, known=LidarError)) for s in scenes]
         found = measured(first, options, compared=compared, others=rest, progress=progress)
     if out is not None:
         write_report(found, out)

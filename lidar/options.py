@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 from cyclopts import Group, Parameter, Token
 
 from geoscene.classes import Class
-from geoscene.console import SEVERAL, WORDS, whole
+from geoscene.console import SEVERAL, WORDS, degrees, whole
+from geoscene.options import KINDS, BuildOptions, Degrees
 from lidar.dataset.export import EXPORTERS
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.errors import InputError
 
 if TYPE_CHECKING:
+    from geoscene.reach import RoadMap
     from geoscene.scene import Scene
     from lidar.dataset.recording import Contents
     from lidar.planning.route import Side, Spec
@@ -271,7 +273,16 @@ class DriveOptions:
         if bool(self.route) == bool(self.survey):
             raise InputError("give one of `route` and `survey`, such as `route` random")
 
-    def side_in(self, scene: Scene) -> Side:
+    def check_on_roads(self, vehicle: str) -> None:
+        """Raise InputError for options of flights, for a vehicle that drives on roads."""
+        if self.survey or self.altitude is not None:
+            option = "survey" if self.survey else "altitude"
+            raise InputError(
+                f"`{option}` is for aircraft, and a {vehicle} does not fly; set `vehicle` to drone or"
+                " aircraft, or take the rig of one"
+            )
+
+    def side_in(self, scene: Scene | RoadMap) -> Side:
         """Side of the road that the vehicle drives on."""
         return cast("Side", self.side) if self.side else "left" if scene.left_hand else "right"
 
@@ -304,6 +315,8 @@ class DriveOptions:
         recipe = {"scene": scene.manifest.get("fingerprint", scene.path.name)}
         names = [f.name for f in fields(self) if f.name not in _NOT_IN_RECIPE]
         recipe |= {name: getattr(self, name) for name in names}
+        if scene.area is not None:
+            resolved["map"] = scene.origin
         if self.stages:
             resolved["stages"] = [stage.to_json() for stage in self.stages]
         return recipe | resolved
@@ -391,6 +404,46 @@ class AccuracyOptions:
     def checks(self) -> bool:
         """Whether a sample of frames is to be checked."""
         return self.picks or self.spot_check
+
+
+_MAP = Group("Map instead of a scene", sort_key=2)
+
+
+@Parameter(name="*", group=_MAP)
+@dataclass(frozen=True, slots=True)
+class PlaceOptions:
+    """The map that a drive's scene is built of, and how; what the drive needs of it is built and cached."""
+
+    place: str = ""
+    """Name of a place instead of SCENE, found by Nominatim and downloaded from Overpass (needs a network;
+    answers are cached)."""
+
+    bbox: Annotated[Degrees | None, degrees("W,S,E,N")] = None
+    """W,S,E,N in degrees: only this part of the map."""
+
+    dem: Annotated[tuple[str, ...], SEVERAL] = ()
+    """Elevation files, or the word tiles, as for geoscene build. By default the ground is level."""
+
+    dem_gaps: str = "error"
+    """If elevation files do not cover the scene: error, or nearest."""
+
+    lod: Annotated[int, Parameter(converter=whole)] = 2
+    """Level of detail of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs."""
+
+    only: Annotated[tuple[str, ...], WORDS] = KINDS
+    """Kinds of features to build besides the ground, separated by commas."""
+
+    scene_crs: str = "local"
+    """CRS of the scene: local, utm or an EPSG code."""
+
+    scene_cache: Path | None = None
+    """Folder of the scenes that drives build; ~/.cache/geoscene/scenes by default."""
+
+    def build_options(self, name: str) -> BuildOptions:
+        """Options of the build, with a title of the scene; raises InputError for invalid ones."""
+        return BuildOptions(
+            crs=self.scene_crs, lod=self.lod, dem=self.dem, dem_gaps=self.dem_gaps, only=self.only, name=name
+        )
 
 
 @Parameter(name="*")

@@ -36,7 +36,7 @@ from lidar.plan import DrivePlan, Job, plan_drive
 from lidar.rig.devices import Scanner
 from lidar.world.thread_worlds import Worlds
 
-_CHUNK = 200.0
+CHUNK = 200.0
 """Scene metres along each axis that the vehicle may cover before other tiles are loaded."""
 
 _FORGET = 1024
@@ -285,7 +285,7 @@ def _take(running: set[Future[None]], *, finished: set[Future[None]]) -> int:
 def _chunks(
     jobs: Sequence[Job], trajectory: Trajectory
 ) -> Iterator[tuple[Sequence[Job], tuple[float, float, float, float]]]:
-    """Runs of jobs during which the vehicle stays within a square of `_CHUNK`, with the box it covers."""
+    """Runs of jobs during which the vehicle stays within a square of `CHUNK`, with the box it covers."""
     first = 0
     low = high = np.zeros(2)
     for row, job in enumerate(jobs):
@@ -294,7 +294,7 @@ def _chunks(
         new_low, new_high = xy.min(axis=0), xy.max(axis=0)
         if row > first:
             new_low, new_high = np.minimum(low, new_low), np.maximum(high, new_high)
-            if (new_high - new_low).max() > _CHUNK:
+            if (new_high - new_low).max() > CHUNK:
                 yield jobs[first:row], _box(low, high)
                 first = row
                 new_low, new_high = xy.min(axis=0), xy.max(axis=0)

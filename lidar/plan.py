@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,9 @@ from lidar.traffic.fcd_replay import replay
 from lidar.traffic.populate import populate
 from lidar.traffic.sumo import SumoOptions, drive_in_sumo
 from lidar.world.actors import Actors
+
+if TYPE_CHECKING:
+    from lidar.planning.flight_planning import FlightOptions
 
 _RANDOM_SECONDS = 60.0
 
@@ -255,7 +258,7 @@ def plan_motion(
 
     Raises RouteError for a route that it cannot take.
     """
-    from lidar.planning.flight_planning import FlightOptions, plan_flight  # noqa: PLC0415
+    from lidar.planning.flight_planning import plan_flight  # noqa: PLC0415
     from lidar.planning.replay import read_replay  # noqa: PLC0415
 
     route = options.route or "random"
@@ -263,12 +266,7 @@ def plan_motion(
         replayed = read_replay(route, scene.frame)
         return replayed if options.duration is None else replayed.until(round(options.duration * 1e9))
     if vehicle.kind != "air":
-        if options.survey or options.altitude is not None:
-            option = "survey" if options.survey else "altitude"
-            raise InputError(
-                f"`{option}` is for aircraft, and a {vehicle.name} does not fly; set `vehicle` to drone or"
-                " aircraft, or take the rig of one"
-            )
+        options.check_on_roads(vehicle.name)
         travel = plan_road_drive(
             scene,
             route,
@@ -293,23 +291,24 @@ def plan_motion(
             trajectory = trajectory.until(round(travel.duration * 1e9))
         return RoadMotion(travel, trajectory)
     progress("planning", 0, total=0)
+    return plan_flight(scene, route, vehicle=vehicle, sensors=sensors, options=flight_options(options))
+
+
+def flight_options(options: DriveOptions) -> FlightOptions:
+    """How the flight of a drive's options is planned."""
+    from lidar.planning.flight_planning import FlightOptions  # noqa: PLC0415
+
     seconds = options.duration
-    if seconds is None and route == "random" and not options.survey:
+    if seconds is None and options.route in ("", "random") and not options.survey:
         seconds = _RANDOM_SECONDS
-    return plan_flight(
-        scene,
-        route,
-        vehicle=vehicle,
-        sensors=sensors,
-        options=FlightOptions(
-            survey=options.survey,
-            altitude=options.altitude,
-            overlap=options.overlap,
-            turns=options.turns,
-            seed=options.seed,
-            duration=seconds,
-            from_rest=options.from_rest,
-        ),
+    return FlightOptions(
+        survey=options.survey,
+        altitude=options.altitude,
+        overlap=options.overlap,
+        turns=options.turns,
+        seed=options.seed,
+        duration=seconds,
+        from_rest=options.from_rest,
     )
 
 

@@ -167,6 +167,26 @@ class Scene:
         start, stop = self.layers.get(layer, (0, 0))
         return int(self.manifest.get("cut", {"rows": {}})["rows"].get(layer, stop - start))
 
+    @functools.cached_property
+    def area(self) -> Any | None:
+        """Polygon, scene metres, for which the tiles and tables were built; None without such a limit.
+
+        The road graph of a scene with an area is that of the whole map.
+        """
+        text = self.manifest.get("area")
+        return None if text is None else shapely.from_wkt(text)
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """The map that the scene was built of, a digest of its contents, and the options of the build."""
+        maps = [{name: s[name] for name in ("kind", "from")} for s in self.manifest["sources"]]
+        return {
+            "digest": self.manifest["map"],
+            "sources": maps,
+            "bounds": self.manifest["geographic_bounds"],
+            "options": self.manifest["options"],
+        }
+
     @property
     def cut_nodes(self) -> Ints:
         """Ids (n,) of the road graph's nodes from which roads lead that a build along a route left out."""

@@ -22,7 +22,8 @@ E2 = F * (2 - F)
 _RINGS = 6  # rings of directions that sample the blocked share of the sky
 _SPOKES = 16
 _EPOCHS = 4096  # epochs whose satellites are worked on at once
-_BLOCK_M = 100.0  # metres of the drive whose epochs share one loaded region
+BLOCK_M = 100.0
+"""Metres of the drive whose epochs share one loaded region."""
 REACH = 400.0
 """Distance in metres within which buildings can block satellites."""
 
@@ -187,9 +188,9 @@ def sky_view(
 
 
 def _blocks(antenna: Float) -> list[NDArray[np.int64]]:
-    """Rows of consecutive positions, split every `_BLOCK_M` along the path."""
+    """Rows of consecutive positions, split every `BLOCK_M` along the path."""
     step = np.hypot(*np.diff(antenna[:, :2], axis=0).T) if len(antenna) > 1 else np.empty(0)
-    block = np.floor(np.concatenate([[0.0], np.cumsum(step)]) / _BLOCK_M)
+    block = np.floor(np.concatenate([[0.0], np.cumsum(step)]) / BLOCK_M)
     return np.split(np.arange(len(antenna)), np.flatnonzero(np.diff(block)) + 1)
 
 

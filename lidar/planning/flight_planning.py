@@ -7,12 +7,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import shapely
 
 from geoscene.classes import Class
+from geoscene.reach import RoadMap
 from geoscene.scene import Scene
 from geoscene.sources.tracks import read_geometries
 from geoscene.typing import Float
@@ -83,9 +84,7 @@ def plan_flight(
 
     Raises RouteError for a flight that the aircraft cannot fly or that would collide with the scene.
     """
-    survey, above, duration = options.survey, options.altitude, options.duration
-    if above is None:
-        above = ALTITUDES["slow" if vehicle.max_speed < 30.0 else "fast"]
+    survey, above, duration = options.survey, _above(vehicle, options), options.duration
     below = _SceneBelow(scene)
     if survey:
         route, lines, spacing = _strips(
@@ -107,6 +106,46 @@ def plan_flight(
             " record longer, or scan on the way there too (`turns`)"
         )
     return Flight(trajectory, scanning_ns)
+
+
+def flight_course(
+    roads: RoadMap,
+    spec: Spec,
+    *,
+    vehicle: Vehicle,
+    sensors: Sequence[Scanner | Camera],
+    options: FlightOptions,
+) -> Float:
+    """Scene metres (n, 2) of the course that `plan_flight` will plan over the scene of a map.
+
+    In plan it does not depend on heights. Raises RouteError as `plan_flight` does, but for collisions.
+    """
+    above = _above(vehicle, options)
+    if options.survey:
+        route, _, _ = _strips(roads, vehicle, sensors=sensors, options=options, height=above, below=_LEVEL)
+    else:
+        route = _along(roads, spec, vehicle=vehicle, options=options, above=above, below=_LEVEL)
+    return plan_path(route, vehicle, frame=roads.frame).position[:, :2]
+
+
+def _above(vehicle: Vehicle, options: FlightOptions) -> float:
+    """Metres of a flight above the ground."""
+    if options.altitude is not None:
+        return options.altitude
+    return ALTITUDES["slow" if vehicle.max_speed < 30.0 else "fast"]
+
+
+class _Ground(Protocol):
+    def ground(self, x: Float, y: Float) -> Float: ...
+
+
+class _Level:
+    def ground(self, x: Float, y: Float) -> Float:  # noqa: ARG002
+        """Height (n,) of level ground."""
+        return np.zeros(len(x))
+
+
+_LEVEL = _Level()
 
 
 class _SceneBelow:
@@ -155,13 +194,13 @@ class _SceneBelow:
 
 
 def _along(
-    scene: Scene,
+    scene: Scene | RoadMap,
     spec: Spec,
     *,
     vehicle: Vehicle,
     options: FlightOptions,
     above: float,
-    below: _SceneBelow,
+    below: _Ground,
 ) -> Route:
     """The route along waypoints or streets, ``above`` metres over the ground."""
     if isinstance(spec, str) and spec == "random":
@@ -172,7 +211,7 @@ def _along(
             )
         seconds = 60.0 if options.duration is None else options.duration
         length = vehicle.max_speed * (seconds + ROUTE_MARGIN_S)
-        graph = graph_on_tiles(scene.road_graph(), scene)
+        graph = graph_on_tiles(scene.graph if isinstance(scene, RoadMap) else scene.road_graph(), scene)
         line = plan_route(
             graph, scene.frame, spec="random", options=RouteOptions(seed=options.seed, length=length)
         ).line
@@ -205,13 +244,13 @@ def _dense(xy: Float) -> Float:
 
 
 def _strips(
-    scene: Scene,
+    scene: Scene | RoadMap,
     vehicle: Vehicle,
     *,
     sensors: Sequence[Scanner | Camera],
     options: FlightOptions,
     height: float,
-    below: _SceneBelow,
+    below: _Ground,
 ) -> tuple[Route, Float, float]:
     """The route in strips along an area's longer side, the strips (k, 2, 2), and their spacing."""
     area, overlap = survey_area(scene, options.survey), options.overlap
@@ -246,7 +285,7 @@ def _strips(
     return route, survey_lines(area, spacing=spacing, heading_deg=heading_deg), spacing
 
 
-def survey_area(scene: Scene, text: str) -> Any:
+def survey_area(scene: Scene | RoadMap, text: str) -> Any:
     """The polygon, scene metres, that ``all``, W,S,E,N or a GeoJSON file names.
 
     Raises RouteError for a file without a polygon and for an area that does not touch the scene.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -31,11 +31,13 @@ def plan_route_and_path(
     obstacles: Sequence[Any] | NDArray[np.object_] | shapely.STRtree | None = None,
     ground: Surface | None = None,
     margin: float = MARGIN,
+    tried: Callable[[Route], None] = lambda _: None,
 ) -> tuple[Route, Path]:
     """A route and a path along it on which the vehicle touches no obstacle.
 
     Parameters are those of `plan_route` and `lidar.planning.path.plan_path`; ``body_width`` is the vehicle's.
-    Where the body does not pass, the route is planned again without that street or turn.
+    Where the body does not pass, the route is planned again without that street or turn; ``tried`` is called
+    with each route.
 
     Raises RouteError as `plan_route` does, and BlockedError if every route is blocked.
     """
@@ -51,6 +53,7 @@ def plan_route_and_path(
             if avoid:
                 break
             raise
+        tried(route)
         try:
             return route, plan_path(
                 route, vehicle, frame=frame, obstacles=obstacles, ground=ground, margin=margin

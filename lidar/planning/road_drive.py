@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.columns import row_blocks
 from geoscene.progress import Progress, silent
+from geoscene.reach import RoadMap
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.typing import Float
@@ -27,7 +28,9 @@ ROUTE_MARGIN_S = 15.0
 
 It covers the braking distance at any speed that streets allow."""
 _RAYS = 1 << 17  # rays that are cast at once
+_HEADROOM = 2.5  # metres below a building from which on vehicles pass under it
 _SEARCH_M = 1.5  # metres above and below the road graph within which the road surface is searched
+_NO_ROADS = "has no drivable roads within its bounds; choose a place with roads"
 _DRIVEN = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD or c == Class.BRIDGE]
 
 
@@ -48,25 +51,35 @@ class RoadPlan:
     at_speed: bool = False
 
 
-def graph_on_tiles(graph: RoadGraph, scene: Scene) -> RoadGraph:
+def graph_on_tiles(graph: RoadGraph | None, scene: Scene | RoadMap) -> RoadGraph:
     """The part of a road graph on the scene's tiles; raises RouteError if it is empty."""
+    if graph is None:
+        raise RouteError(f"{_name(scene)}: {_NO_ROADS}")
     kept = edges_on_tiles(graph, scene)
     return graph if kept.all() else graph.take(kept)
 
 
-def edges_on_tiles(graph: RoadGraph, scene: Scene) -> NDArray[np.bool_]:
-    """Whether (m,) each edge of a road graph lies on the scene's tiles; raises RouteError if none does."""
+def edges_on_tiles(graph: RoadGraph, scene: Scene | RoadMap) -> NDArray[np.bool_]:
+    """Whether (m,) each edge of a road graph lies on the scene's tiles; raises RouteError if none does.
+
+    Of a map, and of a scene for an area, it is whether the edge lies on the tiles of the whole map.
+    """
     xmin, ymin, xmax, ymax = scene.bounds
     points = np.concatenate([np.empty((0, 3)), *graph.geometry])[:, :2]
     edge = np.repeat(np.arange(len(graph)), [len(line) for line in graph.geometry])
     low, high = np.array([xmin, ymin]), np.array([xmax, ymax])
     inside = ((points >= low) & (points <= high)).all(axis=1)
-    inside &= scene.tiles_at(points) >= 0
+    if isinstance(scene, Scene) and scene.area is None:
+        inside &= scene.tiles_at(points) >= 0
     kept = np.bincount(edge, ~inside, minlength=len(graph)) == 0
     if not kept.any():
-        raise RouteError(f"{scene.path}: no road lies within the tiles of this scene")
+        raise RouteError(f"{_name(scene)}: {_NO_ROADS}")
     on_tiles: NDArray[np.bool_] = kept
     return on_tiles
+
+
+def _name(scene: Scene | RoadMap) -> str:
+    return str(scene.path) if isinstance(scene, Scene) else scene.name
 
 
 def ground_footprints(scene: Scene) -> NDArray[np.object_]:
@@ -74,8 +87,21 @@ def ground_footprints(scene: Scene) -> NDArray[np.object_]:
     if not scene.table_length("buildings"):
         return np.empty(0, object)
     layer = scene.features("buildings")
-    low = np.asarray(layer.columns["min_height"], float)
-    return layer.geometry[low < 2.5]
+    return _obstacles(layer.geometry, np.asarray(layer.columns["min_height"], float))
+
+
+def _obstacles(footprints: NDArray[np.object_], min_height: Float) -> NDArray[np.object_]:
+    return footprints[min_height < _HEADROOM]
+
+
+def road_map(scene: Scene) -> RoadMap:
+    """The roads and buildings of a scene."""
+    xy, height = np.empty(0, object), np.empty(0)
+    if scene.table_length("buildings"):
+        layer = scene.features("buildings")
+        xy, height = layer.geometry, np.asarray(layer.columns["min_height"], float)
+    graph = scene.road_graph() if scene.files.road_graph.exists() else None
+    return RoadMap(str(scene.path), scene.frame, scene.bounds, graph, xy, height, scene.left_hand)
 
 
 def road_surface(scene: Scene) -> Surface:
@@ -122,20 +148,56 @@ def plan_road_drive(
     body = load_vehicle(vehicle)
     obstacles = ground_footprints(scene)
     progress("planning", 0, total=0)
-    seconds = duration if duration is not None or spec != "random" else _RANDOM_SECONDS
-    at_speed = spec == "random" and not from_rest
+    seconds, at_speed = _record(spec, duration, from_rest=from_rest)
     route, path = plan_route_and_path(
         graph,
         scene.frame,
         spec=spec,
         vehicle=body,
-        options=RouteOptions(
-            seed=seed,
-            duration=None if seconds is None else seconds + (ROUTE_MARGIN_S if at_speed else 0.0),
-            side=cast("Side", side),
-        ),
+        options=_route_options(seconds, at_speed=at_speed, seed=seed, side=side),
         obstacles=obstacles,
         ground=road_surface(scene),
     )
     path = replace(path, edge=np.where(path.edge >= 0, np.flatnonzero(kept)[path.edge], -1).astype(np.int32))
     return RoadPlan(whole, route, path, seconds, at_speed)
+
+
+def road_course(
+    roads: RoadMap,
+    spec: Spec,
+    *,
+    vehicle: str,
+    seed: int = 0,
+    duration: float | None = None,
+    side: str = "right",
+    from_rest: bool = False,
+) -> tuple[Float, list[Float]]:
+    """Scene metres (n, 2) of the path that `plan_road_drive` will plan, and of all routes that it will try.
+
+    Raises RouteError as `plan_road_drive` does.
+    """
+    seconds, at_speed = _record(spec, duration, from_rest=from_rest)
+    tried: list[Float] = []
+    _, path = plan_route_and_path(
+        graph_on_tiles(roads.graph, roads),
+        roads.frame,
+        spec=spec,
+        vehicle=load_vehicle(vehicle),
+        options=_route_options(seconds, at_speed=at_speed, seed=seed, side=side),
+        obstacles=_obstacles(roads.footprints, roads.min_height),
+        tried=lambda route: tried.append(route.line[:, :2]),
+    )
+    return path.position[:, :2], tried
+
+
+def _record(spec: Spec, duration: float | None, *, from_rest: bool) -> tuple[float | None, bool]:
+    """Seconds to record, None for the whole route, and whether the vehicle is at speed at both ends."""
+    seconds = duration if duration is not None or spec != "random" else _RANDOM_SECONDS
+    return seconds, spec == "random" and not from_rest
+
+
+def _route_options(seconds: float | None, *, at_speed: bool, seed: int, side: str) -> RouteOptions:
+    more = ROUTE_MARGIN_S if at_speed else 0.0
+    return RouteOptions(
+        seed=seed, duration=None if seconds is None else seconds + more, side=cast("Side", side)
+    )

@@ -27,7 +27,8 @@ SOLID, GLASS, FOLIAGE, WATER = 1, 2, 4, 8
 """Mask bits of a world's faces, by material: ``mask=ALL & ~GLASS`` lets rays pass through windows."""
 
 _SEEN_THROUGH = {"glass": GLASS, "foliage": FOLIAGE, "conifer": FOLIAGE, "water": WATER}
-_OVERHANG = 50.0  # metres by which a building may extend beyond its tile and still be loaded
+OVERHANG = 50.0
+"""Metres by which a building may extend beyond its tile and still be loaded."""
 _GRID = 2048.0  # spacing in metres of possible origins of float32 coordinates
 _PARTS = 8  # part numbers per tile, one for each mask
 
@@ -184,7 +185,7 @@ class World:
 
         The hits depend on the region alone, not on earlier ones.
         """
-        ranks = _tiles_intersecting(self.scene, region, margin=self.margin + _OVERHANG)
+        ranks = _tiles_intersecting(self.scene, region, margin=self.margin + OVERHANG)
         if not ranks:
             raise InputError(
                 f"no tile of {self.scene.path} lies in {tuple(round(float(v), 1) for v in region)};"

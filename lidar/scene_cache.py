@@ -1,0 +1,250 @@
+"""A cache of scenes of maps: each has what drives needed so far, and grows when one needs more.
+
+A folder of the cache holds one scene: of one map, by the digest of its contents, built with one set of
+options.
+
+    <cache>/monaco-1a2b3c/scene/          a scene directory; its area is what all drives so far need
+    <cache>/monaco-1a2b3c/drives/*.wkb    areas of single drives, by the digests of their recipes
+
+A scene grows in place: tiles first, then tables that hold more rows, the manifest last. Each file is replaced
+atomically, so programs that read the scene meanwhile find all that they need.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import shapely
+
+from geoscene import __version__ as builder_version
+from geoscene.errors import FrameError, SceneFormatError
+from geoscene.errors import InputError as SceneInputError
+from geoscene.files import digest, digest_of, exclusive, write_atomically
+from geoscene.options import BuildOptions
+from geoscene.pipeline import build, elevation_digests
+from geoscene.progress import Progress, silent
+from geoscene.reach import RoadMap
+from geoscene.scene import Scene, open_scene
+from geoscene.scene.layout import SCHEMA, SceneFiles, changed_files
+from geoscene.sources import OsmData, Servers, fetch_elevation, fetch_place, read_osm
+from lidar import __version__
+from lidar.course import needed_area
+from lidar.errors import InputError, LidarError
+from lidar.options import DriveOptions, PlaceOptions
+from lidar.planning.road_drive import road_map
+
+_MARGIN = 2.0
+"""Metres that are built beyond the needed area: coordinates on disk are rounded."""
+
+_ROUNDS = 5
+"""Maximum number of builds for a drive; more than one is needed after a detour that was not foreseen."""
+
+_PAUSE_S = 0.2
+"""Seconds between attempts to take a turn at a scene."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedScene:
+    """A scene for a drive.
+
+    built : tiles that were built for this drive; None for the directory of a scene
+    """
+
+    scene: Scene
+    built: int | None = None
+
+
+def open_scene_or_map(
+    path: Path | None,
+    drive: DriveOptions,
+    *,
+    place: PlaceOptions = PlaceOptions(),
+    servers: Servers | None = None,
+    progress: Progress = silent,
+) -> OpenedScene:
+    """The scene that a drive needs: of a scene directory, or of a map, from the cache or built now.
+
+    path    : a scene directory or a map file; None for the name of a place
+    place   : that name, and how the scene of a map is built
+    servers : of maps, for a place
+
+    Raises InputError (also as RouteError) for what is neither and for a drive that cannot be planned, and
+    NetworkError if a place cannot be downloaded.
+    """
+    if (path is None) == (not place.place):
+        raise InputError("give one of SCENE, the directory of a scene or a map file, and `place` NAME")
+    if path is not None and not path.is_file():
+        changed = [f.name for f in fields(place) if getattr(place, f.name) != f.default]
+        if changed:
+            raise InputError(
+                f"`{changed[0]}`: is for maps, and {path} is not a file; give a map, or leave it out"
+            )
+        return OpenedScene(open_scene(path))
+    source = _Map(path, place, servers=servers or Servers(), progress=progress)
+    folder = _folder(source, place)
+    with _turn(folder, progress):
+        return _CachedScene(folder, source, drive, progress).opened()
+
+
+class _Map:
+    """A map that is read when it is needed.
+
+    name   : of its file or place
+    digest : of the file's bytes; of a place's features
+    """
+
+    def __init__(
+        self, path: Path | None, options: PlaceOptions, *, servers: Servers, progress: Progress
+    ) -> None:
+        self._path, self._options, self._servers, self._progress = path, options, servers, progress
+        self.name = re.sub(r"\.(osm|pbf|gz|bz2|json|o5m)\b", "", path.name) if path else options.place
+        self.digest = digest_of(path) if path else self.data.digest
+
+    @cached_property
+    def data(self) -> OsmData:
+        """Its features."""
+        self._progress("reading the map", 0, total=0)
+        if self._path is not None:
+            return read_osm(self._path, bounds=self._options.bbox)
+        return fetch_place(self._options.place, cache_dir=_answers(), servers=self._servers)
+
+    def build_options(self, progress: Progress) -> BuildOptions:
+        """Options of the build, with the path of fetched elevation."""
+        options = self._options.build_options(self.name)
+        if options.dem == ("tiles",):
+            found = fetch_elevation(self.data, cache_dir=_answers(), crs=options.crs, progress=progress)
+            return replace(options, dem=(str(found),))
+        return options
+
+
+def _answers() -> Path:
+    """Folder of the answers of map servers, as of ``geoscene build``."""
+    return Path.home() / ".cache" / "geoscene"
+
+
+def _folder(source: _Map, options: PlaceOptions) -> Path:
+    """Folder of the cache for a map and options, by digests of both."""
+    chosen = asdict(options.build_options("")) | {"bbox": options.bbox, "dem": elevation_digests(options.dem)}
+    key = digest(
+        json.dumps([builder_version, SCHEMA, source.digest, options.dem == ("tiles",), chosen]).encode()
+    )
+    cache = options.scene_cache or _answers() / "scenes"
+    slug = re.sub(r"[^\w.-]+", "-", source.name).strip("-.")[:32] or "map"
+    return next(iter(sorted(cache.glob(f"*-{key}"))), cache / f"{slug}-{key}")
+
+
+@contextmanager
+def _turn(folder: Path, progress: Progress) -> Iterator[None]:
+    """Wait until no other process builds or checks the scene of a folder, and keep others out meanwhile."""
+    with ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(exclusive(folder))
+                break
+            except SceneInputError:
+                progress("waiting for another build", 0, total=0)
+                time.sleep(_PAUSE_S)
+        yield
+
+
+@dataclass(frozen=True, slots=True)
+class _CachedScene:
+    """The scene of a folder of the cache, for one drive."""
+
+    folder: Path
+    source: _Map
+    drive: DriveOptions
+    progress: Progress
+
+    @property
+    def path(self) -> Path:
+        """Directory of the scene."""
+        return self.folder / "scene"
+
+    def opened(self) -> OpenedScene:
+        """The scene with all that the drive needs; what is missing or damaged is built."""
+        scene, built = _intact(self.path), 0
+        for _ in range(_ROUNDS):
+            area = None if scene is None else self._drive_area(scene)
+            if scene is not None and shapely.covers(scene.area, area):
+                return OpenedScene(scene, built)
+            scene, more = self._grown(scene, area)
+            built += more
+        raise LidarError(
+            f"{self.source.name}: the route changes with what is built; build all by geoscene build"
+        )
+
+    def _drive_area(self, scene: Scene) -> Any:
+        """The area that the drive needs, as planned in the scene; it holds if the scene covers it."""
+        recipe = json.dumps([__version__, self.drive.recipe(scene)], default=str, sort_keys=True)
+        known = self.folder / "drives" / f"{digest(recipe.encode())}.wkb"
+        with suppress(OSError, shapely.errors.GEOSException):
+            return shapely.from_wkb(known.read_bytes())
+        self.progress("planning", 0, total=0)
+        area = needed_area(road_map(scene), self.drive)
+        if shapely.covers(scene.area, area):
+            write_atomically(known, shapely.to_wkb(area))
+        return area
+
+    def _grown(self, scene: Scene | None, area: Any | None) -> tuple[Scene, int]:
+        """The scene with an area and with what the drive needs, and the number of tiles that were built."""
+        kept = [shape for shape in (scene and scene.area, area) if shape is not None]
+
+        def needed(roads: RoadMap) -> Any:
+            wanted = needed_area(roads, self.drive)
+            return shapely.union_all([*kept, shapely.buffer(wanted, _MARGIN)])
+
+        new = self.folder / "scene.new"
+        try:
+            build(
+                self.source.data,
+                new,
+                options=self.source.build_options(self.progress),
+                overwrite=True,
+                workers=self.drive.workers,
+                needed=needed,
+                former=self.path,
+                progress=self.progress,
+            )
+        except FrameError as error:
+            raise InputError(str(error).replace("`crs`", "`scene_crs`")) from error
+        before = set(scene.tile_indices) if scene is not None else set()
+        _publish(new, self.path)
+        grown = open_scene(self.path)
+        return grown, len(set(grown.tile_indices) - before)
+
+
+def _intact(path: Path) -> Scene | None:
+    """The scene of a directory; None if it is not there, or a file of it is damaged or missing."""
+    with suppress(SceneFormatError, OSError, ValueError, LookupError):
+        scene = open_scene(path)
+        reports = json.loads(scene.files.tile_reports.read_text("utf-8"))["tiles"]
+        whole = {(r["i"], r["j"]) for r in reports} == set(scene.tile_indices) and scene.area is not None
+        if whole and not changed_files(scene):
+            return scene
+    return None
+
+
+def _publish(new: Path, path: Path) -> None:
+    """Move the files of a new scene into the directory of the scene that it continues, the manifest last."""
+    if not path.exists():
+        new.rename(path)
+        return
+    source, target = SceneFiles(new), SceneFiles(path)
+    target.tiles.mkdir(exist_ok=True)
+    for tile in source.tiles.iterdir():
+        tile.replace(target.tiles / tile.name)
+    for file in new.iterdir():
+        if file not in (source.tiles, source.manifest):
+            file.replace(path / file.name)
+    source.manifest.replace(target.manifest)
+    shutil.rmtree(new)
