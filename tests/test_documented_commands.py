@@ -145,7 +145,7 @@ def test_documented_commands_succeed(source, folder):
         if words[0] in ("build", "drive"):
             shutil.rmtree(folder / words[words.index("-o") + 1], ignore_errors=True)
         if words[0] == "drive" and words[1].endswith(".osm.pbf"):
-            words += ["--scene-cache", "scenes"]  # noqa: PLW2901
+            words += ["--scene-cache", "scenes"]
         (folder / "map.laz").unlink(missing_ok=True)
         # builds fork workers: from a process of their own, as users run them, not one with others' threads
         run = run_process if words[0] == "build" else run_program

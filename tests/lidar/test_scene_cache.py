@@ -25,6 +25,7 @@ from lidar.errors import InputError, RouteError
 from lidar.options import DriveOptions, PlaceOptions
 from lidar.pipeline import drive
 from lidar.scene_cache import open_scene_or_map
+from lidar.traffic.populate import TrafficOptions
 
 RIG = """
 name = "one scanner"
@@ -41,7 +42,7 @@ WEST, SOUTH = 9.5, 47.1
 STREETS = 9  # from south to north: 4 km
 
 
-def osm_of(streets=STREETS, roads=True):
+def osm_of(streets=STREETS, *, roads=True):
     """A map of a long avenue with cross streets, and buildings along them, as OSM XML."""
     nodes, ways = [], []
 
@@ -112,7 +113,7 @@ def test_drives_of_a_map_have_the_bytes_of_drives_in_its_whole_scene(kind, town,
     options = {
         "waypoints": south,
         "random": replace(south, route="random", seed=5),
-        "traffic": replace(south, traffic=scene_traffic()),
+        "traffic": replace(south, traffic=TrafficOptions(vehicles=60, radius=100)),
         "satellites and sun": replace(south, rig="seed"),
     }[kind]
     whole = open_scene(town / "whole")
@@ -123,12 +124,6 @@ def test_drives_of_a_map_have_the_bytes_of_drives_in_its_whole_scene(kind, town,
     drive(whole, tmp_path / "a", options=options)
     drive(found.scene, tmp_path / "b", options=options)
     same_drives(tmp_path / "a", tmp_path / "b")
-
-
-def scene_traffic():
-    from lidar.traffic.populate import TrafficOptions
-
-    return TrafficOptions(vehicles=60, radius=100)
 
 
 def test_flights_of_a_map_have_the_bytes_of_flights_in_its_whole_scene(town, tmp_path):
