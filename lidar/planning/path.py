@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,7 +20,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene import polylines
-from geoscene.columns import Columns
+from geoscene.columns import Columns, row_blocks
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import BlockedError, RouteError
@@ -46,6 +46,8 @@ _WHEEL_STEP = 0.2  # metres: a kerb
 _PUSH = 4.0  # metres before and behind an obstacle over which the line is shifted
 _ASTRAY = 1.5  # turning radii, maximum distance of a vehicle from its lane centre
 _FINISH = 3.0  # turning radii, maximum distance between the ends of a path and of its line off the roads
+_REGION = 2000.0  # metres, side of the square whose ground is loaded at once
+_RUN_STEP, _RUN = 256, 512  # rows of a track that stay together, and how many of these share loaded ground
 _WHEEL = 0.95  # share of the maximum curvature of a line, a margin for feedback
 
 
@@ -229,7 +231,8 @@ def _joined(legs: list[Track], lines: list[Line], *, setting: Setting, ground: S
         over = np.full(len(z) - 1, leg.step)
         s = start + np.concatenate([[0.0], np.cumsum(np.hypot(over, np.diff(z)))])
         start = float(s[-1])
-        scale = np.asarray(setting.frame.scale_at(leg.xy[:, 0], leg.xy[:, 1]), float)
+        blocks = [leg.xy[rows] for rows in row_blocks(len(leg.xy), _RUN * _RUN_STEP)]
+        scale = np.concatenate([setting.frame.scale_at(xy[:, 0], xy[:, 1]) for xy in blocks]).astype(float)
         heading = polylines.headings(line.xyz[:, :2])[leg.row]
         d = leg.xy - line.xyz[leg.row, :2]
         parts.append(
@@ -318,26 +321,58 @@ def _raw_heights(
     rise = leg.gear * np.gradient(z, leg.step)
     if ground is None or not len(z):
         return z, rise, np.zeros(len(leg.row))
+    parts = [
+        _on_wheels(
+            leg.xy[rows], leg.heading[rows], z=z[rows], rise=rise[rows], setting=setting, ground=ground
+        )
+        for rows in _runs(leg.xy)
+    ]
+    rear, ahead, across = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return rear, ahead, across
+
+
+def _runs(xy: Float) -> Iterator[slice]:
+    """Runs of rows of a track (n, 2) within a square of `_REGION`: the ground is loaded run by run."""
+    starts = np.arange(0, len(xy), _RUN_STEP)
+    low, high = np.minimum.reduceat(xy, starts, axis=0), np.maximum.reduceat(xy, starts, axis=0)
+    first = 0
+    for k in range(1, len(starts)):
+        size = high[first : k + 1].max(axis=0) - low[first : k + 1].min(axis=0)
+        if size.max() > _REGION or k - first == _RUN:
+            yield slice(int(starts[first]), int(starts[k]))
+            first = k
+    yield slice(int(starts[first]), len(xy))
+
+
+def _on_wheels(
+    xy: Float, heading: Float, *, z: Float, rise: Float, setting: Setting, ground: Surface
+) -> tuple[Float, Float, Float]:
+    """Height of the rear axle, and rise to the front axle and to the left, of a body on the ground.
+
+    xy, heading : (n, 2) and (n,) of the rear axle
+    z, rise     : (n,) heights near the ground, and their change per metre ahead
+    """
     base = max(setting.vehicle.wheelbase, _AXLES)
-    rear, across = _axle(leg, z, ahead=0.0, setting=setting, ground=ground)
+    rear, across = _axle(xy, heading, z=z, ahead=0.0, setting=setting, ground=ground)
     ahead = np.clip(rise, -_STEEP, _STEEP)
     for _ in range(2):  # on a slope the front axle is less than the wheelbase ahead, in plan
         reach = base / np.hypot(1.0, ahead)
-        front, twisted = _axle(leg, rear + reach * ahead, ahead=reach, setting=setting, ground=ground)
+        near = rear + reach * ahead
+        front, twisted = _axle(xy, heading, z=near, ahead=reach, setting=setting, ground=ground)
         ahead = (front - rear) / reach
     # a rigid body on four wheels: springs take the twist of the ground
     return rear, ahead, (across + twisted) / 2
 
 
 def _axle(
-    leg: Track, z: Float, *, ahead: Float | float, setting: Setting, ground: Surface
+    xy: Float, heading: Float, *, z: Float, ahead: Float | float, setting: Setting, ground: Surface
 ) -> tuple[Float, Float]:
     """Mean height of the ground under the wheels of an axle, and its rise to the left, near heights (n,).
 
     ahead : metres in plan from the rear axle
     """
-    c, s = np.cos(leg.heading), np.sin(leg.heading)
-    x, y = leg.xy.T
+    c, s = np.cos(heading), np.sin(heading)
+    x, y = xy.T
     scale = setting.frame.scale_at(x, y)
     track = max(setting.vehicle.track, 0.1)
     x, y, half = x + ahead * scale * c, y + ahead * scale * s, track / 2 * scale

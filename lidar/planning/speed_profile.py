@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import row_blocks
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.geometry.poses import BLOCK_POSES
 from lidar.planning.motion import DWELL_S, Motion, legs_of, speed_limits
 from lidar.planning.path import Path
 from lidar.rig.vehicle import Vehicle
@@ -132,11 +134,19 @@ class _Limits:
 
     def at(self, s: Float) -> Float:
         """Cautious limits (n,) at distances (n,)."""
-        return np.interp(s, _GAP * np.arange(len(self.cautious)), self.cautious)
+        return _looked_up(self.cautious, s)
 
     def excess(self, s: Float, *, v: Float) -> float:
         """Largest ratio of speeds (n,) to the limits at distances (n,)."""
-        return float((v / np.interp(s, _GAP * np.arange(len(self.strict)), self.strict)).max())
+        return float((v / _looked_up(self.strict, s)).max())
+
+
+def _looked_up(limit: Float, s: Float) -> Float:
+    """Values (n,) at distances (n,) of a column with a row every `_GAP` metres."""
+    last = len(limit) - 1
+    low, high = (min(max(int(end / _GAP), 0), last) for end in (s.min(), s.max()))
+    rows = np.arange(low, min(high + 1, last) + 1)
+    return np.interp(s, _GAP * rows, limit[rows])
 
 
 def _limits(s: Float, limit: Float, *, vehicle: Vehicle) -> _Limits:
@@ -213,10 +223,12 @@ def _reachable(allowed: Float, limits: _Limits, *, vehicle: Vehicle, start: tupl
     """
     out = np.empty_like(allowed)
     s, v = start
-    table, most = limits.cautious.tolist(), len(limits.cautious) - 1
+    near = int(s / _GAP)
+    table = limits.cautious[near : int(max(s, float(allowed.max())) / _GAP) + 1].tolist()
+    most = len(table) - 1
     out[0] = s
     for k, bound in enumerate(allowed[1:].tolist(), 1):
-        v = min(v + _SPARE * vehicle.acceleration * STEP_S, table[min(int(s / _GAP), most)])
+        v = min(v + _SPARE * vehicle.acceleration * STEP_S, table[min(int(s / _GAP) - near, most)])
         ahead = max(min(s + v * STEP_S, bound), s)
         s, v = ahead, (ahead - s) / STEP_S
         out[k] = s
@@ -278,10 +290,16 @@ def _sampled(knots: _Knots, end: float, *, dt: float) -> tuple[Float, Float]:
     resting = np.flatnonzero((knots.s > end - _NEAR) & (knots.v < _AT_REST))
     if len(resting):
         last = int(resting[0])
-    t = np.arange(0.0, last * knots.dt + 1e-9, dt)
-    i = np.minimum((t / knots.dt).astype(int), len(knots.s) - 2)
-    u = t - i * knots.dt
-    jerk = (knots.a[i + 1] - knots.a[i]) / knots.dt
-    v = knots.v[i] + knots.a[i] * u + jerk * u**2 / 2
-    s = knots.s[i] + knots.v[i] * u + knots.a[i] * u**2 / 2 + jerk * u**3 / 6
-    return np.maximum.accumulate(np.clip(s, 0.0, end)), np.maximum(v, 0.0)
+    count = math.ceil((last * knots.dt + 1e-9) / dt)
+    s, v = np.empty(count), np.empty(count)
+    furthest = 0.0
+    for rows in row_blocks(count, BLOCK_POSES):
+        t = dt * np.arange(rows.start, rows.stop)
+        i = np.minimum((t / knots.dt).astype(int), len(knots.s) - 2)
+        u = t - i * knots.dt
+        jerk = (knots.a[i + 1] - knots.a[i]) / knots.dt
+        v[rows] = np.maximum(knots.v[i] + knots.a[i] * u + jerk * u**2 / 2, 0.0)
+        far = knots.s[i] + knots.v[i] * u + knots.a[i] * u**2 / 2 + jerk * u**3 / 6
+        s[rows] = np.maximum(np.maximum.accumulate(np.clip(far, 0.0, end)), furthest)
+        furthest = float(s[rows.stop - 1])
+    return s, v

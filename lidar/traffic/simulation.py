@@ -211,8 +211,10 @@ def _tables(
     for trip in trips:
         path = trip.path
         xy, heading = trip.body()
-        level = np.where(path.edge >= 0, covered[path.edge], False).astype(np.int64)
-        swept = sweep(xy, heading, length=trip.length, width=trip.width, level=level, scale=path.scale)
+        swept = Sweep.empty()
+        if len(trips) > 1 or len(ego.event_cell):  # alone, nobody takes its ground
+            level = np.where(path.edge >= 0, covered[path.edge], False).astype(np.int64)
+            swept = sweep(xy, heading, length=trip.length, width=trip.width, level=level, scale=path.scale)
         own = _records(STATION, desired_speed=trip.desired_speed, x=xy[:, 0], y=xy[:, 1], heading=heading)
         stations.append(own)
         sweeps.append(swept)

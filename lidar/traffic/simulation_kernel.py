@@ -308,16 +308,42 @@ def _release_behind(i: int, m: Any, g: Any, st: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _cells_of_junction(i: int, m: Any, st: Any) -> Any:
+    """First and last (exclusive) row of the cells that a road user comes to in its next junction."""
+    b, q = st[i].block, m.user[i].cell_start
+    end = m.user[i + 1].cell_start
+    above = end
+    while q < above:  # cells are in the order of ``first``
+        middle = (q + above) // 2
+        if m.cell[middle].first < m.block[b].first:
+            q = middle + 1
+        else:
+            above = middle
+    while above < end and m.cell[above].first <= m.block[b].last:
+        above += 1
+    return q, above
+
+
+@njit(cache=True, nogil=True)
+def _hold_junction(i: int, m: Any, g: Any, st: Any) -> None:
+    """Reserve the route through a road user's next junction."""
+    first, end = _cells_of_junction(i, m, st)
+    for q in range(first, end):
+        g[m.cell[q].number].hold = m.block[st[i].block].route
+        g[m.cell[q].number].holds += 1
+    st[i].granted = True
+
+
+@njit(cache=True, nogil=True)
 def _release_junction(i: int, m: Any, g: Any, st: Any) -> None:
     """Release the route through a road user's next junction."""
-    b = st[i].block
     if st[i].granted:
-        for q in range(m.user[i].cell_start, m.user[i + 1].cell_start):
-            if m.block[b].first <= m.cell[q].first <= m.block[b].last:
-                p = m.cell[q].number
-                g[p].holds -= 1
-                if g[p].holds == 0:
-                    g[p].hold = _NOBODY
+        first, end = _cells_of_junction(i, m, st)
+        for q in range(first, end):
+            p = m.cell[q].number
+            g[p].holds -= 1
+            if g[p].holds == 0:
+                g[p].hold = _NOBODY
     st[i].granted = False
 
 
@@ -353,12 +379,8 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     if b < m.user[i + 1].block_start and not st[i].granted:
         near = m.block[b].stop - k <= (v * v / (1.3 * m.user[i].deceleration) + 2.0 * v) / STEP + 12
         must_stop = m.block[b].stop_sign and st[i].rested < _STOP_STEPS
-        if near and not must_stop and k <= m.block[b].first and _may_enter(i, k, t, m, g, st, signals):
-            st[i].granted = True
-            for q in range(st[i].ahead, m.user[i + 1].cell_start):
-                if m.block[b].first <= m.cell[q].first <= m.block[b].last:
-                    g[m.cell[q].number].hold = m.block[b].route
-                    g[m.cell[q].number].holds += 1
+        if near and not must_stop and _may_enter(i, k, t, m, g, st, signals):
+            _hold_junction(i, m, g, st)
             if m.user[i].whole_block:
                 _reserve(i, max(st[i].station, min(m.block[b].last + 1, end)), m, g, st)
         else:
@@ -376,6 +398,8 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     new = max(v + min(max(m.user[i].acceleration * accel, -HARD), m.user[i].acceleration) * dt, 0.0)
     # reserve the stopping distance; drive no faster than the reserved cells allow
     need = min(int((s + (v + new) / 2 * dt + new * new / (2 * HARD)) / STEP) + 2, limit)
+    if st[i].granted and _next_signal_is_red(i, k, t, need, m, st, signals):
+        need = m.block[b + 1].stop
     q = st[i].reserved
     while q < m.user[i + 1].cell_start and m.cell[q].first <= need:
         p = m.cell[q].number
@@ -395,6 +419,18 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     st[i].v = new
     if m.user[i].leaves and st[i].s > (end - 3) * STEP:
         st[i].departed = True
+
+
+@njit(cache=True, nogil=True)
+def _next_signal_is_red(i: int, k: int, t: float, need: int, m: Any, st: Any, signals: Any) -> bool:
+    """Whether a station is beyond the stop line of the junction after the next one, whose signal is red."""
+    b = st[i].block + 1
+    if m.user[i].whole_block or b >= m.user[i + 1].block_start or need <= m.block[b].stop:
+        return False
+    zone, group = m.block[b].zone, m.block[b].group
+    eta = max(m.block[b].stop - k, 0) * STEP / max(st[i].v, 3.0)
+    green = group < 0 or (is_green(zone, group, t, signals) and is_green(zone, group, t + eta, signals))
+    return not green
 
 
 @njit(cache=True, nogil=True)

@@ -37,6 +37,12 @@ class Sweep(Columns):
     last: NDArray[np.int32]
     leave: NDArray[np.int32]
 
+    @classmethod
+    def empty(cls) -> Sweep:
+        """No cells."""
+        none = np.empty(0, np.int32)
+        return cls(np.empty(0, np.int64), none, none, none)
+
 
 def sweep(
     xy: Float, heading: Float, *, length: float, width: float, level: NDArray[np.int64], scale: float

@@ -18,7 +18,8 @@ from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
 from lidar.navigation.gnss import antenna_motion
 from lidar.navigation.imu import true_inertial
 from lidar.plan import schedule
-from lidar.planning import clearance
+from lidar.planning import clearance, speed_profile, steering
+from lidar.planning import path as path_module
 from lidar.planning.clearance import Line, Setting, touching
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
@@ -82,6 +83,46 @@ def test_receivers_and_units_measure_the_same_along_parts_of_a_trajectory(path, 
     for part, one in zip(measured(), expected, strict=True):
         # differences over even and over uneven times round differently
         np.testing.assert_allclose(part, one, rtol=0, atol=1e-9)
+
+
+def test_long_lines_are_smoothed_in_windows(monkeypatch):
+    along = np.arange(0.0, 2000.0, 0.5)
+    line = np.column_stack([along, 30.0 * np.floor(along / 40.0) % 2])  # jumps that no car can follow
+    whole = steering.relaxed(line, 0.17, reach=2.6)
+    monkeypatch.setattr(steering, "_SOLVED", 500)
+    monkeypatch.setattr(steering, "_OVERLAP", 400)
+    assert np.abs(steering.relaxed(line, 0.17, reach=2.6) - whole).max() < 1e-6
+    monkeypatch.setattr(steering, "_OVERLAP", 100)
+    plain = steering.relaxed(line, 1e9, reach=2.6)
+    monkeypatch.setattr(steering, "_SOLVED", 1 << 17)
+    assert np.abs(steering.relaxed(line, 1e9, reach=2.6) - plain).max() < 1e-9
+
+
+def test_the_ground_is_loaded_in_regions_around_the_vehicle(monkeypatch):
+    graph = grid(gap=80.0)
+    route = plan_route(graph, FRAME, spec="random", options=RouteOptions(seed=3, length=600.0))
+    boxes = []
+
+    def ground(x, y, z):
+        boxes.append((np.ptp(x), np.ptp(y)))
+        return z + 0.1 * np.sin(x / 9) * np.cos(y / 7)
+
+    whole = plan_path(route, load_vehicle("car"), frame=FRAME, ground=ground)
+    boxes.clear()
+    monkeypatch.setattr(path_module, "_REGION", 150.0)
+    parts = plan_path(route, load_vehicle("car"), frame=FRAME, ground=ground)
+    assert len(boxes) > 9
+    assert np.max(boxes) < 150.0 + 2 * 4.0  # and the axles beside and ahead
+    for name, column in whole.columns().items():
+        assert column.tobytes() == parts.columns()[name].tobytes()
+
+
+def test_limits_are_looked_up_in_the_rows_around_a_place():
+    limit = np.random.default_rng(1).uniform(1.0, 20.0, 4000)
+    for first in (-0.2, 0.0, 313.7, 990.0, 999.9):
+        s = np.linspace(first, first + 12.0, 41)
+        expected = np.interp(s, 0.25 * np.arange(len(limit)), limit)
+        assert speed_profile._looked_up(limit, s).tobytes() == expected.tobytes()
 
 
 def test_poses_that_do_not_follow_each_other_are_refused_across_blocks(monkeypatch):

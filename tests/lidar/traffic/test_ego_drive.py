@@ -55,15 +55,9 @@ def check_gentle(ego):
     assert np.abs(np.diff(change)).max() * 100.0 <= CAR.jerk + 1e-2
 
 
-@pytest.mark.parametrize("at_speed", [False, True])
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_ego_enters_no_junction_on_red(seed, at_speed):
-    graph = city(signalised=True)
-    path = path_on(graph, seed, 95.0)
-    ego = drive_with_signals(path, CAR, graph=graph, seed=seed, duration=80.0, at_speed=at_speed)
-    assert (speed_of(ego)[0] > 1.0) == at_speed
+def check_enters_on_green(ego, graph, seed, *, until):
     plan = junction_plan(graph, lanes_of(graph), seed=seed)
-    times = np.arange(0.0, 80.0, STEP_S)
+    times = np.arange(0.0, until, STEP_S)
     middle, heading = middle_of(ego, times)
     front = middle + CAR.length / 2 * np.column_stack([np.cos(heading), np.sin(heading)])
     zone = zone_at(plan.zones, front)
@@ -73,8 +67,30 @@ def test_the_ego_enters_no_junction_on_red(seed, at_speed):
         group = signal_group(plan, int(zone[k]), heading=float(heading[k]))
         ago = np.arange(0.0, AMBER, 0.5)  # entered on green, or slightly later (smoothing)
         assert any(is_green(int(zone[k]), group, float(times[k] - a), plan.signals) for a in ago)
+
+
+@pytest.mark.parametrize("at_speed", [False, True])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_ego_enters_no_junction_on_red(seed, at_speed):
+    graph = city(signalised=True)
+    path = path_on(graph, seed, 95.0)
+    ego = drive_with_signals(path, CAR, graph=graph, seed=seed, duration=80.0, at_speed=at_speed)
+    assert (speed_of(ego)[0] > 1.0) == at_speed
+    check_enters_on_green(ego, graph, seed, until=80.0)
     check_gentle(ego)
     assert (speed_of(ego)[500:-500] < 0.05).any()  # it had to wait
+
+
+@pytest.mark.parametrize("gap", [25.0, 26.0])
+def test_the_ego_waits_between_junctions_that_are_close_and_goes_on(gap):
+    graph = grid(6, 6, gap, speed=13.9)
+    graph = replace(graph, signals=np.full(len(graph.node_id), True))
+    path = path_on(graph, 1, 600.0)
+    ego = drive_with_signals(path, CAR, graph=graph, seed=1, duration=500.0)
+    check_enters_on_green(ego, graph, 1, until=500.0)
+    moving = np.flatnonzero(speed_of(ego) > 0.05)
+    assert np.diff(moving).max() < 60_00  # a cycle of the signals, at 100 Hz
+    assert moving[-1] > 450_00
 
 
 def test_the_ego_stops_at_stop_signs_and_continues():
