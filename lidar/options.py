@@ -454,7 +454,8 @@ class TradeoffOptions:
     compare: Annotated[tuple[str, ...], Parameter(name="--settings"), WORDS] = ()
     """Settings to compare, separated by commas: rays, poses, mirrors, foliage of scanners; supersample, blur,
     shadows, detail, resolution, haze of cameras; precision, retrace of both; origin, reach, forests, trees,
-    furniture, barriers, scene, traffic, georeferencing; all by default. Cheap ones are combined, too."""
+    furniture, barriers, scene, traffic; georeferencing, files (formats), voxel (of maps) and frame
+    (projections); all by default. Cheap ones are combined, too."""
 
     sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
     """Names of the scanners and cameras to compare; all by default."""

@@ -214,7 +214,7 @@ def _colored(table: Table, color: str, *, limits: tuple[float, float]) -> Table:
     return table | {"red": rgb[:, 0], "green": rgb[:, 1], "blue": rgb[:, 2]}
 
 
-def _nearest_to_centre(data: NDArray[np.void], voxel: float) -> NDArray[np.void]:
+def nearest_to_centre(data: NDArray[np.void], voxel: float) -> NDArray[np.void]:
     """The record nearest to the centre of each voxel; of equally near ones the earliest."""
     xyz = np.column_stack([data[k] for k in "xyz"])
     cell = np.floor(xyz / voxel)
@@ -243,7 +243,7 @@ def _voxels(
             kinds = data.dtype
             for axis, shift in zip("xyz", offset, strict=True):
                 data[axis] -= shift
-            data = _nearest_to_centre(data, voxel)
+            data = nearest_to_centre(data, voxel)
             squares = np.floor(np.column_stack([data["x"], data["y"]]) / side).astype(np.int64)
             keys, inverse = np.unique(squares, axis=0, return_inverse=True)
             for k, (i, j) in enumerate(keys):
@@ -252,10 +252,10 @@ def _voxels(
                 with path.open("ab") as file:
                     file.write(merged.tobytes())
                 if path.stat().st_size > limits.get(path, _SHRINK_AT):
-                    path.write_bytes(_nearest_to_centre(np.fromfile(path, kinds), voxel).tobytes())
+                    path.write_bytes(nearest_to_centre(np.fromfile(path, kinds), voxel).tobytes())
                     limits[path] = max(_SHRINK_AT, 2 * path.stat().st_size)
         for path in sorted(folder.iterdir(), key=lambda p: tuple(map(int, p.name.split("_")))):
-            merged = _nearest_to_centre(np.fromfile(path, kinds or np.dtype([])), voxel)
+            merged = nearest_to_centre(np.fromfile(path, kinds or np.dtype([])), voxel)
             table = {name: merged[name].copy() for name in merged.dtype.names or ()}
             for axis, shift in zip("xyz", offset, strict=True):
                 table[axis] += shift

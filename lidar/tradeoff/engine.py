@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,14 +16,17 @@ from lidar.options import DriveOptions, TradeoffOptions
 from lidar.plan import DrivePlan, plan_drive, schedule
 from lidar.rig.devices import Camera, Scanner
 from lidar.tradeoff.cameras import compared_camera
-from lidar.tradeoff.comparison import Comparison
+from lidar.tradeoff.comparison import Comparison, Listing
 from lidar.tradeoff.errors import percentile
+from lidar.tradeoff.files import formats_listing
+from lidar.tradeoff.projections import frames_listing
 from lidar.tradeoff.scanners import compared_scanner
-from lidar.tradeoff.simulate import EXACT, Bench, bench_of, sampled_returns
+from lidar.tradeoff.simulate import EXACT, Bench, bench_of, measured_frame
 from lidar.tradeoff.variants import CAMERA_VALUES, SCANNER_VALUES, WORLD_VALUES
+from lidar.tradeoff.voxels import voxels_listing
 
 _OF_SENSORS = (*WORLD_VALUES, "scene", "traffic")
-_OF_DRIVE = ("georeferencing",)
+_OF_DRIVE = ("georeferencing", "files", "voxel", "frame")
 COMPARED = tuple(dict.fromkeys((*SCANNER_VALUES, *CAMERA_VALUES, *_OF_SENSORS, *_OF_DRIVE)))
 """Names that `TradeoffOptions.compare` may hold."""
 
@@ -33,11 +36,13 @@ class Tradeoff:
     """Comparisons of all sensors of a rig on a drive.
 
     georeferencing : metres between the affine map and the full projection; empty where not compared
+    listings       : tables of formats and maps of each scanner, and of frames
     """
 
     plan: DrivePlan
     comparisons: tuple[Comparison, ...]
     georeferencing: dict[str, float]
+    listings: tuple[Listing, ...]
 
 
 def tradeoff(
@@ -78,7 +83,18 @@ def tradeoff(
             bench.close(backend=EXACT)
     wanted = compared.compare or COMPARED
     geo = _georeferencing(bench) if "georeferencing" in wanted else {}
-    return Tradeoff(plan, tuple(found), geo)
+    return Tradeoff(plan, tuple(found), geo, tuple(_listings(bench, wanted, progress=progress)))
+
+
+def _listings(bench: Bench, wanted: Sequence[str], *, progress: Progress) -> Iterator[Listing]:
+    scanners = [s for s in bench.plan.sensors if isinstance(s, Scanner)]
+    for scanner in scanners:
+        if "files" in wanted:
+            yield formats_listing(bench, scanner, progress=progress)
+        if "voxel" in wanted:
+            yield voxels_listing(bench, scanner, progress=progress)
+    if scanners and "frame" in wanted:
+        yield frames_listing(bench, scanners[0])
 
 
 def _with_sensors(plan: DrivePlan, names: Sequence[str]) -> DrivePlan:
@@ -123,10 +139,10 @@ def _georeferencing(bench: Bench) -> dict[str, float]:
     if scanner is None:
         return {}
     affine, full = (Georeference(plan.scene.frame, plan.geo.crs, exact=exact) for exact in (False, True))
-    away = [
-        np.linalg.norm(affine.points(found.xyz) - full.points(found.xyz), axis=1)
-        for found in sampled_returns(bench, scanner, every=8)
-    ]
+    away = []
+    for frame in bench.frames[scanner.name]:
+        placed = measured_frame(bench, scanner, frame=frame, every=8).placed
+        away.append(np.linalg.norm(affine.points(placed) - full.points(placed), axis=1))
     every = np.concatenate(away)
     return {"99.9_m": percentile(every, 0.999), "max_m": percentile(every, 1.0)}
 

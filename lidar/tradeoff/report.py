@@ -6,6 +6,7 @@ import base64
 import html
 import io
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from geoscene.files import write_atomically, write_json
-from lidar.tradeoff.comparison import Comparison, Kind, Row
+from lidar.tradeoff.comparison import Comparison, Kind, Listing, Row
 from lidar.tradeoff.engine import Tradeoff
 from lidar.tradeoff.errors import Estimate
 from lidar.tradeoff.words import (
@@ -90,6 +91,47 @@ def cells(row: Row, comparison: Comparison) -> list[str]:
     ]
 
 
+HEADINGS = {
+    "rms_m": "rms",
+    "99.9_m": "99.9 %",
+    "max_m": "max",
+    "back_max_m": "back, max",
+    "bound_m": "bound",
+    "height_max_m": "height, max",
+    "scale_ppm": "scale",
+    "per_point_bytes": "bytes/point",
+    "share": "points",
+    "bytes": "size",
+    "write_s": "write",
+    "read_s": "read",
+    "thin_s": "thin",
+}
+"""Headings of figures of listings, by name."""
+
+
+def figure(name: str, value: float) -> str:
+    """A figure of a listing in the unit that its name ends in."""
+    unit = name.rpartition("_")[2]
+    texts: dict[str, Callable[[float], str]] = {
+        "m": metres,
+        "ppm": lambda v: f"{v:+.3g} ppm",
+        "bytes": lambda v: size(v) if v >= 1000 else f"{v:.3g} B",
+        "share": share,
+        "s": lambda v: f"{v:.2g} s",
+    }
+    return texts[unit](value)
+
+
+def table_of(listing: Listing) -> tuple[list[str], list[list[str]]]:
+    """Headings and rows of a listing; figures that a row lacks are empty."""
+    names = [name for name in HEADINGS if any(name in r.figures for r in listing.records)]
+    rows = [
+        [r.label, *(figure(n, r.figures[n]) if n in r.figures else "" for n in names), r.note]
+        for r in listing.records
+    ]
+    return [listing.name, *(HEADINGS[n] for n in names), "note"], rows
+
+
 def _with_interval(cost: Estimate) -> str:
     return f"{cost.value:.3g} ({cost.low:.3g} to {cost.high:.3g})"
 
@@ -122,6 +164,13 @@ def print_tables(found: Tradeoff) -> None:
         console.print(table)
         for text in (residual_text(comparison), *recommendations(comparison)):
             console.print(text, highlight=False)
+    for listing in found.listings:
+        heading, rows = table_of(listing)
+        table = Table(*heading, title=listing.title)
+        for cells_of_row in rows:
+            table.add_row(*cells_of_row)
+        console.print(table)
+        console.print(listing.note, highlight=False)
     for text in filter(None, (georeferencing_text(found), NOISE)):
         console.print(text, highlight=False)
 
@@ -139,6 +188,15 @@ def document(found: Tradeoff) -> dict[str, Any]:
         "duration_s": plan.trajectory.duration_ns / 1e9,
         "sensors": [_sensor_json(c) for c in found.comparisons],
         "georeferencing": found.georeferencing,
+        "tables": [
+            {
+                "name": listing.name,
+                "title": listing.title,
+                "note": listing.note,
+                "rows": [{"row": r.label, **r.figures, "note": r.note} for r in listing.records],
+            }
+            for listing in found.listings
+        ],
         "note": NOISE,
     }
 
@@ -257,21 +315,28 @@ _STYLE = (
 )
 
 
+def _html_table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th>{html.escape(text)}</th>" for text in heading)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in row) + "</tr>" for row in rows
+    )
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
 def _page(found: Tradeoff, plots: list[bytes]) -> str:
     """A self-contained HTML page."""
     parts = []
     for comparison, plot in zip(found.comparisons, plots, strict=True):
-        head = "".join(f"<th>{html.escape(text)}</th>" for text in heads(comparison.kind))
-        body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in cells(row, comparison)) + "</tr>"
-            for row in comparison.rows
-        )
         said = "".join(f"<li>{html.escape(text)}</li>" for text in recommendations(comparison))
+        rows = [cells(row, comparison) for row in comparison.rows]
         parts.append(
             f"<h2>{html.escape(headline(comparison))}</h2><p>{html.escape(residual_text(comparison))}</p>"
-            f"<ul>{said}</ul><table><tr>{head}</tr>{body}</table>"
+            f"<ul>{said}</ul>{_html_table(heads(comparison.kind), rows)}"
             f'<img alt="error against cost" src="data:image/png;base64,{base64.b64encode(plot).decode()}">'
         )
+    for listing in found.listings:
+        title, note = html.escape(listing.title), html.escape(listing.note)
+        parts.append(f"<h2>{title}</h2><p>{note}</p>{_html_table(*table_of(listing))}")
     notes = "".join(f"<p>{html.escape(text)}</p>" for text in (georeferencing_text(found), NOISE))
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Speed against accuracy</title>'

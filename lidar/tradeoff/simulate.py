@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 
@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.scene import Scene
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 from lidar.camera.sun import sun_direction
 from lidar.dataset.formats.table import cloud_table, records
 from lidar.physics.settings import ScannerSettings
 from lidar.plan import DrivePlan
 from lidar.rig.devices import Camera, Scanner
 from lidar.rig.scanner import firings
+from lidar.sensors.cloud import Cloud
 from lidar.sensors.scan import Detection, Sweep, cast, detect, deviates_of, report
 from lidar.tradeoff.errors import Returns
 from lidar.tradeoff.images import Shot
@@ -172,13 +173,43 @@ def returns_of(
     return Returns(key, found.range, found.echoes.klass, placed)
 
 
-def sampled_returns(bench: Bench, scanner: Scanner, *, every: int) -> Iterator[Returns]:
-    """Returns of every n-th pulse of the sampled frames, with one ray per pulse."""
-    settings = replace(noiseless(bench.plan.options.contents().scanner), rays=1)
-    for frame in bench.frames[scanner.name]:
-        pulses = np.arange(0, len(firings(scanner.sensor, frame)), every)
-        world = bench.world(scanner, frame, backend=FAST)
-        yield returns_of(bench.plan, scanner, frame=frame, world=world, settings=settings, pulses=pulses)
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A frame of a scanner without noise, with one ray per pulse; n returns.
+
+    cloud   : as the sensor reports it, float32
+    time_ns : (n,) int64, of the drive
+    exact   : (n, 3) float64, sensor frame
+    placed  : (n, 3) the same points in the scene
+    start   : (n, 3) scene points from which ranges are measured
+    range   : (n,) metres from there
+    """
+
+    cloud: Cloud
+    time_ns: Ints
+    exact: Float
+    placed: Float
+    start: Float
+    range: Float
+
+
+def measured_frame(bench: Bench, scanner: Scanner, *, frame: int, every: int = 1) -> Measured:
+    """Every n-th pulse of a frame."""
+    plan = bench.plan
+    settings = replace(noiseless(plan.options.contents().scanner), rays=1)
+    pulses = np.arange(0, len(firings(scanner.sensor, frame)), every)
+    world = bench.world(scanner, frame, backend=FAST)
+    sweep, found = swept(plan, scanner, frame=frame, world=world, settings=settings, pulses=pulses)
+    fired, rows = sweep.firings, found.echoes.pulse
+    away = found.range - scanner.sensor.pattern.range_offset
+    origin, time_ns = fired.origin[rows], fired.time_ns[rows]
+    exact = origin + away[:, None] * fired.direction[rows]
+    mount = scanner.spec.mount
+    placed, start = (
+        plan.trajectory.place(xyz, time_ns, translation=mount.translation, rotation=mount.rotation)
+        for xyz in (exact, origin)
+    )
+    return Measured(report(sweep, found), time_ns, exact, placed, start, away)
 
 
 def frame_cost(

@@ -15,15 +15,15 @@ LOST = 0.001
 
 def metres(value: float) -> str:
     """A length with a unit that fits it."""
-    for unit, size in (("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("µm", 1e-6)):
+    for unit, size in (("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("µm", 1e-6), ("nm", 1e-9)):
         if abs(value) >= size:
             return f"{value / size:.3g} {unit}"
-    return "0" if value == 0 else f"{value * 1e9:.2g} nm"
+    return "0" if value == 0 else "below 1 nm"
 
 
 def share(value: float) -> str:
     """A share in percent."""
-    return "0" if value == 0 else f"{100 * value:.2g} %"
+    return "0" if value == 0 else f"{100 * value:.3g} %"
 
 
 def size(value: float) -> str:

@@ -26,7 +26,7 @@ from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
 
 SCALE = 0.001
-"""Metres per count of a coordinate; the rounding error is at most half of it along each axis."""
+"""Metres per count of a coordinate by default; the rounding error is at most half of it along each axis."""
 
 INTENSITY_UNIT = 257.0
 """LAS intensity (16 bits) per unit of calibrated reflectivity (0 to 255)."""
@@ -58,11 +58,13 @@ class LasInfo:
     crs     : of the coordinates; written as WKT
     offset  : (3,) whole metres near the data
     created : date in the header: the drive's, so that the same drive gives the same bytes
+    scale   : metres per count of a coordinate
     """
 
     crs: CRS
     offset: tuple[float, float, float]
     created: datetime
+    scale: float = SCALE
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def _layout(info: LasInfo, extra: tuple[str, ...], *, colour: bool) -> _Layout:
     import laspy  # noqa: PLC0415  (0.4 s)
 
     header = laspy.LasHeader(version="1.4", point_format=7 if colour else 6)
-    header.scales = np.full(3, SCALE)
+    header.scales = np.full(3, info.scale)
     header.offsets = np.asarray(info.offset, float)
     header.add_crs(info.crs)
     header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
@@ -109,7 +111,7 @@ class _Uncompressed:
     def __init__(self, path: Path, layout: _Layout) -> None:
         self.dest = path.open("wb")
         self.dest.write(layout.start)
-        self._offset = layout.header.offsets
+        self._offset, self._scale = layout.header.offsets, layout.header.scales
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
         self._by_return = np.zeros(16, np.uint64)
 
@@ -118,8 +120,8 @@ class _Uncompressed:
         if not len(points):
             return
         counts = [points[axis] for axis in "XYZ"]
-        self._low = np.minimum(self._low, [c.min() * SCALE for c in counts] + self._offset)
-        self._high = np.maximum(self._high, [c.max() * SCALE for c in counts] + self._offset)
+        self._low = np.minimum(self._low, [c.min() for c in counts] * self._scale + self._offset)
+        self._high = np.maximum(self._high, [c.max() for c in counts] * self._scale + self._offset)
         self._by_return += np.bincount(points["bit_fields"] & 15, minlength=16).astype(np.uint64)
         self.dest.write(points.data)
 
@@ -185,11 +187,12 @@ class _Encoder:
     def records(self, table: Table) -> NDArray[np.void]:
         """The point records of a table.
 
-        Raises FormatError for coordinates too far from the offset to be counted in millimetres.
+        Raises FormatError for coordinates too far from the offset to be counted in 32 bits.
         """
         points = np.zeros(rows(table), self.layout.kinds)
         for k, axis in enumerate("xyz"):
-            if not _count(np.asarray(table[axis], np.float64), self._info.offset[k], points[axis.upper()]):
+            origin_scale = self._info.offset[k], self._info.scale
+            if not _count(np.asarray(table[axis], np.float64), *origin_scale, points[axis.upper()]):
                 raise FormatError(f"{self.path}: a point lies too far from {self._info.offset} for LAS")
         points["classification"] = class_codes().asprs[table["label"]]
         one = np.ones(1, np.uint8)
@@ -229,11 +232,11 @@ def open_las(path: Path, info: LasInfo, *, columns: tuple[str, ...]) -> Iterator
 
 
 @njit(cache=True, nogil=True)
-def _count(coordinate: Any, offset: float, counts: Any) -> bool:
-    """Fill ``counts`` with multiples of `SCALE` from the offset; return whether all fit 32 bits."""
+def _count(coordinate: Any, offset: float, scale: float, counts: Any) -> bool:
+    """Fill ``counts`` with multiples of ``scale`` from the offset; return whether all fit 32 bits."""
     fits = True
     for i in range(len(coordinate)):
-        count = np.rint((coordinate[i] - offset) / SCALE)
+        count = np.rint((coordinate[i] - offset) / scale)
         fits &= abs(count) < 2.0**31
         counts[i] = np.int32(count)
     return fits
