@@ -29,6 +29,7 @@ from geoscene.console import main as run
 from geoscene.errors import GeosceneError, InputError
 from geoscene.options import BuildOptions, Degrees, ExportOptions, ViewOptions
 from geoscene.progress import Progress
+from geoscene.uses import USES
 
 app = App(
     name="geoscene",
@@ -166,7 +167,7 @@ def build(
         _print_scene(document)
         drive = ("lidar", "drive", out, "--route", "random", "-o", "drive")
         words = drive if document["counts"]["road_edges"] else ("geoscene", "export", out, "-o", "scene.glb")
-        if options.use == "gis":
+        if not scene.has_tiles:
             words = ("geoscene", "export", out, "-o", "scene.gpkg")
         print(f"\n{document['seconds']:.1f} s; next: {command_line(*words)}")
     return 0
@@ -404,16 +405,15 @@ def _print_scene(report: dict[str, Any]) -> None:
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
     }
-    if "cut" in report:
+    if report["options"].get("along"):
         features = max(stop for _, stop in report["layers"].values())
         rows["along"] = (
             f"{len(report['tiles'])} tiles are built, those in range of the route; solids, watertight,"
             " trees in forests and ground count these tiles, all other figures the whole map;"
             f" tables hold {sum(report['cut']['rows'].values())} of {features} features"
         )
-    if report["options"].get("use") == "gis":
-        left_out = report["left_out"]["tiles"]
-        rows["for gis"] = f"tables and road graph only; {left_out} tiles with all meshes are left out"
+    if (use := report["options"].get("use", "all")) != "all":
+        rows[f"for {use}"] = f"{USES[use].contents}; left out: {_left_out_text(report['left_out'])}"
     print(report["name"] or report["path"])
     for title, text in rows.items():
         if text:
@@ -422,6 +422,18 @@ def _print_scene(report: dict[str, Any]) -> None:
         for kind, reasons in kinds.items():
             print(f"  {action:<10} {kind}: {_listed(reasons)}")
     print(f"  {report['attribution']}")
+
+
+def _left_out_text(counts: dict[str, int]) -> str:
+    """What a scene for a use does not have."""
+    names = {
+        "tiles": "tiles with all meshes",
+        "features": "features of other tables",
+        "attributes": "attributes of features",
+    }
+    parts = [f"{counts[name]:,} {title}" for name, title in names.items() if counts.get(name)]
+    size = f" ({counts['bytes'] / 1e6:.2f} MB before compression)" if counts.get("bytes") else ""
+    return f"{', '.join(parts)}{size}"
 
 
 def _steep_roads(counts: dict[str, Any], *, terrain: bool) -> str:

@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from geoscene.console import SEVERAL, WORDS, degrees, whole
 from geoscene.errors import InputError
+from geoscene.uses import USES
 
 KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
 """Kinds of features that a scene can have besides its ground."""
@@ -43,8 +44,8 @@ class BuildOptions:
     """Kinds of features to build besides the ground, separated by commas."""
 
     use: Annotated[str, Parameter(name="--for")] = "all"
-    """What the scene is for: all, or gis (tables and road graph, no tiles: it cannot be driven in, shown,
-    validated or exported as meshes)."""
+    """What the scene is for: all; lidar or camera (to be driven in by such sensors, not shown or
+    exported); gis (tables and road graph) or map (those in plan), without tiles."""
 
     along: Annotated[tuple[str, ...], SEVERAL] = ()
     """Build only the tiles within sensor range of a route: LAT,LON LAT,LON ... or a GPX, GeoJSON or CSV file
@@ -73,8 +74,8 @@ class BuildOptions:
             raise InputError(f"`dem_tolerance` {self.dem_tolerance:g}: give metres from 0 to 1000")
         if unknown := sorted(set(self.only) - set(KINDS)):
             raise InputError(f"`only` {','.join(unknown)}: of {','.join(KINDS)}")
-        if self.use not in ("all", "gis"):
-            raise InputError(f"`use` {self.use}: all or gis")
+        if self.use not in USES:
+            raise InputError(f"`use` {self.use}: one of {', '.join(USES)}")
         if self.driving_side not in ("", "left", "right"):
             raise InputError(f"`driving_side` {self.driving_side}: left or right")
         if not 0 < self.reach < 1e6:

@@ -24,6 +24,7 @@ from geoscene.scene.layout import SCHEMA
 from geoscene.scene.writer import SceneWriter
 from geoscene.sources import OsmData
 from geoscene.tiles import Keys, TileReport, build_tiles, tiles_document
+from geoscene.uses import USES
 
 _NOT_IN_TILES = frozenset({"name", "along", "reach", "use"})
 """Options on which no tile depends; some select the tiles to build."""
@@ -65,7 +66,7 @@ def build(
             cluster.check(writer.folder)
         plan, problems = make_plan(osm, options, progress=progress, needed=needed)
         keys = _keys(osm, options)
-        tiles = plan.chosen if options.use == "all" else []
+        tiles = plan.chosen if plan.use.tiles else []
         reports: list[TileReport] = []
         for report in build_tiles(
             plan,
@@ -85,7 +86,8 @@ def build(
             layers=plan.layers,
             graph=plan.graph,
             kept=plan.kept,
-            shapes=shapes(),
+            shapes=shapes() if plan.use.tiles else {},
+            use=plan.use,
             problems=problems,
             tiles=tiles_document(keys, reports),
             manifest=scene_manifest(
@@ -110,6 +112,7 @@ def _keys(osm: OsmData, options: BuildOptions) -> Keys:
         **{name: value for name, value in chosen.items() if name not in _NOT_IN_GROUND},
         "dem": elevation_digests(options.dem),
         "only": sorted(options.only),
+        "colors": USES[options.use].colors,
     }
     rest = {name: chosen[name] for name in _NOT_IN_GROUND}
     return Keys(ground=_digest(common), solids=_digest(common | rest))

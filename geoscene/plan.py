@@ -62,6 +62,7 @@ from geoscene.structures import (
     within_extent,
 )
 from geoscene.typing import Float, Height
+from geoscene.uses import USES, Use
 
 Bounds = tuple[float, float, float, float]
 T = TypeVar("T")
@@ -98,6 +99,7 @@ class Plan:
     forests   : what their trees are generated from, None without trees
     structures : bridges and tunnels
     openings  : area of each structure where the ground is left out, None for most
+    use       : what of the scene is written
     layers    : feature tables in the order of feature numbers
     chosen    : tiles to build, sorted: all, or those in reach of a route
     kept      : rows of each of ``layers`` that tables on disk hold, None for all
@@ -121,6 +123,7 @@ class Plan:
     barriers: Barriers
     structures: Structures
     openings: NDArray[np.object_]
+    use: Use
     layers: list[Layer]
     chosen: list[tuple[int, int]]
     kept: dict[str, NDArray[np.int64]] | None
@@ -256,6 +259,7 @@ def make_plan(
         barriers=barriers,
         structures=structures,
         openings=roads.openings,
+        use=USES[options.use],
         layers=layers,
         area=area,
     )

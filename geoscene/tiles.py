@@ -40,6 +40,9 @@ T = TypeVar("T")
 _TILES = 4
 """Tiles of a task of a cluster: few, so that the tasks of a lost worker are soon repeated."""
 
+_GREY = 128
+"""Colour of faces whose colour is left out."""
+
 _SINGULAR = {"trees": "tree", "furniture": "furniture", "barriers": "barrier", "structures": "structure"}
 
 
@@ -163,6 +166,8 @@ def build_tile(
         rest = ground.take(np.arange(len(ground))).shifted(-origin)
         copies = copies.shifted(-origin)
     mesh = concatenate([solids.shifted(-origin), rest])
+    if not plan.use.colors:
+        mesh = replace(mesh, color=np.full_like(mesh.color, _GREY), surface=np.zeros_like(mesh.surface))
     digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies))
     forest_trees = 0
     if plan.forests is not None:

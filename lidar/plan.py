@@ -187,6 +187,8 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     check_start(start, 0)
     rig = load_rig(options.rig)
     sensors = sensors_of(rig, options)
+    if any(isinstance(sensor, Camera) for sensor in sensors):
+        scene.require("colors")
     vehicle = load_vehicle(options.vehicle or rig.vehicle)
     motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
     trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)

@@ -104,6 +104,8 @@ def export_scene(
             raise InputError(f"{path}: exists; set `overwrite` to replace it")
     if out.is_dir() and kind.suffixes:
         raise InputError(f"{out}: is a folder; {kind.title} needs a file name")
+    if scene.has_tiles:
+        scene.require("tables")
     module, function = kind.writer.split(":")
     write = getattr(importlib.import_module(f"geoscene.export.{module}"), function)
     summary: Summary = write(scene, out, **given, progress=progress)

@@ -55,10 +55,12 @@ def _geometry_type(geometry: NDArray[np.object_]) -> str:
 
 
 @contextmanager
-def open_geopackage(path: Path) -> Iterator[Callable[[Layer, str | None, str | None], None]]:
+def open_geopackage(
+    path: Path, *, indexed: bool = True
+) -> Iterator[Callable[[Layer, str | None, str | None], None]]:
     """Yield a function that appends rows: a layer, its geometry type and the WKT of its CRS.
 
-    A layer without a geometry type becomes a table of attributes.
+    A layer without a geometry type becomes a table of attributes; ``indexed`` ones have a spatial index.
 
     The file appears under its name unless the block raises; the same rows give the same bytes.
 
@@ -84,7 +86,7 @@ def open_geopackage(path: Path) -> Iterator[Callable[[Layer, str | None, str | N
                     layer=rows.name,
                     driver="GPKG",
                     append=part.exists(),
-                    layer_options={"FID": "fid", "SPATIAL_INDEX": "YES"},
+                    layer_options={"FID": "fid", "SPATIAL_INDEX": "YES" if indexed else "NO"},
                 )
 
             yield append
@@ -94,9 +96,9 @@ def open_geopackage(path: Path) -> Iterator[Callable[[Layer, str | None, str | N
         pyogrio.set_gdal_config_options(before)
 
 
-def write_geopackage(path: Path, layers: Sequence[Layer], *, frame: Frame) -> None:
+def write_geopackage(path: Path, layers: Sequence[Layer], *, frame: Frame, indexed: bool = True) -> None:
     """Write layers in the frame's projected CRS; empty layers are left out."""
-    with open_geopackage(path) as append:
+    with open_geopackage(path, indexed=indexed) as append:
         for layer in filter(len, layers):
             kind, geometry = _geometry_type(layer.geometry), layer.geometry
             if kind.startswith("Multi"):

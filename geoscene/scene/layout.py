@@ -23,6 +23,14 @@ from geoscene.roadgraph import RoadGraph, read_graphml
 from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile, with_forests
 from geoscene.typing import Float, Ints
+from geoscene.uses import USES
+
+_PARTS = {
+    "tiles": "tiles",
+    "colors": "colours for cameras",
+    "tables": "attributes of features",
+}
+"""Parts that scenes for some uses lack, in words."""
 
 SCHEMA = 2
 """Version of the scene directory; a reader refuses others."""
@@ -126,7 +134,20 @@ class Scene:
     @property
     def has_tiles(self) -> bool:
         """Whether the scene was built with its tiles."""
-        return bool(self.manifest.get("options", {}).get("use", "all") == "all")
+        return not USES[self.use].lacks("tiles")
+
+    @property
+    def use(self) -> str:
+        """What the scene was built for, one of `geoscene.uses.USES`."""
+        return str(self.manifest.get("options", {}).get("use", "all"))
+
+    def require(self, *parts: str) -> None:
+        """Raises SceneFormatError if the scene was built for a use that `lacks` one of the parts."""
+        for part in parts:
+            if USES[self.use].lacks(part):
+                raise SceneFormatError(
+                    f"{self.path}: built for {self.use}, has no {_PARTS[part]}; build it again without --for"
+                )
 
     @functools.cached_property
     def tile_indices(self) -> list[tuple[int, int]]:
@@ -134,8 +155,7 @@ class Scene:
 
         Raises SceneFormatError if the scene was built without tiles.
         """
-        if not self.has_tiles:
-            raise SceneFormatError(f"{self.path}: has tables but no tiles (built for gis); build it for all")
+        self.require("tiles")
         return [(int(i), int(j)) for i, j, _ in self.manifest["tiles"]]
 
     @functools.cached_property

@@ -58,6 +58,7 @@ def _osm_ids(scene: Scene, features: set[int]) -> dict[int, str]:
     out: dict[int, str] = {}
     for name, (start, stop) in scene.layers.items():
         if scene.table_length(name) and features & set(range(start, stop)):
-            layer = scene.features(name, geometry="none")
-            out |= dict(zip(layer.columns["feature"].tolist(), layer.columns["osm_id"].tolist(), strict=True))
+            columns = scene.features(name, geometry="none").columns
+            if "osm_id" in columns:  # scenes for sensors have none
+                out |= dict(zip(columns["feature"].tolist(), columns["osm_id"].tolist(), strict=True))
     return out

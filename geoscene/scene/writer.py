@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+import shapely
 
 from geoscene.classes import Class, materials
 from geoscene.errors import SceneFormatError, WorkersLostError
@@ -24,6 +25,7 @@ from geoscene.scene.geopackage import Layer, write_geopackage
 from geoscene.scene.layout import SCHEMA, SceneFiles, manifest_digest
 from geoscene.scene.tile_files import write_shapes
 from geoscene.typing import Ints
+from geoscene.uses import USES, Needed, Use
 
 log = logging.getLogger(__name__)
 
@@ -110,6 +112,7 @@ class SceneWriter:
         graph: RoadGraph,
         kept: Mapping[str, Ints] | None = None,
         shapes: Mapping[str, Mesh],
+        use: Use = USES["all"],
         problems: Iterable[Problem],
         tiles: Mapping[str, Any],
         manifest: Mapping[str, Any],
@@ -119,6 +122,8 @@ class SceneWriter:
         layers   : features; the number of a feature is its row, counted through all layers in order
         graph    : the drivable road graph; not written if it has no edges
         kept     : rows of each layer, ascending, that tables and road graph hold; all by default
+        shapes   : meshes that the tiles' instances copy; not written if there are none
+        use      : which tables and columns are written
         tiles    : the document of tile reports
         manifest : the manifest without frame, layers and codes
         """
@@ -129,15 +134,20 @@ class SceneWriter:
         ]
         cut: dict[str, Any] = {}
         if kept is not None:
-            left_out = np.setdiff1d(np.arange(len(graph)), kept["roads"])
-            onward = graph.node_id[np.unique(graph.tail[left_out])]
+            beyond = np.setdiff1d(np.arange(len(graph)), kept["roads"])
+            onward = graph.node_id[np.unique(graph.tail[beyond])]
             numbered, graph = _only_kept(numbered, graph, kept=kept)
-            rows = {layer.name: len(layer) for layer in numbered}
-            cut = {"cut": {"rows": rows, "nodes": np.intersect1d(onward, graph.node_id).tolist()}}
-        write_geopackage(self.files.features, numbered, frame=frame)
+            cut = {"nodes": np.intersect1d(onward, graph.node_id).tolist()}
+        left_out: dict[str, int] = {}
+        if use.tables is not None:
+            left_out, numbered = _left_out(numbered, use), [_needed(layer, use) for layer in numbered]
+        if kept is not None or use.tables is not None:
+            cut = {"nodes": [], **cut, "rows": {layer.name: len(layer) for layer in numbered}}
+        write_geopackage(self.files.features, numbered, frame=frame, indexed=use.indexed)
         if len(graph):
             write_graphml(graph, frame, path=self.files.road_graph)
-        write_shapes(self.files.shapes, shapes)
+        if shapes:
+            write_shapes(self.files.shapes, shapes)
         found = sorted(problems)
         columns = {f.name: [getattr(row, f.name) for row in found] for f in fields(Problem)}
         write_columns(self.files.problems, columns)
@@ -150,7 +160,8 @@ class SceneWriter:
             **manifest,
             "frame": frame.to_json(),
             "layers": ranges,
-            **cut,
+            "left_out": _totals(manifest.get("left_out", {}), left_out),
+            **({"cut": cut} if cut else {}),
             "classes": {c.name.lower(): int(c) for c in Class},
             "materials": {name: m.code for name, m in materials().items()},
             "files": {file.name: digest_of(file) for file in tables if file.exists()},
@@ -172,6 +183,41 @@ class SceneWriter:
         with self._lock:
             if not resumable:
                 shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _needed(layer: Layer, use: Use) -> Layer:
+    """The rows and columns of a layer that a use needs."""
+    needed = Needed() if use.tables is None else use.tables.get(layer.name, Needed((), ()))
+    rows: Any = slice(None)
+    if needed.classes is not None:
+        rows = np.isin(layer.columns.get("class", np.full(len(layer), "")), needed.classes)
+    names = layer.columns if needed.columns is None else ("feature", *needed.columns)
+    return Layer(layer.name, layer.geometry[rows], {name: layer.columns[name][rows] for name in names})
+
+
+def _left_out(layers: Sequence[Layer], use: Use) -> dict[str, int]:
+    """Number of features that a use does not need, of attributes of the others, and bytes of both."""
+    found = {"features": 0, "attributes": 0, "bytes": 0}
+    for layer in layers:
+        needed = _needed(layer, use)
+        found["features"] += len(layer) - len(needed)
+        found["attributes"] += len(needed) * (len(layer.columns) - len(needed.columns))
+        found["bytes"] += _bytes(layer) - _bytes(needed)
+    return found
+
+
+def _bytes(layer: Layer) -> int:
+    """Bytes of geometries and values, texts in UTF-8."""
+    size = sum(map(len, shapely.to_wkb(layer.geometry)))
+    for values in layer.columns.values():
+        texts = values.dtype.kind in "USO"
+        size += sum(len(str(value).encode()) for value in values.tolist()) if texts else values.nbytes
+    return size
+
+
+def _totals(*counts: Mapping[str, int]) -> dict[str, int]:
+    """Sums by name."""
+    return {name: sum(part.get(name, 0) for part in counts) for name in {k: None for c in counts for k in c}}
 
 
 def _only_kept(

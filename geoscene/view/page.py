@@ -49,6 +49,7 @@ def view_scene(
     layer, and a page that would be too large; the message then gives the bounds of a part that would fit.
     """
     out = Path(out)
+    scene.require("tiles", "tables")
     _check(out, overwrite=overwrite)
     bounds_deg, layers, max_mb = options.bounds_deg, options.layers, options.max_mb
     chosen = _tiles_within(scene, bounds_deg)

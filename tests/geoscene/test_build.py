@@ -26,6 +26,7 @@ from geoscene.scene.tile_files import Tile, write_tile
 from geoscene.scene.validate import check_scene
 from geoscene.sources import OsmData, demo_path, read_osm
 from geoscene.sources.data import Way
+from geoscene.view import view_scene
 from geoscene.watertight import validate_mesh
 
 
@@ -246,6 +247,35 @@ def test_scene_for_gis_has_the_tables_and_no_tiles(osm, scene, tmp_path):
     assert len(done.stderr.splitlines()) == 1
     assert "no tiles" in done.stderr
     assert not (tmp_path / "drive").exists()
+
+
+def test_scene_for_a_map_has_tables_in_plan(osm, scene, tmp_path):
+    part = build(osm, tmp_path / "map", options=BuildOptions(name="demo", use="map"))
+    assert part.files.road_graph.read_bytes() == scene.files.road_graph.read_bytes()
+    for name in scene.layers:
+        kept = name not in ("building_parts", "structures")
+        assert part.table_length(name) == (scene.table_length(name) if kept else 0)
+    assert part.manifest["left_out"]["tiles"] == len(scene.tile_indices)
+    assert part.manifest["left_out"]["bytes"] > 0
+    for name in ("a.gpkg", "a.xodr"):
+        assert export_scene(part, tmp_path / name).objects > 0
+    with pytest.raises(SceneFormatError, match=r"no tiles; build it again without --for"):
+        export_scene(part, tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize("use", ["lidar", "camera"])
+def test_scene_for_sensors_is_not_exported_or_shown(use, osm, tmp_path):
+    part = build(osm, tmp_path / use, options=BuildOptions(name="demo", use=use, only=("buildings",)))
+    for call in (
+        lambda: export_scene(part, tmp_path / "a.glb"),
+        lambda: export_scene(part, tmp_path / "a.gpkg"),
+        lambda: view_scene(part, tmp_path / "a.html"),
+    ):
+        with pytest.raises(SceneFormatError, match=f"built for {use}, has no .*without --for"):
+            call()
+    done = run_program("geoscene", "info", part.path)
+    assert f"for {use}" in done.stdout
+    assert "attributes of features" in done.stdout
 
 
 def test_only_selected_kinds_are_built(osm, tmp_path):

@@ -1,0 +1,80 @@
+"""What scenes hold for a use: a drive, a map or a GIS needs only part of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+
+@dataclass(frozen=True, slots=True)
+class Needed:
+    """What of a table is needed.
+
+    columns : besides geometry and number; None for all
+    classes : values of the column ``class``; None for all rows
+    """
+
+    columns: tuple[str, ...] | None = None
+    classes: tuple[str, ...] | None = None
+
+
+_DRIVEN = MappingProxyType(
+    {
+        "buildings": Needed(("min_height",)),
+        "landcover": Needed(("class",), ("parking",)),
+        "road_surfaces": Needed(("class",), ("road", "lane_marking", "crossing", "parking", "sidewalk")),
+        "structures": Needed(()),
+    }
+)
+"""What routes, traffic and parked vehicles are planned with."""
+
+
+@dataclass(frozen=True, slots=True)
+class Use:
+    """Contents of scenes for a use.
+
+    contents : in words
+    tiles  : meshes
+    colors : colours of faces, and which of them are walls
+    tables : what is written of which tables; None for all
+    indexed : tables have spatial indices
+    """
+
+    contents: str
+    tiles: bool = True
+    colors: bool = True
+    tables: Mapping[str, Needed] | None = None
+    indexed: bool = True
+
+    def lacks(self, part: str) -> bool:
+        """Whether scenes for this use lack a part: ``tiles``, ``colors`` or some of the ``tables``."""
+        return self.tables is not None if part == "tables" else not getattr(self, part)
+
+
+USES: Mapping[str, Use] = MappingProxyType(
+    {
+        "all": Use("everything"),
+        "lidar": Use(
+            "what laser scanners, positions and traffic need",
+            colors=False,
+            tables=_DRIVEN,
+            indexed=False,
+        ),
+        "camera": Use(
+            "what cameras, laser scanners, positions and traffic need",
+            tables=_DRIVEN,
+            indexed=False,
+        ),
+        "gis": Use("tables and road graph only", tiles=False),
+        "map": Use(
+            "road graph and tables in plan only",
+            tiles=False,
+            tables=dict.fromkeys(
+                ("buildings", "landcover", "road_surfaces", "roads", "trees", "furniture", "barriers"),
+                Needed(),
+            ),
+        ),
+    }
+)
+"""Uses by name; ``all`` is the default."""
