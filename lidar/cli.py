@@ -160,9 +160,9 @@ def drive(
             f" {total:,} points{before} in {summary.wall:.1f} s;"
             f" next: {command_line('lidar', 'map', out, '-o', 'map.laz')}"
         )
-        if done.reached:
-            print(done.reached.to_text())
-    if missed := done.missed():
+        if reached := done.to_text():
+            print(reached)
+    for missed in done.missed():
         print(f"lidar: {missed}", file=sys.stderr)
     for name in (name for name, points in summary.points.items() if not points):
         print(

@@ -55,6 +55,7 @@ class DriveSummary:
     duration  : seconds of simulated time
     length    : true metres driven
     wall      : seconds of this run
+    recording : seconds of it in which frames were recorded
     stages    : seconds of all threads by stage
     """
 
@@ -66,6 +67,7 @@ class DriveSummary:
     duration: float
     length: float
     wall: float
+    recording: float
     stages: dict[str, float]
 
 
@@ -141,6 +143,7 @@ def _driven(
         _write_plan(plan, out, manifest=manifest)
         pending = plan.jobs.where(lambda job: (job.sensor.name, job.frame) not in journal.entries)
         resumed, before = len(plan.jobs) - len(pending), _points(plan, journal)
+        recording_from = time.perf_counter()
         if cluster is None:
             record_all(
                 recording, pending, scene=scene, journal=journal, workers=options.workers, progress=progress
@@ -150,6 +153,7 @@ def _driven(
             record_on_cluster(
                 plan, recording=recording, chunks=chunks, cluster=cluster, journal=journal, progress=progress
             )
+        recording_s = time.perf_counter() - recording_from
         points = _points(plan, journal)
         journal.close()
         if plan.actors is not None:
@@ -168,6 +172,7 @@ def _driven(
         duration=plan.trajectory.duration_ns / 1e9,
         length=plan.length,
         wall=wall,
+        recording=recording_s,
         stages=recording.watch.seconds,
     )
 

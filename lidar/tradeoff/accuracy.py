@@ -98,23 +98,43 @@ class CheckedDrive:
                 "profile": str(self.pick.profile.path),
                 "profile_made": self.pick.profile.made,
             }
+        if self.pick and self.speed:
+            document["speed"] = round(self.speed, 3)
         return document | (self.reached.to_json() if self.reached else {})
 
-    def missed(self) -> str:
-        """That the accuracy asked for is missed; empty if it is not."""
-        if not self.wanted.accuracy or self.reached is None:
+    @property
+    def speed(self) -> float | None:
+        """Simulated seconds per second in which frames were recorded; None for a drive that was resumed."""
+        if self.summary.resumed or not self.summary.recording:
+            return None
+        return self.summary.duration / self.summary.recording
+
+    def to_text(self) -> str:
+        """What was reached, in one line; empty without a check."""
+        if self.reached is None:
             return ""
-        asked = read_accuracy(self.wanted.accuracy)
-        worse = [
-            f"{name} has {error_text(error)}"
-            for name, error in self.reached.reached.items()
-            if error.value > asked.metres
-        ]
-        if not worse:
-            return ""
-        return (
-            f"the accuracy of {asked.text} at {asked.percent:g} % is missed on this drive: {', '.join(worse)}"
-        )
+        pace = f"; recorded at {self.speed:.2g} x real time" if self.speed else ""
+        return self.reached.to_text() + pace * bool(self.pick)
+
+    def missed(self) -> list[str]:
+        """That the accuracy or the budget is missed, a line for each."""
+        lines = []
+        if self.wanted.accuracy and self.reached is not None:
+            asked = read_accuracy(self.wanted.accuracy)
+            worse = [
+                f"{name} has {error_text(error)}"
+                for name, error in self.reached.reached.items()
+                if error.value > asked.metres
+            ]
+            if worse:
+                goal = f"{asked.text.split('@')[0]} at {asked.percent:g} %"
+                lines.append(f"the accuracy of {goal} is missed on this drive: {', '.join(worse)}")
+        if self.wanted.budget and self.speed and self.speed < read_budget(self.wanted.budget):
+            lines.append(
+                f"the budget of {self.wanted.budget} is missed: recorded at {self.speed:.2g} x real time;"
+                " was the machine busy?"
+            )
+        return lines
 
 
 def picked(

@@ -1,8 +1,8 @@
 """Stored profiles: error and cost of numbers of rays, for a scene, a rig and settings on a machine.
 
 Errors are measured on random drives through the scene, so that one profile holds for all routes in it.
-Such drives do not stand for flights, repeated trajectories and road users of SUMO: there, and where none is
-possible, errors are measured on the drive itself.
+Such drives do not stand for flights, repeated trajectories and road users of SUMO, and may leave the area
+that was built along routes: there, and where none is possible, errors are measured on the drive itself.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def profile_of(
     if not any(isinstance(s, Scanner) for s in sensors_of(load_rig(options.rig), options)):
         raise InputError(f"`rig` {options.rig}: has no scanner, whose errors could be measured")
     bare = replace(options, settings=(*options.settings, ("rays", "1")))
-    if _stands_for(options):
+    if scene.area is None and _stands_for(options):
         key = _key(scene, options, own_course=False)
         if stored := _read(folder, key):
             return stored

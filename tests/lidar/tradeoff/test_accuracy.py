@@ -14,7 +14,7 @@ from helpers.scenes import same_files
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError
 from lidar.options import PERCENTS, AccuracyOptions, DriveOptions, read_accuracy, read_budget
-from lidar.pipeline import drive
+from lidar.pipeline import DriveSummary, drive
 from lidar.sweep import sweep
 from lidar.tradeoff import profile
 from lidar.tradeoff.accuracy import CheckedDrive, choice, driven, picked
@@ -229,6 +229,18 @@ def test_a_profile_is_kept_for_other_routes_and_made_for_other_settings(scene, c
             profile_of(scene, replace(DRIVE, **change), folder=cache)
 
 
+@pytest.mark.usefixtures("measured_before")
+def test_flights_and_scenes_along_routes_have_profiles_of_their_own_drive(scene, cache, monkeypatch):
+    plans = []
+    monkeypatch.setattr(profile, "plan_drive", lambda _scene, options, **_more: plans.append(options))
+    part = replace(scene, manifest=scene.manifest | {"area": "POLYGON ((0 0, 50 0, 50 50, 0 0))"})
+    flight = DriveOptions(survey="all", altitude=50.0, rig="drone", duration=2.0)
+    for where, options in ((part, DRIVE), (scene, flight)):
+        with pytest.raises(AssertionError, match="measured again"):
+            profile_of(where, options, folder=cache)
+    assert [(p.duration, p.survey) for p in plans] == [(0.5, ""), (2.0, "all")]
+
+
 def test_errors_are_measured_the_same_again_and_damaged_profiles_are_replaced(scene, cache, tmp_path):
     first = profile_of(scene, DRIVE, folder=cache)
     (tmp_path / first.path.name).write_text("{")
@@ -313,14 +325,20 @@ def test_the_program_says_what_it_picks_and_what_was_reached(scene, cache, tmp_p
     assert "picked" not in manifest["accuracy"]
 
 
-def test_a_missed_accuracy_is_named():
+def test_a_missed_accuracy_or_budget_is_named():
     errors = PROFILE.candidates[0].errors
     reached = SpotCheck(99.9, errors, dict.fromkeys(errors, 5))
-    done = CheckedDrive(None, AccuracyOptions("15cm"), None, reached)
-    assert done.missed() == (
-        "the accuracy of 15cm at 99.9 % is missed on this drive: scanner_1 has 20 cm (10 cm to 40 cm)"
+    summary = DriveSummary(
+        Path("d"), 5, 0, {}, 0, duration=3.0, length=9.0, wall=9.0, recording=2.0, stages={}
     )
-    assert not replace(done, wanted=AccuracyOptions("25cm")).missed()
+    done = CheckedDrive(summary, AccuracyOptions("15cm", "2x-realtime"), None, reached)
+    assert done.missed() == [
+        "the accuracy of 15cm at 99.9 % is missed on this drive: scanner_1 has 20 cm (10 cm to 40 cm)",
+        "the budget of 2x-realtime is missed: recorded at 1.5 x real time; was the machine busy?",
+    ]
+    assert not replace(done, wanted=AccuracyOptions("25cm", "1x-realtime")).missed()
+    assert not replace(done, wanted=AccuracyOptions()).missed()
+    assert replace(done, summary=replace(summary, resumed=2)).speed is None
 
 
 @pytest.mark.usefixtures("measured_before")
