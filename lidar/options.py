@@ -466,7 +466,7 @@ class TradeoffOptions:
     pulses: Annotated[int, Parameter(converter=whole)] = 16_000
     """Pulses of each scanner to compare, at random over the sampled frames: 100 to 10,000,000."""
 
-    pixels: Annotated[int, Parameter(converter=whole)] = 8192
+    pixels: Annotated[int, Parameter(converter=whole)] = 4096
     """Pixels of each camera to compare, in blocks of 8 by 8 at random over the sampled frames: 256 to
     10,000,000."""
 

@@ -95,7 +95,7 @@ def compared_camera(
             figures(alone[i]),
             spent[i],
             "; ".join(text for text in (notes.of(i), _against_means(figures(reduced[i]))) if text),
-            variant.choice,
+            notes.choice(i),
         )
         for i, variant in enumerate(variants)
     )

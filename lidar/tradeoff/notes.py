@@ -40,6 +40,11 @@ class Notes:
             texts.append("changes what is modelled")
         return "; ".join(texts)
 
+    def choice(self, row: int) -> bool:
+        """Whether a drive may choose a variant, and all kinds of objects that it leaves out are there."""
+        idle = {change.partition("=")[0] for change, same in self._same[row].items() if same}
+        return self._variants[row].choice and not idle & {*KINDS, "blur"}
+
     def _absent(self, variant: Variant[Any]) -> bool:
         """Whether a variant's world holds as many faces and instances as the one of the settings as asked."""
         sizes = {self._size(of.world) for of in (variant, self._variants[0])}

@@ -85,7 +85,7 @@ def compared_scanner(
             figures(alone[i]),
             spent[i],
             notes.of(i),
-            variant.choice,
+            notes.choice(i),
         )
         for i, variant in enumerate(variants)
     )
