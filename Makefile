@@ -2,6 +2,8 @@
 # make test        all tests; those of the web page need chromium and chromedriver, and are skipped without
 # make test-fast   the tests outside the modules that build scenes, record drives or compile kernels
 # make fuzz        property tests with fresh random seeds and ten times the examples
+# make bench       benchmark against references, in bench/; options in ARGS, such as ARGS="--only casting writing"
+# make bench-quick the same on a part of the demo, about a minute
 # make lint        style, types, layer contract
 # make wheel-test  build sdist and wheel, and run the installed wheel away from the repository
 PYTHON ?= python3
@@ -11,7 +13,7 @@ STAMP := $(VENV)/.installed
 # One worker process per core; all tests of a file run in one worker, so that they share what they record.
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile
 
-.PHONY: demo test test-fast fuzz lint wheel-test clean
+.PHONY: demo test test-fast fuzz bench bench-quick lint wheel-test clean
 
 $(STAMP): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; name one: make PYTHON=python3.12")'
@@ -32,6 +34,12 @@ test-fast: $(STAMP)
 fuzz: $(STAMP)
 	$(PYTEST) --hypothesis-profile=fuzz -m hypothesis
 
+bench: $(STAMP)
+	PYTHONPATH=benchmarks $(BIN)/python -m bench $(ARGS)
+
+bench-quick: $(STAMP)
+	PYTHONPATH=benchmarks $(BIN)/python -m bench --quick $(ARGS)
+
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -42,4 +50,4 @@ wheel-test: $(STAMP)
 	$(BIN)/python tests/wheel.py
 
 clean:
-	rm -rf $(VENV) demo build dist *.egg-info
+	rm -rf $(VENV) demo bench build dist *.egg-info

@@ -4,19 +4,20 @@
                                [--workers 2] [--folder DIR] [--json]
 
 Builds the whole extract and the part along the route, drives the route through both with a 16-beam scanner,
-and compares the common tiles and the point clouds byte by byte. Costs as in benchmarks/scale.py.
+and compares the common tiles and the point clouds byte by byte. Costs as of `bench.measure.command`.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import tempfile
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from scale import build_command, run, show
+from bench.maps import build_command
+from bench.measure import command
 
 from geoscene.scene import SceneFiles
 
@@ -25,11 +26,11 @@ def along(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     """Costs of the whole build and of the build along a route, and whether tiles and clouds are equal."""
     rows, clouds, tiles = [], [], []
     extra = {"whole": [], "along": ["--along", *given.route, "--reach", str(given.reach)]}
-    for name, words in extra.items():
+    for name, part in extra.items():
         out, drive = folder / name, folder / f"{name}_drive"
-        cost = run(build_command(given.extract, out, "--workers", str(given.workers), *words))
-        command = [sys.executable, "-m", "lidar.cli", "drive", str(out), "--route", *given.route]
-        command += [
+        cost = command(build_command(given.extract, out, "--workers", str(given.workers), *part))
+        words = [sys.executable, "-m", "lidar", "drive", str(out), "--route", *given.route]
+        words += [
             "--rig",
             "vlp16",
             "--duration",
@@ -39,12 +40,12 @@ def along(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
             "--out",
             str(drive),
         ]
-        driven = run([*command, "--overwrite", "--quiet"])
+        driven = command([*words, "--overwrite", "--quiet"])
         clouds.append(_bytes(drive, "*.pcd"))
         tiles.append(_bytes(SceneFiles(out).tiles, "*.npz"))
         rows.append(
-            {"build": name, "tiles": len(tiles[-1]), "scene_mib": _mib(_bytes(out, "*")), **asdict(cost)}
-            | {f"drive_{key}": value for key, value in asdict(driven).items() if key != "largest_mib"}
+            {"build": name, "tiles": len(tiles[-1]), "scene_mib": _mib(_bytes(out, "*")), **cost.row()}
+            | {f"drive_{key}": value for key, value in driven.row().items() if key != "largest_mib"}
             | {"clouds": len(clouds[-1]), "cloud_mib": _mib(clouds[-1])}
         )
     whole, part = tiles
@@ -63,6 +64,18 @@ def _bytes(folder: Path, pattern: str) -> dict[Path, bytes]:
 
 def _mib(files: dict[Path, bytes]) -> float:
     return round(sum(map(len, files.values())) / 2**20, 1)
+
+
+def show(rows: list[dict[str, Any]], *, as_json: bool) -> None:
+    """Print rows as JSON or as a table."""
+    if as_json:
+        print(json.dumps(rows, indent=1))
+        return
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    cells = [names, *([str(row.get(name, "")) for name in names] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for line in cells:
+        print("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)))
 
 
 def main() -> None:

@@ -3,7 +3,7 @@
     python benchmarks/extracts.py FOLDER_OR_FILE [...] [--lod 2] [--workers 1] [--json]
 
 Builds each extract with the program and checks every solid of the written scene with ``geoscene validate``.
-Costs as in benchmarks/scale.py. Rows are printed one by one, as Markdown or as one JSON object per line.
+Costs as of `bench.measure.command`. Rows are printed one by one, as Markdown or as one JSON object per line.
 ``ground`` is the relative difference between the area of the ground (its triangles plus the openings over
 tunnel mouths) and that of the extent. ``repaired`` counts repaired buildings, ``dropped`` those not built.
 """
@@ -15,11 +15,11 @@ import json
 import subprocess
 import sys
 import tempfile
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from scale import build_command, run
+from bench.maps import build_command
+from bench.measure import command
 
 from geoscene.scene import open_scene
 
@@ -35,7 +35,7 @@ def row_of(extract: Path, folder: Path, *, lod: int, workers: int) -> dict[str, 
     words = ["--lod", str(lod), "--workers", str(workers)]
     with (folder / "words").open("w+b") as said:
         try:
-            cost = run(build_command(extract, out, *words), errors=said)
+            cost = command(build_command(extract, out, *words), errors=said)
         except subprocess.CalledProcessError:
             said.seek(0)
             return {"extract": extract.name, "error": said.read().decode().strip()}
@@ -57,7 +57,10 @@ def row_of(extract: Path, folder: Path, *, lod: int, workers: int) -> dict[str, 
         "broken": len(verdict["broken"]),
         "roofs": scene["roofs"],
         "ground": missing / ground["extent_area"],
-        **asdict(cost),
+        "tiles": len(scene["tiles"]),
+        "faces": counts["faces"],
+        "scene_mib": sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) >> 20,
+        **cost.row(),
     }
 
 

@@ -1,0 +1,156 @@
+"""Subjects writing and mapping, against laspy and numpy alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+
+from bench.measure import Case
+from bench.scenes import Setup
+from geoscene.classes import class_codes
+from lidar.dataset.formats import FORMATS, read_table
+from lidar.dataset.formats.las import SCALE, LasInfo
+from lidar.dataset.formats.pcd import pcd_header
+from lidar.dataset.formats.table import Table, rows
+from lidar.dataset.layout import open_dataset
+from lidar.maps.aggregate import aggregate
+from lidar.options import MapOptions
+from lidar.pipeline import drive
+
+_EXTRA = ("ring", "label", "instance", "range", "incidence", "true_range")
+_KINDS = {"ring": "uint16", "label": "uint8", "instance": "int32"}
+_VOXEL = 0.1
+
+
+def recorded(setup: Setup) -> Path:
+    """A dataset of a VLP-16 with clouds as LAS and PCD; recorded when it is first needed."""
+    out = setup.folder / "dataset"
+    if not out.exists():
+        options = setup.options("VLP-16", seconds=2.0 if setup.quick else 20.0, formats=("las", "pcd"))
+        drive(setup.scene, out, options=options)
+    return out
+
+
+def las_info(setup: Setup) -> LasInfo:
+    """Properties of the dataset's LAS files."""
+    return setup.plan("VLP-16", seconds=0.5).recording(setup.folder).las_info
+
+
+def table_of(dataset: Path, suffix: str) -> Table:
+    """All points of a dataset's files of one format, as one table."""
+    tables = [read_table(path) for path in sorted(dataset.rglob(f"*{suffix}"))]
+    return {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
+
+
+def writing(setup: Setup) -> Iterator[Case]:
+    """Writing the points of a drive as one file of each format."""
+    dataset, info = recorded(setup), las_info(setup)
+    world, local = table_of(dataset, ".las"), table_of(dataset, ".pcd")
+    folder = setup.folder
+    for name in ("las", "laz"):
+        sides = {
+            "lidar": partial(_written, name, folder / f"ours.{name}", world, info=info),
+            "laspy": partial(laspy_written, folder / f"theirs.{name}", world, info=info),
+        }
+        note = (
+            "same points, columns and CRS. lidar: class codes from labels, 15 echoes at most, millimetres"
+            " checked, a complete file or none; laspy: finished columns, through its scaled x, y, z"
+        )
+        yield Case("writing", name.upper(), rows(world) / 1e6, "M points", sides, note)
+    note = "same bytes after the header; numpy: fields copied into records, then tofile, in place"
+    for name, plain in (("pcd", numpy_pcd), ("kitti", numpy_kitti)):
+        sides = {
+            "lidar": partial(_written, name, folder / f"ours.{name}", local),
+            "numpy": partial(plain, folder / f"theirs.{name}", local),
+        }
+        yield Case("writing", name.upper(), rows(local) / 1e6, "M points", sides, note)
+
+
+def _written(name: str, path: Path, table: Table, **info: Any) -> None:
+    FORMATS[name].write(path, table, **info)
+
+
+def _las_header(info: LasInfo, *, point_format: int, extra: tuple[str, ...]) -> Any:
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
+    header.scales, header.offsets = np.full(3, SCALE), np.asarray(info.offset, float)
+    header.add_crs(info.crs)
+    header.add_extra_dims([laspy.ExtraBytesParams(n, _KINDS.get(n, "float32")) for n in extra])
+    return header
+
+
+def laspy_written(path: Path, table: Table, *, info: LasInfo) -> None:
+    """Write a table as LAS or LAZ by laspy alone."""
+    las = laspy.LasData(_las_header(info, point_format=6, extra=_EXTRA))
+    las.x, las.y, las.z = table["x"], table["y"], table["z"]
+    las.intensity = np.rint(table["intensity"] * 257).astype(np.uint16)
+    las.gps_time, las.classification = table["gps_time"], table["classification"]
+    las.return_number, las.number_of_returns = table["echo"], table["echoes"]
+    for name in _EXTRA:
+        las[name] = table[name]
+    las.write(path)
+
+
+def numpy_pcd(path: Path, table: Table) -> None:
+    """Write a table as binary PCD by numpy alone."""
+    points = np.empty(rows(table), [(name, column.dtype) for name, column in table.items()])
+    for name, column in table.items():
+        points[name] = column
+    with path.open("wb") as file:
+        file.write(pcd_header(table, len(points)))
+        points.tofile(file)
+
+
+def numpy_kitti(path: Path, table: Table) -> None:
+    """Write a table as a KITTI cloud by numpy alone."""
+    points = np.empty((rows(table), 4), np.float32)
+    for k, name in enumerate("xyz"):
+        points[:, k] = table[name]
+    np.divide(table["intensity"], np.float32(255), out=points[:, 3])
+    points.tofile(path)
+
+
+def mapping(setup: Setup) -> Iterator[Case]:
+    """Aggregating a dataset's LAS files into one LAS file."""
+    dataset, info, folder = recorded(setup), las_info(setup), setup.folder
+    count = rows(table_of(dataset, ".las")) / 1e6
+    for name, voxel in (("all points", None), (f"voxels of {_VOXEL} m", _VOXEL)):
+        options = MapOptions(voxel=voxel)
+        sides = {
+            "lidar": partial(
+                aggregate,
+                open_dataset(dataset),
+                folder / "ours_map.las",
+                options=options,
+                overwrite=True,
+            ),
+            "laspy": partial(laspy_map, dataset, folder / "theirs_map.las", info=info, voxel=voxel),
+        }
+        note = "lidar: a frame at a time, moving road users left out; laspy: all points in memory" + (
+            ". lidar keeps the point nearest to a voxel's centre and sorts on disk; laspy (numpy) the first"
+            if voxel
+            else ""
+        )
+        yield Case("mapping", name, count, "M points", sides, note)
+
+
+def laspy_map(dataset: Path, out: Path, *, info: LasInfo, voxel: float | None) -> None:
+    """The LAS files of a dataset as one, with colours of classes, by laspy and numpy alone."""
+    files = [laspy.read(path) for path in sorted(dataset.rglob("*.las"))]
+    points = np.concatenate([file.points.array for file in files])
+    if voxel:
+        xyz = np.column_stack([points[axis] for axis in "XYZ"])
+        _, first = np.unique(np.floor(xyz * (SCALE / voxel)).astype(np.int64), axis=0, return_index=True)
+        points = points[np.sort(first)]
+    las = laspy.LasData(_las_header(info, point_format=7, extra=("ring", "label", "instance")))
+    las.points = laspy.ScaleAwarePointRecord.zeros(len(points), header=las.header)
+    for name in las.points.array.dtype.names:
+        if name in points.dtype.names:
+            las.points.array[name] = points[name]
+    color = class_codes().color[points["label"]].astype(np.uint16) * 257
+    las.red, las.green, las.blue = color.T
+    las.write(out)
