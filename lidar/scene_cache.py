@@ -26,7 +26,7 @@ from typing import Any
 import shapely
 
 from geoscene import __version__ as builder_version
-from geoscene.errors import FrameError, SceneFormatError
+from geoscene.errors import FrameError, NetworkError, SceneFormatError
 from geoscene.errors import InputError as SceneInputError
 from geoscene.files import digest, digest_of, exclusive, write_atomically
 from geoscene.options import BuildOptions
@@ -83,11 +83,11 @@ def open_scene_or_map(
     if (path is None) == (not place.place):
         raise InputError("give one of SCENE, the directory of a scene or a map file, and `place` NAME")
     if path is not None and not path.is_file():
+        if not path.exists():
+            raise InputError(f"{path}: no such scene or map; give a map file, or the directory of a scene")
         changed = [f.name for f in fields(place) if getattr(place, f.name) != f.default]
         if changed:
-            raise InputError(
-                f"`{changed[0]}`: is for maps, and {path} is not a file; give a map, or leave it out"
-            )
+            raise InputError(f"`{changed[0]}`: is for maps, and {path} is a directory; leave it out")
         return OpenedScene(open_scene(path))
     source = _Map(path, place, servers=servers or Servers(), progress=progress)
     folder = _folder(source, place)
@@ -115,7 +115,11 @@ class _Map:
         self._progress("reading the map", 0, total=0)
         if self._path is not None:
             return read_osm(self._path, bounds=self._options.bbox)
-        return fetch_place(self._options.place, cache_dir=_answers(), servers=self._servers)
+        try:
+            return fetch_place(self._options.place, cache_dir=_answers(), servers=self._servers)
+        except NetworkError as error:
+            cause = str(error).split("; without a network")[0]
+            raise NetworkError(f"{cause}; without a network, give a map file instead of `place`") from error
 
     def build_options(self, progress: Progress) -> BuildOptions:
         """Options of the build, with the path of fetched elevation."""
@@ -144,7 +148,10 @@ def _folder(source: _Map, options: PlaceOptions) -> Path:
 
 @contextmanager
 def _turn(folder: Path, progress: Progress) -> Iterator[None]:
-    """Wait until no other process builds or checks the scene of a folder, and keep others out meanwhile."""
+    """Wait until no other process builds or checks the scene of a folder, and keep others out meanwhile.
+
+    A folder that is empty in the end is deleted.
+    """
     with ExitStack() as stack:
         while True:
             try:
@@ -153,7 +160,11 @@ def _turn(folder: Path, progress: Progress) -> Iterator[None]:
             except SceneInputError:
                 progress("waiting for another build", 0, total=0)
                 time.sleep(_PAUSE_S)
-        yield
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # it holds a scene
+                folder.rmdir()
 
 
 @dataclass(frozen=True, slots=True)

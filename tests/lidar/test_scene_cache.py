@@ -283,7 +283,9 @@ def test_errors_are_one_line_and_leave_nothing(town, south, tmp_path):
         open_scene_or_map(town / "whole", south, place=PlaceOptions(lod=1))
     with pytest.raises(InputError, match="`place` NAME"):
         open_scene_or_map(None, south, place=place)
-    assert not cache.exists() or not list(cache.rglob("*.*"))
+    with pytest.raises(InputError, match="no such scene or map"):
+        open_scene_or_map(town / "nowhere.osm.pbf", south, place=place)
+    assert list(cache.iterdir()) == []
 
 
 def test_a_place_without_a_network_is_one_line(south, tmp_path, monkeypatch):
@@ -291,7 +293,7 @@ def test_a_place_without_a_network_is_one_line(south, tmp_path, monkeypatch):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{probe.getsockname()[1]}"
-    with pytest.raises(NetworkError, match="Connection refused"):
+    with pytest.raises(NetworkError, match=r"Connection refused.*give a map file instead of `place`"):
         open_scene_or_map(
             None, south, place=PlaceOptions(place="Nowhere"), servers=Servers(nominatim=url, wait=0.0)
         )
