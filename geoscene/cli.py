@@ -405,10 +405,12 @@ def _print_scene(report: dict[str, Any]) -> None:
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
     }
-    if report["options"].get("along"):
+    for_drives = "area" in report
+    if for_drives or report["options"].get("along"):
         features = max(stop for _, stop in report["layers"].values())
+        part = "that drives need" if for_drives else "in range of the route"
         rows["along"] = (
-            f"{len(report['tiles'])} tiles are built, those in range of the route; solids, watertight,"
+            f"{len(report['tiles'])} tiles are built, those {part}; solids, watertight,"
             " trees in forests and ground count these tiles, all other figures the whole map;"
             f" tables hold {sum(report['cut']['rows'].values())} of {features} features"
         )

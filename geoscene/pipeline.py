@@ -17,7 +17,7 @@ from geoscene.objects.shapes import shapes
 from geoscene.options import BuildOptions
 from geoscene.plan import make_plan
 from geoscene.progress import Progress, silent
-from geoscene.reach import Needed
+from geoscene.reach import AreaOf
 from geoscene.report import Problem
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA
@@ -41,7 +41,7 @@ def build(
     overwrite: bool = False,
     workers: int = 1,
     cluster: Cluster | None = None,
-    needed: Needed | None = None,
+    needed: AreaOf | None = None,
     former: Path | None = None,
     progress: Progress = silent,
 ) -> Scene:

@@ -42,7 +42,7 @@ from geoscene.objects.furniture import Furniture, read_furniture
 from geoscene.objects.vegetation import Trees, clear_of, read_trees
 from geoscene.options import BuildOptions
 from geoscene.progress import Progress
-from geoscene.reach import Needed, Reach, RoadMap, all_tiles
+from geoscene.reach import AreaOf, Reach, RoadMap, all_tiles
 from geoscene.report import Problem
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.driving_side import Side
@@ -140,7 +140,7 @@ class Plan:
 
 
 def make_plan(
-    osm: OsmData, options: BuildOptions, *, progress: Progress, needed: Needed | None = None
+    osm: OsmData, options: BuildOptions, *, progress: Progress, needed: AreaOf | None = None
 ) -> tuple[Plan, list[Problem]]:
     """The plan of a scene of a map, and the features that were repaired or dropped.
 

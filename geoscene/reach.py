@@ -54,7 +54,7 @@ class RoadMap:
     left_hand: bool
 
 
-Needed = Callable[[RoadMap], Any]
+AreaOf = Callable[[RoadMap], Any]
 """The area that a scene is built for, as a shapely polygon in scene metres."""
 
 

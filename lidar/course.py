@@ -93,7 +93,8 @@ def needed_area(roads: RoadMap, options: DriveOptions) -> Any:
     margin = min(max((s.max_range for s in sensors), default=0.0), contents.world.reach)
     parts = [_around(course.path, (margin + _ASIDE) * scale)]
     parts += [_around(line, _OBSTACLES * scale) for line in course.tried]
-    if contents.camera.shadows and any(isinstance(s, Camera) for s in sensors):
+    colored = any(isinstance(s, Camera) and "rgb" in s.spec.images for s in sensors)
+    if colored and contents.camera.shadows:
         parts += _squares(course.path, CHUNK, margin=margin + OVERHANG)
     if rig.gnss:
         parts += _squares(course.path, BLOCK_M * scale, margin=REACH + OVERHANG)

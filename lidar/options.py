@@ -442,7 +442,13 @@ class PlaceOptions:
     def build_options(self, name: str) -> BuildOptions:
         """Options of the build, with a title of the scene; raises InputError for invalid ones."""
         return BuildOptions(
-            crs=self.scene_crs, lod=self.lod, dem=self.dem, dem_gaps=self.dem_gaps, only=self.only, name=name
+            crs=self.scene_crs,
+            lod=self.lod,
+            dem=self.dem,
+            dem_gaps=self.dem_gaps,
+            only=self.only,
+            use="camera",  # all that drives need
+            name=name,
         )
 
 
