@@ -6,6 +6,7 @@ import os
 import time
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -123,7 +124,7 @@ def build(
     Parameters
     ----------
     out
-        Directory to write the scene to.
+        Directory to write the scene to, or URL of one in object storage (s3://BUCKET/NAME, gs://).
     workers
         Number of processes, by default one per core. The scene does not depend on it.
     scheduler
@@ -133,17 +134,21 @@ def build(
     from geoscene.cluster import connected  # noqa: PLC0415
     from geoscene.pipeline import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
     from geoscene.scene.writer import check_target  # noqa: PLC0415
+    from geoscene.storage import published, shown, url_of  # noqa: PLC0415
 
     started = time.perf_counter()
     if workers is not None and not 1 <= workers <= 256:
         raise InputError(f"`workers` {workers}: give 1 to 256")
     if source.dem_server and options.dem != ("tiles",):
         raise InputError("`dem_server` needs --dem tiles")
-    check_target(out, overwrite=report.overwrite)
+    if not url_of(out):
+        check_target(out, overwrite=report.overwrite)
     note_new_folder(out)
+    bar = partial(progress_bar, quiet=report.quiet)
     with (
         connected(scheduler) if scheduler else nullcontext() as cluster,
-        progress_bar(quiet=report.quiet) as progress,
+        published(out, last="scene.json", replaces=report.overwrite, bar=bar) as folder,
+        bar() as progress,
     ):
         progress("reading the map", 0, total=0)
         data = _read_map(source)
@@ -153,22 +158,23 @@ def build(
             )
         scene = build_scene(
             data,
-            out,
+            folder,
             options=options,
             overwrite=report.overwrite,
             workers=workers or os.cpu_count() or 1,
             cluster=cluster,
             progress=progress,
         )
-    document = scene.manifest | {"path": str(out), "seconds": round(time.perf_counter() - started, 2)}
+    document = scene.manifest | {"path": shown(out), "seconds": round(time.perf_counter() - started, 2)}
     if report.json:
         print_json(document)
     else:
         _print_scene(document)
-        drive = ("lidar", "drive", out, "--route", "random", "-o", "drive")
-        words = drive if document["counts"]["road_edges"] else ("geoscene", "export", out, "-o", "scene.glb")
+        path = shown(out)
+        drive = ("lidar", "drive", path, "--route", "random", "-o", "drive")
+        words = drive if document["counts"]["road_edges"] else ("geoscene", "export", path, "-o", "scene.glb")
         if not scene.has_tiles:
-            words = ("geoscene", "export", out, "-o", "scene.gpkg")
+            words = ("geoscene", "export", path, "-o", "scene.gpkg")
         print(f"\n{document['seconds']:.1f} s; next: {command_line(*words)}")
     return 0
 
@@ -235,14 +241,15 @@ def info(
     Parameters
     ----------
     scene
-        Directory of the scene.
+        Directory or URL of the scene.
     json
         Print as JSON.
     """
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
+    from geoscene.storage import shown  # noqa: PLC0415
 
     opened = open_scene(scene)
-    report = opened.manifest | {"path": str(scene), "extent": _extent(opened.manifest)}
+    report = opened.manifest | {"path": shown(scene), "extent": _extent(opened.manifest)}
     if json:
         print_json(report)
     else:
@@ -261,7 +268,7 @@ def validate(scene: Path, /, *, json: bool = False) -> int:
     Parameters
     ----------
     scene
-        Directory of the scene.
+        Directory or URL of the scene.
     json
         Print the result as JSON.
     """
@@ -312,7 +319,7 @@ def export(
     Parameters
     ----------
     scene
-        Directory of the scene.
+        Directory or URL of the scene.
     out
         File to write; for 3D Tiles a directory.
     """
@@ -351,7 +358,7 @@ def view(
     Parameters
     ----------
     scene
-        Directory of the scene.
+        Directory or URL of the scene.
     out
         File to write.
     """

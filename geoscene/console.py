@@ -21,6 +21,7 @@ from typing import Annotated, Any, NoReturn
 from cyclopts import App, CycloptsError, Parameter, Token
 
 from geoscene.progress import Progress, silent
+from geoscene.storage import url_of
 
 DONE, FAILURE, USAGE = 0, 1, 2
 """Exit codes: success, failure, unusable input or options."""
@@ -231,7 +232,7 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 def note_new_folder(out: Path) -> None:
     """Say on standard error which folder is made to hold an output, so that a mistyped path is noticed."""
-    if not (folder := out.absolute().parent).exists():
+    if not url_of(out) and not (folder := out.absolute().parent).exists():
         print(f"{folder}: this folder does not exist and is made", file=sys.stderr)
 
 

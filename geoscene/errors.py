@@ -28,6 +28,10 @@ class NetworkError(GeosceneError, OSError):
     """A map server that cannot be reached or refuses the request."""
 
 
+class StorageError(GeosceneError):
+    """Object storage that cannot be reached, refuses access or lacks a file."""
+
+
 class NotWrittenError(GeosceneError, OSError):
     """A file that a library could not write, as on a full disk."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from contextlib import ExitStack
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -101,32 +102,37 @@ def drive(
     Parameters
     ----------
     scene
-        Directory of the scene, or a map: .osm, .osm.gz, .osm.bz2, .osm.pbf or Overpass JSON.
+        Directory of the scene, or URL of one in object storage (s3://BUCKET/NAME, gs://), or a map: .osm,
+        .osm.gz, .osm.bz2, .osm.pbf or Overpass JSON.
     out
-        Directory to write the dataset to.
+        Directory or URL to write the dataset to.
     """
     from geoscene.scene.layout import using  # noqa: PLC0415
+    from geoscene.storage import published, shown  # noqa: PLC0415
     from lidar.scene_cache import open_scene_or_map  # noqa: PLC0415
     from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415
 
     options = options or DriveOptions()
     options.check_course()
     note_new_folder(out)
-    with progress_bar(quiet=report.quiet) as progress:
+    bar = partial(progress_bar, quiet=report.quiet)
+    with bar() as progress:
         found = open_scene_or_map(scene, options, place=place, progress=progress)
     if not report.json:
         _print_built(found)
-    with using(found.scene, known=LidarError) as opened:
-        with progress_bar(quiet=report.quiet) as progress:
-            pick = picked(
-                opened, options, wanted=wanted, out=None if report.overwrite else out, progress=progress
-            )
+    with (
+        using(found.scene, known=LidarError) as opened,
+        published(out, last="dataset.json", replaces=True, bar=bar) as folder,
+    ):
+        with bar() as progress:
+            begun = None if report.overwrite else folder
+            pick = picked(opened, options, wanted=wanted, out=begun, progress=progress)
         if pick and not report.json:
             print(pick.to_text(options.workers), flush=True)
-        with progress_bar(quiet=report.quiet) as progress:
+        with bar() as progress:
             done = driven(
                 opened,
-                out,
+                folder,
                 options=options,
                 wanted=wanted,
                 pick=pick,
@@ -135,8 +141,8 @@ def drive(
             )
     summary = done.summary
     document: dict[str, Any] = {
-        "path": str(summary.path),
-        "scene": str(found.scene.path),
+        "path": shown(out),
+        "scene": found.scene.location,
         **({} if found.built is None else {"tiles_built": found.built}),
         "frames": summary.frames,
         "resumed": summary.resumed,
@@ -156,9 +162,9 @@ def drive(
         total = sum(summary.points.values())
         before = f" ({total - summary.written:,} recorded before)" if summary.resumed else ""
         print(
-            f"{out}: {summary.duration:.1f} s, {summary.length:.0f} m, {summary.frames} frames,"
+            f"{shown(out)}: {summary.duration:.1f} s, {summary.length:.0f} m, {summary.frames} frames,"
             f" {total:,} points{before} in {summary.wall:.1f} s;"
-            f" next: {command_line('lidar', 'map', out, '-o', 'map.laz')}"
+            f" next: {command_line('lidar', 'map', shown(out), '-o', 'map.laz')}"
         )
         if reached := done.to_text():
             print(reached)
@@ -318,7 +324,7 @@ def map_(
     Parameters
     ----------
     dataset
-        Directory of the dataset.
+        Directory or URL of the dataset.
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.maps.aggregate import aggregate  # noqa: PLC0415
@@ -380,7 +386,7 @@ def export(
     Parameters
     ----------
     dataset
-        Directory of the dataset.
+        Directory or URL of the dataset.
     out
         Directory to make.
     """

@@ -154,7 +154,7 @@ class DrivePlan:
         manifest = {
             "schema": 1,
             "generator": f"geoscene lidar {__version__}",
-            "scene": {"name": scene.manifest.get("name", ""), "path": str(scene.path)},
+            "scene": {"name": scene.manifest.get("name", ""), "path": scene.location},
             "attribution": scene.manifest.get("attribution", ""),
             "frame": scene.frame.to_json(),
             "export_crs": self.geo.crs.to_wkt(),

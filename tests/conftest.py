@@ -1,8 +1,10 @@
 """Shared fixtures, marks of slow tests, and profiles of Hypothesis."""
 
+import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from filelock import FileLock
@@ -31,7 +33,7 @@ SLOW = frozenset(
         "test_flight_planning", "test_footprints", "test_interruptions", "test_network",
         "test_outputs", "test_overture", "test_places", "test_raycast", "test_rays",
         "test_real", "test_render", "test_roofs",
-        "test_scale", "test_scene_cache", "test_sensors", "test_siting", "test_structures",
+        "test_scale", "test_scene_cache", "test_sensors", "test_siting", "test_storage", "test_structures",
         "test_sumo", "test_sweep", "test_traffic", "test_view", "test_view_browser",
     )
 )  # fmt: skip
@@ -108,3 +110,39 @@ def scene(demo_scene: Callable[[str], Scene]) -> Scene:
 def scene_utm(demo_scene: Callable[[str], Scene]) -> Scene:
     """The middle of the demo map in UTM."""
     return demo_scene("utm")
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A home of its own, hence an empty cache."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+@pytest.fixture(scope="session")
+def storage_server() -> Iterator[str]:
+    """Address of an S3-compatible server on this machine."""
+    from moto.server import ThreadedMotoServer  # noqa: PLC0415 - takes a second
+
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)  # it prints every request
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture
+def s3(storage_server: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> Any:  # noqa: ARG001
+    """The file system of an empty bucket, ``s3://bucket``."""
+    import fsspec  # noqa: PLC0415
+
+    monkeypatch.setenv("AWS_ENDPOINT_URL", storage_server)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, "test")
+    fsspec.get_filesystem_class("s3").clear_instance_cache()
+    system = fsspec.filesystem("s3", use_listings_cache=False)
+    if system.exists("bucket"):
+        system.rm("bucket", recursive=True)
+    system.mkdir("bucket")
+    return system

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,13 +15,14 @@ import numpy as np
 import shapely
 
 from geoscene.errors import BUILD_AGAIN, GeosceneError, SceneFormatError, reading
-from geoscene.files import digest, digest_of
+from geoscene.files import digest, digest_of, write_atomically
 from geoscene.frames import Frame
 from geoscene.mesh import Mesh
 from geoscene.objects.forests import Forests
 from geoscene.roadgraph import RoadGraph, read_graphml
 from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile, with_forests
+from geoscene.storage import Stored, cache_folder, url_of
 from geoscene.typing import Float, Ints
 from geoscene.uses import USES
 
@@ -36,11 +37,23 @@ SCHEMA = 2
 """Version of the scene directory; a reader refuses others."""
 
 
+_TILES = "tiles"
+"""Name of the folder of tiles."""
+
+
 @dataclass(frozen=True, slots=True)
 class SceneFiles:
-    """Paths of the files in a scene directory."""
+    """Paths of the files in a scene directory.
+
+    folder : the directory, or the cache of one in object storage
+    stored : that one in storage, from which files are fetched when their paths are asked for
+    """
 
     folder: Path
+    stored: Stored | None = None
+
+    def _local(self, name: str) -> Path:
+        return self.folder / name if self.stored is None else self.stored.local(name, self.folder)
 
     @property
     def manifest(self) -> Path:
@@ -50,27 +63,27 @@ class SceneFiles:
     @property
     def features(self) -> Path:
         """GeoPackage of the features."""
-        return self.folder / "features.gpkg"
+        return self._local("features.gpkg")
 
     @property
     def road_graph(self) -> Path:
         """GraphML of the drivable road graph; missing in a scene without drivable roads."""
-        return self.folder / "roads.graphml"
+        return self._local("roads.graphml")
 
     @property
     def problems(self) -> Path:
         """Table of what was repaired or dropped."""
-        return self.folder / "problems.csv"
+        return self._local("problems.csv")
 
     @property
     def shapes(self) -> Path:
         """Meshes that the tiles' instances copy."""
-        return self.folder / "shapes.npz"
+        return self._local("shapes.npz")
 
     @property
     def tiles(self) -> Path:
         """Folder of the tiles."""
-        return self.folder / "tiles"
+        return self.folder / _TILES
 
     @property
     def tile_reports(self) -> Path:
@@ -84,7 +97,7 @@ class SceneFiles:
 
     def tile(self, i: int, j: int) -> Path:
         """Tile (i, j)."""
-        return self.tiles / f"{i}_{j}.npz"
+        return self._local(f"{_TILES}/{i}_{j}.npz")
 
     def owns(self, path: Path) -> bool:
         """Whether a path in the directory, or in its folder of tiles, is named as a file of a scene."""
@@ -106,19 +119,26 @@ _NAMES = frozenset(
 class Scene:
     """A scene directory, opened. Its files are read on request; no other module needs their names.
 
-    path     : the directory
+    path     : the directory, or the cache of one in object storage
     manifest : the document that the build wrote
     frame    : the scene frame
+    stored   : the directory in object storage, if it is there
     """
 
     path: Path
     manifest: dict[str, Any]
     frame: Frame
+    stored: Stored | None = None
 
     @property
     def files(self) -> SceneFiles:
         """Paths of the files."""
-        return SceneFiles(self.path)
+        return SceneFiles(self.path, self.stored)
+
+    @property
+    def location(self) -> str:
+        """Path or URL of the scene, as it was opened."""
+        return str(self.path) if self.stored is None else self.stored.url
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -269,10 +289,15 @@ class Scene:
 
 
 def open_scene(path: str | Path) -> Scene:
-    """Open a scene directory.
+    """Open a scene directory, of this machine or at a URL (``s3://``, ``gs://``, ``file://``).
 
-    Raises SceneFormatError if it is not a scene, is unfinished, or has another schema version.
+    Files of a scene at a URL are fetched when they are read, into a folder of the user's cache.
+
+    Raises SceneFormatError if it is not a scene, is unfinished, or has another schema version, and
+    StorageError if the storage cannot be reached or has no scene there.
     """
+    if url := url_of(path):
+        return _open_stored(url)
     folder = Path(path)
     manifest_file = SceneFiles(folder).manifest
     if not folder.is_dir():
@@ -296,6 +321,21 @@ def open_scene(path: str | Path) -> Scene:
     return scene
 
 
+def _open_stored(url: str) -> Scene:
+    """Open the scene at a URL; its cache is of these contents of ``scene.json``."""
+    stored, names = Stored(url), SceneFiles(Path())
+    data = stored.read(names.manifest.name)
+    folder = cache_folder() / "stored" / digest(url.encode() + data)
+    write_atomically(SceneFiles(folder).manifest, data)
+    scene, reports = open_scene(folder), SceneFiles(folder).tile_reports
+    if not reports.exists():
+        stored.fetch(reports.name, reports)
+    with reading(reports, SceneFormatError, remedy=BUILD_AGAIN):
+        rows = json.loads(reports.read_text("utf-8"))["tiles"]
+        tiles = {names.tile(int(r["i"]), int(r["j"])).as_posix(): str(r["digest"]) for r in rows}
+    return replace(scene, stored=Stored(url, {**scene.manifest.get("files", {}), **tiles}))
+
+
 def manifest_digest(manifest: Mapping[str, Any]) -> str:
     """Digest of a manifest but for its own entry of it."""
     rest = {key: value for key, value in manifest.items() if key != "digest"}
@@ -307,8 +347,9 @@ def changed_files(scene: Scene) -> list[Path]:
     stated = {scene.path / name: value for name, value in scene.manifest.get("files", {}).items()}
     with suppress(OSError, ValueError, LookupError, TypeError):
         reports = json.loads(scene.files.tile_reports.read_text("utf-8"))["tiles"]
-        stated |= {scene.files.tile(int(r["i"]), int(r["j"])): r["digest"] for r in reports}
-    return [path for path, value in stated.items() if digest_of(path) != value]
+        stated |= {SceneFiles(scene.path).tile(int(r["i"]), int(r["j"])): r["digest"] for r in reports}
+    here = {path: value for path, value in stated.items() if scene.stored is None or path.exists()}
+    return [path for path, value in here.items() if digest_of(path) != value]
 
 
 @contextmanager

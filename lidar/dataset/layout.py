@@ -30,7 +30,9 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from geoscene.errors import reading
+from geoscene.files import digest
 from geoscene.frames import Frame
+from geoscene.storage import Stored, cache_folder, url_of
 from lidar.dataset.formats import Format
 from lidar.errors import DatasetError, LidarError
 from lidar.geometry.poses import Trajectory
@@ -129,9 +131,9 @@ class Dataset:
 
     @property
     def scene_path(self) -> Path:
-        """The scene's folder as it was given for the drive; if it is not there, from the dataset's parent."""
+        """The scene's URL or folder as it was given for the drive, or in the dataset's parent."""
         given = Path(self.manifest["scene"]["path"])
-        return given if given.exists() else self.path.resolve().parent / given
+        return given if url_of(given) or given.exists() else self.path.resolve().parent / given
 
     @property
     def start(self) -> datetime:
@@ -183,11 +185,16 @@ class Dataset:
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """Open a dataset directory, finished or not.
+    """Open a dataset directory, finished or not, or one at a URL, which is fetched into the user's cache.
 
-    Raises DatasetError if it is not a dataset or has another schema version.
+    Raises DatasetError if it is not a dataset or has another schema version, and StorageError if the storage
+    cannot be reached or has no dataset there.
     """
     folder = Path(path)
+    if url := url_of(path):
+        stored, folder = Stored(url), cache_folder() / "datasets" / digest(url.encode())
+        stored.read(MANIFEST)
+        stored.mirror(folder)
     manifest_path = Paths(folder).manifest
     if not manifest_path.exists():
         raise DatasetError(f"{folder}: no dataset.json in it; lidar drive records a dataset")
