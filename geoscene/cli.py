@@ -430,6 +430,8 @@ def _print_scene(report: dict[str, Any]) -> None:
     for action, kinds in report["problems"].items():
         for kind, reasons in kinds.items():
             print(f"  {action:<10} {kind}: {_listed(reasons)}")
+    for limit in report.get("limits", []):
+        print(f"  {'limit':<10} {with_flags(app, limit['advice'])}")
     print(f"  {report['attribution']}")
 
 

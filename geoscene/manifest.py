@@ -12,6 +12,7 @@ import shapely
 from geoscene import __version__
 from geoscene.frames import wrapped
 from geoscene.ground import tile_span
+from geoscene.limits import height_limit, places, scale_limit
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.plan import Plan
 from geoscene.report import Problem, summarise
@@ -74,6 +75,13 @@ def scene_manifest(
         "forests": plan.forests.to_json() if plan.forests else None,
         "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),
         "problems": summarise(problems),
+        "limits": [
+            limit.to_json()
+            for limit in (
+                *scale_limit(plan.frame, plan.extent),
+                *height_limit(plan.terrain.height(*places(plan.extent).T)),
+            )
+        ],
     }
 
 

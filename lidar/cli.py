@@ -109,6 +109,7 @@ def drive(
     """
     from geoscene.scene.layout import using  # noqa: PLC0415
     from geoscene.storage import published, shown  # noqa: PLC0415
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.scene_cache import open_scene_or_map  # noqa: PLC0415
     from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415
 
@@ -139,6 +140,7 @@ def drive(
                 overwrite=report.overwrite,
                 progress=progress,
             )
+        limits = open_dataset(folder).manifest["limits"]
     summary = done.summary
     document: dict[str, Any] = {
         "path": shown(out),
@@ -170,6 +172,8 @@ def drive(
             print(reached)
     for missed in done.missed():
         print(f"lidar: {missed}", file=sys.stderr)
+    for limit in limits:
+        print(f"lidar: {limit['advice']}", file=sys.stderr)
     for name in (name for name, points in summary.points.items() if not points):
         print(
             f"lidar: {name} has no returns in the whole drive; check its mount and maximum range",

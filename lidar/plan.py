@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
+from geoscene.limits import Limit, height_limit
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Ints
@@ -134,6 +135,13 @@ class DrivePlan:
         count = np.bincount(self.jobs.order, minlength=len(self.sensors)).tolist()
         return dict(zip((s.name for s in self.sensors), count, strict=True))
 
+    @property
+    def limits(self) -> list[Limit]:
+        """Errors of lengths at the height of the trajectory, which no range is corrected for."""
+        height = self.trajectory.position[:: max(len(self.trajectory) // 1000, 1), 2].copy()
+        self.trajectory.release()
+        return height_limit(height)
+
     def recording(self, out: Path) -> Recording:
         """What the frames are recorded from."""
         return Recording(
@@ -175,6 +183,7 @@ class DrivePlan:
         if self.scanning_ns is not None:
             on = np.clip(self.scanning_ns, 0, self.trajectory.duration_ns)
             manifest["scanners_on_ns"] = on.tolist()
+        manifest["limits"] = [limit.to_json() for limit in self.limits]
         return manifest | {"recipe": options.recipe(scene)}
 
 

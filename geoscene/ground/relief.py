@@ -1,6 +1,6 @@
 """Triangles of ground on which nothing lies: as few as its relief needs.
 
-A tile is halved along diagonals again and again, down to a lattice as fine as the terrain's lines (a
+A tile is halved along diagonals again and again, down to a lattice about as fine as the terrain's lines (a
 right-triangulated irregular network, Evans, Kirkpatrick and Townsend 2001). A vertex of the lattice is
 left out, with all that depend on it, if the heights of none of them are off by more than a tolerance then.
 What depends on a vertex on a tile's side lies within one square of it, so both tiles beside a
@@ -27,7 +27,7 @@ class Relief:
 
     height    : z of the terrain at x, y
     tolerance : maximum difference in metres from the heights of the lattice's vertices
-    spacing   : maximum metres between those vertices
+    spacing   : metres between those vertices; a square has a power of two of steps, so up to a quarter more
     """
 
     height: Height
@@ -36,7 +36,7 @@ class Relief:
 
     def steps(self, tile_size: float) -> int:
         """Steps of the lattice along a square, a power of two."""
-        return int(2 ** np.ceil(np.log2(max(tile_size / self.spacing, 1.0))))
+        return int(2 ** np.ceil(np.log2(max(tile_size / self.spacing / 1.25, 1.0))))
 
 
 @dataclass(frozen=True, slots=True)

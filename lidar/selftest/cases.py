@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lidar.selftest import footprints, places, rays, scale, statistics
+from lidar.selftest import footprints, places, rays, regions, scale, statistics
 from lidar.selftest.case import Case
 
 CASES: tuple[Case, ...] = (
@@ -11,6 +11,7 @@ CASES: tuple[Case, ...] = (
     *footprints.CASES,
     *statistics.CASES,
     *scale.CASES,
+    *regions.CASES,
 )
 """All cases, by group."""
 

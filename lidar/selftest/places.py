@@ -136,6 +136,11 @@ def lengths_on_high_ground(count: int) -> float:
     return worst
 
 
+def utm_lengths_taken_as_true(count: int) -> float:
+    """Largest error in mm of 1 km in UTM or UPS, taken as true, within 5 km."""
+    return _length_errors(count, crs="utm", reach=5e3, scaled=False)
+
+
 def wrong_zones(count: int) -> float:
     """Points at edges of zones with another zone than in the standard's grid."""
     return float(sum(utm_crs(lon, lat) != f"EPSG:{code}" for lon, lat, code in _ZONES[:count]))
@@ -204,6 +209,44 @@ def _stands(lonlat: tuple[float, float], out: Path, *, crs: str) -> bool:
     return bool(checks["solids"] == 2 and not checks["broken"] and abs(down - 50) < 1)
 
 
+def unbuilt_heights(count: int) -> float:
+    """Scenes on elevation models at -430 and 5,000 m that are not whole, or do not tell errors of lengths."""
+    lost = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for k in range(count):
+            height = (5000.0, -430.0)[k % 2]
+            lost += not _stands_at(height, Path(folder) / f"{k}", crs=("local", "utm")[k // 2 % 2])
+    return float(lost)
+
+
+def _stands_at(height: float, out: Path, *, crs: str) -> bool:
+    place = Frame.at(-67.0, -18.1)
+    write_hamlet(place, out.with_suffix(".osm"), reach=60.0)
+    write_elevation(place, out.with_suffix(".tif"), height=height)
+    options = BuildOptions(crs=crs, only=("buildings", "roads"), dem=(str(out.with_suffix(".tif")),))
+    scene = build(read_osm(out.with_suffix(".osm")), out, options=options)
+    checks = check_scene(scene)
+    x, y = scene.frame.from_geographic(*place.to_geographic(3.3, 1.7))
+    world = World.load(scene, region=(x - 1, y - 1, x + 1, y + 1), margin=1.0)
+    down = world.caster.cast([x, y, height + 50], np.array([[0.0, 0, -1]])).range[0]
+    told = "height" in {limit["name"] for limit in scene.manifest["limits"]}
+    whole = checks["solids"] == 2 and not checks["broken"] and not checks["broken_surfaces"]
+    return bool(whole and abs(down - 50) < 1 and told == (height > 637))
+
+
+def write_elevation(frame: Frame, path: Path, *, height: float) -> None:
+    """Write a raster of 1 km around a frame's origin: a slope of 1 in 1,000 through ``height`` there."""
+    import rasterio  # noqa: PLC0415 - slow to import
+
+    lon, lat = (float(v) for v in frame.to_geographic(0.0, 0.0))
+    side, step = 101, 1e-4
+    heights = height + (np.arange(side) - side // 2) * 0.01 * np.ones((side, 1))
+    corner = rasterio.Affine(step, 0.0, lon - side / 2 * step, 0.0, -step, lat + side / 2 * step)
+    shape = {"width": side, "height": side, "count": 1, "dtype": "float32"}
+    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:4326", transform=corner, **shape) as raster:
+        raster.write(heights.astype(np.float32), 1)
+
+
 def small_scenes(count: int) -> float:
     """Scenes of 10 m that are not built whole."""
     lost, places = 0, list(PLACES.values())
@@ -263,6 +306,17 @@ CASES = (
     ),
     Case(
         "places",
+        "1 km in UTM or UPS, taken as true",
+        6100.0,
+        "mm",
+        utm_lengths_taken_as_true,
+        "lines",
+        17_000,
+        1_700_000,
+        "scale is 0.9996 amid a UTM zone, 0.994 at a pole; told by `geoscene build`, corrected in drives",
+    ),
+    Case(
+        "places",
         "1 km in a local frame, scene of 10 km",
         1.0,
         "mm",
@@ -292,7 +346,7 @@ CASES = (
         "lines",
         17_000,
         1_700_000,
-        "lengths are those on the ellipsoid: z / R, 785 mm per km at 5,000 m",
+        "lengths are those on the ellipsoid: z / R, 785 mm per km at 5,000 m; told by builds and drives",
     ),
     Case(
         "places",
@@ -325,6 +379,17 @@ CASES = (
         "scenes",
         4,
         2 * len(PLACES),
+        "",
+    ),
+    Case(
+        "places",
+        "scenes on elevation models at -430 and 5,000 m, not whole or error of lengths not told",
+        0,
+        "scenes",
+        unbuilt_heights,
+        "scenes",
+        1,
+        4,
         "",
     ),
     Case("places", "scenes of 10 m, not whole", 0, "scenes", small_scenes, "scenes", 1, 5, ""),

@@ -6,7 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.frames import Frame, utm_crs
-from lidar.selftest.places import CASES
+from geoscene.options import BuildOptions
+from geoscene.pipeline import build
+from geoscene.sources import read_osm
+from lidar.options import DriveOptions
+from lidar.plan import plan_drive
+from lidar.selftest.places import CASES, write_elevation, write_hamlet
 from lidar.selftest.run import outcome
 
 
@@ -31,3 +36,15 @@ def test_points_anywhere_return_to_their_place(lon, lat, crs, x, y):
 @given(st.floats(-180, 180), st.floats(-90, 90))
 def test_a_turn_of_longitude_does_not_change_the_zone(lon, lat):
     assert utm_crs(lon, lat) == utm_crs(lon + 360, lat)
+
+
+@pytest.mark.parametrize(("height", "told"), [(5000.0, ["height"]), (300.0, [])])
+def test_a_drive_tells_the_error_of_lengths_at_its_height(height, told, tmp_path):
+    frame = Frame.at(-67.0, -18.1)
+    write_hamlet(frame, tmp_path / "map.osm", reach=150.0)
+    write_elevation(frame, tmp_path / "dem.tif", height=height)
+    options = BuildOptions(only=("roads",), dem=(str(tmp_path / "dem.tif"),))
+    scene = build(read_osm(tmp_path / "map.osm"), tmp_path / "scene", options=options)
+    limits = plan_drive(scene, DriveOptions(route="random", duration=2.0)).manifest()["limits"]
+    assert [limit["name"] for limit in limits] == told
+    assert [limit["name"] for limit in scene.manifest["limits"]] == told

@@ -10,12 +10,13 @@ from helpers.programs import ENVIRONMENT, command
 from lidar.selftest import run
 from lidar.selftest.case import Case
 from lidar.selftest.cases import CASES, GROUPS
+from lidar.selftest.regions import CASES as REGIONS
 from lidar.selftest.scale import CASES as SCALE
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extremes.md"
 
 
-@pytest.mark.parametrize("case", SCALE, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", [*SCALE, *REGIONS], ids=lambda case: case.name)
 def test_scale_stays_within_the_bound(case):
     done = run.outcome(case, case.quick)
     assert done.error == ""
