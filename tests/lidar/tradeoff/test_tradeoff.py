@@ -6,14 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from geoscene.progress import silent
 from lidar.errors import InputError
 from lidar.options import DriveOptions, TradeoffOptions
 from lidar.physics.settings import LEVELS, PLAIN
+from lidar.plan import plan_drive
 from lidar.tradeoff.comparison import Comparison, Row
+from lidar.tradeoff.costs import costs
 from lidar.tradeoff.engine import scene_label, tradeoff
 from lidar.tradeoff.errors import STATISTICS, Estimate, Returns, estimates, frame_error, median
 from lidar.tradeoff.report import document, write_report
-from lidar.tradeoff.simulate import chosen_pulses, spread_frames
+from lidar.tradeoff.simulate import bench_of, chosen_pulses, spread_frames
 from lidar.tradeoff.variants import next_step, noiseless, reference, scanner_basis, scanner_variants
 from lidar.tradeoff.words import metres, pareto, recommendation
 from lidar.world.settings import PLAIN as WHOLE
@@ -247,3 +250,19 @@ def test_kinds_of_objects_that_a_place_lacks_have_no_effect(scene):
     assert notes["furniture=off"] == ""
     without = {r.label: r.error for r in one.rows}["furniture=off"]
     assert without["range_max_m"].value > one.rows[0].error["range_max_m"].value
+
+
+def test_rows_of_the_world_are_timed_in_their_own_world(scene):
+    bench = bench_of(plan_drive(scene, DRIVE), frames=2)
+    (scanner,) = bench.plan.sensors
+    variants = scanner_variants(scanner_basis(PLAIN, rays=31), compared=("reach",))[:2]
+    found = costs(
+        bench,
+        scanner,
+        variants=variants,
+        frame_cost=lambda _, world, variant: (min(world.settings.reach, 999.0), variant.used.rays),
+        repetitions=3,
+        progress=silent,
+    )
+    assert [f["cpu_s"].value * scanner.period_ns / 1e9 for f in found] == pytest.approx([999.0, 25.0])
+    assert all(f["memory_bytes"].value > 2**20 for f in found)
