@@ -24,6 +24,7 @@ from lidar.tradeoff.words import (
     candidates,
     metres,
     pareto,
+    reached,
     recommendations,
     residual_text,
     share,
@@ -246,10 +247,14 @@ def _png(pixels: NDArray[np.uint8]) -> bytes:
 
 
 def pareto_plot(comparison: Comparison, *, width: int = 1100, height: int = 700) -> NDArray[np.uint8]:
-    """A picture (height, width, 3): error against CPU time, both logarithmic."""
+    """A picture (height, width, 3): error against CPU time, both logarithmic.
+
+    Settings that miss or add too many returns are not drawn, see `words.reached`.
+    """
     picture = Image.new("RGB", (width, height), (255, 255, 255))
     pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=15)
-    rows, best = candidates(comparison), pareto(comparison)
+    best = pareto(comparison)
+    rows = [row for row in candidates(comparison) if math.isfinite(reached(comparison, row))]
     x = [row.cost["cpu_s"] for row in rows]
     y = [row.error[comparison.tail] for row in rows]
     left, right, top, bottom = 90, width - 150, 70, height - 70
@@ -278,10 +283,11 @@ def pareto_plot(comparison: Comparison, *, width: int = 1100, height: int = 700)
         name = row.label.partition(" (")[0]
         for x_text, y_text, anchor in ((u + 8, v - 4, "ls"), (u + 8, v + 4, "lt"), (u - 8, v + 4, "rt")):
             box = pen.textbbox((x_text, y_text), name, font=font, anchor=anchor)
-            if not any(_overlap(box, other) for other in named):  # else without a name: the table has it
-                pen.text((x_text, y_text), name, **said, anchor=anchor)
-                named.append(box)
-                break
+            if box[0] < 0 or box[2] > width or any(_overlap(box, other) for other in named):
+                continue  # at worst without a name: the table has it
+            pen.text((x_text, y_text), name, **said, anchor=anchor)
+            named.append(box)
+            break
     return np.asarray(picture).copy()
 
 
