@@ -169,10 +169,11 @@ def distances(first: Ints, second: Ints, *, same: Bools) -> Float:
 
 
 def _from_triangles(points: Ints, triangles: Ints) -> Float:
-    """Distance (n,) of points (n, 3) from triangles (n, 3, 3)."""
+    """Distance (n,) of points (n, 3) from triangles (n, 3, 3); one without area is its edges."""
     a, b, c = triangles.transpose(1, 0, 2).astype(float)
-    normal = np.cross(b - a, c - a)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    across = np.cross(b - a, c - a)
+    size = np.linalg.norm(across, axis=1, keepdims=True)
+    normal = np.divide(across, size, out=np.full_like(across, np.nan), where=size > 0)
     sides = [(end - start, points - start) for start, end in ((a, b), (b, c), (c, a))]
     over = np.all([np.vecdot(np.cross(side, away), normal) >= 0 for side, away in sides], axis=0)
     beside = np.min([_from_edges(away, side) for side, away in sides], axis=0)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from geoscene.intersections import intersecting_faces
+from geoscene.intersections import distances, intersecting_faces
 from geoscene.mesh import Mesh, concatenate
 from geoscene.watertight import validate_mesh
 
@@ -233,3 +233,11 @@ def test_faces_intersect_as_linear_programs_say():
         far = points + rng.integers(-(10**7), 10**7, 3)
         hit = len(intersecting_faces(far, faces, owner=np.zeros(2, np.int64))) == 1
         assert hit == common_points(*points[faces].astype(float), shared=shared)
+
+
+def test_a_triangle_without_area_is_as_far_away_as_its_edges():
+    flat = np.array([[[0, 0, 0], [4, 0, 0], [2, 0, 0]]])
+    other = np.array([[[0, 0, 3], [4, 0, 3], [2, 5, 3]]])
+    apart = np.zeros((3, 3, 1), bool)
+    assert distances(flat, other, same=apart) == pytest.approx(3)
+    assert distances(other, flat, same=apart) == pytest.approx(3)
