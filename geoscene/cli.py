@@ -28,7 +28,7 @@ from geoscene.console import (
 )
 from geoscene.console import main as run
 from geoscene.errors import GeosceneError, InputError
-from geoscene.options import BuildOptions, Degrees, ExportOptions, ViewOptions
+from geoscene.options import BuildOptions, Degrees, ExportOptions, TradeoffOptions, ViewOptions
 from geoscene.progress import Progress
 from geoscene.uses import USES
 
@@ -227,6 +227,61 @@ def _read_map(source: MapSource) -> Any:
         found = sources.read_source(name, path, bounds=data.bounds if data else source.bbox)
         data = sources.merged(data, found) if data else found
     return data
+
+
+@app.command
+def tradeoff(
+    *,
+    source: Annotated[MapSource, Parameter(group=_SOURCE)] = MapSource(),
+    options: Annotated[BuildOptions, Parameter(group=_SCENE)] = BuildOptions(),
+    compared: TradeoffOptions = TradeoffOptions(),
+    out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=_OUTPUT)] = None,
+    report: Reporting = Report(),
+) -> int:
+    """Build a place with other settings, measure error and cost of each, and recommend the cheapest.
+
+    Errors are those of the surface model, of volumes and footprints of buildings, and missing objects,
+    against the full scene (--lod 2, all of --only, --for all); costs are CPU time, peak memory and bytes of
+    a build by one process.
+
+    For example:
+
+    geoscene tradeoff --osm city.osm.pbf -o tradeoff
+
+    geoscene tradeoff --osm city.osm.pbf --dem heights.tif --settings lod,terrain --json
+
+    Parameters
+    ----------
+    out
+        Folder to write tradeoff.json, tradeoff.html and pareto.png to.
+    """
+    from geoscene.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
+    from geoscene.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
+
+    if options.dem == ("tiles",):
+        raise InputError("`dem` tiles: not compared; give elevation files")
+    if out is not None:
+        note_new_folder(out)
+        if out.exists() and not report.overwrite:
+            raise InputError(f"{out}: exists already; set `overwrite` to replace it")
+    with progress_bar(quiet=report.quiet) as progress:
+        found = measured(
+            partial(_read_map, source),
+            options,
+            settings=compared.settings,
+            resolution=compared.resolution,
+            repetitions=compared.repetitions,
+            progress=progress,
+        )
+    if report.json:
+        print_json(document(found))
+    else:
+        print_tables(found)
+    if out is not None:
+        write_report(found, out)
+        if not report.json:
+            print(f"{out / 'tradeoff.html'}")
+    return 0
 
 
 @app.command

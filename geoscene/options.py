@@ -86,6 +86,28 @@ class BuildOptions:
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
+class TradeoffOptions:
+    """Options of a comparison of builds."""
+
+    settings: Annotated[tuple[str, ...], WORDS] = ()
+    """Settings to compare, separated by commas: lod, only, terrain (with --dem), for; all by default."""
+
+    resolution: float = 1.0
+    """Metres of the cells of the surface models that are compared; larger ones for more than 16 million."""
+
+    repetitions: Annotated[int, Parameter(converter=whole)] = 1
+    """Builds of each setting, in turn: 1 to 20."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if not 0.1 <= self.resolution <= 100:
+            raise InputError(f"`resolution` {self.resolution:g}: give 0.1 to 100 metres")
+        if not 1 <= self.repetitions <= 20:
+            raise InputError(f"`repetitions` {self.repetitions}: give 1 to 20")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
 class ViewOptions:
     """Options of the web page of a scene."""
 

@@ -19,6 +19,7 @@ from helpers.rasters import write_slope
 
 import geoscene.cli
 import geoscene.sources
+import geoscene.tradeoff.engine
 import lidar.cli
 import lidar.pipeline
 import lidar.tradeoff.engine
@@ -125,6 +126,12 @@ def folder(inputs, tmp_path, monkeypatch):
         compared = replace(compared, frames=2, pulses=100, pixels=256, reference_rays=7)
         return compare(scene, replace(options, duration=0.4), compared=compared, **more)
 
+    builds = geoscene.tradeoff.engine.tradeoff
+    monkeypatch.setattr(
+        geoscene.tradeoff.engine,
+        "tradeoff",
+        lambda *args, **more: builds(*args, **more | {"settings": ("lod",)}),
+    )
     measure_little(monkeypatch, folder=tmp_path / "profiles")
     monkeypatch.setattr(lidar.tradeoff.engine, "tradeoff", small)
     monkeypatch.setattr(lidar.pipeline, "drive", short)

@@ -33,7 +33,7 @@ _STRUCTURES = (Class.BUILDING, Class.BRIDGE, Class.TUNNEL, Class.WALL, Class.FEN
 
 
 @dataclass(frozen=True, slots=True)
-class _Grid:
+class Grid:
     """Cells of a raster: its north-west corner in projected coordinates, their side, their counts."""
 
     west: float
@@ -49,7 +49,7 @@ class _Grid:
         return np.stack([x, y, points[..., 2]], axis=-1)
 
 
-def _grid(scene: Scene, resolution: float) -> _Grid:
+def grid_of(scene: Scene, resolution: float) -> Grid:
     """The scene's extent aligned to multiples of the resolution, so that rasters of one CRS match."""
     if not (np.isfinite(resolution) and resolution > 0):
         raise InputError(f"`resolution` {resolution}: must be positive metres")
@@ -62,7 +62,7 @@ def _grid(scene: Scene, resolution: float) -> _Grid:
         raise InputError(
             f"`resolution` {resolution}: {columns} x {rows} cells are too many; use a larger one"
         )
-    return _Grid(float(left * resolution), float(high * resolution), resolution, columns, rows)
+    return Grid(float(left * resolution), float(high * resolution), resolution, columns, rows)
 
 
 def write_geotiff(
@@ -88,7 +88,7 @@ def write_geotiff(
 
     if model not in ("surface", "terrain", "classes"):
         raise InputError(f"`model` {model}: surface, terrain or classes")
-    grid = _grid(scene, resolution)
+    grid = grid_of(scene, resolution)
     library = list(scene.shapes().values())
     faces = 0
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ def write_geotiff(
                 mesh = mesh.take(~mesh.closed & ~np.isin(mesh.klass, _STRUCTURES))
             elif len(part.instances):
                 mesh = concatenate([mesh, expand(part.instances, library)])
-            _draw(mesh, part.origin, scene=scene, grid=grid, height=height, labels=labels)
+            draw(mesh, part.origin, scene=scene, grid=grid, height=height, labels=labels)
             faces += len(mesh)
         if not faces:
             raise InputError(
@@ -118,7 +118,7 @@ def write_geotiff(
     return Summary.of(path, "geotiff", objects=count, faces=faces, crs=scene.frame.name)
 
 
-def _cells_on_disk(path: Path, grid: _Grid, *, value: np.generic) -> NDArray[Any]:
+def _cells_on_disk(path: Path, grid: Grid, *, value: np.generic) -> NDArray[Any]:
     """Cells (rows, columns) of a value in a file, mapped to memory.
 
     They are written first: a disk that is full then ends in an OSError, not in a fault of the memory.
@@ -130,15 +130,16 @@ def _cells_on_disk(path: Path, grid: _Grid, *, value: np.generic) -> NDArray[Any
     return np.memmap(path, value.dtype, "r+", shape=(grid.rows, grid.columns))
 
 
-def _draw(
+def draw(
     mesh: Mesh,
     origin: Float,
     *,
     scene: Scene,
-    grid: _Grid,
+    grid: Grid,
     height: NDArray[np.float32],
     labels: NDArray[np.uint8],
 ) -> None:
+    """Rasterise a mesh at an origin (scene metres) into cells (rows, columns), in place."""
     if not len(mesh):
         return
     corners = grid.cells((mesh.vertices + origin)[mesh.faces], scene.frame.origin)
@@ -149,7 +150,7 @@ def _draw(
     draw_triangles(corners, mesh.klass, height[window], labels[window])
 
 
-def _write_draft(path: Path, scene: Scene, *, grid: _Grid, cells: NDArray[Any], model: Model) -> None:
+def _write_draft(path: Path, scene: Scene, *, grid: Grid, cells: NDArray[Any], model: Model) -> None:
     import rasterio  # noqa: PLC0415  (0.4 s)
     from rasterio.windows import Window  # noqa: PLC0415
 

@@ -239,7 +239,7 @@ class _Raster:
         return np.array([beside(self.origin[0], other.origin[0], turn=self.turn), self.origin[1]])
 
 
-def _gdal_name(path: Path) -> str:
+def gdal_name(path: Path) -> str:
     """What GDAL calls the raster: a path, or one within a zip archive."""
     if not path.exists():
         raise SourceNotFoundError(f"{path}: no such elevation file")
@@ -259,7 +259,7 @@ def _open(path: Path, *, unit: str | None, vertical: Literal["orthometric", "ell
     """Metadata of a file, completed by the caller's where it has none."""
     import rasterio  # noqa: PLC0415 - slow to import
 
-    name = _gdal_name(path)
+    name = gdal_name(path)
     with (
         reading(path, InputError, remedy=_REMEDY),
         rasterio.Env(GTIFF_REPORT_COMPD_CS="YES"),

@@ -1,0 +1,155 @@
+"""Charts and pages of reports: figures as people read them, scatter plots, self-contained HTML."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from PIL import Image, ImageDraw, ImageFont
+
+_INK, _GREY, _CHOICE, _OTHER = (30, 32, 38), (205, 208, 214), (200, 60, 40), (60, 110, 180)
+_STYLE = (
+    "body{font:15px system-ui,sans-serif;margin:2em;color:#1e2026}"
+    "table{border-collapse:collapse;margin:1em 0}"
+    "td,th{border-bottom:1px solid #cdd0d6;padding:.3em .6em;text-align:right;white-space:nowrap}"
+    "td:first-child,th:first-child,td:last-child{text-align:left;white-space:normal}img{max-width:100%}"
+)
+
+
+def metres(value: float) -> str:
+    """A length with a unit that fits it."""
+    for unit, size in (("m", 1.0), ("cm", 0.01), ("mm", 0.001)):
+        if abs(value) >= size:
+            return f"{value / size:.3g} {unit}"
+    return "0" if value == 0 else f"{value * 1000:.2g} mm"
+
+
+def share(value: float) -> str:
+    """A share in percent, with its sign if negative."""
+    return "0" if value == 0 else f"{100 * value:.2g} %"
+
+
+def size(value: float) -> str:
+    """Bytes in decimal units."""
+    for unit, one in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if abs(value) >= one:
+            return f"{value / one:.3g} {unit}"
+    return f"{value:.0f} B"
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A named point of a chart; ``best`` ones are joined by a line."""
+
+    name: str
+    x: float
+    y: float
+    best: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Axes:
+    """Titles of a chart and its axes, both logarithmic, and the texts of values of y."""
+
+    title: str
+    x: str
+    y: str
+    y_text: Callable[[float], str]
+
+
+def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: int = 700) -> bytes:
+    """A PNG of points, both axes logarithmic; values of 0 are drawn at the lower end, marked ``0``."""
+    picture = Image.new("RGB", (width, height), (255, 255, 255))
+    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=15)
+    left, right, top, bottom = 90, width - 190, 70, height - 70
+    x_ends, y_ends = _ends([p.x for p in points]), _ends([p.y for p in points])
+    nothing = any(p.y <= 0 for p in points)
+
+    def across(value: float) -> float:
+        return _place(value, x_ends, at=(left, right))
+
+    def up(value: float) -> float:
+        return _place(value, y_ends, at=(bottom - 40 * nothing, top)) if value > 0 else bottom
+
+    def text(place: tuple[float, float], words: str, *, anchor: str) -> None:
+        pen.text(place, words, fill=_INK, font=font, anchor=anchor)
+
+    text((left, 16), axes.title, anchor="la")
+    text(((left + right) / 2, height - 16), axes.x, anchor="ms")
+    text((12, top - 10), axes.y, anchor="ls")
+    for value in _marks(x_ends):
+        pen.line((across(value), top, across(value), bottom), fill=_GREY)
+        text((across(value), bottom + 8), f"{value:g}", anchor="mt")
+    for value in [*_marks(y_ends), *[0.0] * nothing]:
+        pen.line((left, up(value), right, up(value)), fill=_GREY)
+        text((left - 8, up(value)), axes.y_text(value), anchor="rm")
+    ordered = sorted(points, key=lambda p: (not p.best, p.x))
+    line = [(across(p.x), up(p.y)) for p in ordered if p.best]
+    if len(line) > 1:
+        pen.line(line, fill=_CHOICE, width=2)
+    named: list[tuple[float, float, float, float]] = []
+    for p in ordered:
+        u, v, color = across(p.x), up(p.y), _CHOICE if p.best else _OTHER
+        pen.ellipse((u - 4, v - 4, u + 4, v + 4), fill=color)
+        for place, anchor in (((u + 8, v - 4), "ls"), ((u + 8, v + 4), "lt"), ((u - 8, v + 4), "rt")):
+            box = pen.textbbox(place, p.name, font=font, anchor=anchor)
+            if not any(_overlap(box, other) for other in named):  # else without a name: the table has it
+                text(place, p.name, anchor=anchor)
+                named.append(box)
+                break
+    file = io.BytesIO()
+    picture.save(file, "PNG")
+    return file.getvalue()
+
+
+def _ends(values: Sequence[float]) -> tuple[float, float]:
+    """The powers of ten around values; 1, 2 or 5 of them."""
+    known = [v for v in values if v > 0] or [1.0]
+    marks = [m * 10.0**k for k in range(-9, 13) for m in (1, 2, 5)]
+    low = max((m for m in marks if m <= min(known)), default=marks[0])
+    high = min((m for m in marks if m >= max(known) and m > low), default=marks[-1])
+    return low, high
+
+
+def _marks(ends: tuple[float, float]) -> list[float]:
+    """Values to mark on an axis: powers of ten, and 2 and 5 of them on a short one."""
+    steps = (1, 2, 5) if ends[1] / ends[0] <= 100 else (1,)
+    every = (m * 10.0**k for k in range(-9, 13) for m in steps)
+    return [v for v in every if ends[0] * (1 - 1e-9) <= v <= ends[1] * (1 + 1e-9)]
+
+
+def _place(value: float, ends: tuple[float, float], *, at: tuple[float, float]) -> float:
+    low, high = map(math.log10, ends)
+    part = (math.log10(min(max(value, ends[0]), ends[1])) - low) / (high - low)
+    return at[0] + (at[1] - at[0]) * part
+
+
+def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+    """Whether two boxes (left, top, right, bottom) overlap."""
+    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of texts."""
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(text)}</{tag}>" for text in cells) + "</tr>"
+
+    return f"<table>{line(head, 'th')}{''.join(line(row, 'td') for row in rows)}</table>"
+
+
+def html_picture(png: bytes, *, alt: str) -> str:
+    """A picture within the page."""
+    return f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+
+
+def html_page(title: str, body: str) -> bytes:
+    """A page without links to other files."""
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        f"<style>{_STYLE}</style><h1>{html.escape(title)}</h1>{body}</html>\n"
+    ).encode()

@@ -1,0 +1,250 @@
+"""Errors and costs of builds with other settings, against the full scene."""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.export.objects import expand, parts
+from geoscene.export.raster import Grid, draw, grid_of
+from geoscene.mesh import concatenate
+from geoscene.options import BuildOptions
+from geoscene.progress import Progress, silent
+from geoscene.scene import Scene, open_scene
+from geoscene.sources import OsmData
+from geoscene.tradeoff.variants import Variant, coarse_elevation, full, variants
+from geoscene.watertight import volumes
+
+MOST_CELLS = 16_000_000
+"""Cells of the surface models that are compared; larger scenes have larger cells."""
+
+_SAME = 1e-3
+"""Metres of difference in height that do not count as different: the grid of solids."""
+
+_OBJECTS = {
+    "solids": "solids of buildings",
+    "trees": "mapped trees",
+    "forest_trees": "trees of forests",
+    "furniture": "furniture",
+    "barriers": "barriers",
+    "bridge_pieces": "pieces of bridges",
+    "tunnel_pieces": "pieces of tunnels",
+    "road_edges": "edges of the road graph",
+}
+"""Counts of `scene.json` that are compared, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Cost of a build in a process of its own, with imports and reading the map; bytes of the scene."""
+
+    cpu_s: float
+    memory_bytes: int
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A build.
+
+    costs   : of each repetition
+    error   : of the surface model in metres (``height_rms_m``, ``height_99_m``, ``height_max_m``), the shares
+              of its cells with another height (``cells``) and of another class (``classes``), relative
+              errors of the buildings' volume (``volume``) and footprint area (``area``); empty without meshes
+    missing : number of objects that the full scene has besides, by kind in words
+    note    : what figures do not say
+    """
+
+    label: str
+    costs: tuple[Cost, ...]
+    error: dict[str, float]
+    missing: dict[str, int]
+    note: str = ""
+
+    @property
+    def cost(self) -> Cost:
+        """The median of the repetitions."""
+        columns = ([getattr(c, name) for c in self.costs] for name in ("cpu_s", "memory_bytes", "bytes"))
+        cpu, memory, size = (float(np.median(column)) for column in columns)
+        return Cost(cpu, int(memory), int(size))
+
+
+@dataclass(frozen=True, slots=True)
+class Tradeoff:
+    """Rows of a place; the first is the full scene. ``resolution`` is that of the surface models, metres."""
+
+    name: str
+    resolution: float
+    rows: tuple[Row, ...]
+
+
+def tradeoff(
+    read: Callable[[], OsmData],
+    options: BuildOptions,
+    *,
+    settings: Sequence[str] = (),
+    resolution: float = 1.0,
+    repetitions: int = 1,
+    progress: Progress = silent,
+) -> Tradeoff:
+    """Errors and costs of builds of a map, each setting changed alone.
+
+    read       : reads the map; called in the process of each build, so it must be picklable
+    settings   : names of `geoscene.tradeoff.variants.SETTINGS`; all by default
+    resolution : metres of the cells of the surface models, at least; larger for places of many cells
+
+    Raises the errors of a build.
+    """
+    chosen = variants(options, settings)
+    builds = [full(options), *chosen]
+    with tempfile.TemporaryDirectory(prefix="geoscene-tradeoff-") as name:
+        folder = Path(name)
+        costs: list[list[Cost]] = [[] for _ in builds]
+        for turn in range(repetitions):  # in turn, so that a busy machine troubles all alike
+            for k, variant in enumerate(builds):
+                progress("builds", turn * len(builds) + k, total=repetitions * len(builds))
+                costs[k].append(_measured(read, variant, folder=folder / str(k)))
+        scene = open_scene(folder / "0" / "scene")
+        xmin, ymin, xmax, ymax = scene.bounds
+        cell = max(resolution, float(np.sqrt((xmax - xmin) * (ymax - ymin) / MOST_CELLS)))
+        grid = grid_of(scene, cell)
+        exact = _Measures.of(scene, grid)
+        rows = [Row(builds[0].label, tuple(costs[0]), _errors(exact, exact), {})]
+        for k, variant in enumerate(chosen, start=1):
+            progress("comparisons", k - 1, total=len(chosen))
+            other = open_scene(folder / str(k) / "scene")
+            rows.append(_row(variant, tuple(costs[k]), scene=other, exact=exact, grid=grid))
+    return Tradeoff(scene.manifest["name"] or scene.manifest["sources"][0]["from"], cell, tuple(rows))
+
+
+def _measured(read: Callable[[], OsmData], variant: Variant, *, folder: Path) -> Cost:
+    """The cost of a build into a folder, made in a process of its own."""
+    folder.mkdir(exist_ok=True)
+    options = variant.options
+    if variant.coarser > 1:
+        files = [
+            coarse_elevation(Path(path), folder / f"{n}.tif", factor=variant.coarser)
+            for n, path in enumerate(options.dem)
+        ]
+        options = replace(options, dem=tuple(map(str, files)), dem_gaps="nearest")
+    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context = multiprocessing.get_context(method)
+    with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
+        return pool.submit(_build, read, options=options, out=folder / "scene").result()
+
+
+def _build(read: Callable[[], OsmData], *, options: BuildOptions, out: Path) -> Cost:
+    """Build a scene in this process and return all that it cost."""
+    from geoscene.pipeline import build  # noqa: PLC0415 - part of the cost
+
+    build(read(), out, options=options, overwrite=out.exists())
+    size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+    return Cost(time.process_time(), peak_memory(), size)
+
+
+def peak_memory() -> int:
+    """Peak memory of this process in bytes; Linux's own count, as a parent's may be part of the other."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        line = next(text for text in status.read_text().splitlines() if text.startswith("VmHWM"))
+        return 1024 * int(line.split()[1])
+    unit = 1 if sys.platform == "darwin" else 1024
+    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+@dataclass(frozen=True, slots=True)
+class _Measures:
+    """What is compared of a scene.
+
+    height : (rows, columns) of the highest face over each cell; NaN without one
+    klass  : (rows, columns) class of that face
+    volume : cubic metres of the solids of buildings
+    area   : square metres of the footprints of buildings
+    counts : of objects, by the names of `_OBJECTS`
+    """
+
+    height: NDArray[np.float32]
+    klass: NDArray[np.uint8]
+    volume: float
+    area: float
+    counts: dict[str, int]
+
+    @classmethod
+    def of(cls, scene: Scene, grid: Grid) -> _Measures:
+        counts = {name: int(scene.manifest["counts"][name]) for name in _OBJECTS}
+        area = 0.0
+        if scene.table_length("buildings"):
+            area = float(shapely.area(scene.features("buildings").geometry).sum())
+        height, klass = surface_model(scene, grid)
+        return cls(height, klass, building_volume(scene), area, counts)
+
+
+def surface_model(scene: Scene, grid: Grid) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Height and class (rows, columns) of the highest face over cells' middles; NaN and 0 without one."""
+    height = np.full((grid.rows, grid.columns), np.nan, np.float32)
+    labels = np.zeros(height.shape, np.uint8)
+    library = list(scene.shapes().values())
+    for part in parts(scene, None, stage="surface", progress=silent):
+        mesh = concatenate([part.mesh, expand(part.instances, library)])
+        draw(mesh, part.origin, scene=scene, grid=grid, height=height, labels=labels)
+    return height, labels
+
+
+def building_volume(scene: Scene) -> float:
+    """True cubic metres of the solids of buildings."""
+    total = 0.0
+    for tile in scene.tiles(forests=False):
+        mesh = tile.mesh
+        corners = mesh.vertices[mesh.faces[mesh.closed & (mesh.klass == Class.BUILDING)]]
+        scale = float(scene.frame.scale_at(*(tile.origin[:2] + scene.tile_size / 2).tolist()))
+        total += float(volumes(corners, owner=np.zeros(len(corners), np.int64), n=1)[0]) / scale**2
+    return total
+
+
+def _row(variant: Variant, costs: tuple[Cost, ...], *, scene: Scene, exact: _Measures, grid: Grid) -> Row:
+    counts = scene.manifest["counts"]
+    lost = {_OBJECTS[name]: n - int(counts[name]) for name, n in exact.counts.items() if n > counts[name]}
+    if not scene.has_tiles:
+        return Row(variant.label, costs, {}, lost, "no meshes")
+    error = _errors(_Measures.of(scene, grid), exact)
+    note = "" if any(error.values()) or lost else "no error here"
+    if variant.options.use != "all":
+        note = "; ".join(filter(None, (note, f"no {', '.join(_left_out(scene))}")))
+    return Row(variant.label, costs, error, lost, note)
+
+
+def _left_out(scene: Scene) -> list[str]:
+    return [name for name in ("features", "attributes") if scene.manifest["left_out"].get(name)]
+
+
+def _errors(found: _Measures, exact: _Measures) -> dict[str, Any]:
+    """The errors of `Row`."""
+    known = np.isfinite(exact.height) & np.isfinite(found.height)
+    off = np.abs(found.height[known].astype(float) - exact.height[known])
+    off = np.where(off > _SAME, off, 0.0) if len(off) else np.zeros(1)
+    return {
+        "height_rms_m": float(np.sqrt((off**2).mean())),
+        "height_99_m": float(np.percentile(off, 99)),
+        "height_max_m": float(off.max()),
+        "cells": float((off > 0).mean()),
+        "classes": float((found.klass != exact.klass).mean()),
+        "volume": _relative(found.volume, exact.volume),
+        "area": _relative(found.area, exact.area),
+    }
+
+
+def _relative(found: float, exact: float) -> float:
+    return (found - exact) / exact if exact else 0.0

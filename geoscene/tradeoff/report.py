@@ -1,0 +1,150 @@
+"""The report of a comparison of builds: terminal table, plot, HTML page, JSON, recommendations in words."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from geoscene.charts import Axes, Point, html_page, html_picture, html_table, metres, scatter, share, size
+from geoscene.files import write_atomically, write_json
+from geoscene.tradeoff.engine import Row, Tradeoff
+
+TARGETS = (0.01, 0.1, 1.0)
+"""Metres (rms) of the surface model for which a setting is recommended."""
+
+_HEAD = (
+    *("setting", "height rms", "99 %", "max", "other height", "other class", "volume", "footprints"),
+    *("CPU s", "memory", "bytes", "missing, note"),
+)
+
+
+def cells(row: Row) -> list[str]:
+    """Texts of a row of the table."""
+    cpu = [cost.cpu_s for cost in row.costs]
+    spread = f" ({min(cpu):.3g} to {max(cpu):.3g})" if len(cpu) > 1 else ""
+    e = row.error
+    errors = [""] * 7
+    if e:
+        heights = [metres(e[name]) for name in ("height_rms_m", "height_99_m", "height_max_m")]
+        errors = [*heights, share(e["cells"]), share(e["classes"]), share(e["volume"]), share(e["area"])]
+    lost = [f"{n:,} {name}" for name, n in row.missing.items()]
+    return [
+        row.label,
+        *errors,
+        f"{row.cost.cpu_s:.3g}{spread}",
+        size(row.cost.memory_bytes),
+        size(row.cost.bytes),
+        "; ".join(filter(None, (f"without {', '.join(lost)}" if lost else "", row.note))),
+    ]
+
+
+def headline(found: Tradeoff) -> str:
+    """What was compared."""
+    return f"{found.name}: surface models of {metres(found.resolution)} cells against the full scene"
+
+
+def pareto(found: Tradeoff) -> list[Row]:
+    """Builds for all uses of which no other is both cheaper and at least as exact, the cheapest first."""
+    best: list[Row] = []
+    shown = [row for row in found.rows if not row.label.startswith("for=")]
+    for row in sorted(shown, key=lambda r: (r.cost.cpu_s, r.error["height_rms_m"])):
+        if not best or row.error["height_rms_m"] < best[-1].error["height_rms_m"]:
+            best.append(row)
+    return best
+
+
+def recommendations(found: Tradeoff) -> list[str]:
+    """A sentence for each of `TARGETS`, and one for scenes for drives."""
+    full, best = found.rows[0], pareto(found)
+    said = []
+    for target in TARGETS:
+        row = next(row for row in best if row.error["height_rms_m"] <= target)
+        wanted = f"For a surface model within {metres(target)} rms"
+        if row is full:
+            said.append(f"{wanted} no setting that was compared is cheaper than the full scene.")
+            continue
+        lost = f", without {', '.join(row.missing)}" if row.missing else ""
+        said.append(
+            f"{wanted} the cheapest setting is {row.label}: {_saving(row, full)};"
+            f" it errs by {metres(row.error['height_rms_m'])} rms, {metres(row.error['height_99_m'])} at"
+            f" 99 %{lost}."
+        )
+    return said + [
+        f"For drives with laser scanners {row.label} has no error: {_saving(row, full)}."
+        for row in found.rows
+        if row.label == "for=lidar"
+    ]
+
+
+def _saving(row: Row, full: Row) -> str:
+    return (
+        f"{row.cost.cpu_s:.3g} instead of {full.cost.cpu_s:.3g} CPU s,"
+        f" {size(row.cost.bytes)} instead of {size(full.cost.bytes)}"
+    )
+
+
+def print_tables(found: Tradeoff) -> None:
+    """Print the table and the recommendations."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=240)
+    table = Table(*_HEAD, title=headline(found))
+    for row in found.rows:
+        table.add_row(*cells(row))
+    console.print(table)
+    for text in recommendations(found):
+        console.print(text, highlight=False)
+
+
+def document(found: Tradeoff) -> dict[str, Any]:
+    """The contents of ``tradeoff.json``."""
+    rows = [
+        {
+            "setting": row.label,
+            "error": row.error,
+            "missing": row.missing,
+            "cost": asdict(row.cost),
+            "costs": [asdict(cost) for cost in row.costs],
+            "note": row.note,
+        }
+        for row in found.rows
+    ]
+    return {
+        "schema": 1,
+        "name": found.name,
+        "resolution_m": found.resolution,
+        "rows": rows,
+        "pareto": [row.label for row in pareto(found)],
+        "recommendations": recommendations(found),
+    }
+
+
+def plot(found: Tradeoff) -> bytes:
+    """A PNG: error of the surface model against CPU time."""
+    best = [row.label for row in pareto(found)]
+    points = [
+        Point(row.label, row.cost.cpu_s, row.error["height_rms_m"], row.label in best)
+        for row in found.rows
+        if row.error
+    ]
+    return scatter(points, Axes(headline(found), "CPU s of the build", "height error, rms", metres))
+
+
+def write_report(found: Tradeoff, out: Path) -> None:
+    """Write ``tradeoff.json``, ``tradeoff.html`` and ``pareto.png`` into a folder."""
+    out.mkdir(parents=True, exist_ok=True)
+    picture = plot(found)
+    said = "".join(f"<li>{html.escape(text)}</li>" for text in recommendations(found))
+    body = (
+        f"<p>{html.escape(headline(found))}</p><ul>{said}</ul>"
+        f"{html_table(_HEAD, [cells(row) for row in found.rows])}"
+        f"{html_picture(picture, alt='error against cost')}"
+    )
+    write_atomically(out / "pareto.png", picture)
+    write_atomically(out / "tradeoff.html", html_page(f"Cost against accuracy: {found.name}", body))
+    write_json(out / "tradeoff.json", document(found))

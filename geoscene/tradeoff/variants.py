@@ -1,0 +1,96 @@
+"""Settings of a build that are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from geoscene.errors import InputError
+from geoscene.options import KINDS, BuildOptions
+from geoscene.uses import USES
+
+SETTINGS = ("lod", "only", "terrain", "for")
+"""Names of the settings that are compared."""
+
+FULL = "full scene"
+"""Label of the reference."""
+
+_KINDS = {
+    "only=buildings": ("buildings",),
+    "only=buildings,roads": ("buildings", "roads"),
+    "without trees": tuple(kind for kind in KINDS if kind != "trees"),
+    "without furniture, barriers": tuple(kind for kind in KINDS if kind not in ("furniture", "barriers")),
+    "without landcover": tuple(kind for kind in KINDS if kind != "landcover"),
+}
+_COARSER = (2, 4, 8)
+"""Posts of the elevation model along each side of which one is made."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """A build with a setting changed.
+
+    coarser : posts of the elevation files along each side of which one is made; 1 for the files as they are
+    """
+
+    label: str
+    options: BuildOptions
+    coarser: int = 1
+
+
+def full(options: BuildOptions) -> Variant:
+    """The reference: everything, at the highest level of detail."""
+    return Variant(FULL, replace(options, lod=2, only=KINDS, use="all"))
+
+
+def variants(options: BuildOptions, settings: Sequence[str]) -> list[Variant]:
+    """Builds to compare with the full scene, one setting changed in each, and a combination of cheap ones.
+
+    Raises InputError for unknown settings.
+    """
+    if unknown := sorted(set(settings) - set(SETTINGS)):
+        raise InputError(f"`settings` {','.join(unknown)}: of {', '.join(SETTINGS)}")
+    chosen, base = settings or SETTINGS, full(options).options
+    found: list[Variant] = []
+    if "lod" in chosen:
+        found += [Variant(f"lod={lod}", replace(base, lod=lod)) for lod in (1, 0)]
+    if "only" in chosen:
+        found += [Variant(label, replace(base, only=kinds)) for label, kinds in _KINDS.items()]
+    if "terrain" in chosen and base.dem:
+        found += [Variant(f"terrain={n} x {n} posts", base, coarser=n) for n in _COARSER]
+        found.append(Variant("terrain=level", replace(base, dem=())))
+    if "for" in chosen:
+        found += [Variant(f"for={use}", replace(base, use=use)) for use in USES if use != "all"]
+    if {"lod", "only"} <= set(chosen):
+        cheap = replace(base, lod=0, only=("buildings",))
+        found.append(Variant("lod=0 only=buildings", cheap))
+    return found
+
+
+def coarse_elevation(path: Path, out: Path, *, factor: int) -> Path:
+    """An elevation file of which each post is the mean of ``factor`` by ``factor`` posts of another."""
+    import rasterio  # noqa: PLC0415 - slow to import
+    from rasterio.enums import Resampling  # noqa: PLC0415
+
+    from geoscene.ground.terrain import gdal_name  # noqa: PLC0415
+
+    with rasterio.open(gdal_name(path)) as source:
+        rows, columns = (max(side // factor, 2) for side in source.shape)
+        values = source.read(1, out_shape=(rows, columns), resampling=Resampling.average, masked=True)
+        a, across, down = source.transform, source.width / columns, source.height / rows
+        profile = {
+            **{name: source.profile[name] for name in ("dtype", "crs", "nodata")},
+            "driver": "GTiff",
+            "count": 1,
+            "width": columns,
+            "height": rows,
+            "transform": rasterio.Affine(a.a * across, a.b * down, a.c, a.d * across, a.e * down, a.f),
+        }
+        with rasterio.open(out, "w", **profile) as target:
+            target.write(values.filled(source.nodata if source.nodata is not None else 0), 1)
+            target.units, target.scales, target.offsets = source.units, source.scales, source.offsets
+            tags = source.tags()
+            tags.pop("AREA_OR_POINT", None)  # the transform is that of areas
+            target.update_tags(**tags)
+    return out
