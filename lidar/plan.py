@@ -34,6 +34,7 @@ from lidar.traffic.fcd_replay import replay
 from lidar.traffic.populate import populate
 from lidar.traffic.sumo import SumoOptions, drive_in_sumo
 from lidar.world.actors import Actors
+from lidar.world.settings import origin_limit
 
 if TYPE_CHECKING:
     from lidar.planning.flight_planning import FlightOptions
@@ -137,10 +138,11 @@ class DrivePlan:
 
     @property
     def limits(self) -> list[Limit]:
-        """Errors of lengths at the height of the trajectory, which no range is corrected for."""
-        height = self.trajectory.position[:: max(len(self.trajectory) // 1000, 1), 2].copy()
+        """Errors that no range is corrected for: of lengths at the trajectory's height, and of its origin."""
+        position = self.trajectory.position[:: max(len(self.trajectory) // 1000, 1)].copy()
         self.trajectory.release()
-        return height_limit(height)
+        fixed = self.options.contents().world.origin == "scene"
+        return [*height_limit(position[:, 2]), *(origin_limit(position) if fixed else [])]
 
     def recording(self, out: Path) -> Recording:
         """What the frames are recorded from."""

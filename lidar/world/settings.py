@@ -5,7 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import inf
 
+import numpy as np
+
+from geoscene.limits import Limit
+from geoscene.typing import Float
 from lidar.errors import InputError
+
+_FAR = 10_000.0
+"""Metres from their origin up to which rays at edges are tested (docs/extremes.md)."""
 
 ORIGINS = ("near", "scene")
 """Origins of the float32 coordinates of a caster."""
@@ -45,3 +52,17 @@ class WorldSettings:
 
 PLAIN = WorldSettings()
 """The whole scene within range."""
+
+
+def origin_limit(position: Float) -> list[Limit]:
+    """The limit of rays from places (n, 3) that refer to the scene's origin; none within the bound."""
+    from lidar.raycast.hull import ROUNDING  # noqa: PLC0415 - slow to import
+
+    away = float(np.linalg.norm(position, axis=1).max(initial=0.0))
+    if away <= _FAR:
+        return []
+    advice = (
+        f"with the setting origin=scene rays are cast up to {away / 1000:,.0f} km from their origin, where"
+        f" edges of surfaces are off by up to {ROUNDING * away * 1000:.1f} mm; leave the setting out"
+    )
+    return [Limit("origin", round(away / 1000, 1), _FAR / 1000, "km", advice)]

@@ -17,7 +17,7 @@ from lidar.geometry.poses import Poses
 from lidar.raycast import ALL
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.scene import Float64Scene
-from lidar.world.settings import WorldSettings
+from lidar.world.settings import WorldSettings, origin_limit
 from lidar.world.world import FOLIAGE, GLASS, World
 
 TILE = 100.0
@@ -260,3 +260,10 @@ def test_classes_of_settings_are_left_out_of_tiles(tmp_path, name, klass):
     for chosen, features in (({}, [77, 55]), ({name: False}, [0, 0])):
         world = World.load(scene, settings=WorldSettings(**chosen))
         assert world.lookup(world.caster.cast(above, np.repeat(DOWN, 2, 0))).feature.tolist() == features
+
+
+def test_rays_far_from_the_origin_of_the_scene_are_told():
+    assert origin_limit(np.array([[9000.0, 4000.0, 100.0]])) == []
+    (limit,) = origin_limit(np.array([[0.0, 0.0, 0.0], [48_000.0, -36_000.0, 0.0]]))
+    assert (limit.measured, limit.bound, limit.unit) == (60.0, 10.0, "km")
+    assert "14.3 mm" in limit.advice
