@@ -5,7 +5,7 @@
     PYTHONPATH=benchmarks python -m bench compare A.json B.json    two runs on one machine
 
 Each case is the same work by several sides that take turns in one process: ours and a reference. Writes
-bench.json, bench.md and bench.html. HELIOS++ joins by --helios PROGRAM.
+bench.json, bench.md and bench.html after each subject. HELIOS++ joins by --helios PROGRAM.
 """
 
 from __future__ import annotations
@@ -85,8 +85,9 @@ def _run(given: argparse.Namespace) -> None:
             print(f"measuring {subject}", file=sys.stderr, flush=True)
             if subject == "growth":
                 run.curves += growth(setup)
-                continue
-            run.results += [measured(case, repetitions=repetitions) for case in CASES[subject](setup)]
+            else:
+                run.results += [measured(case, repetitions=repetitions) for case in CASES[subject](setup)]
+            write_report(run, given.out)
     late = machine.warnings_about(run.machine, machine.load())
     run.notes += [note for note in late if note not in run.notes]
     write_report(run, given.out)

@@ -104,7 +104,6 @@ def reading_maps(setup: Setup) -> Iterator[Case]:
             "all in this process. geoscene: columns, areas and lines with repairs, of any order of objects;"
             " areas: libosmium's areas and lines as WKB, and tags; objects: ids, positions, references and"
             " tags of all objects as Python lists, no geometry",
-            clock="wall",
         )
 
 
@@ -155,7 +154,6 @@ def reading_scenes(setup: Setup) -> Iterator[Case]:
             {"lidar": lambda s=scene: _world(s), "numpy, embreex": lambda s=scene: _plain_world(s)},
             "lidar: tables of surfaces, and instances of trees and furniture, too; embreex: tiles' own"
             " triangles as one mesh. Embree builds on all cores",
-            clock="wall",
         )
 
 

@@ -10,7 +10,7 @@ import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Literal
 
@@ -70,7 +70,7 @@ class Case:
     amount, unit : the work that each side does once
     sides   : functions by name, ours first; one may return its own `Spent`, else this process is timed
     note    : what the sides do differently
-    clock   : of rates and ratios: CPU time where all sides run in one thread, else wall time
+    clock   : of rates and ratios: CPU time of all threads, or wall time to compare workers and programs
     simulated_s : seconds of simulated time; 0 where there are none
     processes : sides are whole processes, which are not run uncounted before, and three times at most
     """
@@ -88,7 +88,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A measured case: costs of each side, one for each repetition."""
+    """A measured case without its sides' functions: costs of each side, one for each repetition."""
 
     case: Case
     spent: dict[str, list[Spent]]
@@ -124,7 +124,7 @@ def measured(case: Case, *, repetitions: int) -> Result:
         for name in names[first:] + names[:first]:
             gc.collect()
             spent[name].append(timed(case.sides[name]))
-    return Result(case, spent)
+    return Result(replace(case, sides={}), spent)  # sides hold scenes, which must not stay in memory
 
 
 def timed(work: Callable[[], object]) -> Spent:

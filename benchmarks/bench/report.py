@@ -22,7 +22,8 @@ from geoscene.files import write_atomically, write_json
 _INK, _GREY, _LINE, _DOT = (30, 32, 38), (205, 208, 214), (200, 60, 40), (60, 110, 180)
 
 READING = (
-    "Figures are medians of repetitions by turns, with the smallest and greatest in brackets. A ratio is the"
+    "Figures are medians of repetitions by turns, with the smallest and greatest in brackets; rates are per"
+    " second of CPU time of all threads, or of wall time to compare workers and programs. A ratio is the"
     " rate of the first side over that of another, both measured in this run, repetition by repetition."
 )
 
@@ -315,24 +316,31 @@ def curve_plot(curve: Curve, *, width: int = 560, height: int = 400) -> Image.Im
 
 def ratio_plot(results: Sequence[Result], *, width: int = 1100) -> Image.Image:
     """Our rate over that of each reference, with smallest and greatest, on a logarithmic axis."""
-    bars = [(r.case.name, side, r.ratio(side)) for r in results for side in list(r.spent)[1:]]
+    bars = [
+        (f"{r.case.name}: {first} / {side}", r.ratio(side))
+        for r in results
+        for first, *others in [list(r.spent)]
+        for side in others
+    ]
     height, left, right = 60 + 22 * len(bars), 460, width - 60
     picture = Image.new("RGB", (width, height), (255, 255, 255))
     pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=13)
     said: dict[str, Any] = {"fill": _INK, "font": font}
     if not bars:
         return picture
-    across, marks = _scale([1.0, *(v for *_, s in bars for v in (s.low, s.high))], ends=(left, right))
+    across, marks = _scale([1.0, *(v for _, s in bars for v in (s.low, s.high))], ends=(left, right))
     for value in marks:
         pen.line((across(value), 30, across(value), height - 10), fill=_GREY)
         pen.text((across(value), 24), f"{value:g}", **said, anchor="ms")
     pen.line((across(1.0), 30, across(1.0), height - 10), fill=_INK, width=2)
-    pen.text((10, 24), "rate of the first side over that of", **said, anchor="ls")
-    for k, (name, side, ratio) in enumerate(bars):
+    pen.text((10, 24), "ratio of rates", **said, anchor="ls")
+    for k, (name, ratio) in enumerate(bars):
         v = 46 + 22 * k
-        pen.text((left - 12, v), f"{name}: {side}", **said, anchor="rm")
+        pen.text((left - 12, v), name, **said, anchor="rm")
         pen.line((across(ratio.low), v, across(ratio.high), v), fill=_DOT, width=3)
         u = across(ratio.median)
         pen.ellipse((u - 5, v - 5, u + 5, v + 5), fill=_LINE if ratio.median < 1 else _DOT)
-        pen.text((across(ratio.high) + 10, v), f"{ratio.median:.3g}", **said, anchor="lm")
+        place, text = (across(ratio.high) + 10, v), f"{ratio.median:.3g}"
+        pen.rectangle(pen.textbbox(place, text, font=font, anchor="lm"), fill=(255, 255, 255))
+        pen.text(place, text, **said, anchor="lm")
     return picture
