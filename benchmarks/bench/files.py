@@ -130,11 +130,9 @@ def mapping(setup: Setup) -> Iterator[Case]:
             ),
             "laspy": partial(laspy_map, dataset, folder / "theirs_map.las", info=info, voxel=voxel),
         }
-        note = "lidar: a frame at a time, moving road users left out; laspy: all points in memory" + (
-            ". lidar keeps the point nearest to a voxel's centre and sorts on disk; laspy (numpy) the first"
-            if voxel
-            else ""
-        )
+        note = "lidar: a frame at a time, moving road users left out; laspy: all points in memory"
+        if voxel:
+            note = "voxels: lidar keeps the point nearest to the centre and sorts on disk, numpy the first"
         yield Case("mapping", name, count, "M points", sides, note)
 
 

@@ -61,8 +61,9 @@ def tables(run: Run) -> list[Table]:
         chosen = [result for result in run.results if result.case.subject == subject]
         notes = dict.fromkeys(result.case.note for result in chosen if result.case.note)
         rows = [row for result in chosen for row in _rows(result)]
-        text = " ".join(note[0].upper() + note[1:] + "." for note in notes)
-        found.append(Table(subject.capitalize(), text, _HEADS, tuple(rows)))
+        text = "; ".join(notes) + "."
+        keep = len(_HEADS) if any(row[-1] for row in rows) else -1  # without memory: no empty column
+        found.append(Table(subject.capitalize(), text, _HEADS[:keep], tuple(row[:keep] for row in rows)))
     if run.curves:
         rows = [_curve_row(curve) for curve in run.curves]
         found.append(Table("Growth", _GROWTH, _GROWTH_HEADS, tuple(rows)))
