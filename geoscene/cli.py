@@ -143,7 +143,7 @@ def build(
         raise InputError("`dem_server` needs --dem tiles")
     if not url_of(out):
         check_target(out, overwrite=report.overwrite)
-    note_new_folder(out)
+        note_new_folder(out)
     bar = partial(progress_bar, quiet=report.quiet)
     with (
         connected(scheduler) if scheduler else nullcontext() as cluster,

@@ -20,6 +20,7 @@ from typing import Annotated, Any, NoReturn
 
 from cyclopts import App, CycloptsError, Parameter, Token
 
+from geoscene.errors import InputError
 from geoscene.progress import Progress, silent
 from geoscene.storage import url_of
 
@@ -231,8 +232,16 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 
 def note_new_folder(out: Path) -> None:
-    """Say on standard error which folder is made to hold an output, so that a mistyped path is noticed."""
-    if not url_of(out) and not (folder := out.absolute().parent).exists():
+    """Say on standard error which folder is made to hold an output, so that a mistyped path is noticed.
+
+    Raises InputError for a URL.
+    """
+    if url := url_of(out):
+        raise InputError(
+            f"`out` {url}: only geoscene build and lidar drive write to object storage; give a path of this"
+            " machine"
+        )
+    if not (folder := out.absolute().parent).exists():
         print(f"{folder}: this folder does not exist and is made", file=sys.stderr)
 
 

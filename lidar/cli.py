@@ -108,14 +108,15 @@ def drive(
         Directory or URL to write the dataset to.
     """
     from geoscene.scene.layout import using  # noqa: PLC0415
-    from geoscene.storage import published, shown  # noqa: PLC0415
+    from geoscene.storage import published, shown, url_of  # noqa: PLC0415
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.scene_cache import open_scene_or_map  # noqa: PLC0415
     from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415
 
     options = options or DriveOptions()
     options.check_course()
-    note_new_folder(out)
+    if not url_of(out):
+        note_new_folder(out)
     bar = partial(progress_bar, quiet=report.quiet)
     with bar() as progress:
         found = open_scene_or_map(scene, options, place=place, progress=progress)

@@ -69,7 +69,7 @@ def record_on_cluster(
     chunks : frames during which the vehicle stays in a region, and the region
     """
     out, scene = recording.out.resolve(), replace(plan.scene, path=plan.scene.path.resolve())
-    cluster.check(out, inputs=[scene.files.manifest])
+    cluster.check(out, inputs=[] if scene.stored else [scene.files.manifest])  # workers fetch stored ones
     file = out / f"plan-{secrets.token_hex(8)}.part"
     tasks = [
         _Task(file, out, region, tuple((job.order, job.frame) for job in jobs[k : k + _FRAMES]))

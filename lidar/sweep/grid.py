@@ -6,31 +6,27 @@ import hashlib
 import itertools
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cyclopts import App, CycloptsError
+from cyclopts import App
 
 from geoscene.console import DEFAULTS, guard_numbers
-from geoscene.errors import GeosceneError, reading
+from geoscene.errors import reading
 from geoscene.scene import open_scene
 from geoscene.scene.layout import SceneFiles
-from lidar.errors import InputError, LidarError
+from geoscene.storage import url_of
+from lidar.errors import InputError
 from lidar.options import AccuracyOptions, DriveOptions
 from lidar.plan import sensors_of
 from lidar.rig.specs import load_rig
 from lidar.rig.vehicle import load_vehicle
+from lidar.sweep.maps import MapScene, map_of_file, read_maps
+from lidar.sweep.words import naming, text_of, words_of
 from lidar.time_scales import check_start
 from lidar.traffic.fcd import TrafficFile
-
-_REPEATED = ("set", "stage")
-"""Options of which each value is given by a flag of its own."""
-
-_JOINED = ("format", "labels")
-"""Options whose values are separated by commas."""
 
 _OF_THE_SWEEP = ("out", "workers", "scheduler", "overwrite", "json", "quiet")
 """Options of the command, not of a drive."""
@@ -44,10 +40,11 @@ class GridDrive:
     """One drive of a sweep.
 
     name    : of its folder: the values of the grid's options
-    scene   : directory of a scene, or a map that one is built of
+    scene   : directory or URL of a scene, or the first file of its map
     values  : options of the grid as text, by name
     options : of the drive; their paths are absolute, as workers may have another current folder
     wanted  : accuracy and budget of the drive
+    map     : that the scene is built of, if it is not built yet
     """
 
     name: str
@@ -55,6 +52,7 @@ class GridDrive:
     values: dict[str, str]
     options: DriveOptions
     wanted: AccuracyOptions = AccuracyOptions()
+    map: MapScene | None = None
 
     @property
     def inputs(self) -> list[Path]:
@@ -64,7 +62,9 @@ class GridDrive:
         if isinstance(options.traffic, TrafficFile):
             named += [options.traffic.path, options.traffic.net]
         paths = [Path(name) for name in named if isinstance(name, str | Path)]
-        return [SceneFiles(self.scene).manifest, *(path for path in paths if path.is_file())]
+        local = self.map is None and not url_of(self.scene)
+        manifest = [SceneFiles(self.scene).manifest] if local else []
+        return [*manifest, *(path for path in paths if path.is_file())]
 
 
 def read_grid(path: Path) -> list[GridDrive]:
@@ -72,31 +72,32 @@ def read_grid(path: Path) -> list[GridDrive]:
 
     Table ``drive`` holds options of all drives. Table ``grid``, or each table ``[[grid]]``, holds lists,
     whose combinations are the drives. Names are those of the flags of ``lidar drive``, and ``scene``.
+    Tables ``[[map]]`` name maps that scenes are built of; see `read_maps`.
 
     Raises InputError, which names the drive, for anything that can be known before the drive starts.
     """
     with reading(path, InputError, remedy="give a TOML file with a table [grid]", known=InputError):
         document = tomllib.loads(path.read_text("utf-8"))
-    if unknown := sorted(set(document) - {"drive", "grid"}):
-        raise InputError(f"{path}: unknown {unknown[0]}; there are the tables drive and grid")
+    if unknown := sorted(set(document) - {"drive", "grid", "map"}):
+        raise InputError(f"{path}: unknown {unknown[0]}; there are the tables drive, grid and map")
     common, grids = document.get("drive", {}), document.get("grid", {})
     grids = grids if isinstance(grids, list) else [grids]
     if not isinstance(common, dict) or not all(isinstance(grid, dict) for grid in grids):
         raise InputError(f"{path}: drive and grid are tables, as in [grid]")
     if not grids:
         raise InputError(f"{path}: no drives; add a table [grid]")
+    maps = read_maps(path, document.get("map", []))
     drives: dict[str, GridDrive] = {}
     for grid in grids:
         _check_keys(path, common, grid=grid)
         for values in itertools.product(*grid.values()):
-            drive = _drive(path, common, grid=dict(zip(grid, values, strict=True)))
+            drive = _drive(path, common, grid=dict(zip(grid, values, strict=True)), maps=maps)
             if drive.name in drives:
                 raise InputError(f"{path}: drive {drive.name} is in it twice")
             drives[drive.name] = drive
-    for scene in dict.fromkeys(drive.scene for drive in drives.values()):
-        with _naming(path, "scene"):
-            if not scene.is_file():
-                open_scene(scene)
+    for scene in dict.fromkeys(drive.scene for drive in drives.values() if drive.map is None):
+        with naming(path, "scene"):
+            open_scene(scene)
     return list(drives.values())
 
 
@@ -114,39 +115,27 @@ def _check_keys(path: Path, common: Mapping[str, Any], *, grid: Mapping[str, Any
         raise InputError(f'{path}: no scene; add scene = ["DIRECTORY"] to the grid')
 
 
-def _drive(path: Path, common: Mapping[str, Any], *, grid: Mapping[str, Any]) -> GridDrive:
+def _drive(
+    path: Path, common: Mapping[str, Any], *, grid: Mapping[str, Any], maps: Mapping[str, MapScene]
+) -> GridDrive:
     """The drive of one combination of values."""
-    texts = {name: _text(value) for name, value in grid.items()}
+    texts = {name: text_of(value) for name, value in grid.items()}
     name = "_".join(f"{key}-{_slug(text)}" if key != "scene" else _slug(text) for key, text in texts.items())
     name = name or "drive"
-    with _naming(path, f"drive {name}"):
+    with naming(path, f"drive {name}"):
         values = {**common, **grid}
         scene = values.pop("scene")
         if not isinstance(scene, str):
-            raise InputError("scene: give the directory of a scene, or a map")
-        words = [word for key, value in values.items() for word in _words(key, value)]
+            raise InputError("scene: give the directory of a scene, a map, or the name of a table [[map]]")
+        words = [word for key, value in values.items() for word in words_of(key, value)]
         options, wanted = _parsed(words)
         _check(options)
         options = _with_absolute_paths(options)
         if wanted.profile_cache:
             wanted = replace(wanted, profile_cache=wanted.profile_cache.absolute())
-    return GridDrive(name, Path(scene).absolute(), texts, options, wanted)
-
-
-@contextmanager
-def _naming(path: Path, what: str) -> Iterator[None]:
-    """Raise errors of the block as InputErrors that name the file and what in it has the error."""
-    try:
-        yield
-    except (CycloptsError, LidarError, GeosceneError, OSError) as error:
-        raise InputError(f"{path}: {what}: {str(error).rstrip('.')}") from error
-
-
-def _text(value: Any) -> str:
-    """A value of the grid as one text."""
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+        place = Path(scene) if url_of(scene) else Path(scene).absolute()
+        source = maps.get(scene) or (map_of_file(place) if place.is_file() else None)
+    return GridDrive(name, source.osm[0] if source else place, texts, options, wanted, source)
 
 
 def _slug(text: str) -> str:
@@ -157,22 +146,6 @@ def _slug(text: str) -> str:
     if plain == text:
         return plain
     return f"{plain}-{hashlib.blake2b(text.encode(), digest_size=3).hexdigest()}"
-
-
-def _words(key: str, value: Any) -> list[str]:
-    """An option and its value as on the command line of ``lidar drive``."""
-    flag = f"--{key.replace('_', '-')}"
-    if isinstance(value, dict):
-        raise InputError(f"{key}: give a text, a number or a list")
-    if isinstance(value, bool) and key != "traffic":
-        return [flag] * value
-    if not isinstance(value, list):
-        return [flag, _text(value)] if value != "" else []
-    if key in _REPEATED:
-        return [word for item in value for word in (flag, str(item))]
-    if key in _JOINED:
-        return [flag, ",".join(map(str, value))] if value else []
-    return [flag, *map(str, value)]
 
 
 def _parsed(words: list[str]) -> tuple[DriveOptions, AccuracyOptions]:

@@ -15,13 +15,10 @@ import numpy as np
 from geoscene.cluster import Cluster, connected
 from geoscene.errors import GeosceneError, WorkersLostError
 from geoscene.files import digest_of, exclusive, write_columns, write_json
-from geoscene.options import BuildOptions
-from geoscene.pipeline import build
 from geoscene.processes import run_tasks
 from geoscene.progress import Progress, silent
 from geoscene.scene import open_scene
 from geoscene.scene.layout import using
-from geoscene.sources import read_osm
 from lidar import __version__
 from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Paths
@@ -132,24 +129,19 @@ def sweep(
 def _with_scenes(
     drives: Sequence[GridDrive], folder: Path, *, workers: int, cluster: Cluster | None, progress: Progress
 ) -> list[GridDrive]:
-    """The drives with scenes in folder ``scenes`` for those of maps; they are built as needed."""
-    scenes: dict[Path, Path] = {}
-    for file in dict.fromkeys(planned.scene for planned in drives if planned.scene.is_file()):
-        name = file.name.split(".")[0]
-        target = folder / "scenes" / name
-        if target in scenes.values():
-            raise InputError(f"scene: two maps are named {name}; rename one of them")
-        build(
-            read_osm(file),
-            target,
-            options=BuildOptions(name=name),
-            overwrite=target.exists(),  # its unchanged tiles are kept
-            workers=workers,
-            cluster=cluster,
-            progress=progress,
-        )
-        scenes[file] = target
-    return [replace(planned, scene=scenes.get(planned.scene, planned.scene)) for planned in drives]
+    """The drives with scenes in folder ``scenes`` for those of maps; each is built once, as needed."""
+    maps = {planned.map.name: planned.map for planned in drives if planned.map}
+    for planned in drives:
+        if planned.map and planned.map != maps[planned.map.name]:
+            raise InputError(f"scene: two maps are named {planned.map.name}; rename one of them")
+    scenes = {
+        name: one.built(folder / "scenes", workers=workers, cluster=cluster, progress=progress)
+        for name, one in maps.items()
+    }
+    return [
+        replace(planned, scene=scenes[planned.map.name], map=None) if planned.map else planned
+        for planned in drives
+    ]
 
 
 def _is_sweep(folder: Path) -> bool:

@@ -205,3 +205,19 @@ def test_local_folders_are_written_as_they_are(tmp_path):
         assert folder == tmp_path / "scene"
     with pytest.raises(SceneFormatError, match="no such scene directory"):
         open_scene(tmp_path / "scene")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("geoscene", "export", "scene", "-o", "s3://bucket/city.glb"),
+        ("geoscene", "view", "scene", "-o", "s3://bucket/page.html"),
+        ("lidar", "map", "drive", "-o", "s3://bucket/map.laz"),
+        ("lidar", "sweep", "grid.toml", "-o", "s3://bucket/drives"),
+    ],
+)
+def test_outputs_that_are_not_published_are_refused(words, tmp_path):
+    done = run_program(*words, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert f"--out {words[-1]}: only geoscene build and lidar drive write to object storage" in done.stderr
+    assert not list(tmp_path.iterdir())

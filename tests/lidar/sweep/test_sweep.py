@@ -11,6 +11,7 @@ from helpers.scenes import same_files
 
 import geoscene.processes
 import lidar.pipeline
+from geoscene.pipeline import build
 from geoscene.scene import open_scene
 from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError
@@ -144,11 +145,93 @@ def test_several_grids_make_one_job(scene, tmp_path):
     assert [drive.options.fidelity for drive in drives] == ["standard", "standard", "survey"]
 
 
-def test_a_map_is_built_into_a_scene_that_is_kept(tmp_path):
+def write_street(path):
+    """A map of one street."""
     nodes = "".join(f'<node id="{k}" lat="60.16{k}" lon="24.94"/>' for k in range(1, 6))
     refs = "".join(f'<nd ref="{k}"/>' for k in range(1, 6))
+    house = "".join(
+        f'<node id="{k}" lat="{lat}" lon="{lon}"/>'
+        for k, (lat, lon) in enumerate([(60.162, 24.9405), (60.162, 24.9408), (60.1622, 24.9408)], 21)
+    )
     way = f'<way id="9">{refs}<tag k="highway" v="residential"/></way>'
-    (tmp_path / "street.osm").write_text(f'<osm version="0.6">{nodes}{way}</osm>', "utf-8")
+    corners = "".join(f'<nd ref="{k}"/>' for k in (21, 22, 23, 21))
+    way += f'<way id="8">{corners}<tag k="building" v="yes"/></way>'
+    path.write_text(f'<osm version="0.6">{nodes}{house}{way}</osm>', "utf-8")
+
+
+MAPS = """
+[drive]
+route = "random"
+rig = "vlp16"
+duration = 0.2
+[[map]]
+name = "whole"
+osm = "{osm}"
+[[map]]
+name = "blocks"
+osm = ["{osm}"]
+lod = 0
+only = ["buildings", "roads"]
+[grid]
+scene = ["whole", "blocks"]
+seed = [1, 2]
+"""
+
+
+def test_maps_are_built_once_with_their_options_and_shared(tmp_path, monkeypatch):
+    write_street(tmp_path / "street.osm")
+    file = tmp_path / "grid.toml"
+    file.write_text(MAPS.format(osm=tmp_path / "street.osm"))
+    first = sweep(file, tmp_path / "out")
+    assert [row.state for row in first.rows] == ["done"] * 4, first.rows
+    assert [row.name for row in first.rows][::2] == ["whole_seed-1", "blocks_seed-1"]
+    options = [open_scene(tmp_path / "out" / "scenes" / n).manifest["options"] for n in ("whole", "blocks")]
+    assert [(o["lod"], o["name"]) for o in options] == [(2, "whole"), (0, "blocks")]
+    assert options[1]["only"] == ["buildings", "roads"]
+    built = []
+
+    def build_again(*arguments, **options):
+        built.append(arguments[1].name)
+        return build(*arguments, **options)
+
+    monkeypatch.setattr("lidar.sweep.maps.build", build_again)
+    assert sweep(file, tmp_path / "out").rows == first.rows
+    assert not built
+    scene = open_scene(tmp_path / "out" / "scenes" / "whole")
+    tile = scene.files.tile(*scene.tile_indices[0])
+    before = tile.read_bytes()
+    tile.write_bytes(b"damaged")
+    file.write_text(file.read_text().replace("lod = 0", "lod = 1"))
+    again = sweep(file, tmp_path / "out", overwrite=True)
+    assert built == ["whole", "blocks"]
+    assert tile.read_bytes() == before
+    assert again.rows[:2] == first.rows[:2]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (("lod = 0", "lod = 7"), "map blocks: .*lod"),
+        (("lod = 0", "colour = 7"), "map blocks: .*colour"),
+        (("lod = 0", 'dem = ["absent.tif"]'), r"map blocks: absent\.tif: no such file"),
+        (("lod = 0", 'along = ["absent.gpx"]'), r"map blocks: absent\.gpx: no such file"),
+        (("lod = 0", "bbox = [1, 2]"), "map blocks: bbox: give"),
+        (('name = "blocks"', 'name = "whole"'), "two maps are named whole"),
+        (('name = "blocks"', 'name = "../x"'), "map 2: give it a name"),
+        (('osm = ["', 'osms = ["'), "map blocks: give it a map"),
+        (("street.osm", "absent.osm"), "map whole: .*absent.osm: no such file"),
+    ],
+)
+def test_errors_of_maps_are_found_before_the_first_build(tmp_path, changes, message):
+    write_street(tmp_path / "street.osm")
+    (tmp_path / "grid.toml").write_text(MAPS.format(osm=tmp_path / "street.osm").replace(*changes))
+    with pytest.raises(InputError, match=message):
+        sweep(tmp_path / "grid.toml", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_map_is_built_into_a_scene_that_is_kept(tmp_path):
+    write_street(tmp_path / "street.osm")
     text = '[drive]\nroute = "random"\nrig = "vlp16"\nduration = 0.2\n[grid]\nscene = ["{}"]\nseed = [1]\n'
     (tmp_path / "grid.toml").write_text(text.format(tmp_path / "street.osm"), "utf-8")
     first = sweep(tmp_path / "grid.toml", tmp_path / "out")
