@@ -30,7 +30,8 @@ def metres(value: float) -> str:
 
 def share(value: float) -> str:
     """A share in percent, with its sign if negative."""
-    return "0" if value == 0 else f"{100 * value:.2g} %"
+    digits = 3 if abs(value) >= 0.995 else 2
+    return "0" if value == 0 else f"{100 * value:.{digits}g} %"
 
 
 def size(value: float) -> str:
