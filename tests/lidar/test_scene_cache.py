@@ -5,12 +5,14 @@ import shutil
 import socket
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import shapely
 from helpers.programs import ENVIRONMENT, command
 from helpers.scenes import same_files
 
+from geoscene import tiles
 from geoscene.errors import InputError as SceneInputError
 from geoscene.errors import NetworkError
 from geoscene.options import BuildOptions
@@ -149,12 +151,11 @@ def test_the_same_drive_again_reads_no_map_and_builds_nothing(town, south, tmp_p
 
 def test_a_scene_grows_by_the_tiles_that_another_drive_needs(town, south, tmp_path, monkeypatch):
     first = opened(town, south, tmp_path / "cache")
-    tiles = {p.name: p.stat().st_ino for p in first.scene.files.tiles.iterdir()}
     before = {p.name: p.read_bytes() for p in first.scene.files.tiles.iterdir()}
     made = []
-    build_tile = scene_cache.build.__globals__["build_tiles"].__globals__["build_tile"]
-    monkeypatch.setitem(
-        build_tile.__globals__,
+    build_tile = tiles.build_tile
+    monkeypatch.setattr(
+        tiles,
         "build_tile",
         lambda *args, tile, **more: made.append(tile) or build_tile(*args, tile=tile, **more),
     )
@@ -163,8 +164,8 @@ def test_a_scene_grows_by_the_tiles_that_another_drive_needs(town, south, tmp_pa
     assert second.scene.path == first.scene.path
     assert second.built == len(made) > 0
     assert set(second.scene.tile_indices) == set(first.scene.tile_indices) | set(made)
-    for name in tiles:
-        assert (second.scene.files.tiles / name).read_bytes() == before[name]
+    for name, data in before.items():
+        assert (second.scene.files.tiles / name).read_bytes() == data
     assert changed_files(second.scene) == []
     # The scene that was opened before is still good for its drive, and the grown one for both.
     whole = open_scene(town / "whole")
@@ -198,6 +199,54 @@ def test_damaged_and_half_scenes_of_the_cache_are_built_again(harm, town, south,
     assert opened(town, south, tmp_path / "cache").scene.path == first.scene.path
     same_files(first.scene.path, tmp_path / "good")
     assert sorted(p.name for p in first.scene.path.parent.iterdir()) == ["drives", "scene"]
+
+
+def test_a_program_that_is_killed_while_a_scene_grows_leaves_a_cache_that_works(
+    town, south, tmp_path, monkeypatch
+):
+    north = replace(south, route=[at(3020), at(3180)])
+    opened(town, south, tmp_path / "cache")
+    replaced = Path.replace
+
+    def killed(path, target):
+        if path.name == "scene.json" and path.parent.name == "scene.new":
+            raise KeyboardInterrupt
+        return replaced(path, target)
+
+    monkeypatch.setattr(Path, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        opened(town, north, tmp_path / "cache")
+    monkeypatch.undo()
+    for number, options in enumerate((north, south, north)):
+        scene = opened(town, options, tmp_path / "cache").scene
+        assert changed_files(scene) == []
+        drive(open_scene(town / "whole"), tmp_path / f"a{number}", options=options)
+        drive(scene, tmp_path / f"b{number}", options=options)
+        same_drives(tmp_path / f"a{number}", tmp_path / f"b{number}")
+    assert opened(town, south, tmp_path / "cache").built == 0
+
+
+def test_a_build_that_is_interrupted_is_resumed(town, south, tmp_path, monkeypatch):
+    build_tile = tiles.build_tile
+    made = []
+
+    def stopping(*args, tile, **more):
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        made.append(tile)
+        return build_tile(*args, tile=tile, **more)
+
+    monkeypatch.setattr(tiles, "build_tile", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        opened(town, south, tmp_path / "cache")
+    monkeypatch.setattr(
+        tiles,
+        "build_tile",
+        lambda *args, tile, **more: made.append(tile) or build_tile(*args, tile=tile, **more),
+    )
+    found = opened(town, south, tmp_path / "cache")
+    assert sorted(made) == found.scene.tile_indices  # each once
+    assert sorted(p.name for p in found.scene.path.parent.iterdir()) == ["drives", "scene"]
 
 
 def test_other_options_and_contents_have_scenes_of_their_own(town, south, tmp_path):
