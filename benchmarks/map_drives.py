@@ -4,7 +4,7 @@
                                     [--workers 2] [--folder DIR] [--json]
 
 All drives must have the same files but for ``dataset.json``, which names the scene. ``first_s`` is the wall
-time to the first point cloud, of a drive through a scene with the build. Costs as in benchmarks/scale.py.
+time to the first point cloud, of a drive through a scene with the build. Costs as of `bench.measure.command`.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import argparse
 import sys
 import tempfile
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from scale import build_command, run, show
+from along import show
+from bench.maps import build_command
+from bench.measure import command
 
 from geoscene.scene import open_scene
 
@@ -25,8 +26,8 @@ from geoscene.scene import open_scene
 def compared(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
     """Costs of the build, of the drive in its scene, and of two drives through the map."""
     whole, cache = folder / "whole", folder / "cache"
-    cost = run(build_command(given.extract, whole, "--workers", str(given.workers)))
-    rows = [{"what": "build of the whole map", **_scene(whole), **asdict(cost)}]
+    cost = command(build_command(given.extract, whole, "--workers", str(given.workers)))
+    rows = [{"what": "build of the whole map", **_scene(whole), **cost.row()}]
     drives = []
     for what, scene in (
         ("drive in its scene", whole),
@@ -34,18 +35,18 @@ def compared(given: argparse.Namespace, folder: Path) -> list[dict[str, Any]]:
         ("the same again", given.extract),
     ):
         out = folder / f"drive_{len(drives)}"
-        command = [sys.executable, "-m", "lidar.cli", "drive", str(scene), "--route", *given.route]
-        command += ["--rig", given.rig, "--format", "pcd", "--workers", str(given.workers), "--out", str(out)]
-        command += ["--overwrite", "--quiet"]
-        command += ["--duration", str(given.duration)] if given.duration else []
-        command += ["--scene-cache", str(cache)] if scene == given.extract else []
+        words = [sys.executable, "-m", "lidar", "drive", str(scene), "--route", *given.route]
+        words += ["--rig", given.rig, "--format", "pcd", "--workers", str(given.workers), "--out", str(out)]
+        words += ["--overwrite", "--quiet"]
+        words += ["--duration", str(given.duration)] if given.duration else []
+        words += ["--scene-cache", str(cache)] if scene == given.extract else []
         began = time.time()
-        cost = run(command)
+        cost = command(words)
         first = min(path.stat().st_mtime for path in out.rglob("*.pcd")) - began
         drives.append(_files(out))
         (cached,) = cache.glob("*/scene") if scene == given.extract else [whole]
         before = rows[0]["wall_s"] if scene == whole else 0.0
-        rows.append({"what": what, **_scene(cached), **asdict(cost), "first_s": round(before + first, 1)})
+        rows.append({"what": what, **_scene(cached), **cost.row(), "first_s": round(before + first, 1)})
         rows[-1] |= {
             "clouds": sum(name.suffix == ".pcd" for name in drives[-1]),
             "same": drives[-1] == drives[0],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,14 +18,12 @@ class Needed:
     classes: tuple[str, ...] | None = None
 
 
-_DRIVEN = MappingProxyType(
-    {
-        "buildings": Needed(("min_height",)),
-        "landcover": Needed(("class",), ("parking",)),
-        "road_surfaces": Needed(("class",), ("road", "lane_marking", "crossing", "parking", "sidewalk")),
-        "structures": Needed(()),
-    }
-)
+_DRIVEN: Mapping[str, Needed] = {
+    "buildings": Needed(("min_height",)),
+    "landcover": Needed(("class",), ("parking",)),
+    "road_surfaces": Needed(("class",), ("road", "lane_marking", "crossing", "parking", "sidewalk")),
+    "structures": Needed(()),
+}
 """What routes, traffic and parked vehicles are planned with."""
 
 
@@ -52,29 +49,27 @@ class Use:
         return self.tables is not None if part == "tables" else not getattr(self, part)
 
 
-USES: Mapping[str, Use] = MappingProxyType(
-    {
-        "all": Use("everything"),
-        "lidar": Use(
-            "what laser scanners, positions and traffic need",
-            colors=False,
-            tables=_DRIVEN,
-            indexed=False,
+USES: Mapping[str, Use] = {
+    "all": Use("everything"),
+    "lidar": Use(
+        "what laser scanners, positions and traffic need",
+        colors=False,
+        tables=_DRIVEN,
+        indexed=False,
+    ),
+    "camera": Use(
+        "what cameras, laser scanners, positions and traffic need",
+        tables=_DRIVEN,
+        indexed=False,
+    ),
+    "gis": Use("tables and road graph only", tiles=False),
+    "map": Use(
+        "road graph and tables in plan only",
+        tiles=False,
+        tables=dict.fromkeys(
+            ("buildings", "landcover", "road_surfaces", "roads", "trees", "furniture", "barriers"),
+            Needed(),
         ),
-        "camera": Use(
-            "what cameras, laser scanners, positions and traffic need",
-            tables=_DRIVEN,
-            indexed=False,
-        ),
-        "gis": Use("tables and road graph only", tiles=False),
-        "map": Use(
-            "road graph and tables in plan only",
-            tiles=False,
-            tables=dict.fromkeys(
-                ("buildings", "landcover", "road_surfaces", "roads", "trees", "furniture", "barriers"),
-                Needed(),
-            ),
-        ),
-    }
-)
+    ),
+}
 """Uses by name; ``all`` is the default."""

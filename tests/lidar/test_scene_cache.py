@@ -201,6 +201,15 @@ def test_damaged_and_half_scenes_of_the_cache_are_built_again(harm, town, south,
     assert sorted(p.name for p in first.scene.path.parent.iterdir()) == ["drives", "scene"]
 
 
+def test_scenes_are_built_by_several_processes_that_start_anew_if_libraries_have_threads(
+    town, south, tmp_path
+):
+    drive(open_scene(town / "whole"), tmp_path / "threads", options=south)
+    alone = opened(town, south, tmp_path / "one").scene
+    together = opened(town, replace(south, workers=2), tmp_path / "two").scene
+    same_files(alone.path, together.path)
+
+
 def test_a_program_that_is_killed_while_a_scene_grows_leaves_a_cache_that_works(
     town, south, tmp_path, monkeypatch
 ):
