@@ -23,7 +23,7 @@ from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.cluster import record_on_cluster
 from lidar.dataset.boxes import merge_box_files
-from lidar.dataset.journal import Journal, read_journal
+from lidar.dataset.journal import Entries, Journal, read_journal
 from lidar.dataset.layout import Paths, prepare
 from lidar.dataset.metadata import write_metadata
 from lidar.dataset.record import record_frame
@@ -32,7 +32,7 @@ from lidar.errors import LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import write_trajectory
 from lidar.options import DriveOptions
-from lidar.plan import DrivePlan, Job, plan_drive
+from lidar.plan import DrivePlan, Job, Jobs, plan_drive
 from lidar.rig.devices import Scanner
 from lidar.world.thread_worlds import Worlds
 
@@ -141,7 +141,7 @@ def _driven(
         recording = plan.recording(out)
         journal = _verified(recording, plan.jobs, progress=progress)
         _write_plan(plan, out, manifest=manifest)
-        pending = plan.jobs.where(lambda job: (job.sensor.name, job.frame) not in journal.entries)
+        pending = _pending(plan, journal)
         resumed, before = len(plan.jobs) - len(pending), _points(plan, journal)
         recording_from = time.perf_counter()
         if cluster is None:
@@ -198,22 +198,32 @@ def _write_plan(plan: DrivePlan, out: Path, *, manifest: dict[str, Any]) -> None
 def _verified(recording: Recording, jobs: Sequence[Job], *, progress: Progress) -> Journal:
     """The journal of the dataset, with only those of the frames whose files are as they were written."""
     path = Paths(recording.out).journal
-    old, kept = read_journal(path), {}
-    for k, job in enumerate(jobs if old else ()):
+    old, kept = read_journal(path), Entries()
+    tables = {name: old.of(name) for name in old.sensors}
+    for k, job in enumerate(jobs if tables else ()):
         progress("verifying", k, total=len(jobs))
-        key = job.sensor.name, job.frame
-        if key in old and old[key][1] == recording.digest(job.sensor, job.frame):
-            kept[key] = old[key]
+        table = tables.get(job.sensor.name)
+        row = -1 if table is None else table.row(job.frame)
+        if table is None or row < 0:
+            continue
+        points, digest = int(table.points[row]), table.digest[row].decode()
+        if digest == recording.digest(job.sensor, job.frame):
+            kept.add(job.sensor.name, job.frame, points=points, digest=digest)
     return Journal(path, kept)
+
+
+def _pending(plan: DrivePlan, journal: Journal) -> Jobs:
+    """The frames that are not finished."""
+    finished = {name: np.zeros(count, bool) for name, count in plan.frames.items()}
+    for name, done in finished.items():
+        done[journal.entries.of(name).frame] = True
+    return plan.jobs.where(lambda job: not finished[job.sensor.name][job.frame])
 
 
 def _points(plan: DrivePlan, journal: Journal) -> dict[str, int]:
     """Points of the finished frames, by scanner."""
-    points = {s.name: 0 for s in plan.sensors if isinstance(s, Scanner)}
-    for (name, _), (count, _) in journal.entries.items():
-        if name in points:
-            points[name] += count
-    return points
+    names = [s.name for s in plan.sensors if isinstance(s, Scanner)]
+    return {name: int(journal.entries.of(name).points.sum()) for name in names}
 
 
 @contextmanager

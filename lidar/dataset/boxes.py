@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import heapq
+import itertools
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class
-from geoscene.files import write_atomically
+from geoscene.files import atomic_path
 from geoscene.typing import Float, Ints
 from lidar.camera.outline import outline
-from lidar.dataset.layout import Paths, read_rows, read_sensors, reading_file
+from lidar.dataset.layout import Paths, frame_numbers, read_rows, read_sensors, reading_file
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.camera_model import project
@@ -215,67 +220,88 @@ def merge_box_files(out: Path) -> None:
     """
     paths = Paths(out)
     calibration = read_sensors(paths)
-    lines = {
-        name: _merged(paths, name) for name, s in calibration.items() if s["kind"] in ("lidar", "camera")
+    headers = {
+        name: _merge(paths, name) for name, s in calibration.items() if s["kind"] in ("lidar", "camera")
     }
-    scanners = [name for name in lines if calibration[name]["kind"] == "lidar"]
-    if not scanners or not lines[scanners[0]]:
+    scanners = [name for name in headers if calibration[name]["kind"] == "lidar"]
+    if not scanners or not headers[scanners[0]]:
         return
     with reading_file(paths.calibration):  # its kinds of sensors and their box files may disagree
-        header, *rows = lines[scanners[0]]
-        step_ns = 10**9 / calibration[scanners[0]]["rate_hz"]
-        first_ns = calibration[scanners[0]]["time_offset_ns"]
-        counts = [_points_by_step(lines[name], first_ns, step_ns=step_ns) for name in scanners]
-        names = header.split(",")
-        frame, number, time = names.index("frame"), names.index("id"), names.index("time_ns")
-        keyed = {(int(c[frame]), int(c[number])): row for row in rows for c in [row.split(",")]}
-        for name, count in zip(scanners[1:], counts[1:], strict=True):
-            for row in lines[name][1:]:
-                cells = row.split(",")
-                key = _step(int(cells[time]), first_ns, step_ns=step_ns), int(cells[number])
-                if key not in keyed and count[key]:
-                    cells[frame] = str(key[0])
-                    keyed[key] = ",".join(cells)
-    merged = [",".join([header, *(f"points_{name}" for name in scanners)])]
-    merged += [",".join([keyed[k], *(str(count.get(k, 0)) for count in counts)]) for k in sorted(keyed)]
-    write_atomically(paths.boxes, ("\n".join(merged) + "\n").encode("utf-8"))
+        if len({headers[name] for name in scanners} - {""}) > 1:
+            raise ValueError("box files of scanners have other columns")
+        first = calibration[scanners[0]]
+        step = partial(_step, first_ns=first["time_offset_ns"], step_ns=10**9 / first["rate_hz"])
+        streams = [
+            _by_step(paths.sensor_boxes(name), order, step=step)
+            for order, name in enumerate(scanners)
+            if headers[name]
+        ]
+        with atomic_path(paths.boxes) as part, part.open("w", encoding="utf-8", newline="") as file:
+            file.write(",".join([headers[scanners[0]], *(f"points_{name}" for name in scanners)]) + "\n")
+            names = headers[scanners[0]].split(",")
+            in_time = heapq.merge(*streams, key=itemgetter(0, 1))
+            for k, group in itertools.groupby(in_time, key=itemgetter(0)):
+                rows = {order: cells for _, order, cells in group}
+                file.writelines(_merged(names, k, rows=rows, scanners=len(scanners)))
 
 
-def _merged(paths: Paths, name: str) -> list[str]:
-    """Header and rows of all box files of a sensor, written to its ``boxes.csv`` too; empty without files.
-
-    Raises DatasetError for a damaged file.
-    """
-    lines: list[str] = []
-    for part in sorted(paths.frame_boxes(name, 0).parent.glob("*.csv")):
-        with reading_file(part):
-            header, *rows = part.read_text("utf-8").splitlines()
-            names = header.split(",")
-            whole = [names.index(key) for key in ("frame", "time_ns", "id", "points") if key in names]
-            for cells in (row.split(",") for row in rows):
-                if len(cells) != len(names) or header != (lines or [header])[0]:
-                    raise ValueError("rows and columns disagree")
-                _ = [int(cells[column]) for column in whole]
-        lines += rows if lines else [header, *rows]
-    if lines:
-        write_atomically(paths.sensor_boxes(name), ("\n".join(lines) + "\n").encode("utf-8"))
-    return lines
+def _by_step(
+    path: Path, order: int, *, step: Callable[[int], int]
+) -> Iterator[tuple[int, int, list[list[str]]]]:
+    """Number of each step with boxes of a scanner, the scanner's order, and the cells of the rows in it."""
+    with path.open(encoding="utf-8", newline="") as file:
+        time = next(file).rstrip("\n").split(",").index("time_ns")
+        cells = (line.rstrip("\n").split(",") for line in file)
+        for k, group in itertools.groupby(cells, key=lambda row: step(int(row[time]))):
+            yield k, order, list(group)
 
 
-def _step(time_ns: int, first_ns: int, *, step_ns: float) -> int:
+def _merged(
+    names: list[str], step: int, *, rows: Mapping[int, list[list[str]]], scanners: int
+) -> Iterator[str]:
+    """Lines of the dataset's boxes of a step, from the rows of each scanner; ``names`` of their columns."""
+    frame, number, points = (names.index(name) for name in ("frame", "id", "points"))
+    boxes = {int(cells[number]): cells for cells in rows.get(0, ())}
+    counts: list[Counter[int]] = []
+    for order in range(scanners):
+        count: Counter[int] = Counter()
+        for cells in rows.get(order, ()):
+            count[int(cells[number])] += int(cells[points])
+        for cells in rows.get(order, ()):
+            user = int(cells[number])
+            if user not in boxes and count[user]:
+                boxes[user] = [*cells[:frame], str(step), *cells[frame + 1 :]]
+        counts.append(count)
+    for user in sorted(boxes):
+        yield ",".join([*boxes[user], *(str(count[user]) for count in counts)]) + "\n"
+
+
+def _step(time_ns: int, *, first_ns: int, step_ns: float) -> int:
     """Number of the step that holds a frame's start; 1 ns is added because starts are rounded down."""
     return int((time_ns - first_ns + 1) // step_ns)
 
 
-def _points_by_step(lines: list[str], first_ns: int, *, step_ns: float) -> dict[tuple[int, int], int]:
-    """Sums of points by (step, road user's id); step k starts ``k * step_ns`` after ``first_ns``."""
-    if not lines:
-        return {}
-    names = lines[0].split(",")
-    time, number, points = (names.index(name) for name in ("time_ns", "id", "points"))
-    total: dict[tuple[int, int], int] = {}
-    for line in lines[1:]:
-        cells = line.split(",")
-        key = _step(int(cells[time]), first_ns, step_ns=step_ns), int(cells[number])
-        total[key] = total.get(key, 0) + int(cells[points])
-    return total
+def _merge(paths: Paths, name: str) -> str:
+    """Write all box files of a sensor as one, its ``boxes.csv``; return the header, empty without files.
+
+    Raises DatasetError for a damaged file.
+    """
+    header = ""
+    frames = frame_numbers(paths.frame_boxes(name, 0).parent, ".csv").tolist()
+    if not frames:
+        return header
+    target = paths.sensor_boxes(name)
+    with atomic_path(target) as whole, whole.open("w", encoding="utf-8", newline="") as file:
+        for part in (paths.frame_boxes(name, frame) for frame in frames):
+            with reading_file(part):
+                own, *rows = part.read_text("utf-8").splitlines()
+                names = own.split(",")
+                numbers = [names.index(key) for key in ("frame", "time_ns", "id", "points") if key in names]
+                for cells in (row.split(",") for row in rows):
+                    if len(cells) != len(names) or own != (header or own):
+                        raise ValueError("rows and columns disagree")
+                    _ = [int(cells[column]) for column in numbers]
+            lines = rows if header else [own, *rows]
+            header = header or own
+            file.writelines(f"{line}\n" for line in lines)
+    return header

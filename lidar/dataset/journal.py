@@ -5,17 +5,23 @@ from __future__ import annotations
 import csv
 import hashlib
 import threading
-from collections.abc import Iterable, Mapping
+from array import array
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from geoscene.files import write_columns
+from geoscene.columns import Columns
+from geoscene.files import table_blocks, write_blocks
+from geoscene.typing import Ints
 
 _HEADER = ("sensor", "frame", "points", "digest")
-
-Entry = tuple[int, str]
-"""Number of points of a frame (0 for images), and the digest of its files."""
+_DIGEST = 20
+"""Characters of a digest."""
+_LARGEST = 1 << 62
 
 
 def digest_of_files(paths: Iterable[Path]) -> str:
@@ -28,41 +34,108 @@ def digest_of_files(paths: Iterable[Path]) -> str:
             digest.update(data)
     except OSError:
         return ""
-    return digest.hexdigest()[:20]
+    return digest.hexdigest()[:_DIGEST]
 
 
-def read_journal(path: Path) -> dict[tuple[str, int], Entry]:
-    """Finished frames by sensor and number; lines that are damaged or cut off are left out."""
-    found: dict[tuple[str, int], Entry] = {}
+@dataclass(frozen=True, slots=True)
+class FinishedFrames(Columns):
+    """Finished frames of a sensor.
+
+    frame  : (n,) int64, rising
+    points : (n,) int64, number of points, 0 for images
+    digest : (n,) ASCII, of the files
+    """
+
+    frame: Ints
+    points: Ints
+    digest: NDArray[np.bytes_]
+
+    def row(self, frame: int) -> int:
+        """Row of a frame; -1 for none."""
+        k = int(np.searchsorted(self.frame, frame))
+        return k if k < len(self.frame) and self.frame[k] == frame else -1
+
+
+class Entries:
+    """Finished frames of all sensors; memory holds 38 bytes of each."""
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+        self._sensor, self._frame, self._points = array("H"), array("q"), array("q")
+        self._digest = bytearray()
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return sum(len(self.of(name)) for name in self._names)
+
+    @property
+    def sensors(self) -> list[str]:
+        """Names of the sensors with finished frames, sorted."""
+        return sorted(self._names)
+
+    def add(self, sensor: str, frame: int, *, points: int, digest: str) -> None:
+        """Add a frame; it replaces an earlier entry of the same frame."""
+        if sensor not in self._names:
+            self._names.append(sensor)
+        self._sensor.append(self._names.index(sensor))
+        self._frame.append(frame)
+        self._points.append(points)
+        self._digest += digest.encode("ascii").ljust(_DIGEST)
+
+    def of(self, sensor: str) -> FinishedFrames:
+        """The finished frames of a sensor."""
+        number = self._names.index(sensor) if sensor in self._names else -1
+        rows = np.flatnonzero(np.array(self._sensor) == number)
+        frame = np.array(self._frame)[rows]
+        frame, last = np.unique(frame[::-1], return_index=True)
+        rows = rows[::-1][last]
+        digest = np.frombuffer(bytes(self._digest), f"S{_DIGEST}")[rows]
+        return FinishedFrames(frame, np.array(self._points)[rows], np.char.rstrip(digest))
+
+
+def read_journal(path: Path) -> Entries:
+    """Finished frames of a dataset; lines that are damaged or cut off are left out."""
+    found = Entries()
     if not path.is_file():
         return found
-    for row in csv.reader(path.read_text("utf-8", "replace").splitlines()):
-        if len(row) == len(_HEADER) and row[1].isdecimal() and row[2].isdecimal():
-            found[row[0], int(row[1])] = int(row[2]), row[3]
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+        for row in csv.reader(file):
+            if len(row) != len(_HEADER) or not (row[1].isdecimal() and row[2].isdecimal()):
+                continue
+            sensor, frame, points, digest = row[0], int(row[1]), int(row[2]), row[3]
+            if max(frame, points) < _LARGEST and digest.isascii() and len(digest) <= _DIGEST:
+                found.add(sensor, frame, points=points, digest=digest)
     return found
 
 
-def write_journal(path: Path, entries: Mapping[tuple[str, int], Entry]) -> None:
+def write_journal(path: Path, entries: Entries) -> None:
     """Write finished frames in order of sensor and number."""
-    rows = [(*key, *entries[key]) for key in sorted(entries)]
-    columns = zip(*rows, strict=True) if rows else [()] * len(_HEADER)
-    write_columns(path, dict(zip(_HEADER, map(np.array, columns), strict=True)))
+    write_blocks(path, _blocks(entries))
+
+
+def _blocks(entries: Entries) -> Iterator[dict[str, Any]]:
+    for name in entries.sensors or [""]:
+        table = entries.of(name)
+        for rows in table_blocks(len(table)):
+            block = table.take(rows)
+            columns = [name] * len(block), block.frame, block.points, block.digest.astype(str)
+            yield dict(zip(_HEADER, columns, strict=True))
 
 
 class Journal:
     """The frames that are finished; several threads may add to it.
 
-    entries : by sensor and frame, those of earlier runs among them
+    entries : those of earlier runs among them
     """
 
-    def __init__(self, path: Path, entries: Mapping[tuple[str, int], Entry]) -> None:
-        self.path, self.entries, self._lock = path, dict(entries), threading.Lock()
+    def __init__(self, path: Path, entries: Entries) -> None:
+        self.path, self.entries, self._lock = path, entries, threading.Lock()
         write_journal(path, self.entries)
 
     def add(self, sensor: str, frame: int, *, points: int, digest: str) -> None:
         """Add a frame whose files are written."""
         with self._lock:
-            self.entries[sensor, frame] = points, digest
+            self.entries.add(sensor, frame, points=points, digest=digest)
             with self.path.open("a", encoding="utf-8") as file:
                 file.write(f"{sensor},{frame},{points},{digest}\n")
 

@@ -17,22 +17,23 @@ from __future__ import annotations
 import csv
 import json
 import logging
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import CRS
 
 from geoscene.errors import reading
 from geoscene.files import digest
 from geoscene.frames import Frame
 from geoscene.storage import Stored, cache_folder, url_of
+from geoscene.typing import Ints
 from lidar.dataset.formats import Format
 from lidar.errors import DatasetError, LidarError
 from lidar.geometry.poses import Trajectory
@@ -159,16 +160,15 @@ class Dataset:
         """Entries of ``calibration.json`` by name, of sensors of some kinds (lidar, camera, gnss, imu)."""
         return read_sensors(self.paths, *kinds)
 
-    def sample_times(self, name: str) -> NDArray[np.int64]:
+    def sample_times(self, name: str) -> Ints:
         """Times (n,) of a sensor's measurements or frame starts, nanoseconds since the drive's start.
 
         Raises DatasetError if the drive has not written them.
         """
         frames = self.sensors()[name]["kind"] in ("lidar", "camera")
         path = self.paths.timestamps(name) if frames else self.paths.measurements(name)
-        rows = read_rows(path)
-        with reading_file(path):
-            times = np.array([int(row["time_ns"]) for row in rows], np.int64)
+        with reading_file(path), opened_rows(path) as rows:
+            times = np.fromiter((int(row["time_ns"]) for row in rows), np.int64)
             if (np.diff(times) <= 0).any() or (times < 0).any():
                 raise DatasetError(f"{path}: damaged (times do not increase); drive again with `overwrite`")
         return times
@@ -179,9 +179,9 @@ class Dataset:
 
     def files(self, sensor: str, form: Format) -> Iterator[tuple[int, Path]]:
         """(frame number, path) of a sensor's clouds of one format, in order."""
-        for path in sorted(form.path(self.paths.sensor(sensor), 0).parent.glob(f"*{form.suffix}")):
-            if (number := path.name.removesuffix(form.suffix)).isdigit():
-                yield int(number), path
+        folder = self.paths.sensor(sensor)
+        for frame in frame_numbers(form.path(folder, 0).parent, form.suffix).tolist():
+            yield frame, form.path(folder, frame)
 
 
 def open_dataset(path: str | Path) -> Dataset:
@@ -220,8 +220,28 @@ def reading_file(path: Path) -> AbstractContextManager[None]:
     return reading(path, DatasetError, remedy="drive again with `overwrite`", known=LidarError)
 
 
+def frame_numbers(folder: Path, suffix: str) -> Ints:
+    """Numbers (n,) of the frames that have a file in a folder, rising; none without the folder."""
+    if not folder.is_dir():
+        return np.empty(0, np.int64)
+    with os.scandir(folder) as entries:
+        stems = (entry.name.removesuffix(suffix) for entry in entries if entry.name.endswith(suffix))
+        numbers = np.fromiter((int(s) for s in stems if s.isdecimal() and s == f"{int(s):06d}"), np.int64)
+    return np.sort(numbers)
+
+
 def read_rows(path: Path) -> list[dict[str, str]]:
     """The rows of a dataset's CSV file.
+
+    Raises DatasetError if it cannot be read.
+    """
+    with opened_rows(path) as rows:
+        return list(rows)
+
+
+@contextmanager
+def opened_rows(path: Path) -> Iterator[Iterator[dict[str, str]]]:
+    """Yield the rows of a dataset's CSV file, of which one at a time is in memory.
 
     Raises DatasetError if it cannot be read.
     """
@@ -230,7 +250,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         reading(path, DatasetError, remedy=remedy, known=LidarError),
         path.open(newline="", encoding="utf-8") as file,
     ):
-        return list(csv.DictReader(file, strict=True))
+        yield csv.DictReader(file, strict=True)
 
 
 def read_sensors(paths: Paths, *kinds: str) -> dict[str, dict[str, Any]]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import table_blocks, write_atomically, write_blocks, write_columns, write_json
+from geoscene.files import atomic_path, table_blocks, write_blocks, write_json
 from geoscene.frames import Frame
 from geoscene.scene import Scene
 from lidar.dataset.kitti_sequence import write_sequence
@@ -202,14 +202,23 @@ def _write_fixes(
     fixes = observe_gnss(trajectory, scene.frame, spec=spec, seed=seed, start=start, sky=sky)
     vertical = scene.frame.vertical
     geoid = None if vertical == "flat" else geoid_at(*fixes.true_lonlath[:, :2].T)
-    stamped: dict[str, Any] = {"timestamp": iso_times(start, fixes.time_ns), **gnss_columns(fixes)}
-    stamped["h_above"] = np.full(len(fixes), HEIGHTS[vertical].split()[-1])
-    if geoid is not None:
-        stamped["geoid"] = geoid.separation
-    write_columns(paths.measurements(spec.name), stamped)
+    columns = gnss_columns(fixes) | {"h_above": np.full(len(fixes), HEIGHTS[vertical].split()[-1])}
     separation = None if geoid is None else geoid.separation
-    lines = [
-        height_note(vertical, geoid.name if geoid else ""),
-        *nmea(fixes, start, vertical=vertical, separation=separation),
-    ]
-    write_atomically(paths.measurements(spec.name, ".nmea"), "".join(lines).encode("ascii"))
+    if separation is not None:
+        columns["geoid"] = separation
+    write_blocks(
+        paths.measurements(spec.name),
+        (
+            {
+                "timestamp": iso_times(start, fixes.time_ns[rows]),
+                **{name: column[rows] for name, column in columns.items()},
+            }
+            for rows in table_blocks(len(fixes))
+        ),
+    )
+    with (
+        atomic_path(paths.measurements(spec.name, ".nmea")) as part,
+        part.open("w", encoding="ascii", newline="") as file,
+    ):
+        file.write(height_note(vertical, geoid.name if geoid else ""))
+        file.writelines(nmea(fixes, start, vertical=vertical, separation=separation))

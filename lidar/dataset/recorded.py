@@ -15,7 +15,7 @@ from geoscene.typing import Ints
 from lidar.dataset.deskew import deskewed
 from lidar.dataset.formats import FORMATS, Format, format_of, read_table
 from lidar.dataset.formats.table import PointLabels, Table, placed_returns
-from lidar.dataset.layout import Dataset, reading_file
+from lidar.dataset.layout import Dataset, frame_numbers, reading_file
 from lidar.errors import DatasetError
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.mounts import Mount
@@ -90,8 +90,8 @@ def color_images(dataset: Dataset, name: str) -> Stream | None:
         if not np.isfinite(np.array(camera["K"], float).reshape(3, 3)).all():
             raise ValueError("intrinsics are not finite")
         _ = int(camera["width"]), int(camera["height"]), str(camera["model"]), list(camera["distortion"])
-    paths = sorted(dataset.paths.image(name, 0, kind="rgb").parent.glob("*.png"))
-    found = [(int(path.stem), path) for path in paths if path.stem.isdigit()]
+    numbers = frame_numbers(dataset.paths.image(name, 0, kind="rgb").parent, ".png").tolist()
+    found = [(frame, dataset.paths.image(name, frame, kind="rgb")) for frame in numbers]
     return _stream(dataset, name, found=found) if found else None
 
 

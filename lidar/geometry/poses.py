@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from geoscene.columns import Columns, row_blocks
 from geoscene.typing import Float
@@ -28,18 +28,24 @@ At a yaw rate of 1 rad/s the chord deviates from the arc by (2e-4)^2 / 8 = 5e-9 
 BLOCK_POSES = 1 << 17
 """Poses of a trajectory that are worked on at once: 22 minutes at 100 Hz."""
 _IN_MEMORY = 1 << 20
-"""Poses up to which a trajectory is kept in memory: three hours at 100 Hz."""
+"""Poses up to which a trajectory is in memory: three hours at 100 Hz; other arrays: three times as many."""
 _RISING = "a trajectory needs two or more poses at increasing times"
 
 
 def blocks_of(count: int, *, overlap: int = 0) -> Iterator[slice]:
-    """Slices that cover ``count`` rows: `BLOCK_POSES` each, and ``overlap`` rows of the next one."""
-    return row_blocks(count, BLOCK_POSES, overlap=overlap)
+    """Slices that cover ``count`` rows: `BLOCK_POSES` each, and ``overlap`` rows of the next one.
+
+    A last slice of one row, which is no trajectory, is part of the one before.
+    """
+    even = count - 1 if count > 1 and count % BLOCK_POSES == 1 else count
+    for rows in row_blocks(even, BLOCK_POSES, overlap=overlap):
+        yield slice(rows.start, count if rows.stop == even else rows.stop)
 
 
-def _room(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
-    """An array to fill, in memory, or for a long trajectory in a temporary file: see `_release`."""
-    if shape[0] <= _IN_MEMORY:
+def room(shape: tuple[int, ...], kind: DTypeLike = float) -> NDArray[Any]:
+    """An array to fill, in memory, or for a long drive in a temporary file: see `release`."""
+    kind = np.dtype(kind)
+    if math.prod(shape) <= 3 * _IN_MEMORY:
         return np.empty(shape, kind)
     size = math.prod(shape) * kind.itemsize
     with tempfile.TemporaryFile() as file:
@@ -50,15 +56,16 @@ def _room(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
         return np.frombuffer(mmap.mmap(file.fileno(), size), kind).reshape(shape)
 
 
-def _release(column: NDArray[Any]) -> None:
-    """Let go of the memory of an array of `_room` in a file, which keeps its values."""
-    base: Any = column
-    while isinstance(base, np.ndarray):
-        base = base.base
-    if isinstance(base, memoryview):
-        base = base.obj
-    if isinstance(base, mmap.mmap) and hasattr(base, "madvise"):
-        base.madvise(mmap.MADV_DONTNEED)
+def release(*columns: NDArray[Any]) -> None:
+    """Let go of the memory of arrays of `room` in files, which keep their values."""
+    for column in columns:
+        base: Any = column
+        while isinstance(base, np.ndarray):
+            base = base.base
+        if isinstance(base, memoryview):
+            base = base.obj
+        if isinstance(base, mmap.mmap) and hasattr(base, "madvise"):
+            base.madvise(mmap.MADV_DONTNEED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,21 +142,19 @@ class Trajectory(Columns):
         """The trajectory of ``count`` poses that comes in blocks of rows; a long one is kept in a file."""
         kinds = {f.name: (np.dtype(np.int64 if f.name == "time_ns" else float)) for f in fields(cls)}
         shapes = {"position": (count, 3), "quat_xyzw": (count, 4), "velocity": (count, 3)}
-        out = {name: _room(shapes.get(name, (count,)), kind) for name, kind in kinds.items()}
+        out = {name: room(shapes.get(name, (count,)), kind) for name, kind in kinds.items()}
         first = 0
         for block in blocks:
             last = first + len(block)
             for name, column in block.columns().items():
                 out[name][first:last] = column
-            for column in out.values():
-                _release(column)
+            release(*out.values())
             first = last
         return cls(**out)
 
     def release(self) -> None:
         """Let go of the memory of a trajectory in a file; its rows are read again when needed."""
-        for column in self.columns().values():
-            _release(column)
+        release(*self.columns().values())
 
     def windows(self, time_ns: NDArray[np.int64], *, margin: int) -> Iterator[tuple[slice, Trajectory]]:
         """Runs of rising times with the part of the trajectory around each, ``margin`` poses wider."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.files import write_blocks
-from lidar.errors import DatasetError
+from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Trajectory, blocks_of
 
 MANIFEST = "dataset.json"
@@ -46,18 +47,30 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises DatasetError if the file is missing or damaged.
     """
     try:
-        names, *rows = path.read_text("utf-8").splitlines()
-        values = np.loadtxt(rows, delimiter=",", ndmin=2) if rows else np.empty((0, 0))
-    except (OSError, ValueError) as error:
+        with path.open(encoding="utf-8") as lines:
+            count = sum(1 for _ in lines) - 1
+        with path.open(encoding="utf-8") as lines:
+            return Trajectory.gathered(max(count, 1), _parts(path, lines, count=count))
+    except DatasetError:
+        raise
+    except (OSError, ValueError, InputError) as error:
         raise DatasetError(f"{path}: not a readable trajectory ({error})") from error
+
+
+def _parts(path: Path, lines: Iterator[str], *, count: int) -> Iterator[Trajectory]:
+    """The trajectory in blocks of rows; raises DatasetError for other columns and rows that hold no pose."""
+    names = next(lines, "").rstrip("\n")
     if tuple(names.split(",")) != _TRAJECTORY:
         raise DatasetError(f"{path}: columns {names}; expected {','.join(_TRAJECTORY)}")
-    if values.shape[1:] != (len(_TRAJECTORY),):
+    if count < 1:
         raise DatasetError(f"{path}: no rows")
-    time, quat, scale = values[:, 0], values[:, 4:8], values[:, 11]
-    if not (np.abs(values) < _LARGEST).all():
-        raise DatasetError(f"{path}: a row holds no pose")
-    unit = np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-3
-    if not (unit & (scale > 0)).all() or (np.diff(time) <= 0).any():
-        raise DatasetError(f"{path}: a row holds no pose, or times do not increase")
-    return Trajectory(time.astype(np.int64), values[:, 1:4], quat, values[:, 8:11], scale)
+    for rows in blocks_of(count):
+        size = rows.stop - rows.start
+        values = np.loadtxt(itertools.islice(lines, size), delimiter=",", ndmin=2)
+        if values.shape != (size, len(_TRAJECTORY)):
+            raise DatasetError(f"{path}: rows and columns disagree")
+        time, quat, scale = values[:, 0], values[:, 4:8], values[:, 11]
+        finite = bool((np.abs(values) < _LARGEST).all())
+        if not (finite and (np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-3).all() and (scale > 0).all()):
+            raise DatasetError(f"{path}: a row holds no pose")
+        yield Trajectory(time.astype(np.int64), values[:, 1:4], quat, values[:, 8:11], scale)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta
 
 import numpy as np
@@ -69,7 +69,7 @@ def height_note(vertical: str, geoid: str = "") -> str:
 
 def nmea(
     fixes: Fixes, start: datetime, *, vertical: str = "flat", separation: Float | None = None
-) -> list[str]:
+) -> Iterator[str]:
     """Sentences for each fix: GGA, RMC, VTG, and a GSA for each system; at most 82 characters each.
 
     The talker is GN for a receiver of several systems, else that of its system. GSA lists at most twelve
@@ -82,15 +82,13 @@ def nmea(
 
     Fields of a missing fix are empty.
     """
-    lines: list[str] = []
     known = np.full(len(fixes), np.nan) if separation is None else separation
     for k in range(len(fixes)):
         when = start + timedelta(microseconds=round(int(fixes.time_ns[k]) / 1000))
         height = fixes.lonlath[k, 2]
         if vertical == "ellipsoidal" and math.isfinite(known[k]):
             height -= known[k]
-        lines += _epoch(fixes, k, when=when, height=float(height), separation=float(known[k]))
-    return lines
+        yield from _epoch(fixes, k, when=when, height=float(height), separation=float(known[k]))
 
 
 def _epoch(fixes: Fixes, k: int, *, when: datetime, height: float, separation: float) -> Sequence[str]:

@@ -252,7 +252,7 @@ def _joined(legs: list[Track], lines: list[Line], *, setting: Setting, ground: S
                 offset=(d[:, 1] * np.cos(heading) - d[:, 0] * np.sin(heading)) / scale,
             )
         )
-    whole = Path.concatenate(parts)
+    whole = parts[0] if len(parts) == 1 else Path.concatenate(parts)
     # headings of consecutive legs may differ by whole turns
     turns = np.concatenate([[0.0], np.cumsum(np.round(np.diff(whole.heading) / (2 * np.pi)) * 2 * np.pi)])
     return replace(whole, heading=whole.heading - turns)

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.columns import row_blocks
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.geometry.poses import BLOCK_POSES
+from lidar.geometry.poses import BLOCK_POSES, release, room
 from lidar.planning.motion import DWELL_S, Motion, legs_of, speed_limits
 from lidar.planning.path import Path
 from lidar.rig.vehicle import Vehicle
@@ -71,7 +70,7 @@ def motion_within(
     if len(time_s) < 2 or (np.diff(max_distance) < -1e-9).any():
         raise InputError("the maximum distances of a speed profile must not decrease")
     limit = speed_limits(path, vehicle)
-    parts: list[tuple[Float, Float, NDArray[np.int32]]] = []
+    parts: list[_Part] = []
     begin, dt, total = 0.0, 1.0 / rate_hz, float(time_s[-1])
     for first, last in legs_of(path):
         if parts and total - begin < 2 * STEP_S:
@@ -95,16 +94,44 @@ def motion_within(
         if driven and last < len(path):
             rest = round(DWELL_S / dt)
             s, v = np.append(s, np.full(rest, s[-1])), np.append(v, np.zeros(rest))
-        parts.append((origin + s, v, np.full(len(s), path.leg[first], np.int32)))
+        parts.append(_Part(origin, first, last - 1, s, v))
         begin += len(s) * dt
         if not driven:
             break
-    s, v, leg = (np.concatenate(column) for column in zip(*parts, strict=True))
-    time_ns = np.round(np.arange(len(s)) * (1e9 / rate_hz)).astype(np.int64)
-    low = np.searchsorted(path.leg, leg, side="left")
-    high = np.searchsorted(path.leg, leg, side="right") - 1
-    row = np.clip(np.searchsorted(path.s, s, side="right") - 1, low, high)
-    return Motion(time_ns, s, v, np.gradient(v, dt), row)
+    return _joined(parts, path, rate_hz=rate_hz)
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """The profile of a leg: metres to its start, its first and last row, distances and speeds (n,) in it."""
+
+    origin: float
+    first: int
+    last: int
+    s: Float
+    v: Float
+
+
+def _joined(parts: list[_Part], path: Path, *, rate_hz: float) -> Motion:
+    """The profile of all legs."""
+    n, kinds = sum(len(part.s) for part in parts), (np.int64, float, float, float, np.int64)
+    time_ns, s, v, acceleration, row = columns = [room((n,), kind) for kind in kinds]
+    start = 0
+    for part in parts:
+        for rows in row_blocks(len(part.s), BLOCK_POSES):
+            to = slice(start + rows.start, start + rows.stop)
+            s[to], v[to] = part.origin + part.s[rows], part.v[rows]
+            near = np.searchsorted(path.s, s[to], side="right") - 1
+            row[to] = np.clip(near, part.first, part.last)
+            release(*columns, part.s, part.v)
+        start += len(part.s)
+    for rows in row_blocks(n, BLOCK_POSES):
+        time_ns[rows] = np.round(np.arange(rows.start, rows.stop) * (1e9 / rate_hz))
+        around = slice(max(rows.start - 1, 0), rows.stop + 1)
+        change = np.gradient(v[around], 1.0 / rate_hz)
+        acceleration[rows] = change[rows.start - around.start :][: rows.stop - rows.start]
+        release(*columns)
+    return Motion(time_ns, s, v, acceleration, row)
 
 
 def desired_speed(path: Path, vehicle: Vehicle) -> Float:
@@ -291,7 +318,7 @@ def _sampled(knots: _Knots, end: float, *, dt: float) -> tuple[Float, Float]:
     if len(resting):
         last = int(resting[0])
     count = math.ceil((last * knots.dt + 1e-9) / dt)
-    s, v = np.empty(count), np.empty(count)
+    s, v = room((count,)), room((count,))
     furthest = 0.0
     for rows in row_blocks(count, BLOCK_POSES):
         t = dt * np.arange(rows.start, rows.stop)
@@ -302,4 +329,5 @@ def _sampled(knots: _Knots, end: float, *, dt: float) -> tuple[Float, Float]:
         far = knots.s[i] + knots.v[i] * u + knots.a[i] * u**2 / 2 + jerk * u**3 / 6
         s[rows] = np.maximum(np.maximum.accumulate(np.clip(far, 0.0, end)), furthest)
         furthest = float(s[rows.stop - 1])
+        release(s, v)
     return s, v

@@ -127,8 +127,14 @@ def _driven(
     seconds = duration if duration is not None else factor * alone_ns * 1e-9 + more
     if duration is not None and at_speed:
         seconds += _ON_S
-    trip = ego_trip(path, vehicle, at_speed=at_speed)
-    travelled = simulate_ego(trip, trips, graph=graph, plan=plan, seconds=seconds, radius=radius)
+    travelled = simulate_ego(
+        ego_trip(path, vehicle, at_speed=at_speed),
+        trips,
+        graph=graph,
+        plan=plan,
+        seconds=seconds,
+        radius=radius,
+    )
     time_s: Float = STEP_S * np.arange(len(travelled), dtype=float)
     motion = motion_within(
         path, vehicle, time_s=time_s, max_distance=travelled.clip(max=path.length), at_speed=at_speed

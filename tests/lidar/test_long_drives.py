@@ -10,7 +10,9 @@ from helpers.roadgrids import grid
 from geoscene import files
 from geoscene.files import write_columns
 from geoscene.frames import Frame
-from lidar.errors import InputError
+from lidar.dataset.journal import Journal, read_journal
+from lidar.dataset.layout import frame_numbers
+from lidar.errors import DatasetError, InputError
 from lidar.geometry import poses
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
@@ -50,7 +52,7 @@ def test_long_trajectory_is_kept_in_a_file_with_the_same_values(path, monkeypatc
     whole = drive_path(path, load_vehicle("car"))
     write_trajectory(tmp_path / "whole.csv", whole)
     monkeypatch.setattr(poses, "BLOCK_POSES", 257)
-    monkeypatch.setattr(poses, "_IN_MEMORY", 1000)
+    monkeypatch.setattr(poses, "_IN_MEMORY", 500)
     monkeypatch.setattr(files, "BLOCK_ROWS", 100)
     parts = drive_path(path, load_vehicle("car"))
     assert len(parts) == len(whole) > 2000
@@ -175,3 +177,50 @@ def test_obstacles_along_a_track_are_found_block_by_block(monkeypatch):
     parts = touching(track, line, setting=setting)
     assert len(whole[0])
     assert all((one == other).all() for one, other in zip(whole, parts, strict=True))
+
+
+def test_journal_keeps_the_last_entry_of_each_frame_in_order(tmp_path):
+    path = tmp_path / "frames.csv"
+    journal = Journal(path, read_journal(path))
+    for frame in (1_000_000, 7, 8, 7):
+        journal.add("top", frame, points=frame + 1, digest=f"{frame:020x}")
+    journal.add("front", 3, points=0, digest="")
+    with path.open("a") as file:
+        file.write("top,9,5\ntop,x,1,2\ntop,99999999999999999999,1,ab\n")  # cut off and damaged
+    again = read_journal(path)
+    assert len(again) == len(journal.entries) == 4
+    table = again.of("top")
+    assert table.frame.tolist() == [7, 8, 1_000_000]
+    assert table.points.tolist() == [8, 9, 1_000_001]
+    assert (table.row(8), table.row(9)) == (1, -1)
+    assert again.of("none").frame.tolist() == []
+    journal.close()
+    assert path.read_text().splitlines() == [
+        "sensor,frame,points,digest",
+        "front,3,0,",
+        *(f"top,{frame},{frame + 1},{frame:020x}" for frame in (7, 8, 1_000_000)),
+    ]
+
+
+def test_frames_beyond_a_million_follow_in_order(tmp_path):
+    for frame in (1_000_000, 999_999, 12):
+        (tmp_path / f"{frame:06d}.laz").touch()
+    for other in ("12.laz", "000013.laz.part", "notes.txt"):
+        (tmp_path / other).touch()
+    assert frame_numbers(tmp_path, ".laz").tolist() == [12, 999_999, 1_000_000]
+    assert not len(frame_numbers(tmp_path / "none", ".laz"))
+
+
+@pytest.mark.parametrize("rows", [5, 8, 9, 13])
+def test_trajectories_of_any_length_are_read_in_blocks(rows, monkeypatch, tmp_path):
+    still, turn = np.zeros((rows, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (rows, 1))
+    whole = Trajectory(np.arange(rows) * 10, still, turn, still, np.ones(rows))
+    monkeypatch.setattr(poses, "BLOCK_POSES", 4)  # a row more than two blocks is no block
+    assert [block.stop - block.start for block in poses.blocks_of(9)] == [4, 5]
+    write_trajectory(tmp_path / "trajectory.csv", whole)
+    again = read_trajectory(tmp_path / "trajectory.csv")
+    assert again.time_ns.tolist() == whole.time_ns.tolist()
+    text = (tmp_path / "trajectory.csv").read_text()
+    (tmp_path / "trajectory.csv").write_text(text[:-30])
+    with pytest.raises(DatasetError):
+        read_trajectory(tmp_path / "trajectory.csv")

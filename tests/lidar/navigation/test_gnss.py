@@ -401,7 +401,7 @@ def read(lines):
 @pytest.mark.parametrize("mode", ["single", "sbas", "rtk"])
 def test_pynmeagps_reads_the_fixes(mode):
     fixes = observe_gnss(eastward(5.0), FRAME, spec=spec(mode, constellations=("gps",)), seed=1, start=START)
-    lines = nmea(fixes, START)
+    lines = list(nmea(fixes, START))
     assert max(map(len, lines)) <= 82
     assert all(line.endswith("\r\n") for line in lines)
     messages = read(lines)
@@ -428,7 +428,7 @@ def test_pynmeagps_reads_the_fixes(mode):
 
 def test_a_receiver_of_four_systems_names_the_satellites_of_each():
     fixes = observe_gnss(eastward(1.0), FRAME, spec=spec("single"), seed=1, start=START)
-    lines = nmea(fixes, START)
+    lines = list(nmea(fixes, START))
     assert max(map(len, lines)) <= 82
     assert all(line.startswith("$GN") for line in lines)
     gga, _, _, *gsa = read(lines[:7])
@@ -445,7 +445,7 @@ def test_sentences_without_a_fix_have_empty_fields_and_quality_0():
         *(np.full((6, 24), 0.5),) * 2, *(np.zeros((6, 24), bool),) * 2, np.ones(6), satellite_names(("gps",))
     )
     fixes = observe_gnss(standing(0.5), FRAME, spec=spec("single"), seed=0, start=START, sky=sky)
-    gga, rmc, _, gsa = read(nmea(fixes, START)[:4])
+    gga, rmc, _, gsa = read(list(nmea(fixes, START))[:4])
     assert gga.quality == 0
     assert gga.lat == ""
     assert rmc.status == "V"
@@ -458,10 +458,10 @@ def test_sentences_without_a_fix_have_empty_fields_and_quality_0():
 def test_sentences_give_the_geoid_separation(vertical, altitude):
     fixes = observe_gnss(standing(0.5, height=-30.0), FRAME, spec=spec(), seed=0, start=START)
     known = np.full(len(fixes), -38.0)
-    gga = read(nmea(fixes, START, vertical=vertical, separation=known)[:1])[0]
+    gga = read(list(nmea(fixes, START, vertical=vertical, separation=known))[:1])[0]
     assert gga.alt == pytest.approx(altitude)
     assert gga.sep == -38.0
-    plain = read(nmea(fixes, START, vertical=vertical)[:1])[0]
+    plain = read(list(nmea(fixes, START, vertical=vertical))[:1])[0]
     assert (plain.alt, plain.sep) == (pytest.approx(-30.0), "")
 
 
