@@ -36,6 +36,7 @@ from geoscene.reach import RoadMap
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA, SceneFiles, changed_files
 from geoscene.sources import OsmData, Servers, fetch_elevation, fetch_place, read_osm
+from geoscene.storage import url_of
 from lidar import __version__
 from lidar.course import needed_area
 from lidar.errors import InputError, LidarError
@@ -83,7 +84,7 @@ def open_scene_or_map(
     if (path is None) == (not place.place):
         raise InputError("give one of SCENE, the directory of a scene or a map file, and `place` NAME")
     if path is not None and not path.is_file():
-        if not path.exists():
+        if not (path.exists() or url_of(path)):
             raise InputError(f"{path}: no such scene or map; give a map file, or the directory of a scene")
         changed = [f.name for f in fields(place) if getattr(place, f.name) != f.default]
         if changed:
