@@ -100,9 +100,9 @@ def test_a_quick_run_measures_every_subject_against_its_references(quick):
     assert {"1 worker", "2 workers"} <= sides["building"]
     assert "mapping" in sides
     sizes = {(curve["size"], curve["cost"]) for curve in document["curves"]}
-    for size in ("buildings", "triangles", "frames"):
+    for size in ("buildings", "triangles", "rays per pulse", "frames"):
         assert {(size, "CPU s"), (size, "bytes")} <= sizes
-    assert {("rays per pulse", "CPU s"), ("road users", "CPU s"), ("workers", "wall s")} <= sizes
+    assert {("road users", "CPU s"), ("workers", "wall s"), ("workers", "bytes")} <= sizes
     assert document["machine"]["cores"] >= 1
     assert document["machine"]["libraries"]["numpy"] == np.__version__
 
@@ -175,6 +175,7 @@ def test_sides_take_turns_and_ratios_are_of_the_same_repetition(bench):
     found = measure.measured(case, repetitions=2)
     assert "".join(order) == "abab" + "ba"
     assert found.rate("a") == measure.Summary(4.5, 3.0, 6.0)
+    assert not found.case.sides  # they hold scenes
     assert found.ratio("b") == measure.Summary(3.5, 3.0, 4.0)
 
 

@@ -78,7 +78,8 @@ class Setup:
         """The scene of a map, built when it is first needed."""
         out = self.folder / f"scene_{name}"
         bounds = QUICK_BOX if self.quick else None
-        build(read_osm(self.maps()[name], bounds=bounds), out, options=BuildOptions(name=name))
+        if not out.exists():
+            build(read_osm(self.maps()[name], bounds=bounds), out, options=BuildOptions(name=name))
         return open_scene(out)
 
     def plan(self, rig: str, *, seconds: float, formats: tuple[str, ...] = ("pcd",)) -> DrivePlan:
