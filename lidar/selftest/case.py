@@ -10,7 +10,7 @@ from dataclasses import dataclass
 class Case:
     """A row of the table of extremes.
 
-    group   : rays, places, footprints, statistics or scale
+    group   : rays, places, footprints, time, statistics or scale
     name    : the case in words
     bound   : the largest value that may be measured
     unit    : of bound and measurement; what is counted if the bound is 0

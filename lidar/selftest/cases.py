@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from lidar.selftest import footprints, places, rays, regions, scale, statistics
+from lidar.selftest import footprints, places, rays, regions, scale, statistics, times
 from lidar.selftest.case import Case
 
 CASES: tuple[Case, ...] = (
     *rays.CASES,
     *places.CASES,
     *footprints.CASES,
+    *times.CASES,
     *statistics.CASES,
     *scale.CASES,
     *regions.CASES,

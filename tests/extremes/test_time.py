@@ -18,6 +18,8 @@ from lidar.plan import schedule
 from lidar.rig.devices import cameras, scanners
 from lidar.rig.patterns.beams import frame_window_ns
 from lidar.rig.specs import GnssSpec, ImuSpec, load_rig
+from lidar.selftest.run import outcome
+from lidar.selftest.times import CASES
 from lidar.time_scales import GPS_EPOCH, LEAPS, check_start, gps_seconds, leap_seconds
 
 FRAME = Frame.at(9.52, 47.14)
@@ -35,6 +37,13 @@ def straight(speed, seconds, *, every=1.0):
     level = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
     at = np.round(time * 1e9).astype(np.int64)
     return Trajectory(at, east * (speed * time)[:, None], level, speed * east, np.ones(n))
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_time_stays_within_the_bound(case):
+    done = outcome(case, case.quick)
+    assert done.error == ""
+    assert done.measured <= case.bound
 
 
 @pytest.mark.parametrize("rate", RATES)
