@@ -51,7 +51,7 @@ Poses, precision and the second trace are none of the choice, as they save a few
 """
 
 _SCHEMA = 1
-_DRIVES, _SECONDS, _FRAMES = 8, 8.0, 3
+_DRIVES, _SECONDS, _FRAMES = 12, 8.0, 2
 """Random drives through the scene, seconds of each, and frames of each."""
 
 _TIMINGS = 3
@@ -227,22 +227,27 @@ def _errors(
     plain = plans[0].options.contents().scanner
     settings = [replace(plain, rays=rays) for rays in RAYS]
     found: dict[str, list[list[SampledError]]] = {s.name: [[] for _ in RAYS] for s in scanners}
+    drives: dict[str, list[int]] = {s.name: [] for s in scanners}
     total = len(plans) * frames * len(scanners)
     done = 0
     progress("measuring errors", done, total=total)
-    for plan in plans:
+    for k, plan in enumerate(plans):
         for bench in places(plan, frames=frames):
             for scanner in scanners:
                 for errors in errors_of(bench, scanner, settings=settings):
                     for of_rays, error in zip(found[scanner.name], errors, strict=True):
                         of_rays.append(error)
+                    drives[scanner.name].append(k)
                     done += 1
                     progress("measuring errors", done, total=total)
     counts = {name: len(of_rays[0]) for name, of_rays in found.items()}
     if not all(counts.values()):
         idle = ", ".join(name for name, count in counts.items() if not count)
         raise InputError(f"`rig`: {idle} has no frame in this drive, whose errors could be measured")
-    by_name = {name: [range_error(errors) for errors in of_rays] for name, of_rays in found.items()}
+    by_name = {
+        name: [range_error(errors, drives=drives[name]) for errors in of_rays]
+        for name, of_rays in found.items()
+    }
     return by_name, max(counts.values())
 
 

@@ -186,10 +186,14 @@ def _stratified(
     return np.sort(np.concatenate([hard, easy])), weights
 
 
-def range_error(frames: Sequence[SampledError], *, seed: int = 0) -> RangeError:
+def range_error(
+    frames: Sequence[SampledError], *, drives: Sequence[int] | None = None, seed: int = 0
+) -> RangeError:
     """Quantiles of the range errors of frames, and shares of missed and extra returns.
 
-    Intervals are 95 %, by resampling the frames.
+    drives : number of the drive that each frame is of, from 0; all of one by default
+
+    Intervals are 95 %, by resampling the drives, as frames of one drive are alike; of one drive, its frames.
     """
     count = len(frames)
     ranges = np.concatenate([f.range for f in frames])
@@ -204,9 +208,11 @@ def range_error(frames: Sequence[SampledError], *, seed: int = 0) -> RangeError:
         every = [_quantile(ranges, below, share=percent / 100) for percent in PERCENTS]
         return [*every, missed / max(returns, 1.0), extra / max(returns, 1.0)]
 
-    picks = np.random.default_rng(seed).integers(0, count, (RESAMPLES, count))
+    group = np.arange(count) if drives is None or len(set(drives)) < 2 else np.asarray(drives)
+    groups = int(group.max()) + 1
+    picks = np.random.default_rng(seed).integers(0, groups, (RESAMPLES, groups))
     value = figures(np.ones(count))
-    again = [figures(np.bincount(pick, minlength=count).astype(float)) for pick in picks]
+    again = [figures(np.bincount(pick, minlength=groups)[group].astype(float)) for pick in picks]
     low, high = np.percentile(again, [2.5, 97.5], axis=0)
     every = [Estimate(float(v), float(a), float(b)) for v, a, b in zip(value, low, high, strict=True)]
     return RangeError(dict(zip(PERCENTS, every, strict=False)), missed=every[-2], extra=every[-1])

@@ -167,6 +167,17 @@ def test_a_stratified_sample_has_the_quantiles_of_all():
         assert found.range_m[percent].low <= found.range_m[percent].value <= found.range_m[percent].high
 
 
+def test_intervals_are_by_drives_whose_frames_are_alike():
+    def frame(error):
+        return SampledError(np.full(50, error), np.ones(50), missed=0.0, extra=0.0, returns=50.0)
+
+    frames = [frame(error) for error in (0.01, 0.02, 0.03, 0.1) for _ in range(8)]
+    drives = np.repeat(np.arange(4), 8).tolist()
+    by_frame, by_drive = range_error(frames), range_error(frames, drives=drives)
+    assert by_frame.range_m[50.0].value == by_drive.range_m[50.0].value == 0.02
+    assert by_frame.range_m[50.0].high <= 0.03 < by_drive.range_m[50.0].high
+
+
 @pytest.fixture(scope="module", autouse=True)
 def quick():
     """Smaller samples, so that a profile takes a second."""
