@@ -35,7 +35,7 @@ class Notes:
         elif idle and "blur" in variant.names and _takes_no_time(self._sensor):
             texts.append("no effect here: the camera's exposure takes no time (exposure_ns is 0)")
         elif idle:
-            texts.append("no effect with the other settings as asked")
+            texts.append("no effect on what was sampled, with the other settings as asked")
         if variant.names & MODELS:
             texts.append("changes what is modelled")
         return "; ".join(texts)

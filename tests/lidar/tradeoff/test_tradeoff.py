@@ -246,7 +246,7 @@ def test_kinds_of_objects_that_a_place_lacks_have_no_effect(scene):
     (one,) = tradeoff(scene, DRIVE, compared=compared).comparisons
     notes = {r.label: r.note for r in one.rows}
     assert notes["forests=off"] == "no effect here: there are none within reach"
-    assert notes["trees=off"] == "no effect with the other settings as asked"
+    assert notes["trees=off"] == "no effect on what was sampled, with the other settings as asked"
     assert notes["furniture=off"] == ""
     without = {r.label: r.error for r in one.rows}["furniture=off"]
     assert without["range_max_m"].value > one.rows[0].error["range_max_m"].value
