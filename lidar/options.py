@@ -472,8 +472,8 @@ class TradeoffOptions:
     pulses: Annotated[int, Parameter(converter=whole)] = 16_000
     """Pulses of each scanner to compare, at random over the sampled frames: 100 to 10,000,000."""
 
-    pixels: Annotated[int, Parameter(converter=whole)] = 4096
-    """Pixels of each camera to compare, in blocks of 8 by 8 at random over the sampled frames: 256 to
+    pixels: Annotated[int, Parameter(converter=whole)] = 16384
+    """Pixels of each camera to compare, in blocks of 4 by 4 spread over the sampled frames: 256 to
     10,000,000."""
 
     reference_rays: Annotated[int, Parameter(converter=whole)] = 217

@@ -36,6 +36,9 @@ from lidar.tradeoff.variants import (
 from lidar.world.settings import PLAIN as WHOLE
 from lidar.world.settings import WorldSettings
 
+_PART = slice(None, None, 4)
+"""Of the blocks, those on which settings are compared alone: each costs as much as the reference."""
+
 
 def compared_camera(
     bench: Bench, camera: Camera, *, compared: TradeoffOptions, scenes: Sequence[str], progress: Progress
@@ -58,7 +61,7 @@ def compared_camera(
     for k, frame in enumerate(frames):
         blocks = blocks_of_frame(camera.spec, per_frame, frame=frame, seed=plan.options.seed)
         count += len(blocks) * BLOCK**2
-        look = _Look(bench, bench.shot(camera, frame), blocks)
+        look, part = (_Look(bench, bench.shot(camera, frame), of) for of in (blocks, blocks[_PART]))
         truth, less = (
             look.pixels(basis.variant(), settings, world=WHOLE, backend=EXACT)
             for settings in (basis.exact, coarser(basis.exact))
@@ -73,7 +76,7 @@ def compared_camera(
             for change, rest in without_each(basis, variant):
                 notes.add(i, change, same=found.equals(look.used(rest)))
             if len(variant.changes) == 1:
-                alone[i].append(image_error(look.alone(variant).enlarged(factor), truth))
+                alone[i].append(image_error(part.alone(variant).enlarged(factor), truth.take(_PART)))
     spent = costs(
         bench,
         camera,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.camera.png import depth_to_counts, encode_png, feature_to_image
 from lidar.camera.render import Frame, exposure_times, render
@@ -18,8 +19,11 @@ from lidar.rig.specs import CameraSpec
 from lidar.tradeoff.errors import ImageError
 from lidar.world.world import World
 
-BLOCK = 8
-"""Pixels along each side of the blocks that are compared."""
+BLOCK = 4
+"""Pixels along each side of the blocks that are compared: one of the lowest resolution."""
+
+_STEPS = (0.7548776662466927, 0.5698402909980532)
+"""Steps along columns and rows of the R2 sequence of low discrepancy: powers of the plastic number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +40,7 @@ class Shot:
 
 
 @dataclass(frozen=True, slots=True)
-class Pixels:
+class Pixels(Columns):
     """Blocks of a frame: rgb (n, b, b, 3) uint8, depth (n, b, b) metres, klass (n, b, b) uint8."""
 
     rgb: NDArray[np.uint8]
@@ -86,10 +90,16 @@ def image(shot: Shot, *, world: World, settings: CameraSettings, resolution: int
 
 
 def blocks_of_frame(camera: CameraSpec, count: int, *, frame: int, seed: int) -> Ints:
-    """Columns and rows (n, 2) of the top left pixels of at most ``count`` blocks of a frame, at random."""
+    """Columns and rows (n, 2) of the top left pixels of at most ``count`` blocks, spread evenly over a frame.
+
+    No square twice as wide as their mean distance is without one: rare effects are met in their share.
+    """
     across, down = camera.width // BLOCK, camera.height // BLOCK
-    chosen = np.sort(np.random.default_rng([seed, frame]).permutation(across * down)[:count])
-    return (BLOCK * np.column_stack([chosen % across, chosen // across])).astype(np.int64)
+    row, column = np.divmod(np.arange(across * down), across)
+    start = np.random.default_rng([seed, frame]).random()
+    order = np.argsort((start + column * _STEPS[0] + row * _STEPS[1]) % 1.0, kind="stable")
+    chosen = np.sort(order[:count])
+    return (BLOCK * np.column_stack([column[chosen], row[chosen]])).astype(np.int64)
 
 
 def pixels(

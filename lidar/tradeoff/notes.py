@@ -29,7 +29,7 @@ class Notes:
         variant, idle = self._variants[row], [change for change, same in self._same[row].items() if same]
         texts = []
         if idle and len(variant.changes) > 1:
-            texts.append(f"no effect here: {', '.join(idle)}")
+            texts.append(f"no effect on what was sampled: {', '.join(idle)}")
         elif idle and variant.names & set(KINDS) and self._absent(variant):
             texts.append("no effect here: there are none within reach")
         elif idle and "blur" in variant.names and _takes_no_time(self._sensor):
@@ -41,9 +41,11 @@ class Notes:
         return "; ".join(texts)
 
     def choice(self, row: int) -> bool:
-        """Whether a drive may choose a variant, and all kinds of objects that it leaves out are there."""
-        idle = {change.partition("=")[0] for change, same in self._same[row].items() if same}
-        return self._variants[row].choice and not idle & {*KINDS, "blur"}
+        """Whether a drive may choose a variant, and each of its changes has an effect on what was sampled.
+
+        A change without one may have a rare effect elsewhere, of unknown size, or saves nothing.
+        """
+        return self._variants[row].choice and not any(self._same[row].values())
 
     def _absent(self, variant: Variant[Any]) -> bool:
         """Whether a variant's world holds as many faces and instances as the one of the settings as asked."""

@@ -58,7 +58,7 @@ MODELS = frozenset({"mirrors", "foliage", "haze"})
 """Settings that change what is modelled: the difference that they make is no error."""
 
 CHEAPER: tuple[tuple[tuple[str, Any], ...], ...] = (
-    (("retrace", False), ("precision", "float32")),
+    (("precision", "float32"),),
     (("reach", 50.0),),
     (("forests", False),),
 )

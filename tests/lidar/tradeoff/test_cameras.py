@@ -1,5 +1,7 @@
 """Errors and costs of cameras' settings: known differences, blocks of images, a comparison on a drive."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,8 +11,10 @@ from lidar.plan import plan_drive
 from lidar.tradeoff.engine import tradeoff
 from lidar.tradeoff.errors import IMAGE_STATISTICS, estimates
 from lidar.tradeoff.images import Pixels, blocks_of_frame, image, image_error, pixels
+from lidar.tradeoff.notes import Notes
 from lidar.tradeoff.report import document, write_report
 from lidar.tradeoff.simulate import FAST, bench_of
+from lidar.tradeoff.variants import camera_basis, camera_variants
 from lidar.tradeoff.words import recommendation
 
 RIG = """
@@ -81,7 +85,7 @@ def test_blocks_are_parts_of_the_whole_image(scene, drive, resolution):
     assert len(np.unique(blocks, axis=0)) == 20
     whole = image(shot, world=world, settings=PLAIN, resolution=resolution)
     parts = pixels(shot, blocks, world=world, settings=PLAIN, resolution=resolution)
-    size = 8 // resolution
+    size = 4 // resolution
     for (left, top), rgb, depth, klass in zip(
         blocks // resolution, parts.rgb, parts.depth, parts.klass, strict=True
     ):
@@ -89,6 +93,44 @@ def test_blocks_are_parts_of_the_whole_image(scene, drive, resolution):
         assert np.array_equal(klass, whole.klass[window])
         np.testing.assert_allclose(depth, whole.depth[window], rtol=1e-6)
         assert np.abs(rgb.astype(int) - whole.rgb[window]).max() <= 1
+
+
+def test_blocks_are_spread_so_that_small_effects_are_met(scene, drive):
+    camera = replace(plan_drive(scene, drive).sensors[0].spec, width=1280, height=720)
+    for count in (16, 64, 170, 512):
+        for frame in range(5):
+            column, row = blocks_of_frame(camera, count, frame=frame, seed=1).T // 4
+            met = np.zeros((181, 321), int)
+            met[row + 1, column + 1] = 1
+            met = met.cumsum(axis=0).cumsum(axis=1)
+            side = int(2 * np.sqrt(180 * 320 / count))
+            inside = met[side:, side:] - met[:-side, side:] - met[side:, :-side] + met[:-side, :-side]
+            assert met[-1, -1] == count
+            assert inside.min() >= 1
+
+
+def test_settings_without_effect_on_a_sample_are_no_choice(scene, drive):
+    bench = bench_of(plan_drive(scene, drive), frames=2)
+    (camera,) = bench.plan.sensors
+    variants = camera_variants(
+        camera_basis(PLAIN, exposed=False), compared=("supersample", "shadows", "resolution")
+    )
+    notes = Notes(bench, camera, variants=variants)
+    by_label = {variant.label: k for k, variant in enumerate(variants)}
+    alone, both = by_label["shadows=off"], by_label["resolution=2 shadows=off"]
+    for same in (True, False):
+        notes.add(both, "resolution=2", same=False)
+        notes.add(both, "shadows=off", same=same)
+        notes.add(by_label["resolution=4"], "resolution=4", same=same)
+    notes.add(alone, "shadows=off", same=True)
+    assert notes.of(alone) == "no effect on what was sampled, with the other settings as asked"
+    assert not notes.choice(alone)
+    assert notes.choice(both)
+    assert notes.choice(by_label["resolution=4"])
+    once = Notes(bench, camera, variants=variants)
+    once.add(both, "shadows=off", same=True)
+    assert once.of(both) == "no effect on what was sampled: shadows=off"
+    assert not once.choice(both)
 
 
 def test_errors_of_a_camera_on_a_drive(found):

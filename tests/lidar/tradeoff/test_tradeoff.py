@@ -126,15 +126,15 @@ def test_variants_change_one_setting_each():
 
 
 def test_cheap_settings_are_combined():
-    assert labels("rays", "retrace", "reach", "forests")[-8:] == [
-        "retrace=off reach=50",
-        "retrace=off reach=50 forests=off",
-        "rays=7 retrace=off",
-        "rays=7 retrace=off reach=50",
-        "rays=7 retrace=off reach=50 forests=off",
-        "rays=19 retrace=off",
-        "rays=19 retrace=off reach=50",
-        "rays=19 retrace=off reach=50 forests=off",
+    assert labels("rays", "precision", "reach", "forests")[-8:] == [
+        "precision=float32 reach=50",
+        "precision=float32 reach=50 forests=off",
+        "rays=7 precision=float32",
+        "rays=7 precision=float32 reach=50",
+        "rays=7 precision=float32 reach=50 forests=off",
+        "rays=19 precision=float32",
+        "rays=19 precision=float32 reach=50",
+        "rays=19 precision=float32 reach=50 forests=off",
     ]
     without = labels("rays", "forests", world=WorldSettings(forests=False))
     assert without == ["", "rays=7", "rays=19", "forests=on"]
