@@ -164,16 +164,11 @@ def write_metadata(
     for receiver in rig.gnss:
         _write_fixes(paths, scene, spec=receiver, trajectory=trajectory, start=start, seed=seed)
     for unit in rig.imus:
-        rows = observe_imu(trajectory, scene.frame, spec=unit, seed=seed)
-        columns = imu_columns(rows)
         write_blocks(
             paths.measurements(unit.name),
             (
-                {
-                    "timestamp": iso_times(start, rows.time_ns[block]),
-                    **{name: column[block] for name, column in columns.items()},
-                }
-                for block in table_blocks(len(rows.time_ns))
+                {"timestamp": iso_times(start, rows.time_ns), **imu_columns(rows)}
+                for rows in observe_imu(trajectory, scene.frame, spec=unit, seed=seed)
             ),
         )
 

@@ -210,17 +210,27 @@ class Trajectory(Columns):
         time_ns     : (n,) nanoseconds since the drive's start
         translation, rotation : of the mount, see `Poses.mounted`
 
-        Poses are computed every `KNOT_NS`; points are interpolated linearly between them.
+        Poses are computed every `KNOT_NS`; points are interpolated linearly between them. Times may be far
+        apart: there are at most two poses for each point, and one.
         """
         if not len(points):
             return np.empty((0, 3))
         knot, elapsed = np.divmod(np.asarray(time_ns, np.int64), KNOT_NS)
-        first = int(knot.min())
-        knots = self.at(KNOT_NS * np.arange(first, int(knot.max()) + 2)).mounted(translation, rotation)
+        needed, row = _needed_knots(knot)
+        knots = self.at(KNOT_NS * needed).mounted(translation, rotation)
         turn = knots.scale[:, :, None] * knots.rotation
         out: Float = np.empty((len(points), 3))
-        _place(points, knot - first, elapsed / KNOT_NS, knots.position, turn, out)
+        _place(points, row, elapsed / KNOT_NS, knots.position, turn, out)
         return out
+
+
+def _needed_knots(knot: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Knots (k,), and the row (n,) of each given one, which the next one follows."""
+    first, last = int(knot.min()), int(knot.max())
+    if last - first < 2 * len(knot):
+        return np.arange(first, last + 2), knot - first
+    each, row = np.unique(knot, return_inverse=True)
+    return np.stack([each, each + 1], axis=1).ravel(), 2 * row
 
 
 @njit(cache=True, nogil=True)

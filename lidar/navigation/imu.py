@@ -10,16 +10,19 @@ of the local vertical due to travel); f includes the Coriolis acceleration.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.columns import Columns
+from geoscene.files import table_blocks
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.geometry.attitude import body_rates, matrix_from_quat
-from lidar.geometry.poses import Trajectory
+from lidar.geometry.poses import Trajectory, release, room
 from lidar.navigation.satellite_visibility import E2, A
 from lidar.random_streams import generator
 from lidar.rig.specs import ImuSpec
@@ -34,7 +37,7 @@ EARTH_RATE = 7.292115e-5
 
 
 @dataclass(frozen=True, slots=True)
-class Inertial:
+class Inertial(Columns):
     """Measurements of a unit and ground truth, in its own axes, one row per time.
 
     time_ns     : (n,) int64, since the drive's start
@@ -60,20 +63,35 @@ def normal_gravity(lat_deg: ArrayLike, h: ArrayLike) -> Float:
 def true_inertial(
     trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, time_ns: NDArray[np.int64]
 ) -> tuple[Float, Float]:
-    """True angular rate (n, 3) and specific force (n, 3) of a unit, in its own axes.
+    """True angular rate (n, 3) and specific force (n, 3) of a unit at rising times, in its own axes.
 
     Central differences of the trajectory's attitudes and of the unit's velocity, interpolated linearly.
     """
     rate, force = np.empty((len(time_ns), 3)), np.empty((len(time_ns), 3))
-    for rows, part in trajectory.windows(time_ns, margin=_AROUND):
-        rate[rows], force[rows] = _true_inertial(part, frame, spec=spec, time_ns=time_ns[rows])
+    for rows, *signals in _true_blocks(trajectory, frame, spec=spec, time_ns=time_ns):
+        rate[rows], force[rows] = signals
     return rate, force
 
 
-def _true_inertial(
+def _true_blocks(
     trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, time_ns: NDArray[np.int64]
-) -> tuple[Float, Float]:
-    """Columns of `true_inertial` from the part of the trajectory around some times."""
+) -> Iterator[tuple[slice, Float, Float]]:
+    """Rows of times, and `true_inertial` of these, in order: blocks for tables."""
+    own = spec.mount.rotation
+    for window, part in trajectory.windows(time_ns, margin=_AROUND):
+        seconds = part.time_ns * 1e-9
+        signals = _at_poses(part, frame, spec=spec)
+        for block in table_blocks(window.stop - window.start):
+            rows = slice(window.start + block.start, window.start + block.stop)
+            at = time_ns[rows] * 1e-9
+            rate, force = (
+                np.stack([np.interp(at, seconds, v[:, k]) for k in range(3)], axis=1) @ own for v in signals
+            )
+            yield rows, rate, force
+
+
+def _at_poses(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec) -> tuple[Float, Float]:
+    """Angular rate (n, 3) and specific force (n, 3) of a unit at a trajectory's poses, in vehicle axes."""
     seconds = trajectory.time_ns * 1e-9
     R = matrix_from_quat(trajectory.quat_xyzw)
     turn = body_rates(seconds, trajectory.quat_xyzw)
@@ -84,11 +102,7 @@ def _true_inertial(
     specific_force = acceleration + np.cross(2 * earth + transport, velocity)
     specific_force[:, 2] += gravity
     rate = turn + np.einsum("nji,nj->ni", R, earth + transport)
-    force = np.einsum("nji,nj->ni", R, specific_force)
-    at = np.asarray(time_ns, float) * 1e-9
-    own = spec.mount.rotation
-    out = [np.stack([np.interp(at, seconds, v[:, k]) for k in range(3)], axis=1) @ own for v in (rate, force)]
-    return out[0], out[1]
+    return rate, np.einsum("nji,nj->ni", R, specific_force)
 
 
 def _earth(trajectory: Trajectory, frame: Frame, *, velocity: Float) -> tuple[Float, Float, Float]:
@@ -109,51 +123,96 @@ def _earth(trajectory: Trajectory, frame: Frame, *, velocity: Float) -> tuple[Fl
     return earth, transport, normal_gravity(lat, z)
 
 
-def observe_imu(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, seed: int) -> Inertial:
-    """The measurements of an inertial unit along a drive.
+def observe_imu(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, seed: int) -> Iterator[Inertial]:
+    """The measurements of an inertial unit along a drive, in blocks for tables; an empty one for none.
 
     Random numbers are keyed by seed and unit and drawn in time order from the start, so that a shorter
     drive has the same first rows, bit for bit.
     """
+    time_ns = _times(trajectory, spec)
+    noise = _Noise(spec, seed)
+    if not len(time_ns):
+        yield Inertial(time_ns, *(np.empty((0, 3)) for _ in range(4)))
+    for rows, rate, force in _true_blocks(trajectory, frame, spec=spec, time_ns=time_ns):
+        errors = noise.following(len(rate))
+        yield Inertial(time_ns[rows].copy(), rate + errors[:, :3], force + errors[:, 3:], rate, force)
+        release(time_ns)
+
+
+def _times(trajectory: Trajectory, spec: ImuSpec) -> NDArray[np.int64]:
+    """Times (n,) of a unit's measurements along a drive."""
     step = 1e9 / spec.rate_hz
     count = int(np.floor((trajectory.duration_ns - spec.time_offset_ns) / step + 1e-9)) + 1
-    time_ns = np.round(np.arange(max(count, 0)) * step).astype(np.int64) + spec.time_offset_ns
-    rate, force = true_inertial(trajectory, frame, spec=spec, time_ns=time_ns)
-    noise = inertial_noise(spec, len(time_ns), seed=seed)
-    return Inertial(time_ns, rate + noise[:, :3], force + noise[:, 3:], rate, force)
+    out = room((max(count, 0),), np.int64)
+    for rows in table_blocks(len(out)):
+        out[rows] = np.round(np.arange(rows.start, rows.stop) * step)
+        out[rows] += spec.time_offset_ns
+        release(out)
+    return out
 
 
 def inertial_noise(spec: ImuSpec, count: int, *, seed: int) -> Float:
     """Errors (n, 6) of gyros, rad/s, and accelerometers, m/s^2: white noise, random walk, flicker."""
-    draw = generator(seed, spec.name, "imu").standard_normal((count, 12))
-    dt = 1.0 / spec.rate_hz
-    white = np.repeat([spec.gyro_noise, spec.accel_noise], 3) / np.sqrt(dt)
-    walk = np.repeat([spec.gyro_walk, spec.accel_walk], 3) * np.sqrt(dt)
-    total: Float = draw[:, :6] * white + np.cumsum(draw[:, 6:] * walk, axis=0)
-    for axes, instability in ((slice(0, 3), spec.gyro_instability), (slice(3, 6), spec.accel_instability)):
-        if instability:
-            total[:, axes] += instability * _flicker(
-                count, dt, seed=seed, name=f"{spec.name}/imu/{axes.start}"
+    return _Noise(spec, seed).following(count)
+
+
+class _Noise:
+    """Errors of a unit, drawn in blocks of rows; their values do not depend on the blocks."""
+
+    def __init__(self, spec: ImuSpec, seed: int) -> None:
+        dt = 1.0 / spec.rate_hz
+        self._random = generator(seed, spec.name, "imu")
+        self._white = np.repeat([spec.gyro_noise, spec.accel_noise], 3) / np.sqrt(dt)
+        self._step = np.repeat([spec.gyro_walk, spec.accel_walk], 3) * np.sqrt(dt)
+        self._walk = np.full(6, -0.0)  # changes no step, not even the sign of zero
+        self._flicker = [
+            (axes, instability, _Flicker(dt, seed=seed, name=f"{spec.name}/imu/{axes.start}"))
+            for axes, instability in (
+                (slice(0, 3), spec.gyro_instability),
+                (slice(3, 6), spec.accel_instability),
             )
-    return total
+            if instability
+        ]
+
+    def following(self, count: int) -> Float:
+        """Errors (n, 6) of the next ``count`` measurements."""
+        draw = self._random.standard_normal((count, 12))
+        steps = draw[:, 6:] * self._step
+        steps[:1] += self._walk
+        walk = np.cumsum(steps, axis=0)
+        total: Float = draw[:, :6] * self._white + walk
+        self._walk = walk[-1] if count else self._walk
+        for axes, instability, flicker in self._flicker:
+            total[:, axes] += instability * flicker.following(count)
+        return total
 
 
-def _flicker(count: int, dt: float, *, seed: int, name: str) -> Float:
-    """Three columns (n, 3) of noise whose spectrum is 1 / (2 pi f), with an Allan deviation of 0.664.
+class _Flicker:
+    """Three columns of noise whose spectrum is 1 / (2 pi f), with an Allan deviation of 0.664.
 
     The sum of stationary first-order Gauss-Markov processes, a factor of e apart in correlation time, each of
     variance 1 / pi: between the shortest and the longest time their spectra add up to it (IEEE Std 952-1997,
     annex C, for the spectrum of bias instability and its Allan deviation, B sqrt(2 ln 2 / pi)).
     """
-    from scipy.signal import lfilter  # noqa: PLC0415 - slow to import
 
-    total = np.zeros((count, 3))
-    for time in _FLICKER_TIMES:
-        phi = np.exp(-dt / time)
-        noise = generator(seed, name, time).standard_normal((count, 3)) / np.sqrt(np.pi)
-        noise[1:] *= np.sqrt(1 - phi**2)
-        total += lfilter([1.0], [1.0, -phi], noise, axis=0)
-    return total
+    def __init__(self, dt: float, *, seed: int, name: str) -> None:
+        self._random = [generator(seed, name, time) for time in _FLICKER_TIMES]
+        self._phi = np.exp(-dt / _FLICKER_TIMES)
+        self._state = np.zeros((len(_FLICKER_TIMES), 1, 3))
+        self._begun = False
+
+    def following(self, count: int) -> Float:
+        """The next ``count`` rows (n, 3)."""
+        from scipy.signal import lfilter  # noqa: PLC0415 - slow to import
+
+        total = np.zeros((count, 3))
+        for k, (random, phi) in enumerate(zip(self._random, self._phi, strict=True)):
+            noise = random.standard_normal((count, 3)) / np.sqrt(np.pi)
+            noise[0 if self._begun else 1 :] *= np.sqrt(1 - phi**2)
+            sums, self._state[k] = lfilter([1.0], [1.0, -phi], noise, axis=0, zi=self._state[k])
+            total += sums
+        self._begun = self._begun or count > 0
+        return total
 
 
 def imu_columns(rows: Inertial) -> dict[str, NDArray[Any]]:

@@ -1,6 +1,7 @@
 """Time at the extremes: a day, rates that do not divide each other, speeds, years and leap seconds."""
 
 import itertools
+import tracemalloc
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
 
@@ -97,10 +98,27 @@ def test_poses_at_a_days_end_are_exact_at_rest_and_at_100_m_s(speed):
     assert np.abs(placed - [5.0 + wall[0], 2.0, 2.5]).max() < 1e-7
 
 
+def test_points_of_a_whole_day_are_placed_with_the_poses_that_they_need():
+    ego = straight(20.0, DAY_S, every=10.0)
+    draw = np.random.default_rng(3)
+    time = draw.integers(0, DAY_NS, 5000)
+    points = draw.uniform(-50, 50, (5000, 3))
+    mount = {"translation": (1.0, 0.5, 1.5), "rotation": np.eye(3)}
+    tracemalloc.start()
+    placed = ego.place(points, time, **mount)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10_000_000
+    at = np.array([1.0, 0.5, 1.5]) + np.outer(time * 2e-8, [1, 0, 0])
+    np.testing.assert_allclose(placed, points + at, atol=1e-6)
+    alone = [ego.place(points[k : k + 1], time[k : k + 1], **mount)[0] for k in range(50)]
+    np.testing.assert_array_equal(placed[:50], alone)
+
+
 @pytest.mark.parametrize("speed", [0.0, 100.0])
 def test_receivers_and_units_at_rest_and_at_100_m_s(speed):
     ego = straight(speed, 60.0, every=0.01)
-    imu = observe_imu(ego, FRAME, spec=ImuSpec("imu", MOUNT, rate_hz=7.0), seed=1)
+    imu = next(observe_imu(ego, FRAME, spec=ImuSpec("imu", MOUNT, rate_hz=7.0), seed=1))
     assert np.isfinite(imu.accel).all()
     assert np.abs(imu.true_accel[:, :2]).max() < 0.05  # Coriolis: 2 w v
     np.testing.assert_allclose(imu.true_accel[:, 2], 9.807, atol=0.05)

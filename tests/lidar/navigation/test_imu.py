@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from geoscene import files
 from geoscene.frames import Frame
+from lidar.geometry import poses
 from lidar.geometry.attitude import quat_from_euler
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.navigation.imu import (
     EARTH_RATE,
+    Inertial,
     imu_columns,
     inertial_noise,
     normal_gravity,
@@ -42,6 +45,10 @@ def track(position, velocity, quat):
         TIMES, np.broadcast_to(position, (n, 3)), np.broadcast_to(quat, (n, 4)),
         np.broadcast_to(velocity, (n, 3)), np.ones(n),
     )  # fmt: skip
+
+
+def observed(trajectory, *, spec, seed):
+    return Inertial.concatenate(list(observe_imu(trajectory, FRAME, spec=spec, seed=seed)))
 
 
 def test_gravity_is_that_of_wgs84():
@@ -149,18 +156,37 @@ def test_a_reading_does_not_depend_on_later_motion():
         *(getattr(whole, f)[:500] for f in ("time_ns", "position", "quat_xyzw", "velocity", "scale"))
     )
     spec = ImuSpec("imu", Mount(), rate_hz=200.0)
-    one, two = observe_imu(half, FRAME, spec=spec, seed=5), observe_imu(whole, FRAME, spec=spec, seed=5)
+    one, two = observed(half, spec=spec, seed=5), observed(whole, spec=spec, seed=5)
     n = len(one.time_ns) - 4  # the last differences are one-sided
     np.testing.assert_array_equal(one.gyro[:n], two.gyro[:n])
     np.testing.assert_array_equal(one.accel[:n], two.accel[:n])
-    assert (observe_imu(whole, FRAME, spec=spec, seed=6).gyro != two.gyro).all()
+    assert (observed(whole, spec=spec, seed=6).gyro != two.gyro).all()
 
 
 def test_an_imu_without_noise_reports_the_truth():
-    rows = observe_imu(circling(), FRAME, spec=ImuSpec("imu", Mount(), rate_hz=50.0, **SILENT), seed=0)
+    rows = observed(circling(), spec=ImuSpec("imu", Mount(), rate_hz=50.0, **SILENT), seed=0)
     np.testing.assert_array_equal(rows.gyro, rows.true_gyro)
     np.testing.assert_array_equal(rows.accel, rows.true_accel)
     np.testing.assert_array_equal(np.diff(rows.time_ns), 20_000_000)
     columns = imu_columns(rows)
     assert list(columns)[:4] == ["time_ns", "gyro_x", "gyro_y", "gyro_z"]
     assert {len(c) for c in columns.values()} == {len(rows.time_ns)}
+
+
+@pytest.mark.parametrize("offset_ns", [0, 3_000_000, 20_000_000_000])
+def test_measurements_do_not_depend_on_the_blocks_in_which_they_are_drawn(offset_ns, monkeypatch):
+    spec = ImuSpec(
+        "imu", Mount(), rate_hz=170.0, gyro_instability=2e-6, accel_instability=7e-4, time_offset_ns=offset_ns
+    )
+    whole = observed(circling(), spec=spec, seed=4)
+    noise = inertial_noise(spec, len(whole), seed=4)
+    np.testing.assert_array_equal(whole.gyro, whole.true_gyro + noise[:, :3])
+    np.testing.assert_array_equal(whole.accel, whole.true_accel + noise[:, 3:])
+    monkeypatch.setattr(files, "BLOCK_ROWS", 100)
+    monkeypatch.setattr(poses, "BLOCK_POSES", 257)
+    monkeypatch.setattr(poses, "_IN_MEMORY", 300)
+    blocks = list(observe_imu(circling(), FRAME, spec=spec, seed=4))
+    assert max(len(block) for block in blocks) <= 100
+    parts = Inertial.concatenate(blocks)
+    for name, column in whole.columns().items():
+        np.testing.assert_array_equal(getattr(parts, name), column)
