@@ -73,7 +73,7 @@ class BuildOptions:
         if self.dem_tolerance is not None and not 0 <= self.dem_tolerance <= 1000:
             raise InputError(f"`dem_tolerance` {self.dem_tolerance:g}: give metres from 0 to 1000")
         if unknown := sorted(set(self.only) - set(KINDS)):
-            raise InputError(f"`only` {','.join(unknown)}: of {','.join(KINDS)}")
+            raise InputError(f"`only` {','.join(unknown)}: unknown; choose from {', '.join(KINDS)}")
         if self.use not in USES:
             raise InputError(f"`use` {self.use}: one of {', '.join(USES)}")
         if self.driving_side not in ("", "left", "right"):

@@ -50,7 +50,7 @@ def variants(options: BuildOptions, settings: Sequence[str]) -> list[Variant]:
     Raises InputError for unknown settings.
     """
     if unknown := sorted(set(settings) - set(SETTINGS)):
-        raise InputError(f"`settings` {','.join(unknown)}: of {', '.join(SETTINGS)}")
+        raise InputError(f"`settings` {','.join(unknown)}: unknown; choose from {', '.join(SETTINGS)}")
     chosen, base = settings or SETTINGS, full(options).options
     found: list[Variant] = []
     if "lod" in chosen:

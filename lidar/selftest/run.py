@@ -48,7 +48,7 @@ def outcomes(
     Raises InputError for an unknown group.
     """
     if unknown := sorted(set(groups) - set(GROUPS)):
-        raise InputError(f"`only` {','.join(unknown)}: of {','.join(GROUPS)}")
+        raise InputError(f"`only` {','.join(unknown)}: unknown; choose from {', '.join(GROUPS)}")
     chosen = [case for case in CASES if not groups or case.group in groups]
     for k, case in enumerate(chosen):
         yield outcome(case, case.full if full else case.quick)
