@@ -15,6 +15,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.columns import row_blocks
 from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
 from geoscene.files import write_atomically
 from geoscene.frames import Frame
@@ -22,6 +23,7 @@ from geoscene.roadgraph.graph import RoadGraph
 
 _XMLNS = "http://graphml.graphdrawing.org/xmlns"
 _FLAGS = {"signals": "traffic_signals", "stop": "stop", "give_way": "give_way"}
+_WKT_BLOCK = 256  # lines that are read at once: GEOS needs 20 kB for each meanwhile
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
 
 
@@ -261,7 +263,8 @@ def _way_ids(osmid: str) -> str:
 def _lines(rows: list[_Row], frame: Frame) -> NDArray[np.object_]:
     if not rows:
         return np.empty(0, object)
-    shapes = shapely.from_wkt([row["geometry"] for row in rows])
+    texts = [row["geometry"] for row in rows]
+    shapes = np.concatenate([shapely.from_wkt(texts[block]) for block in row_blocks(len(texts), _WKT_BLOCK)])
     points, index = shapely.get_coordinates(shapes, include_z=True, return_index=True)
     x, y = frame.from_geographic(points[:, 0], points[:, 1])
     xyz = np.stack([x, y, np.nan_to_num(points[:, 2])], axis=1)

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,6 +15,7 @@ from geoscene.roadgraph import (
     RoadOptions,
     build_road_graph,
     find_components,
+    graphml,
     main_network,
     read_graphml,
     write_graphml,
@@ -640,6 +642,20 @@ def test_restrictions_via_ways_survive_graphml_and_a_cut(tmp_path):
     cut = graph.take(np.arange(len(graph)) != link)
     assert [c.tolist() for c in cut.chain_edges] == [(c - (c > link)).tolist() for c in graph.chain_edges]
     assert len(graph.take(np.arange(len(graph)) != edge_between(graph, 7, 8)).chain_edges) == 1
+
+
+def test_lines_of_graphml_are_read_in_blocks(monkeypatch, tmp_path):
+    graph = graph_of(DUAL, CARRIAGEWAYS)
+    write_graphml(graph, FRAME, path=tmp_path / "roads.graphml")
+    whole = read_graphml(tmp_path / "roads.graphml", FRAME)
+    sizes = []
+    read = shapely.from_wkt
+    monkeypatch.setattr(graphml, "_WKT_BLOCK", 3)
+    monkeypatch.setattr(shapely, "from_wkt", lambda texts: sizes.append(len(texts)) or read(texts))
+    parts = read_graphml(tmp_path / "roads.graphml", FRAME)
+    assert sum(sizes) == len(graph) > max(sizes) == 3
+    for one, two in zip(whole.geometry, parts.geometry, strict=True):
+        np.testing.assert_array_equal(one, two)
 
 
 def test_osmnx_reads_our_graphml(tmp_path):
