@@ -1,4 +1,4 @@
-"""Charts and pages of reports: figures as people read them, scatter plots, self-contained HTML."""
+"""Charts, tables and pages of reports: figures as people read them, scatter plots, self-contained HTML."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import base64
 import html
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from PIL import Image, ImageDraw, ImageFont
+from rich.console import Console
+from rich.table import Table
 
 _INK, _GREY, _CHOICE, _OTHER = (30, 32, 38), (205, 208, 214), (200, 60, 40), (60, 110, 180)
 _STYLE = (
@@ -22,10 +24,10 @@ _STYLE = (
 
 def metres(value: float) -> str:
     """A length with a unit that fits it."""
-    for unit, size in (("m", 1.0), ("cm", 0.01), ("mm", 0.001)):
+    for unit, size in (("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("µm", 1e-6), ("nm", 1e-9)):
         if abs(value) >= size:
             return f"{value / size:.3g} {unit}"
-    return "0" if value == 0 else f"{value * 1000:.2g} mm"
+    return "0" if value == 0 else "below 1 nm"
 
 
 def share(value: float) -> str:
@@ -44,12 +46,24 @@ def size(value: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A named point of a chart; ``best`` ones are joined by a line."""
+    """A named point of a chart, with intervals if they are known; ``best`` ones are joined by a line."""
 
     name: str
     x: float
     y: float
     best: bool
+    x_interval: tuple[float, float] | None = None
+    y_interval: tuple[float, float] | None = None
+
+    @property
+    def xs(self) -> tuple[float, ...]:
+        """The value of x and the ends of its interval."""
+        return (self.x, *(self.x_interval or ()))
+
+    @property
+    def ys(self) -> tuple[float, ...]:
+        """The value of y and the ends of its interval."""
+        return (self.y, *(self.y_interval or ()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +81,8 @@ def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: i
     picture = Image.new("RGB", (width, height), (255, 255, 255))
     pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=15)
     left, right, top, bottom = 90, width - 190, 70, height - 70
-    x_ends, y_ends = _ends([p.x for p in points]), _ends([p.y for p in points])
-    nothing = any(p.y <= 0 for p in points)
+    x_ends, y_ends = _ends([x for p in points for x in p.xs]), _ends([y for p in points for y in p.ys])
+    nothing = any(y <= 0 for p in points for y in p.ys)
 
     def across(value: float) -> float:
         return _place(value, x_ends, at=(left, right))
@@ -95,10 +109,13 @@ def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: i
     named: list[tuple[float, float, float, float]] = []
     for p in ordered:
         u, v, color = across(p.x), up(p.y), _CHOICE if p.best else _OTHER
+        pen.line((across(min(p.xs)), v, across(max(p.xs)), v), fill=color)
+        pen.line((u, up(min(p.ys)), u, up(max(p.ys))), fill=color)
         pen.ellipse((u - 4, v - 4, u + 4, v + 4), fill=color)
         for place, anchor in (((u + 8, v - 4), "ls"), ((u + 8, v + 4), "lt"), ((u - 8, v + 4), "rt")):
             box = pen.textbbox(place, p.name, font=font, anchor=anchor)
-            if not any(_overlap(box, other) for other in named):  # else without a name: the table has it
+            outside = box[0] < left or box[2] > width
+            if not outside and not any(_overlap(box, other) for other in named):  # else the table has it
                 text(place, p.name, anchor=anchor)
                 named.append(box)
                 break
@@ -132,6 +149,25 @@ def _place(value: float, ends: tuple[float, float], *, at: tuple[float, float]) 
 def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
     """Whether two boxes (left, top, right, bottom) overlap."""
     return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+
+
+def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str) -> None:
+    """Print a table, 240 characters wide if not to a terminal."""
+    table = Table(*head, title=title)
+    for row in rows:
+        table.add_row(*row)
+    _console().print(table)
+
+
+def print_lines(texts: Iterable[str]) -> None:
+    """Print texts that are not empty, each from a new line."""
+    for text in filter(None, texts):
+        _console().print(text, highlight=False)
+
+
+def _console() -> Console:
+    console = Console()
+    return console if console.is_terminal else Console(width=240)
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import resource
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -20,6 +18,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.export.objects import expand, parts
 from geoscene.export.raster import Grid, draw, grid_of
+from geoscene.memory import peak_memory
 from geoscene.mesh import concatenate
 from geoscene.options import BuildOptions
 from geoscene.progress import Progress, silent
@@ -153,16 +152,6 @@ def _build(read: Callable[[], OsmData], *, options: BuildOptions, out: Path) -> 
     build(read(), out, options=options, overwrite=out.exists())
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
     return Cost(time.process_time(), peak_memory(), size)
-
-
-def peak_memory() -> int:
-    """Peak memory of this process in bytes; Linux's own count, as a parent's may be part of the other."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        line = next(text for text in status.read_text().splitlines() if text.startswith("VmHWM"))
-        return 1024 * int(line.split()[1])
-    unit = 1 if sys.platform == "darwin" else 1024
-    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,19 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
-from geoscene.charts import Axes, Point, html_page, html_picture, html_table, metres, scatter, share, size
+from geoscene.charts import (
+    Axes,
+    Point,
+    html_page,
+    html_picture,
+    html_table,
+    metres,
+    print_lines,
+    print_table,
+    scatter,
+    share,
+    size,
+)
 from geoscene.files import write_atomically, write_json
 from geoscene.tradeoff.engine import Row, Tradeoff
 
@@ -94,15 +103,8 @@ def _saving(row: Row, full: Row) -> str:
 
 def print_tables(found: Tradeoff) -> None:
     """Print the table and the recommendations."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=240)
-    table = Table(*_HEAD, title=headline(found))
-    for row in found.rows:
-        table.add_row(*cells(row))
-    console.print(table)
-    for text in recommendations(found):
-        console.print(text, highlight=False)
+    print_table(_HEAD, [cells(row) for row in found.rows], title=headline(found))
+    print_lines(recommendations(found))
 
 
 def document(found: Tradeoff) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from geoscene.charts import metres
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from lidar import pipeline
@@ -17,7 +18,6 @@ from lidar.plan import DrivePlan
 from lidar.tradeoff.errors import Estimate
 from lidar.tradeoff.profile import Candidate, Profile, profile_of
 from lidar.tradeoff.spot import SpotCheck, error_text, spot_check
-from lidar.tradeoff.words import metres
 
 PICKED = "rays"
 """The setting that is picked."""

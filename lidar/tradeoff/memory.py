@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import multiprocessing
-import resource
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from geoscene.memory import peak_memory
 from geoscene.scene import open_scene
 from geoscene.typing import Float
 from lidar.camera.settings import CameraSettings
@@ -57,7 +56,7 @@ def peaks(tasks: list[Task]) -> list[int]:
 
 
 def _growth(task: Task) -> int:
-    before = _peak()
+    before = peak_memory()
     actors = task.actors
     world = World.load(
         open_scene(task.scene),
@@ -88,14 +87,4 @@ def _growth(task: Task) -> int:
                 settings=task.settings,
             )
         )
-    return _peak() - before
-
-
-def _peak() -> int:
-    """Peak memory of this process in bytes; Linux's own count, as a parent's may be part of the other."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        line = next(text for text in status.read_text().splitlines() if text.startswith("VmHWM"))
-        return 1024 * int(line.split()[1])
-    unit = 1 if sys.platform == "darwin" else 1024
-    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak_memory() - before

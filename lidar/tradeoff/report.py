@@ -2,37 +2,37 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
-from rich.console import Console
-from rich.table import Table
-
+from geoscene.charts import (
+    Axes,
+    Point,
+    html_page,
+    html_picture,
+    html_table,
+    metres,
+    print_lines,
+    print_table,
+    scatter,
+    share,
+    size,
+)
 from geoscene.files import write_atomically, write_json
 from lidar.tradeoff.comparison import Comparison, Kind, Listing, Row
 from lidar.tradeoff.engine import Tradeoff
 from lidar.tradeoff.errors import Estimate
 from lidar.tradeoff.words import (
     candidates,
-    metres,
     pareto,
     reached,
     recommendations,
     residual_text,
-    share,
-    size,
     size_of,
 )
-
-_INK, _GREY, _CHOICE, _OTHER = (30, 32, 38), (205, 208, 214), (200, 60, 40), (60, 110, 180)
 
 _RANKED: dict[Kind, str] = {
     "scanner": "range error at 99.9 %",
@@ -155,25 +155,14 @@ def georeferencing_text(found: Tradeoff) -> str:
 
 def print_tables(found: Tradeoff) -> None:
     """Print the tables and recommendations."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=240)
     for comparison in found.comparisons:
-        table = Table(*heads(comparison.kind), title=headline(comparison))
-        for row in comparison.rows:
-            table.add_row(*cells(row, comparison))
-        console.print(table)
-        for text in (residual_text(comparison), *recommendations(comparison)):
-            console.print(text, highlight=False)
+        rows = [cells(row, comparison) for row in comparison.rows]
+        print_table(heads(comparison.kind), rows, title=headline(comparison))
+        print_lines([residual_text(comparison), *recommendations(comparison)])
     for listing in found.listings:
-        heading, rows = table_of(listing)
-        table = Table(*heading, title=listing.title)
-        for cells_of_row in rows:
-            table.add_row(*cells_of_row)
-        console.print(table)
-        console.print(listing.note, highlight=False)
-    for text in filter(None, (georeferencing_text(found), NOISE)):
-        console.print(text, highlight=False)
+        print_table(*table_of(listing), title=listing.title)
+        print_lines([listing.note])
+    print_lines([georeferencing_text(found), NOISE])
 
 
 def document(found: Tradeoff) -> dict[str, Any]:
@@ -234,102 +223,32 @@ def write_report(found: Tradeoff, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     plots = []
     for comparison in found.comparisons:
-        plots.append(_png(pareto_plot(comparison)))
+        plots.append(pareto_plot(comparison))
         write_atomically(out / f"pareto_{comparison.sensor.split()[0]}.png", plots[-1])
-    write_atomically(out / "tradeoff.html", _page(found, plots).encode())
+    write_atomically(out / "tradeoff.html", _page(found, plots))
     write_json(out / "tradeoff.json", document(found))
 
 
-def _png(pixels: NDArray[np.uint8]) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "PNG")
-    return file.getvalue()
-
-
-def pareto_plot(comparison: Comparison, *, width: int = 1100, height: int = 700) -> NDArray[np.uint8]:
-    """A picture (height, width, 3): error against CPU time, both logarithmic.
+def pareto_plot(comparison: Comparison) -> bytes:
+    """A PNG: error against CPU time.
 
     Settings that miss or add too many returns are not drawn, see `words.reached`.
     """
-    picture = Image.new("RGB", (width, height), (255, 255, 255))
-    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=15)
-    best = pareto(comparison)
-    rows = [row for row in candidates(comparison) if math.isfinite(reached(comparison, row))]
-    x = [row.cost["cpu_s"] for row in rows]
-    y = [row.error[comparison.tail] for row in rows]
-    left, right, top, bottom = 90, width - 150, 70, height - 70
-    across, up = _scale(x, ends=(left, right)), _scale(y, ends=(bottom, top))
-    said: dict[str, Any] = {"fill": _INK, "font": font}
-    pen.text((left, 16), headline(comparison), **said)
-    pen.text(((left + right) / 2, height - 16), "CPU s per simulated second", **said, anchor="ms")
-    pen.text((12, top - 10), _RANKED[comparison.kind], **said, anchor="ls")
-    for value in _decades(x):
-        pen.line((across(value), top, across(value), bottom), fill=_GREY)
-        pen.text((across(value), bottom + 8), f"{value:g}", **said, anchor="mt")
-    for value in _decades(y):
-        pen.line((left, up(value), right, up(value)), fill=_GREY)
-        pen.text((left - 8, up(value)), size_of(value, comparison.kind), **said, anchor="rm")
-    places = [(across(row.cost["cpu_s"].value), up(row.error[comparison.tail].value)) for row in best]
-    if len(places) > 1:
-        pen.line(places, fill=_CHOICE, width=2)
-    named: list[tuple[float, float, float, float]] = []
-    for row in (*best, *(row for row in rows if row not in best)):
+    kind, best = comparison.kind, pareto(comparison)
+    points = []
+    for row in candidates(comparison):
         cost, error = row.cost["cpu_s"], row.error[comparison.tail]
-        u, v = across(cost.value), up(error.value)
-        color = _CHOICE if row in best else _OTHER
-        pen.line((across(cost.low), v, across(cost.high), v), fill=color)
-        pen.line((u, up(error.low), u, up(error.high)), fill=color)
-        pen.ellipse((u - 4, v - 4, u + 4, v + 4), fill=color)
-        name = row.label.partition(" (")[0]
-        for x_text, y_text, anchor in ((u + 8, v - 4, "ls"), (u + 8, v + 4, "lt"), (u - 8, v + 4, "rt")):
-            box = pen.textbbox((x_text, y_text), name, font=font, anchor=anchor)
-            if box[0] < 0 or box[2] > width or any(_overlap(box, other) for other in named):
-                continue  # at worst without a name: the table has it
-            pen.text((x_text, y_text), name, **said, anchor=anchor)
-            named.append(box)
-            break
-    return np.asarray(picture).copy()
-
-
-def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
-    """Whether two boxes (left, top, right, bottom) overlap."""
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
-
-
-def _ends(figures: list[Estimate]) -> tuple[float, float]:
-    values = [v for f in figures for v in (f.low, f.value, f.high) if v > 0] or [1.0]
-    return 10 ** math.floor(math.log10(min(values))), 10 ** math.ceil(math.log10(max(values)) + 1e-9)
-
-
-def _scale(figures: list[Estimate], *, ends: tuple[float, float]) -> Any:
-    """A function from a figure to pixels between two ends; 0 is drawn at the first."""
-    start, end = ends
-    low, high = (math.log10(v) for v in _ends(figures))
-    return lambda v: start + (end - start) * (math.log10(max(v, 10**low)) - low) / max(high - low, 1e-9)
-
-
-def _decades(figures: list[Estimate]) -> list[float]:
-    low, high = _ends(figures)
-    return [10.0**k for k in range(round(math.log10(low)), round(math.log10(high)) + 1)]
-
-
-_STYLE = (
-    "body{font:15px system-ui,sans-serif;margin:2em;color:#1e2026}"
-    "table{border-collapse:collapse;margin:1em 0}"
-    "td,th{border-bottom:1px solid #cdd0d6;padding:.3em .6em;text-align:right;white-space:nowrap}"
-    "td:first-child,th:first-child,td:last-child{text-align:left}img{max-width:100%}"
-)
-
-
-def _html_table(heading: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{html.escape(text)}</th>" for text in heading)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in row) + "</tr>" for row in rows
+        if math.isfinite(reached(comparison, row)):
+            name = row.label.partition(" (")[0]
+            cpu, away = (cost.low, cost.high), (error.low, error.high)
+            points.append(Point(name, cost.value, error.value, row in best, cpu, away))
+    axes = Axes(
+        headline(comparison), "CPU s per simulated second", _RANKED[kind], lambda value: size_of(value, kind)
     )
-    return f"<table><tr>{head}</tr>{body}</table>"
+    return scatter(points, axes)
 
 
-def _page(found: Tradeoff, plots: list[bytes]) -> str:
+def _page(found: Tradeoff, plots: Sequence[bytes]) -> bytes:
     """A self-contained HTML page."""
     parts = []
     for comparison, plot in zip(found.comparisons, plots, strict=True):
@@ -337,15 +256,11 @@ def _page(found: Tradeoff, plots: list[bytes]) -> str:
         rows = [cells(row, comparison) for row in comparison.rows]
         parts.append(
             f"<h2>{html.escape(headline(comparison))}</h2><p>{html.escape(residual_text(comparison))}</p>"
-            f"<ul>{said}</ul>{_html_table(heads(comparison.kind), rows)}"
-            f'<img alt="error against cost" src="data:image/png;base64,{base64.b64encode(plot).decode()}">'
+            f"<ul>{said}</ul>{html_table(heads(comparison.kind), rows)}"
+            f"{html_picture(plot, alt='error against cost')}"
         )
     for listing in found.listings:
         title, note = html.escape(listing.title), html.escape(listing.note)
-        parts.append(f"<h2>{title}</h2><p>{note}</p>{_html_table(*table_of(listing))}")
-    notes = "".join(f"<p>{html.escape(text)}</p>" for text in (georeferencing_text(found), NOISE))
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>Speed against accuracy</title>'
-        f"<style>{_STYLE}</style><h1>Speed against accuracy: {html.escape(str(found.plan.scene.path))}</h1>"
-        f"{''.join(parts)}{notes}</html>\n"
-    )
+        parts.append(f"<h2>{title}</h2><p>{note}</p>{html_table(*table_of(listing))}")
+    parts += [f"<p>{html.escape(text)}</p>" for text in (georeferencing_text(found), NOISE)]
+    return html_page(f"Speed against accuracy: {found.plan.scene.path}", "".join(parts))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from geoscene.charts import metres
 from geoscene.progress import Progress, silent
 from lidar.plan import DrivePlan
 from lidar.rig.devices import Scanner
 from lidar.tradeoff.errors import Estimate
 from lidar.tradeoff.sampling import RangeError, SampledError, errors_of, places, range_error
-from lidar.tradeoff.words import metres
 
 _FRAMES = 10
 """Frames of each scanner that are checked."""

@@ -1,9 +1,10 @@
-"""Recommendations in words, and figures as people read them."""
+"""Recommendations in words."""
 
 from __future__ import annotations
 
 from math import inf
 
+from geoscene.charts import metres, share
 from lidar.tradeoff.comparison import Comparison, Kind, Row
 
 TARGETS: dict[Kind, tuple[float, ...]] = {"scanner": (0.001, 0.01, 0.1), "camera": (1.0, 3.0, 10.0)}
@@ -11,27 +12,6 @@ TARGETS: dict[Kind, tuple[float, ...]] = {"scanner": (0.001, 0.01, 0.1), "camera
 
 LOST = 0.001
 """Share of missed and extra returns beyond which a setting does not keep any error at 99.9 %."""
-
-
-def metres(value: float) -> str:
-    """A length with a unit that fits it."""
-    for unit, size in (("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("µm", 1e-6), ("nm", 1e-9)):
-        if abs(value) >= size:
-            return f"{value / size:.3g} {unit}"
-    return "0" if value == 0 else "below 1 nm"
-
-
-def share(value: float) -> str:
-    """A share in percent."""
-    return "0" if value == 0 else f"{100 * value:.3g} %"
-
-
-def size(value: float) -> str:
-    """Bytes in decimal units."""
-    for unit, one in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if abs(value) >= one:
-            return f"{value / one:.3g} {unit}"
-    return f"{value:.0f} B"
 
 
 def levels(value: float) -> str:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from geoscene.charts import metres
 from geoscene.progress import silent
 from lidar.errors import InputError
 from lidar.options import DriveOptions, TradeoffOptions
@@ -18,7 +19,7 @@ from lidar.tradeoff.errors import STATISTICS, Estimate, Returns, estimates, fram
 from lidar.tradeoff.report import document, write_report
 from lidar.tradeoff.simulate import bench_of, chosen_pulses, spread_frames
 from lidar.tradeoff.variants import next_step, noiseless, reference, scanner_basis, scanner_variants
-from lidar.tradeoff.words import metres, pareto, recommendation
+from lidar.tradeoff.words import pareto, recommendation
 from lidar.world.settings import PLAIN as WHOLE
 from lidar.world.settings import WorldSettings
 
