@@ -19,6 +19,7 @@ from geoscene.errors import FrameError
 from geoscene.typing import Float
 
 _GEOGRAPHIC = "EPSG:4326"
+_LOCAL = "Local transverse Mercator at"
 
 
 def _local_wkt(lon_deg: float, lat_deg: float) -> str:
@@ -26,7 +27,7 @@ def _local_wkt(lon_deg: float, lat_deg: float) -> str:
     return str(
         ProjectedCRS(
             TransverseMercatorConversion(lat_deg, lon_deg, scale_factor_natural_origin=1.0),
-            name=f"Local transverse Mercator at {lat_deg:.6f}, {lon_deg:.6f}",
+            name=f"{_LOCAL} {lat_deg:.6f}, {lon_deg:.6f}",
             geodetic_crs=CRS.from_user_input(_GEOGRAPHIC),
         ).to_wkt()
     )
@@ -36,7 +37,7 @@ def _local_wkt(lon_deg: float, lat_deg: float) -> str:
 def _crs_name(wkt: str) -> str:
     """``EPSG:n`` if the CRS has an EPSG code, else its name; the search takes a tenth of a second."""
     crs = CRS.from_wkt(wkt)
-    code = crs.to_authority(min_confidence=100)
+    code = None if crs.name.startswith(_LOCAL) else crs.to_authority(min_confidence=100)
     return ":".join(code) if code else str(crs.name)
 
 

@@ -29,12 +29,16 @@ def scene_manifest(
     osm: OsmData,
     options: Mapping[str, Any],
     *,
+    digest: str,
     plan: Plan,
     reports: Sequence[TileReport],
     problems: Sequence[Problem],
     fingerprint: str,
 ) -> dict[str, Any]:
-    """The JSON object: sources, options, counts, sources of heights, repaired and dropped features."""
+    """The JSON object: sources, options, counts, sources of heights, repaired and dropped features.
+
+    digest : of the map
+    """
     xmin, ymin, xmax, ymax = plan.extent
     west, south, east, north = osm.bounds
     terrain = plan.terrain
@@ -51,7 +55,7 @@ def scene_manifest(
         "tiles": sorted((r.i, r.j, tile_span(plan.ground, r.i, j=r.j)) for r in reports),
         "options": dict(options),
         **({} if plan.area is None else {"area": shapely.to_wkt(plan.area, rounding_precision=3)}),
-        "map": osm.digest,
+        "map": digest,
         "left_out": {"tiles": len(plan.chosen) - len(reports)},
         "terrain": {
             "vertical": terrain.vertical,

@@ -65,7 +65,8 @@ def build(
         if cluster is not None:
             cluster.check(writer.folder)
         plan, problems = make_plan(osm, options, progress=progress, needed=needed)
-        keys = _keys(osm, options)
+        digest = osm.digest
+        keys = _keys(osm, options, digest=digest)
         tiles = plan.chosen if plan.use.tiles else []
         reports: list[TileReport] = []
         for report in build_tiles(
@@ -91,7 +92,13 @@ def build(
             problems=problems,
             tiles=tiles_document(keys, reports),
             manifest=scene_manifest(
-                osm, asdict(options), plan=plan, reports=reports, problems=problems, fingerprint=_digest(keys)
+                osm,
+                asdict(options),
+                digest=digest,
+                plan=plan,
+                reports=reports,
+                problems=problems,
+                fingerprint=_digest(keys),
             ),
         )
     return open_scene(out)
@@ -101,13 +108,16 @@ def _tile_problems(reports: Sequence[TileReport]) -> list[Problem]:
     return [problem for report in sorted(reports, key=lambda r: (r.i, r.j)) for problem in report.problems]
 
 
-def _keys(osm: OsmData, options: BuildOptions) -> Keys:
-    """Digests of all inputs of the ground and of the solids of tiles: program, format, map and options."""
+def _keys(osm: OsmData, options: BuildOptions, *, digest: str) -> Keys:
+    """Digests of all inputs of the ground and of the solids of tiles: program, format, map and options.
+
+    digest : of the map
+    """
     chosen = {f.name: getattr(options, f.name) for f in fields(options) if f.name not in _NOT_IN_TILES}
     common = {
         "version": __version__,
         "schema": SCHEMA,
-        "map": osm.digest,
+        "map": digest,
         "bounds": osm.bounds,
         **{name: value for name, value in chosen.items() if name not in _NOT_IN_GROUND},
         "dem": elevation_digests(options.dem),

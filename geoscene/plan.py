@@ -222,10 +222,9 @@ def make_plan(
             kept["roads"] = np.arange(len(roads.graph))
     standing = np.arange(buildings.count) if kept is None else kept["buildings"]
     base, foot = np.full((2, buildings.count), np.nan)
-    z = roads.height or terrain.height
-    base[standing] = base_heights(footprints[standing], z)
+    base[standing] = base_heights(footprints[standing], roads.height)
     foot[standing] = foundation_heights(
-        footprints[standing], base[standing], height=z, layers=covers, levels=levels
+        footprints[standing], base[standing], height=roads.height, layers=covers, levels=levels
     )
     buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=roads.structures))
 
@@ -316,7 +315,7 @@ def _plan_roads(
     graph = _collect(problems, build_road_graph(mapped, frame))
     graph = profile(graph, terrain.height, obstacles=find_obstacles(osm, frame))
     uneven = bool(terrain.grids) or any(line[:, 2].any() for line in graph.geometry)
-    height = graded_ground(graph, terrain.height) if uneven else None
+    height = graded_ground(graph, terrain.height, level=not terrain.grids) if uneven else None
     side, source = found_side(osm)
     if options.driving_side:
         side, source = cast("Side", options.driving_side), "option"

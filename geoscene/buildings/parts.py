@@ -23,14 +23,26 @@ _LEAST_SHOWN = 0.01
 
 def overlapping(a: Polygons, b: Polygons, *, least: float = 1e-4) -> tuple[Rows, Rows, Float]:
     """Pairs of rows of a and b that share more than ``least`` square metres, and the shared areas."""
-    j, i = shapely.STRtree(a).query(b, predicate="intersects")  # first row: index into b
-    j, i = i.astype(np.int64), j.astype(np.int64)
+    of_b, of_a = shapely.STRtree(a).query(b, predicate="intersects")
+    return _shared(a, b, rows=(of_a.astype(np.int64), of_b.astype(np.int64)), least=least)
+
+
+def overlapping_pairs(polygons: Polygons, *, least: float = 1e-4) -> tuple[Rows, Rows, Float]:
+    """Pairs of rows, the lesser first, that share more than ``least`` square metres, and the shared areas."""
+    second, first = shapely.STRtree(polygons).query(polygons, predicate="intersects").astype(np.int64)
+    once = first < second
+    return _shared(polygons, polygons, rows=(first[once], second[once]), least=least)
+
+
+def _shared(a: Polygons, b: Polygons, *, rows: tuple[Rows, Rows], least: float) -> tuple[Rows, Rows, Float]:
+    """The pairs of rows of a and b that share more than ``least`` square metres, and the shared areas."""
+    i, j = rows
     # most pairs only touch; this test is cheaper than their intersection
-    overlap = ~shapely.touches(a[j], b[i])
-    j, i = j[overlap], i[overlap]
-    area = shapely.area(shapely.intersection(a[j], b[i]))
+    overlap = ~shapely.touches(a[i], b[j])
+    i, j = i[overlap], j[overlap]
+    area = shapely.area(shapely.intersection(a[i], b[j]))
     keep = area > least
-    return j[keep], i[keep], area[keep]
+    return i[keep], j[keep], area[keep]
 
 
 def duplicates(
@@ -45,15 +57,15 @@ def duplicates(
     """
     area = shapely.area(footprint)
     # Equal outlines first: each overlaps all others.
-    shapes = np.array([shape.wkb for shape in shapely.normalize(footprint)], object)
+    shapes = shapely.to_wkb(shapely.normalize(footprint))
     order = np.argsort(-score, kind="stable")
     _, best, group = np.unique(shapes[order], return_index=True, return_inverse=True)
     first = np.empty(len(footprint), np.int64)
     first[order] = order[best][group.ravel()]
     kept = np.flatnonzero(first == np.arange(len(footprint)))
-    a, b, shared = overlapping(footprint[kept], footprint[kept])
+    a, b, shared = overlapping_pairs(footprint[kept])
     a, b = kept[a], kept[b]
-    same = (a < b) & (shared > 0.9 * np.maximum(area[a], area[b]))
+    same = shared > 0.9 * np.maximum(area[a], area[b])
     repeated = first != np.arange(len(footprint))
     problems = [
         Problem(osm_id[i], "building", "dropped", "duplicate", f"the same outline as {osm_id[first[i]]}")
@@ -149,8 +161,8 @@ def cut_overlaps(
     low, high : metres above the base; pieces above one another do not overlap
     """
     area = shapely.area(footprint)
-    a, b, shared = overlapping(footprint, footprint)
-    overlap = (a < b) & (owner[a] != owner[b]) & (np.minimum(high[a], high[b]) > np.maximum(low[a], low[b]))
+    a, b, shared = overlapping_pairs(footprint)
+    overlap = (owner[a] != owner[b]) & (np.minimum(high[a], high[b]) > np.maximum(low[a], low[b]))
     a, b, shared = a[overlap], b[overlap], shared[overlap]
     b_smaller = area[b] < area[a]  # of equal ones a comes first
     small, large = np.where(b_smaller, (b, a), (a, b))

@@ -24,7 +24,12 @@ _AT_ONCE = 10_000
 
 
 def foundation_heights(
-    footprints: NDArray[np.object_], base: Float, *, height: Height, layers: Layers, levels: WaterLevels
+    footprints: NDArray[np.object_],
+    base: Float,
+    *,
+    height: Height | None,
+    layers: Layers,
+    levels: WaterLevels,
 ) -> Float:
     """Height z (n,) of the lower end of each building's walls: 0.5 m below the lowest ground beside them.
 
@@ -33,15 +38,12 @@ def foundation_heights(
 
     footprints : (n,) polygons, scene metres
     base       : (n,) z of the lowest ground along each outline, NaN for an empty footprint
+    height     : z of the ground at x, y; None if it is 0 everywhere, as the base then is
     layers     : of the ground; ``levels`` are those of their water
     """
     lowest = np.where(np.isnan(base), np.inf, base)
-    for first in range(0, len(footprints), _AT_ONCE):
-        some = footprints[first : first + _AT_ONCE]
-        for reach in _BESIDE:
-            rim = shapely.boundary(shapely.buffer(some, reach, quad_segs=2))
-            xy, owner = shapely.get_coordinates(shapely.segmentize(rim, 1.0), return_index=True)
-            np.minimum.at(lowest, first + owner, height(xy[:, 0], xy[:, 1]))
+    if height is not None:
+        lowest = np.minimum(lowest, _beside(footprints, height))
     water = np.flatnonzero(layers.body != "")
     near, row = shapely.STRtree(layers.polygon[water]).query(footprints, predicate="dwithin", distance=_SHORE)
     row = water[row]
@@ -53,3 +55,15 @@ def foundation_heights(
         xy, owner = shapely.get_coordinates(fine, return_index=True)
         np.minimum.at(lowest, rivers[owner], levels.height[levels.nearest.query(xy)[1]])
     return np.where(lowest < base, lowest - _MARGIN, base)
+
+
+def _beside(footprints: NDArray[np.object_], height: Height) -> Float:
+    """The lowest ground (n,) up to 1 m outside each building's walls; inf for an empty footprint."""
+    lowest = np.full(len(footprints), np.inf)
+    for first in range(0, len(footprints), _AT_ONCE):
+        some = footprints[first : first + _AT_ONCE]
+        for reach in _BESIDE:
+            rim = shapely.boundary(shapely.buffer(some, reach, quad_segs=2))
+            xy, owner = shapely.get_coordinates(shapely.segmentize(rim, 1.0), return_index=True)
+            np.minimum.at(lowest, first + owner, height(xy[:, 0], xy[:, 1]))
+    return lowest

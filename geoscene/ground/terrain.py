@@ -202,13 +202,15 @@ def open_terrain(
     )
 
 
-def base_heights(footprints: Sequence[object] | NDArray[np.object_], height: Height) -> Float:
+def base_heights(footprints: Sequence[object] | NDArray[np.object_], height: Height | None) -> Float:
     """The lowest ground (n,) along each footprint's outline, metres: where a building on a slope stands.
 
-    ``height`` (z of the ground at x, y) is sampled at the outline's vertices and at most 2 m apart between
-    them. NaN for a footprint that is None or empty.
+    ``height`` (z of the ground at x, y; None if it is 0 everywhere) is sampled at the outline's vertices and
+    at most 2 m apart between them. NaN for a footprint that is None or empty.
     """
     outlines = np.fromiter(footprints, object)
+    if height is None:
+        return np.where(shapely.is_missing(outlines) | shapely.is_empty(outlines), np.nan, 0.0)
     lowest = np.full(len(outlines), np.inf)
     for first in range(0, len(outlines), _AT_ONCE):
         fine = shapely.segmentize(shapely.boundary(outlines[first : first + _AT_ONCE]), 2.0)

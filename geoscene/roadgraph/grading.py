@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from geoscene.frames import Frame
 from geoscene.roadgraph.carriageways import place_of
@@ -14,10 +15,13 @@ from geoscene.roadgraph.longitudinal_profile import Obstacles
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
 from geoscene.sources.data import OsmData, Tags
-from geoscene.typing import Bools, Float, Height
+from geoscene.typing import Bools, Float, Height, Ints
 
 _SHARP = 0.05
 """Where carriageways overlap, a road counts for most near its middle: the less this is, the more so."""
+
+_LEVEL = 1e-6
+"""Metres: lower roads on level ground count as level."""
 
 # Metres of clearance below bridges (railways: EN 15273 with overhead line; small waterways: a rowing boat).
 _CLEAR = {
@@ -42,7 +46,9 @@ def _required_clearance(tags: Tags) -> float | None:
     return None
 
 
-def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 2.5, batter: float = 8.0) -> Height:
+def graded_ground(
+    graph: RoadGraph, ground: Height, *, level: bool = False, shoulder: float = 2.5, batter: float = 8.0
+) -> Height:
     """The terrain with roads graded into it: a function of x, y (n,) that returns z (n,).
 
     Within a carriageway and its shoulder the ground is level across, at the road's profile; over the next
@@ -51,6 +57,7 @@ def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 2.5, ba
 
     graph  : with heights, from `profile`
     ground : height of the terrain
+    level  : the terrain is 0 everywhere, so that only roads near ramps count
     """
     once = np.flatnonzero(
         ((graph.twin < 0) | (graph.twin > np.arange(len(graph)))) & ~graph.bridge & ~graph.tunnel
@@ -69,19 +76,26 @@ def graded_ground(graph: RoadGraph, ground: Height, *, shoulder: float = 2.5, ba
     square_start, square_end = np.zeros((2, len(start)), np.bool_)
     square_start[last - sizes + 1] = mouth[graph.tail[once]]
     square_end[last] = mouth[graph.head[once]]
-    boxes = shapely.linestrings(np.stack([start[:, :2], end[:, :2]], axis=1))
-    tree = shapely.STRtree(boxes)
+    pieces = shapely.linestrings(np.stack([start[:, :2], end[:, :2]], axis=1))
+    reach = float(half.max()) + batter
+    rows = _beside_ramps(pieces, start, end=end, reach=2 * reach) if level else np.arange(len(pieces))
     return partial(
         _graded_height,
         ground=ground,
-        tree=tree,
-        start=start,
-        end=end,
-        half=half,
-        square_start=square_start,
-        square_end=square_end,
+        tree=shapely.STRtree(pieces[rows]),
+        start=start[rows],
+        end=end[rows],
+        half=half[rows],
+        square_start=square_start[rows],
+        square_end=square_end[rows],
         batter=batter,
     )
+
+
+def _beside_ramps(pieces: NDArray[np.object_], start: Float, *, end: Float, reach: float) -> Ints:
+    """Rows of the pieces of road that are not at height 0, and of those within ``reach`` metres of them."""
+    ramps = pieces[np.maximum(np.abs(start[:, 2]), np.abs(end[:, 2])) > _LEVEL]
+    return np.unique(shapely.STRtree(pieces).query(ramps, predicate="dwithin", distance=reach)[1])
 
 
 def _graded_height(
@@ -100,7 +114,8 @@ def _graded_height(
     """The height of `graded_ground`; a function of a module, so that worker processes can take it."""
     z = np.asarray(ground(x, y), float).copy()
     xy = np.stack([x, y], axis=1)
-    point, road = tree.query(shapely.points(xy), predicate="dwithin", distance=float(half.max()) + batter)
+    reach = float(half.max(initial=0.0)) + batter
+    point, road = tree.query(shapely.points(xy), predicate="dwithin", distance=reach)
     along = end[road, :2] - start[road, :2]
     square = np.maximum((along**2).sum(axis=1), 1e-12)
     free = ((xy[point] - start[road, :2]) * along).sum(axis=1) / square

@@ -66,7 +66,7 @@ class SurfaceRows(Columns):
         n = (len(polygon),)
         table = materials()
         names = np.broadcast_to(np.asarray(material, np.str_), n).tolist()
-        shapes = shapely.set_precision(polygon, GRID)
+        shapes = _on_grid(polygon)
         parts, row = shapely.get_parts(shapes, return_index=True)
         keep = (shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > GRID)
         row = row[keep]
@@ -81,3 +81,11 @@ class SurfaceRows(Columns):
             np.broadcast_to(np.asarray(level, np.int8), n)[row],
             np.broadcast_to(np.asarray(edge, np.int32), n)[row],
         )
+
+
+def _on_grid(shapes: NDArray[np.object_]) -> NDArray[np.object_]:
+    """Shapes with coordinates on the grid, valid; those that rounding leaves valid have only been rounded."""
+    rounded = shapely.remove_repeated_points(shapely.set_precision(shapes, GRID, mode="pointwise"))
+    broken = ~shapely.is_valid(rounded)
+    rounded[broken] = shapely.set_precision(shapes[broken], GRID)
+    return rounded

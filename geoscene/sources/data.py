@@ -129,10 +129,9 @@ class OsmData:
         digest = hashlib.sha256()
         for way in self.ways:
             digest.update(repr((way.osm_id, sorted(way.tags.items()))).encode() + way.lonlat.tobytes())
-        for area in self.areas:
-            digest.update(
-                repr((area.osm_id, sorted(area.tags.items()))).encode() + shapely.to_wkb(area.geometry)
-            )
+        shapes = shapely.to_wkb([area.geometry for area in self.areas])
+        for area, shape in zip(self.areas, shapes, strict=True):
+            digest.update(repr((area.osm_id, sorted(area.tags.items()))).encode() + shape)
         for point in self.points:
             digest.update(repr((point.osm_id, sorted(point.tags.items()), point.lon, point.lat)).encode())
         for relation in self.relations:

@@ -451,13 +451,13 @@ def test_of_overlapping_buildings_the_one_with_a_known_height_keeps_its_shape():
 
 def test_thousands_of_equal_outlines_are_compared_once(monkeypatch):
     compared = []
-    query = parts.overlapping
+    query = parts.overlapping_pairs
 
-    def counted(a, b):
-        compared.append(len(a))
-        return query(a, b)
+    def counted(polygons):
+        compared.append(len(polygons))
+        return query(polygons)
 
-    monkeypatch.setattr(parts, "overlapping", counted)
+    monkeypatch.setattr(parts, "overlapping_pairs", counted)
     square = shapely.box(0, 0, 10, 20)
     outlines = np.array([square, square.reverse()] * 1000 + [shapely.box(50, 0, 60, 10)], object)
     score = np.zeros(2001)
@@ -466,6 +466,16 @@ def test_thousands_of_equal_outlines_are_compared_once(monkeypatch):
     assert np.flatnonzero(~repeated).tolist() == [77, 2000]
     assert compared == [2]
     assert len(problems) == 1999
+
+
+def test_pairs_that_overlap_are_found_once():
+    rng = np.random.default_rng(3)
+    low = rng.uniform(0, 50, (200, 2))
+    boxes = shapely.box(*low.T, *(low + rng.uniform(2, 8, (200, 2))).T)
+    a, b, shared = parts.overlapping(boxes, boxes)
+    once = a < b
+    for mine, theirs in zip(parts.overlapping_pairs(boxes), (a, b, shared), strict=True):
+        np.testing.assert_array_equal(mine, theirs[once])
 
 
 def test_of_duplicates_the_one_with_storeys_is_kept():

@@ -19,7 +19,8 @@ def foundations(height, water=None):
     if water is not None:
         material = materials()["water"].code
         layers = Layers.of([water], klass=Class.WATER, material=material, priority=0.0, body="sea")
-    levels = water_levels(layers, [], frame=Frame.at(7.0, 43.0), height=height)
+    flat = height or (lambda x, y: 0.0 * (x + y))
+    levels = water_levels(layers, [], frame=Frame.at(7.0, 43.0), height=flat)
     footprints = np.array([HOUSE, shapely.Polygon()], object)
     base = base_heights(footprints, height)
     return base, foundation_heights(footprints, base, height=height, layers=layers, levels=levels)
@@ -29,6 +30,7 @@ def test_walls_on_level_ground_end_at_the_base():
     base, foot = foundations(lambda x, y: 0.0 * (x + y))
     assert base[0] == foot[0] == 0.0
     assert np.isnan(foot[1])
+    np.testing.assert_array_equal((base, foot), foundations(None))
 
 
 def test_walls_on_a_slope_end_below_the_ground_beside_them():

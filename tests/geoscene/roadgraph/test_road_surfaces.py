@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from geoscene.classes import Class, materials
 from geoscene.frames import Frame
 from geoscene.roadgraph import build_road_graph
+from geoscene.roadgraph.surface_rows import GRID, SurfaceRows
 from geoscene.roadgraph.surfaces import SurfaceOptions, road_surfaces
 from geoscene.sources import read_osm
 from geoscene.sources.data import OsmData, Point, Way
@@ -222,6 +223,20 @@ def networks(draw):
 
 _ROAD_AND_BACK = {0: (33, 38), 3: (53, 6), 5: (20, -31)}
 _LOOP = {0: (0, 0), 2: (1, 0), 3: (1, 0), 5: (0, -1)}
+
+
+def test_shapes_that_rounding_would_break_are_valid_on_the_grid():
+    hourglass = shapely.Polygon([(0, 0), (4, 0), (2.00003, 2), (4, 4), (0, 4), (2.00002, 2)])
+    square = shapely.box(0.00004, 0, 1, 1)
+    rows = SurfaceRows.of(
+        np.array([hourglass, square, None]), klass=Class.ROAD, material="asphalt", priority=1.0
+    )
+    assert shapely.is_valid(rows.polygon).all()
+    assert shapely.area(rows.polygon).sum() == pytest.approx(9.0, abs=1e-3)
+    xy = shapely.get_coordinates(rows.polygon) / GRID
+    np.testing.assert_allclose(xy, np.round(xy), atol=1e-6)
+
+
 _TWO_NODES_AT_ONE_PLACE = {0: (1, 1), 3: (1, 0), 5: (1, 1), 6: (-1, 0)}
 _SHARP_LOOP = {0: (0, 1), 1: (1, 0), 3: (2, 0), 4: (2, 0), 5: (-2, 2)}
 

@@ -255,6 +255,24 @@ def test_the_ground_is_built_up_and_cut_down_to_the_road(slope, half, angle_deg,
     assert np.abs(np.diff(cut)).max() < 0.1 * (1.5 * (rise + 1.0) / 8.0 + abs(slope) + 0.05)
 
 
+def test_level_ground_is_graded_to_ramps_alone_with_the_same_heights():
+    places = {1: (-3000, 0), 2: (-30, 0), 3: (30, 0), 4: (3000, 0), 5: (0, -400), 6: (0, 400)}
+    graph = profile(
+        graph_of(places, [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), (ROAD, [5, 6])]), flat
+    )
+    whole, near = graded_ground(graph, flat), graded_ground(graph, flat, level=True)
+    x, y = np.random.default_rng(1).uniform([[-3000], [-20]], [[3000], [20]], (2, 20_000))
+    z = whole(x, y)
+    assert z.max() > 2.0
+    np.testing.assert_allclose(near(x, y), z, atol=2e-6)
+    assert len(near.keywords["start"]) < len(whole.keywords["start"])
+
+
+def test_level_ground_without_ramps_stays_level():
+    graph = profile(graph_of({1: (-50, 0), 2: (50, 0)}, [(ROAD, [1, 2])]), flat)
+    assert not graded_ground(graph, flat, level=True)(np.zeros(5), np.arange(5.0)).any()
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 12), st.integers(1, 12))
 def test_interior_point_solver_finds_the_constrained_minimum(seed, n, k):
