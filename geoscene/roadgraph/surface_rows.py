@@ -85,7 +85,8 @@ class SurfaceRows(Columns):
 
 def _on_grid(shapes: NDArray[np.object_]) -> NDArray[np.object_]:
     """Shapes with coordinates on the grid, valid; those that rounding leaves valid have only been rounded."""
-    rounded = shapely.remove_repeated_points(shapely.set_precision(shapes, GRID, mode="pointwise"))
+    rounded: NDArray[np.object_] = shapely.set_precision(shapes, GRID, mode="pointwise")
+    rounded = shapely.remove_repeated_points(rounded)
     broken = ~shapely.is_valid(rounded)
     rounded[broken] = shapely.set_precision(shapes[broken], GRID)
     return rounded
