@@ -1,6 +1,9 @@
 """Long drives are planned and written in blocks of rows, with the bytes of those worked on at once."""
 
 import mmap
+import os
+import platform
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +22,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
 from lidar.navigation.gnss import antenna_motion
 from lidar.navigation.imu import true_inertial
+from lidar.pipeline import trim_memory
 from lidar.plan import schedule
 from lidar.planning import clearance, speed_profile, steering
 from lidar.planning import path as path_module
@@ -224,3 +228,17 @@ def test_trajectories_of_any_length_are_read_in_blocks(rows, monkeypatch, tmp_pa
     (tmp_path / "trajectory.csv").write_text(text[:-30])
     with pytest.raises(DatasetError):
         read_trajectory(tmp_path / "trajectory.csv")
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries keep less")
+def test_memory_that_planning_freed_goes_back_to_the_system():
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    rows = [np.ones(1000) for _ in range(20_000)]
+    last = rows[::1000]
+    rows.clear()
+    before = resident()
+    trim_memory()
+    assert before - resident() > 100_000_000
+    assert len(last) == 20
