@@ -133,6 +133,7 @@ def build(
     """
     from geoscene.cluster import connected  # noqa: PLC0415
     from geoscene.pipeline import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
+    from geoscene.scene.layout import SceneFiles  # noqa: PLC0415
     from geoscene.scene.writer import check_target  # noqa: PLC0415
     from geoscene.storage import published, shown, url_of  # noqa: PLC0415
 
@@ -147,7 +148,7 @@ def build(
     bar = partial(progress_bar, quiet=report.quiet)
     with (
         connected(scheduler) if scheduler else nullcontext() as cluster,
-        published(out, last="scene.json", replaces=report.overwrite, bar=bar) as folder,
+        published(out, last=SceneFiles(Path()).manifest.name, replaces=report.overwrite, bar=bar) as folder,
         bar() as progress,
     ):
         progress("reading the map", 0, total=0)

@@ -8,7 +8,6 @@ import pytest
 from cyclopts import CoercionError
 from helpers.programs import run_program
 
-from geoscene.errors import SceneFormatError
 from lidar.camera.settings import CameraSettings
 from lidar.cli import app
 from lidar.errors import InputError
@@ -144,5 +143,5 @@ def test_options_are_read_where_pydantic_is_imported(tmp_path):
     """The command-line parser checks values against types if pydantic is imported."""
     pytest.importorskip("pydantic")
     words = ["drive", str(tmp_path / "none"), "--route", "60.1,24.9", "60.2,24.8", "--traffic", "vehicles=3"]
-    with pytest.raises(SceneFormatError, match="no such scene"):
+    with pytest.raises(InputError, match="no such scene"):
         app([*words, "-o", str(tmp_path / "out")], exit_on_error=False, result_action="return_value")
