@@ -1,16 +1,24 @@
-"""Build sdist and wheel, and run both programs from a new environment with only the wheel installed.
+"""Build sdist and wheel, and run both programs from a new environment of the wheel and what it declares.
 
 python tests/wheel.py    needs the packages of requirements.lock; writes sdist and wheel to dist/
 """
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tarfile
 import tempfile
 import venv
+from collections.abc import Iterable
+from importlib.metadata import requires
 from pathlib import Path
+from zipfile import ZipFile
+
+from packaging.metadata import Metadata
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 BACKEND = "import setuptools.build_meta as b; print(b.build_{kind}({folder!r}))"
@@ -38,6 +46,33 @@ def build_packages(folder: Path) -> Path:
     return wheel
 
 
+def declared(wheel: Path) -> Iterable[Requirement]:
+    """Requirements in the metadata of a wheel."""
+    with ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        return Metadata.from_email(archive.read(name)).requires_dist or ()
+
+
+def needed(requirements: Iterable[Requirement]) -> set[str]:
+    """Names of the packages that requirements bring without extras, as installed here."""
+    found: set[str] = set()
+    todo = list(requirements)
+    while todo:
+        requirement = todo.pop()
+        name = canonicalize_name(requirement.name)
+        if name in found or not (requirement.marker is None or requirement.marker.evaluate({"extra": ""})):
+            continue
+        found.add(name)
+        todo += map(Requirement, requires(name) or ())
+    return found
+
+
+def write_lock(path: Path, *, names: set[str]) -> None:
+    """Write the entries of requirements.lock for some packages."""
+    entries = re.split(r"^(?=[a-z])", (ROOT / "requirements.lock").read_text(), flags=re.MULTILINE)
+    path.write_text("".join(entry for entry in entries if entry.split("==")[0] in names))
+
+
 def main() -> None:
     """Build, install, run."""
     with tempfile.TemporaryDirectory() as temporary:
@@ -47,8 +82,9 @@ def main() -> None:
         venv.create(away / "venv", with_pip=True)
         binaries = away / "venv" / "bin"
         pip = (binaries / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
-        run(*pip, "--require-hashes", "-r", ROOT / "requirements.lock", cwd=away)
-        run(*pip, "--no-deps", "--no-index", wheel, cwd=away)
+        write_lock(away / "needed.lock", names=needed(declared(wheel)))
+        run(*pip, "--require-hashes", "-r", "needed.lock", cwd=away)
+        run(*pip, "--no-index", wheel, cwd=away)
         run(binaries / "geoscene", "build", "--demo", "-o", "scene", "-q", cwd=away)
         run(binaries / "geoscene", "validate", "scene", cwd=away)
         words = ("scene", "--route=random", "--duration=1", "-o", "drive", "-q")
