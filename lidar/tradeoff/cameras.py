@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from geoscene.progress import Progress
 from geoscene.typing import Ints
 from lidar.camera.settings import CameraSettings
 from lidar.options import TradeoffOptions
 from lidar.rig.devices import Camera
-from lidar.tradeoff.comparison import Comparison, Row
+from lidar.tradeoff.comparison import Comparison
 from lidar.tradeoff.costs import costs
 from lidar.tradeoff.errors import IMAGE_STATISTICS, Estimate, ImageError, estimates
 from lidar.tradeoff.images import (
@@ -88,19 +89,13 @@ def compared_camera(
         progress=progress,
     )
 
-    def figures(errors: list[ImageError]) -> dict[str, Estimate]:
-        return estimates(errors, seed=plan.options.seed, statistics=IMAGE_STATISTICS) if errors else {}
-
-    rows = tuple(
-        Row(
-            variant.label or f"as asked ({basis.described(CAMERA_VALUES)})",
-            figures(used[i]),
-            figures(alone[i]),
-            spent[i],
-            "; ".join(text for text in (notes.of(i), _against_means(figures(reduced[i]))) if text),
-            notes.choice(i),
-        )
-        for i, variant in enumerate(variants)
+    figures = partial(estimates, seed=plan.options.seed, statistics=IMAGE_STATISTICS)
+    rows = notes.rows(
+        basis.described(CAMERA_VALUES),
+        used=[figures(errors) for errors in used],
+        alone=[figures(errors) for errors in alone],
+        spent=spent,
+        further=[_against_means(figures(errors)) for errors in reduced],
     )
     moments = basis.exact.moments(camera.spec)
     return Comparison(

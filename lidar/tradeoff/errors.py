@@ -199,7 +199,9 @@ E = TypeVar("E", FrameError, ImageError)
 def estimates(
     frames: Sequence[E], *, seed: int, statistics: Mapping[str, Callable[[Sequence[E]], float]]
 ) -> dict[str, Estimate]:
-    """All figures of an error, with intervals by resampling frames."""
+    """All figures of an error, with intervals by resampling frames; none without frames."""
+    if not frames:
+        return {}
     picks = np.random.default_rng(seed).integers(0, len(frames), (RESAMPLES, len(frames)))
     found = {}
     for name, figure in statistics.items():

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from lidar.rig.devices import Camera, Scanner
+from lidar.tradeoff.comparison import Row
+from lidar.tradeoff.errors import Estimate
 from lidar.tradeoff.simulate import FAST, Bench
 from lidar.tradeoff.variants import KINDS, MODELS, Variant
 from lidar.world.settings import WorldSettings
@@ -46,6 +48,32 @@ class Notes:
         A change without one may have a rare effect elsewhere, of unknown size, or saves nothing.
         """
         return self._variants[row].choice and not any(self._same[row].values())
+
+    def rows(
+        self,
+        asked: str,
+        *,
+        used: Sequence[dict[str, Estimate]],
+        alone: Sequence[dict[str, Estimate]],
+        spent: Sequence[dict[str, Estimate]],
+        further: Sequence[str] = (),
+    ) -> tuple[Row, ...]:
+        """Rows of the variants.
+
+        asked   : the settings as asked, in words
+        further : notes of each variant beside these
+        """
+        return tuple(
+            Row(
+                variant.label or f"as asked ({asked})",
+                used[i],
+                alone[i],
+                spent[i],
+                "; ".join(text for text in (self.of(i), *further[i : i + 1]) if text),
+                self.choice(i),
+            )
+            for i, variant in enumerate(self._variants)
+        )
 
     def _absent(self, variant: Variant[Any]) -> bool:
         """Whether a variant's world holds as many faces and instances as the one of the settings as asked."""

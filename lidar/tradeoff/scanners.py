@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,9 @@ from lidar.options import TradeoffOptions
 from lidar.physics.settings import ScannerSettings
 from lidar.rig.devices import Scanner
 from lidar.rig.scanner import firings
-from lidar.tradeoff.comparison import Comparison, Row
+from lidar.tradeoff.comparison import Comparison
 from lidar.tradeoff.costs import costs
-from lidar.tradeoff.errors import STATISTICS, Estimate, FrameError, Returns, estimates, frame_error
+from lidar.tradeoff.errors import STATISTICS, FrameError, Returns, estimates, frame_error
 from lidar.tradeoff.notes import Notes
 from lidar.tradeoff.simulate import EXACT, FAST, Bench, chosen_pulses, frame_cost, returns_of
 from lidar.tradeoff.variants import (
@@ -75,19 +76,12 @@ def compared_scanner(
         progress=progress,
     )
 
-    def figures(errors: list[FrameError]) -> dict[str, Estimate]:
-        return estimates(errors, seed=plan.options.seed, statistics=STATISTICS) if errors else {}
-
-    rows = tuple(
-        Row(
-            variant.label or f"as asked ({basis.described(SCANNER_VALUES)})",
-            figures(used[i]),
-            figures(alone[i]),
-            spent[i],
-            notes.of(i),
-            notes.choice(i),
-        )
-        for i, variant in enumerate(variants)
+    figures = partial(estimates, seed=plan.options.seed, statistics=STATISTICS)
+    rows = notes.rows(
+        basis.described(SCANNER_VALUES),
+        used=[figures(errors) for errors in used],
+        alone=[figures(errors) for errors in alone],
+        spent=spent,
     )
     return Comparison(
         f"{scanner.name} ({scanner.spec.preset})",
