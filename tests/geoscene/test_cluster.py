@@ -4,7 +4,8 @@ import os
 import signal
 
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client
+from helpers.clusters import two_workers
 from helpers.programs import run_program
 from helpers.scenes import same_files
 
@@ -22,10 +23,8 @@ pytestmark = pytest.mark.filterwarnings("default:::distributed")
 @pytest.fixture(scope="module")
 def address():
     """Address of the scheduler of two worker processes."""
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=False, processes=True
-    ) as made:
-        yield made.scheduler_address
+    with two_workers() as made:
+        yield made
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client
+from helpers.clusters import two_workers
 from helpers.programs import run_program
 from helpers.scenes import same_files
 
@@ -28,10 +29,8 @@ pytestmark = pytest.mark.filterwarnings("default:::distributed")
 @pytest.fixture(scope="module")
 def cluster():
     """Address of the scheduler of two worker processes."""
-    with LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=False, processes=True
-    ) as made:
-        yield made.scheduler_address
+    with two_workers() as made:
+        yield made
 
 
 def pids(address):
