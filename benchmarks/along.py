@@ -10,12 +10,11 @@ and compares the common tiles and the point clouds byte by byte. Costs as of `be
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
+from bench.extract import measure_extract
 from bench.maps import build_command
 from bench.measure import command
 
@@ -66,35 +65,9 @@ def _mib(files: dict[Path, bytes]) -> float:
     return round(sum(map(len, files.values())) / 2**20, 1)
 
 
-def show(rows: list[dict[str, Any]], *, as_json: bool) -> None:
-    """Print rows as JSON or as a table."""
-    if as_json:
-        print(json.dumps(rows, indent=1))
-        return
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    cells = [names, *([str(row.get(name, "")) for name in names] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for line in cells:
-        print("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)))
-
-
 def main() -> None:
     """Measure the extract of the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("extract", type=Path)
-    parser.add_argument("--route", nargs="+", required=True)
-    parser.add_argument("--reach", type=float, default=120.0)
-    parser.add_argument("--duration", type=float, default=20.0)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--folder", type=Path)
-    parser.add_argument("--json", action="store_true")
-    given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = given.folder or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
-        show(along(given, folder), as_json=given.json)
+    measure_extract(__doc__, along, {"reach": 120.0, "duration": 20.0})
 
 
 if __name__ == "__main__":

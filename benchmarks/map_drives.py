@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
-from along import show
+from bench.extract import measure_extract
 from bench.maps import build_command
 from bench.measure import command
 
@@ -67,21 +66,7 @@ def _files(folder: Path) -> dict[Path, bytes]:
 
 def main() -> None:
     """Measure the extract of the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("extract", type=Path)
-    parser.add_argument("--route", nargs="+", required=True)
-    parser.add_argument("--rig", default="vlp16")
-    parser.add_argument("--duration", type=float)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--folder", type=Path)
-    parser.add_argument("--json", action="store_true")
-    given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = given.folder or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
-        show(compared(given, folder), as_json=given.json)
+    measure_extract(__doc__, compared, {"rig": "vlp16", "duration": None})
 
 
 if __name__ == "__main__":
