@@ -55,13 +55,12 @@ def scale_limit(frame: Frame, bounds: Sequence[float]) -> list[Limit]:
     if abs(worst) <= LENGTHS:
         return []
     way = "longer" if worst > 0 else "shorter"
+    remedy = "build a smaller scene" if frame.name.startswith("Local") else "build with `crs` local"
     advice = (
         f"lengths in scene coordinates are up to {abs(worst):,.0f} mm per km {way} than true ones"
         f" ({frame.name}); drives take that into account, your own measurements must divide by the scale, or"
-        " build with `crs` local"
+        f" {remedy}"
     )
-    if frame.name.startswith("Local"):
-        advice = advice.replace(", or build with `crs` local", ", or build a smaller scene")
     return [Limit("map scale", round(abs(worst), 1), LENGTHS, "mm/km", advice)]
 
 
