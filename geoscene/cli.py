@@ -450,6 +450,8 @@ def _extent(manifest: dict[str, Any]) -> dict[str, Any]:
 def _print_scene(report: dict[str, Any]) -> None:
     counts, frame, ground = report["counts"], report["frame"], report["ground"]
     water = ground.get("water_area", 0.0) / 1e6
+    use = report["options"].get("use", "all")
+    has_tiles = not USES[use].lacks("tiles")
     steep = _steep_roads(counts, terrain=frame["vertical"] != "flat")
     xmin, ymin, xmax, ymax = report["bounds"]
     west, south, east, north = report["geographic_bounds"]
@@ -457,12 +459,16 @@ def _print_scene(report: dict[str, Any]) -> None:
         "frame": f"{frame['name']}, heights {frame['vertical']}",
         "extent": f"{xmax - xmin:.0f} x {ymax - ymin:.0f} m;"
         f" lon {west:.5f} to {east:.5f}, lat {south:.5f} to {north:.5f}",
-        "buildings": f"{counts['buildings']} in the map, {counts['dropped']} dropped,"
-        f" {counts['solids']} solids",
-        "watertight": f"{counts['watertight']} of {counts['closed_objects']} closed objects",
+        "buildings": f"{counts['buildings']} in the map, {counts['dropped']} dropped"
+        + (f", {counts['solids']} solids" if has_tiles else ""),
+        "watertight": f"{counts['watertight']} of {counts['closed_objects']} closed objects"
+        if has_tiles
+        else "",
         "standing": f"{counts['trees']} mapped trees, {counts['forest_trees']} in forests,"
-        f" {counts['furniture']} pieces of furniture, {counts['barriers']} barriers",
-        "ground": f"{ground['area'] / 1e6:.2f} km2" + (f", {water:.3g} km2 of it water" if water else ""),
+        f" {counts['furniture']} lamps, signs and other furniture, {counts['barriers']} barriers",
+        "ground": f"{ground['area'] / 1e6:.2f} km2" + (f", {water:.3g} km2 of it water" if water else "")
+        if has_tiles
+        else "",
         "roads": f"{counts['road_km']:.1f} km of carriageway in the extent; {counts['road_edges']} edges by"
         f" direction{steep}",
         "heights": _listed(report["heights"]),
@@ -477,7 +483,7 @@ def _print_scene(report: dict[str, Any]) -> None:
             " trees in forests and ground count these tiles, all other figures the whole map;"
             f" tables hold {sum(report['cut']['rows'].values())} of {features} features"
         )
-    if (use := report["options"].get("use", "all")) != "all":
+    if use != "all":
         rows[f"for {use}"] = f"{USES[use].contents}; left out: {_left_out_text(report['left_out'])}"
     print(report["name"] or report["path"])
     for title, text in rows.items():

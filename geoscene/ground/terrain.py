@@ -326,9 +326,11 @@ def _outline(raster: _Raster, frame: Frame) -> Any:
 def _not_covered(rasters: Sequence[_Raster], frame: Frame, *, bounds: Sequence[float], share: float) -> str:
     xmin, ymin, xmax, ymax = bounds
     lon, lat = frame.to_geographic([xmin, xmax, xmax, xmin], [ymin, ymin, ymax, ymax])
+    names = ", ".join(r.path.name for r in rasters)
+    lacking = "no part of the scene is" if share >= 1.0 else f"{_percent(share)} of the scene is not"
     return (
-        f"{', '.join(r.path.name for r in rasters)}: {_percent(share)} of the scene is not covered; it spans "
-        f"W {lon.min():.5f} S {lat.min():.5f} E {lon.max():.5f} N {lat.max():.5f}; add files that cover it"
+        f"{names}: {lacking} covered; the scene spans W {lon.min():.5f} S {lat.min():.5f}"
+        f" E {lon.max():.5f} N {lat.max():.5f}; add files that cover it"
         + (", or let the rest take the nearest height (`dem_gaps` nearest)" if share < 1.0 else "")
     )
 

@@ -218,7 +218,7 @@ def test_incomplete_coverage_is_an_error_or_filled_with_the_nearest_height(tmp_p
     west = FRAME.to_crs(bounds[0], 0, crs=UTM)[0]
     assert terrain.uncovered == pytest.approx(1 - (edge - west) / 400, abs=1e-3)
     assert terrain.height(40, 0) == pytest.approx(east.max() - 499000)
-    with pytest.raises(InputError, match=r"all of the scene is not covered.*add files that cover it$"):
+    with pytest.raises(InputError, match=r"no part of the scene is covered.*add files that cover it$"):
         open_terrain([path], FRAME, bounds=(500, 0, 600, 100), outside="nearest")
 
 
