@@ -173,10 +173,11 @@ def digest_of(path: Path) -> str:
         return ""
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write ``data`` as a file, atomically."""
-    with atomic_path(path) as part:
-        part.write_bytes(data)
+def write_atomically(path: Path, *data: bytes | NDArray[Any]) -> None:
+    """Write bytes and arrays, one after another, as a file, atomically."""
+    with atomic_file(path) as file:
+        for part in data:
+            file.write(part.data if isinstance(part, np.ndarray) else part)
 
 
 def write_json(path: Path, document: Mapping[str, Any], *, indent: int = 2) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import class_codes
 from geoscene.files import write_atomically
-from lidar.dataset.formats.table import PointLabels, Table, read_rows
+from lidar.dataset.formats.table import PointLabels, Table, columns_as_rows, read_rows
 
 # Moving road users have codes of their own: car, bicyclist, person, motorcyclist, bus, truck, other vehicle.
 _MOVING = {10: 252, 31: 253, 30: 254, 32: 255, 13: 257, 18: 258, 20: 259}
@@ -21,8 +21,9 @@ _MOVING = {10: 252, 31: 253, 30: 254, 32: 255, 13: 257, 18: 258, 20: 259}
 
 def write(path: Path, table: Table) -> None:
     """Write x, y, z (metres, sensor frame) and reflectance (0 to 1) as little-endian float32."""
-    columns = [table["x"], table["y"], table["z"], table["intensity"] / np.float32(255)]
-    write_atomically(path, np.stack(columns, axis=1).astype("<f4").tobytes())
+    points = columns_as_rows(table, ("x", "y", "z", "intensity"))
+    points[:, 3] /= np.float32(255)
+    write_atomically(path, points)
 
 
 def read(path: Path) -> Table:
@@ -59,4 +60,4 @@ def read_labels(path: Path) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
 
 def write_labels(path: Path, labels: PointLabels) -> None:
     """Write SemanticKITTI's labels as little-endian uint32."""
-    write_atomically(path, semantic_kitti_labels(labels).astype("<u4").tobytes())
+    write_atomically(path, semantic_kitti_labels(labels).astype("<u4"))

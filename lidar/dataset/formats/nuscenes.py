@@ -8,15 +8,14 @@ import numpy as np
 
 from geoscene.classes import class_codes
 from geoscene.files import write_atomically
-from lidar.dataset.formats.table import PointLabels, Table, read_rows
+from lidar.dataset.formats.table import PointLabels, Table, columns_as_rows, read_rows
 
 _COLUMNS = ("x", "y", "z", "intensity", "ring")
 
 
 def write(path: Path, table: Table) -> None:
     """Write x, y, z (metres, sensor frame), intensity (0 to 255) and ring as little-endian float32."""
-    columns = [table[name].astype("<f4") for name in _COLUMNS]
-    write_atomically(path, np.stack(columns, axis=1).tobytes())
+    write_atomically(path, columns_as_rows(table, _COLUMNS))
 
 
 def read(path: Path) -> Table:
@@ -35,4 +34,4 @@ def count(path: Path) -> int:
 
 def write_labels(path: Path, labels: PointLabels) -> None:
     """Write the lidarseg class of each point as uint8."""
-    write_atomically(path, class_codes().nuscenes[labels.klass].astype(np.uint8).tobytes())
+    write_atomically(path, class_codes().nuscenes[labels.klass].astype(np.uint8))

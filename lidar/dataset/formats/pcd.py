@@ -46,7 +46,7 @@ def pcd_header(table: Table, points: int, *, data: str = "binary", comment: str 
 
 def write(path: Path, table: Table, *, comment: str = "") -> None:
     """Write a table as binary PCD."""
-    write_atomically(path, pcd_header(table, rows(table), comment=comment) + records(table).tobytes())
+    write_atomically(path, pcd_header(table, rows(table), comment=comment), records(table))
 
 
 def read(path: Path) -> Table:

@@ -50,7 +50,7 @@ def ply_header(table: Table, count: int, *, comments: tuple[str, ...] = ()) -> b
 def write(path: Path, table: Table, *, comments: tuple[str, ...] = ()) -> None:
     """Write a table as PLY."""
     out = ply_table(table)
-    write_atomically(path, ply_header(out, rows(out), comments=comments) + records(out).tobytes())
+    write_atomically(path, ply_header(out, rows(out), comments=comments), records(out))
 
 
 def read(path: Path) -> Table:

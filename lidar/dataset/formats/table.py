@@ -19,7 +19,7 @@ red, green, blue  uint8
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -100,6 +100,14 @@ def records(table: Table) -> NDArray[np.void]:
     out = np.empty(rows(table), kinds)
     for name, column in table.items():
         out[name] = column
+    return out
+
+
+def columns_as_rows(table: Table, names: Sequence[str]) -> NDArray[np.float32]:
+    """Columns of the table as rows (n, columns) of little-endian float32."""
+    out = np.empty((rows(table), len(names)), "<f4")
+    for k, name in enumerate(names):
+        out[:, k] = table[name]
     return out
 
 

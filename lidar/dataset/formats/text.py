@@ -62,8 +62,8 @@ def write(path: Path, table: Table) -> None:
     for j, (column, places) in enumerate(zip(table.values(), decimals, strict=True)):
         values[:, j] = np.rint(column.astype(np.float64) * 10.0**places) if places else column
     out = np.empty(values.size * 22 + 1, np.uint8)
-    text = out[: _format(values, decimals, out)].tobytes()
-    write_atomically(path, (",".join(table) + "\n").encode("ascii") + text)
+    text = out[: _format(values, decimals, out)]
+    write_atomically(path, (",".join(table) + "\n").encode("ascii"), text)
 
 
 def read(path: Path) -> Table:
