@@ -236,8 +236,10 @@ def sweep(
         points, length = (sum(r.points for r in summary.rows), sum(r.metres for r in summary.rows))
         done = len(summary.rows) - len(failed)
         print(f"{out}: {done} of {len(summary.rows)} drives, {length:,.0f} m, {points:,} points")
-    for row in failed:
-        print(f"lidar: {row.name}: {row.error}", file=sys.stderr)
+    for error in dict.fromkeys(row.error for row in failed):  # a map may fail many drives
+        names = [row.name for row in failed if row.error == error]
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        print(f"lidar: {names[0]}{more}: {error}", file=sys.stderr)
     return FAILURE if failed else 0
 
 

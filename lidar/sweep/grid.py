@@ -95,6 +95,10 @@ def read_grid(path: Path) -> list[GridDrive]:
             if drive.name in drives:
                 raise InputError(f"{path}: drive {drive.name} is in it twice")
             drives[drive.name] = drive
+    named: dict[str, MapScene] = {}
+    for one in (drive.map for drive in drives.values() if drive.map):
+        if named.setdefault(one.name, one) != one:
+            raise InputError(f"{path}: scene: two maps are named {one.name}; rename one of them")
     for scene in dict.fromkeys(drive.scene for drive in drives.values() if drive.map is None):
         with naming(path, "scene"):
             open_scene(scene)

@@ -22,9 +22,13 @@ from geoscene.pipeline import build
 from geoscene.progress import Progress, silent
 from geoscene.scene import open_scene
 from geoscene.scene.layout import changed_files
-from geoscene.sources import read_osm
+from geoscene.sources import fetch_elevation, read_osm
+from geoscene.storage import cache_folder
 from lidar.errors import InputError
 from lidar.sweep.words import naming, words_of
+
+_TILES = ("tiles",)
+"""Elevation from public tiles instead of files, as for ``geoscene build``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +49,8 @@ class MapScene:
     @property
     def inputs(self) -> list[Path]:
         """Files that the scene depends on."""
-        named = (*self.osm, *map(Path, self.options.dem), *map(Path, self.options.along))
+        dem = () if self.options.dem == _TILES else self.options.dem
+        named = (*self.osm, *map(Path, dem), *map(Path, self.options.along))
         return [path for path in named if path.is_file()]
 
     def built(
@@ -60,10 +65,14 @@ class MapScene:
             "files": {str(path): digest_of(path) for path in self.inputs},
         }
         if not _is_made_of(target, stamp, made_of=made_of):
+            data, options = read_osm(self.osm, bounds=self.bounds), self.options
+            if options.dem == _TILES:
+                fetched = fetch_elevation(data, cache_dir=cache_folder(), crs=options.crs, progress=progress)
+                options = replace(options, dem=(str(fetched),))
             scene = build(
-                read_osm(self.osm, bounds=self.bounds),
+                data,
                 target,
-                options=self.options,
+                options=options,
                 overwrite=target.exists(),  # its unchanged tiles are kept
                 workers=workers,
                 cluster=cluster,
@@ -122,11 +131,13 @@ def _map(name: str, table: dict[str, Any]) -> MapScene:
     words = [word for key, value in table.items() for word in words_of(key, value)]
     options = _parsed(words)
     along = options.along if len(options.along) == 1 else ()  # several are waypoints
-    for file in (*files, *options.dem, *along):
+    dem = () if options.dem == _TILES else options.dem
+    for file in (*files, *dem, *along):
         if not Path(file).is_file():
             raise InputError(f"{file}: no such file")
-    dem = tuple(str(Path(file).absolute()) for file in options.dem)
-    options = replace(options, name=name, dem=dem)
+    if dem:
+        options = replace(options, dem=tuple(str(Path(file).absolute()) for file in dem))
+    options = replace(options, name=name)
     return MapScene(name, tuple(Path(file).absolute() for file in files), bounds, options)
 
 

@@ -85,8 +85,9 @@ def sweep(
 ) -> SweepSummary:
     """Record all drives of a grid; finished ones of the same options are verified and kept.
 
-    Folder ``out`` gets a dataset for each drive, ``sweep.json`` and ``sweep.csv``. A drive that fails is a
-    row with the reason, and the others go on. The bytes depend neither on ``workers`` nor on ``scheduler``.
+    Folder ``out`` gets a dataset for each drive, ``sweep.json`` and ``sweep.csv``. A drive that fails, or
+    whose map cannot be built, is a row with the reason, and the others go on. The bytes depend neither on
+    ``workers`` nor on ``scheduler``.
 
     file      : TOML file, see `lidar.sweep.grid.read_grid`
     workers   : processes, each of which records a drive at a time
@@ -106,19 +107,20 @@ def sweep(
             inputs = dict.fromkeys(path for planned in drives for path in planned.inputs)
             cluster.check(folder.absolute(), inputs=list(inputs))
         with _table(folder, Path(file), drives=drives) as table:
-            drives = _with_scenes(
-                drives, folder.absolute(), workers=workers, cluster=cluster, progress=progress
-            )
+            scenes = _scenes(drives, folder.absolute(), workers=workers, cluster=cluster, progress=progress)
             threads = 1 if cluster else max(workers // len(drives), 1)
-            tasks, failed = [], []
+            tasks = []
             for row, planned in enumerate(drives):
-                task = _Task(row, planned, folder.absolute(), threads, overwrite=overwrite)
+                scene = scenes[planned.map.name] if planned.map else planned.scene
+                if isinstance(scene, str):
+                    table.set(row, DriveRow(planned.name, "failed", scene))
+                    continue
+                ready = replace(planned, scene=scene, map=None)
+                task = _Task(row, ready, folder.absolute(), threads, overwrite=overwrite)
                 try:
                     tasks.append(_with_pick(task, progress=progress))
                 except (GeosceneError, LidarError, OSError) as error:
-                    failed.append((row, DriveRow(planned.name, "failed", " ".join(str(error).split()))))
-            for row, result in failed:
-                table.set(row, result)
+                    table.set(row, DriveRow(planned.name, "failed", _one_line(error)))
             progress("drives", 0, total=len(tasks))
             for done, (row, result) in enumerate(_results(tasks, workers=workers, cluster=cluster), 1):
                 table.set(row, result)
@@ -126,22 +128,27 @@ def sweep(
     return SweepSummary(folder, tuple(table.rows))
 
 
-def _with_scenes(
+def _scenes(
     drives: Sequence[GridDrive], folder: Path, *, workers: int, cluster: Cluster | None, progress: Progress
-) -> list[GridDrive]:
-    """The drives with scenes in folder ``scenes`` for those of maps; each is built once, as needed."""
-    maps = {planned.map.name: planned.map for planned in drives if planned.map}
-    for planned in drives:
-        if planned.map and planned.map != maps[planned.map.name]:
-            raise InputError(f"scene: two maps are named {planned.map.name}; rename one of them")
-    scenes = {
-        name: one.built(folder / "scenes", workers=workers, cluster=cluster, progress=progress)
-        for name, one in maps.items()
-    }
-    return [
-        replace(planned, scene=scenes[planned.map.name], map=None) if planned.map else planned
-        for planned in drives
-    ]
+) -> dict[str, Path | str]:
+    """Scenes of maps by name, in folder ``scenes``, each built once, as needed; or why it cannot be built."""
+    scenes: dict[str, Path | str] = {}
+    for one in {planned.map.name: planned.map for planned in drives if planned.map}.values():
+        try:
+            scenes[one.name] = one.built(
+                folder / "scenes", workers=workers, cluster=cluster, progress=progress
+            )
+        except (GeosceneError, LidarError, OSError) as error:
+            scenes[one.name] = f"map {one.name}: {_one_line(error)}"
+        except Exception as error:  # one map's defect must not end the others
+            log.exception("map %s", one.name)
+            scenes[one.name] = f"map {one.name}: {type(error).__name__}: {_one_line(error)}"
+    return scenes
+
+
+def _one_line(error: Exception) -> str:
+    """The text of an error without line breaks."""
+    return " ".join(str(error).split())
 
 
 def _is_sweep(folder: Path) -> bool:
@@ -209,10 +216,10 @@ def _recorded(task: _Task) -> tuple[int, DriveRow]:
                 overwrite=task.overwrite,
             ).summary
     except (GeosceneError, LidarError, OSError) as error:
-        return task.row, DriveRow(name, "failed", " ".join(str(error).split()))
+        return task.row, DriveRow(name, "failed", _one_line(error))
     except Exception as error:  # one drive's defect must not end the others
         log.exception("drive %s", name)
-        return task.row, DriveRow(name, "failed", " ".join(f"{type(error).__name__}: {error}".split()))
+        return task.row, DriveRow(name, "failed", f"{type(error).__name__}: {_one_line(error)}")
     return task.row, DriveRow(
         name,
         "done",

@@ -7,6 +7,7 @@ import signal
 
 import pytest
 from helpers.programs import run_program
+from helpers.rasters import write_slope
 from helpers.scenes import same_files
 
 import geoscene.processes
@@ -208,12 +209,51 @@ def test_maps_are_built_once_with_their_options_and_shared(tmp_path, monkeypatch
     assert again.rows[:2] == first.rows[:2]
 
 
+def test_a_map_that_cannot_be_built_fails_its_drives_and_the_others_go_on(tmp_path):
+    write_street(tmp_path / "street.osm")
+    far = write_slope(tmp_path / "far.tif", (10.0, 50.0, 10.01, 50.01))
+    file = tmp_path / "grid.toml"
+    file.write_text(MAPS.format(osm=tmp_path / "street.osm").replace("lod = 0", f'dem = ["{far}"]'))
+    done = run_program("lidar", "sweep", file, "-o", tmp_path / "out")
+    rows = json.loads((tmp_path / "out" / "sweep.json").read_text())["drives"]
+    assert [row["state"] for row in rows] == ["done", "done", "failed", "failed"]
+    assert {row["error"].partition(": ")[0] for row in rows[2:]} == {"map blocks"}
+    assert "far.tif" in rows[2]["error"]
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == f"lidar: blocks_seed-1 and 1 more: {rows[2]['error']}"
+    assert "Traceback" not in done.stderr
+    assert "2 of 4 drives" in done.stdout
+    file.write_text(file.read_text().replace(f'dem = ["{far}"]', "lod = 0"))
+    again = sweep(file, tmp_path / "out").rows
+    assert [row.state for row in again] == ["done"] * 4
+    assert [row.digest for row in again[:2]] == [row["digest"] for row in rows[:2]]
+
+
+def test_public_elevation_tiles_of_a_map_are_fetched_once(tmp_path, monkeypatch):
+    write_street(tmp_path / "street.osm")
+    file = tmp_path / "grid.toml"
+    file.write_text(MAPS.format(osm=tmp_path / "street.osm").replace("lod = 0", 'dem = ["tiles"]'))
+    fetched = []
+
+    def fetch(osm, *, crs, **_):
+        fetched.append(crs)
+        return write_slope(tmp_path / "slope.tif", osm.bounds, rise=20.0)
+
+    monkeypatch.setattr("lidar.sweep.maps.fetch_elevation", fetch)
+    for _ in range(2):
+        assert [row.state for row in sweep(file, tmp_path / "out").rows] == ["done"] * 4
+    assert fetched == ["local"]
+    scenes = [open_scene(tmp_path / "out" / "scenes" / name) for name in ("whole", "blocks")]
+    assert [scene.manifest["terrain"]["vertical"] for scene in scenes] == ["flat", "orthometric"]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         (("lod = 0", "lod = 7"), "map blocks: .*lod"),
         (("lod = 0", "colour = 7"), "map blocks: .*colour"),
         (("lod = 0", 'dem = ["absent.tif"]'), r"map blocks: absent\.tif: no such file"),
+        (("lod = 0", 'dem = ["tiles", "a.tif"]'), "map blocks: tiles: no such file"),
         (("lod = 0", 'along = ["absent.gpx"]'), r"map blocks: absent\.gpx: no such file"),
         (("lod = 0", "bbox = [1, 2]"), "map blocks: bbox: give"),
         (('name = "blocks"', 'name = "whole"'), "two maps are named whole"),
