@@ -71,12 +71,15 @@ class Stored:
             data: bytes = system.cat_file(f"{root}/{name}")
         return data
 
-    def listed(self) -> dict[str, dict[str, Any]]:
-        """Names of all files, at any depth, with what the storage tells of each."""
+    def listed(self, *, depth: int | None = None) -> dict[str, dict[str, Any]]:
+        """Names of files, with what the storage tells of each.
+
+        depth : of the folders, 1 for the files in the folder itself; all by default
+        """
         with self._reached() as (system, root):
             system.invalidate_cache()
             try:
-                found = system.find(root, detail=True)
+                found = system.find(root, maxdepth=depth, detail=True)
             except FileNotFoundError:
                 return {}
         start = f"{root.strip('/')}/"
@@ -110,11 +113,16 @@ class Stored:
             system.pipe_file(f"{root}/{name}", b"probe")
             system.rm_file(f"{root}/{name}")
 
-    def mirror(self, folder: Path, *, progress: Progress = silent) -> None:
-        """Fetch all files that are missing in a local folder or differ there, and remove others from it."""
-        listed = self.listed()
+    def mirror(self, folder: Path, *, depth: int | None = None, progress: Progress = silent) -> None:
+        """Fetch all files that are missing in a local folder or differ there, and remove others from it.
+
+        depth : of the folders, 1 for the files in the folder itself; all by default
+        """
+        listed = self.listed(depth=depth)
         for path in list(folder.rglob("*")):
-            if path.is_file() and path.relative_to(folder).as_posix() not in listed:
+            place = path.relative_to(folder)
+            within = depth is None or len(place.parts) <= depth
+            if within and path.is_file() and place.as_posix() not in listed:
                 path.unlink()
         wanted = [
             name for name, about in listed.items() if not self._same(folder / name, name=name, about=about)

@@ -21,7 +21,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -43,6 +43,9 @@ log = logging.getLogger(__name__)
 
 SCHEMA = 1
 """Version of the dataset directory; a reader refuses others."""
+
+_DEPTH_OF_TABLES = 2
+"""Files in a dataset and in its sensors' folders are not of single frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +121,15 @@ class Paths:
 class Dataset:
     """An opened dataset directory.
 
-    path     : the directory
+    path     : the directory, or the cache of one in object storage
     manifest : the document ``dataset.json``
+    stored   : the directory in object storage, if it is there
     """
 
     path: Path
     manifest: dict[str, Any]
+    stored: Stored | None = None
+    _fetched: set[Path] = field(default_factory=set, repr=False, compare=False)
 
     @property
     def frame(self) -> Frame:
@@ -180,21 +186,31 @@ class Dataset:
     def files(self, sensor: str, form: Format) -> Iterator[tuple[int, Path]]:
         """(frame number, path) of a sensor's clouds of one format, in order."""
         folder = self.paths.sensor(sensor)
-        for frame in frame_numbers(form.path(folder, 0).parent, form.suffix).tolist():
+        for frame in frame_numbers(self.frame_file(form.path(folder, 0)).parent, form.suffix).tolist():
             yield frame, form.path(folder, frame)
+
+    def frame_file(self, path: Path) -> Path:
+        """The path of a file of a frame; of a dataset in storage, its folder is fetched first."""
+        folder = path.parent
+        if self.stored is not None and folder not in self._fetched:
+            Stored(f"{self.stored.url}/{folder.relative_to(self.path).as_posix()}").mirror(folder)
+            self._fetched.add(folder)
+        return path
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """Open a dataset directory, finished or not, or one at a URL, which is fetched into the user's cache.
+    """Open a dataset directory, finished or not, or one at a URL.
+
+    Files at a URL are fetched into the user's cache: tables now, folders of frames when they are read.
 
     Raises DatasetError if it is not a dataset or has another schema version, and StorageError if the storage
     cannot be reached or has no dataset there.
     """
-    folder = Path(path)
+    folder, stored = Path(path), None
     if url := url_of(path):
         stored, folder = Stored(url), cache_folder() / "datasets" / digest(url.encode())
         stored.read(MANIFEST)
-        stored.mirror(folder)
+        stored.mirror(folder, depth=_DEPTH_OF_TABLES)
     manifest_path = Paths(folder).manifest
     if not manifest_path.exists():
         raise DatasetError(f"{folder}: no dataset.json in it; lidar drive records a dataset")
@@ -204,7 +220,7 @@ def open_dataset(path: str | Path) -> Dataset:
             raise DatasetError(
                 f"{folder}: schema version {manifest['schema']}, this program reads {SCHEMA}; drive again"
             )
-        dataset = Dataset(folder, manifest)
+        dataset = Dataset(folder, manifest, stored)
         _ = dataset.frame, dataset.start, dataset.crs, dataset.frames, int(manifest["frames_done"])
         _ = dataset.scene_path
         if not isinstance(manifest["recipe"], dict):

@@ -90,7 +90,8 @@ def color_images(dataset: Dataset, name: str) -> Stream | None:
         if not np.isfinite(np.array(camera["K"], float).reshape(3, 3)).all():
             raise ValueError("intrinsics are not finite")
         _ = int(camera["width"]), int(camera["height"]), str(camera["model"]), list(camera["distortion"])
-    numbers = frame_numbers(dataset.paths.image(name, 0, kind="rgb").parent, ".png").tolist()
+    first = dataset.frame_file(dataset.paths.image(name, 0, kind="rgb"))
+    numbers = frame_numbers(first.parent, ".png").tolist()
     found = [(frame, dataset.paths.image(name, frame, kind="rgb")) for frame in numbers]
     return _stream(dataset, name, found=found) if found else None
 

@@ -17,7 +17,7 @@ from geoscene.progress import Progress, silent
 from lidar.dataset.formats import FORMATS, Format, format_of, map_suffixes
 from lidar.dataset.formats.las import LasInfo, read_chunks
 from lidar.dataset.formats.table import Table, placed_returns, records, rows
-from lidar.dataset.layout import Dataset, Paths, read_rows, reading_file
+from lidar.dataset.layout import Dataset, read_rows, reading_file
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
@@ -155,7 +155,7 @@ class _Source:
 
     def moving(self, name: str, frame: int) -> list[int]:
         """Instances of the road users near a frame of a scanner that move during the drive."""
-        path = Paths(self.dataset.path).frame_boxes(name, frame)
+        path = self.dataset.frame_file(self.dataset.paths.frame_boxes(name, frame))
         if not path.exists():  # without road users
             return []
         boxes = read_rows(path)

@@ -74,3 +74,77 @@ def test_dataset_whose_upload_was_interrupted_is_no_dataset(s3, scene, monkeypat
     assert "recorded before" in lidar(*words)
     assert "dataset.json.part" not in Stored("s3://bucket/one").listed()
     assert s3.exists("bucket/one/dataset.json")
+
+
+RIG = """
+name = "three"
+[[lidar]]
+name = "top"
+preset = "vlp16"
+translation = [1.2, 0.0, 1.9]
+[[lidar]]
+name = "rear"
+preset = "vlp16"
+translation = [-1.2, 0.0, 1.9]
+[[camera]]
+name = "front"
+translation = [1.5, 0.2, 1.7]
+width = 32
+height = 18
+fov_deg = 80.0
+rate_hz = 10.0
+images = ["rgb", "depth"]
+"""
+
+
+@pytest.fixture
+def stored(s3, scene, tmp_path):  # noqa: ARG001
+    """A local dataset of two scanners and a camera, and its URL."""
+    (tmp_path / "three.toml").write_text(RIG)
+    words = (
+        "--route=random",
+        "--duration=0.3",
+        "--format=laz,kitti",
+        "--labels=semantickitti",
+        "--traffic=on",
+    )
+    lidar("drive", scene.path, *words, "--rig", tmp_path / "three.toml", "-o", tmp_path / "drive")
+    Stored("s3://bucket/drive").publish(tmp_path / "drive", last="dataset.json")
+    return tmp_path / "drive", "s3://bucket/drive"
+
+
+def fetched_folders():
+    """Folders of frames in the cache, and their files."""
+    found = {}
+    for path in sorted((cache_folder() / "datasets").rglob("*")):
+        place = path.relative_to(cache_folder() / "datasets").parts[1:]
+        if path.is_file() and len(place) > 2:
+            found.setdefault("/".join(place[:-1]), []).append(place[-1])
+    return found
+
+
+def test_commands_fetch_the_frames_that_they_read(stored, tmp_path):
+    local, url = stored
+    lidar("export", url, "--to", "tum", "-o", tmp_path / "tum")
+    assert not fetched_folders()
+    lidar("map", url, "--sensor", "rear", "-o", tmp_path / "stored.laz")
+    assert {name: len(files) for name, files in fetched_folders().items()} == {"rear/laz": 3, "rear/boxes": 3}
+    lidar("map", local, "--sensor", "rear", "-o", tmp_path / "local.laz")
+    assert (tmp_path / "stored.laz").read_bytes() == (tmp_path / "local.laz").read_bytes()
+    lidar("export", url, "--to", "kitti", "-o", tmp_path / "stored")
+    lidar("export", local, "--to", "kitti", "-o", tmp_path / "local")
+    same_files(tmp_path / "stored", tmp_path / "local")
+    new = {"top/velodyne", "top/labels", "front/rgb"}
+    assert set(fetched_folders()) == {"rear/laz", "rear/boxes"} | new
+
+
+def test_frames_that_changed_in_storage_are_fetched_again(s3, stored, tmp_path):
+    local, url = stored
+    lidar("map", url, "-o", tmp_path / "first.laz")
+    s3.rm_file("bucket/drive/top/laz/000001.laz")
+    s3.put_file(str(local / "top" / "laz" / "000000.laz"), "bucket/drive/top/laz/000002.laz")
+    (local / "top" / "laz" / "000001.laz").unlink()
+    (local / "top" / "laz" / "000002.laz").write_bytes((local / "top" / "laz" / "000000.laz").read_bytes())
+    for name, source in (("stored", url), ("local", local)):
+        assert run_program("lidar", "map", source, "-o", tmp_path / f"{name}.laz").returncode == 0
+    assert (tmp_path / "stored.laz").read_bytes() == (tmp_path / "local.laz").read_bytes()

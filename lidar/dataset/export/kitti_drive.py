@@ -124,9 +124,9 @@ class KittiDrive:
         source = self.clouds.files[row]
         if source.name.endswith(FORMATS["kitti"].suffix):
             shutil.copyfile(source, path)
-            form = LABELS["semantickitti"]
-            recorded = form.path(self.dataset.paths.sensor(self.clouds.name), int(self.clouds.frames[row]))
-            if labels is not None and recorded.exists():
+            folder, frame = self.dataset.paths.sensor(self.clouds.name), int(self.clouds.frames[row])
+            recorded = LABELS["semantickitti"].path(folder, frame)
+            if labels is not None and self.dataset.frame_file(recorded).exists():
                 labels.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(recorded, labels)
             return
