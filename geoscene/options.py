@@ -72,6 +72,8 @@ class BuildOptions:
             raise InputError(f"`dem_gaps` {self.dem_gaps}: error or nearest")
         if self.dem_tolerance is not None and not 0 <= self.dem_tolerance <= 1000:
             raise InputError(f"`dem_tolerance` {self.dem_tolerance:g}: give metres from 0 to 1000")
+        if self.dem_tolerance is not None and not self.dem:
+            raise InputError("`dem_tolerance`: has no effect without `dem`; leave it out")
         if unknown := sorted(set(self.only) - set(KINDS)):
             raise InputError(f"`only` {','.join(unknown)}: unknown; choose from {', '.join(KINDS)}")
         if self.use not in USES:

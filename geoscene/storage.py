@@ -25,7 +25,7 @@ from geoscene.errors import GeosceneError, InputError, MissingExtraError, Storag
 from geoscene.files import atomic_path, digest, digest_of, exclusive
 from geoscene.progress import Progress, silent
 
-_URL = re.compile(r"([a-z][a-z0-9+.-]+):/+(.*)")
+_URL = re.compile(r"([a-z][a-z0-9+.-]+):(?:/+(.*))?")
 _PACKAGES = {"gs": "gcsfs", "gcs": "gcsfs"}
 """Packages of protocols that the extra does not bring."""
 
@@ -36,11 +36,16 @@ _fetching = threading.Lock()
 
 
 def url_of(path: str | Path) -> str:
-    """The URL of a folder, also if `pathlib` has taken slashes from it; empty for a path of this machine."""
+    """The URL of a folder, also if `pathlib` has taken slashes from it; empty for a path of this machine.
+
+    Raises InputError for a URL that ends after its protocol.
+    """
     found = _URL.fullmatch(str(path))
     if not found:
         return ""
     scheme, rest = found.groups()
+    if not rest:
+        raise InputError(f"{scheme}://: names no folder; give one, such as {scheme}://BUCKET/NAME")
     return f"{scheme}://{'/' if scheme == 'file' else ''}{rest}".rstrip("/")
 
 

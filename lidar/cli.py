@@ -605,7 +605,7 @@ def selftest(
     Parameters
     ----------
     only
-        Groups of cases: rays, places, footprints, statistics, scale. All by default.
+        Groups of cases: rays, places, footprints, time, statistics, scale. All by default.
     full
         Measure as many samples as in the documentation, up to 100 million a case; takes tens of minutes.
     json

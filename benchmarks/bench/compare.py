@@ -73,8 +73,8 @@ def _key(case: dict[str, Any], side: str) -> tuple[Any, ...]:
 def _read(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise BenchError(f"{path}: no such file; give a bench.json") from None
+    except OSError as error:
+        raise BenchError(f"{path}: {error.strerror}; give a bench.json") from None
     except ValueError as error:
         raise BenchError(f"{path}: not JSON ({error})") from error
     if not isinstance(document, dict) or document.get("schema") != 1 or "cases" not in document:

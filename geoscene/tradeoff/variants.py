@@ -59,7 +59,7 @@ def variants(options: BuildOptions, settings: Sequence[str]) -> list[Variant]:
         found += [Variant(label, replace(base, only=kinds)) for label, kinds in _KINDS.items()]
     if "terrain" in chosen and base.dem:
         found += [Variant(f"terrain={n} x {n} posts", base, coarser=n) for n in _COARSER]
-        found.append(Variant("terrain=level", replace(base, dem=())))
+        found.append(Variant("terrain=level", replace(base, dem=(), dem_tolerance=None)))
     if "for" in chosen:
         found += [Variant(f"for={use}", replace(base, use=use)) for use in USES if use != "all"]
     if {"lod", "only"} <= set(chosen):

@@ -109,7 +109,8 @@ def _check_keys(path: Path, common: Mapping[str, Any], *, grid: Mapping[str, Any
     """Raise InputError for options in the wrong place."""
     for name, values in grid.items():
         if not isinstance(values, list) or not values:
-            raise InputError(f"{path}: {name} in the grid: give a list of values, as in {name} = [1, 2]")
+            example = '["city", "town.osm.pbf"]' if name == "scene" else "[1, 2]"
+            raise InputError(f"{path}: {name} in the grid: give a list of values, as in {name} = {example}")
         if name in common:
             raise InputError(f"{path}: {name} is in both drive and grid; keep one of them")
     for name in (*common, *grid):

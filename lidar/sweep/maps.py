@@ -123,7 +123,8 @@ def _map(name: str, table: dict[str, Any]) -> MapScene:
     osm, bounds = table.pop("osm", []), table.pop("bbox", None)
     files = [osm] if isinstance(osm, str) else osm
     if not isinstance(files, list) or not files or not all(isinstance(file, str) for file in files):
-        raise InputError('give it a map: osm = "city.osm.pbf"')
+        instead = f" (there is {next(iter(table))})" if table and osm == [] else ""
+        raise InputError(f'give it a map: osm = "city.osm.pbf"{instead}')
     if bounds is not None:
         if not isinstance(bounds, list) or [type(v) in (int, float) for v in bounds] != [True] * 4:
             raise InputError("bbox: give [W, S, E, N] in degrees")

@@ -358,7 +358,9 @@ def test_map_without_features_is_refused(tmp_path):
         build(OsmData((24.9, 60.1, 24.91, 60.11), [], [], [], []), tmp_path / "x")
 
 
-@pytest.mark.parametrize("change", [{"lod": 3}, {"tile_size": 10.5}, {"tile_size": 1e6}])
+@pytest.mark.parametrize(
+    "change", [{"lod": 3}, {"tile_size": 10.5}, {"tile_size": 1e6}, {"dem_tolerance": 1.0}]
+)
 def test_invalid_build_options_are_refused(change):
     with pytest.raises(InputError, match="`"):
         BuildOptions(**change)

@@ -78,6 +78,8 @@ def test_rebuild_with_another_option_has_the_bytes_of_a_fresh_build(
     change = {name: CHANGES[name]} | {"dem": {"dem": (str(raster),)}}.get(name, {})
     if name in ("along", "reach"):
         change["along"] = (str(route),)
+    if name == "dem_tolerance":
+        change["dem"] = (str(raster),)
     options = replace(OPTIONS, **change)
     shutil.copytree(whole.path, tmp_path / "scene")
     made, ground_tile = [], geoscene.tiles.ground_tile

@@ -200,6 +200,16 @@ def test_unknown_storage_names_those_that_are_known():
         open_scene("nowhere://bucket/scene")
 
 
+@pytest.mark.parametrize(
+    "words", [("geoscene", "build", "--demo"), ("lidar", "drive", "scene", "--route=random")]
+)
+def test_url_without_a_folder_is_refused_before_any_work(words, tmp_path):
+    done = run_program(*words, "-o", "s3://", cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "s3://: names no folder" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_local_folders_are_written_as_they_are(tmp_path):
     with published(tmp_path / "scene", last="scene.json", replaces=False) as folder:
         assert folder == tmp_path / "scene"

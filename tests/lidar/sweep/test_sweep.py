@@ -258,7 +258,7 @@ def test_public_elevation_tiles_of_a_map_are_fetched_once(tmp_path, monkeypatch)
         (("lod = 0", "bbox = [1, 2]"), "map blocks: bbox: give"),
         (('name = "blocks"', 'name = "whole"'), "two maps are named whole"),
         (('name = "blocks"', 'name = "../x"'), "map 2: give it a name"),
-        (('osm = ["', 'osms = ["'), "map blocks: give it a map"),
+        (('osm = ["', 'osms = ["'), r"map blocks: give it a map: .* \(there is osms\)"),
         (("street.osm", "absent.osm"), "map whole: .*absent.osm: no such file"),
     ],
 )
