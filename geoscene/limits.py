@@ -1,4 +1,4 @@
-"""Errors of lengths that the place and the frame of a scene set, with what to do about them."""
+"""Length errors that follow from where a scene lies and which CRS it has: map scale, ellipsoidal height."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Limit:
 
 
 def scale_limit(frame: Frame, bounds: Sequence[float]) -> list[Limit]:
-    """The limit of lengths in a scene's coordinates, by the scale of its CRS; none if it is within the bound.
+    """A limit if the map scale of the CRS puts lengths in scene coordinates off by more than `LENGTHS`.
 
     bounds : (xmin, ymin, xmax, ymax), scene metres
     """
@@ -65,7 +65,7 @@ def scale_limit(frame: Frame, bounds: Sequence[float]) -> list[Limit]:
 
 
 def height_limit(z: Float) -> list[Limit]:
-    """The limit of lengths at heights z (n,) in metres above the ellipsoid; none within the bound."""
+    """A limit if heights z (n,) in metres above the ellipsoid put lengths off by more than `LENGTHS`."""
     height = float(z[np.argmax(np.abs(z))])
     off = height / _RADIUS * 1e6
     if abs(off) <= LENGTHS:

@@ -37,15 +37,16 @@ class BuildOptions:
     """If elevation files do not cover the scene: error, or nearest (use the nearest height and report it)."""
 
     dem_tolerance: float | None = None
-    """Maximum difference in metres from the terrain's grid, of ground on which nothing lies: more needs fewer
-    triangles. By default 1 % of the distance between heights in the elevation files; 0 keeps the grid."""
+    """Metres by which bare ground (no building, road or land cover on it) may differ from the elevation grid;
+    more gives fewer triangles. By default 1 % of the grid's spacing; 0 keeps all heights. With --dem."""
 
     only: Annotated[tuple[str, ...], WORDS] = KINDS
     """Kinds of features to build besides the ground, separated by commas."""
 
     use: Annotated[str, Parameter(name="--for")] = "all"
     """What the scene is for: all; lidar or camera (to be driven in by such sensors, not shown or
-    exported); gis (tables and road graph) or map (those in plan), without tiles."""
+    exported); gis (all tables and the road graph, no meshes), or map (the same in plan, without building
+    parts and bridges)."""
 
     along: Annotated[tuple[str, ...], SEVERAL] = ()
     """Build only the tiles within sensor range of a route: LAT,LON LAT,LON ... or a GPX, GeoJSON or CSV file
@@ -95,7 +96,8 @@ class TradeoffOptions:
     """Settings to compare, separated by commas: lod, only, terrain (with --dem), for; all by default."""
 
     resolution: float = 1.0
-    """Metres of the cells of the surface models that are compared; larger ones for more than 16 million."""
+    """Cell size in metres of the surface models that are compared; enlarged where there would be more than 16
+    million cells."""
 
     repetitions: Annotated[int, Parameter(converter=whole)] = 1
     """Builds of each setting, in turn: 1 to 20."""

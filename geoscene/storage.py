@@ -36,7 +36,7 @@ _fetching = threading.Lock()
 
 
 def url_of(path: str | Path) -> str:
-    """The URL of a folder, also if `pathlib` has taken slashes from it; empty for a path of this machine.
+    """The URL of a folder, mended where `pathlib` has collapsed ``s3://``; empty for a local path.
 
     Raises InputError for a URL that ends after its protocol.
     """
@@ -63,7 +63,7 @@ def cache_folder() -> Path:
 class Stored:
     """A folder in object storage; its methods raise StorageError, which names it.
 
-    url     : of the folder
+    url     : such as s3://bucket/name, without a slash at the end
     digests : of files in it by name, which `local` verifies
     """
 
@@ -237,16 +237,17 @@ def published(
 ) -> Iterator[Path]:
     """Yield a local folder to write; for a URL, its files are published there unless the block raises.
 
-    What is in storage is first fetched, as if the folder were there; files that the block removes are removed
-    there at the end. After an error a folder that was not in storage is kept, for the same command to resume.
+    Files that are already in storage are downloaded first. After the block, new and changed files are
+    uploaded, and files that the block deleted are deleted there. After an error a folder that was not in
+    storage is kept, for the same command to resume.
 
     out      : path of this machine, which is yielded, or URL
     last     : name of the file that marks a complete folder and is written last
     replaces : whether a complete folder in storage may be changed
     bar      : gives what transfers before and after the block report their progress to
 
-    Raises InputError for a folder in storage that is complete and must not be changed, or is of others, and
-    StorageError if the storage cannot be written.
+    Raises InputError for a folder in storage that is complete and must not be changed, or holds other files,
+    and StorageError if the storage cannot be written.
     """
     if not (url := url_of(out)):
         yield out

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Needed:
-    """What of a table is needed.
+    """Columns and rows of a table that a use needs.
 
     columns : besides geometry and number; None for all
     classes : values of the column ``class``; None for all rows
@@ -31,10 +31,10 @@ _DRIVEN: Mapping[str, Needed] = {
 class Use:
     """Contents of scenes for a use.
 
-    contents : in words
+    contents : what the scene holds, for its summary
     tiles  : meshes
     colors : colours of faces, and which of them are walls
-    tables : what is written of which tables; None for all
+    tables : columns and rows to write, by table; None for all tables in full
     indexed : tables have spatial indices
     """
 
@@ -52,13 +52,13 @@ class Use:
 USES: Mapping[str, Use] = {
     "all": Use("everything"),
     "lidar": Use(
-        "what laser scanners, positions and traffic need",
+        "what laser scanners, GNSS, IMU and traffic need",
         colors=False,
         tables=_DRIVEN,
         indexed=False,
     ),
     "camera": Use(
-        "what cameras, laser scanners, positions and traffic need",
+        "what cameras, laser scanners, GNSS, IMU and traffic need",
         tables=_DRIVEN,
         indexed=False,
     ),

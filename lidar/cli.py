@@ -594,9 +594,10 @@ def selftest(
     markdown: bool = False,
     quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT)] = False,
 ) -> int:
-    """Measure accuracy and stability at the extremes on this machine, against the bounds that must hold.
+    """Check on this machine that errors stay within documented bounds in extreme cases.
 
-    Exits with 1 if a bound does not hold.
+    Such as grazing rays, ranges of 100 km, places near the poles and zone borders, long drives and large
+    scenes; docs/extremes.md lists them. Takes about 10 s. Exits with 1 if a bound does not hold.
 
     For example:
 

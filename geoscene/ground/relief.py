@@ -2,9 +2,9 @@
 
 A tile is halved along diagonals again and again, down to a lattice about as fine as the terrain's lines (a
 right-triangulated irregular network, Evans, Kirkpatrick and Townsend 2001). A vertex of the lattice is
-left out, with all that depend on it, if the heights of none of them are off by more than a tolerance then.
-What depends on a vertex on a tile's side lies within one square of it, so both tiles beside a
-side keep the same vertices, whichever is made.
+left out, together with its descendants in the hierarchy, if without them the height of no vertex is off by
+more than a tolerance. The descendants of a vertex on a tile's side lie within one square of it, so two
+neighbouring tiles choose the same vertices on their common side, in whatever order they are built.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Relief:
 
     height    : z of the terrain at x, y
     tolerance : maximum difference in metres from the heights of the lattice's vertices
-    spacing   : metres between those vertices; a square has a power of two of steps, so up to a quarter more
+    spacing   : metres between those vertices; up to a quarter more, as a square has a power of two of steps
     """
 
     height: Height
@@ -67,7 +67,8 @@ def lattice(
 
     square : (i, j) of the south-west square
     span   : squares along a side, a power of two
-    odd    : whether i + j, counted from a corner that all tiles have in common, is odd; only if the span is 1
+    odd    : whether i + j, counted from a corner that all tiles have in common, is odd, which tells the
+             diagonal that halves the square; used if the span is 1
     """
     k = relief.steps(tile_size)
     around = np.arange(-k, (span + 1) * k + 1) / k
