@@ -42,7 +42,7 @@ CHUNK = 200.0
 """Scene metres along each axis that the vehicle may cover before other tiles are loaded."""
 
 _FORGET = 1024
-"""Frames of a sensor after which the memory of a long trajectory is let go."""
+"""Frames of a sensor after which the memory of long motion is let go."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,6 +267,7 @@ def record_all(
     with _pool(workers) as pool:
         for chunk, region in _chunks(jobs, recording.trajectory):
             with recording.watch.stage("load"):
+                recording.release()
                 worlds.follow(region)
             running: set[Future[None]] = set()
             for job in chunk:
@@ -275,7 +276,7 @@ def record_all(
                     done += _take(running, finished=wait(running, return_when=FIRST_COMPLETED).done)
                     progress("driving", done, total=len(jobs))
                 if not job.frame % _FORGET:
-                    recording.trajectory.release()
+                    recording.release()
             done += _take(running, finished=wait(running).done)
             progress("driving", done, total=len(jobs))
 

@@ -151,6 +151,12 @@ class Recording:
         """What all LAS and LAZ files of the dataset share."""
         return LasInfo(self.geo.crs, self.geo.offset, self.start)
 
+    def release(self) -> None:
+        """Let go of the memory of motion in files, see `lidar.geometry.poses.release`."""
+        self.trajectory.release()
+        if self.actors is not None:
+            self.actors.release()
+
     def paths(self, sensor: Scanner | Camera, frame: int) -> dict[str, Path]:
         """Files of one frame, by image, format, ``deskewed <format>``, ``labels <format>``, boxes, truth."""
         name, paths = sensor.name, Paths(self.out)

@@ -16,7 +16,8 @@ from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import lanes_of
 from lidar.traffic.populate import TrafficOptions, simulated_actors, traffic_setup
-from lidar.traffic.simulation import STEP_S, has_traffic_control, simulate_ego
+from lidar.traffic.simulation import has_traffic_control, simulate_ego
+from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.trips import Trip
 from lidar.world.actors import Actors
 

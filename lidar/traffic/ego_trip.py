@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from lidar.planning.path import Path
 from lidar.planning.speed_profile import desired_speed
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.lanes import STEP, ActorPath
-from lidar.traffic.trips import Driver
+from lidar.traffic.trips import Course, Driver
 
 _ROOM = (0.4, 0.2)
 """Metres added to length and width of the ego's bounding box, for its deviation from the simulated motion."""
@@ -25,14 +24,13 @@ _BEYOND = 2.0
 
 @dataclass(frozen=True, slots=True)
 class EgoTrip:
-    """The ego's trip, with the columns of `lidar.traffic.trips.Trip`.
+    """The ego's trip, with the attributes of `lidar.traffic.trips.Trip`.
 
     xy, heading : (n, 2) and (n,) of the box's centre at each station
     """
 
-    path: ActorPath
+    course: Course
     driver: Driver
-    desired_speed: Float
     length: float
     width: float
     xy: Float
@@ -41,9 +39,12 @@ class EgoTrip:
     appear_s: float = 0.0
     leaves: bool = False
     on_foot: bool = False
-    crossing: Sequence[tuple[int, int, int]] = ()
 
-    def body(self) -> tuple[Float, Float]:
+    def draw(self) -> Course:
+        """Its course."""
+        return self.course
+
+    def body(self, path: ActorPath) -> tuple[Float, Float]:  # noqa: ARG002 - as of other trips
         """Centre and heading of the box at each station."""
         return self.xy, self.heading
 
@@ -73,6 +74,5 @@ def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False) -> EgoTrip
     desired = np.interp(at, s, desired_speed(path, vehicle))
     if not at_speed:
         desired = np.minimum(desired, np.sqrt(2 * acceleration * (at + 0.2)))
-    return EgoTrip(
-        actor_path, driver, desired, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading
-    )
+    course = Course(actor_path, desired)
+    return EgoTrip(course, driver, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading)

@@ -20,13 +20,13 @@ from lidar.random_streams import generator
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.fcd import Fcd, TrafficFile, read_fcd
 from lidar.traffic.populate import TrafficOptions, TrafficSetup, first_feature, parked_vehicles, traffic_setup
-from lidar.traffic.simulation import STEP_S
+from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.surroundings import LEFT
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import Tracks, actors_on_ground
 from lidar.traffic.trips import VEHICLE_SHARES, random_shape, random_stretch
 from lidar.world.actor_shapes import Shape
-from lidar.world.actors import Actors, existing_actors, joined, states
+from lidar.world.actors import KNOTS, Actors, existing_actors, joined, states
 
 _KINDS: dict[str, tuple[str, ...]] = {
     "passenger": ("sedan", "hatchback", "suv"),
@@ -98,7 +98,7 @@ def replay_fcd(
     setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
     moving = _moving(fcd, begin, scene=scene, graph=graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed)
     parked = parked_vehicles(
-        scene, ego, vehicle=vehicle, setup=setup, swept=_covered(moving), seed=seed, share=options.parked
+        scene, ego, vehicle=vehicle, setup=setup, swept=[_covered(moving)], seed=seed, share=options.parked
     )
     return joined([moving, parked], first_feature=first_feature(scene))
 
@@ -334,12 +334,11 @@ def _without(actors: Actors, rows: Ints) -> Actors:
     keep[rows] = False
     knots = np.diff(actors.first)
     kept = np.repeat(keep, knots)
-    each = ("shape", "poses", "stride", "kind", "klass", "size", "stretch", "parked", "feature")
-    every = ("time_ns", "position", "angles", "velocity", "travelled")
+    columns = actors.columns()
+    del columns["first"]
     return replace(
         actors,
-        **{name: getattr(actors, name)[keep] for name in each},
-        **{name: getattr(actors, name)[kept] for name in every},
+        **{name: column[kept if name in KNOTS else keep] for name, column in columns.items()},
         first=np.concatenate([[0], np.cumsum(knots[keep])]).astype(np.int64),
     )
 

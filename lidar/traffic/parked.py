@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.traffic.lanes import Lanes, edge_name, lane_shift
 from lidar.traffic.sweep import rectangles
-from lidar.traffic.tracks import actor_table, poses_on_ground
+from lidar.traffic.tracks import Knots, actor_table, poses_on_ground
 from lidar.traffic.trips import random_shape
 from lidar.world.actors import Actors
 
@@ -137,13 +137,13 @@ def parked_actors(
     spots: ParkingSpaces,
     scene: Scene,
     *,
-    trees: Sequence[shapely.STRtree],
+    free: Iterable[NDArray[np.object_]],
     seed: int,
     scale: float,
 ) -> Actors:
     """Vehicles on the spaces where all wheels have ground and the body touches no obstacle or other vehicle.
 
-    trees : obstacles and areas that must stay free, polygons in plan
+    free : obstacles and areas that must stay free, polygons in plan
     """
     n = len(spots.xy)
     rng = generator(seed, "parked", *PARKED)
@@ -154,10 +154,10 @@ def parked_actors(
     length, width, base = size[:, 0] * grow[:, 0], size[:, 1] * grow[:, 1], size[:, 2] * grow[:, 0]
     boxes = rectangles(spots.xy, spots.heading, length=length * scale, width=width * scale)
     keep = np.ones(n, bool)
-    for tree in trees:
-        if len(tree):
-            keep[np.unique(tree.query(boxes, predicate="dwithin", distance=_ROOM)[0])] = False
-    a, b = shapely.STRtree(boxes).query(boxes, predicate="dwithin", distance=_BETWEEN)
+    tree = shapely.STRtree(boxes)
+    for areas in free:
+        keep[tree.query(areas, predicate="dwithin", distance=_ROOM)[1]] = False
+    a, b = tree.query(boxes, predicate="dwithin", distance=_BETWEEN)
     for first, second in zip(a[a < b].tolist(), b[a < b].tolist(), strict=True):
         keep[second] &= not keep[first]
     rows = np.flatnonzero(keep)
@@ -176,11 +176,13 @@ def parked_actors(
         [shapes[k] for k in rows],
         grow[rows],
         knots=np.ones(len(rows), np.int64),
-        time_ns=np.zeros(len(rows), np.int64),
-        position=np.column_stack([spots.xy[rows], height]),
-        angles=np.column_stack([spots.heading[rows], pitch, roll]),
-        velocity=np.zeros((len(rows), 3)),
-        travelled=np.zeros(len(rows)),
+        motion=Knots(
+            np.zeros(len(rows), np.int64),
+            np.column_stack([spots.xy[rows], height]),
+            np.column_stack([spots.heading[rows], pitch, roll]),
+            np.zeros((len(rows), 3)),
+            np.zeros(len(rows)),
+        ),
         parked=True,
         scale=scale,
     )

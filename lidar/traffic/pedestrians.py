@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import shapely
@@ -15,7 +16,7 @@ from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, rounded
 from lidar.traffic.surroundings import Surroundings
-from lidar.traffic.trips import Driver, Trip, random_shape, random_stretch
+from lidar.traffic.trips import Course, Driver, Trip, random_shape, random_stretch
 
 _KINDS = {"adult": 0.5, "small_adult": 0.38, "child": 0.12}
 _FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}
@@ -119,22 +120,8 @@ def pedestrian_trips(
                 side=lanes.side,
                 rng=rng,
             )
-            path, crossed = _walking_path(line, over, scale=area.scale)
-            desired_speed = np.full(len(path), pace)
-            trips.append(
-                Trip(
-                    shape,
-                    grow,
-                    path,
-                    _WALK,
-                    desired_speed,
-                    0,
-                    start,
-                    leaves=False,
-                    on_foot=True,
-                    crossing=crossed,
-                )
-            )
+            draw = partial(_course, line, over, pace=pace, scale=area.scale)
+            trips.append(Trip(shape, grow, draw, _WALK, 0, start, leaves=False, on_foot=True))
     return trips
 
 
@@ -209,10 +196,8 @@ def _crossings(lanes: Lanes, walks: Sidewalks) -> dict[int, list[tuple[int, floa
     return found
 
 
-def _walking_path(
-    parts: list[Float], over: list[tuple[int, int]], *, scale: float
-) -> tuple[ActorPath, tuple[tuple[int, int, int], ...]]:
-    """The path along lines, and first station, last station and number of each crossing on it."""
+def _course(parts: list[Float], over: list[tuple[int, int]], *, pace: float, scale: float) -> Course:
+    """The course along lines with their crossings, at an even pace."""
     line = np.concatenate(parts)
     ends = np.cumsum([len(p) for p in parts])
     along = polylines.stations(line)
@@ -231,7 +216,7 @@ def _walking_path(
             _nearest(path, line[k, :2], about=along[k] / gap) for k in (ends[part] - 1, ends[part])
         )
         crossed.append((first + 1, max(last - 1, first + 2), number))
-    return path, tuple(crossed)
+    return Course(path, np.full(len(path), pace), tuple(crossed))
 
 
 def _nearest(path: ActorPath, point: Float, *, about: float) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,6 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene import polylines
+from geoscene.columns import row_blocks
 from geoscene.errors import SceneFormatError
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
@@ -24,13 +26,14 @@ from lidar.traffic.parked import ParkingSpaces, kerb_spaces, lot_spaces, parked_
 from lidar.traffic.pedestrians import pedestrian_trips, sidewalks_around
 from lidar.traffic.simulation import simulate_trips
 from lidar.traffic.surroundings import Surroundings, ego_line, surroundings_of
-from lidar.traffic.sweep import body_poses, rectangles
+from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import moving_actors
 from lidar.traffic.trips import Trip, vehicle_trips
 from lidar.world.actors import Actors, joined
 
 _ROAD = ("road", "lane_marking", "crossing", "parking")
 _HEADROOM = 2.5  # metres, minimum height of a building part above a passage
+_BOXES = 1 << 14  # boxes of the ego vehicle that are made at once
 _BUILDING_AREA = 1.0  # square metres from which an obstacle is a building
 _POST_RADIUS = 0.2  # metres, of posts and trunks
 _BOUNDS = {
@@ -199,35 +202,37 @@ def parked_vehicles(
     *,
     vehicle: Vehicle,
     setup: TrafficSetup,
-    swept: NDArray[np.object_],
+    swept: Iterable[NDArray[np.object_]],
     seed: int,
     share: float,
 ) -> Actors:
     """Parked vehicles along kerbs and in parking lots, and bicycles on sidewalks.
 
-    swept : areas swept by moving road users, polygons in plan
+    swept : areas swept by moving road users, polygons in plan, in several arrays
     share : share of the spaces that are occupied
     """
     surfaces, around, lanes = setup.surfaces, setup.around, setup.lanes
     lots = _polygons(_layer(scene, "landcover"), ("parking",), area=around)
     structures = _layer(scene, "structures")
     crossings = shapely.buffer(_polygons(surfaces, ("crossing",), area=around), 2.0)
-    free = [
+    free = itertools.chain(
+        [
+            setup.obstacles,
+            _strips(lanes, setup.area),
+            shapely.buffer(setup.plan.zones.polygon, 3.0),
+            crossings,
+            np.empty(0, object) if structures is None else shapely.buffer(structures.geometry, 0.5),
+        ],
         _ego_boxes(ego, vehicle, scale=setup.scale),
         swept,
-        _strips(lanes, setup.area),
-        shapely.buffer(setup.plan.zones.polygon, 3.0),
-        crossings,
-        np.empty(0, object) if structures is None else shapely.buffer(structures.geometry, 0.5),
-    ]
-    trees = [shapely.STRtree(part) for part in (setup.obstacles, np.concatenate(free))]
+    )
     spots = ParkingSpaces.concatenate(
         [
             kerb_spaces(lanes, setup.area.near, seed=seed, share=share),
             lot_spaces(lots, seed=seed, share=share),
         ]
     )
-    return parked_actors(spots, scene, trees=trees, seed=seed, scale=setup.scale)
+    return parked_actors(spots, scene, free=free, seed=seed, scale=setup.scale)
 
 
 def _passable(
@@ -242,16 +247,14 @@ def _passable(
     return whole
 
 
-def _swept(trips: list[Trip]) -> NDArray[np.object_]:
-    """Bounding boxes (k,) of moving road users along their paths, with a margin."""
-    parts = [np.empty(0, object)]
+def _swept(trips: list[Trip]) -> Iterator[NDArray[np.object_]]:
+    """Bounding boxes (k,) of each moving road user along its path, with a margin."""
     for trip in trips:
-        xy, heading = body_poses(trip.path, trip.axle)
+        xy, heading = trip.body(trip.draw().path)
         every = slice(0, None, 2 if trip.on_foot else 4)
-        parts.append(
-            rectangles(xy[every], heading[every], length=max(trip.length, 1.0) + 0.5, width=trip.width + 0.3)
+        yield rectangles(
+            xy[every], heading[every], length=max(trip.length, 1.0) + 0.5, width=trip.width + 0.3
         )
-    return np.concatenate(parts)
 
 
 def _strips(lanes: Lanes, area: Surroundings) -> NDArray[np.object_]:
@@ -269,15 +272,17 @@ def _strips(lanes: Lanes, area: Surroundings) -> NDArray[np.object_]:
     return strips
 
 
-def _ego_boxes(ego: Trajectory, vehicle: Vehicle, *, scale: float) -> NDArray[np.object_]:
+def _ego_boxes(ego: Trajectory, vehicle: Vehicle, *, scale: float) -> Iterator[NDArray[np.object_]]:
     """Bounding boxes (k,) of the ego vehicle every metre of its trajectory, with a margin."""
     moved = polylines.stations(ego.position)
-    rows = np.unique(np.searchsorted(moved, np.arange(0.0, moved[-1] + 1.0, 1.0)).clip(0, len(moved) - 1))
-    poses = ego.at(ego.time_ns[rows])
-    forward = poses.rotation[:, :2, 0]
-    middle = poses.position[:, :2] + scale * forward * (vehicle.length / 2 - vehicle.rear_overhang)
-    heading = np.arctan2(forward[:, 1], forward[:, 0])
-    return rectangles(middle, heading, length=vehicle.length + 1.2, width=vehicle.width + 0.5)
+    every = np.unique(np.searchsorted(moved, np.arange(0.0, moved[-1] + 1.0, 1.0)).clip(0, len(moved) - 1))
+    for rows in row_blocks(len(every), _BOXES):
+        poses = ego.at(ego.time_ns[every[rows]])
+        forward = poses.rotation[:, :2, 0]
+        middle = poses.position[:, :2] + scale * forward * (vehicle.length / 2 - vehicle.rear_overhang)
+        heading = np.arctan2(forward[:, 1], forward[:, 0])
+        yield rectangles(middle, heading, length=vehicle.length + 1.2, width=vehicle.width + 0.5)
+    ego.release()
 
 
 def _layer(scene: Scene, name: str) -> Layer | None:

@@ -24,16 +24,20 @@ from geoscene.typing import Float, Ints
 from lidar.traffic.junctions import Signals, is_green
 from lidar.traffic.lanes import STEP
 
+STEP_S = 0.1
+"""Seconds of a simulation step."""
 HARD = 8.0
 """m/s^2, emergency deceleration: decides how far ahead a road user reserves the ground."""
-_LOOK_AHEAD = (15.0, 5.0)  # metres, and metres per m/s, within which obstacles are searched
+LOOK_AHEAD = (15.0, 5.0)
+"""Metres, and metres per m/s, within which obstacles are searched."""
 _NEAR_EGO = 90.0  # metres from the ego within which reserved cells are checked again
 _EVERY = 3  # every third cell is checked: bodies cover more than that
 _YIELD_S = 4.0  # seconds to arrival within which a road user with priority is waited for
 _PATIENCE = 20  # steps that a road user waits for room to appear
 _STOP_STEPS = 10  # steps at rest at a stop sign
 _AT_LINE = 3.0  # metres from the stop line within which a road user has stopped there
-_NOBODY = -1
+NOBODY = -1
+"""Owner of a cell that is not reserved, and route of a cell that no road user holds."""
 
 
 # Tables of records: a function with one argument per column takes a minute to compile.
@@ -92,7 +96,7 @@ RESERVATION = np.dtype(
 )
 """Reservations of a cell.
 
-owner, times  : road user that has reserved it, `_NOBODY` for none, and how often
+owner, times  : road user that has reserved it, `NOBODY` for none, and how often
 hold, holds   : junction route that it is reserved for, and by how many road users
 arrive, until : seconds from and until which the ego covers it next
 """
@@ -131,13 +135,23 @@ class EgoMotion(NamedTuple):
 
     motion                  : (t,) `MOTION`
     half                    : (2,) metres, half length and half width of its bounding box
-    event_start, event_cell : (t + 1) and (e,), cells under the box and its safety margin at each step
+    first                   : the step of the first row of ``event_start``
+    event_start, event_cell : (k + 1) and (e,), cells under the box and its safety margin at each step
     """
 
     motion: NDArray[np.void]
     half: Float
+    first: int
     event_start: Ints
     event_cell: NDArray[np.integer]
+
+
+def unreserved(cells: int) -> NDArray[np.void]:
+    """Reservations of cells that nobody has reserved."""
+    out = np.zeros(cells, RESERVATION)
+    out["owner"] = out["hold"] = NOBODY
+    out["arrive"], out["until"] = np.inf, -np.inf
+    return out
 
 
 def simulated(
@@ -145,8 +159,9 @@ def simulated(
     ego: EgoMotion,
     *,
     signals: Signals,
-    excluded: NDArray[np.bool_],
-    cells: int,
+    reservations: NDArray[np.void],
+    state: NDArray[np.void],
+    steps: tuple[int, int],
     dt: float,
     horizon: int,
     radius: float,
@@ -155,23 +170,15 @@ def simulated(
     """Rows (k, 4) of road user, step, metres along the path and speed; whether each (n,) hits the ego.
 
     ego      : its motion; filled in step by step if the ego is simulated
-    excluded : (n,) bool, road users to leave out
-    cells    : number of cells
+    reservations, state : of the cells and road users, `RESERVATION` and `STATE`; changed in place
+    steps    : first step, and the one at which to end
     dt       : seconds of a step
     horizon  : steps that the ego's motion is known ahead
     radius   : metres from the ego beyond which road users disappear
     ego_row  : row of a simulated ego, -1 if the ego's motion is fixed
     """
-    reservations = np.zeros(cells, RESERVATION)
-    reservations["owner"] = reservations["hold"] = _NOBODY
-    reservations["arrive"], reservations["until"] = np.inf, -np.inf
-    state = np.zeros(len(excluded), STATE)
-    state["departed"] = excluded
-    first = movers.user[:-1]
-    state["ahead"] = state["reserved"] = state["released"] = first["cell_start"]
-    state["block"], state["station"] = first["block_start"], -1
-    hit_ego = np.zeros(len(excluded), bool)
-    log = _run(movers, reservations, state, ego, signals, dt, horizon, radius, ego_row, hit_ego)
+    hit_ego = np.zeros(len(state), bool)
+    log = _run(movers, reservations, state, ego, signals, steps, dt, horizon, radius, ego_row, hit_ego)
     return log, hit_ego
 
 
@@ -182,6 +189,7 @@ def _run(
     st: Any,
     ego: Any,
     signals: Any,
+    steps: Any,
     dt: float,
     horizon: int,
     radius: float,
@@ -191,7 +199,7 @@ def _run(
     """The time loop of `simulated`: returns its rows and fills ``hit_ego``."""
     log = np.empty((4096, 4))
     rows = 0
-    for step in range(len(ego.motion)):
+    for step in range(steps[0], steps[1]):
         for ahead in range(step + horizon if step else 0, step + horizon + 1):
             _reserve_for_ego(g, ego, ahead, step * dt, dt)
         if ego_row >= 0:
@@ -226,7 +234,7 @@ def _reserve_for_ego(g: Any, ego: Any, ahead: int, t: float, dt: float) -> None:
     """Reserve the cells that the ego covers at step ``ahead``."""
     if ahead >= len(ego.motion):
         return
-    for q in range(ego.event_start[ahead], ego.event_start[ahead + 1]):
+    for q in range(ego.event_start[ahead - ego.first], ego.event_start[ahead - ego.first + 1]):
         p = ego.event_cell[q]
         if g[p].until < t:
             g[p].arrive = ahead * dt
@@ -259,7 +267,7 @@ def _try_to_appear(i: int, step: int, t: float, m: Any, g: Any, st: Any) -> bool
         if m.cell[q].first > free:
             break
         if m.cell[q].last >= k and (
-            g[m.cell[q].number].owner != _NOBODY or _needed_by_ego(g, m.cell[q].number, t, 6.0)
+            g[m.cell[q].number].owner != NOBODY or _needed_by_ego(g, m.cell[q].number, t, 6.0)
         ):
             free = m.cell[q].first - 1
     if free < k + 2:
@@ -297,7 +305,7 @@ def _release_behind(i: int, m: Any, g: Any, st: Any) -> None:
             p = m.cell[row].number
             g[p].times -= 1
             if g[p].times == 0:
-                g[p].owner = _NOBODY
+                g[p].owner = NOBODY
         st[i].released += 1
     b = st[i].block
     if b == m.user[i + 1].block_start or not (st[i].departed or k > m.block[b].last):
@@ -343,7 +351,7 @@ def _release_junction(i: int, m: Any, g: Any, st: Any) -> None:
             p = m.cell[q].number
             g[p].holds -= 1
             if g[p].holds == 0:
-                g[p].hold = _NOBODY
+                g[p].hold = NOBODY
     st[i].granted = False
 
 
@@ -403,7 +411,7 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     q = st[i].reserved
     while q < m.user[i + 1].cell_start and m.cell[q].first <= need:
         p = m.cell[q].number
-        other = g[p].owner not in (_NOBODY, i)
+        other = g[p].owner not in (NOBODY, i)
         if other or _needed_by_ego(g, p, t, (m.cell[q].last - k) * STEP / max(v, 2.0) + 0.5):
             need = m.cell[q].first - 1
             break
@@ -436,7 +444,7 @@ def _next_signal_is_red(i: int, k: int, t: float, need: int, m: Any, st: Any, si
 @njit(cache=True, nogil=True)
 def _stations_ahead(v: float) -> int:
     """Stations ahead that are searched for obstacles."""
-    return int((_LOOK_AHEAD[0] + _LOOK_AHEAD[1] * v) / STEP)
+    return int((LOOK_AHEAD[0] + LOOK_AHEAD[1] * v) / STEP)
 
 
 @njit(cache=True, nogil=True)
@@ -460,7 +468,7 @@ def _obstacle(
             break
         p = m.cell[q].number
         o = g[p].owner
-        if o not in (_NOBODY, i):
+        if o not in (NOBODY, i):
             here = m.station[base + m.cell[q].first].heading
             theirs = m.station[m.user[o].station_start + int(st[o].s / STEP)].heading
             return m.cell[q].first, max(st[o].v * math.cos(theirs - here), 0.0)
@@ -487,7 +495,7 @@ def _may_enter(i: int, k: int, t: float, m: Any, g: Any, st: Any, signals: Any) 
             break
         p = m.cell[q].number
         o = g[p].owner
-        if q >= st[i].reserved and o not in (_NOBODY, i) and not behind:
+        if q >= st[i].reserved and o not in (NOBODY, i) and not behind:
             theirs = m.station[m.user[o].station_start + int(st[o].s / STEP)].heading
             same = st[o].block < m.user[o + 1].block_start and m.block[st[o].block].route == route
             moves = (
@@ -497,7 +505,7 @@ def _may_enter(i: int, k: int, t: float, m: Any, g: Any, st: Any, signals: Any) 
                 return False
             behind = True
         if m.cell[q].first >= m.block[b].first:
-            if g[p].hold not in (_NOBODY, route) and m.cell[q].first <= m.block[b].last:
+            if g[p].hold not in (NOBODY, route) and m.cell[q].first <= m.block[b].last:
                 return False
             if _needed_by_ego(g, p, t, (m.cell[q].last - k) * STEP / pace + 2.0):
                 return False

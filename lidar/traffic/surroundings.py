@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,8 @@ class Surroundings:
     """The area within ``radius`` of the ego over time.
 
     lines  : (m,) the graph's edges in plan
+    tree   : their search tree
+    start  : (m, 2) where they begin
     near   : (m,) bool, edges that ever come within radius
     time   : (t,) seconds, about one apart
     ego    : (t, 2) scene metres, the ego vehicle then
@@ -30,6 +33,8 @@ class Surroundings:
     """
 
     lines: NDArray[np.object_]
+    tree: shapely.STRtree
+    start: Float
     near: NDArray[np.bool_]
     time: Float
     ego: Float
@@ -39,16 +44,11 @@ class Surroundings:
     def visits(self, xy: Float) -> list[tuple[float, float]]:
         """Seconds from and until which a place (2,) is in the surroundings of the ego, visit by visit."""
         away = np.hypot(*(self.ego - xy).T) / self.scale
-        out: list[tuple[float, float]] = []
-        inside = False
-        for t, d in zip(self.time.tolist(), away.tolist(), strict=True):
-            if not inside and d <= self.radius:
-                out.append((t, float(self.time[-1])))
-                inside = True
-            elif inside and d > self.radius + LEFT:
-                out[-1] = (out[-1][0], t)
-                inside = False
-        return out
+        turns = np.flatnonzero((away <= self.radius) | (away > self.radius + LEFT))
+        inside = away[turns] <= self.radius
+        change = turns[np.flatnonzero(np.diff(inside, prepend=False))]
+        begins, ends = self.time[change[::2]].tolist(), self.time[change[1::2]].tolist()
+        return list(itertools.zip_longest(begins, ends, fillvalue=float(self.time[-1])))
 
     def until(self, xy: Float, start: float) -> float:
         """Seconds until which a place (2,) that is in the surroundings at ``start`` stays in them."""
@@ -63,7 +63,9 @@ def surroundings_of(lanes: Lanes, ego: Trajectory, *, radius: float, scale: floa
     seconds = ego.duration_ns * 1e-9
     time = np.linspace(0.0, seconds, max(int(np.ceil(seconds)), 1) + 1)
     xy = ego.at(np.round(time * 1e9).astype(np.int64)).position[:, :2]
-    return Surroundings(lines, shapely.dwithin(lines, ego_line(ego), radius * scale), time, xy, radius, scale)
+    near = shapely.dwithin(lines, ego_line(ego), radius * scale)
+    start = shapely.get_coordinates(shapely.get_point(lines, 0)).reshape(-1, 2)
+    return Surroundings(lines, shapely.STRtree(lines), start, near, time, xy, radius, scale)
 
 
 def ego_line(ego: Trajectory) -> shapely.Geometry:
@@ -79,7 +81,9 @@ def entrances(lanes: Lanes, area: Surroundings, *, t: float) -> list[tuple[int, 
     """
     here = np.array([np.interp(t, area.time, area.ego[:, c]) for c in (0, 1)])
     rim = shapely.Point(here).buffer(area.radius * area.scale, quad_segs=16).exterior
-    rows = np.flatnonzero(area.near & (lanes.traffic_weight > 0) & lanes.open)
+    used = area.near & (lanes.traffic_weight > 0) & lanes.open
+    rows = np.sort(area.tree.query(rim))
+    rows = rows[used[rows]]
     found: list[tuple[int, float]] = []
     cut = shapely.intersection(area.lines[rows], rim)
     points, owner = shapely.get_parts(cut, return_index=True)
@@ -91,6 +95,5 @@ def entrances(lanes: Lanes, area: Surroundings, *, t: float) -> list[tuple[int, 
         ahead = shapely.line_interpolate_point(area.lines[k], min(share + 2.0 / length, 1.0), normalized=True)
         if np.hypot(ahead.x - here[0], ahead.y - here[1]) < area.radius * area.scale:
             found.append((k, share))
-    begins = np.array([line.coords[0] for line in area.lines[rows]]).reshape(-1, 2)
-    within = np.hypot(*(begins - here).T) < area.radius * area.scale
-    return found + [(k, 0.0) for k in rows[within & lanes.entry[rows]].tolist()]
+    within = np.hypot(*(area.start - here).T) < area.radius * area.scale
+    return found + [(k, 0.0) for k in np.flatnonzero(within & lanes.entry & used).tolist()]

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.columns import Columns, row_blocks
 from geoscene.scene import Scene
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
+from lidar.geometry.poses import BLOCK_POSES, release, room
 from lidar.traffic.ground import ground_heights
 from lidar.traffic.lanes import STEP
-from lidar.traffic.simulation import STEP_S, SimulatedTrips
-from lidar.traffic.sweep import body_poses
+from lidar.traffic.simulation import SimulatedTrips
+from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.trips import Trip
 from lidar.world.actor_shapes import STRIDE, Shape, catalogue
 from lidar.world.actors import Actors
@@ -25,6 +27,7 @@ _STRIDE = {"cyclist": 5.6, "adult": 1.45, "small_adult": 1.35, "child": 1.05}
 _UPRIGHT = ("adult", "small_adult", "child")
 _LEANING = ("cyclist", "motorcycle")
 _TRACK = 0.8  # track width over body width
+_KNOTS = 1 << 16  # knots whose ground is looked for at once
 _SKY = 1e4  # metres above and below zero within which the ground is searched
 _STEP_UP = 0.5  # metres, maximum height difference between a wheel and the centre
 _STEEP, _BANKED = 0.3, 0.15  # radians, maximum pitch and roll
@@ -34,16 +37,12 @@ def actor_table(
     shapes: Sequence[Shape],
     stretch: ArrayLike,
     *,
-    knots: NDArray[np.int64],
-    time_ns: NDArray[np.int64],
-    position: Float,
-    angles: Float,
-    velocity: Float,
-    travelled: Float,
+    knots: Ints,
+    motion: Knots,
     parked: bool,
     scale: float,
 ) -> Actors:
-    """Actors (n) with ``knots`` (n,) rows of motion each; feature numbers are zero."""
+    """Actors (n) with ``knots`` (n,) rows of motion each, which are not copied; feature numbers are zero."""
     known = catalogue()
     names: dict[str, int] = {}
     first = []
@@ -57,6 +56,7 @@ def actor_table(
     grow = np.reshape(np.asarray(stretch, float), (-1, 3))
     size = np.array([[s.length, s.width, s.height] for s in shapes]).reshape(-1, 3) * grow
     kinds = [s.kind for s in shapes]
+    ends = np.concatenate([[0], np.cumsum(knots)]).astype(np.int64)
     return Actors(
         shapes=tuple(known[name] for name in names),
         shape=np.array(first, np.int32),
@@ -68,33 +68,65 @@ def actor_table(
         stretch=grow,
         parked=np.full(len(kinds), parked),
         feature=np.zeros(len(kinds), np.int32),
-        first=np.concatenate([[0], np.cumsum(knots)]).astype(np.int64),
-        time_ns=time_ns.astype(np.int64),
-        position=position.reshape(-1, 3),
-        angles=angles.reshape(-1, 3),
-        velocity=velocity.reshape(-1, 3),
-        travelled=travelled,
+        begin_ns=motion.time_ns[ends[:-1]],
+        end_ns=motion.time_ns[ends[1:] - 1],
+        first=ends,
         scale=scale,
+        **motion.columns(),
     )
 
 
 def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, scale: float) -> Actors:
     """Actors of the trips that appeared in a simulation."""
-    present, counts = np.unique(flow.trip, return_counts=True)
+    n = len(flow.trip)
+    counts = sum(
+        (np.bincount(flow.trip[rows], minlength=len(trips)) for rows in row_blocks(n, BLOCK_POSES)),
+        np.zeros(len(trips), np.int64),
+    )
+    present, first = np.flatnonzero(counts), np.cumsum(counts) - counts
+    knots = Knots(room((n,), np.int64), room((n, 3)), room((n, 3)), room((n, 3)), room((n,)))
+    for some in _together(present, trips, counts=counts):  # in order of time: they are near each other
+        rows = np.concatenate([np.arange(first[row], first[row] + counts[row]) for row in some])
+        tracks = _tracks([trips[row] for row in some], flow.take(rows), counts=counts[some])
+        part = knots_on_ground(scene, tracks, scale=scale)
+        for name, column in knots.columns().items():
+            column[rows] = getattr(part, name)
+        release(*knots.columns().values(), *flow.columns().values())
+    return actor_table(
+        [trips[row].shape for row in present.tolist()],
+        [trips[row].stretch for row in present.tolist()],
+        knots=counts[present],
+        motion=knots,
+        parked=False,
+        scale=scale,
+    )
+
+
+def _together(rows: Ints, trips: Sequence[Trip], *, counts: Ints) -> Iterator[list[int]]:
+    """Trips in order of appearance, as many at once as have about `_KNOTS` knots."""
+    order = rows[np.argsort([trips[row].appear_s for row in rows.tolist()], kind="stable")]
+    block = np.cumsum(counts[order]) // _KNOTS
+    for some in np.split(order, np.flatnonzero(np.diff(block)) + 1):
+        if len(some):
+            yield some.tolist()
+
+
+def _tracks(trips: Sequence[Trip], flow: SimulatedTrips, *, counts: Ints) -> Tracks:
+    """Tracks of trips from their motion (k,), one after another; ``counts`` are their numbers of rows."""
     ends = np.concatenate([[0], np.cumsum(counts)])
     n = len(flow.trip)
     middle, yaw, hint = np.empty((n, 2)), np.empty(n), np.empty(n)
-    for k, row in enumerate(present.tolist()):
-        trip, part = trips[row], slice(ends[k], ends[k + 1])
+    for k, trip in enumerate(trips):
+        part, path = slice(ends[k], ends[k + 1]), trip.draw().path
         at = flow.travelled[part] / STEP
-        xy, heading = body_poses(trip.path, trip.axle)
+        xy, heading = trip.body(path)
         stations = np.arange(len(xy))
         middle[part] = np.stack([np.interp(at, stations, xy[:, c]) for c in (0, 1)], axis=1)
         yaw[part] = np.interp(at, stations, heading)
-        hint[part] = np.interp(at, stations, trip.path.xyz[:, 2])
-    tracks = Tracks(
-        shapes=[trips[row].shape for row in present],
-        stretch=[trips[row].stretch for row in present],
+        hint[part] = np.interp(at, stations, path.xyz[:, 2])
+    return Tracks(
+        shapes=[trip.shape for trip in trips],
+        stretch=[trip.stretch for trip in trips],
         knots=counts,
         step=flow.step,
         middle=middle,
@@ -103,7 +135,17 @@ def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, 
         speed=flow.speed,
         travelled=flow.travelled,
     )
-    return actors_on_ground(scene, tracks, scale=scale)
+
+
+@dataclass(frozen=True, slots=True)
+class Knots(Columns):
+    """Knots of actors, one after another: the columns of `lidar.world.actors.KNOTS`."""
+
+    time_ns: Ints
+    position: Float
+    angles: Float
+    velocity: Float
+    travelled: Float
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +174,14 @@ class Tracks:
 
 def actors_on_ground(scene: Scene, tracks: Tracks, *, scale: float) -> Actors:
     """Actors (n) that follow tracks on the scene's ground."""
+    motion = knots_on_ground(scene, tracks, scale=scale)
+    return actor_table(
+        tracks.shapes, tracks.stretch, knots=tracks.knots, motion=motion, parked=False, scale=scale
+    )
+
+
+def knots_on_ground(scene: Scene, tracks: Tracks, *, scale: float) -> Knots:
+    """Knots (k) of actors that follow tracks on the scene's ground."""
     shapes, stretch, knots = tracks.shapes, tracks.stretch, tracks.knots
     middle, yaw, travelled = tracks.middle, tracks.yaw, tracks.travelled
     ends = np.concatenate([[0], np.cumsum(knots)])
@@ -150,17 +200,12 @@ def actors_on_ground(scene: Scene, tracks: Tracks, *, scale: float) -> Actors:
         roll[part] *= shape.kind not in _UPRIGHT and shape.kind not in _LEANING
         climb[part] = _rate(z[part])
     v = tracks.speed * scale
-    return actor_table(
-        shapes,
-        stretch,
-        knots=knots,
-        time_ns=np.round(tracks.step * STEP_S * 1e9).astype(np.int64),
-        position=np.column_stack([middle, z]),
-        angles=np.column_stack([yaw, pitch, roll]),
-        velocity=np.column_stack([v * np.cos(course), v * np.sin(course), climb]),
-        travelled=travelled,
-        parked=False,
-        scale=scale,
+    return Knots(
+        np.round(tracks.step * STEP_S * 1e9).astype(np.int64),
+        np.column_stack([middle, z]),
+        np.column_stack([yaw, pitch, roll]),
+        np.column_stack([v * np.cos(course), v * np.sin(course), climb]),
+        travelled,
     )
 
 

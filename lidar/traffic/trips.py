@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import shapely
@@ -73,31 +74,41 @@ VEHICLE_SHARES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Trip:
-    """One simulated road user and its path.
+class Course:
+    """The path of a trip, and how fast it is followed.
 
-    shape         : body
-    stretch       : scale factors of the body along x, y and z
-    path          : path, n stations
-    driver        : driver model
+    path          : n stations
     desired_speed : (n,) m/s at each station
-    begin         : station of the start
-    appear_s      : seconds after the drive's start at which it appears
-    leaves        : whether it disappears at the end of the path; otherwise it stops there
-    on_foot       : whether it is a pedestrian
     crossing      : of pedestrians: first station, last station and number of each crossing on the path
+    """
+
+    path: ActorPath
+    desired_speed: Float
+    crossing: Sequence[tuple[int, int, int]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Trip:
+    """One simulated road user. Its course is drawn when it is needed: those of a long drive fill memory.
+
+    shape    : body
+    stretch  : scale factors of the body along x, y and z
+    draw     : returns its course, the same at each call
+    driver   : driver model
+    begin    : station of the start
+    appear_s : seconds after the drive's start at which it appears
+    leaves   : whether it disappears at the end of the path; otherwise it stops there
+    on_foot  : whether it is a pedestrian
     """
 
     shape: Shape
     stretch: tuple[float, float, float]
-    path: ActorPath
+    draw: Callable[[], Course]
     driver: Driver
-    desired_speed: Float
     begin: int
     appear_s: float
     leaves: bool
     on_foot: bool = False
-    crossing: tuple[tuple[int, int, int], ...] = ()
 
     @property
     def length(self) -> float:
@@ -114,9 +125,9 @@ class Trip:
         """Wheelbase in metres: both axles stay on the path."""
         return self.shape.base * self.stretch[0]
 
-    def body(self) -> tuple[Float, Float]:
+    def body(self, path: ActorPath) -> tuple[Float, Float]:
         """Centre (n, 2) in scene metres and heading (n,) in radians of the body at each station."""
-        return body_poses(self.path, self.axle)
+        return body_poses(path, self.axle)
 
 
 def vehicle_trips(
@@ -198,26 +209,33 @@ def _trip(
         edges, picked = random_lanes(
             lanes, rng, edge=edge, lane=lane, metres=metres, inside=area.near, width=width
         )
-        whole = path_along_lanes(
+        drawn = partial(
+            path_along_lanes,
             lanes,
-            edges,
-            picked=picked,
+            tuple(edges),
+            picked=tuple(picked),
             width=width,
             radius=driver.min_radius,
             scale=area.scale,
             keeps_kerb=driver.keeps_kerb,
         )
+        whole = drawn()
         begin = int(at * float(lanes.graph.length[edge]) / STEP)
         first, last = _stations_on_carriageway(whole, shape, grow=grow, ground=ground, begin=begin)
         complete = len(whole) - last <= shape.length / STEP + 4
         if not complete or last - begin < _MIN_STATIONS:
             continue
-        path = whole.take(slice(first, last))
         end = edges[-1]
         leaves = bool(lanes.exit[end] or not area.near[end])
-        desired = speed_profile(path, driver, pace=pace)
-        return Trip(shape, grow, path, driver, desired, begin - first, span[0], leaves)
+        draw = partial(_course, drawn, slice(first, last), driver=driver, pace=pace)
+        return Trip(shape, grow, draw, driver, begin - first, span[0], leaves)
     return None
+
+
+def _course(whole: Callable[[], ActorPath], stations: slice, *, driver: Driver, pace: float) -> Course:
+    """The course along some stations of a path."""
+    path = whole().take(stations)
+    return Course(path, speed_profile(path, driver, pace=pace))
 
 
 def random_shape(kind: str, rng: np.random.Generator) -> Shape:

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.columns import Columns
+from geoscene.columns import Columns, row_blocks
 from geoscene.mesh import Mesh
 from geoscene.typing import Float
+from lidar.geometry.poses import BLOCK_POSES, release, room
 from lidar.world.actor_shapes import Shape
 
 Region = tuple[float, float, float, float]
-
-_AGE = 1 << 50
-"""Offset in nanoseconds between the concatenated time axes of two actors: 13 days."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +33,10 @@ class Actors(Columns):
     stretch : (n, 3) scale factors along x, y and z from the body to the actor
     parked  : (n,) bool, it never moves
     feature : (n,) int32, feature number of the actor's points and pixels, above the scene's numbers
+    begin_ns, end_ns : (n,) int64, times of its first and last knot; a parked one is always there
     first   : (n + 1,) int64 rows of the knots below
 
-    Knots of each actor, times ascending; an actor exists from its first to its last knot, a parked one
-    always:
+    Knots of each actor, times ascending, for a long drive in files (see `lidar.geometry.poses.room`):
 
     time_ns  : (k,) int64, nanoseconds since the drive's start
     position : (k, 3) scene metres, centre of the bounding box, on the ground
@@ -57,6 +56,8 @@ class Actors(Columns):
     stretch: Float
     parked: NDArray[np.bool_]
     feature: NDArray[np.int32]
+    begin_ns: NDArray[np.int64]
+    end_ns: NDArray[np.int64]
     first: NDArray[np.int64]
     time_ns: NDArray[np.int64]
     position: Float
@@ -64,6 +65,14 @@ class Actors(Columns):
     velocity: Float
     travelled: Float
     scale: float
+
+    def release(self) -> None:
+        """Let go of the memory of knots in files; they are read again when needed."""
+        release(*(getattr(self, name) for name in KNOTS))
+
+
+KNOTS = ("time_ns", "position", "angles", "velocity", "travelled")
+"""Columns of `Actors` with a row for each knot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,9 +93,7 @@ class States(Columns):
 
 def existing_actors(actors: Actors, start_ns: int, *, end_ns: int) -> NDArray[np.int64]:
     """Actors (k,) that exist at some time of a span."""
-    begin = actors.time_ns[actors.first[:-1]]
-    end = actors.time_ns[actors.first[1:] - 1]
-    return np.flatnonzero(actors.parked | ((begin <= end_ns) & (end >= start_ns)))
+    return np.flatnonzero(actors.parked | ((actors.begin_ns <= end_ns) & (actors.end_ns >= start_ns)))
 
 
 def states(actors: Actors, rows: ArrayLike, *, time_ns: ArrayLike) -> States:
@@ -95,13 +102,9 @@ def states(actors: Actors, rows: ArrayLike, *, time_ns: ArrayLike) -> States:
     Cubic between knots in position (Hermite, with the knots' velocities), linear in angles.
     """
     which = np.asarray(rows, np.int64)
-    t = np.broadcast_to(np.asarray(time_ns, np.int64), which.shape)
     first, last = actors.first[which], actors.first[which + 1] - 1
-    axis = actors.time_ns + _AGE * np.repeat(np.arange(len(actors)), np.diff(actors.first))
-    t = np.clip(t, actors.time_ns[first], actors.time_ns[last])
-    low = np.clip(
-        np.searchsorted(axis, t + _AGE * which, side="right") - 1, first, np.maximum(last - 1, first)
-    )
+    t = np.clip(np.asarray(time_ns, np.int64), actors.begin_ns[which], actors.end_ns[which])
+    low = _knots_before(actors.time_ns, first, last, t)
     high = np.minimum(low + 1, last)
     span = np.maximum(actors.time_ns[high] - actors.time_ns[low], 1) * 1e-9
     w = ((t - actors.time_ns[low]) * 1e-9 / span)[:, None]
@@ -120,6 +123,22 @@ def states(actors: Actors, rows: ArrayLike, *, time_ns: ArrayLike) -> States:
         velocity,
         actors.travelled[low] + w[:, 0] * (actors.travelled[high] - actors.travelled[low]),
     )
+
+
+@njit(cache=True, nogil=True)
+def _knots_before(time_ns: Any, first: Any, last: Any, t: Any) -> Any:  # noqa: PLR0917 - compiled
+    """Rows (k,) of the knots at or before times (k,), of ``first`` to ``last``; the last only if alone."""
+    out = np.empty(len(first), np.int64)
+    for k in range(len(first)):
+        low, high = first[k], max(last[k], first[k] + 1)
+        while high - low > 1:
+            middle = (low + high) // 2
+            if time_ns[middle] <= t[k]:
+                low = middle
+            else:
+                high = middle
+        out[k] = low
+    return out
 
 
 def velocities(actors: Actors, time_ns: int) -> Float:
@@ -169,23 +188,25 @@ def actor_transforms(
     if which != "all":
         rows = rows[actors.parked[rows] == (which == "parked")]
     times = np.linspace(start_ns, end_ns, moments).astype(np.int64)
+    if region is not None:
+        rows = rows[_within(actors, rows, region=region, time_ns=int(times[0]))]
     k = len(rows)
     at = states(actors, np.repeat(rows, moments), time_ns=np.tile(times, k))
     turn = rotations(at.angles) * actors.stretch[np.repeat(rows, moments), None, :]
     turn[:, :2] *= actors.scale
     transform = np.concatenate([turn, at.position[:, :, None]], axis=2).reshape(k, moments, 3, 4)
     shape = poses_of(actors, rows, at=at.take(slice(None, None, moments)))
-    if region is not None:
-        x, y = transform[:, 0, :2, 3].T
-        reach = actors.size[rows, 0]
-        near = (
-            (x > region[0] - reach)
-            & (x < region[2] + reach)
-            & (y > region[1] - reach)
-            & (y < region[3] + reach)
-        )
-        shape, transform, rows = shape[near], transform[near], rows[near]
     return shape.astype(np.int32), transform, actors.feature[rows]
+
+
+def _within(actors: Actors, rows: NDArray[np.int64], *, region: Region, time_ns: int) -> NDArray[np.bool_]:
+    """Whether (k,) actors are in a region at a time, or no further beyond it than they are long."""
+    x, y = states(actors, rows, time_ns=time_ns).position[:, :2].T
+    reach = actors.size[rows, 0]
+    inside: NDArray[np.bool_] = (
+        (x > region[0] - reach) & (x < region[2] + reach) & (y > region[1] - reach) & (y < region[3] + reach)
+    )
+    return inside
 
 
 def joined(groups: Sequence[Actors], *, first_feature: int) -> Actors:
@@ -201,10 +222,31 @@ def joined(groups: Sequence[Actors], *, first_feature: int) -> Actors:
         ]
     )
     knots = np.concatenate([np.diff(g.first) for g in groups])
-    return replace(
-        Actors.concatenate(groups),
+    each = {
+        name: np.concatenate([getattr(g, name) for g in groups])
+        for name in groups[0].columns()
+        if name not in (*KNOTS, "shape", "feature", "first")
+    }
+    every = {name: _end_to_end([getattr(g, name) for g in groups]) for name in KNOTS}
+    return Actors(
         shapes=tuple(shapes.values()),
         shape=shape,
         feature=(first_feature + np.arange(len(shape))).astype(np.int32),
         first=np.concatenate([[0], np.cumsum(knots)]).astype(np.int64),
+        scale=groups[0].scale,
+        **each,
+        **every,
     )
+
+
+def _end_to_end(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Arrays end to end, block by block where they are in files."""
+    count = sum(map(len, parts))
+    out = room((count, *parts[0].shape[1:]), parts[0].dtype)
+    to = 0
+    for part in parts:
+        for rows in row_blocks(len(part), BLOCK_POSES):
+            out[to + rows.start : to + rows.stop] = part[rows]
+            release(out, part)
+        to += len(part)
+    return out

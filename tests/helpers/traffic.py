@@ -1,10 +1,12 @@
 """A car, a flat frame, and the bodies of simulated traffic over time."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.lanes import STEP
-from lidar.traffic.sweep import body_poses, rectangles
+from lidar.traffic.sweep import rectangles
 
 CAR = load_vehicle("car")
 BOX = (CAR.length, CAR.width, CAR.length / 2 - CAR.rear_overhang)
@@ -22,7 +24,7 @@ def tracks(trips, flow):
     out = np.full((int(flow.step.max()) + 1, len(trips), 3), np.nan)
     for k in np.unique(flow.trip):
         rows = flow.trip == k
-        xy, heading = body_poses(trips[k].path, trips[k].axle)
+        xy, heading = trips[k].body(trips[k].draw().path)
         at = flow.travelled[rows] / STEP
         for c, column in enumerate((*xy.T, heading)):
             out[flow.step[rows], k, c] = np.interp(at, np.arange(len(xy)), column)
@@ -34,3 +36,9 @@ def boxes_at(trips, poses):
     length = np.array([trips[k].length for k in there])
     width = np.array([trips[k].width for k in there])
     return rectangles(poses[there, :2], poses[there, 2], length=length, width=width)
+
+
+def with_speed(trip, desired_speed):
+    """A trip with another desired speed (n,) at its stations."""
+    course = replace(trip.draw(), desired_speed=desired_speed)
+    return replace(trip, draw=lambda: course)

@@ -1,26 +1,29 @@
 """Built-in simulation: gaps, lanes, signals and the ego vehicle."""
 
 import itertools
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import shapely
 from helpers.roadgrids import grid, road_graph
-from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks
+from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks, with_speed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidar.geometry import poses
 from lidar.geometry.poses import Trajectory
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
 from lidar.planning.route import RouteOptions, plan_route
+from lidar.traffic import simulation_windows
+from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.traffic.lanes import STEP, lane_shift, lanes_of, random_lanes
-from lidar.traffic.simulation import STEP_S, ego_motion, green_windows, simulate_trips
-from lidar.traffic.simulation_kernel import HARD
+from lidar.traffic.simulation import ego_motion, green_windows, simulate_ego, simulate_trips
+from lidar.traffic.simulation_kernel import HARD, STEP_S
 from lidar.traffic.surroundings import surroundings_of
-from lidar.traffic.sweep import body_poses, rectangles
+from lidar.traffic.sweep import rectangles
 from lidar.traffic.trips import vehicle_trips
 
 
@@ -97,9 +100,8 @@ def test_reckless_drivers_do_not_collide():
     trips = vehicle_trips(lanes, surroundings_of(lanes, ego, radius=600.0, scale=1.0), seed=9, density=30.0)
     wild = [
         replace(
-            t,
+            with_speed(t, 0 * t.draw().desired_speed + 16.0),
             driver=replace(t.driver, headway=0.0, gap=0.0, deceleration=50.0, acceleration=4.0),
-            desired_speed=0 * t.desired_speed + 16.0,
         )
         for t in trips
     ]
@@ -109,6 +111,36 @@ def test_reckless_drivers_do_not_collide():
     for moment in tracks(wild, flow)[::2]:
         assert overlaps(boxes_at(wild, moment)) == 0
     assert flow.speed.max() > 14.0
+
+
+@pytest.mark.parametrize(("seed", "steps"), [(1, 37), (2, 100)])
+def test_the_simulation_does_not_depend_on_its_windows(monkeypatch, seed, steps):
+    """Tables of a short window hold the road users of that time; nobody moves otherwise, the ego included."""
+    graph, most = city(signalised=True), []
+    ego = driving(graph, seed, 90.0)
+    route = plan_route(graph, Plane(), spec="random", options=RouteOptions(seed=seed, duration=90.0))
+    own = ego_trip(plan_path(route, CAR, frame=Plane()), CAR)
+    numbered = simulation_windows.Simulation._numbered
+
+    def counted(self, rows, tables, *, known):
+        most.append(len(rows))
+        return numbered(self, rows, tables, known=known)
+
+    monkeypatch.setattr(simulation_windows.Simulation, "_numbered", counted)
+    found = []
+    for window in (10_000, steps):
+        monkeypatch.setattr(simulation_windows, "_STEPS", window)
+        monkeypatch.setattr(poses, "_IN_MEMORY", 10_000 if window == steps else 10**9)  # in files
+        most.clear()
+        trips, flow, plan = flow_on(graph, ego, seed=seed, radius=60.0)
+        far = simulate_ego(own, trips, graph=graph, plan=plan, seconds=90.0, radius=60.0)
+        found.append((flow, far, max(most)))
+    (one, alone, everyone), (other, windowed, some) = found
+    assert len(np.unique(one.trip)) > 15
+    for name in (f.name for f in fields(one)):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(alone, windowed)
+    assert some < 0.7 * everyone
 
 
 def test_speed_changes_within_the_limits_of_the_vehicle():
@@ -192,13 +224,13 @@ def test_no_road_user_enters_a_junction_on_red():
     entered = 0
     for k in np.unique(flow.trip):
         rows = flow.trip == k
-        zone = zone_at(plan.zones, trips[k].path.xyz[:, :2])
+        zone = zone_at(plan.zones, trips[k].draw().path.xyz[:, :2])
         station = (flow.travelled[rows] + trips[k].length / 2) / STEP
         front = np.minimum(station, len(zone) - 1).astype(int)
         here = zone[front]
         for i in np.flatnonzero((np.diff(here) != 0) & (here[1:] >= 0)):
             z = int(here[i + 1])
-            group = signal_group(plan, z, heading=float(trips[k].path.heading[front[i]]))
+            group = signal_group(plan, z, heading=float(trips[k].draw().path.heading[front[i]]))
             t = float(flow.step[rows][i + 1]) * STEP_S
             # green now, or it entered on green and is within amber and clearing
             lately = [is_green(z, group, t - ago, plan.signals) for ago in np.arange(0.0, AMBER, 0.5)]
@@ -228,11 +260,11 @@ def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
         trips = vehicle_trips(lanes, area, seed=1, density=10.0, ground=road)
         assert len(trips) > 10
         for trip in trips:
-            xy, heading = body_poses(trip.path, trip.axle)
+            xy, heading = trip.body(trip.draw().path)
             assert shapely.covers(road, rectangles(xy, heading, length=trip.length, width=trip.width)).all()
-            line = shapely.LineString(graph.geometry[trip.path.edge[trip.begin]][:, :2])
-            ring = shapely.LinearRing([*line.coords, trip.path.xyz[trip.begin, :2]])
-            if abs(trip.path.curvature[trip.begin]) < 1e-3:
+            line = shapely.LineString(graph.geometry[trip.draw().path.edge[trip.begin]][:, :2])
+            ring = shapely.LinearRing([*line.coords, trip.draw().path.xyz[trip.begin, :2]])
+            if abs(trip.draw().path.curvature[trip.begin]) < 1e-3:
                 assert ring.is_ccw == (sign < 0)
 
 
