@@ -16,7 +16,7 @@ from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, rounded
 from lidar.traffic.surroundings import Surroundings
-from lidar.traffic.trips import Course, Driver, Trip, random_shape, random_stretch
+from lidar.traffic.trips import Course, Drawings, Driver, Trip, random_shape, random_stretch
 
 _KINDS = {"adult": 0.5, "small_adult": 0.38, "child": 0.12}
 _FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}
@@ -101,7 +101,7 @@ def pedestrian_trips(
     metres = np.array([polylines.length(line) for line in walks.line])
     crossings = _crossings(lanes, walks)
     names, chance = list(_KINDS), np.array(list(_KINDS.values()))
-    trips = []
+    trips, drawings = [], Drawings()
     for number in range(round(density * float(metres.sum()) / 1000)):
         rng = generator(seed, "traffic", "walker", number)
         walk = int(rng.choice(len(metres), p=metres / metres.sum()))
@@ -120,7 +120,7 @@ def pedestrian_trips(
                 side=lanes.side,
                 rng=rng,
             )
-            draw = partial(_course, line, over, pace=pace, scale=area.scale)
+            draw = partial(drawings.of, partial(_course, line, over, pace=pace, scale=area.scale))
             trips.append(Trip(shape, grow, draw, _WALK, 0, start, leaves=False, on_foot=True))
     return trips
 

@@ -16,6 +16,8 @@ from lidar.traffic.surroundings import Surroundings, entrances
 from lidar.traffic.sweep import body_poses, rectangles
 from lidar.world.actor_shapes import PAINTS, Shape, catalogue
 
+_STATIONS = 1 << 19
+"""Stations of courses that are kept in memory: 40 MB."""
 _LATERAL = 2.0  # m/s^2, comfortable lateral acceleration in bends
 _TRIES = 5  # paths tried for a vehicle until one stays on the carriageway
 _MIN_STATIONS = 40  # of a path
@@ -87,6 +89,24 @@ class Course:
     crossing: Sequence[tuple[int, int, int]] = ()
 
 
+class Drawings:
+    """Courses and the functions that draw them; those drawn last are kept, up to `_STATIONS` in total."""
+
+    def __init__(self) -> None:
+        self._kept: dict[Callable[[], Course], Course] = {}
+        self._stations = 0
+
+    def of(self, draw: Callable[[], Course]) -> Course:
+        """The course that a function draws, the same at each call."""
+        course = self._kept.get(draw)
+        if course is None:
+            course = self._kept[draw] = draw()
+            self._stations += len(course.path)
+            while self._stations > _STATIONS and len(self._kept) > 1:
+                self._stations -= len(self._kept.pop(next(iter(self._kept))).path)
+        return course
+
+
 @dataclass(frozen=True, slots=True)
 class Trip:
     """One simulated road user. Its course is drawn when it is needed: those of a long drive fill memory.
@@ -151,15 +171,13 @@ def vehicle_trips(
     used = np.flatnonzero(metres)
     metres, name = metres[used], "+".join(shares)
     trips: list[Trip | None] = []
+    make = partial(_trip, lanes, area, drawings=Drawings(), shares=shares, ground=ground)
     for number in range(round(density * float(metres.sum()) / 1000)):
         rng = generator(seed, "traffic", name, number)
         edge, at = int(rng.choice(used, p=metres / metres.sum())), rng.random()
         where = shapely.line_interpolate_point(area.lines[edge], at, normalized=True)
         spans = area.visits(shapely.get_coordinates(where)[0])
-        trips += [
-            _trip(lanes, area, rng=rng, shares=shares, place=(edge, at), span=span, ground=ground)
-            for span in spans
-        ]
+        trips += [make(rng=rng, place=(edge, at), span=span) for span in spans]
     for wave in range(int(area.time[-1] / _WAVE_S)):
         begin = wave * _WAVE_S
         for edge, at in entrances(lanes, area, t=begin):
@@ -171,9 +189,7 @@ def vehicle_trips(
                 t = begin + rng.random() * _WAVE_S
                 where = shapely.line_interpolate_point(area.lines[edge], at, normalized=True)
                 span = (t, area.until(shapely.get_coordinates(where)[0], t))
-                trips.append(
-                    _trip(lanes, area, rng=rng, shares=shares, place=(edge, at), span=span, ground=ground)
-                )
+                trips.append(make(rng=rng, place=(edge, at), span=span))
     return [trip for trip in trips if trip is not None]
 
 
@@ -181,6 +197,7 @@ def _trip(
     lanes: Lanes,
     area: Surroundings,
     *,
+    drawings: Drawings,
     rng: np.random.Generator,
     shares: dict[str, float],
     place: tuple[int, float],
@@ -227,7 +244,8 @@ def _trip(
             continue
         end = edges[-1]
         leaves = bool(lanes.exit[end] or not area.near[end])
-        draw = partial(_course, drawn, slice(first, last), driver=driver, pace=pace)
+        course = partial(_course, drawn, slice(first, last), driver=driver, pace=pace)
+        draw = partial(drawings.of, course)
         return Trip(shape, grow, draw, driver, begin - first, span[0], leaves)
     return None
 

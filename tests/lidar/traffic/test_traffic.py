@@ -17,6 +17,7 @@ from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
 from lidar.planning.route import RouteOptions, plan_route
 from lidar.traffic import simulation_windows
+from lidar.traffic import trips as trips_module
 from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.traffic.lanes import STEP, lane_shift, lanes_of, random_lanes
@@ -141,6 +142,18 @@ def test_the_simulation_does_not_depend_on_its_windows(monkeypatch, seed, steps)
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     np.testing.assert_array_equal(alone, windowed)
     assert some < 0.7 * everyone
+
+
+def test_courses_are_drawn_again_when_more_were_drawn_since(monkeypatch):
+    monkeypatch.setattr(trips_module, "_STATIONS", 1000)
+    trips, _, _ = flow_on(city(signalised=False), standing((400.0, 400.0), 20.0), seed=3, radius=600.0)
+    first = [trip.draw() for trip in trips]
+    assert sum(len(course.path) for course in first) > 5000
+    assert trips[-1].draw() is first[-1]
+    again = trips[0].draw()
+    assert again is not first[0]
+    np.testing.assert_array_equal(again.path.xyz, first[0].path.xyz)
+    np.testing.assert_array_equal(again.desired_speed, first[0].desired_speed)
 
 
 def test_speed_changes_within_the_limits_of_the_vehicle():
