@@ -481,7 +481,7 @@ def _print_scene(report: dict[str, Any]) -> None:
         rows["along"] = (
             f"{len(report['tiles'])} tiles are built, those {part}; solids, watertight,"
             " trees in forests and ground count these tiles, all other figures the whole map;"
-            f" tables hold {sum(report['cut']['rows'].values())} of {features} features"
+            f" tables hold {sum(report['rows'].values())} of {features} features"
         )
     if use != "all":
         rows[f"for {use}"] = f"{USES[use].contents}; left out: {_left_out_text(report['left_out'])}"

@@ -52,7 +52,7 @@ def ground_layer(name: str, ground: Layers) -> Layer:
         ground.polygon,
         _columns(
             ground,
-            "osm_id class material priority source",
+            "feature osm_id class material priority source",
             **{"class": class_names(ground.klass)},
             material=material_names(ground.material),
         ),
@@ -75,7 +75,7 @@ def tree_layer(trees: Trees, z: NDArray[np.float64]) -> Layer:
     """Layer ``trees``: mapped trees and those of tree rows, as points at the foot of the trunk."""
     columns = _columns(
         trees,
-        "osm_id height height_source crown crown_source trunk form form_source place_source moved",
+        "feature osm_id height height_source crown crown_source trunk form form_source place_source moved",
     )
     return Layer("trees", shapely.points(np.column_stack([trees.xy, z])), columns)
 
@@ -83,7 +83,7 @@ def tree_layer(trees: Trees, z: NDArray[np.float64]) -> Layer:
 def furniture_layer(furniture: Furniture, z: NDArray[np.float64]) -> Layer:
     """Layer ``furniture``: positions of lamps, signals, signs, benches and similar objects."""
     columns = _columns(
-        furniture, "osm_id shape height height_source heading heading_source place_source moved"
+        furniture, "feature osm_id shape height height_source heading heading_source place_source moved"
     )
     return Layer("furniture", shapely.points(np.column_stack([furniture.xy, z])), columns)
 
@@ -92,7 +92,7 @@ def barrier_layer(barriers: Barriers) -> Layer:
     """Layer ``barriers``: walls, fences and hedges in plan."""
     columns = _columns(
         barriers,
-        "osm_id class material height height_source width_source",
+        "feature osm_id class material height height_source width_source",
         **{"class": class_names(barriers.klass)},
         material=material_names(barriers.material),
     )

@@ -85,6 +85,7 @@ def build(
         writer.finish(
             frame=plan.frame,
             layers=plan.layers,
+            ranges=plan.ranges,
             graph=plan.graph,
             kept=plan.kept,
             shapes=shapes() if plan.use.tiles else {},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar, cast
 
@@ -30,27 +30,30 @@ from geoscene.ground import (
     joined,
     landcover,
     plan_ground,
+    tile_span,
     water_levels,
 )
 from geoscene.ground.foundations import foundation_heights
 from geoscene.ground.relief import Relief
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.ground.urban import paved_fabric
-from geoscene.objects.barriers import Barriers, read_barriers
+from geoscene.objects.barriers import Barriers, open_barriers, read_barriers
 from geoscene.objects.forests import Forests
-from geoscene.objects.furniture import Furniture, read_furniture
+from geoscene.objects.furniture import Furniture, mapped_furniture, read_furniture
 from geoscene.objects.vegetation import Trees, clear_of, read_trees
 from geoscene.options import BuildOptions
 from geoscene.progress import Progress
-from geoscene.reach import AreaOf, Reach, RoadMap, all_tiles
+from geoscene.reach import AROUND, AreaOf, Reach, RoadMap, all_tiles, tile_boxes
 from geoscene.report import Problem
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
+from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
 from geoscene.roadgraph.driving_side import Side
 from geoscene.roadgraph.driving_side import driving_side as found_side
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
-from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, road_surfaces
+from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, carriageway_boxes, road_surfaces
 from geoscene.scene.geopackage import Layer
+from geoscene.scene.writer import number_ranges
 from geoscene.sources import OsmData
 from geoscene.structures import (
     Structures,
@@ -75,6 +78,7 @@ _ROAD_LINES = 10.0  # metres between the lines at which ground graded to roads c
 _ROAD_REACH = 25.0  # metres, maximum distance from a centre line of ground that is graded to the road
 _MARGIN = 10.0  # metres of ground added on both sides of maps narrower than twice that
 _ARM = 10.0  # metres, maximum horizontal extent of lamps and signals from their position
+_MOVED = 40.0  # metres, more than trees and furniture are moved by and keep from other features
 _RAISED = 1.0  # metres, minimum height of an underside for a building to have no pad
 
 
@@ -100,7 +104,9 @@ class Plan:
     structures : bridges and tunnels
     openings  : area of each structure where the ground is left out, None for most
     use       : what of the scene is written
-    layers    : feature tables in the order of feature numbers
+    layers    : feature tables in the order of feature numbers; those of objects and surfaces far from a route
+                are not complete
+    ranges    : range [start, stop) of the feature numbers of each table
     chosen    : tiles to build, sorted: all, or those in reach of a route
     kept      : rows of each of ``layers`` that tables on disk hold, None for all
     area      : polygon that the scene is built for, in place of a route; None without
@@ -125,6 +131,7 @@ class Plan:
     openings: NDArray[np.object_]
     use: Use
     layers: list[Layer]
+    ranges: dict[str, tuple[int, int]]
     chosen: list[tuple[int, int]]
     kept: dict[str, NDArray[np.int64]] | None
     area: Any | None = None
@@ -163,8 +170,7 @@ def make_plan(
     frame = replace(frame, vertical=terrain.vertical)
 
     progress("roads", 0, total=0)
-    roads = _plan_roads(osm, frame, options=options, terrain=terrain, extent=extent, problems=problems)
-    footprints = buildings.footprint[: buildings.count]
+    roads = _plan_roads(osm, frame, options=options, terrain=terrain, problems=problems)
     reach, area = Reach.of(options, roads.graph, frame=frame), None
     if needed is not None:
         area = needed(
@@ -173,7 +179,7 @@ def make_plan(
                 frame,
                 extent,
                 roads.graph if len(roads.graph) else None,
-                footprints,
+                buildings.footprint[: buildings.count],
                 buildings.min_height[: buildings.count],
                 left_hand=roads.side == "left",
             )
@@ -181,67 +187,39 @@ def make_plan(
         reach = Reach.within(area)
 
     progress("ground", 0, total=0)
-    cover, surfaces, pads = _collect(
-        problems, _surfaces(osm, frame, extent=extent, buildings=buildings, roads=roads, only=options.only)
-    )
-    openings = opening_layers(roads.structures, roads.openings)
-    covers = Layers.concatenate([cover, surfaces, pads, openings])
-    levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
-    cover, surfaces = _numbered([cover, surfaces], len(buildings))
-    covers = Layers.concatenate([cover, surfaces, pads, openings])
-    ground = _plan_ground(covers, roads, extent=extent, terrain=terrain, options=options)
-    objects = _collect(problems, _objects(osm, frame, ground=ground, only=options.only, side=roads.side))
-    first = len(buildings) + len(cover) + len(surfaces) + len(roads.graph)
-    trees, furniture, barriers, structures = _numbered([*objects, roads.structures], first)
-
-    shapes = {
-        "buildings": footprints,
-        "parts": footprints[buildings.outline[buildings.count :]],
-        "trees": shapely.points(trees.xy),
-        "furniture": shapely.points(furniture.xy),
-        "barriers": barriers.polygon,
-        "structures": structures.polygon,
-    }
-    rows = {kind: _by_tile(column, options.tile_size) for kind, column in shapes.items()}
-    rows["parts"] = {tile: buildings.count + parts for tile, parts in rows["parts"].items()}
-    ground = joined(ground, set().union(*rows.values()))
-
-    chosen, kept = all_tiles(ground, rows), None
+    place = _Place(osm, frame, extent, terrain, buildings, roads, options)
+    local = _collect(problems, _in_reach(place, reach))
+    cover, surfaces, structures = local.cover, local.surfaces, local.structures
+    trees, furniture, barriers = local.trees, local.furniture, local.barriers
+    ground, rows = local.ground, local.rows
+    footprints = buildings.footprint[: buildings.count]
+    chosen, kept = local.chosen, None
     if reach is not None:
-        shapes |= {
-            "buildings": buildings.footprint,
-            "parts": buildings.footprint,
-            "landcover": cover.polygon,
-            "road_surfaces": surfaces.polygon,
-            "roads": edge_lines(roads.graph),
-        }
-        beyond = {"trees": trees.crown / 2, "furniture": _ARM}
-        chosen = reach.tiles(ground, rows=rows, shapes=shapes, beyond=beyond)
-        kept = reach.rows(shapes, tiles=chosen, ground=ground, rows=rows, buildings=buildings)
+        kept = reach.rows(local.shapes, tiles=chosen, ground=ground, rows=rows, buildings=buildings)
         if needed is not None:
             kept["roads"] = np.arange(len(roads.graph))
     standing = np.arange(buildings.count) if kept is None else kept["buildings"]
     base, foot = np.full((2, buildings.count), np.nan)
-    base[standing] = base_heights(footprints[standing], roads.height)
+    base[standing] = base_heights(footprints[standing], local.height)
     foot[standing] = foundation_heights(
-        footprints[standing], base[standing], height=roads.height, layers=covers, levels=levels
+        footprints[standing], base[standing], height=local.height, layers=ground.layers, levels=local.levels
     )
-    buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=roads.structures))
+    buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=structures))
 
     layers = [
         *building_layers(buildings, base),
         ground_layer("landcover", cover),
         ground_layer("road_surfaces", surfaces),
         road_layer(roads.graph),
-        tree_layer(trees, _foot(trees.xy, roads.height)),
-        furniture_layer(furniture, _foot(furniture.xy, roads.height)),
+        tree_layer(trees, _foot(trees.xy, local.height)),
+        furniture_layer(furniture, _foot(furniture.xy, local.height)),
         barrier_layer(barriers),
         structure_layer(structures),
     ]
     plan = Plan(
         frame=frame,
         terrain=terrain,
-        height=roads.height,
+        height=local.height,
         buildings=buildings,
         base=base,
         foot=foot,
@@ -251,15 +229,16 @@ def make_plan(
         ground=ground,
         chosen=chosen,
         kept=kept,
-        levels=levels,
+        levels=local.levels,
         trees=trees,
         forests=Forests.of(ground.layers, osm) if "trees" in options.only else None,
         furniture=furniture,
         barriers=barriers,
         structures=structures,
-        openings=roads.openings,
+        openings=local.openings,
         use=USES[options.use],
         layers=layers,
+        ranges=local.ranges,
         area=area,
     )
     return plan, problems
@@ -286,15 +265,14 @@ def _checked_centre(osm: OsmData) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class _Roads:
-    """Roads of a scene and the ground graded to them; see `Plan` for the columns.
+    """Roads of a map and the ground graded to them.
 
+    height : z of the graded ground, None if it is 0 everywhere
     uneven : the ground or a road has heights other than 0
     """
 
     graph: RoadGraph
-    surfaces: RoadSurfaces
-    structures: Structures
-    openings: NDArray[np.object_]
+    carriageways: Carriageways
     side: Side
     side_source: str
     height: Height | None
@@ -302,16 +280,10 @@ class _Roads:
 
 
 def _plan_roads(
-    osm: OsmData,
-    frame: Frame,
-    *,
-    options: BuildOptions,
-    terrain: Terrain,
-    extent: Bounds,
-    problems: list[Problem],
+    osm: OsmData, frame: Frame, *, options: BuildOptions, terrain: Terrain, problems: list[Problem]
 ) -> _Roads:
-    """Road graph with heights, road surfaces, bridges and tunnels."""
-    mapped = osm if "roads" in options.only else replace(osm, areas=[], ways=[], relations=[], points=[])
+    """Road graph with heights, and carriageways."""
+    mapped = _only_roads(osm, options)
     graph = _collect(problems, build_road_graph(mapped, frame))
     graph = profile(graph, terrain.height, obstacles=find_obstacles(osm, frame))
     uneven = bool(terrain.grids) or any(line[:, 2].any() for line in graph.geometry)
@@ -319,13 +291,169 @@ def _plan_roads(
     side, source = found_side(osm)
     if options.driving_side:
         side, source = cast("Side", options.driving_side), "option"
-    surfaces = road_surfaces(mapped, graph, frame=frame, options=SurfaceOptions(left_hand=side == "left"))
-    structures = _collect(problems, read_structures(surfaces, graph, osm=osm, frame=frame, height=height))
-    structures = within_extent(structures, extent)
-    height = ground_below(structures, height or terrain.height) if len(structures) else height
-    return _Roads(
-        graph, surfaces, structures, find_openings(structures, height), side, source, height, uneven
+    sidewalks = SurfaceOptions().sidewalks
+    carriageways = read_carriageways(mapped, frame, sidewalks=sidewalks, left_hand=side == "left")
+    return _Roads(graph, carriageways, side, source, height, uneven)
+
+
+def _only_roads(osm: OsmData, options: BuildOptions) -> OsmData:
+    """The map that roads are read from: without features if the scene has none."""
+    return osm if "roads" in options.only else replace(osm, areas=[], ways=[], relations=[], points=[])
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """What is planned of the whole map."""
+
+    osm: OsmData
+    frame: Frame
+    extent: Bounds
+    terrain: Terrain
+    buildings: Buildings
+    roads: _Roads
+    options: BuildOptions
+
+
+@dataclass(frozen=True, slots=True)
+class _Local:
+    """What is planned near a route, or everywhere; see `Plan` for the columns.
+
+    shapes : of all features by kind
+    """
+
+    cover: Layers
+    surfaces: Layers
+    structures: Structures
+    openings: NDArray[np.object_]
+    height: Height | None
+    levels: WaterLevels
+    ground: GroundPlan
+    trees: Trees
+    furniture: Furniture
+    barriers: Barriers
+    shapes: dict[str, NDArray[np.object_]]
+    rows: dict[str, dict[tuple[int, int], NDArray[np.int64]]]
+    chosen: list[tuple[int, int]]
+    ranges: dict[str, tuple[int, int]]
+
+
+def _in_reach(place: _Place, reach: Reach | None) -> tuple[_Local, list[Problem]]:
+    """Surfaces, structures and objects of all tiles in reach, and what was repaired or dropped."""
+    if reach is None:
+        return _plan_within(place, None, area=None)
+    size = place.options.tile_size
+    area = reach.surroundings(size, extent=place.extent)
+    while True:
+        local, problems = _plan_within(place, reach, area=area)
+        # A tile far away may be chosen for what extends from it into the reach; joined tiles are empty.
+        boxes = tile_boxes(
+            local.ground, [t for t in local.chosen if tile_span(local.ground, t[0], j=t[1]) == 1]
+        )
+        around = shapely.buffer(boxes, AROUND, join_style="mitre")
+        beyond = around[~shapely.covers(area, around)]
+        if not len(beyond):
+            return local, problems
+        area = shapely.union_all([area, *beyond])
+
+
+def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tuple[_Local, list[Problem]]:
+    """What is planned within an area, or everywhere."""
+    osm, frame, extent, roads, options = place.osm, place.frame, place.extent, place.roads, place.options
+    buildings, terrain = place.buildings, place.terrain
+    footprints = buildings.footprint[: buildings.count]
+    problems: list[Problem] = []
+    made = road_surfaces(
+        _only_roads(osm, options),
+        roads.graph,
+        frame=frame,
+        roads=roads.carriageways,
+        options=SurfaceOptions(left_hand=roads.side == "left"),
+        area=area,
     )
+    structures = _collect(
+        problems, read_structures(made, roads.graph, osm=osm, frame=frame, height=roads.height, area=area)
+    )
+    structures = within_extent(structures, extent)
+    height = roads.height
+    if len(structures):
+        height = ground_below(structures, height or terrain.height)
+    openings = find_openings(structures, height)
+
+    cover, surfaces, pads = _collect(
+        problems, _surfaces(osm, frame, extent=extent, buildings=buildings, made=made, only=options.only)
+    )
+    found = _collect(problems, _objects(osm, frame, extent=extent, only=options.only))
+    ranges = number_ranges(
+        {
+            "buildings": buildings.count,
+            "building_parts": len(buildings) - buildings.count,
+            "landcover": len(cover),
+            "road_surfaces": made.count,
+            "roads": len(roads.graph),
+            **{name: count for name, (_, _, count) in found.items()},
+            "structures": len(structures),
+        }
+    )
+    cover, surfaces = (
+        replace(table, feature=table.feature + np.int32(ranges[name][0]))
+        for name, table in (("landcover", cover), ("road_surfaces", surfaces))
+    )
+    structures = replace(structures, feature=np.arange(*ranges["structures"], dtype=np.int32))
+    low = opening_layers(structures, openings)
+    covers = Layers.concatenate([cover, surfaces, pads, low])
+    levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
+    ground = _plan_ground(covers, roads, extent=extent, terrain=terrain, options=options)
+    trees, furniture, barriers = (
+        replace(table, feature=table.feature + np.int32(ranges[name][0]))
+        for name, table in _sited(osm, frame, ground=ground, found=found, side=roads.side, problems=problems)
+    )
+
+    shapes = {
+        "buildings": footprints,
+        "parts": footprints[buildings.outline[buildings.count :]],
+        "trees": shapely.points(trees.xy),
+        "furniture": shapely.points(furniture.xy),
+        "barriers": barriers.polygon,
+        "structures": structures.polygon,
+    }
+    rows = {kind: _by_tile(column, options.tile_size) for kind, column in shapes.items()}
+    rows["parts"] = {tile: buildings.count + parts for tile, parts in rows["parts"].items()}
+    boxes = np.concatenate(
+        [
+            carriageway_boxes(roads.carriageways),
+            *(boxes for _, boxes, _ in found.values()),
+            shapely.bounds(structures.polygon).reshape(-1, 4),
+        ]
+    )
+    ground = joined(ground, {*rows["buildings"], *rows["parts"], *_squares(boxes, options.tile_size)})
+
+    chosen = all_tiles(ground, rows)
+    if reach is not None:
+        shapes |= {
+            "buildings": buildings.footprint,
+            "parts": buildings.footprint,
+            "landcover": cover.polygon,
+            "road_surfaces": surfaces.polygon,
+            "roads": edge_lines(roads.graph),
+        }
+        beyond = {"trees": trees.crown / 2, "furniture": _ARM}
+        chosen = reach.tiles(ground, rows=rows, shapes=shapes, beyond=beyond)
+    return _Local(
+        cover,
+        surfaces,
+        structures,
+        openings,
+        height,
+        levels,
+        ground,
+        trees,
+        furniture,
+        barriers,
+        shapes,
+        rows,
+        chosen,
+        ranges,
+    ), problems
 
 
 def _plan_ground(
@@ -367,11 +495,10 @@ def _surfaces(
     *,
     extent: Bounds,
     buildings: Buildings,
-    roads: _Roads,
+    made: RoadSurfaces,
     only: Collection[str],
 ) -> tuple[tuple[Layers, Layers, Layers], list[Problem]]:
-    """Land cover, road surfaces and building pads, as layers of the ground."""
-    surfaces = roads.surfaces
+    """Land cover, road surfaces and building pads, as layers of the ground; numbers from 0 in each."""
     problems: list[Problem] = []
     count = buildings.count
     footprints = buildings.footprint[:count]
@@ -380,38 +507,78 @@ def _surfaces(
         cover, found = landcover(osm, frame, extent=extent)
         parts.append(cover)
         problems += found
+    first = np.flatnonzero(np.diff(made.number, prepend=-1))  # of the parts of each shape
+    surfaces = made.take(first)
     paved = Layers.of(
-        surfaces.polygon,
+        _together(made.polygon, first),
         klass=surfaces.klass,
         material=surfaces.material,
         priority=surfaces.priority,
         osm_id=surfaces.osm_id,
         source=surfaces.source,
+        feature=surfaces.number,
     )
     on_ground = footprints.copy()
     on_ground[buildings.min_height[:count] >= _RAISED] = None
     pads = building_pads(
         on_ground, osm_id=buildings.osm_id[:count].astype(str), feature=np.arange(count, dtype=np.int32)
     )
-    return (Layers.concatenate(parts), paved, pads), problems
+    cover = Layers.concatenate(parts)
+    return (replace(cover, feature=np.arange(len(cover), dtype=np.int32)), paved, pads), problems
+
+
+def _together(polygons: NDArray[np.object_], first: NDArray[np.int64]) -> NDArray[np.object_]:
+    """Shapes of parts that follow each other, given each one's first: polygons if they have one part."""
+    shapes = polygons[first]
+    sizes = np.diff(first, append=len(polygons))
+    for k in np.flatnonzero(sizes > 1).tolist():
+        shapes[k] = shapely.MultiPolygon(polygons[first[k] : first[k] + sizes[k]].tolist())
+    return shapes
 
 
 def _objects(
-    osm: OsmData, frame: Frame, *, ground: GroundPlan, only: Collection[str], side: Side
-) -> tuple[list[Any], list[Problem]]:
-    """Trees, furniture and barriers, moved off carriageways; empty tables for kinds not in ``only``."""
+    osm: OsmData, frame: Frame, *, extent: Bounds, only: Collection[str]
+) -> tuple[dict[str, tuple[Any, Float, int]], list[Problem]]:
+    """What is mapped of trees, furniture and barriers, by kind; nothing of kinds not in ``only``.
+
+    These are a table of the objects before they are sited (None for furniture), boxes (n, 4) within which
+    they will stand, and the count of their feature numbers.
+    """
     trees, problems = read_trees(osm, frame)
-    trees, moved = clear_of(ground, trees)
-    found: dict[str, tuple[Any, list[Problem]]] = {
-        "trees": (trees, problems + moved),
-        "furniture": read_furniture(osm, frame, plan=ground, left_hand=side == "left"),
-        "barriers": read_barriers(osm, frame, plan=ground),
+    barriers, more = read_barriers(osm, frame, extent=extent)
+    posts = mapped_furniture(osm, frame, extent=extent)[1]
+    around = np.array([-_MOVED, -_MOVED, _MOVED, _MOVED])
+    found: dict[str, tuple[Any, Float, int]] = {
+        "trees": (trees, np.tile(trees.xy, 2) + around, len(trees)),
+        "furniture": (None, np.tile(posts, 2) + around, 2 * len(posts)),
+        "barriers": (barriers, shapely.bounds(barriers.polygon).reshape(-1, 4), len(barriers)),
     }
     none = np.empty(0, np.int64)
+    wanted = {"trees": problems, "furniture": [], "barriers": more}
     return (
-        [table if kind in only else table.take(none) for kind, (table, _) in found.items()],
-        [problem for kind, (_, problems) in found.items() if kind in only for problem in problems],
+        {
+            kind: row if kind in only else (row[0] and row[0].take(none), row[1][:0], 0)
+            for kind, row in found.items()
+        },
+        [problem for kind, some in wanted.items() if kind in only for problem in some],
     )
+
+
+def _sited(
+    osm: OsmData,
+    frame: Frame,
+    *,
+    ground: GroundPlan,
+    found: Mapping[str, tuple[Any, Float, int]],
+    side: Side,
+    problems: list[Problem],
+) -> list[tuple[str, Any]]:
+    """Trees, furniture and barriers, moved off carriageways, by name."""
+    trees = _collect(problems, clear_of(ground, found["trees"][0]))
+    given = osm if found["furniture"][2] else replace(osm, points=[])
+    furniture = _collect(problems, read_furniture(given, frame, plan=ground, left_hand=side == "left"))
+    barriers = _collect(problems, open_barriers(found["barriers"][0], ground))
+    return [("trees", trees), ("furniture", furniture), ("barriers", barriers)]
 
 
 def _graded_tiles(graph: RoadGraph, tile_size: float, *, level: bool) -> set[tuple[int, int]]:
@@ -426,13 +593,16 @@ def _graded_tiles(graph: RoadGraph, tile_size: float, *, level: bool) -> set[tup
     return {(int(i), int(j)) for i, j in np.unique(tiles, axis=0)}
 
 
-def _numbered(tables: Sequence[Any], first: int) -> list[Any]:
-    """The tables with consecutive feature numbers, starting at ``first``."""
-    starts = np.cumsum([first, *map(len, tables)])
-    return [
-        replace(table, feature=np.arange(a, b, dtype=np.int32))
-        for table, a, b in zip(tables, starts[:-1], starts[1:], strict=True)
-    ]
+def _squares(boxes: Float, tile_size: float) -> set[tuple[int, int]]:
+    """Squares of the grid of tiles that boxes (n, 4) touch."""
+    low, high = (np.floor(corner / tile_size).astype(np.int64) for corner in (boxes[:, :2], boxes[:, 2:]))
+    span = high - low + 1
+    copies = span[:, 0] * span[:, 1]
+    box = np.repeat(np.arange(len(boxes)), copies)
+    nth = np.arange(len(box)) - np.repeat(np.cumsum(copies) - copies, copies)
+    down, across = np.divmod(nth, span[box, 0])
+    found = np.unique(low[box] + np.stack([across, down], axis=1), axis=0)
+    return {(i, j) for i, j in found.tolist()}
 
 
 def _foot(xy: Float, height: Height | None) -> Float:

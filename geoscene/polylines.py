@@ -12,6 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.typing import Float
 
+_UNITS = 2.0**30
+"""Units of stations per metre in which they are summed: a nanometre each."""
+
 
 def length(line: Float) -> float:
     """Length in plan."""
@@ -54,8 +57,9 @@ def heads(lines: NDArray[np.object_], end: Float) -> NDArray[np.object_]:
     first = np.flatnonzero(np.diff(of, prepend=-1))
     step = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
     step[first] = 0.0
-    along = np.cumsum(step)
-    along -= along[first][of]
+    # Sums of whole numbers are exact, so that a line's stations do not depend on the lines before it.
+    summed = np.cumsum(np.rint(step * _UNITS).astype(np.int64))
+    along = (summed - summed[first][of]) / _UNITS
     last = np.append(first[1:], len(of)) - 1
     end = np.minimum(end, along[last])
     # The cut is in the segment that ends in the first vertex beyond it.

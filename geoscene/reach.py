@@ -25,6 +25,9 @@ TABLE_MARGIN = 250.0
 """Metres beyond the sensors' reach that tables of features and the road graph hold: the default radius of
 traffic is 200 m."""
 
+AROUND = 50.0
+"""Metres around tiles and tables in which surfaces are planned: more than objects are moved by."""
+
 _OFFSET = 15.0
 """Metres, maximum distance of a sensor from the centre line of its road."""
 
@@ -83,6 +86,20 @@ class Reach:
         """What is in an area, a shapely polygon in scene metres."""
         shapely.prepare(area)
         return cls(area, 0.0)
+
+    def surroundings(self, tile_size: float, *, extent: Sequence[float]) -> Any:
+        """A polygon of squares around all that tables of features hold, and around most tiles in reach."""
+        far = self.metres + TABLE_MARGIN
+        low, high = np.array(extent[:2]), np.array(extent[2:])
+        box = np.array(shapely.bounds(self.line)) + far * np.array([-1, -1, 1, 1])
+        low, high = np.maximum(box[:2], low), np.minimum(box[2:], high)
+        first, last = np.floor(low / tile_size), high / tile_size
+        i, j = (axis.ravel() for axis in np.meshgrid(*map(np.arange, first, last)))
+        squares = shapely.box(i * tile_size, j * tile_size, (i + 1) * tile_size, (j + 1) * tile_size)
+        near = squares[shapely.dwithin(self.line, squares, far)]
+        area = shapely.union_all(shapely.buffer(near, AROUND, join_style="mitre"))
+        shapely.prepare(area)
+        return area
 
     def tiles(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -85,7 +86,7 @@ class Barriers(Columns):
     height_source, width_source : (n,) str: ``height``, ``width`` or ``default``; ``area`` where its shape is
                drawn
     osm_id   : (n,) str
-    feature  : (n,) int32, -1 for none
+    feature  : (n,) int32: as read, consecutive
     """
 
     polygon: NDArray[np.object_]
@@ -98,13 +99,12 @@ class Barriers(Columns):
     feature: NDArray[np.int32]
 
 
-def read_barriers(osm: OsmData, frame: Frame, *, plan: GroundPlan) -> tuple[Barriers, list[Problem]]:
-    """The mapped barriers within the ground's extent, and problems: what was changed or left out.
+def read_barriers(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Barriers, list[Problem]]:
+    """The mapped barriers within an extent, and problems: what was changed.
 
-    A line has its ``width`` or the default of its kind. It is open at gates on its nodes, on roads, crossings
-    and tracks, and within buildings.
+    A line has its ``width`` or the default of its kind. It is open at gates on its nodes.
     """
-    box = shapely.box(*plan.extent)
+    box = shapely.box(*extent)
     gates = _gates(osm)
     problems: list[Problem] = []
     rows: list[tuple[object, Kind, str, float, str, str, str]] = []
@@ -141,9 +141,13 @@ def read_barriers(osm: OsmData, frame: Frame, *, plan: GroundPlan) -> tuple[Barr
                 area.tags, area.osm_id, key="height", usual=kind.height, most=_HIGHEST, problems=problems
             )
             rows.append((shape, kind, _material(area.tags, kind), height, height_source, "area", area.osm_id))
-    table = _table(rows)
+    return _table(rows), problems
+
+
+def open_barriers(table: Barriers, plan: GroundPlan) -> tuple[Barriers, list[Problem]]:
+    """The barriers open on roads, crossings, tracks and in buildings; those of no area are left out."""
     polygon, opened = _with_openings(table.polygon, plan)
-    problems += [
+    problems = [
         Problem(str(osm_id), "barrier", "repaired", "across-road", "open where a road passes")
         for osm_id in table.osm_id[opened]
     ]
@@ -286,5 +290,5 @@ def _table(rows: list[tuple[object, Kind, str, float, str, str, str]]) -> Barrie
         np.array([row[4] for row in rows], np.str_),
         np.array([row[5] for row in rows], np.str_),
         np.array([row[6] for row in rows], np.str_),
-        np.full(len(rows), -1, np.int32),
+        np.arange(len(rows), dtype=np.int32),
     )

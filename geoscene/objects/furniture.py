@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +25,7 @@ from geoscene.typing import Bools, Float, Height, Ints
 
 _Stand = tuple[Float, float, str]
 """(place, heading, heading source)."""
-_Row = tuple[Float, float, str, str, float, str, str, str, Float]
+_Row = tuple[Float, float, str, str, float, str, str, str, Float, int]
 """A stand with (shape, height, height source, place source, id, where it is mapped)."""
 
 _TALLEST = 60.0
@@ -70,7 +71,7 @@ class Furniture(Columns):
     moved    : (n,) float64 metres from where it is mapped
     heading_source : (n,) str: ``direction`` (tag), ``road`` (towards its traffic or the road) or ``default``
     osm_id   : (n,) str
-    feature  : (n,) int32, -1 for none
+    feature  : (n,) int32: as read, twice the row of its node among `mapped_furniture`; a second post adds 1
     """
 
     xy: Float
@@ -104,15 +105,7 @@ def read_furniture(
 
     left_hand : traffic keeps left
     """
-    chosen = [
-        (point, shape)
-        for point in osm.points
-        if (shape := shape_of(point.tags)) is not None and not _off_ground(point.tags)
-    ]
-    x, y = frame.from_geographic(*np.array([(p.lon, p.lat) for p, _ in chosen]).reshape(-1, 2).T)
-    xmin, ymin, xmax, ymax = plan.extent
-    inside = np.flatnonzero((x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax))
-    chosen, mapped = [chosen[k] for k in inside.tolist()], np.column_stack([x, y])[inside]
+    chosen, mapped = mapped_furniture(osm, frame, extent=plan.extent)
     roads, sites = _Roads.of(osm, frame), Sites.of(plan)
     addressing = np.array([_addresses(shape) and bool(roads.at(p)) for p, shape in chosen], np.bool_)
     amid = ~addressing & sites.driven(mapped)
@@ -134,7 +127,10 @@ def read_furniture(
         if not stands:
             problems.append(Problem(point.osm_id, "furniture", "dropped", "on-bridge-or-in-tunnel"))
         source = "roadside" if addressing[k] else "moved" if amid[k] else "node"
-        rows += [(*stand, shape, height, height_source, source, point.osm_id, mapped[k]) for stand in stands]
+        rows += [
+            (*stand, shape, height, height_source, source, point.osm_id, mapped[k], 2 * k + nth)
+            for nth, stand in enumerate(stands)
+        ]
     table, lost = _beside_roads(_table(rows), sites, left_hand=left_hand)
     problems += [Problem(str(osm_id), "furniture", "dropped", "no-roadside") for osm_id in np.unique(lost)]
     built = sites.classes(table.xy) == Class.BUILDING_PAD
@@ -143,6 +139,21 @@ def read_furniture(
         for osm_id in np.unique(table.osm_id[built])
     ]
     return table.take(~built), problems
+
+
+def mapped_furniture(
+    osm: OsmData, frame: Frame, *, extent: Sequence[float]
+) -> tuple[list[tuple[Point, str]], Float]:
+    """The nodes within an extent that are street furniture, with their shapes, and their places (n, 2)."""
+    chosen = [
+        (point, shape)
+        for point in osm.points
+        if (shape := shape_of(point.tags)) is not None and not _off_ground(point.tags)
+    ]
+    x, y = frame.from_geographic(*np.array([(p.lon, p.lat) for p, _ in chosen]).reshape(-1, 2).T)
+    xmin, ymin, xmax, ymax = extent
+    inside = np.flatnonzero((x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax))
+    return [chosen[k] for k in inside.tolist()], np.column_stack([x, y])[inside]
 
 
 def furniture_instances(furniture: Furniture, *, height: Height | None = None) -> Instances:
@@ -368,8 +379,10 @@ def _beside_roads(table: Furniture, sites: Sites, *, left_hand: bool) -> tuple[F
 
 
 def _table(rows: list[_Row]) -> Furniture:
-    columns: list[list[object]] = [list(column) for column in zip(*rows, strict=True)] if rows else [[]] * 9
-    where, heading, heading_source, shape, height, height_source, place_source, osm_id, mapped = columns
+    columns: list[list[object]] = [list(column) for column in zip(*rows, strict=True)] if rows else [[]] * 10
+    where, heading, heading_source, shape, height, height_source, place_source, osm_id, mapped, number = (
+        columns
+    )
     xy = np.array(where, float).reshape(-1, 2)
     return Furniture(
         xy,
@@ -381,5 +394,5 @@ def _table(rows: list[_Row]) -> Furniture:
         np.hypot(*(xy - np.array(mapped, float).reshape(-1, 2)).T),
         np.array(heading_source, np.str_),
         np.array(osm_id, np.str_),
-        np.full(len(rows), -1, np.int32),
+        np.array(number, np.int32),
     )

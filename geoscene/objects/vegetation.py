@@ -65,7 +65,7 @@ class Trees(Columns):
               nearest clear place), ``row`` (spaced along a tree row) or ``sampled``
     moved   : (n,) float64 metres from where it is mapped
     osm_id  : (n,) str: the tree's node, or its row's way; "" for a sampled one
-    feature : (n,) int32, -1 for none
+    feature : (n,) int32: as read, consecutive
     """
 
     xy: Float
@@ -126,7 +126,7 @@ def read_trees(osm: OsmData, frame: Frame, *, spacing: float = 8.0) -> tuple[Tre
         np.array(["node" if osm_id.startswith("node/") else "row" for osm_id in ids], np.str_),
         np.zeros(len(ids)),
         np.array(ids, np.str_),
-        np.full(len(ids), -1, np.int32),
+        np.arange(len(ids), dtype=np.int32),
     ), list(dict.fromkeys(problems))  # the tags of a row are read once per tree
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene import polylines
 from geoscene.roadgraph.carriageways import KERB, Carriageways
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 
 # Metres, radius of the kerb at a corner by the lesser road of the two. Assumed within the usual ranges of
 # street design guides (NACTO: 3 to 4.5 on city streets; larger where lorries turn).
@@ -28,6 +28,9 @@ _RADIUS = {
 _RADIUS_ELSE = 2.0
 # Metres that a joint reaches into an arm at most: roads that part at a small angle have no end of joint.
 _REACH = 20.0
+JOINT = 30.0
+"""Metres beyond the outside of the widest arm that a joint, its corners and their sidewalks reach at most."""
+
 # Roads that continue within these limits of direction (radians) and width (metres) need no joint.
 _BEND, _STEP = np.radians(1.0), 0.05
 # Where a road that bends less than this (radians) changes its width, it does so by 1 in twice this number.
@@ -47,24 +50,29 @@ class Junctions:
 
     polygon : (j,) shapely, the joint's carriageway
     main    : (j,) int64 the joint's most important arm, a row of the carriageways
+    number  : (j,) int64 of the joint among all, less than twice the number of carriageways
     kerb, walk : (c,) shapely, kerb and sidewalk round a corner: the joint buffered by their widths
     corner_main : (c,) int64 the more important of the corner's two arms
+    corner_number : (c,) int64 of the corner among all, less than twice the number of carriageways
     """
 
     polygon: NDArray[np.object_]
     main: Ints
+    number: Ints
     kerb: NDArray[np.object_]
     walk: NDArray[np.object_]
     corner_main: Ints
+    corner_number: Ints
 
 
-def build_junctions(roads: Carriageways, importance: Ints) -> Junctions:
+def build_junctions(roads: Carriageways, importance: Ints, *, wanted: Bools) -> Junctions:
     """The joints of all carriageways that share a node, a place and (off the ground) a layer.
 
     A corner is the morphological closing of two neighbouring arms with the corner's radius: it rounds the
     inner corner with that radius and changes nothing else.
 
     importance : (k,) rank of the carriageways; the higher wins where joints and carriageways overlap
+    wanted     : (k, 2) whether joints at the start and end of each carriageway are built
     """
     arms = _arms(roads)
     after, between, width, radius, tangent = _corners(roads, arms)
@@ -76,18 +84,25 @@ def build_junctions(roads: Carriageways, importance: Ints) -> Junctions:
         & (np.abs(arms.walk - arms.walk[after][:, ::-1]) < _STEP).all(axis=1)
     )
     keep = (count > 1) & ~straight & ~straight[np.argsort(after)]
-    none = np.empty(0, object)
+    groups = np.zeros(int(arms.group.max(initial=-1)) + 1, np.bool_)
+    groups[arms.group[wanted[arms.road, arms.end]]] = True
+    keep &= groups[arms.group]
+    none, no_rows = np.empty(0, object), np.empty(0, np.int64)
     if not keep.any():
-        return Junctions(none, np.empty(0, np.int64), none, none, np.empty(0, np.int64))
+        return Junctions(none, no_rows, no_rows, none, none, no_rows, no_rows)
 
     half = np.maximum(width, width[after]) / 2
     reach = np.maximum(tangent, tangent[np.argsort(after)])
-    stub = _stubs(roads, arms, length=np.maximum(reach + 0.5, half + 1.0))
-    disc = shapely.buffer(shapely.points(arms.node_xy), np.minimum(width, width[after]) / 2, quad_segs=_QUAD)
+    used = np.flatnonzero(groups[arms.group])
+    stub, disc, taper = np.full((3, len(half)), None)
+    stub[used] = _stubs(roads, arms, rows=used, length=np.maximum(reach + 0.5, half + 1.0)[used])
+    disc[used] = shapely.buffer(
+        shapely.points(arms.node_xy[used]), np.minimum(width, width[after])[used] / 2, quad_segs=_QUAD
+    )
     rounded = np.where(np.abs(between - np.pi) > _ROUNDED, radius, 0.0)
     slanted = (count == 2) & (np.abs(between - np.pi) < _BENT) & (width[after] > width + _STEP)
-    taper = np.empty(len(stub), object)
-    taper[slanted] = _tapers(roads, arms, after=after)[slanted]
+    tapered = np.flatnonzero(slanted & groups[arms.group])
+    taper[tapered] = _tapers(roads, arms, rows=tapered, widest=np.maximum(width, width[after])[tapered])
     corner = _corner(np.stack([stub, stub[after], disc, taper], axis=1)[keep], rounded[keep])
 
     walk_width = np.minimum(arms.walk[:, 0], arms.walk[after][:, 1])[keep]
@@ -104,7 +119,8 @@ def build_junctions(roads: Carriageways, importance: Ints) -> Junctions:
     rank = importance[arms.road]
     main = np.where(rank >= rank[after], arms.road, arms.road[after])[keep]
     best = np.lexsort([-importance[main], group])
-    return Junctions(polygon, main[best][first], kerb, walk, main[walked])
+    number = np.flatnonzero(keep)[walked]
+    return Junctions(polygon, main[best][first], group[first], kerb, walk, main[walked], number)
 
 
 def junction_reach(roads: Carriageways) -> tuple[Float, Ints]:
@@ -185,12 +201,13 @@ def _neighbour(group: Ints) -> Ints:
     return after
 
 
-def _stubs(roads: Carriageways, arms: _Arms, *, length: Float) -> NDArray[np.object_]:
-    """Carriageways of the first metres of each arm (a,)."""
-    lines = roads.line[arms.road].copy()
-    from_end = arms.end == 1
+def _stubs(roads: Carriageways, arms: _Arms, *, rows: Ints, length: Float) -> NDArray[np.object_]:
+    """Carriageways of the first metres (n,) of some arms (n,)."""
+    road = arms.road[rows]
+    lines = roads.line[road]
+    from_end = arms.end[rows] == 1
     lines[from_end] = shapely.reverse(lines[from_end])
-    return carriageway(polylines.heads(lines, length), roads.width[arms.road] / 2)
+    return carriageway(polylines.heads(lines, length), roads.width[road] / 2)
 
 
 def carriageway(lines: NDArray[np.object_], half: Float) -> NDArray[np.object_]:
@@ -201,18 +218,17 @@ def carriageway(lines: NDArray[np.object_], half: Float) -> NDArray[np.object_]:
     return bands
 
 
-def _tapers(roads: Carriageways, arms: _Arms, *, after: Ints) -> NDArray[np.object_]:
-    """Tapers between each arm's end and the wider next arm's."""
-    width = roads.width[arms.road]
-    wide = np.maximum(width, width[after])
-    line = roads.line[arms.road]
-    far = np.minimum(_SLANT * (wide - width), shapely.length(line) / 2)
-    ahead = np.where(arms.end == 0, far, -np.maximum(far, 1e-9))
+def _tapers(roads: Carriageways, arms: _Arms, *, rows: Ints, widest: Float) -> NDArray[np.object_]:
+    """Tapers (n,) between the ends of some arms (n,) and the next arms'; ``widest`` (n,) of both."""
+    width, line = roads.width[arms.road[rows]], roads.line[arms.road[rows]]
+    far = np.minimum(_SLANT * (widest - width), shapely.length(line) / 2)
+    ahead = np.where(arms.end[rows] == 0, far, -np.maximum(far, 1e-9))
     there = shapely.get_coordinates(shapely.line_interpolate_point(line, ahead))
-    across = np.stack([-np.sin(arms.angle), np.cos(arms.angle)], axis=1) / 2
+    across = np.stack([-np.sin(arms.angle[rows]), np.cos(arms.angle[rows])], axis=1) / 2
+    node = arms.node_xy[rows]
     corners = [
-        arms.node_xy + across * wide[:, None],
-        arms.node_xy - across * wide[:, None],
+        node + across * widest[:, None],
+        node - across * widest[:, None],
         there - across * width[:, None],
         there + across * width[:, None],
     ]

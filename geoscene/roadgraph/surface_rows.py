@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import materials
 from geoscene.columns import Columns
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float
 
 GRID = 1e-4
 """Metres: coordinates of surfaces are whole multiples of it."""
@@ -33,6 +34,7 @@ class SurfaceRows(Columns):
     place    : (n,) int8, 0 on the ground, 1 on a bridge or an upper storey, 2 in a tunnel or a basement
     level    : (n,) int8, OSM layer
     edge     : (n,) int32, the edge of the road graph on it, -1 for none
+    number   : (n,) int32, of the shape that the polygon is a part of, -1 for none
     """
 
     polygon: NDArray[np.object_]
@@ -44,6 +46,7 @@ class SurfaceRows(Columns):
     place: NDArray[np.int8]
     level: NDArray[np.int8]
     edge: NDArray[np.int32]
+    number: NDArray[np.int32]
 
     @classmethod
     def of(
@@ -58,6 +61,7 @@ class SurfaceRows(Columns):
         place: ArrayLike = 0,
         level: ArrayLike = 0,
         edge: ArrayLike = -1,
+        number: ArrayLike = -1,
     ) -> SurfaceRows:
         """Rows of shapes; materials by name, every other column broadcast.
 
@@ -80,7 +84,15 @@ class SurfaceRows(Columns):
             np.broadcast_to(np.asarray(place, np.int8), n)[row],
             np.broadcast_to(np.asarray(level, np.int8), n)[row],
             np.broadcast_to(np.asarray(edge, np.int32), n)[row],
+            np.broadcast_to(np.asarray(number, np.int32), n)[row],
         )
+
+
+def in_reach(shapes: NDArray[np.object_], area: Any | None, *, metres: ArrayLike) -> Bools:
+    """Whether shapes (n,) are within ``metres``, one or (n,), of an area; all are if it is None."""
+    if area is None:
+        return np.ones(len(shapes), np.bool_)
+    return np.asarray(shapely.dwithin(area, shapes, metres), np.bool_)
 
 
 def _on_grid(shapes: NDArray[np.object_]) -> NDArray[np.object_]:

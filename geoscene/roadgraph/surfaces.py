@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import shapely
@@ -14,14 +14,14 @@ from geoscene.frames import Frame
 from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, read_carriageways
 from geoscene.roadgraph.crossings import crossing_rows
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.junctions import build_junctions, carriageway
+from geoscene.roadgraph.junctions import JOINT, build_junctions, carriageway
 from geoscene.roadgraph.markings import marking_rows, stop_rows
 from geoscene.roadgraph.paths import path_surfaces, rail_surfaces, square_surfaces
 from geoscene.roadgraph.routing import edge_lines
-from geoscene.roadgraph.surface_rows import SurfaceRows
+from geoscene.roadgraph.surface_rows import SurfaceRows, in_reach
 from geoscene.roadgraph.tags import CLASSES
 from geoscene.sources.data import OsmData
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 
 _SIDEWALK, _KERB, _CARRIAGEWAY = 112.0, 120.0, 130.0
 # Metres by which a bridge is wider than its surfaces on each side, for the parapet. Assumed.
@@ -47,38 +47,80 @@ class RoadSurfaces(SurfaceRows):
 
     raised : the surfaces on bridges and in tunnels: their carriageways, kerbs, sidewalks and markings, and
              (class BRIDGE, lowest) the outline of the deck
+    count  : of numbers, which neither depend on how shapes are cut nor on the area
     """
 
     raised: SurfaceRows
+    count: int
 
 
 def road_surfaces(
-    osm: OsmData, graph: RoadGraph, *, frame: Frame, options: SurfaceOptions | None = None
+    osm: OsmData,
+    graph: RoadGraph,
+    *,
+    frame: Frame,
+    roads: Carriageways | None = None,
+    options: SurfaceOptions | None = None,
+    area: Any | None = None,
 ) -> RoadSurfaces:
     """The surfaces of roads, paths and rails in plan.
 
     Surfaces overlap: the kerb extends under the carriageway and the sidewalk under the kerb, so that cutting
     by priority leaves neither gaps nor slivers between them.
+
+    roads : the map's carriageways, read with the same options if not given
+    area  : shapely geometry, scene metres: carriageways on the ground far from it are left out, with the same
+            numbers for the others; none are by default
     """
     options = options or SurfaceOptions()
-    roads = read_carriageways(osm, frame, sidewalks=options.sidewalks, left_hand=options.left_hand)
+    roads = roads or read_carriageways(osm, frame, sidewalks=options.sidewalks, left_hand=options.left_hand)
     edge = _edges_below(roads, graph)
     crossings = crossing_rows(osm, roads, frame=frame)
     strips = crossings.polygon[crossings.priority == crossings.priority.min(initial=np.inf)]
+    carriageways, count = _carriageway_rows(roads, edge, area=area)
     rows = SurfaceRows.concatenate(
         [
             square_surfaces(osm, frame),
             path_surfaces(osm, frame),
-            *_carriageway_rows(roads, edge),
+            *carriageways,
             crossings,
             marking_rows(roads, edge, left_hand=options.left_hand),
             stop_rows(graph, roads, crossings=strips, left_hand=options.left_hand),
             rail_surfaces(osm, frame),
         ]
     )
+    others = np.flatnonzero(rows.number < 0)
+    rows.number[others] = count + np.arange(len(others))
     ground = rows.take(rows.place == 0)
     columns = {f.name: getattr(ground, f.name) for f in fields(ground)}
-    return RoadSurfaces(**columns, raised=rows.take(rows.place != 0))
+    return RoadSurfaces(**columns, raised=rows.take(rows.place != 0), count=count + len(others))
+
+
+def carriageway_boxes(roads: Carriageways) -> Float:
+    """Boxes (n, 4) that cover all surfaces of carriageways and junctions, however these are cut."""
+    xy, road = shapely.get_coordinates(roads.line, return_index=True)
+    beside = _beside(roads)
+    on = np.flatnonzero(road[1:] == road[:-1])
+    near = beside[road[on], None]
+    low, high = np.minimum(xy[on], xy[on + 1]) - near, np.maximum(xy[on], xy[on + 1]) + near
+    reach = _junction_reach(roads)[:, None]
+    return np.concatenate(
+        [np.hstack([low, high]), np.hstack([roads.node_xy - reach, roads.node_xy + reach])[reach[:, 0] > 0]]
+    )
+
+
+def _beside(roads: Carriageways) -> Float:
+    """Metres (k,) from the centre line of each carriageway to the outside of its surfaces, at most."""
+    out: Float = roads.width / 2 + roads.walk.max(axis=1, initial=0.0) + KERB + _PARAPET + 1.0
+    return out
+
+
+def _junction_reach(roads: Carriageways) -> Float:
+    """Metres (n,) from each node to the outside of the junction there, at most; 0 where roads do not meet."""
+    reach = np.zeros(len(roads.node_xy))
+    np.maximum.at(reach, roads.ends.ravel(), np.repeat(_beside(roads), 2) + JOINT)
+    reach[np.bincount(roads.ends.ravel(), minlength=len(reach)) < 2] = 0.0
+    return reach
 
 
 def _edges_below(roads: Carriageways, graph: RoadGraph) -> NDArray[np.int32]:
@@ -94,9 +136,12 @@ def _edges_below(roads: Carriageways, graph: RoadGraph) -> NDArray[np.int32]:
     return edge
 
 
-def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[SurfaceRows]:
+def _carriageway_rows(
+    roads: Carriageways, edge: NDArray[np.int32], *, area: Any | None
+) -> tuple[list[SurfaceRows], int]:
+    """Surfaces of carriageways that are raised or near the area, and the count of all their numbers."""
     if not len(roads):
-        return []
+        return [], 0
     importance = np.array(
         [len(CLASSES) - CLASSES.index(s.highway) if s.highway in CLASSES else 0 for s in roads.street]
     )
@@ -104,21 +149,26 @@ def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[Surf
     half = roads.width / 2
     common = {"osm_id": roads.osm_id, "place": place, "level": level, "edge": edge}
 
-    def at(rows: NDArray[np.integer]) -> dict[str, NDArray[np.generic]]:
+    def at(rows: Ints) -> dict[str, NDArray[np.generic]]:
         return {name: column[rows] for name, column in common.items()}
 
     source = np.array(
         [f"{s.width_source}/{m}" for s, m in zip(roads.street, roads.material_source, strict=True)]
     )
-    joints = build_junctions(roads, importance)
+    wanted = (place != 0) | in_reach(roads.line, area, metres=_beside(roads))
+    chosen = np.flatnonzero(wanted)
+    at_node = in_reach(shapely.points(roads.node_xy), area, metres=_junction_reach(roads))
+    joints = build_junctions(roads, importance, wanted=(place != 0)[:, None] | at_node[roads.ends])
+    count = len(roads)
     out = [
         SurfaceRows.of(
-            carriageway(roads.line, half),
+            carriageway(roads.line[chosen], half[chosen]),
             klass=Class.ROAD,
-            material=roads.material,
-            priority=_CARRIAGEWAY + importance,
-            source=source,
-            **common,
+            material=roads.material[chosen],
+            priority=_CARRIAGEWAY + importance[chosen],
+            source=source[chosen],
+            number=chosen,
+            **at(chosen),
         ),
         SurfaceRows.of(
             joints.polygon,
@@ -126,9 +176,11 @@ def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[Surf
             material=roads.material[joints.main],
             priority=_CARRIAGEWAY + importance[joints.main] + 0.5,
             source=source[joints.main],
+            number=count + joints.number,
             **at(joints.main),
         ),
     ]
+    count += 2 * len(roads)
     tagged = (roads.walk_source == "sidewalk").any(axis=1)
     walk_source = np.where(tagged, "sidewalk/default", "default/default")
     walk_material = np.where(np.isin(roads.material, list(PAVED)), "paving", "gravel")
@@ -137,8 +189,9 @@ def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[Surf
         (Class.SIDEWALK, _SIDEWALK, walk_material, "walk"),
     ):
         extra = np.where(roads.walk > 0, KERB + (roads.walk if shape == "walk" else 0.0), 0.0)
-        corners = (joints.corner_main, getattr(joints, shape))
-        for rows, bands in (*_widened(roads, half, extra=extra), corners):
+        bands_of = _widened(roads, half, extra=extra, rows=chosen)
+        corners = (joints.corner_main, joints.corner_number, getattr(joints, shape))
+        for rows, number, bands in (*((rows, rows, bands) for rows, bands in bands_of), corners):
             out.append(
                 SurfaceRows.of(
                     bands,
@@ -146,9 +199,11 @@ def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[Surf
                     material=material[rows],
                     priority=priority,
                     source=walk_source[rows],
+                    number=count + number,
                     **at(rows),
                 )
             )
+            count += 2 * len(roads)
     bridge = np.flatnonzero(place == 1)
     out.append(
         SurfaceRows.of(
@@ -156,21 +211,22 @@ def _carriageway_rows(roads: Carriageways, edge: NDArray[np.int32]) -> list[Surf
             klass=Class.BRIDGE,
             material="concrete",
             priority=101.0,
+            number=count + bridge,
             **at(bridge),
         )
     )
-    return out
+    return out, count + len(roads)
 
 
 def _widened(
-    roads: Carriageways, half: Float, *, extra: Float
-) -> list[tuple[NDArray[np.integer], NDArray[np.object_]]]:
-    """Bands ``extra`` (k, 2) wider than the carriageway on the left and right, with their rows."""
-    both = np.flatnonzero((extra[:, 0] == extra[:, 1]) & (extra[:, 0] > 0))
-    out: list[tuple[NDArray[np.integer], NDArray[np.object_]]] = []
+    roads: Carriageways, half: Float, *, extra: Float, rows: Ints
+) -> list[tuple[Ints, NDArray[np.object_]]]:
+    """Bands ``extra`` (k, 2) wider than some carriageways on the left and right, with their rows."""
+    both = rows[(extra[rows, 0] == extra[rows, 1]) & (extra[rows, 0] > 0)]
+    out: list[tuple[Ints, NDArray[np.object_]]] = []
     out.append((both, carriageway(roads.line[both], half[both] + extra[both, 0])))
     for side, sign in ((0, 1.0), (1, -1.0)):
-        one = np.flatnonzero((extra[:, 0] != extra[:, 1]) & (extra[:, side] > 0))
+        one = rows[(extra[rows, 0] != extra[rows, 1]) & (extra[rows, side] > 0)]
         far = sign * (half[one] + extra[one, side])
         bands = shapely.buffer(roads.line[one], far, single_sided=True, join_style="mitre", mitre_limit=1.1)
         out.append((one, bands))

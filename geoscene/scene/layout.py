@@ -33,7 +33,7 @@ _PARTS = {
 }
 """Parts that scenes for some uses lack, in words."""
 
-SCHEMA = 2
+SCHEMA = 3
 """Version of the scene directory; a reader refuses others."""
 
 
@@ -204,8 +204,7 @@ class Scene:
 
     def table_length(self, layer: str) -> int:
         """Number of rows of a layer's table, which holds the features within reach of a build's route."""
-        start, stop = self.layers.get(layer, (0, 0))
-        return int(self.manifest.get("cut", {"rows": {}})["rows"].get(layer, stop - start))
+        return int(self.manifest["rows"].get(layer, 0))
 
     @functools.cached_property
     def area(self) -> Any | None:

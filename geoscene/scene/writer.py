@@ -109,6 +109,7 @@ class SceneWriter:
         *,
         frame: Frame,
         layers: Sequence[Layer],
+        ranges: Mapping[str, tuple[int, int]] | None = None,
         graph: RoadGraph,
         kept: Mapping[str, Ints] | None = None,
         shapes: Mapping[str, Mesh],
@@ -119,7 +120,9 @@ class SceneWriter:
     ) -> None:
         """Write everything but the tiles and move the directory to its name.
 
-        layers   : features; the number of a feature is its row, counted through all layers in order
+        layers   : features; the column ``feature`` has their numbers, by default their rows, counted through
+                   all layers in order
+        ranges   : range [start, stop) of the numbers of each layer
         graph    : the drivable road graph; not written if it has no edges
         kept     : rows of each layer, ascending, that tables and road graph hold; all by default
         shapes   : meshes that the tiles' instances copy; not written if there are none
@@ -127,11 +130,8 @@ class SceneWriter:
         tiles    : the document of tile reports
         manifest : the manifest without frame, layers and codes
         """
-        starts = np.cumsum([0, *(len(layer) for layer in layers)]).tolist()
-        numbered = [
-            Layer(layer.name, layer.geometry, {"feature": np.arange(a, b, dtype=np.int32), **layer.columns})
-            for layer, a, b in zip(layers, starts[:-1], starts[1:], strict=True)
-        ]
+        ranges = ranges or number_ranges({layer.name: len(layer) for layer in layers})
+        numbered = [_numbered(layer, ranges[layer.name][0]) for layer in layers]
         cut: dict[str, Any] = {}
         if kept is not None:
             beyond = np.setdiff1d(np.arange(len(graph)), kept["roads"])
@@ -141,8 +141,6 @@ class SceneWriter:
         left_out: dict[str, int] = {}
         if use.tables is not None:
             left_out, numbered = _left_out(numbered, use), [_needed(layer, use) for layer in numbered]
-        if kept is not None or use.tables is not None:
-            cut = {"nodes": [], **cut, "rows": {layer.name: len(layer) for layer in numbered}}
         write_geopackage(self.files.features, numbered, frame=frame, indexed=use.indexed)
         if len(graph):
             write_graphml(graph, frame, path=self.files.road_graph)
@@ -153,13 +151,13 @@ class SceneWriter:
         write_columns(self.files.problems, columns)
         write_json(self.files.tile_reports, tiles, indent=1)
         self.files.tile_journal.unlink(missing_ok=True)
-        ranges = {layer.name: [a, b] for layer, a, b in zip(layers, starts[:-1], starts[1:], strict=True)}
         tables = (self.files.features, self.files.road_graph, self.files.shapes, self.files.problems)
         document = {
             "schema": SCHEMA,
             **manifest,
             "frame": frame.to_json(),
-            "layers": ranges,
+            "layers": {name: list(ends) for name, ends in ranges.items()},
+            "rows": {layer.name: len(layer) for layer in numbered},
             "left_out": _totals(manifest.get("left_out", {}), left_out),
             **({"cut": cut} if cut else {}),
             "classes": {c.name.lower(): int(c) for c in Class},
@@ -183,6 +181,18 @@ class SceneWriter:
         with self._lock:
             if not resumable:
                 shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def number_ranges(counts: Mapping[str, int]) -> dict[str, tuple[int, int]]:
+    """Ranges [start, stop) of feature numbers of layers that follow each other, by the count of each."""
+    stops = np.cumsum(list(counts.values())).tolist()
+    return {name: (stop - counts[name], stop) for name, stop in zip(counts, stops, strict=True)}
+
+
+def _numbered(layer: Layer, first: int) -> Layer:
+    """The layer with feature numbers, from the first on unless it has its own."""
+    rows = np.arange(first, first + len(layer), dtype=np.int32)
+    return Layer(layer.name, layer.geometry, {"feature": rows, **layer.columns})
 
 
 def _needed(layer: Layer, use: Use) -> Layer:

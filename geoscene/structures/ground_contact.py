@@ -16,7 +16,7 @@ from geoscene.ground.layers import PADS, Layers
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.sheets import areal
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
-from geoscene.typing import Float, Height, Ints
+from geoscene.typing import Bools, Float, Height, Ints
 
 OPENING, LOW = PADS + 100.0, PADS + 50.0
 """Priority of openings, above all others, and of the ground inside decks, which is hidden."""
@@ -76,13 +76,14 @@ def _lowered_height(
     return z
 
 
-def find_low_decks(table: Structures, height: Height | None) -> Structures:
+def find_low_decks(table: Structures, height: Height | None, *, near: Bools) -> Structures:
     """The table with the areas (``low``) where the ground would rise into a bridge's deck.
 
     height : height of the ground before `ground_below` lowers it
+    near   : (n,) which pieces have such areas
     """
     low = table.low.copy()
-    for k in np.flatnonzero(~table.tunnel).tolist():
+    for k in np.flatnonzero(~table.tunnel & near).tolist():
         xy, _, ground = _ground_on(np.array([table.polygon[k]], object), height)
         if (ground < surface_heights(table, k, xy=xy) - table.body[k] - _HIGH).all():
             continue

@@ -38,11 +38,12 @@ _SHIFTS = (0.0, 2.0, -2.0, 4.0, -4.0, 6.0, -6.0, 8.0, -8.0, 10.0, -10.0)
 
 
 def place_piers(
-    table: Structures, ground: SurfaceRows, *, height: Height | None, options: StructureOptions
+    table: Structures, ground: SurfaceRows, *, height: Height | None, near: Bools, options: StructureOptions
 ) -> Structures:
     """The table with piers at equal spans, moved or left out where something passes below.
 
     ground : roads, paths and rails on the ground
+    near   : (n,) which pieces have piers
     """
     rows = np.flatnonzero(np.isin(ground.klass, _KEPT_FREE))
     below = shapely.STRtree(ground.polygon[rows])
@@ -50,7 +51,7 @@ def place_piers(
     pieces = shapely.STRtree(table.polygon)
     pier, spacing = table.pier.copy(), table.pier_spacing.copy()
     ends, solid = _ends(table), shapely.STRtree(ground.polygon[rows[~rail]])
-    for k in np.flatnonzero(~table.tunnel).tolist():
+    for k in np.flatnonzero(~table.tunnel & near).tolist():
         flat = shapely.LineString(table.line[k][:, :2])
         count = max(int(np.ceil(flat.length / options.pier_spacing)), 1)
         spacing[k] = flat.length / count

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from geoscene.frames import Frame
 from geoscene.report import Problem
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.surface_rows import in_reach
 from geoscene.roadgraph.surfaces import RoadSurfaces
 from geoscene.sources.data import OsmData
 from geoscene.structures.ground_contact import find_low_decks
@@ -15,6 +18,9 @@ from geoscene.structures.piers import place_piers
 from geoscene.structures.table import StructureOptions, Structures
 from geoscene.typing import Height
 
+_NEAR = 10.0
+"""Metres from an area within which pieces have piers: more than surfaces below keep a pier away."""
+
 
 def read_structures(
     surfaces: RoadSurfaces,
@@ -24,15 +30,19 @@ def read_structures(
     frame: Frame,
     height: Height | None = None,
     options: StructureOptions | None = None,
+    area: Any | None = None,
 ) -> tuple[Structures, list[Problem]]:
     """The bridges and tunnels of a map, and the problems repaired or dropped.
 
     graph  : with heights, from `geoscene.roadgraph.profile`
     height : height of the graded ground (`geoscene.roadgraph.graded_ground`); level at 0 by default
+    area   : shapely geometry, scene metres: pieces far from it have neither piers nor low ground; all have
+             by default
     """
     options = options or StructureOptions()
     raised = surfaces.raised
     paths, problems = path_members(raised, osm, frame=frame, graph=graph, height=height, options=options)
     table = cut_pieces(Members.concatenate([road_members(graph, raised), paths]), raised, options=options)
-    table = place_piers(table, surfaces, height=height, options=options)
-    return find_low_decks(table, height), problems
+    near = in_reach(table.polygon, area, metres=_NEAR)
+    table = place_piers(table, surfaces, height=height, near=near, options=options)
+    return find_low_decks(table, height, near=near), problems

@@ -10,7 +10,7 @@ from geoscene.classes import Class, materials
 from geoscene.export.objects import expand
 from geoscene.frames import Frame
 from geoscene.ground import Layers, building_pads, plan_ground
-from geoscene.objects.barriers import barrier_meshes, read_barriers
+from geoscene.objects.barriers import barrier_meshes, open_barriers, read_barriers
 from geoscene.objects.furniture import furniture_instances, read_furniture, shape_of
 from geoscene.objects.shapes import shapes
 from geoscene.sources import read_osm
@@ -254,8 +254,14 @@ def volume(mesh):
     return part.volume()
 
 
+def opened(osm, frame, plan):
+    barriers, problems = read_barriers(osm, frame, extent=plan.extent)
+    barriers, more = open_barriers(barriers, plan)
+    return barriers, problems + more
+
+
 def solids(*features, roads=(), houses=(), height=None):
-    barriers, problems = read_barriers(osm_of(*features), FRAME, plan=plan_with(roads, houses))
+    barriers, problems = opened(osm_of(*features), FRAME, plan_with(roads, houses))
     return barriers, barrier_meshes(barriers, height=height), problems
 
 
@@ -298,9 +304,7 @@ def test_a_barrier_is_open_where_a_road_passes_and_ends_at_houses():
 
 def test_a_barrier_is_open_over_the_mouth_of_a_tunnel():
     wall = way(1, [(-20, 0), (20, 0)], barrier="wall", height="2.2", width="0.5")
-    barriers, problems = read_barriers(
-        osm_of(wall), FRAME, plan=plan_with(mouths=[shapely.box(-4, -10, 5, 10)])
-    )
+    barriers, problems = opened(osm_of(wall), FRAME, plan_with(mouths=[shapely.box(-4, -10, 5, 10)]))
     assert barriers.polygon[0].area == pytest.approx((40 - 9) * 0.5)
     assert [p.reason for p in problems] == ["across-road"]
 
@@ -336,6 +340,6 @@ def test_every_barrier_of_a_real_place_is_closed(shared_osm, name):
     frame = Frame.at((west + east) / 2, (south + north) / 2)
     x, y = frame.from_geographic([west, east], [south, north])
     plan = plan_ground((x.min(), y.min(), x.max(), y.max()), Layers.empty())
-    barriers, _ = read_barriers(osm, frame, plan=plan)
+    barriers, _ = opened(osm, frame, plan)
     assert len(barriers) > 50
     assert all(volume(mesh) > 0 for mesh in barrier_meshes(barriers))

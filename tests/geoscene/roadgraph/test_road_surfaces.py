@@ -1,20 +1,25 @@
 """Road surfaces have the width of their roads, join without gaps, and carry the road markings."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import shapely
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+import geoscene
 from geoscene.classes import Class, materials
 from geoscene.frames import Frame
 from geoscene.roadgraph import build_road_graph
+from geoscene.roadgraph.carriageways import read_carriageways
 from geoscene.roadgraph.surface_rows import GRID, SurfaceRows
-from geoscene.roadgraph.surfaces import SurfaceOptions, road_surfaces
+from geoscene.roadgraph.surfaces import SurfaceOptions, carriageway_boxes, road_surfaces
 from geoscene.sources import read_osm
 from geoscene.sources.data import OsmData, Point, Way
 
 FRAME = Frame.at(10.0, 50.0)
+DEMO = Path(geoscene.__file__).parent / "demo" / "helsinki.osm.pbf"
 PAINT = materials()["lane_paint"].code
 
 
@@ -292,3 +297,34 @@ def test_road_surfaces_of_real_places_are_valid_and_reproducible(shared_osm, nam
     road = shapely.union_all(rows.polygon[rows.klass == Class.ROAD])
     outside = shapely.length(shapely.difference(shapely.union_all(lines), shapely.buffer(road, 0.01)))
     assert outside < 1e-3 * shapely.length(np.array(lines)).sum()
+
+
+def test_surfaces_near_an_area_have_the_shapes_and_numbers_of_all_surfaces():
+    osm = read_osm(DEMO)
+    west, south, east, north = osm.bounds
+    frame = Frame.at((west + east) / 2, (south + north) / 2)
+    graph, _ = build_road_graph(osm, frame)
+    square = shapely.box(-100, -100, 100, 100)
+    whole, some = (road_surfaces(osm, graph, frame=frame, area=area) for area in (None, square))
+    assert 0 < len(some) < 0.9 * len(whole)
+    assert some.count == whole.count
+    at = np.flatnonzero(np.isin(whole.number, some.number))
+    np.testing.assert_array_equal(whole.number[at], some.number)
+    assert shapely.equals_identical(whole.polygon[at], some.polygon).all()
+    left = np.setdiff1d(np.arange(len(whole)), at)
+    assert not shapely.intersects(whole.polygon[left], square).any()
+    assert shapely.equals_identical(whole.raised.polygon, some.raised.polygon).all()
+
+
+def test_boxes_cover_the_surfaces_of_carriageways_and_junctions():
+    osm = read_osm(DEMO)
+    west, south, east, north = osm.bounds
+    frame = Frame.at((west + east) / 2, (south + north) / 2)
+    graph, _ = build_road_graph(osm, frame)
+    roads = read_carriageways(osm, frame, sidewalks="urban", left_hand=False)
+    rows = road_surfaces(osm, graph, frame=frame)
+    cover = shapely.union_all(shapely.box(*carriageway_boxes(roads).T))
+    shapely.prepare(cover)
+    own = np.isin(rows.klass, (Class.ROAD, Class.KERB, Class.SIDEWALK)) & np.isin(rows.osm_id, roads.osm_id)
+    assert own.sum() > 500
+    assert shapely.covers(cover, rows.polygon[own]).all()
