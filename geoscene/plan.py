@@ -377,7 +377,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     height = roads.height
     if len(structures):
         height = ground_below(structures, height or terrain.height)
-    openings = find_openings(structures, height)
+    openings = find_openings(structures, height, area=area)
 
     cover, surfaces, pads = _collect(
         problems, _surfaces(osm, frame, extent=extent, buildings=buildings, made=made, only=options.only)

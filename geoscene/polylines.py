@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 
 _UNITS = 2.0**30
 """Units of stations per metre in which they are summed: a nanometre each."""
@@ -49,6 +49,15 @@ def cut(line: Float, start: float, *, end: float, gap: float = 0.0, least: float
     return points_at(line, np.concatenate([[start], along[inside], [end]]), along=along)
 
 
+def summed(steps: Float, first: Ints) -> Float:
+    """Sums (n,) of steps (n,) after given earlier ones (n,): stations of points of many lines in one array.
+
+    In whole nanometres, so that they do not depend on the lines before.
+    """
+    total = np.cumsum(np.rint(steps * _UNITS).astype(np.int64))
+    return np.asarray((total - total[first]) / _UNITS, float)
+
+
 def heads(lines: NDArray[np.object_], end: Float) -> NDArray[np.object_]:
     """The parts (n,) of shapely lines from their starts to stations (n,), clamped to their ends."""
     if not len(lines):
@@ -57,9 +66,7 @@ def heads(lines: NDArray[np.object_], end: Float) -> NDArray[np.object_]:
     first = np.flatnonzero(np.diff(of, prepend=-1))
     step = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
     step[first] = 0.0
-    # Sums of whole numbers are exact, so that a line's stations do not depend on the lines before it.
-    summed = np.cumsum(np.rint(step * _UNITS).astype(np.int64))
-    along = (summed - summed[first][of]) / _UNITS
+    along = summed(step, first[of])
     last = np.append(first[1:], len(of)) - 1
     end = np.minimum(end, along[last])
     # The cut is in the segment that ends in the first vertex beyond it.

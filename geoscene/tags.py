@@ -142,7 +142,7 @@ class Quantities:
     ) -> float:
         """The first value of the keys that ``parse`` can read and that lies from low to high; NaN if none."""
         for key in keys:
-            text = " ".join(self.tags.get(key, "").split())
+            text = " ".join(self.tags[key].split()) if key in self.tags else ""
             if not text:
                 continue
             value = parse(text)

@@ -14,6 +14,7 @@ from geoscene.ground import Layers
 _CELL = 20.0  # metres
 _AROUND = 2  # cells on each side that a cell's density is taken over: 100 m in all
 _DENSE = 0.2  # built-up share from which yards are paved; assumed
+_ROUND = 4  # segments of a quarter circle at corners
 _PRIORITY = -1.0  # below everything that is mapped
 
 
@@ -40,8 +41,9 @@ def paved_fabric(footprints: NDArray[Any]) -> Layers:
     around = np.lib.stride_tricks.sliding_window_view(padded, (width, width)).sum(axis=(2, 3))
     dense = around > _DENSE * (width * _CELL) ** 2
     x, y = ((np.argwhere(dense) + low) * _CELL).T
-    cells = shapely.union_all(shapely.box(x, y, x + _CELL, y + _CELL))
-    smooth = shapely.get_parts(shapely.buffer(shapely.buffer(cells, 30.0), -15.0))
+    cells = shapely.coverage_union_all(shapely.box(x, y, x + _CELL, y + _CELL))
+    wide = shapely.buffer(cells, 30.0, quad_segs=_ROUND)
+    smooth = shapely.get_parts(shapely.buffer(wide, -15.0, quad_segs=_ROUND))
     return Layers.of(
         smooth,
         klass=Class.TERRAIN,

@@ -247,15 +247,17 @@ class _Roads:
     def of(cls, osm: OsmData, frame: Frame) -> _Roads:
         ways = [w for w in osm.ways if w.tags.get("highway") in _TRAVELLED and len(w.lonlat) > 1]
         nodes = [way.nodes for way in ways]
-        lines = np.empty(len(ways), object)
+        lonlat = np.concatenate([np.empty((0, 2)), *(way.lonlat for way in ways)])
+        of = np.repeat(np.arange(len(ways)), [len(way.lonlat) for way in ways])
+        xy = np.column_stack(frame.from_geographic(*lonlat.T))
+        lines = np.asarray(shapely.linestrings(xy, indices=of), object)
         by_node: dict[int, list[tuple[int, int]]] = {}
         oneway = []
         for row, way in enumerate(ways):
-            lines[row] = shapely.LineString(np.column_stack(frame.from_geographic(*way.lonlat.T)))
             value = way.tags.get("oneway", "yes" if way.tags.get("junction") == "roundabout" else "no")
             oneway.append({"yes": 1, "1": 1, "true": 1, "-1": -1, "reverse": -1}.get(value, 0))
-            for index, node in enumerate(way.nodes):
-                by_node.setdefault(int(node), []).append((row, index))
+            for index, node in enumerate(way.nodes.tolist()):
+                by_node.setdefault(node, []).append((row, index))
         raised = np.array([is_bridge(way.tags) or is_tunnel(way.tags) for way in ways], np.bool_)
         return cls(lines, np.array(oneway, np.int8), raised, by_node, nodes, shapely.STRtree(lines))
 

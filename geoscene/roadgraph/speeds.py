@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import re
 
 from geoscene.sources.data import Tags
@@ -69,6 +70,7 @@ _ZONES: dict[str, dict[str, float]] = {
 }
 
 
+@functools.lru_cache(maxsize=1024)
 def speed_limit(text: str) -> tuple[float, str] | None:
     """A speed limit in m/s with its source (``maxspeed`` or ``zone``), or None if the text has no number.
 

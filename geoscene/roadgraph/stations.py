@@ -91,31 +91,34 @@ def _pairs(group: Ints) -> tuple[Ints, Ints]:
 def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
     """Stations at all vertices and, between them, at most ``spacing`` metres apart."""
     once = np.flatnonzero((graph.twin < 0) | (graph.twin > np.arange(len(graph))))
-    rows, edges, alongs, drawns, places = [], [], [], [], [graph.node_xyz[:, :2]]
-    count = len(graph.node_id)
-    for edge in once.tolist():
-        xy = graph.geometry[edge][:, :2]
-        corner = polylines.stations(xy)
-        pieces = np.maximum(np.ceil(np.diff(corner) / spacing), 1).astype(np.int64)
-        first = np.repeat(np.arange(len(pieces)), pieces)
-        part = np.arange(len(first)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-        along = np.append(corner[first] + part * (np.diff(corner) / pieces)[first], corner[-1])
-        inner = len(along) - 2
-        rows.append(np.r_[graph.tail[edge], np.arange(count, count + inner), graph.head[edge]])
-        places.append(polylines.points_at(xy, along[1:-1], along=corner))
-        edges.append(np.full(len(along), edge))
-        alongs.append(along)
-        drawns.append(np.append(part == 0, True))
-        count += inner
     if not len(once):
         none = np.empty(0, np.int64)
         return Stations(graph.node_xyz[:, :2], none, none, np.empty(0), np.empty(0, np.bool_))
+    lines = [graph.geometry[edge][:, :2] for edge in once.tolist()]
+    xy, of = np.concatenate(lines), np.repeat(np.arange(len(once)), [len(line) for line in lines])
+    first, last = np.flatnonzero(np.diff(of, prepend=-1)), np.flatnonzero(np.diff(of, append=-1))
+    step = np.diff(xy, axis=0, append=xy[-1:])
+    step[last] = 0.0
+    metres = np.hypot(*step.T)
+    corner = polylines.summed(np.concatenate([[0.0], metres[:-1]]), first[of])
+    pieces = np.maximum(np.ceil(metres / spacing), 1).astype(np.int64)
+    vertex = np.repeat(np.arange(len(xy)), pieces)
+    part = np.arange(len(vertex)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    share = part / pieces[vertex]
+    is_first, is_last = np.zeros((2, len(xy)), np.bool_)
+    is_first[first], is_last[last] = True, True
+    tail, head = is_first[vertex] & (part == 0), is_last[vertex]
+    inner = ~tail & ~head
+    edge = once[of[vertex]]
+    row = np.where(tail, graph.tail[edge], graph.head[edge]).astype(np.int64)
+    row[inner] = len(graph.node_id) + np.arange(int(inner.sum()))
+    places = xy[vertex] + share[:, None] * step[vertex]
     return Stations(
-        np.concatenate(places),
-        np.concatenate(rows).astype(np.int64),
-        np.concatenate(edges),
-        np.concatenate(alongs),
-        np.concatenate(drawns),
+        np.concatenate([graph.node_xyz[:, :2], places[inner]]),
+        row,
+        edge,
+        corner[vertex] + share * metres[vertex],
+        part == 0,
     )
 
 

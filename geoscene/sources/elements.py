@@ -101,6 +101,16 @@ class Collector:
         if tags:
             self._node_tags[osm_id] = tags
 
+    def nodes(self, ids: Ints, *, x: NDArray[np.int32], y: NDArray[np.int32]) -> None:
+        """Add nodes (n,) as `node`, without tags."""
+        self._node_id.frombytes(np.ascontiguousarray(ids, np.int64).tobytes())
+        self._node_x.frombytes(np.ascontiguousarray(x, np.int32).tobytes())
+        self._node_y.frombytes(np.ascontiguousarray(y, np.int32).tobytes())
+
+    def node_tags(self, osm_id: int, tags: Tags) -> None:
+        """Add the tags of a node."""
+        self._node_tags[osm_id] = tags
+
     def way(self, osm_id: int, refs: Iterable[int], *, tags: Tags) -> None:
         """Add a way by its node ids."""
         before = len(self._refs)
@@ -112,6 +122,11 @@ class Collector:
     def relation(self, osm_id: int, tags: Tags, *, members: Members) -> None:
         """Add a relation."""
         self._relations[osm_id] = (tags, members)
+
+    def has_drawn_nodes(self) -> bool:
+        """Whether tags or ways refer to nodes with negative ids, which are not in OpenStreetMap yet."""
+        refs = np.array(self._refs, np.int64)
+        return bool((refs < 0).any()) or min(self._node_tags, default=0) < 0
 
     def clashing(self, other: Collector) -> str:
         """A node or way with a negative id that differs between both, such as ``node/-3``; "" if none does.

@@ -6,7 +6,11 @@ import datetime as dt
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.sources.assemble import features
@@ -46,19 +50,43 @@ def _format_of(path: Path) -> str:
     raise InputError(f"{path}: not an OpenStreetMap file; {_HELP}")
 
 
-def _stream(file: Any, collector: Collector, *, progress: Progress) -> None:
-    """Add the objects that libosmium reads to ``collector``."""
+def _node_places(file: Any) -> NDArray[Any] | None:
+    """Columns ``id``, ``x``, ``y`` of all nodes of a file; None if their ids are not positive and ascending.
+
+    libosmium writes them into a file, in a tenth of the time that reading the nodes one by one takes.
+    """
+    import osmium  # noqa: PLC0415 - heavy
+
+    record = [("id", "<u8"), ("x", "<i4"), ("y", "<i4")]
+    with TemporaryDirectory() as folder:
+        index = osmium.index.create_map(f"sparse_file_array,{folder}/nodes")
+        osmium.apply(osmium.io.Reader(file, osmium.osm.NODE), osmium.NodeLocationsForWays(index))
+        nodes = np.fromfile(f"{folder}/nodes", np.dtype(record))
+    nodes = nodes[: np.count_nonzero(nodes["id"])]  # what follows is empty
+    return nodes if (np.diff(nodes["id"], prepend=np.uint64(0)).astype(np.int64) > 0).all() else None
+
+
+def _stream(file: Any, collector: Collector, *, nodes: NDArray[Any] | None, progress: Progress) -> None:
+    """Add the objects that libosmium reads to ``collector``; of ``nodes`` with known places only the tags."""
     import osmium  # noqa: PLC0415 - heavy
 
     stream = osmium.FileProcessor(file)
+    if nodes is not None:
+        collector.nodes(nodes["id"].astype(np.int64), x=nodes["x"], y=nodes["y"])
+        tagged = osmium.filter.EmptyTagFilter()
+        tagged.enable_for(osmium.osm.NODE)
+        stream = stream.with_filter(tagged)
     stated = stream.header.get("osmosis_replication_timestamp") or stream.header.get("timestamp")
     newest = dt.datetime.fromtimestamp(0, dt.UTC)
     kinds = {"n": "node", "w": "way", "r": "relation"}
     for item in progress(stream):
         if item.is_node():
-            place = item.location
             tags = {tag.k: tag.v for tag in item.tags} if item.tags else None
-            collector.node(item.id, place.x, y=place.y, tags=tags)
+            if nodes is None:
+                place = item.location
+                collector.node(item.id, place.x, y=place.y, tags=tags)
+            elif tags:
+                collector.node_tags(item.id, tags)
             if tags is None:
                 continue
         elif item.is_way() and not item.deleted:
@@ -91,7 +119,11 @@ def _collect(path: Path, progress: Progress) -> Collector:
         low, high = box.bottom_left, box.top_right
         collector.bounds = (low.lon, low.lat, high.lon, high.lat)
     try:
-        _stream(file, collector, progress=progress)
+        nodes = _node_places(file) if file_format == "pbf" else None
+        _stream(file, collector, nodes=nodes, progress=progress)
+        if nodes is not None and collector.has_drawn_nodes():  # which libosmium's index leaves out
+            collector = Collector(bounds=collector.bounds)
+            _stream(file, collector, nodes=None, progress=progress)
     except osmium.InvalidLocationError:  # the position of a node is not a number: read without libosmium
         collector = Collector(bounds=collector.bounds)
         collect_xml(path, file_format, collector=collector, progress=progress)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import shapely
@@ -13,7 +14,9 @@ from numpy.typing import NDArray
 from geoscene import polylines
 from geoscene.classes import Class, materials
 from geoscene.ground.layers import PADS, Layers
+from geoscene.roadgraph.surface_rows import in_reach
 from geoscene.structures.heights import surface_heights
+from geoscene.structures.pieces import NEAR
 from geoscene.structures.sheets import areal
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
 from geoscene.typing import Bools, Float, Height, Ints
@@ -116,13 +119,17 @@ def _ground_on(strips: NDArray[np.object_], height: Height | None) -> tuple[Floa
     return xy, strip, np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
 
 
-def find_openings(table: Structures, height: Height | None) -> NDArray[np.object_]:
+def find_openings(
+    table: Structures, height: Height | None, *, area: Any | None = None
+) -> NDArray[np.object_]:
     """Areas (n,) over each tunnel piece without ground, as shapely polygons; None if there are none.
 
     There the ground is not higher than the minimum roof over the tunnel's ceiling.
+
+    area : shapely geometry: pieces far from it have none
     """
     openings = np.empty(len(table), object)
-    for k in np.flatnonzero(table.tunnel).tolist():
+    for k in np.flatnonzero(table.tunnel & in_reach(table.polygon, area, metres=NEAR)).tolist():
         strips = _strips(table, k)
         xy, strip, ground = _ground_on(strips, height)
         covered = ground > surface_heights(table, k, xy=xy) + table.rise[k] + THINNEST + 2 * LIP

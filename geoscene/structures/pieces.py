@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import shapely
@@ -12,13 +13,16 @@ from numpy.typing import NDArray
 
 from geoscene import polylines
 from geoscene.classes import Class
-from geoscene.roadgraph.surface_rows import SurfaceRows
+from geoscene.roadgraph.surface_rows import SurfaceRows, in_reach
 from geoscene.structures.heights import PARTED, SHEET, nearest_on_line
 from geoscene.structures.layered import PRECISION
 from geoscene.structures.members import Members
 from geoscene.structures.sheets import Sheets, areal, find_sheets, part_outlines, strips_of_equal_height
 from geoscene.structures.table import THINNEST, StructureOptions, Structures
 from geoscene.typing import Float, Ints
+
+NEAR = 10.0
+"""Metres from an area within which pieces are complete: more than surfaces below keep a pier away."""
 
 _AROUND = 12.0
 """Metres by which a piece's centre line is known beyond its ends."""
@@ -42,9 +46,12 @@ _CRUMB = 0.02
 """Square metres; smaller parts of a piece are left out."""
 
 
-def cut_pieces(members: Members, raised: SurfaceRows, *, options: StructureOptions) -> Structures:
+def cut_pieces(
+    members: Members, raised: SurfaceRows, *, options: StructureOptions, area: Any | None
+) -> Structures:
     """The pieces of all members, in order, without piers.
 
+    Those far from an ``area``, a shapely geometry, have no area within their parapets; all have without one.
     Where outlines of one carriageway overlap, as at junctions, the smaller one keeps the area.
     """
     member, polygon, line, around, half = _outlines(members, raised, options=options)
@@ -57,7 +64,14 @@ def cut_pieces(members: Members, raised: SurfaceRows, *, options: StructureOptio
     near = sheets.near
     rim = np.where(tunnel, options.wall, options.rim)
     inner = _inner(
-        polygon, line, around=around, half=half, sheets=sheets, approach=members.approach[member], rim=rim
+        polygon,
+        line,
+        around=around,
+        half=half,
+        sheets=sheets,
+        approach=members.approach[member],
+        rim=rim,
+        rows=np.flatnonzero(in_reach(polygon, area, metres=NEAR)),
     )
     polygon = _territories(polygon, around, sheets=sheets)
     rise = np.where(
@@ -190,11 +204,16 @@ def _inner(
     sheets: Sheets,
     approach: NDArray[np.object_],
     rim: Float,
+    rows: Ints,
 ) -> NDArray[np.object_]:
-    """The area within the parapets of a piece and its neighbours, open towards roads on the ground."""
-    inner = np.empty(len(polygon), object)
+    """The area within the parapets of a piece and its neighbours, open towards roads on the ground.
+
+    Of pieces in ``rows``; none of others.
+    """
+    inner = np.full(len(polygon), shapely.Polygon(), object)
     near = sheets.near
-    for k, others in enumerate(near):
+    for k in rows.tolist():
+        others = near[k]
         # Neighbours' neighbours too, so that no parapet stands where the next piece but one begins.
         beyond = np.unique(np.concatenate([others, *(near[q] for q in others)]).astype(np.int64))
         shapes = [polygon[k]]

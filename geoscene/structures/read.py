@@ -13,13 +13,10 @@ from geoscene.sources.data import OsmData
 from geoscene.structures.ground_contact import find_low_decks
 from geoscene.structures.members import Members, road_members
 from geoscene.structures.paths import path_members
-from geoscene.structures.pieces import cut_pieces
+from geoscene.structures.pieces import NEAR, cut_pieces
 from geoscene.structures.piers import place_piers
 from geoscene.structures.table import StructureOptions, Structures
 from geoscene.typing import Height
-
-_NEAR = 10.0
-"""Metres from an area within which pieces have piers: more than surfaces below keep a pier away."""
 
 
 def read_structures(
@@ -36,13 +33,14 @@ def read_structures(
 
     graph  : with heights, from `geoscene.roadgraph.profile`
     height : height of the graded ground (`geoscene.roadgraph.graded_ground`); level at 0 by default
-    area   : shapely geometry, scene metres: pieces far from it have neither piers nor low ground; all have
-             by default
+    area   : shapely geometry, scene metres: pieces far from it have no piers, no low ground and no area
+             within their parapets; all have by default
     """
     options = options or StructureOptions()
     raised = surfaces.raised
     paths, problems = path_members(raised, osm, frame=frame, graph=graph, height=height, options=options)
-    table = cut_pieces(Members.concatenate([road_members(graph, raised), paths]), raised, options=options)
-    near = in_reach(table.polygon, area, metres=_NEAR)
+    members = Members.concatenate([road_members(graph, raised), paths])
+    table = cut_pieces(members, raised, options=options, area=area)
+    near = in_reach(table.polygon, area, metres=NEAR)
     table = place_piers(table, surfaces, height=height, near=near, options=options)
     return find_low_decks(table, height, near=near), problems

@@ -585,3 +585,19 @@ def test_multipolygons_of_the_test_grid_have_their_known_areas(shared_osm):
     assert agree == 88
     told = {p.osm_id: p.action for p in data.problems}
     assert all(told[f"relation/{i}900"] == "repaired" for i in REPAIRED)
+
+
+@pytest.mark.parametrize("ids", [(1, 2, 3), (3, 2, 1), (-1, -2, -3), (1, 2, 1)])
+def test_nodes_of_pbf_files_are_read_with_any_ids_in_any_order(tmp_path, ids):
+    places = [(10.0, 50.0), (10.001, 50.0), (10.001, 50.001)]
+    with osmium.SimpleWriter(str(tmp_path / "a.osm.pbf")) as writer:
+        for k, (osm_id, place) in enumerate(zip(ids, places, strict=True)):
+            tags = {"n": str(k)} if k else {}
+            writer.add_node(osmium.osm.mutable.Node(id=osm_id, location=place, tags=tags))
+                osmium.osm.mutable.Node(id=osm_id, location=place, tags={"n": str(k)} if k else {})
+            )
+        writer.add_way(osmium.osm.mutable.Way(id=7, nodes=sorted(set(ids)), tags={"highway": "service"}))
+    osm = read_osm(tmp_path / "a.osm.pbf")
+    where = dict(zip(ids, places, strict=True))  # of equal ids the last counts
+    np.testing.assert_allclose(osm.ways[0].lonlat, [where[i] for i in sorted(set(ids))], atol=1e-7)
+    assert {p.osm_id for p in osm.points} == {f"node/{i}" for i in ids[1:]}
