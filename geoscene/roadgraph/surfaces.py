@@ -77,20 +77,19 @@ def road_surfaces(
     edge = _edges_below(roads, graph)
     crossings = crossing_rows(osm, roads, frame=frame)
     strips = crossings.polygon[crossings.priority == crossings.priority.min(initial=np.inf)]
-    carriageways, count = _carriageway_rows(roads, edge, area=area)
-    rows = SurfaceRows.concatenate(
+    paths = SurfaceRows.concatenate([square_surfaces(osm, frame), path_surfaces(osm, frame)])
+    carriageways, count = _carriageway_rows(roads, edge, first=len(paths), area=area)
+    others = SurfaceRows.concatenate(
         [
-            square_surfaces(osm, frame),
-            path_surfaces(osm, frame),
-            *carriageways,
             crossings,
             marking_rows(roads, edge, left_hand=options.left_hand),
             stop_rows(graph, roads, crossings=strips, left_hand=options.left_hand),
             rail_surfaces(osm, frame),
         ]
     )
-    others = np.flatnonzero(rows.number < 0)
-    rows.number[others] = count + np.arange(len(others))
+    paths.number[:] = np.arange(len(paths))
+    others.number[:] = count + np.arange(len(others))
+    rows = SurfaceRows.concatenate([paths, *carriageways, others])
     ground = rows.take(rows.place == 0)
     columns = {f.name: getattr(ground, f.name) for f in fields(ground)}
     return RoadSurfaces(**columns, raised=rows.take(rows.place != 0), count=count + len(others))
@@ -137,11 +136,11 @@ def _edges_below(roads: Carriageways, graph: RoadGraph) -> NDArray[np.int32]:
 
 
 def _carriageway_rows(
-    roads: Carriageways, edge: NDArray[np.int32], *, area: Any | None
+    roads: Carriageways, edge: NDArray[np.int32], *, first: int, area: Any | None
 ) -> tuple[list[SurfaceRows], int]:
-    """Surfaces of carriageways that are raised or near the area, and the count of all their numbers."""
+    """Surfaces of carriageways that are raised or near the area, numbered from ``first``; the next number."""
     if not len(roads):
-        return [], 0
+        return [], first
     importance = np.array(
         [len(CLASSES) - CLASSES.index(s.highway) if s.highway in CLASSES else 0 for s in roads.street]
     )
@@ -159,7 +158,7 @@ def _carriageway_rows(
     chosen = np.flatnonzero(wanted)
     at_node = in_reach(shapely.points(roads.node_xy), area, metres=_junction_reach(roads))
     joints = build_junctions(roads, importance, wanted=(place != 0)[:, None] | at_node[roads.ends])
-    count = len(roads)
+    count = first + len(roads)
     out = [
         SurfaceRows.of(
             carriageway(roads.line[chosen], half[chosen]),
@@ -167,7 +166,7 @@ def _carriageway_rows(
             material=roads.material[chosen],
             priority=_CARRIAGEWAY + importance[chosen],
             source=source[chosen],
-            number=chosen,
+            number=first + chosen,
             **at(chosen),
         ),
         SurfaceRows.of(

@@ -594,8 +594,6 @@ def test_nodes_of_pbf_files_are_read_with_any_ids_in_any_order(tmp_path, ids):
         for k, (osm_id, place) in enumerate(zip(ids, places, strict=True)):
             tags = {"n": str(k)} if k else {}
             writer.add_node(osmium.osm.mutable.Node(id=osm_id, location=place, tags=tags))
-                osmium.osm.mutable.Node(id=osm_id, location=place, tags={"n": str(k)} if k else {})
-            )
         writer.add_way(osmium.osm.mutable.Way(id=7, nodes=sorted(set(ids)), tags={"highway": "service"}))
     osm = read_osm(tmp_path / "a.osm.pbf")
     where = dict(zip(ids, places, strict=True))  # of equal ids the last counts
