@@ -480,7 +480,8 @@ def _print_scene(report: dict[str, Any]) -> None:
         part = "that drives need" if for_drives else "in range of the route"
         rows["along"] = (
             f"{len(report['tiles'])} tiles are built, those {part}; solids, watertight,"
-            " trees in forests and ground count these tiles, all other figures the whole map;"
+            " trees in forests and ground count these tiles, all other figures the whole map (objects far"
+            " away as mapped);"
             f" tables hold {sum(report['rows'].values())} of {features} features"
         )
     if use != "all":
