@@ -31,6 +31,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from bench.measure import restart_peak
 from damaged_inputs import KINDS, Inputs, Words
 from mutations import mutate
 from readers import readable, reader_of
@@ -39,6 +40,7 @@ from geoscene.console import main as main_of
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
 from geoscene.files import digest_of
+from geoscene.memory import peak_memory
 from lidar.errors import InputError, LidarError
 
 _SHARES = {"maps": 1, "scenes": 3, "datasets": 2, "configurations": 8}
@@ -164,9 +166,9 @@ def _serve(link: Connection, folder: Path, options: argparse.Namespace) -> None:
         link.send(Trial(path, valid, words))
         if path:
             mutate(path, rng)
-        Path("/proc/self/clear_refs").write_text("5")
+        restart_peak()
         wrong = reading(kind, path) if only_read and path else outcome(words)
-        peak = int(Path("/proc/self/status").read_text().partition("VmHWM:")[2].split()[0]) / 2**20
+        peak = peak_memory() / 2**30
         link.send(wrong or (f"memory: {peak:.1f} GB" if peak > options.gigabytes else ""))
         if link.recv() and path:
             path.parent.mkdir(exist_ok=True)

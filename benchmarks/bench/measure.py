@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, Literal
 
 from geoscene.errors import GeosceneError
+from geoscene.memory import peak_memory
 
 SAMPLE_S = 0.2
 """Seconds between two samples of a command's memory."""
@@ -149,15 +150,15 @@ def alone(function: Callable[..., Callable[[], object]], *arguments: object) -> 
 def _in_child(function: Callable[..., Callable[[], object]], arguments: tuple[object, ...]) -> Spent:
     work = function(*arguments)
     gc.collect()
-    Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from now
-    before = _status_bytes("VmRSS")
+    restart_peak()
+    before = peak_memory()
     cost = timed(work)
-    return Spent(cost.wall_s, cost.cpu_s, max(_status_bytes("VmHWM") - before, 0))
+    return Spent(cost.wall_s, cost.cpu_s, max(peak_memory() - before, 0))
 
 
-def _status_bytes(name: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * int(next(line for line in lines if line.startswith(name + ":")).split()[1])
+def restart_peak() -> None:
+    """Let `peak_memory` be the peak from now on; Linux only."""
+    Path("/proc/self/clear_refs").write_text("5")
 
 
 def command(words: Sequence[str], *, errors: IO[bytes] | None = None, cwd: Path | None = None) -> Spent:
