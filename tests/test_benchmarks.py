@@ -19,6 +19,8 @@ PEER = """#!{python}
 import sys, xml.etree.ElementTree as ET
 from pathlib import Path
 import laspy, numpy as np
+if sys.argv[1] == "--version":
+    sys.exit(print("Stand-in 1.0"))
 survey = ET.parse(sys.argv[1]).getroot()
 words = survey.find("survey").attrib
 def part(name, tag):
@@ -158,6 +160,47 @@ def test_curves_without_an_exponent(bench):
     two = exponent([1, 2], [8, 4])
     assert two.value == pytest.approx(-1)
     assert np.isnan(two.low)
+    assert np.isnan(two.error)
+
+
+def test_curves_are_fitted_through_the_medians_of_their_sizes(bench):
+    curve = bench("bench.growth").Curve
+    x, cost = [1.0, 10.0, 100.0, 1000.0], [3.0, 40.0, 200.0, 3000.0]
+    once = curve("n", "s", "CPU s", tuple(x), tuple(cost)).exponent
+    often = curve("n", "s", "CPU s", (*x, *x, 1.0), (*cost, *cost, 90.0)).exponent
+    assert often == once  # repetitions do not narrow the interval of a bent line
+    slope, covariance = np.polyfit(np.log(x), np.log(cost), 1, cov=True)
+    assert (once.value, once.error) == pytest.approx((slope[0], np.sqrt(covariance[0, 0])))
+    assert once.low < once.value - 4 * once.error < once.value + 4 * once.error < once.high
+
+    small = curve("n", "s", "bytes", (1.0, 10.0, 100.0, 1000.0), (0.0, 2.0, 20.0, 200.0))
+    assert small.exponent.value == pytest.approx(1)
+    assert curve("n", "s", "bytes", (1.0, 10.0, 100.0), (0.0, 2.0, 20.0)).exponent is None
+    workers = curve("n", "workers", "wall s", (1.0, 2.0, 1.0, 2.0), (8.0, 4.0, 8.0, 4.4)).exponent
+    assert workers.error > 0
+
+
+@pytest.mark.parametrize("what", ["buildings", "triangles", "rays per pulse", "frames", "road users"])
+def test_sizes_of_curves_span_two_decades(what, bench, tmp_path):
+    curves, setup = bench("bench.curves"), bench("bench.scenes").Setup
+    whole = curves.sizes(setup(quick=False, repetitions=1, folder=tmp_path), what)
+    full = curves.sizes(setup(quick=False, repetitions=1, folder=tmp_path, full=True), what)
+    assert whole[-1] >= 100 * whole[0]
+    assert len(whole) >= 5
+    assert full[: len(whole)] == whole
+    if what == "buildings":
+        assert (whole[-1], full[-1]) == (10_000, 100_000)
+
+
+def test_great_sizes_are_not_repeated(bench, tmp_path):
+    curves, measure = bench("bench.curves"), bench("bench.measure")
+    setup = bench("bench.scenes").Setup(quick=True, repetitions=5, folder=tmp_path)
+    seconds = {1: 0.5, 10: 0.6 * curves.ENOUGH_S, 100: curves.ENOUGH_S}
+    x, spent = curves._processes(
+        setup, {n: functools.partial(measure.Spent, 1.0, s) for n, s in seconds.items()}
+    )
+    assert x == (1.0, 1.0, 1.0, 10.0, 10.0, 100.0)
+    assert [s.cpu_s for s in spent] == [seconds[int(n)] for n in x]
 
 
 def test_sides_take_turns_and_ratios_are_of_the_same_repetition(bench):
@@ -242,9 +285,18 @@ def test_a_peer_gets_the_same_scene_and_pulses_and_must_do_the_same_work(share, 
         assert "not the same work" in done.stderr
         return
     assert done.returncode == 0, done.stderr
-    (case,) = json.loads((out / "bench.json").read_text())["cases"]
+    document = json.loads((out / "bench.json").read_text())
+    assert "HELIOS++ is Stand-in 1.0" in document["notes"]
+    assert document["seconds"]["helios"] > 0
+    (case,) = document["cases"]
     assert set(case["sides"]) == {"lidar", "HELIOS++"}
     assert case["sides"]["HELIOS++"]["ratio"] is not None
+
+
+def test_a_run_is_quick_or_full():
+    done = run_bench("--quick", "--full")
+    assert done.returncode == 2
+    assert "give one of them" in error_line(done)
 
 
 def test_a_missing_peer_is_refused(tmp_path):

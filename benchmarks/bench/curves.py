@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,64 +33,95 @@ from lidar.world.world import World
 
 Prepared = Callable[[], object]
 
+ENOUGH_S = 10.0
+"""CPU seconds after which a size is not repeated."""
+
+_SIZES: dict[str, tuple[Sequence[int], Sequence[int], Sequence[int]]] = {
+    "buildings": ((25, 50, 100), (100, 300, 1000, 3000, 10_000), (30_000, 100_000)),
+    "triangles": (
+        (60_000, 120_000, 240_000),
+        (40_000, 120_000, 400_000, 1_200_000, 4_000_000),
+        (12_000_000,),
+    ),
+    "rays per pulse": ((1, 7, 19), (1, 7, 19, 61, 217), ()),
+    "frames": ((10, 20, 40), (5, 15, 50, 150, 500), (2000,)),
+    "road users": ((30, 100, 300), (30, 100, 300, 1000, 3000), (10_000,)),
+}
+"""Sizes of quick and of whole runs, and those that full runs add."""
+
+_RATE = 10
+"""Frames per second of the VLP-16."""
+
+
+def sizes(setup: Setup, what: str) -> tuple[int, ...]:
+    """The sizes of a curve of the run, growing."""
+    if what == "buildings" and setup.buildings:
+        return tuple(sorted(set(setup.buildings)))
+    quick, whole, more = _SIZES[what]
+    return tuple(quick if setup.quick else (*whole, *(more if setup.full else ())))
+
 
 def growth(setup: Setup) -> Iterator[Curve]:
     """All curves; memory is that of processes of their own."""
-    sizes = setup.sizes or ((25, 50, 100) if setup.quick else (500, 1000, 2000, 4000))
-    cities = {n: setup.folder / f"city_{n}.osm.pbf" for n in sizes}
+    cities = {n: setup.folder / f"city_{n}.osm.pbf" for n in sizes(setup, "buildings")}
     for count, path in cities.items():
         write_city(make_city(count, seed=0), path)
     yield from _alone(
         setup,
         "building",
-        {float(n): (_building, path, setup.folder / "grown") for n, path in cities.items()},
+        {n: (_building, path, setup.folder / "grown") for n, path in cities.items()},
         size="buildings",
         note="map to scene of a synthetic city, LoD 2, one process, without imports and compilation",
     )
-    triangles = (6e4, 1.2e5, 2.4e5) if setup.quick else (1e5, 2e5, 4e5, 8e5, 1.6e6)
     yield from _alone(
         setup,
         "tree of triangles",
-        {n: (_tree, n) for n in triangles},
+        {n: (_tree, n) for n in sizes(setup, "triangles")},
         size="triangles",
         note="Embree's tree and the tables of a caster over a synthetic city; Embree builds on all cores",
     )
-    yield _rays_into_triangles(setup, triangles)
+    yield _rays_into_triangles(setup)
     _ = setup.scene  # built here, not in the processes that are measured
     yield from _alone(
         setup,
         "scanning",
-        {float(n): (_scan, setup, n) for n in (1, 7, 19, 37, 61)},
+        {n: (_scan, setup, n) for n in sizes(setup, "rays per pulse")},
         size="rays per pulse",
         note=f"five VLP-16 frames in {setup.town}",
     )
-    seconds = (1.0, 2.0, 4.0) if setup.quick else (5.0, 10.0, 20.0, 40.0)
     yield from _alone(
         setup,
         "driving",
-        {10 * s: (_drive, setup, s) for s in seconds},
+        {n: (_drive, setup, n) for n in sizes(setup, "frames")},
         size="frames",
         note="a VLP-16 to PCD, from planning to files, one worker, without imports and compilation",
     )
     yield _road_users(setup)
-    yield from _workers(setup, cities[sizes[-1]], seconds=seconds[-1])
+    yield from _workers(setup, cities)
 
 
 def _alone(
     setup: Setup,
     name: str,
-    tasks: dict[float, tuple[Any, ...]],
+    tasks: dict[int, tuple[Any, ...]],
     *,
     size: str,
     note: str,
 ) -> Iterator[Curve]:
     """Curves of CPU time and memory of work in processes of its own, all sizes by turns."""
-    spent = [
-        (x, alone(*task)) for _ in range(min(setup.repetitions, MOST_PROCESSES)) for x, task in tasks.items()
-    ]
-    x = tuple(x for x, _ in spent)
-    yield Curve(name, size, "CPU s", x, tuple(s.cpu_s for _, s in spent), note)
-    yield Curve(name, size, "bytes", x, tuple(float(s.peak_bytes) for _, s in spent), note)
+    x, spent = _processes(setup, {n: partial(alone, *task) for n, task in tasks.items()})
+    yield Curve(name, size, "CPU s", x, tuple(s.cpu_s for s in spent), note)
+    yield Curve(name, size, "bytes", x, tuple(float(s.peak_bytes) for s in spent), note)
+
+
+def _processes(setup: Setup, tasks: dict[int, Callable[[], Spent]]) -> tuple[tuple[float, ...], list[Spent]]:
+    """Sizes and costs of tasks in processes, by turns; one that took `ENOUGH_S` is not repeated."""
+    spent: dict[int, list[Spent]] = {n: [] for n in tasks}
+    for _ in range(min(setup.repetitions, MOST_PROCESSES)):
+        for n, task in tasks.items():
+            if sum(s.cpu_s for s in spent[n]) < ENOUGH_S:
+                spent[n].append(task())
+    return tuple(float(n) for n in spent for _ in spent[n]), [s for costs in spent.values() for s in costs]
 
 
 def _building(city: Path, out: Path) -> Prepared:
@@ -104,23 +136,23 @@ def _building(city: Path, out: Path) -> Prepared:
     return work
 
 
-def _tree(triangles: float) -> Prepared:
+def _tree(triangles: int) -> Prepared:
     vertices, faces = boxes_on_hills(triangles)
     Caster(*boxes_on_hills(100.0)).cast([0.0, 0.0, 99.0], [[0.0, 0.0, -1.0]])
     return lambda: Caster(vertices, faces).cast([0.0, 0.0, 99.0], [[0.0, 0.0, -1.0]])
 
 
-def _rays_into_triangles(setup: Setup, triangles: Sequence[float]) -> Curve:
-    """CPU time of ten VLP-16 frames against triangles, by turns in this process."""
-    casters = {round(n): Caster(*boxes_on_hills(n)) for n in triangles}
+def _rays_into_triangles(setup: Setup) -> Curve:
+    """CPU time of 100 VLP-16 frames against triangles, by turns in this process."""
+    casters = {n: Caster(*boxes_on_hills(n)) for n in sizes(setup, "triangles")}
     directions, index = SENSORS["VLP-16"]()
     (poses,) = street(1, int(index.max()) + 1)
 
     def frames(count: int) -> None:
-        for _ in range(10):
+        for _ in range(100):
             casters[count].cast_posed(poses, index, directions=directions)
 
-    note = "ten VLP-16 frames in a tree of so many triangles"
+    note = "100 VLP-16 frames in a tree of so many triangles"
     return _by_turns(setup, "rays", tuple(casters), frames, size="triangles", note=note)
 
 
@@ -139,18 +171,18 @@ def _scan(setup: Setup, rays: int) -> Prepared:
 
 
 def _by_turns(
-    setup: Setup, name: str, sizes: Sequence[int], work: Callable[[int], object], *, size: str, note: str
+    setup: Setup, name: str, counts: Sequence[int], work: Callable[[int], object], *, size: str, note: str
 ) -> Curve:
-    case = Work("growth", name, 1, "", {str(n): partial(work, n) for n in sizes})
+    case = Work("growth", name, 1, "", {str(n): partial(work, n) for n in counts})
     found = measured(case, repetitions=setup.repetitions)
-    pairs = [(float(n), s.cpu_s) for n in sizes for s in found.spent[str(n)]]
+    pairs = [(float(n), s.cpu_s) for n in counts for s in found.spent[str(n)]]
     return Curve(name, size, "CPU s", *zip(*pairs, strict=True), note)
 
 
-def _drive(setup: Setup, seconds: float, workers: int = 1) -> Prepared:
+def _drive(setup: Setup, frames: int, workers: int = 1) -> Prepared:
     out = setup.folder / "grown_drive"
     drive(setup.scene, out, options=setup.options("VLP-16", seconds=0.5), overwrite=True)
-    options = setup.options("VLP-16", seconds=seconds, workers=workers)
+    options = setup.options("VLP-16", seconds=frames / _RATE, workers=workers)
     return lambda: drive(setup.scene, out, options=options, overwrite=True)
 
 
@@ -170,24 +202,32 @@ def _road_users(setup: Setup) -> Curve:
         for _ in range(10):
             world.place_actors(shape, transform, feature=np.arange(count, dtype=np.int32) + 10**6)
 
-    return _by_turns(
-        setup, "placing", (100, 200, 400, 800), place, size="road users", note="ten frames, 111 shapes"
-    )
+    note = f"ten frames, {len(shapes)} shapes"
+    return _by_turns(setup, "placing", sizes(setup, "road users"), place, size="road users", note=note)
 
 
-def _workers(setup: Setup, city: Path, *, seconds: float) -> Iterator[Curve]:
-    """Wall time and memory of builds and drives by one and two workers."""
+def _bounded(counts: Iterable[int], most: int) -> int:
+    """The greatest size up to a bound, or else the smallest."""
+    found = sorted(counts)
+    return max((n for n in found if n <= most), default=found[0])
+
+
+def _workers(setup: Setup, cities: dict[int, Path]) -> Iterator[Curve]:
+    """Wall time and memory of builds and drives by one, two, four ... workers, at most one a core."""
+    counts = [1, 2, *(2**k for k in range(2, 10) if 2**k <= len(os.sched_getaffinity(0)))]
+    buildings, frames = _bounded(cities, 3000), _bounded(sizes(setup, "frames"), 500)
 
     def built(workers: int) -> Spent:
-        return command(build_command(city, setup.folder / "grown", "--workers", str(workers)))
+        return command(build_command(cities[buildings], setup.folder / "grown", "--workers", str(workers)))
 
     def driven(workers: int) -> Spent:
-        return alone(_drive, setup, seconds, workers)
+        return alone(_drive, setup, frames, workers)
 
-    for name, work in (("building", built), ("driving", driven)):
-        repetitions = range(min(setup.repetitions, MOST_PROCESSES))
-        spent = [(float(n), work(n)) for _ in repetitions for n in (1, 2)]
-        x = tuple(n for n, _ in spent)
-        note = "the largest city or drive above; with -1, two workers would be twice as fast"
-        yield Curve(name, "workers", "wall s", x, tuple(s.wall_s for _, s in spent), note)
-        yield Curve(name, "workers", "bytes", x, tuple(float(s.peak_bytes) for _, s in spent), note)
+    for name, work, size in (
+        ("building", built, f"{buildings:,} buildings"),
+        ("driving", driven, f"{frames} frames"),
+    ):
+        x, spent = _processes(setup, {n: partial(work, n) for n in counts})
+        note = f"{size}; with -1, twice as many workers would take half the time"
+        yield Curve(name, "workers", "wall s", x, tuple(s.wall_s for s in spent), note)
+        yield Curve(name, "workers", "bytes", x, tuple(float(s.peak_bytes) for s in spent), note)

@@ -37,7 +37,7 @@ def driving(setup: Setup) -> Iterator[Case]:
     """Each rig along the same random route: in memory, and as a dataset."""
     for rig in RIGS:
         camera = not RIGS[rig]
-        seconds = (0.2 if camera else 1.0) if setup.quick else (2.0 if camera else 5.0)
+        seconds = (0.2 if camera else 1.0) if setup.quick else (1.0 if camera else 5.0)
         plan = setup.plan(rig, seconds=seconds)
         shared: Shared = {
             "amount": sum(map(_samples, plan.sensors, plan.frames.values())) / 1e6,

@@ -12,9 +12,10 @@ from scipy import stats
 
 @dataclass(frozen=True, slots=True)
 class Exponent:
-    """The exponent b of y = a x^b with its 95 % interval; the interval is NaN for two points."""
+    """The exponent b of y = a x^b, its standard error and 95 % interval, which are NaN for two points."""
 
     value: float
+    error: float
     low: float
     high: float
     factor: float
@@ -44,8 +45,16 @@ class Curve:
 
     @property
     def exponent(self) -> Exponent | None:
-        """Of the curve; None if a cost is 0 or all sizes are equal."""
-        return exponent(self.x, self.y)
+        """Through the medians of at least three sizes with a cost, or through all costs of two sizes.
+
+        None for fewer sizes. Repetitions of one size say nothing about how straight the line is.
+        """
+        points = list(zip(self.x, self.y, strict=True))
+        if len(set(self.x)) > 2:
+            points = [(x, y) for x, y in self.medians() if y > 0]
+            if len(points) < 3:
+                return None
+        return exponent(*zip(*points, strict=True))
 
     @property
     def last_exponent(self) -> float | None:
@@ -66,6 +75,6 @@ def exponent(x: Sequence[float], y: Sequence[float]) -> Exponent | None:
     u, v = np.log(np.asarray(x, float)), np.log(np.asarray(y, float))
     line = stats.linregress(u, v)
     free = len(u) - 2
-    half = float(stats.t.ppf(0.975, free) * line.stderr) if free else math.nan
-    b = float(line.slope)
-    return Exponent(b, b - half, b + half, float(np.exp(line.intercept)))
+    error = float(line.stderr) if free else math.nan
+    b, half = float(line.slope), float(stats.t.ppf(0.975, free)) * error if free else math.nan
+    return Exponent(b, error, b - half, b + half, float(np.exp(line.intercept)))

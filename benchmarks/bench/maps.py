@@ -31,6 +31,7 @@ _TILE_M = 250.0
 def building(setup: Setup) -> Iterator[Case]:
     """Whole builds by one and two workers, and the solids of buildings alone."""
     for name, path in setup.maps().items():
+        _ = setup.scene_of(name)  # fills the cache of compiled code, which the first process would wait for
         out, box = setup.folder / "built", QUICK_BOX if setup.quick else None
         part = [f"--bbox={','.join(map(str, box))}"] if box else []
         yield Case(

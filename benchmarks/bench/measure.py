@@ -73,7 +73,8 @@ class Case:
     note    : what the sides do differently
     clock   : of rates and ratios: CPU time of all threads, or wall time to compare workers and programs
     simulated_s : seconds of simulated time; 0 where there are none
-    processes : sides are whole processes, which are not run uncounted before, and three times at most
+    processes : sides are whole processes, which are not run uncounted before, and three times at most; the
+                cache of compiled code must be full
     """
 
     subject: str

@@ -35,6 +35,7 @@ class Run:
     machine  : see `bench.machine.described`
     options  : of the command
     notes    : what was left out, and warnings
+    seconds  : that each subject took
     """
 
     machine: dict[str, Any]
@@ -42,6 +43,13 @@ class Run:
     notes: list[str] = field(default_factory=list)
     results: list[Result] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def took(self) -> str:
+        """The time of the run in words."""
+        parts = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.seconds.items())
+        return f"{sum(self.seconds.values()) / 60:.1f} minutes: {parts}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +81,11 @@ def tables(run: Run) -> list[Table]:
 _HEADS = ("case", "side", "rate", "ratio", "wall s", "CPU s", "peak memory")
 _GROWTH_HEADS = ("work", "sizes", "cost", "exponent (95 %)", "last step", "what")
 _GROWTH = (
-    "Cost grows as size to the power of the exponent: least squares through the logarithms of all"
-    " repetitions. The last step is the exponent between the two greatest sizes, where fixed costs count"
-    " least. Memory is the growth of a process of its own, or of workers the sum of all processes."
+    "Cost grows as size to the power of the exponent: least squares through the logarithms of the sizes'"
+    " medians, or of all repetitions where there are two sizes; with its standard error and, in brackets, its"
+    " 95 % interval. Sizes too small for a cost are left out. The last step is the exponent between the two"
+    " greatest sizes, where fixed costs count least. Memory is the growth of a process of its own, or of"
+    " workers the sum of all processes."
 )
 
 
@@ -120,11 +130,13 @@ def _curve_row(curve: Curve) -> tuple[str, ...]:
 
 
 def exponent_text(curve: Curve) -> str:
-    """The exponent of a curve with its interval."""
+    """The exponent of a curve with its standard error and interval."""
     b = curve.exponent
     if b is None:
-        return "none: no cost at some size"
-    return f"{b.value:.2f}" if math.isnan(b.low) else f"{b.value:.2f} ({b.low:.2f} to {b.high:.2f})"
+        return "none: too few sizes with a cost"
+    if math.isnan(b.error):
+        return f"{b.value:.2f}"
+    return f"{b.value:.2f} ± {b.error:.2f} ({b.low:.2f} to {b.high:.2f})"
 
 
 def machine_text(machine: dict[str, Any]) -> str:
@@ -156,6 +168,7 @@ def document(run: Run) -> dict[str, Any]:
         "machine": run.machine,
         "options": run.options,
         "notes": run.notes,
+        "seconds": run.seconds,
         "cases": [_case_json(result) for result in run.results],
         "curves": [_curve_json(curve) for curve in run.curves],
     }
@@ -189,9 +202,12 @@ def _json_of(summary: Summary) -> dict[str, float]:
     return {"median": summary.median, "low": summary.low, "high": summary.high}
 
 
+_FIT = ("value", "error", "low", "high")
+
+
 def _curve_json(curve: Curve) -> dict[str, Any]:
     b = curve.exponent
-    fit = None if b is None else {"value": b.value, "low": _number(b.low), "high": _number(b.high)}
+    fit = None if b is None else {name: _number(getattr(b, name)) for name in _FIT}
     return {
         "name": curve.name,
         "size": curve.size,
@@ -218,7 +234,7 @@ def write_report(run: Run, out: Path) -> None:
 
 def markdown(run: Run) -> str:
     """The report as Markdown."""
-    lines = ["# Benchmark", "", machine_text(run.machine) + ".", ""]
+    lines = ["# Benchmark", "", f"{machine_text(run.machine)}. Took {run.took}.", ""]
     lines += [f"- {note}" for note in run.notes] + [""] * bool(run.notes)
     lines += [READING, ""]
     for table in tables(run):
@@ -238,7 +254,7 @@ _STYLE = (
 
 def _page(run: Run) -> str:
     """A self-contained HTML page."""
-    parts = [f"<p>{html.escape(machine_text(run.machine))}.</p>"]
+    parts = [f"<p>{html.escape(f'{machine_text(run.machine)}. Took {run.took}.')}</p>"]
     parts += [f"<p><strong>{html.escape(note)}</strong></p>" for note in run.notes]
     parts.append(f"<p>{html.escape(READING)}</p>")
     for table in tables(run):
@@ -282,6 +298,8 @@ def _scale(values: Sequence[float], *, ends: tuple[float, float]) -> tuple[Any, 
         for m in ((1, 2, 5) if high - low < 2.5 else (1,))
         if low <= math.log10(m * 10.0**k) <= high
     ]
+    if len(marks) < 2:
+        marks = [min(values), max(values)]
     start, end = ends
     return lambda v: start + (end - start) * (math.log10(v) - low) / (high - low), marks
 
@@ -296,20 +314,21 @@ def curve_plot(curve: Curve, *, width: int = 560, height: int = 400) -> Image.Im
     points = [(x, y / share) for x, y in zip(curve.x, curve.y, strict=True) if y > 0]
     if not points:
         return picture
+    b, x = curve.exponent, [x for x, _ in points]
+    line = [(end, b.at(end) / share) for end in (min(x), max(x))] if b else []
     left, right, top, bottom = 70, width - 20, 50, height - 50
-    across, columns = _scale([x for x, _ in points], ends=(left, right))
-    up, rows = _scale([y for _, y in points], ends=(bottom, top))
+    across, columns = _scale(x, ends=(left, right))
+    up, rows = _scale([y for _, y in points + line], ends=(bottom, top))
     for value in columns:
         pen.line((across(value), top, across(value), bottom), fill=_GREY)
         pen.text((across(value), bottom + 6), f"{value:,.4g}", **said, anchor="mt")
     for value in rows:
         pen.line((left, up(value), right, up(value)), fill=_GREY)
-        pen.text((left - 6, up(value)), f"{value:.4g}", **said, anchor="rm")
+        pen.text((left - 6, up(value)), f"{value:,.4g}", **said, anchor="rm")
     pen.text(((left + right) / 2, height - 8), curve.size, **said, anchor="ms")
     pen.text((10, top - 8), unit, **said, anchor="ls")
-    if b := curve.exponent:
-        ends = [(x, b.at(x) / share) for x in (min(curve.x), max(curve.x))]
-        pen.line([(across(x), up(y)) for x, y in ends], fill=_LINE, width=2)
+    if line:
+        pen.line([(across(x), up(y)) for x, y in line], fill=_LINE, width=2)
     for x, y in points:
         pen.ellipse((across(x) - 4, up(y) - 4, across(x) + 4, up(y) + 4), fill=_DOT)
     return picture

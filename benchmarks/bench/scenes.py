@@ -45,14 +45,16 @@ class Setup:
     repetitions : of each measurement
     folder      : for files of the run
     helios      : the HELIOS++ program; None if none was given
-    sizes       : numbers of buildings of the growth curve; by default those of the run's extent
+    buildings   : sizes of the growth curve of builds; by default those of the run's extent
+    full        : the greatest sizes of all growth curves
     """
 
     quick: bool
     repetitions: int
     folder: Path
     helios: Path | None = None
-    sizes: tuple[int, ...] = ()
+    buildings: tuple[int, ...] = ()
+    full: bool = False
 
     def maps(self) -> dict[str, Path]:
         """Map files by name: the demo and, in whole runs, extracts in GEOSCENE_SHARED (default ../shared)."""
