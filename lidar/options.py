@@ -323,39 +323,65 @@ class DriveOptions:
 
 
 PERCENTS = (50.0, 68.0, 90.0, 95.0, 99.0, 99.9)
-"""Percent of the returns that an accuracy may be asked for."""
+"""Percent of the returns, or of the pixels with a depth, that an accuracy may be asked for."""
 
-_LENGTH = re.compile(r"([\d.]+) ?(um|µm|mm|cm|m)(?:@([\d.]+) ?%?)?")
+_ACCURACY = re.compile(r"([\d.]+) ?(um|µm|mm|cm|m|levels?)(?:@([\d.]+) ?%?)?")
 _METRES = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 @dataclass(frozen=True, slots=True)
 class Accuracy:
-    """A range error that a share of the returns of each scanner must not exceed.
+    """Errors that the sensors of a drive must not exceed; 0 where none is asked for.
 
     text    : as it was asked for
-    metres  : the error
-    percent : the share, of `PERCENTS`
+    metres  : error of ranges of scanners, and of depths of cameras
+    percent : share of the returns or pixels to which it applies, of `PERCENTS`
+    levels  : rms error of colours of cameras, levels of 255
     """
 
     text: str
-    metres: float
+    metres: float = 0.0
     percent: float = 99.9
+    levels: float = 0.0
 
 
 def read_accuracy(text: str) -> Accuracy:
-    """An accuracy of a text such as ``1cm`` or ``5mm@99``; raises InputError for others."""
-    found = _LENGTH.fullmatch(text.strip().lower())
-    metres, percent = 0.0, 99.9
-    with suppress(ValueError):  # of numbers with two points
-        if found:
-            metres, percent = float(found[1]) * _METRES[found[2]], float(found[3] or percent)
-    if not 1e-6 <= metres <= 1000:
-        raise InputError(f"`accuracy` {text}: give a length and its unit, as in 1cm, 5mm@99 or 0.1m")
-    if percent not in PERCENTS:
-        among = ", ".join(f"{p:g}" for p in PERCENTS)
-        raise InputError(f"`accuracy` {text}: after the @ give one of {among} percent of the returns")
-    return Accuracy(text.strip(), metres, percent)
+    """An accuracy of a text such as ``1cm``, ``5mm@99``, ``3levels`` or ``1cm,3levels``.
+
+    Raises InputError for others.
+    """
+    asked = Accuracy(text.strip())
+    for part in text.lower().split(","):
+        found = _ACCURACY.fullmatch(part.strip())
+        size = 0.0
+        with suppress(ValueError):  # of numbers with two points
+            size = float(found[1]) if found else 0.0
+        if found and found[2].startswith("level"):
+            if not 0 < size <= 255 or found[3]:
+                raise InputError(f"`accuracy` {text}: give levels of 255, rms, as in 3levels")
+            given, asked = asked.levels, replace(asked, levels=size)
+        else:
+            metres = size * _METRES[found[2]] if found else 0.0
+            if not found or not 1e-6 <= metres <= 1000:
+                raise InputError(
+                    f"`accuracy` {text}: give a length and its unit, as in 1cm, 5mm@99 or 0.1m, levels of"
+                    " colours, as in 3levels, or both, as in 1cm,3levels"
+                )
+            given, asked = asked.metres, replace(asked, metres=metres, percent=_percent(text, found[3]))
+        if given:
+            raise InputError(f"`accuracy` {text}: give one length and one number of levels at most")
+    return asked
+
+
+def _percent(text: str, share: str | None) -> float:
+    """Percent of the returns, of `PERCENTS`."""
+    percent = 99.9
+    with suppress(ValueError):
+        percent = float(share) if share else percent
+        if percent in PERCENTS:
+            return percent
+    among = ", ".join(f"{p:g}" for p in PERCENTS)
+    raise InputError(f"`accuracy` {text}: after the @ give one of {among} percent of the returns")
 
 
 def read_budget(text: str) -> float:
@@ -370,16 +396,17 @@ def read_budget(text: str) -> float:
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class AccuracyOptions:
-    """Options by which the number of rays of scanners is picked, and errors are checked."""
+    """Options by which rays of scanners and cameras are picked, and errors are checked."""
 
-    accuracy: Annotated[str, Parameter(metavar="LENGTH[@PERCENT]")] = ""
-    """Pick the fewest rays per pulse with which the range errors of every scanner are below this: 1cm is at
-    99.9 % of the returns, 5mm@99 at 99 %. By the upper end of the 95 % interval of a measurement, which is
-    made once for a scene, rig and settings."""
+    accuracy: Annotated[str, Parameter(metavar="LENGTH[@PERCENT],LEVELS")] = ""
+    """Pick the fewest rays with which the errors of every sensor are below this: 1cm is for ranges and depths
+    at 99.9 % of the returns or pixels, 5mm@99 at 99 %, 3levels for colours of cameras (rms, of 255), and
+    1cm,3levels for both. What counts is the upper end of the 95 % interval for the next drive, by a
+    measurement made once for a scene, rig and settings."""
 
     budget: Annotated[str, Parameter(metavar="Nx-realtime")] = ""
-    """Pick the most rays per pulse with which the drive is simulated this much faster than real time, with
-    the workers given: 2x-realtime is two simulated seconds per second. With an accuracy: a limit to it."""
+    """Pick the most rays with which the drive is simulated this much faster than real time, with the workers
+    given: 2x-realtime is two simulated seconds per second. With an accuracy: a limit to it."""
 
     spot_check: bool = False
     """Compare a sample of the recorded frames with the exact end afterwards; always done for an accuracy or a

@@ -57,6 +57,7 @@ class DriveSummary:
     duration  : seconds of simulated time
     length    : true metres driven
     wall      : seconds of this run
+    planning  : seconds of it in which the drive was planned
     recording : seconds of it in which frames were recorded
     stages    : seconds of all threads by stage
     """
@@ -69,6 +70,7 @@ class DriveSummary:
     duration: float
     length: float
     wall: float
+    planning: float
     recording: float
     stages: dict[str, float]
 
@@ -82,11 +84,13 @@ def drive(
     progress: Progress = silent,
     notes: Mapping[str, Any] | None = None,
     check: Callable[[DrivePlan], Mapping[str, Any]] | None = None,
+    plan: DrivePlan | None = None,
 ) -> DriveSummary:
     """Drive a route through a scene and write the dataset; an unfinished one of the same options is finished.
 
     notes : further entries of ``dataset.json``
     check : called when all frames are recorded; returns entries that replace or join the notes
+    plan  : of the same scene and options; made here by default
 
     Raises InputError (also as RouteError, RigError, DatasetError) for what cannot be driven or written.
     """
@@ -104,6 +108,7 @@ def drive(
             progress=progress,
             notes=notes or {},
             check=check,
+            plan=plan,
             began=began,
         )
 
@@ -133,10 +138,13 @@ def _driven(
     progress: Progress,
     notes: Mapping[str, Any],
     check: Callable[[DrivePlan], Mapping[str, Any]] | None,
+    plan: DrivePlan | None,
     began: float,
 ) -> DriveSummary:
     """Plan and record; ``began`` is the time of the start, seconds."""
-    plan = plan_drive(scene, options, progress=progress)
+    planning_from = time.perf_counter()
+    plan = plan or plan_drive(scene, options, progress=progress)
+    planning_s = time.perf_counter() - planning_from
     manifest = plan.manifest() | dict(notes)
     prepare(out, manifest["recipe"], overwrite=overwrite)
     with _removed_if_nothing_recorded(out), exclusive(out):
@@ -152,9 +160,13 @@ def _driven(
                 recording, pending, scene=scene, journal=journal, workers=options.workers, progress=progress
             )
         else:
-            chunks = _chunks(pending, recording.trajectory)
             record_on_cluster(
-                plan, recording=recording, chunks=chunks, cluster=cluster, journal=journal, progress=progress
+                plan,
+                recording=recording,
+                chunks=chunks(pending, recording.trajectory),
+                cluster=cluster,
+                journal=journal,
+                progress=progress,
             )
         recording_s = time.perf_counter() - recording_from
         points = _points(plan, journal)
@@ -175,6 +187,7 @@ def _driven(
         duration=plan.trajectory.duration_ns / 1e9,
         length=plan.length,
         wall=wall,
+        planning=planning_s,
         recording=recording_s,
         stages=recording.watch.seconds,
     )
@@ -265,7 +278,7 @@ def record_all(
     worlds = Worlds(scene, max_range, actors=recording.actors, settings=recording.contents.world)
     workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
     with _pool(workers) as pool:
-        for chunk, region in _chunks(jobs, recording.trajectory):
+        for chunk, region in chunks(jobs, recording.trajectory):
             with recording.watch.stage("load"):
                 recording.release()
                 worlds.follow(region)
@@ -309,7 +322,7 @@ def _take(running: set[Future[None]], *, finished: set[Future[None]]) -> int:
     return len(finished)
 
 
-def _chunks(
+def chunks(
     jobs: Sequence[Job], trajectory: Trajectory
 ) -> Iterator[tuple[Sequence[Job], tuple[float, float, float, float]]]:
     """Runs of jobs during which the vehicle stays within a square of `CHUNK`, with the box it covers."""

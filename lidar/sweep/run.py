@@ -176,7 +176,7 @@ def _with_pick(task: _Task, *, progress: Progress) -> _Task:
     out = None if task.overwrite else task.folder / planned.name
     with using(open_scene(planned.scene), known=LidarError) as scene:
         pick = picked(scene, options, wanted=planned.wanted, out=out, progress=progress)
-    return replace(task, pick=pick)
+    return replace(task, pick=pick and replace(pick, planned=None))
 
 
 def _results(

@@ -1,76 +1,112 @@
-"""Drives to an accuracy or within a budget of time: the number of rays is picked by a stored profile."""
+"""Drives to an accuracy or within a budget of time: numbers of rays are picked by a stored profile."""
 
 from __future__ import annotations
 
-import os
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from geoscene.charts import metres
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from lidar import pipeline
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import DatasetError, InputError
-from lidar.options import Accuracy, AccuracyOptions, DriveOptions, read_accuracy, read_budget
-from lidar.plan import DrivePlan
-from lidar.tradeoff.errors import Estimate
-from lidar.tradeoff.profile import Candidate, Profile, profile_of
-from lidar.tradeoff.spot import SpotCheck, error_text, spot_check
-
-PICKED = "rays"
-"""The setting that is picked."""
+from lidar.options import AccuracyOptions, DriveOptions, read_accuracy, read_budget
+from lidar.plan import DrivePlan, plan_drive, sensors_of
+from lidar.rig.devices import Camera, Scanner
+from lidar.rig.specs import load_rig
+from lidar.tradeoff.choice import Choice, Kind, Wanted, choice, speed, workers_text
+from lidar.tradeoff.profile import Profile, profile_of
+from lidar.tradeoff.sensor_errors import SensorErrors, kinds_of, stated
+from lidar.tradeoff.spot import SpotCheck, spot_check
 
 _PERCENT = 99.9
 """Percent of the returns whose error is stated where no accuracy says another."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pick:
-    """A number of rays that was picked for a drive.
+class Planned:
+    """The plan of a drive within a budget of time.
 
-    asked     : accuracy and budget, as text
-    rays      : per pulse
-    percent   : of the returns for which errors are stated
-    expected  : range error by scanner, metres, of the profile's places
-    candidate : of the profile; None where an earlier run had picked
-    profile   : by which it was picked; None likewise
+    seconds : that planning took
+    loading : seconds to load tiles along it, as expected
+    """
+
+    plan: DrivePlan
+    seconds: float
+    loading: float
+
+    @property
+    def overhead(self) -> float:
+        """Seconds per simulated second beside recording."""
+        return (self.seconds + self.loading) / (self.plan.trajectory.duration_ns / 1e9)
+
+
+@dataclass(frozen=True, slots=True)
+class Pick:
+    """Numbers of rays that were picked for a drive.
+
+    asked    : accuracy and budget, as text
+    settings : that were picked, by name
+    expected : errors of the next drive in the scene, or of this one if the profile is of it
+    chosen   : from the profile; None where an earlier run had picked
+    profile  : by which it was picked; None likewise
+    planned  : the drive with these settings, if there is a budget; None likewise
     """
 
     asked: dict[str, str]
-    rays: int
-    percent: float
-    expected: dict[str, Estimate]
-    candidate: Candidate | None = None
+    settings: dict[str, int]
+    expected: SensorErrors
+    chosen: Choice | None = None
     profile: Profile | None = None
+    planned: Planned | None = None
 
     def to_json(self) -> dict[str, Any]:
         """All that does not depend on the machine."""
-        expected = {name: error.to_json() for name, error in self.expected.items()}
-        return {
-            "asked": self.asked,
-            "picked": {PICKED: self.rays},
-            "percent": self.percent,
-            "expected_error_m": expected,
-        }
-
-    @property
-    def settings(self) -> tuple[tuple[str, str], ...]:
-        """The picked setting as of `DriveOptions.settings`."""
-        return ((PICKED, str(self.rays)),)
+        return {"asked": self.asked, "picked": self.settings} | self.expected.to_json("expected")
 
     def to_text(self, workers: int) -> str:
         """What was picked and what to expect of it."""
-        found = ", ".join(f"{name} {error_text(error)}" for name, error in self.expected.items())
-        text = f"picked {PICKED}={self.rays}: expect range errors at {self.percent:g} % of {found}"
-        if self.candidate is None:
-            return f"{text}; as picked before for this dataset"
-        cost = self.candidate.cpu_s
-        return (
-            f"{text}, and {cost.value:.3g} CPU s per simulated second, which is"
-            f" {speed(self.candidate, workers):.2g} x real time with {workers_text(workers)}"
+        words = " ".join(f"{name}={value}" for name, value in self.settings.items())
+        text = f"picked {words or 'nothing, as no setting changes depths'}: expect"
+        if self.chosen is None or self.profile is None:
+            return f"{text} {self.expected.to_text()}; as picked before for this dataset"
+        whose = "the next drive" if self.profile.drives > 1 else "this drive"
+        cost = self.chosen.cpu_s
+        text = (
+            f"{text} (95 % intervals for {whose}) {self.expected.to_text()}, and {cost.value:.3g} CPU s per"
+            f" simulated second, which is {speed(cost, workers):.2g} x real time with {workers_text(workers)}"
         )
+        if self.planned is None:
+            return text
+        return (
+            f"{text}; with planning ({self.planned.seconds:.2g} s) and loading ({self.planned.loading:.2g} s)"
+            f" {self._whole_speed(workers):.2g} x real time"
+        )
+
+    def _whole_speed(self, workers: int) -> float:
+        """Simulated seconds per second, with planning and loading."""
+        assert self.chosen is not None  # noqa: S101 - only then there is a speed
+        overhead = self.planned.overhead if self.planned else 0.0
+        return 1 / (1 / speed(self.chosen.cpu_s, workers) + overhead)
+
+    def costs(self, workers: int) -> dict[str, Any]:
+        """What depends on the machine; empty where an earlier run had picked."""
+        if self.chosen is None or self.profile is None:
+            return {}
+        planned = self.planned and {
+            "planning_s": round(self.planned.seconds, 3),
+            "expected_loading_s": round(self.planned.loading, 3),
+        }
+        return {
+            "expected_cpu_s": self.chosen.cpu_s.to_json(),
+            "expected_speed": round(self._whole_speed(workers), 3),
+            **(planned or {}),
+            "profile": str(self.profile.path),
+            "profile_made": self.profile.made,
+            "profile_drives": self.profile.drives,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,31 +125,29 @@ class CheckedDrive:
 
     def accuracy(self, workers: int) -> dict[str, Any]:
         """What was picked, expected and reached, with the costs on this machine."""
-        document = self.pick.to_json() if self.pick else {}
-        if self.pick and self.pick.candidate and self.pick.profile:
-            cost = self.pick.candidate.cpu_s
-            document |= {
-                "expected_cpu_s": cost.to_json(),
-                "expected_speed": round(threads(workers) / cost.value, 3),
-                "profile": str(self.pick.profile.path),
-                "profile_made": self.pick.profile.made,
-            }
+        document = self.pick.to_json() | self.pick.costs(workers) if self.pick else {}
         if self.pick and self.speed:
             document["speed"] = round(self.speed, 3)
         return document | (self.reached.to_json() if self.reached else {})
 
     @property
     def speed(self) -> float | None:
-        """Simulated seconds per second in which frames were recorded; None for a drive that was resumed."""
+        """Simulated seconds per second of planning and recording; None for a drive that was resumed."""
         if self.summary.resumed or not self.summary.recording:
             return None
-        return self.summary.duration / self.summary.recording
+        return self.summary.duration / (self.planning + self.summary.recording)
+
+    @property
+    def planning(self) -> float:
+        """Seconds in which the drive was planned."""
+        ahead = self.pick.planned.seconds if self.pick and self.pick.planned else 0.0
+        return ahead + self.summary.planning
 
     def to_text(self) -> str:
         """What was reached, in one line; empty without a check."""
         if self.reached is None:
             return ""
-        pace = f"; recorded at {self.speed:.2g} x real time" if self.speed else ""
+        pace = f"; planned and recorded at {self.speed:.2g} x real time" if self.speed else ""
         return self.reached.to_text() + pace * bool(self.pick)
 
     def missed(self) -> list[str]:
@@ -121,18 +155,14 @@ class CheckedDrive:
         lines = []
         if self.wanted.accuracy and self.reached is not None:
             asked = read_accuracy(self.wanted.accuracy)
-            worse = [
-                f"{name} has {error_text(error)}"
-                for name, error in self.reached.reached.items()
-                if error.value > asked.metres
-            ]
-            if worse:
-                goal = f"{asked.text.split('@')[0]} at {asked.percent:g} %"
-                lines.append(f"the accuracy of {goal} is missed on this drive: {', '.join(worse)}")
+            if worse := self.reached.reached.beyond(asked):
+                lines.append(f"the accuracy of {asked.text} is missed on this drive: {', '.join(worse)}")
         if self.wanted.budget and self.speed and self.speed < read_budget(self.wanted.budget):
+            summary = self.summary
             lines.append(
-                f"the budget of {self.wanted.budget} is missed: recorded at {self.speed:.2g} x real time;"
-                " was the machine busy?"
+                f"the budget of {self.wanted.budget} is missed: {summary.duration:.3g} s took"
+                f" {self.planning:.2g} s to plan and {summary.recording:.2g} s to record, {self.speed:.2g} x"
+                " real time; was the machine busy?"
             )
         return lines
 
@@ -154,20 +184,87 @@ def picked(
     """
     if not wanted.picks:
         return None
-    asker = "accuracy" if wanted.accuracy else "budget"
-    for name, value in options.settings:
-        if name in (PICKED, "stretch"):
-            why = "picks it" if name == PICKED else f"picks {PICKED}, and more than one has no stretch"
-            raise InputError(f"`settings` {name}={value}: `{asker}` {why}; leave one of them out")
-    if wanted.budget and options.scheduler:
-        raise InputError("`budget` is for this machine, and `scheduler` for others; leave one of them out")
+    free = _free(options, wanted)
     if before := _picked_before(out, wanted) if out else None:
         return before
     profile = profile_of(scene, options, folder=wanted.profile_cache, progress=progress)
-    candidate = choice(profile, wanted, workers=options.workers)
-    percent = read_accuracy(wanted.accuracy).percent if wanted.accuracy else _PERCENT
-    expected = {name: error.range_m[percent] for name, error in candidate.errors.items()}
-    return Pick(_asked(wanted), candidate.rays, percent, expected, candidate=candidate, profile=profile)
+    asked = read_accuracy(wanted.accuracy) if wanted.accuracy else None
+    contents = options.contents()
+    given = {
+        "rays": contents.scanner.rays,
+        "supersample": contents.camera.supersample,
+        "blur": contents.camera.blur,
+    }
+    by = Wanted(asked, workers=options.workers, given=given, free=free)
+    planned = None
+    if wanted.budget:
+        planned = _planned(scene, options, profile=profile, progress=progress)
+        by = replace(by, budget=wanted.budget, pace=_pace(planned, wanted.budget))
+    chosen = choice(profile, by)
+    percent = asked.percent if asked else _PERCENT
+    expected = stated(chosen.errors, percent=percent, kinds=kinds_of(asked))
+    return Pick(_asked(wanted), chosen.settings, expected, chosen, profile, planned)
+
+
+def _planned(scene: Scene, options: DriveOptions, *, profile: Profile, progress: Progress) -> Planned:
+    """The plan of a drive, and what it and loading cost."""
+    began = time.perf_counter()
+    plan = plan_drive(scene, options, progress=progress)
+    seconds = time.perf_counter() - began
+    chunks = sum(1 for _ in pipeline.chunks(plan.jobs, plan.trajectory))
+    return Planned(plan, seconds, chunks * profile.load_s.high)
+
+
+def _pace(planned: Planned, budget: str) -> float:
+    """Simulated seconds that are to be recorded per second, so that a budget holds for all."""
+    left = 1 / read_budget(budget) - planned.overhead
+    if left <= 0:
+        duration = planned.plan.trajectory.duration_ns / 1e9
+        raise InputError(
+            f"`budget` {budget}: allows {duration / read_budget(budget):.2g} s for a drive of"
+            f" {duration:.3g} s, and planning took {planned.seconds:.2g} s and loading takes"
+            f" {planned.loading:.2g} s; give more time"
+        )
+    return 1 / left
+
+
+def _free(options: DriveOptions, wanted: AccuracyOptions) -> tuple[Kind, ...]:
+    """Kinds of sensors for which settings may be picked.
+
+    Raises InputError for settings that contradict what is wanted, and for errors that no sensor has.
+    """
+    sensors = sensors_of(load_rig(options.rig), options)
+    images = {image for s in sensors if isinstance(s, Camera) for image in s.spec.images}
+    scanning = any(isinstance(s, Scanner) for s in sensors)
+    asked = read_accuracy(wanted.accuracy) if wanted.accuracy else None
+    if asked and asked.metres and not (scanning or "depth" in images):
+        raise InputError(
+            f"`accuracy` {asked.text}: no sensor of rig {options.rig} measures lengths; ask for levels of"
+            " colours, as in 3levels"
+        )
+    if asked and asked.levels and "rgb" not in images:
+        raise InputError(
+            f"`accuracy` {asked.text}: no sensor of rig {options.rig} has colours; ask for a length, as in"
+            " 1cm"
+        )
+    if wanted.budget and options.scheduler:
+        raise InputError("`budget` is for this machine, and `scheduler` for others; leave one of them out")
+    names: dict[Kind, tuple[str, ...]] = {"scanners": ("rays", "stretch"), "cameras": ("supersample",)}
+    if any(isinstance(s, Camera) and s.spec.exposure_ns for s in sensors):
+        names["cameras"] += ("blur",)
+    held = {
+        kind: [(name, value) for name, value in options.settings if name in of] for kind, of in names.items()
+    }
+    has: dict[Kind, bool] = {"scanners": scanning, "cameras": "rgb" in images}
+    here = [kind for kind, there in has.items() if there]
+    picks = {"scanners": asked is None or bool(asked.metres), "cameras": asked is None or bool(asked.levels)}
+    free = tuple(kind for kind in here if picks[kind] and not held[kind])
+    taken = [held[kind][0] for kind in here if picks[kind] and held[kind]]
+    if taken and (asked or not free):
+        (name, value), asker = taken[0], "accuracy" if asked else "budget"
+        why = "picks rays, and more than one has no stretch" if name == "stretch" else "picks it"
+        raise InputError(f"`settings` {name}={value}: `{asker}` {why}; leave one of them out")
+    return free
 
 
 def driven(
@@ -188,13 +285,18 @@ def driven(
     """
     found: list[SpotCheck] = []
     notes = pick.to_json() if pick else {}
+    percent = pick.expected.percent if pick else _PERCENT
+    kinds = kinds_of(read_accuracy(wanted.accuracy) if wanted.accuracy else None)
 
     def check(plan: DrivePlan) -> dict[str, Any]:
-        found.append(spot_check(plan, percent=pick.percent if pick else _PERCENT, progress=progress))
+        found.append(spot_check(plan, percent=percent, kinds=kinds, progress=progress))
         return {"accuracy": notes | found[0].to_json()}
 
+    plan = None
     if pick:
-        options = replace(options, settings=(*options.settings, *pick.settings))
+        more = tuple((name, str(value)) for name, value in pick.settings.items())
+        options = replace(options, settings=(*options.settings, *more))
+        plan = replace(pick.planned.plan, options=options) if pick.planned else None
     summary = pipeline.drive(
         scene,
         out,
@@ -203,6 +305,7 @@ def driven(
         progress=progress,
         notes={"accuracy": notes} if notes else {},
         check=check if wanted.checks else None,
+        plan=plan,
     )
     return CheckedDrive(summary, wanted, pick, found[0] if found else None)
 
@@ -220,89 +323,9 @@ def _picked_before(out: Path, wanted: AccuracyOptions) -> Pick | None:
     if notes.get("asked") != _asked(wanted):
         return None
     try:
-        expected = {
-            name: Estimate(**{key: float(figures[key]) for key in ("value", "low", "high")})
-            for name, figures in notes["expected_error_m"].items()
-        }
-        return Pick(notes["asked"], int(notes["picked"][PICKED]), float(notes["percent"]), expected)
-    except (KeyError, TypeError, ValueError):
+        settings = {str(name): int(value) for name, value in notes["picked"].items()}
+        return Pick(notes["asked"], settings, SensorErrors.from_json(notes, "expected"))
+    except (AttributeError, KeyError, TypeError, ValueError):
         raise DatasetError(
             f"{Paths(out).manifest}: damaged (accuracy); set `overwrite` to drive again"
         ) from None
-
-
-def choice(profile: Profile, wanted: AccuracyOptions, *, workers: int) -> Candidate:
-    """The candidate to take: the first that reaches an accuracy, or the last within a budget.
-
-    Errors count by the upper end of their intervals, and so do costs. The order of candidates is the same on
-    all machines, and so is what an accuracy alone picks.
-
-    Raises InputError, which names the nearest, if there is none.
-    """
-    asked = read_accuracy(wanted.accuracy) if wanted.accuracy else None
-    limit = read_budget(wanted.budget) if wanted.budget else 0.0
-    affordable = [c for c in profile.candidates if slowest(c, workers) >= limit]
-    if not affordable:
-        first = profile.candidates[0]
-        raise InputError(
-            f"`budget` {wanted.budget}: even {_rays(first)} is simulated at"
-            f" {slowest(first, workers):.2g} x real time with {workers_text(workers)}; give more time"
-        )
-    if asked is None:
-        return affordable[-1]
-    enough = [c for c in profile.candidates if worst(c, asked.percent).high <= asked.metres]
-    if not enough:
-        raise InputError(_out_of_reach(profile, asked))
-    if enough[0].rays > affordable[-1].rays:
-        best = worst(affordable[-1], asked.percent)
-        raise InputError(
-            f"`accuracy` {wanted.accuracy} takes {_rays(enough[0])}, simulated at"
-            f" {slowest(enough[0], workers):.2g} x real time with {workers_text(workers)}, and `budget`"
-            f" {wanted.budget} allows {_rays(affordable[-1])}, with errors of {error_text(best)}"
-        )
-    return enough[0]
-
-
-def _out_of_reach(profile: Profile, asked: Accuracy) -> str:
-    """That an accuracy is not reached, and what is."""
-    best = min(profile.candidates, key=lambda c: worst(c, asked.percent).high)
-    error = worst(best, asked.percent)
-    return (
-        f"`accuracy` {asked.text}: no number of rays is sure to reach it at {asked.percent:g} % of the"
-        f" returns; {_rays(best)} errs by {error_text(error)}: give {metres(error.high)} or more, or a"
-        f" smaller share, as in {asked.text.split('@')[0]}@{_smaller(asked.percent):g}"
-    )
-
-
-def _smaller(percent: float) -> float:
-    return 99.0 if percent > 99 else 95.0 if percent > 95 else 90.0 if percent > 90 else 50.0
-
-
-def worst(candidate: Candidate, percent: float) -> Estimate:
-    """The range error of the scanner with the largest upper end."""
-    return max((e.range_m[percent] for e in candidate.errors.values()), key=lambda error: error.high)
-
-
-def speed(candidate: Candidate, workers: int) -> float:
-    """Simulated seconds per second that a cost stands for, if no worker waits for others."""
-    return threads(workers) / candidate.cpu_s.value
-
-
-def slowest(candidate: Candidate, workers: int) -> float:
-    """Simulated seconds per second by the upper end of the cost."""
-    return threads(workers) / candidate.cpu_s.high
-
-
-def threads(workers: int) -> int:
-    """Threads that work at a time."""
-    return min(workers, os.cpu_count() or 1)
-
-
-def workers_text(workers: int) -> str:
-    """A number of workers in words."""
-    count = threads(workers)
-    return f"{count} worker{'s' * (count > 1)}"
-
-
-def _rays(candidate: Candidate) -> str:
-    return f"{PICKED}={candidate.rays}"

@@ -1,4 +1,4 @@
-"""Differences between two simulations of the same pulses, with intervals by resampling frames."""
+"""Differences between two simulations of the same pulses, with intervals."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import stdtrit
 
 from geoscene.columns import Columns
 from geoscene.typing import Float
@@ -35,7 +36,7 @@ class Returns(Columns):
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A figure with the 95 % interval of its repetition."""
+    """A figure with a 95 % interval: of itself, or for the next drive (see `next_drive`)."""
 
     value: float
     low: float
@@ -45,6 +46,15 @@ class Estimate:
         """The figures; None for those that are not finite."""
         figures = {"value": self.value, "low": self.low, "high": self.high}
         return {name: float(f"{v:.6g}") if np.isfinite(v) else None for name, v in figures.items()}
+
+    @classmethod
+    def from_json(cls, figures: Mapping[str, float]) -> Estimate:
+        """The figures of `to_json`, all finite; raises KeyError, TypeError or ValueError for others."""
+        return cls(float(figures["value"]), float(figures["low"]), float(figures["high"]))
+
+    def __add__(self, other: Estimate) -> Estimate:
+        """The sum, with the ends of both."""
+        return Estimate(self.value + other.value, self.low + other.low, self.high + other.high)
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,22 +203,49 @@ IMAGE_STATISTICS: dict[str, Callable[[Sequence[ImageError]], float]] = {
 }
 """Figures of an error of images, over all sampled frames: levels of 255, metres, shares of the pixels."""
 
-E = TypeVar("E", FrameError, ImageError)
+E = TypeVar("E")
 
 
 def estimates(
     frames: Sequence[E], *, seed: int, statistics: Mapping[str, Callable[[Sequence[E]], float]]
 ) -> dict[str, Estimate]:
     """All figures of an error, with intervals by resampling frames; none without frames."""
+    return resampled(
+        frames, seed=seed, figures=lambda of: {name: figure(of) for name, figure in statistics.items()}
+    )
+
+
+def resampled(
+    frames: Sequence[E], *, seed: int, figures: Callable[[Sequence[E]], Mapping[str, float]]
+) -> dict[str, Estimate]:
+    """Figures of frames with 95 % intervals by resampling these; not those that are NaN.
+
+    None without frames.
+    """
     if not frames:
         return {}
     picks = np.random.default_rng(seed).integers(0, len(frames), (RESAMPLES, len(frames)))
+    again = [figures([frames[k] for k in pick]) for pick in picks]
     found = {}
-    for name, figure in statistics.items():
-        again = [figure([frames[k] for k in pick]) for pick in picks]
-        low, high = np.percentile(again, [2.5, 97.5])
-        found[name] = Estimate(figure(frames), float(low), float(high))
+    for name, value in figures(frames).items():
+        if not np.isnan(value):
+            low, high = np.nanpercentile([one[name] for one in again], [2.5, 97.5])
+            found[name] = Estimate(value, float(low), float(high))
     return found
+
+
+def next_drive(values: Sequence[float], *, least: float) -> Estimate:
+    """The typical error of drives, at least two, and the 95 % prediction interval for that of one more.
+
+    Errors of drives spread by factors, and their logarithms about as a normal distribution does: the interval
+    is Student's for one future observation of it (Hahn, G. J., Additional Factors for Calculating Prediction
+    Intervals for Samples from a Normal Distribution, J. Am. Stat. Assoc. 65, 1970). Errors below ``least``
+    count as that.
+    """
+    logs = np.log(np.maximum(values, least))
+    n, middle = len(logs), float(np.mean(logs))
+    reach = float(stdtrit(n - 1, 0.975)) * float(np.std(logs, ddof=1)) * (1 + 1 / n) ** 0.5
+    return Estimate(*np.exp([middle, middle - reach, middle + reach]).tolist())
 
 
 def median(values: Sequence[float], *, seed: int) -> Estimate:

@@ -102,6 +102,13 @@ def blocks_of_frame(camera: CameraSpec, count: int, *, frame: int, seed: int) ->
     return (BLOCK * np.column_stack([column[chosen], row[chosen]])).astype(np.int64)
 
 
+def strip(shot: Shot, *, world: World, settings: CameraSettings, top: int, height: int) -> Frame:
+    """The rows of a frame from ``top`` on."""
+    spec = shot.camera.spec
+    window = replace(spec, height=height, cy=spec.cy - top)
+    return _rendered(shot, window, world=world, settings=settings, top=top)
+
+
 def pixels(
     shot: Shot, blocks: Ints, *, world: World, settings: CameraSettings, resolution: int = 1
 ) -> Pixels:

@@ -1,4 +1,4 @@
-"""Sampled frames of scanners, their errors against the exact end, and quantiles of these with intervals."""
+"""Sampled frames of sensors, and errors of scanners in them against the exact end."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from math import inf
-from typing import Any
+from math import inf, nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,9 @@ from geoscene.typing import Float
 from lidar.options import PERCENTS
 from lidar.physics.settings import MOST_RAYS, ScannerSettings
 from lidar.plan import DrivePlan, schedule
-from lidar.rig.devices import Scanner
+from lidar.rig.devices import Camera, Scanner
 from lidar.rig.scanner import firings
-from lidar.tradeoff.errors import RESAMPLES, Estimate, Returns
+from lidar.tradeoff.errors import Returns
 from lidar.tradeoff.simulate import EXACT, FAST, Bench, chosen_pulses, returns_of, spread_frames
 from lidar.tradeoff.variants import noiseless, reference
 
@@ -33,61 +32,43 @@ _PLACE = 200.0
 """Scene metres along each axis that frames of a place are within."""
 
 
-@dataclass(frozen=True, slots=True)
-class RangeError:
-    """Range errors of a scanner against the exact end, without random effects.
+def places(plan: DrivePlan, sensors: Sequence[Scanner | Camera], *, frames: int) -> list[Bench]:
+    """At most ``frames`` of the frames of each sensor, spread over a drive, grouped where they are near.
 
-    range_m       : metres that shares of the returns do not exceed, by `PERCENTS`
-    missed, extra : shares of the reference's returns that only either of the two has
+    Frames in which a scanner does not work are left out.
     """
-
-    range_m: dict[float, Estimate]
-    missed: Estimate
-    extra: Estimate
-
-    def to_json(self) -> dict[str, Any]:
-        """All figures by name, such as ``range_99.9_m``."""
-        ranges = {f"range_{percent:g}_m": found.to_json() for percent, found in self.range_m.items()}
-        return ranges | {"missed": self.missed.to_json(), "extra": self.extra.to_json()}
-
-
-def places(plan: DrivePlan, *, frames: int) -> list[Bench]:
-    """At most ``frames`` of the frames of each scanner, spread over a drive, grouped where they are near.
-
-    Frames in which no scanner works are left out.
-    """
-    scanners = tuple(s for s in plan.sensors if isinstance(s, Scanner))
-    plan = replace(plan, sensors=scanners, jobs=schedule(scanners, plan.trajectory.duration_ns))
-    chosen = {s.name: _spread(plan, s, frames=frames) for s in scanners}
+    jobs = schedule(sensors, plan.trajectory.duration_ns)
+    plan = replace(plan, sensors=tuple(sensors), jobs=jobs)
+    chosen = {s.name: _spread(plan, s, frames=frames) for s in sensors}
     groups: list[dict[str, list[int]]] = []
     low, high = np.full(2, inf), np.full(2, -inf)
     for k in range(frames):
-        now = [(s, chosen[s.name][k]) for s in scanners if k < len(chosen[s.name])]
+        now = [(s, chosen[s.name][k]) for s in sensors if k < len(chosen[s.name])]
         if not now:
             continue
         starts = np.array([s.frame_start_ns(frame) for s, frame in now], np.int64)
         xy = plan.trajectory.at(starts).position[:, :2]
         low, high = np.minimum(low, xy.min(axis=0)), np.maximum(high, xy.max(axis=0))
         if not groups or (high - low).max() > _PLACE:
-            groups.append({s.name: [] for s in scanners})
+            groups.append({s.name: [] for s in sensors})
             low, high = xy.min(axis=0), xy.max(axis=0)
-        for scanner, frame in now:
-            groups[-1][scanner.name].append(frame)
+        for sensor, frame in now:
+            groups[-1][sensor.name].append(frame)
     return [
         Bench(plan, (plan.scene,), {name: tuple(numbers) for name, numbers in group.items()})
         for group in groups
     ]
 
 
-def _spread(plan: DrivePlan, scanner: Scanner, *, frames: int) -> list[int]:
-    """Numbers of frames of a scanner, spread over those in which it works."""
-    count = plan.frames[scanner.name]
-    if plan.scanning_ns is None:
+def _spread(plan: DrivePlan, sensor: Scanner | Camera, *, frames: int) -> list[int]:
+    """Numbers of frames of a sensor, spread over those in which it works."""
+    count = plan.frames[sensor.name]
+    if plan.scanning_ns is None or isinstance(sensor, Camera):
         return list(spread_frames(count, frames))
-    starts = np.fromiter(map(scanner.frame_start_ns, range(count)), np.int64, count)
+    starts = np.fromiter(map(sensor.frame_start_ns, range(count)), np.int64, count)
     first, last = plan.scanning_ns[:, 0], plan.scanning_ns[:, 1]
     span = np.searchsorted(first, starts, side="right") - 1
-    on = np.flatnonzero((span >= 0) & (starts + scanner.period_ns <= last[np.maximum(span, 0)]))
+    on = np.flatnonzero((span >= 0) & (starts + sensor.period_ns <= last[np.maximum(span, 0)]))
     return [int(on[k]) for k in spread_frames(len(on), frames)]
 
 
@@ -186,40 +167,29 @@ def _stratified(
     return np.sort(np.concatenate([hard, easy])), weights
 
 
-def range_error(
-    frames: Sequence[SampledError], *, drives: Sequence[int] | None = None, seed: int = 0
-) -> RangeError:
-    """Quantiles of the range errors of frames, and shares of missed and extra returns.
+def range_figures(frames: Sequence[SampledError]) -> dict[str, float]:
+    """Metres that shares of the returns of frames do not exceed, by name, such as ``range_99.9_m``.
 
-    drives : number of the drive that each frame is of, from 0; all of one by default
-
-    Intervals are 95 %, by resampling the drives, as frames of one drive are alike; of one drive, its frames.
+    NaN without returns.
     """
-    count = len(frames)
     ranges = np.concatenate([f.range for f in frames])
     order = np.argsort(ranges)
-    ranges, weight = ranges[order], np.concatenate([f.weight for f in frames])[order]
-    frame = np.repeat(np.arange(count), [len(f.range) for f in frames])[order]
-    sums = np.array([(f.missed, f.extra, f.returns) for f in frames])
+    below = np.cumsum(np.concatenate([f.weight for f in frames])[order])
+    ranges = ranges[order]
+    return {f"range_{p:g}_m": _quantile(ranges, below, share=p / 100) for p in PERCENTS}
 
-    def figures(times: Float) -> list[float]:
-        below = np.cumsum(weight * times[frame])
-        missed, extra, returns = times @ sums
-        every = [_quantile(ranges, below, share=percent / 100) for percent in PERCENTS]
-        return [*every, missed / max(returns, 1.0), extra / max(returns, 1.0)]
 
-    group = np.arange(count) if drives is None or len(set(drives)) < 2 else np.asarray(drives)
-    groups = int(group.max()) + 1
-    picks = np.random.default_rng(seed).integers(0, groups, (RESAMPLES, groups))
-    value = figures(np.ones(count))
-    again = [figures(np.bincount(pick, minlength=groups)[group].astype(float)) for pick in picks]
-    low, high = np.percentile(again, [2.5, 97.5], axis=0)
-    every = [Estimate(float(v), float(a), float(b)) for v, a, b in zip(value, low, high, strict=True)]
-    return RangeError(dict(zip(PERCENTS, every, strict=False)), missed=every[-2], extra=every[-1])
+def lost_figures(frames: Sequence[SampledError]) -> dict[str, float]:
+    """Shares of missed and extra returns of frames."""
+    missed, extra, returns = np.sum([(f.missed, f.extra, f.returns) for f in frames], axis=0).tolist()
+    return {"missed": missed / max(returns, 1.0), "extra": extra / max(returns, 1.0)}
 
 
 def _quantile(values: Float, below: Float, *, share: float) -> float:
-    """The value that a share of a weight does not exceed; ``below`` is the weight up to each value."""
+    """The value that a share of a weight does not exceed; ``below`` is the weight up to each value.
+
+    NaN without values.
+    """
     if not len(values) or below[-1] <= 0:
-        return 0.0
+        return nan
     return float(values[min(int(np.searchsorted(below, share * below[-1])), len(values) - 1)])

@@ -1,69 +1,98 @@
-"""Check of a recorded drive: a sample of its pulses, simulated again and compared with the exact end."""
+"""Check of a recorded drive: a sample of its frames, simulated again and compared with the exact end."""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from geoscene.charts import metres
 from geoscene.progress import Progress, silent
 from lidar.plan import DrivePlan
-from lidar.rig.devices import Scanner
-from lidar.tradeoff.errors import Estimate
-from lidar.tradeoff.sampling import RangeError, SampledError, errors_of, places, range_error
+from lidar.rig.devices import Camera, Scanner
+from lidar.tradeoff.errors import Estimate, resampled
+from lidar.tradeoff.profile_errors import blocks_of, measuring
+from lidar.tradeoff.sampled_images import image_errors_of, image_figures
+from lidar.tradeoff.sampling import SampledError, errors_of, lost_figures, places, range_figures
+from lidar.tradeoff.sensor_errors import SensorErrors, stated
 
 _FRAMES = 10
-"""Frames of each scanner that are checked."""
+"""Frames of each sensor that are checked."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpotCheck:
     """Errors that a drive has reached.
 
-    percent : of the returns for which errors are stated
-    errors  : of each scanner, by its name
-    frames  : checked of each scanner
+    percent : of the returns or pixels for which errors are stated
+    kinds   : of errors that are stated, see `sensor_errors.stated`
+    errors  : figures of each sensor, by its name, with intervals by resampling frames
+    frames  : checked of each sensor
     """
 
     percent: float
-    errors: dict[str, RangeError]
+    kinds: Collection[str]
+    errors: dict[str, dict[str, Estimate]]
     frames: dict[str, int]
 
     @property
-    def reached(self) -> dict[str, Estimate]:
-        """Range error of each scanner, metres."""
-        return {name: error.range_m[self.percent] for name, error in self.errors.items()}
+    def reached(self) -> SensorErrors:
+        """What is stated."""
+        return stated(self.errors, percent=self.percent, kinds=self.kinds)
 
     def to_text(self) -> str:
         """What was reached, in one line."""
-        found = ", ".join(f"{name} {error_text(error)}" for name, error in self.reached.items())
         count = max(self.frames.values(), default=0)
-        return f"spot check of {count} frames: range errors at {self.percent:g} % are {found or 'unknown'}"
+        return f"spot check of {count} frames: {self.reached.to_text()}"
 
     def to_json(self) -> dict[str, Any]:
         """All figures."""
-        reached = {name: error.to_json() for name, error in self.reached.items()}
-        every = {name: {"frames": self.frames[name]} | error.to_json() for name, error in self.errors.items()}
-        return {"percent": self.percent, "reached_error_m": reached, "spot_check": every}
+        every = {
+            name: {"frames": self.frames[name]} | {figure: error.to_json() for figure, error in of.items()}
+            for name, of in self.errors.items()
+        }
+        return self.reached.to_json("reached") | {"spot_check": every}
 
 
-def error_text(error: Estimate) -> str:
-    """An error with its interval."""
-    return f"{metres(error.value)} ({metres(error.low)} to {metres(error.high)})"
+def spot_check(
+    plan: DrivePlan, *, percent: float, kinds: Collection[str], progress: Progress = silent
+) -> SpotCheck:
+    """Errors of a sample of frames of a drive's sensors, without random effects and stages.
 
-
-def spot_check(plan: DrivePlan, *, percent: float, progress: Progress = silent) -> SpotCheck:
-    """Range errors of a sample of frames of a drive's scanners, without random effects and stages.
+    kinds : of errors that are stated; sensors that have none of these are not checked
 
     Frames are spread over the drive. The same drive has the same sample.
     """
-    settings = plan.options.contents().scanner
-    found: dict[str, list[SampledError]] = {s.name: [] for s in plan.sensors if isinstance(s, Scanner)}
-    total = _FRAMES * len(found)
-    for bench in places(plan, frames=_FRAMES):
-        for scanner in (s for s in bench.plan.sensors if isinstance(s, Scanner)):
-            for (error,) in errors_of(bench, scanner, settings=[settings]):
-                found[scanner.name].append(error)
-                progress("checking errors", sum(map(len, found.values())), total=total)
-    errors = {name: range_error(frames) for name, frames in found.items() if frames}
-    return SpotCheck(percent, errors, {name: len(found[name]) for name in errors})
+    found: dict[str, list[Any]] = {}
+    scanners = [s for s in plan.sensors if isinstance(s, Scanner) and "ranges" in kinds]
+    cameras = [
+        s
+        for s in measuring([s for s in plan.sensors if isinstance(s, Camera)])
+        if ("colours" in kinds and "rgb" in s.spec.images) or ("depths" in kinds and "depth" in s.spec.images)
+    ]
+    total = _FRAMES * (len(scanners) + len(cameras))
+
+    def add(name: str, errors: Sequence[Any]) -> None:
+        found.setdefault(name, []).extend(errors)
+        progress("checking errors", sum(map(len, found.values())), total=total)
+
+    contents = plan.options.contents()
+    for bench in places(plan, scanners, frames=_FRAMES):
+        for scanner in scanners:
+            for errors in errors_of(bench, scanner, settings=[contents.scanner]):
+                add(scanner.name, errors)
+    for bench in places(plan, cameras, frames=_FRAMES):
+        for camera in cameras:
+            for images in image_errors_of(
+                bench, camera, settings=[contents.camera], blocks=blocks_of(cameras)
+            ):
+                add(camera.name, images)
+    figures = {s.name: _scanner_figures for s in scanners} | {
+        c.name: partial(image_figures, camera=c) for c in cameras
+    }
+    estimates = {name: resampled(of, seed=0, figures=figures[name]) for name, of in found.items()}
+    return SpotCheck(percent, kinds, estimates, {name: len(of) for name, of in found.items()})
+
+
+def _scanner_figures(frames: Sequence[SampledError]) -> Mapping[str, float]:
+    return range_figures(frames) | lost_figures(frames)

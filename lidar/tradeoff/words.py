@@ -16,7 +16,8 @@ LOST = 0.001
 
 def levels(value: float) -> str:
     """A difference of colours, of 255."""
-    return "0" if value == 0 else f"{value:.3g} levels"
+    text = f"{value:.3g}"
+    return f"{text} level{'' if text == '1' else 's'}"
 
 
 def size_of(error: float, kind: Kind) -> str:
@@ -30,7 +31,7 @@ def candidates(comparison: Comparison) -> list[Row]:
 
 
 def pareto(comparison: Comparison) -> list[Row]:
-    """Choices of which no other is both cheaper and at least as exact, the cheapest first.
+    """Choices of which no other is both cheaper and at least as exact (see `reached`), the cheapest first.
 
     Settings that miss or add more than `LOST` of the returns are left out.
     """
@@ -43,14 +44,17 @@ def pareto(comparison: Comparison) -> list[Row]:
 
 
 def reached(comparison: Comparison, row: Row) -> float:
-    """The error by which a row is ranked; inf if more than `LOST` of the returns are missed or extra."""
+    """The error by which a row is ranked: the upper end of its interval.
+
+    inf if more than `LOST` of the returns are missed or extra.
+    """
     if "missed" in row.error and row.error["missed"].value + row.error["extra"].value > LOST:
         return inf
-    return row.error[comparison.tail].value
+    return row.error[comparison.tail].high
 
 
 def recommendation(comparison: Comparison, target: float) -> str:
-    """The cheapest setting that reaches an error (see `TARGETS`), or that none does."""
+    """The cheapest setting that is sure to reach an error (see `TARGETS`), or that none is."""
     kind, rows = comparison.kind, pareto(comparison)
     wanted = f"For {size_of(target, kind)} {'at 99.9 %' if kind == 'scanner' else 'rms'}"
     fit = [row for row in rows if reached(comparison, row) <= target]
@@ -60,18 +64,20 @@ def recommendation(comparison: Comparison, target: float) -> str:
         what = f"the one {row.label}" if row.label.startswith("as asked") else row.label
         text = (
             f"{wanted} the cheapest setting is {what}; it costs {cost.value:.3g} CPU s per simulated second"
-            f" ({cost.low:.3g} to {cost.high:.3g}) and errs by {size_of(error.value, kind)}"
-            f" ({size_of(error.low, kind)} to {size_of(error.high, kind)})."
+            f" ({cost.low:.3g} to {cost.high:.3g}) and errs by {size_of(error.value, kind)}, by"
+            f" {size_of(error.high, kind)} at the upper end of the 95 % interval."
         )
         if comparison.uncertainty > target:
             text += f" The reference is certain to {size_of(comparison.uncertainty, kind)} only."
         return text
-    text = f"{wanted} no setting that was compared is enough"
+    text = f"{wanted} no setting that was compared is sure to be enough"
     if not rows:
         return f"{text}: all miss or add more than {share(LOST)} of the returns."
     nearest = rows[-1]
+    error = nearest.error[comparison.tail]
     return (
-        f"{text}; {nearest.label} comes nearest with {size_of(reached(comparison, nearest), kind)}, at"
+        f"{text}; {nearest.label} comes nearest with {size_of(error.value, kind)},"
+        f" {size_of(error.high, kind)} at the upper end of the 95 % interval, at"
         f" {nearest.cost['cpu_s'].value:.3g} CPU s per simulated second."
     )
 

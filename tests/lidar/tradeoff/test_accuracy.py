@@ -13,14 +13,16 @@ from helpers.scenes import same_files
 
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError
-from lidar.options import PERCENTS, AccuracyOptions, DriveOptions, read_accuracy, read_budget
+from lidar.options import AccuracyOptions, DriveOptions, read_accuracy, read_budget
 from lidar.pipeline import DriveSummary, drive
 from lidar.sweep import sweep
 from lidar.tradeoff import profile
-from lidar.tradeoff.accuracy import CheckedDrive, choice, driven, picked
-from lidar.tradeoff.errors import Estimate, Returns
+from lidar.tradeoff.accuracy import CheckedDrive, driven, picked
+from lidar.tradeoff.choice import Wanted, choice, worst
+from lidar.tradeoff.errors import Estimate, Returns, next_drive, resampled
 from lidar.tradeoff.profile import Candidate, Profile, profile_of
-from lidar.tradeoff.sampling import RangeError, SampledError, range_error, sampled_error
+from lidar.tradeoff.profile_errors import drive_estimates
+from lidar.tradeoff.sampling import SampledError, lost_figures, range_figures, sampled_error
 from lidar.tradeoff.spot import SpotCheck
 
 DRIVE = DriveOptions(route="random", rig="vlp16", duration=0.5, seed=3, formats=("pcd",))
@@ -40,11 +42,29 @@ DRIVE = DriveOptions(route="random", rig="vlp16", duration=0.5, seed=3, formats=
 )
 def test_accuracies_are_read(text, metres, percent):
     found = read_accuracy(text)
-    assert (found.metres, found.percent) == (pytest.approx(metres), percent)
+    assert (found.metres, found.percent, found.levels) == (pytest.approx(metres), percent, 0.0)
 
 
 @pytest.mark.parametrize(
-    "text", ["", "1", "cm", "0cm", "-1cm", "1in", "1cm@", "1cm@100", "1cm@98.7", "1..2cm", "5km", "nan m"]
+    ("text", "metres", "percent", "levels"),
+    [
+        ("3levels", 0.0, 99.9, 3.0),
+        ("1 level", 0.0, 99.9, 1.0),
+        ("1cm,3levels", 0.01, 99.9, 3.0),
+        ("0.5 levels, 5mm@95", 0.005, 95.0, 0.5),
+    ],
+)
+def test_levels_of_colours_are_read(text, metres, percent, levels):
+    found = read_accuracy(text)
+    assert (found.metres, found.percent, found.levels) == (pytest.approx(metres), percent, levels)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *["", "1", "cm", "0cm", "-1cm", "1in", "1cm@", "1cm@100", "1cm@98.7", "1..2cm", "5km", "nan m"],
+        *["0levels", "256levels", "3levels@99", "1cm,2cm", "1levels,2levels", "1cm,", "1cm 3levels"],
+    ],
 )
 def test_other_accuracies_are_refused_in_one_line(text):
     with pytest.raises(InputError, match="`accuracy`") as error:
@@ -67,23 +87,41 @@ def test_other_budgets_are_refused(text):
         read_budget(text)
 
 
+def around(error, *, least=0.5, most=2.0):
+    return Estimate(error, least * error, most * error)
+
+
 def candidate(rays, cpu, *errors):
     """A candidate of scanners with these errors, which reach twice as far up; ten times less at 99 %."""
+    figures = [{"range_99_m": around(e / 10), "range_99.9_m": around(e)} for e in errors]
+    cost = around(cpu, least=0.9, most=1.1)
+    return Candidate({"rays": rays}, {f"scanner_{k}": of for k, of in enumerate(figures)}, cost)
 
-    def of(error):
-        at = {p: Estimate(e, e / 2, 2 * e) for p, e in ((99.0, error / 10), (99.9, error))}
-        nothing = Estimate(0.0, 0.0, 0.0)
-        return RangeError(dict.fromkeys(PERCENTS, nothing) | at, missed=nothing, extra=nothing)
 
-    cost = Estimate(cpu, 0.9 * cpu, 1.1 * cpu)
-    return Candidate(rays, {f"scanner_{k}": of(error) for k, error in enumerate(errors)}, cost)
+def camera_candidate(rays, cpu, levels):
+    """A candidate of a camera of colours and depths, whose depths err by 2 mm, up to 4 mm."""
+    figures = {"rgb_rms": around(levels), "depth_99.9_m": around(0.002)}
+    return Candidate({"supersample": rays}, {"eye": figures}, around(cpu, least=0.9, most=1.1))
 
 
 PROFILE = Profile(
     Path("profile.json"),
     (candidate(1, 0.1, 0.1, 0.2), candidate(7, 0.4, 0.02, 0.04), candidate(19, 0.9, 0.004, 0.009)),
-    frames=20,
+    (),
+    drives=12,
+    load_s=Estimate(0.1, 0.1, 0.1),
 )
+CAMERAS = (camera_candidate(1, 0.3, 4.0), camera_candidate(2, 0.7, 1.0), camera_candidate(3, 2.0, 0.5))
+BOTH = replace(PROFILE, cameras=CAMERAS)
+
+
+def wanted(accuracy="", budget="", **more):
+    return Wanted(
+        read_accuracy(accuracy) if accuracy else None,
+        pace=read_budget(budget) if budget else 0.0,
+        budget=budget,
+        **more,
+    )
 
 
 @pytest.mark.parametrize(
@@ -104,7 +142,41 @@ PROFILE = Profile(
     ],
 )
 def test_the_first_that_is_enough_or_the_last_that_is_affordable_is_chosen(accuracy, budget, rays):
-    assert choice(PROFILE, AccuracyOptions(accuracy, budget), workers=1).rays == rays
+    assert choice(PROFILE, wanted(accuracy, budget)).settings == {"rays": rays}
+
+
+@pytest.mark.parametrize(
+    ("accuracy", "budget", "settings"),
+    [
+        ("3levels", "", {"supersample": 2}),
+        ("8levels", "", {"supersample": 1}),
+        ("1.9levels", "", {"supersample": 3}),
+        ("8cm", "", {"rays": 7}),
+        ("8cm,3levels", "", {"rays": 7, "supersample": 2}),
+        ("", "2x-realtime", {"rays": 1, "supersample": 1}),
+        ("", "1.2x-realtime", {"rays": 7, "supersample": 1}),  # the cheaper step is taken first
+        ("", "0.7x-realtime", {"rays": 7, "supersample": 2}),
+        ("", "0.1x-realtime", {"rays": 19, "supersample": 3}),
+    ],
+)
+def test_rigs_with_scanners_and_cameras_have_both_picked(accuracy, budget, settings):
+    assert choice(BOTH, wanted(accuracy, budget)).settings == settings
+
+
+def test_what_is_given_is_neither_picked_nor_forgotten():
+    one = choice(BOTH, wanted("8cm", given={"supersample": 2}))
+    assert (one.settings, one.cpu_s.value) == ({"rays": 7}, pytest.approx(1.1))
+    fixed = choice(BOTH, wanted("", "0.1x-realtime", free=("scanners",), given={"supersample": 2}))
+    assert fixed.settings == {"rays": 19}
+
+
+def test_depths_need_no_setting_and_are_refused_beyond_what_files_hold():
+    eye = replace(BOTH, scanners=())
+    assert choice(eye, wanted("1cm")).settings == {}
+    with pytest.raises(
+        InputError, match=r"no image of depths is sure .* that of eye errs .*give 4 mm or more"
+    ):
+        choice(eye, wanted("3mm"))
 
 
 @pytest.mark.parametrize(
@@ -121,13 +193,26 @@ def test_the_first_that_is_enough_or_the_last_that_is_affordable_is_chosen(accur
 )
 def test_what_none_reaches_is_one_line_with_the_nearest(accuracy, budget, line):
     with pytest.raises(InputError, match=line):
-        choice(PROFILE, AccuracyOptions(accuracy, budget), workers=1)
+        choice(PROFILE, wanted(accuracy, budget))
+
+
+def test_colours_that_none_reaches_are_one_line_with_the_nearest():
+    with pytest.raises(InputError, match=r"supersample=3 errs by 0.5 levels .*: give 1 level or more"):
+        choice(BOTH, wanted("0.9levels"))
 
 
 def test_more_workers_afford_more(monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 4)
-    wanted = AccuracyOptions(budget="2x-realtime")
-    assert [choice(PROFILE, wanted, workers=w).rays for w in (1, 2, 9)] == [7, 19, 19]
+    every = [choice(PROFILE, wanted(budget="2x-realtime", workers=w)).settings["rays"] for w in (1, 2, 9)]
+    assert every == [7, 19, 19]
+
+
+def test_errors_that_are_given_as_the_nearest_are_enough():
+    best = 0.0123456
+    profile = replace(PROFILE, scanners=(candidate(1, 0.1, best / 2),))
+    with pytest.raises(InputError, match=r"give 1.3 cm or more"):
+        choice(profile, wanted("1cm"))
+    assert choice(profile, wanted("1.3cm")).settings == {"rays": 1}
 
 
 def returns(rows, ranges):
@@ -142,11 +227,11 @@ def test_weighted_errors_of_matched_missed_and_extra_returns():
     )
     np.testing.assert_allclose(error.range, [0.1, 0])
     assert (error.weight.tolist(), error.missed, error.extra, error.returns) == ([1, 10], 1, 5, 12)
-    found = range_error([error, error])
-    assert found.range_m[90.0].value == 0
-    assert found.range_m[95.0].value == pytest.approx(0.1)
-    assert found.missed.value == pytest.approx(1 / 12)
-    assert found.extra.value == pytest.approx(5 / 12)
+    found = range_figures([error, error]) | lost_figures([error, error])
+    assert found["range_90_m"] == 0
+    assert found["range_95_m"] == pytest.approx(0.1)
+    assert found["missed"] == pytest.approx(1 / 12)
+    assert found["extra"] == pytest.approx(5 / 12)
 
 
 def test_a_stratified_sample_has_the_quantiles_of_all():
@@ -160,22 +245,45 @@ def test_a_stratified_sample_has_the_quantiles_of_all():
         weight = np.r_[np.ones(120), np.full(120, (5000 - 120) / 120)]
         return SampledError(errors[np.r_[hard, easy]], weight, missed=0.0, extra=0.0, returns=5000.0)
 
-    found = range_error([sampled(errors) for errors in every])
-    for percent, tolerance in ((50.0, 0.2), (90.0, 0.2), (99.0, 0.1), (99.9, 0.01)):
-        true = np.quantile(every, percent / 100)
-        assert found.range_m[percent].value == pytest.approx(true, rel=tolerance)
-        assert found.range_m[percent].low <= found.range_m[percent].value <= found.range_m[percent].high
+    found = resampled([sampled(errors) for errors in every], seed=0, figures=range_figures)
+    for percent, tolerance in ((50, 0.2), (90, 0.2), (99, 0.1), (99.9, 0.01)):
+        true, one = np.quantile(every, percent / 100), found[f"range_{percent}_m"]
+        assert one.value == pytest.approx(true, rel=tolerance)
+        assert one.low <= one.value <= one.high
 
 
-def test_intervals_are_by_drives_whose_frames_are_alike():
-    def frame(error):
-        return SampledError(np.full(50, error), np.ones(50), missed=0.0, extra=0.0, returns=50.0)
+def frame_of(error):
+    return SampledError(np.full(50, error), np.ones(50), missed=0.0, extra=0.0, returns=50.0)
 
-    frames = [frame(error) for error in (0.01, 0.02, 0.03, 0.1) for _ in range(8)]
-    drives = np.repeat(np.arange(4), 8).tolist()
-    by_frame, by_drive = range_error(frames), range_error(frames, drives=drives)
-    assert by_frame.range_m[50.0].value == by_drive.range_m[50.0].value == 0.02
-    assert by_frame.range_m[50.0].high <= 0.03 < by_drive.range_m[50.0].high
+
+def test_intervals_are_of_the_next_drive_or_of_the_frames_of_one():
+    errors = (0.01, 0.02, 0.03, 0.1)
+    frames = [(k, frame_of(error)) for k, error in enumerate(errors) for _ in range(8)]
+    of_next = drive_estimates(frames, figures=range_figures)["range_50_m"]
+    of_one = drive_estimates([(0, frame) for _, frame in frames], figures=range_figures)["range_50_m"]
+    assert of_next == next_drive(errors, least=1e-6)
+    assert of_next.value == pytest.approx(np.exp(np.log(errors).mean()))
+    assert of_one.high <= 0.1 < of_next.high
+
+
+def test_drives_without_returns_tell_nothing():
+    empty = SampledError(np.empty(0), np.empty(0), missed=0.0, extra=0.0, returns=0.0)
+    frames = [(k, frame_of(error)) for k, error in enumerate((0.01, 0.02, 0.03))]
+    assert drive_estimates([*frames, (3, empty)], figures=range_figures) == drive_estimates(
+        frames, figures=range_figures
+    )
+    assert not drive_estimates([(0, empty)], figures=range_figures)
+
+
+@pytest.mark.parametrize("drives", [4, 12])
+def test_the_next_drive_is_within_its_interval_as_often_as_promised(drives):
+    rng = np.random.default_rng(7)
+    errors = rng.lognormal(-4, 0.8, (4000, drives + 1))
+    intervals = [next_drive(row[:-1], least=1e-9) for row in errors]
+    above = np.mean([row[-1] > one.high for row, one in zip(errors, intervals, strict=True)])
+    below = np.mean([row[-1] < one.low for row, one in zip(errors, intervals, strict=True)])
+    assert above == pytest.approx(0.025, abs=0.007)  # 3 standard errors
+    assert below == pytest.approx(0.025, abs=0.007)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -183,6 +291,7 @@ def quick():
     """Smaller samples, so that a profile takes a second."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(profile, "RAYS", (1, 7, 61))
+        patch.setattr(profile, "SUPERSAMPLES", (1, 3))
         measure_little(patch)
         yield
 
@@ -205,25 +314,23 @@ def measured_before(monkeypatch):
     monkeypatch.setattr(profile, "_measured", again)
 
 
-def accurate(scene, out, *, options=DRIVE, wanted):
-    pick = picked(scene, options, wanted=wanted, out=out)
-    return driven(scene, out, options=options, wanted=wanted, pick=pick)
+def accurate(scene, out, *, options=DRIVE, by):
+    pick = picked(scene, options, wanted=by, out=out)
+    return driven(scene, out, options=options, wanted=by, pick=pick)
 
 
 def between(cache, scene):
     """An accuracy that takes 7 rays, by the profile."""
-    one, seven, _ = profile_of(scene, DRIVE, folder=cache).candidates
-    low, high = (max(e.range_m[99.0].high for e in c.errors.values()) for c in (seven, one))
+    one, seven, _ = profile_of(scene, DRIVE, folder=cache).scanners
+    low, high = (worst(c, "range_99_m").high for c in (seven, one))
     assert low < high
     return f"{500 * (low + high):.6f}mm@99"
 
 
 def test_more_rays_err_less_and_cost_more(scene, cache):
-    one, _, most = profile_of(scene, DRIVE, folder=cache).candidates
-    for percent in (99.0, 99.9):
-        assert (
-            most.errors["lidar_top"].range_m[percent].value < one.errors["lidar_top"].range_m[percent].value
-        )
+    one, _, most = profile_of(scene, DRIVE, folder=cache).scanners
+    for figure in ("range_99_m", "range_99.9_m"):
+        assert most.errors["lidar_top"][figure].value < one.errors["lidar_top"][figure].value
     assert one.cpu_s.value < most.cpu_s.value
 
 
@@ -257,20 +364,20 @@ def test_errors_are_measured_the_same_again_and_damaged_profiles_are_replaced(sc
     (tmp_path / first.path.name).write_text("{")
     again = profile_of(scene, DRIVE, folder=tmp_path)
     assert again.made
-    assert [c.errors for c in again.candidates] == [c.errors for c in first.candidates]
+    assert [c.errors for c in again.scanners] == [c.errors for c in first.scanners]
 
 
 @pytest.mark.usefixtures("measured_before")
 def test_a_drive_holds_what_was_asked_picked_expected_and_reached(scene, cache, tmp_path):
-    wanted = AccuracyOptions(between(cache, scene), profile_cache=cache)
-    done = accurate(scene, tmp_path / "a", wanted=wanted)
+    by = AccuracyOptions(between(cache, scene), profile_cache=cache)
+    done = accurate(scene, tmp_path / "a", by=by)
     manifest = open_dataset(tmp_path / "a").manifest
     notes = manifest["accuracy"]
-    assert notes["asked"] == {"accuracy": wanted.accuracy}
+    assert notes["asked"] == {"accuracy": by.accuracy}
     assert notes["picked"] == {"rays": 7}
     assert manifest["recipe"]["settings"] == [["rays", "7"]]
     expected, reached = (notes[f"{name}_error_m"]["lidar_top"] for name in ("expected", "reached"))
-    assert expected["low"] <= expected["value"] <= expected["high"] <= read_accuracy(wanted.accuracy).metres
+    assert expected["low"] <= expected["value"] <= expected["high"] <= read_accuracy(by.accuracy).metres
     assert 0 < reached["low"] <= reached["value"] <= reached["high"]
     assert notes["spot_check"]["lidar_top"]["frames"] == 5
     assert "rays=7" in done.pick.to_text(2)
@@ -282,18 +389,18 @@ def test_a_drive_holds_what_was_asked_picked_expected_and_reached(scene, cache, 
 
 @pytest.mark.usefixtures("measured_before")
 def test_a_drive_is_resumed_with_what_was_picked_and_has_the_same_bytes(scene, cache, tmp_path):
-    wanted = AccuracyOptions(between(cache, scene), profile_cache=cache)
-    accurate(scene, tmp_path / "a", wanted=wanted)
-    accurate(scene, tmp_path / "b", options=replace(DRIVE, workers=1), wanted=wanted)
+    by = AccuracyOptions(between(cache, scene), profile_cache=cache)
+    accurate(scene, tmp_path / "a", by=by)
+    accurate(scene, tmp_path / "b", options=replace(DRIVE, workers=1), by=by)
     same_files(tmp_path / "a", tmp_path / "b")
     manifest = json.loads(Paths(tmp_path / "b").manifest.read_text())
     for key in ("reached_error_m", "spot_check"):
         del manifest["accuracy"][key]
     Paths(tmp_path / "b").manifest.write_text(json.dumps(manifest | {"frames_done": 0}))
     next((tmp_path / "b").glob("*/pcd/*")).unlink()
-    elsewhere = replace(wanted, profile_cache=tmp_path / "none")
-    done = accurate(scene, tmp_path / "b", wanted=elsewhere)
-    assert (done.summary.resumed, done.pick.rays) == (4, 7)
+    elsewhere = replace(by, profile_cache=tmp_path / "none")
+    done = accurate(scene, tmp_path / "b", by=elsewhere)
+    assert (done.summary.resumed, done.pick.settings) == (4, {"rays": 7})
     assert "as picked before" in done.pick.to_text(1)
     same_files(tmp_path / "a", tmp_path / "b")
 
@@ -312,12 +419,56 @@ def test_settings_that_contradict_and_rigs_without_scanners_are_one_line(scene, 
         assert line in ended.stderr
         assert ended.stderr.count("\n") == 1
     assert not (tmp_path / "d").exists()
-    rig = tmp_path / "camera.toml"
-    rig.write_text(
-        'name = "eye"\nvehicle = "car"\n[[camera]]\nname = "front"\nwidth = 64\nheight = 48\nfx = 60.0\n'
-    )
-    ended = run_program("lidar", *words, "--accuracy", "1cm", "--rig", rig, "-o", tmp_path / "d")
-    assert (ended.returncode, "has no scanner" in ended.stderr) == (2, True), ended.stderr
+
+
+EYE = """
+name = "eye"
+vehicle = "car"
+[[camera]]
+name = "front"
+width = 64
+height = 48
+fx = 60.0
+images = IMAGES
+"""
+
+
+@pytest.mark.parametrize(
+    ("images", "accuracy", "line"),
+    [
+        ('["rgb"]', "1cm", "no sensor of rig .* measures lengths; ask for levels of colours, as in 3levels"),
+        ('["depth"]', "3levels", "no sensor of rig .* has colours; ask for a length, as in 1cm"),
+        ('["semantic"]', "1cm", "no sensor of rig .* measures lengths"),
+    ],
+)
+def test_units_that_no_sensor_has_are_refused(scene, tmp_path, images, accuracy, line):
+    rig = tmp_path / "eye.toml"
+    rig.write_text(EYE.replace("IMAGES", images))
+    with pytest.raises(InputError, match=line):
+        picked(scene, replace(DRIVE, rig=str(rig)), wanted=AccuracyOptions(accuracy))
+
+
+def test_a_rig_of_a_camera_drives_to_levels_and_to_depths(scene, tmp_path):
+    rig = tmp_path / "eye.toml"
+    rig.write_text(EYE.replace("IMAGES", '["rgb", "depth"]'))
+    options = replace(DRIVE, rig=str(rig))
+    one, three = profile_of(scene, options, folder=tmp_path).cameras
+    low, high = (worst(c, "rgb_rms").high for c in (three, one))
+    assert 0 < low < high
+    by = AccuracyOptions(f"1cm,{(low + high) / 2:.3f}levels", profile_cache=tmp_path)
+    done = accurate(scene, tmp_path / "d", options=options, by=by)
+    manifest = open_dataset(tmp_path / "d").manifest
+    notes = manifest["accuracy"]
+    assert notes["picked"] == {"supersample": 3}
+    assert manifest["recipe"]["settings"] == [["supersample", "3"]]
+    for kind in ("expected", "reached"):
+        assert 0 < notes[f"{kind}_error_levels"]["front"]["value"] < (low + high) / 2
+        assert 0 < notes[f"{kind}_depth_error_m"]["front"]["value"] <= 0.0021
+    assert "colour errors (rms) of front" in done.to_text()
+    depths = AccuracyOptions("5mm", profile_cache=tmp_path)
+    assert picked(scene, options, wanted=depths).settings == {}
+    with pytest.raises(InputError, match="`settings` supersample=2: `accuracy` picks it"):
+        picked(scene, replace(options, settings=(("supersample", "2"),)), wanted=by)
 
 
 @pytest.mark.usefixtures("measured_before")
@@ -327,9 +478,12 @@ def test_the_program_says_what_it_picks_and_what_was_reached(scene, cache, tmp_p
     ended = run_program("lidar", *words, "--budget", "0.01x-realtime", "-o", tmp_path / "d")
     assert ended.returncode == 0, ended.stderr
     first, _, last = ended.stdout.splitlines()
-    assert first.startswith("picked rays=61: expect range errors at 99.9 % of lidar_top")
+    assert first.startswith(
+        "picked rays=61: expect (95 % intervals for the next drive) range errors at 99.9 % of lidar_top"
+    )
+    assert "with planning (" in first
     assert "x real time with" in first
-    assert last.startswith("spot check of 5 frames: range errors at 99.9 % are lidar_top")
+    assert last.startswith("spot check of 5 frames: range errors at 99.9 % of lidar_top")
     ended = run_program("lidar", *words, "--spot-check", "--json", "-o", tmp_path / "e")
     assert json.loads(ended.stdout)["accuracy"]["reached_error_m"]["lidar_top"]["value"] > 0
     manifest = open_dataset(tmp_path / "e").manifest
@@ -337,15 +491,18 @@ def test_the_program_says_what_it_picks_and_what_was_reached(scene, cache, tmp_p
 
 
 def test_a_missed_accuracy_or_budget_is_named():
-    errors = PROFILE.candidates[0].errors
-    reached = SpotCheck(99.9, errors, dict.fromkeys(errors, 5))
+    errors = PROFILE.scanners[0].errors
+    reached = SpotCheck(99.9, ("ranges",), errors, dict.fromkeys(errors, 5))
     summary = DriveSummary(
-        Path("d"), 5, 0, {}, 0, duration=3.0, length=9.0, wall=9.0, recording=2.0, stages={}
+        Path("d"), 5, 0, {}, 0, duration=3.0, length=9.0, wall=9.0, planning=0.5, recording=1.5, stages={}
     )
     done = CheckedDrive(summary, AccuracyOptions("15cm", "2x-realtime"), None, reached)
     assert done.missed() == [
-        "the accuracy of 15cm at 99.9 % is missed on this drive: scanner_1 has 20 cm (10 cm to 40 cm)",
-        "the budget of 2x-realtime is missed: recorded at 1.5 x real time; was the machine busy?",
+        "the accuracy of 15cm is missed on this drive: scanner_1 has 20 cm (10 cm to 40 cm)",
+        (
+            "the budget of 2x-realtime is missed: 3 s took 0.5 s to plan and 1.5 s to record, 1.5 x real"
+            " time; was the machine busy?"
+        ),
     ]
     assert not replace(done, wanted=AccuracyOptions("25cm", "1x-realtime")).missed()
     assert not replace(done, wanted=AccuracyOptions()).missed()
@@ -358,11 +515,11 @@ def test_drives_of_a_sweep_have_picks_of_their_own(scene, cache, tmp_path):
     (tmp_path / "grid.toml").write_text(
         f'[drive]\nroute = "random"\nrig = "vlp16"\nduration = 0.5\nformat = ["pcd"]\nseed = 3\n'
         f'profile-cache = "{cache}"\n'
-        f'[grid]\nscene = ["{scene.path}"]\naccuracy = ["{coarse}", "100m", "1um"]\n'
+        f'[grid]\nscene = ["{scene.path}"]\naccuracy = ["{coarse}", "100m@50", "1um"]\n'
     )
     summary = sweep(tmp_path / "grid.toml", tmp_path / "out")
     assert [row.state for row in summary.rows] == ["done", "done", "failed"]
-    assert "no number of rays is sure to reach it" in summary.rows[2].error
+    assert "no number of rays is sure to reach 1 µm" in summary.rows[2].error
     picks = [open_dataset(summary.path / row.name).manifest["accuracy"]["picked"] for row in summary.rows[:2]]
     assert picks == [{"rays": 7}, {"rays": 1}]
     shutil.rmtree(summary.path / summary.rows[1].name / "lidar_top")

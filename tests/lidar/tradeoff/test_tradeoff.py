@@ -19,7 +19,7 @@ from lidar.tradeoff.errors import STATISTICS, Estimate, Returns, estimates, fram
 from lidar.tradeoff.report import document, write_report
 from lidar.tradeoff.simulate import bench_of, chosen_pulses, spread_frames
 from lidar.tradeoff.variants import next_step, noiseless, reference, scanner_basis, scanner_variants
-from lidar.tradeoff.words import pareto, recommendation
+from lidar.tradeoff.words import levels, pareto, recommendation
 from lidar.world.settings import PLAIN as WHOLE
 from lidar.world.settings import WorldSettings
 
@@ -197,9 +197,23 @@ def test_the_cheapest_sufficient_setting_is_recommended():
     assert "cheapest setting is rays=19; it costs 9 CPU s" in recommendation(several, 0.1)
     assert "cheapest setting is rays=61" in recommendation(several, 0.01)
     none = recommendation(several, 0.001)
-    assert "no setting that was compared is enough; rays=61 comes nearest with 5 mm" in none
+    assert "no setting that was compared is sure to be enough; rays=61 comes nearest with 5 mm" in none
     loose = comparison(row("rays=61", 0.0005, 30.0), residual=0.002)
     assert "certain to 2 mm only" in recommendation(loose, 0.001)
+
+
+def test_recommendations_count_the_upper_end_of_the_interval():
+    unsure = row("rays=7", 0.008, 4.0)
+    unsure.error["range_99.9_m"] = Estimate(0.008, 0.002, 0.03)
+    several = comparison(unsure, row("rays=19", 0.009, 9.0))
+    said = recommendation(several, 0.01)
+    assert "cheapest setting is rays=19" in said
+    assert "errs by 9 mm, by 9 mm at the upper end of the 95 % interval" in said
+    assert "comes nearest with 9 mm" in recommendation(several, 0.001)
+
+
+def test_levels_have_a_singular():
+    assert [levels(v) for v in (0, 0.5, 1.0, 3.0)] == ["0 levels", "0.5 levels", "1 level", "3 levels"]
 
 
 def test_settings_that_lose_returns_are_not_recommended():

@@ -1,0 +1,101 @@
+"""Errors of the sensors of a drive, expected or reached: as text and as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from geoscene.charts import metres
+from lidar.options import Accuracy
+from lidar.tradeoff.errors import Estimate
+from lidar.tradeoff.words import levels
+
+
+@dataclass(frozen=True, slots=True)
+class SensorErrors:
+    """Errors by name of the sensor; of some sensors, or none, of each kind.
+
+    percent : of the returns or pixels for which ranges and depths are stated
+    ranges  : of scanners, metres
+    depths  : of cameras, metres
+    colours : of cameras, levels of 255, rms
+    """
+
+    percent: float
+    ranges: dict[str, Estimate] = field(default_factory=dict)
+    depths: dict[str, Estimate] = field(default_factory=dict)
+    colours: dict[str, Estimate] = field(default_factory=dict)
+
+    def to_json(self, prefix: str) -> dict[str, Any]:
+        """The errors that there are, such as ``expected_error_m``, for a prefix."""
+        found: dict[str, Any] = {"percent": self.percent}
+        for kind, name in _KEYS.items():
+            if errors := getattr(self, kind):
+                found[f"{prefix}_{name}"] = {sensor: error.to_json() for sensor, error in errors.items()}
+        return found
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any], prefix: str) -> SensorErrors:
+        """The errors of `to_json`; raises KeyError, TypeError or ValueError for others."""
+        every = {
+            kind: {
+                sensor: Estimate.from_json(error)
+                for sensor, error in document.get(f"{prefix}_{name}", {}).items()
+            }
+            for kind, name in _KEYS.items()
+        }
+        return cls(float(document["percent"]), **every)
+
+    def to_text(self) -> str:
+        """All of them, in one line."""
+        share = f"at {self.percent:g} % of "
+        texts = [
+            f"range errors {share}{_listed(self.ranges)}" if self.ranges else "",
+            f"depth errors {share}{_listed(self.depths)}" if self.depths else "",
+            f"colour errors (rms) of {_listed(self.colours, size=levels)}" if self.colours else "",
+        ]
+        return ", ".join(filter(None, texts)) or "no errors that are known"
+
+    def beyond(self, asked: Accuracy) -> list[str]:
+        """Those that are larger than what was asked for, in words."""
+        lengths = {name: e for name, e in (self.ranges | self.depths).items() if e.value > asked.metres > 0}
+        colours = {name: e for name, e in self.colours.items() if e.value > asked.levels > 0}
+        return [
+            *(f"{name} has {error_text(error)}" for name, error in lengths.items()),
+            *(f"{name} has {error_text(error, size=levels)}" for name, error in colours.items()),
+        ]
+
+
+_KEYS = {"ranges": "error_m", "depths": "depth_error_m", "colours": "error_levels"}
+
+
+def error_text(error: Estimate, *, size: Callable[[float], str] = metres) -> str:
+    """An error with its interval."""
+    return f"{size(error.value)} ({size(error.low)} to {size(error.high)})"
+
+
+def _listed(errors: Mapping[str, Estimate], *, size: Callable[[float], str] = metres) -> str:
+    return ", ".join(f"{name} {error_text(error, size=size)}" for name, error in errors.items())
+
+
+def stated(
+    errors: Mapping[str, Mapping[str, Estimate]], *, percent: float, kinds: Collection[str]
+) -> SensorErrors:
+    """Of all figures of sensors, by their names, those of some kinds: ranges, depths and colours."""
+    names = {"ranges": f"range_{percent:g}_m", "depths": f"depth_{percent:g}_m", "colours": "rgb_rms"}
+    return SensorErrors(
+        percent,
+        **{
+            kind: {sensor: figures[name] for sensor, figures in errors.items() if name in figures}
+            for kind, name in names.items()
+            if kind in kinds
+        },
+    )
+
+
+def kinds_of(asked: Accuracy | None) -> tuple[str, ...]:
+    """Kinds of errors that are stated for an accuracy, or for a drive for which none was asked."""
+    if asked is None:
+        return ("ranges", "colours")
+    return (("ranges", "depths") if asked.metres else ()) + (("colours",) if asked.levels else ())
