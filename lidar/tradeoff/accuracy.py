@@ -30,17 +30,19 @@ class Planned:
     """The plan of a drive within a budget of time.
 
     seconds : that planning took
-    loading : seconds to load tiles along it, as expected
+    cpu_s   : CPU seconds of these
+    loading : CPU seconds to load tiles along it, as expected
     """
 
     plan: DrivePlan
     seconds: float
+    cpu_s: float
     loading: float
 
     @property
     def overhead(self) -> float:
-        """Seconds per simulated second beside recording."""
-        return (self.seconds + self.loading) / (self.plan.trajectory.duration_ns / 1e9)
+        """Seconds per simulated second beside recording, if no other program takes time."""
+        return (self.cpu_s + self.loading) / (self.plan.trajectory.duration_ns / 1e9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,7 @@ class Pick:
         if self.planned is None:
             return text
         return (
-            f"{text}; with planning ({self.planned.seconds:.2g} s) and loading ({self.planned.loading:.2g} s)"
+            f"{text}; with planning ({self.planned.cpu_s:.2g} CPU s) and loading ({self.planned.loading:.2g})"
             f" {self._whole_speed(workers):.2g} x real time"
         )
 
@@ -96,8 +98,8 @@ class Pick:
         if self.chosen is None or self.profile is None:
             return {}
         planned = self.planned and {
-            "planning_s": round(self.planned.seconds, 3),
-            "expected_loading_s": round(self.planned.loading, 3),
+            "planning_cpu_s": round(self.planned.cpu_s, 3),
+            "expected_loading_cpu_s": round(self.planned.loading, 3),
         }
         return {
             "expected_cpu_s": self.chosen.cpu_s.to_json(),
@@ -199,7 +201,7 @@ def picked(
     planned = None
     if wanted.budget:
         planned = _planned(scene, options, profile=profile, progress=progress)
-        by = replace(by, budget=wanted.budget, pace=_pace(planned, wanted.budget))
+        by = replace(by, budget=wanted.budget, pace=pace_of(planned, wanted.budget))
     chosen = choice(profile, by)
     percent = asked.percent if asked else _PERCENT
     expected = stated(chosen.errors, percent=percent, kinds=kinds_of(asked))
@@ -208,22 +210,22 @@ def picked(
 
 def _planned(scene: Scene, options: DriveOptions, *, profile: Profile, progress: Progress) -> Planned:
     """The plan of a drive, and what it and loading cost."""
-    began = time.perf_counter()
+    began, cpu_began = time.perf_counter(), time.process_time()
     plan = plan_drive(scene, options, progress=progress)
-    seconds = time.perf_counter() - began
+    seconds, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
     chunks = sum(1 for _ in pipeline.chunks(plan.jobs, plan.trajectory))
-    return Planned(plan, seconds, chunks * profile.load_s.high)
+    return Planned(plan, seconds, cpu_s=cpu_s, loading=chunks * profile.load_s.high)
 
 
-def _pace(planned: Planned, budget: str) -> float:
+def pace_of(planned: Planned, budget: str) -> float:
     """Simulated seconds that are to be recorded per second, so that a budget holds for all."""
     left = 1 / read_budget(budget) - planned.overhead
     if left <= 0:
         duration = planned.plan.trajectory.duration_ns / 1e9
         raise InputError(
             f"`budget` {budget}: allows {duration / read_budget(budget):.2g} s for a drive of"
-            f" {duration:.3g} s, and planning took {planned.seconds:.2g} s and loading takes"
-            f" {planned.loading:.2g} s; give more time"
+            f" {duration:.3g} s, and planning took {planned.cpu_s:.2g} CPU s and loading takes"
+            f" {planned.loading:.2g}; give more time"
         )
     return 1 / left
 

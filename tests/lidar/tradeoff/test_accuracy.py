@@ -15,15 +15,17 @@ from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError
 from lidar.options import AccuracyOptions, DriveOptions, read_accuracy, read_budget
 from lidar.pipeline import DriveSummary, drive
+from lidar.plan import plan_drive
 from lidar.sweep import sweep
-from lidar.tradeoff import profile
-from lidar.tradeoff.accuracy import CheckedDrive, driven, picked
+from lidar.tradeoff import accuracy, profile
+from lidar.tradeoff.accuracy import CheckedDrive, Planned, driven, pace_of, picked
 from lidar.tradeoff.choice import Wanted, choice, worst
 from lidar.tradeoff.errors import Estimate, Returns, next_drive, resampled
 from lidar.tradeoff.profile import Candidate, Profile, profile_of
 from lidar.tradeoff.profile_errors import drive_estimates
 from lidar.tradeoff.sampling import SampledError, lost_figures, range_figures, sampled_error
 from lidar.tradeoff.spot import SpotCheck
+from lidar.traffic.populate import TrafficOptions
 
 DRIVE = DriveOptions(route="random", rig="vlp16", duration=0.5, seed=3, formats=("pcd",))
 
@@ -525,3 +527,35 @@ def test_drives_of_a_sweep_have_picks_of_their_own(scene, cache, tmp_path):
     shutil.rmtree(summary.path / summary.rows[1].name / "lidar_top")
     again = sweep(tmp_path / "grid.toml", tmp_path / "out", workers=2)
     assert [row.digest for row in again.rows] == [row.digest for row in summary.rows]
+
+
+def test_a_budget_leaves_time_for_planning_and_loading(scene, cache):
+    options = replace(DRIVE, traffic=TrafficOptions())
+    plan = plan_drive(scene, options)
+    planned = Planned(plan, seconds=9.0, cpu_s=0.2, loading=0.05)  # of 0.5 s: half as much again as the drive
+    assert planned.overhead == pytest.approx(0.5)
+    assert pace_of(planned, "1x-realtime") == pytest.approx(2.0)
+    with pytest.raises(InputError, match=r"allows 0.25 s for a drive of 0.5 s, and planning took 0.2 CPU s"):
+        pace_of(planned, "2x-realtime")
+    by = AccuracyOptions(budget="0.01x-realtime", profile_cache=cache)
+    pick = picked(scene, DRIVE, wanted=by)
+    assert pick.planned.plan.options == DRIVE
+    assert pick.costs(1)["expected_speed"] < pick.costs(1)["expected_cpu_s"]["value"] ** -1
+
+
+def test_a_drive_within_a_budget_is_planned_once(scene, cache, tmp_path, monkeypatch):
+    plans = []
+
+    def counted(*args, **more):
+        plans.append(args)
+        return plan_drive(*args, **more)
+
+    monkeypatch.setattr(accuracy, "plan_drive", counted)
+    monkeypatch.setattr("lidar.pipeline.plan_drive", counted)
+    by = AccuracyOptions(budget="0.001x-realtime", profile_cache=cache)
+    pick = picked(scene, DRIVE, wanted=by)
+    done = driven(scene, tmp_path / "d", options=DRIVE, wanted=by, pick=pick)
+    assert len(plans) == 1
+    assert done.speed < done.summary.duration / done.summary.recording
+    drive(scene, tmp_path / "set", options=replace(DRIVE, settings=(("rays", "61"),)))
+    assert Paths(tmp_path / "d").journal.read_bytes() == Paths(tmp_path / "set").journal.read_bytes()
