@@ -41,8 +41,8 @@ from lidar.world.thread_worlds import Worlds
 CHUNK = 200.0
 """Scene metres along each axis that the vehicle may cover before other tiles are loaded."""
 
-_FORGET = 1024
-"""Frames of a sensor after which the memory of long motion is let go."""
+_FORGET_NS = 60 * 10**9
+"""Nanoseconds of a drive after which the memory of long motion is let go."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,7 +272,7 @@ def record_all(
     progress: Progress = silent,
 ) -> None:
     """Record frames and add them to the journal."""
-    done = 0
+    done = released_ns = 0
     progress("driving", done, total=len(jobs))
     max_range = max((job.sensor.max_range for job in jobs), default=0.0)
     worlds = Worlds(scene, max_range, actors=recording.actors, settings=recording.contents.world)
@@ -288,8 +288,9 @@ def record_all(
                 if len(running) >= 2 * workers:
                     done += _take(running, finished=wait(running, return_when=FIRST_COMPLETED).done)
                     progress("driving", done, total=len(jobs))
-                if not job.frame % _FORGET:
+                if job.start_ns - released_ns > _FORGET_NS:
                     recording.release()
+                    released_ns = job.start_ns
             done += _take(running, finished=wait(running).done)
             progress("driving", done, total=len(jobs))
 
