@@ -16,9 +16,15 @@ from rich.table import Table
 _INK, _GREY, _CHOICE, _OTHER = (30, 32, 38), (205, 208, 214), (200, 60, 40), (60, 110, 180)
 _STYLE = (
     "body{font:15px system-ui,sans-serif;margin:2em;color:#1e2026}"
-    "table{border-collapse:collapse;margin:1em 0}"
-    "td,th{border-bottom:1px solid #cdd0d6;padding:.3em .6em;text-align:right;white-space:nowrap}"
-    "td:first-child,th:first-child,td:last-child{text-align:left;white-space:normal}img{max-width:100%}"
+    ".wide{overflow-x:auto;margin:1em 0}table{border-collapse:collapse;font-size:13px}"
+    "td,th{border-bottom:1px solid #cdd0d6;padding:.3em .5em;text-align:right;white-space:nowrap}"
+    "td:first-child,th:first-child{position:sticky;left:0;background:#fff}"
+    "td:first-child,th:first-child{text-align:left;white-space:normal;min-width:12em}"
+    "td:last-child{text-align:left;white-space:normal;min-width:16em}img{max-width:100%}"
+)
+_LEGEND = (
+    (_CHOICE, "no other setting is both cheaper and more exact"),
+    (_OTHER, "another setting is cheaper and at least as exact"),
 )
 
 
@@ -77,10 +83,14 @@ class Axes:
 
 
 def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: int = 700) -> bytes:
-    """A PNG of points, both axes logarithmic; values of 0 are drawn at the lower end, marked ``0``."""
+    """A PNG of points with a legend, both axes logarithmic.
+
+    Values of 0 are drawn at the lower end, marked ``0``. Points whose names have no room are counted in the
+    legend.
+    """
     picture = Image.new("RGB", (width, height), (255, 255, 255))
     pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=15)
-    left, right, top, bottom = 90, width - 190, 70, height - 70
+    left, right, top, bottom = 90, width - 130, 96, height - 70
     x_ends, y_ends = _ends([x for p in points for x in p.xs]), _ends([y for p in points for y in p.ys])
     nothing = any(y <= 0 for p in points for y in p.ys)
 
@@ -91,7 +101,7 @@ def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: i
         return _place(value, y_ends, at=(bottom - 40 * nothing, top)) if value > 0 else bottom
 
     def text(place: tuple[float, float], words: str, *, anchor: str) -> None:
-        pen.text(place, words, fill=_INK, font=font, anchor=anchor)
+        pen.text(place, words, fill=_INK, font=font, anchor=anchor, stroke_width=2, stroke_fill="white")
 
     text((left, 16), axes.title, anchor="la")
     text(((left + right) / 2, height - 16), axes.x, anchor="ms")
@@ -106,12 +116,14 @@ def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: i
     line = [(across(p.x), up(p.y)) for p in ordered if p.best]
     if len(line) > 1:
         pen.line(line, fill=_CHOICE, width=2)
-    named: list[tuple[float, float, float, float]] = []
     for p in ordered:
         u, v, color = across(p.x), up(p.y), _CHOICE if p.best else _OTHER
         pen.line((across(min(p.xs)), v, across(max(p.xs)), v), fill=color)
         pen.line((u, up(min(p.ys)), u, up(max(p.ys))), fill=color)
         pen.ellipse((u - 4, v - 4, u + 4, v + 4), fill=color)
+    named: list[tuple[float, float, float, float]] = []
+    for p in ordered:
+        u, v = across(p.x), up(p.y)
         for place, anchor in (((u + 8, v - 4), "ls"), ((u + 8, v + 4), "lt"), ((u - 8, v + 4), "rt")):
             box = pen.textbbox(place, p.name, font=font, anchor=anchor)
             outside = box[0] < left or box[2] > width
@@ -119,6 +131,14 @@ def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: i
                 text(place, p.name, anchor=anchor)
                 named.append(box)
                 break
+    at = left
+    unnamed = len(ordered) - len(named)
+    for color, words in _LEGEND:
+        pen.ellipse((at, 44, at + 8, 52), fill=color)
+        text((at + 14, 48), words, anchor="lm")
+        at += 34 + int(pen.textlength(words, font=font))
+    if unnamed:
+        text((at, 48), f"{unnamed} without a name, see the table", anchor="lm")
     file = io.BytesIO()
     picture.save(file, "PNG")
     return file.getvalue()
@@ -171,12 +191,16 @@ def _console() -> Console:
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of texts."""
+    """A table of texts; intervals in brackets stand below their values."""
 
     def line(cells: Sequence[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(text)}</{tag}>" for text in cells) + "</tr>"
+        first, *middle, last = map(html.escape, cells)
+        texts = [first, *(text.replace(" (", "<br>(") for text in middle), last]
+        return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>"
 
-    return f"<table>{line(head, 'th')}{''.join(line(row, 'td') for row in rows)}</table>"
+    return (
+        f'<div class="wide"><table>{line(head, "th")}{"".join(line(row, "td") for row in rows)}</table></div>'
+    )
 
 
 def html_picture(png: bytes, *, alt: str) -> str:
