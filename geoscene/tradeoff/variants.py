@@ -47,10 +47,15 @@ def full(options: BuildOptions) -> Variant:
 def variants(options: BuildOptions, settings: Sequence[str]) -> list[Variant]:
     """Builds to compare with the full scene, one setting changed in each, and a combination of cheap ones.
 
-    Raises InputError for unknown settings.
+    Raises InputError for unknown settings, ``terrain`` without elevation files, and options that are
+    compared.
     """
     if unknown := sorted(set(settings) - set(SETTINGS)):
         raise InputError(f"`settings` {','.join(unknown)}: unknown; choose from {', '.join(SETTINGS)}")
+    if "terrain" in settings and not options.dem:
+        raise InputError("`settings` terrain: needs `dem`")
+    if options.lod != 2 or set(options.only) != set(KINDS) or options.use != "all":
+        raise InputError("`lod`, `only` and `use` are compared, all values of them; leave them out")
     chosen, base = settings or SETTINGS, full(options).options
     found: list[Variant] = []
     if "lod" in chosen:

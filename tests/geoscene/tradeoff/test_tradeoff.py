@@ -23,7 +23,7 @@ BOX = (24.9400, 60.1660, 24.9430, 60.1675)
 @pytest.fixture(scope="module")
 def found():
     """Levels of detail and kinds of features in a few blocks of the demo map."""
-    return tradeoff(partial(read_osm, demo_path(), bounds=BOX), BuildOptions(lod=1), settings=("lod", "for"))
+    return tradeoff(partial(read_osm, demo_path(), bounds=BOX), BuildOptions(), settings=("lod", "for"))
 
 
 def test_errors_are_against_the_full_scene_and_ordered(found):
@@ -71,13 +71,18 @@ def test_recommendations_name_the_cheapest_that_is_enough():
 
 
 def test_variants_change_one_setting_of_the_full_scene():
-    base = BuildOptions(lod=0, only=("roads",), crs="utm")
+    base = BuildOptions(crs="utm")
     assert {v.options.crs for v in variants(base, ())} == {"utm"}
     assert not [v for v in variants(base, ()) if v.label.startswith("terrain")]
     labels = [v.label for v in variants(replace(base, dem=("a.tif",)), ("terrain",))]
     assert labels == ["terrain=2 x 2 posts", "terrain=4 x 4 posts", "terrain=8 x 8 posts", "terrain=level"]
     with pytest.raises(InputError, match="`settings` rays: unknown; choose from lod, only, terrain, for"):
         variants(base, ("rays",))
+    with pytest.raises(InputError, match="terrain: needs `dem`"):
+        variants(base, ("terrain",))
+    for change in ({"lod": 1}, {"only": ("roads",)}, {"use": "gis"}):
+        with pytest.raises(InputError, match="are compared"):
+            variants(replace(base, **change), ())
 
 
 def test_coarse_elevation_averages_posts_and_keeps_voids(tmp_path):
@@ -97,7 +102,7 @@ def test_coarse_elevation_averages_posts_and_keeps_voids(tmp_path):
 
 
 def test_command_refuses_unknown_settings_and_existing_folders(tmp_path):
-    for words in (["--settings", "rays"], ["--dem", "tiles"], ["-o", tmp_path]):
+    for words in (["--settings", "rays"], ["--lod", "1"], ["--dem", "tiles"], ["-o", tmp_path]):
         done = run_program("geoscene", "tradeoff", "--demo", *words)
         assert done.returncode == 2
         assert len(done.stderr.splitlines()) == 1
