@@ -45,6 +45,9 @@ _BROKEN_PIPE = 141
 _INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM)
 """Signals of Ctrl-C, and of ``timeout``, ``kill`` and batch systems; the exit code is 128 plus the number."""
 
+_RESUMED = ("build", "drive", "sweep")
+"""Commands that go on where they were interrupted."""
+
 _GRACE = 1.5
 """Seconds to clear up in after an interruption, which may also get lost in callbacks of compiled code."""
 
@@ -193,7 +196,8 @@ def _exit_interrupted(app: App, number: int) -> NoReturn:
     for child in active_children():
         child.kill()
     with suppress(RuntimeError):  # if it was interrupted in writing to standard error
-        _print_error(app, "interrupted; repeat the command to resume")
+        resumed = _command(app).strip() in _RESUMED
+        _print_error(app, "interrupted" + "; repeat the command to resume" * resumed)
         sys.stderr.flush()
     os._exit(128 + number)
 
