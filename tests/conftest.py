@@ -2,6 +2,7 @@
 
 import logging
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,10 @@ from geoscene.options import BuildOptions
 from geoscene.pipeline import build
 from geoscene.scene import Scene, open_scene
 from geoscene.sources import demo_path, read_osm
+
+# Many tests start processes, which else compile every module that they import: half a second for each.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # The same examples on every machine, however slow; `make fuzz` draws others, and ten times as many.
 settings.register_profile(
