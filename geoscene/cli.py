@@ -172,7 +172,7 @@ def build(
     else:
         _print_scene(document)
         path = shown(out)
-        drive = ("lidar", "drive", path, "--route", "random", "-o", "drive")
+        drive = ("lidar", "drive", path, "--route", *(options.along or ("random",)), "-o", "drive")
         words = drive if document["counts"]["road_edges"] else ("geoscene", "export", path, "-o", "scene.glb")
         if not scene.has_tiles:
             words = ("geoscene", "export", path, "-o", "scene.gpkg")

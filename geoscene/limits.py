@@ -25,7 +25,7 @@ _SIDE = 33
 class Limit:
     """An error that exceeds its bound.
 
-    name     : ``map scale`` or ``height``
+    name     : ``map scale``, ``height``, ``origin`` or ``reach``
     measured : the largest error found
     bound    : the largest that is not reported
     unit     : of both

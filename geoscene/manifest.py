@@ -55,6 +55,7 @@ def scene_manifest(
         "tiles": sorted((r.i, r.j, tile_span(plan.ground, r.i, j=r.j)) for r in reports),
         "options": dict(options),
         **({} if plan.area is None else {"area": shapely.to_wkt(plan.area, rounding_precision=3)}),
+        **({} if plan.route is None else {"route": shapely.to_wkt(plan.route, rounding_precision=3)}),
         "map": digest,
         "left_out": {"tiles": len(plan.chosen) - len(reports)},
         "terrain": {

@@ -110,6 +110,7 @@ class Plan:
     chosen    : tiles to build, sorted: all, or those in reach of a route
     kept      : rows of each of ``layers`` that tables on disk hold, None for all
     area      : polygon that the scene is built for, in place of a route; None without
+    route     : line that the scene is built along, scene metres; None without
     """
 
     frame: Frame
@@ -135,6 +136,7 @@ class Plan:
     chosen: list[tuple[int, int]]
     kept: dict[str, NDArray[np.int64]] | None
     area: Any | None = None
+    route: Any | None = None
 
     @property
     def extent(self) -> Bounds:
@@ -172,6 +174,7 @@ def make_plan(
     progress("roads", 0, total=0)
     roads = _plan_roads(osm, frame, options=options, terrain=terrain, problems=problems)
     reach, area = Reach.of(options, roads.graph, frame=frame), None
+    route = None if reach is None else reach.line
     if needed is not None:
         area = needed(
             RoadMap(
@@ -240,6 +243,7 @@ def make_plan(
         layers=layers,
         ranges=local.ranges,
         area=area,
+        route=route,
     )
     return plan, problems
 

@@ -28,7 +28,7 @@ traffic is 200 m."""
 AROUND = 50.0
 """Metres around tiles and tables in which surfaces are planned: more than objects are moved by."""
 
-_OFFSET = 15.0
+OFFSET = 15.0
 """Metres, maximum distance of a sensor from the centre line of its road."""
 
 _CROWN = 5.0
@@ -79,7 +79,7 @@ class Reach:
             return None
         line = route_line(options.along, graph, frame=frame)
         shapely.prepare(line)
-        return cls(line, options.reach + _OFFSET)
+        return cls(line, options.reach + OFFSET)
 
     @classmethod
     def within(cls, area: Any) -> Reach:

@@ -9,13 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.limits import Limit, height_limit
 from geoscene.progress import Progress, silent
+from geoscene.reach import OFFSET
 from geoscene.scene import Scene
-from geoscene.typing import Ints
+from geoscene.typing import Float, Ints
 from lidar import __version__
 from lidar.dataset.recording import Recording
 from lidar.errors import InputError
@@ -138,11 +140,19 @@ class DrivePlan:
 
     @property
     def limits(self) -> list[Limit]:
-        """Errors that no range is corrected for: of lengths at the trajectory's height, and of its origin."""
+        """Errors that no range is corrected for: of lengths at the trajectory's height, and of its origin.
+
+        And surfaces that are missing, where sensors see farther than a scene along a route was built.
+        """
         position = self.trajectory.position[:: max(len(self.trajectory) // 1000, 1)].copy()
         self.trajectory.release()
-        fixed = self.options.contents().world.origin == "scene"
-        return [*height_limit(position[:, 2]), *(origin_limit(position) if fixed else [])]
+        settings = self.options.contents().world
+        sight = min(self.max_range, settings.reach)
+        return [
+            *height_limit(position[:, 2]),
+            *(origin_limit(position) if settings.origin == "scene" else []),
+            *reach_limit(self.scene, position, sight=sight),
+        ]
 
     def recording(self, out: Path) -> Recording:
         """What the frames are recorded from."""
@@ -219,6 +229,27 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
         geo=Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact),
         jobs=jobs,
     )
+
+
+def reach_limit(scene: Scene, position: Float, *, sight: float) -> list[Limit]:
+    """The limit of what sensors at places (n, 3) see of a scene that was built along a route.
+
+    sight : metres, range of the sensors
+    """
+    if scene.route is None:
+        return []
+    reach = float(scene.manifest["options"]["reach"])
+    off = float(shapely.distance(scene.route, shapely.points(position[:, :2])).max())
+    needed = sight + max(off - OFFSET, 0.0)
+    if needed <= reach:
+        return []
+    where = f" at up to {off:,.0f} m from that route" if off > OFFSET else ""
+    advice = (
+        f"the scene was built along a route for ranges of {reach:g} m; sensors of this drive see up to"
+        f" {sight:g} m{where}, so surfaces that far away may be missing: build the scene with a reach of"
+        f" {needed:.0f} m or as a whole"
+    )
+    return [Limit("reach", round(needed, 1), reach, "m", advice)]
 
 
 def solar_start(scene: Scene) -> datetime:

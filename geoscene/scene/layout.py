@@ -215,6 +215,12 @@ class Scene:
         text = self.manifest.get("area")
         return None if text is None else shapely.from_wkt(text)
 
+    @functools.cached_property
+    def route(self) -> Any | None:
+        """Line, scene metres, along which the scene was built; None if it was not."""
+        text = self.manifest.get("route")
+        return None if text is None else shapely.from_wkt(text)
+
     @property
     def origin(self) -> dict[str, Any]:
         """The map that the scene was built of, a digest of its contents, and the options of the build."""

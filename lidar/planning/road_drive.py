@@ -149,15 +149,20 @@ def plan_road_drive(
     obstacles = ground_footprints(scene)
     progress("planning", 0, total=0)
     seconds, at_speed = _record(spec, duration, from_rest=from_rest)
-    route, path = plan_route_and_path(
-        graph,
-        scene.frame,
-        spec=spec,
-        vehicle=body,
-        options=_route_options(seconds, at_speed=at_speed, seed=seed, side=side),
-        obstacles=obstacles,
-        ground=road_surface(scene),
-    )
+    try:
+        route, path = plan_route_and_path(
+            graph,
+            scene.frame,
+            spec=spec,
+            vehicle=body,
+            options=_route_options(seconds, at_speed=at_speed, seed=seed, side=side),
+            obstacles=obstacles,
+            ground=road_surface(scene),
+        )
+    except RouteError as error:
+        if scene.route is None:
+            raise
+        raise RouteError(f"{error}; the scene has only what lies along the route it was built for") from None
     path = replace(path, edge=np.where(path.edge >= 0, np.flatnonzero(kept)[path.edge], -1).astype(np.int32))
     return RoadPlan(whole, route, path, seconds, at_speed)
 

@@ -24,8 +24,10 @@ from geoscene.progress import silent
 from geoscene.scene.validate import check_scene
 from geoscene.sources import Way, read_osm
 from geoscene.view import view_scene
+from lidar.errors import RouteError
 from lidar.options import DriveOptions
 from lidar.pipeline import drive
+from lidar.plan import plan_drive
 from lidar.traffic.populate import TrafficOptions
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -140,7 +142,7 @@ def test_long_wall_in_range_adds_its_tile(make_osm, town, tmp_path):
 
 
 def test_bridge_with_an_end_in_range_adds_its_tile(town, tmp_path, monkeypatch):
-    monkeypatch.setattr("geoscene.reach._OFFSET", 0.0)
+    monkeypatch.setattr("geoscene.reach.OFFSET", 0.0)
     monkeypatch.setattr("geoscene.reach._CROWN", 0.0)
     options = BuildOptions(tile_size=50.0, only=("roads",))
     osm = read_osm(town)
@@ -176,6 +178,20 @@ def test_drive_on_tiles_along_its_route_gives_the_same_bytes(make_osm, town, sce
     clouds = [{p.relative_to(d): p.read_bytes() for p in d.rglob("*.pcd")} for d in drives]
     assert len(clouds[0]) == 20
     assert clouds[0] == clouds[1]
+    assert plan_drive(part, words).limits == []
+
+
+def test_drive_beyond_what_was_built_along_a_route_says_so(make_osm, part, scene):
+    lonlat = make_osm.on_globe(np.array([(-300.0, 0.0), (-250.0, 0.0), (250.0, 0.0)]))
+    route = tuple((lat, lon) for lon, lat in lonlat.tolist())
+    words = DriveOptions(route=route[:2], rig="vlp16", duration=1.0)
+    (limit,) = plan_drive(part, words).limits
+    assert (limit.name, limit.measured, limit.bound, limit.unit) == ("reach", 100.0, 20.0, "m")
+    assert plan_drive(scene, words).limits == []
+    near = replace(words, settings=(("reach", "20"),))
+    assert plan_drive(part, near).limits == []
+    with pytest.raises(RouteError, match="only what lies along the route it was built for"):
+        plan_drive(part, replace(words, route=(route[0], route[2])))
 
 
 @pytest.fixture(scope="module")
