@@ -80,8 +80,9 @@ def drive(
 ) -> int:
     """Drive a route through a scene or a map and record what the rig senses.
 
-    The same command resumes an interrupted drive; the bytes are those of an uninterrupted one. Of a map, what
-    the drive needs is built first and kept for later drives; the bytes are those of a scene of the whole map.
+    The same command resumes an interrupted drive; its files are those of an uninterrupted one, byte for
+    byte. Of a map, the part that the drive needs is built first and kept for later drives; the recorded files
+    are those of a drive in a scene of the whole map.
 
     For example:
 
@@ -213,7 +214,8 @@ def sweep(
     Parameters
     ----------
     file
-        TOML file with the options of all drives in [drive] and lists of values in [grid].
+        TOML file with the options of all drives in [drive], lists of values in [grid], and maps to build in
+        [[map]]; docs/sweeps.md has an example.
     out
         Directory to write to: a dataset for each drive, and the table sweep.json, also as sweep.csv.
     workers
@@ -284,6 +286,8 @@ def tradeoff(
 
     options = options or DriveOptions()
     options.check_course()
+    if options.scheduler:
+        raise InputError("`scheduler`: costs are those of this machine; leave it out")
     if out is not None:
         note_new_folder(out)
         if out.exists() and not report.overwrite:

@@ -218,7 +218,8 @@ class DriveOptions:
     """CRS of LAZ files: utm, scene, or an EPSG code."""
 
     exact: Annotated[bool, Parameter(group=OUTPUT)] = False
-    """Georeference every point through the full projection instead of a map that is within 0.1 mm of it."""
+    """Georeference every point through the full projection; by default by a local affine approximation, which
+    is within 0.1 mm of it."""
 
     side: str = ""
     """Side of the road to drive on, right or left; the scene's by default."""
@@ -239,7 +240,7 @@ class DriveOptions:
         tuple[tuple[str, str], ...],
         Parameter(name="--set", converter=_settings, n_tokens=1, metavar="NAME=VALUE"),
     ] = ()
-    """One setting that differs from the level; repeat for more. lidar settings lists them."""
+    """One setting that differs from the fidelity level; repeat for more. lidar settings lists them."""
 
     stages: Annotated[StageList, _STAGE] = ()
     """Change echoes, clouds or images by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or a TOML file with tables
@@ -399,18 +400,18 @@ class AccuracyOptions:
     """Options by which rays of scanners and cameras are picked, and errors are checked."""
 
     accuracy: Annotated[str, Parameter(metavar="LENGTH[@PERCENT],LEVELS")] = ""
-    """Pick the fewest rays with which the errors of every sensor are below this: 1cm is for ranges and depths
-    at 99.9 % of the returns or pixels, 5mm@99 at 99 %, 3levels for colours of cameras (rms, of 255), and
-    1cm,3levels for both. What counts is the upper end of the 95 % interval for the next drive, by a
-    measurement made once for a scene, rig and settings."""
+    """Pick the fewest rays with which every sensor errs less than this: 1cm for 99.9 % of the ranges and
+    depths, 5mm@99 for 99 % of them, 3levels for colours of cameras (rms, of 255), 1cm,3levels for both. What
+    counts is the upper end of the 95 % interval for the next drive, by a measurement made once for a scene,
+    rig and settings."""
 
     budget: Annotated[str, Parameter(metavar="Nx-realtime")] = ""
-    """Pick the most rays with which the drive is simulated this much faster than real time, with the workers
-    given: 2x-realtime is two simulated seconds per second. With an accuracy: a limit to it."""
+    """Pick the most rays with which the workers simulate the drive at this speed: 2x-realtime is two
+    simulated seconds per second, 0.5x-realtime half of one. With an accuracy: a limit to it."""
 
     spot_check: bool = False
-    """Compare a sample of the recorded frames with the exact end afterwards; always done for an accuracy or a
-    budget."""
+    """Compare a sample of the recorded frames with the exact reference (float64, up to 999 rays a pulse)
+    afterwards; always done for an accuracy or a budget."""
 
     profile_cache: Path | None = None
     """Folder of the measurements that accuracy and budget pick by; ~/.cache/geoscene/profiles by default."""
@@ -488,7 +489,8 @@ class TradeoffOptions:
     """Settings to compare, separated by commas: rays, poses, mirrors, foliage of scanners; supersample, blur,
     shadows, detail, resolution, haze of cameras; precision, retrace of both; origin, reach, forests, trees,
     furniture, barriers, scene, traffic; georeferencing, files (formats), voxel (of maps) and frame
-    (projections); all by default. Cheap ones are combined, too."""
+    (projections); all by default. Cheap ones are also tried together. lidar settings
+    explains them."""
 
     sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
     """Names of the scanners and cameras to compare; all by default."""

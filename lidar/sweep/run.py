@@ -45,6 +45,8 @@ class DriveRow:
     seconds : of simulated time
     metres  : driven
     digest  : of the journal, hence of all frames
+    picked  : settings by which the drive reaches its accuracy or keeps its budget, in words
+    reached : errors that its spot check found, in words
     """
 
     name: str
@@ -55,6 +57,8 @@ class DriveRow:
     seconds: float = 0.0
     metres: float = 0.0
     digest: str = ""
+    picked: str = ""
+    reached: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,19 +211,20 @@ def _recorded(task: _Task) -> tuple[int, DriveRow]:
     options = replace(task.drive.options, workers=task.threads)
     try:
         with using(open_scene(task.drive.scene), known=LidarError) as scene:
-            done = driven(
+            checked = driven(
                 scene,
                 out,
                 options=options,
                 wanted=task.drive.wanted,
                 pick=task.pick,
                 overwrite=task.overwrite,
-            ).summary
+            )
     except (GeosceneError, LidarError, OSError) as error:
         return task.row, DriveRow(name, "failed", _one_line(error))
     except Exception as error:  # one drive's defect must not end the others
         log.exception("drive %s", name)
         return task.row, DriveRow(name, "failed", f"{type(error).__name__}: {_one_line(error)}")
+    done = checked.summary
     return task.row, DriveRow(
         name,
         "done",
@@ -228,6 +233,8 @@ def _recorded(task: _Task) -> tuple[int, DriveRow]:
         seconds=done.duration,
         metres=round(done.length, 3),
         digest=digest_of(Paths(out).journal),
+        picked=task.pick.label if task.pick else "",
+        reached=checked.reached.reached.to_text("are") if checked.reached else "",
     )
 
 

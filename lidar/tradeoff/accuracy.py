@@ -65,20 +65,25 @@ class Pick:
     planned: Planned | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """All that does not depend on the machine."""
+        """The entry ``accuracy`` of ``dataset.json``, without figures of this machine."""
         return {"asked": self.asked, "picked": self.settings} | self.expected.to_json("expected")
+
+    @property
+    def label(self) -> str:
+        """The settings, as in ``rays=7``; empty if none was to be picked."""
+        return " ".join(f"{name}={value}" for name, value in self.settings.items())
 
     def to_text(self, workers: int) -> str:
         """What was picked and what to expect of it."""
-        words = " ".join(f"{name}={value}" for name, value in self.settings.items())
-        text = f"picked {words or 'nothing, as no setting changes depths'}: expect"
+        words = self.label or "nothing, as no setting changes depths"
+        text = f"picked {words}: {self.expected.to_text('should be')}"
         if self.chosen is None or self.profile is None:
-            return f"{text} {self.expected.to_text()}; as picked before for this dataset"
+            return f"{text}; as picked before for this dataset"
         whose = "the next drive" if self.profile.drives > 1 else "this drive"
         cost = self.chosen.cpu_s
         text = (
-            f"{text} (95 % intervals for {whose}) {self.expected.to_text()}, and {cost.value:.3g} CPU s per"
-            f" simulated second, which is {speed(cost, workers):.2g} x real time with {workers_text(workers)}"
+            f"{text} (95 % intervals for {whose}); it takes {cost.value:.3g} CPU s per simulated second,"
+            f" which is {speed(cost, workers):.2g} x real time with {workers_text(workers)}"
         )
         if self.planned is None:
             return text
@@ -153,7 +158,7 @@ class CheckedDrive:
         return self.reached.to_text() + pace * bool(self.pick)
 
     def missed(self) -> list[str]:
-        """That the accuracy or the budget is missed, a line for each."""
+        """Warnings, a line for each, that the accuracy or the budget was missed."""
         lines = []
         if self.wanted.accuracy and self.reached is not None:
             asked = read_accuracy(self.wanted.accuracy)

@@ -158,6 +158,6 @@ class _Look:
         return self._known[variant.changes]
 
     def alone(self, variant: Variant[CameraSettings]) -> Pixels:
-        """The pixels of the exact end, changed as in a variant."""
+        """The pixels of the reference, changed as in a variant."""
         backend = FAST if variant.names <= OF_EMBREE else EXACT
         return self.pixels(variant, variant.alone, world=variant.alone_world, backend=backend)

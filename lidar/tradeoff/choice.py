@@ -166,13 +166,13 @@ def _affordable(profile: Profile, wanted: Wanted, *, begin: Choice) -> Choice:
 
 
 def _out_of_reach(candidates: Sequence[Candidate], accuracy: Accuracy, *, figure: str) -> str:
-    """That an accuracy is not reached, and what is."""
+    """The message of an accuracy that no candidate reaches, with the nearest."""
     best = min(candidates, key=lambda c: worst(c, figure).high)
     error = worst(best, figure)
     if figure == "rgb_rms":
         return (
             f"`accuracy` {accuracy.text}: no number of rays is sure to reach {levels(accuracy.levels)};"
-            f" {_label(best.settings)} errs by {error_text(error, size=levels)}: give"
+            f" {_label(best.settings)} comes nearest with {error_text(error, size=levels)}: give"
             f" {levels(_up(error.high))} or more"
         )
     ranges = figure.startswith("range")
@@ -181,7 +181,7 @@ def _out_of_reach(candidates: Sequence[Candidate], accuracy: Accuracy, *, figure
     length = accuracy.text.split("@")[0].split(",")[0]
     return (
         f"`accuracy` {accuracy.text}: no {what} is sure to reach {metres(accuracy.metres)} at"
-        f" {accuracy.percent:g} % of the {of}; {subject} errs by {error_text(error)}: give"
+        f" {accuracy.percent:g} % of the {of}; {subject} comes nearest with {error_text(error)}: give"
         f" {metres(_up(error.high))} or more, or a smaller share, as in"
         f" {length}@{_smaller(accuracy.percent):g}"
     )
@@ -220,7 +220,7 @@ def _label(settings: Mapping[str, int]) -> str:
 
 
 def speed(cost: Estimate, workers: int) -> float:
-    """Simulated seconds per second that a cost stands for, if no worker waits for others."""
+    """Simulated seconds per second of wall time at a cost, if all workers are always busy."""
     return threads(workers) / cost.value
 
 

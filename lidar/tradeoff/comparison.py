@@ -17,9 +17,9 @@ TAILS: dict[Kind, str] = {"scanner": "range_99.9_m", "camera": "rgb_rms"}
 class Row:
     """A measured variant.
 
-    error  : of the user's settings with this one changed, against the exact end; see `errors.STATISTICS`
+    error  : of the user's settings with this one changed, against the reference; see `errors.STATISTICS`
              and `errors.IMAGE_STATISTICS`
-    alone  : of the exact end with this one changed; empty for the user's own settings and combinations
+    alone  : of the reference with this one changed; empty for the user's own settings and combinations
     cost   : CPU seconds (``cpu_s``) and bytes (``bytes``) per simulated second, peak memory
              (``memory_bytes``)
     note   : what the figures do not say, such as that a setting has no effect
@@ -39,7 +39,7 @@ class Comparison:
     """The rows of a sensor.
 
     sensor    : name on the rig, with its preset or size
-    reference : of the exact end, in words
+    reference : what errors are measured against, in words
     residual  : difference between the reference and one with another number of rays: its own uncertainty
     rows      : the user's own settings come first
     samples   : number of pulses or pixels compared

@@ -21,8 +21,9 @@ from lidar.tradeoff.sampling import errors_of, places, range_figures
 Errors = dict[str, list[dict[str, Estimate]]]
 """Figures of each setting, by sensor."""
 
-_LEAST_M, _LEAST_LEVELS = 1e-6, 0.01
-"""Errors below which drives count as equal: of files in float32, and of images of a single colour."""
+_LEAST_M, _LEAST = 1e-6, {"rgb_rms": 0.01, "lost": 1e-5}
+"""Errors below which drives count as equal: metres of files in float32, and by name levels of images of a
+single colour and the share of returns that are missed or extra."""
 
 _BLOCKS, _FEWEST = 48, 12
 """Blocks of pixels of a frame that are compared, of all cameras, and of each at least."""
@@ -117,7 +118,7 @@ def drive_estimates(
     every = [figures(frames) for frames in drives]
     known = {name: [f[name] for f in every if not math.isnan(f[name])] for name in every[0]}
     return {
-        name: next_drive(values, least=_LEAST_LEVELS if name == "rgb_rms" else _LEAST_M)
+        name: next_drive(values, least=_LEAST.get(name, _LEAST_M))
         for name, values in known.items()
         if len(values) > 1
     }

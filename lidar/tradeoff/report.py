@@ -32,6 +32,7 @@ from lidar.tradeoff.words import (
     recommendations,
     residual_text,
     size_of,
+    tail_text,
 )
 
 _RANKED: dict[Kind, str] = {
@@ -41,7 +42,7 @@ _RANKED: dict[Kind, str] = {
 
 NOISE = (
     "Random effects and the sensor's own imperfections are off in both: the error of a setting is not noise."
-    " 'alone' is the exact end with only this setting changed."
+    " 'alone' is the reference with only this setting changed."
 )
 
 
@@ -158,7 +159,7 @@ def print_tables(found: Tradeoff) -> None:
     for comparison in found.comparisons:
         rows = [cells(row, comparison) for row in comparison.rows]
         print_table(heads(comparison.kind), rows, title=headline(comparison))
-        print_lines([residual_text(comparison), *recommendations(comparison)])
+        print_lines([residual_text(comparison), tail_text(comparison), *recommendations(comparison)])
     for listing in found.listings:
         print_table(*table_of(listing), title=listing.title)
         print_lines([listing.note])
@@ -235,15 +236,20 @@ def pareto_plot(comparison: Comparison) -> bytes:
     Settings that miss or add too many returns are not drawn, see `words.reached`.
     """
     kind, best = comparison.kind, pareto(comparison)
-    points = []
+    points, hidden = [], 0
     for row in candidates(comparison):
+        hidden += not math.isfinite(reached(comparison, row))
         cost, error = row.cost["cpu_s"], row.error[comparison.tail]
         if math.isfinite(reached(comparison, row)):
             name = row.label.partition(" (")[0]
             cpu, away = (cost.low, cost.high), (error.low, error.high)
             points.append(Point(name, cost.value, error.value, row in best, cpu, away))
+    left_out = f"; {hidden} settings that miss or add returns are not drawn" if hidden else ""
     axes = Axes(
-        headline(comparison), "CPU s per simulated second", _RANKED[kind], lambda value: size_of(value, kind)
+        headline(comparison) + left_out,
+        "CPU s per simulated second",
+        _RANKED[kind],
+        lambda value: size_of(value, kind),
     )
     return scatter(points, axes)
 
@@ -255,7 +261,8 @@ def _page(found: Tradeoff, plots: Sequence[bytes]) -> bytes:
         said = "".join(f"<li>{html.escape(text)}</li>" for text in recommendations(comparison))
         rows = [cells(row, comparison) for row in comparison.rows]
         parts.append(
-            f"<h2>{html.escape(headline(comparison))}</h2><p>{html.escape(residual_text(comparison))}</p>"
+            f"<h2>{html.escape(headline(comparison))}</h2><p>{html.escape(residual_text(comparison))}"
+            f" {html.escape(tail_text(comparison))}</p>"
             f"<ul>{said}</ul>{html_table(heads(comparison.kind), rows)}"
             f"{html_picture(plot, alt='error against cost')}"
         )
@@ -263,4 +270,5 @@ def _page(found: Tradeoff, plots: Sequence[bytes]) -> bytes:
         title, note = html.escape(listing.title), html.escape(listing.note)
         parts.append(f"<h2>{title}</h2><p>{note}</p>{html_table(*table_of(listing))}")
     parts += [f"<p>{html.escape(text)}</p>" for text in (georeferencing_text(found), NOISE)]
-    return html_page(f"Speed against accuracy: {found.plan.scene.path}", "".join(parts))
+    scene = found.plan.scene
+    return html_page(f"Speed against accuracy: {scene.manifest['name'] or scene.location}", "".join(parts))

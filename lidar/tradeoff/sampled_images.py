@@ -1,4 +1,4 @@
-"""Errors of cameras in sampled frames against the exact end."""
+"""Errors of cameras in sampled frames against the reference."""
 
 from __future__ import annotations
 

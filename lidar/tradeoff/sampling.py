@@ -1,4 +1,4 @@
-"""Sampled frames of sensors, and errors of scanners in them against the exact end."""
+"""Sampled frames of sensors, and errors of scanners in them against the reference."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _spread(plan: DrivePlan, sensor: Scanner | Camera, *, frames: int) -> list[i
 
 @dataclass(frozen=True, slots=True)
 class SampledError:
-    """Differences of some pulses of a frame from the exact end, with weights by which they stand for all.
+    """Differences of some pulses of a frame from the reference, with weights by which they stand for all.
 
     range   : (m,) metres, absolute, of returns that both have
     weight  : (m,) number of returns for which each stands
@@ -170,19 +170,20 @@ def _stratified(
 def range_figures(frames: Sequence[SampledError]) -> dict[str, float]:
     """Metres that shares of the returns of frames do not exceed, by name, such as ``range_99.9_m``.
 
-    NaN without returns.
+    NaN without returns; and `lost`.
     """
     ranges = np.concatenate([f.range for f in frames])
     order = np.argsort(ranges)
     below = np.cumsum(np.concatenate([f.weight for f in frames])[order])
     ranges = ranges[order]
-    return {f"range_{p:g}_m": _quantile(ranges, below, share=p / 100) for p in PERCENTS}
+    found = {f"range_{p:g}_m": _quantile(ranges, below, share=p / 100) for p in PERCENTS}
+    return found | {"lost": lost(frames)}
 
 
-def lost_figures(frames: Sequence[SampledError]) -> dict[str, float]:
-    """Shares of missed and extra returns of frames."""
+def lost(frames: Sequence[SampledError]) -> float:
+    """Missed and extra returns of frames over the returns of the reference; NaN without these."""
     missed, extra, returns = np.sum([(f.missed, f.extra, f.returns) for f in frames], axis=0).tolist()
-    return {"missed": missed / max(returns, 1.0), "extra": extra / max(returns, 1.0)}
+    return float((missed + extra) / returns) if returns else nan
 
 
 def _quantile(values: Float, below: Float, *, share: float) -> float:

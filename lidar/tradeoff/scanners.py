@@ -85,8 +85,8 @@ def compared_scanner(
     )
     return Comparison(
         f"{scanner.name} ({scanner.spec.preset})",
-        f"float64 ray casting, {basis.exact.rays} rays per pulse, a pose for every firing; half as many rays"
-        " more",
+        f"float64 ray casting, {basis.exact.rays} rays per pulse, a pose for every firing; 1.5 times as many"
+        " rays",
         figures(residual),
         rows,
         pulses,
@@ -139,7 +139,7 @@ class _Look:
         return self._known[variant.changes]
 
     def alone(self, variant: Variant[ScannerSettings]) -> Returns:
-        """The returns of the exact end, changed as in a variant."""
+        """The returns of the reference, changed as in a variant."""
         return self.returns(
             variant.alone,
             backend=FAST if variant.names <= OF_EMBREE else EXACT,

@@ -6,10 +6,10 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from geoscene.charts import metres
+from geoscene.charts import metres, share
 from lidar.options import Accuracy
 from lidar.tradeoff.errors import Estimate
-from lidar.tradeoff.words import levels
+from lidar.tradeoff.words import LOST, levels
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,12 +20,14 @@ class SensorErrors:
     ranges  : of scanners, metres
     depths  : of cameras, metres
     colours : of cameras, levels of 255, rms
+    lost    : of scanners, missed and extra returns over all, where they are more than `words.LOST`
     """
 
     percent: float
     ranges: dict[str, Estimate] = field(default_factory=dict)
     depths: dict[str, Estimate] = field(default_factory=dict)
     colours: dict[str, Estimate] = field(default_factory=dict)
+    lost: dict[str, Estimate] = field(default_factory=dict)
 
     def to_json(self, prefix: str) -> dict[str, Any]:
         """The errors that there are, such as ``expected_error_m``, for a prefix."""
@@ -47,15 +49,16 @@ class SensorErrors:
         }
         return cls(float(document["percent"]), **every)
 
-    def to_text(self) -> str:
-        """All of them, in one line."""
-        share = f"at {self.percent:g} % of "
+    def to_text(self, are: str) -> str:
+        """All of them, in one line; ``are`` is the verb: are, or should be."""
+        below = f"{self.percent:g} % of the"
         texts = [
-            f"range errors {share}{_listed(self.ranges)}" if self.ranges else "",
-            f"depth errors {share}{_listed(self.depths)}" if self.depths else "",
-            f"colour errors (rms) of {_listed(self.colours, size=levels)}" if self.colours else "",
+            f"{below} range errors {are} below {_listed(self.ranges)}" if self.ranges else "",
+            f"{below} depth errors {are} below {_listed(self.depths)}" if self.depths else "",
+            f"colour errors (rms) {are} {_listed(self.colours, size=levels)}" if self.colours else "",
+            f"missed and extra returns {are} {_listed(self.lost, size=share)}" if self.lost else "",
         ]
-        return ", ".join(filter(None, texts)) or "no errors that are known"
+        return ", ".join(filter(None, texts)) or "no errors are known"
 
     def beyond(self, asked: Accuracy) -> list[str]:
         """Those that are larger than what was asked for, in words."""
@@ -67,7 +70,7 @@ class SensorErrors:
         ]
 
 
-_KEYS = {"ranges": "error_m", "depths": "depth_error_m", "colours": "error_levels"}
+_KEYS = {"ranges": "error_m", "depths": "depth_error_m", "colours": "error_levels", "lost": "lost"}
 
 
 def error_text(error: Estimate, *, size: Callable[[float], str] = metres) -> str:
@@ -76,7 +79,7 @@ def error_text(error: Estimate, *, size: Callable[[float], str] = metres) -> str
 
 
 def _listed(errors: Mapping[str, Estimate], *, size: Callable[[float], str] = metres) -> str:
-    return ", ".join(f"{name} {error_text(error, size=size)}" for name, error in errors.items())
+    return ", ".join(f"{error_text(error, size=size)} for {name}" for name, error in errors.items())
 
 
 def stated(
@@ -84,14 +87,13 @@ def stated(
 ) -> SensorErrors:
     """Of all figures of sensors, by their names, those of some kinds: ranges, depths and colours."""
     names = {"ranges": f"range_{percent:g}_m", "depths": f"depth_{percent:g}_m", "colours": "rgb_rms"}
-    return SensorErrors(
-        percent,
-        **{
-            kind: {sensor: figures[name] for sensor, figures in errors.items() if name in figures}
-            for kind, name in names.items()
-            if kind in kinds
-        },
-    )
+    found = {
+        kind: {sensor: figures[name] for sensor, figures in errors.items() if name in figures}
+        for kind, name in names.items()
+        if kind in kinds
+    }
+    lost = {sensor: errors[sensor]["lost"] for sensor in found.get("ranges", {}) if "lost" in errors[sensor]}
+    return SensorErrors(percent, **found, lost={s: share for s, share in lost.items() if share.value > LOST})
 
 
 def kinds_of(asked: Accuracy | None) -> tuple[str, ...]:

@@ -1,8 +1,8 @@
-"""Check of a recorded drive: a sample of its frames, simulated again and compared with the exact end."""
+"""Check of a recorded drive: some of its frames, simulated again and compared with the reference."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,7 +13,7 @@ from lidar.rig.devices import Camera, Scanner
 from lidar.tradeoff.errors import Estimate, resampled
 from lidar.tradeoff.profile_errors import blocks_of, measuring
 from lidar.tradeoff.sampled_images import image_errors_of, image_figures
-from lidar.tradeoff.sampling import SampledError, errors_of, lost_figures, places, range_figures
+from lidar.tradeoff.sampling import errors_of, places, range_figures
 from lidar.tradeoff.sensor_errors import SensorErrors, stated
 
 _FRAMES = 10
@@ -43,7 +43,7 @@ class SpotCheck:
     def to_text(self) -> str:
         """What was reached, in one line."""
         count = max(self.frames.values(), default=0)
-        return f"spot check of {count} frames: {self.reached.to_text()}"
+        return f"spot check of {count} frames: {self.reached.to_text('are')}"
 
     def to_json(self) -> dict[str, Any]:
         """All figures."""
@@ -87,12 +87,8 @@ def spot_check(
                 bench, camera, settings=[contents.camera], blocks=blocks_of(cameras)
             ):
                 add(camera.name, images)
-    figures = {s.name: _scanner_figures for s in scanners} | {
+    figures = {s.name: range_figures for s in scanners} | {
         c.name: partial(image_figures, camera=c) for c in cameras
     }
     estimates = {name: resampled(of, seed=0, figures=figures[name]) for name, of in found.items()}
     return SpotCheck(percent, kinds, estimates, {name: len(of) for name, of in found.items()})
-
-
-def _scanner_figures(frames: Sequence[SampledError]) -> Mapping[str, float]:
-    return range_figures(frames) | lost_figures(frames)

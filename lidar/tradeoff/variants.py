@@ -1,4 +1,4 @@
-"""Settings to compare: the user's with some of them changed, and the exact end."""
+"""Settings to compare: the user's with some of them changed, and the reference."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def noiseless(settings: ScannerSettings) -> ScannerSettings:
 
 
 def reference(settings: ScannerSettings, *, rays: int) -> ScannerSettings:
-    """The exact end of settings: a pose for every firing and a dense footprint; cast it in float64."""
+    """The reference of settings: a pose for every firing and a dense footprint; cast it in float64."""
     return replace(noiseless(settings), poses="firing", precision="exact", retrace=True, rays=rays)
 
 

@@ -14,6 +14,10 @@ LOST = 0.001
 """Share of missed and extra returns beyond which a setting does not keep any error at 99.9 %."""
 
 
+_ENOUGH = 10_000
+"""Pulses from which an error at 99.9 % is that of ten or more."""
+
+
 def levels(value: float) -> str:
     """A difference of colours, of 255."""
     text = f"{value:.3g}"
@@ -85,6 +89,18 @@ def recommendation(comparison: Comparison, target: float) -> str:
 def recommendations(comparison: Comparison) -> list[str]:
     """A sentence for each of `TARGETS`."""
     return [recommendation(comparison, target) for target in TARGETS[comparison.kind]]
+
+
+def tail_text(comparison: Comparison) -> str:
+    """That the errors at 99.9 % are those of a few pulses; empty for enough of them."""
+    if comparison.kind != "scanner" or comparison.samples >= _ENOUGH:
+        return ""
+    largest = -(-comparison.samples // 1000)
+    which = "the largest error" if largest == 1 else f"the {largest} largest errors"
+    return (
+        f"Of {comparison.samples:,} pulses, 99.9 % tells no more than {which}, and its interval is too"
+        f" narrow: compare {_ENOUGH:,} (`pulses`)."
+    )
 
 
 def residual_text(comparison: Comparison) -> str:

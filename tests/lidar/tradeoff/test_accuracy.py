@@ -23,7 +23,8 @@ from lidar.tradeoff.choice import Wanted, choice, worst
 from lidar.tradeoff.errors import Estimate, Returns, next_drive, resampled
 from lidar.tradeoff.profile import Candidate, Profile, profile_of
 from lidar.tradeoff.profile_errors import drive_estimates
-from lidar.tradeoff.sampling import SampledError, lost_figures, range_figures, sampled_error
+from lidar.tradeoff.sampling import SampledError, range_figures, sampled_error
+from lidar.tradeoff.sensor_errors import SensorErrors, stated
 from lidar.tradeoff.spot import SpotCheck
 from lidar.traffic.populate import TrafficOptions
 
@@ -176,7 +177,7 @@ def test_depths_need_no_setting_and_are_refused_beyond_what_files_hold():
     eye = replace(BOTH, scanners=())
     assert choice(eye, wanted("1cm")).settings == {}
     with pytest.raises(
-        InputError, match=r"no image of depths is sure .* that of eye errs .*give 4 mm or more"
+        InputError, match=r"no image of depths is sure .* that of eye comes nearest .*give 4 mm or more"
     ):
         choice(eye, wanted("3mm"))
 
@@ -184,7 +185,7 @@ def test_depths_need_no_setting_and_are_refused_beyond_what_files_hold():
 @pytest.mark.parametrize(
     ("accuracy", "budget", "line"),
     [
-        ("1cm", "", r"rays=19 errs by 9 mm \(4.5 mm to 1.8 cm\): give 1.8 cm or more"),
+        ("1cm", "", r"rays=19 comes nearest with 9 mm \(4.5 mm to 1.8 cm\): give 1.8 cm or more"),
         ("", "10x-realtime", "even rays=1 is simulated at 9.1 x real time with 1 worker"),
         (
             "5cm",
@@ -199,7 +200,9 @@ def test_what_none_reaches_is_one_line_with_the_nearest(accuracy, budget, line):
 
 
 def test_colours_that_none_reaches_are_one_line_with_the_nearest():
-    with pytest.raises(InputError, match=r"supersample=3 errs by 0.5 levels .*: give 1 level or more"):
+    with pytest.raises(
+        InputError, match=r"supersample=3 comes nearest with 0.5 levels .*: give 1 level or more"
+    ):
         choice(BOTH, wanted("0.9levels"))
 
 
@@ -229,11 +232,19 @@ def test_weighted_errors_of_matched_missed_and_extra_returns():
     )
     np.testing.assert_allclose(error.range, [0.1, 0])
     assert (error.weight.tolist(), error.missed, error.extra, error.returns) == ([1, 10], 1, 5, 12)
-    found = range_figures([error, error]) | lost_figures([error, error])
+    found = range_figures([error, error])
     assert found["range_90_m"] == 0
     assert found["range_95_m"] == pytest.approx(0.1)
-    assert found["missed"] == pytest.approx(1 / 12)
-    assert found["extra"] == pytest.approx(5 / 12)
+    assert found["lost"] == pytest.approx(6 / 12)
+
+
+def test_missed_and_extra_returns_are_stated_where_they_matter():
+    half, few = Estimate(0.5, 0.4, 0.6), Estimate(1e-4, 0.0, 1e-3)
+    errors = {"a": {"range_99_m": few, "lost": half}, "b": {"range_99_m": few, "lost": few}}
+    found = stated(errors, percent=99.0, kinds=("ranges",))
+    assert found.lost == {"a": half}
+    assert "missed and extra returns are 50 % (40 % to 60 %) for a" in found.to_text("are")
+    assert SensorErrors.from_json(found.to_json("expected"), "expected") == found
 
 
 def test_a_stratified_sample_has_the_quantiles_of_all():
@@ -466,7 +477,7 @@ def test_a_rig_of_a_camera_drives_to_levels_and_to_depths(scene, tmp_path):
     for kind in ("expected", "reached"):
         assert 0 < notes[f"{kind}_error_levels"]["front"]["value"] < (low + high) / 2
         assert 0 < notes[f"{kind}_depth_error_m"]["front"]["value"] <= 0.0021
-    assert "colour errors (rms) of front" in done.to_text()
+    assert "levels) for front" in done.to_text()
     depths = AccuracyOptions("5mm", profile_cache=tmp_path)
     assert picked(scene, options, wanted=depths).settings == {}
     with pytest.raises(InputError, match="`settings` supersample=2: `accuracy` picks it"):
@@ -480,12 +491,10 @@ def test_the_program_says_what_it_picks_and_what_was_reached(scene, cache, tmp_p
     ended = run_program("lidar", *words, "--budget", "0.01x-realtime", "-o", tmp_path / "d")
     assert ended.returncode == 0, ended.stderr
     first, _, last = ended.stdout.splitlines()
-    assert first.startswith(
-        "picked rays=61: expect (95 % intervals for the next drive) range errors at 99.9 % of lidar_top"
-    )
+    assert first.startswith("picked rays=61: 99.9 % of the range errors should be below ")
     assert "with planning (" in first
     assert "x real time with" in first
-    assert last.startswith("spot check of 5 frames: range errors at 99.9 % of lidar_top")
+    assert last.startswith("spot check of 5 frames: 99.9 % of the range errors are below ")
     ended = run_program("lidar", *words, "--spot-check", "--json", "-o", tmp_path / "e")
     assert json.loads(ended.stdout)["accuracy"]["reached_error_m"]["lidar_top"]["value"] > 0
     manifest = open_dataset(tmp_path / "e").manifest
@@ -524,6 +533,8 @@ def test_drives_of_a_sweep_have_picks_of_their_own(scene, cache, tmp_path, monke
         summary = sweep(tmp_path / "grid.toml", tmp_path / "out")
     assert [row.state for row in summary.rows] == ["done", "done", "failed"]
     assert "no number of rays is sure to reach 1 µm" in summary.rows[2].error
+    assert [row.picked for row in summary.rows] == ["rays=7", "rays=1", ""]
+    assert all("range errors are below" in row.reached for row in summary.rows[:2])
     picks = [open_dataset(summary.path / row.name).manifest["accuracy"]["picked"] for row in summary.rows[:2]]
     assert picks == [{"rays": 7}, {"rays": 1}]
     shutil.rmtree(summary.path / summary.rows[1].name / "lidar_top")
