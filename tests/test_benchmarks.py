@@ -203,6 +203,14 @@ def test_great_sizes_are_not_repeated(bench, tmp_path):
     assert [s.cpu_s for s in spent] == [seconds[int(n)] for n in x]
 
 
+def test_builds_that_are_measured_make_all_their_tiles(bench, tmp_path, monkeypatch):
+    maps = bench("bench.maps")
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "tiles.json").write_text("of a former build")
+    monkeypatch.setattr(maps, "command", lambda _: (tmp_path / "scene").exists())
+    assert not maps.built(tmp_path / "a.osm", tmp_path / "scene", workers=1)
+
+
 def test_sides_take_turns_and_ratios_are_of_the_same_repetition(bench):
     measure, order = bench("bench.measure"), []
 

@@ -15,8 +15,8 @@ from make_osm import make_city, write_city
 from bench.casting import SENSORS, street
 from bench.drives import world_of
 from bench.growth import Curve
-from bench.maps import build_command
-from bench.measure import MOST_PROCESSES, Spent, alone, command, measured
+from bench.maps import built
+from bench.measure import MOST_PROCESSES, Spent, alone, measured
 from bench.measure import Case as Work
 from bench.scenes import Setup, boxes_on_hills
 from geoscene.options import BuildOptions
@@ -217,14 +217,14 @@ def _workers(setup: Setup, cities: dict[int, Path]) -> Iterator[Curve]:
     counts = [1, 2, *(2**k for k in range(2, 10) if 2**k <= len(os.sched_getaffinity(0)))]
     buildings, frames = _bounded(cities, 3000), _bounded(sizes(setup, "frames"), 500)
 
-    def built(workers: int) -> Spent:
-        return command(build_command(cities[buildings], setup.folder / "grown", "--workers", str(workers)))
+    def built_by(workers: int) -> Spent:
+        return built(cities[buildings], setup.folder / "grown", workers=workers)
 
     def driven(workers: int) -> Spent:
         return alone(_drive, setup, frames, workers)
 
     for name, work, size in (
-        ("building", built, f"{buildings:,} buildings"),
+        ("building", built_by, f"{buildings:,} buildings"),
         ("driving", driven, f"{frames} frames"),
     ):
         x, spent = _processes(setup, {n: partial(work, n) for n in counts})

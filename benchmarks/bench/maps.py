@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -39,7 +40,7 @@ def building(setup: Setup) -> Iterator[Case]:
             f"{name}: map file to scene",
             1,
             "scenes",
-            {f"{n} worker{'s'[: n > 1]}": partial(_built, path, out, *part, workers=n) for n in (2, 1)},
+            {f"{n} worker{'s'[: n > 1]}": partial(built, path, out, *part, workers=n) for n in (2, 1)},
             "whole processes with imports; the same bytes by one and two workers",
             clock="wall",
             processes=True,
@@ -60,7 +61,9 @@ def building(setup: Setup) -> Iterator[Case]:
             )
 
 
-def _built(osm: Path, out: Path, *words: str, workers: int) -> Spent:
+def built(osm: Path, out: Path, *words: str, workers: int) -> Spent:
+    """Cost of a build by a process of its own, with all tiles: those of a former one would be kept."""
+    shutil.rmtree(out, ignore_errors=True)
     return command(build_command(osm, out, *words, "--workers", str(workers)))
 
 
