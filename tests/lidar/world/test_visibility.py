@@ -37,6 +37,8 @@ def one_car(place=(20.0, 0.0, 0.0), *, yaw=0.0, velocity=(0.0, 0.0, 0.0), turnin
         parked=np.array([not (any(velocity) or turning)]),
         feature=np.array([100], np.int32),
         first=np.array([0, n]),
+        begin_ns=t[:1],
+        end_ns=t[-1:],
         time_ns=t,
         position=np.array(place) + s[:, None] * np.array(velocity),
         angles=angles,
