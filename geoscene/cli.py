@@ -140,7 +140,7 @@ def build(
     started = time.perf_counter()
     if workers is not None and not 1 <= workers <= 256:
         raise InputError(f"`workers` {workers}: give 1 to 256")
-    if source.dem_server and options.dem != ("tiles",):
+    if source.dem_server and not options.elevation_tiles:
         raise InputError("`dem_server` needs --dem tiles")
     if not url_of(out):
         check_target(out, overwrite=report.overwrite)
@@ -153,10 +153,7 @@ def build(
     ):
         progress("reading the map", 0, total=0)
         data = _read_map(source)
-        if options.dem == ("tiles",):
-            options = replace(
-                options, dem=(_fetch_elevation(source, data, crs=options.crs, progress=progress),)
-            )
+        options = _with_elevation(source, data, options=options, progress=progress)
         scene = build_scene(
             data,
             folder,
@@ -181,16 +178,20 @@ def build(
 
 
 def _cache_of(source: MapSource) -> Path:
-    return source.cache or Path.home() / ".cache" / "geoscene"
+    from geoscene.storage import cache_folder  # noqa: PLC0415
+
+    return source.cache or cache_folder()
 
 
-def _fetch_elevation(source: MapSource, data: Any, *, crs: str, progress: Progress) -> str:
-    """Path of the elevation file of a map, merged from public tiles."""
-    from geoscene.sources import TileServer, fetch_elevation  # noqa: PLC0415
+def _with_elevation(
+    source: MapSource, data: Any, *, options: BuildOptions, progress: Progress
+) -> BuildOptions:
+    """The options with the elevation file of a map, if they ask for public tiles."""
+    from geoscene.sources import TileServer, with_elevation  # noqa: PLC0415
 
     url = source.dem_server
     server = TileServer(url, credit=f"elevation tiles: {url}") if url else None
-    return str(fetch_elevation(data, cache_dir=_cache_of(source), crs=crs, server=server, progress=progress))
+    return with_elevation(options, data, cache_dir=_cache_of(source), server=server, progress=progress)
 
 
 def _read_map(source: MapSource) -> Any:
@@ -259,7 +260,7 @@ def tradeoff(
     from geoscene.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
     from geoscene.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
 
-    if options.dem == ("tiles",):
+    if options.elevation_tiles:
         raise InputError("`dem` tiles: not compared; give elevation files")
     if out is not None:
         note_new_folder(out)

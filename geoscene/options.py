@@ -65,6 +65,11 @@ class BuildOptions:
     name: str = ""
     """Title of the scene."""
 
+    @property
+    def elevation_tiles(self) -> bool:
+        """Whether heights are those of public tiles, which are fetched first."""
+        return self.dem == ("tiles",)
+
     def __post_init__(self) -> None:
         """Validate the options."""
         if self.lod not in (0, 1, 2):

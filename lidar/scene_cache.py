@@ -18,7 +18,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -35,8 +35,8 @@ from geoscene.progress import Progress, silent
 from geoscene.reach import RoadMap
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA, SceneFiles, changed_files
-from geoscene.sources import OsmData, Servers, fetch_elevation, fetch_place, read_osm
-from geoscene.storage import url_of
+from geoscene.sources import OsmData, Servers, fetch_place, read_osm, with_elevation
+from geoscene.storage import cache_folder, url_of
 from lidar import __version__
 from lidar.course import needed_area
 from lidar.errors import InputError, LidarError
@@ -117,7 +117,7 @@ class _Map:
         if self._path is not None:
             return read_osm(self._path, bounds=self._options.bbox)
         try:
-            return fetch_place(self._options.place, cache_dir=_answers(), servers=self._servers)
+            return fetch_place(self._options.place, cache_dir=cache_folder(), servers=self._servers)
         except NetworkError as error:
             cause = str(error).split("; without a network")[0]
             raise NetworkError(f"{cause}; without a network, give a map file instead of `place`") from error
@@ -125,15 +125,9 @@ class _Map:
     def build_options(self, progress: Progress) -> BuildOptions:
         """Options of the build, with the path of fetched elevation."""
         options = self._options.build_options(self.name)
-        if options.dem == ("tiles",):
-            found = fetch_elevation(self.data, cache_dir=_answers(), crs=options.crs, progress=progress)
-            return replace(options, dem=(str(found),))
-        return options
-
-
-def _answers() -> Path:
-    """Folder of the answers of map servers, as of ``geoscene build``."""
-    return Path.home() / ".cache" / "geoscene"
+        if not options.elevation_tiles:  # the map need not be read
+            return options
+        return with_elevation(options, self.data, cache_dir=cache_folder(), progress=progress)
 
 
 def _folder(source: _Map, options: PlaceOptions) -> Path:
@@ -142,7 +136,7 @@ def _folder(source: _Map, options: PlaceOptions) -> Path:
     key = digest(
         json.dumps([builder_version, SCHEMA, source.digest, options.dem == ("tiles",), chosen]).encode()
     )
-    cache = options.scene_cache or _answers() / "scenes"
+    cache = options.scene_cache or cache_folder() / "scenes"
     slug = re.sub(r"[^\w.-]+", "-", source.name).strip("-.")[:32] or "map"
     return next(iter(sorted(cache.glob(f"*-{key}"))), cache / f"{slug}-{key}")
 

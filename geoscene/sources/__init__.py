@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from geoscene.sources.demo import demo_path as demo_path
     from geoscene.sources.elevation import TileServer as TileServer
     from geoscene.sources.elevation import fetch_elevation as fetch_elevation
+    from geoscene.sources.elevation import with_elevation as with_elevation
     from geoscene.sources.files import read_osm as read_osm
     from geoscene.sources.network import Servers as Servers
     from geoscene.sources.network import fetch_bbox as fetch_bbox
@@ -36,6 +37,7 @@ _LATE = {
     "fetch_place": "network",
     "fetch_point": "network",
     "locate": "network",
+    "with_elevation": "elevation",
 }
 
 

@@ -6,7 +6,7 @@ import hashlib
 import io
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -18,6 +18,7 @@ from geoscene import __version__
 from geoscene.errors import InputError, NetworkError
 from geoscene.files import write_atomically
 from geoscene.frames import Frame, beside, rim_of, wrapped
+from geoscene.options import BuildOptions
 from geoscene.progress import Progress, silent
 from geoscene.sources.data import Bounds, OsmData
 from geoscene.sources.http import BUSY, RefusedError, cause, open_session
@@ -76,6 +77,21 @@ def zoom_at(lat_deg: float, *, deepest: int = 15) -> int:
 def decode_terrarium(rgb: NDArray[np.uint8]) -> Float:
     """Metres (rows, columns) of terrarium colours (rows, columns, 3): R * 256 + G + B / 256 - 32768."""
     return rgb.astype(np.float64) @ (256.0, 1.0, 1 / 256) - 32768.0
+
+
+def with_elevation(
+    options: BuildOptions,
+    osm: OsmData,
+    *,
+    cache_dir: Path,
+    server: TileServer | None = None,
+    progress: Progress = silent,
+) -> BuildOptions:
+    """Options of a build of a map; with the file of `fetch_elevation` if they ask for public tiles."""
+    if not options.elevation_tiles:
+        return options
+    found = fetch_elevation(osm, cache_dir=cache_dir, crs=options.crs, server=server, progress=progress)
+    return replace(options, dem=(str(found),))
 
 
 def fetch_elevation(

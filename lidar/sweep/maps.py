@@ -22,13 +22,10 @@ from geoscene.pipeline import build
 from geoscene.progress import Progress, silent
 from geoscene.scene import open_scene
 from geoscene.scene.layout import changed_files
-from geoscene.sources import fetch_elevation, read_osm
+from geoscene.sources import read_osm, with_elevation
 from geoscene.storage import cache_folder
 from lidar.errors import InputError
 from lidar.sweep.words import naming, words_of
-
-_TILES = ("tiles",)
-"""Elevation from public tiles instead of files, as for ``geoscene build``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +46,7 @@ class MapScene:
     @property
     def inputs(self) -> list[Path]:
         """Files that the scene depends on."""
-        dem = () if self.options.dem == _TILES else self.options.dem
+        dem = () if self.options.elevation_tiles else self.options.dem
         named = (*self.osm, *map(Path, dem), *map(Path, self.options.along))
         return [path for path in named if path.is_file()]
 
@@ -65,10 +62,8 @@ class MapScene:
             "files": {str(path): digest_of(path) for path in self.inputs},
         }
         if not _is_made_of(target, stamp, made_of=made_of):
-            data, options = read_osm(self.osm, bounds=self.bounds), self.options
-            if options.dem == _TILES:
-                fetched = fetch_elevation(data, cache_dir=cache_folder(), crs=options.crs, progress=progress)
-                options = replace(options, dem=(str(fetched),))
+            data = read_osm(self.osm, bounds=self.bounds)
+            options = with_elevation(self.options, data, cache_dir=cache_folder(), progress=progress)
             scene = build(
                 data,
                 target,
@@ -132,7 +127,7 @@ def _map(name: str, table: dict[str, Any]) -> MapScene:
     words = [word for key, value in table.items() for word in words_of(key, value)]
     options = _parsed(words)
     along = options.along if len(options.along) == 1 else ()  # several are waypoints
-    dem = () if options.dem == _TILES else options.dem
+    dem = () if options.elevation_tiles else options.dem
     for file in (*files, *dem, *along):
         if not Path(file).is_file():
             raise InputError(f"{file}: no such file")

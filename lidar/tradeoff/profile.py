@@ -20,6 +20,7 @@ from geoscene.errors import reading
 from geoscene.files import digest, write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.storage import cache_folder
 from lidar import __version__
 from lidar.camera.settings import CameraSettings
 from lidar.errors import InputError
@@ -146,7 +147,7 @@ def ladders_of(options: DriveOptions, sensors: Sequence[Scanner | Camera]) -> La
 
 def default_folder() -> Path:
     """Folder of profiles."""
-    return Path.home() / ".cache" / "geoscene" / "profiles"
+    return cache_folder() / "profiles"
 
 
 def profile_of(

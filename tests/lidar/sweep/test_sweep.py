@@ -235,7 +235,7 @@ def test_public_elevation_tiles_of_a_map_are_fetched_once(tmp_path, monkeypatch)
         fetched.append(crs)
         return write_slope(tmp_path / "slope.tif", osm.bounds, rise=20.0)
 
-    monkeypatch.setattr("lidar.sweep.maps.fetch_elevation", fetch)
+    monkeypatch.setattr("geoscene.sources.elevation.fetch_elevation", fetch)
     maps = {drive.map.name: drive.map for drive in read_grid(file)}
     scenes = [open_scene(maps[name].built(tmp_path / "scenes")) for name in ("whole", "blocks", "blocks")]
     assert fetched == ["local"]
