@@ -61,8 +61,9 @@ def interior_point(cost: Any, pull: Float, *, bounds: Bounds, start: Float) -> F
 
         _, more_gap, more_force = step(gap * force)
         far = _reach(gap, more_gap), _reach(force, more_force)
-        mean = float(gap @ force) / max(len(b), 1)
-        ahead = float((gap + far[0] * more_gap) @ (force + far[1] * more_force)) / max(len(b), 1)
+        # Not products of vectors by BLAS: the number of its threads, which wait busily, would change sums.
+        mean = float((gap * force).sum()) / max(len(b), 1)
+        ahead = float(((gap + far[0] * more_gap) * (force + far[1] * more_force)).sum()) / max(len(b), 1)
         centre = (ahead / mean) ** 3 * mean
         move, more_gap, more_force = step(gap * force + more_gap * more_force - centre)
         share = 0.995 * min(_reach(gap, more_gap), _reach(force, more_force))

@@ -1,5 +1,9 @@
 """Longitudinal profiles are smooth, bridges have clearance, and tunnels run below the ground."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import shapely
@@ -306,3 +310,30 @@ def test_roads_of_monaco_are_smooth_and_clear_each_other(shared_osm, shared_dem)
     ground = terrain.height(*stations.xy.T)
     inside = np.unique(a[graph.tunnel[edge]])
     assert (z[inside] <= ground[inside] + 0.05).mean() > 0.99
+
+
+def test_heights_do_not_depend_on_the_number_of_threads_of_linear_algebra():
+    code = """
+import hashlib
+import numpy as np
+from scipy.sparse import diags_array, eye_array
+from geoscene.roadgraph.quadratic import Bounds, interior_point
+
+count = 30_000
+rng = np.random.default_rng(2)
+cost = (diags_array([-1.0, 2.1, -1.0], offsets=[-1, 0, 1], shape=(count, count))).tocsc()
+bounds = Bounds(eye_array(count).tocsr(), rng.normal(0, 1, count), np.full(count, 1e6))
+z = interior_point(cost, rng.normal(0, 1, count), bounds=bounds, start=np.zeros(count))
+print(hashlib.sha256(z.tobytes()).hexdigest())
+"""
+    digests = {
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "OPENBLAS_NUM_THREADS": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in ("1", "2", "4")
+    }
+    assert len(digests) == 1
