@@ -31,6 +31,10 @@ _COLLECTED = (100_000, 50, 50)
 """Thresholds of Python's search for cyclic garbage: with its defaults it takes a tenth of a build, whose many
 objects are kept."""
 
+_THREADS = "OPENBLAS_NUM_THREADS"
+"""Environment variable of NumPy and SciPy, which are imported later: threads of their linear algebra wait
+busily for work, of which the small blocks of sparse matrices give them none."""
+
 _NO_SPACE = "; free some space and run the same command again"
 _PERMISSION = "; give a path that you may write to and files that you may read"
 _HINTS = {
@@ -133,6 +137,7 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
         level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
     gc.set_threshold(*_COLLECTED)
+    os.environ.setdefault(_THREADS, "1")
     logging.getLogger("geoscene.cluster").setLevel(logging.INFO)  # it names the page with the progress
     try:
         with _ended_by_interruptions(app):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import errno
 import hashlib
 import importlib
@@ -13,21 +12,17 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from geoscene.columns import row_blocks
 from geoscene.errors import InputError, NotWrittenError
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
-BLOCK_ROWS = 1 << 16
-"""Rows of a table that are formatted at once."""
+log = logging.getLogger(__name__)
 
 fcntl = None if sys.platform == "win32" else importlib.import_module("fcntl")
 
@@ -177,37 +172,12 @@ def write_atomically(path: Path, *data: bytes | NDArray[Any]) -> None:
     """Write bytes and arrays, one after another, as a file, atomically."""
     with atomic_file(path) as file:
         for part in data:
-            file.write(part.data if isinstance(part, np.ndarray) else part)
+            file.write(part if isinstance(part, (bytes, bytearray)) else part.data)
 
 
 def write_json(path: Path, document: Mapping[str, Any], *, indent: int = 2) -> None:
     """Write a document as indented UTF-8 JSON."""
     write_atomically(path, (json.dumps(document, indent=indent, ensure_ascii=False) + "\n").encode("utf-8"))
-
-
-def write_columns(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> None:
-    """Write columns as CSV with a header; floats as the shortest text that reads back the same value."""
-    arrays = {name: np.asarray(column) for name, column in columns.items()}
-    most = max((len(array) for array in arrays.values()), default=0)
-    write_blocks(
-        path,
-        ({name: array[rows] for name, array in arrays.items()} for rows in table_blocks(most)),
-    )
-
-
-def table_blocks(count: int) -> Iterator[slice]:
-    """Slices of the rows of a table, of which one at a time is in memory; see `write_blocks`."""
-    return row_blocks(count, BLOCK_ROWS)
-
-
-def write_blocks(path: Path, blocks: Iterable[Mapping[str, Sequence[Any] | NDArray[Any]]]) -> None:
-    """Write a table that comes in blocks of rows as CSV, as `write_columns` does; memory holds one block."""
-    with atomic_path(path) as part, part.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        for number, columns in enumerate(blocks):
-            if not number:
-                writer.writerow(columns)
-            writer.writerows(zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True))
 
 
 @contextmanager

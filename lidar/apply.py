@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.files import write_columns, write_json
+from geoscene.csv_tables import write_columns
+from geoscene.files import write_json
 from geoscene.progress import Progress, silent
 from lidar.camera.png import counts_to_depth, image_to_feature, read_png, write_png
 from lidar.camera.render import Frame as Image

@@ -15,8 +15,9 @@ import numpy as np
 import shapely
 
 from geoscene.classes import Class, materials
+from geoscene.csv_tables import write_columns
 from geoscene.errors import SceneFormatError, WorkersLostError
-from geoscene.files import digest_of, exclusive, write_columns, write_json
+from geoscene.files import digest_of, exclusive, write_json
 from geoscene.frames import Frame
 from geoscene.mesh import Mesh
 from geoscene.report import Problem

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.columns import Columns
-from geoscene.files import table_blocks, write_blocks
+from geoscene.csv_tables import table_blocks, write_blocks
 from geoscene.typing import Ints
 
 _HEADER = ("sensor", "frame", "points", "digest")

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import atomic_path, table_blocks, write_blocks, write_json
+from geoscene.csv_tables import table_blocks, write_blocks
+from geoscene.files import atomic_path, write_json
 from geoscene.frames import Frame
 from geoscene.scene import Scene
 from lidar.dataset.kitti_sequence import write_sequence

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.files import write_columns
+from geoscene.csv_tables import write_columns
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.columns import Columns
-from geoscene.files import table_blocks
+from geoscene.csv_tables import table_blocks
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.geometry.attitude import body_rates, matrix_from_quat

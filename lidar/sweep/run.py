@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from geoscene.cluster import Cluster, connected
+from geoscene.csv_tables import write_columns
 from geoscene.errors import GeosceneError, WorkersLostError
-from geoscene.files import digest_of, exclusive, write_columns, write_json
+from geoscene.files import digest_of, exclusive, write_json
 from geoscene.processes import run_tasks
 from geoscene.progress import Progress, silent
 from geoscene.scene import open_scene

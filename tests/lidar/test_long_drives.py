@@ -10,8 +10,8 @@ import pytest
 import shapely
 from helpers.roadgrids import grid
 
-from geoscene import files
-from geoscene.files import write_columns
+from geoscene import csv_tables
+from geoscene.csv_tables import write_columns
 from geoscene.frames import Frame
 from lidar.dataset.journal import Journal, read_journal
 from lidar.dataset.layout import frame_numbers
@@ -57,7 +57,7 @@ def test_long_trajectory_is_kept_in_a_file_with_the_same_values(path, monkeypatc
     write_trajectory(tmp_path / "whole.csv", whole)
     monkeypatch.setattr(poses, "BLOCK_POSES", 257)
     monkeypatch.setattr(poses, "_IN_MEMORY", 500)
-    monkeypatch.setattr(files, "BLOCK_ROWS", 100)
+    monkeypatch.setattr(csv_tables, "BLOCK_ROWS", 100)
     parts = drive_path(path, load_vehicle("car"))
     assert len(parts) == len(whole) > 2000
     for name, column in parts.columns().items():
@@ -155,7 +155,7 @@ def test_jobs_are_in_order_of_time_and_made_on_demand():
 def test_tables_are_written_in_blocks(rows, monkeypatch, tmp_path):
     columns = {"k": np.arange(rows), "x": np.arange(rows) / 7, "name": [f"a,{k}" for k in range(rows)]}
     write_columns(tmp_path / "whole.csv", columns)
-    monkeypatch.setattr(files, "BLOCK_ROWS", 10)
+    monkeypatch.setattr(csv_tables, "BLOCK_ROWS", 10)
     write_columns(tmp_path / "parts.csv", columns)
     text = (tmp_path / "parts.csv").read_bytes()
     assert text == (tmp_path / "whole.csv").read_bytes()

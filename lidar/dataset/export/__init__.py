@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from geoscene.files import atomic_folder
 from geoscene.progress import Progress, silent
 from lidar.errors import InputError
 
@@ -61,8 +62,6 @@ class Exporter:
         Raises InputError if the folder exists and may not be overwritten, and DatasetError for a dataset that
         lacks what the layout needs.
         """
-        from geoscene.files import atomic_folder  # noqa: PLC0415  (imports numpy)
-
         if out.exists() and not overwrite:
             raise InputError(f"{out}: exists already; set `overwrite` to replace it")
         module = importlib.import_module(f"{__name__}.{self.module}")

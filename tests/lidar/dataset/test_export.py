@@ -8,8 +8,9 @@ import pytest
 from helpers.sensor_worlds import driven
 from scipy.spatial.transform import Rotation
 
+from geoscene.csv_tables import write_columns
 from geoscene.errors import InputError as FolderError
-from geoscene.files import write_columns, write_json
+from geoscene.files import write_json
 from geoscene.frames import Frame
 from lidar.dataset.boxes import COLUMNS
 from lidar.dataset.export import EXPORTERS, exporter

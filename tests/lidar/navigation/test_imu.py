@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geoscene import files
+from geoscene import csv_tables
 from geoscene.frames import Frame
 from lidar.geometry import poses
 from lidar.geometry.attitude import quat_from_euler
@@ -182,7 +182,7 @@ def test_measurements_do_not_depend_on_the_blocks_in_which_they_are_drawn(offset
     noise = inertial_noise(spec, len(whole), seed=4)
     np.testing.assert_array_equal(whole.gyro, whole.true_gyro + noise[:, :3])
     np.testing.assert_array_equal(whole.accel, whole.true_accel + noise[:, 3:])
-    monkeypatch.setattr(files, "BLOCK_ROWS", 100)
+    monkeypatch.setattr(csv_tables, "BLOCK_ROWS", 100)
     monkeypatch.setattr(poses, "BLOCK_POSES", 257)
     monkeypatch.setattr(poses, "_IN_MEMORY", 300)
     blocks = list(observe_imu(circling(), FRAME, spec=spec, seed=4))
