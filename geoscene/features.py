@@ -15,6 +15,7 @@ from geoscene.objects.barriers import Barriers
 from geoscene.objects.furniture import Furniture
 from geoscene.objects.vegetation import Trees
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import edge_lines
 from geoscene.scene.geopackage import Layer
 from geoscene.structures import Structures
 
@@ -61,14 +62,12 @@ def ground_layer(name: str, ground: Layers) -> Layer:
 
 def road_layer(graph: RoadGraph) -> Layer:
     """Layer ``roads``: centre lines with heights, one row per directed edge."""
-    lines = np.empty(len(graph), object)
-    lines[:] = [shapely.linestrings(line) for line in graph.geometry]
     columns = _columns(
         graph,
         "osm_id highway name ref oneway speed speed_source lanes lanes_source width width_source layer"
         " layer_source bridge tunnel length",
     )
-    return Layer("roads", lines, columns)
+    return Layer("roads", edge_lines(graph, heights=True), columns)
 
 
 def tree_layer(trees: Trees, z: NDArray[np.float64]) -> Layer:

@@ -64,7 +64,7 @@ from geoscene.structures import (
     read_structures,
     within_extent,
 )
-from geoscene.typing import Float, Height
+from geoscene.typing import Float, Height, Ints
 from geoscene.uses import USES, Use
 
 Bounds = tuple[float, float, float, float]
@@ -593,8 +593,7 @@ def _graded_tiles(graph: RoadGraph, tile_size: float, *, level: bool) -> set[tup
     if level:
         points = points[np.abs(points[:, 2]) > 1e-3]
     around = np.array([(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]) * _ROAD_REACH
-    tiles = np.floor((points[:, None, :2] + around).reshape(-1, 2) / tile_size).astype(int)
-    return {(int(i), int(j)) for i, j in np.unique(tiles, axis=0)}
+    return _distinct(np.floor((points[:, None, :2] + around).reshape(-1, 2) / tile_size).astype(np.int64))
 
 
 def _squares(boxes: Float, tile_size: float) -> set[tuple[int, int]]:
@@ -605,8 +604,15 @@ def _squares(boxes: Float, tile_size: float) -> set[tuple[int, int]]:
     box = np.repeat(np.arange(len(boxes)), copies)
     nth = np.arange(len(box)) - np.repeat(np.cumsum(copies) - copies, copies)
     down, across = np.divmod(nth, span[box, 0])
-    found = np.unique(low[box] + np.stack([across, down], axis=1), axis=0)
-    return {(i, j) for i, j in found.tolist()}
+    return _distinct(low[box] + np.stack([across, down], axis=1))
+
+
+def _distinct(tiles: Ints) -> set[tuple[int, int]]:
+    """The different ones among tiles (n, 2)."""
+    low, high = tiles.min(axis=0, initial=0), tiles.max(axis=0, initial=0)
+    key = np.unique(np.ravel_multi_index((tiles - low).T, high - low + 1))
+    i, j = np.unravel_index(key, high - low + 1)
+    return set(zip((i + low[0]).tolist(), (j + low[1]).tolist(), strict=True))
 
 
 def _foot(xy: Float, height: Height | None) -> Float:

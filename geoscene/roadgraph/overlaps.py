@@ -9,6 +9,7 @@ import shapely
 
 from geoscene.polylines import directions, unit
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.stations import Stations
 from geoscene.typing import Float, Ints
 
@@ -57,7 +58,7 @@ def find_overlaps(
     """
     once = np.unique(stations.edge)
     structure = graph.bridge | graph.tunnel
-    lines = np.array([shapely.linestrings(graph.geometry[e][:, :2]) for e in once.tolist()], object)
+    lines = edge_lines(graph)[once]
     rows = np.flatnonzero(structure[stations.edge])
     points = shapely.points(stations.xy[stations.row[rows]])
     tree = shapely.STRtree(lines)

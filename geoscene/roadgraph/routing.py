@@ -32,13 +32,14 @@ class RoadPath:
     time: float
 
 
-def edge_lines(graph: RoadGraph) -> NDArray[np.object_]:
-    """The edges' centre lines in plan, as shapely LineStrings (m,)."""
+def edge_lines(graph: RoadGraph, *, heights: bool = False) -> NDArray[np.object_]:
+    """The edges' centre lines as shapely LineStrings (m,), in plan or with heights."""
     if not len(graph):
         return np.empty(0, object)
     sizes = [len(line) for line in graph.geometry]
     lines: NDArray[np.object_] = shapely.linestrings(
-        np.concatenate(list(graph.geometry))[:, :2], indices=np.repeat(np.arange(len(sizes)), sizes)
+        np.concatenate(list(graph.geometry))[:, : 2 + heights],
+        indices=np.repeat(np.arange(len(sizes)), sizes),
     )
     return lines
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import edge_lines
 from geoscene.typing import Bools, Float, Ints
 
 # Arms of a node that deviate from a straight line by less than this (radians) are one continuous road.
@@ -129,7 +130,7 @@ def find_crossings(graph: RoadGraph, stations: Stations) -> tuple[Ints, Float, I
     margin is the length in metres along the upper road that half the lower road's width takes up.
     """
     once = np.unique(stations.edge)
-    lines = np.array([shapely.linestrings(graph.geometry[e][:, :2]) for e in once.tolist()], object)
+    lines = edge_lines(graph)[once]
     rank = graph.layer[once] * 2.0 + graph.bridge[once] - graph.tunnel[once]
     one, two = shapely.STRtree(lines).query(lines, predicate="intersects")
     over = rank[one] > rank[two]

@@ -83,7 +83,9 @@ def _uncrowded(ways: list[Way]) -> tuple[list[Way], list[Problem]]:
     )
     cell = np.floor(xy / _CELL).astype(np.int64)
     where = (cell[:, 1] * len(_KINDS) + number_of_kind[line]) * 2**32 + cell[:, 0]
-    pairs = np.unique(np.stack([where, line], axis=1), axis=0)
+    _, place, points = np.unique(where, return_inverse=True, return_counts=True)
+    many = points[place] > _CROWD
+    pairs = np.unique(np.stack([place[many], line[many]], axis=1), axis=0)
     _, first, number = np.unique(pairs[:, 0], return_index=True, return_inverse=True)
     beyond = np.arange(len(pairs)) - first[number.ravel()] >= _CROWD
     dropped = set(rows[np.unique(pairs[beyond, 1])].tolist())

@@ -121,9 +121,10 @@ def is_open_area(tags: Tags) -> bool:
     """Whether a way with these tags must be an area, so that it is a defect if it is open."""
     if is_building(tags):
         return True
-    if any(tags.get(key, "no") not in _NO for key in LINE_KEYS if key not in area_tags(tags)):
+    found = area_tags(tags)
+    if any(tags.get(key, "no") not in _NO and key not in found for key in LINE_KEYS):
         return False
-    return tags.get("area") == "yes" or "landuse" in tags or "natural" in area_tags(tags)
+    return tags.get("area") == "yes" or "landuse" in tags or "natural" in found
 
 
 def kind_of(tags: Tags, *, area: bool = False) -> str:
