@@ -27,8 +27,8 @@ At a yaw rate of 1 rad/s the chord deviates from the arc by (2e-4)^2 / 8 = 5e-9 
 
 BLOCK_POSES = 1 << 17
 """Poses of a trajectory that are worked on at once: 22 minutes at 100 Hz."""
-_IN_MEMORY = 1 << 20
-"""Poses up to which a trajectory is in memory: three hours at 100 Hz; other arrays: three times as many."""
+_IN_MEMORY = 1 << 18
+"""Numbers of an array up to which it is in memory: 2 MiB."""
 _RISING = "a trajectory needs two or more poses at increasing times"
 
 
@@ -45,7 +45,7 @@ def blocks_of(count: int, *, overlap: int = 0) -> Iterator[slice]:
 def room(shape: tuple[int, ...], kind: DTypeLike = float) -> NDArray[Any]:
     """An array to fill, in memory, or for a long drive in a temporary file: see `release`."""
     kind = np.dtype(kind)
-    if math.prod(shape) <= 3 * _IN_MEMORY:
+    if math.prod(shape) <= _IN_MEMORY:
         return np.empty(shape, kind)
     size = math.prod(shape) * kind.itemsize
     with tempfile.TemporaryFile() as file:

@@ -13,6 +13,8 @@ from geoscene.columns import Columns, row_blocks
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import BlockedError
+from lidar.geometry.poses import release
+from lidar.planning.blockwise import mean_gap
 from lidar.planning.steering import Pose, Track
 from lidar.rig.vehicle import Vehicle
 
@@ -59,7 +61,7 @@ class Line(Columns):
     @property
     def gap(self) -> float:
         """Mean distance between points in plan, scene metres."""
-        return float(np.hypot(*np.diff(self.xyz[:, :2], axis=0).T).mean())
+        return mean_gap(self.xyz)
 
 
 def body_outlines(
@@ -85,16 +87,19 @@ def touching(
 ) -> tuple[NDArray[np.int64], NDArray[np.object_], NDArray[np.object_]]:
     """Rows of a track where the body intersects obstacles, its outlines there, and these obstacles."""
     every = max(round(_SWEEP / track.step), 1)
-    rows = np.unique(np.append(np.arange(0, len(track.row), every), len(track.row) - 1))
-    rows = rows[~line.free[track.row[rows]]]
+    last = len(track.row) - 1
     found: list[tuple[NDArray[np.int64], NDArray[np.object_], NDArray[np.object_]]] = []
-    for block in row_blocks(len(rows), _BODIES):
-        part = rows[block]
+    for rows in row_blocks(last + 1, every * _BODIES):
+        part = np.arange(rows.start, rows.stop, every)
+        if rows.stop > last > part[-1]:
+            part = np.append(part, last)
+        part = part[~line.free[track.row[part]]]
         bodies = body_outlines(
             track.xy[part], track.heading[part], vehicle=setting.vehicle, margin=setting.margin
         )
         body, obstacle = setting.tree.query(bodies, predicate="intersects")
         found.append((part[body], bodies[body], setting.tree.geometries[obstacle]))
+        release(track.xy, track.heading, track.row, line.free)
     at, outlines, obstacles = (np.concatenate(column) for column in zip(*found, strict=True))
     return at, outlines, obstacles
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,8 @@ from geoscene.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.attitude import quat_from_euler
-from lidar.geometry.poses import Trajectory, blocks_of
+from lidar.geometry.poses import Trajectory, blocks_of, release, room
+from lidar.planning.blockwise import fill, rowwise, smoothed
 from lidar.planning.path import Path
 from lidar.rig.vehicle import Vehicle
 
@@ -116,47 +117,52 @@ def ended_at_rest(motion: Motion) -> Motion:
 
 def speed_limits(path: Path, vehicle: Vehicle) -> Float:
     """Speed (n,) in m/s that speed limits, bends, crests and steering rate allow along a path."""
-    bend = np.abs(path.curvature)
-    change = np.abs(_along(path, path.curvature))
-    crest = np.abs(_along(path, _softened(path, vehicle)))
-    with np.errstate(divide="ignore", over="ignore"):  # a straight allows any speed
-        by_bend = np.sqrt(_SPARE * vehicle.lateral_acceleration / bend)
-        by_wheel = np.cbrt(_SPARE * vehicle.lateral_jerk / change)
-        by_crest = np.sqrt(_SPARE * vehicle.lateral_acceleration / crest)
-    posted = np.minimum(
-        path.limit, np.minimum(np.append(path.limit[1:], np.inf), np.append(np.inf, path.limit[:-1]))
+    change, crest = _along(path, path.curvature), _along(path, _softened(path, vehicle))
+
+    def allowed(curvature: Float, *changes: Float) -> Float:
+        bend, wheel, crest = (np.abs(column) for column in (curvature, *changes))
+        with np.errstate(divide="ignore", over="ignore"):  # a straight allows any speed
+            by_bend = np.sqrt(_SPARE * vehicle.lateral_acceleration / bend)
+            by_wheel = np.cbrt(_SPARE * vehicle.lateral_jerk / wheel)
+            by_crest = np.sqrt(_SPARE * vehicle.lateral_acceleration / crest)
+        return np.asarray(np.minimum(by_bend, np.minimum(by_wheel, by_crest)))
+
+    def posted(limit: Float) -> Float:
+        beside = np.minimum(np.append(limit[1:], np.inf), np.append(np.inf, limit[:-1]))
+        return np.asarray(np.minimum(limit, beside))
+
+    return rowwise(
+        lambda limit, other: np.maximum(np.minimum(np.minimum(limit, vehicle.max_speed), other), _SLOWEST),
+        rowwise(posted, path.limit, reach=1),
+        rowwise(allowed, path.curvature, change, crest),
     )
-    allowed = np.minimum(
-        np.minimum(posted, vehicle.max_speed), np.minimum(by_bend, np.minimum(by_wheel, by_crest))
-    )
-    limit: Float = np.maximum(allowed, _SLOWEST)
-    return limit
 
 
 def _softened(path: Path, vehicle: Vehicle) -> Float:
     """Slopes (n,) smoothed over the wheelbase: shorter bumps do not raise the body."""
-    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
-
-    out = path.slope.copy()
+    out = room((len(path),))
     over = vehicle.turning_radius if vehicle.kind == "air" else max(vehicle.wheelbase, 1.0)
     for first, last in legs_of(path):
         gap = (path.s[last - 1] - path.s[first]) / max(last - first - 1, 1)
-        out[first:last] = gaussian_filter1d(path.slope[first:last], over / max(gap, 1e-6), mode="nearest")
+        soft = smoothed(path.slope[first:last], over / max(gap, 1e-6), mode="nearest")
+        fill(out[first:last], soft)
     return out
 
 
 def _along(path: Path, values: Float) -> Float:
     """Derivative of a column along the path, leg by leg."""
-    out = np.zeros(len(path))
+    out = room((len(path),))
     for first, last in legs_of(path):
+        out[first] = 0.0
         if last - first > 1:
-            out[first:last] = np.gradient(values[first:last], path.s[first:last])
+            fill(out[first:last], rowwise(np.gradient, values[first:last], path.s[first:last], reach=1))
     return out
 
 
 def legs_of(path: Path) -> list[tuple[int, int]]:
     """First and last row (exclusive) of each leg."""
-    cuts = [0, *(np.flatnonzero(np.diff(path.leg)) + 1).tolist(), len(path)]
+    begins = rowwise(lambda leg: np.diff(leg, prepend=leg[0]) != 0, path.leg, reach=1)
+    cuts = [0, *np.flatnonzero(begins).tolist(), len(path)]
     return list(itertools.pairwise(cuts))
 
 
@@ -316,8 +322,14 @@ def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:
     legs = legs_of(path)
     # the speed of a walker's gait is a difference over time, of all rows at once
     blocks = [slice(0, len(motion))] if any(vehicle.bob) else blocks_of(len(motion))
-    parts = (_poses(path, vehicle, legs=legs, motion=motion.take(rows)) for rows in blocks)
-    return Trajectory.gathered(len(motion), parts)
+
+    def parts() -> Iterator[Trajectory]:
+        for rows in blocks:
+            yield _poses(path, vehicle, legs=legs, motion=motion.take(rows))
+            path.release()
+            release(*motion.columns().values())
+
+    return Trajectory.gathered(len(motion), parts())
 
 
 def _poses(path: Path, vehicle: Vehicle, *, legs: Sequence[tuple[int, int]], motion: Motion) -> Trajectory:

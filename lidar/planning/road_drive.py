@@ -16,6 +16,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.errors import RouteError
+from lidar.planning.blockwise import rowwise
 from lidar.planning.path import Path, Surface
 from lidar.planning.rerouting import plan_route_and_path
 from lidar.planning.route import Route, RouteOptions, Side, Spec
@@ -163,7 +164,8 @@ def plan_road_drive(
         if scene.route is None:
             raise
         raise RouteError(f"{error}; the scene has only what lies along the route it was built for") from None
-    path = replace(path, edge=np.where(path.edge >= 0, np.flatnonzero(kept)[path.edge], -1).astype(np.int32))
+    number = np.append(np.flatnonzero(kept), -1).astype(np.int32)
+    path = replace(path, edge=rowwise(lambda edge: number[edge], path.edge))
     return RoadPlan(whole, route, path, seconds, at_speed)
 
 

@@ -19,6 +19,7 @@ from geoscene.columns import row_blocks
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import BLOCK_POSES, release, room
+from lidar.planning.blockwise import even, fill, interpolated, lowest_ahead, rowwise
 from lidar.planning.motion import DWELL_S, Motion, legs_of, speed_limits
 from lidar.planning.path import Path
 from lidar.rig.vehicle import Vehicle
@@ -78,7 +79,8 @@ def motion_within(
         origin, end = float(path.s[first]), float(path.s[last - 1])
         allowed = np.clip(max_distance, origin, end) - origin
         there = np.flatnonzero(allowed >= end - origin - 1e-6)
-        needed = _TAIL_S + 1.5 * float((np.diff(path.s[first:last]) / limit[first : last - 1]).sum())
+        s = rowwise(lambda along, origin=origin: along - origin, path.s[first:last])
+        needed = _TAIL_S + 1.5 * float(rowwise(_seconds, s, limit[first:last], reach=1)[:-1].sum())
         until = max(float(time_s[there[0]]) - begin, 0.0) + needed if len(there) else math.inf
         t = STEP_S * np.arange(max(math.floor(min(total - begin, until) / STEP_S), 2) + 1)
         rolls = at_speed and not parts
@@ -86,9 +88,7 @@ def motion_within(
         late = STEP_S * np.minimum(t / _SETTLING_S, 1.0) if rolls else STEP_S
         bounds = np.interp(begin + t - late, time_s, allowed)
         still = (not rolls, not at_speed or until < total - begin)
-        knots = _best(
-            path.s[first:last] - origin, limit[first:last], vehicle=vehicle, allowed=bounds, rest=still
-        )
+        knots = _best(s, limit[first:last], vehicle=vehicle, allowed=bounds, rest=still)
         s, v = _sampled(knots, end - origin, dt=dt)
         driven = s[-1] > end - origin - 2 * _NEAR
         if driven and last < len(path):
@@ -123,7 +123,7 @@ def _joined(parts: list[_Part], path: Path, *, rate_hz: float) -> Motion:
             s[to], v[to] = part.origin + part.s[rows], part.v[rows]
             near = np.searchsorted(path.s, s[to], side="right") - 1
             row[to] = np.clip(near, part.first, part.last)
-            release(*columns, part.s, part.v)
+            release(*columns, part.s, part.v, path.s)
         start += len(part.s)
     for rows in row_blocks(n, BLOCK_POSES):
         time_ns[rows] = np.round(np.arange(rows.start, rows.stop) * (1e9 / rate_hz))
@@ -137,19 +137,24 @@ def _joined(parts: list[_Part], path: Path, *, rate_hz: float) -> Motion:
 def desired_speed(path: Path, vehicle: Vehicle) -> Float:
     """Desired speed (n,) in m/s along a path: comfortable braking, rest at the end of each leg."""
     limit = speed_limits(path, vehicle)
-    out = np.empty(len(limit))
+    out = room((len(limit),))
     for first, last in legs_of(path):
-        wished = limit[first:last].copy()
-        wished[-1] = 0.0
-        out[first:last] = _braked(path.s[first:last], wished, vehicle=vehicle)
+        limit[last - 1] = 0.0
+        fill(out[first:last], _braked(path.s[first:last], limit[first:last], vehicle=vehicle))
     return out
+
+
+def _seconds(s: Float, limit: Float) -> Float:
+    """Seconds (n,) from each row to the next at the speed limits."""
+    time: Float = np.diff(s, append=s[-1]) / limit
+    return time
 
 
 def _braked(s: Float, limit: Float, *, vehicle: Vehicle) -> Float:
     """Speed limits (n,) at distances (n,), lowered for comfortable braking before lower ones."""
-    ramp = 2 * _COMFORT * vehicle.deceleration * s
-    square = np.minimum.accumulate((limit**2 + ramp)[::-1])[::-1] - ramp
-    return np.sqrt(np.maximum(square, 0.0))
+    by = 2 * _COMFORT * vehicle.deceleration
+    lowest = lowest_ahead(rowwise(lambda s, limit: limit**2 + by * s, s, limit))
+    return rowwise(lambda s, lowest: np.sqrt(np.maximum(lowest - by * s, 0.0)), s, lowest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,10 +184,11 @@ def _looked_up(limit: Float, s: Float) -> Float:
 def _limits(s: Float, limit: Float, *, vehicle: Vehicle) -> _Limits:
     from scipy.ndimage import minimum_filter1d  # noqa: PLC0415
 
-    place = np.arange(0.0, s[-1] + _GAP, _GAP)
-    strict = np.interp(place, s, limit)
+    place = even(math.ceil((s[-1] + _GAP) / _GAP), _GAP)
+    strict = interpolated(place, s, column=limit)
     around = 2 * round(_AROUND / _GAP) + 1
-    return _Limits(strict, _braked(place, minimum_filter1d(strict, around), vehicle=vehicle))
+    least = rowwise(lambda part: minimum_filter1d(part, around), strict, reach=around)
+    return _Limits(strict, _braked(place, least, vehicle=vehicle))
 
 
 def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tuple[bool, bool]) -> _Knots:
@@ -206,6 +212,7 @@ def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tup
             ends=ends,
             rests=ends and rest[1],
         )
+        release(limits.strict, limits.cautious)
         kept = part if ends else part[:, : _KEPT + 1]
         knots[:, first : first + kept.shape[1]] = kept
         excess, first = max(excess, over), first + kept.shape[1] - 1

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import math
-from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene import polylines
 from geoscene.columns import row_blocks
 from geoscene.typing import Float
+from lidar.geometry.poses import release, room
+from lidar.planning.blockwise import curvatures, gathered, headings, mean_gap, rowwise, smoothed
 from lidar.rig.vehicle import Vehicle
 
 Pose = tuple[float, float, float]
 """Scene x and y of the rear axle, and heading in radians."""
 
 _SOLVED, _OVERLAP = 1 << 17, 1 << 13  # rows of a line that are smoothed at once, and of the next ones beside
+_FOLLOWED = 1 << 14  # rows of a track up to which it is in memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,19 +56,24 @@ def relaxed(xy: Float, cap: float, *, reach: float) -> Float:
     """
     from scipy.ndimage import maximum_filter1d  # noqa: PLC0415
 
-    n = len(xy)
-    gap = float(np.mean(np.hypot(*np.diff(xy, axis=0).T)))
-    weight = np.ones(n)
+    gap = mean_gap(xy)
+    wide = 2 * math.ceil(1.0 / (cap * gap)) + 1
+    weight = rowwise(lambda part: np.ones(len(part)), xy)
     weight[[0, -1]] = 1e3
     out = xy
+
+    def lowered(old: Float, bad: NDArray[np.uint8]) -> Float:
+        return np.where(maximum_filter1d(bad, wide) > 0, old * 0.6, old)
+
     for _ in range(25):
         out = _smoothed(xy, weight, stiffness=(reach / gap) ** 4)
-        bad = np.abs(polylines.curvatures(out)) > cap
-        loose = np.hypot(*(out - xy).T) > 1.5 / cap
-        if not (bad & ~loose).any():
+        loose = rowwise(lambda moved, line: np.hypot(*(moved - line).T) > 1.5 / cap, out, xy)
+        bad = rowwise(
+            lambda bend, loose: ((np.abs(bend) > cap) & ~loose).astype(np.uint8), curvatures(out), loose
+        )
+        if not bad.any():
             break
-        near = maximum_filter1d((bad & ~loose).astype(np.uint8), 2 * math.ceil(1.0 / (cap * gap)) + 1) > 0
-        weight = np.where(near, weight * 0.6, weight)
+        weight = rowwise(lowered, weight, bad, reach=wide)
     return out
 
 
@@ -78,7 +86,7 @@ def _smoothed(xy: Float, weight: Float, *, stiffness: float) -> Float:
     from scipy.sparse import diags_array  # noqa: PLC0415
     from scipy.sparse.linalg import spsolve  # noqa: PLC0415
 
-    out = np.empty_like(xy)
+    out = room(xy.shape)
     kept = 0
     for rows in row_blocks(len(xy), _SOLVED, overlap=_OVERLAP):
         part = xy[rows]
@@ -91,6 +99,7 @@ def _smoothed(xy: Float, weight: Float, *, stiffness: float) -> Float:
         ends = rows.stop == len(xy)
         until = rows.stop if ends else rows.stop - _OVERLAP // 2
         out[kept:until] = solved[kept - rows.start : until - rows.start]
+        release(out, xy, weight)
         if ends:
             break
         kept = until
@@ -108,21 +117,30 @@ def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose
 
     If the vehicle cannot reach the end, the track ends at the last row of the line that it reached.
     """
-    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415
+    rows = gathered(_followed(xy, vehicle, scale=scale, step=step, pose=pose))
+    row = rowwise(lambda part: part[:, 4].astype(np.int64), rows)
+    return Track(rows[:, :2], rows[:, 2], rows[:, 3], row, 1, step)
 
+
+def _followed(
+    xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose | None
+) -> Iterator[Float]:
+    """Blocks of rows (k, 5) of the track of `follow`: x, y, heading, curvature, row of the line."""
     most, rate = 1.0 / vehicle.turning_radius, vehicle.steering
-    gap = float(np.mean(np.hypot(*np.diff(xy, axis=0).T)))
-    heading, bend = polylines.headings(xy), polylines.curvatures(xy) * scale
+    gap = mean_gap(xy)
     # steering starts half the steering time ahead of the bend
-    bend = gaussian_filter1d(bend, max(0.5 * most / rate / gap, 0.5), mode="nearest")
+    early = max(0.5 * most / rate / gap, 0.5)
+    bend = smoothed(rowwise(lambda part: part * scale, curvatures(xy)), early, mode="nearest")
     length = 1.2 * most / rate
     near, turn_in = 1.0 / length**2, 2.0 / length
-    lx, ly, lh, lk = (array("d", column.tobytes()) for column in (xy[:, 0], xy[:, 1], heading, bend))
+    columns: list[Any] = [rowwise(lambda part, k=k: part[:, k].copy(), xy) for k in (0, 1)]
+    columns += [headings(xy), bend]
+    lx, ly, lh, lk = (memoryview(column) for column in columns)  # their items are numbers of Python
     m = len(lx)
     x, y, th = pose if pose is not None else (lx[0], ly[0], lh[0])
-    j = 0 if pose is None else int(np.argmin(np.hypot(xy[:, 0] - x, xy[:, 1] - y)))
+    j = 0 if pose is None else int(np.argmin(rowwise(lambda part: np.hypot(*(part - (x, y)).T), xy)))
     k = 0.0 if pose is not None else max(-most, min(most, lk[0]))
-    out = array("d")
+    out: list[tuple[float, float, float, float, int]] = []
     stride = step * scale
     budget = int(3 * m * gap / stride) + 400
     for _ in range(budget):
@@ -130,7 +148,11 @@ def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose
             j + 1 < m and (x - lx[j + 1]) ** 2 + (y - ly[j + 1]) ** 2 <= (x - lx[j]) ** 2 + (y - ly[j]) ** 2
         ):
             j += 1
-        out.extend((x, y, th, k, j))
+        out.append((x, y, th, k, j))
+        if len(out) == _FOLLOWED:
+            yield np.array(out)
+            out.clear()
+            release(*columns)
         c, s = math.cos(lh[j]), math.sin(lh[j])
         along, aside = (x - lx[j]) * c + (y - ly[j]) * s, ((y - ly[j]) * c - (x - lx[j]) * s) / scale
         if j == m - 1 and along >= -0.5 * stride:
@@ -148,5 +170,5 @@ def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose
         chord = stride * (1.0 - half * half / 6.0)  # of an arc; the next term is below 1e-9 m
         x, y = x + chord * math.cos(th + half), y + chord * math.sin(th + half)
         th, k = th + mean * step, new
-    rows = np.frombuffer(out).reshape(-1, 5)
-    return Track(rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4].astype(np.int64), 1, step)
+    if out:
+        yield np.array(out)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from geoscene.typing import Float
+from lidar.planning.blockwise import even, interpolated, rowwise
 from lidar.planning.path import Path
 from lidar.planning.speed_profile import desired_speed
 from lidar.rig.vehicle import Vehicle
@@ -51,28 +53,34 @@ class EgoTrip:
 
 def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False) -> EgoTrip:
     """The ego's trip along its path, from rest or at speed; stations are `STEP` metres apart."""
-    at = np.arange(0.0, path.length + _BEYOND, STEP)
+    at = even(math.ceil((path.length + _BEYOND) / STEP), STEP)
     # `s` repeats where the vehicle turns round
-    s = path.s + 1e-9 * np.arange(len(path))
+    s = rowwise(np.add, path.s, even(len(path), 1e-9))
     scale = float(path.scale.mean())
-    heading = np.interp(at, s, path.heading)
+    heading = interpolated(at, s, column=path.heading)
     ahead = scale * (vehicle.length / 2 - vehicle.rear_overhang)
-    axle = np.stack([np.interp(at, s, path.position[:, c]) for c in range(3)], axis=1)
-    xy = axle[:, :2] + ahead * np.column_stack([np.cos(heading), np.sin(heading)])
-    row = np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(path) - 1)
+    axle = [interpolated(at, s, column=path.position[:, c]) for c in range(3)]
+    shift = rowwise(lambda angle: ahead * np.column_stack([np.cos(angle), np.sin(angle)]), heading)
+    xy = rowwise(lambda by, *axle: np.column_stack(axle) + by, shift, *axle[:2])
+    row = rowwise(lambda at: np.searchsorted(s, at, side="right").clip(1, len(s)) - 1, at, looked_up=(s,))
+    curvature, edge, limit = (
+        rowwise(lambda row, column=column: column[row], row, looked_up=(column,))
+        for column in (path.curvature, path.edge, path.limit)
+    )
     actor_path = ActorPath(
-        np.column_stack([xy, axle[:, 2]]),
+        rowwise(lambda xy, z: np.column_stack([xy, z]), xy, axle[2]),
         heading,
-        path.curvature[row],
-        path.edge[row].astype(np.int64),
-        np.zeros(len(at), np.int64),
-        path.limit[row],
+        curvature,
+        rowwise(lambda edge: edge.astype(np.int64), edge),
+        rowwise(lambda at: np.zeros(len(at), np.int64), at),
+        limit,
         scale,
     )
     deceleration, acceleration = _BRAKE * vehicle.deceleration, _PULL * vehicle.acceleration
     driver = Driver(vehicle.turning_radius, vehicle.max_speed, _HEADWAY_S, acceleration, deceleration, _GAP)
-    desired = np.interp(at, s, desired_speed(path, vehicle))
+    desired = interpolated(at, s, column=desired_speed(path, vehicle))
     if not at_speed:
-        desired = np.minimum(desired, np.sqrt(2 * acceleration * (at + 0.2)))
+        desired = rowwise(lambda v, at: np.minimum(v, np.sqrt(2 * acceleration * (at + 0.2))), desired, at)
+    path.release()
     course = Course(actor_path, desired)
     return EgoTrip(course, driver, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading)

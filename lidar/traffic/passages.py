@@ -9,6 +9,8 @@ import numpy as np
 from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Float
+from lidar.geometry.poses import release
+from lidar.planning.blockwise import rowwise
 from lidar.traffic.ego_trip import EgoTrip
 from lidar.traffic.junctions import JunctionPlan, road_rank, signal_group, zone_at
 from lidar.traffic.lanes import STEP, ActorPath
@@ -31,7 +33,7 @@ def passages(
     routes : numbers of the routes through junctions so far; new ones are added
     """
     path = course.path
-    zone = zone_at(plan.zones, path.xyz[:, :2])
+    zone = rowwise(lambda xyz: zone_at(plan.zones, xyz[:, :2]), path.xyz)
     half = int(np.ceil((trip.length / 2 + 0.5) / STEP))
     rows: list[list[float]] = []
     for first, last, number in course.crossing:
@@ -42,8 +44,9 @@ def passages(
             rows.append([first, last, first - 1, z, group, key, 99.0, 0.0])
     if trip.on_foot:
         return np.array(rows, float).reshape(-1, 8)
-    cuts = np.flatnonzero(np.diff(np.concatenate([[-2], zone, [-2]])))
-    for a, b in itertools.pairwise(cuts.tolist()):
+    begins = rowwise(lambda part: np.diff(part, prepend=-2) != 0, zone, reach=1)
+    for a, b in itertools.pairwise([*np.flatnonzero(begins).tolist(), len(zone)]):
+        release(*path.columns().values())
         z = int(zone[a])
         if z < 0 or b - 1 + half < trip.begin:
             continue

@@ -112,7 +112,8 @@ def simulate_ego(
     It follows, gives way and obeys signals and signs like the other road users, and they react to it.
     """
     steps = int(np.ceil(seconds / STEP_S)) + 1
-    motion = EgoBox(np.zeros(steps, MOTION), np.full(2, -np.inf))
+    motion = EgoBox(room((steps,), MOTION), np.full(2, -np.inf))
+    motion.motion[:] = 0
     simulation = Simulation(
         [ego, *trips], graph, plan=plan, ego=motion, signals=plan.signals, radius=radius, ego_row=0
     )

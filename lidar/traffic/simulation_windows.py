@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Float, Ints
+from lidar.geometry.poses import release
+from lidar.planning.blockwise import rowwise
 from lidar.traffic.ego_trip import EgoTrip
 from lidar.traffic.junctions import JunctionPlan, Signals
 from lidar.traffic.lanes import STEP
@@ -181,6 +183,7 @@ class Simulation:
                 radius=self._radius + LEFT,
                 ego_row=self._ego_row,
             )
+            release(movers.station, self._ego.motion)
             _shift(state, start, sign=-1)
             log[:, 0] = rows[log[:, 0].astype(np.int64)]
             yield log, rows[hit]
@@ -194,11 +197,18 @@ class Simulation:
         course = trip.draw()
         path = course.path
         xy, heading = trip.body(path)
-        station = records(
-            STATION, desired_speed=course.desired_speed, x=xy[:, 0], y=xy[:, 1], heading=heading
+        station = rowwise(
+            lambda speed, xy, heading: records(
+                STATION, desired_speed=speed, x=xy[:, 0], y=xy[:, 1], heading=heading
+            ),
+            course.desired_speed,
+            xy,
+            heading,
         )
         block = passages(trip, course, graph=self._graph, plan=self._plan, routes=self._routes)
-        level = np.where(path.edge >= 0, self._covered[path.edge], False).astype(np.int64)
+        level = rowwise(
+            lambda edge: np.where(edge >= 0, self._covered[edge], False).astype(np.int64), path.edge
+        )
         return _Tables(station, level, path.scale, block, Sweep.empty())
 
     def _around(self, row: int, tables: _Tables, *, state: NDArray[np.void]) -> _Tables:
@@ -253,9 +263,10 @@ class Simulation:
         user["whole_block"] = [t.on_foot for t in trips]
         end = {name: [*values, 0] for name, values in user.items()}
         block = np.concatenate([np.empty((0, 8)), *(part.block for part in tables)])
+        station = [part.station for part in tables] or [np.empty(0, STATION)]
         movers = Movers(
             records(USER, **starts, **end),
-            np.concatenate([np.empty(0, STATION), *(part.station for part in tables)]),
+            station[0] if len(station) == 1 else np.concatenate(station),
             records(CELL, number=mine, first=columns.first, last=columns.last, leave=columns.leave),
             records(BLOCK, **dict(zip(BLOCK.names or (), block.T, strict=True))),
         )

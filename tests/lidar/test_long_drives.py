@@ -3,6 +3,7 @@
 import mmap
 import os
 import platform
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +28,15 @@ from lidar.plan import schedule
 from lidar.planning import clearance, speed_profile, steering
 from lidar.planning import path as path_module
 from lidar.planning.clearance import Line, Setting, touching
-from lidar.planning.motion import drive_path
+from lidar.planning.motion import drive_path, poses_along, speed_limits
 from lidar.planning.path import plan_path
-from lidar.planning.route import RouteOptions, plan_route
+from lidar.planning.route import RouteOptions, free_route, plan_route
+from lidar.planning.speed_profile import motion_within
 from lidar.planning.steering import follow
 from lidar.rig.devices import scanners
 from lidar.rig.specs import GnssSpec, ImuSpec, load_rig
 from lidar.rig.vehicle import load_vehicle
+from lidar.traffic.ego_trip import ego_trip
 
 FRAME = Frame.at(-76.3, 36.88)
 ARM = Mount((1.2, 0.3, 1.5), (0.0, 0.0, 0.0, 1.0))
@@ -70,6 +73,68 @@ def test_long_trajectory_is_kept_in_a_file_with_the_same_values(path, monkeypatc
     assert all(
         column.tobytes() == again.columns()[name].tobytes() for name, column in whole.columns().items()
     )
+
+
+def in_small_blocks(monkeypatch):
+    monkeypatch.setattr(poses, "BLOCK_POSES", 500)
+    monkeypatch.setattr(poses, "_IN_MEMORY", 500)
+    monkeypatch.setattr(steering, "_FOLLOWED", 500)
+
+
+@pytest.mark.parametrize("ground", [None, lambda x, y, z: z + 0.1 * np.sin(x / 9) * np.cos(y / 7)])
+def test_long_path_is_kept_in_files_with_the_same_values(ground, monkeypatch):
+    car, graph = load_vehicle("car"), grid(gap=80.0)
+    route = plan_route(graph, FRAME, spec="random", options=RouteOptions(seed=3, length=1500.0))
+    time_s = np.arange(0.0, 120.0, 0.2)
+    allowed = np.minimum(12.0 * time_s, 700.0)
+
+    def planned():
+        path = plan_path(route, car, frame=FRAME, ground=ground)
+        trip = ego_trip(path, car)
+        motion = motion_within(path, car, time_s=time_s, max_distance=allowed)
+        return path, {
+            **path.columns(),
+            **trip.course.path.columns(),
+            "desired": trip.course.desired_speed,
+            "limits": speed_limits(path, car),
+            **motion.columns(),
+            **poses_along(path, car, motion=motion).columns(),
+        }
+
+    whole, columns = planned()
+    in_small_blocks(monkeypatch)
+    path, parts = planned()
+    assert len(path) == len(whole) > 5000
+    assert all(isinstance(backing(column), mmap.mmap) for column in path.columns().values())
+    for name, column in columns.items():
+        assert parts[name].tobytes() == column.tobytes(), name
+
+
+def test_planning_of_a_longer_route_needs_no_more_memory(monkeypatch):
+    car = load_vehicle("car")
+
+    def planned(metres):
+        along = np.arange(0.0, metres, 20.0)
+        route = free_route(np.column_stack([along, 9 * np.sin(along / 60), 0 * along]), limit=13.9)
+        path = plan_path(route, car, frame=FRAME)
+        ego_trip(path, car)
+        return sum(column.nbytes for column in path.columns().values())
+
+    def peak(metres):
+        tracemalloc.start()
+        held = planned(metres)
+        bytes_at_most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return bytes_at_most, held
+
+    in_small_blocks(monkeypatch)
+    monkeypatch.setattr(steering, "_SOLVED", 1000)
+    monkeypatch.setattr(steering, "_OVERLAP", 400)
+    monkeypatch.setattr(clearance, "_BODIES", 500)
+    planned(500.0)  # imports
+    (short, _), (long, held) = peak(1000.0), peak(3000.0)
+    assert held > 1_000_000
+    assert long < short + 0.1 * held
 
 
 def test_receivers_and_units_measure_the_same_along_parts_of_a_trajectory(path, monkeypatch):
