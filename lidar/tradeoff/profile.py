@@ -169,7 +169,7 @@ def profile_of(
             " measured"
         )
     bare = replace(options, settings=(*options.settings, *ladders.first))
-    if scene.area is None and _stands_for(options):
+    if scene.area is None and scene.route is None and _stands_for(options):
         key = _key(scene, options, ladders=ladders, own_course=False)
         if stored := _read(folder, key):
             return stored

@@ -364,12 +364,13 @@ def test_a_profile_is_kept_for_other_routes_and_made_for_other_settings(scene, c
 def test_flights_and_scenes_along_routes_have_profiles_of_their_own_drive(scene, cache, monkeypatch):
     plans = []
     monkeypatch.setattr(profile, "plan_drive", lambda _scene, options, **_more: plans.append(options))
-    part = replace(scene, manifest=scene.manifest | {"area": "POLYGON ((0 0, 50 0, 50 50, 0 0))"})
+    limits = {"area": "POLYGON ((0 0, 50 0, 50 50, 0 0))"}, {"route": "LINESTRING (0 0, 50 0)"}
+    part, along = (replace(scene, manifest=scene.manifest | limit) for limit in limits)
     flight = DriveOptions(survey="all", altitude=50.0, rig="drone", duration=2.0)
-    for where, options in ((part, DRIVE), (scene, flight)):
+    for where, options in ((part, DRIVE), (along, DRIVE), (scene, flight)):
         with pytest.raises(AssertionError, match="measured again"):
             profile_of(where, options, folder=cache)
-    assert [(p.duration, p.survey) for p in plans] == [(0.5, ""), (2.0, "all")]
+    assert [(p.duration, p.survey) for p in plans] == [(0.5, ""), (0.5, ""), (2.0, "all")]
 
 
 def test_errors_are_measured_the_same_again_and_damaged_profiles_are_replaced(scene, cache, tmp_path):
