@@ -152,11 +152,12 @@ def write_metadata(
             ),
         )
         if k == 0:
+            windows = trajectory.windows(times, margin=2) if len(times) else [(slice(0), trajectory)]
             write_blocks(
                 paths.poses,
                 (
-                    pose_columns(trajectory, scene.frame, start=start, time_ns=times[rows], first=rows.start)
-                    for rows in table_blocks(len(times))
+                    pose_columns(part, scene.frame, start=start, time_ns=times[rows], first=rows.start)
+                    for rows, part in windows
                 ),
             )
         if contents.kitti and isinstance(sensor, Scanner):
