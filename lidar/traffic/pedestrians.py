@@ -27,6 +27,7 @@ _EDGE = 0.15  # metres, minimum distance of a path from the edge of the sidewalk
 _OUT = (2.4, 2.1, 1.8, 1.5, 1.3, 1.1, 0.95, 0.8)
 """Metres beyond the carriageway's edge where the line may run, best first."""
 _ROOM = 1.0  # metres, minimum distance of a sidewalk's line from obstacles
+_TURN = 4  # stations before and after the end of a sidewalk within which nobody waits for others who turn
 _PIECE = 12.0  # metres, minimum length of a stretch of sidewalk
 
 
@@ -135,9 +136,11 @@ def _stroll(
     side: int,
     rng: np.random.Generator,
 ) -> tuple[list[Float], list[tuple[int, int]]]:
-    """Consecutive lines that a pedestrian walks, and pairs of a line and the crossing after it.
+    """Consecutive lines that a pedestrian walks, and pairs of a line and the passage after it.
 
-    It walks to the end of a sidewalk and back, or over a crossing on the way, until it has walked ``metres``.
+    A passage is the number of a crossing, or a negative number of an end of a sidewalk where the pedestrian
+    turns. It walks to the end of a sidewalk and back, or over a crossing on the way, until it has walked
+    ``metres``.
     """
     parts: list[Float] = []
     over: list[tuple[int, int]] = []
@@ -149,6 +152,8 @@ def _stroll(
         taken = ahead[int(rng.integers(len(ahead)))] if ahead and rng.random() < 0.5 else None
         stop = end if taken is None else taken[1]
         if abs(stop - begin) > 0.5:
+            if len(parts) > (over[-1][0] + 1 if over else 0):
+                over.append((len(parts) - 1, -1 - 2 * walk - forwards))
             parts.append(_lane(own, begin, end=stop, side=side))
             far += abs(stop - begin)
         if taken is None:
@@ -215,6 +220,8 @@ def _course(parts: list[Float], over: list[tuple[int, int]], *, pace: float, sca
         first, last = (
             _nearest(path, line[k, :2], about=along[k] / gap) for k in (ends[part] - 1, ends[part])
         )
+        if number < 0:
+            first, last = max(first - _TURN, 0), min(last + _TURN, len(path) - 1)
         crossed.append((first + 1, max(last - 1, first + 2), number))
     return Course(path, np.full(len(path), pace), tuple(crossed))
 

@@ -7,8 +7,9 @@ whatever the shape of their paths. Within these bounds its speed follows the Int
 simulations", 2000).
 
 A road user enters a junction only once it has reserved its whole route through it. Crossing routes exclude
-each other, users of the same route follow each other: so no one waits inside a junction, and there is no
-deadlock.
+each other, users of the same route follow each other: so no one waits inside a junction for those who cross
+it. Paths also meet elsewhere, on sidewalks and behind junctions: of road users that wait for each other in a
+circle, and so for good, the smallest one disappears.
 """
 
 from __future__ import annotations
@@ -34,7 +35,11 @@ _NEAR_EGO = 90.0  # metres from the ego within which reserved cells are checked 
 _EVERY = 3  # every third cell is checked: bodies cover more than that
 _YIELD_S = 4.0  # seconds to arrival within which a road user with priority is waited for
 _PATIENCE = 20  # steps that a road user waits for room to appear
+_AT_REST = 0.01  # m/s
 _STOP_STEPS = 10  # steps at rest at a stop sign
+_DEADLOCK_STEPS = 50  # steps at rest after which road users that wait for each other are a deadlock
+_ARRIVED_STEPS = 30  # steps at rest at the end of a path after which a road user disappears
+_LOOK_EVERY = 10  # steps
 _AT_LINE = 3.0  # metres from the stop line within which a road user has stopped there
 NOBODY = -1
 """Owner of a cell that is not reserved, and route of a cell that no road user holds."""
@@ -57,7 +62,7 @@ station_start, cell_start, block_start : its first row in the other tables; ends
 headway, acceleration, deceleration, gap : of the driver model, see `lidar.traffic.trips.Driver`
 length, width : metres
 appear, begin : step and station at which it appears
-leaves        : whether it disappears at the end of its path; otherwise it stops there
+leaves        : whether it drives on at the end of its path; otherwise it stops there before it disappears
 whole_block   : whether it reserves a whole passage at once: pedestrians on crossings
 """
 
@@ -105,6 +110,7 @@ STATE = np.dtype(
     [
         *((name, np.float64) for name in ("s", "v")),
         *((name, np.int64) for name in ("ahead", "reserved", "released", "station", "block", "rested")),
+        *((name, np.int64) for name in ("still", "waits_for")),
         *((name, np.bool_) for name in ("active", "departed", "granted")),
     ],
     align=True,
@@ -118,6 +124,7 @@ reserved, released : rows reserved, and rows (in the order of leaving) released
 station            : last station reserved
 block, granted     : next passage through a junction, and whether it may be entered
 rested             : steps at rest at the stop sign of the next passage
+still, waits_for   : steps at rest, and the road user that is in its way, `NOBODY` for none
 """
 
 
@@ -226,7 +233,31 @@ def _run(
             if _boxes_overlap(i, row, step, m, ego):
                 hit_ego[i] = True
             _release_behind(i, m, g, st)
+        if step % _LOOK_EVERY == 0:
+            _end_deadlocks(m, g, st, ego_row)
     return log[:rows]
+
+
+@njit(cache=True, nogil=True)
+def _end_deadlocks(m: Any, g: Any, st: Any, ego_row: int) -> None:
+    """Remove one of the road users of each circle of those that wait for each other, the smallest one."""
+    seen = np.full(len(st), NOBODY)
+    for i in range(len(st)):
+        j = i
+        while j != NOBODY and seen[j] == NOBODY and st[j].still >= _DEADLOCK_STEPS:
+            seen[j] = i
+            j = st[j].waits_for
+        if j == NOBODY or seen[j] != i:
+            continue
+        smallest, k = NOBODY, st[j].waits_for
+        while True:
+            if k != ego_row and (smallest == NOBODY or m.user[k].length < m.user[smallest].length):
+                smallest = k
+            if k == j:
+                break
+            k = st[k].waits_for
+        st[smallest].departed = True
+        _release_behind(smallest, m, g, st)
 
 
 @njit(cache=True, nogil=True)
@@ -370,6 +401,19 @@ def _signal_will_change(i: int, k: int, t: float, m: Any, st: Any, signals: Any)
 
 
 @njit(cache=True, nogil=True)
+def _is_queueing(i: int, m: Any, g: Any, st: Any) -> bool:
+    """Whether someone who may not enter the next junction has come between it and a road user."""
+    b = st[i].block
+    for q in range(st[i].reserved, m.user[i + 1].cell_start):
+        if m.cell[q].first >= m.block[b].first:
+            break
+        o = g[m.cell[q].number].owner
+        if o not in (NOBODY, i):
+            return not st[o].granted
+    return False
+
+
+@njit(cache=True, nogil=True)
 def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signals: Any) -> None:
     """Advance a road user by one step."""
     base = m.user[i].station_start
@@ -378,11 +422,16 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     k = int(s / STEP)
     while st[i].ahead < m.user[i + 1].cell_start and m.cell[st[i].ahead].first <= k:
         st[i].ahead += 1
+    st[i].waits_for = NOBODY
     limit = end
     line = not m.user[i].leaves
     must_stop = False
     b = st[i].block
-    if b < m.user[i + 1].block_start and st[i].granted and _signal_will_change(i, k, t, m, st, signals):
+    if (
+        b < m.user[i + 1].block_start
+        and st[i].granted
+        and (_signal_will_change(i, k, t, m, st, signals) or _is_queueing(i, m, g, st))
+    ):
         _release_junction(i, m, g, st)
     if b < m.user[i + 1].block_start and not st[i].granted:
         near = m.block[b].stop - k <= (v * v / (1.3 * m.user[i].deceleration) + 2.0 * v) / STEP + 12
@@ -408,10 +457,13 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     need = min(int((s + (v + new) / 2 * dt + new * new / (2 * HARD)) / STEP) + 2, limit)
     if st[i].granted and _next_signal_is_red(i, k, t, need, m, st, signals):
         need = m.block[b + 1].stop
+    route = m.block[b].route if st[i].granted else NOBODY
     q = st[i].reserved
     while q < m.user[i + 1].cell_start and m.cell[q].first <= need:
         p = m.cell[q].number
-        other = g[p].owner not in (NOBODY, i)
+        other = g[p].owner not in (NOBODY, i) or (m.user[i].whole_block and g[p].hold not in (NOBODY, route))
+        if other:
+            st[i].waits_for = g[p].owner if g[p].owner not in (NOBODY, i) else _holder(g[p].hold, m, st)
         if other or _needed_by_ego(g, p, t, (m.cell[q].last - k) * STEP / max(v, 2.0) + 0.5):
             need = m.cell[q].first - 1
             break
@@ -423,9 +475,10 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     if must_stop and new < 0.4 and (m.block[b].stop - k) * STEP < _AT_LINE:
         st[i].rested += 1
         new = 0.0
+    st[i].still = st[i].still + 1 if new < _AT_REST else 0
     st[i].s = min(s + (v + new) / 2 * dt, max(end - 1, k) * STEP)
     st[i].v = new
-    if m.user[i].leaves and st[i].s > (end - 3) * STEP:
+    if st[i].s > (end - 3) * STEP and (m.user[i].leaves or st[i].still >= _ARRIVED_STEPS):
         st[i].departed = True
 
 
@@ -471,6 +524,7 @@ def _obstacle(
         if o not in (NOBODY, i):
             here = m.station[base + m.cell[q].first].heading
             theirs = m.station[m.user[o].station_start + int(st[o].s / STEP)].heading
+            st[i].waits_for = o
             return m.cell[q].first, max(st[o].v * math.cos(theirs - here), 0.0)
         if _needed_by_ego(g, p, t, (m.cell[q].last - k) * STEP / pace + 1.0):
             return m.cell[q].first, max(
@@ -489,27 +543,41 @@ def _may_enter(i: int, k: int, t: float, m: Any, g: Any, st: Any, signals: Any) 
     eta = max(m.block[b].stop - k, 0) * STEP / pace
     if group >= 0 and not (is_green(zone, group, t, signals) and is_green(zone, group, t + eta, signals)):
         return False
-    behind = False  # a road user on the same route is ahead
+    leader = NOBODY  # the last road user found ahead, on the same route
     for q in range(st[i].ahead, m.user[i + 1].cell_start):
         if m.cell[q].first > m.block[b].last + 2:
             break
         p = m.cell[q].number
         o = g[p].owner
-        if q >= st[i].reserved and o not in (NOBODY, i) and not behind:
+        if q >= st[i].reserved and o not in (NOBODY, i, leader):
             theirs = m.station[m.user[o].station_start + int(st[o].s / STEP)].heading
             same = st[o].block < m.user[o + 1].block_start and m.block[st[o].block].route == route
             moves = (
                 st[o].v > 0.5 * pace and math.cos(theirs - m.station[base + m.cell[q].first].heading) > 0.5
             )
             if not moves or not (same or m.cell[q].first > m.block[b].first):
+                st[i].waits_for = o
                 return False
-            behind = True
+            leader = o
         if m.cell[q].first >= m.block[b].first:
             if g[p].hold not in (NOBODY, route) and m.cell[q].first <= m.block[b].last:
+                st[i].waits_for = _holder(g[p].hold, m, st)
                 return False
             if _needed_by_ego(g, p, t, (m.cell[q].last - k) * STEP / pace + 2.0):
                 return False
-    return not (m.user[i].whole_block and behind) and not _yields(i, eta, m, st)
+    if m.user[i].whole_block and leader != NOBODY:
+        st[i].waits_for = leader
+        return False
+    return not _yields(i, eta, m, st)
+
+
+@njit(cache=True, nogil=True)
+def _holder(route: int, m: Any, st: Any) -> int:
+    """A road user that has reserved a route through a junction, `NOBODY` for none."""
+    for j in range(len(st)):
+        if st[j].granted and m.block[st[j].block].route == route:
+            return j
+    return NOBODY
 
 
 @njit(cache=True, nogil=True)

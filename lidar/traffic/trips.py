@@ -81,7 +81,7 @@ class Course:
 
     path          : n stations
     desired_speed : (n,) m/s at each station
-    crossing      : of pedestrians: first station, last station and number of each crossing on the path
+    crossing      : of pedestrians: first and last station and number of each crossing or turn on the path
     """
 
     path: ActorPath
@@ -117,7 +117,7 @@ class Trip:
     driver   : driver model
     begin    : station of the start
     appear_s : seconds after the drive's start at which it appears
-    leaves   : whether it disappears at the end of the path; otherwise it stops there
+    leaves   : whether it drives on at the end of its path; otherwise it stops there before it disappears
     on_foot  : whether it is a pedestrian
     """
 

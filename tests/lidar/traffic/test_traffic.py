@@ -209,6 +209,30 @@ def test_vehicles_queue_behind_an_ego_that_stands_in_their_lane():
     assert 0.8 < tail - nose < 8.0
 
 
+def longest_rests(flow):
+    """Seconds (t,) that each trip stands at most."""
+    out = []
+    for trip in np.unique(flow.trip):
+        mine = flow.trip == trip
+        step, moves = flow.step[mine], flow.speed[mine] > 0.05
+        out.append(np.diff(np.concatenate([step[:1], step[moves], step[-1:]])).max() * STEP_S)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_no_road_user_stands_for_good(seed):
+    """Cars, trucks and cyclists in a town of 16 junctions that none can leave, for five minutes."""
+    graph, ego = grid(4, 4, 90.0, lanes=1.0, width=7.0, speed=13.9), standing((135.0, 135.0), 300.0)
+    lanes = lanes_of(graph, bounds=(-500.0, -500.0, 800.0, 800.0))
+    area = surroundings_of(lanes, ego, radius=400.0, scale=1.0)
+    shares = {"sedan": 0.6, "cyclist": 0.3, "truck": 0.1}
+    trips = vehicle_trips(lanes, area, seed=seed, density=15.0, shares=shares)
+    plan = junction_plan(graph, lanes, seed=seed)
+    flow = simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, radius=400.0)
+    assert len(np.unique(flow.trip)) > 20
+    assert longest_rests(flow).max() < 100.0
+
+
 def test_the_gap_to_a_leader_grows_with_speed():
     """At rest bodies are some 2 m apart; on a free road followers keep a second and more."""
     graph = road_graph([(0.0, 0.0), (2000.0, 0.0)], [(0, 1)], twoway=False, width=4.0, speed=13.9)
