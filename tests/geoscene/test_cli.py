@@ -8,7 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from helpers.programs import ENVIRONMENT, command, run_program
+from helpers.programs import ENVIRONMENT, SMALL_FILES, command, run_program
 
 from geoscene import cli
 from geoscene.sources import demo_path
@@ -178,7 +178,7 @@ def test_full_disk_gives_one_line_that_names_the_file(scene, tmp_path, suffix):
     words = ["view" if suffix == "html" else "export", str(scene), "-o", str(out)]
     done = subprocess.run(
         [sys.executable, "-c", limit + run, "geoscene", *words],
-        env=ENVIRONMENT, capture_output=True, text=True, check=False,
+        env=SMALL_FILES, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 1, done.stderr
     assert done.stderr.startswith(f"geoscene: {out}: ")

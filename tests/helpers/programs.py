@@ -15,6 +15,8 @@ import pytest
 _ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(_ROOT)}
 """Environment of processes that import this checkout, even if another version is installed."""
+SMALL_FILES = ENVIRONMENT | {"PYTHONDONTWRITEBYTECODE": "1"}
+"""The same for processes with a limit on the size of files, which would cut compiled modules off."""
 
 
 def command(name, *words):
@@ -22,10 +24,10 @@ def command(name, *words):
     return [sys.executable, "-m", f"{name}.cli", *map(str, words)]
 
 
-def run_process(name, *words, **options):
+def run_process(name, *words, env=ENVIRONMENT, **options):
     """The completed process of the program ``name``, with its output as text; options of `subprocess.run`."""
     return subprocess.run(
-        command(name, *words), env=ENVIRONMENT, capture_output=True, text=True, check=False, **options
+        command(name, *words), env=env, capture_output=True, text=True, check=False, **options
     )
 
 
