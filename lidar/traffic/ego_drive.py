@@ -89,8 +89,8 @@ def drive_in_traffic(
     Raises InputError for a scene whose features cannot be read.
     """
     options = options or TrafficOptions()
-    ego = first
-    for _ in range(_ROUNDS):
+    ego, rounds = first, 0
+    while True:
         setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
         before, radius = ego, options.radius * setup.scale
         ego = _driven(
@@ -104,11 +104,20 @@ def drive_in_traffic(
             radius=radius,
             at_speed=at_speed,
         )
-        if _apart(before, ego) < _SAME * setup.scale:
-            break
-    return ego, simulated_actors(
-        scene, graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed, options=options, obeys_signals=True
-    )
+        rounds += 1
+        if rounds == _ROUNDS or _apart(before, ego) < _SAME * setup.scale:
+            others = simulated_actors(
+                scene,
+                graph,
+                ego=ego,
+                vehicle=vehicle,
+                setup=setup,
+                seed=seed,
+                options=options,
+                obeys_signals=True,
+            )
+            return ego, others
+        del setup  # it grows with the drive, and the next one does not need it
 
 
 def _driven(

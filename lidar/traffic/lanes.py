@@ -244,9 +244,9 @@ def random_lanes(
 
 def path_along_lanes(
     lanes: Lanes,
-    edges: Sequence[int],
+    edges: NDArray[np.int32],
     *,
-    picked: Sequence[int],
+    picked: NDArray[np.int8],
     width: float,
     radius: float,
     scale: float,
@@ -265,7 +265,7 @@ def path_along_lanes(
             graph.geometry[e],
             -lanes.side * scale * lane_shift(lanes, e, lane=k, width=width, kerb=keeps_kerb),
         )
-        for e, k in zip(edges, picked, strict=True)
+        for e, k in zip(edges.tolist(), picked.tolist(), strict=True)
     ]
     for k, line in enumerate(lines):
         if k + 1 < len(lines):
@@ -283,7 +283,7 @@ def path_along_lanes(
     at = np.arange(0.0, max(along[-1], 6 * gap), gap)
     line = polylines.points_at(xyz, at, along=along)
     row = own[np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(own) - 1)]
-    edge, lane = np.asarray(edges, np.int64)[row], np.asarray(picked, np.int64)[row]
+    edge, lane = edges[row].astype(np.int64), picked[row].astype(np.int64)
     return rounded(line, edge, lane=lane, limit=graph.speed[edge], radius=radius, scale=scale)
 
 

@@ -40,7 +40,7 @@ _HORIZON = 60  # steps that the ego's path is known ahead: 6 s
 _STEPS = 200
 """Steps of a window: 20 s."""
 _FASTER = 1.2  # maximum factor by which a road user exceeds its desired speed
-_MEMORY = 1 << 26  # bytes up to which a log is in memory
+_MEMORY = 1 << 22  # bytes up to which a log is in memory
 
 
 @dataclass(frozen=True, slots=True)

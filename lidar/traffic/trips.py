@@ -229,8 +229,8 @@ def _trip(
         drawn = partial(
             path_along_lanes,
             lanes,
-            tuple(edges),
-            picked=tuple(picked),
+            np.array(edges, np.int32),  # many trips are kept: a list takes nine times the memory
+            picked=np.array(picked, np.int8),
             width=width,
             radius=driver.min_radius,
             scale=area.scale,
