@@ -25,6 +25,7 @@ from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, readin
 from lidar.dataset.record_clouds import write_clouds
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.recording import Contents, Recording
+from lidar.dataset.situations import situation_of
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.options import ApplyOptions
@@ -36,6 +37,7 @@ from lidar.settings import settings_of
 from lidar.signal.recorded import altered_recording
 from lidar.signal.registry import NamedStage, Stages
 from lidar.signal.run import Altered, altered_image, cloud_truth, image_truth, write_truth
+from lidar.signal.situation import Situation
 
 _KITTI, _NUSCENES = FORMATS["kitti"], FORMATS["nuscenes"]
 _SENSORS = {"kitti": "hdl64e_s3", "nuscenes": "hdl32e"}
@@ -193,9 +195,8 @@ def _apply_to_frame(
     table = cloud_points(source[form.name])
     recorded = _completed(table_cloud(table, start_ns=begin), scanner.sensor, columns=form.columns)
     threshold = contents.scanner.link or contents.scanner.detection
-    altered = altered_recording(
-        recorded, contents.stages, sensor=scanner.sensor, frame=frame, threshold=threshold
-    )
+    at = situation_of(recording, scanner, frame=frame)
+    altered = altered_recording(recorded, contents.stages, sensor=scanner.sensor, at=at, threshold=threshold)
     cloud = altered.cloud
     if form.kitti:  # recorded without the vehicle's motion: all points are those of the frame's start
         cloud = replace(cloud, time_ns=np.zeros_like(cloud.time_ns))
@@ -244,7 +245,7 @@ def _apply_to_image(dataset: Dataset, recording: Recording, *, camera: Camera, f
         read.get("semantic", np.full(shape, Class.UNLABELED, np.uint8)),
         image_to_feature(read["instance"]) if "instance" in read else np.full(shape, -1, np.int32),
     )
-    found = altered_image(image, recording.contents.stages, sensor=camera.name, frame=frame)
+    found = altered_image(image, recording.contents.stages, at=situation_of(recording, camera, frame=frame))
     assert found.rgb is not None  # noqa: S101
     for path in (paths["rgb"], paths["truth"]):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -292,8 +293,8 @@ def _apply_to_clouds(
         stem = path.name.removesuffix(form.suffix)
         device = devices[path.parent.name, form.name]
         recorded = _completed(table_cloud(form.read(path)), device, columns=form.columns)
-        frame = int(stem) if stem.isdigit() else stem
-        altered = altered_recording(recorded, chosen, sensor=device, frame=frame)
+        at = Situation(device.name, int(stem) if stem.isdigit() else stem)
+        altered = altered_recording(recorded, chosen, sensor=device, at=at)
         for target in (out / place, out / "truth" / place):
             target.parent.mkdir(parents=True, exist_ok=True)
         form.write(out / place, cloud_table(altered.cloud))

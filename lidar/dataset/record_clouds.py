@@ -14,6 +14,7 @@ from lidar.dataset.boxes import box_rows, count_points
 from lidar.dataset.deskew import MOMENTS, deskewed
 from lidar.dataset.formats.table import Table, cloud_table, point_labels
 from lidar.dataset.recording import Recording
+from lidar.dataset.situations import situation_of
 from lidar.random_streams import generator
 from lidar.rig.devices import Scanner
 from lidar.sensors.cloud import Cloud, TracedCloud, no_returns
@@ -57,7 +58,11 @@ def _altered(recording: Recording, scanner: Scanner, *, frame: int, world: World
         return unaltered(no_returns(scanner.sensor.window_ns(frame)[0]))
     with recording.watch.stage("scan"):
         sweep = _swept(recording, scanner, frame=frame, world=world)
-        altered = altered_sweep(sweep, recording.contents.stages)
+        altered = altered_sweep(
+            sweep,
+            recording.contents.stages,
+            at=situation_of(recording, scanner, frame=frame, world=world),
+        )
     return altered if recording.scanning_ns is None else altered.where(partial(_while_on, recording))
 
 

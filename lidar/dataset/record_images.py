@@ -20,12 +20,14 @@ from lidar.camera.render import exposure_times, optical_flow, render
 from lidar.camera.sun import sun_direction
 from lidar.dataset.boxes import ImageBoxes, image_boxes
 from lidar.dataset.recording import Recording
+from lidar.dataset.situations import situation_of
 from lidar.geometry.poses import Poses
 from lidar.random_streams import generator
 from lidar.rig.devices import Camera
 from lidar.signal.run import altered_image, image_truth, write_truth
 from lidar.world.actors import Actors
 from lidar.world.thread_worlds import Worlds
+from lidar.world.world import World
 
 _SUN_NS = 10_000_000_000
 """Nanoseconds between updates of the sun's direction, which changes by 0.04 degrees meanwhile."""
@@ -38,7 +40,9 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
     times = exposure_times(camera.spec, camera.frame_start_ns(frame), samples=samples)
     rows = len(times) // samples
     first = (samples // 2) * rows  # of the exposure's middle sample, whose depth and labels are kept
-    image = _rendered(recording, camera, frame=frame, times=times, worlds=worlds)
+    start = camera.frame_start_ns(frame)
+    world = worlds.during(start, max(int(times[-1]), start + 1))
+    image = _rendered(recording, camera, frame=frame, times=times, world=world)
     if recording.actors is not None:
         with watch.stage("boxes"):
             middle = int(times[first + rows // 2])
@@ -49,13 +53,14 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
                 pose=pose,
                 time_ns=middle,
                 instance=image.feature,
-                span_ns=(camera.frame_start_ns(frame), int(times[-1])),
+                span_ns=(start, int(times[-1])),
             )
             columns = _box_columns(recording.actors, found, frame=frame, time_ns=middle)
             write_columns(paths["boxes"], columns)
     if recording.has_stages(camera):
-        original, stages = image, recording.contents.stages
-        image = altered_image(image, stages, sensor=camera.name, frame=frame)
+        original = image
+        at = situation_of(recording, camera, frame=frame, world=world)
+        image = altered_image(image, recording.contents.stages, at=at)
         write_truth(paths["truth"], image_truth(image, original))
     for kind in camera.spec.images:
         with watch.stage(f"write {kind}"):
@@ -67,13 +72,12 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
 
 
 def _rendered(
-    recording: Recording, camera: Camera, *, frame: int, times: NDArray[np.int64], worlds: Worlds
+    recording: Recording, camera: Camera, *, frame: int, times: NDArray[np.int64], world: World
 ) -> Image:
     """A frame of a camera; ``times`` are its exposure times."""
     contents = recording.contents
     start = camera.frame_start_ns(frame)
     end = max(int(times[-1]), start + 1)
-    world = worlds.during(start, end)
     with recording.watch.stage("render"):
         return render(
             camera.spec,

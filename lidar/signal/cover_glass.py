@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidar.physics.echoes import TracedEchoes
+from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, Stage, parameter
 
 
@@ -20,9 +21,11 @@ class CoverGlass(Stage):
     )
     width: float = parameter(360.0, "width of the sector, degrees", low=0, high=360)
 
-    def echoes(self, pulses: Pulses, echoes: TracedEchoes, *, rng: np.random.Generator) -> TracedEchoes:
+    def echoes(
+        self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator
+    ) -> TracedEchoes:
         """The echoes with the power that is left."""
-        del rng
+        del at, rng
         x, y = pulses.direction[echoes.pulse, :2].T
         off = (np.degrees(np.arctan2(y, x)) - self.azimuth + 180) % 360 - 180
         share = np.where(np.abs(off) <= self.width / 2, self.transmission**2, 1.0)

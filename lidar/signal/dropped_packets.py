@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidar.sensors.cloud import TracedCloud
+from lidar.signal.situation import Situation
 from lidar.signal.stage import Stage, parameter
 
 
@@ -24,8 +25,9 @@ class DroppedPackets(Stage):
         24, "firing blocks (azimuth steps) a packet; 24 for a VLP-16", low=1, high=100_000
     )
 
-    def cloud(self, cloud: TracedCloud, *, rng: np.random.Generator) -> TracedCloud:
+    def cloud(self, cloud: TracedCloud, *, at: Situation, rng: np.random.Generator) -> TracedCloud:
         """The cloud without the returns of lost packets."""
+        del at
         packet = cloud.column // self.columns
         recover = 1 / self.burst
         # A loss that the burst length cannot reach has the next packet lost for certain.

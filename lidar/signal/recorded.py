@@ -13,21 +13,21 @@ from lidar.rig.scanner import Sensor
 from lidar.sensors.cloud import Cloud
 from lidar.signal.registry import Stages
 from lidar.signal.run import Altered, altered_cloud, altered_echoes, linked
+from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses
 
 _SEEN = 1 + 1e-9  # power over the threshold that a recorded return had at least
 
 
 def altered_recording(
-    cloud: Cloud, stages: Stages, *, sensor: Sensor, frame: int | str, threshold: bool = True
+    cloud: Cloud, stages: Stages, *, sensor: Sensor, at: Situation, threshold: bool = True
 ) -> Altered:
     """A recorded cloud after the stages on its echoes and on the cloud itself.
 
     Each return is one echo, with the power that its intensity and range imply; pulses without a return are
     unknown, so that echo stages add nothing to them. Ranges get no further noise.
 
-    sensor    : the scanner that recorded the cloud; stages are chosen by its name
-    frame     : number of the frame, or its file's name
+    sensor    : the scanner that recorded the cloud
     threshold : echoes whose power falls to the detection threshold are lost
     """
     pulse = _pulse_rows(cloud)
@@ -36,8 +36,8 @@ def altered_recording(
         least = pulses.apparent(np.full(len(echoes), _SEEN), echoes.range)
         echoes = replace(echoes, apparent=np.maximum(echoes.apparent, least))
     found, result = echoes, cloud
-    if stages.at("echoes", sensor.name):
-        found = altered_echoes(pulses, echoes, stages=stages, frame=frame)
+    if stages.at("echoes", at.sensor):
+        found = altered_echoes(pulses, echoes, stages=stages, at=at)
         away = found.range + sensor.pattern.range_offset
         keep = (found.source >= 0) | ((away >= sensor.min_range) & (away <= sensor.max_range))
         if threshold:
@@ -53,7 +53,7 @@ def altered_recording(
         found, numbers = found.where(keep), (number[keep], count[keep])
         result = _cloud(cloud, found, sensor=sensor, before=echoes, numbers=numbers)
     linked_cloud = linked(result, found, first=echoes)
-    return Altered(altered_cloud(linked_cloud, stages, sensor=sensor.name, frame=frame), cloud)
+    return Altered(altered_cloud(linked_cloud, stages, at=at), cloud)
 
 
 def _pulse_rows(cloud: Cloud) -> NDArray[np.int32]:

@@ -20,6 +20,7 @@ from lidar.random_streams import generator
 from lidar.sensors.cloud import Cloud, TracedCloud
 from lidar.sensors.scan import Sweep, detect, deviates_of, report
 from lidar.signal.registry import Stages
+from lidar.signal.situation import Situation
 from lidar.signal.stage import CloudStage, EchoStage, ImageStage, Pulses, pulses_of
 
 _FALSE_KINDS = 3  # kinds of false echoes, each at most one per pulse
@@ -56,32 +57,31 @@ def unaltered(cloud: Cloud) -> Altered:
     return Altered(TracedCloud(cloud.start_ns, *cloud.columns().values(), *added), cloud)
 
 
-def altered_sweep(sweep: Sweep, stages: Stages) -> Altered:
+def altered_sweep(sweep: Sweep, stages: Stages, *, at: Situation) -> Altered:
     """The point cloud of a sweep after the stages on its echoes and on the cloud."""
-    sensor, m = sweep.sensor, len(sweep.echoes)
+    m = len(sweep.echoes)
     noise = _RepeatedNoise(sweep)
     echoes = traced(sweep.echoes, Origin.SURFACE, source=np.arange(m))
     first = last = detect(sweep, echoes, deviates=noise.first)
     original = report(sweep, first)
-    before = stages.at("echoes", sensor.name)
+    before = stages.at("echoes", at.sensor)
     if before:
-        pulses = pulses_of(sensor, sweep.sent)
-        echoes = altered_echoes(pulses, echoes, stages=stages, frame=sweep.frame)
+        pulses = pulses_of(sweep.sensor, sweep.sent)
+        echoes = altered_echoes(pulses, echoes, stages=stages, at=at)
         last = detect(sweep, echoes, deviates=noise.again)
     reported, unaltered = cast("TracedEchoes", last.echoes), cast("TracedEchoes", first.echoes)
     cloud = linked(report(sweep, last) if before else original, reported, first=unaltered)
-    return Altered(altered_cloud(cloud, stages, sensor=sensor.name, frame=sweep.frame), original)
+    return Altered(altered_cloud(cloud, stages, at=at), original)
 
 
-def altered_echoes(pulses: Pulses, echoes: TracedEchoes, *, stages: Stages, frame: int | str) -> TracedEchoes:
+def altered_echoes(pulses: Pulses, echoes: TracedEchoes, *, stages: Stages, at: Situation) -> TracedEchoes:
     """Echoes after the stages on them, sorted by pulse and range.
 
     Echoes within the sensor's echo separation are merged in pulses that have added or moved ones.
     """
-    name = pulses.sensor.name
-    for named in stages.at("echoes", name):
-        stage = cast("EchoStage", named.stage)
-        echoes = stage.echoes(pulses, echoes, rng=named.rng(stages.seed, name, frame=frame))
+    for named in stages.at("echoes", at.sensor):
+        stage, rng = cast("EchoStage", named.stage), named.rng(stages.seed, at.sensor, frame=at.frame)
+        echoes = stage.echoes(pulses, echoes, at=at, rng=rng)
         if len(echoes) and not 0 <= echoes.pulse.min() <= echoes.pulse.max() < len(pulses):
             raise LidarError(f"stage {named.name} returned echoes of pulses that were not fired")
     is_new = (echoes.source < 0) | (echoes.origin == Origin.MOVED)
@@ -115,20 +115,20 @@ def linked(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> Traced
     return TracedCloud(cloud.start_ns, *cloud.columns().values(), *added)
 
 
-def altered_cloud(cloud: TracedCloud, stages: Stages, *, sensor: str, frame: int | str) -> TracedCloud:
+def altered_cloud(cloud: TracedCloud, stages: Stages, *, at: Situation) -> TracedCloud:
     """A cloud after the stages on it."""
-    for named in stages.at("cloud", sensor):
-        rng = named.rng(stages.seed, sensor, frame=frame)
-        cloud = cast("CloudStage", named.stage).cloud(cloud, rng=rng)
+    for named in stages.at("cloud", at.sensor):
+        rng = named.rng(stages.seed, at.sensor, frame=at.frame)
+        cloud = cast("CloudStage", named.stage).cloud(cloud, at=at, rng=rng)
     moved = (cloud.origin == Origin.MOVED) & (cloud.hidden < 0)
     return replace(cloud, hidden=np.where(moved, cloud.source, cloud.hidden))
 
 
-def altered_image(image: Frame, stages: Stages, *, sensor: str, frame: int | str) -> Frame:
+def altered_image(image: Frame, stages: Stages, *, at: Situation) -> Frame:
     """An image with colours after the stages on it."""
-    for named in stages.at("image", sensor):
-        rng = named.rng(stages.seed, sensor, frame=frame)
-        image = replace(image, rgb=cast("ImageStage", named.stage).image(image, rng=rng).rgb)
+    for named in stages.at("image", at.sensor):
+        rng = named.rng(stages.seed, at.sensor, frame=at.frame)
+        image = replace(image, rgb=cast("ImageStage", named.stage).image(image, at=at, rng=rng).rgb)
     return image
 
 

@@ -20,6 +20,7 @@ from lidar.physics.link import apparent_of
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
 from lidar.sensors.cloud import TracedCloud
+from lidar.signal.situation import Situation
 
 T = TypeVar("T", bool, int, float, str)
 
@@ -135,19 +136,21 @@ def added_echoes(
 class EchoStage(Protocol):
     """A stage before the detector."""
 
-    def echoes(self, pulses: Pulses, echoes: TracedEchoes, *, rng: np.random.Generator) -> TracedEchoes:
+    def echoes(
+        self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator
+    ) -> TracedEchoes:
         """The echoes that reach the detector, in any order."""
 
 
 class CloudStage(Protocol):
     """A stage after the sensor."""
 
-    def cloud(self, cloud: TracedCloud, *, rng: np.random.Generator) -> TracedCloud:
+    def cloud(self, cloud: TracedCloud, *, at: Situation, rng: np.random.Generator) -> TracedCloud:
         """The cloud that is recorded. Moved returns get the origin MOVED and keep their source."""
 
 
 class ImageStage(Protocol):
     """A stage on camera images."""
 
-    def image(self, frame: Frame, *, rng: np.random.Generator) -> Frame:
+    def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
         """The frame that is recorded. Only its colours are used: depth and labels stay ground truth."""

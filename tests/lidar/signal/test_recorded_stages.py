@@ -3,7 +3,7 @@
 import hashlib
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,8 @@ from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.physics.echoes import Origin
 from lidar.pipeline import drive
-from lidar.signal.registry import read_stages
+from lidar.signal.registry import NamedStage, read_stages
+from lidar.signal.stage import Stage
 from lidar.traffic.populate import TrafficOptions
 
 RIG = """
@@ -239,3 +240,40 @@ def test_the_programs_list_and_apply_stages(plain, tmp_path):
     document = json.loads(result.stdout)
     assert document["points"] < document["points_in"]
     assert Path(document["path"], "top", "truth", "000000.npz").exists()
+
+
+SEEN = []
+
+
+@dataclass(frozen=True)
+class Watched(Stage):
+    """Notes what it is told, and how far the world is along the returns' beams."""
+
+    def cloud(self, cloud, *, at, rng):
+        del rng
+        far = np.empty(0)
+        if at.world is not None:
+            time_ns = cloud.start_ns + cloud.time_ns[::50].astype(np.int64)
+            poses = at.poses(time_ns)
+            beams = cloud.xyz[::50] / np.linalg.norm(cloud.xyz[::50], axis=1, keepdims=True)
+            far = at.world.caster.cast(poses.position, poses.directions(beams)).range
+        SEEN.append((at, far, cloud.true_range[::50]))
+        return cloud
+
+
+def test_stages_know_where_and_when_a_frame_is_taken(scene, options, plain, tmp_path):
+    """Rays cast from the sensor's poses along the returns meet the world where the returns are from."""
+    SEEN.clear()
+    watched = (NamedStage("watched", Watched()),)
+    alone = replace(options, stages=watched, traffic=None, formats=("pcd",), labels=(), deskew="")
+    drive(scene, tmp_path / "a", options=alone)
+    assert [at.frame for at, _, _ in SEEN] == list(range(len(SEEN)))
+    for at, far, recorded in SEEN:
+        assert at.sensor == "top"
+        assert at.start_ns == at.frame * 100_000_000
+        assert np.median(np.abs(far - recorded)) < 0.02
+    SEEN.clear()
+    apply_stages(plain, tmp_path / "b", options=ApplyOptions(stages=watched))
+    assert all(at.world is None and at.poses is not None and at.utc is not None for at, _, _ in SEEN)
+    apply_stages(plain / "top", tmp_path / "c", options=ApplyOptions(stages=watched))
+    assert SEEN[-1][0].poses is None

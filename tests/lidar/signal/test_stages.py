@@ -21,6 +21,7 @@ from lidar.signal.dropped_packets import DroppedPackets
 from lidar.signal.recorded import altered_recording
 from lidar.signal.registry import NamedStage, Stages, read_stage, read_stages, stage_rows, stages_of
 from lidar.signal.run import altered_image, altered_sweep, cloud_truth, image_truth
+from lidar.signal.situation import Situation
 from lidar.signal.stage import Stage, added_echoes, parameter
 
 ROOF = Mount((1.2, 0.0, 1.9))
@@ -41,8 +42,8 @@ class Injected(Stage):
     distance: float = parameter(3.0, "metres")
     power: float = parameter(1e6, "over the detection threshold")
 
-    def echoes(self, pulses, echoes, *, rng):
-        del rng
+    def echoes(self, pulses, echoes, *, at, rng):
+        del at, rng
         number = np.arange(len(pulses))
         distance = np.full(len(pulses), self.distance)
         apparent = pulses.apparent(np.full(len(pulses), self.power), distance)
@@ -53,14 +54,18 @@ class Injected(Stage):
 class Shifted(Stage):
     """All returns are moved to the left."""
 
-    def cloud(self, cloud, *, rng):
-        del rng
+    def cloud(self, cloud, *, at, rng):
+        del at, rng
         moved = np.full(len(cloud), Origin.MOVED, np.uint8)
         return replace(cloud, xyz=cloud.xyz + np.float32([0, 1, 0]), origin=moved)
 
 
 def swept(settings=PLAIN, *, sensor="vlp16", frame=2, **options):
     return cast(load_sensor(sensor, **options), ROOF, frame=frame, seed=5, settings=settings, **HERE)
+
+
+def altered(sweep, stages, **known):
+    return altered_sweep(sweep, stages, at=Situation(sweep.sensor.name, sweep.frame, **known))
 
 
 def plain(settings=PLAIN, **options):
@@ -80,7 +85,7 @@ def assert_same(cloud, other):
 @pytest.mark.parametrize("mode", ["strongest", "dual"])
 def test_stages_without_an_effect_leave_the_returns_unchanged(effects, mode):
     idle = read_stages(["cover_glass:transmission=1", "dropped_packets:loss=0"], seed=5)
-    found = altered_sweep(swept(effects, return_mode=mode), idle)
+    found = altered(swept(effects, return_mode=mode), idle)
     expected = plain(effects, return_mode=mode)
     assert_same(found.cloud, expected)
     assert_same(found.original, expected)
@@ -96,7 +101,7 @@ def test_stages_without_an_effect_leave_the_returns_unchanged(effects, mode):
 @given(loss=st.floats(0, 1), burst=st.floats(1, 50), columns=st.integers(1, 2000), seed=st.integers(0, 9))
 def test_kept_and_removed_returns_are_the_original(loss, burst, columns, seed):
     stages = chain(DroppedPackets(loss, burst, columns), seed=seed)
-    found = altered_sweep(SWEPT, stages)
+    found = altered(SWEPT, stages)
     assert_same(found.original, PLAIN_CLOUD)
     truth = cloud_truth(found, start_ns=0)
     rows = np.concatenate([truth["source"], truth["removed"]])
@@ -114,23 +119,25 @@ SWEPT, PLAIN_CLOUD = swept(), plain()
 
 def test_lost_packets_have_the_given_loss_and_burst_length():
     rows = 400_000
-    cloud = altered_sweep(SWEPT, Stages()).cloud
+    cloud = altered(SWEPT, Stages()).cloud
     many = replace(
         cloud,
         **{f.name: getattr(cloud, f.name)[np.zeros(rows, int)] for f in fields(cloud)[1:]},
     )
     many = replace(many, column=np.arange(rows, dtype=np.int32), source=np.arange(rows, dtype=np.int32))
-    kept = DroppedPackets(0.2, 5, 1).cloud(many, rng=np.random.default_rng(1))
+    kept = DroppedPackets(0.2, 5, 1).cloud(many, at=Situation("vlp16", 2), rng=np.random.default_rng(1))
     lost = np.ones(rows, bool)
     lost[kept.source] = False
     assert lost.mean() == pytest.approx(0.2, abs=0.01)
     bursts = np.count_nonzero(np.diff(lost.astype(int)) == 1)
     assert lost.sum() / bursts == pytest.approx(5, rel=0.05)
-    assert len(DroppedPackets(1, 1, 1).cloud(many, rng=np.random.default_rng(1))) == 0
+    assert (
+        len(DroppedPackets(1, 1, 1).cloud(many, at=Situation("vlp16", 2), rng=np.random.default_rng(1))) == 0
+    )
 
 
 def test_an_injected_echo_hides_the_surface_in_strongest_mode_and_joins_it_in_dual_mode():
-    found = altered_sweep(SWEPT, chain(Injected(3.0)))
+    found = altered(SWEPT, chain(Injected(3.0)))
     injected = found.cloud.origin == Origin.INJECTED
     near = np.linalg.norm(found.cloud.xyz[injected], axis=1)
     assert near == pytest.approx(3.0, abs=0.1)
@@ -146,7 +153,7 @@ def test_an_injected_echo_hides_the_surface_in_strongest_mode_and_joins_it_in_du
     assert np.array_equal(found.original.ring[order], found.cloud.ring[injected][hides])
     truth = cloud_truth(found, start_ns=0)
     assert np.array_equal(truth["removed"], np.sort(order))
-    dual = altered_sweep(swept(return_mode="dual"), chain(Injected(3.0)))
+    dual = altered(swept(return_mode="dual"), chain(Injected(3.0)))
     added = dual.cloud.origin == Origin.INJECTED
     assert (dual.cloud.hidden[added] == -1).all()
     assert len(cloud_truth(dual, start_ns=0)["removed"]) == 0
@@ -154,16 +161,16 @@ def test_an_injected_echo_hides_the_surface_in_strongest_mode_and_joins_it_in_du
 
 def test_an_injected_echo_obeys_threshold_separation_and_range_limits():
     effects = ScannerSettings(link=True)
-    faint = altered_sweep(swept(effects), chain(Injected(3.0, power=0.9)))
+    faint = altered(swept(effects), chain(Injected(3.0, power=0.9)))
     assert_same(faint.cloud, plain(effects))
-    bright = altered_sweep(swept(effects), chain(Injected(3.0, power=1.1)))
+    bright = altered(swept(effects), chain(Injected(3.0, power=1.1)))
     assert (bright.cloud.origin == Origin.INJECTED).sum() > 5000
-    far = altered_sweep(swept(effects), chain(Injected(200.0)))
+    far = altered(swept(effects), chain(Injected(200.0)))
     assert (far.cloud.origin == Origin.SURFACE).all()
     wall = world(plate(20.0))
     sweep = cast(load_sensor("utm30lx"), Mount(), trajectory=driven(), world=wall, frame=0)
     ahead = np.argmin(np.abs(sweep.echoes.range - 20))
-    both = altered_sweep(sweep, chain(Injected(20.05, power=1e-3)))
+    both = altered(sweep, chain(Injected(20.05, power=1e-3)))
     row = np.flatnonzero(both.cloud.source == ahead)
     assert len(row) == 1  # one echo, of the wall, which sends back more
     assert both.cloud.origin[row[0]] == Origin.SURFACE
@@ -174,9 +181,7 @@ def test_an_injected_echo_obeys_threshold_separation_and_range_limits():
 
 def test_returns_that_a_stage_leaves_alone_keep_their_noise():
     """A cover glass over the left half changes no return on the right, noise included."""
-    found = altered_sweep(
-        swept(NOISY), read_stages(["cover_glass:transmission=0.2,azimuth=90,width=180"], seed=5)
-    )
+    found = altered(swept(NOISY), read_stages(["cover_glass:transmission=0.2,azimuth=90,width=180"], seed=5))
     right = found.cloud.xyz[:, 1] < -0.5
     assert (found.cloud.source[right] >= 0).all()
     assert np.array_equal(found.cloud.range[right], found.original.range[found.cloud.source[right]])
@@ -187,7 +192,7 @@ def test_returns_that_a_stage_leaves_alone_keep_their_noise():
 
 def test_cover_glass_attenuates_by_the_square_of_its_transmission():
     effects = ScannerSettings(link=True)
-    found = altered_sweep(swept(effects), read_stages(["cover_glass:transmission=0.5"]))
+    found = altered(swept(effects), read_stages(["cover_glass:transmission=0.5"]))
     diffuse = found.cloud.feature != 11  # codes of retro-reflectors are logarithmic
     before = found.original.intensity[found.cloud.source]
     assert found.cloud.intensity[diffuse] == pytest.approx(before[diffuse] / 4, rel=1e-5)
@@ -195,7 +200,7 @@ def test_cover_glass_attenuates_by_the_square_of_its_transmission():
 
 
 def test_moved_returns_replace_their_source():
-    found = altered_sweep(SWEPT, chain(Shifted()))
+    found = altered(SWEPT, chain(Shifted()))
     assert np.array_equal(found.cloud.hidden, found.cloud.source)
     truth = cloud_truth(found, start_ns=0)
     assert np.array_equal(truth["removed_xyz"], PLAIN_CLOUD.xyz)
@@ -203,9 +208,9 @@ def test_moved_returns_replace_their_source():
 
 def test_random_numbers_depend_on_seed_stage_sensor_and_frame_alone():
     stages = read_stages(["dropped_packets:loss=0.3", "dropped_packets:loss=0.3"], seed=5)
-    first = altered_sweep(SWEPT, stages).cloud.source
-    altered_sweep(swept(frame=1), stages)
-    assert np.array_equal(first, altered_sweep(SWEPT, stages).cloud.source)
+    first = altered(SWEPT, stages).cloud.source
+    altered(swept(frame=1), stages)
+    assert np.array_equal(first, altered(SWEPT, stages).cloud.source)
     draws = {
         (seed, name, sensor, frame): NamedStage(name, DroppedPackets())
         .rng(seed, sensor, frame=frame)
@@ -224,7 +229,7 @@ def test_random_numbers_depend_on_seed_stage_sensor_and_frame_alone():
 
 def test_a_stage_may_act_on_one_sensor():
     stages = read_stages(["dropped_packets:loss=1,sensor=other"])
-    assert_same(altered_sweep(SWEPT, stages).cloud, PLAIN_CLOUD)
+    assert_same(altered(SWEPT, stages).cloud, PLAIN_CLOUD)
     assert not stages.act_on("vlp16", kind="lidar")
     assert stages.act_on("other", kind="lidar")
     assert not stages.act_on("other", kind="camera")
@@ -239,7 +244,7 @@ def test_lost_rows_are_black_and_kept_as_truth():
     blank = np.zeros((40, 4))
     frame = Frame(rgb, blank.astype(np.float32), blank.astype(np.uint8), blank.astype(np.int32))
     stages = read_stages(["lost_rows:loss=0.5,rows=4"], seed=3)
-    found = altered_image(frame, stages, sensor="front", frame=0)
+    found = altered_image(frame, stages, at=Situation("front", 0))
     black = (found.rgb == 0).all(axis=(1, 2))
     assert 0 < black.sum() < 40
     assert (black.reshape(10, 4).all(axis=1) | ~black.reshape(10, 4).any(axis=1)).all()
@@ -303,15 +308,17 @@ def test_recorded_clouds_stay_the_same_without_an_effect(effects, mode):
     recorded = plain(effects, return_mode=mode)
     sensor = load_sensor("vlp16", return_mode=mode)
     idle = read_stages(["cover_glass:transmission=1", "dropped_packets:loss=0"])
-    found = altered_recording(recorded, idle, sensor=sensor, frame=2)
+    found = altered_recording(recorded, idle, sensor=sensor, at=Situation(sensor.name, 2))
     assert_same(found.cloud, recorded)
     assert np.array_equal(found.cloud.source, np.arange(len(recorded)))
 
 
 def test_dropped_packets_of_a_recorded_cloud_are_those_of_the_drive():
     stages = read_stages(["dropped_packets:loss=0.3,burst=4"], seed=5)
-    driven_cloud = altered_sweep(SWEPT, stages).cloud
-    recorded = altered_recording(PLAIN_CLOUD, stages, sensor=load_sensor("vlp16"), frame=2).cloud
+    driven_cloud = altered(SWEPT, stages).cloud
+    recorded = altered_recording(
+        PLAIN_CLOUD, stages, sensor=load_sensor("vlp16"), at=Situation("vlp16", 2)
+    ).cloud
     assert_same(recorded, driven_cloud)
     assert np.array_equal(recorded.source, driven_cloud.source)
 
@@ -319,12 +326,14 @@ def test_dropped_packets_of_a_recorded_cloud_are_those_of_the_drive():
 def test_echo_stages_treat_recorded_returns_as_echoes():
     effects = ScannerSettings(link=True)
     glass = read_stages(["cover_glass:transmission=0.5"])
-    simulated = altered_sweep(swept(effects), glass)
-    recorded = altered_recording(plain(effects), glass, sensor=load_sensor("vlp16"), frame=2)
+    simulated = altered(swept(effects), glass)
+    recorded = altered_recording(plain(effects), glass, sensor=load_sensor("vlp16"), at=Situation("vlp16", 2))
     assert np.array_equal(recorded.cloud.source, simulated.cloud.source)
     assert recorded.cloud.intensity == pytest.approx(simulated.cloud.intensity, rel=1e-4)
     assert np.array_equal(recorded.cloud.xyz, simulated.cloud.xyz)
-    near = altered_recording(PLAIN_CLOUD, chain(Injected(3.0)), sensor=load_sensor("vlp16"), frame=2)
+    near = altered_recording(
+        PLAIN_CLOUD, chain(Injected(3.0)), sensor=load_sensor("vlp16"), at=Situation("vlp16", 2)
+    )
     injected = near.cloud.origin == Origin.INJECTED
     assert injected.sum() > 5000
     assert np.linalg.norm(near.cloud.xyz[injected], axis=1) == pytest.approx(3.0, abs=0.1)
@@ -332,7 +341,7 @@ def test_echo_stages_treat_recorded_returns_as_echoes():
 
 
 def test_a_rule_selects_returns_of_both_clouds():
-    found = altered_sweep(swept(return_mode="dual"), chain(Injected(3.0), DroppedPackets(0.3)))
+    found = altered(swept(return_mode="dual"), chain(Injected(3.0), DroppedPackets(0.3)))
     early = found.where(lambda cloud: cloud.time_ns < 40_000_000)
     assert 0 < len(early.original) < len(found.original)
     known = early.cloud.source >= 0

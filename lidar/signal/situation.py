@@ -1,0 +1,34 @@
+"""What stages know of the frame that they act on, beside its echoes, its cloud or its image."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.geometry.poses import Poses
+from lidar.world.world import World
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """Where and when a sensor takes a frame, as far as it is known.
+
+    sensor   : its name
+    frame    : number of the frame; of clouds that are not numbered, the file's name without its ending
+    start_ns : of the frame, nanoseconds since the drive's start
+    utc      : of the drive's start; None for clouds without a dataset
+    poses    : of the sensor in the scene frame at times (n,) in nanoseconds since the drive's start; None for
+        clouds without a dataset
+    world    : what rays hit; None for recorded data
+    """
+
+    sensor: str
+    frame: int | str
+    start_ns: int = 0
+    utc: datetime | None = None
+    poses: Callable[[NDArray[np.int64]], Poses] | None = None
+    world: World | None = None
