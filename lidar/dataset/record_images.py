@@ -41,8 +41,9 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
     rows = len(times) // samples
     first = (samples // 2) * rows  # of the exposure's middle sample, whose depth and labels are kept
     start = camera.frame_start_ns(frame)
-    world = worlds.during(start, max(int(times[-1]), start + 1))
-    image = _rendered(recording, camera, frame=frame, times=times, world=world)
+    span_ns = start, max(int(times[-1]), start + 1)
+    world = worlds.during(*span_ns)
+    image = _rendered(recording, camera, frame=frame, times=times, span_ns=span_ns, world=world)
     if recording.actors is not None:
         with watch.stage("boxes"):
             middle = int(times[first + rows // 2])
@@ -72,12 +73,16 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
 
 
 def _rendered(
-    recording: Recording, camera: Camera, *, frame: int, times: NDArray[np.int64], world: World
+    recording: Recording,
+    camera: Camera,
+    *,
+    frame: int,
+    times: NDArray[np.int64],
+    span_ns: tuple[int, int],
+    world: World,
 ) -> Image:
-    """A frame of a camera; ``times`` are its exposure times."""
-    contents = recording.contents
-    start = camera.frame_start_ns(frame)
-    end = max(int(times[-1]), start + 1)
+    """A frame of a camera; ``times`` are its exposure times, ``span_ns`` the times of the world's motion."""
+    contents, (start, end) = recording.contents, span_ns
     with recording.watch.stage("render"):
         return render(
             camera.spec,

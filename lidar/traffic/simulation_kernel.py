@@ -39,7 +39,7 @@ _AT_REST = 0.01  # m/s
 _STOP_STEPS = 10  # steps at rest at a stop sign
 _DEADLOCK_STEPS = 50  # steps at rest after which road users that wait for each other are a deadlock
 _ARRIVED_STEPS = 30  # steps at rest at the end of a path after which a road user disappears
-_LOOK_EVERY = 10  # steps
+_LOOK_EVERY = 10  # steps from one search for deadlocks to the next
 _AT_LINE = 3.0  # metres from the stop line within which a road user has stopped there
 NOBODY = -1
 """Owner of a cell that is not reserved, and route of a cell that no road user holds."""
@@ -427,11 +427,7 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
     line = not m.user[i].leaves
     must_stop = False
     b = st[i].block
-    if (
-        b < m.user[i + 1].block_start
-        and st[i].granted
-        and (_signal_will_change(i, k, t, m, st, signals) or _is_queueing(i, m, g, st))
-    ):
+    if st[i].granted and (_signal_will_change(i, k, t, m, st, signals) or _is_queueing(i, m, g, st)):
         _release_junction(i, m, g, st)
     if b < m.user[i + 1].block_start and not st[i].granted:
         near = m.block[b].stop - k <= (v * v / (1.3 * m.user[i].deceleration) + 2.0 * v) / STEP + 12
