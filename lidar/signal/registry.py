@@ -18,13 +18,13 @@ from lidar.random_streams import generator
 from lidar.signal.stage import Stage
 
 _STAGES = {
-    "cover_glass": "cover_glass.CoverGlass",
-    "dropped_packets": "dropped_packets.DroppedPackets",
-    "lost_rows": "lost_rows.LostRows",
+    "cover_glass": "signal.cover_glass.CoverGlass",
+    "dropped_packets": "signal.dropped_packets.DroppedPackets",
+    "lost_rows": "signal.lost_rows.LostRows",
 }
-"""Module within this folder and class, by name."""
+"""Module within `lidar` and class, by name."""
 
-SEAMS = {"echoes": "lidar", "cloud": "lidar", "image": "camera"}
+SEAMS = {"echoes": "lidar", "cloud": "lidar", "image": "camera", "fixes": "gnss", "samples": "imu"}
 """Kind of sensor of each seam; a stage has a method of that name for each seam that it acts on."""
 
 
@@ -70,7 +70,7 @@ class Stages:
         return [s for s in self.stages if s.sensor in ("", sensor) and hasattr(s.stage, seam)]
 
     def act_on(self, sensor: str, *, kind: str) -> bool:
-        """Whether any stage acts on a sensor of a kind, ``lidar`` or ``camera``."""
+        """Whether any stage acts on a sensor of a kind of `SEAMS`."""
         return any(self.at(seam, sensor) for seam, of in SEAMS.items() if of == kind)
 
     def check(self, sensors: Mapping[str, str]) -> None:
@@ -96,8 +96,8 @@ def stage_class(name: str) -> type[Stage]:
         near = get_close_matches(name, _STAGES, 1)
         hint = f"; is {near[0]} meant?" if near else ""
         raise InputError(f"stage {name!r} is unknown{hint} (known are {', '.join(_STAGES)})")
-    module, kind = _STAGES[name].split(".")
-    return cast("type[Stage]", getattr(import_module(f"lidar.signal.{module}"), kind))
+    module, _, kind = _STAGES[name].rpartition(".")
+    return cast("type[Stage]", getattr(import_module(f"lidar.{module}"), kind))
 
 
 def read_stage(table: Mapping[str, Any]) -> NamedStage:
