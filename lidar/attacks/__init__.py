@@ -1,0 +1,1 @@
+"""Stages that an attacker causes: injected, replayed, removed and moved returns."""
