@@ -1,0 +1,298 @@
+"""What weather there is: one kind with its amount, where and when; read from text and TOML files."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from lidar.errors import InputError
+from lidar.signal.stage import Stage, parameter
+
+FOREVER = 1e9
+"""Seconds; the default end of weather."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of weather.
+
+    unit      : of the amount
+    meaning   : of the amount
+    low, high : bounds of the amount, both allowed
+    default   : amount of a text without one; None if it must be given
+    media     : words for ``medium``, the default first
+    """
+
+    unit: str
+    meaning: str
+    low: float
+    high: float
+    default: float | None
+    media: tuple[str, ...]
+
+
+KINDS = {
+    "rain": Kind("mm/h", "rain rate", 0.0, 300.0, None, ("marshall-palmer", "large-drop")),
+    "fog": Kind(
+        "m",
+        "visibility at 2 % contrast",
+        5.0,
+        1e5,
+        None,
+        ("kim", "kruse", "advection", "radiation", "strong-advection", "moderate-advection", "chu-hogg"),
+    ),
+    "snow": Kind(
+        "mm/h",
+        "snowfall rate as water",
+        0.0,
+        50.0,
+        None,
+        ("gunn-marshall", "sekhon-srivastava", "itu-dry", "itu-wet"),
+    ),
+    "dust": Kind("m", "visibility within the dust", 2.0, 1e5, 20.0, ("plumes", "even")),
+    "spray": Kind("mm", "depth of the water on the road", 0.0, 10.0, 1.0, ("plumes",)),
+    "clear": Kind("", "nothing", 0.0, 0.0, 0.0, ("air",)),
+}
+"""Kinds of weather; ``clear`` carries the sun, the cover glass and wet ground without anything in the air."""
+
+MODELS = {
+    "physical": tuple(KINDS),
+    "lisa": ("rain", "snow", "fog"),
+    "goodin": ("rain",),
+    "hahner_fog": ("fog",),
+    "hahner_snow": ("snow",),
+}
+"""Models of what lasers measure, and the kinds that each knows."""
+
+_UNITS = {
+    "mm/h": {"mm/h": 1.0, "cm/h": 10.0},
+    "m": {"m": 1.0, "km": 1000.0},
+    "mm": {"mm": 1.0, "cm": 10.0},
+    "": {},
+}
+_AMOUNT = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(\S*)\s*")
+
+
+@dataclass(frozen=True)
+class WeatherSetting(Stage):
+    """Weather of one kind; several settings act one after the other, in the order given.
+
+    Raises InputError for a value that is out of bounds or does not belong to the kind.
+    """
+
+    kind: str = parameter("rain", "what is in the air", among=tuple(KINDS))
+    amount: float = parameter(
+        10.0, "rain and snow: mm/h (as water); fog and dust: visibility, m; spray: mm of water on the road"
+    )
+    amount_to: float = parameter(-1.0, "amount at the end, approached linearly; -1: amount, all the time")
+    start: float = parameter(0.0, "begin, seconds since the drive's start", low=0, high=FOREVER)
+    end: float = parameter(FOREVER, "end, seconds since the drive's start", low=0, high=FOREVER)
+    model: str = parameter("physical", "model of what lasers measure", among=tuple(MODELS))
+    medium: str = parameter("", "law of extinction and sizes of the particles; of the kind if empty")
+    longitude: float = parameter(0.0, "centre of the place, degrees, with radius", low=-180, high=180)
+    latitude: float = parameter(0.0, "centre of the place, degrees, with radius", low=-90, high=90)
+    radius: float = parameter(0.0, "radius of the place, metres; 0: everywhere", low=0, high=1e6)
+    polygon: str = parameter("", "the place as 'LON LAT, LON LAT, ...', degrees; everywhere if empty")
+    edge: float = parameter(
+        0.0, "metres over which the weather fades in at the place's edge", low=0, high=1e5
+    )
+    wind: float = parameter(0.0, "wind speed, m/s", low=0, high=60)
+    wind_from: float = parameter(270.0, "direction that the wind comes from, degrees", low=0, high=360)
+    wetness: float = parameter(-1.0, "wetness of surfaces, 0 to 1; -1: of the kind", low=-1, high=1)
+    snow_cover: float = parameter(-1.0, "share of ground under snow; -1: of the kind", low=-1, high=1)
+    drops: float = parameter(0.0, "share of the cover glass under drops of water", low=0, high=1)
+    dirt: float = parameter(0.0, "share of light that dirt on the cover glass absorbs", low=0, high=0.99)
+    sunlight: float = parameter(0.0, "direct sunlight, lux, which dazzles the detector", low=0, high=150_000)
+
+    def __post_init__(self) -> None:
+        """Validate the parameters, and fill in the medium of the kind."""
+        super().__post_init__()
+        kind = KINDS[self.kind]
+        if not self.medium:
+            object.__setattr__(self, "medium", kind.media[0])
+        if faults := _faults(self, kind):
+            raise InputError("; ".join(faults))
+
+    def amount_at(self, seconds: float) -> float | None:
+        """The amount at a time since the drive's start; None before and after the weather.
+
+        Visibilities change so that their reciprocal, the extinction, is linear in time.
+        """
+        if not self.start <= seconds < self.end:
+            return None
+        if self.amount_to < 0:
+            return self.amount
+        share = (seconds - self.start) / (self.end - self.start)
+        if KINDS[self.kind].unit == "m":
+            return 1 / ((1 - share) / self.amount + share / self.amount_to)
+        return (1 - share) * self.amount + share * self.amount_to
+
+    def corners(self) -> list[tuple[float, float]]:
+        """Longitude and latitude of the place's corners; empty without a polygon."""
+        pairs = [pair.split() for pair in self.polygon.split(",")] if self.polygon else []
+        return [(float(lon), float(lat)) for lon, lat in pairs]
+
+    def table(self) -> dict[str, Any]:
+        """The stage of this setting, as `lidar.signal.registry.read_stage` reads it."""
+        name = "weather" if self.model == "physical" else "weather_model"
+        return {"name": name, **asdict(self)}
+
+
+def _faults(setting: WeatherSetting, kind: Kind) -> list[str]:
+    """What is wrong with a setting whose values are each of their type."""
+    faults = []
+    amounts = {"amount": setting.amount}
+    if setting.amount_to != -1:
+        amounts["amount_to"] = setting.amount_to
+    faults += [
+        f"{name} = {value:g} {kind.unit} of {setting.kind} is not within {kind.low:g} to {kind.high:g}"
+        for name, value in amounts.items()
+        if not kind.low <= value <= kind.high
+    ]
+    if setting.medium not in kind.media:
+        faults.append(f"medium = {setting.medium!r} of {setting.kind} is none of {', '.join(kind.media)}")
+    if setting.kind not in MODELS[setting.model]:
+        known = [name for name, kinds in MODELS.items() if setting.kind in kinds]
+        faults.append(f"model {setting.model} has no {setting.kind}; {setting.kind} has {', '.join(known)}")
+    if setting.end <= setting.start:
+        faults.append(f"end = {setting.end:g} is not after start = {setting.start:g}")
+    if setting.amount_to >= 0 and setting.end == FOREVER:
+        faults.append("amount_to needs an end")
+    if setting.polygon and setting.radius:
+        faults.append("a place is a polygon or a centre with radius, not both")
+    if setting.polygon:
+        faults += _polygon_faults(setting)
+    return faults
+
+
+def _polygon_faults(setting: WeatherSetting) -> list[str]:
+    """What is wrong with the polygon of a setting."""
+    from shapely import Polygon  # noqa: PLC0415  (0.1 s)
+
+    try:
+        corners = setting.corners()
+    except ValueError:
+        return [f"polygon = {setting.polygon!r} is not 'LON LAT, LON LAT, ...' in degrees"]
+    if any(not (abs(lon) <= 180 and abs(lat) <= 90) for lon, lat in corners):
+        return ["polygon has corners that are not longitude and latitude in degrees"]
+    if len(corners) < 3 or not Polygon(corners).is_valid:
+        return ["polygon needs three or more corners, and its sides may not cross"]
+    return []
+
+
+def read_weather(text: str) -> tuple[WeatherSetting, ...]:
+    """Weather from a text such as ``rain=10mm/h``, ``fog=50m,medium=radiation`` or from a file ``FILE.toml``.
+
+    A text names one or more kinds, separated by commas, each followed by its parameters. A file has a table
+    ``[[weather]]`` for each setting, with ``kind``, ``amount``, optionally ``from`` and ``to`` (seconds),
+    ``polygon`` ([[lon, lat], ...]) or ``centre`` ([lon, lat]) and ``radius`` (metres), ``interpolation``
+    (``step`` or ``linear``, which goes to ``amount_to``), and the other parameters of `WeatherSetting`.
+
+    Raises InputError for what cannot be read.
+    """
+    if text.endswith(".toml"):
+        return _of_file(Path(text))
+    tables: list[dict[str, Any]] = []
+    for part in text.split(","):
+        name, equals, value = (word.strip() for word in part.partition("="))
+        if name in KINDS:
+            tables.append({"kind": name} | ({"amount": value} if equals else {}))
+        elif tables and equals:
+            tables[-1][name] = _number(value)
+        else:
+            known = ", ".join(KINDS)
+            raise InputError(f"weather {text!r}: {part.strip()!r} is no kind of weather; known are {known}")
+    try:
+        return tuple(_setting(table) for table in tables)
+    except InputError as error:
+        raise InputError(f"weather {text!r}: {error}") from None
+
+
+def _of_file(path: Path) -> tuple[WeatherSetting, ...]:
+    try:
+        document = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as TOML ({error})") from None
+    tables = document.pop("weather", None)
+    if document or not tables or not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
+        raise InputError(f"{path}: give tables [[weather]] with kind and amount, and nothing else")
+    found = []
+    for number, table in enumerate(tables, 1):
+        try:
+            found.append(_setting(_row(table)))
+        except InputError as error:
+            raise InputError(f"{path}: [[weather]] {number}: {error}") from None
+    return tuple(found)
+
+
+def _row(table: Mapping[str, Any]) -> dict[str, Any]:
+    """A table of a file with the names of `WeatherSetting`."""
+    row = {{"from": "start", "to": "end"}.get(key, key): value for key, value in table.items()}
+    if "kind" not in row:
+        raise InputError("kind is missing")
+    if "centre" in row:
+        centre = row.pop("centre")
+        if not _is_pair(centre) or "radius" not in row:
+            raise InputError("centre is [longitude, latitude] in degrees, with a radius in metres")
+        row["longitude"], row["latitude"] = centre
+    if isinstance(row.get("polygon"), list):
+        if not all(_is_pair(corner) for corner in row["polygon"]):
+            raise InputError("polygon is [[longitude, latitude], ...] in degrees")
+        row["polygon"] = ", ".join(f"{lon!r} {lat!r}" for lon, lat in row["polygon"])
+    way = row.pop("interpolation", "linear" if "amount_to" in row else "step")
+    if way not in ("step", "linear") or (way == "linear") != ("amount_to" in row):
+        raise InputError("interpolation is step, or linear with amount_to")
+    return row
+
+
+def _is_pair(value: Any) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(isinstance(x, int | float) and isfinite(x) for x in value)
+    )
+
+
+def _setting(table: Mapping[str, Any]) -> WeatherSetting:
+    known = [f.name for f in fields(WeatherSetting)]
+    if unknown := [key for key in table if key not in known]:
+        raise InputError(f"no parameter {unknown[0]!r} (known are {', '.join(known)})")
+    values = dict(table)
+    kind = KINDS.get(values["kind"]) if isinstance(values["kind"], str) else None
+    if kind is None:
+        raise InputError(f"kind = {values['kind']!r} is none of {', '.join(KINDS)}")
+    if "amount" not in values and kind.default is None:
+        raise InputError(f"{values['kind']} needs an amount ({kind.meaning}, {kind.unit})")
+    values.setdefault("amount", kind.default)
+    for name in ("amount", "amount_to"):
+        if isinstance(values.get(name), str):
+            values[name] = _amount(values[name], values["kind"])
+    return WeatherSetting(**values)
+
+
+def _amount(text: str, kind: str) -> float:
+    """An amount in the unit of its kind, from a number with or without a unit."""
+    unit = KINDS[kind].unit
+    found = _AMOUNT.fullmatch(text)
+    factors = {"": 1.0, **_UNITS[unit]}
+    if not found or found[2] not in factors:
+        raise InputError(
+            f"amount {text!r} of {kind} is not a number in {' or '.join(_UNITS[unit]) or 'no unit'}"
+        )
+    try:
+        return float(found[1]) * factors[found[2]]
+    except ValueError:
+        raise InputError(f"amount {text!r} of {kind} is not a number") from None
+
+
+def _number(text: str) -> float | str:
+    """A number if the text is one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
