@@ -1,4 +1,4 @@
-"""Daylight under a clear sky: direct sunlight, sky radiance and ambient irradiance."""
+"""Daylight under a clear or clouded sky: direct sunlight, sky radiance and ambient irradiance."""
 
 from __future__ import annotations
 
@@ -25,6 +25,11 @@ _GROUND = 0.18  # albedo of what lies below the horizon
 _MULTIPLE = 3.0
 _GREYING = 0.4  # share of ambient light that is reflected by grey walls and pavements
 
+# Irradiance under clouds by their share N of the sky: G = G0 (1 - 0.75 N^3.4), of which the diffuse share is
+# 0.3 + 0.7 N^2 (Kasten and Czeplak, Solar Energy 24, 1980). The radiance of an overcast sky is
+# (1 + 2 sin(elevation)) / 3 of that of its zenith (CIE standard overcast sky, ISO 15469).
+_CLOUD_LOSS, _CLOUD_POWER = 0.75, 3.4
+
 
 @dataclass(frozen=True)
 class Light:
@@ -36,6 +41,7 @@ class Light:
     sky       : (rows, columns, 3) radiance of the sky: rows by sqrt(elevation / 90°) from 0 to 1, columns by
                 the cosine of the azimuth from the sun, from 1 to -1
     horizon   : (3,) mean radiance at the horizon, the colour of haze
+    mean      : (3,) mean radiance from all directions, the sun's beam included: the colour of dense fog
     exposure  : factor that brings a level surface of 18 % in sun and sky to a quarter of full scale
     """
 
@@ -44,6 +50,7 @@ class Light:
     ambient: Float
     sky: Float
     horizon: Float
+    mean: Float
     exposure: float
 
 
@@ -94,8 +101,10 @@ def _harmonics(n: Float) -> Float:
     )
 
 
-def daylight(direction: ArrayLike, *, rows: int = 64, columns: int = 64) -> Light:
-    """The light of a clear day with the sun towards ``direction`` (3,), scene axes.
+def daylight(direction: ArrayLike, *, cloud: float = 0.0, rows: int = 64, columns: int = 64) -> Light:
+    """The light of a day with the sun towards ``direction`` (3,), scene axes.
+
+    cloud : share of the sky that clouds cover, 0 to 1
 
     With the sun below the horizon there is no direct light and the sky fades to that of a moonlit night; the
     exposure follows. Ambient light is stored as spherical harmonics of order 2 (Ramamoorthi and Hanrahan, An
@@ -121,7 +130,11 @@ def daylight(direction: ArrayLike, *, rows: int = 64, columns: int = 64) -> Ligh
     cos_turn = (normal[:, 0] * s[0] + normal[:, 1] * s[1]) / np.maximum(bearing * np.hypot(s[0], s[1]), 1e-9)
     radiance = sky_colour(sky, normal[:, 2], cos_turn=cos_turn)
     above = normal[:, 2] > 0
-    down = (radiance * (weight * normal[:, 2])[:, None])[above].sum(axis=0) + beam * max(rise, 0.0)
+    diffuse = (radiance * (weight * normal[:, 2])[:, None])[above].sum(axis=0)
+    down = diffuse + beam * max(rise, 0.0)
+    if cloud > 0:
+        beam, sky, down = _clouded(beam, sky, diffuse=diffuse, rise=rise, sine=sine, cloud=cloud)
+        radiance = sky_colour(sky, normal[:, 2], cos_turn=cos_turn)
     radiance[~above] = _GROUND / np.pi * down
     basis = _harmonics(normal)
     # The clamped cosine in harmonics: pi, 2 pi / 3, pi / 4 for the orders 0, 1, 2.
@@ -129,7 +142,25 @@ def daylight(direction: ArrayLike, *, rows: int = 64, columns: int = 64) -> Ligh
     ambient = lobe[:, None] * np.einsum("ki,k,kc->ic", basis, weight, radiance)
     ambient += _GREYING * (ambient.mean(axis=1, keepdims=True) - ambient)
     exposure = 0.25 / 0.18 * np.pi / float(down.mean())
-    return Light(s, beam, ambient, sky, sky[1].mean(axis=0), exposure)
+    mean = (np.einsum("k,kc->c", weight, radiance) + beam) / (4 * np.pi)
+    return Light(s, beam, ambient, sky, sky[1].mean(axis=0), mean, exposure)
+
+
+def _clouded(
+    beam: Float, sky: Float, *, diffuse: Float, rise: float, sine: Float, cloud: float
+) -> tuple[Float, Float, Float]:
+    """Beam, sky and downward irradiance under clouds that cover a share of the sky.
+
+    diffuse : (3,) irradiance of the clear sky on level ground
+    rise    : sine of the sun's elevation
+    sine    : (rows, 1) of the elevation, of the rows of ``sky``
+    """
+    clear = diffuse + beam * max(rise, 0.0)
+    down = clear * (1 - _CLOUD_LOSS * cloud**_CLOUD_POWER)
+    beam = beam * (1 - _CLOUD_LOSS * cloud**_CLOUD_POWER) * (1 - cloud**2)
+    rest = down - beam * max(rise, 0.0) - (1 - cloud) * diffuse
+    overcast = (1 + 2 * sine[..., None]) / 3 * rest / (7 * np.pi / 9)
+    return beam, (1 - cloud) * sky + overcast, down
 
 
 def _sphere(rows: int, columns: int) -> tuple[Float, Float]:

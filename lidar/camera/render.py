@@ -44,6 +44,7 @@ class RenderOptions:
     detail      : draw windows, joints and grain on surfaces of uniform colour
     supersample : rays along each side of a pixel, for colour only; labels and depth are those of its centre
     visibility  : metres at which haze has taken 98 % of a contrast (Koschmieder); inf for clear air
+    cloud       : share of the sky that clouds cover
     exposure    : stops added to the automatic exposure
     full_well   : electrons at full scale, which set the shot noise; inf for none
     read_noise  : electrons (standard deviation), with a finite ``full_well``
@@ -56,6 +57,7 @@ class RenderOptions:
     detail: bool = True
     supersample: int = 1
     visibility: float = 20_000.0
+    cloud: float = 0.0
     exposure: float = 0.0
     full_well: float = float("inf")
     read_noise: float = 4.0
@@ -63,7 +65,8 @@ class RenderOptions:
 
     def __post_init__(self) -> None:
         """Raise InputError for values out of range."""
-        if not (1 <= self.supersample <= 16 and self.visibility > 0 and self.full_well > 0 and self.threads):
+        sound = 1 <= self.supersample <= 16 and self.visibility > 0 and 0 <= self.cloud <= 1
+        if not (sound and self.full_well > 0 and self.threads):
             raise InputError(f"camera options out of range: {self}")
 
 
@@ -149,7 +152,7 @@ def render(
     rgb = np.empty((h, w, 3), np.uint8)
     depth, klass = np.empty((h, w), np.float32), np.empty((h, w), np.uint8)
     feature = np.empty((h, w), np.int32)
-    light = _light(tuple(float(c) for c in np.asarray(sun, float)))
+    light = light_of(sun, cloud=options.cloud)
     walls = facades_of(world)
     k = options.supersample
     fine = _finer(camera, k)
@@ -194,9 +197,15 @@ def render(
     return Frame(rgb if coloured else None, depth, klass, feature)
 
 
+def light_of(sun: ArrayLike, *, cloud: float) -> Light:
+    """The light of `render` with the sun towards ``sun`` (3,), scene axes."""
+    x, y, z = np.asarray(sun, float).tolist()
+    return _light((x, y, z), cloud)
+
+
 @functools.lru_cache(maxsize=8)
-def _light(sun: tuple[float, float, float]) -> Light:
-    return daylight(sun)
+def _light(sun: tuple[float, float, float], cloud: float) -> Light:
+    return daylight(sun, cloud=cloud)
 
 
 def _finer(camera: CameraSpec, k: int) -> CameraSpec:

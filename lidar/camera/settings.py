@@ -23,6 +23,7 @@ class CameraSettings:
     supersample  : rays along each side of a pixel, for colour: 1 to 16
     blur         : samples of the exposure (the camera's ``exposure_ns``) that are averaged: motion blur
     haze         : distance in metres at which haze removes 98 % of contrast; inf for clear air
+    cloud        : share of the sky that clouds cover, 0 to 1; overcast light casts no shadows
     camera_noise : shot noise and read noise (the camera's ``full_well``, ``read_noise``)
     """
 
@@ -33,6 +34,7 @@ class CameraSettings:
     supersample: int = 1
     blur: int = 5
     haze: float = 20_000.0
+    cloud: float = 0.0
     camera_noise: bool = False
 
     def __post_init__(self) -> None:
@@ -46,6 +48,8 @@ class CameraSettings:
             faults.append(f"blur={self.blur}: give 1 to 64")
         if not self.haze > 0:
             faults.append(f"haze={self.haze}: give metres above 0, or inf")
+        if not 0 <= self.cloud <= 1:
+            faults.append(f"cloud={self.cloud:g}: give 0 to 1")
         if faults:
             raise InputError("; ".join(faults))
 
@@ -62,6 +66,7 @@ class CameraSettings:
             detail=self.detail,
             supersample=self.supersample,
             visibility=self.haze,
+            cloud=self.cloud,
             exposure=camera.exposure_ev,
             full_well=camera.full_well if self.camera_noise else np.inf,
             read_noise=camera.read_noise,

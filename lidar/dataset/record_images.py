@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +10,12 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.csv_tables import write_columns
-from geoscene.frames import Frame
-from geoscene.typing import Float
 from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
 from lidar.camera.render import Frame as Image
 from lidar.camera.render import exposure_times, optical_flow, render
-from lidar.camera.sun import sun_direction
 from lidar.dataset.boxes import ImageBoxes, image_boxes
 from lidar.dataset.recording import Recording
-from lidar.dataset.situations import situation_of
+from lidar.dataset.situations import situation_of, sun_during
 from lidar.geometry.poses import Poses
 from lidar.random_streams import generator
 from lidar.rig.devices import Camera
@@ -28,9 +23,6 @@ from lidar.signal.run import altered_image, image_truth, write_truth
 from lidar.world.actors import Actors
 from lidar.world.thread_worlds import Worlds
 from lidar.world.world import World
-
-_SUN_NS = 10_000_000_000
-"""Nanoseconds between updates of the sun's direction, which changes by 0.04 degrees meanwhile."""
 
 
 def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> None:
@@ -88,7 +80,7 @@ def _rendered(
             camera.spec,
             _poses(recording, camera, times=times),
             world=world,
-            sun=_sun(recording, start),
+            sun=sun_during(recording, start),
             times=None if recording.actors is None else (times - start) / (end - start),
             random=generator(contents.seed, camera.name, frame, "image"),
             options=contents.camera.options(camera.spec),
@@ -142,15 +134,3 @@ def _flow(
     shares = [(t - start) / (end - start) for t in (times, later)]
     here, there = (_poses(recording, camera, times=t) for t in (times, later))
     return optical_flow(camera.spec, here, later=there, world=world, times=shares[0], later_times=shares[1])
-
-
-def _sun(recording: Recording, time_ns: int) -> Float:
-    """Direction (3,) towards the sun."""
-    when = recording.start + timedelta(seconds=(time_ns // _SUN_NS) * _SUN_NS // 10**9)
-    x, y = recording.trajectory.position[0, :2].tolist()
-    return _sun_direction(recording.frame, when, x=x, y=y)
-
-
-@functools.lru_cache(maxsize=4)
-def _sun_direction(frame: Frame, when: datetime, *, x: float, y: float) -> Float:
-    return sun_direction(frame, when, at=(x, y))

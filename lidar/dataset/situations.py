@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import functools
+from datetime import datetime, timedelta
+
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.frames import Frame
+from geoscene.typing import Float
+from lidar.camera.light import Light
+from lidar.camera.render import light_of
+from lidar.camera.sun import sun_direction
 from lidar.dataset.recording import Recording
 from lidar.geometry.poses import Poses
 from lidar.rig.devices import Camera, Scanner
 from lidar.signal.situation import Situation
 from lidar.world.world import World
+
+_SUN_NS = 10_000_000_000
+"""Nanoseconds between updates of the sun's direction, which changes by 0.04 degrees meanwhile."""
 
 
 def situation_of(
@@ -22,4 +33,32 @@ def situation_of(
         return recording.trajectory.at(time_ns).mounted(mount.translation, mount.rotation)
 
     start_ns = device.frame_start_ns(frame)
-    return Situation(device.name, frame, start_ns, utc=recording.start, poses=poses, world=world)
+    camera = device.spec if isinstance(device, Camera) else None
+    return Situation(
+        device.name,
+        frame,
+        start_ns,
+        utc=recording.start,
+        poses=poses,
+        world=world,
+        seed=recording.contents.seed,
+        camera=camera,
+        light=None if camera is None else light_during(recording, start_ns),
+    )
+
+
+def light_during(recording: Recording, time_ns: int) -> Light:
+    """Sun and sky of the images of a drive at a time."""
+    return light_of(sun_during(recording, time_ns), cloud=recording.contents.camera.cloud)
+
+
+def sun_during(recording: Recording, time_ns: int) -> Float:
+    """Direction (3,) towards the sun, scene axes."""
+    when = recording.start + timedelta(seconds=(time_ns // _SUN_NS) * _SUN_NS // 10**9)
+    x, y = recording.trajectory.position[0, :2].tolist()
+    return _sun_direction(recording.frame, when, x=x, y=y)
+
+
+@functools.lru_cache(maxsize=4)
+def _sun_direction(frame: Frame, when: datetime, *, x: float, y: float) -> Float:
+    return sun_direction(frame, when, at=(x, y))

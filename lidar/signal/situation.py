@@ -9,7 +9,9 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar.camera.light import Light
 from lidar.geometry.poses import Poses
+from lidar.rig.specs import CameraSpec
 from lidar.world.world import World
 
 
@@ -24,6 +26,9 @@ class Situation:
     poses    : of the sensor in the scene frame at times (n,) in nanoseconds since the drive's start; None for
         clouds without a dataset
     world    : what rays hit; None for recorded data
+    seed     : of the drive, for what lasts longer than a frame
+    camera   : the camera that takes an image; None of other sensors
+    light    : sun and sky of an image; None of other sensors
     """
 
     sensor: str
@@ -32,3 +37,6 @@ class Situation:
     utc: datetime | None = None
     poses: Callable[[NDArray[np.int64]], Poses] | None = None
     world: World | None = None
+    seed: int = 0
+    camera: CameraSpec | None = None
+    light: Light | None = None

@@ -122,3 +122,21 @@ def test_light_and_exposure_are_positive_at_any_hour(elevation):
         assert np.isfinite(values).all()
     assert (light.sky > 0).all()
     assert 0 < light.exposure < np.inf
+
+
+@pytest.mark.parametrize(("cloud", "share"), [(0.0, 1.0), (0.5, 0.929), (1.0, 0.25)])
+def test_clouds_take_the_share_of_the_light_that_kasten_and_czeplak_measured(cloud, share):
+    e = np.radians(40.0)
+    towards = [np.cos(e), 0.0, np.sin(e)]
+    clear, light = daylight(towards), daylight(towards, cloud=cloud)
+    assert clear.exposure / light.exposure == pytest.approx(share, abs=1e-3)
+    assert (light.sky > 0).all()
+
+
+def test_an_overcast_sky_is_three_times_as_bright_overhead_as_at_the_horizon():
+    e = np.radians(40.0)
+    light = daylight([np.cos(e), 0.0, np.sin(e)], cloud=1.0)
+    assert light.beam.max() == 0
+    np.testing.assert_allclose(light.sky[-1].mean(axis=0) / light.sky[0].mean(axis=0), 3.0)
+    # Fog in this light is bright: 0.7 to 0.9 of full scale.
+    assert 0.7 < light.mean[1] * light.exposure < 0.9
