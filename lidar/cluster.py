@@ -110,7 +110,9 @@ def _recorded(task: _Task) -> _Done:
         plan: DrivePlan = pickle.loads(task.plan.read_bytes())  # noqa: S301 - of the program that gave the task
         _station.recording = plan.recording(task.out)
         _station.sensors = plan.sensors
-        _station.worlds = Worlds(plan.scene, plan.max_range, actors=plan.actors)
+        _station.worlds = Worlds(
+            plan.scene, plan.max_range, actors=plan.actors, settings=_station.recording.contents.world
+        )
         _station.plan = task.plan
     recording, worlds = _station.recording, _station.worlds
     recording.watch.seconds.clear()

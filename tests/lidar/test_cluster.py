@@ -21,7 +21,14 @@ from lidar.pipeline import drive
 from lidar.sweep import sweep
 from lidar.traffic.populate import TrafficOptions
 
-OPTIONS = DriveOptions(rig="vlp16", duration=3.0, seed=3, formats=("pcd", "laz"), traffic=TrafficOptions())
+OPTIONS = DriveOptions(
+    rig="vlp16",
+    duration=3.0,
+    seed=3,
+    formats=("pcd", "laz"),
+    settings=(("reach", "30"),),
+    traffic=TrafficOptions(),
+)
 
 pytestmark = pytest.mark.filterwarnings("default:::distributed")
 
