@@ -194,8 +194,14 @@ def _apply_to_frame(
         path.parent.mkdir(parents=True, exist_ok=True)
     table = cloud_points(source[form.name])
     recorded = _completed(table_cloud(table, start_ns=begin), scanner.sensor, columns=form.columns)
+
+    def cloud_of(earlier: int) -> Cloud:
+        path = replace(recording, out=dataset.path).paths(scanner, earlier)[form.name]
+        cloud = table_cloud(cloud_points(path), start_ns=scanner.frame_start_ns(earlier))
+        return _completed(cloud, scanner.sensor, columns=form.columns)
+
     threshold = contents.scanner.link or contents.scanner.detection
-    at = situation_of(recording, scanner, frame=frame)
+    at = situation_of(recording, scanner, frame=frame, cloud_of=cloud_of)
     altered = altered_recording(recorded, contents.stages, sensor=scanner.sensor, at=at, threshold=threshold)
     cloud = altered.cloud
     if form.kitti:  # recorded without the vehicle's motion: all points are those of the frame's start
@@ -292,8 +298,9 @@ def _apply_to_clouds(
         place = path.relative_to(source)
         stem = path.name.removesuffix(form.suffix)
         device = devices[path.parent.name, form.name]
-        recorded = _completed(table_cloud(form.read(path)), device, columns=form.columns)
-        at = Situation(device.name, int(stem) if stem.isdigit() else stem)
+        recorded = _read_foreign(path, form, device=device)
+        frame = int(stem) if stem.isdigit() else stem
+        at = Situation(device.name, frame, earlier=_Former(clouds, done, device=device).cloud)
         altered = altered_recording(recorded, chosen, sensor=device, at=at)
         for target in (out / place, out / "truth" / place):
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -305,6 +312,32 @@ def _apply_to_clouds(
         before, after = before + len(recorded), after + len(altered.cloud)
     progress("stages", len(clouds), total=len(clouds))
     return ApplySummary(out, len(clouds), before, after)
+
+
+def _read_foreign(path: Path, form: Format, *, device: Sensor) -> Cloud:
+    """A point cloud of KITTI or nuScenes."""
+    return _completed(table_cloud(form.read(path)), device, columns=form.columns)
+
+
+@dataclass(frozen=True, slots=True)
+class _Former:
+    """The point clouds before one in the order of names, of the same folder.
+
+    clouds : all files
+    row    : of the one
+    """
+
+    clouds: Sequence[tuple[Path, Format]]
+    row: int
+    device: Sensor
+
+    def cloud(self, frames: int) -> Cloud | None:
+        """The cloud a number of frames before; None before the first."""
+        path, form = self.clouds[self.row]
+        row = self.row - frames
+        if row < 0 or self.clouds[row][0].parent != path.parent:
+            return None
+        return _read_foreign(self.clouds[row][0], form, device=self.device)
 
 
 def _select_labels(path: Path, out: Path, *, altered: Altered) -> None:

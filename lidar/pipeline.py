@@ -37,6 +37,7 @@ from lidar.options import DriveOptions
 from lidar.plan import DrivePlan, Job, Jobs, plan_drive
 from lidar.rig.devices import Scanner
 from lidar.world.thread_worlds import Worlds
+from lidar.world.world import Region
 
 CHUNK = 200.0
 """Scene metres along each axis that the vehicle may cover before other tiles are loaded."""
@@ -163,7 +164,7 @@ def _driven(
             record_on_cluster(
                 plan,
                 recording=recording,
-                chunks=chunks(pending, recording.trajectory),
+                chunks=recording_chunks(pending, recording),
                 cluster=cluster,
                 journal=journal,
                 progress=progress,
@@ -278,7 +279,7 @@ def record_all(
     worlds = Worlds(scene, max_range, actors=recording.actors, settings=recording.contents.world)
     workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
     with _pool(workers) as pool:
-        for chunk, region in chunks(jobs, recording.trajectory):
+        for chunk, region in recording_chunks(jobs, recording):
             with recording.watch.stage("load"):
                 recording.release()
                 worlds.follow(region)
@@ -323,9 +324,26 @@ def _take(running: set[Future[None]], *, finished: set[Future[None]]) -> int:
     return len(finished)
 
 
-def chunks(
-    jobs: Sequence[Job], trajectory: Trajectory
-) -> Iterator[tuple[Sequence[Job], tuple[float, float, float, float]]]:
+def recording_chunks(jobs: Sequence[Job], recording: Recording) -> Iterator[tuple[Sequence[Job], Region]]:
+    """`chunks` whose boxes also cover the places of earlier frames that stages ask for."""
+    back_ns = recording.contents.stages.lookback_ns
+    for run, box in chunks(jobs, recording.trajectory):
+        yield run, _widened(box, run, trajectory=recording.trajectory, back_ns=back_ns) if back_ns else box
+
+
+def _widened(box: Region, jobs: Sequence[Job], *, trajectory: Trajectory, back_ns: int) -> Region:
+    """A box that also covers where the vehicle was within some time before jobs."""
+    until, spans = 0, []
+    for job in jobs:  # in order of time
+        first = max(job.start_ns - back_ns, until, 0)
+        spans.append(np.arange(first, job.start_ns, job.sensor.period_ns // 4))
+        until = max(until, job.start_ns)
+    places = trajectory.at(np.concatenate(spans)).position[:, :2]
+    xy = np.vstack([places, np.reshape(box, (2, 2))])
+    return _box(xy.min(axis=0), xy.max(axis=0))
+
+
+def chunks(jobs: Sequence[Job], trajectory: Trajectory) -> Iterator[tuple[Sequence[Job], Region]]:
     """Runs of jobs during which the vehicle stays within a square of `CHUNK`, with the box it covers."""
     first = 0
     low = high = np.zeros(2)
@@ -344,5 +362,5 @@ def chunks(
         yield jobs[first:], _box(low, high)
 
 
-def _box(low: Float, high: Float) -> tuple[float, float, float, float]:
+def _box(low: Float, high: Float) -> Region:
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])

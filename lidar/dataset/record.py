@@ -17,5 +17,4 @@ def record_frame(recording: Recording, sensor: Scanner | Camera, *, frame: int, 
     if isinstance(sensor, Camera):
         record_images(recording, sensor, frame=frame, worlds=worlds)
         return 0
-    world = worlds.during(*sensor.sensor.window_ns(frame))
-    return record_cloud(recording, sensor, frame=frame, world=world)
+    return record_cloud(recording, sensor, frame=frame, worlds=worlds)

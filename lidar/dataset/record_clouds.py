@@ -15,6 +15,7 @@ from lidar.dataset.deskew import MOMENTS, deskewed
 from lidar.dataset.formats.table import Table, cloud_table, point_labels
 from lidar.dataset.recording import Recording
 from lidar.dataset.situations import situation_of
+from lidar.errors import LidarError
 from lidar.random_streams import generator
 from lidar.rig.devices import Scanner
 from lidar.sensors.cloud import Cloud, TracedCloud, no_returns
@@ -22,14 +23,15 @@ from lidar.sensors.doppler import radial_velocity, surface_velocity
 from lidar.sensors.scan import Sweep, cast, measured
 from lidar.signal.run import Altered, altered_sweep, cloud_truth, unaltered, write_truth
 from lidar.time_scales import gps_seconds
+from lidar.world.thread_worlds import Worlds
 from lidar.world.world import World
 
 
-def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> int:
+def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> int:
     """Scan one frame and write its clouds, labels and boxes; return the number of points."""
-    paths = recording.paths(scanner, frame)
+    paths, world = recording.paths(scanner, frame), worlds.during(*scanner.sensor.window_ns(frame))
     if recording.has_stages(scanner):
-        altered = _altered(recording, scanner, frame=frame, world=world)
+        altered = _altered(recording, scanner, frame=frame, worlds=worlds)
         write_truth(paths["truth"], cloud_truth(altered, start_ns=scanner.frame_start_ns(frame)))
         cloud: Cloud = altered.cloud
     else:
@@ -52,18 +54,31 @@ def _scanned(recording: Recording, scanner: Scanner, *, frame: int, world: World
     return cloud if recording.scanning_ns is None else cloud.where(_while_on(recording, cloud))
 
 
-def _altered(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> Altered:
+def _altered(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> Altered:
     """What a scanner measures in a frame, after the stages on it."""
+    window = scanner.sensor.window_ns(frame)
     if not _works(recording, scanner, frame=frame):
-        return unaltered(no_returns(scanner.sensor.window_ns(frame)[0]))
+        return unaltered(no_returns(window[0]))
+
+    def cloud_of(earlier: int) -> Cloud:
+        _check_lookback(recording, scanner, frames=frame - earlier)
+        then = worlds.during(*scanner.sensor.window_ns(earlier))
+        cloud = _scanned(recording, scanner, frame=earlier, world=then)
+        worlds.during(*window)  # this thread's world is again that of the frame
+        return cloud
+
+    world = worlds.during(*window)
+    at = situation_of(recording, scanner, frame=frame, world=world, cloud_of=cloud_of)
     with recording.watch.stage("scan"):
         sweep = _swept(recording, scanner, frame=frame, world=world)
-        altered = altered_sweep(
-            sweep,
-            recording.contents.stages,
-            at=situation_of(recording, scanner, frame=frame, world=world),
-        )
+        altered = altered_sweep(sweep, recording.contents.stages, at=at)
     return altered if recording.scanning_ns is None else altered.where(partial(_while_on, recording))
+
+
+def _check_lookback(recording: Recording, scanner: Scanner, *, frames: int) -> None:
+    """Raise LidarError if no stage says that it looks back so many frames: tiles there are not loaded."""
+    if frames * scanner.period_ns > recording.contents.stages.lookback_ns:
+        raise LidarError(f"a stage looks back {frames} frames of {scanner.name}, more than its `lookback`")
 
 
 def _swept(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> Sweep:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from datetime import datetime, timedelta
 
 import numpy as np
@@ -16,6 +17,7 @@ from lidar.camera.sun import sun_direction
 from lidar.dataset.recording import Recording
 from lidar.geometry.poses import Poses
 from lidar.rig.devices import Camera, Scanner
+from lidar.sensors.cloud import Cloud
 from lidar.signal.situation import Situation
 from lidar.world.world import World
 
@@ -24,13 +26,26 @@ _SUN_NS = 10_000_000_000
 
 
 def situation_of(
-    recording: Recording, device: Scanner | Camera, *, frame: int, world: World | None = None
+    recording: Recording,
+    device: Scanner | Camera,
+    *,
+    frame: int,
+    world: World | None = None,
+    cloud_of: Callable[[int], Cloud] | None = None,
 ) -> Situation:
-    """Where and when a sensor takes a frame; ``world`` during it, None for recorded data."""
+    """Where and when a sensor takes a frame.
+
+    world    : what rays hit during it; None for recorded data
+    cloud_of : the cloud of a frame of the same scanner, as without stages
+    """
     mount = device.spec.mount
 
     def poses(time_ns: NDArray[np.int64]) -> Poses:
         return recording.trajectory.at(time_ns).mounted(mount.translation, mount.rotation)
+
+    def earlier(frames: int) -> Cloud | None:
+        assert cloud_of is not None  # noqa: S101
+        return cloud_of(frame - frames) if 1 <= frames <= frame else None
 
     start_ns = device.frame_start_ns(frame)
     camera = device.spec if isinstance(device, Camera) else None
@@ -44,6 +59,7 @@ def situation_of(
         seed=recording.contents.seed,
         camera=camera,
         light=None if camera is None else light_during(recording, start_ns),
+        earlier=None if cloud_of is None else earlier,
     )
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from difflib import get_close_matches
 from importlib import import_module
-from math import isfinite
 from pathlib import Path
 from typing import Any, cast
 
@@ -72,6 +72,11 @@ class Stages:
     def act_on(self, sensor: str, *, kind: str) -> bool:
         """Whether any stage acts on a sensor of a kind of `SEAMS`."""
         return any(self.at(seam, sensor) for seam, of in SEAMS.items() if of == kind)
+
+    @property
+    def lookback_ns(self) -> int:
+        """Nanoseconds before a frame whose clouds the stages ask for."""
+        return max((math.ceil(named.stage.lookback * 1e9) for named in self.stages), default=0)
 
     def check(self, sensors: Mapping[str, str]) -> None:
         """Raise InputError for a stage that acts on none of the sensors; ``sensors``: kind by name."""
@@ -192,7 +197,7 @@ def stage_rows() -> list[dict[str, Any]]:
             {
                 "name": f.name,
                 "default": f.default,
-                **{end: f.metadata[end] for end in ("low", "high") if isfinite(f.metadata[end])},
+                **{end: f.metadata[end] for end in ("low", "high") if math.isfinite(f.metadata[end])},
                 **({"among": f.metadata["among"]} if f.metadata["among"] else {}),
                 "meaning": f.metadata["meaning"],
             }

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lidar.camera.light import Light
 from lidar.geometry.poses import Poses
 from lidar.rig.specs import CameraSpec
+from lidar.sensors.cloud import Cloud
 from lidar.world.world import World
 
 
@@ -29,6 +30,9 @@ class Situation:
     seed     : of the drive, for what lasts longer than a frame
     camera   : the camera that takes an image; None of other sensors
     light    : sun and sky of an image; None of other sensors
+    earlier  : the cloud of the same scanner a number of frames (1 or more) before, as without stages; None
+        before the first frame. On drives it reaches back for the seconds of `Stage.lookback`. None for
+        sensors that are not scanners
     """
 
     sensor: str
@@ -40,3 +44,4 @@ class Situation:
     seed: int = 0
     camera: CameraSpec | None = None
     light: Light | None = None
+    earlier: Callable[[int], Cloud | None] | None = None

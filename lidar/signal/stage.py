@@ -50,6 +50,11 @@ class Stage:
         if faults := [fault for f in fields(self) if (fault := _fault(f, getattr(self, f.name)))]:
             raise InputError("; ".join(faults))
 
+    @property
+    def lookback(self) -> float:
+        """Seconds before a frame whose clouds the stage asks `Situation.earlier` for."""
+        return 0.0
+
 
 def _fault(declared: Any, value: Any) -> str:
     """What is wrong with the value of a parameter; empty if nothing is."""

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.programs import run_program
 
+from lidar import pipeline
 from lidar.apply import apply_stages
 from lidar.camera.png import read_png
 from lidar.dataset.formats import FORMATS, read_cloud
@@ -17,9 +18,10 @@ from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.physics.echoes import Origin
-from lidar.pipeline import drive
+from lidar.pipeline import chunks, drive, recording_chunks
+from lidar.plan import plan_drive
 from lidar.signal.registry import NamedStage, read_stages
-from lidar.signal.stage import Stage
+from lidar.signal.stage import Stage, parameter
 from lidar.traffic.populate import TrafficOptions
 
 RIG = """
@@ -277,3 +279,72 @@ def test_stages_know_where_and_when_a_frame_is_taken(scene, options, plain, tmp_
     assert all(at.world is None and at.poses is not None and at.utc is not None for at, _, _ in SEEN)
     apply_stages(plain / "top", tmp_path / "c", options=ApplyOptions(stages=watched))
     assert SEEN[-1][0].poses is None
+
+
+@dataclass(frozen=True)
+class Watching(Stage):
+    """Notes the cloud of two frames before."""
+
+    back: int = parameter(2, "frames")
+
+    @property
+    def lookback(self):
+        return 0.2
+
+    def cloud(self, cloud, *, at, rng):
+        del rng
+        before = at.earlier(self.back)
+        FORMER[at.frame] = before
+        return cloud
+
+
+FORMER = {}
+
+
+@pytest.mark.parametrize("chunk", [200.0, 0.5])
+def test_stages_are_given_earlier_clouds_as_they_are_without_stages(
+    scene, options, plain, tmp_path, chunk, monkeypatch
+):
+    """Whichever way a drive is cut into regions; on recorded data from the files."""
+    monkeypatch.setattr(pipeline, "CHUNK", chunk)
+    watching = (NamedStage("watching", Watching()),)
+    formats = replace(options, stages=watching, formats=("pcd",), labels=(), deskew="")
+    FORMER.clear()
+    drive(scene, tmp_path / "a", options=formats)
+    assert sorted(FORMER) == list(range(5))
+    assert FORMER[0] is FORMER[1] is None
+    for name in ("top/pcd", "front/rgb"):  # the frame itself is as it was
+        for path in sorted((plain / name).iterdir()):
+            assert path.read_bytes() == (tmp_path / "a" / name / path.name).read_bytes()
+    boxes = "top/boxes/000004.csv"
+    assert (plain / boxes).read_bytes() == (tmp_path / "a" / boxes).read_bytes()
+    expected = [read_cloud(plain / "top" / "pcd" / f"00000{frame}.pcd") for frame in range(3)]
+    driven = [FORMER[frame] for frame in range(2, 5)]
+    FORMER.clear()
+    apply_stages(plain, tmp_path / "b", options=ApplyOptions(stages=watching))
+    applied = [FORMER[frame] for frame in range(2, 5)]
+    FORMER.clear()
+    apply_stages(plain / "top", tmp_path / "c", options=ApplyOptions(stages=watching))
+    loose = [FORMER[frame] for frame in range(2, 5)]
+    for before, one, other, third in zip(expected, driven, applied, loose, strict=True):
+        assert np.array_equal(one.xyz, before.xyz)
+        assert np.array_equal(one.feature, before.feature)
+        assert np.array_equal(one.start_ns + one.time_ns, other.start_ns + other.time_ns)
+        assert np.array_equal(other.xyz, before.xyz)
+        assert len(third) == len(before)
+
+
+def test_regions_cover_the_places_of_earlier_clouds(scene, options, tmp_path):
+    plan = plan_drive(scene, replace(options, traffic=None, stages=(NamedStage("watching", Watching()),)))
+    recording = plan.recording(tmp_path / "a")
+    late = plan.jobs.where(lambda job: job.start_ns == 400_000_000)
+    [(_, wide)], [(_, box)] = recording_chunks(late, recording), chunks(late, plan.trajectory)
+    x, y = plan.trajectory.at(np.linspace(200_000_000, 500_000_000, 9).astype(np.int64)).position[:, :2].T
+    assert wide == pytest.approx((x.min(), y.min(), x.max(), y.max()), abs=0.01)
+    assert max(abs(a - b) for a, b in zip(wide, box, strict=True)) > 0.5
+
+
+def test_a_stage_that_looks_back_farther_than_it_says_is_an_error(scene, options, tmp_path):
+    far = (NamedStage("watching", Watching(3)),)
+    with pytest.raises(LidarError, match="looks back 3 frames of top, more than its `lookback`"):
+        drive(scene, tmp_path / "a", options=replace(options, stages=far))
