@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +23,17 @@ from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.kitti import read_labels
 from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file, remove_dataset
+from lidar.dataset.navigation_files import read_fixes, read_samples, record_fixes, record_samples
 from lidar.dataset.record_clouds import write_clouds
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.recording import Contents, Recording
-from lidar.dataset.situations import situation_of
+from lidar.dataset.situations import situation_of, situation_of_unit
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.options import ApplyOptions
-from lidar.rig.devices import Camera, Scanner, cameras, scanners
+from lidar.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.rig.scanner import Sensor, firings, load_sensor
-from lidar.rig.specs import load_rig, rig_digest
+from lidar.rig.specs import GnssSpec, ImuSpec, Rig, load_rig, rig_digest
 from lidar.sensors.cloud import Cloud
 from lidar.settings import settings_of
 from lidar.signal.recorded import altered_recording
@@ -104,9 +106,10 @@ def _apply_to_dataset(
         raise DatasetError(f"{dataset.path}: has stages already; apply all to the original")
     with reading_file(dataset.paths.manifest):
         seed = int(dataset.manifest["seed"])
-        sensors = _sensors(recipe["rig"])
+        rig = _rig(recipe["rig"])
+        sensors: list[Scanner | Camera] = [*scanners(rig), *cameras(rig)]
         chosen = Stages(stages, seed)
-        chosen.check({s.name: "lidar" if isinstance(s, Scanner) else "camera" for s in sensors})
+        chosen.check(sensor_kinds(rig))
         settings = settings_of(recipe["fidelity"], [(name, text) for name, text in recipe["settings"]])
         contents = Contents(
             tuple(recipe["formats"]), tuple(recipe["labels"]), recipe["deskew"], seed, *settings, chosen
@@ -129,6 +132,7 @@ def _apply_to_dataset(
     ]
     form = _richest_format(contents) if any(isinstance(s, Scanner) for s, _ in jobs) else None
     written = {path for job in jobs for path in recording.paths(*job).values()}
+    written |= {Paths(out).measurements(unit.name) for unit in _altered_units(rig, chosen)}
     if Paths(out).manifest.exists():  # a former dataset, to be replaced
         remove_dataset(out)
     _copy(dataset.path, out, leave_out=written | {Paths(out).manifest, Paths(out).journal})
@@ -141,6 +145,8 @@ def _apply_to_dataset(
         elif form is not None:
             points[device.name] += _apply_to_frame(dataset, recording, form=form, scanner=device, frame=frame)
     progress("stages", len(jobs), total=len(jobs))
+    for unit in _altered_units(rig, chosen):
+        _apply_to_unit(dataset, recording, spec=unit)
     if Paths(out).boxes.exists():
         merge_box_files(out)
     applied = {"applied_stages": [stage.to_json() for stage in stages]}
@@ -148,16 +154,37 @@ def _apply_to_dataset(
     return ApplySummary(out, len(jobs), before, sum(points.values()))
 
 
-def _sensors(rig: str) -> list[Scanner | Camera]:
-    """Sensors of a rig as a recipe names it: its name or file, and a digest.
+def _rig(rig: str) -> Rig:
+    """A rig as a recipe names it: its name or file, and a digest.
 
     Raises InputError if the rig has changed since.
     """
     name = rig.rpartition(" (")[0]
     if f"{name} ({rig_digest(name)})" != rig:
         raise InputError(f"rig {name}: has changed since the drive")
-    loaded = load_rig(name)
-    return [*scanners(loaded), *cameras(loaded)]
+    return load_rig(name)
+
+
+def _altered_units(rig: Rig, stages: Stages) -> list[GnssSpec | ImuSpec]:
+    """Receivers and inertial units whose measurements stages change."""
+    return [
+        *(receiver for receiver in rig.gnss if stages.at("fixes", receiver.name)),
+        *(unit for unit in rig.imus if stages.at("samples", unit.name)),
+    ]
+
+
+def _apply_to_unit(dataset: Dataset, recording: Recording, *, spec: GnssSpec | ImuSpec) -> None:
+    """Write the measurements of a receiver or an inertial unit after the stages, and their truth."""
+    stages, start, out = recording.contents.stages, recording.start, Paths(recording.out)
+    at = situation_of_unit(
+        spec.name, spec.mount, trajectory=recording.trajectory, start=start, seed=recording.contents.seed
+    )
+    if isinstance(spec, ImuSpec):
+        path = dataset.paths.measurements(spec.name)
+        record_samples(out, partial(read_samples, path), at=at, stages=stages, start=start)
+        return
+    fixes, heights = read_fixes(dataset.paths, spec.name, vertical=dataset.frame.vertical)
+    record_fixes(out, fixes, at=at, stages=stages, start=start, heights=heights)
 
 
 def _richest_format(contents: Contents) -> Format:

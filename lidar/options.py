@@ -243,8 +243,8 @@ class DriveOptions:
     """One setting that differs from the fidelity level; repeat for more. lidar settings lists them."""
 
     stages: Annotated[StageList, _STAGE] = ()
-    """Change echoes, clouds or images by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or a TOML file with tables
-    [[stage]]; repeat for more. lidar stages lists them."""
+    """Change echoes, clouds, images, fixes or inertial samples by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or
+    a TOML file with tables [[stage]]; repeat for more. lidar stages lists them."""
 
     workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2
     """Threads, at most one per core; each records one frame at a time. The bytes do not depend on it."""

@@ -26,7 +26,7 @@ from lidar.geometry.poses import Trajectory, blocks_of
 from lidar.options import DriveOptions
 from lidar.planning.flight import Flight
 from lidar.planning.road_drive import RoadPlan, plan_road_drive
-from lidar.rig.devices import Camera, Scanner, cameras, scanners
+from lidar.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.rig.specs import Rig, load_rig
 from lidar.rig.vehicle import Vehicle, load_vehicle
 from lidar.time_scales import check_start
@@ -264,8 +264,7 @@ def sensors_of(rig: Rig, options: DriveOptions) -> tuple[Scanner | Camera, ...]:
     sensors: tuple[Scanner | Camera, ...] = (*scanners(rig), *cameras(rig))
     if not sensors and not rig.gnss:
         raise InputError(f"rig {rig.name} has no sensors")
-    kinds = {s.name: "lidar" if isinstance(s, Scanner) else "camera" for s in sensors}
-    options.contents().stages.check(kinds)
+    options.contents().stages.check(sensor_kinds(rig))
     return sensors
 
 

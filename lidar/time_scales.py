@@ -57,3 +57,11 @@ def check_start(start: datetime, duration_ns: int) -> None:
                 f"`start` {start.isoformat()}: the drive lasts until {end.isoformat(timespec='seconds')} and"
                 f" crosses the leap second before {leap.isoformat()}; start there or end before"
             )
+
+
+def iso_times(start: datetime, time_ns: NDArray[np.integer]) -> list[str]:
+    """ISO 8601 UTC time stamps with nanoseconds of times since a start."""
+    whole = start.replace(tzinfo=None)
+    base = np.datetime64(whole - timedelta(microseconds=whole.microsecond), "ns")
+    stamps = base + np.asarray(time_ns, "timedelta64[ns]") + np.timedelta64(whole.microsecond, "us")
+    return [f"{s}Z" for s in np.datetime_as_string(stamps, unit="ns")]

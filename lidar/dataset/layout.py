@@ -88,6 +88,10 @@ class Paths:
         """Measurements of a GNSS receiver (also ``.nmea``) or an inertial unit."""
         return self.root / f"{name}{suffix}"
 
+    def measurements_truth(self, name: str) -> Path:
+        """What stages did to the measurements of a GNSS receiver or an inertial unit."""
+        return self.measurements(name, ".truth.csv")
+
     def sensor(self, name: str) -> Path:
         """Folder of a scanner or camera."""
         return self.root / name
@@ -330,7 +334,9 @@ def remove_dataset(path: Path) -> None:
     with suppress(DatasetError):
         sensors = set(read_sensors(paths))
     top = {paths.calibration, paths.trajectory, paths.poses, paths.boxes, paths.journal, paths.manifest}
-    top |= {paths.measurements(name, suffix) for name in sensors for suffix in (".csv", ".nmea")}
+    top |= {
+        paths.measurements(name, suffix) for name in sensors for suffix in (".csv", ".nmea", ".truth.csv")
+    }
     folders: list[Path] = []
     for entry in sorted(path.rglob("*")):
         place = entry.relative_to(path).parts

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from datetime import datetime, timedelta
+from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,32 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.csv_tables import table_blocks, write_blocks
-from geoscene.files import atomic_path, write_json
+from geoscene.files import write_json
 from geoscene.frames import Frame
 from geoscene.scene import Scene
 from lidar.dataset.kitti_sequence import write_sequence
 from lidar.dataset.layout import Paths
+from lidar.dataset.navigation_files import heights_of, observed_fixes, record_fixes, record_samples
 from lidar.dataset.recording import Contents
+from lidar.dataset.situations import situation_of_unit
 from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
-from lidar.navigation.geoid import geoid_at
-from lidar.navigation.gnss import antenna_motion, epochs, gnss_columns, observe_gnss
-from lidar.navigation.imu import imu_columns, observe_imu
-from lidar.navigation.nmea import HEIGHTS, height_note, nmea
-from lidar.navigation.satellite_visibility import sky_view
+from lidar.navigation.imu import observe_imu
 from lidar.rig.camera_model import intrinsic_matrix
 from lidar.rig.devices import Camera, Scanner
-from lidar.rig.specs import GnssSpec, Rig
-from lidar.world.world import World
-
-
-def iso_times(start: datetime, time_ns: NDArray[np.integer]) -> list[str]:
-    """ISO 8601 UTC time stamps with nanoseconds of times since a start."""
-    whole = start.replace(tzinfo=None)
-    base = np.datetime64(whole - timedelta(microseconds=whole.microsecond), "ns")
-    stamps = base + np.asarray(time_ns, "timedelta64[ns]") + np.timedelta64(whole.microsecond, "us")
-    return [f"{s}Z" for s in np.datetime_as_string(stamps, unit="ns")]
+from lidar.rig.specs import Rig
+from lidar.time_scales import iso_times
 
 
 def pose_columns(
@@ -163,59 +154,13 @@ def write_metadata(
         if contents.kitti and isinstance(sensor, Scanner):
             folder, mount = paths.sensor(sensor.name), sensor.spec.mount
             write_sequence(folder, rig, mount=mount, trajectory=trajectory, time_ns=times)
+    stages = contents.stages
     for receiver in rig.gnss:
-        _write_fixes(paths, scene, spec=receiver, trajectory=trajectory, start=start, seed=seed)
+        fixes = observed_fixes(scene, receiver, trajectory=trajectory, start=start, seed=seed)
+        at = situation_of_unit(receiver.name, receiver.mount, trajectory=trajectory, start=start, seed=seed)
+        heights = heights_of(scene.frame, fixes)
+        record_fixes(paths, fixes, at=at, stages=stages, start=start, heights=heights)
     for unit in rig.imus:
-        write_blocks(
-            paths.measurements(unit.name),
-            (
-                {"timestamp": iso_times(start, rows.time_ns), **imu_columns(rows)}
-                for rows in observe_imu(trajectory, scene.frame, spec=unit, seed=seed)
-            ),
-        )
-
-
-def _write_fixes(
-    paths: Paths, scene: Scene, *, spec: GnssSpec, trajectory: Trajectory, start: datetime, seed: int
-) -> None:
-    times = epochs(spec, trajectory.duration_ns)
-    antenna, _ = antenna_motion(trajectory, scene.frame, spec=spec, time_ns=times)
-
-    world = World(scene)
-
-    def world_at(region: tuple[float, float, float, float]) -> World:
-        world.follow(region)
-        return world
-
-    sky = sky_view(
-        scene.frame,
-        antenna,
-        start=start,
-        time_ns=times,
-        world_at=world_at,
-        mask_deg=spec.mask_deg,
-        systems=spec.constellations,
-    )
-    fixes = observe_gnss(trajectory, scene.frame, spec=spec, seed=seed, start=start, sky=sky)
-    vertical = scene.frame.vertical
-    geoid = None if vertical == "flat" else geoid_at(*fixes.true_lonlath[:, :2].T)
-    columns = gnss_columns(fixes) | {"h_above": np.full(len(fixes), HEIGHTS[vertical].split()[-1])}
-    separation = None if geoid is None else geoid.separation
-    if separation is not None:
-        columns["geoid"] = separation
-    write_blocks(
-        paths.measurements(spec.name),
-        (
-            {
-                "timestamp": iso_times(start, fixes.time_ns[rows]),
-                **{name: column[rows] for name, column in columns.items()},
-            }
-            for rows in table_blocks(len(fixes))
-        ),
-    )
-    with (
-        atomic_path(paths.measurements(spec.name, ".nmea")) as part,
-        part.open("w", encoding="ascii", newline="") as file,
-    ):
-        file.write(height_note(vertical, geoid.name if geoid else ""))
-        file.writelines(nmea(fixes, start, vertical=vertical, separation=separation))
+        samples = partial(observe_imu, trajectory, scene.frame, spec=unit, seed=seed)
+        at = situation_of_unit(unit.name, unit.mount, trajectory=trajectory, start=start, seed=seed)
+        record_samples(paths, samples, at=at, stages=stages, start=start)

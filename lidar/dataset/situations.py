@@ -15,7 +15,8 @@ from lidar.camera.light import Light
 from lidar.camera.render import light_of
 from lidar.camera.sun import sun_direction
 from lidar.dataset.recording import Recording
-from lidar.geometry.poses import Poses
+from lidar.geometry.mounts import Mount
+from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.devices import Camera, Scanner
 from lidar.sensors.cloud import Cloud
 from lidar.signal.situation import Situation
@@ -61,6 +62,17 @@ def situation_of(
         light=None if camera is None else light_during(recording, start_ns),
         earlier=None if cloud_of is None else earlier,
     )
+
+
+def situation_of_unit(
+    name: str, mount: Mount, *, trajectory: Trajectory, start: datetime, seed: int
+) -> Situation:
+    """Where and when a satellite receiver or an inertial unit measures during a drive."""
+
+    def poses(time_ns: NDArray[np.int64]) -> Poses:
+        return trajectory.at(time_ns).mounted(mount.translation, mount.rotation)
+
+    return Situation(name, 0, utc=start, poses=poses, seed=seed)
 
 
 def light_during(recording: Recording, time_ns: int) -> Light:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from datetime import datetime, timedelta
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.navigation.gnss import Fixes
@@ -129,6 +130,38 @@ def _epoch(fixes: Fixes, k: int, *, when: datetime, height: float, separation: f
         ),
         *active,
     ]
+
+
+def satellites_used(lines: Sequence[str], *, count: int) -> tuple[NDArray[np.str_], NDArray[np.bool_], Float]:
+    """Names (k,) of satellites, which are used (n, k), and PDOP (n,), of `count` fixes, from their sentences.
+
+    At most twelve satellites of a system; of a system that is never used there is one, which is not used.
+    Raises ValueError for sentences of another number of fixes.
+    """
+    letters = {str(number): letter for letter, (_, number, _) in _SYSTEMS.items()}
+    epoch, found, pdop = -1, [], np.full(count, np.nan)
+    names: dict[str, dict[str, None]] = {}
+    for line in lines:
+        fields = line.partition("*")[0].split(",")
+        epoch += fields[0].endswith("GGA")
+        if not fields[0].endswith("GSA"):
+            continue
+        letter = letters[fields[18]]
+        own = names.setdefault(letter, {})
+        for text in filter(None, fields[3:15]):
+            name = f"{letter}{int(text) - _SYSTEMS[letter][2]:02d}"
+            own[name] = None
+            found.append((epoch, name))
+        if fields[15]:
+            pdop[epoch] = float(fields[15])
+    if epoch + 1 != count:
+        raise ValueError(f"sentences of {epoch + 1} fixes, where there are {count}")
+    columns = [name for letter, own in names.items() for name in sorted(own) or [f"{letter}00"]]
+    used = np.zeros((count, len(columns)), bool)
+    column = {name: k for k, name in enumerate(columns)}
+    for row, name in found:
+        used[row, column[name]] = True
+    return np.array(columns, np.str_), used, pdop
 
 
 def _dop(value: float) -> str:

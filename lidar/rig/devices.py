@@ -93,3 +93,13 @@ def scanners(rig: Rig) -> list[Scanner]:
 def cameras(rig: Rig) -> list[Camera]:
     """The rig's cameras."""
     return [Camera(s) for s in rig.cameras]
+
+
+def sensor_kinds(rig: Rig) -> dict[str, str]:
+    """Kind of each sensor of a rig by name: lidar, camera, gnss or imu."""
+    return {
+        **{spec.name: "lidar" for spec in rig.lidars},
+        **{spec.name: "camera" for spec in rig.cameras},
+        **{spec.name: "gnss" for spec in rig.gnss},
+        **{spec.name: "imu" for spec in rig.imus},
+    }

@@ -21,7 +21,8 @@ class Situation:
     """Where and when a sensor takes a frame, as far as it is known.
 
     sensor   : its name
-    frame    : number of the frame; of clouds that are not numbered, the file's name without its ending
+    frame    : number of the frame, 0 for a receiver or inertial unit, whose measurements are those of a whole
+        drive; of clouds that are not numbered, the file's name without its ending
     start_ns : of the frame, nanoseconds since the drive's start
     utc      : of the drive's start; None for clouds without a dataset
     poses    : of the sensor in the scene frame at times (n,) in nanoseconds since the drive's start; None for

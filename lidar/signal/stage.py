@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from math import inf, isfinite
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,10 @@ from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
 from lidar.sensors.cloud import TracedCloud
 from lidar.signal.situation import Situation
+
+if TYPE_CHECKING:
+    from lidar.navigation.gnss import Fixes
+    from lidar.navigation.imu import Inertial
 
 T = TypeVar("T", bool, int, float, str)
 
@@ -159,3 +163,17 @@ class ImageStage(Protocol):
 
     def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
         """The frame that is recorded. Only its colours are used: depth and labels stay ground truth."""
+
+
+class FixesStage(Protocol):
+    """A stage on the fixes of a satellite receiver."""
+
+    def fixes(self, fixes: Fixes, *, at: Situation, rng: np.random.Generator) -> Fixes:
+        """The fixes of the whole drive that are recorded, as many. Only measurements are used, not truth."""
+
+
+class SamplesStage(Protocol):
+    """A stage on the samples of an inertial unit."""
+
+    def samples(self, samples: Inertial, *, at: Situation, rng: np.random.Generator) -> Inertial:
+        """The samples that are recorded, as many. Long drives come in blocks, in order of time."""

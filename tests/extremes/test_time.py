@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from geoscene.frames import Frame
-from lidar.dataset.metadata import iso_times
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.navigation.gnss import epochs, observe_gnss
@@ -21,7 +20,7 @@ from lidar.rig.patterns.beams import frame_window_ns
 from lidar.rig.specs import GnssSpec, ImuSpec, load_rig
 from lidar.selftest.run import outcome
 from lidar.selftest.times import CASES
-from lidar.time_scales import GPS_EPOCH, LEAPS, check_start, gps_seconds, leap_seconds
+from lidar.time_scales import GPS_EPOCH, LEAPS, check_start, gps_seconds, iso_times, leap_seconds
 
 FRAME = Frame.at(9.52, 47.14)
 DAY_S = 86400

@@ -18,12 +18,12 @@ from geoscene.typing import Float
 from lidar.dataset.export.kitti_drive import CAMERAS, KittiDrive, read_drive
 from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset, read_rows, reading_file
-from lidar.dataset.metadata import iso_times
 from lidar.dataset.recorded import nearest
 from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
 from lidar.navigation.gnss import antenna_motion
 from lidar.navigation.imu import true_inertial
 from lidar.rig.specs import GnssSpec, ImuSpec
+from lidar.time_scales import iso_times
 
 _NAVSTAT = 4
 """OXTS's navigation status ``real time``."""

@@ -1,0 +1,206 @@
+"""Files of satellite receivers and inertial units, after stages on them, and readers of the same files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.csv_tables import BLOCK_ROWS, table_blocks, write_blocks, write_columns
+from geoscene.files import atomic_path
+from geoscene.frames import Frame
+from geoscene.scene import Scene
+from geoscene.typing import Float
+from lidar.dataset.layout import Paths, opened_rows, read_rows, reading_file
+from lidar.geometry.poses import Trajectory
+from lidar.navigation.geoid import geoid_at
+from lidar.navigation.gnss import NAMES, STATES, Fixes, antenna_motion, epochs, gnss_columns, observe_gnss
+from lidar.navigation.imu import Inertial, imu_columns
+from lidar.navigation.nmea import HEIGHTS, height_note, nmea, satellites_used
+from lidar.navigation.satellite_visibility import sky_view
+from lidar.rig.specs import GnssSpec
+from lidar.signal.navigation import altered_fixes, altered_samples, fixes_truth, samples_truth
+from lidar.signal.registry import Stages
+from lidar.signal.situation import Situation
+from lidar.time_scales import iso_times
+from lidar.world.world import World
+
+
+@dataclass(frozen=True, slots=True)
+class Heights:
+    """What the heights of fixes are above.
+
+    vertical   : as in `geoscene.frames.Frame`
+    separation : (n,) metres, geoid above the ellipsoid at each fix; None if unknown
+    geoid      : its name, or empty
+    """
+
+    vertical: str
+    separation: Float | None = None
+    geoid: str = ""
+
+
+def heights_of(frame: Frame, fixes: Fixes) -> Heights:
+    """What the heights of fixes in a scene are above."""
+    geoid = None if frame.vertical == "flat" else geoid_at(*fixes.true_lonlath[:, :2].T)
+    return Heights(frame.vertical, geoid.separation, geoid.name) if geoid else Heights(frame.vertical)
+
+
+def observed_fixes(
+    scene: Scene, spec: GnssSpec, *, trajectory: Trajectory, start: datetime, seed: int
+) -> Fixes:
+    """The fixes of a receiver among the scene's buildings, without stages."""
+    times = epochs(spec, trajectory.duration_ns)
+    antenna, _ = antenna_motion(trajectory, scene.frame, spec=spec, time_ns=times)
+
+    world = World(scene)
+
+    def world_at(region: tuple[float, float, float, float]) -> World:
+        world.follow(region)
+        return world
+
+    sky = sky_view(
+        scene.frame,
+        antenna,
+        start=start,
+        time_ns=times,
+        world_at=world_at,
+        mask_deg=spec.mask_deg,
+        systems=spec.constellations,
+    )
+    return observe_gnss(trajectory, scene.frame, spec=spec, seed=seed, start=start, sky=sky)
+
+
+def record_fixes(
+    paths: Paths, fixes: Fixes, *, at: Situation, stages: Stages, start: datetime, heights: Heights
+) -> None:
+    """Write the fixes of the receiver ``at.sensor`` after the stages on them, with the truth of changes."""
+    if stages.at("fixes", at.sensor):
+        original, fixes = fixes, altered_fixes(fixes, stages, at=at)
+        write_columns(paths.measurements_truth(at.sensor), fixes_truth(fixes, original))
+    _write_fixes(paths, at.sensor, fixes=fixes, start=start, heights=heights)
+
+
+def _write_fixes(paths: Paths, name: str, *, fixes: Fixes, start: datetime, heights: Heights) -> None:
+    columns = gnss_columns(fixes) | {"h_above": np.full(len(fixes), HEIGHTS[heights.vertical].split()[-1])}
+    if heights.separation is not None:
+        columns["geoid"] = heights.separation
+    write_blocks(
+        paths.measurements(name),
+        (
+            {
+                "timestamp": iso_times(start, fixes.time_ns[rows]),
+                **{name: column[rows] for name, column in columns.items()},
+            }
+            for rows in table_blocks(len(fixes))
+        ),
+    )
+    with (
+        atomic_path(paths.measurements(name, ".nmea")) as part,
+        part.open("w", encoding="ascii", newline="") as file,
+    ):
+        file.write(height_note(heights.vertical, heights.geoid))
+        file.writelines(nmea(fixes, start, vertical=heights.vertical, separation=heights.separation))
+
+
+def read_fixes(paths: Paths, name: str, *, vertical: str) -> tuple[Fixes, Heights]:
+    """The fixes of a receiver of a dataset, and what their heights are above.
+
+    vertical : of the dataset's frame
+
+    Errors against the truth are NaN. Raises DatasetError for files that cannot be read.
+    """
+    path, sentences = paths.measurements(name), paths.measurements(name, ".nmea")
+    rows = read_rows(path)
+    with reading_file(path):
+        columns = {key: np.array([row[key] for row in rows]) for key in (rows[0] if rows else _EMPTY)}
+        value = {key: column.astype(np.float64) for key, column in columns.items() if key not in _TEXTS}
+        quality = columns["quality"].astype(np.int8)
+    with reading_file(sentences):
+        note, *lines = sentences.read_text("ascii").splitlines()
+        names, used, pdop = satellites_used(lines, count=len(rows))
+    found = re.search(r"separation of (.*)\)", note)
+    fixes = Fixes(
+        time_ns=columns["time_ns"].astype(np.int64),
+        state=_state(quality),
+        quality=quality,
+        satellites=columns["satellites"].astype(np.int8),
+        dop=np.column_stack([value["hdop"], value["vdop"], pdop]),
+        lonlath=np.column_stack([value[key] for key in ("lon", "lat", "h")]),
+        speed=value["speed"],
+        course=_radians(value["course_deg"]),
+        error=np.full((len(rows), 3), np.nan),
+        true_lonlath=np.column_stack([value[key] for key in ("true_lon", "true_lat", "true_h")]),
+        true_velocity=np.column_stack([value[key] for key in ("true_east", "true_north", "true_up")]),
+        used=used,
+        names=names,
+    )
+    return fixes, Heights(vertical, value.get("geoid"), found[1] if found else "")
+
+
+_TEXTS = ("timestamp", "h_above", "time_ns", "quality", "satellites")
+_EMPTY = (
+    *("timestamp", "time_ns", "lon", "lat", "h", "speed", "course_deg", "quality", "satellites", "hdop"),
+    *("vdop", "true_lon", "true_lat", "true_h", "true_east", "true_north", "true_up", "h_above"),
+)
+
+
+def _radians(degrees: Float) -> Float:
+    """Angles (n,) whose value in degrees is the given one, to the last bit where there is one."""
+    found = np.radians(degrees)
+    for ulps in (-2, -1, 1, 2):
+        near = found + ulps * np.spacing(found)
+        found = np.where((np.degrees(near) == degrees) & (np.degrees(found) != degrees), near, found)
+    return found
+
+
+def _state(quality: NDArray[np.int8]) -> NDArray[np.int8]:
+    """Rows (n,) of `NAMES` of the states with a quality, the first of several."""
+    table = [next(k for k, name in enumerate(NAMES) if STATES[name].quality == q) for q in (0, 1, 2, 4, 5)]
+    return np.array(table, np.int8)[np.searchsorted((0, 1, 2, 4, 5), quality)]
+
+
+def record_samples(
+    paths: Paths, samples: Callable[[], Iterator[Inertial]], *, at: Situation, stages: Stages, start: datetime
+) -> None:
+    """Write the samples of the inertial unit ``at.sensor`` after the stages, with the truth of changes.
+
+    samples : the unit's samples in blocks, as without stages; called twice if there are stages
+    """
+    path = paths.measurements(at.sensor)
+    if not stages.at("samples", at.sensor):
+        write_blocks(path, (_sample_columns(rows, start) for rows in samples()))
+        return
+    write_blocks(
+        paths.measurements_truth(at.sensor),
+        (samples_truth(*pair) for pair in altered_samples(samples(), stages, at=at)),
+    )
+    write_blocks(
+        path, (_sample_columns(rows, start) for rows, _ in altered_samples(samples(), stages, at=at))
+    )
+
+
+def _sample_columns(rows: Inertial, start: datetime) -> dict[str, Any]:
+    return {"timestamp": iso_times(start, rows.time_ns), **imu_columns(rows)}
+
+
+def read_samples(path: Path) -> Iterator[Inertial]:
+    """The samples of an inertial unit of a dataset, in blocks.
+
+    Raises DatasetError for a file that cannot be read.
+    """
+    with opened_rows(path) as rows:
+        while block := list(islice(rows, BLOCK_ROWS)):
+            time_ns = np.array([int(row["time_ns"]) for row in block], np.int64)
+            columns = (
+                np.array([[float(row[f"{name}_{axis}"]) for axis in "xyz"] for row in block])
+                for name in ("gyro", "accel", "true_gyro", "true_accel")
+            )
+            yield Inertial(time_ns, *columns)

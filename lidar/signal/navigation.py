@@ -1,0 +1,66 @@
+"""Stages on the measurements of receivers and inertial units, and the truth about their changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.errors import LidarError
+from lidar.navigation.gnss import Fixes, gnss_columns
+from lidar.navigation.imu import Inertial, imu_columns
+from lidar.signal.registry import Stages
+from lidar.signal.situation import Situation
+from lidar.signal.stage import FixesStage, SamplesStage
+
+
+def altered_fixes(fixes: Fixes, stages: Stages, *, at: Situation) -> Fixes:
+    """The fixes of a receiver after the stages on them; ground truth stays."""
+    found = fixes
+    for named in stages.at("fixes", at.sensor):
+        rng = named.rng(stages.seed, at.sensor, frame=at.frame)
+        found = cast("FixesStage", named.stage).fixes(found, at=at, rng=rng)
+        if len(found) != len(fixes):
+            raise LidarError(f"stage {named.name} returned {len(found)} of {len(fixes)} fixes")
+    truth = {name: getattr(fixes, name) for name in ("error", "true_lonlath", "true_velocity")}
+    return replace(found, **truth)
+
+
+def altered_samples(
+    blocks: Iterable[Inertial], stages: Stages, *, at: Situation
+) -> Iterator[tuple[Inertial, Inertial]]:
+    """Each block of an inertial unit's samples after the stages on them, and as without; truth stays."""
+    chosen = [
+        (named.name, cast("SamplesStage", named.stage), named.rng(stages.seed, at.sensor, frame=at.frame))
+        for named in stages.at("samples", at.sensor)
+    ]
+    for original in blocks:
+        found = original
+        for name, stage, rng in chosen:
+            found = stage.samples(found, at=at, rng=rng)
+            if len(found) != len(original):
+                raise LidarError(f"stage {name} returned {len(found)} of {len(original)} samples")
+        yield replace(found, true_gyro=original.true_gyro, true_accel=original.true_accel), original
+
+
+def fixes_truth(fixes: Fixes, original: Fixes) -> dict[str, NDArray[Any]]:
+    """Columns of the truth file of a receiver, see `_truth`."""
+    return _truth(gnss_columns(fixes), gnss_columns(original))
+
+
+def samples_truth(samples: Inertial, original: Inertial) -> dict[str, NDArray[Any]]:
+    """Columns of the truth file of an inertial unit, see `_truth`."""
+    return _truth(imu_columns(samples), imu_columns(original))
+
+
+def _truth(altered: dict[str, NDArray[Any]], original: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """``changed`` (n,), 1 where a measurement differs, and the measurements as without stages."""
+    before = {name: column for name, column in original.items() if not name.startswith("true_")}
+    changed = np.zeros(len(before["time_ns"]), bool)
+    for name, column in before.items():
+        missing = np.isnan(altered[name]) & np.isnan(column)  # no fix, before and after
+        changed |= (altered[name] != column) & ~missing
+    return {"changed": changed.astype(np.int8), **before}
