@@ -33,6 +33,7 @@ from lidar.options import (
     OUTPUT,
     AccuracyOptions,
     ApplyOptions,
+    DefendOptions,
     DriveOptions,
     ExportOptions,
     MapOptions,
@@ -452,6 +453,109 @@ def apply(
         print_json({**asdict(summary), "path": str(out)})
     else:
         print(f"{out}: {summary.files} files, {summary.points:,} of {summary.points_in:,} points")
+    return 0
+
+
+@app.command
+def defend(
+    *datasets: Path,
+    options: DefendOptions,
+    out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
+    report: Reporting = Report(),
+) -> int:
+    """Judge recorded frames by defences against spoofing, and score the verdicts where the truth is known.
+
+    Defences see what the sensors measured, never labels or truth files. Thresholds are those that a stated
+    share of genuine returns, objects and frames passes.
+
+    For example:
+
+    lidar defend drive --defence occlusion,shadow -o verdicts
+
+    lidar defend drive --defence all --fuse fisher --json
+
+    lidar defend drive --defence all --calibrate -o calibration.toml
+
+    Parameters
+    ----------
+    datasets
+        Directories or URLs of datasets, which are judged together.
+    out
+        Directory to write the verdicts to: defend.json, frames.csv, objects.csv and an archive of suspicions
+        of returns per frame; with --calibrate the TOML file.
+    """
+    from geoscene.scene import open_scene  # noqa: PLC0415
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.defences.calibration import read_calibration  # noqa: PLC0415
+    from lidar.defences.defend import calibrate, score_rows  # noqa: PLC0415
+    from lidar.defences.defend import defend as judged  # noqa: PLC0415
+    from lidar.defences.registry import read_defences  # noqa: PLC0415
+
+    if not datasets:
+        raise InputError("`datasets`: give one or more")
+    if options.calibrate and out is None:
+        raise InputError("`calibrate`: give `out`, the file to write")
+    if out is not None:
+        note_new_folder(out)
+        if out.exists() and (out.is_file() or any(out.iterdir())) and not report.overwrite:
+            raise InputError(f"{out}: exists already; set `overwrite` to replace it")
+    chosen = read_defences(options.defences)
+    opened = [open_dataset(path) for path in datasets]
+    scene = None if options.scene is None else open_scene(options.scene)
+    if options.calibrate and out is not None:
+        with progress_bar(quiet=report.quiet) as progress:
+            made = calibrate(opened, chosen, scene=scene, out=out, seed=options.seed, progress=progress)
+        if report.json:
+            print_json({"path": str(out), "note": made.note})
+        else:
+            print(f"{out}: {made.note}")
+        return 0
+    with progress_bar(quiet=report.quiet) as progress:
+        found = judged(
+            opened,
+            chosen,
+            calibration=read_calibration(options.calibration),
+            rule=options.fuse,
+            scene=scene,
+            out=out,
+            seed=options.seed,
+            progress=progress,
+        )
+    if report.json:
+        print_json(found.document())
+    else:
+        from lidar.rig.catalog import columns  # noqa: PLC0415
+
+        print(columns(score_rows(found)))
+    return 0
+
+
+@app.command
+def defences(*, json: JsonFlag = False) -> int:
+    """List the defences against spoofing, with their parameters.
+
+    Parameters
+    ----------
+    json
+        Print them as JSON.
+    """
+    from lidar.defences.registry import defence_rows  # noqa: PLC0415
+    from lidar.rig.catalog import columns  # noqa: PLC0415
+
+    rows = defence_rows()
+    if json:
+        print_json({"defences": rows})
+        return 0
+    cells = [["name", "parameter", "default", "from", "to", "meaning"]]
+    for row in rows:
+        needs = f" Needs: {', '.join(row['needs'])}." if row["needs"] else ""
+        past = f" Earlier frames: {row['history']}." if row["history"] else ""
+        cells.append([row["name"], "", "", "", "", f"{row['meaning']}{needs}{past}"])
+        for p in row["parameters"]:
+            ends = [f"{p[end]:g}" if end in p else "" for end in ("low", "high")]
+            cells.append(["", p["name"], str(p["default"]), *ends, p["meaning"]])
+    print(columns(cells))
+    print("\nlidar defend DATASET --defence NAME:KEY=VALUE,... judges recorded data (see docs/defences.md).")
     return 0
 
 

@@ -583,6 +583,41 @@ class ApplyOptions:
             raise InputError("`stages`: give one or more")
 
 
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class DefendOptions:
+    """Options of defences on recorded data."""
+
+    defences: Annotated[tuple[str, ...], Parameter(name="--defence"), WORDS]
+    """Defences, separated by commas: NAME or NAME:KEY=VALUE:KEY=VALUE, or all that the data allow; lidar
+    defences lists them."""
+
+    scene: Path | None = None
+    """Scene that the map defence compares with; by default the one that the dataset was driven in."""
+
+    fuse: Annotated[str, Parameter(converter=_lower)] = ""
+    """Fuse the verdicts: max (the most unusual one counts) or fisher (all count, as if independent)."""
+
+    calibrate: bool = False
+    """Instead of judging, write the suspicions of these datasets, which must be genuine, to the TOML file
+    --out, for --calibration."""
+
+    calibration: Path | None = None
+    """TOML file of thresholds and suspicions of genuine data; those of docs/defences.md by default."""
+
+    seed: Annotated[int, Parameter(converter=whole)] = 0
+    """Seed of the defences' random numbers and of the intervals."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if self.fuse not in ("", "max", "fisher"):
+            raise InputError(f"`fuse` {self.fuse}: max or fisher")
+        if self.calibrate and (self.fuse or self.calibration is not None):
+            raise InputError("`calibrate`: leave out `fuse` and `calibration`")
+        if not 0 <= self.seed < 1 << 63:
+            raise InputError(f"`seed` {self.seed}: give a non-negative integer")
+
+
 def classes_of(names: Iterable[str]) -> list[int]:
     """Codes of classes by name; ``vehicles`` stands for all of them, with and without riders.
 

@@ -1,0 +1,1 @@
+"""Defences against spoofing, which judge recorded frames, and their scores against the truth."""

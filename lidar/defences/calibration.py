@@ -1,0 +1,118 @@
+"""Suspicions of genuine data: thresholds at stated false alarms, and how unusual a suspicion is."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geoscene.typing import Float
+from lidar.defences.scores import FALSE_ALARMS, Samples, threshold_at
+from lidar.errors import InputError
+
+TAILS = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001)
+"""Shares of genuine returns, objects or frames at whose suspicions a calibration is stored."""
+
+_FEWEST = 3
+"""Genuine samples above the last stored suspicion."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tail:
+    """Suspicions above which given shares of genuine samples are.
+
+    count     : genuine samples that it is made of
+    share     : (k,) falling
+    suspicion : (k,) rising
+    """
+
+    count: int
+    share: Float
+    suspicion: Float
+
+    def of(self, suspicion: Float) -> Float:
+        """Share (n,) of genuine samples that are at least as suspicious; at least 1 / (count + 1).
+
+        Between stored suspicions, and from the last one to suspicion 1, its logarithm is linear.
+        """
+        least = 1 / (self.count + 1)
+        x = np.concatenate([[-1e-9], self.suspicion, [1.0]])
+        y = np.log(
+            np.concatenate([[1.0], self.share, [min(least, self.share[-1] / 2 if len(self.share) else 0.5)]])
+        )
+        x, first = np.unique(x[::-1], return_index=True)  # of equal suspicions the least share
+        found: Float = np.exp(np.interp(suspicion, x, np.maximum(y[::-1][first], np.log(least))))
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Tails by defence and level of `lidar.defences.scores.LEVELS`; ``note`` says of which data."""
+
+    tails: Mapping[tuple[str, str], Tail]
+    note: str = ""
+
+    def tail(self, defence: str, level: str) -> Tail:
+        """A tail; raises InputError if the defence is not calibrated at that level."""
+        if (defence, level) not in self.tails:
+            raise InputError(
+                f"defence {defence}: the calibration has no suspicions of {level}; calibrate again"
+            )
+        return self.tails[defence, level]
+
+    def threshold(self, defence: str, level: str) -> float:
+        """Suspicion above which is the share `FALSE_ALARMS` of genuine samples."""
+        tail = self.tail(defence, level)
+        at = np.flatnonzero(tail.share <= FALSE_ALARMS[level] * (1 + 1e-9))
+        return float(tail.suspicion[at[0]]) if len(at) else 1.0
+
+
+def tail_of(samples: Samples) -> Tail:
+    """The tail of genuine samples; shares that too few samples support are left out."""
+    count = int(samples.genuine.sum())
+    shares = [share for share in TAILS if share * count >= _FEWEST]
+    return Tail(count, np.array(shares), np.array([threshold_at(samples, share) for share in shares]))
+
+
+def read_calibration(path: Path | None = None) -> Calibration:
+    """The calibration of a TOML file, or the one that comes with the program.
+
+    Raises InputError for a file that is none.
+    """
+    file = resources.files("lidar.defences") / "calibration.toml" if path is None else path
+    tails: dict[tuple[str, str], Tail] = {}
+    try:
+        document = tomllib.loads(file.read_text("utf-8"))
+        for defence, levels in document["defence"].items():
+            for level, row in levels.items():
+                tails[defence, level] = _tail(row)
+        return Calibration(tails, str(document["note"]))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{file}: is no calibration of defences ({error})") from None
+
+
+def _tail(row: Mapping[str, Any]) -> Tail:
+    """A tail of a file; raises ValueError, KeyError or TypeError if it is none."""
+    share, suspicion = np.array(row["share"], float), np.array(row["suspicion"], float)
+    if share.shape != suspicion.shape or (np.diff(share) >= 0).any() or (np.diff(suspicion) < 0).any():
+        raise ValueError("shares must fall and suspicions rise")
+    return Tail(int(row["count"]), share, suspicion)
+
+
+def calibration_text(calibration: Calibration) -> str:
+    """A calibration as `read_calibration` reads it."""
+    lines = [f'note = "{calibration.note}"']
+    for (defence, level), tail in sorted(calibration.tails.items()):
+        lines += [
+            "",
+            f"[defence.{defence}.{level}]",
+            f"count = {tail.count}",
+            f"share = [{', '.join(f'{v:g}' for v in tail.share)}]",
+            f"suspicion = [{', '.join(f'{v:g}' for v in tail.suspicion)}]",
+        ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,100 @@
+"""Runs defences over a dataset."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from geoscene.progress import Progress, silent
+from geoscene.scene import Scene
+from lidar.defences.observation import Observation
+from lidar.defences.reading import Scans
+from lidar.defences.registry import NamedDefence
+from lidar.defences.verdict import Verdict
+from lidar.errors import InputError
+from lidar.random_streams import generator
+from lidar.world.world import World
+
+_AROUND = 20.0
+"""Metres around the vehicle's path during a frame that its region covers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A frame with its verdicts and the seconds that each took, by defence."""
+
+    frame: Observation
+    verdicts: dict[str, Verdict]
+    seconds: dict[str, float]
+
+
+def able(scans: Sequence[Scans], defences: Sequence[NamedDefence]) -> list[NamedDefence]:
+    """The defences that the data of all scanners allow.
+
+    Raises InputError if they lack what a defence needs that the user named, or if none is left.
+    """
+    found = []
+    for named in defences:
+        lacks = [text for each in scans if (text := _lacks(each, needs=named.defence.needs))]
+        if lacks and named.named:
+            raise InputError(f"defence {named.name}: {lacks[0]}")
+        if not lacks:
+            found.append(named)
+    if not found:
+        raise InputError("`defence`: the data lack what each of them needs")
+    return found
+
+
+def _lacks(scans: Scans, *, needs: frozenset[str]) -> str:
+    """What a defence needs and the data of a scanner lack; empty if nothing."""
+    path = scans.dataset.path
+    if "cameras" in needs and not scans.pictures:
+        return f"needs colour images, and {path} has none"
+    if "navigation" in needs and scans.navigation is None:
+        return f"needs a GNSS receiver and an inertial unit, and the rig of {path} lacks one"
+    return ""
+
+
+def judged_frames(
+    scans: Scans,
+    defences: Sequence[NamedDefence],
+    *,
+    scene: Scene | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Iterator[Judged]:
+    """The frames of a scanner in order, with the verdict of each defence.
+
+    scene : the map of defences that need one
+    seed  : of the defences' random numbers
+    """
+    past: deque[Observation] = deque(maxlen=1 + max((d.defence.history for d in defences), default=0))
+    reach = scans.sensor.max_range
+    world = World(scene, margin=reach) if scene is not None else None
+    for done, frame in enumerate(scans):
+        progress(scans.sensor.name, done, total=len(scans.frames))
+        past.append(frame)
+        if world is not None:
+            x, y, _ = frame.poses([frame.start_ns]).position[0]
+            world.follow((x - _AROUND, y - _AROUND, x + _AROUND, y + _AROUND))
+        verdicts: dict[str, Verdict] = {}
+        seconds: dict[str, float] = {}
+        for named in defences:
+            window = list(past)[-1 - named.defence.history :]
+            rng = generator(seed, "defence", named.name, scans.sensor.name, frame.number)
+            began = time.perf_counter()
+            verdicts[named.name] = named.defence.judge(window, scene=world, rng=rng)
+            seconds[named.name] = time.perf_counter() - began
+            _check_length(verdicts[named.name], frame, name=named.name)
+        yield Judged(frame, verdicts, seconds)
+    progress(scans.sensor.name, len(scans.frames), total=len(scans.frames))
+
+
+def _check_length(verdict: Verdict, frame: Observation, *, name: str) -> None:
+    for column, count in ((verdict.returns, len(frame)), (verdict.objects, len(frame.objects))):
+        if column is not None and np.shape(column) != (count,):
+            raise AssertionError(f"defence {name} gives {np.shape(column)} suspicions for {count}")

@@ -1,0 +1,143 @@
+"""Scores of suspicions against the truth: ROC, detection at fixed false alarms, bootstrap intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.typing import Float
+
+LEVELS = ("returns", "objects", "frames")
+"""What is scored."""
+
+FALSE_ALARMS = {"returns": 0.001, "objects": 0.01, "frames": 0.05}
+"""Share of genuine returns, objects and frames that may be suspected, by level."""
+
+_BINS = 2000
+_BOOTSTRAPS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Counts of suspicions by frame and bin, from 0 to 1.
+
+    genuine  : (frames, bins + 1)
+    attacked : (frames, bins + 1)
+    """
+
+    genuine: NDArray[np.int64]
+    attacked: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, frames: Sequence[tuple[Float, NDArray[np.bool_]]]) -> Samples:
+        """Samples of frames; each gives its suspicions and which of them are of attacked ones."""
+        genuine = np.zeros((len(frames), _BINS + 1), np.int64)
+        attacked = np.zeros_like(genuine)
+        for k, (suspicion, truth) in enumerate(frames):
+            rows = bins_of(suspicion)
+            genuine[k] = np.bincount(rows[~truth], minlength=_BINS + 1)
+            attacked[k] = np.bincount(rows[truth], minlength=_BINS + 1)
+        return cls(genuine, attacked)
+
+
+def bins_of(suspicion: Float) -> NDArray[np.int64]:
+    """Bin of each suspicion."""
+    return np.clip(np.round(np.asarray(suspicion) * _BINS), 0, _BINS).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """How well suspicions tell attacked from genuine ones.
+
+    genuine, attacked : numbers of both
+    auc        : area under the ROC, with its 95 % interval; nan without both kinds
+    threshold  : suspicion above which there is an alarm
+    fpr, tpr   : shares of genuine and attacked ones above it, with their 95 % intervals
+    roc        : (false positive rate, true positive rate) at falling thresholds
+    """
+
+    genuine: int
+    attacked: int
+    auc: tuple[float, float, float]
+    threshold: float
+    fpr: tuple[float, float, float]
+    tpr: tuple[float, float, float]
+    roc: list[tuple[float, float]]
+
+    def to_json(self) -> dict[str, Any]:
+        """Columns of the score; unknown figures are null."""
+        document = asdict(self)
+        for name in ("auc", "fpr", "tpr"):
+            document[name] = [None if np.isnan(v) else round(v, 5) for v in document[name]]
+        document["roc"] = [[round(x, 5), round(y, 5)] for x, y in self.roc]
+        return document
+
+
+def threshold_at(samples: Samples, rate: float) -> float:
+    """The least suspicion above which at most a share ``rate`` of genuine ones is; 1 if there is none."""
+    genuine = samples.genuine.sum(axis=0)
+    above = genuine.sum() - np.cumsum(genuine)
+    allowed = np.flatnonzero(above <= rate * genuine.sum())
+    return float(allowed[0] / _BINS)
+
+
+def score(samples: Samples, *, threshold: float, rng: np.random.Generator) -> Score:
+    """The score of samples at a threshold.
+
+    Intervals are those of frames drawn with replacement (percentile bootstrap), as returns and objects of a
+    frame are not independent.
+    """
+    weights = np.ones((1, len(samples.genuine)), np.int64)
+    drawn = rng.multinomial(
+        len(samples.genuine), np.full(len(samples.genuine), 1 / max(len(samples.genuine), 1)), _BOOTSTRAPS
+    )
+    every = np.concatenate([weights, drawn])
+    genuine, attacked = every @ samples.genuine, every @ samples.attacked
+    alarm = int(np.floor(threshold * _BINS + 1e-9)) + 1
+    return Score(
+        int(genuine[0].sum()),
+        int(attacked[0].sum()),
+        _interval(_area(genuine, attacked)),
+        threshold,
+        _interval(_share(genuine[:, alarm:].sum(axis=1), genuine.sum(axis=1))),
+        _interval(_share(attacked[:, alarm:].sum(axis=1), attacked.sum(axis=1))),
+        _curve(genuine[0], attacked[0]),
+    )
+
+
+def _share(part: NDArray[np.int64], whole: NDArray[np.int64]) -> Float:
+    return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
+
+
+def _area(genuine: NDArray[np.int64], attacked: NDArray[np.int64]) -> Float:
+    """Areas under the ROC: the probability that an attacked one has the higher suspicion, ties half."""
+    below = np.cumsum(genuine, axis=1) - genuine / 2
+    pairs = genuine.sum(axis=1).astype(float) * attacked.sum(axis=1)
+    area: Float = np.where(pairs > 0, (below * attacked).sum(axis=1) / np.maximum(pairs, 1), np.nan)
+    return area
+
+
+def _interval(values: Float) -> tuple[float, float, float]:
+    """The first value, and the 95 % interval of the others."""
+    known = values[1:][np.isfinite(values[1:])]
+    if not np.isfinite(values[0]) or not len(known):
+        return float(values[0]), float("nan"), float("nan")
+    low, high = np.percentile(known, [2.5, 97.5])
+    return float(values[0]), float(low), float(high)
+
+
+def _curve(genuine: NDArray[np.int64], attacked: NDArray[np.int64]) -> list[tuple[float, float]]:
+    """The corners of the ROC."""
+    if not genuine.sum() or not attacked.sum():
+        return []
+    x = np.concatenate([[0], np.cumsum(genuine[::-1])]) / genuine.sum()
+    y = np.concatenate([[0], np.cumsum(attacked[::-1])]) / attacked.sum()
+    corner = np.ones(len(x), bool)
+    corner[1:-1] = (np.diff(x)[:-1] > 0) | (np.diff(y)[:-1] > 0) | (np.diff(x)[1:] > 0) | (np.diff(y)[1:] > 0)
+    points = np.unique(np.column_stack([x[corner], y[corner]]), axis=0)
+    keep = np.linspace(0, len(points) - 1, min(len(points), 200)).round().astype(int)
+    return [(float(a), float(b)) for a, b in points[np.unique(keep)]]

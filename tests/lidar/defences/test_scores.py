@@ -1,0 +1,116 @@
+"""Scores, calibrations and fusion against figures that are known."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from lidar.defences.calibration import Calibration, calibration_text, read_calibration, tail_of
+from lidar.defences.fusion import fused, fused_threshold
+from lidar.defences.registry import defence_names, defence_rows, read_defences
+from lidar.defences.scores import FALSE_ALARMS, Samples, score, threshold_at
+from lidar.defences.verdict import Verdict
+from lidar.errors import InputError
+
+
+def normal_frames(rng, shift, frames=100, each=100):
+    """Suspicions of two normal distributions a ``shift`` apart, squeezed to 0 to 1."""
+    rows = []
+    for _ in range(frames):
+        truth = rng.random(each) < 0.3
+        rows.append((norm.cdf(rng.standard_normal(each) + shift * truth), truth))
+    return rows
+
+
+def test_area_and_detection_are_those_of_two_normal_distributions():
+    rng = np.random.default_rng(3)
+    samples = Samples.of(normal_frames(rng, 1.5))
+    threshold = threshold_at(samples, 0.05)
+    found = score(samples, threshold=threshold, rng=rng)
+    assert found.auc[0] == pytest.approx(norm.cdf(1.5 / np.sqrt(2)), abs=0.01)
+    assert found.tpr[0] == pytest.approx(1 - norm.cdf(norm.ppf(0.95) - 1.5), abs=0.04)
+    assert found.fpr[0] <= 0.05
+    for value, low, high in (found.auc, found.tpr, found.fpr):
+        assert low < value < high
+    assert found.genuine + found.attacked == 100 * 100
+    x, y = np.array(found.roc).T
+    assert (np.diff(x) >= 0).all()
+    assert np.trapezoid(y, x) == pytest.approx(found.auc[0], abs=0.01)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    rng, truth, inside = np.random.default_rng(4), norm.cdf(1 / np.sqrt(2)), 0
+    for _ in range(60):
+        found = score(Samples.of(normal_frames(rng, 1.0, frames=30, each=30)), threshold=0.9, rng=rng)
+        inside += found.auc[1] <= truth <= found.auc[2]
+    assert inside >= 51  # 95 % of 60 is 57; 51 is 3 standard deviations below
+
+
+def test_frames_that_are_alike_within_give_wide_intervals():
+    """Returns of a frame are not independent: a bootstrap of returns would be far too sure."""
+    rng = np.random.default_rng(5)
+    rows = [(np.full(500, rng.random()), np.full(500, k % 2 == 0)) for k in range(20)]
+    _, low, high = score(Samples.of(rows), threshold=0.5, rng=rng).tpr
+    assert high - low > 0.25
+
+
+def calibrated(rng):
+    samples = Samples.of([(rng.random(1000), np.zeros(1000, bool)) for _ in range(100)])
+    levels = [(name, level) for name in ("one", "other") for level in ("returns", "objects", "frames")]
+    return Calibration(dict.fromkeys(levels, tail_of(samples)), "uniform")
+
+
+def test_a_calibration_gives_the_share_of_genuine_samples_and_survives_its_file(tmp_path):
+    found = calibrated(np.random.default_rng(6))
+    (tmp_path / "c.toml").write_text(calibration_text(found))
+    again = read_calibration(tmp_path / "c.toml")
+    assert again.note == "uniform"
+    for level, share in FALSE_ALARMS.items():
+        assert again.threshold("one", level) == pytest.approx(1 - share, abs=0.002)
+    share = again.tail("one", "returns").of(np.array([0.0, 0.5, 0.9, 0.99, 0.9999, 1.0]))
+    assert share[1:4] == pytest.approx([0.5, 0.1, 0.01], rel=0.1)
+    assert (np.diff(share) <= 0).all()
+    assert share[-1] > 0
+    with pytest.raises(InputError, match="calibrate again"):
+        again.threshold("third", "frames")
+    (tmp_path / "bad.toml").write_text(
+        'note = "x"\n[defence.one.returns]\ncount = 1\nshare = [0.1]\nsuspicion = []\n'
+    )
+    with pytest.raises(InputError, match="no calibration"):
+        read_calibration(tmp_path / "bad.toml")
+
+
+@pytest.mark.parametrize("rule", ["max", "fisher"])
+def test_fused_verdicts_of_independent_defences_alarm_as_often_as_they_say(rule):
+    rng = np.random.default_rng(7)
+    calibration = calibrated(rng)
+    n = 200_000
+    verdicts = {name: Verdict(rng.random(n), None, float(rng.random())) for name in ("one", "other")}
+    found = fused(verdicts, calibration, rule=rule)
+    assert found.objects is None
+    for level in ("objects", "frames"):  # 1 % and 5 %; 0.1 % is at the end of the tail
+        alarms = np.mean(found.returns > fused_threshold(level))
+        assert alarms == pytest.approx(FALSE_ALARMS[level], rel=0.1)
+    both = {name: Verdict(np.array([0.97]), None, 0.97) for name in ("one", "other")}
+    one = {"one": both["one"], "other": Verdict(np.array([0.3]), None, 0.3)}
+    assert fused(both, calibration, rule="fisher").frame > fused(one, calibration, rule="fisher").frame
+
+
+def test_defences_are_read_from_text():
+    every = read_defences(["all"])
+    assert [named.name for named in every] == defence_names()
+    assert len(defence_rows()) == len(every)
+    (one,) = read_defences(["occlusion:cell=0.5:core=1"])
+    assert one.to_json() == {"name": "occlusion", "valid": 0.05, "spoofed": 0.15, "cell": 0.5, "core": 1.0}
+    for text, message in {
+        "occlusio": "is occlusion meant",
+        "shadow:size=3": "no parameter 'size'",
+        "shadow:length": "NAME:KEY=VALUE",
+        "shadow:length=far": "length = 'far' is not a number",
+        "shadow:length=0": "not within 1 to 100",
+    }.items():
+        with pytest.raises(InputError, match=message):
+            read_defences([text])
+    with pytest.raises(InputError, match="given twice"):
+        read_defences(["shadow", "all"])
+    with pytest.raises(InputError, match="give one or more"):
+        read_defences([])
