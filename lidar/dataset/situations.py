@@ -61,6 +61,7 @@ def situation_of(
         camera=camera,
         light=None if camera is None else light_during(recording, start_ns),
         earlier=None if cloud_of is None else earlier,
+        geo=recording.frame,
     )
 
 

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, Origin, TracedEchoes, numbered, reported, traced
 from lidar.physics.intensity import apparent_of_code, reflectivity_code
-from lidar.rig.scanner import Sensor
+from lidar.physics.range_error import quantised
+from lidar.rig.scanner import Sensor, firings
 from lidar.sensors.cloud import Cloud
 from lidar.signal.registry import Stages
 from lidar.signal.run import Altered, altered_cloud, altered_echoes, linked
@@ -17,6 +19,8 @@ from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses
 
 _SEEN = 1 + 1e-9  # power over the threshold that a recorded return had at least
+_CODES = 256  # most values of intensities that are whole codes
+_ON_STEP = 0.1  # share of the range's step by which rounded coordinates put a range off it
 
 
 def altered_recording(
@@ -25,7 +29,8 @@ def altered_recording(
     """A recorded cloud after the stages on its echoes and on the cloud itself.
 
     Each return is one echo, with the power that its intensity and range imply; pulses without a return are
-    unknown, so that echo stages add nothing to them. Ranges get no further noise.
+    unknown, so that echo stages add nothing to them. Ranges get no further noise; new ranges and intensities
+    have the steps of the recorded ones.
 
     sensor    : the scanner that recorded the cloud
     threshold : echoes whose power falls to the detection threshold are lost
@@ -51,7 +56,7 @@ def altered_recording(
         keep = ~np.isin(found.pulse, found.pulse[found.source < 0])
         keep[rows] = True
         found, numbers = found.where(keep), (number[keep], count[keep])
-        result = _cloud(cloud, found, sensor=sensor, before=echoes, numbers=numbers)
+        result = _cloud(cloud, found, pulses=pulses, before=echoes, numbers=numbers)
     linked_cloud = linked(result, found, first=echoes)
     return Altered(altered_cloud(linked_cloud, stages, at=at), cloud)
 
@@ -68,17 +73,33 @@ def _pulse_rows(cloud: Cloud) -> NDArray[np.int32]:
 
 def _pulses(cloud: Cloud, sensor: Sensor, *, pulse: NDArray[np.int32]) -> Pulses:
     first = np.flatnonzero(np.diff(pulse, prepend=-1))
-    xyz = cloud.xyz[first].astype(np.float64)
+    origin = _origins(cloud, sensor)[first]
+    xyz = cloud.xyz[first] - origin
     return Pulses(
         sensor,
         cloud.start_ns + cloud.time_ns[first].astype(np.int64),
         xyz / np.maximum(np.linalg.norm(xyz, axis=1, keepdims=True), 1e-9),
-        np.zeros((len(first), 3)),
+        origin,
         cloud.ring[first],
         cloud.column[first],
         cloud.ring[first],
         np.ones(len(first)),
     )
+
+
+def _origins(cloud: Cloud, sensor: Sensor) -> Float:
+    """Where the beam of each return (n, 3) starts in the sensor frame, by its ring and column."""
+    sent = firings(sensor, 0)
+    if not sent.origin.any():
+        return np.zeros((len(cloud), 3))
+    width = int(sent.column.max()) + 1
+    row = np.zeros(width * (int(sent.ring.max()) + 1), np.int64)
+    row[sent.ring.astype(np.int64) * width + sent.column] = np.arange(len(sent))
+    # The first and last firing block of a frame may be incomplete; their neighbours start within 1 mm.
+    column = np.clip(cloud.column, min(1, width - 1), max(width - 2, 0))
+    ring = np.minimum(cloud.ring, sent.ring.max()).astype(np.int64)
+    found: Float = sent.origin[row[ring * width + column]]
+    return found
 
 
 def _echoes(cloud: Cloud, sensor: Sensor, *, pulse: NDArray[np.int32]) -> TracedEchoes:
@@ -100,21 +121,21 @@ def _cloud(
     cloud: Cloud,
     echoes: TracedEchoes,
     *,
-    sensor: Sensor,
+    pulses: Pulses,
     before: TracedEchoes,
     numbers: tuple[NDArray[np.uint8], NDArray[np.uint8]],
 ) -> Cloud:
     """The cloud of echoes that are reported; columns of echoes that did not change stay as they are."""
-    first = np.flatnonzero(np.diff(before.pulse, prepend=-1))
+    sensor, first = pulses.sensor, np.flatnonzero(np.diff(before.pulse, prepend=-1))
     is_known = echoes.source >= 0
     row = np.where(is_known, echoes.source, first[echoes.pulse])
     xyz, old = cloud.xyz[row].astype(np.float64), cloud.range[row]
     distance = echoes.range + sensor.pattern.range_offset
     moved = ~is_known | (echoes.range != before.range[row])
-    length = np.linalg.norm(xyz[moved], axis=1, keepdims=True)
-    xyz[moved] *= 1 + (distance - old)[moved, None] / np.maximum(length, 1e-9)
+    distance = np.where(moved, _stepped(distance, cloud.range, step=sensor.range_quantum), old)
+    xyz += (distance - old)[:, None] * pulses.direction[echoes.pulse]
     brighter = ~is_known | (echoes.apparent != before.apparent[row])
-    code = reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code)
+    code = _coded(reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code), cloud.intensity)
     number, count = numbers
     return replace(
         cloud,
@@ -122,7 +143,7 @@ def _cloud(
         time_ns=cloud.time_ns[row],
         ring=cloud.ring[row],
         column=cloud.column[row],
-        range=np.where(moved, distance, old),
+        range=distance,
         intensity=np.where(brighter, code, cloud.intensity[row]),
         klass=echoes.klass,
         feature=echoes.feature,
@@ -131,3 +152,19 @@ def _cloud(
         echo=np.where(is_known, cloud.echo[row], number),
         echoes=np.where(is_known, cloud.echoes[row], count),
     )
+
+
+def _stepped(distance: Float, recorded: Float, *, step: float) -> Float:
+    """Ranges (m,), rounded to the sensor's step if recorded ones (n,) are."""
+    if not step or not len(recorded):
+        return distance
+    off = np.abs(recorded / step - np.round(recorded / step))
+    return quantised(distance, step) if np.percentile(off, 99) < _ON_STEP else distance
+
+
+def _coded(intensity: NDArray[np.float32], recorded: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Intensities (m,), each the nearest recorded value if there are few of these, as of whole codes."""
+    values = np.unique(recorded)
+    if not 0 < len(values) <= min(_CODES, len(recorded) // 2):
+        return intensity
+    return values[np.searchsorted((values[1:] + values[:-1]) / 2, intensity)]

@@ -21,6 +21,11 @@ _STAGES = {
     "cover_glass": "signal.cover_glass.CoverGlass",
     "dropped_packets": "signal.dropped_packets.DroppedPackets",
     "lost_rows": "signal.lost_rows.LostRows",
+    "inject": "attacks.inject.Inject",
+    "replay": "attacks.replay.Replay",
+    "relay": "attacks.relay.Relay",
+    "remove": "attacks.remove.Remove",
+    "high_frequency_removal": "attacks.high_frequency_removal.HighFrequencyRemoval",
 }
 """Module within `lidar` and class, by name."""
 

@@ -9,6 +9,7 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.frames import Frame
 from lidar.camera.light import Light
 from lidar.geometry.poses import Poses
 from lidar.rig.specs import CameraSpec
@@ -27,6 +28,7 @@ class Situation:
     utc      : of the drive's start; None for clouds without a dataset
     poses    : of the sensor in the scene frame at times (n,) in nanoseconds since the drive's start; None for
         clouds without a dataset
+    geo      : from degrees to the scene frame; None for clouds without a dataset
     world    : what rays hit; None for recorded data
     seed     : of the drive, for what lasts longer than a frame
     camera   : the camera that takes an image; None of other sensors
@@ -46,3 +48,4 @@ class Situation:
     camera: CameraSpec | None = None
     light: Light | None = None
     earlier: Callable[[int], Cloud | None] | None = None
+    geo: Frame | None = None

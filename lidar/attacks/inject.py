@@ -1,0 +1,93 @@
+"""Injected returns: points, a wall, or the shape of a road user."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geoscene.typing import Float
+from lidar.attacks.attacker import Aim, SynchronisedAttacker, power_of, sent_back
+from lidar.attacks.phantoms import OBJECTS, far_trace_ranges, ground_below, object_ranges, wall_ranges
+from lidar.errors import InputError
+from lidar.physics.echoes import Origin, TracedEchoes
+from lidar.signal.situation import Situation
+from lidar.signal.stage import Pulses, parameter
+
+
+@dataclass(frozen=True)
+class Inject(SynchronisedAttacker):
+    """Returns of nothing: random points, a wall, or a road user (Cao 2019, Sun 2020, Jin 2023)."""
+
+    shape: str = parameter(
+        "object",
+        "random points, a wall, a whole road user, a strip of one, the few returns of a far one",
+        among=("random", "wall", "object", "occluded", "far"),
+    )
+    kind: str = parameter("sedan", "road user that the phantom resembles", among=OBJECTS)
+    range: float = parameter(7.0, "metres from the sensor to the phantom", low=0.1, high=1000)
+    closing: float = parameter(0.0, "m/s by which it comes nearer", low=-100, high=100)
+    offset: float = parameter(
+        0.0, "degrees of azimuth of the phantom from the device to the left", low=-180, high=180
+    )
+    wide: float = parameter(4.0, "metres, width of a wall", low=0.1, high=1000)
+    high: float = parameter(2.0, "metres, height of a wall", low=0.1, high=100)
+    deep: float = parameter(10.0, "metres behind range over which random points lie", low=0, high=1000)
+    strip: float = parameter(
+        0.3, "share of the width of an occluded road user that is seen", low=0.01, high=1
+    )
+    seen_at: float = parameter(40.0, "metres away at which a far road user was recorded", low=1, high=200)
+    predicts: bool = parameter(True, "fires before the sensor does, so that phantoms may be nearer than it")
+    dimmest: float = parameter(0.3, "least apparent reflectance of a point", low=0, high=1)
+    brightest: float = parameter(1.0, "greatest apparent reflectance of a point", low=0, high=1)
+
+    def __post_init__(self) -> None:
+        """Validate the parameters, also against each other."""
+        super().__post_init__()
+        if self.dimmest > self.brightest:
+            raise InputError(f"dimmest = {self.dimmest:g} is over brightest = {self.brightest:g}")
+        if not self.predicts and not self.place and self.range < self.distance:
+            raise InputError(
+                f"range = {self.range:g} is nearer than the device at {self.distance:g} m,"
+                " which needs predicts = true"
+            )
+
+    def echoes(
+        self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator
+    ) -> TracedEchoes:
+        """The echoes with those of the phantom."""
+        aim = self.aim(pulses, echoes, at=at)
+        if aim is None:
+            return echoes
+        distance = self._distances(pulses, echoes, aim=aim, at=at, rng=rng)
+        sensor = pulses.sensor
+        away = distance + sensor.pattern.range_offset
+        usable = (away >= sensor.min_range) & (away <= sensor.max_range)
+        if not self.predicts:
+            usable &= distance >= aim.distance
+        known = np.full(len(pulses), np.inf)
+        known[aim.row] = distance
+        aim = self.accepted(self.spent(aim.where(usable), rng=rng), rng=rng)
+        distance = known[aim.row] + self.errors(aim, rng=rng)
+        reflectance = rng.uniform(self.dimmest, self.brightest, len(aim.row))
+        power = np.minimum(power_of(pulses, reflectance, distance=distance), aim.power)
+        return sent_back(pulses, echoes, row=aim.row, distance=distance, power=power, origin=Origin.INJECTED)
+
+    def _distances(
+        self, pulses: Pulses, echoes: TracedEchoes, *, aim: Aim, at: Situation, rng: np.random.Generator
+    ) -> Float:
+        """Distance (k,) of the phantom along each beam, metres; infinite where it has none."""
+        way = pulses.direction[aim.row]
+        ahead = float(np.degrees(np.arctan2(way[0, 1], way[0, 0])) - aim.azimuth[0]) if len(way) else 0.0
+        azimuth = ahead + self.offset + self.frame_jitter * rng.standard_normal()
+        distance = self.range - self.closing * (at.start_ns * 1e-9 - self.start)
+        if self.shape == "random":
+            return rng.uniform(distance, distance + self.deep, len(aim.row))
+        ground = ground_below(pulses, echoes, azimuth=azimuth)
+        place = {"azimuth": azimuth, "distance": distance, "ground": ground}
+        if self.shape == "wall":
+            return wall_ranges(pulses, aim.row, size=(self.wide, self.high), **place)
+        if self.shape == "far":
+            return far_trace_ranges(pulses, aim.row, kind=self.kind, seen_at=self.seen_at, **place)
+        part = (0.0, self.strip) if self.shape == "occluded" else (0.0, 1.0)
+        return object_ranges(pulses, aim.row, kind=self.kind, part=part, **place)
