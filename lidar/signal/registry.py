@@ -26,6 +26,7 @@ _STAGES = {
     "relay": "attacks.relay.Relay",
     "remove": "attacks.remove.Remove",
     "high_frequency_removal": "attacks.high_frequency_removal.HighFrequencyRemoval",
+    "weather": "weather.stage.Weather",
 }
 """Module within `lidar` and class, by name."""
 

@@ -1,0 +1,29 @@
+"""The stage ``weather``: what lasers and cameras get through the air."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidar.physics.echoes import TracedEchoes
+from lidar.signal.situation import Situation
+from lidar.signal.stage import Pulses
+from lidar.weather.air import through_even_air
+from lidar.weather.media import medium_of
+from lidar.weather.setting import WeatherSetting
+
+
+@dataclass(frozen=True)
+class Weather(WeatherSetting):
+    """Rain, fog, snow, dust or spray: dims echoes, and sends back echoes of its own."""
+
+    def echoes(
+        self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator
+    ) -> TracedEchoes:
+        """The echoes that reach the receiver."""
+        amount = self.amount_at(at.start_ns / 1e9)
+        if amount is None:
+            return echoes
+        medium = medium_of(self.kind, amount, wavelength_nm=pulses.sensor.wavelength_nm, medium=self.medium)
+        return through_even_air(pulses, echoes, medium=medium, rng=rng)

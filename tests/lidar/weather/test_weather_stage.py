@@ -1,0 +1,221 @@
+"""The stage on the echoes of a frame, and its consistency."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.sensor_worlds import box, driven, world
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from geoscene.classes import Class
+from lidar.geometry.mounts import Mount
+from lidar.physics.echoes import Origin
+from lidar.physics.settings import LEVELS, ScannerSettings
+from lidar.rig.scanner import load_sensor
+from lidar.sensors.cloud import Cloud
+from lidar.sensors.scan import cast
+from lidar.signal.recorded import altered_recording
+from lidar.signal.registry import stages_of
+from lidar.signal.run import altered_sweep
+from lidar.signal.situation import Situation
+from lidar.weather.backscatter import (
+    drawn_particles,
+    particles,
+    response_ranges,
+    soft_target,
+    strength,
+)
+from lidar.weather.media import fog_extinction, medium_of, rain, snow
+from lidar.weather.setting import read_weather
+
+ROOM = world(
+    box((-40, -30, -1), (40, 30, 0), feature=7, klass=Class.ROAD, material="asphalt"),
+    box((12, -20, 0), (15, 25, 9), feature=8),
+)
+DRIVE = {"trajectory": driven((10.0, 0.0, 0.0), start=(-20, -10, 0)), "world": ROOM}
+LINK = ScannerSettings(link=True)
+KINDS = ["rain=40", "snow=3", "fog=60", "dust=15,medium=even"]
+
+
+def sweep_of(detector=LINK, *, sensor="vlp16", **options):
+    options.setdefault("return_mode", "strongest")
+    return cast(
+        load_sensor(sensor, **options), Mount((1.2, 0, 1.9)), frame=2, seed=5, settings=detector, **DRIVE
+    )
+
+
+def altered(sweep, text, *, seed=3):
+    stages = stages_of([s.table() for s in read_weather(text)], seed=seed)
+    return altered_sweep(sweep, stages, at=Situation(sweep.sensor.name, sweep.frame))
+
+
+SWEEP = sweep_of()
+SURVEY = sweep_of(replace(LEVELS["survey"], rays=1))
+
+
+def assert_same(cloud, other):
+    for name, column in cloud.columns().items():
+        if name in Cloud.__dataclass_fields__:
+            np.testing.assert_array_equal(column, other.columns()[name], err_msg=name)
+
+
+@pytest.mark.parametrize("text", ["rain=0", "snow=0", "clear", "rain=50,start=5", "fog=20,start=1,end=2"])
+def test_without_extinction_the_cloud_is_the_clear_one(text):
+    for sweep in (SWEEP, SURVEY):
+        found = altered(sweep, text)
+        assert_same(found.original, found.cloud)
+        np.testing.assert_array_equal(found.cloud.source, np.arange(len(found.original)))
+
+
+@pytest.mark.parametrize("text", KINDS)
+def test_the_same_seed_gives_the_same_cloud(text):
+    first, again, other = (altered(SURVEY, text, seed=seed) for seed in (3, 3, 4))
+    assert_same(first.cloud, again.cloud)
+    if text.startswith("snow"):
+        assert len(first.cloud) != len(other.cloud) or (first.cloud.range != other.cloud.range).any()
+
+
+@given(
+    st.sampled_from(["rain", "snow", "fog", "dust"]),
+    st.floats(0, 1),
+    st.integers(0, 99),
+    st.sampled_from([SWEEP, SURVEY]),
+)
+@settings(max_examples=25, deadline=None)
+def test_returns_are_kept_lost_or_scattered_and_scattered_ones_lie_before_the_surface(
+    kind, amount, seed, sweep
+):
+    low, high = {"rain": (0, 200), "snow": (0, 20), "fog": (10, 1000), "dust": (5, 200)}[kind]
+    text = f"{kind}={low + amount * (high - low)}" + (",medium=even" if kind == "dust" else "")
+    found = altered(sweep, text, seed=seed)
+    cloud, original = found.cloud, found.original
+    kept, hidden = cloud.source[cloud.source >= 0], cloud.hidden[cloud.hidden >= 0]
+    assert len(np.unique(np.concatenate((kept, hidden)))) == len(kept) + len(hidden)
+    lost = np.setdiff1d(np.arange(len(original)), np.concatenate((kept, hidden)))
+    assert len(kept) + len(hidden) + len(lost) == len(original)
+    # What is kept has its range, and no more intensity than in clear air.
+    stays = cloud.source >= 0
+    np.testing.assert_allclose(cloud.true_range[stays], original.true_range[kept])
+    scattered = cloud.origin == Origin.WEATHER
+    assert np.all((cloud.source[scattered] < 0) & (cloud.klass[scattered] == Class.NOISE))
+    hides = scattered & (cloud.hidden >= 0)
+    behind = cloud.hidden[hides]
+    noise = 0.5  # metres, of weak echoes in the survey level
+    assert np.all(cloud.range[hides] < original.range[behind] + noise)
+    for column in ("time_ns", "ring", "column"):
+        np.testing.assert_array_equal(
+            getattr(cloud, column)[hides], getattr(original, column)[behind], err_msg=column
+        )
+    # Beams start some centimetres beside the sensor's origin.
+    angle = np.arccos(np.clip(np.sum(unit(cloud.xyz[hides]) * unit(original.xyz[behind]), axis=1), -1, 1))
+    assert np.all(angle * cloud.range[hides] < 0.1)
+
+
+def unit(xyz):
+    xyz = xyz.astype(float)
+    return xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("reflectance", [0.1, 0.5])
+def test_the_range_of_detection_is_the_root_of_the_link_equation(reflectance):
+    sensor = SWEEP.sensor
+
+    def seen(alpha):
+        def excess(r):
+            clear = reflectance / sensor.reference_reflectance * (sensor.reference_range / r) ** 2
+            return np.log(clear) - 2 * alpha * r
+
+        return brentq(excess, 0.5, 1000)
+
+    visibilities = np.array([2000.0, 500, 200, 100, 50])
+    ranges = [seen(fog_extinction(v, sensor.wavelength_nm)) for v in visibilities]
+    assert np.all(np.diff(ranges) < 0)
+    # The stage loses the echoes beyond that range and keeps those before it.
+    for visibility, reach in zip(visibilities, ranges, strict=True):
+        echoes = SWEEP.echoes
+        flat = replace(echoes, apparent=np.full(len(echoes), reflectance))
+        found = altered(replace(SWEEP, echoes=flat), f"fog={visibility}")
+        kept = found.cloud.source[found.cloud.source >= 0]
+        far = np.setdiff1d(np.flatnonzero(found.original.range > reach * 1.001), kept)
+        assert len(far) == np.sum(found.original.range > reach * 1.001)
+        near = found.original.range < reach * 0.999
+        hidden = found.cloud.hidden[found.cloud.hidden >= 0]
+        assert set(np.flatnonzero(near)) <= set(kept) | set(hidden)
+
+
+def test_dense_fog_is_a_ring_around_the_sensor():
+    found = altered(sweep_of(sensor="hdl64e_s2"), "fog=30").cloud
+    ring = found.range[found.origin == Origin.WEATHER]
+    assert len(ring) > 50_000
+    assert 1 < ring.min() <= ring.max() < 2
+    assert found.intensity[found.origin == Origin.WEATHER].max() < 5
+
+
+def test_snow_returns_thin_out_with_range_and_are_dim():
+    found = altered(sweep_of(sensor="hdl64e_s2"), "snow=2").cloud
+    flakes = found.origin == Origin.WEATHER
+    near, middle, far = (np.sum(flakes & (found.range > a) & (found.range <= a + 4)) for a in (2, 6, 10))
+    assert near > middle > far > 0
+    assert found.intensity[flakes].mean() < 0.2 * found.intensity[found.source >= 0].mean()
+
+
+def test_more_weather_loses_more_returns():
+    for kind, amounts in {"rain": (5, 50, 200), "snow": (0.5, 3, 15), "fog": (500, 150, 40)}.items():
+        kept = [np.sum(altered(SURVEY, f"{kind}={a}").cloud.source >= 0) for a in amounts]
+        assert np.all(np.diff(kept) < 0), kind
+
+
+@pytest.mark.parametrize("mode", ["strongest", "last", "dual"])
+def test_return_modes_choose_among_surfaces_and_flakes(mode):
+    found = altered(sweep_of(sensor="vlp16", return_mode=mode), "snow=4")
+    flakes = found.cloud.origin == Origin.WEATHER
+    behind = np.sum(found.cloud.hidden[flakes] >= 0)
+    if mode == "last":
+        assert behind == np.sum(np.isin(found.cloud.hidden, lost_ranges(found)))
+    else:
+        assert flakes.sum() > 0
+
+
+def lost_ranges(found):
+    """Rows of the original that the extinction alone would lose."""
+    kept = found.cloud.source[found.cloud.source >= 0]
+    return np.setdiff1d(np.arange(len(found.original)), kept)
+
+
+@pytest.mark.parametrize("medium", [rain(50, 905.0), snow(5, 905.0)])
+def test_drawn_and_undrawn_particles_send_back_what_the_medium_does(medium):
+    sensor = load_sensor("hdl64e_s2")
+    some, rest, distance = particles(sensor, medium, most=1e9)
+    pulses = 300_000
+    _, place, power = drawn_particles(some, pulses, rng=np.random.default_rng(0))
+    edges = np.array([2.0, 4, 8, 16, 32])
+    drawn = np.histogram(place, edges, weights=power)[0] / pulses
+    step = distance[1] - distance[0]
+    clear = np.pi * strength(sensor, distance) * step
+    undrawn = np.histogram(distance, edges, weights=clear * rest)[0]
+    whole = np.histogram(distance, edges, weights=clear * medium.backscatter)[0]
+    np.testing.assert_allclose(drawn + undrawn, whole, rtol=0.05)
+    assert drawn[0] > 0.5 * whole[0]
+
+
+def test_a_pulse_of_no_length_sees_the_lidar_equation():
+    sensor = replace(load_sensor("vlp16"), pulse_ns=2.0)
+    medium = medium_of("fog", 100, wavelength_nm=903, medium="kim")
+    distance = response_ranges(sensor)
+    soft = soft_target(
+        sensor, medium.extinction, backscatter=np.full(len(distance), medium.backscatter), distance=distance
+    )
+    length = 0.299792458 * sensor.pulse_ns / 2
+    white = strength(sensor, soft.range[-1:]) * np.exp(-2 * medium.extinction * soft.range[-1])
+    assert soft.power[-1] == pytest.approx(np.pi * medium.backscatter * length * white[0], rel=0.05)
+
+
+def test_weather_on_recorded_clouds_leaves_what_it_cannot_know():
+    original = altered(SWEEP, "clear").original
+    stages = stages_of([s.table() for s in read_weather("snow=5")])
+    at = Situation(SWEEP.sensor.name, 2)
+    found = altered_recording(original, stages, sensor=SWEEP.sensor, at=at).cloud
+    assert 0 < np.sum(found.origin == Origin.WEATHER) < len(original)
+    assert len(found) <= len(original)
