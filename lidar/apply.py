@@ -30,7 +30,7 @@ from lidar.dataset.recording import Contents, Recording
 from lidar.dataset.situations import situation_of, situation_of_unit
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
-from lidar.options import ApplyOptions
+from lidar.options import ApplyOptions, with_stage_settings
 from lidar.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.rig.scanner import Sensor, firings, load_sensor
 from lidar.rig.specs import GnssSpec, ImuSpec, Rig, load_rig, rig_digest
@@ -92,7 +92,7 @@ def apply_stages(
     if is_dataset:
         if options.sensor:
             raise InputError("`sensor`: a dataset has its own sensors; leave it out")
-        return _apply_to_dataset(open_dataset(source), out, stages=options.stages, progress=progress)
+        return _apply_to_dataset(open_dataset(source), out, stages=options.all_stages, progress=progress)
     return _apply_to_clouds(clouds, source, out=out, options=options, progress=progress)
 
 
@@ -110,7 +110,8 @@ def _apply_to_dataset(
         sensors: list[Scanner | Camera] = [*scanners(rig), *cameras(rig)]
         chosen = Stages(stages, seed)
         chosen.check(sensor_kinds(rig))
-        settings = settings_of(recipe["fidelity"], [(name, text) for name, text in recipe["settings"]])
+        recorded = [(name, text) for name, text in recipe["settings"]]
+        settings = settings_of(recipe["fidelity"], with_stage_settings(recorded, stages))
         contents = Contents(
             tuple(recipe["formats"]), tuple(recipe["labels"]), recipe["deskew"], seed, *settings, chosen
         )
@@ -317,7 +318,7 @@ def _apply_to_clouds(
         key = path.parent.name, form.name
         if key not in devices:
             devices[key] = load_sensor(options.sensor or _SENSORS[form.name], name=key[0])
-    chosen = Stages(options.stages)
+    chosen = Stages(options.all_stages)
     chosen.check({name: "lidar" for name, _ in devices})
     before = after = 0
     for done, (path, form) in enumerate(clouds):

@@ -422,11 +422,11 @@ def apply(
     dataset: Path,
     /,
     *,
-    options: ApplyOptions,
+    options: ApplyOptions | None = None,
     out: Out,
     report: Reporting = Report(),
 ) -> int:
-    """Apply stages to recorded data: a dataset, or point clouds of KITTI or nuScenes.
+    """Apply weather, attacks or other stages to recorded data: a dataset, or clouds of KITTI or nuScenes.
 
     Stages before the detector take each recorded return as one echo, with the power that its intensity
     implies; they add nothing to pulses without a return.
@@ -446,6 +446,7 @@ def apply(
     """
     from lidar.apply import apply_stages  # noqa: PLC0415
 
+    options = options or ApplyOptions()
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
         summary = apply_stages(dataset, out, options=options, overwrite=report.overwrite, progress=progress)

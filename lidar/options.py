@@ -30,12 +30,14 @@ if TYPE_CHECKING:
     from lidar.signal.registry import NamedStage
     from lidar.traffic.fcd import TrafficFile
     from lidar.traffic.populate import TrafficOptions
+    from lidar.weather.setting import WeatherSetting
 
+    WeatherList = tuple[WeatherSetting, ...]
     Traffic = TrafficOptions | TrafficFile
     StageList = tuple[NamedStage, ...]
 else:  # types that help shows; converters make the values, whose classes take a second to import; Any, as
     # cyclopts checks values against these types where pydantic is imported
-    Spec, Traffic, StageList = list[str] | Any, str | Any, tuple[str, ...] | Any
+    Spec, Traffic, StageList, WeatherList = (list[str] | Any, str | Any, *(tuple[str, ...] | Any,) * 2)
 
 OUTPUT = Group("Output", sort_key=3)
 
@@ -102,7 +104,39 @@ def _stages(_: object, tokens: Sequence[Token]) -> Any:
     return read_stages([token.value for token in tokens]).stages
 
 
+def _attacks(_: object, tokens: Sequence[Token]) -> Any:
+    from lidar.signal.registry import read_attacks  # noqa: PLC0415
+
+    return read_attacks([token.value for token in tokens])
+
+
+def _weather(_: object, tokens: Sequence[Token]) -> Any:
+    from lidar.weather.setting import read_weather  # noqa: PLC0415
+
+    return tuple(setting for token in tokens for setting in read_weather(token.value))
+
+
 _STAGE = Parameter(name="--stage", converter=_stages, n_tokens=1, accepts_keys=False, metavar="STAGE")
+_ATTACK = Parameter(name="--attack", converter=_attacks, n_tokens=1, accepts_keys=False, metavar="ATTACK")
+_WEATHER = Parameter(name="--weather", converter=_weather, n_tokens=1, accepts_keys=False, metavar="WEATHER")
+
+
+def chosen_stages(
+    weather: Iterable[WeatherSetting], attacks: Iterable[NamedStage], *, stages: Iterable[NamedStage]
+) -> tuple[NamedStage, ...]:
+    """All stages in the order in which they act: weather, attacks, others."""
+    from lidar.signal.registry import numbered, read_stage  # noqa: PLC0415
+
+    return numbered([*(read_stage(setting.table()) for setting in weather), *attacks, *stages])
+
+
+def with_stage_settings(
+    settings: Sequence[tuple[str, str]], stages: Iterable[NamedStage]
+) -> tuple[tuple[str, str], ...]:
+    """Settings that differ from a fidelity level: those of stages, unless given, and the given ones."""
+    given = {name for name, _ in settings}
+    by_stages = (pair for named in stages for pair in named.stage.settings)
+    return (*dict.fromkeys(pair for pair in by_stages if pair[0] not in given), *settings)
 
 
 def _pair(text: str) -> tuple[str, str]:
@@ -151,7 +185,7 @@ def _values(text: str, words: Sequence[str], *, known: dict[str, Any]) -> dict[s
 _EXAMPLES = {float: "0.5", Path: "map.net.xml"}
 
 
-_NOT_IN_RECIPE = ("stages", "workers", "scheduler")
+_NOT_IN_RECIPE = ("stages", "weather", "attacks", "workers", "scheduler")
 """Options that the recipe states otherwise, or on which no byte depends."""
 
 
@@ -246,6 +280,15 @@ class DriveOptions:
     """Change echoes, clouds, images, fixes or inertial samples by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or
     a TOML file with tables [[stage]]; repeat for more. lidar stages lists them."""
 
+    weather: Annotated[WeatherList, _WEATHER] = ()
+    """Weather for all sensors: rain=10mm/h, fog=50m (visibility), snow=2mm/h (as water), dust, spray, several
+    separated by commas, or a TOML file with tables [[weather]] of time and place; repeat for more. Echoes
+    that are too weak are then lost at every fidelity level (--set link=on)."""
+
+    attacks: Annotated[StageList, _ATTACK] = ()
+    """Attack on sensors: a TOML file with tables [[attack]], NAME or NAME:KEY=VALUE,KEY=VALUE; repeat for
+    more. It acts after the weather and before other stages."""
+
     workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2
     """Threads, at most one per core; each records one frame at a time. The bytes do not depend on it."""
 
@@ -293,9 +336,16 @@ class DriveOptions:
         from lidar.settings import settings_of  # noqa: PLC0415
         from lidar.signal.registry import Stages  # noqa: PLC0415
 
-        chosen = settings_of(self.fidelity, self.settings)
-        stages = Stages(self.stages, self.seed)
-        return Contents(self.formats, self.labels, self.deskew, self.seed, *chosen, stages)
+        stages = self.all_stages
+        chosen = settings_of(self.fidelity, with_stage_settings(self.settings, stages))
+        return Contents(self.formats, self.labels, self.deskew, self.seed, *chosen, Stages(stages, self.seed))
+
+    @property
+    def all_stages(self) -> StageList:
+        """Weather, attacks and other stages in the order in which they act."""
+        if not (self.weather or self.attacks):
+            return self.stages
+        return chosen_stages(self.weather, self.attacks, stages=self.stages)
 
     def recipe(self, scene: Scene) -> dict[str, Any]:
         """All that the dataset's bytes depend on, as JSON; files with a digest of their contents."""
@@ -318,8 +368,9 @@ class DriveOptions:
         recipe |= {name: getattr(self, name) for name in names}
         if scene.area is not None:
             resolved["map"] = scene.origin
-        if self.stages:
-            resolved["stages"] = [stage.to_json() for stage in self.stages]
+        if stages := self.all_stages:
+            resolved["stages"] = [stage.to_json() for stage in stages]
+            resolved["settings"] = with_stage_settings(self.settings, stages)
         return recipe | resolved
 
 
@@ -570,17 +621,30 @@ class ExportOptions:
 class ApplyOptions:
     """Options of stages on recorded data."""
 
-    stages: Annotated[StageList, _STAGE]
+    stages: Annotated[StageList, _STAGE] = ()
     """Stage to apply: NAME, NAME:KEY=VALUE,KEY=VALUE or a TOML file with tables [[stage]]; repeat for more.
     lidar stages lists them."""
 
     sensor: str = ""
     """Scanner of KITTI's or nuScenes' clouds: a preset or a TOML file; hdl64e_s3 or hdl32e by default."""
 
+    weather: Annotated[WeatherList, _WEATHER] = ()
+    """Weather for all sensors: rain=10mm/h, fog=50m (visibility), snow=2mm/h (as water), dust, spray, several
+    separated by commas, or a TOML file with tables [[weather]]; repeat for more."""
+
+    attacks: Annotated[StageList, _ATTACK] = ()
+    """Attack on sensors: a TOML file with tables [[attack]], NAME or NAME:KEY=VALUE,KEY=VALUE; repeat for
+    more. It acts after the weather and before other stages."""
+
     def __post_init__(self) -> None:
         """Validate the options."""
-        if not self.stages:
-            raise InputError("`stages`: give one or more")
+        if not self.all_stages:
+            raise InputError("give one or more of `stages`, `weather` and `attacks`")
+
+    @property
+    def all_stages(self) -> StageList:
+        """Weather, attacks and other stages in the order in which they act."""
+        return chosen_stages(self.weather, self.attacks, stages=self.stages)
 
 
 @Parameter(name="*")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
@@ -142,30 +142,51 @@ def read_stages(texts: Iterable[str], *, seed: int = 0) -> Stages:
 
     Raises InputError as `read_stage` does, and for a file that cannot be read.
     """
-    tables: list[Mapping[str, Any]] = []
-    for text in texts:
-        tables += _file_tables(Path(text)) if text.endswith(".toml") else [_text_table(text)]
-    return stages_of(tables, seed=seed)
+    return stages_of(_tables(texts, "stage"), seed=seed)
+
+
+def read_attacks(texts: Iterable[str]) -> tuple[NamedStage, ...]:
+    """Attacks from texts as `read_stages` reads them, and from files with tables ``[[attack]]``.
+
+    Raises InputError as `read_stages` does, and for a stage that is no attack.
+    """
+    tables = _tables(texts, "attack")
+    known = [name for name, place in _STAGES.items() if place.startswith("attacks.")]
+    for table in tables:
+        if (name := table.get("name")) in _STAGES and name not in known:
+            raise InputError(f"stage {name} is no attack (attacks are {', '.join(known)})")
+    return stages_of(tables).stages
 
 
 def stages_of(tables: Iterable[Mapping[str, Any]], *, seed: int = 0) -> Stages:
     """Stages from tables as `read_stage` reads them."""
+    return Stages(numbered(map(read_stage, tables)), seed)
+
+
+def numbered(stages: Iterable[NamedStage]) -> tuple[NamedStage, ...]:
+    """Stages in the order in which they act, each with the number of earlier ones of the same name."""
     found: list[NamedStage] = []
-    for table in tables:
-        named = read_stage(table)
-        number = sum(other.name == named.name for other in found)
-        found.append(NamedStage(named.name, named.stage, named.seed, named.sensor, number))
-    return Stages(tuple(found), seed)
+    for named in stages:
+        found.append(replace(named, number=sum(other.name == named.name for other in found)))
+    return tuple(found)
 
 
-def _file_tables(path: Path) -> list[Mapping[str, Any]]:
+def _tables(texts: Iterable[str], kind: str) -> list[Mapping[str, Any]]:
+    """Tables of stages from texts, and from files with tables ``[[kind]]``."""
+    tables: list[Mapping[str, Any]] = []
+    for text in texts:
+        tables += _file_tables(Path(text), kind) if text.endswith(".toml") else [_text_table(text)]
+    return tables
+
+
+def _file_tables(path: Path, kind: str) -> list[Mapping[str, Any]]:
     try:
         document = tomllib.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as TOML ({error})") from None
-    tables = document.pop("stage", None)
-    if document or not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
-        raise InputError(f"{path}: give tables [[stage]] with a name and parameters, and nothing else")
+    tables = document.pop(kind, None)
+    if document or not tables or not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
+        raise InputError(f"{path}: give tables [[{kind}]] with a name and parameters, and nothing else")
     return tables
 
 

@@ -12,7 +12,7 @@ from cyclopts import CycloptsError
 from geoscene.errors import GeosceneError
 from lidar.errors import InputError, LidarError
 
-_REPEATED = ("set", "stage")
+_REPEATED = ("set", "stage", "weather", "attack")
 """Options of which each value is given by a flag of its own."""
 
 _JOINED = ("format", "labels", "only")

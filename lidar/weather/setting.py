@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from lidar.errors import InputError
 from lidar.signal.stage import Stage, parameter
@@ -84,6 +84,8 @@ class WeatherSetting(Stage):
 
     Raises InputError for a value that is out of bounds or does not belong to the kind.
     """
+
+    settings: ClassVar[tuple[tuple[str, str], ...]] = (("link", "on"),)  # weak echoes are lost
 
     kind: str = parameter("rain", "what is in the air", among=tuple(KINDS))
     amount: float = parameter(

@@ -1,0 +1,137 @@
+"""Options --weather and --attack: order, settings, recipe, and bad input."""
+
+from dataclasses import dataclass
+
+import pytest
+from helpers.programs import run_program
+
+from lidar.errors import InputError
+from lidar.options import ApplyOptions, DriveOptions
+from lidar.signal import registry
+from lidar.signal.registry import NamedStage, read_attacks, read_stages
+from lidar.signal.stage import Stage, parameter
+from lidar.weather.setting import WeatherSetting, read_weather
+
+LOSSY = read_stages(["dropped_packets:loss=0.1"]).stages
+
+
+@dataclass(frozen=True)
+class Blinding(Stage):
+    """An attack."""
+
+    power: float = parameter(1.0, "watts", low=0, high=10)
+
+    def echoes(self, pulses, echoes, *, at, rng):
+        del pulses, at, rng
+        return echoes
+
+
+@dataclass(frozen=True)
+class Clouding(WeatherSetting):
+    """A weather."""
+
+    def echoes(self, pulses, echoes, *, at, rng):
+        del pulses, at, rng
+        return echoes
+
+
+@pytest.fixture
+def _known(monkeypatch):
+    """A registry with an attack and weather, whatever there is."""
+    stages = {"dropped_packets": "signal.dropped_packets.DroppedPackets"}
+    monkeypatch.setattr(registry, "_STAGES", stages | {"blinding": "attacks.b.Blinding", "weather": "w.W"})
+    classes = {"blinding": Blinding, "weather": Clouding}
+    plain = registry.stage_class
+    monkeypatch.setattr(registry, "stage_class", lambda name: classes.get(name) or plain(name))
+
+
+@pytest.mark.usefixtures("_known")
+def test_weather_comes_first_then_attacks_then_other_stages():
+    attacks = read_attacks(["blinding:power=2", "blinding"])
+    options = DriveOptions(
+        route="random", stages=LOSSY, attacks=attacks, weather=read_weather("rain=10mm/h,fog=50m")
+    )
+    stages = options.all_stages
+    assert [s.name for s in stages] == ["weather", "weather", "blinding", "blinding", "dropped_packets"]
+    assert [s.number for s in stages] == [0, 1, 0, 1, 0]
+    assert [s.stage.kind for s in stages[:2]] == ["rain", "fog"]
+    assert stages[2].stage.power == 2
+    assert stages == ApplyOptions(LOSSY, weather=options.weather, attacks=attacks).all_stages
+
+
+@pytest.mark.usefixtures("_known")
+def test_weather_loses_weak_echoes_unless_the_user_says_otherwise():
+    fog = read_weather("fog=50m")
+    assert not DriveOptions(route="random").contents().scanner.link
+    assert DriveOptions(route="random", weather=fog).contents().scanner.link
+    off = DriveOptions(route="random", weather=fog, settings=(("link", "off"),))
+    assert not off.contents().scanner.link
+    assert (
+        DriveOptions(route="random", stages=read_stages(["weather:kind=fog,amount=9"]).stages)
+        .contents()
+        .scanner.link
+    )
+
+
+@pytest.mark.usefixtures("_known")
+def test_the_recipe_lists_weather_and_attacks_as_stages(scene):
+    plain = DriveOptions(route="random").recipe(scene)
+    assert not {"stages", "weather", "attacks"} & plain.keys()
+    wanted = DriveOptions(
+        route="random", weather=read_weather("rain=3mm/h"), attacks=read_attacks(["blinding"])
+    )
+    recipe = wanted.recipe(scene)
+    assert [row["name"] for row in recipe["stages"]] == ["weather", "blinding"]
+    assert recipe["stages"][0]["amount"] == 3
+    assert recipe["settings"] == (("link", "on"),)
+    assert not {"weather", "attacks"} & recipe.keys()
+
+
+@pytest.mark.usefixtures("_known")
+def test_files_of_attacks_hold_attacks_only(tmp_path):
+    file = tmp_path / "a.toml"
+    file.write_text('[[attack]]\nname = "blinding"\npower = 3\nsensor = "top"\n')
+    assert read_attacks([str(file)]) == (NamedStage("blinding", Blinding(3), sensor="top"),)
+    for text, match in (
+        ('[[stage]]\nname = "blinding"\n', r"give tables \[\[attack\]\]"),
+        ('[[attack]]\nname = "dropped_packets"\n', r"is no attack \(attacks are blinding\)"),
+        ("[[attack]]\npower = 3\n", "has no name"),
+        ("attack = []\n", r"give tables \[\[attack\]\]"),
+        ('[[attack]]\nname = "blinding"\npower = 11\n', "power = 11 is not within 0 to 10"),
+    ):
+        file.write_text(text)
+        with pytest.raises(InputError, match=match):
+            read_attacks([str(file)])
+    with pytest.raises(InputError, match="give one or more of `stages`, `weather` and `attacks`"):
+        ApplyOptions()
+
+
+BAD = [
+    ("--weather", "hail", "no kind of weather"),
+    ("--weather", "rain=-1mm/h", "not within 0 to 300"),
+    ("--weather", "fog", "needs an amount"),
+    ("--weather", "none.toml", "cannot be read"),
+    ("--attack", "blinding-laser", "is unknown"),
+    ("--attack", "dropped_packets", "is no attack"),
+    ("--attack", "none.toml", "cannot be read"),
+]
+
+
+@pytest.mark.parametrize(("flag", "text", "match"), BAD)
+def test_bad_weather_and_attacks_end_in_one_line_with_nothing_written(scene, tmp_path, flag, text, match):
+    (tmp_path / "velodyne").mkdir()
+    (tmp_path / "velodyne" / "000000.bin").write_bytes(b"")
+    file = tmp_path / "sweep.toml"
+    file.write_text(f'[drive]\nscene = "{scene.path}"\nroute = "random"\n[grid]\n{flag[2:]} = ["{text}"]\n')
+    route = ("--route", "random", "--duration", "0.5", flag, text)
+    for words in (
+        ("drive", scene.path, *route),
+        ("apply", tmp_path, flag, text),
+        ("sweep", file),
+    ):
+        result = run_program("lidar", *words, "-o", tmp_path / "out", "-q")
+        assert result.returncode == 2, result.stderr
+        assert result.stderr.count("\n") == 1
+        assert result.stderr.startswith("lidar: ")
+        assert match in result.stderr
+        assert not (tmp_path / "out").exists()
