@@ -16,6 +16,7 @@ from geoscene.classes import Class
 from geoscene.csv_tables import write_columns
 from geoscene.files import write_json
 from geoscene.progress import Progress, silent
+from lidar.attacks.sight import Seen, check_sight
 from lidar.camera.png import counts_to_depth, image_to_feature, read_png, write_png
 from lidar.camera.render import Frame as Image
 from lidar.dataset.boxes import merge_box_files
@@ -36,7 +37,7 @@ from lidar.rig.scanner import Sensor, firings, load_sensor
 from lidar.rig.specs import GnssSpec, ImuSpec, Rig, load_rig, rig_digest
 from lidar.sensors.cloud import Cloud
 from lidar.settings import settings_of
-from lidar.signal.recorded import altered_recording
+from lidar.signal.recorded import altered_recording, recorded_echoes
 from lidar.signal.registry import NamedStage, Stages
 from lidar.signal.run import Altered, altered_image, cloud_truth, image_truth, write_truth
 from lidar.signal.situation import Situation
@@ -132,6 +133,8 @@ def _apply_to_dataset(
         for frame in range(len(dataset.sample_times(s.name)))
     ]
     form = _richest_format(contents) if any(isinstance(s, Scanner) for s, _ in jobs) else None
+    if form is not None:
+        _check_sight(dataset, recording, form=form, jobs=jobs)
     written = {path for job in jobs for path in recording.paths(*job).values()}
     written |= {Paths(out).measurements(unit.name) for unit in _altered_units(rig, chosen)}
     if Paths(out).manifest.exists():  # a former dataset, to be replaced
@@ -224,9 +227,7 @@ def _apply_to_frame(
     recorded = _completed(table_cloud(table, start_ns=begin), scanner.sensor, columns=form.columns)
 
     def cloud_of(earlier: int) -> Cloud:
-        path = replace(recording, out=dataset.path).paths(scanner, earlier)[form.name]
-        cloud = table_cloud(cloud_points(path), start_ns=scanner.frame_start_ns(earlier))
-        return _completed(cloud, scanner.sensor, columns=form.columns)
+        return _recorded(dataset, recording, form=form, scanner=scanner, frame=earlier)
 
     threshold = contents.scanner.link or contents.scanner.detection
     at = situation_of(recording, scanner, frame=frame, cloud_of=cloud_of)
@@ -252,6 +253,36 @@ def _apply_to_frame(
             write_columns(Paths(recording.out).frame_boxes(scanner.name, frame), columns | {"points": hits})
     write_truth(paths["truth"], cloud_truth(altered, start_ns=begin))
     return len(cloud)
+
+
+def _recorded(dataset: Dataset, recording: Recording, *, form: Format, scanner: Scanner, frame: int) -> Cloud:
+    """A cloud of a dataset."""
+    path = replace(recording, out=dataset.path).paths(scanner, frame)[form.name]
+    cloud = table_cloud(cloud_points(path), start_ns=scanner.frame_start_ns(frame))
+    return _completed(cloud, scanner.sensor, columns=form.columns)
+
+
+def _check_sight(
+    dataset: Dataset,
+    recording: Recording,
+    *,
+    form: Format,
+    jobs: Sequence[tuple[Scanner | Camera, int]],
+) -> None:
+    """Raise InputError for an attacker that no scanner sees in any of the frames."""
+    check_sight(
+        recording.contents.stages,
+        (
+            (
+                *recorded_echoes(
+                    _recorded(dataset, recording, form=form, scanner=device, frame=frame), device.sensor
+                ),
+                situation_of(recording, device, frame=frame),
+            )
+            for device, frame in jobs
+            if isinstance(device, Scanner)
+        ),
+    )
 
 
 def _labels(altered: Altered, semantic_kitti: Path | None) -> PointLabels:
@@ -320,6 +351,9 @@ def _apply_to_clouds(
             devices[key] = load_sensor(options.sensor or _SENSORS[form.name], name=key[0])
     chosen = Stages(options.all_stages)
     chosen.check({name: "lidar" for name, _ in devices})
+    check_sight(
+        chosen, (_seen(path, form, device=devices[path.parent.name, form.name]) for path, form in clouds)
+    )
     before = after = 0
     for done, (path, form) in enumerate(clouds):
         progress("stages", done, total=len(clouds))
@@ -340,6 +374,12 @@ def _apply_to_clouds(
         before, after = before + len(recorded), after + len(altered.cloud)
     progress("stages", len(clouds), total=len(clouds))
     return ApplySummary(out, len(clouds), before, after)
+
+
+def _seen(path: Path, form: Format, *, device: Sensor) -> Seen:
+    """What a point cloud of KITTI or nuScenes tells about an attacker's line of sight."""
+    recorded = _read_foreign(path, form, device=device)
+    return (*recorded_echoes(recorded, device), Situation(device.name, path.name))
 
 
 def _read_foreign(path: Path, form: Format, *, device: Sensor) -> Cloud:

@@ -23,6 +23,7 @@ from geoscene.files import exclusive, write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float
+from lidar.attacks.sight import Seen, check_sight, sent_only
 from lidar.cluster import record_on_cluster
 from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.journal import Entries, Journal, read_journal
@@ -30,6 +31,7 @@ from lidar.dataset.layout import Paths, prepare
 from lidar.dataset.metadata import write_metadata
 from lidar.dataset.record import record_frame
 from lidar.dataset.recording import Recording
+from lidar.dataset.situations import situation_of
 from lidar.errors import LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import write_trajectory
@@ -147,9 +149,10 @@ def _driven(
     plan = plan or plan_drive(scene, options, progress=progress)
     planning_s = time.perf_counter() - planning_from
     manifest = plan.manifest() | dict(notes)
+    recording = plan.recording(out)
+    check_sight(recording.contents.stages, _scanner_frames(plan, recording))
     prepare(out, manifest["recipe"], overwrite=overwrite)
     with _removed_if_nothing_recorded(out), exclusive(out):
-        recording = plan.recording(out)
         journal = _verified(recording, plan.jobs, progress=progress)
         _write_plan(plan, out, manifest=manifest)
         pending = _pending(plan, journal)
@@ -192,6 +195,18 @@ def _driven(
         recording=recording_s,
         stages=recording.watch.seconds,
     )
+
+
+def _scanner_frames(plan: DrivePlan, recording: Recording) -> Iterator[Seen]:
+    """Frames of a drive's scanners in its world."""
+    worlds = Worlds(plan.scene, plan.max_range, actors=recording.actors, settings=recording.contents.world)
+    for chunk, region in chunks(plan.jobs, recording.trajectory):
+        worlds.follow(region)
+        for job in chunk:
+            if isinstance(job.sensor, Scanner):
+                world = worlds.during(*job.sensor.sensor.window_ns(job.frame))
+                at = situation_of(recording, job.sensor, frame=job.frame, world=world)
+                yield sent_only(job.sensor.sensor, at)
 
 
 def trim_memory() -> None:

@@ -35,8 +35,7 @@ def altered_recording(
     sensor    : the scanner that recorded the cloud
     threshold : echoes whose power falls to the detection threshold are lost
     """
-    pulse = _pulse_rows(cloud)
-    pulses, echoes = _pulses(cloud, sensor, pulse=pulse), _echoes(cloud, sensor, pulse=pulse)
+    pulses, echoes = recorded_echoes(cloud, sensor)
     if threshold:
         least = pulses.apparent(np.full(len(echoes), _SEEN), echoes.range)
         echoes = replace(echoes, apparent=np.maximum(echoes.apparent, least))
@@ -59,6 +58,12 @@ def altered_recording(
         result = _cloud(cloud, found, pulses=pulses, before=echoes, numbers=numbers)
     linked_cloud = linked(result, found, first=echoes)
     return Altered(altered_cloud(linked_cloud, stages, at=at), cloud)
+
+
+def recorded_echoes(cloud: Cloud, sensor: Sensor) -> tuple[Pulses, TracedEchoes]:
+    """The pulses of a recorded cloud's returns, and these as their echoes."""
+    pulse = _pulse_rows(cloud)
+    return _pulses(cloud, sensor, pulse=pulse), _echoes(cloud, sensor, pulse=pulse)
 
 
 def _pulse_rows(cloud: Cloud) -> NDArray[np.int32]:

@@ -10,6 +10,7 @@ from scipy import stats
 from geoscene.classes import Class
 from geoscene.frames import Frame
 from lidar.attacks.attacker import DEVICES, METRES_PER_NS
+from lidar.attacks.sight import check_sight, sent_only
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.physics.echoes import Origin
@@ -327,3 +328,16 @@ def test_faulty_attacks_are_refused_in_one_line(table, message):
     with pytest.raises(InputError, match=message) as error:
         read_stage(table)
     assert "\n" not in str(error.value)
+
+
+def test_a_device_that_is_never_in_sight_is_refused():
+    seen, hidden = place_of((20.0, 5.0, 1.5)), place_of((20.0, 5.0, -3.0))
+    for place, fits in ((seen, True), (hidden, False)):
+        stages = stages_of([{"name": "inject", "place": "{} {} {}".format(*place)}], seed=5)
+        frames = [sent_only(VLP.sensor, situation(VLP))] * 2
+        if fits:
+            check_sight(stages, frames)
+        else:
+            with pytest.raises(InputError, match="attack inject: its device is in the line of sight of no"):
+                check_sight(stages, frames)
+    check_sight(stages_of([{"name": "cover_glass"}]), [])
