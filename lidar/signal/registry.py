@@ -27,6 +27,7 @@ _STAGES = {
     "remove": "attacks.remove.Remove",
     "high_frequency_removal": "attacks.high_frequency_removal.HighFrequencyRemoval",
     "weather": "weather.stage.Weather",
+    "weather_model": "weather.model_stage.WeatherModel",
 }
 """Module within `lidar` and class, by name."""
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar.physics.echoes import TracedEchoes
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Pulses
+from lidar.signal.stage import Pulses, parameter
 from lidar.weather.air import through_even_air
 from lidar.weather.media import medium_of
 from lidar.weather.setting import WeatherSetting
@@ -17,6 +17,8 @@ from lidar.weather.setting import WeatherSetting
 @dataclass(frozen=True)
 class Weather(WeatherSetting):
     """Rain, fog, snow, dust or spray: dims echoes, and sends back echoes of its own."""
+
+    model: str = parameter("physical", "the model; others are stage weather_model", among=("physical",))
 
     def echoes(
         self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator
