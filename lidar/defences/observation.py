@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from geoscene.typing import Float, Ints
 from lidar.detection import Detections, detect
 from lidar.detection.detector import inside
-from lidar.detection.ground import height_above_ground
+from lidar.detection.ground import Ground, ground_of
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.patterns.beams import Firings
@@ -23,6 +24,7 @@ from lidar.rig.specs import CameraSpec
 
 GROUND_BAND = 0.3
 """Metres above the ground up to which returns count as of the ground, as for the detector."""
+_DIRECTIONS = 360, 120  # cells of azimuth and elevation in which the depth of view is kept
 _MARGIN = 0.1  # metres by which boxes are grown on each side
 
 
@@ -159,14 +161,37 @@ class Observation:
         return np.flatnonzero(~has)
 
     @functools.cached_property
+    def surface(self) -> Ground:
+        """Height of the ground around the sensor."""
+        return ground_of(self.xyz)
+
+    @functools.cached_property
     def height(self) -> Float:
         """Metres (n,) above the ground."""
-        return height_above_ground(self.xyz)
+        above: Float = self.xyz[:, 2] - self.surface.below(self.xyz)
+        return above
 
     @functools.cached_property
     def ground(self) -> NDArray[np.bool_]:
         """Whether each return (n,) is of the ground."""
         return self.height <= GROUND_BAND
+
+    @functools.cached_property
+    def obstacles(self) -> cKDTree:
+        """Tree of the scene coordinates of the returns that are not of the ground."""
+        return cKDTree(self.scene_xyz[~self.ground])
+
+    @functools.cached_property
+    def _depths(self) -> Float:
+        """Least range in cells of direction, of returns; 0 in those without."""
+        depth = np.full(_DIRECTIONS, np.inf)
+        np.minimum.at(depth, _direction_cell(self.xyz), self.distance)
+        return np.where(np.isfinite(depth), depth, 0.0)
+
+    def depth_towards(self, points: Float) -> Float:
+        """Metres (n,) that the frame looks in the direction of points (n, 3); 0 without a return."""
+        depth: Float = self._depths[_direction_cell(points)]
+        return depth
 
     @functools.cached_property
     def objects(self) -> Detections:
@@ -184,3 +209,14 @@ class Observation:
             size = boxes.size[k] + 2 * _MARGIN
             found.append(rows[near[inside(xyz[near], boxes.centre[k], size=size, yaw=float(boxes.yaw[k]))]])
         return tuple(found)
+
+
+def _direction_cell(points: Float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Cells of azimuth and elevation of points (n, 3)."""
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) + 180
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))) + 90
+    cells = (azimuth / 360 * _DIRECTIONS[0], elevation / 180 * _DIRECTIONS[1])
+    first, second = (
+        np.clip(cell, 0, most - 1).astype(np.int64) for cell, most in zip(cells, _DIRECTIONS, strict=True)
+    )
+    return first, second

@@ -15,6 +15,12 @@ from lidar.errors import InputError
 _DEFENCES = {
     "occlusion": "occlusion.Occlusion",
     "shadow": "shadow.Shadow",
+    "temporal": "temporal.Temporal",
+    "void": "void.Void",
+    "azimuth": "azimuth.Azimuth",
+    "map": "map.Map",
+    "physics": "physics.Physics",
+    "statistical": "statistical.Statistical",
 }
 """Module within this folder and class, by name."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import median_filter
 
@@ -23,25 +25,63 @@ _NEAR = (3.0, 15.0)
 """Metres of range within which the height of the sensor is estimated."""
 
 
-def height_above_ground(xyz: Float) -> Float:
-    """Metres (n,) of points (n, 3) above the ground, along the sensor's z axis.
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """Height of the ground around the sensor.
+
+    surface : (sectors, cells) metres, in the middle of each cell of the polar grid
+    """
+
+    surface: Float
+
+    def below(self, xy: Float) -> Float:
+        """Height (n,) of the ground at places (n, 2 or 3)."""
+        middle = np.arange(_CELLS) * _BIN + _BIN / 2
+        place = np.clip((np.hypot(xy[:, 0], xy[:, 1]) - middle[0]) / _BIN, 0, _CELLS - 1 - 1e-9)
+        inner, sector = place.astype(np.int64), _sector(xy)
+        part = place - inner
+        height: Float = self.surface[sector, inner] * (1 - part) + self.surface[sector, inner + 1] * part
+        return height
+
+    def hit(self, direction: Float, *, reach: float) -> Float:
+        """Metres (n,) along unit vectors (n, 3) from the sensor to the ground; inf beyond ``reach``."""
+        middle = np.arange(_CELLS) * _BIN + _BIN / 2
+        near = middle < reach + _BIN
+        level = np.maximum(np.hypot(direction[:, 0], direction[:, 1]), 1e-9)
+        over = direction[:, 2:] / level[:, None] * middle[near] - self.surface[_sector(direction)][:, near]
+        below = over <= 0
+        first = np.argmax(below, axis=1)
+        before = np.maximum(first - 1, 0)
+        row = np.arange(len(direction))
+        fall = over[row, before] - over[row, first]
+        part = np.where(first > 0, over[row, before] / np.where(fall > 0, fall, 1.0), 0.0)
+        away = (middle[before] + part * _BIN) / level
+        found: Float = np.where(below.any(axis=1) & (away * level < reach), away, np.inf)
+        return found
+
+
+def ground_of(xyz: Float) -> Ground:
+    """The ground below the points (n, 3) of one cloud.
 
     In each sector of 2 degrees the ground is followed outwards through the lowest points of cells of 1 m: a
     cell is ground if it continues the sector's gradient within 0.15 m and 5 % of the distance to the cell
     before. A median over five sectors removes those that went astray.
     """
     distance = np.hypot(xyz[:, 0], xyz[:, 1])
-    turn = np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) + 0.5
-    sector = np.minimum((turn * _SECTORS).astype(np.int64), _SECTORS - 1)
     cell = np.minimum((distance / _BIN).astype(np.int64), _CELLS - 1)
-    surface = _surface(_lowest(xyz[:, 2], sector=sector, cell=cell), start=_start(xyz[:, 2], distance))
-    middle = np.arange(_CELLS) * _BIN + _BIN / 2
-    place = np.clip((distance - middle[0]) / _BIN, 0, _CELLS - 1 - 1e-9)
-    inner = place.astype(np.int64)
-    part = place - inner
-    below = surface[sector, inner] * (1 - part) + surface[sector, inner + 1] * part
-    found: Float = xyz[:, 2] - below
+    lowest = _lowest(xyz[:, 2], sector=_sector(xyz), cell=cell)
+    return Ground(_surface(lowest, start=_start(xyz[:, 2], distance)))
+
+
+def height_above_ground(xyz: Float) -> Float:
+    """Metres (n,) of points (n, 3) above the ground, along the sensor's z axis."""
+    found: Float = xyz[:, 2] - ground_of(xyz).below(xyz)
     return found
+
+
+def _sector(xyz: Float) -> np.ndarray:
+    turn = np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) + 0.5
+    return np.minimum((turn * _SECTORS).astype(np.int64), _SECTORS - 1)
 
 
 def _start(z: Float, distance: Float) -> float:

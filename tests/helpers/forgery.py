@@ -82,12 +82,14 @@ def in_box(frame, center, *, yaw=0.0, size=CAR):
     return (np.abs(local) <= np.asarray(size) / 2).all(axis=1)
 
 
-def observed(world, *, sensor="hdl32e", frames=1, trajectory=None, mount=ROOF, settings=PLAIN, seed=5):
-    """Frames that a scanner on a vehicle records in a world."""
+def observed(
+    world, *, sensor="hdl32e", frames=1, trajectory=None, mount=ROOF, settings=PLAIN, seed=5, only=None
+):
+    """Frames that a scanner on a vehicle records in a world, or ``only`` one of them."""
     device = load_sensor(sensor, name="top")
     trajectory = trajectory or driven()
     found = []
-    for frame in range(frames):
+    for frame in range(frames) if only is None else [only]:
         cloud = scan(
             device, mount, trajectory=trajectory, world=world, frame=frame, seed=seed, settings=settings
         )

@@ -1,13 +1,22 @@
 """Defences on frames with forged cars and missing returns, against the same frames as they were measured."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from helpers.forgery import CAR, observed, with_car
-from helpers.sensor_worlds import box, world
+from helpers.forgery import CAR, in_box, observed, with_car, without
+from helpers.sensor_worlds import box, driven, world
 
 from geoscene.classes import Class
+from lidar.defences.azimuth import Azimuth
+from lidar.defences.map import Map
 from lidar.defences.occlusion import Occlusion
+from lidar.defences.physics import Physics
 from lidar.defences.shadow import Shadow
+from lidar.defences.statistical import Statistical
+from lidar.defences.temporal import Temporal
+from lidar.defences.void import Void
+from lidar.physics.settings import LEVELS
 
 STREET = (
     box((-60, -60, -1), (60, 60, 0), feature=7, klass=Class.ROAD, material="asphalt"),
@@ -55,3 +64,119 @@ def test_a_car_that_stops_every_ray_is_beyond_occlusion_and_shadow(frame):
     attacked, forged = with_car(frame, (9.0, 4.0, -0.98), points=10**6, noise=0.0, window=np.pi)
     for defence in (Occlusion(), Shadow()):
         assert split(attacked, forged, judged(defence, attacked).objects)[0] < 0.3
+
+
+def test_a_void_is_where_a_car_was_removed(frame):
+    gone = in_box(frame, (GENUINE[0], GENUINE[1], -0.9), size=CAR + 0.3)
+    verdict = judged(Void(), without(frame, gone))
+    worst = verdict.gaps.suspicion.argmax()
+    assert verdict.frame == verdict.gaps.suspicion[worst] > 0.4
+    assert np.linalg.norm(verdict.gaps.xy[worst] - GENUINE) < verdict.gaps.radius[worst] + 3
+    assert judged(Void(), frame).frame < 0.15
+
+
+def test_ground_that_is_moved_outwards_is_a_void(frame):
+    """Pulses that go on through the ground are as suspicious as those without a return."""
+    near = frame.ground & (np.abs(frame.azimuth) < 0.2) & (frame.distance < 15)
+    shift = np.where(near, 10.0, 0.0)[:, None] * frame.direction
+    moved = replace(frame, xyz=frame.xyz + shift, range=frame.range + 10.0 * near)
+    assert judged(Void(), moved).frame > 0.5
+
+
+@pytest.mark.parametrize("earlier", [0, 3])
+def test_a_sector_without_returns_stands_out_of_its_neighbours_and_of_earlier_frames(earlier):
+    frames = observed(world(*STREET), frames=earlier + 1, trajectory=driven((8.0, 0.0, 0.0), yaw_rate=0.1))
+    last = frames[-1]
+    gone = np.abs(last.azimuth - np.radians(40)) < np.radians(5)
+    verdict = judged(Azimuth(), *frames[:-1], without(last, gone))
+    assert verdict.frame > (0.8 if earlier else 0.4)
+    assert np.degrees(np.arctan2(*verdict.gaps.xy[0, ::-1])) == pytest.approx(40, abs=4)
+    assert judged(Azimuth(), *frames).frame < 0.2
+
+
+def test_returns_behind_a_wall_of_the_map_and_lost_walls_stand_out(frame):
+    here = world(*STREET)
+    verdict = judged(Map(), frame, scene=here)
+    assert verdict.frame < 0.05, "a car that the map does not have is no contradiction"
+    wall = (frame.azimuth > 0.9) & (frame.azimuth < 1.0) & (frame.xyz[:, 2] > 0)
+    behind = replace(frame, xyz=frame.xyz + np.where(wall, 5.0, 0.0)[:, None] * frame.direction)
+    verdict = judged(Map(), behind, scene=here)
+    assert verdict.returns[wall].min() > 0.9
+    assert verdict.returns[~wall].max() < 0.05
+    lost = judged(Map(), without(frame, (frame.azimuth > 0.85) & (frame.azimuth < 1.05)), scene=here)
+    assert lost.frame > 0.9
+    assert np.arctan2(*lost.gaps.xy[0, ::-1]) == pytest.approx(0.95, abs=0.1)
+
+
+def test_physics_finds_what_no_pulse_can_give(frame):
+    some = np.arange(0, len(frame), 50)
+    chosen = np.isin(np.arange(len(frame)), some)
+    after = np.roll(chosen, 1)
+    assert judged(Physics(), frame).returns.max() == 0
+    changes = {
+        "off the ray": {"xyz": frame.xyz + 0.3 * chosen[:, None]},
+        "late": {"time_ns": frame.time_ns + 20_000 * chosen},
+        "no such column": {"column": frame.column + 10**6 * chosen},
+        "range": {"range": frame.range + 0.2 * chosen},
+        "second return": {
+            name: np.where(after, np.roll(getattr(frame, name), 1), getattr(frame, name))
+            for name in ("ring", "column")
+        },
+    }
+    for name, columns in changes.items():
+        found = judged(Physics(), replace(frame, **columns)).returns
+        assert found[some[:-1]].mean() > 0.9, name
+        assert np.median(found) == 0, name
+
+
+def test_returns_too_weak_to_be_detected_are_suspicious_where_the_others_keep_the_threshold():
+    noisy = observed(world(*STREET), settings=replace(LEVELS["survey"], false_alarms=False))[0]
+    far = np.flatnonzero(noisy.distance > 30)[:100]
+    assert judged(Physics(), noisy).returns.max() <= 0.2
+    dark = np.where(np.isin(np.arange(len(noisy)), far), 0.0, noisy.intensity)
+    weak = judged(Physics(), replace(noisy, intensity=dark, range=noisy.range)).returns
+    assert (weak[far] > 0.8).sum() > 0.5 * len(far)
+
+
+def test_scattered_returns_are_outliers(frame):
+    rng = np.random.default_rng(2)
+    some = rng.permutation(len(frame))[:60]
+    xyz = frame.xyz.copy()
+    xyz[some] = frame.direction[some] * rng.uniform(2, 8, 60)[:, None]
+    verdict = judged(Statistical(), replace(frame, xyz=xyz))
+    assert np.median(verdict.returns[some]) > 0.5
+    assert np.median(verdict.returns) < 0.1
+    assert verdict.frame > judged(Statistical(), frame).frame
+
+
+def followed(speed, frames=9):
+    """Frames of a moving vehicle behind a genuine car that drives at a speed (m/s)."""
+    ego = driven((6.0, 0.0, 0.0))
+    found = []
+    for frame in range(frames):
+        here = world(*STREET, car(GENUINE[0] + speed * frame / 10, GENUINE[1]))
+        found += observed(here, trajectory=ego, only=frame)
+    return found
+
+
+@pytest.mark.parametrize("speed", [0.0, 9.0])
+def test_earlier_frames_support_genuine_cars_and_no_sudden_ones(speed):
+    frames = followed(speed)
+    last = frames[-1]
+    attacked, forged = with_car(last, (9.0, 4.0, -0.98), points=10**6, noise=0.02, window=np.pi)
+    verdict = judged(Temporal(), *frames[:-1], attacked)
+    fake, genuine = split(attacked, forged, verdict.objects)
+    assert fake > 0.75, "at most one of five frames has something where a motion puts the car"
+    assert genuine < 0.3
+    assert judged(Temporal(), *frames).frame < 0.3
+    assert judged(Temporal(), attacked).frame == 0, "without earlier frames nothing is known"
+
+
+def test_an_object_that_comes_out_of_hiding_is_not_suspicious():
+    """Nothing is known of places that earlier frames did not see."""
+    wall = box((6, 3, 0), (6.3, 9, 4), feature=10)
+    hidden = observed(world(*STREET, wall, car(12.0, 5.0)))[0]
+    seen = replace(observed(world(*STREET, car(12.0, 5.0)))[0], number=1)
+    assert judged(Temporal(), hidden, seen).frame < 0.3
+    empty = observed(world(*STREET))[0]
+    assert judged(Temporal(), empty, seen).frame > 0.8
