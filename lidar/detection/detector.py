@@ -269,7 +269,7 @@ def _as_cycle(shape: _Shape) -> float:
 def _as_car(shape: _Shape) -> float:
     """0 to 1: of a car's or van's length, width and height, with points along two edges and nothing above."""
     length, width = shape.sides
-    size = _ramp(-length, -7.0, -5.4) * _ramp(length, 0.9, 1.5) * _ramp(-width, -2.6, -2.1)
+    size = _ramp(-length, -6.4, -5.4) * _ramp(length, 0.9, 1.5) * _ramp(-width, -2.6, -2.1)
     return _many(shape) * size * _ramp(shape.top, 0.8, 1.2) * _ramp(-shape.above, -0.05, 0.0) * _edge(shape)
 
 
@@ -282,7 +282,8 @@ def _as_truck(shape: _Shape) -> float:
 
 
 def _many(shape: _Shape) -> float:
-    return shape.standing * _ramp(shape.cells, 2, 12)
+    """0 to 1 by the number of cells and, as a single beam tells little, by the heights that they span."""
+    return shape.standing * _ramp(shape.cells, 2, 12) * (0.5 + 0.5 * _ramp(shape.top - shape.bottom, 0.1, 0.5))
 
 
 def _edge(shape: _Shape) -> float:
