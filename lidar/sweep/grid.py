@@ -78,6 +78,14 @@ def read_grid(path: Path) -> list[GridDrive]:
     """
     with reading(path, InputError, remedy="give a TOML file with a table [grid]", known=InputError):
         document = tomllib.loads(path.read_text("utf-8"))
+    return drives_of(document, path)
+
+
+def drives_of(document: Mapping[str, Any], path: Path) -> list[GridDrive]:
+    """The drives of a file's tables; see `read_grid`.
+
+    path : of the file, for messages
+    """
     if unknown := sorted(set(document) - {"drive", "grid", "map"}):
         raise InputError(f"{path}: unknown {unknown[0]}; there are the tables drive, grid and map")
     common, grids = document.get("drive", {}), document.get("grid", {})

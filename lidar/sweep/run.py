@@ -100,10 +100,33 @@ def sweep(
 
     Raises InputError for a file with an error, before the first drive starts.
     """
+    return recorded(
+        read_grid(Path(file)),
+        Path(out),
+        source=Path(file).name,
+        workers=workers,
+        scheduler=scheduler,
+        overwrite=overwrite,
+        progress=progress,
+    )
+
+
+def recorded(
+    drives: Sequence[GridDrive],
+    folder: Path,
+    *,
+    source: str,
+    workers: int = 1,
+    scheduler: str = "",
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> SweepSummary:
+    """Record drives into a folder; see `sweep`.
+
+    source : name of the file that describes them, for the table
+    """
     if not 1 <= workers <= 256:
         raise InputError(f"`workers` {workers}: give 1 to 256")
-    folder = Path(out)
-    drives = read_grid(Path(file))
     if folder.exists() and not (folder.is_dir() and (_is_sweep(folder) or not any(folder.iterdir()))):
         raise InputError(f"{folder}: is not empty and no sweep; give another directory")
     with connected(scheduler) if scheduler else nullcontext() as cluster, exclusive(folder):
@@ -111,7 +134,7 @@ def sweep(
         if cluster is not None:
             inputs = dict.fromkeys(path for planned in drives for path in planned.inputs)
             cluster.check(folder.absolute(), inputs=list(inputs))
-        with _table(folder, Path(file), drives=drives) as table:
+        with _table(folder, source, drives=drives) as table:
             scenes = _scenes(drives, folder.absolute(), workers=workers, cluster=cluster, progress=progress)
             threads = 1 if cluster else max(workers // len(drives), 1)
             tasks = []
@@ -242,9 +265,9 @@ def _recorded(task: _Task) -> tuple[int, DriveRow]:
 class _Table:
     """The files ``sweep.json`` and ``sweep.csv`` of a sweep."""
 
-    def __init__(self, folder: Path, file: Path, *, drives: Sequence[GridDrive]) -> None:
+    def __init__(self, folder: Path, source: str, *, drives: Sequence[GridDrive]) -> None:
         self.rows = [DriveRow(drive.name) for drive in drives]
-        self._folder, self._file, self._drives = folder, file, drives
+        self._folder, self._source, self._drives = folder, source, drives
         self._written = 0.0
 
     def set(self, row: int, result: DriveRow) -> None:
@@ -262,7 +285,7 @@ class _Table:
         generator = f"geoscene lidar {__version__}"
         write_json(
             self._folder / _TABLE,
-            {"schema": 1, "generator": generator, "grid": self._file.name, "drives": documents},
+            {"schema": 1, "generator": generator, "grid": self._source, "drives": documents},
         )
         names = list(dict.fromkeys(name for drive in self._drives for name in drive.values))
         columns = {name: [drive.values.get(name, "") for drive in self._drives] for name in names}
@@ -273,9 +296,9 @@ class _Table:
 
 
 @contextmanager
-def _table(folder: Path, file: Path, *, drives: Sequence[GridDrive]) -> Iterator[_Table]:
+def _table(folder: Path, source: str, *, drives: Sequence[GridDrive]) -> Iterator[_Table]:
     """Yield the table of a sweep, written at the start and at the end, however that comes."""
-    table = _Table(folder, file, drives=drives)
+    table = _Table(folder, source, drives=drives)
     table.write()
     try:
         yield table
