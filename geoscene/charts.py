@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from PIL import Image, ImageDraw, ImageFont
@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 _INK, _GREY, _CHOICE, _OTHER = (30, 32, 38), (205, 208, 214), (200, 60, 40), (60, 110, 180)
+_BAND = (250, 224, 160)
 _STYLE = (
     "body{font:15px system-ui,sans-serif;margin:2em;color:#1e2026}"
     ".wide{overflow-x:auto;margin:1em 0}table{border-collapse:collapse;font-size:13px}"
@@ -21,6 +22,7 @@ _STYLE = (
     "td:first-child,th:first-child{position:sticky;left:0;background:#fff}"
     "td:first-child,th:first-child{text-align:left;white-space:normal;min-width:12em}"
     "td:last-child{text-align:left;white-space:normal;min-width:16em}img{max-width:100%}"
+    ".matrix td:last-child{text-align:right;min-width:0}"
 )
 _LEGEND = (
     (_CHOICE, "no other setting is both cheaper and more exact"),
@@ -74,7 +76,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """Titles of a chart and its axes, both logarithmic, and the texts of values of y."""
+    """Titles of a chart and its axes, and the texts of values of y."""
 
     title: str
     x: str
@@ -139,6 +141,84 @@ def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: i
         at += 34 + int(pen.textlength(words, font=font))
     if unnamed:
         text((at, 48), f"{unnamed} without a name, see the table", anchor="lm")
+    return _png(picture)
+
+
+_COLORS = (
+    *((200, 60, 40), (60, 110, 180), (70, 150, 90), (150, 90, 170), (220, 150, 40), (90, 90, 90)),
+    *((40, 160, 170), (190, 110, 140), (130, 110, 60), (110, 140, 220), (160, 190, 60), (20, 60, 90)),
+)
+
+
+def curves(lines: Mapping[str, Sequence[tuple[float, float]]], axes: Axes, *, size: int = 560) -> bytes:
+    """A PNG of named lines of shares, both axes linear from 0 to 1, with a legend and the diagonal."""
+    left, top, bottom = 70, 70, size - 60
+    right = left + bottom - top
+    picture = Image.new("RGB", (right + 200, size), (255, 255, 255))
+    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=14)
+
+    def place(point: tuple[float, float]) -> tuple[float, float]:
+        return left + (right - left) * point[0], bottom + (top - bottom) * point[1]
+
+    pen.text((left, 14), axes.title, fill=_INK, font=font)
+    pen.text(((left + right) / 2, size - 14), axes.x, fill=_INK, font=font, anchor="ms")
+    pen.text((12, top - 12), axes.y, fill=_INK, font=font, anchor="ls")
+    for value in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0):
+        pen.line((*place((value, 0)), *place((value, 1))), fill=_GREY)
+        pen.line((*place((0, value)), *place((1, value))), fill=_GREY)
+        pen.text((place((value, 0))[0], bottom + 6), f"{value:g}", fill=_INK, font=font, anchor="mt")
+        pen.text((left - 8, place((0, value))[1]), axes.y_text(value), fill=_INK, font=font, anchor="rm")
+    pen.line((*place((0, 0)), *place((1, 1))), fill=_GREY, width=2)
+    for k, (name, points) in enumerate(lines.items()):
+        color = _COLORS[k % len(_COLORS)]
+        if len(points) > 1:
+            pen.line([place(point) for point in points], fill=color, width=2)
+        pen.line((right + 16, top + 10 + 20 * k, right + 36, top + 10 + 20 * k), fill=color, width=3)
+        pen.text((right + 44, top + 10 + 20 * k), name, fill=_INK, font=font, anchor="lm")
+    return _png(picture)
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A named share with its interval, and the bounds of what others published of it."""
+
+    name: str
+    share: float
+    interval: tuple[float, float]
+    published: tuple[float, float] | None = None
+
+
+def spans(rows: Sequence[Span], *, title: str, width: int = 1000) -> bytes:
+    """A PNG of shares from 0 to 1 with their intervals, one below the other, published bounds as bars."""
+    left, right, top = 330, width - 40, 70
+    picture = Image.new("RGB", (width, top + 26 * len(rows) + 50), (255, 255, 255))
+    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=14)
+    bottom = top + 26 * len(rows)
+    pen.text((left, 14), title, fill=_INK, font=font)
+    pen.rectangle((left, 42, left + 14, 54), fill=_BAND)
+    pen.text((left + 22, 48), "published", fill=_INK, font=font, anchor="lm")
+
+    def across(share: float) -> float:
+        return left + (right - left) * share
+
+    for k, row in enumerate(rows):
+        v = top + 26 * k + 13
+        if row.published is not None:
+            low, high = map(across, row.published)
+            pen.rectangle((low - 2, v - 9, high + 2, v + 9), fill=_BAND)
+    for value in (0.0, 0.25, 0.5, 0.75, 1.0):
+        pen.line((across(value), top, across(value), bottom), fill=_GREY)
+        pen.text((across(value), bottom + 8), f"{100 * value:g} %", fill=_INK, font=font, anchor="mt")
+    for k, row in enumerate(rows):
+        v = top + 26 * k + 13
+        pen.text((left - 10, v), row.name, fill=_INK, font=font, anchor="rm")
+        if math.isfinite(row.share):
+            pen.line((across(row.interval[0]), v, across(row.interval[1]), v), fill=_CHOICE, width=2)
+            pen.ellipse((across(row.share) - 4, v - 4, across(row.share) + 4, v + 4), fill=_CHOICE)
+    return _png(picture)
+
+
+def _png(picture: Image.Image) -> bytes:
     file = io.BytesIO()
     picture.save(file, "PNG")
     return file.getvalue()
@@ -201,6 +281,24 @@ def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return (
         f'<div class="wide"><table>{line(head, "th")}{"".join(line(row, "td") for row in rows)}</table></div>'
     )
+
+
+def html_matrix(
+    head: Sequence[str], rows: Sequence[Sequence[str]], *, shades: Sequence[Sequence[float]]
+) -> str:
+    """A table of texts whose cells but the first of each row are shaded from 0 (white) to 1; nan is white."""
+
+    def cell(text: str, shade: float) -> str:
+        strength = 0.0 if math.isnan(shade) else min(max(shade, 0.0), 1.0)
+        words = html.escape(text).replace(" (", "<br>(")
+        return f'<td style="background:rgba(70,150,90,{0.65 * strength:.2f})">{words}</td>'
+
+    lines = [
+        f"<tr><td>{html.escape(row[0])}</td>{''.join(map(cell, row[1:], some))}</tr>"
+        for row, some in zip(rows, shades, strict=True)
+    ]
+    titles = "".join(f"<th>{html.escape(name)}</th>" for name in head)
+    return f'<div class="wide"><table class="matrix"><tr>{titles}</tr>{"".join(lines)}</table></div>'
 
 
 def html_picture(png: bytes, *, alt: str) -> str:

@@ -247,6 +247,55 @@ def sweep(
 
 
 @app.command
+def redteam(
+    file: Path,
+    /,
+    *,
+    out: Out,
+    workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2,
+    report: Reporting = Report(),
+) -> int:
+    """Measure attacks against defences: success, detection at fixed false alarms, ROC, latency and cost.
+
+    Each drive of a grid is recorded without attack and with each attack, and judged by all defences; a
+    detector without learning shows which attacks succeed. Nothing is sent to any device. The same command
+    resumes an interrupted matrix.
+
+    For example:
+
+    lidar redteam matrix.toml -o matrix
+
+    Parameters
+    ----------
+    file
+        TOML file with drives as for lidar sweep, attacks in [[attack]] and defences in [defences];
+        docs/security.md has an example.
+    out
+        Directory to write to: drives, redteam.json, CSV tables and the page redteam.html.
+    workers
+        Processes; each records or judges one drive at a time.
+    """
+    from lidar.redteam import redteam as run_matrix  # noqa: PLC0415
+    from lidar.redteam.report import detection_tables, success_rows  # noqa: PLC0415
+    from lidar.redteam.run import failed_drives  # noqa: PLC0415
+    from lidar.rig.catalog import columns  # noqa: PLC0415
+
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = run_matrix(file, out, workers=workers, overwrite=report.overwrite, progress=progress)
+    if report.json:
+        print_json({"path": str(out), "drives": list(summary.drives), "failed": summary.failed})
+    else:
+        print(columns(success_rows(summary.matrix)))
+        for title, table in detection_tables(summary.matrix):
+            print(f"\n{title}\n{columns(table)}")
+        print(f"\n{out}: {len(summary.drives)} drives; page: {out / 'redteam.html'}")
+    for line in failed_drives(summary.failed):
+        print(f"lidar: {line}", file=sys.stderr)
+    return FAILURE if summary.failed else 0
+
+
+@app.command
 def tradeoff(
     scene: Path | None = None,
     /,

@@ -96,8 +96,10 @@ def inputs(tmp_path_factory):
     stages = (ROOT / "docs" / "stages.md").read_text("utf-8").split("```toml")[1].split("```")[0]
     sweep = (ROOT / "docs" / "sweeps.md").read_text("utf-8").split("```toml")[1].split("```")[0]
     sweep = sweep.replace("duration = 20", "duration = 0.1").replace("seed = [1, 2, 3]", "seed = [1]")
+    matrix = (ROOT / "docs" / "security.md").read_text("utf-8").split("```toml")[1].split("```")[0]
+    matrix = matrix.replace("duration = 5", "duration = 0.1").replace("seed = [1, 2]", "seed = [1]")
     texts = {"track.gpx": ROUTE, "my_rig.toml": RIG, "fcd.xml": TRAFFIC, "stages.toml": stages}
-    texts["sweep.toml"] = sweep
+    texts |= {"sweep.toml": sweep, "matrix.toml": matrix}
     for name, text in texts.items():
         (folder / name).write_text(text, "utf-8")
     for name in ("scene", "city"):

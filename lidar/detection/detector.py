@@ -283,7 +283,9 @@ def _as_truck(shape: _Shape) -> float:
 
 def _many(shape: _Shape) -> float:
     """0 to 1 by the number of cells and, as a single beam tells little, by the heights that they span."""
-    return shape.standing * _ramp(shape.cells, 2, 12) * (0.5 + 0.5 * _ramp(shape.top - shape.bottom, 0.1, 0.5))
+    return (
+        shape.standing * _ramp(shape.cells, 2, 12) * (0.5 + 0.5 * _ramp(shape.top - shape.bottom, 0.1, 0.5))
+    )
 
 
 def _edge(shape: _Shape) -> float:

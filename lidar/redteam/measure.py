@@ -1,0 +1,274 @@
+"""Figures of one drive of the matrix: what an attack did to each frame, and what defences say of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.files import digest_of, write_json
+from geoscene.scene import Scene, open_scene
+from geoscene.scene.layout import using
+from geoscene.typing import Bools, Ints
+from lidar import __version__
+from lidar.dataset.boxes import read_boxes
+from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
+from lidar.defences.observation import Observation
+from lidar.defences.reading import Scans, read_scans
+from lidar.defences.registry import NamedDefence
+from lidar.defences.run import able, judged_frames
+from lidar.defences.truth import frame_truth
+from lidar.errors import InputError, LidarError
+
+KINDS = {
+    **dict.fromkeys(("car", "van", "truck", "bus"), "vehicle"),
+    "pedestrian": "person",
+    **dict.fromkeys(("bicycle", "bicyclist", "motorcycle", "motorcyclist"), "cycle"),
+}
+"""What the detector calls a class of road users."""
+
+FEWEST = 10
+"""Returns of a road user from which on the detector should find it."""
+
+NEAR = {"vehicle": 2.0, "person": 1.0, "cycle": 1.5}
+"""Metres between a detection and a road user's middle within which it is found."""
+
+_LOST = 0.5
+"""Share of a road user's returns that an attack takes from which on the road user is a target."""
+
+_COLUMNS = ("id", "instance", "x", "y", "vx", "vy", "points")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A drive to measure.
+
+    path     : its folder
+    twin     : folder of the same drive without attack; None for one without
+    out      : file for the figures
+    defences : that judge it
+    score    : of a detection from which on it counts
+    """
+
+    path: Path
+    twin: Path | None
+    out: Path
+    defences: tuple[NamedDefence, ...]
+    score: float
+
+
+def measured(case: Case) -> dict[str, Any]:
+    """The figures of a drive; from the file if it has them of the same drive, twin and defences.
+
+    ``frames`` has a row for each frame of each scanner. ``absent`` are defences whose needs the data lack.
+
+    Raises LidarError for a dataset that cannot be read.
+    """
+    key = _key(case)
+    if case.out.exists():
+        document = json.loads(case.out.read_text("utf-8"))
+        if document["key"] == key:
+            return dict(document)
+    dataset = open_dataset(case.path)
+    needs_scene = any("scene" in named.defence.needs for named in case.defences)
+    if needs_scene:
+        with using(open_scene(dataset.scene_path), known=LidarError) as scene:
+            document = _document(case, dataset, scene=scene)
+    else:
+        document = _document(case, dataset, scene=None)
+    document = json.loads(json.dumps({"key": key} | document))
+    write_json(case.out, document)
+    return dict(document)
+
+
+def _key(case: Case) -> str:
+    drives = [Paths(path).journal for path in (case.path, case.twin) if path is not None]
+    made_of = [__version__, case.score, [digest_of(path) for path in drives]]
+    return json.dumps([*made_of, [named.to_json() for named in case.defences]])
+
+
+def _document(case: Case, dataset: Dataset, *, scene: Scene | None) -> dict[str, Any]:
+    twins = {} if case.twin is None else {s.sensor.name: s for s in read_scans(open_dataset(case.twin))}
+    frames: list[dict[str, Any]] = []
+    absent: set[str] = set()
+    for scans in read_scans(dataset):
+        defences, lacking = _able(scans, case.defences)
+        absent |= set(lacking)
+        frames += _frames(scans, defences, twin=twins.get(scans.sensor.name), scene=scene, score=case.score)
+    return {"absent": sorted(absent), "frames": frames}
+
+
+def _able(scans: Scans, defences: Sequence[NamedDefence]) -> tuple[list[NamedDefence], list[str]]:
+    """Defences whose needs the data have, and the names of the others."""
+    found, lacking = [], []
+    for named in defences:
+        try:
+            found += able([scans], [named])
+        except InputError:
+            lacking.append(named.name)
+    return found, lacking
+
+
+def _frames(
+    scans: Scans,
+    defences: Sequence[NamedDefence],
+    *,
+    twin: Scans | None,
+    scene: Scene | None,
+    score: float,
+) -> Iterator[dict[str, Any]]:
+    dataset, name = scans.dataset, scans.sensor.name
+    for row, judged in enumerate(judged_frames(scans, defences, scene=scene)):
+        frame = judged.frame
+        truth = frame_truth(dataset, name, frame=frame.number, count=len(frame))
+        users = _users(dataset, name, frame=frame.number)
+        matched = _matched(frame, users)
+        figures: dict[str, Any] = {
+            "sensor": name,
+            "frame": frame.number,
+            "seconds": frame.start_ns * 1e-9,
+            "added": int(truth.returns.sum()),
+            "lost": len(truth.removed_xyz),
+            "objects": _objects(frame, forged=truth.objects(frame.members), matched=matched),
+            "suspicion": {key: round(v.frame, 5) for key, v in judged.verdicts.items()},
+            "object_suspicion": {
+                key: v.objects.round(5).tolist()
+                for key, v in judged.verdicts.items()
+                if v.objects is not None
+            },
+            "cost": {key: round(seconds, 5) for key, seconds in judged.seconds.items()},
+        }
+        if twin is None:
+            figures["users"] = _found(frame, users)
+        else:
+            known = _Twin(twin, row, score=score)
+            found = set(matched[frame.objects.score >= score].tolist())
+            figures |= known.compared(frame, found=found, truth=dataset.paths.truth(name, frame.number))
+            figures["lost"] = max(figures["lost"] - known.lost, 0)
+        yield figures
+
+
+def _objects(frame: Observation, *, forged: Bools, matched: Ints) -> dict[str, Any]:
+    """Columns of the detector's boxes; ``user`` is the number of the road user, -1 for none."""
+    boxes = frame.objects
+    return {
+        "score": boxes.score.round(4).tolist(),
+        "distance": np.hypot(*boxes.centre[:, :2].T).round(2).tolist(),
+        "kind": boxes.kind.tolist(),
+        "forged": forged.tolist(),
+        "user": matched.tolist(),
+    }
+
+
+class _Twin:
+    """A frame of the drive without attack."""
+
+    def __init__(self, scans: Scans, row: int, *, score: float) -> None:
+        dataset, name = scans.dataset, scans.sensor.name
+        self._frame = frame = scans.frame(row)
+        self._users = _users(dataset, name, frame=frame.number)
+        matched = _matched(frame, self._users)
+        self._found = set(matched[frame.objects.score >= score].tolist()) - {-1}
+        self._truth = dataset.paths.truth(name, frame.number)
+        self.lost = len(frame_truth(dataset, name, frame=frame.number, count=len(frame)).removed_xyz)
+
+    def compared(self, frame: Observation, *, found: set[int], truth: Path) -> dict[str, Any]:
+        """What the attack did to the road users, the images and the fixes.
+
+        found : numbers of the road users that the detector finds in spite of it
+        truth : file of what stages did to the attacked frame
+
+        ``targets`` are road users that the detector finds without the attack, and that lose half of their
+        returns to it; it no longer finds the ``hidden`` ones.
+        """
+        taken, before = _removed(truth), _removed(self._truth)
+        targets = set()
+        for user in self._users:
+            returns, feature = int(user["points"]), int(user["instance"])
+            lost = np.count_nonzero(taken == feature) - np.count_nonzero(before == feature)
+            if user["id"] in self._found and returns >= FEWEST and lost >= _LOST * returns:
+                targets.add(int(user["id"]))
+        pictures = zip(frame.pictures, self._frame.pictures, strict=True)
+        return {
+            "targets": len(targets),
+            "hidden": len(targets - found),
+            "images": sum(one.file.read_bytes() != other.file.read_bytes() for one, other in pictures),
+            "fix_error": round(_fix_error(frame, self._frame), 3),
+        }
+
+
+def _removed(path: Path) -> NDArray[np.int32]:
+    """Features (k,) of the returns that stages removed or moved."""
+    if not path.exists():
+        return np.empty(0, np.int32)
+    with reading_file(path), np.load(path) as file:
+        features: NDArray[np.int32] = file["removed_feature"]
+    return features
+
+
+def _fix_error(frame: Observation, twin: Observation) -> float:
+    """Metres between the last fixes before the end of a frame and of its twin; 0 without fixes."""
+    if frame.navigation is None or twin.navigation is None:
+        return 0.0
+    end = frame.time_ns.max(initial=frame.start_ns)
+    row = int(np.searchsorted(frame.navigation.gnss["time_ns"], end, side="right")) - 1
+    if row < 0 or row >= len(twin.navigation.east_north):
+        return 0.0
+    apart = frame.navigation.east_north[row] - twin.navigation.east_north[row]
+    return float(np.nan_to_num(np.hypot(*apart)))
+
+
+def _users(dataset: Dataset, sensor: str, *, frame: int) -> list[dict[str, Any]]:
+    """Boxes of road users of a frame."""
+    path = dataset.paths.frame_boxes(sensor, frame)
+    return read_boxes(path, _COLUMNS) if path.exists() else []
+
+
+def _matched(frame: Observation, users: Sequence[Mapping[str, Any]]) -> Ints:
+    """Number of the road user that each box of the detector is of; -1 for none.
+
+    A box is of the nearest road user of its kind that no better one is of. Both are compared at the time of
+    the box's returns.
+    """
+    boxes = frame.objects
+    number = np.full(len(boxes), -1, np.int64)
+    if not users:
+        return number
+    time_ns = np.array([_time(frame, rows) for rows in frame.members], np.int64)
+    place = frame.placed(boxes.centre, time_ns)[:, :2]
+    scale = float(frame.poses([frame.start_ns]).scale[0, 0])
+    xy, speed = (np.array([[user[a], user[b]] for user in users]) for a, b in (("x", "y"), ("vx", "vy")))
+    kinds = np.array([KINDS.get(user["class"], "") for user in users])
+    free = np.ones(len(users), bool)
+    for k in range(len(boxes)):
+        later = (time_ns[k] - frame.start_ns) * 1e-9
+        apart = np.hypot(*(xy + later * speed * scale - place[k]).T) / scale
+        apart[~free | (kinds != boxes.kind[k])] = np.inf
+        nearest = int(np.argmin(apart))
+        if apart[nearest] <= NEAR[str(boxes.kind[k])]:
+            number[k], free[nearest] = users[nearest]["id"], False
+    return number
+
+
+def _time(frame: Observation, rows: NDArray[np.intp]) -> int:
+    """Time of the returns of a box."""
+    return int(np.median(frame.time_ns[rows])) if len(rows) else frame.start_ns
+
+
+def _found(frame: Observation, users: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Road users that have returns, with their distances from the scanner in metres."""
+    pose = frame.poses([frame.start_ns])
+    rows = []
+    for user in users:
+        away = float(np.hypot(*(np.array([user["x"], user["y"]]) - pose.position[0, :2])) / pose.scale[0, 0])
+        if user["points"] > 0:
+            kind = KINDS.get(user["class"], "")
+            rows.append(
+                {"id": user["id"], "kind": kind, "distance": round(away, 2), "points": user["points"]}
+            )
+    return rows

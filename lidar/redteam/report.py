@@ -1,0 +1,282 @@
+"""Results of a matrix as JSON, CSV tables and a page with plots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from geoscene.charts import Axes, Span, curves, html_matrix, html_page, html_picture, html_table, share, spans
+from geoscene.csv_tables import write_columns
+from geoscene.files import write_atomically, write_json
+from lidar import __version__
+from lidar.redteam.evaluate import Accuracy, Detection, Matrix, Success, document_of
+from lidar.redteam.measure import FEWEST
+from lidar.redteam.plan import Attack, Plan
+from lidar.redteam.published import ATTACKS, DEFENCES, Band
+from lidar.redteam.statistics import Rate
+
+REPORT = "redteam.json"
+
+_METHOD = (
+    "Intervals are 95 %: Wilson's with as many trials as blocks of {m.block:g} s; of areas under the ROC, the"
+    " percentiles of a bootstrap of these blocks. A detection counts from score {m.score:g} on. Thresholds"
+    " are those that {frames} of the frames and {objects} of the objects of the same sensor pass without"
+    " attack and weather. Published figures are of other detectors, sensors and data."
+)
+
+
+def write_report(
+    matrix: Matrix,
+    folder: Path,
+    *,
+    plan: Plan,
+    failed: Mapping[str, str],
+    absent: Sequence[str],
+    source: str,
+) -> None:
+    """Write ``redteam.json``, a CSV file of each table, and ``redteam.html``.
+
+    failed : reason by name of drives that are not in the matrix
+    absent : defences whose needs the data of some drive lack
+    source : name of the file that describes the matrix
+    """
+    document: dict[str, Any] = {
+        "schema": 1,
+        "generator": f"geoscene lidar {__version__}",
+        "file": source,
+        "attacks": [{"name": a.name, "attack": a.option, "goal": a.goal} for a in plan.attacks],
+        "defences": [named.to_json() for named in plan.defences],
+        "measure": {name: getattr(plan.measure, name) for name in plan.measure.__dataclass_fields__},
+        "failed": dict(failed),
+        "absent": list(absent),
+    }
+    tables = {
+        name: document_of(getattr(matrix, name)) for name in ("success", "detection", "accuracy", "cost")
+    }
+    for name, rows in tables.items():
+        flat = [_flat(row) for row in rows]
+        columns = list(dict.fromkeys(key for row in flat for key in row))
+        if flat:
+            write_columns(
+                folder / f"{name}.csv", {key: [row.get(key, "") for row in flat] for key in columns}
+            )
+    page = html_page(f"Attacks and defences: {source}", _body(matrix, plan, failed=failed, absent=absent))
+    write_atomically(folder / "redteam.html", page)
+    write_json(folder / REPORT, document | tables)
+
+
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of one level; the ROC is left out."""
+    flat: dict[str, Any] = {}
+    for name, value in row.items():
+        if isinstance(value, dict):
+            own = {} if name == "setting" else {"": name}
+            prefix = f"{own['']}_" if own else ""
+            flat |= {
+                f"{prefix}{key}": part
+                for key, part in _flat(value).items()
+                if key not in ("genuine", "attacked", "fpr", "tpr")
+            }
+        elif name == "auc":
+            flat |= dict(zip(("auc", "auc_low", "auc_high"), value, strict=True))
+        elif name != "roc":
+            flat[name] = "" if value is None else value
+    return flat
+
+
+def words_of(setting: Mapping[str, str]) -> str:
+    """A setting in words."""
+    return ", ".join(f"{name} {text or 'none'}" for name, text in setting.items()) or "one setting"
+
+
+def _body(matrix: Matrix, plan: Plan, *, failed: Mapping[str, str], absent: Sequence[str]) -> str:
+    pooled = matrix.of_all_scenes
+    settings = list({str(row.setting): row.setting for row in pooled.success}.values())
+    measure = plan.measure
+    frames, objects = share(measure.false_alarms), share(measure.false_objects)
+    parts = [
+        f"<p>{_METHOD.format(m=measure, frames=frames, objects=objects)}</p>",
+        *(f"<p>Not measured: {name}: {reason}</p>" for name, reason in failed.items()),
+        *(f"<p>Defence {name}: some drives lack the data that it needs.</p>" for name in absent),
+        "<h2>Success of attacks</h2>",
+        _success_table(pooled, plan.attacks),
+        html_picture(_success_picture(pooled.success, plan.attacks), alt="Success of attacks"),
+    ]
+    for setting in settings:
+        parts += [f"<h2>Detection: {words_of(setting)}</h2>"]
+        mine = [row for row in pooled.detection if row.setting == setting]
+        for level, what in (("frames", "attacked frames"), ("objects", "forged objects")):
+            some = [row for row in mine if row.level == level]
+            if some:
+                parts += [f"<h3>Share of {what} with an alarm</h3>", _detection_matrix(some)]
+                parts += [f"<h3>Area under the ROC, {what}</h3>", _area_matrix(some)]
+        of_frames = [row for row in mine if row.level == "frames"]
+        parts += ["<h3>Success of the attack without an alarm</h3>", _residual_matrix(of_frames)]
+        parts += [_curves(of_frames)]
+    parts += [
+        "<h2>Latency and cost of defences</h2>",
+        _cost_table(pooled),
+        "<h2>Published figures of defences</h2>",
+        html_table(
+            ("defence", "published", "source"),
+            [(name, band.text, band.source) for name, band in DEFENCES.items()],
+        ),
+        "<h2>The detector without attacks</h2>",
+        f"<p>Road users with {FEWEST} returns or more, by distance.</p>",
+        _accuracy_table(pooled.accuracy),
+    ]
+    return "".join(parts)
+
+
+def _band(attack: str, attacks: Sequence[Attack]) -> Band | None:
+    return next((ATTACKS[one.published] for one in attacks if one.name == attack and one.published), None)
+
+
+def success_rows(matrix: Matrix) -> list[list[str]]:
+    """Texts of the table of success over all scenes, with a head."""
+    found = [["attack", "setting", "goal", "frames attacked", "success", "added", "lost"]]
+    found += [
+        [
+            *(row.attack, words_of(row.setting), row.goal, f"{row.attacked} of {row.frames}"),
+            *(row.success.to_text(), _number(row.added), _number(row.lost)),
+        ]
+        for row in matrix.of_all_scenes.success
+    ]
+    return found
+
+
+def detection_tables(matrix: Matrix) -> list[tuple[str, list[list[str]]]]:
+    """Titles and texts of tables of alarmed frames over all scenes, one for each setting, with heads."""
+    rows = [row for row in matrix.of_all_scenes.detection if row.level == "frames"]
+    tables = []
+    for setting in {str(row.setting): row.setting for row in rows}.values():
+        defences, lines, names = detection_rows([row for row in rows if row.setting == setting])
+        texts = [[name, *(one.to_text() for one in line)] for name, line in zip(names, lines, strict=True)]
+        tables.append((f"Frames with an alarm: {words_of(setting)}", [["attack", *defences], *texts]))
+    return tables
+
+
+def _number(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.0f}"
+
+
+def _success_table(matrix: Matrix, attacks: Sequence[Attack]) -> str:
+    head, *lines = success_rows(matrix)
+    bands = [_band(line[0], attacks) for line in lines]
+    texts = [f"{band.text} [{band.source}]" if band else "" for band in bands]
+    return html_table([*head, "published"], [[*line, text] for line, text in zip(lines, texts, strict=True)])
+
+
+def _success_picture(rows: Sequence[Success], attacks: Sequence[Attack]) -> bytes:
+    marks = []
+    for row in rows:
+        band = _band(row.attack, attacks)
+        bounds = None
+        if band is not None and band.low is not None:
+            bounds = band.low, 1.0 if band.high is None else band.high
+        several = len({str(other.setting) for other in rows}) > 1
+        name = f"{row.attack}, {_short(row.setting)}" if several else row.attack
+        marks.append(Span(name, row.success.share, (row.success.low, row.success.high), bounds))
+    return spans(marks, title="Success with 95 % intervals")
+
+
+def _short(setting: Mapping[str, str]) -> str:
+    return " ".join(text for text in setting.values() if text) or "plain"
+
+
+def detection_rows(rows: Sequence[Detection]) -> tuple[list[str], list[list[Rate]], list[str]]:
+    """Defences, shares with an alarm by attack and defence, and the attacks; the first is no attack."""
+    defences = list(dict.fromkeys(row.defence for row in rows))
+    attacks = list(dict.fromkeys(row.attack for row in rows))
+    by_pair = {(row.attack, row.defence): row for row in rows}
+    plain = [next(row.genuine for row in rows if row.defence == defence) for defence in defences]
+    lines = [[by_pair[attack, defence].attacked for defence in defences] for attack in attacks]
+    return defences, [plain, *lines], ["without attack", *attacks]
+
+
+def _detection_matrix(rows: Sequence[Detection]) -> str:
+    defences, lines, names = detection_rows(rows)
+    texts = [[name, *(one.to_text() for one in line)] for name, line in zip(names, lines, strict=True)]
+    return html_matrix(["attack", *defences], texts, shades=[[one.share for one in line] for line in lines])
+
+
+def _residual_matrix(rows: Sequence[Detection]) -> str:
+    """What is left of the success of attacks: the less, the darker."""
+    defences, _, (_, *attacks) = detection_rows(rows)
+    by_pair = {(row.attack, row.defence): row.residual for row in rows}
+    lines = [[by_pair[attack, defence] for defence in defences] for attack in attacks]
+    texts = [[name, *(one.to_text() for one in line)] for name, line in zip(attacks, lines, strict=True)]
+    return html_matrix(
+        ["attack", *defences], texts, shades=[[1 - one.share for one in line] for line in lines]
+    )
+
+
+def _area_matrix(rows: Sequence[Detection]) -> str:
+    defences = list(dict.fromkeys(row.defence for row in rows))
+    by_pair = {(row.attack, row.defence): row.score.auc for row in rows}
+    attacks = list(dict.fromkeys(row.attack for row in rows))
+    texts, shades = [], []
+    for attack in attacks:
+        areas = [by_pair[attack, defence] for defence in defences]
+        texts.append(
+            [
+                attack,
+                *("–" if math.isnan(a) else f"{a:.2f} ({low:.2f} to {high:.2f})" for a, low, high in areas),
+            ]
+        )
+        shades.append([2 * area[0] - 1 for area in areas])
+    return html_matrix(["attack", *defences], texts, shades=shades)
+
+
+def _area(area: tuple[float, float, float]) -> str:
+    value, low, high = area
+    return "–" if math.isnan(value) else f"{value:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _curves(rows: Sequence[Detection]) -> str:
+    """A picture of the ROC of frames for each attack."""
+    pictures = []
+    for attack in dict.fromkeys(row.attack for row in rows):
+        lines = {row.defence: row.score.roc for row in rows if row.attack == attack and row.level == "frames"}
+        axes = Axes(f"ROC of frames: {attack}", "false alarms", "detected", lambda value: f"{value:g}")
+        pictures.append(html_picture(curves(lines, axes), alt=f"ROC of {attack}"))
+    return "".join(pictures)
+
+
+def _cost_table(matrix: Matrix) -> str:
+    rows = []
+    for cost in matrix.cost:
+        mine = [
+            row
+            for row in matrix.detection
+            if row.level == "frames" and row.defence == cost.defence and row.setting == cost.setting
+        ]
+        known = sorted(row.latency for row in mine if math.isfinite(row.latency))
+        alarmed, drives = (sum(getattr(row, name) for row in mine) for name in ("alarmed", "drives"))
+        latency = f"{known[len(known) // 2]:.1f} s" if known else "–"
+        ms = f"{1000 * cost.seconds:.1f} ms"
+        rows.append((cost.defence, words_of(cost.setting), ms, latency, f"{alarmed} of {drives}"))
+    return html_table(
+        ("defence", "setting", "per frame", "first alarm after", "attacked drives with an alarm"), rows
+    )
+
+
+def accuracy_rows(rows: Iterable[Accuracy]) -> list[list[str]]:
+    """Texts of the detector's table, with a head; lines without road users and detections are left out."""
+    found = [["kind", "setting", "distance", "road users", "recall", "precision", "false per frame"]]
+    found += [
+        [
+            *(row.kind, words_of(row.setting), f"{row.near} to {row.far} m", str(row.recall.count)),
+            *(row.recall.to_text(), row.precision.to_text(), f"{row.false_per_frame:.2f}"),
+        ]
+        for row in rows
+        if row.recall.count or row.precision.count
+    ]
+    return found
+
+
+def _accuracy_table(rows: Iterable[Accuracy]) -> str:
+    head, *lines = accuracy_rows(rows)
+    return html_table(head, lines)
