@@ -102,6 +102,7 @@ def inputs(tmp_path_factory):
     texts |= {"sweep.toml": sweep, "matrix.toml": matrix}
     for name, text in texts.items():
         (folder / name).write_text(text, "utf-8")
+    shutil.copytree(ROOT / "examples", folder / "examples")
     for name in ("scene", "city"):
         scene = build(osm, folder / name)
     options = DriveOptions(rig=str(folder / "my_rig.toml"), duration=0.2, formats=("kitti",))
