@@ -1,6 +1,7 @@
 """Physical attacks: budgets, published figures, line of sight, and what their returns look like."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from lidar.physics.settings import LEVELS, PLAIN
 from lidar.rig.scanner import firings, load_sensor
 from lidar.sensors.scan import cast
 from lidar.signal.recorded import altered_recording
-from lidar.signal.registry import read_stage, stages_of
+from lidar.signal.registry import Stages, read_attacks, read_stage, stages_of
 from lidar.signal.run import altered_sweep, cloud_truth
 from lidar.signal.situation import Situation
 
@@ -341,3 +342,32 @@ def test_a_device_that_is_never_in_sight_is_refused():
             with pytest.raises(InputError, match="attack inject: its device is in the line of sight of no"):
                 check_sight(stages, frames)
     check_sight(stages_of([{"name": "cover_glass"}]), [])
+
+
+EXAMPLES = sorted((Path(__file__).parents[3] / "examples" / "attacks").glob("*.toml"))
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("on", ["drive", "recording"])
+def test_truth_of_every_example_is_the_original_cloud(path, on):
+    """Every return of the original is kept or removed once; an added one hides only what was removed."""
+    named = read_attacks([str(path)])
+    if any(hasattr(one.stage, "cloud") or not hasattr(one.stage, "echoes") for one in named):
+        pytest.skip("no attack before the detector")
+    original, stages = recorded(VLP), Stages(named, 5)
+    if on == "drive":
+        found = altered_sweep(VLP, stages, at=situation(VLP, earlier=lambda _: original))
+    else:
+        at = Situation("vlp16", 2, earlier=lambda _: original)
+        found = altered_recording(original, stages, sensor=VLP.sensor, at=at)
+    truth = cloud_truth(found, start_ns=0)
+    kept = truth["source"][truth["source"] >= 0]
+    rows = np.sort(np.concatenate([kept, truth["removed"]]))
+    assert np.array_equal(rows, np.arange(len(original)))
+    assert np.array_equal(truth["removed_xyz"], original.xyz[truth["removed"]])
+    fake = truth["source"] < 0
+    assert set(truth["origin"][fake]) <= {Origin.INJECTED, Origin.REPLAYED, Origin.SURFACE}
+    assert (truth["origin"][~fake] == Origin.SURFACE).all()
+    hidden = truth["hidden"][truth["hidden"] >= 0]
+    assert np.isin(hidden, truth["removed"]).all()
+    assert len(truth["removed"]) > 0
