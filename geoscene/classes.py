@@ -152,6 +152,7 @@ class Material:
     color       : sRGB 0..255, used where the map has no colour
     reflectance : diffuse (hemispherical) reflectance 0..1 at 905, 1064 and 1550 nm
     specular    : share of the reflected light that is specular, 0..1
+    wet         : factor of the diffuse reflectance where water has soaked the surface
     source      : source of the numbers
     """
 
@@ -160,6 +161,7 @@ class Material:
     color: tuple[int, int, int]
     reflectance: tuple[float, float, float]
     specular: float
+    wet: float
     source: str
 
 
@@ -174,6 +176,7 @@ def materials() -> dict[str, Material]:
             tuple(row["color"]),
             tuple(row["reflectance"]),
             row["specular"],
+            row["wet"],
             row["source"],
         )
         for name, row in table.items()

@@ -20,6 +20,7 @@ _AEROSOL = 0.06 * _WAVELENGTH**-1.3
 _OZONE = np.array([0.036, 0.022, 0.004])
 _FORWARD = 0.72  # asymmetry of the aerosol's Henyey-Greenstein phase function, continental haze
 _GROUND = 0.18  # albedo of what lies below the horizon
+_SNOW = 0.83  # the same under snow; 0.75 to 0.9 when fresh, typical value
 # Multiple scattering is isotropic and grows with the optical depth: this multiple of the isotropic part of
 # single scattering gives clear skies their measured fifth to quarter of daylight.
 _MULTIPLE = 3.0
@@ -101,10 +102,13 @@ def _harmonics(n: Float) -> Float:
     )
 
 
-def daylight(direction: ArrayLike, *, cloud: float = 0.0, rows: int = 64, columns: int = 64) -> Light:
+def daylight(
+    direction: ArrayLike, *, cloud: float = 0.0, snow: float = 0.0, rows: int = 64, columns: int = 64
+) -> Light:
     """The light of a day with the sun towards ``direction`` (3,), scene axes.
 
     cloud : share of the sky that clouds cover, 0 to 1
+    snow  : share of the ground under snow, 0 to 1, which is exposed to three quarters of full scale
 
     With the sun below the horizon there is no direct light and the sky fades to that of a moonlit night; the
     exposure follows. Ambient light is stored as spherical harmonics of order 2 (Ramamoorthi and Hanrahan, An
@@ -135,13 +139,13 @@ def daylight(direction: ArrayLike, *, cloud: float = 0.0, rows: int = 64, column
     if cloud > 0:
         beam, sky, down = _clouded(beam, sky, diffuse=diffuse, rise=rise, sine=sine, cloud=cloud)
         radiance = sky_colour(sky, normal[:, 2], cos_turn=cos_turn)
-    radiance[~above] = _GROUND / np.pi * down
+    radiance[~above] = (_GROUND + snow * (_SNOW - _GROUND)) / np.pi * down
     basis = _harmonics(normal)
     # The clamped cosine in harmonics: pi, 2 pi / 3, pi / 4 for the orders 0, 1, 2.
     lobe = np.array([np.pi, *[2 * np.pi / 3] * 3, *[np.pi / 4] * 5])
     ambient = lobe[:, None] * np.einsum("ki,k,kc->ic", basis, weight, radiance)
     ambient += _GREYING * (ambient.mean(axis=1, keepdims=True) - ambient)
-    exposure = 0.25 / 0.18 * np.pi / float(down.mean())
+    exposure = 0.25 / 0.18 * np.pi / float(down.mean()) / (1 + snow * (_SNOW / 0.18 * 0.25 / 0.75 - 1))
     mean = (np.einsum("k,kc->c", weight, radiance) + beam) / (4 * np.pi)
     return Light(s, beam, ambient, sky, sky[1].mean(axis=0), mean, exposure)
 

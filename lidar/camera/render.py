@@ -16,6 +16,7 @@ from lidar.camera.facades import Facades, facades_of
 from lidar.camera.light import Light, daylight
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
+from lidar.physics.fresnel import mirrored
 from lidar.raycast import Hits
 from lidar.rig.camera_model import pixel_rays, project, unproject
 from lidar.rig.specs import CameraSpec
@@ -29,6 +30,9 @@ _SHARED = 1 << 23
 
 _ROLLS = 5
 """Fixed-point iterations for the row in which a rolling shutter sees a point; each gains some digits."""
+
+_GLOSS = 0.002
+"""Share of light below which what a wet surface mirrors is left out."""
 
 _LIFT = 1e-3
 """Offset in metres of a shadow ray from its surface; it grows with distance."""
@@ -152,7 +156,7 @@ def render(
     rgb = np.empty((h, w, 3), np.uint8)
     depth, klass = np.empty((h, w), np.float32), np.empty((h, w), np.uint8)
     feature = np.empty((h, w), np.int32)
-    light = light_of(sun, cloud=options.cloud)
+    light = light_of(sun, cloud=options.cloud, snow=world.settings.snow)
     walls = facades_of(world)
     k = options.supersample
     fine = _finer(camera, k)
@@ -197,15 +201,15 @@ def render(
     return Frame(rgb if coloured else None, depth, klass, feature)
 
 
-def light_of(sun: ArrayLike, *, cloud: float) -> Light:
-    """The light of `render` with the sun towards ``sun`` (3,), scene axes."""
+def light_of(sun: ArrayLike, *, cloud: float, snow: float) -> Light:
+    """The light of `render` with the sun towards ``sun`` (3,), as `lidar.camera.light.daylight` describes."""
     x, y, z = np.asarray(sun, float).tolist()
-    return _light((x, y, z), cloud)
+    return _light((x, y, z), cloud, snow=snow)
 
 
 @functools.lru_cache(maxsize=8)
-def _light(sun: tuple[float, float, float], cloud: float) -> Light:
-    return daylight(sun, cloud=cloud)
+def _light(sun: tuple[float, float, float], cloud: float, *, snow: float) -> Light:
+    return daylight(sun, cloud=cloud, snow=snow)
 
 
 def _finer(camera: CameraSpec, k: int) -> CameraSpec:
@@ -311,6 +315,56 @@ def radiance(
 
     blur, angle : a pixel is blur + angle * distance metres wide
     """
+    wet = world.settings.wetness > 0
+    out, gloss, facet = _shaded(
+        world, view, light=light, walls=walls, size=(blur, angle), options=options, wet=wet
+    )
+    row = np.flatnonzero(gloss > _GLOSS)
+    if len(row):
+        mirror = _mirrored_view(world, view, row=row, facet=facet[row], options=options)
+        size = float(angle * np.median(view.hits.range[row])), angle
+        seen, _, _ = _shaded(world, mirror, light=light, walls=walls, size=size, options=options, wet=False)
+        out[row] += gloss[row, None] * seen
+    return out
+
+
+def _mirrored_view(
+    world: World, view: View, *, row: NDArray[np.intp], facet: NDArray[np.float32], options: RenderOptions
+) -> View:
+    """What rays (k,) of a view hit after films of water with these normals (k, 3) mirror them."""
+    direction, normal = view.direction[row], view.hits.normal[row]
+    place = view.origin[view.row[row]] + view.hits.range[row, None] * direction
+    facets = facet / np.linalg.norm(facet, axis=1, keepdims=True)
+    towards = mirrored(
+        direction / np.linalg.norm(direction, axis=1, keepdims=True), facets.astype(np.float64)
+    )
+    # A rough film also sends light below its horizon, from where it is mirrored once more.
+    below = np.minimum(np.einsum("ij,ij->i", towards, normal), 0.0)
+    towards -= 2 * below[:, None] * normal
+    start = place + (_LIFT + 1e-6 * view.hits.range[row, None]) * normal
+    time = None if view.time is None else view.time[row]
+    hits = world.caster.cast(
+        start, towards, far=world.reach, time=time, normals=True, retrace=options.retrace
+    )
+    each = np.arange(len(row), dtype=np.int32)
+    return View(start, each, towards, np.ones(len(row), np.bool_), time, hits, world.lookup(hits))
+
+
+def _shaded(
+    world: World,
+    view: View,
+    *,
+    light: Light,
+    walls: Facades,
+    size: tuple[float, float],
+    options: RenderOptions,
+    wet: bool,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Linear light (n, 3) along the rays of a view, and gloss (n,) and normals (n, 3) of wet surfaces.
+
+    size : width of a pixel at distance 0 in metres, and its growth with distance
+    wet  : whether films of water mirror, as `lidar.camera.shade.shade` describes
+    """
     hits, surfaces = view.hits, view.surfaces
     n = len(hits)
     normal = hits.normal
@@ -328,6 +382,7 @@ def radiance(
         else:
             lit[which] = True
     out = np.empty((n, 3), np.float32)
+    gloss, facet = np.zeros(n if wet else 0, np.float32), np.empty((n if wet else 0, 3), np.float32)
     if len(walls.style):
         wall = np.where(hits.instance < 0, walls.wall[hits.face], np.int32(-1))
     else:
@@ -347,11 +402,14 @@ def radiance(
         lit,
         (light.direction, light.beam, light.ambient, light.sky, light.horizon),
         (*shade.material_tables(), shade.linear_table()),
-        (blur, angle, 3.912 / options.visibility, options.detail),
+        (*size, 3.912 / options.visibility, options.detail),
+        shade.covers(world.settings.wetness, world.settings.snow),
         out,
+        gloss,
+        facet,
     )
     out[~view.seen] = 0.0
-    return out
+    return out, gloss, facet
 
 
 def _noisy(

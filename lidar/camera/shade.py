@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 import math
+from statistics import NormalDist
 
 import numpy as np
 from numba import njit
@@ -14,7 +15,7 @@ from geoscene.classes import Class, materials
 from geoscene.typing import Float
 from lidar.camera import texture
 from lidar.camera.facades import PAINT, windows
-from lidar.camera.texture import detail, hashed, noise
+from lidar.camera.texture import detail, grain, hashed, noise
 
 Single = NDArray[np.float32]
 
@@ -36,15 +37,17 @@ _MIRROR = {"water": 0.02, "glass": 0.08, "car_paint": 0.04, "metal": 0.15, "rail
 
 
 @functools.cache
-def material_tables() -> tuple[NDArray[np.uint8], Float, NDArray[np.uint8]]:
-    """Detail kind (256,), specular reflectance at normal incidence (256,) and colour (256, 3) by material."""
+def material_tables() -> tuple[NDArray[np.uint8], Float, NDArray[np.uint8], Float]:
+    """Detail kind, specular reflectance at normal incidence, colour, factor of soaked albedo, by material."""
     kind, mirror, plain = np.zeros(256, np.uint8), np.zeros(256), np.zeros((256, 3), np.uint8)
+    soaked = np.ones(256)
     kinds = {name: kind for kind, names in _KINDS.items() for name in names}
     for name, material in materials().items():
         kind[material.code] = kinds.get(name, texture.PLAIN)
         mirror[material.code] = _MIRROR.get(name, 0.0)
         plain[material.code] = material.color
-    return kind, mirror, plain
+        soaked[material.code] = material.wet
+    return kind, mirror, plain, soaked
 
 
 @functools.cache
@@ -54,17 +57,41 @@ def linear_table() -> Float:
     return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
 
 
+_SNOW = np.array([0.80, 0.83, 0.87])
+"""Albedo of snow, red, green and blue; 0.75 to 0.9 when fresh, typical value."""
+
+_PUDDLES = 0.35
+"""Share of level ground under puddles where wetness is 1, typical; none up to a wetness of 0.5."""
+
+_DEVIATION = 0.32
+"""Standard deviation of the bumps and hollows of the ground, whose heights are about normal."""
+
+
+def covers(wetness: float, snow: float) -> tuple[float, float, float, float]:
+    """Wetness, height of hollows that are not under puddles, snow, height of bumps that are under snow.
+
+    wetness, snow : as in `lidar.world.settings.WorldSettings`
+    """
+    return wetness, _level(_PUDDLES * (2 * wetness - 1)), snow, _level(snow)
+
+
+def _level(share: float) -> float:
+    """Height that a share of bumps exceeds."""
+    return _DEVIATION * NormalDist().inv_cdf(min(max(1 - share, 1e-9), 1 - 1e-9))
+
+
 _STEPS = 8192
-_FULL = 4.0
+FULL = 4.0
+"""Greatest exposed light that `transfer_table` distinguishes."""
 
 
 @functools.cache
 def transfer_table() -> NDArray[np.uint8]:
-    """Bytes of sRGB for exposed linear light: entry i is for ``_FULL`` * (i / (steps - 1))^2.
+    """Bytes of sRGB for exposed linear light: entry i is for ``FULL`` * (i / (steps - 1))^2.
 
     IEC 61966-2-1 up to 0.8 of full scale; above, highlights roll off towards white instead of clipping.
     """
-    x = _FULL * (np.arange(_STEPS) / (_STEPS - 1)) ** 2
+    x = FULL * (np.arange(_STEPS) / (_STEPS - 1)) ** 2
     x = np.where(x > 0.8, 1.0 - 0.2 * np.exp(-(x - 0.8) / 0.2), x)
     s = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
     table: NDArray[np.uint8] = np.rint(255 * s).astype(np.uint8)
@@ -74,7 +101,7 @@ def transfer_table() -> NDArray[np.uint8]:
 @compiled
 def develop(radiance: Single, exposure: float, table: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
     """Fill ``out`` (n, 3) with the sRGB bytes of radiances (n, 3) times the exposure."""
-    scale = exposure / _FULL
+    scale = exposure / FULL
     for i in range(len(radiance)):
         for c in range(3):
             x = min(max(radiance[i, c] * scale, 0.0), 1.0)
@@ -165,6 +192,12 @@ def _mirrored(
 
 
 @compiled
+def _step(value: float, level: float, edge: float) -> float:
+    """0 below a level, 1 above, with an edge of some width."""
+    return min(max((value - level) / edge + 0.5, 0.0), 1.0)
+
+
+@compiled
 def _painted(feature: int, wall: int, albedo: Float) -> None:
     """Replace a building's default colour by one derived from its number."""
     shade = hashed(feature, 7, 20)
@@ -197,22 +230,30 @@ def shade(
     walls: tuple[Float, Float, Float, Float],
     lit: NDArray[np.bool_],
     light: tuple[Float, Float, Float, Float, Float],
-    tables: tuple[NDArray[np.uint8], Float, NDArray[np.uint8], Float],
+    tables: tuple[NDArray[np.uint8], Float, NDArray[np.uint8], Float, Float],
     settings: tuple[float, float, float, bool],
+    covers: tuple[float, float, float, float],
     out: Single,
+    gloss: Single,
+    facet: Single,
 ) -> None:
     """Fill ``out`` (n, 3) with the radiance along each ray.
+
+    Of wet surfaces also fill ``gloss`` (n,) with the share of what their films of water reflect, which is not
+    in ``out``, and ``facet`` (n, 3) with the films' normals; both are empty in a dry world.
 
     walls    : tangent, along, height, style of `lidar.camera.facades.Facades`; ``wall`` (n,) are rows of them
     light    : direction, beam, ambient, sky, horizon of `lidar.camera.light.Light`
     tables   : `material_tables` and `linear_table`
     settings : size of a pixel at distance 0 (metres) and its growth with distance (radians), extinction of
                haze (1/m), whether detail is drawn
+    covers   : `covers` of the world
     """
     tangent, along, height, style = walls
     sun, beam, ambient, sky, horizon = light
-    kinds, mirrors, plain, linear = tables
+    kinds, mirrors, plain, soaked, linear = tables
     blur, angle, extinction, detailed = settings
+    wetness, pools, snow, patches = covers
     glow = np.empty(3)
     pane = np.empty(4)
     d = np.empty(3)
@@ -239,7 +280,8 @@ def shade(
         distance = t * length
         size = blur + distance * angle
         footprint = size / math.sqrt(max(cosine, 0.02))
-        m = material[i]
+        m = material[i] & 127
+        is_open = material[i] > 127
         kind = kinds[m]
         mirror = mirrors[m]
         w = wall[i]
@@ -270,6 +312,25 @@ def shade(
                     albedo[c] *= 1.0 - 0.3 * pane[2]
                     albedo[c] += pane[1] * (paint - albedo[c]) + glass * (pane[3] - albedo[c])
 
+        film = pool = 0.0
+        if is_open:
+            edge = 0.1 + 0.5 * min(footprint, 1.0)
+            bumps, hollows = 0.0, 0.0
+            if 0.0 < snow < 1.0:
+                bumps = 0.6 * noise(x / 2.3, y / 2.3, 34) + 0.4 * noise(x / 0.6, y / 0.6, 35)
+            white = _step(bumps, patches, edge)
+            if wetness > 0.0 and nz > 0.97:
+                hollows = 0.7 * noise(x / 3.1, y / 3.1, 36) + 0.3 * noise(x / 0.8, y / 0.8, 37)
+                pool = _step(hollows, pools, edge)
+            damp = max(wetness, pool) * (1.0 - white)
+            bright = 1.0
+            if detailed and white > 0.0:
+                bright += 0.05 * grain(x, y, 1.3, footprint, 38) + 0.04 * grain(x, y, 0.16, footprint, 39)
+            for c in range(3):
+                albedo[c] *= 1.0 - damp * (1.0 - soaked[m])
+                albedo[c] += white * (_SNOW[c] * bright - albedo[c])
+            film = (0.25 * damp + 0.75 * min(pool, damp)) * _fresnel(0.02, cosine)
+
         rx, ry, rz = nx, ny, nz
         if kind == texture.LIQUID and detailed:
             ripple = 0.02 / (1.0 + footprint)
@@ -293,7 +354,14 @@ def shade(
             _mirrored(sky, sun, d, rx, ry, rz, town, glow)
         clear = math.exp(-extinction * distance)
         for c in range(3):
-            r = (1.0 - shine) * albedo[c] * irradiance[c] / math.pi
+            r = (1.0 - shine) * (1.0 - film) * albedo[c] * irradiance[c] / math.pi
             if shine > 0.0:
                 r += shine * glow[c]
             out[i, c] = r * clear + horizon[c] * (1.0 - clear)
+        if len(gloss):
+            # The texture of the surface shows through a thin film, puddles are smooth but for ripples.
+            rough = (0.12 * (1.0 - pool) + 0.006) / (1.0 + 8.0 * footprint) if film > 0.0 else 0.0
+            gloss[i] = film * clear
+            facet[i, 0] = nx + rough * noise(x / 0.03, y / 0.03, 32)
+            facet[i, 1] = ny + rough * noise(x / 0.03 + 40.0, y / 0.03, 33)
+            facet[i, 2] = nz

@@ -78,7 +78,8 @@ def situation_of_unit(
 
 def light_during(recording: Recording, time_ns: int) -> Light:
     """Sun and sky of the images of a drive at a time."""
-    return light_of(sun_during(recording, time_ns), cloud=recording.contents.camera.cloud)
+    contents = recording.contents
+    return light_of(sun_during(recording, time_ns), cloud=contents.camera.cloud, snow=contents.world.snow)
 
 
 def sun_during(recording: Recording, time_ns: int) -> Float:

@@ -1,14 +1,22 @@
-"""Reflection and transmission of glass and water."""
+"""Reflection and transmission of glass, water and films of water."""
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 from geoscene.typing import Float
+from lidar.raycast.memory import inlined
 
 AIR, WATER, GLASS = 1.0003, 1.33, 1.5
 """Refractive indices."""
+
+_ABSORPTION = (900.0, 1000.0, 1200.0, 1400.0, 1600.0), (6.8, 36.3, 104.0, 1239.0, 672.0)
+"""Absorption of water: nanometres, and 1/m (Hale and Querry 1973)."""
 
 _SLOPE_CALM, _SLOPE_WIND = 0.003, 0.00512  # Cox and Munk 1954: mean square slope 0.003 + 0.00512 U
 
@@ -32,6 +40,35 @@ def pane_reflection(cosine: ArrayLike, index: float = GLASS) -> Float:
     """Reflected share of unpolarised light at a pane: both faces and all inner reflections, lossless."""
     s, p = fresnel(cosine, index)
     return s / (1 + s) + p / (1 + p)
+
+
+@inlined
+def film(cosine: Any, reflectance: Any) -> Any:
+    """Factor of the reflectance of a diffuse surface under a smooth film of water; compiled.
+
+    Mean of both polarisations of t^2 / (1 - reflectance r), with the reflected share r and the transmitted
+    share t = 1 - r of the air's boundary at the cosine of incidence, inside and outside (Hahner et al. 2022).
+    """
+    inside = math.sqrt(1.0 - (AIR / WATER) ** 2 * (1.0 - cosine * cosine))
+    s = ((AIR * cosine - WATER * inside) / (AIR * cosine + WATER * inside)) ** 2
+    p = ((WATER * cosine - AIR * inside) / (WATER * cosine + AIR * inside)) ** 2
+    through_s = (1.0 - s) ** 2 / (1.0 - reflectance * s)
+    return 0.5 * (through_s + (1.0 - p) ** 2 / (1.0 - reflectance * p))
+
+
+@njit(cache=True, nogil=True)
+def under_film(cosine: Float, reflectance: Float) -> Float:
+    """`film` of surfaces (n,)."""
+    factor = np.empty(len(cosine))
+    for i in range(len(cosine)):
+        factor[i] = film(cosine[i], reflectance[i])
+    return factor
+
+
+def through_water(wavelength_nm: float, path: float) -> float:
+    """Share of light that a path through water leaves."""
+    wavelength, absorption = np.array(_ABSORPTION)
+    return math.exp(-math.exp(float(np.interp(wavelength_nm, wavelength, np.log(absorption)))) * path)
 
 
 def glint(cosine: ArrayLike, *, wind: float = 3.0) -> Float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -12,6 +12,7 @@ from numba import njit
 from geoscene.classes import materials
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.physics.fresnel import through_water
 from lidar.raycast.memory import inlined
 
 WAVELENGTHS_NM = (905.0, 1064.0, 1550.0)
@@ -28,6 +29,8 @@ RETRO = 1.0
 _ROUGHNESS = float(np.radians(20.0))  # slope deviation of rough facades, typical value
 _RETRO_FLAT, _RETRO_FALL = math.pi / 6, math.pi / 4  # sheeting: flat to 30°, 40 % at 45°, typical
 _RETRO_LEFT = 0.4
+
+_FILM = 0.5e-3  # metres of water on and in a soaked surface, half of a road's texture of 1.2 mm, typical
 
 
 @functools.lru_cache(maxsize=16)
@@ -46,6 +49,37 @@ def reflectance_table(wavelength_nm: float) -> tuple[Float, Float]:
         specular[material.code] = material.specular
     reflectance.flags.writeable = specular.flags.writeable = False
     return reflectance, specular
+
+
+class CoveredReflectance(NamedTuple):
+    """Reflectance of surfaces open to the sky that are partly wet or under snow, by material code.
+
+    That of a surface is open + film * `lidar.physics.fresnel.film` (cosine, soaked).
+
+    open   : (256,) of what is dry or under snow, times its share
+    film   : (256,) of what is under water, times its share; 0 for dry surfaces
+    soaked : (256,) of what is under water
+    """
+
+    open: Float
+    film: Float
+    soaked: Float
+
+
+@functools.lru_cache(maxsize=16)
+def covered_reflectance(wavelength_nm: float, *, wetness: float, snow: float) -> CoveredReflectance:
+    """Reflectance in a world that is wet or under snow; snow lies on top of water.
+
+    Water in the pores darkens the surface (`geoscene.classes.Material.wet`) and absorbs light.
+    """
+    dry, _ = reflectance_table(wavelength_nm)
+    known, factor = materials(), np.ones(256)
+    for material in known.values():
+        factor[material.code] = material.wet
+    soaked = dry * factor * through_water(wavelength_nm, 2 * _FILM)
+    on_snow = dry[known["snow"].code]
+    covered = snow * on_snow + (1 - snow) * (1 - wetness) * dry
+    return CoveredReflectance(covered, (1 - snow) * wetness * soaked, soaked)
 
 
 def apparent(

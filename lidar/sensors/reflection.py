@@ -13,12 +13,19 @@ from geoscene.classes import materials
 from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, depth_of, gather, insert
 from lidar.physics.footprint import Gap
-from lidar.physics.fresnel import glint
-from lidar.physics.reflect import INCIDENCE_LAWS, RETRO, apparent, reflectance_table, sent_back
+from lidar.physics.fresnel import film, glint, under_film
+from lidar.physics.reflect import (
+    INCIDENCE_LAWS,
+    RETRO,
+    apparent,
+    covered_reflectance,
+    reflectance_table,
+    sent_back,
+)
 from lidar.physics.settings import ScannerSettings
 from lidar.random_streams import normal_of
 from lidar.raycast import Hits
-from lidar.world.world import Faces, World
+from lidar.world.world import OPEN, Faces, World
 
 
 @functools.cache
@@ -38,6 +45,7 @@ class ReflectionTables(NamedTuple):
     """Reflection properties by material and feature, for compiled code.
 
     reflectance, specular : (256,) by material code
+    film, soaked : (256,) of wet surfaces, as in `lidar.physics.reflect.CoveredReflectance`
     factor : (k,) of the reflectance, by feature number minus ``low``; empty if there is no spread
     law    : index in `INCIDENCE_LAWS`
     glossy : (256,) bool, by material code: rays are mirrored or pass through
@@ -45,6 +53,8 @@ class ReflectionTables(NamedTuple):
 
     reflectance: Float
     specular: Float
+    film: Float
+    soaked: Float
     factor: Float
     low: int
     law: int
@@ -62,19 +72,30 @@ class SurfaceOptics:
         self.world, self.settings = world, settings
         self.faces: Faces = world.faces
         reflectance, specular = reflectance_table(wavelength_nm)
+        films = soaked = np.zeros(256)
+        wetness, snow = world.settings.wetness, world.settings.snow
+        if wetness or snow:
+            covered = covered_reflectance(wavelength_nm, wetness=wetness, snow=snow)
+            reflectance = _with_open(reflectance, covered.open)
+            films, soaked = _with_open(films, covered.film), _with_open(soaked, covered.soaked)
+            specular = _with_open(specular, (1 - snow) * specular)
         glossy = np.zeros(256, np.bool_)
         glossy[list(glossy_codes())] = settings.mirrors
         factor = np.empty(0)
         if settings.spread:
             factor = _factors(self.faces.low, self.faces.high, spread=settings.spread, seed=seed)
         law = INCIDENCE_LAWS.index(settings.law)
-        self.tables = ReflectionTables(reflectance, specular, factor, self.faces.low, law, glossy)
+        low = self.faces.low
+        self.tables = ReflectionTables(reflectance, specular, films, soaked, factor, low, law, glossy)
 
     def at(self, hits: Hits) -> tuple[Echoes, NDArray[np.uint8]]:
         """Surfaces (n,) of hits, with the hit's row as pulse and all on the axis; and their materials."""
         found, tables = self.world.lookup(hits), self.tables
         cosine = np.minimum(np.abs(hits.cosine).astype(np.float64), 1.0)
         rho = tables.reflectance[found.material]
+        wet = np.flatnonzero(tables.film[found.material])
+        code = found.material[wet]
+        rho[wet] += tables.film[code] * under_film(cosine[wet], tables.soaked[code])
         if len(tables.factor):
             one_off = rho * tables.factor[np.maximum(found.feature - tables.low, 0)]
             rho = np.where(rho > RETRO, one_off, np.minimum(one_off, RETRO))
@@ -86,6 +107,11 @@ class SurfaceOptics:
         number, axis = np.arange(n, dtype=np.int32), np.ones(n, bool)
         rows = Echoes(number, hits.range, back, found.feature, found.klass, cosine, hits.range, axis)
         return rows, found.material
+
+
+def _with_open(plain: Float, covered: Float) -> Float:
+    """A table by material code with the codes of `OPEN` replaced by what they are when covered."""
+    return np.concatenate([plain[:OPEN], covered[:OPEN]])
 
 
 class EchoCollector:
@@ -178,6 +204,7 @@ def _receive(
     # Fields of a tuple that are read in a loop cost a reference count each time.
     starts, named, packed, own = faces.start, faces.named, faces.packed, len(faces.start) - 1
     reflectance, specular, factor, mirrors = tables.reflectance, tables.specular, tables.factor, tables.glossy
+    films, soaked = tables.film, tables.soaked
     low, law, spread = tables.low, tables.law, len(tables.factor) > 0
     numbers, ranges, apparents, features, classes, cosines, trues, axes = out
     back, away, slant, depth = np.empty(rays), np.empty(rays), np.empty(rays), np.empty(rays)
@@ -199,10 +226,12 @@ def _receive(
                 surface = (np.int64(named[copy]) << 32) | (surface & 0xFFFFFFFF)
             material = surface & 255
             rho = reflectance[material]
+            c = min(abs(np.float64(cosine[i])), 1.0)
+            if films[material] > 0.0:
+                rho += films[material] * film(c, soaked[material])
             if spread:
                 one_off = rho * factor[max((surface >> 32) - low, 0)]
                 rho = one_off if rho > RETRO else min(one_off, RETRO)
-            c = min(abs(np.float64(cosine[i])), 1.0)
             surfaces[k], slant[k], away[k] = surface, c, distance[i]
             depth[k] = depth_of(distance[i], c, gap)
             back[k] = sent_back(rho, c, specular[material], law) / rays

@@ -30,6 +30,8 @@ class WorldSettings:
     trees     : single trees and those of rows
     furniture : poles, lamps, signs, traffic lights, bollards, benches and wires
     barriers  : walls, fences and hedges
+    wetness   : share of surfaces open to the sky that is soaked and under a film of water, 0 to 1
+    snow      : share of surfaces open to the sky that is under snow, 0 to 1
     """
 
     origin: str = "near"
@@ -38,6 +40,8 @@ class WorldSettings:
     trees: bool = True
     furniture: bool = True
     barriers: bool = True
+    wetness: float = 0.0
+    snow: float = 0.0
 
     def __post_init__(self) -> None:
         """Validate the settings; one InputError names all faults."""
@@ -46,6 +50,11 @@ class WorldSettings:
             faults.append(f"origin={self.origin}: known are {', '.join(ORIGINS)}")
         if not self.reach > 0:
             faults.append(f"reach={self.reach:g}: give metres above 0, or inf")
+        faults += [
+            f"{name}={value:g}: give 0 to 1"
+            for name, value in (("wetness", self.wetness), ("snow", self.snow))
+            if not 0 <= value <= 1
+        ]
         if faults:
             raise InputError("; ".join(faults))
 

@@ -26,6 +26,18 @@ Region = tuple[float, float, float, float]
 SOLID, GLASS, FOLIAGE, WATER = 1, 2, 4, 8
 """Mask bits of a world's faces, by material: ``mask=ALL & ~GLASS`` lets rays pass through windows."""
 
+OPEN = 128
+"""Bit of a material's code on faces open to the sky, in a world that is wet or under snow."""
+
+_STEEPEST = 0.5
+"""Least vertical part of the normal of a face that water and snow stay on: up to 60 degrees of slope."""
+
+_ABOVE, _CEILING = 0.05, 100.0
+"""Metres above a face from which, and up to which, roofs are looked for."""
+
+_BARE = ("glass", "water", "skin", "retroreflector")
+"""Materials that the weather leaves as they are."""
+
 _SEEN_THROUGH = {"glass": GLASS, "foliage": FOLIAGE, "conifer": FOLIAGE, "water": WATER}
 OVERHANG = 50.0
 """Metres by which a building may extend beyond its tile and still be loaded."""
@@ -39,7 +51,7 @@ class Surfaces(Columns):
 
     feature  : (n,) int32, feature number of the scene, or of the actor
     klass    : (n,) uint8, code of `geoscene.classes.Class`
-    material : (n,) uint8, code of `geoscene.classes.Material`
+    material : (n,) uint8, code of `geoscene.classes.Material`, with the bit `OPEN` where water or snow lies
     surface  : (n,) uint8, OTHER, WALL, ROOF or FLOOR of `geoscene.mesh`
     color    : (n, 3) uint8, sRGB
     """
@@ -81,8 +93,20 @@ def packed(surfaces: Surfaces, leaves: NDArray[np.integer] | None = None) -> NDA
     return column
 
 
-def _surfaces(mesh: Mesh) -> Surfaces:
-    return Surfaces(mesh.feature, mesh.klass, mesh.material, mesh.surface, mesh.color)
+def surfaces_of(mesh: Mesh, settings: WorldSettings) -> Surfaces:
+    """The faces of a mesh as surfaces, with the bit `OPEN` where water or snow may lie."""
+    material = mesh.material
+    if settings.wetness or settings.snow:
+        material = material | np.where(_is_open(mesh), np.uint8(OPEN), np.uint8(0))
+    return Surfaces(mesh.feature, mesh.klass, material, mesh.surface, mesh.color)
+
+
+def _is_open(mesh: Mesh) -> NDArray[np.bool_]:
+    """Faces (m,) that face the sky and are not of a material that the weather leaves as it is."""
+    known = materials()
+    up = mesh.normals()[:, 2] > _STEEPEST
+    open_faces: NDArray[np.bool_] = up & ~np.isin(mesh.material, [known[name].code for name in _BARE])
+    return open_faces
 
 
 _MISS = Surfaces(
@@ -109,13 +133,17 @@ def _shape(mesh: Mesh, *, backend: str) -> Caster:
 
 @dataclass(frozen=True, slots=True)
 class _Tile:
-    """A loaded tile: its parts by number, attributes of its faces, instances of shapes in scene metres."""
+    """A loaded tile: its parts by number, attributes of its faces, instances of shapes in scene metres.
+
+    centre : (m, 3) of the faces, scene metres
+    """
 
     parts: Mapping[int, Geometry]
     surfaces: Surfaces
     shape: NDArray[np.int32]
     transform: Float
     feature: NDArray[np.int32]
+    centre: Float
 
 
 class World:
@@ -151,7 +179,7 @@ class World:
         self.region: Region | None = None
         self._shapes = tuple(_shape(mesh, backend=backend) for mesh in shapes)
         self._actors = tuple(_shape(mesh, backend=backend) for mesh in actors)
-        self._copied = [_surfaces(mesh) for mesh in (*shapes, *actors)]
+        self._copied = [surfaces_of(mesh, settings) for mesh in (*shapes, *actors)]
         self._tiles: dict[int, _Tile] = {}
         self._moving: tuple[Instances, NDArray[np.int32]] = _no_instances(self._actors)
         self.caster = Caster(origin=np.zeros(3), dynamic=True, backend=backend)
@@ -209,6 +237,10 @@ class World:
             first={n: self._first[rank] for rank in ranks for n in self._tiles[rank].parts},
             instances=[self._still, self._moving[0]],
         )
+        if self.settings.wetness or self.settings.snow:
+            self.caster.update(instances=[self._still])
+            self._shelter()
+            self.caster.update(instances=[self._still, self._moving[0]])
 
     def place_actors(self, shape: NDArray[np.int32], transform: Float, *, feature: NDArray[np.int32]) -> None:
         """Replace the actors of this world; its static part is not rebuilt.
@@ -250,10 +282,11 @@ class World:
         transform[:, :, 3] += tile.origin
         return _Tile(
             {_PARTS * rank + k: part for k, part in enumerate(parts)},
-            _surfaces(mesh),
+            surfaces_of(mesh, self.settings),
             copies.shape,
             transform,
             copies.feature,
+            mesh.vertices[mesh.faces].mean(axis=1) + tile.origin,
         )
 
     def _concatenate_tables(self) -> None:
@@ -267,6 +300,19 @@ class World:
         self._bounds = int(feature.min()), int(feature.max())
         self._still = self._static()
         self._of_shape, self._of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes)])
+        self._index_instances()
+
+    def _shelter(self) -> None:
+        """Clear `OPEN` of faces of tiles under roofs, bridges and in tunnels, by a ray upwards from each."""
+        first = len(self._surfaces) - sum(len(table) for table in self._copied) - 1
+        row = np.flatnonzero(self._surfaces.material[:first] & OPEN)
+        if not len(row):
+            return
+        start = np.concatenate([tile.centre for tile in self._tiles.values()])[row] + [0.0, 0.0, _ABOVE]
+        up = np.broadcast_to([0.0, 0.0, 1.0], start.shape)
+        covered = row[self.caster.occluded(start, up, far=_CEILING, mask=SOLID)]
+        self._surfaces.material[covered] &= ~np.uint8(OPEN)
+        self._packed[covered] &= ~np.int64(OPEN)
         self._index_instances()
 
     def _leaves_of(self, starts: NDArray[np.integer]) -> NDArray[np.uint8]:

@@ -8,7 +8,8 @@ from geoscene.classes import Class, materials
 from geoscene.mesh import Mesh, concatenate
 from lidar.geometry.poses import Trajectory
 from lidar.raycast import Caster
-from lidar.world.world import Faces, Surfaces, packed
+from lidar.world.settings import PLAIN, WorldSettings
+from lidar.world.world import Faces, Surfaces, packed, surfaces_of
 
 LEAVES = 0.8  # m2/m3 of leaves in boxes of class HEDGE
 
@@ -27,20 +28,20 @@ class MeshWorld:
 
     mesh: Mesh
     reach = np.inf
+    settings: WorldSettings = PLAIN
 
     def __post_init__(self):
         self.caster = Caster(self.mesh.vertices, self.mesh.faces)
 
     @property
     def faces(self):
-        m = self.mesh
-        surfaces = Surfaces(m.feature, m.klass, m.material, m.surface, m.color)
+        m, surfaces = self.mesh, surfaces_of(self.mesh, self.settings)
         what = np.append(packed(surfaces, m.klass == Class.HEDGE), np.int64(-1) << 32)
         low, high = int(m.feature.min()), int(m.feature.max())
         return Faces(np.zeros(1, np.int64), np.empty(0, np.int32), what, low, high, np.array([0.0, LEAVES]))
 
     def lookup(self, hits):
-        seen, m = hits.face >= 0, self.mesh
+        seen, m = hits.face >= 0, surfaces_of(self.mesh, self.settings)
         rows = np.where(seen, hits.face, 0)
         feature = np.where(seen, m.feature[rows], -1).astype(np.int32)
         columns = (np.where(seen, c[rows], 0).astype(np.uint8) for c in (m.klass, m.material, m.surface))
@@ -65,8 +66,8 @@ def plate(x, *, half=500.0, feature=0, klass=Class.WALL, material="plaster", til
     return Mesh.of(np.array(vertices), faces, feature=feature, klass=klass, material=code)
 
 
-def world(*meshes):
-    return MeshWorld(concatenate(meshes))
+def world(*meshes, **settings):
+    return MeshWorld(concatenate(meshes), settings=WorldSettings(**settings))
 
 
 def driven(velocity=(0.0, 0.0, 0.0), *, yaw_rate=0.0, start=(0.0, 0.0, 0.0), seconds=5.0, scale=1.0):

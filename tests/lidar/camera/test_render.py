@@ -18,6 +18,7 @@ from lidar.geometry.poses import Poses
 from lidar.raycast import Caster, Instances
 from lidar.rig.camera_model import pixel_rays, project
 from lidar.rig.specs import CameraSpec
+from lidar.world.settings import WorldSettings
 
 CAMERA = CameraSpec("c", Mount(), 160, 120, 100.0, 100.0, 79.5, 59.5)
 FLAT = RenderOptions(detail=False, visibility=np.inf)
@@ -434,6 +435,7 @@ class ActorWorld:
     shift: tuple[float, float, float]
     way: tuple[float, float, float]
     reach = np.inf
+    settings = WorldSettings()
 
     def __post_init__(self):
         self.mesh = box((-1, -1, -1), (1, 1, 1), feature=9)
@@ -488,3 +490,39 @@ def test_options_out_of_range_are_refused():
 def test_the_whole_street_is_one_mesh():
     assert len(street().mesh) == 2 + 3 * 12
     assert isinstance(concatenate([ground()]), Mesh)
+
+
+def test_wet_ground_is_darker_and_mirrors_what_stands_on_it():
+    tower = replace(house((30, -3, 0), (34, 3, 60)), color=np.tile(np.uint8([220, 20, 20]), (12, 1)))
+    dry, damp, wet = (
+        render(CAMERA, looking(), world=world(ground(), tower, wetness=w), sun=NOON, options=FLAT).rgb
+        for w in (0.0, 0.4, 1.0)
+    )
+    near = slice(112, 120), slice(60, 100)
+    assert damp[near].mean() < dry[near].mean()
+    mirrored = slice(75, 110), slice(74, 86)  # below the tower, on the ground in front of it
+    redness = [np.diff(image[mirrored][..., [2, 0]].astype(int)).mean() for image in (dry, damp, wet)]
+    assert redness[0] < redness[1] < redness[2]
+    assert redness[2] > 5
+
+
+def test_snow_covers_its_share_of_the_ground_and_none_of_the_walls():
+    scene = ground(material="soil", color=(60, 50, 40)), house((30, -80, 0), (34, -20, 40))
+    look = {"sun": NOON, "options": FLAT}
+    above = looking((0, 0, 40), down=np.pi / 2)
+    for share in (0.2, 0.5, 0.8):
+        rgb = render(CAMERA, above, world=world(*scene, snow=share), **look).rgb
+        assert (rgb[..., 2] > 170).mean() == pytest.approx(share, abs=0.1)
+    bare, deep = (render(CAMERA, looking(yaw=-1.0), world=world(*scene, snow=s), **look) for s in (0.0, 1.0))
+    wall = bare.klass == Class.BUILDING
+    assert deep.rgb[bare.klass == Class.ROAD].min() > 180
+    assert deep.rgb[bare.klass == Class.ROAD].max() < 255  # exposed for it
+    assert deep.rgb[wall].mean() < bare.rgb[wall].mean()  # as exposed for snow
+
+
+def test_depth_and_labels_are_those_of_the_dry_world():
+    dry, wet = (
+        render(CAMERA, looking(), world=world(ground(), wetness=w, snow=w), sun=NOON) for w in (0.0, 0.7)
+    )
+    for name in ("depth", "klass", "feature"):
+        assert np.array_equal(getattr(dry, name), getattr(wet, name))

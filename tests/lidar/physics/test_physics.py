@@ -9,7 +9,17 @@ from geoscene.classes import materials
 from lidar.errors import InputError
 from lidar.physics.echoes import Echoes, joined, merged, numbered, reported
 from lidar.physics.footprint import bundle
-from lidar.physics.fresnel import WATER, fresnel, glint, mirrored, pane_reflection, surface_reflection
+from lidar.physics.fresnel import (
+    WATER,
+    film,
+    fresnel,
+    glint,
+    mirrored,
+    pane_reflection,
+    surface_reflection,
+    through_water,
+    under_film,
+)
 from lidar.physics.intensity import reflectivity_code
 from lidar.physics.link import (
     amplitude,
@@ -20,7 +30,7 @@ from lidar.physics.link import (
     transmission,
 )
 from lidar.physics.range_error import quantised, signal_sigma, stretch_sigma, walk
-from lidar.physics.reflect import apparent, reflectance_table
+from lidar.physics.reflect import apparent, covered_reflectance, reflectance_table
 from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.random_streams import generator, normal_of
 from lidar.rig.scanner import WEAK_SIGMA, load_sensor
@@ -50,6 +60,42 @@ def test_water_reflects_by_fresnels_equations(angle_deg, s, p):
 )
 def test_a_pane_reflects_with_both_faces(angle_deg, share):
     assert pane_reflection(np.cos(np.radians(angle_deg))) == pytest.approx(share, abs=2e-4)
+
+
+@pytest.mark.parametrize(("angle_deg", "expected"), [(0, 0.0962), (60, (0.0794 + 0.0992) / 2)])
+def test_a_film_of_water_takes_the_published_share(angle_deg, expected):
+    """Anchors of Hahner et al. 2022: diffuse reflectance 0.1 under a film."""
+    assert 0.1 * film(np.cos(np.radians(angle_deg)), 0.1) == pytest.approx(expected, abs=2e-4)
+
+
+def test_films_of_many_surfaces_are_those_of_each():
+    cosine, rho = np.linspace(0, 1, 7), np.linspace(0.05, 0.9, 7)
+    assert np.array_equal(under_film(cosine, rho), [film(c, r) for c, r in zip(cosine, rho, strict=True)])
+    assert under_film(np.zeros(1), np.array([0.3]))[0] == pytest.approx(0, abs=1e-12)
+
+
+def test_water_absorbs_infrared():
+    assert through_water(905.0, 1e-3) > 0.99
+    assert through_water(1550.0, 1e-3) == pytest.approx(0.46, abs=0.03)
+
+
+def test_wet_and_snowy_ground_by_wavelength():
+    known = {m.name: m.code for m in materials().values()}
+    asphalt, snow = known["asphalt"], known["snow"]
+    for nm in (905.0, 1550.0):
+        dry, _ = reflectance_table(nm)
+        bare = covered_reflectance(nm, wetness=0.0, snow=0.0)
+        assert np.array_equal(bare.open, dry)
+        assert not bare.film.any()
+        deep = covered_reflectance(nm, wetness=1.0, snow=1.0)
+        assert deep.open[asphalt] == dry[snow]
+        assert not deep.film.any()
+    near, far = (covered_reflectance(nm, wetness=1.0, snow=0.0).film for nm in (905.0, 1550.0))
+    assert near[asphalt] == pytest.approx(0.4 * 0.17, rel=0.02)
+    assert far[asphalt] < 0.65 * near[asphalt]  # water absorbs there, though dry asphalt is brighter
+    assert near[known["car_paint"]] == pytest.approx(
+        reflectance_table(905.0)[0][known["car_paint"]], rel=0.02
+    )
 
 
 @given(st.floats(0.0, 1.0), st.sampled_from([1.33, 1.5]))

@@ -8,9 +8,11 @@ from helpers.sensor_worlds import MeshWorld, box, driven, plate, world
 
 from geoscene.classes import Class, materials
 from lidar.geometry.mounts import Mount
+from lidar.physics.footprint import AXIS_ONLY
 from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.rig.scanner import firings, load_sensor
 from lidar.rig.specs import load_rig
+from lidar.sensors.reflection import EchoCollector, SurfaceOptics
 from lidar.sensors.scan import cast, scan
 
 ROOF = Mount((1.2, 0.0, 1.9))
@@ -226,3 +228,54 @@ def test_nothing_beyond_the_reach_of_the_world_returns():
     within = whole.range <= 8.0
     assert 0 < within.sum() < len(whole)
     np.testing.assert_array_equal(part.range, whole.range[within])
+
+
+ROAD = box((-200, -200, -1), (200, 200, 0), feature=7, klass=Class.ROAD, material="asphalt")
+BEYOND = box((12, -20, 0), (15, 25, 9), feature=8)
+
+
+def on_road(**settings):
+    """Ranges and intensities of the returns of a road in a world with these settings."""
+    cloud = scan(
+        load_sensor("hdl32e"),
+        ROOF,
+        trajectory=driven(),
+        world=world(ROAD, BEYOND, **settings),
+        frame=0,
+        settings=ScannerSettings(link=True),
+    )
+    return cloud, cloud.feature == 7
+
+
+def test_returns_of_a_wet_road_vanish_the_farthest_first():
+    count, farthest = [], []
+    for wetness in (0.0, 0.3, 0.7, 1.0):
+        cloud, road = on_road(wetness=wetness)
+        count.append(np.count_nonzero(road))
+        farthest.append(np.quantile(cloud.range[road], 0.999))
+    assert count == sorted(count, reverse=True)
+    assert count[-1] < 0.9 * count[0]
+    assert farthest == sorted(farthest, reverse=True)
+    assert farthest[-1] < 0.75 * farthest[0]
+
+
+def test_walls_stay_dry_and_without_snow():
+    (dry, _), (wet, _) = on_road(), on_road(wetness=1.0, snow=0.5)
+    assert np.array_equal(dry.intensity[dry.feature == 8], wet.intensity[wet.feature == 8])
+
+
+def test_snow_is_bright_at_905_nm():
+    (dry, road), (snowy, under) = on_road(), on_road(snow=1.0)
+    assert np.median(snowy.intensity[under][:100]) > 3 * np.median(dry.intensity[road][:100])
+
+
+def test_collected_echoes_of_wet_ground_are_those_of_single_surfaces():
+    """The compiled collector and the look-up of single hits agree."""
+    wet = world(ROAD, BEYOND, wetness=0.6, snow=0.2)
+    optics = SurfaceOptics(wet, 905.0, settings=PLAIN, seed=1)
+    down = np.array([[0.3, 0.1, -1.0], [1.0, 0.0, -0.2], [0.9, 0.1, 0.0]])
+    hits = wet.caster.cast(np.array([0.0, 0.0, 2.0]), down / np.linalg.norm(down, axis=1, keepdims=True))
+    single, _ = optics.at(hits)
+    collector = EchoCollector(optics, 1, separation=0.5, gap=AXIS_ONLY, pulses=3)
+    collector.take(hits, 0)
+    np.testing.assert_allclose(collector.echoes()[0].apparent, single.apparent, rtol=1e-12)

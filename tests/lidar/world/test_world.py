@@ -18,7 +18,7 @@ from lidar.raycast import ALL
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.scene import Float64Scene
 from lidar.world.settings import WorldSettings, origin_limit
-from lidar.world.world import FOLIAGE, GLASS, World
+from lidar.world.world import FOLIAGE, GLASS, OPEN, World
 
 TILE = 100.0
 DOWN = np.array([[0.0, 0.0, -1.0]])
@@ -267,3 +267,45 @@ def test_rays_far_from_the_origin_of_the_scene_are_told():
     (limit,) = origin_limit(np.array([[0.0, 0.0, 0.0], [48_000.0, -36_000.0, 0.0]]))
     assert (limit.measured, limit.bound, limit.unit) == (60.0, 10.0, "km")
     assert "14.3 mm" in limit.advice
+
+
+def test_what_lies_under_a_roof_is_neither_wet_nor_under_snow(tmp_path):
+    """Two slabs of ground side by side, one under a bridge; its deck is open, as is the ground beside it."""
+    deck = box([20, 60, 1], [30.0, 30.0, 6.0], klass=Class.BRIDGE, feature=2)
+    corners = [(x, y) for x in (20.0, 40.0) for y in (0.0, 60.0)]
+    sheltered = Mesh.of(
+        np.array([[x, y, 0.0] for x, y in corners]), [[0, 2, 3], [0, 3, 1]], klass=Class.ROAD, feature=1
+    )
+    beside = Mesh.of(
+        np.array([[x + 30, y, 0.0] for x, y in corners]), [[0, 2, 3], [0, 3, 1]], klass=Class.ROAD, feature=3
+    )
+    (tmp_path / "tiles").mkdir()
+    files = SceneFiles(tmp_path)
+    whole = concatenate([sheltered, deck, beside])
+    none = Instances(np.empty(0, np.int32), np.empty((0, 3, 4)), np.empty(0, np.int32))
+    write_tile(files.tile(0, 0), Tile(np.zeros(3), whole, none))
+    write_shapes(files.shapes, {})
+    manifest = {
+        "schema": SCHEMA,
+        "frame": Frame.at(2.0, 48.0).to_json(),
+        "bounds": [0, 0, 100, 100],
+        "tile_size": TILE,
+        "tiles": [(0, 0, 1)],
+        "layers": {},
+    }
+    files.manifest.write_text(json.dumps(manifest | {"digest": manifest_digest(manifest)}))
+    scene = open_scene(tmp_path)
+    start = np.array([[30.0, 30, 3], [30, 30, 20], [55, 30, 3]])
+    for settings, is_open in (
+        (WorldSettings(), [False] * 3),
+        (WorldSettings(wetness=0.5), [False, True, True]),
+        (WorldSettings(snow=0.5), [False, True, True]),
+    ):
+        found = World.load(scene, settings=settings)
+        hits = found.caster.cast(start, np.repeat(DOWN, 3, 0))
+        assert found.lookup(hits).feature.tolist() == [1, 2, 3]
+        assert ((found.lookup(hits).material & OPEN) > 0).tolist() == is_open
+        code = found.faces.packed[hits.face + found.faces.start[hits.instance]] & OPEN
+        assert (code > 0).tolist() == is_open
+    with pytest.raises(InputError, match=r"wetness=2: give 0 to 1; snow=-1: give 0 to 1"):
+        WorldSettings(wetness=2, snow=-1)
