@@ -111,6 +111,7 @@ def _apply_to_dataset(
         sensors: list[Scanner | Camera] = [*scanners(rig), *cameras(rig)]
         chosen = Stages(stages, seed)
         chosen.check(sensor_kinds(rig))
+        _check_images(chosen, rig)
         recorded = [(name, text) for name, text in recipe["settings"]]
         settings = settings_of(recipe["fidelity"], with_stage_settings(recorded, stages))
         contents = Contents(
@@ -189,6 +190,17 @@ def _apply_to_unit(dataset: Dataset, recording: Recording, *, spec: GnssSpec | I
         return
     fixes, heights = read_fixes(dataset.paths, spec.name, vertical=dataset.frame.vertical)
     record_fixes(out, fixes, at=at, stages=stages, start=start, heights=heights)
+
+
+def _check_images(stages: Stages, rig: Rig) -> None:
+    """Raise InputError for a stage on images that needs images of another kind which were not recorded."""
+    for camera in rig.cameras:
+        for named in stages.at("image", camera.name):
+            if missing := sorted(set(named.stage.image_kinds) - set(camera.images)):
+                raise InputError(
+                    f"stage {named.name} needs {' and '.join(missing)} images of {camera.name}, which were"
+                    f" not recorded; drive again with images = {[*camera.images, *missing]} in the rig"
+                )
 
 
 def _richest_format(contents: Contents) -> Format:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from math import inf, isfinite
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +54,15 @@ class Stage:
         if faults := [fault for f in fields(self) if (fault := _fault(f, getattr(self, f.name)))]:
             raise InputError("; ".join(faults))
 
-    settings: ClassVar[tuple[tuple[str, str], ...]] = ()
-    """Settings of scanners and cameras, by name and text, that a drive with the stage has by default."""
+    @property
+    def settings(self) -> tuple[tuple[str, str], ...]:
+        """Settings by name and text that a drive with the stage has by default."""
+        return ()
+
+    @property
+    def image_kinds(self) -> tuple[str, ...]:
+        """Kinds of image, besides colours, that the stage needs of a recorded camera."""
+        return ()
 
     @property
     def lookback(self) -> float:

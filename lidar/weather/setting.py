@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from math import isfinite
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from lidar.errors import InputError
 from lidar.signal.stage import Stage, parameter
+
+_TEXTURE = 1.2  # mm of water that fill the texture of a road (Hahner et al. 2022)
 
 FOREVER = 1e9
 """Seconds; the default end of weather."""
@@ -85,8 +87,6 @@ class WeatherSetting(Stage):
     Raises InputError for a value that is out of bounds or does not belong to the kind.
     """
 
-    settings: ClassVar[tuple[tuple[str, str], ...]] = (("link", "on"),)  # weak echoes are lost
-
     kind: str = parameter("rain", "what is in the air", among=tuple(KINDS))
     amount: float = parameter(
         10.0, "rain and snow: mm/h (as water); fog and dust: visibility, m; spray: mm of water on the road"
@@ -119,6 +119,29 @@ class WeatherSetting(Stage):
             object.__setattr__(self, "medium", kind.media[0])
         if faults := _faults(self, kind):
             raise InputError("; ".join(faults))
+
+    @property
+    def settings(self) -> tuple[tuple[str, str], ...]:
+        """Weak echoes are lost; clouds, wet ground and snow belong to the kind unless they are told.
+
+        Published models of point clouds know dry ground.
+        """
+        if self.model != "physical":
+            return (("link", "on"),)
+        amount, wetness, snow = max(self.amount, self.amount_to), self.wetness, self.snow_cover
+        if wetness < 0:
+            wetness = {"rain": 0.5 + amount / 20, "snow": 0.3, "spray": amount / _TEXTURE}.get(self.kind, 0.0)
+            wetness *= amount > 0
+        if snow < 0:
+            snow = amount / 4 if self.kind == "snow" else 0.0
+        cloud = float(self.kind in ("rain", "snow", "fog", "spray"))
+        implied = {"cloud": cloud, "wetness": wetness, "snow": snow}
+        return (("link", "on"), *((name, f"{min(x, 1.0):g}") for name, x in implied.items() if x > 0))
+
+    @property
+    def image_kinds(self) -> tuple[str, ...]:
+        """The air's light depends on the distance."""
+        return ("depth",)
 
     def amount_at(self, seconds: float) -> float | None:
         """The amount at a time since the drive's start; None before and after the weather.

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidar.camera.render import Frame
 from lidar.physics.echoes import TracedEchoes
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, parameter
 from lidar.weather.air import through_even_air
+from lidar.weather.camera import weathered
 from lidar.weather.media import medium_of
 from lidar.weather.setting import WeatherSetting
 
@@ -29,3 +31,7 @@ class Weather(WeatherSetting):
             return echoes
         medium = medium_of(self.kind, amount, wavelength_nm=pulses.sensor.wavelength_nm, medium=self.medium)
         return through_even_air(pulses, echoes, medium=medium, rng=rng)
+
+    def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
+        """The image that the camera takes."""
+        return weathered(frame, self, at=at, rng=rng)
