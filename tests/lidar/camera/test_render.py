@@ -515,9 +515,9 @@ def test_snow_covers_its_share_of_the_ground_and_none_of_the_walls():
         assert (rgb[..., 2] > 170).mean() == pytest.approx(share, abs=0.1)
     bare, deep = (render(CAMERA, looking(yaw=-1.0), world=world(*scene, snow=s), **look) for s in (0.0, 1.0))
     wall = bare.klass == Class.BUILDING
-    assert deep.rgb[bare.klass == Class.ROAD].min() > 180
+    assert np.median(deep.rgb[bare.klass == Class.ROAD]) > 200  # but for shadows
     assert deep.rgb[bare.klass == Class.ROAD].max() < 255  # exposed for it
-    assert deep.rgb[wall].mean() < bare.rgb[wall].mean()  # as exposed for snow
+    assert deep.rgb[wall].mean() < 180  # though snow lights them
 
 
 def test_depth_and_labels_are_those_of_the_dry_world():

@@ -73,6 +73,29 @@ def test_weather_loses_weak_echoes_unless_the_user_says_otherwise():
     )
 
 
+@pytest.mark.parametrize(
+    ("text", "cloud", "wetness", "snow"),
+    [
+        ("rain=3mm/h", 1, 0.65, 0),
+        ("rain=40mm/h", 1, 1, 0),
+        ("rain=0", 1, 0, 0),
+        ("rain=3mm/h,wetness=0.1", 1, 0.1, 0),
+        ("snow=2mm/h", 1, 0.3, 0.5),
+        ("snow=2mm/h,snow_cover=0,wetness=0", 1, 0, 0),
+        ("spray=0.6mm", 1, 0.5, 0),
+        ("fog=50m", 1, 0, 0),
+        ("clear,wetness=0.4,snow_cover=0.2", 0, 0.4, 0.2),
+        ("rain=3mm/h,model=lisa", 0, 0, 0),
+    ],
+)
+def test_weather_wets_the_ground_and_covers_the_sky_by_its_kind(text, cloud, wetness, snow):
+    contents = DriveOptions(route="random", weather=read_weather(text)).contents()
+    found = contents.camera.cloud, contents.world.wetness, contents.world.snow
+    assert found == pytest.approx((cloud, wetness, snow))
+    told = DriveOptions(route="random", weather=read_weather(text), settings=(("wetness", "0.9"),)).contents()
+    assert told.world.wetness == 0.9
+
+
 @pytest.mark.usefixtures("_known")
 def test_the_recipe_lists_weather_and_attacks_as_stages(scene):
     plain = DriveOptions(route="random").recipe(scene)
@@ -83,7 +106,7 @@ def test_the_recipe_lists_weather_and_attacks_as_stages(scene):
     recipe = wanted.recipe(scene)
     assert [row["name"] for row in recipe["stages"]] == ["weather", "blinding"]
     assert recipe["stages"][0]["amount"] == 3
-    assert recipe["settings"] == (("link", "on"),)
+    assert recipe["settings"] == (("link", "on"), ("cloud", "1"), ("wetness", "0.65"))
     assert not {"weather", "attacks"} & recipe.keys()
 
 
