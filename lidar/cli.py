@@ -101,6 +101,8 @@ def drive(
 
     lidar drive scene --route random --rig vlp16 --accuracy 3cm -o drive
 
+    lidar drive scene --route random --weather rain=10mm/h --road by-weather -o rain
+
     Parameters
     ----------
     scene
@@ -485,6 +487,8 @@ def apply(
     lidar apply drive --stage dropped_packets:loss=0.02,burst=4 -o lossy
 
     lidar apply kitti/sequences/00 --stage cover_glass:transmission=0.7 -o dirty
+
+    lidar apply drive --weather rain=10mm/h -o rainy
 
     Parameters
     ----------

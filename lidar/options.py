@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from geoscene.reach import RoadMap
     from geoscene.scene import Scene
     from lidar.dataset.recording import Contents
+    from lidar.planning.road_conditions import RoadConditions
     from lidar.planning.route import Side, Spec
     from lidar.signal.registry import NamedStage
     from lidar.traffic.fcd import TrafficFile
@@ -185,7 +186,10 @@ def _values(text: str, words: Sequence[str], *, known: dict[str, Any]) -> dict[s
 _EXAMPLES = {float: "0.5", Path: "map.net.xml"}
 
 
-_NOT_IN_RECIPE = ("stages", "weather", "attacks", "workers", "scheduler")
+_ROADS = ("dry", "by-weather", "wet", "snow", "ice")
+"""What vehicles drive on."""
+
+_NOT_IN_RECIPE = ("stages", "weather", "attacks", "road", "workers", "scheduler")
 """Options that the recipe states otherwise, or on which no byte depends."""
 
 
@@ -289,6 +293,10 @@ class DriveOptions:
     """Attack on sensors: a TOML file with tables [[attack]], NAME or NAME:KEY=VALUE,KEY=VALUE; repeat for
     more. It acts after the weather and before other stages."""
 
+    road: str = "dry"
+    """What the ego vehicle and simulated traffic drive on: dry, whatever the weather; by-weather, so that its
+    friction and visibility lower speeds and accelerations; wet, snow or ice."""
+
     workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2
     """Threads, at most one per core; each records one frame at a time. The bytes do not depend on it."""
 
@@ -310,7 +318,28 @@ class DriveOptions:
             raise InputError(f"`altitude` {self.altitude:g}: give metres above the ground, up to 20000")
         if not 0 <= self.overlap < 1:
             raise InputError(f"`overlap` {self.overlap:g}: give a share from 0 to less than 1")
+        if self.road not in _ROADS:
+            raise InputError(f"`road` {self.road}: one of {', '.join(_ROADS)}")
+        if self.road == "by-weather" and not self._weather():
+            raise InputError("`road` by-weather: give `weather`, too")
         self.contents()
+
+    def road_conditions(self) -> RoadConditions:
+        """Grip and visibility that vehicles drive with."""
+        from lidar.planning.road_conditions import ROADS  # noqa: PLC0415
+
+        if self.road != "by-weather":
+            return ROADS[self.road]
+        from lidar.weather.road import road_conditions  # noqa: PLC0415
+
+        return road_conditions(self._weather())
+
+    def _weather(self) -> WeatherList:
+        """Weather among the stages."""
+        from lidar.weather.setting import WeatherSetting  # noqa: PLC0415
+
+        stages = (named.stage for named in self.all_stages)
+        return tuple(stage for stage in stages if isinstance(stage, WeatherSetting))
 
     def check_course(self) -> None:
         """Raise InputError unless the options name either a route or a survey."""
@@ -368,6 +397,8 @@ class DriveOptions:
         recipe |= {name: getattr(self, name) for name in names}
         if scene.area is not None:
             resolved["map"] = scene.origin
+        if self.road != "dry":
+            resolved["road"] = self.road
         if stages := self.all_stages:
             resolved["stages"] = [stage.to_json() for stage in stages]
             resolved["settings"] = with_stage_settings(self.settings, stages)

@@ -25,6 +25,7 @@ from lidar.geometry.georeference import Georeference, export_crs
 from lidar.geometry.poses import Trajectory, blocks_of
 from lidar.options import DriveOptions
 from lidar.planning.flight import Flight
+from lidar.planning.road_conditions import vehicle_on
 from lidar.planning.road_drive import RoadPlan, plan_road_drive
 from lidar.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.rig.specs import Rig, load_rig
@@ -210,7 +211,8 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     sensors = sensors_of(rig, options)
     if any(isinstance(sensor, Camera) for sensor in sensors):
         scene.require("colors")
-    vehicle = load_vehicle(options.vehicle or rig.vehicle)
+    road = options.road_conditions()
+    vehicle = vehicle_on(load_vehicle(options.vehicle or rig.vehicle), road)
     motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
     trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)
     check_start(start, trajectory.duration_ns)
@@ -329,6 +331,7 @@ def plan_motion(
             bounds=scene.bounds,
             duration=travel.duration,
             at_speed=travel.at_speed,
+            road=options.road_conditions(),
         )
         if travel.duration is not None:  # what cannot pull up within a short time is recorded until then
             trajectory = trajectory.until(round(travel.duration * 1e9))
@@ -370,7 +373,7 @@ def _with_traffic(
     progress("traffic", 0, total=0)
     traffic = replace(options.traffic, side=options.side_in(scene))
     graph = motion.plan.graph if isinstance(motion, RoadMotion) else scene.road_graph()
-    seed = options.seed
+    seed, road = options.seed, options.road_conditions()
     if isinstance(traffic, TrafficFile):
         return trajectory, replay(scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic)
     if isinstance(motion, RoadMotion):
@@ -385,7 +388,10 @@ def _with_traffic(
             options=traffic,
             duration=motion.plan.duration,
             at_speed=motion.plan.at_speed,
+            road=road,
         )
     if isinstance(traffic, SumoOptions):
         raise InputError("`traffic`: SUMO needs a drive along a route on roads")
-    return trajectory, populate(scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic)
+    return trajectory, populate(
+        scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic, road=road
+    )

@@ -132,7 +132,9 @@ def speed_limits(path: Path, vehicle: Vehicle) -> Float:
         return np.asarray(np.minimum(limit, beside))
 
     return rowwise(
-        lambda limit, other: np.maximum(np.minimum(np.minimum(limit, vehicle.max_speed), other), _SLOWEST),
+        lambda limit, other: np.maximum(
+            np.minimum(np.minimum(vehicle.pace * limit, vehicle.max_speed), other), _SLOWEST
+        ),
         rowwise(posted, path.limit, reach=1),
         rowwise(allowed, path.curvature, change, crest),
     )

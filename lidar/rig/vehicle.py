@@ -16,7 +16,7 @@ KINDS = ("road", "foot", "air")
 """Where a vehicle moves: on the carriageway, on foot, or through the air."""
 
 _POSITIVE = (
-    *("length", "width", "turning_radius", "steering", "max_speed"),
+    *("length", "width", "turning_radius", "steering", "max_speed", "pace"),
     *("acceleration", "deceleration", "jerk", "lateral_acceleration", "lateral_jerk"),
 )
 
@@ -40,6 +40,7 @@ class Vehicle:
     roll_gradient, pitch_gradient : roll and pitch of the body in radians per m/s^2 of lateral and
                       longitudinal acceleration; positive: out of bends and backwards (suspension), negative:
                       into bends and forwards (aircraft)
+    pace            : share of the speed limits that it drives at
     cruise          : at cruising speed from the start of the drive to its end (aircraft)
     bob             : gait: lateral sway in metres, vertical rise per step in metres, steps per second at full
                       speed
@@ -65,6 +66,7 @@ class Vehicle:
     roll_gradient: float
     pitch_gradient: float
     source: str
+    pace: float = 1.0
     cruise: bool = False
     bob: tuple[float, float, float] = (0.0, 0.0, 0.0)
 

@@ -10,6 +10,7 @@ from geoscene.typing import Float
 from lidar.geometry.poses import Trajectory
 from lidar.planning.motion import ended_at_rest, motion_along, poses_along
 from lidar.planning.path import Path
+from lidar.planning.road_conditions import DRY, RoadConditions
 from lidar.planning.speed_profile import motion_within
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.ego_trip import ego_trip
@@ -37,6 +38,7 @@ def drive_with_signals(
     bounds: tuple[float, float, float, float] | None = None,
     duration: float | None = None,
     at_speed: bool = False,
+    road: RoadConditions = DRY,
 ) -> Trajectory:
     """The trajectory of a vehicle that drives a path alone and stops at red signals and stop signs.
 
@@ -44,6 +46,7 @@ def drive_with_signals(
     side     : of the road that is driven on
     bounds   : of the map in scene metres
     duration, at_speed : as for `drive_path`; a drive without a duration ends `DWELL_S` after its arrival
+    road     : conditions on which it brakes in an emergency
     """
     plan = junction_plan(graph, lanes_of(graph, side=side, bounds=bounds), seed=seed)
     controlled = has_traffic_control(ego_trip(path, vehicle), graph, plan=plan)
@@ -64,6 +67,7 @@ def drive_with_signals(
         duration=duration,
         radius=np.inf,
         at_speed=at_speed,
+        road=road,
     )
 
 
@@ -78,11 +82,13 @@ def drive_in_traffic(
     options: TrafficOptions | None = None,
     duration: float | None = None,
     at_speed: bool = False,
+    road: RoadConditions = DRY,
 ) -> tuple[Trajectory, Actors]:
     """The trajectory of a vehicle along a path in simulated traffic, and the other road users.
 
     first    : its trajectory without other road users, such as `drive_with_signals` gives
     duration, at_speed : as for `drive_with_signals`
+    road     : conditions on which the others drive; ``vehicle`` is the ego as it is driven on them
 
     The ego is simulated together with the others. Its motion is then smoothed to its limits of acceleration
     and jerk, never ahead of the simulated one, and the others are simulated again around it.
@@ -91,7 +97,7 @@ def drive_in_traffic(
     options = options or TrafficOptions()
     ego, rounds = first, 0
     while True:
-        setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
+        setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options, road=road)
         before, radius = ego, options.radius * setup.scale
         ego = _driven(
             path,
@@ -103,6 +109,7 @@ def drive_in_traffic(
             duration=duration,
             radius=radius,
             at_speed=at_speed,
+            road=road,
         )
         rounds += 1
         if rounds == _ROUNDS or _apart(before, ego) < _SAME * setup.scale:
@@ -131,6 +138,7 @@ def _driven(
     duration: float | None,
     radius: float,
     at_speed: bool,
+    road: RoadConditions,
 ) -> Trajectory:
     """The trajectory of the ego simulated with trips; ``alone_ns`` is its time without them."""
     factor, more = _LONGER
@@ -138,7 +146,7 @@ def _driven(
     if duration is not None and at_speed:
         seconds += _ON_S
     travelled = simulate_ego(
-        ego_trip(path, vehicle, at_speed=at_speed),
+        ego_trip(path, vehicle, at_speed=at_speed, road=road),
         trips,
         graph=graph,
         plan=plan,

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from geoscene.typing import Float
 from lidar.planning.blockwise import even, interpolated, rowwise
 from lidar.planning.path import Path
+from lidar.planning.road_conditions import DRY, RoadConditions
 from lidar.planning.speed_profile import desired_speed
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.lanes import STEP, ActorPath
-from lidar.traffic.trips import Course, Driver
+from lidar.traffic.trips import Course, Driver, driver_on
 
 _ROOM = (0.4, 0.2)
 """Metres added to length and width of the ego's bounding box, for its deviation from the simulated motion."""
@@ -51,8 +52,11 @@ class EgoTrip:
         return self.xy, self.heading
 
 
-def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False) -> EgoTrip:
-    """The ego's trip along its path, from rest or at speed; stations are `STEP` metres apart."""
+def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False, road: RoadConditions = DRY) -> EgoTrip:
+    """The ego's trip along its path, from rest or at speed; stations are `STEP` metres apart.
+
+    road : conditions on which it brakes in an emergency
+    """
     at = even(math.ceil((path.length + _BEYOND) / STEP), STEP)
     # `s` repeats where the vehicle turns round
     s = rowwise(np.add, path.s, even(len(path), 1e-9))
@@ -78,6 +82,7 @@ def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False) -> EgoTrip
     )
     deceleration, acceleration = _BRAKE * vehicle.deceleration, _PULL * vehicle.acceleration
     driver = Driver(vehicle.turning_radius, vehicle.max_speed, _HEADWAY_S, acceleration, deceleration, _GAP)
+    driver = replace(driver, hard=driver_on(driver, road).hard)
     desired = interpolated(at, s, column=desired_speed(path, vehicle))
     if not at_speed:
         desired = rowwise(lambda v, at: np.minimum(v, np.sqrt(2 * acceleration * (at + 0.2))), desired, at)

@@ -19,6 +19,7 @@ from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
+from lidar.planning.road_conditions import DRY, RoadConditions
 from lidar.rig.vehicle import Vehicle
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import Lanes, lane_shift, lanes_of
@@ -108,6 +109,7 @@ def populate(
     vehicle: Vehicle,
     seed: int,
     options: TrafficOptions | None = None,
+    road: RoadConditions = DRY,
 ) -> Actors:
     """The road users around an ego vehicle whose trajectory is fixed; deterministic for a seed and options.
 
@@ -115,16 +117,22 @@ def populate(
     that reacts to traffic. Raises InputError for a scene whose features cannot be read.
     """
     options = options or TrafficOptions()
-    setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
+    setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options, road=road)
     return simulated_actors(
         scene, graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed, options=options, obeys_signals=False
     )
 
 
 def traffic_setup(
-    scene: Scene, graph: RoadGraph, *, ego: Trajectory, seed: int, options: TrafficOptions
+    scene: Scene,
+    graph: RoadGraph,
+    *,
+    ego: Trajectory,
+    seed: int,
+    options: TrafficOptions,
+    road: RoadConditions = DRY,
 ) -> TrafficSetup:
-    """Trips, junctions and obstacles around an ego trajectory."""
+    """Trips, junctions and obstacles around an ego trajectory; vehicles drive under conditions ``road``."""
     lanes = lanes_of(graph, side=options.side, bounds=scene.bounds, cut_nodes=scene.cut_nodes)
     plan = junction_plan(graph, lanes, seed=seed)
     scale = float(np.mean(np.asarray(scene.frame.scale_at(*ego.position[0, :2]), float)))
@@ -132,14 +140,20 @@ def traffic_setup(
     around = shapely.buffer(ego_line(ego), (options.radius + 30.0) * scale)
     shapely.prepare(around)
     surfaces = _layer(scene, "road_surfaces")
-    road = _union(surfaces, _ROAD, area=around, grow=0.3)
+    ground = _union(surfaces, _ROAD, area=around, grow=0.3)
     obstacles = _obstacles(scene, around)
-    if road is not None:
-        road = _passable(road, obstacles, lanes=lanes, area=area)
+    if ground is not None:
+        ground = _passable(ground, obstacles, lanes=lanes, area=area)
 
-    trips = vehicle_trips(lanes, area, seed=seed, density=options.vehicles, ground=road)
+    trips = vehicle_trips(lanes, area, seed=seed, density=options.vehicles, ground=ground, road=road)
     trips += vehicle_trips(
-        lanes, area, seed=seed, density=options.cyclists, shares={"cyclist": 1.0}, ground=road
+        lanes,
+        area,
+        seed=seed,
+        density=options.cyclists,
+        shares={"cyclist": 1.0},
+        ground=ground,
+        road=road,
     )
     walks = sidewalks_around(
         lanes, area, pavement=_union(surfaces, ("sidewalk",), area=around, grow=0.0), obstacles=obstacles

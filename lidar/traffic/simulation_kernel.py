@@ -27,8 +27,6 @@ from lidar.traffic.lanes import STEP
 
 STEP_S = 0.1
 """Seconds of a simulation step."""
-HARD = 8.0
-"""m/s^2, emergency deceleration: decides how far ahead a road user reserves the ground."""
 LOOK_AHEAD = (15.0, 5.0)
 """Metres, and metres per m/s, within which obstacles are searched."""
 _NEAR_EGO = 90.0  # metres from the ego within which reserved cells are checked again
@@ -50,7 +48,7 @@ NOBODY = -1
 USER = np.dtype(
     [
         *((name, np.int64) for name in ("station_start", "cell_start", "block_start", "appear", "begin")),
-        *((name, np.float64) for name in ("headway", "acceleration", "deceleration", "gap")),
+        *((name, np.float64) for name in ("headway", "acceleration", "deceleration", "hard", "gap")),
         *((name, np.float64) for name in ("length", "width")),
         *((name, np.bool_) for name in ("leaves", "whole_block")),
     ],
@@ -59,7 +57,7 @@ USER = np.dtype(
 """A moving road user.
 
 station_start, cell_start, block_start : its first row in the other tables; ends where the next one's begin
-headway, acceleration, deceleration, gap : of the driver model, see `lidar.traffic.trips.Driver`
+headway, acceleration, deceleration, hard, gap : of the driver model, see `lidar.traffic.trips.Driver`
 length, width : metres
 appear, begin : step and station at which it appears
 leaves        : whether it drives on at the end of its path; otherwise it stops there before it disappears
@@ -448,9 +446,10 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
         quiet = 0.3 if free else m.user[i].gap
         close = v * (v - lead) / (2 * math.sqrt(m.user[i].acceleration * m.user[i].deceleration))
         accel -= ((quiet + max(v * m.user[i].headway + close, 0.0)) / gap) ** 2
-    new = max(v + min(max(m.user[i].acceleration * accel, -HARD), m.user[i].acceleration) * dt, 0.0)
+    hard = m.user[i].hard
+    new = max(v + min(max(m.user[i].acceleration * accel, -hard), m.user[i].acceleration) * dt, 0.0)
     # reserve the stopping distance; drive no faster than the reserved cells allow
-    need = min(int((s + (v + new) / 2 * dt + new * new / (2 * HARD)) / STEP) + 2, limit)
+    need = min(int((s + (v + new) / 2 * dt + new * new / (2 * hard)) / STEP) + 2, limit)
     if st[i].granted and _next_signal_is_red(i, k, t, need, m, st, signals):
         need = m.block[b + 1].stop
     route = m.block[b].route if st[i].granted else NOBODY
@@ -466,8 +465,8 @@ def _move(i: int, step: int, dt: float, m: Any, g: Any, st: Any, ego: Any, signa
         q += 1
     _reserve(i, max(need, st[i].station), m, g, st)
     room = min(st[i].station - 1, end - 1) * STEP - s - v * dt / 2
-    root = (dt / 2 * HARD) ** 2 + 2 * HARD * room
-    new = min(new, max(math.sqrt(root) - dt / 2 * HARD, 0.0) if root > 0 else 0.0)
+    root = (dt / 2 * hard) ** 2 + 2 * hard * room
+    new = min(new, max(math.sqrt(root) - dt / 2 * hard, 0.0) if root > 0 else 0.0)
     if must_stop and new < 0.4 and (m.block[b].stop - k) * STEP < _AT_LINE:
         st[i].rested += 1
         new = 0.0

@@ -20,7 +20,6 @@ from lidar.traffic.passages import passages
 from lidar.traffic.simulation_kernel import (
     BLOCK,
     CELL,
-    HARD,
     LOOK_AHEAD,
     NOBODY,
     STATE,
@@ -218,7 +217,7 @@ class Simulation:
         trip, own = self._trips[row], state[0]
         at = int(own["s"] / STEP) if own["active"] else trip.begin
         speed = _FASTER * float(tables.station["desired_speed"].max())
-        brake = min(trip.driver.deceleration, HARD)
+        brake = min(trip.driver.deceleration, trip.driver.hard)
         ahead = (max(LOOK_AHEAD[0] + LOOK_AHEAD[1] * speed, speed**2 / brake + 2 * speed) + 20.0) / STEP
         to = max(at + speed * _STEPS * STEP_S / STEP, float(own["station"])) + ahead
         first, last, stop = tables.block[:, :3].T
@@ -256,7 +255,7 @@ class Simulation:
             name: np.cumsum([0, *(len(getattr(part, column)) for part in tables)])
             for name, column in counted.items()
         }
-        drivers = ("headway", "acceleration", "deceleration", "gap")
+        drivers = ("headway", "acceleration", "deceleration", "hard", "gap")
         user = {name: [getattr(t.driver, name) for t in trips] for name in drivers}
         user |= {name: [getattr(t, name) for t in trips] for name in ("length", "width", "begin", "leaves")}
         user["appear"] = self._appear[rows].tolist()

@@ -31,6 +31,7 @@ from lidar.errors import LidarError, RouteError
 from lidar.geometry.poses import Trajectory
 from lidar.planning.motion import ended_at_rest, poses_along
 from lidar.planning.path import Path as VehiclePath
+from lidar.planning.road_conditions import DRY, GRAVITY, RoadConditions
 from lidar.planning.speed_profile import motion_within
 from lidar.random_streams import generator
 from lidar.rig.vehicle import Vehicle
@@ -56,6 +57,18 @@ _TYPES = {
     "motorcycle": (0.03, 'vClass="motorcycle"'),
 }
 """Shares of the vehicle types: assumed."""
+
+
+_DEFAULTS = {
+    "passenger": (2.6, 4.5, 9.0, 200.0, 0.1),
+    "delivery": (2.6, 4.5, 9.0, 200.0, 0.05),
+    "truck": (1.3, 4.0, 7.0, 130.0, 0.05),
+    "bus": (1.2, 4.0, 7.0, 85.0, 0.0),
+    "motorcycle": (6.0, 10.0, 10.0, 200.0, 0.1),
+    "bicycle": (1.2, 3.0, 7.0, 50.0, 0.0),
+}
+"""SUMO's own acceleration, deceleration, emergency deceleration in m/s^2, maximum speed in km/h, deviation of
+the speed factor ("Vehicle Type Parameter Defaults")."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +106,12 @@ def drive_in_sumo(
     options: TrafficOptions,
     duration: float | None = None,
     at_speed: bool = False,
+    road: RoadConditions = DRY,
 ) -> tuple[Trajectory, Actors]:
     """The trajectory of a vehicle along a path in SUMO's traffic, and the other road users.
 
     first : its trajectory without other road users
+    road  : conditions on which the others drive; ``vehicle`` is the ego as it is driven on them
     duration, at_speed : as for `lidar.traffic.ego_drive.drive_with_signals`
 
     The ego is a vehicle of SUMO with the same route, so SUMO's vehicles react to it. Its trajectory follows
@@ -113,7 +128,7 @@ def drive_in_sumo(
         folder = Path(name)
         net = _network(home, scene, folder=folder)
         lanes = _lanes(net, scene)
-        demand = _trips(lanes, seed=seed, seconds=_WARM_UP_S + seconds, options=options)
+        demand = _trips(lanes, seed=seed, seconds=_WARM_UP_S + seconds, options=options, road=road)
         own = _ego(lanes, path, vehicle=vehicle, at_speed=at_speed)
         (folder / "trips.rou.xml").write_text(f"<routes>\n{''.join(demand)}{own}</routes>\n", "utf-8")
         _simulate(home, folder, net=net, seed=seed, seconds=seconds, radius=options.radius + LEFT)
@@ -208,10 +223,12 @@ def _lanes(net: Path, scene: Scene) -> _Lanes:
     return _Lanes(np.array(names), np.array(edges), np.array(lines, object), np.array(sidewalk), linked[rows])
 
 
-def _trips(lanes: _Lanes, *, seed: int, seconds: float, options: TrafficOptions) -> Iterator[str]:
+def _trips(
+    lanes: _Lanes, *, seed: int, seconds: float, options: TrafficOptions, road: RoadConditions
+) -> Iterator[str]:
     """Random trips of road users that are on the road from the first second, and for as long as SUMO runs."""
-    yield from (f'<vType id="{name}" {words}/>\n' for name, (_, words) in _TYPES.items())
-    yield '<vType id="bicycle" vClass="bicycle"/>\n'
+    types = {name: words for name, (_, words) in _TYPES.items()} | {"bicycle": 'vClass="bicycle"'}
+    yield from (f'<vType id="{name}" {words}{_driven_on(road, name)}/>\n' for name, words in types.items())
     shares = np.array([share for share, _ in _TYPES.values()])
     roads, walks = np.flatnonzero(~lanes.sidewalk & lanes.linked), np.flatnonzero(lanes.sidewalk)
     for kind, density in (("vehicle", options.vehicles), ("cyclist", options.cyclists)):
@@ -229,6 +246,21 @@ def _trips(lanes: _Lanes, *, seed: int, seconds: float, options: TrafficOptions)
         names = lanes.edge[_places(lanes, walks, metres=_WALKING_SPEED * seconds, rng=rng)]
         legs = "".join(f'<walk from="{a}" to="{b}"/>' for a, b in itertools.pairwise(names))
         yield f'<person id="pedestrian{k}" depart="0" departPos="random">{legs}</person>\n'
+
+
+def _driven_on(road: RoadConditions, name: str) -> str:
+    """Attributes of a vehicle type under road conditions; none on dry roads."""
+    if road == DRY:
+        return ""
+    acceleration, deceleration, emergency, speed, deviation = _DEFAULTS[name]
+    pace = f"normc({road.pace:.4f},{deviation},0.2,2)" if deviation else f"{road.pace:.4f}"
+    values = {
+        "accel": acceleration * road.share,
+        "decel": deceleration * road.share,
+        "emergencyDecel": max(min(emergency, road.grip * GRAVITY), deceleration * road.share),
+        "maxSpeed": min(speed / 3.6, road.sight_speed),
+    }
+    return "".join(f' {key}="{value:.3f}"' for key, value in values.items()) + f' speedFactor="{pace}"'
 
 
 def _count(lanes: _Lanes, rows: Ints, *, density: float) -> int:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import shapely
 
 from geoscene.typing import Float
+from lidar.planning.road_conditions import DRY, GRAVITY, RoadConditions
 from lidar.random_streams import generator
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, edge_name, path_along_lanes, random_lanes
 from lidar.traffic.surroundings import Surroundings, entrances
@@ -18,7 +19,6 @@ from lidar.world.actor_shapes import PAINTS, Shape, catalogue
 
 _STATIONS = 1 << 19
 """Stations of courses that are kept in memory: 40 MB."""
-_LATERAL = 2.0  # m/s^2, comfortable lateral acceleration in bends
 _TRIES = 5  # paths tried for a vehicle until one stays on the carriageway
 _MIN_STATIONS = 40  # of a path
 _MAX_LENGTH = 3000.0  # metres of a path
@@ -37,6 +37,8 @@ class Driver:
     deceleration : m/s^2, comfortable
     gap          : metres to the road user ahead at standstill
     keeps_kerb   : whether it rides at the kerb within its lane
+    hard         : m/s^2, deceleration in an emergency; decides how far ahead it reserves the ground
+    lateral      : m/s^2, comfortable in bends
     """
 
     min_radius: float
@@ -46,6 +48,22 @@ class Driver:
     deceleration: float
     gap: float
     keeps_kerb: bool = False
+    hard: float = 8.0
+    lateral: float = 2.0
+
+
+def driver_on(driver: Driver, road: RoadConditions) -> Driver:
+    """A driver as it drives under road conditions."""
+    if road == DRY:
+        return driver
+    return replace(
+        driver,
+        max_speed=min(driver.max_speed, road.sight_speed),
+        acceleration=driver.acceleration * road.share,
+        deceleration=driver.deceleration * road.share,
+        lateral=driver.lateral * road.share,
+        hard=min(driver.hard, road.grip * GRAVITY),
+    )
 
 
 DRIVERS: dict[str, Driver] = {
@@ -158,12 +176,14 @@ def vehicle_trips(
     density: float,
     shares: dict[str, float] | None = None,
     ground: shapely.Geometry | None = None,
+    road: RoadConditions = DRY,
 ) -> list[Trip]:
     """Trips that start at random places on the lanes around the ego, and later ones that enter at the rim.
 
     density : vehicles per kilometre of lane
     shares  : shares of the kinds of `DRIVERS`; `VEHICLE_SHARES` by default
     ground  : the carriageways; a path ends where the body would leave them
+    road    : conditions that lower speeds and accelerations
     """
     shares = shares or VEHICLE_SHARES
     graph, weight = lanes.graph, lanes.traffic_weight
@@ -171,7 +191,7 @@ def vehicle_trips(
     used = np.flatnonzero(metres)
     metres, name = metres[used], "+".join(shares)
     trips: list[Trip | None] = []
-    make = partial(_trip, lanes, area, drawings=Drawings(), shares=shares, ground=ground)
+    make = partial(_trip, lanes, area, drawings=Drawings(), shares=shares, ground=ground, road=road)
     for number in range(round(density * float(metres.sum()) / 1000)):
         rng = generator(seed, "traffic", name, number)
         edge, at = int(rng.choice(used, p=metres / metres.sum())), rng.random()
@@ -203,6 +223,7 @@ def _trip(
     place: tuple[int, float],
     span: tuple[float, float],
     ground: shapely.Geometry | None,
+    road: RoadConditions,
 ) -> Trip | None:
     """A trip of a random vehicle; None if no path is long enough.
 
@@ -213,10 +234,10 @@ def _trip(
     kind = list(shares)[
         int(rng.choice(len(shares), p=np.array(list(shares.values())) / sum(shares.values())))
     ]
-    driver = DRIVERS[kind]
+    driver = driver_on(DRIVERS[kind], road)
     lane = 0 if driver.keeps_kerb else int(rng.integers(lanes.count[edge]))
     shape, grow = random_shape(kind, rng), random_stretch(rng)
-    pace = float(np.clip(rng.normal(1.0, 0.06), 0.85, 1.1))
+    pace = float(np.clip(rng.normal(1.0, 0.06), 0.85, 1.1)) * road.pace
     width = shape.width * grow[1]
     if width > lanes.max_width[edge]:
         return None
@@ -295,7 +316,7 @@ def _stations_on_carriageway(
 def speed_profile(path: ActorPath, driver: Driver, *, pace: float) -> Float:
     """Desired speed (n,) in m/s: speed limit times ``pace``, slower in bends and in time before them."""
     bend = np.maximum(np.abs(path.curvature), 1e-6)
-    v = np.minimum(np.minimum(path.limit * pace, driver.max_speed), np.sqrt(_LATERAL / bend))
+    v = np.minimum(np.minimum(path.limit * pace, driver.max_speed), np.sqrt(driver.lateral / bend))
     v = np.maximum(v, 1.0)
     ramp = 2 * driver.deceleration * 0.8 * STEP * np.arange(len(v))
     back = np.minimum.accumulate((v**2 + ramp)[::-1])[::-1] - ramp

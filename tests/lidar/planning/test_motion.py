@@ -14,6 +14,7 @@ from lidar.errors import InputError
 from lidar.geometry.attitude import body_rates, euler_from_quat, matrix_from_quat
 from lidar.planning.motion import drive_path, motion_along, speed_limits
 from lidar.planning.path import plan_path
+from lidar.planning.road_conditions import ROADS, vehicle_on
 from lidar.planning.route import RouteOptions, free_route, lane_route, plan_route
 from lidar.rig.vehicle import load_vehicle
 
@@ -55,6 +56,17 @@ def assert_gentle(trajectory, vehicle, *, rests=True):
     moving = middle > 0.2
     assert np.abs(yaw_rate[moving] / middle[moving]).max() <= 1.02 / vehicle.turning_radius
     np.testing.assert_allclose(np.linalg.norm(trajectory.quat_xyzw, axis=1), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("road", ["wet", "snow", "ice"])
+def test_drives_on_slippery_roads_keep_to_the_limits_that_the_grip_leaves(road):
+    car = vehicle_on(CAR, ROADS[road])
+    graph = grid(4, 4, 90.0, speed=13.9)
+    route = plan_route(graph, FRAME, spec="random", options=RouteOptions(seed=2, duration=60))
+    trajectory = drive_path(plan_path(route, car, frame=FRAME), car)
+    assert_gentle(trajectory, car)
+    speed = np.linalg.norm(trajectory.velocity, axis=1)
+    assert speed.max() <= 13.9 * ROADS[road].pace * 1.001
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["car", "van", "robot"]), st.sampled_from([None, 60.0]))

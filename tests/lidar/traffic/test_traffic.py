@@ -15,6 +15,7 @@ from lidar.geometry import poses
 from lidar.geometry.poses import Trajectory
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
+from lidar.planning.road_conditions import DRY, ROADS
 from lidar.planning.route import RouteOptions, plan_route
 from lidar.traffic import simulation_windows
 from lidar.traffic import trips as trips_module
@@ -22,7 +23,7 @@ from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.traffic.lanes import STEP, lane_shift, lanes_of, random_lanes
 from lidar.traffic.simulation import ego_motion, green_windows, simulate_ego, simulate_trips
-from lidar.traffic.simulation_kernel import HARD, STEP_S
+from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.surroundings import surroundings_of
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.trips import vehicle_trips
@@ -46,11 +47,11 @@ def city(*, signalised, lanes=1.0, width=7.0):
     return replace(graph, signals=np.full(len(graph.node_id), signalised))
 
 
-def flow_on(graph, ego, *, seed, density=25.0, radius=400.0, shares=None):
+def flow_on(graph, ego, *, seed, density=25.0, radius=400.0, shares=None, road=DRY):
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
     plan = junction_plan(graph, lanes, seed=seed)
     area = surroundings_of(lanes, ego, radius=radius, scale=1.0)
-    trips = vehicle_trips(lanes, area, seed=seed, density=density, shares=shares)
+    trips = vehicle_trips(lanes, area, seed=seed, density=density, shares=shares, road=road)
     return trips, simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, radius=radius), plan
 
 
@@ -156,13 +157,23 @@ def test_courses_are_drawn_again_when_more_were_drawn_since(monkeypatch):
     np.testing.assert_array_equal(again.desired_speed, first[0].desired_speed)
 
 
+def test_traffic_on_snow_is_slower_and_brakes_no_harder_than_the_grip_allows():
+    ego, graph = standing((400.0, 400.0), 40.0), city(signalised=True)
+    _, dry, _ = flow_on(graph, ego, seed=3, radius=600.0)
+    trips, snow, _ = flow_on(graph, ego, seed=3, radius=600.0, road=ROADS["snow"])
+    assert snow.speed.mean() < 0.8 * dry.speed.mean()
+    hardest = min(np.diff(snow.speed[snow.trip == k]).min(initial=0.0) for k in np.unique(snow.trip)) / STEP_S
+    assert -0.2 * 9.81 - 1e-6 <= hardest < 0
+    assert {trip.driver.hard for trip in trips} == {0.2 * 9.81}
+
+
 def test_speed_changes_within_the_limits_of_the_vehicle():
     trips, flow, _ = flow_on(city(signalised=True), standing((400.0, 400.0), 60.0), seed=3, radius=600.0)
     for k in np.unique(flow.trip):
         speed = flow.speed[flow.trip == k]
         change = np.diff(speed) / STEP_S
         assert change.max(initial=0.0) <= trips[k].driver.acceleration + 1e-6
-        assert change.min(initial=0.0) >= -HARD - 1e-6
+        assert change.min(initial=0.0) >= -trips[k].driver.hard - 1e-6
         travelled = np.diff(flow.travelled[flow.trip == k])
         np.testing.assert_allclose(travelled, (speed[1:] + speed[:-1]) / 2 * STEP_S, atol=0.02)
         assert (travelled >= -1e-9).all()
