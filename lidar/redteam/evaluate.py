@@ -6,12 +6,15 @@ import itertools
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from lidar.defences.calibration import Calibration, tail_of
+from lidar.defences.fusion import FUSED, fused
 from lidar.defences.scores import Samples, Score, score, threshold_at
+from lidar.defences.verdict import Verdict
 from lidar.random_streams import generator
 from lidar.redteam.measure import FEWEST
 from lidar.redteam.plan import Attack, Measure, Run
@@ -142,6 +145,7 @@ class Matrix:
 def evaluated(figures: Sequence[Figures], attacks: Sequence[Attack], *, measure: Measure) -> Matrix:
     """The matrix of drives with and without attack."""
     found = Matrix([], [], [], [])
+    figures = _with_fused(figures, block=measure.block)
     thresholds = _thresholds(figures, measure=measure)
     for setting, scene, drives in _groups(figures):
         plain = [one for one in drives if one.run.attack is None]
@@ -180,16 +184,60 @@ def _sensor_of(setting: Mapping[str, str]) -> str:
     return str({name: text for name, text in setting.items() if name != "weather"})
 
 
-def _thresholds(figures: Sequence[Figures], *, measure: Measure) -> dict[str, dict[tuple[str, str], float]]:
-    """Thresholds by sensor, defence and level, of drives without attack, and without weather if there are."""
+def _clear(figures: Iterable[Figures]) -> dict[str, list[Figures]]:
+    """Drives without attack by sensor, of which those without weather if there are."""
     plain: dict[str, list[Figures]] = defaultdict(list)
     for one in figures:
         if one.run.attack is None:
             plain[_sensor_of(one.setting)].append(one)
+    return {
+        key: [one for one in drives if not one.setting.get("weather")] or drives
+        for key, drives in plain.items()
+    }
+
+
+def _with_fused(figures: Sequence[Figures], *, block: float) -> list[Figures]:
+    """The drives with the verdict of all defences together as one more, if there are several."""
+    calibrations = {}
+    for key, drives in _clear(figures).items():
+        tails = {}
+        for defence in _defences(drives):
+            for level in ("frames", "objects"):
+                samples = _samples(drives, (), defence=defence, level=level, block=block)
+                if samples.genuine.any():
+                    tails[defence, level] = tail_of(samples)
+        calibrations[key] = Calibration(tails)
+    return [
+        replace(
+            one, frames=[_fused_frame(frame, calibrations[_sensor_of(one.setting)]) for frame in one.frames]
+        )
+        for one in figures
+    ]
+
+
+def _fused_frame(frame: Mapping[str, Any], calibration: Calibration) -> dict[str, Any]:
+    """A frame with the fused verdict of its calibrated defences."""
+    verdicts = {}
+    for name, suspicion in frame["suspicion"].items():
+        objects = frame["object_suspicion"].get(name) if (name, "objects") in calibration.tails else None
+        if (name, "frames") in calibration.tails:
+            verdicts[name] = Verdict(None, None if objects is None else np.array(objects, float), suspicion)
+    if len(verdicts) < 2:
+        return dict(frame)
+    found = fused(verdicts, calibration, rule="max")
+    objects = {} if found.objects is None else {FUSED: found.objects.tolist()}
+    return {
+        **frame,
+        "suspicion": frame["suspicion"] | {FUSED: found.frame},
+        "object_suspicion": frame["object_suspicion"] | objects,
+    }
+
+
+def _thresholds(figures: Sequence[Figures], *, measure: Measure) -> dict[str, dict[tuple[str, str], float]]:
+    """Thresholds by sensor, defence and level, of drives without attack, and without weather if there are."""
     allowed = {"frames": measure.false_alarms, "objects": measure.false_objects}
     found: dict[str, dict[tuple[str, str], float]] = {}
-    for key, drives in plain.items():
-        clear = [one for one in drives if not one.setting.get("weather")] or drives
+    for key, clear in _clear(figures).items():
         found[key] = {
             (defence, level): threshold_at(
                 _samples(clear, (), defence=defence, level=level, block=measure.block), share

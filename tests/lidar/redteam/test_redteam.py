@@ -171,6 +171,35 @@ def test_a_hidden_road_user_counts_while_no_alarm_is_raised(written: Callable[..
     assert found.detection[0].residual.share == 0.25
 
 
+def test_defences_together_notice_what_each_notices(written: Callable[..., Path]) -> None:
+    drives = read_grid(written("", grid="seed = [1, 2]"))
+    attack = Attack("phantom", "inject", "forge")
+    rng = np.random.default_rng(0)
+
+    def frames(*, attacked: bool) -> list[Any]:
+        found = []
+        for k in range(400):
+            frame = _frame(k / 10, suspicion=0.0, forged=int(attacked))
+            values = dict(zip(("a", "b", "c"), rng.uniform(0, 0.9, 3), strict=True))
+            if attacked:
+                values["abc"[k % 3]] = 1.0
+            found.append(frame | {"suspicion": values, "object_suspicion": {}})
+        return found
+
+    found = evaluated(
+        [
+            Figures(Run(drives[0], None, {}, drives[0].name), frames(attacked=False), []),
+            Figures(Run(drives[1], attack, {}, drives[0].name), frames(attacked=True), []),
+        ],
+        [attack],
+        measure=Measure(),
+    )
+    shares = {row.defence: row.attacked.share for row in found.detection if row.level == "frames"}
+    assert max(shares[name] for name in "abc") < 0.5
+    assert shares["fused"] > 0.99
+    assert next(row for row in found.detection if row.defence == "fused").genuine.share <= 0.05
+
+
 def test_a_matrix_of_drives(written: Callable[..., Path], tmp_path: Path) -> None:
     file = written(PHANTOM + DAZZLE + '[defences]\nuse = ["occlusion", "shadow"]')
     first = redteam(file, tmp_path / "out")
@@ -182,7 +211,8 @@ def test_a_matrix_of_drives(written: Callable[..., Path], tmp_path: Path) -> Non
     assert phantom.added > 50
     assert dazzle.added == 0
     assert dazzle.lost > 100
-    assert {row.defence for row in first.matrix.detection} == {"occlusion", "shadow"}
+    assert {row.defence for row in first.matrix.detection} == {"occlusion", "shadow", "fused"}
+    assert {row.defence for row in first.matrix.cost} == {"detector", "occlusion", "shadow"}
     document = json.loads((tmp_path / "out" / "redteam.json").read_text())
     assert [attack["name"] for attack in document["attacks"]] == ["phantom", "dazzle"]
     page = (tmp_path / "out" / "redteam.html").read_text()
