@@ -85,15 +85,14 @@ def altered_echoes(pulses: Pulses, echoes: TracedEchoes, *, stages: Stages, at: 
         if len(echoes) and not 0 <= echoes.pulse.min() <= echoes.pulse.max() < len(pulses):
             raise LidarError(f"stage {named.name} returned echoes of pulses that were not fired")
     is_new = (echoes.source < 0) | (echoes.origin == Origin.MOVED)
-    is_mixed = np.isin(echoes.pulse, echoes.pulse[is_new])
-    order = np.lexsort((np.where(is_mixed, echoes.range, 0.0), echoes.pulse))
-    echoes, is_mixed = echoes.take(order), is_mixed[order]
-    if not is_mixed.any():
-        return echoes
+    has_new = np.zeros(len(pulses), bool)
+    has_new[echoes.pulse[is_new]] = True
+    is_mixed = has_new[echoes.pulse]
+    mixed, others = echoes.take(np.flatnonzero(is_mixed)), echoes.take(np.flatnonzero(~is_mixed))
+    mixed = mixed.take(np.lexsort((mixed.range, mixed.pulse)))
     # Off the axis, so that an echo of several is described by the one that sends back most.
-    mixed = echoes.take(is_mixed)
     mixed = merged(replace(mixed, axis=np.zeros(len(mixed), bool)), pulses.sensor.echo_separation)
-    return by_pulse(echoes.take(~is_mixed), mixed)
+    return by_pulse(others, mixed)
 
 
 def linked(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> TracedCloud:
@@ -105,7 +104,7 @@ def linked(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> Traced
     row = np.full(max(first.source.max(initial=-1), echoes.source.max(initial=-1)) + 2, -1, np.int32)
     row[first.source] = np.arange(len(first))
     source = row[echoes.source]
-    lost = np.setdiff1d(np.arange(len(first)), source)
+    lost = _others(source, len(first))
     hidden = np.full(len(cloud), -1, np.int32)
     if len(lost):
         at = np.minimum(np.searchsorted(first.pulse[lost], echoes.pulse), len(lost) - 1)
@@ -113,6 +112,13 @@ def linked(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> Traced
         hidden[hides] = lost[at[hides]]
     added: list[Any] = [echoes.origin, source, hidden]
     return TracedCloud(cloud.start_ns, *cloud.columns().values(), *added)
+
+
+def _others(rows: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """The rows below ``count`` that are not among some rows, of which negative ones stand for none."""
+    is_other = np.ones(count, bool)
+    is_other[rows[rows >= 0]] = False
+    return np.flatnonzero(is_other)
 
 
 def altered_cloud(cloud: TracedCloud, stages: Stages, *, at: Situation) -> TracedCloud:
@@ -164,7 +170,7 @@ def cloud_truth(altered: Altered, *, start_ns: int) -> dict[str, NDArray[Any]]:
     """
     cloud, original = altered.cloud, altered.original
     kept = cloud.source[(cloud.source >= 0) & (cloud.origin != Origin.MOVED)]
-    removed = np.setdiff1d(np.arange(len(original), dtype=np.int32), kept)
+    removed = _others(kept, len(original)).astype(np.int32)
     removed_columns = original.take(removed).columns()
     time_ns = original.start_ns - start_ns + removed_columns["time_ns"].astype(np.int64)
     removed_columns["time_ns"] = time_ns.astype(np.int64)

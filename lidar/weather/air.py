@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from geoscene.typing import Float
-from lidar.physics.echoes import Origin, TracedEchoes, joined
+from lidar.physics.echoes import Origin, TracedEchoes
 from lidar.signal.stage import Pulses, added_echoes
 from lidar.weather.backscatter import (
-    LEAST,
     drawn_particles,
+    least_power,
     particles,
     response_ranges,
     soft_target,
@@ -28,7 +28,7 @@ def through_even_air(
     end = beam_ends(pulses, echoes)
     added = air_echoes(pulses, end, medium=medium, rng=rng)
     dimmed = echoes.apparent * np.exp(-2 * medium.extinction * echoes.range)
-    return joined(replace(echoes, apparent=dimmed), added)
+    return TracedEchoes.concatenate((replace(echoes, apparent=dimmed), added))
 
 
 def beam_ends(pulses: Pulses, echoes: TracedEchoes) -> Float:
@@ -49,11 +49,15 @@ def air_echoes(pulses: Pulses, end: Float, *, medium: Medium, rng: np.random.Gen
         before = place < end[pulse]
         pulse, place = pulse[before], place[before]
         power = power[before] * np.exp(-2 * extinction * place)
+        # Pulses whose particles stay unseen even together are left as they are.
+        together = np.bincount(pulse, power, minlength=len(pulses))
+        seen = together[pulse] > least_power(sensor)
+        pulse, place, power = pulse[seen], place[seen], power[seen]
     else:
         pulse, place, power = np.empty(0, np.int64), np.empty(0), np.empty(0)
     soft = soft_target(sensor, extinction, backscatter=backscatter, distance=distance)
     soft_place, soft_power = soft.at(end)
-    seen = np.flatnonzero(soft_power > LEAST)
+    seen = np.flatnonzero(soft_power > least_power(sensor))
     pulse = np.concatenate((seen, pulse))
     place, power = np.concatenate((soft_place[seen], place)), np.concatenate((soft_power[seen], power))
     power = power * pulses.power[pulse]

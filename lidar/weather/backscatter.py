@@ -13,13 +13,11 @@ from lidar.physics.link import amplitude
 from lidar.rig.scanner import Sensor
 from lidar.weather.media import Medium
 
-LEAST = 0.1
-"""Power over the detection threshold below which a particle is not drawn but counts as part of a soft target.
-
-Of a receiver with the noise 0.18 of the threshold, such an echo is detected once in 3 million."""
+_DEVIATIONS = 3.5
+"""Standard deviations of the receiver's noise below the threshold, where one in 4300 echoes passes it."""
 
 MOST = 12.0
-"""Mean number of particles per pulse above which `LEAST` is raised."""
+"""Mean number of particles per pulse above which fewer are drawn."""
 
 LIGHT = 0.299792458
 """Metres per nanosecond."""
@@ -65,6 +63,11 @@ def pulse_shape(pulse_ns: float, step: float) -> Float:
     return shape
 
 
+def least_power(sensor: Sensor) -> float:
+    """Power over the threshold from which on the detector may notice an echo; at least 0.2."""
+    return max(0.2, 1 - _DEVIATIONS * sensor.noise_ratio)
+
+
 @dataclass(frozen=True, slots=True)
 class SoftTarget:
     """The echo of even air, by the range at which the beam ends.
@@ -80,9 +83,10 @@ class SoftTarget:
 
     def at(self, end: Float) -> tuple[Float, Float]:
         """Range and power (n,) for beams that end at ranges (n,)."""
-        row = np.searchsorted(self.end, end, side="right") - 1
-        inside = row >= 0
-        return self.range[row], np.where(inside, self.power[row], 0.0)
+        step = self.end[1] - self.end[0] if len(self.end) > 1 else 1.0
+        steps = np.clip((end - self.end[0]) / step + 1e-6, -1, len(self.end) - 1)
+        row = np.floor(steps).astype(np.int64)
+        return self.range[row], np.where(row >= 0, self.power[row], 0.0)
 
 
 def soft_target(sensor: Sensor, extinction: float, *, backscatter: Float, distance: Float) -> SoftTarget:
@@ -102,6 +106,8 @@ def soft_target(sensor: Sensor, extinction: float, *, backscatter: Float, distan
     places = distance[0] + step * (np.arange(len(whole)) - (len(shape) - 1) / 2)
     allowed = places >= sensor.min_range - sensor.pattern.range_offset
     best = int(np.argmax(np.where(allowed, whole, -1.0)))
+    if whole[best] < least_power(sensor):  # too weak wherever the beam ends
+        return SoftTarget(distance[:1], places[best : best + 1], whole[best : best + 1])
     ends = np.arange(min(best + 1, len(distance)))
     found, power = np.empty(len(ends)), np.empty(len(ends))
     for end in ends:
@@ -115,15 +121,13 @@ def soft_target(sensor: Sensor, extinction: float, *, backscatter: Float, distan
 class Particles:
     """Single particles that a pulse may meet in clear air, by classes of range and size.
 
-    count     : mean number per pulse
-    chance    : (c,) cumulative probability of the classes
+    count     : (c,) mean number per pulse of each class
     near, far : (c,) metres, range of each class
     strongest : (c,) power over the threshold on the beam's axis in the middle of each class
     least     : power from which on particles are drawn
     """
 
-    count: float
-    chance: Float
+    count: Float
     near: Float
     far: Float
     strongest: Float
@@ -149,13 +153,12 @@ def particles(sensor: Sensor, medium: Medium, *, most: float = MOST) -> tuple[Pa
         counts: Float = medium.number[:, None] * u * (area * depth)
         return counts
 
-    least = LEAST
+    least = least_power(sensor) / 2
     while (counts := expected(least)).sum() > most:
         least *= 1.25
     cells = counts.ravel() > 0
     drawn = Particles(
-        float(counts.sum()),
-        np.cumsum(counts.ravel()[cells]) / max(counts.sum(), 1e-300),
+        counts.ravel()[cells],
         np.broadcast_to(edges[:-1], counts.shape).ravel()[cells],
         np.broadcast_to(edges[1:], counts.shape).ravel()[cells],
         strongest.ravel()[cells],
@@ -193,9 +196,9 @@ def drawn_particles(
     some: Particles, pulses: int, *, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Float, Float]:
     """Pulse, range and power over the threshold (k,) of particles that pulses meet in clear air."""
-    pulse = np.repeat(np.arange(pulses), rng.poisson(some.count, pulses))
-    cell, along, across = rng.random((3, len(pulse)))
-    row = np.minimum(np.searchsorted(some.chance, cell, side="right"), len(some.chance) - 1)
+    row = np.repeat(np.arange(len(some.count)), rng.poisson(some.count * pulses))
+    pulse = rng.integers(0, pulses, len(row))
+    along, across = rng.random((2, len(row)))
     distance = some.near[row] + along * (some.far[row] - some.near[row])
     strongest = some.strongest[row]
     power = strongest * (some.least / strongest) ** across
